@@ -1,0 +1,433 @@
+"""The map: every type that passes between the stages, in the order of the pipeline.
+
+Units throughout: the submission's own position unit (say cm) and input unit (say V), seconds,
+radians. Time is the last axis. Carts and springs count from 1. A standard error ("std") is one
+sigma; `None` means it could not be had.
+"""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from pipeline.plant.chain import Array, Chain, ComplexArray, frozen_array
+
+Kind = Literal["decay", "step", "sine", "sweep", "closed_loop", "bode"]
+Hold = Literal["zero_order", "band_limited"]
+Outcome = Literal["pass", "fail", "skip"]
+
+
+def _freeze(instance: object, *names: str) -> None:
+    """Replace the named array fields by read-only copies."""
+    for name in names:
+        value = getattr(instance, name)
+        if value is not None:
+            object.__setattr__(instance, name, frozen_array(value, name=name))
+
+
+# ------------------------------------------------------------------------ data
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Record:
+    """One measured time series, in physical units.
+
+    Attributes
+    ----------
+    id : the experiment's id, used in every message.
+    t : (n,) s, strictly increasing, as measured: never assumed uniform.
+    u : (n,) input, or None where the file has none. Positive pushes cart 1 towards positive x.
+    y : (len(carts), n) positions; row j belongs to cart `carts[j]`.
+    carts : the carts that were measured.
+    free : the carts free to move; the others are held.
+    reference : (n,) set point of a closed-loop run, in position units, or None.
+    omega : frequency of a sine dwell, rad/s, or None.
+    resolution : (len(carts),) the encoder step, in position units; 0 where none is seen.
+    hold : how the input behaves between samples.
+    source : path inside the submission; `notes` say what reading it had to mend.
+    """
+
+    id: str
+    kind: Kind
+    t: Array
+    u: Array | None
+    y: Array
+    carts: tuple[int, ...]
+    free: tuple[int, ...]
+    reference: Array | None = None
+    omega: float | None = None
+    resolution: Array
+    hold: Hold = "zero_order"
+    source: str = ""
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        _freeze(self, "t", "u", "y", "reference", "resolution")
+        n = self.t.size
+        if self.y.shape != (len(self.carts), n) or self.resolution.shape != (len(self.carts),):
+            raise ValueError(f"{self.id}: y {self.y.shape} does not match carts and t ({n},)")
+        if any(a is not None and a.shape != (n,) for a in (self.u, self.reference)):
+            raise ValueError(f"{self.id}: the input or reference does not match t ({n},)")
+
+    def position(self, cart: int) -> Array:
+        """Return the measured position (n,) of one cart."""
+        return self.y[self.carts.index(cart)]
+
+    def encoder_step(self, cart: int) -> float:
+        """Return the encoder step of one cart, in position units; 0 where none is seen."""
+        return float(self.resolution[self.carts.index(cart)])
+
+    @property
+    def sample_time(self) -> float:
+        """The mean sample interval, s."""
+        return float((self.t[-1] - self.t[0]) / (self.t.size - 1))
+
+
+# ---------------------------------------------------------- time-domain stages
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SinePoint:
+    """Sinusoidal steady state of one cart in one dwell.
+
+    Attributes
+    ----------
+    omega : rad/s; fitted where the submission did not state it.
+    amplitude, phase : of the position; phase in rad against the input's sine, in (-pi, pi].
+    input_amplitude : of the measured input, fitted the same way.
+    steady_from : s; the transient is over, the fit uses t >= steady_from.
+    settled : False where the record ends before a steady state is seen.
+    note : what a reader must know (few counts, not settled, off-sine residual), or "".
+    """
+
+    experiment: str
+    cart: int
+    omega: float
+    amplitude: float
+    amplitude_std: float
+    phase: float
+    phase_std: float
+    input_amplitude: float
+    input_amplitude_std: float
+    steady_from: float
+    settled: bool
+    n_points: int
+    note: str = ""
+
+    @property
+    def gain(self) -> float:
+        """Amplitude ratio, position unit per input unit."""
+        return self.amplitude / self.input_amplitude
+
+    @property
+    def gain_std(self) -> float:
+        """Standard error of the amplitude ratio, both amplitudes' errors combined."""
+        relative = (
+            (self.amplitude_std / self.amplitude) ** 2
+            + (self.input_amplitude_std / self.input_amplitude) ** 2
+            if self.amplitude > 0
+            else 0.0
+        )
+        return self.gain * relative**0.5 if self.amplitude > 0 else self.amplitude_std
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FrictionTest:
+    """Does dry friction explain the decay better than viscous damping alone?
+
+    Attributes
+    ----------
+    f_statistic, threshold : the F-test of one further parameter; `present` if above.
+    drop : d = F/k, the friction band's half width, position units.
+    zeta, omega_n : of the decay once friction is taken out.
+    """
+
+    f_statistic: float
+    threshold: float
+    present: bool
+    drop: float
+    drop_std: float
+    zeta: float
+    zeta_std: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LogDecrement:
+    """Free decay of one cart: peaks, envelope, natural frequency and damping ratio.
+
+    Attributes
+    ----------
+    release : s; where the free decay begins (a hold or a hand may come before it).
+    peak_t, peak_y : (n_peaks,) the extrema used, maxima and minima in turn.
+    amplitude : (n_peaks - 2,) half the swing about the moving rest point, at peak_t[1:-1].
+    delta, zeta_peaks, omega_n_peaks : by the logarithmic decrement (per full cycle).
+    zeta, omega_n : by the exponential-sinusoid fit, the better estimate.
+    fit_t, fit_y : the fitted decay, for the figure; envelope_upper/lower at fit_t.
+    friction : the dry-friction test; with friction present zeta is biased, and `note` says so.
+    zeta_at_amplitude : (2, n) amplitude and the local damping ratio there.
+    """
+
+    experiment: str
+    cart: int
+    release: float
+    peak_t: Array
+    peak_y: Array
+    amplitude: Array
+    delta: float
+    delta_std: float
+    zeta_peaks: float
+    zeta_peaks_std: float
+    omega_n_peaks: float
+    omega_n_peaks_std: float
+    zeta: float
+    zeta_std: float
+    omega_n: float
+    omega_n_std: float
+    fit_t: Array
+    fit_y: Array
+    envelope_upper: Array
+    envelope_lower: Array
+    friction: FrictionTest | None
+    zeta_at_amplitude: Array
+    note: str = ""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StepEdge:
+    """One edge of the input and the levels on its two sides.
+
+    `gain` is (level_after - level_before) / (u_after - u_before); windows in s.
+    """
+
+    t: float
+    u_before: float
+    u_after: float
+    level_before: float
+    level_after: float
+    window_before: tuple[float, float]
+    window_after: tuple[float, float]
+    gain: float
+    gain_std: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StepGain:
+    """Static gain of one cart from one step record.
+
+    Attributes
+    ----------
+    gain : weighted mean over the edges; gain_std its standard error, spread included.
+    rest_shift : how far the rest point moved between first and last rest (friction), or None.
+    interval : (low, high) of the gain where the cart sticks, else None.
+    """
+
+    experiment: str
+    cart: int
+    edges: tuple[StepEdge, ...]
+    gain: float
+    gain_std: float
+    rest_shift: float | None
+    interval: tuple[float, float] | None
+    note: str = ""
+
+
+# ----------------------------------------------------- frequency-domain stages
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FrequencyResponse:
+    """X_cart/U at omega: (n_w,) arrays, ascending; carries its own grid, never interpolated.
+
+    `phase` (rad) and its error are None for a table of amplitude ratios. `source`: sine dwells,
+    a table the students reduced, or transforms of step and sweep records.
+    """
+
+    cart: int
+    omega: Array
+    magnitude: Array
+    magnitude_std: Array
+    phase: Array | None
+    phase_std: Array | None
+    source: Literal["dwells", "table", "records"]
+
+    def __post_init__(self) -> None:
+        _freeze(self, "omega", "magnitude", "magnitude_std", "phase", "phase_std")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """A number with its standard error and where it comes from ("step", "log_decrement", …)."""
+
+    value: float
+    std: float | None
+    source: str
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ChainFit:
+    """One chain fitted to the measurements of all carts at once.
+
+    Attributes
+    ----------
+    method : "bode_fit" (frequency response) or "time_fit" (time records).
+    chain : the fitted plant.
+    names : physical parameters that were free ("m_1", "c_1", "k_2", …); covariance (n_p, n_p).
+    parameters : the named parameters of the chain with standard errors, in table order.
+    staged : the named parameters the stage-by-stage fit (last cart first) found, for the report.
+    chi_square_per_dof : near 1 where model and stated noise explain the data.
+    standardised : per cart (n_w,) or per record (n,): residual over its standard error.
+    """
+
+    method: Literal["bode_fit", "time_fit"]
+    chain: Chain
+    names: tuple[str, ...]
+    covariance: Array
+    parameters: dict[str, Estimate]
+    staged: dict[str, float] = field(default_factory=dict)
+    chi_square_per_dof: float
+    dof: int
+    n_points: int
+    n_starts: int
+    converged: bool
+    message: str
+    standardised: dict[str, Array] = field(default_factory=dict)
+
+
+# ------------------------------------------------------------------- comparing
+
+
+@dataclass(frozen=True, kw_only=True)
+class ParameterRow:
+    """A line of the paper's Tables 1-3. `consistent` is None where there is nothing to compare."""
+
+    name: str
+    unit: str
+    initial: Estimate | None
+    final: Estimate | None
+    change_percent: float | None
+    change_sigmas: float | None
+    consistent: bool | None
+    note: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check:
+    """One consistency check, in a sentence for a student; outcome against `limit`."""
+
+    id: str
+    outcome: Outcome
+    value: float | None
+    limit: float | None
+    message: str
+
+
+# --------------------------------------------------------------------- control
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FeedbackDesign:
+    """State feedback u = prefilter r - gains [x1, v1, x2, v2, …] and what it should do.
+
+    Attributes
+    ----------
+    gains : (2n,); prefilter = 1 / DC gain of the loop for the chosen cart.
+    poles : closed-loop poles as continuous equivalents (log z / sample_time), rad/s.
+    requested_poles : what pole placement was asked for; None with LQR.
+    sample_time : s; the one-sample delay is part of the model the gains are made for.
+    overshoot_percent, settling_time (s, 2 %), peak_input : of the simulated step.
+    t, y (n_carts, n), u : that step.
+    reachable : False where the goal cannot be met; `message` says what is reachable.
+    """
+
+    cart: int
+    method: Literal["poles", "lqr"]
+    reference: float
+    gains: Array
+    prefilter: float
+    poles: ComplexArray
+    requested_poles: ComplexArray | None
+    sample_time: float
+    overshoot_percent: float
+    settling_time: float | None
+    peak_input: float
+    t: Array
+    y: Array
+    u: Array
+    reachable: bool
+    message: str
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HardwareCheck:
+    """Model against measurement for one cart of one run, as Figures 15-17.
+
+    Attributes
+    ----------
+    loop : "closed" (the controller that ran, simulated) or "open" (measured input applied).
+    nrmse : root-mean-square of measured minus model over that of the measured position.
+    overshoot in percent of the change in level; settling_time s; steady_state position units.
+    input_scale : the factor on the logged input that explains the motion best (1 = as logged),
+        its sign included; None where it was not looked for.
+    t, measured, model : (n,).
+    """
+
+    experiment: str
+    cart: int
+    loop: Literal["closed", "open"]
+    nrmse: float
+    overshoot_model: float | None
+    overshoot_measured: float | None
+    settling_model: float | None
+    settling_measured: float | None
+    steady_state_model: float | None
+    steady_state_measured: float | None
+    input_scale: float | None
+    t: Array
+    measured: Array
+    model: Array
+    note: str = ""
+
+
+# -------------------------------------------------------------------- together
+
+
+@dataclass(frozen=True, kw_only=True)
+class Skipped:
+    """A stage that could not run, and why."""
+
+    stage: str
+    reason: str
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Analysis:
+    """All results of one submission, in pipeline order.
+
+    `files` maps each data file to its SHA-256; `rows` are the table; `chain` is None where no
+    fit was possible (then `skipped` says why).
+    """
+
+    title: str
+    section: str
+    authors: tuple[tuple[str, str], ...]  # (id, name)
+    carts: int
+    springs: tuple[bool, ...]
+    position_unit: str
+    input_unit: str
+    records: tuple[Record, ...]
+    log_decrements: tuple[LogDecrement, ...]
+    step_gains: tuple[StepGain, ...]
+    sine_points: tuple[SinePoint, ...]
+    frequency_responses: tuple[FrequencyResponse, ...]
+    fit: ChainFit | None
+    rows: tuple[ParameterRow, ...]
+    checks: tuple[Check, ...]
+    feedback: FeedbackDesign | None
+    hardware: tuple[HardwareCheck, ...]
+    skipped: tuple[Skipped, ...]
+    warnings: tuple[str, ...]
+    files: dict[str, str]
+    discussion: str | None  # notes.md, as written
+
+    @property
+    def chain(self) -> Chain | None:
+        """The identified plant."""
+        return self.fit.chain if self.fit else None

@@ -1,0 +1,146 @@
+"""`submission.toml`: what was measured, on which system, and what the students claim."""
+
+from decimal import Decimal
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Typed = Annotated[Decimal, Field(allow_inf_nan=False)]  # keeps the digits as typed: 0.10 has two
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Author(_Model):
+    """One student."""
+
+    id: str
+    name: str = ""
+
+
+class Input(_Model):
+    """The input's unit, sign and scale; `sign` None: found from the data."""
+
+    unit: str = "V"
+    sign: Literal[1, -1] | None = None
+    per_count: Positive | None = None
+
+
+class InputOverride(_Model):
+    """Where one record's input differs from the system's."""
+
+    sign: Literal[1, -1] | None = None
+    per_count: Positive | None = None
+
+
+class Position(_Model):
+    """The position's unit; `per_count` converts columns that hold encoder counts."""
+
+    unit: str = "count"
+    per_count: Positive | None = None
+
+
+class System(_Model):
+    """The carts and springs on the bench."""
+
+    carts: Annotated[int, Field(ge=1, le=4)]
+    springs: tuple[bool, ...]
+    input: Input = Input()
+    position: Position = Position()
+
+
+class Design(_Model):
+    """The state-feedback task."""
+
+    cart: int = 1
+    reference: Finite = 1.0
+    overshoot_percent: Annotated[float, Field(ge=0, lt=100)] = 10.0
+    settling_time: Positive = 1.0
+    input_limit: Positive | None = None
+    sample_time: Positive | None = None
+    method: Literal["poles", "lqr"] = "lqr"
+
+
+class StateFeedback(_Model):
+    """u = prefilter r - gains [x1, v1, x2, v2, …]."""
+
+    type: Literal["state_feedback"]
+    gains: tuple[Finite, ...] = ()
+    prefilter: Finite = 1.0
+
+
+class Pid(_Model):
+    """u = scale (kp e + ki ∫e + kd de/dt), e in the file's own counts or units."""
+
+    type: Literal["pid"]
+    kp: Finite = 0.0
+    ki: Finite = 0.0
+    kd: Finite = 0.0
+    scale: Finite = 1.0
+    cart: int = 1
+
+
+Controller = Annotated[StateFeedback | Pid, Field(discriminator="type")]
+
+
+class Experiment(_Model):
+    """One data file and what was done to record it."""
+
+    id: str
+    kind: Literal["decay", "step", "sine", "sweep", "closed_loop", "bode"]
+    file: str
+    carts: tuple[int, ...] = ()  # the free carts; filled in with all of them on loading
+    frequency: Positive | None = None  # Hz
+    window: tuple[Finite, Finite] | None = None  # s
+    note: str = ""
+    input: InputOverride | None = None
+    columns: dict[str, str | int] | None = None
+    sample_rate: Positive | None = None  # Hz
+    hold: Literal["zero_order", "band_limited"] = "zero_order"
+    controlled_cart: int | None = None
+    controller: Controller | None = None
+    reference: Finite | None = None
+
+
+class StateSpace(_Model):
+    """The state matrices as the students wrote them."""
+
+    A: tuple[tuple[Typed, ...], ...] = ()
+    B: tuple[Typed, ...] = ()  # flat; a column is accepted
+
+
+class Feedback(_Model):
+    """The feedback design as the students wrote it."""
+
+    gains: tuple[Typed, ...] = ()
+    prefilter: Typed | None = None
+    overshoot_percent: Typed | None = None
+    settling_time: Typed | None = None
+
+
+class Reported(_Model):
+    """What the students claim; numbers keep the digits as typed."""
+
+    initial: dict[str, Typed] = {}
+    final: dict[str, Typed] = {}
+    state_space: StateSpace | None = None
+    feedback: Feedback | None = None
+
+
+class Submission(_Model):
+    """A validated submission; `folder` is where it lies."""
+
+    version: Literal[1]
+    title: str = ""
+    section: str = ""
+    authors: tuple[Author, ...] = ()
+    system: System
+    design: Design | None = None
+    experiments: tuple[Experiment, ...] = ()
+    reported: Reported | None = None
+    folder: Path = Field(default=Path(), exclude=True)
+    discussion: str | None = Field(default=None, exclude=True)
