@@ -1,0 +1,1 @@
+"""The carts: linear chain, exact simulation, feedback loop."""

@@ -120,12 +120,16 @@ class Chain:
         ------
         DataError : no spring holds the carts, so a constant force has no rest position.
         """
-        if not np.any(self.k > 0):
-            raise DataError("the carts have no spring to a wall: there is no static gain")
-        try:
-            return np.linalg.solve(self.stiffness, np.eye(self.n)[:, 0])
-        except np.linalg.LinAlgError:
-            raise DataError("no spring to a wall: the carts have no static gain") from None
+        if not self.is_tied:
+            raise DataError("no spring ties the carts to a wall: there is no static gain")
+        return np.linalg.solve(self.stiffness, np.eye(self.n)[:, 0]).astype(np.float64)
+
+    @property
+    def is_tied(self) -> bool:
+        """Whether every cart is tied to a wall, by its own springs or through its neighbours."""
+        from_left = np.logical_and.accumulate(self.k[:-1] != 0)
+        from_right = np.logical_and.accumulate(self.k[:0:-1] != 0)[::-1]
+        return bool(np.all(from_left | from_right))
 
     def frequency_response(self, omega: Array) -> ComplexArray:
         """Return X_i/U at `omega` (n_w,), rad/s; shape (n, n_w), position unit per input unit."""
@@ -137,7 +141,7 @@ class Chain:
             + (s**2)[:, None, None] * (self.m * eye)
         )
         force = np.broadcast_to(eye[:, :1], (s.size, self.n, 1))
-        return np.linalg.solve(Z, force)[:, :, 0].T
+        return np.linalg.solve(Z, force)[:, :, 0].T.astype(np.complex128)
 
     # ------------------------------------------------------ the map to names
 
@@ -307,7 +311,7 @@ def _relative_difference(a: float, b: float) -> float:
     return 0.0 if scale == 0 else abs(a - b) / scale
 
 
-def transfer_functions(values: Mapping[str, float]) -> tuple[Array, list[Array]]:
+def transfer_functions(values: Mapping[str, float]) -> tuple[Array, Sequence[Array]]:
     """Return the static gains (n,) and T_1 … T_n that named parameters of 1 to 3 carts stand for.
 
     `values` uses the names of `Chain.parameters`; the recomputed ones (omega_1, …) are not read,
@@ -316,14 +320,16 @@ def transfer_functions(values: Mapping[str, float]) -> tuple[Array, list[Array]]
     if "omega_n" in values:
         return np.array([values["K"]]), [_quadratic(values, "n", zeta="zeta")]
     n = 3 if "K_3" in values else 2
-    denominator = np.array([1.0])
-    for mode in _MODES[:n]:
-        denominator = np.polymul(denominator, _quadratic(values, mode))
-    tails = [denominator]
-    if n == 3:
-        tails.append(np.polymul(_quadratic(values, "x"), _quadratic(values, "y")))
-    tails.append(_quadratic(values, str(n)))
+    factors = [_MODES[:n], *([_NULLS[:2]] if n == 3 else []), str(n)]
+    tails = [_product([_quadratic(values, suffix) for suffix in group]) for group in factors]
     return np.array([values[f"K_{i}"] for i in range(1, n + 1)]), tails
+
+
+def _product(polynomials: Sequence[Array]) -> Array:
+    result: Array = np.ones(1)
+    for polynomial in polynomials:
+        result = np.convolve(result, polynomial)
+    return result
 
 
 def _quadratic(values: Mapping[str, float], suffix: str, zeta: str | None = None) -> Array:

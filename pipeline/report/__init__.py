@@ -1,0 +1,1 @@
+"""Figures, tables and words; HTML and PDF."""

@@ -1,0 +1,204 @@
+"""Compare: initial against final estimates, and the laws a real chain of carts obeys.
+
+Nearly every parameter is estimated in two ways (Throne 2005, Tables 1-3): frequencies and gains
+usually agree within some percent, damping ratios often do not.
+"""
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from pipeline.plant.chain import Chain, parameter_unit, recover_from_parameters
+from pipeline.results import ChainFit, Check, Estimate, ParameterRow
+
+# The paper's own tables: gains and frequencies change by up to 14 % between the two estimates
+# (one null, read off by eye, by 29 %), damping ratios by up to 70 %.
+GAIN_AND_FREQUENCY_LIMIT = 15.0  # percent
+DAMPING_LIMIT = 70.0  # percent
+SIGMA_LIMIT = 3.0  # combined standard errors: below, a difference is chance
+REDUNDANCY_LIMIT = 1e-9  # two routes to one number through unrounded values
+HEAVY_DAMPING = 0.3  # above it the orderings, exact without damping, may bend
+
+
+def compare(
+    initial: Mapping[str, Estimate],
+    *,
+    final: Mapping[str, Estimate],
+    names: Sequence[str],
+    position_unit: str,
+    input_unit: str,
+) -> tuple[ParameterRow, ...]:
+    """Set the initial beside the final estimate of every parameter in `names`."""
+    rows = []
+    for name in names:
+        before, after = initial.get(name), final.get(name)
+        percent = sigmas = consistent = None
+        note = ""
+        if before is not None and before.source == "assumed":
+            note = "the initial value was assumed, not measured"
+        if before is not None and after is not None and before.value != 0:
+            percent = 100 * (after.value - before.value) / abs(before.value)
+            if before.source != "assumed":
+                sigmas = _combined_sigmas(before, after)
+                limit = _limit(name)
+                consistent = abs(percent) <= limit or (
+                    sigmas is not None and sigmas <= SIGMA_LIMIT
+                )
+        rows.append(
+            ParameterRow(
+                name=name,
+                unit=parameter_unit(name, position=position_unit, input=input_unit),
+                initial=before,
+                final=after,
+                change_percent=percent,
+                change_sigmas=sigmas,
+                consistent=consistent,
+                note=note,
+            )
+        )
+    return tuple(rows)
+
+
+def _limit(name: str) -> float:
+    return DAMPING_LIMIT if name.startswith(("zeta", "damping")) else GAIN_AND_FREQUENCY_LIMIT
+
+
+def _combined_sigmas(before: Estimate, after: Estimate) -> float | None:
+    if before.std is None or after.std is None:
+        return None
+    combined = float(np.hypot(before.std, after.std))
+    return abs(after.value - before.value) / combined if combined > 0 else None
+
+
+# ---------------------------------------------------------------------- checks
+
+
+def check_rows(rows: Sequence[ParameterRow]) -> list[Check]:
+    """Judge every parameter that was measured in two ways."""
+    checks = []
+    for row in rows:
+        if row.consistent is None or row.change_percent is None:
+            continue
+        limit = _limit(row.name)
+        verdict = "agree" if row.consistent else "disagree"
+        sigmas = "" if row.change_sigmas is None else f", {row.change_sigmas:.1f} standard errors"
+        advice = "" if row.consistent else _advice(row)
+        checks.append(
+            Check(
+                id=f"initial_final.{row.name}",
+                outcome="pass" if row.consistent else "fail",
+                value=abs(row.change_percent),
+                limit=limit,
+                message=f"Initial and final {row.name} {verdict}: "
+                f"{row.change_percent:+.1f} %{sigmas} (limit {limit:.0f} %).{advice}",
+            )
+        )
+    return checks
+
+
+def _advice(row: ParameterRow) -> str:
+    if row.name.startswith("zeta"):
+        return (
+            " Damping ratios differ where dry friction is at work: a dwell of amplitude A sees "
+            "ζ + 2d/(πA), so ask which of the two methods saw the larger amplitude."
+        )
+    if row.name.startswith("K"):
+        return " Look at the rest and settled levels of the steps, and at the lowest frequencies."
+    return " Look at the peaks of the decay and at the dwells near this frequency."
+
+
+def check_chain(fit: ChainFit, *, springs: Sequence[bool]) -> list[Check]:
+    """Check the fitted chain against the laws of a real one: redundancies, signs, orderings."""
+    chain = fit.chain
+    values = {name: estimate.value for name, estimate in fit.parameters.items()}
+    checks = [_sign_check(fit, springs=springs)]
+    if chain.n in (2, 3) and "omega_a" in values and all(springs[1:-1]):
+        checks += _redundancy_checks(values)
+    if chain.n >= 2 and "omega_a" in values:
+        checks.append(_gain_order_check(values, chain=chain))
+        checks += _frequency_order_checks(values, n=chain.n)
+    return checks
+
+
+def _sign_check(fit: ChainFit, *, springs: Sequence[bool]) -> Check:
+    """No mass, damping or spring may be negative by more than its standard error allows."""
+    chain = fit.chain
+    values = {f"m_{i}": m for i, m in enumerate(chain.m, start=1)}
+    values |= {f"c_{i}": c for i, c in enumerate(chain.c, start=1)}
+    values |= {f"k_{i}": k for i, k in enumerate(chain.k, start=1) if springs[i - 1]}
+    std = dict(zip(fit.names, np.sqrt(np.diag(fit.covariance)), strict=True))
+    below = {
+        name: -value / std.get(name, np.inf) if std.get(name) else np.inf
+        for name, value in values.items()
+        if value < 0
+    }
+    worst = max(below.values(), default=0.0)
+    names = ", ".join(f"{name} = {values[name]:.3g}" for name in below)
+    return Check(
+        id="physical.signs",
+        outcome="pass" if worst <= 2.0 else "fail",
+        value=float(worst) if np.isfinite(worst) else None,
+        limit=2.0,
+        message="All masses, dampings and springs are positive."
+        if not below
+        else f"Not positive: {names}; up to {worst:.1f} standard errors below zero.",
+    )
+
+
+def _redundancy_checks(values: Mapping[str, float]) -> list[Check]:
+    meaning = "two routes through the transfer functions to one physical number agree"
+    return [
+        Check(
+            id=f"redundancy.{name}",
+            outcome="pass" if residual <= REDUNDANCY_LIMIT else "fail",
+            value=float(residual),
+            limit=REDUNDANCY_LIMIT,
+            message=f"Redundancy {name} ({meaning}): relative difference {residual:.1e}.",
+        )
+        for name, residual in recover_from_parameters(values).residuals.items()
+    ]
+
+
+def _gain_order_check(values: Mapping[str, float], *, chain: Chain) -> Check:
+    """The further from the motor, the smaller the static displacement."""
+    gains = [values[f"K_{i}"] for i in range(1, chain.n + 1)]
+    # Equal gains are right where no spring holds the far end: rounding then decides the sign.
+    rise = max(later / earlier - 1 for earlier, later in pairwise(gains))
+    good = rise <= REDUNDANCY_LIMIT and min(gains) >= 0
+    text = " ≥ ".join(f"K_{i}" for i in range(1, chain.n + 1))
+    return Check(
+        id="order.gains",
+        outcome="pass" if good else "fail",
+        value=max(float(rise), 0.0),
+        limit=REDUNDANCY_LIMIT,
+        message=f"Static gains fall along the chain ({text} > 0): {'yes' if good else 'no'}.",
+    )
+
+
+def _frequency_order_checks(values: Mapping[str, float], *, n: int) -> list[Check]:
+    """Carts held still raise every frequency: resonances and nulls interlace (Cauchy)."""
+    modes = [f"omega_{mode}" for mode in "abcdefgh"[:n]]
+    first, last = modes[0], modes[-1]
+    laws = [(first, f"omega_{i}", last) for i in range(1, n + 1)]
+    if n == 3:
+        laws += [("omega_a", "omega_x", "omega_b"), ("omega_b", "omega_y", "omega_c")]
+        laws += [("omega_x", f"omega_{i}", "omega_y") for i in (2, 3)]
+    damped = any(value > HEAVY_DAMPING for name, value in values.items() if name[:4] == "zeta")
+    checks = []
+    for low, middle, high in laws:
+        # How far outside the bracket, in percent of the value.
+        excess = max(values[low] / values[middle], values[middle] / values[high]) - 1
+        good = excess <= REDUNDANCY_LIMIT
+        text = f"{low} < {middle} < {high}"
+        reason = " (not exact where a damping ratio is above 0.3)" if damped and not good else ""
+        checks.append(
+            Check(
+                id=f"order.{middle}" + (f"_in_{low[6:]}{high[6:]}" if n == 3 else ""),
+                outcome="pass" if good else ("skip" if damped else "fail"),
+                value=100 * max(float(excess), 0.0),
+                limit=0.0,
+                message=f"{text}: {'yes' if good else 'no'}{reason}.",
+            )
+        )
+    return checks
