@@ -1,0 +1,215 @@
+"""Chain and fit vector: what the frequency-domain and the time-domain fit share.
+
+A fit moves a vector theta: log m, log c and log k, so that no step leaves the physical range and
+all entries are of order one. The spring wall-1 alone enters as it is, because it may well be zero
+(the paper's plants have none) where the far wall holds the carts.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import DataError
+from pipeline.plant.chain import Array, Chain
+from pipeline.results import Estimate
+
+START_ZETA = 0.05  # damping ratio of each cart alone to start from: what a cart on bearings has
+_DIFFERENCE = 1e-5  # relative step; central differences err by its square, rounding by 1e-16/step
+# A start must be a chain: what a measured table implies below this share of the largest spring
+# (or mass) is raised to it.
+_SMALLEST_SHARE = 0.02
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parametrisation:
+    """Which physical parameters of a chain are free, and how a fit vector holds them.
+
+    Attributes
+    ----------
+    n : number of carts.
+    springs : (n + 1,) which springs there are; one cart has one stiffness, the sum of its two.
+    zero : names of parameters held at zero ("c_2", "k_1"): a fit found them at their bound.
+
+    Raises
+    ------
+    DataError : a spring between two carts is missing, so the motor does not reach the carts
+        beyond it.
+    """
+
+    n: int
+    springs: tuple[bool, ...]
+    zero: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if len(self.springs) != self.n + 1:
+            raise ValueError(f"springs: expected {self.n + 1}, found {len(self.springs)}")
+        for j in range(2, self.n + 1):
+            if not self.springs[j - 1]:
+                raise DataError(
+                    f"the fit needs a spring between carts {j - 1} and {j}, found none: "
+                    f"the motor does not move cart {j}"
+                )
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """The free parameters, "m_1" … "k_n": the order of theta and of its covariance."""
+        springs = (any(self.springs), False) if self.n == 1 else self.springs
+        names = [f"{symbol}_{i}" for symbol in "mc" for i in range(1, self.n + 1)]
+        names += [f"k_{j}" for j, present in enumerate(springs, start=1) if present]
+        return tuple(name for name in names if name not in self.zero)
+
+    @cached_property
+    def logarithmic(self) -> NDArray[np.bool_]:
+        """(n_p,) bool: False for the one spring that enters as it is and may be zero."""
+        may_vanish = "k_1" if self.n > 1 and f"k_{self.n + 1}" in self.names else None
+        return np.array([name != may_vanish for name in self.names])
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Lower and upper bounds (n_p,) of theta."""
+        return np.where(self.logarithmic, -np.inf, 0.0), np.full(len(self.names), np.inf)
+
+    @cached_property
+    def _places(self) -> NDArray[np.intp]:
+        """Index (n_p,) of each free parameter in the flat vector (m, c, k)."""
+        offset = {"m": 0, "c": self.n, "k": 2 * self.n}
+        return np.array([offset[name[0]] + int(name[2:]) - 1 for name in self.names])
+
+    def physical(self, chain: Chain) -> Array:
+        """Return the free parameters (n_p,) of a chain, in physical units."""
+        return np.concatenate([chain.m, chain.c, chain.k])[self._places]
+
+    def chain(self, physical: Array) -> Chain:
+        """Return the chain of the free parameters (n_p,), all others zero."""
+        flat = np.zeros(3 * self.n + 1)
+        flat[self._places] = physical
+        return Chain(m=flat[: self.n], c=flat[self.n : 2 * self.n], k=flat[2 * self.n :])
+
+    def pack(self, chain: Chain) -> Array:
+        """Return theta (n_p,) of a chain whose free parameters are positive (k_1: not negative)."""
+        p = self.physical(chain)
+        return np.where(self.logarithmic, np.log(np.where(self.logarithmic, p, 1.0)), p)
+
+    def unpack(self, theta: Array) -> Chain:
+        """Return the chain of theta (n_p,)."""
+        return self.chain(self._physical_of(theta))
+
+    def _physical_of(self, theta: Array) -> Array:
+        return np.where(self.logarithmic, np.exp(np.where(self.logarithmic, theta, 0.0)), theta)
+
+    def slopes(self, theta: Array) -> Array:
+        """Return dp/dtheta (n_p,): p itself for a logarithm, 1 for the linear spring."""
+        return np.where(self.logarithmic, self._physical_of(theta), 1.0)
+
+    @cached_property
+    def matrix_derivatives(self) -> tuple[Array, Array, Array]:
+        """dM/dp, dC/dp, dK/dp, each (n_p, n, n): constant, as the matrices are linear in p."""
+        shape = (len(self.names), self.n, self.n)
+        dM, dC, dK = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+        for row, name in enumerate(self.names):
+            i = int(name[2:]) - 1
+            if name[0] == "m":
+                dM[row, i, i] = 1.0
+            elif name[0] == "c":
+                dC[row, i, i] = 1.0
+            else:
+                stretch = np.zeros(self.n)  # of spring i + 1: x_{i+1} - x_i
+                if i < self.n:
+                    stretch[i] = 1.0
+                if i > 0:
+                    stretch[i - 1] = -1.0
+                dK[row] = np.outer(stretch, stretch)
+        return dM, dC, dK
+
+    def holding_at_zero(self, *names: str) -> "Parametrisation":
+        """Return the same with further parameters held at zero."""
+        return Parametrisation(n=self.n, springs=self.springs, zero=(*self.zero, *names))
+
+    def physical_covariance(self, theta: Array, covariance: Array) -> Array:
+        """Return the covariance (n_p, n_p) of the physical parameters from that of theta."""
+        slopes = self.slopes(theta)
+        return slopes[:, None] * covariance * slopes
+
+
+def named_estimates(
+    chain: Chain, *, names: Sequence[str], covariance: Array, source: str
+) -> dict[str, Estimate]:
+    """Estimate every named parameter of a chain, with standard errors by the delta method.
+
+    Parameters
+    ----------
+    names : the free physical parameters ("m_1", …); all others are known exactly.
+    covariance : (n_p, n_p) of those, in physical units.
+
+    Raises
+    ------
+    DataError : several carts that no spring ties to a wall have no static gains.
+    """
+    values = chain.parameters()
+    J = _parameter_jacobian(chain, names)
+    variance = np.einsum("ij,jk,ik->i", J, covariance, J)
+    return {
+        name: Estimate(value=value, std=float(np.sqrt(v)) if v >= 0 else None, source=source)
+        for (name, value), v in zip(values.items(), variance, strict=True)
+    }
+
+
+def _parameter_jacobian(chain: Chain, names: Sequence[str]) -> Array:
+    """Return the derivative (n_named, n_p) of `Chain.parameters` by the physical parameters."""
+    columns = []
+    for name in names:
+        values: Array = getattr(chain, name[0])
+        i = int(name[2:]) - 1
+        step = _DIFFERENCE * (values[i] if values[i] > 0 else float(np.max(values)))
+        ends = []
+        for sign in (1.0, -1.0):
+            moved = {"m": chain.m.copy(), "c": chain.c.copy(), "k": chain.k.copy()}
+            moved[name[0]][i] += sign * step
+            ends.append(np.array(list(Chain(**moved).parameters().values())))
+        columns.append((ends[0] - ends[1]) / (2 * step))
+    return np.stack(columns, axis=1)
+
+
+def physical_start(found: Chain, *, springs: Sequence[bool], zeta: float = START_ZETA) -> Chain:
+    """Return a proper chain near one that a measured table implies.
+
+    `found` may hold what no real chain has (a negative spring, a mass far too small): such values
+    are clipped. Dampings are set from `zeta`, as a table's are too uncertain to keep.
+    """
+    present = [any(springs), False] if found.n == 1 else list(springs)
+    k = np.where(present, _raised(found.k), 0.0)
+    m = _raised(found.m)
+    return Chain(m=m, c=2 * zeta * np.sqrt(m * (k[:-1] + k[1:])), k=k)
+
+
+def _raised(values: Array) -> Array:
+    """Return values raised to a small share of the largest."""
+    return np.maximum(values, _SMALLEST_SHARE * np.max(np.abs(values)))
+
+
+def even_chain(values: Mapping[str, float], *, n: int, springs: Sequence[bool]) -> Chain:
+    """Return a chain of equal carts and springs with the gain and mean frequency of `values`.
+
+    A start for a fit when too few estimates are at hand to recover a chain from. `values` needs
+    the first cart's gain (`K` or `K_1`) and at least one resonance (`omega_n`, `omega_a`, …).
+    """
+    omegas = [
+        value
+        for name, value in values.items()
+        if name == "omega_n" or (name.startswith("omega_") and name[6:] in tuple("abcdefgh"))
+    ]
+    gain = values.get("K", values.get("K_1"))
+    if not omegas or gain is None:
+        raise DataError("a start needs the gain of cart 1 and a resonance, found neither or one")
+    present = [any(springs), False] if n == 1 else list(springs)
+    unit = Chain(m=np.ones(n), c=np.zeros(n), k=np.array(present, dtype=float))
+    own = np.sort(np.abs(unit.poles))[::2]  # each resonance stands twice, with its conjugate
+    stretch = np.exp(
+        np.mean(np.log(np.sort(omegas))) - np.mean(np.log(own[own > 0][: len(omegas)]))
+    )
+    k = unit.static_gains()[0] / gain
+    even = Chain(m=unit.m * k / stretch**2, c=unit.c, k=unit.k * k)
+    return physical_start(even, springs=springs)
