@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from pipeline.plant.chain import Chain, parameter_unit, recover_from_parameters
-from pipeline.results import ChainFit, Check, Estimate, ParameterRow
+from pipeline.results import ChainFit, Check, Estimate, LogDecrement, ParameterRow, StepGain
 
 # The paper's own tables: gains and frequencies change by up to 14 % between the two estimates
 # (one null, read off by eye, by 29 %), damping ratios by up to 70 %.
@@ -42,9 +42,7 @@ def compare(
             if before.source != "assumed":
                 sigmas = _combined_sigmas(before, after)
                 limit = _limit(name)
-                consistent = abs(percent) <= limit or (
-                    sigmas is not None and sigmas <= SIGMA_LIMIT
-                )
+                consistent = abs(percent) <= limit or (sigmas is not None and sigmas <= SIGMA_LIMIT)
         rows.append(
             ParameterRow(
                 name=name,
@@ -106,6 +104,48 @@ def _advice(row: ParameterRow) -> str:
     if row.name.startswith("K"):
         return " Look at the rest and settled levels of the steps, and at the lowest frequencies."
     return " Look at the peaks of the decay and at the dwells near this frequency."
+
+
+def check_decays(decays: Sequence[LogDecrement]) -> list[Check]:
+    """Ask of every decay whether viscous damping alone explains it."""
+    return [
+        Check(
+            id=f"decay.{decay.experiment}.cart_{decay.cart}",
+            outcome="fail" if decay.friction.present else "pass",
+            value=decay.friction.f_statistic,
+            limit=decay.friction.threshold,
+            message=f"{decay.experiment}: the decay of cart {decay.cart} "
+            + (
+                "is not exponential: dry friction holds it within "
+                f"±{decay.friction.drop:.3g} of its rest, and ζ = {decay.zeta:.3g} from the "
+                f"envelope is biased (ζ = {decay.friction.zeta:.3g} once friction is taken out)."
+                if decay.friction.present
+                else "is exponential: no dry friction is seen."
+            ),
+        )
+        for decay in decays
+        if decay.friction is not None
+    ]
+
+
+def check_steps(steps: Sequence[StepGain]) -> list[Check]:
+    """Ask whether every step has one gain: a cart that sticks has an interval of them."""
+    return [
+        Check(
+            id=f"step.{step.experiment}.cart_{step.cart}",
+            outcome="pass" if step.interval is None else "fail",
+            value=None if step.interval is None else step.interval[1] - step.interval[0],
+            limit=None,
+            message=f"{step.experiment}: cart {step.cart} "
+            + (
+                "settles where its springs put it."
+                if step.interval is None
+                else "sticks: its static gain is only known to lie between "
+                f"{step.interval[0]:.4g} and {step.interval[1]:.4g}."
+            ),
+        )
+        for step in steps
+    ]
 
 
 def check_chain(fit: ChainFit, *, springs: Sequence[bool]) -> list[Check]:

@@ -1,0 +1,176 @@
+"""The `cartlab` command: parse, call one function, write, exit code.
+
+Data goes to `--out` or stdout, talk to stderr. Exit 0 done, 1 done but checks failed, 2 cannot run.
+Everything heavy is imported by the command that needs it, so that `--help` answers at once.
+"""
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipeline import __version__
+from pipeline.errors import ConfigError, PipelineError
+
+app = typer.Typer(
+    name="cartlab",
+    help="Lab reports and identification for carts on springs: from raw bench data to the plant, "
+    "a controller and a report.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+Folder = Annotated[Path, typer.Argument(metavar="DIR", help="A submission folder.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
+
+
+def main() -> None:
+    """Run the command line; an error that a person can act on is one line and exit status 2."""
+    try:
+        app()
+    except PipelineError as error:
+        _fail(str(error))
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        _fail(f"{where}{error.strerror or error}")
+
+
+def _fail(message: str) -> None:
+    say(f"cartlab: {message}")
+    sys.exit(2)
+
+
+def say(text: str) -> None:
+    """Print to stderr: talk, never data."""
+    typer.echo(text, err=True)
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[[str], None]]:
+    """Show what is being done while it is done; silent where stderr is no terminal."""
+    if not sys.stderr.isatty():
+        yield lambda text: None
+        return
+    from rich.console import Console
+
+    with Console(stderr=True).status("starting") as status:
+        yield lambda text: status.update(text)
+
+
+def _output_folder(out: Path) -> Path:
+    if out.exists() and not out.is_dir():
+        raise ConfigError(f"--out {out}: is a file; name a folder")
+    out.mkdir(parents=True, exist_ok=True)
+    return out
+
+
+def _version(value: bool) -> None:
+    if value:
+        typer.echo(f"cartlab {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
+    ] = False,
+) -> None:
+    pass
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(help="Where to write.")] = Path("cartlab-demo"),
+) -> None:
+    """Run the whole job on the shipped three-cart example."""
+    from pipeline.resources import EXAMPLES
+
+    _run_report(EXAMPLES / "three-cart", out=_output_folder(out) / "report", pdf=True)
+
+
+@app.command()
+def new(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="The folder to make.")],
+    carts: Annotated[int, typer.Option(min=1, max=4, help="How many carts the bench has.")] = 1,
+) -> None:
+    """Write a commented submission folder to fill in."""
+    from pipeline.submission import new_submission
+
+    new_submission(folder, carts=carts)
+    say(f"wrote {folder}: put your data files into {folder / 'data'} and fill in submission.toml")
+
+
+@app.command()
+def inspect(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE…", help="Data files.")],
+    as_json: AsJson = False,
+) -> None:
+    """Show what a data file holds: format, columns, rate, duration, kind, problems."""
+    from pipeline.ingest.inspect import format_inspection, inspect_file
+
+    inspections = [inspect_file(file) for file in files]
+    if as_json:
+        typer.echo(json.dumps([i.to_dict() for i in inspections], indent=1, ensure_ascii=False))
+    else:
+        typer.echo("\n\n".join(format_inspection(i) for i in inspections))
+
+
+@app.command()
+def report(
+    folder: Folder,
+    out: Annotated[Path | None, typer.Option(help="Where to write; default: DIR/report.")] = None,
+    pdf: Annotated[bool, typer.Option("--pdf/--no-pdf", help="Write the PDF too.")] = True,
+    as_json: AsJson = False,
+) -> None:
+    """Identify the carts, design the controller, check the hardware, write the report."""
+    analysis = _run_report(folder, out=out or folder / "report", pdf=pdf)
+    if as_json:
+        from pipeline.results_json import results_text
+
+        typer.echo(results_text(analysis), nl=False)
+    failed = [check for check in analysis.checks if check.outcome == "fail"]
+    if failed:
+        raise typer.Exit(1)
+
+
+def _run_report(folder: Path, *, out: Path, pdf: bool):  # noqa: ANN202
+    from pipeline.report.render import render_report
+    from pipeline.report.words import terminal_summary
+    from pipeline.results_json import results_text
+    from pipeline.submission import load_submission
+    from pipeline.workflow import analyse
+
+    submission = load_submission(folder)
+    _output_folder(out)
+    with _progress() as progress:
+        analysis = analyse(submission, progress=progress)
+        (out / "results.json").write_text(results_text(analysis), encoding="utf-8", newline="\n")
+        render_report(analysis, out, pdf=pdf, progress=progress)
+    say(terminal_summary(analysis))
+    say(f"wrote {out / 'report.html'}" + (f" and {out / 'report.pdf'}" if pdf else ""))
+    return analysis
+
+
+@app.command()
+def simulate(
+    out: Annotated[Path, typer.Option(help="The submission folder to write.")],
+    preset: Annotated[str, typer.Option(help="throne-1dof, throne-2dof or throne-3dof.")],
+    seed: Annotated[int, typer.Option(min=0, help="Random seed: same seed, same bytes.")] = 0,
+    reported: Annotated[
+        bool, typer.Option("--reported", help="Add what an honest student would report.")
+    ] = False,
+) -> None:
+    """Write a synthetic submission: decays, steps, sine dwells, a sweep, a closed-loop step."""
+    from pipeline.synthesis import write_submission
+
+    with _progress() as progress:
+        progress("simulating the experiments")
+        write_submission(out, preset=preset, seed=seed, reported=reported)
+    say(f"wrote {out}: try `cartlab report {out}`")

@@ -1,0 +1,309 @@
+"""The straight line from a submission to its analysis: the only file that knows the order."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+from pipeline.errors import DataError
+from pipeline.ingest.read import Ingested, read_data
+from pipeline.plant.chain import parameter_names
+from pipeline.results import (
+    Analysis,
+    ChainFit,
+    Check,
+    Estimate,
+    FeedbackDesign,
+    FrequencyResponse,
+    HardwareCheck,
+    LogDecrement,
+    Record,
+    SinePoint,
+    Skipped,
+    StepGain,
+)
+from pipeline.stages.bode_fit import fit_bode
+from pipeline.stages.compare import check_chain, check_decays, check_rows, check_steps, compare
+from pipeline.stages.frequency_response import (
+    collect_dwells,
+    find_resonances,
+    response_from_records,
+)
+from pipeline.stages.hardware_check import check_hardware
+from pipeline.stages.initial import estimate_initially
+from pipeline.stages.log_decrement import fit_log_decrement
+from pipeline.stages.sine import fit_sine
+from pipeline.stages.state_feedback import design_feedback
+from pipeline.stages.step_gain import fit_step_gain
+from pipeline.stages.time_fit import find_outlier_repeats, fit_records
+from pipeline.submission import Design, Submission
+
+T = TypeVar("T")
+Progress = Callable[[str], None]
+
+
+def _silent(text: str) -> None:
+    pass
+
+
+@dataclass
+class _Log:
+    """What could not run and what a reader must know, collected along the way."""
+
+    skipped: list[Skipped] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+    def attempt(self, stage: str, call: Callable[[], T]) -> T | None:
+        """Run one stage; data that do not support it are a reason, not an end."""
+        try:
+            return call()
+        except DataError as error:
+            self.skip(stage, str(error))
+            return None
+
+    def skip(self, stage: str, reason: str) -> None:
+        self.skipped.append(Skipped(stage=stage, reason=reason))
+
+    def warn(self, texts: Iterable[str]) -> None:
+        self.warnings += [text for text in texts if text and text not in self.warnings]
+
+
+def analyse(submission: Submission, *, progress: Progress = _silent) -> Analysis:
+    """Run every stage that the submission's data support; the rest is skipped with its reason.
+
+    Raises
+    ------
+    SubmissionError : a data file is broken or missing.
+    """
+    system = submission.system
+    n, springs = system.carts, system.springs
+    log = _Log()
+
+    progress("reading the data")
+    data = read_data(submission)
+    log.warn(data.warnings)
+    log.warn(f"{record.id}: {note}" for record in data.records for note in record.notes)
+    steps = _without_outliers(data.records, log)
+
+    progress("free decays: logarithmic decrement")
+    decays = _log_decrements(data.records, n=n, log=log)
+    progress("steps: static gains")
+    gains = _step_gains(steps, n=n, log=log)
+    progress("sine dwells: steady state")
+    sines = _sine_points(data.records, log=log)
+    progress("frequency response")
+    responses = _frequency_response(data, sines=sines, steps=steps, n=n, log=log)
+
+    found = log.attempt("resonances", lambda: find_resonances(responses, n=n)) or {}
+    initial, remarks = estimate_initially(
+        carts=n, log_decrements=decays, step_gains=gains, from_response=found
+    )
+    log.warn(remarks)
+
+    progress("fitting all carts at once")
+    fit = _fit(responses, steps=steps, initial=initial, n=n, springs=springs, log=log)
+    rows = compare(
+        initial,
+        final=fit.parameters if fit else {},
+        names=list(fit.parameters) if fit else parameter_names(n, rigid=not any(springs)),
+        position_unit=system.position.unit,
+        input_unit=system.input.unit,
+    )
+    checks = [*check_rows(rows), *check_decays(decays), *check_steps(gains)]
+    if fit:
+        checks += check_chain(fit, springs=springs)
+
+    progress("state feedback")
+    feedback = _design(submission, fit, log=log)
+    progress("hardware against model")
+    hardware = _hardware(submission, data.records, fit, log=log)
+
+    return Analysis(
+        title=submission.title,
+        section=submission.section,
+        authors=tuple((author.id, author.name) for author in submission.authors),
+        carts=n,
+        springs=springs,
+        position_unit=system.position.unit,
+        input_unit=system.input.unit,
+        records=data.records,
+        log_decrements=tuple(decays),
+        step_gains=tuple(gains),
+        sine_points=tuple(sines),
+        frequency_responses=tuple(responses),
+        fit=fit,
+        rows=rows,
+        checks=tuple(checks),
+        feedback=feedback,
+        hardware=tuple(hardware),
+        skipped=tuple(log.skipped),
+        warnings=tuple(log.warnings),
+        files=data.files,
+        discussion=submission.discussion,
+    )
+
+
+def _all_free(record: Record, n: int) -> bool:
+    return len(record.free) == n
+
+
+def _without_outliers(records: Sequence[Record], log: _Log) -> list[Record]:
+    """Return the step and sweep records, without a repeat that stands off the others."""
+    driven = [r for r in records if r.kind in ("step", "sweep") and r.u is not None]
+    outliers = find_outlier_repeats(driven)
+    log.warn(outliers.values())
+    return [record for record in driven if record.id not in outliers]
+
+
+def _log_decrements(records: Sequence[Record], *, n: int, log: _Log) -> list[LogDecrement]:
+    """Each cart alone: its decays, or the ring-down of its steps where there is no decay."""
+    decays = []
+    for cart in range(1, n + 1):
+        alone = [r for r in records if r.free == (cart,) and cart in r.carts]
+        runs = [r for r in alone if r.kind == "decay"] or [r for r in alone if r.kind == "step"]
+        if not runs:
+            log.skip(
+                f"log decrement, cart {cart}",
+                f"no decay was recorded in which cart {cart} alone is free",
+            )
+        for run in runs:
+            decay = log.attempt(
+                f"log decrement, {run.id}, cart {cart}", lambda: fit_log_decrement(run, cart=cart)
+            )
+            if decay:
+                decays.append(decay)
+                log.warn([decay.note and f"{run.id}, cart {cart}: {decay.note}"])
+    return decays
+
+
+def _step_gains(steps: Sequence[Record], *, n: int, log: _Log) -> list[StepGain]:
+    runs = [r for r in steps if r.kind == "step" and _all_free(r, n)]
+    if not runs:
+        log.skip("step gain", "no step was recorded with all carts free")
+    gains = []
+    for run in runs:
+        for cart in run.carts:
+            gain = log.attempt(
+                f"step gain, {run.id}, cart {cart}", lambda: fit_step_gain(run, cart=cart)
+            )
+            if gain:
+                gains.append(gain)
+                log.warn([gain.note and f"{run.id}, cart {cart}: {gain.note}"])
+    return gains
+
+
+def _sine_points(records: Sequence[Record], *, log: _Log) -> list[SinePoint]:
+    points = []
+    for run in records:
+        for cart in run.carts if run.kind == "sine" else ():
+            point = log.attempt(
+                f"sine steady state, {run.id}, cart {cart}", lambda: fit_sine(run, cart=cart)
+            )
+            if point:
+                points.append(point)
+                log.warn([point.note and f"{run.id}, cart {cart}: {point.note}"])
+    return points
+
+
+def _frequency_response(
+    data: Ingested,
+    *,
+    sines: Sequence[SinePoint],
+    steps: Sequence[Record],
+    n: int,
+    log: _Log,
+) -> Sequence[FrequencyResponse]:
+    """From dwells; else from the students' own table; else from steps and sweeps."""
+    if sines:
+        return collect_dwells(sines)
+    if data.tables:
+        return data.tables
+    log.skip("sine steady state", "no sine dwells were recorded")
+    runs = [record for record in steps if _all_free(record, n)]
+    if not runs:
+        log.skip("frequency response", "no dwells, no table, and no step or sweep to take it from")
+        return ()
+    responses = log.attempt("frequency response", lambda: response_from_records(runs))
+    if responses:
+        log.warn(["the frequency response comes from the step and sweep records, not from dwells"])
+    return responses or ()
+
+
+def _fit(
+    responses: Sequence[FrequencyResponse],
+    *,
+    steps: Sequence[Record],
+    initial: dict[str, Estimate],
+    n: int,
+    springs: tuple[bool, ...],
+    log: _Log,
+) -> ChainFit | None:
+    """The Bode fit where dwells or a table allow it, else the joint fit on the time records."""
+    if any(response.source != "records" for response in responses):
+        values = {name: estimate.value for name, estimate in initial.items()}
+        fit = log.attempt(
+            "Bode fit", lambda: fit_bode(responses, n=n, springs=springs, initial=values)
+        )
+        if fit:
+            return fit
+    if not steps:
+        log.skip("final estimates", "no dwells, table, step or sweep to fit the carts to")
+        return None
+    return log.attempt("final estimates", lambda: fit_records(steps, n=n, springs=springs))
+
+
+def _design(
+    submission: Submission, fit: ChainFit | None, *, log: _Log
+) -> FeedbackDesign | None:
+    if fit is None:
+        log.skip("state feedback", "the carts are not identified")
+        return None
+    task = submission.design
+    if task is None:
+        task = Design(cart=submission.system.carts)
+        log.warn(
+            [
+                "no [design] in submission.toml: the controller is designed for cart "
+                f"{task.cart}, {task.overshoot_percent:g} % overshoot, {task.settling_time:g} s"
+            ]
+        )
+    return log.attempt(
+        "state feedback",
+        lambda: design_feedback(
+            fit.chain,
+            cart=task.cart,
+            reference=task.reference,
+            overshoot_percent=task.overshoot_percent,
+            settling_time=task.settling_time,
+            input_limit=task.input_limit,
+            sample_time=task.sample_time,
+            method=task.method,
+        ),
+    )
+
+
+def _hardware(
+    submission: Submission, records: Sequence[Record], fit: ChainFit | None, *, log: _Log
+) -> list[HardwareCheck]:
+    runs = {record.id: record for record in records if record.kind == "closed_loop"}
+    if not runs:
+        log.skip("hardware check", "no closed-loop run was recorded")
+        return []
+    if fit is None:
+        log.skip("hardware check", "the carts are not identified")
+        return []
+    limit = submission.design.input_limit if submission.design else None
+    checks: list[HardwareCheck] = []
+    for experiment in submission.experiments:
+        if experiment.id in runs:
+            checks += log.attempt(
+                f"hardware check, {experiment.id}",
+                lambda: check_hardware(
+                    runs[experiment.id],
+                    fit.chain,
+                    controller=experiment.controller,
+                    controlled_cart=experiment.controlled_cart,
+                    input_limit=limit,
+                ),
+            ) or ()
+    log.warn(check.note and f"{check.experiment}, cart {check.cart}: {check.note}" for check in checks)
+    return checks
