@@ -105,24 +105,28 @@ class Parametrisation:
         return np.where(self.logarithmic, self._physical_of(theta), 1.0)
 
     @cached_property
+    def directions(self) -> Array:
+        """b (n_p, n): parameter p enters the impedance as p s^order b bᵀ.
+
+        b picks the cart of a mass or damper, and the stretch of a spring.
+        """
+        eye = np.eye(self.n)
+        stretch = np.diff(np.vstack([np.zeros(self.n), eye, np.zeros(self.n)]), axis=0)
+        return np.concatenate([eye, eye, stretch])[self._places]
+
+    @cached_property
+    def orders(self) -> NDArray[np.intp]:
+        """Power of s (n_p,) a parameter stands at: 2 for a mass, 1 a damper, 0 a spring."""
+        return np.array(["kcm".index(name[0]) for name in self.names])
+
+    @cached_property
     def matrix_derivatives(self) -> tuple[Array, Array, Array]:
         """dM/dp, dC/dp, dK/dp, each (n_p, n, n): constant, as the matrices are linear in p."""
-        shape = (len(self.names), self.n, self.n)
-        dM, dC, dK = np.zeros(shape), np.zeros(shape), np.zeros(shape)
-        for row, name in enumerate(self.names):
-            i = int(name[2:]) - 1
-            if name[0] == "m":
-                dM[row, i, i] = 1.0
-            elif name[0] == "c":
-                dC[row, i, i] = 1.0
-            else:
-                stretch = np.zeros(self.n)  # of spring i + 1: x_{i+1} - x_i
-                if i < self.n:
-                    stretch[i] = 1.0
-                if i > 0:
-                    stretch[i - 1] = -1.0
-                dK[row] = np.outer(stretch, stretch)
-        return dM, dC, dK
+        outer = self.directions[:, :, None] * self.directions[:, None, :]
+        mass, damping, stiffness = (
+            np.where((self.orders == order)[:, None, None], outer, 0.0) for order in (2, 1, 0)
+        )
+        return mass, damping, stiffness
 
     def holding_at_zero(self, *names: str) -> "Parametrisation":
         """Return the same with further parameters held at zero."""
