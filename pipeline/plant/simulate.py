@@ -7,7 +7,7 @@ from scipy.linalg import expm
 
 from pipeline.plant.chain import Array, Chain
 
-_OVERSAMPLING = 8  # points between samples for a band-limited input
+OVERSAMPLING = 8  # points between samples for a band-limited input
 _LANCZOS_WIDTH = 12  # samples on each side of the interpolation kernel
 
 
@@ -37,8 +37,8 @@ def simulate_linear(
     x0 = np.zeros(A.shape[0]) if x0 is None else np.asarray(x0, dtype=np.float64)
     t, u = np.asarray(t, dtype=np.float64), np.asarray(u, dtype=np.float64)
     if hold == "band_limited":
-        fine_t, fine_u = _band_limited(t, u)
-        return (C @ propagate(A, B, fine_t, fine_u, x0=x0, linear=True))[:, ::_OVERSAMPLING]
+        fine_t, fine_u = interpolate_band_limited(t, u)
+        return (C @ propagate(A, B, fine_t, fine_u, x0=x0, linear=True))[:, ::OVERSAMPLING]
     return C @ propagate(A, B, t, u, x0=x0)
 
 
@@ -70,10 +70,10 @@ def propagate(A: Array, B: Array, t: Array, u: Array, *, x0: Array, linear: bool
     return states.T
 
 
-def _band_limited(t: Array, u: Array) -> tuple[Array, Array]:
-    """Return times and the Lanczos-interpolated input on a grid `_OVERSAMPLING` times finer."""
+def interpolate_band_limited(t: Array, u: Array) -> tuple[Array, Array]:
+    """Return times and the Lanczos-interpolated input on a grid `OVERSAMPLING` times finer."""
     index = np.arange(t.size)
-    fine = np.arange((t.size - 1) * _OVERSAMPLING + 1) / _OVERSAMPLING
+    fine = np.arange((t.size - 1) * OVERSAMPLING + 1) / OVERSAMPLING
     padded = np.pad(u, _LANCZOS_WIDTH, mode="edge")
     base = np.floor(fine).astype(int)
     offsets = np.arange(1 - _LANCZOS_WIDTH, _LANCZOS_WIDTH + 1)
