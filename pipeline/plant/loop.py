@@ -167,6 +167,24 @@ def discretise(
     return phi[:size, :size], phi[:size, size]
 
 
+def loop_matrix(chain: Chain, controller: StateFeedback, *, sample_time: float) -> Array:
+    """Return the map of (x, prediction, acting input), (4n + 1)², from tick to tick.
+
+    All carts free, one tick of delay, nothing clipped or rounded, no reference. The loop is
+    stable if and only if all eigenvalues lie inside the unit circle.
+    """
+    free = tuple(range(1, chain.n + 1))
+    size = 2 * chain.n
+    phi, gamma = discretise(chain, sample_time)
+    model, drive = _prediction(controller, free=free, sample_time=sample_time)
+    reading = np.zeros((size, size))  # how the innovation (x - x_predicted) corrects the state
+    reading[0::2, 0::2] = np.eye(chain.n)
+    reading[1::2, 0::2] = VELOCITY_CORRECTION / sample_time * np.eye(chain.n)
+    predicted = np.hstack([model @ reading, model @ (np.eye(size) - reading), drive[:, None]])
+    moved = np.hstack([phi, np.zeros((size, size)), gamma[:, None]])
+    return np.vstack([moved, predicted, -controller.gains @ predicted])
+
+
 # ------------------------------------------------------------------- inside
 
 
@@ -236,18 +254,24 @@ def _law(controller: Controller, *, free: tuple[int, ...], sample_time: float, y
         if controller.cart not in free:
             raise DataError(f"PID needs its cart {controller.cart} free, found {list(free)}")
         return _PidLaw(controller, free.index(controller.cart), sample_time=sample_time)
+    phi, gamma = _prediction(controller, free=free, sample_time=sample_time)
+    return _StateFeedbackLaw(controller, phi, gamma, sample_time=sample_time, y0=y0)
+
+
+def _prediction(
+    controller: StateFeedback, *, free: tuple[int, ...], sample_time: float
+) -> tuple[Array, Array]:
+    """Return Phi and Gamma of the observer's prediction."""
     if controller.gains.size != 2 * len(free):
         raise DataError(
             f"state feedback of {len(free)} carts needs {2 * len(free)} gains, "
             f"found {controller.gains.size}"
         )
-    if controller.model is None:
-        phi = np.eye(2 * len(free))
-        phi[0::2, 1::2] = sample_time * np.eye(len(free))
-        gamma = np.zeros(2 * len(free))
-    else:
-        phi, gamma = discretise(controller.model, sample_time, free=free)
-    return _StateFeedbackLaw(controller, phi, gamma, sample_time=sample_time, y0=y0)
+    if controller.model is not None:
+        return discretise(controller.model, sample_time, free=free)
+    phi = np.eye(2 * len(free))
+    phi[0::2, 1::2] = sample_time * np.eye(len(free))
+    return phi, np.zeros(2 * len(free))
 
 
 def _hermite(at: Array, x: Array, slope: Array) -> Array:
