@@ -1,10 +1,10 @@
-"""`submission.toml`: what was measured, on which system, and what the students claim."""
+"""The tables of `submission.toml`, as validated models."""
 
 from decimal import Decimal
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -45,12 +45,22 @@ class Position(_Model):
 
 
 class System(_Model):
-    """The carts and springs on the bench."""
+    """The carts and springs on the bench; springs not stated are all there."""
 
     carts: Annotated[int, Field(ge=1, le=4)]
     springs: tuple[bool, ...]
     input: Input = Input()
     position: Position = Position()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _all_springs(cls, table: object) -> object:
+        """Fill in `springs` where they are left out."""
+        if isinstance(table, dict) and "springs" not in table:
+            carts = table.get("carts")
+            if isinstance(carts, int) and 1 <= carts <= 4:
+                return {**table, "springs": (True,) * (carts + 1)}
+        return table
 
 
 class Design(_Model):
@@ -110,7 +120,17 @@ class StateSpace(_Model):
     """The state matrices as the students wrote them."""
 
     A: tuple[tuple[Typed, ...], ...] = ()
-    B: tuple[Typed, ...] = ()  # flat; a column is accepted
+    B: tuple[Typed, ...] = ()  # flat; a column [[b1], [b2], …] is accepted
+
+    @field_validator("B", mode="before")
+    @classmethod
+    def _flat(cls, value: object) -> object:
+        """Flatten a column."""
+        if isinstance(value, list | tuple) and all(
+            isinstance(row, list | tuple) and len(row) == 1 for row in value
+        ):
+            return tuple(row[0] for row in value)
+        return value
 
 
 class Feedback(_Model):

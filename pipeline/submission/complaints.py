@@ -1,0 +1,124 @@
+"""What is wrong with a submission, in one line a student can act on."""
+
+import re
+from collections.abc import Sequence
+from difflib import get_close_matches
+
+from pydantic_core import ErrorDetails
+
+from pipeline.submission import models
+
+Location = Sequence[int | str]
+
+_LONGEST_QUOTE = 60  # characters of a found value worth showing
+
+# The tables of the format, by their dotted path without the numbers.
+_TABLES: dict[str, type[models.BaseModel]] = {
+    "authors": models.Author,
+    "system": models.System,
+    "system.input": models.Input,
+    "system.position": models.Position,
+    "design": models.Design,
+    "experiments": models.Experiment,
+    "experiments.input": models.InputOverride,
+    "experiments.controller.state_feedback": models.StateFeedback,
+    "experiments.controller.pid": models.Pid,
+    "reported": models.Reported,
+    "reported.state_space": models.StateSpace,
+    "reported.feedback": models.Feedback,
+}
+TOP_LEVEL = tuple(
+    name for name in models.Submission.model_fields if name not in ("folder", "discussion")
+)
+
+# What a value should have been, by pydantic's name for the error.
+_EXPECTED = {
+    "string_type": "text in quotes",
+    "int_type": "a whole number",
+    "float_type": "a number",
+    "bool_type": "true or false",
+    "tuple_type": "a list [ … ]",
+    "dict_type": "a table",
+    "model_type": "a table",
+    "model_attributes_type": "a table",
+    "is_instance_of": "a number",
+    "greater_than": "more than {gt}",
+    "greater_than_equal": "at least {ge}",
+    "less_than": "less than {lt}",
+    "less_than_equal": "at most {le}",
+    "too_long": "at most {max_length} values",
+    "too_short": "at least {min_length} values",
+    "string_too_long": "at most {max_length} characters",
+    "literal_error": "{expected}",
+    "union_tag_invalid": "type = {expected_tags}",
+    "union_tag_not_found": 'type = "state_feedback" or "pid"',
+}
+
+
+def quote(value: object) -> str:
+    """Return a found value as one short printable line."""
+    text = repr(value) if not isinstance(value, dict | tuple | list) else _summary(value)
+    return text if len(text) <= _LONGEST_QUOTE else text[: _LONGEST_QUOTE - 1] + "…"
+
+
+def _summary(value: dict | tuple | list) -> str:
+    if isinstance(value, dict):
+        return "a table"
+    return f"a list of {len(value)}" if len(value) > 4 else repr(list(value))
+
+
+def nearest(name: object, candidates: Sequence[str]) -> str:
+    """Return "; did you mean …?", or all that would do where nothing is near and few are."""
+    close = get_close_matches(str(name)[:_LONGEST_QUOTE], candidates, n=1, cutoff=0.5)
+    if close:
+        return f"; did you mean {close[0]!r}?"
+    return f"; known: {', '.join(candidates)}" if candidates else ""
+
+
+def dotted(location: Location, document: object) -> str:
+    """Return `experiments[2].kind (step-a)`: lists count from 1, the experiment by its id too."""
+    path, here, name = "", document, ""
+    for part in location:
+        if isinstance(part, int):
+            path += f"[{part + 1}]"
+        else:
+            path += ("." if path else "") + (
+                part if re.fullmatch(r"[A-Za-z0-9_-]{1,40}", part) else quote(part)
+            )
+        try:
+            here = here[part]  # type: ignore[index]
+        except (KeyError, IndexError, TypeError):
+            here = None
+        if isinstance(here, dict) and isinstance(part, int) and isinstance(here.get("id"), str):
+            name = f" ({quote(here['id'])[1:-1]})"
+    return path + name
+
+
+def explain(error: ErrorDetails, document: dict) -> str:
+    """Return one pydantic error as `key: what was expected, what was found, what is near`."""
+    location = [part for part in error["loc"] if not isinstance(part, str) or part != "str"]
+    table = ".".join(part for part in location[:-1] if isinstance(part, str))
+    location = _without_tag(location)
+    where, found = dotted(location, document), error["input"]
+    kind, context = error["type"], error.get("ctx", {})
+    if kind == "missing":
+        return f"{where}: is required and not there"
+    if kind == "extra_forbidden":
+        keys = tuple(_TABLES[table].model_fields) if table in _TABLES else TOP_LEVEL
+        return f"{where}: unknown key{nearest(location[-1], keys)}"
+    if kind not in _EXPECTED:
+        return f"{where}: {error['msg']}, found {quote(found)}"
+    text = f"{where}: expected {_EXPECTED[kind].format(**context)}, found {quote(found)}"
+    if kind == "literal_error" and isinstance(found, str):
+        close = get_close_matches(found, re.findall(r"'([^']*)'", context["expected"]), n=1)
+        text += f"; did you mean {close[0]!r}?" if close else ""
+    return text
+
+
+def _without_tag(location: list[int | str]) -> list[int | str]:
+    """Drop what pydantic adds for a controller's type: it is no key of the file."""
+    return [
+        part
+        for i, part in enumerate(location)
+        if not (i > 0 and location[i - 1] == "controller" and part in ("pid", "state_feedback"))
+    ]

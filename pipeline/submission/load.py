@@ -1,0 +1,308 @@
+"""Read `submission.toml` into a validated `Submission`; whatever is wrong is one line."""
+
+import re
+import stat
+import tomllib
+from collections.abc import Iterator
+from decimal import Decimal
+from pathlib import Path, PurePosixPath, PureWindowsPath
+
+from pydantic import ValidationError
+
+from pipeline.errors import SubmissionError
+from pipeline.plant.chain import parameter_names
+from pipeline.submission.complaints import (
+    TOP_LEVEL,
+    Location,
+    dotted,
+    explain,
+    nearest,
+    quote,
+)
+from pipeline.submission.models import Experiment, StateFeedback, Submission
+
+NAME = "submission.toml"
+MAX_TOML_BYTES = 1_000_000  # a full class section's worth of experiments needs a tenth of it
+MAX_NOTES_BYTES = 1_000_000
+MAX_DATA_BYTES = 100_000_000  # over half an hour at 1 kHz
+_MAX_KEY_DEPTH = 30  # tomllib's time grows with the square of a dotted key's depth
+_LARGEST = Decimal("1e100")  # beyond any physical number in any unit, yet safe to square
+_DOTTED_KEY = re.compile(r"[\w\"'-]+(?:[ \t]*\.[ \t]*[\w\"'-]+)*")
+_COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
+_SYSTEM_COLUMNS = ("time", "input", "reference", "frequency")
+
+
+def load_submission(path: Path) -> Submission:
+    """Read and check a submission: the folder, or its `submission.toml`.
+
+    `carts` left out of an experiment are filled in with all of them, and `file` is normalised to
+    forward slashes. Numbers under `[reported]` keep their digits as typed.
+
+    Raises
+    ------
+    SubmissionError : one line with file, key, what was expected, what was found.
+    """
+    path = Path(path)
+    toml = path if path.is_file() or path.suffix == ".toml" else path / NAME
+    folder = toml.parent
+    where = f"{folder.resolve().name}/{toml.name}"
+    if not folder.is_dir():
+        raise SubmissionError(f"{quote(str(path))}: no such folder")
+    if (problem := outside(folder, toml.name)) is not None:
+        raise SubmissionError(f"{where}: {problem}")
+    text = _text(toml, where=where, limit=MAX_TOML_BYTES)
+    document = _parse(text, where=where)
+    submission = _validate(document, where=where)
+    _raise_first(
+        [f"{dotted(at, document)}: {what}" for at, what in _problems(submission, folder)], where
+    )
+    everyone = tuple(range(1, submission.system.carts + 1))
+    experiments = tuple(
+        experiment.model_copy(
+            update={
+                "carts": tuple(sorted(experiment.carts)) or everyone,
+                "file": _posix(experiment.file),
+            }
+        )
+        for experiment in submission.experiments
+    )
+    return submission.model_copy(
+        update={"experiments": experiments, "folder": folder, "discussion": _notes(folder)}
+    )
+
+
+# ------------------------------------------------------------------ from bytes to a document
+
+
+def _text(path: Path, *, where: str, limit: int) -> str:
+    """Return the text of a small UTF-8 file; a byte-order mark is dropped."""
+    try:
+        size = path.stat().st_size
+        if size > limit:
+            raise SubmissionError(f"{where}: {size:,} bytes, the limit is {limit:,}")
+        raw = path.read_bytes()
+    except OSError as error:
+        raise SubmissionError(f"{where}: cannot be read ({error.strerror})") from None
+    try:
+        return raw.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = raw[: error.start].count(b"\n") + 1
+        raise SubmissionError(f"{where} line {line}: not UTF-8 text; save it as UTF-8") from None
+
+
+def _parse(text: str, *, where: str) -> dict:
+    """Parse TOML; decimals stay `Decimal`, so that no typed digit is lost."""
+    for key in _DOTTED_KEY.finditer(text):
+        if key.group().count(".") > _MAX_KEY_DEPTH:
+            line = text.count("\n", 0, key.start()) + 1
+            raise SubmissionError(f"{where} line {line}: keys nest too deeply")
+    try:
+        return tomllib.loads(text, parse_float=Decimal)
+    except tomllib.TOMLDecodeError as error:
+        message = " ".join(str(error).split())
+        if at := re.search(r" \(at line (\d+), column (\d+)\)$", message):
+            line, message = int(at[1]), message[: at.start()] + f" at column {at[2]}"
+        else:
+            line = text.count("\n") + 1
+        raise SubmissionError(f"{where} line {line}: not valid TOML: {message}") from None
+    except RecursionError:
+        raise SubmissionError(f"{where}: lists or tables nest too deeply") from None
+    except ValueError:  # an integer of thousands of digits
+        raise SubmissionError(f"{where}: a number has too many digits") from None
+
+
+def _validate(document: dict, *, where: str) -> Submission:
+    for key in document:
+        if key not in TOP_LEVEL:
+            raise SubmissionError(
+                f"{where}: {dotted([key], document)}: unknown key{nearest(key, TOP_LEVEL)}"
+            )
+    try:
+        plain = {key: _plain(value, (key,)) for key, value in document.items()}
+    except _Unusable as error:
+        at, what = error.args
+        raise SubmissionError(f"{where}: {dotted(at, document)}: {what}") from None
+    except RecursionError:
+        raise SubmissionError(f"{where}: lists or tables nest too deeply") from None
+    try:
+        return Submission.model_validate(plain, strict=True)
+    except ValidationError as error:
+        # A misspelt required key is both unknown and missing: the first says more.
+        errors = sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
+        _raise_first([explain(e, plain) for e in errors], where)
+        raise  # never: there is at least one error
+
+
+class _Unusable(Exception):
+    """A number that cannot be used: its location and why."""
+
+
+def _plain(value: object, at: tuple[int | str, ...]) -> object:
+    """Return lists as tuples and decimals as floats, but under `reported` all as decimals."""
+    if isinstance(value, dict):
+        return {key: _plain(item, (*at, key)) for key, item in value.items()}
+    if isinstance(value, list):
+        return tuple(_plain(item, (*at, i)) for i, item in enumerate(value))
+    if isinstance(value, bool) or not isinstance(value, int | Decimal):
+        return value
+    if isinstance(value, Decimal) and not value.is_finite():
+        raise _Unusable(at, "expected a finite number, found NaN or infinity")
+    if abs(value) >= _LARGEST or (value and abs(Decimal(value)) <= 1 / _LARGEST):
+        raise _Unusable(
+            at, f"expected a number between {1 / _LARGEST:.0e} and {_LARGEST:.0e} in size"
+        )
+    if at[0] == "reported":
+        return Decimal(value)
+    return float(value) if isinstance(value, Decimal) else value
+
+
+def _raise_first(problems: list[str], where: str) -> None:
+    """Raise the first problem, with a count of the others."""
+    if problems:
+        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+        raise SubmissionError(f"{where}: {problems[0]}{more}")
+
+
+def _notes(folder: Path) -> str | None:
+    """Return `notes.md`, or None where it is absent or holds nothing but comments."""
+    path, where = folder / "notes.md", f"{folder.resolve().name}/notes.md"
+    if not path.exists() and not path.is_symlink():
+        return None
+    if (problem := outside(folder, "notes.md")) is not None:
+        raise SubmissionError(f"{where}: {problem}")
+    text = _text(path, where=where, limit=MAX_NOTES_BYTES)
+    return text if _COMMENT.sub("", text).strip() else None
+
+
+# ------------------------------------------------- what the tables say about one another
+
+
+def _problems(submission: Submission, folder: Path) -> Iterator[tuple[Location, str]]:
+    """Yield (location, what is wrong) for what no single value shows."""
+    n, springs = submission.system.carts, submission.system.springs
+    if len(springs) != n + 1:
+        names = ["wall-1", *(f"{i}-{i + 1}" for i in range(1, n)), f"{n}-wall"]
+        yield (
+            ("system", "springs"),
+            f"expected {n + 1} values ({', '.join(names)}), found {len(springs)}",
+        )
+    if submission.design is not None:
+        yield from _in_range(("design", "cart"), submission.design.cart, n)
+    seen: dict[str, int] = {}
+    for i, experiment in enumerate(submission.experiments):
+        if experiment.id in seen:
+            first = seen[experiment.id] + 1
+            yield ("experiments", i, "id"), f"used before, by experiments[{first}]"
+        seen.setdefault(experiment.id, i)
+        for key, what in _experiment_problems(experiment, n, folder):
+            yield ("experiments", i, *key), what
+    yield from _reported_problems(submission)
+
+
+def _in_range(at: Location, cart: int, n: int) -> Iterator[tuple[Location, str]]:
+    if not 1 <= cart <= n:
+        carts = "only cart 1" if n == 1 else f"carts 1 to {n}"
+        yield at, f"there is no cart {cart}, the system has {carts}"
+
+
+def _experiment_problems(
+    experiment: Experiment, n: int, folder: Path
+) -> Iterator[tuple[Location, str]]:
+    if not experiment.id.strip() or not experiment.id.isprintable() or len(experiment.id) > 100:
+        yield ("id",), "expected 1 to 100 printable characters"
+    if (problem := outside(folder, experiment.file)) is not None:
+        yield ("file",), problem
+    for j, cart in enumerate(experiment.carts):
+        yield from _in_range(("carts", j), cart, n)
+    if len(set(experiment.carts)) < len(experiment.carts):
+        yield ("carts",), f"a cart is named twice: {list(experiment.carts)}"
+    if experiment.window is not None and not experiment.window[0] < experiment.window[1]:
+        start, end = experiment.window
+        yield ("window",), f"expected [start, end] with start before end, found [{start}, {end}]"
+    if experiment.controlled_cart is not None:
+        yield from _in_range(("controlled_cart",), experiment.controlled_cart, n)
+    controller = experiment.controller
+    if isinstance(controller, StateFeedback):
+        if len(controller.gains) not in (0, 2 * n):
+            yield (
+                ("controller", "gains"),
+                f"expected {2 * n} gains (position, velocity of each cart), "
+                f"found {len(controller.gains)}",
+            )
+    elif controller is not None:
+        yield from _in_range(("controller", "cart"), controller.cart, n)
+    roles = (*_SYSTEM_COLUMNS, *(f"x{i}" for i in range(1, n + 1)))
+    for role, column in (experiment.columns or {}).items():
+        if role not in roles:
+            yield ("columns", role), f"unknown column{nearest(role, roles)}"
+        if isinstance(column, int) and column < 1:
+            yield ("columns", role), f"columns count from 1, found {column}"
+
+
+def _reported_problems(submission: Submission) -> Iterator[tuple[Location, str]]:
+    reported, n = submission.reported, submission.system.carts
+    if reported is None:
+        return
+    names = parameter_names(n, rigid=n == 1 and not any(submission.system.springs))
+    for table in ("initial", "final"):
+        for name in getattr(reported, table):
+            if name not in names:
+                yield ("reported", table, name), f"unknown parameter{nearest(name, names)}"
+    if (space := reported.state_space) is not None:
+        if space.A and (len(space.A) != 2 * n or any(len(row) != 2 * n for row in space.A)):
+            yield ("reported", "state_space", "A"), f"expected {2 * n} rows of {2 * n} numbers"
+        if space.B and len(space.B) != 2 * n:
+            yield (
+                ("reported", "state_space", "B"),
+                f"expected {2 * n} numbers, found {len(space.B)}",
+            )
+    if reported.feedback is not None and len(reported.feedback.gains) not in (0, 2 * n):
+        yield (
+            ("reported", "feedback", "gains"),
+            f"expected {2 * n} gains, found {len(reported.feedback.gains)}",
+        )
+
+
+# ------------------------------------------------------------------------- files
+
+
+def _posix(name: str) -> str:
+    """Return a file name with forward slashes, as a student on any system may have typed it."""
+    return str(PurePosixPath(name.replace("\\", "/")))
+
+
+def outside(folder: Path, name: str) -> str | None:
+    """Return why `name` is no readable regular file inside `folder`, or None where it is one."""
+    shown = quote(name)
+    if not name.strip() or not name.isprintable():
+        return f"expected a file name, found {shown}"
+    windows, relative = PureWindowsPath(name), Path(_posix(name))
+    if windows.drive or windows.root or relative.is_absolute() or ".." in windows.parts:
+        return f"{shown} leaves the submission folder"
+    try:
+        root, target = folder.resolve(), (folder / relative).resolve()
+        if not target.is_relative_to(root):
+            return f"{shown} leaves the submission folder through a link"
+        info = target.stat()
+    except FileNotFoundError:
+        return f"there is no file {shown}{_near_file(folder, _posix(name))}"
+    except (OSError, RuntimeError) as error:  # a loop of links is a RuntimeError before 3.13
+        return f"{shown} cannot be read ({getattr(error, 'strerror', None) or 'a loop of links'})"
+    if stat.S_ISDIR(info.st_mode):
+        return f"{shown} is a folder, a file was expected"
+    if not stat.S_ISREG(info.st_mode):
+        return f"{shown} is not a regular file"
+    if info.st_size > MAX_DATA_BYTES:
+        return f"{shown} has {info.st_size:,} bytes, the limit is {MAX_DATA_BYTES:,}"
+    return None
+
+
+def _near_file(folder: Path, name: str) -> str:
+    """Return "; did you mean …?" for a file of a similar name nearby."""
+    parent = (folder / name).parent
+    try:
+        siblings = sorted(p.name for p in parent.iterdir() if p.is_file())[:1000]
+    except OSError:
+        return ""
+    hint = nearest(Path(name).name, siblings)
+    return hint if "did you mean" in hint else ""

@@ -1,0 +1,39 @@
+"""A commented submission folder for a student to fill in."""
+
+from pathlib import Path
+
+from pipeline.errors import ConfigError
+from pipeline.resources import TEMPLATES
+from pipeline.submission.load import NAME
+
+_NOTES = """\
+<!-- What you write here becomes the discussion of the report (Markdown).
+     Why do initial and final values differ? What limits the model? What would you record next? -->
+"""
+
+
+def new_submission(folder: Path, *, carts: int) -> None:
+    """Write `submission.toml`, `notes.md` and an empty `data/` for a bench with `carts` carts.
+
+    Raises
+    ------
+    ConfigError : the folder holds something already, or the number of carts is not 1 to 4.
+    """
+    if not 1 <= carts <= 4:
+        raise ConfigError(f"carts: expected 1 to 4, found {carts}")
+    folder = Path(folder)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ConfigError(f"{folder}: is there already and not empty; name a new folder")
+    import jinja2  # noqa: PLC0415 - only `new` needs it, and it costs 50 ms
+
+    source = (TEMPLATES / f"{NAME}.j2").read_text(encoding="utf-8")
+    environment = jinja2.Environment(  # noqa: S701 - the text is TOML, not HTML
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    text = environment.from_string(source).render(carts=carts)
+    (folder / "data").mkdir(parents=True, exist_ok=True)
+    (folder / NAME).write_text(text, encoding="utf-8", newline="\n")
+    (folder / "notes.md").write_text(_NOTES, encoding="utf-8", newline="\n")
