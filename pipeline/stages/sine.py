@@ -1,0 +1,320 @@
+"""Sine dwell: amplitude and phase of the steady state, and where it begins."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.errors import DataError
+from pipeline.plant.chain import Array
+from pipeline.results import Record, SinePoint
+from pipeline.stages._signals import colour, grain, noise_beyond_rounding, rounding_left
+
+_MIN_SAMPLES = 12  # five unknowns, and something left to judge the fit by
+_WINDOW_CYCLES, _WINDOW_TIME = 3.0, 0.6  # a sliding window: the longer of the two; cycles, s
+_HOP_CYCLES, _HOP_TIME = 1.0, 0.2
+_LAST_WINDOWS = 4
+_SPREAD = 0.005  # of the amplitude: the last windows agree to this, or to their noise
+_OFF_SINE = 0.01  # of the amplitude: a residual below this is a good sine
+_BACK_SIGMAS = 4.0  # a stretch whose mean square residual is further up is not steady
+_MARGIN = 3  # the share of the steady part given up to what is left of the transient
+_DRIFT_SIGMAS = 3.0  # the steady part's two halves differ by no more
+_DROP = 6  # the share of it that goes at once where they do
+_PASSES = 3  # of carrying the sine back; each doubles or so what it stands on
+_DRIVEN = 0.5  # of the input's amplitude: the dwell runs from its first to its last such sample
+_FREQUENCY_SIGMAS, _FREQUENCY_RELATIVE = 5.0, 2e-4  # a stated frequency further off is not believed
+_FEW_COUNTS = 20  # an amplitude below this is known to a few percent only
+_FLOOR_ROUNDING = 0.111  # of the encoder step, times sqrt(step / amplitude): see `_rounding_std`
+_ITERATIONS = 20
+_PHASE_CONVERGED = 1e-9  # rad at the ends of the record
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Sine:
+    """a sin(omega t) + b cos(omega t) + offset + slope (t - middle), and what it leaves."""
+
+    z: complex  # a + jb: amplitude and phase against sin(omega t)
+    std: float  # of |z|; the phase's is std / |z|
+    omega: float
+    omega_std: float
+    middle: float
+    offset: float
+    slope: float
+    rms: float  # of the residual
+
+    def __call__(self, t: Array) -> Array:
+        line = self.offset + self.slope * (t - self.middle)
+        return line + (self.z * np.exp(1j * self.omega * t)).imag
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Steady:
+    """The first sample of the steady part; `left`: what of the transient may still be in it."""
+
+    start: int
+    settled: bool
+    left: float
+
+
+def fit_sine(record: Record, *, cart: int) -> SinePoint:
+    """Fit the sinusoidal steady state of one cart to a dwell.
+
+    The steady part is found: the last windows tell whether there is one, and it reaches back as
+    far as its own sine explains the record. The input is fitted over the same part; where it is
+    held from sample to sample, its amplitude is that of the held staircase. Valid for one
+    frequency, from one cycle on.
+
+    Reference: IEEE Std 1057-2017, section 4.6 (three- and four-parameter sine fits).
+
+    Parameters
+    ----------
+    record : the dwell; without `omega` the frequency is fitted to the input.
+    cart : whose position.
+
+    Raises
+    ------
+    DataError : no input column, an input that does not oscillate, or less than a full cycle.
+    """
+    u, t, y = _input_of(record), record.t, record.position(cart)
+    omega, frequency_note = _frequency(record, u)
+    driven = _driven_part(u)
+    t, u, y = t[driven], u[driven], y[driven]
+    cycles = omega * (t[-1] - t[0]) / (2 * np.pi)
+    if cycles < 1 or t.size < _MIN_SAMPLES:
+        raise DataError(
+            f"{record.id}: a sine fit needs a full cycle of driven motion and {_MIN_SAMPLES} "
+            f"samples, found {cycles:.2f} cycles in {t.size} samples"
+        )
+    step = record.encoder_step(cart)
+    floor = grain(t, y, step=step) / np.sqrt(12)
+    steady = _steady_part(t, y, omega=omega, floor=floor)
+    t, u, y = t[steady.start :], u[steady.start :], y[steady.start :]
+
+    position = _fit(t, y, omega=omega)
+    drive = _fit(t, u, omega=omega)
+    amplitude, input_amplitude = abs(position.z), abs(drive.z)
+    held = _held(t, omega=omega) if record.hold == "zero_order" else 1.0
+    rounding = _rounding_std(position, step=step)  # leaves the phase alone
+    angle_std = _angle_std(position.z, float(np.hypot(position.std, steady.left)))
+    notes = [
+        frequency_note,
+        "" if steady.settled else "no steady state is seen before the record ends",
+        _note_small(amplitude, step=step),
+        _note_off_sine(position, floor=floor),
+    ]
+    return SinePoint(
+        experiment=record.id,
+        cart=cart,
+        omega=omega,
+        amplitude=float(amplitude),
+        amplitude_std=float(np.linalg.norm([position.std, rounding, steady.left])),
+        phase=float(np.angle(position.z / (drive.z * held))),
+        phase_std=float(np.hypot(angle_std, _angle_std(drive.z, drive.std))),
+        input_amplitude=float(input_amplitude * abs(held)),
+        input_amplitude_std=drive.std,
+        steady_from=float(t[0]),
+        settled=steady.settled,
+        n_points=t.size,
+        note="; ".join(note for note in notes if note),
+    )
+
+
+def _input_of(record: Record) -> Array:
+    if record.u is None:
+        raise DataError(
+            f"{record.id}: a sine dwell needs the input beside the positions, found no input "
+            "column: export it too, or name it under `columns`"
+        )
+    if np.ptp(record.u) == 0:
+        raise DataError(
+            f"{record.id}: a sine dwell needs an input that oscillates, found {record.u[0]:g} "
+            "throughout"
+        )
+    return record.u
+
+
+# ------------------------------------------------------------------- the fits
+
+
+def _fit(t: Array, y: Array, *, omega: float, free_frequency: bool = False) -> _Sine:
+    """Least-squares sine with offset and slope; iterate on the frequency if it is free.
+
+    The standard errors allow for a residual that is not white (see `colour`).
+    """
+    middle, half = (t[0] + t[-1]) / 2, (t[-1] - t[0]) / 2
+    tau = (t - middle) / half
+    columns, coefficients = _solve(t, y, omega=omega, tau=tau)
+    for _ in range(_ITERATIONS if free_frequency else 0):
+        per_omega = tau * (coefficients[0] * columns[1] - coefficients[1] * columns[0])
+        columns, coefficients = _solve(t, y, omega=omega, tau=tau, extra=[per_omega])
+        change = coefficients[4] / half
+        omega += change
+        if abs(change) * half < _PHASE_CONVERGED:
+            break
+    X = np.array(columns).T
+    residual = y - X @ coefficients
+    inverse = np.linalg.inv(np.linalg.qr(X, mode="r"))
+    spread = float(residual @ residual) / max(t.size - X.shape[1], 1)
+    variance = spread * colour(residual, angle=omega * 2 * half / (t.size - 1))
+    covariance = variance * (inverse @ inverse.T)
+    return _Sine(
+        z=complex(coefficients[0], coefficients[1]),
+        std=float(np.sqrt((covariance[0, 0] + covariance[1, 1]) / 2)),
+        omega=float(omega),
+        omega_std=float(np.sqrt(covariance[4, 4])) / half if free_frequency else 0.0,
+        middle=float(middle),
+        offset=float(coefficients[2]),
+        slope=float(coefficients[3] / half),
+        rms=float(np.sqrt(np.mean(residual**2))),
+    )
+
+
+def _solve(
+    t: Array, y: Array, *, omega: float, tau: Array, extra: Sequence[Array] = ()
+) -> tuple[list[Array], Array]:
+    columns = [np.sin(omega * t), np.cos(omega * t), np.ones_like(t), tau, *extra]
+    return columns, np.linalg.lstsq(np.array(columns).T, y, rcond=None)[0].astype(np.float64)
+
+
+def _angle_std(z: complex, std: float) -> float:
+    """Return the standard error of the phase; an angle drawn blindly has pi/sqrt(3)."""
+    blind = np.pi / np.sqrt(3)
+    return float(min(std / abs(z), blind)) if z else float(blind)
+
+
+def _rounding_std(fit: _Sine, *, step: float) -> float:
+    """Return the amplitude error that rounding leaves however many samples are averaged.
+
+    Rounding offset + A sin adds sum_k (q / pi k) 2 J1(2 pi k A/q) cos(2 pi k offset/q) to the
+    amplitude, 0.111 q sqrt(q/A) root-mean-square over A and offset; noise takes it away.
+    """
+    if step == 0:
+        return 0.0
+    left = rounding_left(noise_beyond_rounding(fit.rms, step=step), step=step)
+    return _FLOOR_ROUNDING * step * float(np.sqrt(min(step / abs(fit.z), 1.0))) * left
+
+
+def _held(t: Array, *, omega: float) -> complex:
+    """Return the factor from a sampled sine to the first harmonic of its held staircase."""
+    dt = np.diff(t)
+    return complex(np.sum(-np.expm1(-1j * omega * dt)) / (1j * omega * np.sum(dt)))
+
+
+# -------------------------------------------------------- what the record holds
+
+
+def _frequency(record: Record, u: Array) -> tuple[float, str]:
+    """Return the frequency, rad/s: as stated, unless the input clearly says otherwise."""
+    t, stated = record.t, record.omega
+    grid = np.linspace(t[0], t[-1], t.size)
+    even = np.interp(grid, t, u - np.mean(u))
+    n = 4 * t.size  # padded: the peak is found to a quarter of a line
+    spectrum = np.abs(np.fft.rfft(even * np.hanning(t.size), n))
+    line = 2 * np.pi / (n * (grid[1] - grid[0]))
+    fitted = _fit(t, u, omega=line * (1 + int(np.argmax(spectrum[1:]))), free_frequency=True)
+    if stated is None:
+        return fitted.omega, ""
+    off = abs(fitted.omega - stated)
+    if off <= max(_FREQUENCY_SIGMAS * fitted.omega_std, _FREQUENCY_RELATIVE * stated):
+        return stated, ""
+    return fitted.omega, (
+        f"the input oscillates at {fitted.omega / (2 * np.pi):.4g} Hz, not at the "
+        f"{stated / (2 * np.pi):.4g} Hz stated; the former is used"
+    )
+
+
+def _windows(t: Array, *, omega: float) -> list[slice]:
+    """Return sliding windows over the record, the last one ending with it, in order."""
+    period = 2 * np.pi / omega
+    duration = t[-1] - t[0]
+    length = max(_WINDOW_CYCLES * period, _WINDOW_TIME)
+    hop = max(_HOP_CYCLES * period, _HOP_TIME)
+    if length + (_LAST_WINDOWS - 1) * hop > duration:  # short record: single cycles
+        length, hop = period, max(period / 2, (duration - period) / _LAST_WINDOWS)
+    ends = t[-1] - hop * np.arange(int((duration - length) / hop + 1e-9) + 1)
+    return [
+        slice(int(np.searchsorted(t, end - length)), int(np.searchsorted(t, end, side="right")))
+        for end in ends[::-1]
+    ]
+
+
+def _driven_part(u: Array) -> slice:
+    """Return the part of the record in which the input oscillates."""
+    offset = (np.max(u) + np.min(u)) / 2
+    first, last = np.flatnonzero(np.abs(u - offset) > _DRIVEN * np.ptp(u) / 2)[[0, -1]]
+    return slice(int(first), int(last) + 1)
+
+
+def _steady_part(t: Array, y: Array, *, omega: float, floor: float) -> _Steady:
+    """Find where the steady part starts, and whether there is one.
+
+    Settled: the complex amplitudes of the last windows agree. Their sine is then carried back
+    over the record as far as it leaves no more than its own residual.
+    """
+    windows = _windows(t, omega=omega)
+    last = windows[-_LAST_WINDOWS:]
+    fits = [_fit(t[w], y[w], omega=omega) for w in last]
+    z = np.array([fit.z for fit in fits])
+    tolerance = max(_SPREAD * abs(z.mean()), 3 * max(fit.std for fit in fits), floor)
+    latest = last[0].start
+    spread = float(np.max(np.abs(z - z.mean())))
+    if len(last) < 2 or spread > tolerance:
+        return _Steady(start=latest, settled=False, left=spread)
+    start = _carry_back(t, y, latest, omega=omega, floor=floor, stretches=len(windows))
+    if start == 0:
+        return _Steady(start=0, settled=True, left=0.0)
+    start = min(start + (t.size - start) // _MARGIN, latest)
+    start, left = _drop_drifting(t, y, start, latest=latest, omega=omega)
+    return _Steady(start=start, settled=True, left=left)
+
+
+def _carry_back(
+    t: Array, y: Array, start: int, *, omega: float, floor: float, stretches: int
+) -> int:
+    """Return how far back the sine from `start` on explains the record."""
+    for _ in range(_PASSES):
+        steady = _fit(t[start:], y[start:], omega=omega)
+        square = np.cumsum((y - steady(t)) ** 2)
+        hop = max((t.size - start) // stretches, _MIN_SAMPLES)
+        edges = np.arange(start, -1, -hop)
+        mean = -np.diff(square[edges]) / hop  # of the stretches before `start`, going back
+        limit = max(steady.rms, floor) ** 2 * (1 + _BACK_SIGMAS * np.sqrt(2 / hop))
+        worse = np.flatnonzero(mean > limit)
+        reached = int(edges[worse[0] if worse.size else -1])
+        if reached == start:
+            break
+        start = reached
+    return start
+
+
+def _drop_drifting(
+    t: Array, y: Array, start: int, *, latest: int, omega: float
+) -> tuple[int, float]:
+    """Return a start, not after `latest`, from which the two halves agree; and what is left.
+
+    At a resonance the transient has the dwell's own frequency and hides in its amplitude. Half
+    of the difference between the halves, where it is more than noise, is still in the mean.
+    """
+    while True:
+        middle = (start + t.size) // 2
+        early = _fit(t[start:middle], y[start:middle], omega=omega)
+        late = _fit(t[middle:], y[middle:], omega=omega)
+        difference, noise = abs(early.z - late.z), np.hypot(early.std, late.std)
+        if start == latest or difference <= _DRIFT_SIGMAS * noise:
+            return start, float(np.sqrt(max(difference**2 - 4 * noise**2, 0.0))) / 2
+        start = min(start + (t.size - start) // _DROP, latest)
+
+
+# ------------------------------------------------------------------------ notes
+
+
+def _note_small(amplitude: float, *, step: float) -> str:
+    if step == 0 or amplitude >= _FEW_COUNTS * step:
+        return ""
+    return f"the amplitude is {amplitude / step:.1f} encoder counts only"
+
+
+def _note_off_sine(fit: _Sine, *, floor: float) -> str:
+    if fit.rms <= max(2 * floor, _OFF_SINE * abs(fit.z)):
+        return ""
+    return f"{100 * fit.rms / abs(fit.z):.1f} % of the motion is not a sine of this frequency"
