@@ -1,0 +1,320 @@
+"""Measured frequency response: from dwells, or from step and sweep records; its peaks and nulls."""
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.errors import DataError
+from pipeline.plant.chain import Array, ComplexArray, parameter_names
+from pipeline.results import Estimate, FrequencyResponse, Record, SinePoint
+from pipeline.stages.record_transforms import transfer_ratio, visible_band
+
+# Two dwells are repeats where their frequencies differ by less than this: a fitted frequency is
+# good to some 1e-4, and no response changes by more than its error within it.
+_SAME_FREQUENCY = 1e-3
+# A dwell that ends before its steady state is off by a few per cent.
+_UNSETTLED_STD = 0.05
+# No bench measures better; exact data would weigh infinitely.
+_SMALLEST_RELATIVE_STD = 1e-6
+
+# Records: a frequency is kept where the response stands five sigma out.
+_LARGEST_RELATIVE_STD = 0.2
+_GRID_RATIO = 1.02  # some five lines across the half-power width 2ζω of a mode with ζ = 0.05
+
+# Peaks and nulls
+_LEAST_PROMINENCE = 0.05  # of ln|G|; and four standard errors
+_CLEAR = 0.1  # relative error above which a point shows no peak
+_LOW_SHARE = 0.7  # of the first resonance: below, a gain can be told from the magnitude
+_SAME_PEAK = 0.1  # of ln(omega): carts share their resonances
+ASSUMED_ZETA = 0.1  # the paper's usual guess for a mode or a null
+
+
+# ---------------------------------------------------------------------- dwells
+
+
+def collect_dwells(points: Sequence[SinePoint]) -> tuple[FrequencyResponse, ...]:
+    """Collect dwells to one frequency response per cart; repeats of a frequency become one point.
+
+    Repeats combine to their weighted mean; its standard error grows where they scatter more than
+    theirs allow. A dwell that did not settle stays, with an error of 5 % added.
+
+    Raises
+    ------
+    DataError : no dwell has an input to compare with.
+    """
+    usable = [p for p in points if p.input_amplitude > 0]
+    if not usable:
+        raise DataError("frequency response: dwells need a sinusoidal input, found none with one")
+    return tuple(
+        _collect_cart([p for p in usable if p.cart == cart], cart=cart)
+        for cart in sorted({p.cart for p in usable})
+    )
+
+
+def _collect_cart(points: Sequence[SinePoint], *, cart: int) -> FrequencyResponse:
+    ordered = sorted(points, key=lambda p: p.omega)
+    groups = [[ordered[0]]]
+    for before, point in pairwise(ordered):
+        if point.omega > before.omega * (1 + _SAME_FREQUENCY):
+            groups.append([])
+        groups[-1].append(point)
+    rows = []
+    for group in groups:
+        extra = np.array([0.0 if p.settled else _UNSETTLED_STD for p in group])
+        gain = np.array([p.gain for p in group])
+        magnitude, magnitude_std = _weighted_mean(
+            gain, np.hypot([p.gain_std for p in group], extra * gain)
+        )
+        around = group[0].phase
+        turn, phase_std = _weighted_mean(
+            _wrapped(np.array([p.phase for p in group]) - around),
+            np.hypot([p.phase_std for p in group], extra),
+        )
+        omega = float(np.mean([p.omega for p in group]))
+        phase = float(_wrapped(np.array(around + turn)))
+        rows.append((omega, magnitude, magnitude_std, phase, phase_std))
+    omega, magnitude, magnitude_std, phase, phase_std = np.array(rows).T
+    return FrequencyResponse(
+        cart=cart,
+        omega=omega,
+        magnitude=magnitude,
+        magnitude_std=magnitude_std,
+        phase=phase,
+        phase_std=phase_std,
+        source="dwells",
+    )
+
+
+def _wrapped(phase: Array) -> Array:
+    return np.angle(np.exp(1j * phase))
+
+
+def _weighted_mean(values: Array, std: Array) -> tuple[float, float]:
+    """Return the weighted mean and its standard error, scatter beyond `std` included (Birge)."""
+    floor = _SMALLEST_RELATIVE_STD * max(float(np.max(np.abs(values))), _SMALLEST_RELATIVE_STD)
+    weight = 1.0 / np.maximum(std, floor) ** 2
+    mean = float(np.sum(weight * values) / np.sum(weight))
+    error = float(1.0 / np.sqrt(np.sum(weight)))
+    if values.size == 1:
+        return mean, error
+    birge = float(np.sum(weight * (values - mean) ** 2) / (values.size - 1))
+    return mean, error * max(1.0, birge**0.5)
+
+
+# --------------------------------------------------------------------- records
+
+
+def response_from_records(records: Sequence[Record]) -> tuple[FrequencyResponse, ...]:
+    """Take the frequency response of each cart from step and sweep records with all carts free.
+
+    Each record gives its ratio of transforms (`record_transforms`); records combine by weight,
+    their scatter included. Only frequencies at which the input moves the cart are returned.
+
+    Raises
+    ------
+    DataError : no record has an input that changes, or none yields a usable frequency.
+    """
+    runs = [r for r in records if r.u is not None and np.any(r.u != 0) and r.t.size > 16]
+    if not runs:
+        raise DataError("frequency response: needs a step or sweep with its input, found none")
+    omega = _grid(runs)
+    ratios = [transfer_ratio(run, omega=omega) for run in runs]
+    responses = []
+    for cart in sorted({cart for run in runs for cart in run.carts}):
+        rows = [
+            (ratio.G[run.carts.index(cart)], ratio.std[run.carts.index(cart)])
+            for run, ratio in zip(runs, ratios, strict=True)
+            if cart in run.carts
+        ]
+        response = _combined(omega, rows, cart=cart)
+        if response.omega.size:
+            responses.append(response)
+    if not responses:
+        raise DataError(
+            "frequency response: at no frequency does the motion in "
+            f"{', '.join(run.id for run in runs)} stand out of its noise"
+        )
+    return tuple(responses)
+
+
+def _grid(runs: Sequence[Record]) -> Array:
+    """Return harmonics of the (median) record length, thinned to a constant ratio."""
+    base = 2 * np.pi / float(np.median([run.t[-1] - run.t[0] for run in runs]))
+    top = max(int(max(visible_band(run) for run in runs) / base), 2)
+    count = int(np.log(top) / np.log(_GRID_RATIO)) + 2
+    return base * np.unique(np.rint(np.geomspace(1, top, count)))
+
+
+def _combined(
+    omega: Array, rows: Sequence[tuple[ComplexArray, Array]], *, cart: int
+) -> FrequencyResponse:
+    points = []
+    for w in range(omega.size):
+        G = np.array([row[0][w] for row in rows])
+        std = np.array([row[1][w] for row in rows])
+        good = std <= _LARGEST_RELATIVE_STD * np.abs(G)
+        if not good.any():
+            continue
+        real, real_std = _weighted_mean(np.real(G[good]), std[good])
+        imag, imag_std = _weighted_mean(np.imag(G[good]), std[good])
+        magnitude, spread = abs(complex(real, imag)), max(real_std, imag_std)
+        if spread <= _LARGEST_RELATIVE_STD * magnitude:
+            phase = np.arctan2(imag, real)
+            points.append((omega[w], magnitude, spread, phase, spread / magnitude))
+    columns = np.array(points).reshape(-1, 5).T
+    return FrequencyResponse(
+        cart=cart,
+        omega=columns[0],
+        magnitude=columns[1],
+        magnitude_std=columns[2],
+        phase=columns[3],
+        phase_std=columns[4],
+        source="records",
+    )
+
+
+# ------------------------------------------------------------- peaks and nulls
+
+
+class _Extremum(NamedTuple):
+    omega: float
+    std: float
+    prominence: float
+
+
+def find_resonances(responses: Sequence[FrequencyResponse], *, n: int) -> dict[str, Estimate]:
+    """Estimate resonances, nulls and gains from the measured magnitudes, as the paper does.
+
+    The resonances are the peaks that the carts share; a first mode too damped to peak is found
+    from how far the last cart's response has fallen above the others. Where fewer than n are
+    found none is named, as it is not known which is missing. Nulls of cart 1 give omega_x and
+    omega_y (three carts), those of the last but one the last cart's own frequency. Gains are the
+    lowest-frequency magnitudes. Dampings of modes and nulls are assumed.
+    """
+    by_cart = {response.cart: response for response in responses}
+    names = set(parameter_names(n))
+    found: dict[str, Estimate] = {}
+    modes = _shared_peaks(responses, n=n)
+    if len(modes) == n - 1 and n in by_cart:
+        modes = _with_damped_mode(by_cart[n], modes)
+    nulls = {cart: _between(_extrema(r, sign=-1), modes) for cart, r in by_cart.items()}
+    symbols = ["n"] if n == 1 else list("abcdefgh"[:n])
+    if len(modes) == n:
+        found |= _estimates([f"omega_{symbol}" for symbol in symbols], modes)
+    lowest = modes[0].omega if modes else None
+    for cart, response in sorted(by_cart.items()):
+        gain = _low_frequency_gain(response, resonance=lowest)
+        found |= {"K" if n == 1 else f"K_{cart}": gain} if gain else {}
+    if n > 1 and n - 1 in by_cart:
+        found |= _estimates([f"omega_{n}"], _strongest(nulls[n - 1], 1))
+    if n == 3 and 1 in by_cart:
+        found |= _estimates(["omega_x", "omega_y"], _strongest(nulls[1], 2))
+    assumed = ["zeta"] if n == 1 else [f"zeta_{symbol}" for symbol in (*symbols, "x", "y")]
+    return found | {
+        name: Estimate(value=ASSUMED_ZETA, std=None, source="assumed")
+        for name in assumed
+        if by_cart and name in names
+    }
+
+
+def _estimates(names: Sequence[str], extrema: Sequence[_Extremum]) -> Mapping[str, Estimate]:
+    """Name extrema in ascending order; none where their number is not that of the names."""
+    if len(names) != len(extrema):
+        return {}
+    return {
+        name: Estimate(value=e.omega, std=e.std, source="frequency_response")
+        for name, e in zip(names, sorted(extrema), strict=True)
+    }
+
+
+def _between(extrema: Sequence[_Extremum], modes: Sequence[_Extremum]) -> list[_Extremum]:
+    """Return those below the highest mode: there the nulls of a chain are."""
+    top = max((mode.omega for mode in modes), default=np.inf)
+    return [e for e in extrema if e.omega < top]
+
+
+def _strongest(extrema: Sequence[_Extremum], count: int) -> list[_Extremum]:
+    """Return the most prominent ones, ascending in frequency."""
+    return sorted(sorted(extrema, key=lambda e: -e.prominence)[:count])
+
+
+def _extrema(response: FrequencyResponse, *, sign: int) -> list[_Extremum]:
+    """Find the maxima (sign 1) or minima (sign -1) of ln|G| that stand out of its errors."""
+    tiny = 1e-3 * float(np.max(response.magnitude, initial=0.0)) or 1.0
+    error = response.magnitude_std / np.maximum(response.magnitude, tiny)
+    level = sign * np.log(np.maximum(response.magnitude, np.minimum(response.magnitude_std, tiny)))
+    position = np.log(response.omega)
+    found = []
+    for i in range(1, level.size - 1):
+        if not level[i - 1] < level[i] >= level[i + 1] or (sign > 0 and error[i] > _CLEAR):
+            continue
+        left, right = level[:i][::-1], level[i + 1 :]
+        prominence = level[i] - max(_saddle(left, level[i]), _saddle(right, level[i]))
+        if prominence < max(_LEAST_PROMINENCE, 4 * error[i]):
+            continue
+        curve = np.polyfit(position[i - 1 : i + 2] - position[i], level[i - 1 : i + 2], 2)
+        omega = response.omega[i] * np.exp(-curve[1] / (2 * curve[0]))
+        std = (response.omega[i + 1] - response.omega[i - 1]) / 2 / np.sqrt(12.0)
+        found.append(_Extremum(float(omega), float(std), float(prominence)))
+    return found
+
+
+def _saddle(side: Array, peak: float) -> float:
+    """Return the lowest level on one side before it rises above the peak."""
+    higher = np.flatnonzero(side > peak)
+    return float(np.min(side[: higher[0]] if higher.size else side))
+
+
+def _shared_peaks(responses: Sequence[FrequencyResponse], *, n: int) -> list[_Extremum]:
+    """Return up to n peaks, those that most carts show most clearly."""
+    peaks = sorted(peak for response in responses for peak in _extrema(response, sign=1))
+    clusters: list[list[_Extremum]] = []
+    for peak in peaks:
+        if clusters and np.log(peak.omega / clusters[-1][0].omega) < _SAME_PEAK:
+            clusters[-1].append(peak)
+        else:
+            clusters.append([peak])
+    merged = [
+        max(cluster, key=lambda peak: peak.prominence)._replace(
+            prominence=sum(peak.prominence for peak in cluster)
+        )
+        for cluster in clusters
+    ]
+    return _strongest(merged, n)
+
+
+def _with_damped_mode(response: FrequencyResponse, modes: Sequence[_Extremum]) -> list[_Extremum]:
+    """Add the mode that does not peak, from the roll-off above all others of the last cart.
+
+    |G_n| falls as K_n times the product of 1/|1 - (omega/omega_j)²| there; what the known modes
+    leave is 1/((omega/omega_0)² - 1).
+    """
+    top = max((mode.omega for mode in modes), default=0.0)
+    above = response.omega > 1.5 * top
+    if not above.any() or response.omega[0] > 0.7 * response.omega[above][-1]:
+        return list(modes)
+    omega, magnitude = response.omega[above], response.magnitude[above]
+    fall = np.log(response.magnitude[0] / magnitude)
+    for mode in modes:
+        fall -= np.log(np.abs(1 - (omega / mode.omega) ** 2))
+    found = omega / np.sqrt(np.exp(fall) + 1)
+    usable = found[(fall > 0) & (found < 0.7 * omega)]
+    if usable.size == 0:
+        return list(modes)
+    std = float(np.std(usable)) + 0.1 * float(np.median(usable))
+    return sorted([*modes, _Extremum(float(np.median(usable)), std, 0.0)])
+
+
+def _low_frequency_gain(response: FrequencyResponse, *, resonance: float | None) -> Estimate | None:
+    """Estimate K from the lowest frequency, less its rise towards the first resonance."""
+    if resonance is None or response.omega[0] > _LOW_SHARE * resonance:
+        return None
+    ratio = float(response.omega[0]) / resonance
+    rise = abs(1 - ratio**2 + 2j * ASSUMED_ZETA * ratio)
+    magnitude, std = float(response.magnitude[0]), float(response.magnitude_std[0])
+    doubt = abs(rise - 1) / 2 * magnitude  # the assumed damping, and the modes above
+    return Estimate(
+        value=magnitude * rise, std=float(np.hypot(std, doubt)), source="frequency_response"
+    )

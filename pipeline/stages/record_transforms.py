@@ -1,0 +1,147 @@
+"""The transfer ratio of one step or sweep record, whatever its ends.
+
+A record that begins and ends at rest, even displaced, needs no window: the transforms of the
+derivatives, FT(y')/FT(u'), are exact. Any other goes by local polynomials: the unknown motion
+before and after the record adds something smooth in frequency, which is fitted along.
+
+Reference: Pintelon and Schoukens, System Identification: A Frequency Domain Approach, 2nd ed.,
+section 7.2 (the local polynomial method).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.plant.chain import Array, ComplexArray
+from pipeline.results import Record
+
+_LEAST_INPUT_SHARE = 0.01  # of its strongest line; below, the input does not excite the plant
+_REST_SHARE = 0.1  # the part of a record at its end that must be at rest
+_REST_SWING = 0.01  # … to this share of the whole travel
+# A step at the first sample has moved its cart by u t²/2m after two: 3 % of the travel even with
+# samples as far apart as 9 ms and a mode at 20 rad/s.
+_START_SWING = 0.03
+_RING_GAIN = 10.0  # a swing r left at the end errs by up to r / 2ζ, here with ζ = 0.05
+_BAND_TOP = 0.4  # of the Nyquist frequency; above, aliases of the unfiltered encoders come in
+_HALF_WINDOWS, _DEGREE = (4, 6), 2  # lines to each side, and degree, of the local polynomials
+_RANK = 1e-9  # singular values below this share are rounding
+
+
+class TransferRatio(NamedTuple):
+    """G (n_carts, n_w) and its standard error per component; infinite where not excited."""
+
+    G: ComplexArray
+    std: Array
+
+
+def transfer_ratio(run: Record, *, omega: Array) -> TransferRatio:
+    """Return the frequency response that one driven record shows at `omega` (n_w,), rad/s."""
+    if run.u is None:
+        raise ValueError(f"{run.id}: a transfer ratio needs the input")
+    return _at_rest_ratio(run, run.u, omega) or _local_ratio(run, run.u, omega)
+
+
+def visible_band(run: Record) -> float:
+    """Return the highest frequency, rad/s, at which some cart's motion stands out of its noise.
+
+    Only a bound for a grid: it takes the mean sample interval for all.
+    """
+    dt, duration = run.sample_time, run.t[-1] - run.t[0]
+    omega = 2 * np.pi * np.fft.rfftfreq(run.t.size - 1, dt)
+    floor = _noise(run)[:, None] * omega * np.sqrt(dt * duration)
+    # Noise alone passes three sigma on a line in e^-9: too rarely to matter.
+    visible = np.any(np.abs(np.fft.rfft(np.diff(run.y))) > 3 * floor, axis=0)
+    visible &= omega <= _BAND_TOP * np.pi / dt
+    return float(np.max(omega[visible], initial=0.0))
+
+
+def _derivative_transforms(
+    run: Record, u: Array, omega: Array, *, u_before: float
+) -> tuple[ComplexArray, ComplexArray]:
+    """Return FT(u') (n_w,) and FT(y') (n_carts, n_w) over the record, at its own sample times."""
+    between = _turning((run.t[1:] + run.t[:-1]) / 2, omega)
+    # Straight lines between the samples: FT = sum of increments times sinc, over sinc² for what
+    # the straight lines take away from a smooth signal.
+    smooth = 1.0 / np.sinc(omega * run.sample_time / (2 * np.pi))
+    y_transform = np.diff(run.y) @ between * smooth
+    if run.hold == "band_limited":
+        return np.diff(u) @ between * smooth, y_transform
+    jumps = np.diff(u, prepend=u_before)
+    at = np.flatnonzero(jumps)
+    return jumps[at] @ _turning(run.t[at], omega), y_transform
+
+
+def _turning(t: Array, omega: Array) -> ComplexArray:
+    return np.exp(-1j * np.outer(t, omega)).astype(np.complex128)
+
+
+def _at_rest_ratio(run: Record, u: Array, omega: Array) -> TransferRatio | None:
+    """Return FT(y')/FT(u') of a record that begins and ends at rest; None for any other."""
+    travel = np.ptp(run.y, axis=1)
+    noise = _noise(run)
+    tail = run.t >= run.t[-1] - _REST_SHARE * (run.t[-1] - run.t[0])
+    ring = np.ptp(run.y[:, tail], axis=1)
+    quiet = np.maximum(8 * noise, 2 * run.resolution)  # peak to peak of a cart that stands still
+    moving = np.ptp(u[tail]) > 0 or np.any(ring > np.maximum(quiet, _REST_SWING * travel))
+    starts_moving = np.any(np.ptp(run.y[:, :3], axis=1) > np.maximum(quiet, _START_SWING * travel))
+    if moving or starts_moving:
+        return None
+    first_change = int(np.argmax(u != u[0]))
+    waits = first_change > 3 and np.all(np.ptp(run.y[:, :first_change], axis=1) <= quiet)
+    U, Y = _derivative_transforms(run, u, omega, u_before=float(u[0]) if waits else 0.0)
+    excess = np.maximum(ring - quiet, 0.0) / 2
+    duration = run.t[-1] - run.t[0]
+    std = np.sqrt(
+        noise[:, None] ** 2 * (2 + omega**2 * run.sample_time * duration) / 2
+        + (_RING_GAIN * excess[:, None]) ** 2
+    )
+    return _ratio(Y, U, std=std)
+
+
+def _ratio(Y: ComplexArray, U: ComplexArray, *, std: Array) -> TransferRatio:
+    excited = np.abs(U) > _LEAST_INPUT_SHARE * np.max(np.abs(U))
+    U = np.where(excited, U, 1.0)
+    return TransferRatio(G=Y / U, std=np.where(excited, std / np.abs(U), np.inf))
+
+
+def _noise(run: Record) -> Array:
+    """Standard deviation (n_carts,) of what changes from sample to sample, or the encoder's."""
+    white = np.std(np.diff(run.y, n=3, axis=1), axis=1) / np.sqrt(20.0)  # 1 + 9 + 9 + 1
+    return np.maximum(white, run.resolution / np.sqrt(12.0))
+
+
+def _local_ratio(run: Record, u: Array, omega: Array) -> TransferRatio:
+    """Return G by local polynomials: FT(y') = G FT(u') + what the ends left, both smooth.
+
+    What two widths of the polynomials differ by is added to the error: near a sharp resonance
+    of a short record it is the larger part.
+    """
+    base = 2 * np.pi / (run.t[-1] - run.t[0])
+    lines = np.arange(1, int(omega[-1] / base) + max(_HALF_WINDOWS) + 2)
+    U, Y = _derivative_transforms(run, u, lines * base, u_before=float(u[0]))
+    narrow, wide = (
+        _local_polynomials(U, Y, place=omega / base, half=half) for half in _HALF_WINDOWS
+    )
+    excited = np.interp(omega, lines * base, np.abs(U)) > _LEAST_INPUT_SHARE * np.max(np.abs(U))
+    std = np.hypot(narrow.std, np.abs(narrow.G - wide.G) / np.sqrt(2))
+    return TransferRatio(G=narrow.G, std=np.where(excited, std, np.inf))
+
+
+def _local_polynomials(
+    U: ComplexArray, Y: ComplexArray, *, place: Array, half: int
+) -> TransferRatio:
+    """Fit the lines (1, 2, …) around each `place` (n_w,), `half` to each side where there are."""
+    width = 2 * half + 1
+    first = np.clip(np.rint(place).astype(int) - 1 - half, 0, U.size - width)
+    window = first[:, None] + np.arange(width)  # (n_w, width)
+    away = (window + 1 - place[:, None]) / half
+    powers = away[:, :, None] ** np.arange(_DEGREE + 1)
+    regressors = np.concatenate([powers * U[window][:, :, None], powers], axis=2)
+    inverse = np.linalg.pinv(regressors, rcond=_RANK)
+    measured = Y[:, window]  # (n_carts, n_w, width)
+    found = np.einsum("wpj,cwj->cwp", inverse, measured)
+    misfit = measured - np.einsum("wjp,cwp->cwj", regressors, found)
+    freedom = width - 2 * (_DEGREE + 1)
+    variance = np.sum(np.abs(misfit) ** 2, axis=2) / freedom / 2  # per component
+    gain = np.sum(np.abs(inverse[:, 0, :]) ** 2, axis=1)
+    return TransferRatio(G=found[:, :, 0], std=np.sqrt(variance * gain))
