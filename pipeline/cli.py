@@ -172,5 +172,5 @@ def simulate(
 
     with _progress() as progress:
         progress("simulating the experiments")
-        write_submission(out, preset=preset, seed=seed, reported=reported)
+        write_submission(out, chain=preset, seed=seed, reported=reported)
     say(f"wrote {out}: try `cartlab report {out}`")

@@ -1,0 +1,150 @@
+"""The virtual bench: how the carts move in one run, and what the encoders say of it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.plant.chain import Array, Chain
+from pipeline.plant.loop import StateFeedback, simulate_loop
+from pipeline.plant.simulate import propagate, simulate_linear
+from pipeline.results import Kind
+
+# A hand trembles by hundredths of a millimetre at these rates; it is not a clamp.
+_TREMOR_HZ = np.array([1.3, 4.1, 8.7])
+_TREMOR_AMPLITUDE = np.array([4e-3, 2e-3, 1e-3])  # of the distance the cart is held at
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hand:
+    """A hand that holds one cart off its rest and lets go.
+
+    Attributes
+    ----------
+    position : where it holds the cart, position units from rest.
+    release, fade : s; from `release` on its force falls to zero in a straight line over `fade`.
+    tremor : (3,) phases of its trembling, rad.
+    """
+
+    cart: int
+    position: float
+    release: float
+    fade: float
+    tremor: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def hold(self, t: Array) -> tuple[Array, Array]:
+        """Return the position (n,) and velocity (n,) of the cart in the hand."""
+        rate = 2 * np.pi * _TREMOR_HZ
+        phase = np.multiply.outer(np.asarray(t), rate) + np.array(self.tremor)
+        position = self.position * (1.0 + np.sin(phase) @ _TREMOR_AMPLITUDE)
+        return position, self.position * (np.cos(phase) @ (_TREMOR_AMPLITUDE * rate))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Run:
+    """One run: what is done to the carts.
+
+    Attributes
+    ----------
+    t, u : (n,) s and input, held between the samples; in a closed loop the bench finds u itself.
+    free : the carts free to move.
+    frequency : of a sine dwell, Hz.
+    reference, controller, input_limit : of a closed loop; `cart` is the one it steers.
+    keep_from : s; the recorder starts here, and its clock with it.
+    """
+
+    id: str
+    kind: Kind
+    t: Array
+    u: Array
+    free: tuple[int, ...]
+    note: str = ""
+    hand: Hand | None = None
+    frequency: float | None = None
+    cart: int | None = None
+    reference: Array | None = None
+    controller: StateFeedback | None = None
+    input_limit: float | None = None
+    keep_from: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Motion:
+    """What truly happened: the input (n,) and the positions (n_carts, n) from rest."""
+
+    u: Array
+    x: Array
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Bench:
+    """The plant and its encoders.
+
+    Attributes
+    ----------
+    sample_time : s, of the controller, the input and the log.
+    count : the encoder step, position units.
+    noise : standard deviation of what shakes a free cart's encoder, position units.
+    zero_error : the encoders are zeroed within this of the carts' rest, position units.
+    """
+
+    chain: Chain
+    sample_time: float
+    count: float
+    noise: float
+    zero_error: float
+
+    def move(self, run: Run) -> Motion:
+        """Return how the carts move: the one place that knows the law of motion."""
+        chain, x = self.chain, np.zeros((self.chain.n, run.t.size))
+        rows = [cart - 1 for cart in run.free]
+        if run.controller is not None and run.reference is not None:
+            loop = simulate_loop(
+                chain,
+                run.controller,
+                t=run.t,
+                reference=run.reference,
+                sample_time=self.sample_time,
+                input_limit=run.input_limit,
+                encoder_step=self.count,
+                free=run.free,
+            )
+            x[rows] = loop.x
+            return Motion(u=loop.u, x=x)
+        if run.hand is not None:
+            x[rows] = _release(chain, run.t, run.hand, free=run.free)
+        else:
+            x[rows] = simulate_linear(chain, run.t, run.u, free=run.free)
+        return Motion(u=run.u, x=x)
+
+    def read(self, motion: Motion, *, run: Run, rng: np.random.Generator) -> Array:
+        """Return the encoder readings (n_carts, n), whole counts in position units."""
+        n_carts, n = motion.x.shape
+        zero = rng.uniform(-self.zero_error, self.zero_error, size=(n_carts, 1))
+        if run.controller is not None:
+            zero[:] = 0.0  # the controller needs its zero at rest, so that is seen to first
+        shaken = np.isin(np.arange(1, n_carts + 1), run.free)[:, None]
+        x = motion.x + zero + self.noise * shaken * rng.standard_normal((n_carts, n))
+        return self.count * np.round(x / self.count)
+
+
+def _release(chain: Chain, t: Array, hand: Hand, *, free: Sequence[int]) -> Array:
+    """Return the positions (f, n) of the free carts, all but the hand's at rest until it lets go.
+
+    The hand's force on its cart balances the springs at the release and fades from there, so the
+    decay begins softly, as a hand's does, and not with a step.
+    """
+    A, B, C, _ = chain.state_space(free=free)
+    row = sorted(free).index(hand.cart)
+    start = int(np.searchsorted(t, hand.release))
+    x = np.zeros((len(free), t.size))
+    x[row], _ = hand.hold(t)
+    position, velocity = hand.hold(t[start])
+    state = np.zeros(A.shape[0])
+    state[2 * row : 2 * row + 2] = position, velocity
+    push = np.zeros_like(B)
+    push[2 * row + 1] = 1.0 / chain.m[hand.cart - 1]
+    stiffness = chain.k[hand.cart - 1] + chain.k[hand.cart]
+    force = stiffness * position * np.clip(1 - (t[start:] - t[start]) / hand.fade, 0.0, 1.0)
+    x[:, start:] = C @ propagate(A, push, t[start:], force, x0=state, linear=True)
+    return x

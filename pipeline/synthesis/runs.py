@@ -1,0 +1,212 @@
+"""The runs of one laboratory session: decays, steps, sine dwells, a sweep, a closed loop."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.errors import DataError
+from pipeline.plant.chain import Array, Chain, quadratic_factors
+from pipeline.plant.loop import StateFeedback
+from pipeline.plant.simulate import simulate_linear
+from pipeline.synthesis.bench import Hand, Run
+
+INPUT_DECIMALS = 5  # the input is set in steps of 10 µV, so the log holds what was applied
+FIGURE_FREQUENCY = 4.0  # Hz: the dwell of the paper's Figures 12-14
+
+_LETTERS = "abcdefgh"
+_SETTLED = 6.0  # time constants: a transient is down to 0.25 %
+_SETTLED_DWELL = 7.0  # and to 0.1 %, since near a null it hides a small steady motion
+_LONGEST_WAIT = 12.0  # s; no student waits longer, however little damping there is
+_CYCLES = 6.5  # of steady state in a dwell: room to see that six do not change any more
+_SHORTEST_DWELL = 1.4  # s of it, at high frequencies
+_WHOLE_EVERY = 7  # a session that saves space records one dwell in so many from rest
+_REST = 0.5  # s of rest before a step and before a closed loop's
+
+
+@dataclass(frozen=True, kw_only=True)
+class Session:
+    """How thorough a session is, and how far the carts may move.
+
+    Attributes
+    ----------
+    sample_time : s.
+    travel : how far the carts are meant to move, position units.
+    input_limit : the largest input, input units.
+    repeats : of every decay and of every step size.
+    n_dwells : about how many frequencies.
+    transients : every dwell is recorded from rest; else most only once settled: smaller files.
+    sweep_time : s.
+    """
+
+    sample_time: float
+    travel: float
+    input_limit: float
+    repeats: int
+    n_dwells: int
+    transients: bool
+    sweep_time: float
+
+    def clock(self, duration: float) -> Array:
+        """Return sample times (n,) from 0 to about `duration`, s."""
+        return np.arange(int(np.ceil(duration / self.sample_time)) + 1) * self.sample_time
+
+
+def decays(chain: Chain, session: Session, rng: np.random.Generator) -> list[Run]:
+    """Release each cart by hand, the others held, several times; carts without a spring cannot."""
+    runs = []
+    for cart in range(1, chain.n + 1):
+        if chain.k[cart - 1] + chain.k[cart] == 0:
+            continue
+        decay_rate = chain.c[cart - 1] / (2 * chain.m[cart - 1])
+        for repeat in range(session.repeats):
+            side = 1 if rng.random() < 0.5 else -1
+            hand = Hand(
+                cart=cart,
+                position=side * session.travel * rng.uniform(1.0, 1.8),
+                release=float(rng.uniform(0.3, 0.6)),
+                fade=float(rng.uniform(0.01, 0.03)),
+                tremor=tuple(rng.uniform(0, 2 * np.pi, size=3).tolist()),
+            )
+            # After 4.5 time constants 1.5 cm have become 7 counts.
+            t = session.clock(hand.release + np.clip(4.5 / decay_rate, 1.0, 8.0))
+            runs.append(
+                Run(
+                    id=f"decay-{cart}{_LETTERS[repeat]}",
+                    kind="decay",
+                    t=t,
+                    u=np.zeros_like(t),
+                    free=(cart,),
+                    hand=hand,
+                )
+            )
+    return runs
+
+
+def steps(chain: Chain, session: Session) -> list[Run]:
+    """Step the input on and off again: a small size, and a larger one to the other side."""
+    wait = _wait(chain, _SETTLED)
+    t = session.clock(_REST + 2 * wait)
+    on = (t >= _REST) & (t < _REST + wait)
+    # Underdamped carts overshoot to nearly twice their final position.
+    unit = session.travel / float(np.max(np.abs(chain.static_gains())))
+    small, large = _typed(0.5 * unit, session), _typed(0.9 * unit, session)
+    return [
+        Run(
+            id=f"step-{number}",
+            kind="step",
+            t=t,
+            u=u * on,
+            free=_all(chain),
+            note=f"{u:g} on, then off",
+        )
+        for number, u in enumerate([small, -large] * session.repeats, start=1)
+    ]
+
+
+def dwells(chain: Chain, session: Session) -> list[Run]:
+    """Dwell on one frequency after another, each with the input that moves the carts well."""
+    runs = []
+    wait = _wait(chain, _SETTLED_DWELL)
+    for number, hertz in enumerate(dwell_frequencies(chain, n=session.n_dwells), start=1):
+        t = session.clock(wait + max(_CYCLES / hertz, _SHORTEST_DWELL))
+        shape = np.sin(2 * np.pi * hertz * t)
+        unit = np.abs(simulate_linear(chain, t, shape))
+        steady, furthest = float(np.max(unit[:, t >= wait])), float(np.max(unit))
+        # Far above the resonances the carts swing out at first, then hardly move.
+        amplitude = _typed(session.travel * min(0.8 / steady, 1.5 / furthest), session)
+        whole = session.transients or hertz == FIGURE_FREQUENCY or number % _WHOLE_EVERY == 0
+        runs.append(
+            Run(
+                id=f"sine-{number:02d}",
+                kind="sine",
+                t=t,
+                u=np.round(amplitude * shape, INPUT_DECIMALS),
+                free=_all(chain),
+                frequency=hertz,
+                keep_from=0.0 if whole else wait,
+                note="" if whole else "recorded after the transient",
+            )
+        )
+    return runs
+
+
+def dwell_frequencies(chain: Chain, *, n: int) -> list[float]:
+    """Return about `n` frequencies in Hz, ascending: closer at resonances and nulls.
+
+    Half the number is spread evenly over the range, as a first look would; the rest brackets each
+    feature: on it and half a bandwidth to each side. 4 Hz is always among them.
+    """
+    features = [quadratic_factors(chain.poles)]
+    features += [quadratic_factors(chain.zeros(cart)) for cart in range(1, chain.n)]
+    resonances = features[0][0]
+    omega = np.concatenate([f[0] for f in features])
+    zeta = np.clip(np.concatenate([f[1] for f in features]), 0.03, 0.3)
+    sides = np.linspace(-1.0, 1.0, max(3, round(0.5 * n / omega.size)))
+    close = (omega[:, None] * (1 + zeta[:, None] * sides)).ravel()
+    spread = np.geomspace(0.7 * resonances[0], 1.5 * resonances[-1], max(n - close.size, n // 2))
+    hertz = [FIGURE_FREQUENCY]
+    for candidate in [*close, *spread]:
+        f = round(float(candidate) / (2 * np.pi), 2)  # as one types it
+        if all(abs(f - other) > 0.015 * other for other in hertz):
+            hertz.append(f)
+    return sorted(hertz)
+
+
+def sweep(chain: Chain, session: Session) -> Run:
+    """Sweep from well below the first resonance to above the last, then let the carts ring out."""
+    omega = quadratic_factors(chain.poles)[0]
+    low, high = 0.4 * omega[0], 1.4 * omega[-1]
+    t = session.clock(session.sweep_time + 2.0)
+    growth = np.log(high / low) / session.sweep_time
+    phase = low / growth * np.expm1(growth * np.minimum(t, session.sweep_time))
+    shape = np.sin(phase) * (t < session.sweep_time)
+    furthest = float(np.max(np.abs(simulate_linear(chain, t, shape))))
+    u = np.round(_typed(1.2 * session.travel / furthest, session) * shape, INPUT_DECIMALS)
+    return Run(
+        id="sweep",
+        kind="sweep",
+        t=t,
+        u=u,
+        free=_all(chain),
+        note=f"chirp, {low / (2 * np.pi):.1f} Hz to {high / (2 * np.pi):.1f} Hz",
+    )
+
+
+def closed_loop(
+    chain: Chain,
+    session: Session,
+    *,
+    cart: int,
+    reference: float,
+    controller: StateFeedback,
+) -> Run:
+    """Step the set point of one cart under state feedback."""
+    t = session.clock(_REST + 4.0)
+    return Run(
+        id="control",
+        kind="closed_loop",
+        t=t,
+        u=np.zeros_like(t),
+        free=_all(chain),
+        cart=cart,
+        reference=np.where(t >= _REST, reference, 0.0),
+        controller=controller,
+        input_limit=session.input_limit,
+    )
+
+
+def _all(chain: Chain) -> tuple[int, ...]:
+    return tuple(range(1, chain.n + 1))
+
+
+def _wait(chain: Chain, time_constants: float) -> float:
+    """Return how long a student waits for the transient, s."""
+    slowest = float(np.min(-chain.poles.real))
+    if slowest <= 0:
+        raise DataError("the carts never settle: a session needs damping and a spring to a wall")
+    return min(time_constants / slowest, _LONGEST_WAIT)
+
+
+def _typed(value: float, session: Session) -> float:
+    """Return the input as one types it: two digits, within the limit."""
+    return min(float(f"{value:.2g}"), session.input_limit)
