@@ -1,0 +1,373 @@
+"""Design state feedback with a prefilter, so that one cart follows a step.
+
+The design is sampled and its model holds the computer's one-sample delay: the gains multiply the
+state predicted for the moment the effort begins to act (`pipeline.plant.loop`), so the loop has
+the poles of Phi - Gamma G and one at z = 0 for the delay, with 2n gains.
+
+"lqr" weighs energy against the input, alpha times the potential and beta times the kinetic, and
+searches both. "poles" does what is done by hand: a dominant pair in the place of the plant's
+slowest, the further pairs at the plant's own frequencies but better damped, and moves them. Both
+take the gentlest candidates whose simulated step meets the goal, and of these the fastest.
+"""
+
+from dataclasses import dataclass
+from itertools import product
+from typing import Literal
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from pipeline.errors import DataError
+from pipeline.plant import step_response
+from pipeline.plant.chain import Array, Chain, ComplexArray, quadratic_factors
+from pipeline.plant.feedback import lqr_gains, place_poles
+from pipeline.plant.loop import StateFeedback, discretise, simulate_loop
+from pipeline.plant.robustness import (
+    DAMPING_ERROR,
+    MASS_SPRING_ERROR,
+    level_error_percent,
+    stays_stable,
+)
+from pipeline.results import FeedbackDesign
+
+Method = Literal["poles", "lqr"]
+
+_SAMPLE_TIME = 0.00884  # s; the laboratory's controller
+_RADIANS_PER_SAMPLE = 0.5  # of the fastest mode, at most: 12 samples a period
+_SAMPLES_TO_SETTLE = 25  # at least
+_HORIZON = 3.0  # settling times a candidate's step is followed for
+_POINTS = 512  # of a candidate's step; a power of two, as it is made by doubling
+
+# Shares of the goal (settling time, overshoot) to aim at, the best first: the plant is known to
+# a few percent only and should still meet the goal.
+_AIMS = ((0.8, 0.05), (0.8, 0.5), (1.0, 1.0))
+_ROUNDING = 1e-3  # percent of overshoot that is none
+_PEAK_FREEDOM = 1.25  # times the gentlest candidate's peak input that a faster one may take
+
+_ALPHA = _BETA = np.logspace(-3, 4, 25)  # from no feedback to be seen, to all but deadbeat
+_DOMINANT_SETTLING = np.linspace(0.3, 1.0, 8)  # of the goal
+_FURTHER_ZETA = (0.0, 0.1, 0.2, 0.35, 0.5, 0.7)  # at least; a pair keeps its own if better
+_FURTHER_SPEED = (1.0, 1.25)  # of the plant's own frequency
+
+_SCREENED = 8  # candidates, in order, tried for a loop that is stable whatever the model's errors
+_LEVEL_ERROR = 10.0  # percent of the step that such errors may move the level, if it can be had
+_LEVEL_WARNING = 5.0  # percent, worth a word
+
+
+def design_feedback(
+    chain: Chain,
+    *,
+    cart: int,
+    reference: float,
+    overshoot_percent: float,
+    settling_time: float,
+    input_limit: float | None = None,
+    sample_time: float | None = None,
+    method: Method = "lqr",
+) -> FeedbackDesign:
+    """Design u = prefilter r - gains [x1, v1, x2, v2, …] for a step of one cart.
+
+    A goal that cannot be met gives `reachable` False, the nearest design, and a message that
+    says what is reachable.
+
+    Parameters
+    ----------
+    reference : size of the step, position units.
+    overshoot_percent : at most, of the step.
+    settling_time : 2 %, at most, s from the step of the reference, the delay included.
+    input_limit : the input stays within ± this.
+    sample_time : s; default 0.00884, less where the plant or the goal is fast.
+
+    Raises
+    ------
+    DataError : there is no such cart or no step, or a missing spring leaves a cart out of reach.
+    """
+    if not 1 <= cart <= chain.n:
+        raise DataError(f"state feedback needs a cart from 1 to {chain.n}, found {cart}")
+    if reference == 0:
+        raise DataError("state feedback needs a reference other than 0")
+    if np.any(chain.k[1:-1] <= 0):
+        missing = int(np.argmax(chain.k[1:-1] <= 0)) + 1
+        raise DataError(
+            f"state feedback needs every cart within the motor's reach, found no spring between "
+            f"carts {missing} and {missing + 1}"
+        )
+    goal = _Goal(
+        overshoot=overshoot_percent,
+        settling=settling_time,
+        limit=np.inf if input_limit is None else input_limit,
+        reference=reference,
+    )
+    plant = _Sampled.of(chain, cart=cart, settling=settling_time, sample_time=sample_time)
+    if method == "lqr":
+        requested, gains = None, _lqr_candidates(plant)
+    else:
+        requested = _pole_candidates(plant, goal)
+        gains = place_poles(plant.phi, plant.gamma, np.exp(requested * plant.sample_time))
+    best = _choose(plant, _try_step(plant, gains, goal), goal)
+    return _finish(
+        plant,
+        goal,
+        gains=plant.to_units(gains[best]),
+        requested=None if requested is None else requested[best],
+        method=method,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Goal:
+    overshoot: float  # percent
+    settling: float  # s
+    limit: float  # input units; infinite for none
+    reference: float  # position units
+
+    def __str__(self) -> str:
+        within = f" within ±{self.limit:.3g} of input" if np.isfinite(self.limit) else ""
+        return f"overshoot {self.overshoot:g} % and settling in {self.settling:g} s{within}"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Sampled:
+    """The sampled plant, free of units: x over 1, v over `rate`, u over `stiffness`."""
+
+    chain: Chain
+    cart: int
+    sample_time: float
+    rate: float  # rad/s
+    stiffness: float  # input unit per position unit
+    phi: Array  # (2n, 2n)
+    gamma: Array  # (2n,)
+
+    @classmethod
+    def of(
+        cls, chain: Chain, *, cart: int, settling: float, sample_time: float | None
+    ) -> "_Sampled":
+        speeds = np.maximum(np.abs(chain.poles), 4 / settling)
+        rate = float(np.exp(np.log(speeds).mean()))
+        if sample_time is None:
+            sample_time = min(
+                _SAMPLE_TIME, _RADIANS_PER_SAMPLE / speeds.max(), settling / _SAMPLES_TO_SETTLE
+            )
+        tied = chain.k[0] > 0 or chain.k[-1] > 0
+        stiffness = 1 / chain.static_gains()[0] if tied else chain.m.sum() * rate**2
+        phi, gamma = discretise(chain, sample_time)
+        unit = np.tile([1.0, rate], chain.n)
+        return cls(
+            chain=chain,
+            cart=cart,
+            sample_time=float(sample_time),
+            rate=rate,
+            stiffness=float(stiffness),
+            phi=phi * unit / unit[:, None],
+            gamma=gamma * stiffness / unit,
+        )
+
+    @property
+    def row(self) -> int:
+        return 2 * (self.cart - 1)
+
+    def to_units(self, gains: Array) -> Array:
+        return gains * self.stiffness / np.tile([1.0, self.rate], self.chain.n)
+
+    def stays_stable(self, gains: Array) -> bool:
+        controller = StateFeedback(gains=gains, prefilter=1.0, model=self.chain)
+        return stays_stable(self.chain, controller, sample_time=self.sample_time)
+
+
+# -------------------------------------------------------------- candidate gains
+
+
+def _lqr_candidates(plant: _Sampled) -> Array:
+    """Return gains (n_candidates, 2n) for a grid of energy weights."""
+    chain, n = plant.chain, plant.chain.n
+    stiffness = chain.stiffness / plant.stiffness
+    if chain.k[0] == chain.k[-1] == 0:
+        # Nothing holds the carts as a whole: weigh their mean displacement as a spring would.
+        stiffness = stiffness + np.ones((n, n)) / n**2
+    potential, kinetic = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 * n))
+    potential[0::2, 0::2] = stiffness
+    kinetic[1::2, 1::2] = np.diag(chain.m) * plant.rate**2 / plant.stiffness
+    alpha, beta = (w.ravel()[:, None, None] for w in np.meshgrid(_ALPHA, _BETA, indexing="ij"))
+    return lqr_gains(plant.phi, plant.gamma, alpha * potential + beta * kinetic)
+
+
+def _pole_candidates(plant: _Sampled, goal: _Goal) -> ComplexArray:
+    """Return continuous pole sets (n_candidates, 2n), rad/s."""
+    omega, zeta = quadratic_factors(plant.chain.poles)
+    shares = np.array([overshoot for _, overshoot in _AIMS])
+    log = np.log(np.maximum(shares * goal.overshoot, _ROUNDING) / 100)
+    dominant_zeta = -log / np.hypot(np.pi, log)
+    z, settling, further_zeta, further_speed = (
+        axis.ravel()
+        for axis in np.meshgrid(
+            dominant_zeta, goal.settling * _DOMINANT_SETTLING, _FURTHER_ZETA, _FURTHER_SPEED
+        )
+    )
+    pairs = [_pair(4 / (z * settling), z)]  # exp(-4) is the 2 % of the settling time
+    for own_omega, own_zeta in zip(omega[1:], zeta[1:], strict=True):
+        pairs.append(_pair(own_omega * further_speed, np.maximum(own_zeta, further_zeta)))
+    return np.concatenate(pairs, axis=-1)
+
+
+def _pair(omega: Array, zeta: Array) -> ComplexArray:
+    """Return the roots (n, 2) of s² + 2 zeta omega s + omega²."""
+    spread = np.sqrt(zeta**2 - 1, dtype=np.complex128)
+    roots = np.stack([spread - zeta, -spread - zeta], axis=-1)
+    return np.asarray(omega[:, None] * roots, dtype=np.complex128)
+
+
+# ------------------------------------------------------------ judging candidates
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Candidates:
+    """What each set of gains (n_candidates, 2n) does with the step of the goal."""
+
+    gains: Array
+    overshoot: Array  # percent
+    settling: Array  # s; estimated from the slowest pole where the step is not followed so far
+    peak: Array  # input units
+    level_error: Array  # percent of the step, from errors in the model
+
+
+def _try_step(plant: _Sampled, gains: Array, goal: _Goal) -> _Candidates:
+    """Follow the step of every candidate at once; exact at the points looked at."""
+    loop = plant.phi - plant.gamma[:, None] * gains[:, None, :]
+    stride = max(1, round(_HORIZON * goal.settling / (_POINTS * plant.sample_time)))
+    level = np.linalg.solve(np.eye(plant.gamma.size) - loop, plant.gamma[:, None])
+    prefilter = 1 / level[:, plant.row]
+    level = level * prefilter[:, None]
+    # The distance to go shrinks by `loop` each sample; each pass doubles the points known.
+    to_go, ahead = -level, np.linalg.matrix_power(loop, stride)
+    while to_go.shape[-1] < _POINTS:
+        to_go, ahead = np.concatenate([to_go, ahead @ to_go], axis=-1), ahead @ ahead
+    t = plant.sample_time * (
+        1 + stride * np.arange(_POINTS, dtype=np.float64)
+    )  # the first sample is the delay
+    y = 1 + to_go[:, plant.row]
+    # With the input that holds the level: a slow candidate may not be there yet.
+    u = prefilter - np.einsum("ci,cin->cn", gains, np.append(to_go, 0 * level, axis=-1) + level)
+    one = np.ones(len(gains))
+    settling = t[0] + step_response.settling_time(t, y, before=0.0, level=one)
+    radius = np.abs(np.linalg.eigvals(loop)).max(-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slowest = -4 * plant.sample_time / np.log(radius)
+    return _Candidates(
+        gains=gains,
+        overshoot=step_response.overshoot_percent(y, before=0.0, level=one),
+        settling=np.where(np.isnan(settling), np.where(radius < 1, slowest, np.inf), settling),
+        peak=np.abs(u).max(-1) * plant.stiffness * abs(goal.reference),
+        level_error=level_error_percent(plant.chain, plant.to_units(gains), cart=plant.cart),
+    )
+
+
+def _choose(plant: _Sampled, candidates: _Candidates, goal: _Goal) -> int:
+    """Return the index of the best candidate; the nearest where none meets the goal."""
+    within = candidates.peak <= goal.limit
+    if not within.any():  # a step of this size is out of reach: design for a smaller one
+        within = np.full_like(within, True)
+    for level_error, (settling, overshoot) in product((_LEVEL_ERROR, np.inf), _AIMS):
+        good = within & (candidates.level_error <= level_error)
+        good &= candidates.settling <= settling * goal.settling
+        good &= candidates.overshoot <= max(overshoot * goal.overshoot, _ROUNDING)
+        if not good.any():
+            continue
+        good &= candidates.peak <= _PEAK_FREEDOM * candidates.peak[good].min()
+        order = np.flatnonzero(good)[np.argsort(candidates.settling[good], kind="stable")]
+        for index in order[:_SCREENED]:
+            if plant.stays_stable(plant.to_units(candidates.gains[index])):
+                return int(index)
+    excess = np.maximum(
+        candidates.settling / goal.settling,
+        np.maximum(candidates.overshoot, 1.0) / max(goal.overshoot, 1.0),
+    )
+    return int(np.argmin(np.where(within, excess, np.inf)))
+
+
+# ------------------------------------------------------------------- the result
+
+
+def _finish(
+    plant: _Sampled, goal: _Goal, *, gains: Array, requested: ComplexArray | None, method: Method
+) -> FeedbackDesign:
+    """Simulate the chosen design, the delay and the input limit included, and say how it does."""
+    chain, T = plant.chain, plant.sample_time
+    phi, gamma = discretise(chain, T)
+    loop = phi - np.outer(gamma, gains)
+    prefilter = 1 / float(np.linalg.solve(np.eye(2 * chain.n) - loop, gamma)[plant.row])
+    z = np.linalg.eigvals(loop).astype(np.complex128)
+    poles = np.asarray(np.log(z) / T, dtype=np.complex128)
+    if requested is not None:
+        away = np.abs(requested[None, :] - poles[:, None])
+        requested = requested[linear_sum_assignment(away)[1]]
+    t = T * np.arange(np.ceil(_HORIZON * goal.settling / T) + 1, dtype=np.float64)
+    run = simulate_loop(
+        chain,
+        StateFeedback(gains=gains, prefilter=prefilter, model=chain),
+        t=t,
+        reference=goal.reference,
+        sample_time=T,
+        input_limit=goal.limit,
+    )
+    y = run.x[plant.cart - 1]
+    judged = {"before": 0.0, "level": np.float64(goal.reference)}
+    overshoot = float(step_response.overshoot_percent(y, **judged))
+    settling = float(step_response.settling_time(t, y, **judged))
+    peak = float(np.abs(run.u).max())
+    met = overshoot <= goal.overshoot + _ROUNDING and settling <= goal.settling + T / 2
+    return FeedbackDesign(
+        cart=plant.cart,
+        method=method,
+        reference=goal.reference,
+        gains=gains,
+        prefilter=prefilter,
+        poles=poles,
+        requested_poles=requested,
+        sample_time=T,
+        overshoot_percent=overshoot,
+        settling_time=None if np.isnan(settling) else settling,
+        peak_input=peak,
+        t=t,
+        y=run.x,
+        u=run.u,
+        reachable=bool(met),
+        message=_message(plant, goal, gains, overshoot, settling, peak, met=met),
+    )
+
+
+def _message(
+    plant: _Sampled,
+    goal: _Goal,
+    gains: Array,
+    overshoot: float,
+    settling: float,
+    peak: float,
+    *,
+    met: bool,
+) -> str:
+    """Say what is reachable where the goal is not, and what model error does; often nothing."""
+    said = []
+    tied = plant.chain.k[0] > 0 or plant.chain.k[-1] > 0
+    held = abs(plant.chain.static_gains()[plant.cart - 1]) * goal.limit if tied else np.inf
+    if not met and abs(goal.reference) > held:
+        said.append(
+            f"an input of ±{goal.limit:.3g} cannot hold cart {plant.cart} at "
+            f"{goal.reference:.3g}: reachable is {held:.3g}"
+        )
+    elif not met:
+        settles = "no settling" if np.isnan(settling) else f"settling in {settling:.3g} s"
+        said.append(
+            f"{goal} cannot be met: reachable is overshoot {overshoot:.2g} % and {settles} "
+            f"with an input of {peak:.3g}"
+        )
+    if not plant.stays_stable(gains):
+        said.append(
+            f"the loop is unstable where masses or springs are {100 * MASS_SPRING_ERROR:g} % or "
+            f"dampings {100 * DAMPING_ERROR:g} % off"
+        )
+    if (error := float(level_error_percent(plant.chain, gains, cart=plant.cart))) > _LEVEL_WARNING:
+        said.append(
+            f"these gains cancel much of the plant's own stiffness: errors of "
+            f"{100 * MASS_SPRING_ERROR:g} % in the springs move the level by up to {error:.0f} %"
+        )
+    return "; ".join(said)
