@@ -1,0 +1,133 @@
+"""Exact response of a chain to a measured input, and its slopes by the fit vector, by modes.
+
+In modal coordinates every state is alone, z' = lambda z + b u, so an input held between samples
+gives an exact scalar recursion at any sample times, and the slope of the whole response by any
+number of parameters needs only one more recursion a mode (by lambda) and constant matrices.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.plant.chain import Array, Chain, ComplexArray
+from pipeline.stages.chain_parameters import Parametrisation
+
+# Below this |lambda dt| the slope of expm1(z)/z is taken from its series: rounding would leave
+# it 1e-16/|z|, the series errs by z²/8.
+_SMALL_EXPONENT = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Modes:
+    """The modes of the free carts, one of each conjugate pair, with their slopes by theta.
+
+    Attributes
+    ----------
+    poles : (n_m,), rad/s; `shapes` (f, n_m) the positions in each mode, doubled for a pair so
+        that a position is Re(shapes @ z).
+    entry : (n_m, 2f), z(0) = entry @ x(0), with the state (x1, v1, x2, v2, …).
+    drive : (n_m,), z' = poles z + drive u.
+    d_poles (n_p, n_m), d_shapes (n_p, f, n_m), d_entry (n_p, n_m, 2f), d_drive (n_p, n_m).
+    """
+
+    poles: ComplexArray
+    shapes: ComplexArray
+    entry: ComplexArray
+    drive: ComplexArray
+    d_poles: ComplexArray
+    d_shapes: ComplexArray
+    d_entry: ComplexArray
+    d_drive: ComplexArray
+
+
+def find_modes(
+    chain: Chain, *, free: Sequence[int], parametrisation: Parametrisation, slopes: Array
+) -> Modes:
+    """Decompose the free part of a chain into modes.
+
+    `slopes` (n_p,) is dp/dtheta. Eigenvector slopes have the factor 1/(lambda_j - lambda_i);
+    a chain whose poles meet to less than 1e-8 of their size would lose them, which a fit
+    passes by but does not stay at.
+    """
+    A, B, _, _ = chain.state_space(free=free)
+    dA, dB = _state_space_slopes(chain, free, parametrisation)
+    dA, dB = slopes[:, None, None] * dA, slopes[:, None] * dB
+    poles, V = map(np.asarray, np.linalg.eig(A))  # of a real matrix: exact conjugate pairs
+    poles, V = poles.astype(np.complex128), V.astype(np.complex128)
+    W = np.linalg.inv(V)
+    inner = W @ dA @ V
+    gap = poles - poles[:, None]
+    F = np.divide(inner, gap, out=np.zeros_like(inner), where=gap != 0)
+    d_entry = -F @ W
+    drive, d_drive = W @ B[:, 0], d_entry @ B[:, 0] + dB @ W.T
+    kept = poles.imag >= 0
+    pair = np.where(poles[kept].imag > 0, 2.0, 1.0)
+    return Modes(
+        poles=poles[kept],
+        shapes=V[0::2, kept] * pair,
+        entry=W[kept],
+        drive=drive[kept],
+        d_poles=np.einsum("pii->pi", inner)[:, kept],
+        d_shapes=(V @ F)[:, 0::2, kept] * pair,
+        d_entry=d_entry[:, kept],
+        d_drive=d_drive[:, kept],
+    )
+
+
+def _state_space_slopes(
+    chain: Chain, free: Sequence[int], parametrisation: Parametrisation
+) -> tuple[Array, Array]:
+    """Return dA/dp (n_p, 2f, 2f) and dB/dp (n_p, 2f) by the physical parameters."""
+    rows = [cart - 1 for cart in free]
+    mass, damping, stiffness, force = chain.matrices(free=free)
+    dM, dC, dK = (d[:, rows][:, :, rows] for d in parametrisation.matrix_derivatives)
+    inverse = 1.0 / np.diag(mass)
+    d_inverse = -np.einsum("pii->pi", dM) * inverse**2
+    dA = np.zeros((dM.shape[0], 2 * len(rows), 2 * len(rows)))
+    dA[:, 1::2, 0::2] = -inverse[:, None] * dK - d_inverse[:, :, None] * stiffness
+    dA[:, 1::2, 1::2] = -inverse[:, None] * dC - d_inverse[:, :, None] * damping
+    dB = np.zeros(dA.shape[:2])
+    dB[:, 1::2] = d_inverse * force
+    return dA, dB
+
+
+def drive_modes(poles: ComplexArray, t: Array, u: Array) -> tuple[ComplexArray, ComplexArray]:
+    """Return q (n_m, n) with q' = pole q + u from zero, and dq/dpole, at `t`.
+
+    u (n,) is held from sample to sample. Exact for any sample times.
+    """
+    dt = np.diff(t)
+    uniform = np.ptp(dt) <= 1e-9 * dt[0]  # sample times differ by their rounding only
+    step = dt[:1] if uniform else dt
+    z = poles[:, None] * step
+    growth = np.exp(z)
+    small = np.abs(z) < _SMALL_EXPONENT
+    safe = np.where(small, 1.0, z)
+    gain = step * np.where(small, 1 + z / 2, np.expm1(z) / safe)
+    d_gain = step**2 * np.where(small, 0.5 + z / 3, (safe * growth - np.expm1(z)) / safe**2)
+    q = _accumulate(growth, gain * u[:-1])
+    dq = _accumulate(growth, step * growth * q[:, :-1] + d_gain * u[:-1])
+    return q, dq
+
+
+def _accumulate(growth: ComplexArray, forced: ComplexArray) -> ComplexArray:
+    """Return q (n_m, n) of q[0] = 0, q[i + 1] = growth[i] q[i] + forced[i].
+
+    By doubling: after s steps each entry holds the sum over its last 2^s inputs. `growth` is
+    (n_m, 1) for a uniform clock or (n_m, n - 1).
+    """
+    q = np.zeros((forced.shape[0], forced.shape[1] + 1), dtype=np.complex128)
+    total = q[:, 1:]
+    total[:] = forced
+    shift = 1
+    while shift < total.shape[1]:
+        total[:, shift:] += growth[:, -total.shape[1] + shift :] * total[:, :-shift]
+        if growth.shape[1] == 1:
+            growth = growth**2
+        else:
+            growth = np.concatenate(
+                [growth[:, :shift], growth[:, shift:] * growth[:, :-shift]], axis=1
+            )
+        shift *= 2
+    return q

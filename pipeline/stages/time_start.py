@@ -1,0 +1,151 @@
+"""A chain to start the time-domain fit from, found by linear regression alone.
+
+Each cart's equation of motion is multiplied by a smooth bump φ and integrated by parts until no
+derivative of a measured signal is left (modulating functions: M. Shinbrot, Trans. ASME 79, 1957):
+
+    m_i ∫ x_i φ'' - c_i ∫ x_i φ' + k_i ∫ (x_i - x_{i-1}) φ + k_{i+1} ∫ (x_i - x_{i+1}) φ = ∫ u φ
+
+Cart 1's equation gives its mass, damping and springs in input units; each further cart's gives
+its own relative to the spring before it. The encoder zeros act as a constant force in a record.
+"""
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from pipeline.errors import DataError
+from pipeline.plant.chain import Array, Chain
+from pipeline.stages.chain_parameters import START_ZETA, even_chain, physical_start
+from pipeline.stages.time_window import Window
+
+WIDTHS = (0.15, 0.3, 0.6, 1.2)  # s; a bump should span about one period of the carts
+_HOP = 0.25  # of the width, from one bump to the next: they overlap, so closer adds little
+_MOST_BUMPS = 400  # in a record; more only cost time
+_FEWEST_SAMPLES = 8  # in a bump; fewer do not integrate φ'' well
+_FEWEST_PERIODS = 2  # of the slowest resonance worth looking for, in the longest record
+_FEWEST_PER_PERIOD = 8  # samples in a period of the fastest
+_FREQUENCY_STEP = 1.5  # from one even chain to the next: the fit finds its way over a third
+_SWING_OVER_GAIN = 1.6  # of a lightly damped cart after a step
+_SMALLEST_ZETA = START_ZETA / 10  # noise may well make a regressed damping negative
+
+
+def regress_chain(
+    windows: Sequence[Window], *, springs: Sequence[bool], width: float
+) -> Chain | None:
+    """Regress a chain from the windows, with bumps of `width` (s).
+
+    None where some cart's equation cannot be had (it needs the cart and its free neighbours
+    measured) or makes no sense (a negative mass or coupling).
+    """
+    n = len(springs) - 1
+    m, c, k = np.zeros(n), np.zeros(n), np.zeros(n + 1)
+    moments = [_moments(window, n=n, width=width) for window in windows]
+    for cart in range(1, n + 1):
+        seen = [
+            moment
+            for window, moment in zip(windows, moments, strict=True)
+            if moment is not None and _tells_of(window, cart, n)
+        ]
+        if not seen:
+            return None
+        rows, targets = zip(*(_equation(cart, springs, *moment) for moment in seen), strict=True)
+        zeros = np.zeros((sum(map(len, rows)), len(rows)))  # a constant force in each record
+        ends = np.cumsum([0, *map(len, rows)])
+        for column, (first, last) in enumerate(pairwise(ends)):
+            zeros[first:last, column] = 1.0
+        columns = np.hstack([np.concatenate(rows), zeros])
+        scale = np.linalg.norm(columns, axis=0)
+        scale[scale == 0] = 1.0
+        found = np.linalg.lstsq(columns / scale, np.concatenate(targets), rcond=None)[0] / scale
+        unit = 1.0 if cart == 1 else k[cart - 1]
+        m[cart - 1], c[cart - 1], k[cart] = unit * found[:3]
+        if cart == 1:
+            k[0] = found[3]
+        if not m[cart - 1] > 0 or (cart < n and not k[cart] > 0):
+            return None
+    start = physical_start(Chain(m=m, c=c, k=k), springs=springs)
+    return Chain(m=start.m, c=np.maximum(c, start.c * (_SMALLEST_ZETA / START_ZETA)), k=start.k)
+
+
+def _tells_of(window: Window, cart: int, n: int) -> bool:
+    """Tell whether a cart's equation can be set up: it moves, and who pulls at it is known."""
+    near = {j for j in (cart - 1, cart, cart + 1) if 1 <= j <= n and j in window.free}
+    driven = cart > 1 or window.drive_u is not None
+    return driven and cart in window.free and near <= set(window.carts)
+
+
+def _equation(cart: int, springs: Sequence[bool], x: Array, force: Array) -> tuple[Array, Array]:
+    """Return the columns of m, c, the spring after (and for cart 1 that before), and the target.
+
+    `x` (3, n + 2, n_b) holds the moments with φ, φ', φ'' of walls and carts, `force` (n_b,) that
+    of the input.
+    """
+    stretch = x[0, cart] - x[0, cart - 1], x[0, cart] - x[0, cart + 1]
+    single = x.shape[1] == 3  # one cart: two springs act as one, counted as the first
+    after = stretch[1] * (springs[cart] and not single)
+    columns = [x[2, cart], -x[1, cart], after]
+    if cart > 1:
+        return np.stack(columns, axis=1), -stretch[0]
+    columns.append(stretch[0] * (any(springs) if single else springs[0]))
+    return np.stack(columns, axis=1), force
+
+
+def _moments(window: Window, *, n: int, width: float) -> tuple[Array, Array] | None:
+    """Return the moments (3, n + 2, n_b) of the positions with φ, φ', φ'', and (n_b,) of the input.
+
+    φ = (τ (1 - τ))⁴, τ from 0 to 1 over the bump. None where the record is shorter than two
+    bumps or a bump holds too few samples. Walls, held and unmeasured carts are at zero.
+    """
+    t, duration = window.t, window.t[-1]
+    if duration < 2 * width or t.size * width / duration < _FEWEST_SAMPLES:
+        return None
+    count = min(int((duration - width) / (_HOP * width)) + 1, _MOST_BUMPS)
+    starts = np.linspace(0.0, duration - width, count)
+    around = _around(t, starts, width)
+    tau = np.clip((t[around] - starts[:, None]) / width, 0.0, 1.0)
+    b, db = tau * (1 - tau), 1 - 2 * tau
+    bumps = np.stack([b**4, 4 * b**3 * db / width, (12 * b**2 * db**2 - 8 * b**3) / width**2])
+    bumps *= np.gradient(t)[around]  # trapezoid rule: a bump ends smoothly, so it is accurate
+    x = np.zeros((3, n + 2, count))
+    for cart, y in zip(window.carts, window.y, strict=True):
+        x[:, cart] = np.einsum("dbi,bi->db", bumps, y[around])
+    force = np.zeros(count)
+    if window.drive_u is not None:
+        around = _around(window.drive_t, starts, width)
+        tau = np.clip((window.drive_t[around] - starts[:, None]) / width, 0.0, 1.0)
+        # ∫ φ: the input is held between samples, so its moment is exact.
+        area = width * tau**5 * np.polyval([1 / 9, -1 / 2, 6 / 7, -2 / 3, 1 / 5], tau)
+        force = np.sum(window.drive_u[around][:, :-1] * np.diff(area, axis=1), axis=1)
+    return x, force
+
+
+def _around(t: Array, starts: Array, width: float) -> np.ndarray:
+    """Return indices (n_b, n_k) of the samples in each bump, one beyond it on either side."""
+    first = np.searchsorted(t, starts, side="right") - 1
+    last = np.searchsorted(t, starts + width, side="left")
+    return np.minimum(first[:, None] + np.arange(np.max(last - first) + 1), t.size - 1)
+
+
+def even_chains(windows: Sequence[Window], *, springs: Sequence[bool]) -> list[Chain]:
+    """Return chains of equal carts, from slow to fast, with about the gain the records show.
+
+    For records a regression cannot use, as where a cart was not measured. The range of
+    frequencies is what the records can hold.
+    """
+    driven = [window for window in windows if window.drive_u is not None]
+    swing = np.median([np.ptp(w.y[0]) / np.ptp(w.drive_u) for w in driven if w.drive_u is not None])
+    slowest = 2 * np.pi * _FEWEST_PERIODS / max(w.t[-1] for w in driven)
+    fastest = 2 * np.pi / (_FEWEST_PER_PERIOD * min(float(np.median(np.diff(w.t))) for w in driven))
+    if not swing > 0 or fastest <= slowest:
+        return []
+    n, ratio = len(springs) - 1, fastest / slowest
+    count = int(np.log(ratio) / np.log(_FREQUENCY_STEP)) + 1
+    chains = []
+    for omega in slowest * ratio ** (np.arange(count + 1) / count):
+        values = {"K_1": swing / _SWING_OVER_GAIN, "omega_a": omega}
+        try:
+            chains.append(even_chain(values, n=n, springs=springs))
+        except DataError:  # no spring to a wall: nothing sets a gain
+            return []
+    return chains

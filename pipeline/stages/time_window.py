@@ -1,0 +1,203 @@
+"""The part of a record that a chain can explain, and how well a given chain explains it."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.errors import DataError
+from pipeline.plant.chain import Array
+from pipeline.plant.simulate import OVERSAMPLING, interpolate_band_limited
+from pipeline.results import Record
+from pipeline.stages._signals import local_noise
+from pipeline.stages.modal_response import Modes, drive_modes
+
+# A free decay is used from where its largest swing has fallen by half: whatever released the
+# cart has let go of it by then.
+_RELEASED_BELOW = 0.5
+_DECAY_START_SHARE = 0.95  # of the largest swing: the end of the hold
+_RANK = 1e-9  # relative singular value below which two local unknowns are one
+_NOISE_FREE = 1e-6  # of the motion: the error to assume where neither noise nor steps are seen
+_FEWEST_SAMPLES = 16
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Window:
+    """What the fit uses of a record.
+
+    Attributes
+    ----------
+    t : (n,) s, from 0; y : (p, n) positions of the free measured carts.
+    drive_t, drive_u : (n_d,) the held input, on a grid `stride` times finer than t; drive_u is
+        None where no input acts on a free cart.
+    carts, free : as in `Record`; the held carts are gone from both.
+    sigma : (p,) standard error of a position.
+    at_rest : True where the carts start at rest, else position and speed at t = 0 are unknown.
+    """
+
+    id: str
+    t: Array
+    y: Array
+    drive_t: Array
+    drive_u: Array | None
+    stride: int
+    carts: tuple[int, ...]
+    free: tuple[int, ...]
+    sigma: Array
+    at_rest: bool
+
+    def resting(self) -> "Window":
+        """Return the same, taken to start at rest."""
+        return replace(self, at_rest=True)
+
+    def weighted(self, sigma: Array) -> "Window":
+        """Return the same with other standard errors (p,)."""
+        return replace(self, sigma=sigma)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Misfit:
+    """How a chain misses one window, its local unknowns (start, encoder zeros) at their best.
+
+    Attributes
+    ----------
+    residual : (p, n) model minus measured, over sigma.
+    slopes : (n_p, p, n) of the residual by theta, with the local unknowns following.
+    n_local : how many local unknowns were eliminated.
+    """
+
+    residual: Array
+    slopes: Array
+    n_local: int
+
+
+def usable_segment(record: Record) -> slice:
+    """Return the samples of a record that a linear chain can explain.
+
+    All of a driven record. Of a decay the part after the release: from where the largest swing
+    about the final rest has fallen to half, when hand and stop have surely let go.
+
+    Raises
+    ------
+    DataError : nothing moves, or nothing is left after the release.
+    """
+    if record.kind != "decay":
+        return slice(0, record.t.size)
+    rest = np.median(record.y[:, -max(record.t.size // 10, 1) :], axis=1)
+    swing = np.max(np.abs(record.y - rest[:, None]), axis=0)
+    if not np.max(swing) > 3 * np.max(record.resolution, initial=0.0):
+        raise DataError(f"{record.id}: time fit needs a cart that moves, found none")
+    held_until = int(np.flatnonzero(swing >= _DECAY_START_SHARE * swing.max())[-1])
+    released = np.flatnonzero(swing[held_until:] < _RELEASED_BELOW * swing.max())
+    start = held_until + int(released[0]) if released.size else record.t.size
+    if record.t.size - start < _FEWEST_SAMPLES:
+        raise DataError(
+            f"{record.id}: time fit needs {_FEWEST_SAMPLES} samples after the release, "
+            f"found {record.t.size - start}"
+        )
+    return slice(start, record.t.size)
+
+
+def open_window(record: Record) -> Window:
+    """Prepare a record for the fit.
+
+    Raises
+    ------
+    DataError : no free cart was measured, or too few samples are usable.
+    """
+    carts = tuple(cart for cart in record.carts if cart in record.free)
+    used = usable_segment(record)
+    t, y = record.t[used], np.array([record.position(cart)[used] for cart in carts])
+    if not carts or t.size < _FEWEST_SAMPLES:
+        raise DataError(
+            f"{record.id}: time fit needs {_FEWEST_SAMPLES} samples of a free cart, found "
+            f"{t.size if carts else 0}"
+        )
+    drive_t, drive_u, stride = t - t[0], None, 1
+    if 1 in record.free and record.u is not None and np.any(record.u[used]):
+        drive_u = record.u[used]
+        if record.hold == "band_limited":
+            fine_t, fine_u = interpolate_band_limited(drive_t, drive_u)
+            # Held at the middle of a step eight times finer: errs by (omega dt / 8)² / 24.
+            drive_t, stride = fine_t, OVERSAMPLING
+            drive_u = np.append((fine_u[1:] + fine_u[:-1]) / 2, fine_u[-1])
+    steps = np.array([record.encoder_step(cart) for cart in carts])
+    noise = np.array([local_noise(t, position) for position in y])
+    sigma = np.maximum(noise, steps / np.sqrt(12))
+    return Window(
+        id=record.id,
+        t=t - t[0],
+        y=y,
+        drive_t=drive_t,
+        drive_u=drive_u,
+        stride=stride,
+        carts=carts,
+        free=tuple(sorted(record.free)),
+        sigma=np.maximum(sigma, _NOISE_FREE * max(float(np.max(np.ptp(y, axis=1))), 1e-300)),
+        at_rest=False,
+    )
+
+
+def compare(window: Window, modes: Modes) -> Misfit:
+    """Compare a chain, given by its modes, with a window.
+
+    Start and encoder zeros enter linearly and are eliminated: residual and slopes are projected
+    off them (variable projection in Kaufman's form, G. Golub & V. Pereyra, Inverse Problems 19,
+    2003, section 3).
+    """
+    p, n = window.y.shape
+    rows = [window.free.index(cart) for cart in window.carts]
+    shapes, d_shapes = modes.shapes[rows], modes.d_shapes[:, rows]
+    free_motion = np.exp(modes.poles[:, None] * window.t)  # (n_m, n)
+    columns = [np.repeat(np.eye(p)[:, :, None], n, axis=2)]  # encoder zeros
+    if not window.at_rest:
+        start = modes.entry.T[:, None] * shapes  # (2f, p, n_m)
+        columns.append(_real_part(start, free_motion))
+    local = (np.concatenate(columns) / window.sigma[:, None]).reshape(-1, p * n).T
+    scale = np.linalg.norm(local, axis=0)
+    scale[scale == 0] = 1.0
+    Q, R = np.linalg.qr(local / scale)
+    U, s, Vt = np.linalg.svd(R)
+    kept = s > _RANK * s[0]
+    basis = Q @ U[:, kept]
+
+    signals, d_weights = [], []  # modal signals, and their weights in the slopes
+    rest = -window.y
+    if window.drive_u is not None:
+        q, dq = drive_modes(modes.poles, window.drive_t, window.drive_u)
+        signals += [q[:, :: window.stride], dq[:, :: window.stride]]
+        by_shape = shapes * modes.drive
+        rest = rest + _real_part(by_shape, signals[0])
+        d_weights += [
+            d_shapes * modes.drive + shapes * modes.d_drive[:, None],
+            by_shape * modes.d_poles[:, None],
+        ]
+    rest = (rest / window.sigma[:, None]).reshape(-1)
+    along = basis.T @ rest
+    if not window.at_rest:
+        found = -(Vt[kept].T @ (along / s[kept])) / scale
+        x0 = found[p:]
+        z0, d_z0 = modes.entry @ x0, modes.d_entry @ x0
+        signals += [free_motion, free_motion * window.t]
+        d_weights += [
+            d_shapes * z0 + shapes * d_z0[:, None],
+            shapes * z0 * modes.d_poles[:, None],
+        ]
+    n_p = modes.d_poles.shape[0]
+    if signals:
+        slopes = _real_part(np.concatenate(d_weights, axis=2), np.concatenate(signals))
+    else:
+        slopes = np.zeros((n_p, p, n))
+    slopes = (slopes / window.sigma[:, None]).reshape(n_p, -1)
+    slopes = slopes - (slopes @ basis) @ basis.T
+    return Misfit(
+        residual=(rest - basis @ along).reshape(p, n),
+        slopes=slopes.reshape(n_p, p, n),
+        n_local=int(np.count_nonzero(kept)),
+    )
+
+
+def _real_part(weights: np.ndarray, signals: np.ndarray) -> Array:
+    """Return Re(weights @ signals) for (…, n_m) and (n_m, n), by one real product."""
+    return np.concatenate([weights.real, -weights.imag], axis=-1) @ np.concatenate(
+        [signals.real, signals.imag]
+    )
