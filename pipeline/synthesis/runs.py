@@ -48,7 +48,9 @@ class Session:
 
     def clock(self, duration: float) -> Array:
         """Return sample times (n,) from 0 to about `duration`, s."""
-        return np.arange(int(np.ceil(duration / self.sample_time)) + 1) * self.sample_time
+        return self.sample_time * np.arange(
+            np.ceil(duration / self.sample_time) + 1, dtype=np.float64
+        )
 
 
 def decays(chain: Chain, session: Session, rng: np.random.Generator) -> list[Run]:
@@ -95,7 +97,7 @@ def steps(chain: Chain, session: Session) -> list[Run]:
             id=f"step-{number}",
             kind="step",
             t=t,
-            u=u * on,
+            u=np.where(on, u, 0.0),
             free=_all(chain),
             note=f"{u:g} on, then off",
         )

@@ -1,0 +1,392 @@
+"""The plant: matrices, poles, zeros, and the maps between chain and named parameters."""
+
+from itertools import pairwise
+
+import control
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+from pipeline.errors import DataError
+from pipeline.plant.chain import (
+    PRESETS,
+    Chain,
+    parameter_names,
+    parameter_unit,
+    quadratic_factors,
+    recover_chain,
+    recover_from_parameters,
+)
+
+# The paper's final estimates: Tables 1 and 2 are kept by the presets, Table 3 by no real chain.
+TABLE_1 = {"K": 28.9, "omega_n": 13.2, "zeta": 0.10}
+TABLE_2 = {
+    "K_1": 24.3, "K_2": 16.4, "omega_a": 10.1, "omega_b": 37.3,
+    "zeta_a": 0.11, "zeta_b": 0.03, "omega_2": 32.9, "zeta_2": 0.04,
+}  # fmt: skip
+TABLE_3 = {
+    "K_1": 39.4, "K_2": 30.6, "K_3": 16.0, "omega_a": 6.9, "omega_b": 24.1, "omega_c": 34.1,
+    "zeta_a": 0.25, "zeta_b": 0.03, "zeta_c": 0.03, "omega_x": 20.2, "omega_y": 31.6,
+    "zeta_x": 0.04, "zeta_y": 0.03, "omega_3": 25.6, "zeta_3": 0.04,
+}  # fmt: skip
+
+
+def logarithmic(low, high):
+    """Numbers spread evenly over decades."""
+    return st.floats(np.log(low), np.log(high)).map(lambda x: float(np.exp(x)))
+
+
+@st.composite
+def chains(draw, min_carts=1, max_carts=4, max_zeta=0.3):
+    """Chains like those of the laboratory: masses and springs within a factor of four."""
+    n = draw(st.integers(min_carts, max_carts))
+    m = np.array([draw(logarithmic(1e-4, 4e-4)) for _ in range(n)])
+    k = np.array([draw(logarithmic(0.03, 0.12)) for _ in range(n + 1)])
+    if n == 1:
+        k = np.array([k.sum(), 0.0])
+    elif draw(st.booleans()):
+        k[0] = 0.0
+    zeta = np.array([draw(logarithmic(0.005, max_zeta)) for _ in range(n)])
+    return Chain(m=m, c=2 * zeta * np.sqrt(m * (k[:-1] + k[1:])), k=k)
+
+
+def assert_same_chain(got, chain, *, rtol):
+    # A spring is a difference of terms as large as its neighbours, so its error is theirs.
+    assert_allclose(got.m, chain.m, rtol=rtol)
+    assert_allclose(got.c, chain.c, rtol=rtol, atol=rtol * chain.c.max())
+    assert_allclose(got.k, chain.k, rtol=rtol, atol=rtol * chain.k.max())
+
+
+# ---------------------------------------------------------------------- maps
+
+
+@given(chains(max_carts=3))
+def test_chain_to_parameters_and_back(chain):
+    """The named parameters of one to three carts give the chain back, redundancies at zero."""
+    got = recover_from_parameters(chain.parameters())
+
+    # Poles come from an eigenvalue routine with errors near 1e-14; a weak coupling, the
+    # difference of numbers up to 100 times as large, is hundreds of times less exact.
+    assert_same_chain(got, chain, rtol=1e-9)
+    assert max(got.residuals.values(), default=0.0) < 1e-9
+
+
+@given(chains())
+def test_static_gains_and_tails_give_the_chain_back(chain):
+    """Four carts too: the gains and the chain's polynomials determine every number."""
+    got = recover_chain(chain.static_gains(), chain.tails()[:-1])
+
+    assert_same_chain(got, chain, rtol=1e-9)
+    assert max(got.residuals.values(), default=0.0) < 1e-9
+
+
+@pytest.mark.parametrize(("carts", "redundancies"), [(1, 0), (2, 1), (3, 5)])
+def test_number_of_redundancies(carts, redundancies):
+    """Two carts have 8 parameters for 7 numbers, three have 15 for 10."""
+    got = recover_from_parameters(PRESETS[f"throne-{carts}dof"].parameters())
+
+    assert list(got.residuals) == [f"R{i}" for i in range(1, redundancies + 1)]
+
+
+@pytest.mark.parametrize(
+    ("name", "broken"),
+    [("zeta_x", {"R1"}), ("zeta_b", {"R2", "R4"}), ("K_2", {"R5"}), ("omega_3", {"R3"})],
+)
+def test_an_inconsistent_table_shows_in_the_redundancies(name, broken):
+    """A table that no chain made leaves residuals far above rounding."""
+    values = PRESETS["throne-3dof"].parameters()
+    got = recover_from_parameters(values | {name: 1.1 * values[name]})
+
+    assert all(got.residuals[key] > 1e-3 for key in broken)
+
+
+def test_the_names_of_the_tables():
+    """Names come in the order of the paper's tables; a rigid body has its own two."""
+    assert parameter_names(2) == [
+        "K_1", "K_2", "omega_a", "omega_b", "zeta_a", "zeta_b",
+        "omega_1", "omega_2", "zeta_1", "zeta_2",
+    ]  # fmt: skip
+    assert set(TABLE_3) < set(parameter_names(3))
+    assert list(PRESETS["throne-3dof"].parameters()) == parameter_names(3)
+    assert parameter_names(1, rigid=True) == ["mass", "damping"]
+    assert parameter_names(4)[-1] == "zeta_4"
+
+
+def test_units_of_parameters():
+    """Gains, frequencies and the rigid body's two carry units; damping ratios do not."""
+    units = {
+        name: parameter_unit(name, position="cm", input="V")
+        for name in ("K_2", "omega_a", "zeta_1", "mass", "damping")
+    }
+    assert units == {
+        "K_2": "cm/V", "omega_a": "rad/s", "zeta_1": "", "mass": "V s^2/cm", "damping": "V s/cm",
+    }  # fmt: skip
+
+
+# ----------------------------------------------------------- against an oracle
+
+
+@given(chains())
+@settings(max_examples=40)
+def test_poles_are_those_of_the_state_matrix(chain):
+    """Poles, eigenvalues and the common denominator agree."""
+    got = chain.poles
+
+    T = chain.tails()[0]
+    # |T| relative to its terms: a root error of 1e-13 moves it by as much.
+    for pole in got:
+        terms = np.abs(T * pole ** np.arange(T.size - 1, -1, -1))
+        assert abs(np.polyval(T, pole)) < 1e-9 * terms.sum()
+    assert np.all(got.real < 0)
+    assert got.size == 2 * chain.n
+
+
+@given(chains(min_carts=2))
+@settings(max_examples=30)
+def test_zeros_make_each_response_vanish(chain):
+    """Between force and cart i there are 2 (n - i) zeros; python-control finds the same."""
+    for cart in range(1, chain.n):
+        zeros = chain.zeros(cart)
+        assert zeros.size == 2 * (chain.n - cart)
+        A, B, C, D = chain.state_space()
+        oracle = control.zeros(control.ss(A, B, C[[cart - 1]], D[[cart - 1]]))
+        finite = oracle[np.abs(oracle) < 1e4]  # its infinite zeros come out huge
+        matched = [np.min(np.abs(finite - zero)) / abs(zero) for zero in zeros]
+        # The oracle's generalised eigenvalues mix scales of 1 and 1e4 (k/m): 1e-6 is its own.
+        assert max(matched) < 1e-6
+
+
+@given(chains())
+@settings(max_examples=30)
+def test_frequency_response_matches_state_space(chain):
+    """The impedance form and C (sI - A)^-1 B are one function."""
+    omega = np.geomspace(1.0, 100.0, 25)
+
+    got = chain.frequency_response(omega)
+
+    A, B, C, _ = chain.state_space()
+    eye = np.eye(A.shape[0])
+    expected = np.stack([(C @ np.linalg.solve(1j * w * eye - A, B))[:, 0] for w in omega], axis=1)
+    # Beside a sharp null the two routes cancel to a hundredth of what they add up.
+    scale = np.abs(expected).max(axis=1, keepdims=True)
+    assert_allclose(got / scale, expected / scale, atol=1e-10)
+
+
+def test_frequency_response_of_a_preset_by_python_control():
+    """The oracle's evaluation of the three-cart system is the same."""
+    chain, omega = PRESETS["throne-3dof"], np.linspace(2.0, 50.0, 40)
+
+    expected = control.ss(*chain.state_space())(1j * omega)[:, 0, :]
+
+    assert_allclose(chain.frequency_response(omega), expected, rtol=1e-9)
+
+
+@given(chains())
+@settings(max_examples=30)
+def test_transfer_function_is_gain_and_tails(chain):
+    """X_i/U = K_i T_{i+1}(s)/T_{i+1}(0) over T_1(s)/T_1(0)."""
+    s = 1j * np.geomspace(2.0, 60.0, 7)
+    T, K = chain.tails(), chain.static_gains()
+
+    expected = [
+        K[i] * np.polyval(T[i + 1], s) / T[i + 1][-1] / (np.polyval(T[0], s) / T[0][-1])
+        for i in range(chain.n)
+    ]
+
+    got = chain.frequency_response(s.imag)
+    scale = np.abs(got).max(axis=1, keepdims=True)
+    assert_allclose(np.array(expected) / scale, got / scale, atol=1e-9)
+
+
+def test_rows_of_the_state_matrix():
+    """The paper's 4x4 matrix, entry by entry."""
+    m, c, k = [2.0, 4.0], [0.6, 0.8], [1.0, 3.0, 5.0]
+    A, B, C, D = Chain(m=np.array(m), c=np.array(c), k=np.array(k)).state_space()
+
+    assert_allclose(
+        A, [[0, 1, 0, 0], [-2.0, -0.3, 1.5, 0], [0, 0, 0, 1], [0.75, 0, -2.0, -0.2]], rtol=1e-15
+    )
+    assert_allclose(B, [[0], [0.5], [0], [0]])
+    assert_allclose(C, [[1, 0, 0, 0], [0, 0, 1, 0]])
+    assert_allclose(D, [[0], [0]])
+
+
+# ------------------------------------------------------- laws of a real chain
+
+
+@given(chains(max_zeta=0.05))
+def test_gains_fall_along_the_chain(chain):
+    """K_1 >= K_2 >= … > 0, and the ratios are those of the springs (statics)."""
+    K, k = chain.static_gains(), chain.k
+
+    assert np.all(K > 0)
+    assert np.all(np.diff(K) <= 1e-12 * K[0])
+    beyond = k[-1]  # the stiffness a cart leans on beyond spring i, from the far wall inwards
+    for i in range(chain.n - 1, 0, -1):
+        assert_allclose(K[i] / K[i - 1], k[i] / (k[i] + beyond), rtol=1e-9)
+        beyond = k[i] * beyond / (k[i] + beyond)
+
+
+@given(chains(min_carts=2, max_carts=3, max_zeta=0.02))
+def test_frequencies_interlace(chain):
+    """Resonances enclose nulls and single-cart frequencies (exact without damping)."""
+    # Damping moves a frequency by about zeta² = 4e-4; closer pairs prove nothing.
+    values = chain.parameters()
+    if chain.n == 2:
+        order = [("omega_a", "omega_1"), ("omega_1", "omega_b")]
+        order += [("omega_a", "omega_2"), ("omega_2", "omega_b")]
+    else:
+        names = ["omega_a", "omega_x", "omega_b", "omega_y", "omega_c"]
+        order = [*pairwise(names)]
+        order += [("omega_x", "omega_2"), ("omega_2", "omega_y")]
+        order += [("omega_x", "omega_3"), ("omega_3", "omega_y")]
+    for lower, upper in order:
+        assert values[lower] < values[upper] * (1 + 2e-3), (lower, upper)
+
+
+@given(chains(min_carts=2), st.data())
+def test_a_held_cart_is_a_wall(chain, data):
+    """One cart alone has the frequency and damping that bear its number."""
+    cart = data.draw(st.integers(1, chain.n))
+
+    A, B, _, _ = chain.state_space(free=[cart])
+
+    omega, zeta = chain.omega_carts[cart - 1], chain.zeta_carts[cart - 1]
+    assert_allclose(A[1], [-(omega**2), -2 * zeta * omega])
+    assert B[1, 0] == (1 / chain.m[0] if cart == 1 else 0.0)
+
+
+def test_the_order_of_free_carts_does_not_matter():
+    """Free carts are a set; the state always runs from the first cart on."""
+    chain = PRESETS["throne-3dof"]
+    assert_allclose(chain.state_space(free=[3, 1])[0], chain.state_space(free=(1, 3))[0])
+
+
+def test_a_cart_that_is_not_there_cannot_be_free():
+    """Cart 3 of two is a mistake in the call."""
+    with pytest.raises(ValueError, match=r"free carts \[3\] are not among 1 to 2"):
+        PRESETS["throne-2dof"].state_space(free=[3])
+
+
+def test_a_missing_spring_uncouples():
+    """Without the spring between them, the second cart neither moves nor has a gain."""
+    chain = Chain(m=np.array([2e-4, 3e-4]), c=np.array([1e-4, 1e-4]), k=np.array([0.1, 0.0, 0.1]))
+
+    assert_allclose(chain.static_gains(), [10.0, 0.0], atol=1e-15)
+    assert_allclose(chain.frequency_response(np.array([5.0, 20.0]))[1], 0.0, atol=1e-15)
+
+
+def test_equal_gains_without_a_far_spring():
+    """Where no spring holds the far end, both carts go equally far."""
+    chain = Chain(m=np.array([2e-4, 3e-4]), c=np.array([1e-4, 1e-4]), k=np.array([0.1, 0.2, 0.0]))
+
+    assert_allclose(chain.static_gains(), [10.0, 10.0], rtol=1e-12)
+
+
+def test_a_rigid_body():
+    """One cart without springs has a mass and a damping, and no static gain."""
+    body = Chain(m=np.array([2e-4]), c=np.array([5e-4]), k=np.zeros(2))
+
+    assert body.parameters() == {"mass": 2e-4, "damping": 5e-4}
+    omega = np.array([10.0])
+    expected = 1 / (2e-4 * (1j * 10.0) ** 2 + 5e-4 * 1j * 10.0)
+    assert_allclose(body.frequency_response(omega)[0, 0], expected, rtol=1e-12)
+    with pytest.raises(DataError, match="no static gain"):
+        body.static_gains()
+
+
+def test_carts_tied_only_to_each_other_have_no_static_gain():
+    """A spring between the carts but none to a wall: a constant force pushes them away."""
+    chain = Chain(m=np.array([2e-4, 3e-4]), c=np.array([1e-4, 1e-4]), k=np.array([0.0, 0.1, 0.0]))
+
+    with pytest.raises(DataError, match="no static gain"):
+        chain.parameters()
+
+
+def test_an_overdamped_factor_has_zeta_above_one():
+    """Two real roots make one quadratic factor."""
+    omega, zeta = quadratic_factors(np.array([-2.0 + 0j, -8.0 + 0j, -1 + 9j, -1 - 9j]))
+
+    assert_allclose(omega, [4.0, np.sqrt(82)], rtol=1e-12)
+    assert_allclose(zeta, [1.25, 1 / np.sqrt(82)], rtol=1e-12)
+
+
+@given(chains(max_carts=3, max_zeta=3.0))
+def test_heavy_damping_survives_the_maps(chain):
+    """Overdamped carts come back too, as long as the real poles are told apart."""
+    roots = [chain.poles, *(chain.zeros(cart) for cart in range(1, chain.n))]
+    gaps = [
+        np.min(np.abs(r[:, None] - r[None, :]) + np.diag(np.full(r.size, np.inf))) / np.abs(r).min()
+        for r in roots
+    ]
+    assume(min(gaps) > 1e-3)
+
+    got = recover_from_parameters(chain.parameters())
+
+    # A root next to another at distance 1e-3 is known to 1e-15/1e-3; large damping adds the
+    # cancellation of squares up to (2 zeta)^4 = 1300 times larger.
+    assert_same_chain(got, chain, rtol=1e-6)
+
+
+def test_arrays_are_read_only_and_checked():
+    """A chain cannot be changed, and its parts must fit."""
+    chain = PRESETS["throne-1dof"]
+    with pytest.raises(ValueError, match="read-only"):
+        chain.m[0] = 1.0
+    with pytest.raises(ValueError, match=r"k: expected shape \(3,\), found \(2,\)"):
+        Chain(m=np.ones(2), c=np.ones(2), k=np.ones(2))
+
+
+# ------------------------------------------------------------ the paper's tables
+
+
+@pytest.mark.parametrize(("preset", "table"), [("throne-1dof", TABLE_1), ("throne-2dof", TABLE_2)])
+def test_presets_round_to_the_paper(preset, table):
+    """Each independent final value of Tables 1 and 2, to the digits printed."""
+    values = PRESETS[preset].parameters()
+
+    for name, printed in table.items():
+        decimals = 2 if name.startswith("zeta") else 1
+        assert round(values[name], decimals) == printed, name
+
+
+def test_the_three_cart_preset_is_near_table_3():
+    """Gains and frequencies within 1.3 %, every damping but zeta_b within 15 %."""
+    values = PRESETS["throne-3dof"].parameters()
+
+    for name, printed in TABLE_3.items():
+        if name == "zeta_b":
+            continue
+        limit = 0.155 if name.startswith("zeta") else 0.013
+        # Printed dampings of one digit are known to half of 0.01 only.
+        rounding = 0.005 if name.startswith("zeta") else 0.0
+        assert abs(values[name] - printed) <= limit * printed + rounding, name
+
+
+def test_table_2_obeys_its_redundancy_within_rounding():
+    """R1 of the printed Table 2 is what two digits of damping allow, and no spring is negative."""
+    got = recover_from_parameters(TABLE_2)
+
+    assert got.residuals["R1"] < 0.15
+    assert_allclose(np.sqrt((got.k[0] + got.k[1]) / got.m[0]), 20.27, atol=0.005)
+
+
+def test_table_3_is_no_real_chain():
+    """The printed Table 3 breaks R4 and R5 whatever its rounding; its first spring is negative."""
+    rng = np.random.default_rng(3)
+    got = recover_from_parameters(TABLE_3)
+    assert got.k[0] / got.m[0] == pytest.approx(-9, abs=1.5)
+
+    signed = {"R4": [], "R5": []}
+    for _ in range(300):
+        drawn = {
+            name: value + rng.uniform(-0.5, 0.5) * (0.01 if name.startswith("zeta") else 0.1)
+            for name, value in TABLE_3.items()
+        }
+        for name, residual in recover_from_parameters(drawn).residuals.items():
+            if name in signed:
+                signed[name].append(residual)
+    assert min(signed["R4"]) > 0.01
+    assert min(signed["R5"]) > 0.01

@@ -1,0 +1,206 @@
+"""The exact linear simulator."""
+
+import control
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+from pipeline.plant.chain import PRESETS, Chain
+from pipeline.plant.simulate import propagate, simulate_linear
+
+THREE = PRESETS["throne-3dof"]
+SAMPLE_TIME = 0.00884
+
+
+def clock(n, sample_time=SAMPLE_TIME):
+    return sample_time * np.arange(n, dtype=np.float64)
+
+
+def irregular_times(rng, n, mean=SAMPLE_TIME):
+    return np.concatenate([[0.0], np.cumsum(mean * rng.uniform(0.2, 1.8, size=n - 1))])
+
+
+def rms(x):
+    return float(np.sqrt(np.mean(np.square(x))))
+
+
+@pytest.mark.parametrize("zeta", [0.02, 0.1, 0.7])
+def test_step_of_one_cart_is_the_textbook_step(zeta):
+    """1 - exp(-zeta omega t) (cos omega_d t + …), at times that follow no clock."""
+    k, omega_n = 0.03, 13.2
+    m = k / omega_n**2
+    chain = Chain(m=np.array([m]), c=np.array([2 * zeta * omega_n * m]), k=np.array([k, 0.0]))
+    t = irregular_times(np.random.default_rng(1), 300)
+
+    x = simulate_linear(chain, t, np.full(t.size, 0.06))
+
+    omega_d, sigma = omega_n * np.sqrt(1 - zeta**2), zeta * omega_n
+    expected = 2.0 * (
+        1 - np.exp(-sigma * t) * (np.cos(omega_d * t) + sigma / omega_d * np.sin(omega_d * t))
+    )
+    # 300 products of 2 x 2 matrices, each off by a few 1e-16.
+    assert_allclose(x[0], expected, atol=1e-12)
+
+
+def test_free_decay_from_a_state():
+    """Released at 1 cm with a velocity, one cart follows the damped cosine and sine."""
+    chain = PRESETS["throne-1dof"]
+    t = irregular_times(np.random.default_rng(2), 400)
+
+    x = simulate_linear(chain, t, np.zeros(t.size), x0=np.array([1.0, -3.0]))
+
+    sigma = chain.zeta_carts[0] * chain.omega_carts[0]
+    omega_d = np.sqrt(chain.omega_carts[0] ** 2 - sigma**2)
+    sine = (-3.0 + sigma) / omega_d
+    expected = np.exp(-sigma * t) * (np.cos(omega_d * t) + sine * np.sin(omega_d * t))
+    assert_allclose(x[0], expected, atol=1e-12)
+
+
+def test_agrees_with_python_control():
+    """On a uniform clock the oracle's sampled system gives the same positions."""
+    rng = np.random.default_rng(3)
+    t = clock(500)
+    u = 0.05 * rng.standard_normal(t.size)
+
+    sampled = control.sample_system(control.ss(*THREE.state_space()), SAMPLE_TIME, method="zoh")
+    expected = control.forced_response(sampled, T=t, U=u).outputs
+
+    # Both exponentials are good to about 1e-13 of the largest motion.
+    assert_allclose(simulate_linear(THREE, t, u), expected, atol=1e-10 * np.abs(expected).max())
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 3))
+@settings(max_examples=25)
+def test_a_sample_between_two_changes_nothing(seed, carts):
+    """A held input sampled more often is the same input, so the motion is the same."""
+    rng = np.random.default_rng(seed)
+    chain = PRESETS[f"throne-{carts}dof"]
+    t = irregular_times(rng, 60)
+    u = 0.05 * rng.standard_normal(t.size)
+    between = t[:-1] + rng.uniform(0.1, 0.9, size=t.size - 1) * np.diff(t)
+    order = np.argsort(np.concatenate([t, between]))
+    finer_t = np.concatenate([t, between])[order]
+    finer_u = np.concatenate([u, u[:-1]])[order]
+
+    x = simulate_linear(chain, t, u)
+
+    finer = simulate_linear(chain, finer_t, finer_u)[:, order < t.size]
+    # Intervals equal to 1e-12 s count as one: 60 steps at up to 50 cm/s add 60 x 5e-11 at most.
+    assert_allclose(finer, x, atol=3e-9 * np.abs(x).max())
+
+
+def test_motions_add():
+    """The sum of inputs and of starts moves the carts by the sum of the motions."""
+    rng = np.random.default_rng(4)
+    t = irregular_times(rng, 200)
+    u, x0 = 0.05 * rng.standard_normal((2, t.size)), rng.standard_normal((2, 6))
+
+    parts = [simulate_linear(THREE, t, u[i], x0=x0[i]) for i in range(2)]
+
+    whole = simulate_linear(THREE, t, u[0] + u[1], x0=x0[0] + x0[1])
+    assert_allclose(whole, parts[0] + parts[1], atol=1e-12 * np.abs(whole).max())
+
+
+def test_held_carts_are_walls():
+    """Carts 1 and 2 alone, cart 3 held, move as the two-cart chain with cart 3's place as wall."""
+    short = Chain(m=THREE.m[:2], c=THREE.c[:2], k=THREE.k[:3])
+    t = clock(300)
+    u = np.full(t.size, 0.02)
+
+    assert_array_equal(simulate_linear(THREE, t, u, free=(1, 2)), simulate_linear(short, t, u))
+
+
+def test_the_motor_does_not_reach_past_a_held_first_cart():
+    """With cart 1 held the input moves nothing."""
+    t = clock(50)
+
+    x = simulate_linear(THREE, t, np.ones(t.size), free=(2, 3))
+
+    assert x.shape == (2, 50)
+    assert_array_equal(x, 0.0)
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=25)
+def test_energy_never_grows_without_input(seed):
+    """Kinetic and potential energy of a free decay fall from sample to sample."""
+    rng = np.random.default_rng(seed)
+    A, B, _, _ = THREE.state_space()
+    t = irregular_times(rng, 200)
+
+    states = propagate(A, B, t, np.zeros(t.size), x0=rng.standard_normal(6))
+
+    x, v = states[0::2], states[1::2]
+    energy = 0.5 * (np.sum(x * (THREE.stiffness @ x), axis=0) + THREE.m @ v**2)
+    assert np.all(np.diff(energy) <= 1e-12 * energy[0])
+
+
+def test_steady_state_of_a_held_sine():
+    """Held samples of a sine drive the carts as the sine, half a sample late and a little less."""
+    omega = 2 * np.pi * 4.0
+    t = clock(1500)
+    x = simulate_linear(THREE, t, np.sin(omega * t))
+
+    # The first harmonic of the staircase; the images, 28 times faster, move the carts by 28^-3.
+    half = omega * SAMPLE_TIME / 2
+    response = THREE.frequency_response(np.array([omega]))[:, 0] * np.sin(half) / half
+    expected = np.imag(response[:, None] * np.exp(1j * (omega * t - half)))
+    late = t > 12.0  # 13 time constants: 2e-6
+    assert_allclose(x[:, late], expected[:, late], atol=1e-4 * np.abs(response).max())
+
+
+def test_steady_state_of_a_band_limited_sine():
+    """Between its samples the input is the smooth sine itself, though there are few of them."""
+    omega = 2 * np.pi * 4.0
+    t = clock(500, 0.03)  # 8 samples a period
+    x = simulate_linear(THREE, t, np.sin(omega * t), hold="band_limited")
+
+    response = THREE.frequency_response(np.array([omega]))[:, 0]
+    expected = np.imag(response[:, None] * np.exp(1j * omega * t))
+    inner = (t > 11.0) & (t < 14.5)  # the kernel is cut off at the ends
+    # Straight lines between points 64 a period cost (2 pi / 64)^2 / 12 = 8e-4 of amplitude.
+    assert_allclose(x[:, inner], expected[:, inner], atol=1.2e-3 * np.abs(response).max())
+    held = simulate_linear(THREE, t, np.sin(omega * t))
+    assert rms(held[:, inner] - expected[:, inner]) > 0.2 * rms(expected[:, inner])
+
+
+def test_a_band_limited_constant_is_a_constant():
+    """The interpolation of equal samples is flat, to its very ends."""
+    t = clock(100)
+    u = np.full(t.size, 0.03)
+
+    x = simulate_linear(THREE, t, u, hold="band_limited")
+
+    assert_allclose(x, simulate_linear(THREE, t, u), atol=1e-12)
+
+
+def test_input_that_runs_straight_between_samples():
+    """A ramp on a free mass: x = t³ / 6m, whatever the sample times."""
+    A, B, C, _ = Chain(m=np.array([2.0]), c=np.zeros(1), k=np.zeros(2)).state_space()
+    t = irregular_times(np.random.default_rng(5), 80, mean=0.02)
+
+    x = C @ propagate(A, B, t, t, x0=np.zeros(2), linear=True)
+
+    assert_allclose(x[0], t**3 / 12, atol=1e-12)
+
+
+def test_the_last_input_has_no_time_to_act():
+    """The sample at the end of the record is held only beyond it."""
+    t = clock(20)
+    u = np.ones(t.size)
+
+    changed = simulate_linear(THREE, t, np.append(u[:-1], 99.0))
+
+    assert_array_equal(changed, simulate_linear(THREE, t, u))
+
+
+def test_arguments_are_left_alone():
+    """Times, input and start are read, never written."""
+    t, u, x0 = clock(20), np.ones(20), np.ones(6)
+    for array in (t, u, x0):
+        array.flags.writeable = False
+
+    for hold in ("zero_order", "band_limited"):
+        assert simulate_linear(THREE, t, u, x0=x0, hold=hold).shape == (3, 20)
