@@ -252,7 +252,7 @@ def _extrema(response: FrequencyResponse, *, sign: int) -> list[_Extremum]:
             continue
         left, right = level[:i][::-1], level[i + 1 :]
         prominence = level[i] - max(_saddle(left, level[i]), _saddle(right, level[i]))
-        if prominence < max(_LEAST_PROMINENCE, 4 * error[i]):
+        if prominence < max(_LEAST_PROMINENCE, 4 * np.max(error[i - 1 : i + 2])):
             continue
         curve = np.polyfit(position[i - 1 : i + 2] - position[i], level[i - 1 : i + 2], 2)
         omega = response.omega[i] * np.exp(-curve[1] / (2 * curve[0]))
@@ -269,16 +269,19 @@ def _saddle(side: Array, peak: float) -> float:
 
 def _shared_peaks(responses: Sequence[FrequencyResponse], *, n: int) -> list[_Extremum]:
     """Return up to n peaks, those that most carts show most clearly."""
-    peaks = sorted(peak for response in responses for peak in _extrema(response, sign=1))
-    clusters: list[list[_Extremum]] = []
-    for peak in peaks:
-        if clusters and np.log(peak.omega / clusters[-1][0].omega) < _SAME_PEAK:
-            clusters[-1].append(peak)
-        else:
-            clusters.append([peak])
+    peaks = sorted((peak, r.cart) for r in responses for peak in _extrema(r, sign=1))
+    clusters: list[dict[int, _Extremum]] = []  # one peak of each cart at most
+    start = 0.0
+    for peak, cart in peaks:
+        if not clusters or np.log(peak.omega / start) > _SAME_PEAK:
+            clusters.append({})
+            start = peak.omega
+        rival = clusters[-1].get(cart)
+        if rival is None or rival.prominence < peak.prominence:
+            clusters[-1][cart] = peak
     merged = [
-        max(cluster, key=lambda peak: peak.prominence)._replace(
-            prominence=sum(peak.prominence for peak in cluster)
+        max(cluster.values(), key=lambda peak: peak.prominence)._replace(
+            prominence=sum(peak.prominence for peak in cluster.values())
         )
         for cluster in clusters
     ]

@@ -11,6 +11,7 @@ section 7.2 (the local polynomial method).
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.plant.chain import Array, ComplexArray
 from pipeline.results import Record
@@ -24,6 +25,7 @@ _START_SWING = 0.03
 _RING_GAIN = 10.0  # a swing r left at the end errs by up to r / 2ζ, here with ζ = 0.05
 _BAND_TOP = 0.4  # of the Nyquist frequency; above, aliases of the unfiltered encoders come in
 _HALF_WINDOWS, _DEGREE = (4, 6), 2  # lines to each side, and degree, of the local polynomials
+_UNIFORM = 1e-3  # of an interval: what rounding leaves of a uniform time axis
 _RANK = 1e-9  # singular values below this share are rounding
 
 
@@ -118,13 +120,27 @@ def _local_ratio(run: Record, u: Array, omega: Array) -> TransferRatio:
     """
     base = 2 * np.pi / (run.t[-1] - run.t[0])
     lines = np.arange(1, int(omega[-1] / base) + max(_HALF_WINDOWS) + 2)
-    U, Y = _derivative_transforms(run, u, lines * base, u_before=float(u[0]))
+    U, Y = _line_transforms(run, u, lines)
     narrow, wide = (
         _local_polynomials(U, Y, place=omega / base, half=half) for half in _HALF_WINDOWS
     )
     excited = np.interp(omega, lines * base, np.abs(U)) > _LEAST_INPUT_SHARE * np.max(np.abs(U))
     std = np.hypot(narrow.std, np.abs(narrow.G - wide.G) / np.sqrt(2))
     return TransferRatio(G=narrow.G, std=np.where(excited, std, np.inf))
+
+
+def _line_transforms(
+    run: Record, u: Array, lines: NDArray[np.intp]
+) -> tuple[ComplexArray, ComplexArray]:
+    """Return FT(u') and FT(y') at harmonics of the record length; by FFT where time is uniform."""
+    dt, base = run.sample_time, 2 * np.pi / (run.t[-1] - run.t[0])
+    if np.max(np.abs(np.diff(run.t) - dt)) > _UNIFORM * dt:
+        return _derivative_transforms(run, u, lines * base, u_before=float(u[0]))
+    smooth = 1.0 / np.sinc(lines * base * dt / (2 * np.pi))
+    U, Y = np.fft.rfft(np.diff(u))[lines], np.fft.rfft(np.diff(run.y))[:, lines] * smooth
+    # A held input changes at the later sample of an interval, half an interval after its middle.
+    half = smooth if run.hold == "band_limited" else np.exp(-0.5j * lines * base * dt)
+    return U * half, Y
 
 
 def _local_polynomials(

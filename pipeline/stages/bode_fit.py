@@ -1,0 +1,420 @@
+"""Fit one chain to the frequency responses of all carts at once.
+
+The stage-by-stage result becomes a physical chain, which all carts then fit jointly: first on a
+logarithmic scale, to get near, then by maximum likelihood, each point by its standard error.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from pipeline.errors import DataError
+from pipeline.plant.chain import Array, Chain, ComplexArray, recover_chain
+from pipeline.results import ChainFit, FrequencyResponse
+from pipeline.stages.chain_parameters import (
+    Parametrisation,
+    even_chain,
+    named_estimates,
+    physical_start,
+)
+from pipeline.stages.staged_fit import LogMagnitude, StagedFit, fit_stage_by_stage
+
+Scale = Literal["log", "magnitude", "complex"]
+
+_STARTS = 8  # random ones, tried where the first does not explain the data
+_GOOD_CHI_SQUARE = 2.0  # per degree of freedom: the data are explained
+_START_SPREAD = 0.5  # of ln m and ln k of a random start: half to double, mostly
+_START_ZETAS = (0.02, 0.3)
+_SEED = 2005  # of the random starts; any, but the same every time
+_LOG_ERROR = 0.05  # added to the error of ln|G|: on the way there no point should rule
+_TABLE_STD = 0.01  # of a magnitude that comes without an error
+_PHASE_AGREES = 3.0  # times as far off as the magnitudes are: a delay or a wrong sign is further
+_PHASE_KNOWN = 0.5  # rad; a worse phase tells nothing
+_VANISHING = 1e-4  # of its natural size: a damping or far spring that the data put at zero
+_RANK = 1e-8  # smallest singular value over the largest, columns in natural sizes
+# chi² exceeds its mean by more than this many of its standard deviations once in a thousand.
+_EXCESS_SIGMAS = 3.1
+
+
+def fit_bode(
+    responses: Sequence[FrequencyResponse],
+    *,
+    n: int,
+    springs: Sequence[bool],
+    initial: Mapping[str, float] | None = None,
+) -> ChainFit:
+    """Fit the chain of n carts to measured frequency responses; carts may be missing.
+
+    Phases are used where they are given and agree with the magnitudes, else magnitudes alone.
+    A parameter that the data put at or below zero is held there and the others fitted again: the
+    standard errors then hold on both sides of the bound. Errors are scaled up where the misfit
+    is larger than the points' own errors allow, and to the misfit either way for a table that
+    states none.
+
+    Parameters
+    ----------
+    springs : (n + 1,) which springs there are.
+    initial : named parameters to start from, as far as known.
+
+    Returns
+    -------
+    `standardised` has the magnitude residuals by cart ("1", "2", …).
+
+    Raises
+    ------
+    DataError : fewer points than parameters, or responses that do not determine them.
+    """
+    P = Parametrisation(n=n, springs=tuple(springs))
+    data = _Points.collect(responses, n=n)
+    if data.size <= len(P.names):
+        raise DataError(
+            f"Bode fit: {n} cart{'s'[: n > 1]} with {len(P.names)} parameters "
+            f"need more points than that, found {data.size}"
+        )
+    like = _stand_in(data, initial or {}, n=n, springs=springs)
+    staged, start = _staged_start(data, initial or {}, n=n, springs=springs, like=like)
+    best, tried = _fit_from_starts(P, data, first=start, like=like)
+    best = _hold_vanished(best, data)
+    notes = []
+    if data.has_phase:
+        if _phase_misfit(best, data) <= _PHASE_AGREES * max(1.0, best.chi_square_per_dof**0.5):
+            best = _hold_vanished(_solve(best.parametrisation, data, best.theta, "complex"), data)
+        else:
+            notes.append("magnitudes alone: the phases do not agree with them")
+    return _result(best, data, staged=staged, tried=tried, notes=notes)
+
+
+# ------------------------------------------------------------------------ data
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Points:
+    """All measured points in one row (N,); `at` and `cart` index frequency and cart (from 0)."""
+
+    omega: Array  # (n_w,) the distinct frequencies
+    at: NDArray[np.intp]
+    cart: NDArray[np.intp]
+    magnitude: Array
+    std: Array
+    unit: ComplexArray  # exp(-i phase), 1 where not known
+    phase_std: Array  # infinite where not known
+    from_table: bool
+
+    @classmethod
+    def collect(cls, responses: Sequence[FrequencyResponse], *, n: int) -> "_Points":
+        if not responses:
+            raise DataError("Bode fit: needs a frequency response, found none")
+        for response in responses:
+            if not 1 <= response.cart <= n:
+                raise DataError(f"Bode fit: {n} carts, but a response of cart {response.cart}")
+        omega = np.concatenate([r.omega for r in responses])
+        magnitude = np.concatenate([r.magnitude for r in responses])
+        if not (np.all(np.isfinite(omega) & (omega >= 0)) and np.all(np.isfinite(magnitude))):
+            raise DataError("Bode fit: frequencies and magnitudes must be finite numbers")
+        std = np.concatenate([r.magnitude_std for r in responses])
+        stated = np.isfinite(std) & (std > 0)
+        std = np.where(stated, std, _TABLE_STD * np.maximum(magnitude, np.median(magnitude) / 1e3))
+        phase = [np.zeros(r.omega.size) if r.phase is None else r.phase for r in responses]
+        phase_std = [
+            np.full(r.omega.size, np.inf) if r.phase_std is None else r.phase_std for r in responses
+        ]
+        spread = np.concatenate(phase_std)
+        distinct, at = np.unique(omega, return_inverse=True)
+        return cls(
+            omega=distinct,
+            at=at,
+            cart=np.concatenate([np.full(r.omega.size, r.cart - 1) for r in responses]),
+            magnitude=magnitude,
+            std=std,
+            unit=np.exp(-1j * np.concatenate(phase)).astype(np.complex128),
+            phase_std=np.where((spread > 0) & (spread < _PHASE_KNOWN), spread, np.inf),
+            from_table=all(r.source == "table" for r in responses) or not stated.any(),
+        )
+
+    @property
+    def size(self) -> int:
+        return self.magnitude.size
+
+    @property
+    def has_phase(self) -> bool:
+        return bool(np.any(np.isfinite(self.phase_std)))
+
+    @property
+    def level(self) -> Array:
+        """ln|G|; a magnitude lost in its error counts as half that error."""
+        return np.log(np.maximum(self.magnitude, self.std / 2))
+
+    @property
+    def level_weight(self) -> Array:
+        return 1.0 / np.hypot(self.std / np.exp(self.level), _LOG_ERROR)
+
+    def of_cart(self, cart: int) -> NDArray[np.bool_]:
+        return self.cart == cart - 1
+
+
+# ---------------------------------------------------------------------- starts
+
+
+def _stand_in(
+    data: _Points, initial: Mapping[str, float], *, n: int, springs: Sequence[bool]
+) -> Chain:
+    """Return a chain of even carts with the right gain and mean frequency."""
+    first = np.flatnonzero(data.cart == np.min(data.cart))
+    lowest = first[np.argmin(data.omega[data.at[first]])]
+    highest = first[np.argmax(data.omega[data.at[first]])]
+    if n == 1 and not any(springs):
+        omega = data.omega[data.at[highest]]
+        m = 1.0 / (np.exp(data.level[highest]) * omega**2)
+        return Chain(m=np.array([m]), c=np.array([0.1 * m * omega]), k=np.zeros(2))
+    speed = np.exp(data.level[first]) * data.omega[data.at[first]]
+    seen = {
+        "K_1": float(np.exp(data.level[lowest])),
+        "omega_a": float(data.omega[data.at[first[np.argmax(speed)]]]),
+    }
+    known = {name: value for name, value in initial.items() if value > 0}
+    if not any(name.startswith(("omega_a", "omega_n")) for name in known):
+        known["omega_a"] = seen["omega_a"]
+    if "K" not in known and "K_1" not in known:
+        known["K_1"] = seen["K_1"]
+    return even_chain(known, n=n, springs=springs)
+
+
+def _staged_start(
+    data: _Points,
+    initial: Mapping[str, float],
+    *,
+    n: int,
+    springs: Sequence[bool],
+    like: Chain,
+) -> tuple[StagedFit | None, Chain]:
+    """Fit stage by stage and return the chain it implies, made possible where it is not."""
+    if not any(springs):
+        return None, like
+    measured = {}
+    for cart in range(1, n + 1):
+        of = data.of_cart(cart)
+        if of.any():
+            measured[cart] = LogMagnitude(
+                cart=cart,
+                omega=data.omega[data.at[of]],
+                level=data.level[of],
+                weight=data.level_weight[of],
+            )
+    known = {name: value for name, value in initial.items() if value > 0}
+    staged = fit_stage_by_stage(measured, n=n, initial=known, like=like)
+    implied = recover_chain(staged.gains, staged.tails).chain()
+    return staged, physical_start(implied, springs=springs)
+
+
+def _random_starts(like: Chain, springs: Sequence[bool]) -> Iterator[Chain]:
+    rng = np.random.default_rng(_SEED)
+    for _ in range(_STARTS):
+        m = like.m * np.exp(_START_SPREAD * rng.standard_normal(like.m.shape))
+        k = like.k * np.exp(_START_SPREAD * rng.standard_normal(like.k.shape))
+        zeta = float(np.exp(rng.uniform(*np.log(_START_ZETAS))))
+        yield physical_start(Chain(m=m, c=like.c, k=k), springs=springs, zeta=zeta)
+
+
+# ------------------------------------------------------------------------ fits
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Fitted:
+    parametrisation: Parametrisation
+    theta: Array
+    scale: Scale
+    chi_square: float
+    dof: int
+    converged: bool
+
+    @property
+    def chain(self) -> Chain:
+        return self.parametrisation.unpack(self.theta)
+
+    @property
+    def chi_square_per_dof(self) -> float:
+        return self.chi_square / self.dof
+
+
+def _response(
+    P: Parametrisation, data: _Points, physical: Array
+) -> tuple[ComplexArray, ComplexArray]:
+    """Return G (N,) at the points and dG/dp (N, n_p) = -Z⁻¹ (∂Z/∂p) Z⁻¹ e_1."""
+    s = 1j * data.omega
+    b, powers = P.directions, s[:, None] ** P.orders  # (n_p, n), (n_w, n_p)
+    Z = np.einsum("wp,pi,pj->wij", powers * physical, b, b, optimize=True)
+    inverse = np.linalg.inv(Z)
+    G = inverse[:, :, 0]
+    stretch = (G @ b.T) * -powers  # (n_w, n_p)
+    slopes = (inverse @ b.T) * stretch[:, None, :]  # (n_w, n, n_p)
+    return G[data.at, data.cart], slopes[data.at, data.cart]
+
+
+def _residuals(
+    data: _Points, scale: Scale, G: ComplexArray, dG: ComplexArray
+) -> tuple[Array, Array]:
+    """Return the weighted residuals (model minus measured) and their slopes by p."""
+    size = np.abs(G)
+    radial = (np.conj(G)[:, None] * dG).real / size[:, None]  # d|G|/dp
+    if scale == "log":
+        weight = data.level_weight
+        return weight * (np.log(size) - data.level), (weight / size)[:, None] * radial
+    if scale == "magnitude":
+        return (size - data.magnitude) / data.std, radial / data.std[:, None]
+    known = np.isfinite(data.phase_std)
+    turned, slopes = G * data.unit, data.unit[:, None] * dG
+    across_std = (data.magnitude * data.phase_std)[known]
+    along = np.where(known, turned.real, size) - data.magnitude
+    along_slopes = np.where(known[:, None], slopes.real, radial)
+    return (
+        np.concatenate([along / data.std, turned.imag[known] / across_std]),
+        np.vstack([along_slopes / data.std[:, None], slopes.imag[known] / across_std[:, None]]),
+    )
+
+
+def _evaluator(
+    P: Parametrisation, data: _Points, scale: Scale
+) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
+    """Return residuals and Jacobian by theta, each point computed once for both."""
+    last: list[tuple[Array, Array, Array]] = []
+
+    def evaluate(theta: Array) -> tuple[Array, Array]:
+        if not last or not np.array_equal(last[0][0], theta):
+            physical = P.physical(P.unpack(theta))
+            r, J = _residuals(data, scale, *_response(P, data, physical))
+            last[:] = [(theta.copy(), r, J * P.slopes(theta))]
+        return last[0][1], last[0][2]
+
+    return lambda theta: evaluate(theta)[0], lambda theta: evaluate(theta)[1]
+
+
+def _solve(P: Parametrisation, data: _Points, theta: Array, scale: Scale) -> _Fitted:
+    residuals, jacobian = _evaluator(P, data, scale)
+    solution = least_squares(residuals, theta, jac=jacobian, x_scale="jac")
+    return _Fitted(
+        parametrisation=P,
+        theta=solution.x,
+        scale=scale,
+        chi_square=2 * float(solution.cost),
+        dof=solution.fun.size - theta.size,
+        converged=bool(solution.status > 0),
+    )
+
+
+def _fit_from_starts(
+    P: Parametrisation, data: _Points, *, first: Chain, like: Chain
+) -> tuple[_Fitted, int]:
+    """Fit from the first start, and from random ones while the data are not explained."""
+    best, tried = None, 0
+    for start in (first, *_random_starts(like, P.springs)):
+        tried += 1
+        near = _solve(P, data, P.pack(start), "log")
+        fitted = _solve(P, data, near.theta, "magnitude")
+        if best is None or fitted.chi_square < best.chi_square:
+            best = fitted
+        if best.chi_square_per_dof <= _GOOD_CHI_SQUARE:
+            break
+    assert best is not None
+    return best, tried
+
+
+def _hold_vanished(fitted: _Fitted, data: _Points) -> _Fitted:
+    """Fit again with every parameter at zero that the data put there or below."""
+    P, chain = fitted.parametrisation, fitted.chain
+    physical = P.physical(chain)
+    sizes = _natural_sizes(P, chain)
+    vanished = [
+        name
+        for name, value, size in zip(P.names, physical, sizes, strict=True)
+        if value < (0.0 if name == "k_1" else _VANISHING * size)
+    ]
+    if not vanished:
+        return fitted
+    held = replace(P, zero=(*P.zero, *vanished))
+    return _solve(held, data, held.pack(fitted.chain), fitted.scale)
+
+
+def _natural_sizes(P: Parametrisation, chain: Chain) -> Array:
+    """Return what a parameter (n_p,) would be of order one of: damping 2mω, the stiffest spring."""
+    sizes = {"m": chain.m, "c": 2 * np.sqrt(chain.m * (np.abs(chain.k[:-1]) + chain.k[1:]))}
+    return np.array(
+        [
+            float(np.max(chain.k)) if name[0] == "k" else float(sizes[name[0]][int(name[2:]) - 1])
+            for name in P.names
+        ]
+    )
+
+
+def _phase_misfit(fitted: _Fitted, data: _Points) -> float:
+    """Return the root-mean-square distance of the measured phases from the fit's, in errors."""
+    P = fitted.parametrisation
+    G, _ = _response(P, data, P.physical(fitted.chain))
+    known = np.isfinite(data.phase_std)
+    off = np.angle(G * data.unit)[known] / data.phase_std[known]
+    return float(np.sqrt(np.mean(off**2)))
+
+
+# ---------------------------------------------------------------------- result
+
+
+def _result(
+    fitted: _Fitted,
+    data: _Points,
+    *,
+    staged: StagedFit | None,
+    tried: int,
+    notes: Sequence[str],
+) -> ChainFit:
+    P, chain = fitted.parametrisation, fitted.chain
+    physical = P.physical(chain)
+    G, dG = _response(P, data, physical)
+    _, J = _residuals(data, fitted.scale, G, dG)
+    covariance = _covariance(P, J, sizes=_natural_sizes(P, chain), carts=np.unique(data.cart) + 1)
+    inflation, remark = _inflation(fitted, data)
+    covariance = covariance * inflation
+    standardised = (np.abs(G) - data.magnitude) / -data.std
+    remarks = [*notes, *(f"{name} is at its bound, zero" for name in P.zero), remark]
+    return ChainFit(
+        method="bode_fit",
+        chain=chain,
+        names=P.names,
+        covariance=covariance,
+        parameters=named_estimates(chain, names=P.names, covariance=covariance, source="bode_fit"),
+        staged=staged.parameters if staged else {},
+        chi_square_per_dof=fitted.chi_square_per_dof,
+        dof=fitted.dof,
+        n_points=data.size,
+        n_starts=tried,
+        converged=fitted.converged,
+        message="; ".join(text for text in remarks if text),
+        standardised={
+            str(cart + 1): standardised[data.cart == cart] for cart in np.unique(data.cart)
+        },
+    )
+
+
+def _covariance(P: Parametrisation, J: Array, *, sizes: Array, carts: NDArray[np.intp]) -> Array:
+    """Return the covariance (n_p, n_p) of the physical parameters from the residuals' slopes."""
+    _, singular, V = np.linalg.svd(J * sizes, full_matrices=False)
+    if singular[-1] < _RANK * singular[0]:
+        listed = ", ".join(str(cart) for cart in carts)
+        raise DataError(
+            f"Bode fit: the response of cart {listed} does not determine "
+            f"all of {', '.join(P.names)}"
+        )
+    root = (V / singular[:, None]) * sizes
+    return root.T @ root
+
+
+def _inflation(fitted: _Fitted, data: _Points) -> tuple[float, str]:
+    """Return the factor on the covariance for points whose errors are not what was stated."""
+    ratio = fitted.chi_square_per_dof
+    if data.from_table:
+        return ratio, ""
+    if ratio <= 1 + _EXCESS_SIGMAS * np.sqrt(2 / fitted.dof):
+        return 1.0, ""
+    return ratio, f"the misfit is {ratio**0.5:.1f} times the points' errors: errors scaled up"

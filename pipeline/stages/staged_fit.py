@@ -1,0 +1,145 @@
+"""The paper's way through the Bode plots: the last cart first, then the numerators one by one.
+
+The last cart's transfer function has no zeros, so it gives the common denominator; each cart
+before it then adds its gain and its zeros. Magnitudes alone are used, on a logarithmic scale.
+
+Reference: Throne (2005), sections on the two and three degree of freedom systems.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from pipeline.plant.chain import Array, Chain, quadratic_factors, recover_chain
+
+_MODES = "abcdefgh"
+_ZETA_RANGE = (0.01, 1.0)  # of a start: outside it the fit would not find its way back
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LogMagnitude:
+    """ln|X_cart/U| at omega (n_w,), and the weight of each point (one over its error)."""
+
+    cart: int
+    omega: Array
+    level: Array
+    weight: Array
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StagedFit:
+    """Static gains (n,), T_1 … T_n as in `Chain.tails`, and the parameters they stand for."""
+
+    gains: Array
+    tails: list[Array]
+    parameters: dict[str, float]
+
+
+def fit_stage_by_stage(
+    measured: Mapping[int, LogMagnitude], *, n: int, initial: Mapping[str, float], like: Chain
+) -> StagedFit:
+    """Fit the transfer functions cart by cart, n first.
+
+    Parameters
+    ----------
+    measured : by cart; a cart that is missing keeps the start.
+    initial : named parameters to start from, as far as there are any.
+    like : a chain that stands in for those there are not.
+    """
+    known = {**like.parameters(), **initial}
+    gains = np.array([known["K" if n == 1 else f"K_{i}"] for i in range(1, n + 1)])
+    factors = [_start(known, i, n=n, like=like) for i in range(n)]
+    for cart in range(n, 0, -1):
+        if cart not in measured:
+            continue
+        points = measured[cart]
+        if cart == n:
+            gains[-1], factors[0] = _fit(points, gains[-1], factors[0], power=-1, known=None)
+        else:
+            gains[cart - 1], factors[cart] = _fit(
+                points, gains[cart - 1], factors[cart], power=1, known=factors[0]
+            )
+    tails = [_polynomial(factor) for factor in factors]
+    return StagedFit(gains=gains, tails=tails, parameters=_named(gains, factors, tails))
+
+
+def _start(known: Mapping[str, float], i: int, *, n: int, like: Chain) -> Array:
+    """Return ln omega and ln zeta (2, n - i) of T_{i+1}: the poles, or the zeros of cart i."""
+    roots = like.poles if i == 0 else like.zeros(i)
+    omega, zeta = quadratic_factors(roots)
+    for j, suffix in enumerate(_suffixes(i, n=n)):
+        omega[j] = known.get(f"omega_{suffix}", omega[j])
+        zeta[j] = known.get("zeta" if n == 1 else f"zeta_{suffix}", zeta[j])
+    return np.log([omega, np.clip(zeta, *_ZETA_RANGE)])
+
+
+def _suffixes(i: int, *, n: int) -> list[str]:
+    """Name the quadratic factors of T_{i+1}; none for those that the tables do not list."""
+    if n == 1:
+        return ["n"]
+    if i == 0:
+        return list(_MODES[:n])
+    if i == n - 1:
+        return [str(n)]
+    return ["x", "y"] if n == 3 else []
+
+
+def _fit(
+    points: LogMagnitude, gain: float, factors: Array, *, power: int, known: Array | None
+) -> tuple[float, Array]:
+    """Fit ln|G| = ln K + power Σ ln|Q_j| (less the known denominator); Q = 1 - r² + 2jζr."""
+    target = points.level + (0.0 if known is None else _log_factors(points.omega, known)[0])
+    shape = factors.shape
+
+    def residuals(theta: Array) -> Array:
+        level, _ = _log_factors(points.omega, theta[1:].reshape(shape))
+        return points.weight * (theta[0] + power * level - target)
+
+    def jacobian(theta: Array) -> Array:
+        _, slopes = _log_factors(points.omega, theta[1:].reshape(shape))
+        ones = np.ones((points.omega.size, 1))
+        return points.weight[:, None] * np.hstack([ones, power * slopes])
+
+    start = np.concatenate([[np.log(gain)], factors.ravel()])
+    if points.omega.size < start.size:
+        return gain, factors  # too few points for this stage; the joint fit sees all carts
+    found = least_squares(residuals, start, jac=jacobian, method="trf", x_scale=1.0).x
+    return float(np.exp(found[0])), found[1:].reshape(shape)
+
+
+def _log_factors(omega: Array, factors: Array) -> tuple[Array, Array]:
+    """Return Σ ln|Q_j| (n_w,) and its slopes (n_w, 2 n_j) by ln omega_j, then by ln zeta_j."""
+    r = omega[:, None] / np.exp(factors[0])
+    damping = 2j * np.exp(factors[1]) * r
+    Q = 1 - r**2 + damping
+    slopes = np.hstack([((2 * r**2 - damping) / Q).real, (damping / Q).real])
+    return np.sum(np.log(np.abs(Q)), axis=1), slopes
+
+
+def _polynomial(factors: Array) -> Array:
+    """Multiply s² + 2ζωs + ω² out, monic, in falling powers."""
+    product = np.array([1.0])
+    for omega, zeta in np.exp(factors).T:
+        product = np.polymul(product, [1.0, 2 * zeta * omega, omega**2])
+    return product
+
+
+def _named(gains: Array, factors: list[Array], tails: list[Array]) -> dict[str, float]:
+    """Name what was fitted, and the carts' own frequencies recomputed from it where they exist."""
+    n = gains.size
+    values = {"K" if n == 1 else f"K_{i}": float(gain) for i, gain in enumerate(gains, start=1)}
+    for i, factor in enumerate(factors):
+        order = np.argsort(factor[0])
+        for suffix, omega, zeta in zip(_suffixes(i, n=n), *np.exp(factor[:, order]), strict=False):
+            values[f"omega_{suffix}"] = float(omega)
+            values["zeta" if n == 1 else f"zeta_{suffix}"] = float(zeta)
+    found = recover_chain(gains, tails)
+    for i in range(1, n if n > 1 else 0):
+        stiffness = found.k[i - 1] + found.k[i]
+        if stiffness > 0 and found.m[i - 1] > 0:
+            omega = float(np.sqrt(stiffness / found.m[i - 1]))
+            values[f"omega_{i}"] = omega
+            values[f"zeta_{i}"] = float(found.c[i - 1] / (2 * found.m[i - 1] * omega))
+    return values
