@@ -43,6 +43,8 @@ class Record:
     resolution : (len(carts),) the encoder step, in position units; 0 where none is seen.
     hold : how the input behaves between samples.
     source : path inside the submission; `notes` say what reading it had to mend.
+    position_scale, input_scale : what the file's own numbers were multiplied by to get y and u
+        (the sign included); a controller's gains may be in the file's units.
     """
 
     id: str
@@ -58,6 +60,8 @@ class Record:
     hold: Hold = "zero_order"
     source: str = ""
     notes: tuple[str, ...] = ()
+    position_scale: float = 1.0
+    input_scale: float = 1.0
 
     def __post_init__(self) -> None:
         _freeze(self, "t", "u", "y", "reference", "resolution")

@@ -1,0 +1,104 @@
+"""Tables of amplitude ratios the students reduced themselves."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from pipeline.errors import SubmissionError
+from pipeline.ingest.columns import Column, conversion
+from pipeline.ingest.table import Table
+from pipeline.plant.chain import Array
+from pipeline.results import FrequencyResponse
+
+DEFAULT_SPREAD = 0.01  # of a ratio read off two plots, where no repeats show the true spread
+_ENOUGH_REPEATS = 3  # degrees of freedom below which the spread of repeats says little
+
+Points = dict[int, list[tuple[float, float]]]
+
+
+def read_points(table: Table, columns: Mapping[str, Column], *, carts: Sequence[int]) -> Points:
+    """Return (omega in rad/s, amplitude ratio) of every row, by cart.
+
+    Raises
+    ------
+    SubmissionError : no frequency column, no ratio column, or a value that is not positive.
+    """
+    if "frequency" not in columns:
+        raise SubmissionError(
+            f"{table.source}: a bode table needs a column 'frequency' (Hz); "
+            f"it has {table.headings()}"
+        )
+    measured = [c for role, c in columns.items() if role[0] == "x" and c.cart in carts]
+    if not measured:
+        raise SubmissionError(
+            f"{table.source}: a bode table needs amplitude ratios in 'x1', 'x2', …; "
+            f"it has {table.headings()}"
+        )
+    frequency = columns["frequency"]
+    is_omega = frequency.name.casefold().startswith(("omega", "w"))
+    factor = conversion(frequency.unit or ("rad/s" if is_omega else None), "Hz")
+    if factor is None:
+        raise SubmissionError(
+            f"{table.source}: {frequency.name!r} is in {frequency.unit}, Hz was expected"
+        )
+    omega = 2 * np.pi * factor * _positive(table, frequency)
+    return {
+        column.cart: list(zip(omega.tolist(), _ratios(table, column).tolist(), strict=True))
+        for column in measured
+    }
+
+
+def _ratios(table: Table, column: Column) -> Array:
+    if column.unit is not None and column.unit.casefold() == "db":
+        return 10 ** (table.values[column.index] / 20)
+    return _positive(table, column)
+
+
+def _positive(table: Table, column: Column) -> Array:
+    values = table.values[column.index]
+    if (values <= 0).any():
+        row = int(np.argmax(values <= 0))
+        raise SubmissionError(
+            f"{table.source} {table.place(row)}: {column.name!r} must be above 0, "
+            f"found {values[row]:g}"
+        )
+    return values
+
+
+def frequency_responses(points: Points) -> tuple[tuple[FrequencyResponse, ...], str]:
+    """Return one response a cart, repeats averaged, and where its standard errors come from.
+
+    Rows at one frequency are repeats: their pooled relative spread is the standard error of all
+    points. Without enough of them it is `DEFAULT_SPREAD`.
+    """
+    squares, freedom = 0.0, 0
+    averaged: dict[int, tuple[Array, Array, Array]] = {}
+    for cart, rows in sorted(points.items()):
+        omega, which = np.unique(np.round([w for w, _ in rows], 9), return_inverse=True)
+        logs = np.log([ratio for _, ratio in rows])
+        repeats = np.bincount(which).astype(np.float64)
+        means: Array = np.bincount(which, weights=logs) / repeats
+        squares += float(((logs - means[which]) ** 2).sum())
+        freedom += logs.size - omega.size
+        averaged[cart] = (omega, np.exp(means), repeats)
+    spread = np.sqrt(squares / freedom) if freedom >= _ENOUGH_REPEATS and squares > 0 else None
+    relative = DEFAULT_SPREAD if spread is None else float(spread)
+    source = (
+        f"standard errors of the amplitude ratios are taken as {DEFAULT_SPREAD:.0%}: "
+        "the table has no repeats to tell"
+        if spread is None
+        else f"standard errors of the amplitude ratios are {relative:.2%}, from {freedom} repeats"
+    )
+    responses = tuple(
+        FrequencyResponse(
+            cart=cart,
+            omega=omega,
+            magnitude=magnitude,
+            magnitude_std=relative * magnitude / np.sqrt(repeats),
+            phase=None,
+            phase_std=None,
+            source="table",
+        )
+        for cart, (omega, magnitude, repeats) in averaged.items()
+    )
+    return responses, source

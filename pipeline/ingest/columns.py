@@ -1,0 +1,138 @@
+"""Which column is what: time, input, reference, the position of each cart; and its unit."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from pipeline.errors import SubmissionError
+from pipeline.ingest.table import Table
+
+_ROLES = (
+    ("time", r"t|times?|time ?stamps?|t received|elapsed time"),
+    ("input", r"u|inputs?|control effort|effort|duty|duty cycle|voltage|motor|motor voltage|force"),
+    ("reference", r"r|ref|reference|set ?point|commanded pos(ition)?|target( v| value)?"),
+    ("frequency", r"f|freq|frequency|omega|w"),
+)
+_POSITION = re.compile(
+    r"x ?(\d)|enc(?:oder)? ?(\d)(?: pos(?:ition)?)?|(?:cart|pos|position) ?(\d) ?(?:pos(?:ition)?)?"
+)
+_ONE_POSITION = re.compile(r"x|y|pos|position|displacement")
+_NO_ROLE = re.compile(r"|sample|samples|index|n|no|nr")  # known, and of no use
+_COUNTED = re.compile(r"enc|counts?\b|commanded pos", re.IGNORECASE)
+_UNIT = re.compile(r"[\[(]\s*([^\])]+?)\s*[\])]\s*$")
+
+# Factors to the SI unit of the same quantity.
+_SI: dict[str, tuple[str, float]] = {
+    "s": ("time", 1.0),
+    "sec": ("time", 1.0),
+    "ms": ("time", 1e-3),
+    "us": ("time", 1e-6),
+    "ns": ("time", 1e-9),
+    "min": ("time", 60.0),
+    "m": ("length", 1.0),
+    "cm": ("length", 1e-2),
+    "mm": ("length", 1e-3),
+    "um": ("length", 1e-6),
+    "in": ("length", 0.0254),
+    "inch": ("length", 0.0254),
+    "V": ("voltage", 1.0),
+    "mV": ("voltage", 1e-3),
+    "N": ("force", 1.0),
+    "mN": ("force", 1e-3),
+    "rad": ("angle", 1.0),
+    "deg": ("angle", 0.017453292519943295),
+    "Hz": ("frequency", 1.0),
+    "kHz": ("frequency", 1e3),
+    "rad/s": ("frequency", 0.15915494309189535),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Column:
+    """One column with its meaning: `index` in the table, `unit` as the heading states it."""
+
+    role: str
+    index: int
+    name: str
+    unit: str | None
+
+    @property
+    def cart(self) -> int:
+        """The cart whose position this is."""
+        return int(self.role[1:])
+
+    @property
+    def is_counted(self) -> bool:
+        """The heading says that encoder counts stand here."""
+        return bool(_COUNTED.search(self.name)) or self.unit in ("count", "counts")
+
+    @property
+    def is_duty(self) -> bool:
+        """The heading says that duty counts of the motor's amplifier stand here."""
+        return "duty" in self.name.casefold()
+
+
+def conversion(found: str | None, wanted: str) -> float | None:
+    """Return the factor from one unit to another; None where they are not of one quantity."""
+    if found is None or found == wanted:
+        return 1.0
+    a, b = (_SI.get(unit.replace("µ", "u").replace("μ", "u")) for unit in (found, wanted))
+    return a[1] / b[1] if a and b and a[0] == b[0] else None
+
+
+def assign_columns(
+    table: Table, *, explicit: Mapping[str, str | int] | None, free: tuple[int, ...]
+) -> tuple[dict[str, Column], tuple[str, ...]]:
+    """Return the column of each role, and the headings that found none.
+
+    `explicit` (role to heading or number) goes before what the headings say. A single position
+    column without a number belongs to the one cart in `free`.
+
+    Raises
+    ------
+    SubmissionError : a column that is not there, or two columns for one role.
+    """
+    columns: dict[str, Column] = {}
+    for role, wanted in (explicit or {}).items():
+        index = table.index(wanted)
+        columns[role] = _column(table, index, role)
+    taken = {column.index for column in columns.values()}
+    unused: list[str] = []
+    for index, name in enumerate(table.names):
+        if index in taken:
+            continue
+        role = _role(name, free=free)
+        if role is None or (explicit and role in explicit):
+            if role is not None or not _NO_ROLE.fullmatch(_plain(name)):
+                unused.append(name)
+        elif role in columns:
+            raise SubmissionError(
+                f"{table.source}: {columns[role].name!r} and {name!r} both look like {role}; "
+                f"say which: columns = {{ {role} = {name!r} }}"
+            )
+        else:
+            columns[role] = _column(table, index, role)
+    return columns, tuple(unused)
+
+
+def _column(table: Table, index: int, role: str) -> Column:
+    name = table.names[index]
+    unit = _UNIT.search(name)
+    return Column(role=role, index=index, name=name, unit=unit[1] if unit else None)
+
+
+def _plain(name: str) -> str:
+    """Return a heading in small letters without its unit and signs."""
+    return re.sub(r"[^a-z0-9]+", " ", _UNIT.sub("", name).casefold()).strip()
+
+
+def _role(name: str, *, free: tuple[int, ...]) -> str | None:
+    plain = _plain(name)
+    for role, pattern in _ROLES:
+        if re.fullmatch(pattern, plain):
+            return role
+    if match := _POSITION.fullmatch(plain):
+        return f"x{next(number for number in match.groups() if number)}"
+    if len(free) == 1 and _ONE_POSITION.fullmatch(plain):
+        return f"x{free[0]}"
+    return None

@@ -1,0 +1,394 @@
+"""From the files of a submission to records in its units: every conversion happens here."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.errors import SubmissionError
+from pipeline.ingest.bode import Points, frequency_responses, read_points
+from pipeline.ingest.clock import Clock, read_clock
+from pipeline.ingest.columns import Column, assign_columns, conversion
+from pipeline.ingest.files import read_table
+from pipeline.ingest.signals import encoder_step, input_sign
+from pipeline.ingest.table import Table
+from pipeline.plant.chain import Array
+from pipeline.results import FrequencyResponse, Record
+from pipeline.submission import Experiment, Submission, System
+
+DUTY_COUNT = 5 / 4096  # V; the UCSD bench's amplifier gives 5 V for 4096 counts
+_FEWEST_SAMPLES = 8
+_WINDOW_SLACK = 0.01  # of the record's length: "to the end" is often typed rounded up
+_MIRROR = 0.9  # of all samples equal to encoder 1: a commanded position that commands nothing
+_NEED_INPUT = ("step", "sine", "sweep")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Ingested:
+    """All data of a submission.
+
+    Attributes
+    ----------
+    records : the time series, in the order of the submission.
+    tables : frequency responses the students reduced, one a cart.
+    files : SHA-256 of each data file, by path, sorted.
+    warnings : what concerns more than one record.
+    """
+
+    records: tuple[Record, ...]
+    tables: tuple[FrequencyResponse, ...]
+    files: dict[str, str]
+    warnings: tuple[str, ...]
+
+
+def read_data(submission: Submission) -> Ingested:
+    """Read every experiment's file into a record in position and input units.
+
+    Raises
+    ------
+    SubmissionError : a file that is broken, or does not hold what the experiment says; one line.
+    """
+    if not submission.experiments:
+        raise SubmissionError(
+            f"{submission.folder.resolve().name}/submission.toml: there is no [[experiments]] "
+            "table yet; add one for each data file"
+        )
+    tables: dict[str, tuple[Table, str]] = {}
+    records: list[Record] = []
+    points: Points = {}
+    warnings: list[str] = []
+    for experiment in submission.experiments:
+        try:
+            if experiment.file not in tables:
+                tables[experiment.file] = read_table(submission.folder, experiment.file)
+            table, _ = tables[experiment.file]
+            if experiment.kind == "bode":
+                _read_bode(table, experiment, submission.system, points, warnings)
+            else:
+                records.append(_read_record(table, experiment, submission.system))
+        except SubmissionError as error:
+            raise SubmissionError(f"{experiment.id}: {error}") from None
+    records, found = _with_signs(records, submission)
+    responses, spread = frequency_responses(points)
+    return Ingested(
+        records=tuple(records),
+        tables=responses,
+        files={name: digest for name, (_, digest) in sorted(tables.items())},
+        warnings=(*warnings, *found, *((spread,) if responses else ())),
+    )
+
+
+def _read_bode(
+    table: Table,
+    experiment: Experiment,
+    system: System,
+    points: Points,
+    warnings: list[str],
+) -> None:
+    """Add the rows of a Bode table to `points`."""
+    if len(experiment.carts) < system.carts:
+        warnings.append(
+            f"{experiment.id}: not used: a bode table is fitted with all carts free, "
+            f"here only {list(experiment.carts)} are"
+        )
+        return
+    _refuse_cut(table)
+    columns, unused = assign_columns(table, explicit=experiment.columns, free=experiment.carts)
+    for cart, rows in read_points(table, columns, carts=experiment.carts).items():
+        points.setdefault(cart, []).extend(rows)
+    if unused:
+        warnings.append(f"{experiment.id}: columns not used: {', '.join(unused)}")
+
+
+def _refuse_cut(table: Table) -> None:
+    if table.cut is not None:
+        raise SubmissionError(
+            f"{table.source} {table.cut}; the file was cut short: export it again, "
+            "or mend or delete its last line"
+        )
+
+
+# ------------------------------------------------------------------------------ one record
+
+
+def _read_record(table: Table, experiment: Experiment, system: System) -> Record:
+    """Return the record with the input's scale applied, but not yet a sign that must be found."""
+    _refuse_cut(table)
+    notes = list(table.notes)
+    columns, unused = assign_columns(table, explicit=experiment.columns, free=experiment.carts)
+    positions = sorted(
+        (c for role, c in columns.items() if role[0] == "x" and c.cart <= system.carts),
+        key=lambda column: column.cart,
+    )
+    _check_carts(table, experiment, positions)
+    extra = [c.name for role, c in columns.items() if role[0] == "x" and c not in positions]
+    if unused or extra:
+        notes.append(f"columns not used: {', '.join([*unused, *extra])}")
+    clock = _clock(table, columns, experiment, notes)
+    keep = _window(clock, experiment)
+    scales = [_position_scale(table, column, system, notes) for column in positions]
+    y = np.array(
+        [table.values[c.index] * scale for c, scale in zip(positions, scales, strict=True)]
+    )
+    resolution = [
+        scale if _holds_counts(table, c) else encoder_step(row)
+        for c, row, scale in zip(positions, y, scales, strict=True)
+    ]
+    u, input_scale = _input(table, columns, experiment, system, notes)
+    return Record(
+        id=experiment.id,
+        kind=experiment.kind,
+        t=clock.t[keep],
+        u=None if u is None else u[keep],
+        y=y[:, keep],
+        carts=tuple(column.cart for column in positions),
+        free=experiment.carts,
+        reference=_reference(table, columns, experiment, system, notes, keep),
+        omega=None if experiment.frequency is None else 2 * np.pi * experiment.frequency,
+        resolution=np.array(resolution),
+        hold=experiment.hold,
+        source=experiment.file,
+        notes=tuple(notes),
+        position_scale=scales[0],
+        input_scale=input_scale,
+    )
+
+
+def _check_carts(table: Table, experiment: Experiment, positions: list[Column]) -> None:
+    if not positions:
+        raise SubmissionError(
+            f"{table.source}: no column is a cart's position; it has {table.headings()}; "
+            f'say which: columns = {{ time = "…", input = "…", x{experiment.carts[0]} = "…" }}'
+        )
+    measured = {column.cart for column in positions}
+    if not measured & set(experiment.carts):
+        raise SubmissionError(
+            f"{table.source}: the free carts are {list(experiment.carts)}, but the file measures "
+            f"{sorted(measured)}; check `carts` and `file`"
+        )
+
+
+def _clock(
+    table: Table, columns: Mapping[str, Column], experiment: Experiment, notes: list[str]
+) -> Clock:
+    column = columns.get("time")
+    n = table.values.shape[1]
+    if n < _FEWEST_SAMPLES:
+        raise SubmissionError(
+            f"{table.source}: expected at least {_FEWEST_SAMPLES} samples, found {n}"
+        )
+    if column is None:
+        if experiment.sample_rate is None:
+            raise SubmissionError(
+                f"{table.source}: no time column; it has {table.headings()}; name it in "
+                "`columns`, or state `sample_rate` in Hz"
+            )
+        return read_clock(np.arange(n) / experiment.sample_rate)
+    factor = conversion(column.unit, "s")
+    if factor is None:
+        raise SubmissionError(
+            f"{table.source}: {column.name!r} is in {column.unit}, which is no unit of time"
+        )
+    clock = read_clock(table.values[column.index] * factor)
+    if clock.stopped is not None:
+        i = clock.stopped
+        before, after = clock.t[i - 1], clock.t[i]
+        what = "stands still" if after == before else "goes back"
+        hint = "; two records pasted together?" if after < before else ""
+        raise SubmissionError(
+            f"{table.source} {table.place(i)}: time {what}, from {before:g} s to {after:g} s{hint}"
+        )
+    if clock.pieces:
+        even = "" if clock.pieces == 1 else f", in {clock.pieces} pieces"
+        notes.append(
+            f"time stamps rounded to {clock.rounding:g} s were straightened: "
+            f"one sample every {1e3 * clock.mean_interval:.6g} ms{even}"
+        )
+    for i in clock.gaps[:3]:
+        notes.append(f"time is missing between {clock.t[i - 1]:.4g} s and {clock.t[i]:.4g} s")
+    if len(clock.gaps) > 3:
+        notes.append(f"and {len(clock.gaps) - 3} more gaps in time")
+    stated = experiment.sample_rate
+    if stated is not None and abs(stated * clock.mean_interval - 1) > _WINDOW_SLACK:
+        notes.append(
+            f"sample_rate = {stated:g} Hz is not used: the time column says "
+            f"{1 / clock.mean_interval:.5g} Hz"
+        )
+    return clock
+
+
+def _window(clock: Clock, experiment: Experiment) -> slice:
+    """Return the samples inside the experiment's window; all of them without one."""
+    if experiment.window is None:
+        return slice(None)
+    start, end = experiment.window
+    first, last = float(clock.t[0]), float(clock.t[-1])
+    slack = max(_WINDOW_SLACK * (last - first), 2 * clock.mean_interval)
+    if start < first - slack or end > last + slack:
+        raise SubmissionError(
+            f"submission.toml: window = [{start:g}, {end:g}] lies outside the data of "
+            f"{experiment.file}, which run from {first:.4g} s to {last:.4g} s"
+        )
+    half = 0.5 * clock.rounding if clock.pieces else 1e-9
+    inside = np.flatnonzero((clock.t >= start - half) & (clock.t <= end + half))
+    if inside.size < _FEWEST_SAMPLES:
+        raise SubmissionError(
+            f"submission.toml: window = [{start:g}, {end:g}] holds {inside.size} samples of "
+            f"{experiment.file}, {_FEWEST_SAMPLES} are needed"
+        )
+    return slice(int(inside[0]), int(inside[-1]) + 1)
+
+
+# ------------------------------------------------------------------------ units and signs
+
+
+def _holds_counts(table: Table, column: Column) -> bool:
+    """Whole numbers where the form or the heading says that an encoder was read."""
+    return table.whole[column.index] and (table.form != "csv" or column.is_counted)
+
+
+def _position_scale(table: Table, column: Column, system: System, notes: list[str]) -> float:
+    """Return position units per number in the file."""
+    unit, per_count = system.position.unit, system.position.per_count
+    if _holds_counts(table, column):
+        if per_count is not None:
+            return per_count
+        if unit.rstrip("s") == "count" or not (table.form == "ecp" or column.is_counted):
+            return 1.0
+        raise SubmissionError(
+            f"{table.source}: {column.name!r} holds encoder counts; state how many {unit} one "
+            f"count is: position = {{ unit = {unit!r}, per_count = … }}"
+        )
+    factor = conversion(column.unit, unit)
+    if factor is None:
+        notes.append(f"{column.name!r} is taken to be in {unit}")
+        return 1.0
+    if factor != 1.0:
+        notes.append(f"{column.name!r} was converted from {column.unit} to {unit}")
+    return factor
+
+
+def _input(
+    table: Table,
+    columns: Mapping[str, Column],
+    experiment: Experiment,
+    system: System,
+    notes: list[str],
+) -> tuple[Array | None, float]:
+    """Return the input in input units and the scale used, both without a sign to be found."""
+    column = columns.get("input")
+    if column is None:
+        if experiment.kind in _NEED_INPUT:
+            raise SubmissionError(
+                f"{table.source}: a {experiment.kind} needs the input, and no column is one; "
+                f'it has {table.headings()}; say which: columns = {{ input = "…" }}'
+            )
+        return None, 1.0
+    override = experiment.input
+    whole = table.whole[column.index]
+    in_counts = whole and (
+        table.form in ("bench_log", "bench_mat")
+        or column.is_duty
+        or (table.form in ("matrix", "variables") and system.input.per_count is not None)
+    )
+    if override is not None and override.per_count is not None:
+        scale = override.per_count
+    elif in_counts:
+        scale = system.input.per_count or DUTY_COUNT
+        if system.input.per_count is None:
+            notes.append(f"{column.name!r} is taken as duty counts of 5/4096 {system.input.unit}")
+    else:
+        scale = conversion(column.unit, system.input.unit) or 1.0
+        if scale != 1.0:
+            notes.append(f"{column.name!r} was converted to {system.input.unit}")
+    return table.values[column.index] * scale, scale
+
+
+def _reference(
+    table: Table,
+    columns: Mapping[str, Column],
+    experiment: Experiment,
+    system: System,
+    notes: list[str],
+    keep: slice,
+) -> Array | None:
+    """Return the set point of a closed loop: the experiment's own, else the file's column."""
+    if experiment.kind != "closed_loop":
+        return None
+    n = table.values[0, keep].size
+    if experiment.reference is not None:
+        return np.full(n, experiment.reference)
+    column = columns.get("reference")
+    if column is None:
+        return None
+    values = table.values[column.index]
+    mirrored = columns.get("x1")
+    if mirrored is not None and np.ptp(values) > 0:
+        equal = np.mean(np.abs(values - table.values[mirrored.index]) <= 1.0)
+        if equal > _MIRROR:
+            notes.append(f"{column.name!r} only mirrors {mirrored.name!r} and is no reference")
+            return None
+    return values[keep] * _position_scale(table, column, system, notes)
+
+
+def _with_signs(records: list[Record], submission: Submission) -> tuple[list[Record], list[str]]:
+    """Return the records with signed inputs, and what is to be said about the signs.
+
+    Where a record does not tell, it takes the sign of most others of its sort (under feedback or
+    not: a controller's log may count the other way), else of most others.
+    """
+    stated: dict[str, int] = {}
+    for experiment in submission.experiments:
+        own = experiment.input.sign if experiment.input is not None else None
+        if (sign := own or submission.system.input.sign) is not None:
+            stated[experiment.id] = sign
+    driven = [r for r in records if r.u is not None and np.ptp(r.u) > 0]
+    found = {
+        r.id: input_sign(r.u, r.position(1), closed_loop=r.kind == "closed_loop")
+        for r in driven
+        if r.u is not None and 1 in r.carts and 1 in r.free
+    }
+
+    def usual(record: Record) -> int:
+        alike = [r for r in driven if (r.kind == "closed_loop") == (record.kind == "closed_loop")]
+        votes = [
+            sum(stated.get(r.id) or found.get(r.id, 0) for r in group) for group in (alike, driven)
+        ]
+        return next((1 if vote > 0 else -1 for vote in votes if vote), 1)
+
+    signs = {r.id: stated.get(r.id) or found.get(r.id) or usual(r) for r in records}
+    signed = [
+        record
+        if record.u is None or signs[record.id] == 1
+        else replace(record, u=0.0 - record.u, input_scale=-record.input_scale)
+        for record in records
+    ]
+    return signed, _say_signs([r.id for r in driven], stated=stated, found=found, signs=signs)
+
+
+def _say_signs(
+    driven: list[str], *, stated: dict[str, int], found: dict[str, int], signs: dict[str, int]
+) -> list[str]:
+    """Return what was found, what was only taken, and where the data contradict the students."""
+    says = [
+        f"{name}: the sign of the input is stated as {stated[name]:+d}, "
+        f"the data say {found[name]:+d}"
+        for name in driven
+        if name in stated and found.get(name, 0) == -stated[name]
+    ]
+    searched = [name for name in driven if name not in stated]
+    if not searched:
+        return says
+    if not any(found.get(name) for name in searched):
+        return [
+            *says,
+            "the data do not tell the sign of the input: it is taken as "
+            f"{signs[searched[0]]:+d}; state it if it is not",
+        ]
+    usual = 1 if sum(signs[name] for name in searched) >= 0 else -1
+    text = f"sign of the input found from the data: {usual:+d}"
+    if others := [name for name in searched if signs[name] != usual]:
+        text += f", but {-usual:+d} in {', '.join(others)}"
+    if unsure := [name for name in searched if not found.get(name)]:
+        text += f"; taken from the others where the data do not tell: {', '.join(unsure)}"
+    return [*says, text]

@@ -1,0 +1,82 @@
+"""A data file as it stands: named columns of numbers, before any meaning or unit."""
+
+from dataclasses import dataclass
+from difflib import get_close_matches
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import SubmissionError
+from pipeline.plant.chain import Array
+
+Form = Literal["ecp", "bench_log", "bench_mat", "matrix", "variables", "csv"]
+
+FORM_TITLES: dict[Form, str] = {
+    "ecp": 'ECP "Export Raw Data" text',
+    "bench_log": "bench log, tab-separated",
+    "bench_mat": "bench log, .mat",
+    "matrix": "bare matrix, .mat",
+    "variables": "vectors, .mat",
+    "csv": "table of text (CSV)",
+}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Table:
+    """The columns of one file.
+
+    Attributes
+    ----------
+    source : the file's name, for messages.
+    form : how the file is laid out.
+    names : (n_columns,) headings as written; numbers "1", "2", … where there are none.
+    values : (n_columns, n), all finite.
+    whole : (n_columns,) the column holds nothing but whole numbers, written as such.
+    lines : (n,) line of the file each row stands in; None in a binary file.
+    cut : what shows that the file was cut short, or None.
+    notes : what reading had to mend or leave out.
+    """
+
+    source: str
+    form: Form
+    names: tuple[str, ...]
+    values: Array
+    whole: tuple[bool, ...]
+    lines: NDArray[np.int64] | None
+    cut: str | None = None
+    notes: tuple[str, ...] = ()
+
+    def place(self, row: int) -> str:
+        """Return "line 12" (or "sample 12" of a binary file) for a row counted from 0."""
+        return f"sample {row + 1}" if self.lines is None else f"line {self.lines[row]}"
+
+    def index(self, column: str | int) -> int:
+        """Return the position, from 0, of a column given by heading or by number from 1.
+
+        Raises
+        ------
+        SubmissionError : there is no such column.
+        """
+        if isinstance(column, int):
+            if 1 <= column <= len(self.names):
+                return column - 1
+            raise SubmissionError(
+                f"{self.source}: there is no column {column}, the file has {len(self.names)}"
+            )
+        wanted = _loosely(column)
+        for i, name in enumerate(self.names):
+            if _loosely(name) == wanted:
+                return i
+        close = get_close_matches(column, self.names, n=1)
+        hint = f"did you mean {close[0]!r}?" if close else f"it has {self.headings()}"
+        raise SubmissionError(f"{self.source}: there is no column {column!r}; {hint}")
+
+    def headings(self) -> str:
+        """Return the headings as one short line."""
+        shown = ", ".join(self.names[:12])
+        return shown + (", …" if len(self.names) > 12 else "")
+
+
+def _loosely(name: str) -> str:
+    return " ".join(name.casefold().split())
