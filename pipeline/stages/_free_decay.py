@@ -1,0 +1,225 @@
+"""Find the free decay in a record, and fit it from the release to its last turning point."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.errors import DataError
+from pipeline.plant.chain import Array
+from pipeline.results import Record
+from pipeline.stages._dry_friction import FrictionFit, fit_friction
+from pipeline.stages._ringing import Ringing, fit_ringing
+from pipeline.stages._signals import extrema, plateaus
+
+# Swings are counted in grains: encoder steps, or as much noise as would round as coarsely.
+_PROMINENCE = 6.0
+_SMALLEST_SWING = 8.0
+_SWING_GROWTH = 1.02  # a swing may exceed the one before by this much, no more
+_INTERVAL_CHANGE = 0.3  # of the intervals so far; a hand keeps no better time
+_ZERO_INPUT = 0.02  # of the largest input
+_BASE_SKIPS, _BASE_NEEDS = 2, 4  # turning points left to the hand, where enough others remain
+_FEW_TURNINGS = 5  # with fewer, the rest after them is needed too
+_MIN_SAMPLES = 12
+# Carried back, a fit may be off by so many of its own residuals; and by a share of the amplitude
+# while it stands on the smaller swings only, or where it leaves more than noise anyway.
+_BACK_SIGMAS = 4.0
+_BACK_SHARES = (0.05, 0.0, 0.0)
+_REAL_SHARE = 0.15
+_ADEQUATE = 1.5  # residual over noise: up to here the model says all there is to say
+_RELEASE_MARGIN = 1 / 40  # of a period, in which the fingers leave the cart
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Stretch:
+    """Samples [first, stop) without a change of the input; the input's level, None without."""
+
+    first: int
+    stop: int
+    level: float | None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FreeDecay:
+    """Samples [first, stop) of one free decay, its turning points, and the two fits to it."""
+
+    stretch: Stretch
+    first: int
+    stop: int
+    turning: list[int]
+    fit: Ringing
+    friction: FrictionFit | None
+
+    @property
+    def model(self) -> Callable[[Array], Array]:
+        """The better of the two fits, as a function of time."""
+        return self.friction.model if self.friction and self.friction.test.present else self.fit
+
+    def rms(self, t: Array, y: Array) -> float:
+        """Root-mean-square of what the model leaves of the decay; `t`, `y` are the record's."""
+        window = slice(self.first, self.stop)
+        return float(np.sqrt(np.mean((y[window] - self.model(t[window])) ** 2)))
+
+
+def find_decay(record: Record, *, cart: int, size: float) -> tuple[Stretch, list[int]]:
+    """Return the turning points of the record's largest free decay, and the stretch it is in.
+
+    `size` is the smallest change that means anything. The part without input is preferred.
+
+    Raises
+    ------
+    DataError : nowhere two turning points of one decay.
+    """
+    y = record.position(cart)
+    most = 0
+    for group in _stretches(record):
+        found = [(stretch, _decaying_run(record.t, y, stretch, size=size)) for stretch in group]
+        stretch, run = max(found, key=lambda pair: _score(y, pair[1]), default=(None, []))
+        most = max(most, len(run))
+        if stretch and len(run) >= 2:
+            return stretch, run
+    raise DataError(
+        f"{record.id}: log decrement needs 3 turning points of a free decay of cart {cart} (the "
+        f"release and two more) with swings over {_SMALLEST_SWING:.0f} encoder steps, found "
+        f"{most}"
+    )
+
+
+def _stretches(record: Record) -> list[list[Stretch]]:
+    """Return the stretches of constant input: those without input first, the whole record last."""
+    whole = Stretch(first=0, stop=record.t.size, level=None)
+    if record.u is None:
+        return [[whole]]
+    u = record.u
+    parts = [
+        Stretch(first=max(a - 1, 0), stop=b, level=float(np.mean(u[a:b])))
+        for a, b in plateaus(u)
+        if b - a >= _MIN_SAMPLES
+    ]
+    largest = float(np.max(np.abs(u)))
+    off = [part for part in parts if abs(part.level or 0.0) <= _ZERO_INPUT * largest]
+    on = [part for part in parts if part not in off]
+    return [off, on, [whole]] if record.kind == "decay" else [off, on]
+
+
+def _decaying_run(t: Array, y: Array, stretch: Stretch, *, size: float) -> list[int]:
+    """Return the turning points of the largest run of ever smaller swings in equal times."""
+    part = y[stretch.first : stretch.stop]
+    # The first is where the stretch begins, no turning point; the last is kept, where it came to
+    # rest in time.
+    turning = [i + stretch.first for i in extrema(part, prominence=_PROMINENCE * size)][1:]
+    swings = np.abs(np.diff(y[turning]))
+    times = np.diff(t[turning])
+    best: list[int] = []
+    start = 0
+    while start < swings.size:
+        end = start + 1
+        while (
+            end < swings.size
+            and _SMALLEST_SWING * size <= swings[end] <= _SWING_GROWTH * swings[end - 1]
+            and abs(times[end] / np.median(times[start:end]) - 1) <= _INTERVAL_CHANGE
+        ):
+            end += 1
+        best = max(best, turning[start : end + 1], key=lambda run: _score(y, run))
+        start = end
+    return best
+
+
+def _score(y: Array, run: list[int]) -> float:
+    """Rank runs: more swings first by their kind (one, several), then by how far they go."""
+    if len(run) < 2:
+        return 0.0
+    travelled = float(np.sum(np.abs(np.diff(y[run]))))
+    return travelled if len(run) > 2 else 1e-3 * travelled
+
+
+def fit_decay(t: Array, y: Array, *, stretch: Stretch, run: list[int], floor: float) -> FreeDecay:
+    """Fit the free decay from its release to its last turning point.
+
+    The later swings are fitted first and carried back over the earlier ones, as far as they
+    agree: so the hand is told from the cart. Where not even the later swings fit to the noise
+    (real friction is no textbook's), all of them count.
+
+    Parameters
+    ----------
+    run : the turning points.
+    floor : the least residual (root-mean-square) that means anything.
+    """
+    interval = float(np.median(np.diff(t[run])))
+    stop = run[-1] + 1
+    if len(run) < _FEW_TURNINGS:
+        stop = int(np.searchsorted(t[: stretch.stop], t[run[-1]] + 2 * interval))
+    pole = complex(-np.log(_ratio(y, run)) / interval, np.pi / interval)
+
+    def fit_from(first: int) -> FreeDecay:
+        return _fit(t, y, stretch=stretch, first=first, stop=stop, run=run, pole=pole, floor=floor)
+
+    enough = max(stop - _MIN_SAMPLES, stretch.first)
+    later = run[min(_BASE_SKIPS, max(len(run) - _BASE_NEEDS, 0))]
+    latest = min(later, enough)
+    decay = fit_from(latest)
+    if decay.rms(t, y) > _ADEQUATE * floor:
+        # How a real cart breaks away is no part of the model: from its first passage on.
+        decay = fit_from(min(run[0], enough))
+        passage = int(np.searchsorted(t, t[run[0]] - interval / 2))
+        held = _carried_back(t, y, decay, latest=decay.first, share=_REAL_SHARE, floor=floor)
+        return fit_from(passage) if held <= passage < decay.first else decay
+    for share in _BACK_SHARES:
+        first = _carried_back(t, y, decay, latest=latest, share=share, floor=floor)
+        if first == decay.first:
+            break
+        decay = fit_from(first)
+    if decay.first > stretch.first:
+        margin = t[decay.first] + _RELEASE_MARGIN * 2 * interval
+        decay = fit_from(min(int(np.searchsorted(t, margin)), latest))
+    return decay
+
+
+def _carried_back(
+    t: Array, y: Array, decay: FreeDecay, *, latest: int, share: float, floor: float
+) -> int:
+    """Return the first sample, not after `latest`, from which on the decay's model holds."""
+    head = slice(decay.stretch.first, latest)
+    growth = np.exp(decay.fit.poles[0].real * (t[head] - decay.fit.t0))
+    tolerance = (
+        _BACK_SIGMAS * max(decay.rms(t, y), floor) + share * abs(decay.fit.amplitudes[0]) * growth
+    )
+    bad = np.flatnonzero(np.abs(y[head] - decay.model(t[head])) > tolerance)
+    return head.start + (int(bad[-1]) + 1 if bad.size else 0)
+
+
+def _fit(
+    t: Array,
+    y: Array,
+    *,
+    stretch: Stretch,
+    first: int,
+    stop: int,
+    run: list[int],
+    pole: complex,
+    floor: float,
+) -> FreeDecay:
+    t, y = t[:stop], y[:stop]
+    fit = fit_ringing(t[first:], y[first:], poles=np.array([pole]), drift=True)
+    friction = fit_friction(
+        t[first:],
+        y[first:],
+        viscous=fit,
+        turning=float(t[run[0]]),
+        falling=bool(y[run[1]] < y[run[0]]),
+        floor=floor,
+    )
+    return FreeDecay(
+        stretch=stretch,
+        first=first,
+        stop=stop,
+        turning=[i for i in run if i > first],
+        fit=fit,
+        friction=friction,
+    )
+
+
+def _ratio(y: Array, run: list[int]) -> float:
+    """Return the mean ratio of one swing to the one before; for two turning points a guess."""
+    swings = np.abs(np.diff(y[run]))
+    return float((swings[-1] / swings[0]) ** (1 / (swings.size - 1))) if swings.size > 1 else 0.3

@@ -1,0 +1,120 @@
+"""Damped sinusoids about a level: the least-squares fit that decays and steps share."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from pipeline.plant.chain import Array, ComplexArray
+from pipeline.stages._signals import colour
+
+_PENCIL_SAMPLES = 300  # the matrix pencil only starts the fit; more samples would only cost time
+_MAX_EVALUATIONS = 100
+_ALWAYS_DECAYS = 1e-6  # of the frequency: the least damping of a start
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Ringing:
+    """y = level + slope (t - t0) + sum of Re(amplitude exp(pole (t - t0))).
+
+    Attributes
+    ----------
+    poles : (n_modes,) upper half plane, rad/s; `amplitudes` (n_modes,) complex, at `t0`.
+    covariance : of (level, slope, decay rates, frequencies), allowing for a coloured residual;
+        the slope's row is zero where it was not fitted.
+    rms : of the residual; `converged` False where the fit ran out of steps.
+    """
+
+    t0: float
+    level: float
+    slope: float
+    poles: ComplexArray
+    amplitudes: ComplexArray
+    covariance: Array
+    rms: float
+    converged: bool
+
+    def __call__(self, t: Array) -> Array:
+        tau = t - self.t0
+        modes = self.amplitudes[:, None] * np.exp(self.poles[:, None] * tau)
+        return self.level + self.slope * tau + modes.real.sum(0)
+
+
+def fit_ringing(t: Array, y: Array, *, poles: ComplexArray, drift: bool) -> Ringing:
+    """Fit damped sinusoids, a level and (with `drift`) a straight drift, from these poles on.
+
+    Variable projection: the level, slope and amplitudes are linear, so that only decay rates and
+    frequencies are searched (Golub & Pereyra, SIAM J. Numer. Anal. 10, 1973, in Kaufman's form).
+
+    Parameters
+    ----------
+    t, y : (n,), at least 4 n_modes + 3 samples.
+    poles : (n_modes,) start, upper half plane, rad/s.
+    """
+    n_modes, scale = poles.size, float(np.mean(np.abs(poles)))
+    tau = t - t[0]
+    level_columns = [np.ones_like(t), tau] if drift else [np.ones_like(t)]
+
+    def basis(p: Array) -> tuple[Array, Array, Array]:
+        """Return the linear columns (n, n_lin), the cosines and the sines (n_modes, n)."""
+        wave = np.exp((-p[:n_modes, None] + 1j * p[n_modes:, None]) * scale * tau)
+        return np.array([*level_columns, *wave.real, *wave.imag]).T, wave.real, wave.imag
+
+    def solve(p: Array) -> tuple[Array, Array, Array, Array]:
+        X, cosine, sine = basis(p)
+        Q, R = np.linalg.qr(X)
+        linear = np.linalg.lstsq(R, Q.T @ y, rcond=None)[0].astype(np.float64)
+        k = len(level_columns)
+        a, b = linear[k : k + n_modes, None], linear[k + n_modes :, None]
+        per_decay = -tau * scale * (a * cosine + b * sine)
+        per_frequency = tau * scale * (b * cosine - a * sine)
+        return Q, X @ linear - y, np.concatenate([per_decay, per_frequency]).T, linear
+
+    def residual(p: Array) -> Array:
+        return solve(p)[1]
+
+    def jacobian(p: Array) -> Array:
+        Q, _, J, _ = solve(p)
+        return J - Q @ (Q.T @ J)
+
+    start = np.concatenate([np.maximum(-poles.real / scale, _ALWAYS_DECAYS), poles.imag / scale])
+    fit = least_squares(residual, start, jac=jacobian, method="lm", max_nfev=_MAX_EVALUATIONS)
+    _, left, J, linear = solve(fit.x)
+    k = len(level_columns)
+    full = np.column_stack([np.array(level_columns).T, J / scale, basis(fit.x)[0][:, k:]])
+    kept = [0, 1] if drift else [0]
+    kept += list(range(k, k + 2 * n_modes))
+    unscaled = np.linalg.pinv(full.T @ full)[np.ix_(kept, kept)]
+    angle = float(np.median(fit.x[n_modes:])) * scale * (tau[-1] / (t.size - 1))
+    variance = float(left @ left) / max(t.size - full.shape[1], 1) * colour(left, angle=angle)
+    covariance = variance * unscaled
+    if not drift:
+        covariance = np.insert(np.insert(covariance, 1, 0.0, axis=0), 1, 0.0, axis=1)
+    return Ringing(
+        t0=float(t[0]),
+        level=float(linear[0]),
+        slope=float(linear[1]) if drift else 0.0,
+        poles=scale * (-fit.x[:n_modes] + 1j * fit.x[n_modes:]),
+        amplitudes=linear[k : k + n_modes] - 1j * linear[k + n_modes :],
+        covariance=covariance,
+        rms=float(np.sqrt(np.mean(left**2))),
+        converged=bool(fit.success),
+    )
+
+
+def find_poles(t: Array, y: Array, *, n_modes: int) -> ComplexArray:
+    """Return rough poles of `n_modes` damped sinusoids about a level, upper half plane, rad/s.
+
+    Matrix pencil on evenly interpolated samples (Hua & Sarkar, IEEE Trans. ASSP 38, 1990): the
+    level is a known pole at zero and leaves with the first difference. Fewer poles come back
+    where the data do not oscillate in so many modes.
+    """
+    n = min(t.size, _PENCIL_SAMPLES)
+    grid = np.linspace(t[0], t[-1], n)
+    moves = np.diff(np.interp(grid, t, y))
+    columns = n // 3
+    hankel = np.lib.stride_tricks.sliding_window_view(moves, columns)
+    rows = np.linalg.svd(hankel, full_matrices=False)[2][: 2 * n_modes].T
+    z = np.linalg.eigvals(np.linalg.lstsq(rows[:-1], rows[1:], rcond=None)[0])
+    s = np.log(z.astype(np.complex128)) / (grid[1] - grid[0])
+    return s[s.imag > 1e-6 * np.abs(s)]

@@ -1,0 +1,211 @@
+"""Free decay of one cart: logarithmic decrement, exponential fit, dry friction."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.errors import DataError
+from pipeline.plant.chain import Array
+from pipeline.results import LogDecrement, Record
+from pipeline.stages._free_decay import FreeDecay, find_decay, fit_decay
+from pipeline.stages._signals import grain
+
+_PEAKS_FOR_REGRESSION = 4  # two amplitudes
+_PEAK_HALF_WIDTH = 0.5  # rad: so near a turning point a cosine is nearly a parabola
+_NO_DECAY = 0.15  # of the motion: a fit that leaves more is of something else
+_DRIVEN_DIFFERS = 3.0  # standard errors
+_FIGURE_POINTS = 60  # per period
+_MAX_FIGURE_POINTS = 3000
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Peaks:
+    """Turning points and what they give: delta and the damped frequency, with errors."""
+
+    t: Array
+    y: Array
+    amplitude: Array
+    delta: float
+    delta_std: float
+    omega_d: float
+    omega_d_std: float
+
+
+def fit_log_decrement(record: Record, *, cart: int) -> LogDecrement:
+    """Estimate damping ratio and natural frequency of one cart from its free decay.
+
+    The decay is found: a hold, a hand or a driven part may come before it. Two estimates: the
+    classical one from the peaks, and an exponential sinusoid with a drifting rest point fitted
+    to every sample. Dry friction is tested for. Valid for one free cart on at least one spring
+    and damping ratios up to about 0.6.
+
+    Raises
+    ------
+    DataError : no two turning points of one decay, or the motion is no decaying oscillation.
+    """
+    t, y = record.t, record.position(cart)
+    size = grain(t, y, step=record.encoder_step(cart))
+    stretch, run = find_decay(record, cart=cart, size=size)
+    decay = fit_decay(t, y, stretch=stretch, run=run, floor=size / np.sqrt(12))
+    fit, window = decay.fit, slice(decay.first, decay.stop)
+    pole = complex(fit.poles[0])
+    omega_n, zeta = abs(pole), -pole.real / abs(pole)
+    left = fit.rms / float(np.ptp(y[window]))
+    if not (0 < zeta < 1 and pole.imag > 0 and left < _NO_DECAY):
+        raise DataError(
+            f"{record.id}: log decrement needs a decaying oscillation of cart {cart}, found "
+            f"zeta = {zeta:.3g} with {100 * left:.0f} % of the motion unexplained"
+        )
+    of_pole = fit.covariance[2:, 2:]  # of (decay rate, damped frequency)
+    per_zeta = np.array([pole.imag**2, pole.real * pole.imag]) / omega_n**3
+    per_omega = np.array([-pole.real, pole.imag]) / omega_n
+
+    peaks = _peaks(t, y, decay, floor=size / np.sqrt(12))
+    zeta_peaks = peaks.delta / float(np.hypot(2 * np.pi, peaks.delta))
+    per_delta = (2 * np.pi) ** 2 / float(np.hypot(2 * np.pi, peaks.delta)) ** 3
+    stretched = 1 / np.sqrt(1 - zeta_peaks**2)
+    zeta_peaks_std = per_delta * peaks.delta_std
+    omega_n_peaks = peaks.omega_d * stretched
+
+    end = t[decay.stop - 1]
+    n_figure = int(_FIGURE_POINTS * pole.imag * (end - fit.t0) / (2 * np.pi)) + 2
+    fit_t = np.linspace(fit.t0, end, min(n_figure, _MAX_FIGURE_POINTS))
+    middle = fit.level + fit.slope * (fit_t - fit.t0)
+    envelope = np.abs(fit.amplitudes[0]) * np.exp(pole.real * (fit_t - fit.t0))
+    return LogDecrement(
+        experiment=record.id,
+        cart=cart,
+        release=float(t[decay.first]),
+        peak_t=peaks.t,
+        peak_y=peaks.y,
+        amplitude=peaks.amplitude,
+        delta=peaks.delta,
+        delta_std=peaks.delta_std,
+        zeta_peaks=zeta_peaks,
+        zeta_peaks_std=zeta_peaks_std,
+        omega_n_peaks=float(omega_n_peaks),
+        omega_n_peaks_std=float(
+            np.hypot(peaks.omega_d_std * stretched, omega_n_peaks * zeta_peaks * zeta_peaks_std)
+        ),
+        zeta=zeta,
+        zeta_std=float(np.sqrt(per_zeta @ of_pole @ per_zeta)),
+        omega_n=omega_n,
+        omega_n_std=float(np.sqrt(per_omega @ of_pole @ per_omega)),
+        fit_t=fit_t,
+        fit_y=fit(fit_t),
+        envelope_upper=middle + envelope,
+        envelope_lower=middle - envelope,
+        friction=decay.friction.test if decay.friction else None,
+        zeta_at_amplitude=_zeta_at_amplitude(peaks.amplitude),
+        note=_note(record, decay, zeta=zeta, n_peaks=peaks.t.size),
+    )
+
+
+# -------------------------------------------------------------------- the peaks
+
+
+def _peaks(t: Array, y: Array, decay: FreeDecay, *, floor: float) -> _Peaks:
+    """Locate the turning points between samples and regress ln A on their number.
+
+    With fewer than four the numbers are those of the exponential fit.
+    """
+    pole = complex(decay.fit.poles[0])
+    located = [_vertex(t, y, i, half_width=_PEAK_HALF_WIDTH / pole.imag) for i in decay.turning]
+    peak_t, peak_y = (
+        (np.array(values) for values in zip(*located, strict=True))
+        if located
+        else (
+            np.empty(0),
+            np.empty(0),
+        )
+    )
+    n = peak_t.size
+    if n < _PEAKS_FOR_REGRESSION:
+        errors = np.sqrt(np.diag(decay.fit.covariance)[2:])
+        return _Peaks(
+            t=peak_t,
+            y=peak_y,
+            amplitude=_half_swing(n) @ peak_y if n > 2 else np.empty(0),
+            delta=-2 * np.pi * pole.real / pole.imag,
+            delta_std=float(2 * np.pi * errors[0] / pole.imag),
+            omega_d=pole.imag,
+            omega_d_std=float(errors[1]),
+        )
+    swing = _half_swing(n)
+    signed = swing @ peak_y
+    amplitude = np.abs(signed)
+    sigma = max(decay.fit.rms, floor)  # of one turning point, at worst
+    # The noise is constant in A, so ln A is weighted by A²; the errors follow from those of the
+    # turning points, which neighbouring A share.
+    root = np.vander(np.arange(n - 2.0), 2) * amplitude[:, None]
+    solve = np.linalg.pinv(root) * amplitude
+    slope = float((solve @ np.log(amplitude))[0])
+    per_y = (solve / signed) @ swing
+    index = np.vander(np.arange(float(n)), 2) * np.abs(np.gradient(peak_y))[:, None]
+    time = np.linalg.pinv(index) * np.abs(np.gradient(peak_y))
+    interval = float((time @ peak_t)[0])
+    scatter = peak_t - np.vander(np.arange(float(n)), 2) @ (time @ peak_t)
+    interval_std = float(np.linalg.norm(time[0] * scatter) * np.sqrt(n / (n - 2)))
+    return _Peaks(
+        t=peak_t,
+        y=peak_y,
+        amplitude=amplitude,
+        delta=-2 * slope,
+        delta_std=float(2 * sigma * np.linalg.norm(per_y[0])),
+        omega_d=np.pi / interval,
+        omega_d_std=np.pi / interval**2 * interval_std,
+    )
+
+
+def _half_swing(n: int) -> Array:
+    """Return the map (n - 2, n) from turning points to their distance from the moving middle."""
+    return 0.5 * np.eye(n - 2, n, 1) - 0.25 * (np.eye(n - 2, n) + np.eye(n - 2, n, 2))
+
+
+def _vertex(t: Array, y: Array, index: int, *, half_width: float) -> tuple[float, float]:
+    """Return time and value of the local parabola's vertex at a turning point."""
+    first, stop = np.searchsorted(t, t[index] + half_width * np.array([-1, 1]))
+    first, stop = min(int(first), max(index - 1, 0)), max(int(stop), min(index + 2, t.size))
+    tau = (t[first:stop] - t[index]) / half_width
+    if tau.size < 3:
+        return float(t[index]), float(y[index])
+    a, b, c = np.linalg.lstsq(np.vander(tau, 3), y[first:stop], rcond=None)[0]
+    vertex = -b / (2 * a) if a else 0.0
+    if abs(vertex) > 1:  # no turning point inside: the cart stops here
+        return float(t[index]), float(y[index])
+    return float(t[index] + vertex * half_width), float(c + b * vertex / 2)
+
+
+def _zeta_at_amplitude(amplitude: Array) -> Array:
+    """Return (2, n - 1): mean amplitudes and the damping ratios from one to the next."""
+    if amplitude.size < 2:
+        return np.empty((2, 0))
+    loss = np.log(amplitude[:-1] / amplitude[1:])
+    return np.array([np.sqrt(amplitude[:-1] * amplitude[1:]), loss / np.hypot(np.pi, loss)])
+
+
+# ------------------------------------------------------------------------ notes
+
+
+def _note(record: Record, decay: FreeDecay, *, zeta: float, n_peaks: int) -> str:
+    notes = []
+    level = decay.stretch.level
+    if level and record.u is not None and abs(level) > 0.02 * float(np.max(np.abs(record.u))):
+        notes.append(f"the cart swings about its new rest point while the input holds {level:.4g}")
+    if n_peaks < _PEAKS_FOR_REGRESSION:
+        notes.append(
+            f"{n_peaks} turning points are too few for a logarithmic decrement of their own: it is "
+            "that of the exponential fit"
+        )
+    test = decay.friction.test if decay.friction else None
+    if test and test.present:
+        notes.append(
+            "the decay is not exponential: dry friction, which stops the cart within "
+            f"{test.drop:.3g} of its rest point. Viscous damping alone would be zeta = "
+            f"{test.zeta:.3g}; the {zeta:.3g} fitted without it holds for these amplitudes only"
+        )
+    elif test and test.f_statistic > test.threshold:
+        notes.append(
+            "the decay is not exponential: the damping grows with the amplitude, and zeta is a mean"
+        )
+    return "; ".join(notes)
