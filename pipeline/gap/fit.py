@@ -1,0 +1,512 @@
+"""Fit a model to all runs at once: Levenberg-Marquardt, with each run's own unknowns eliminated.
+
+A run's own unknowns are the carts' start (and restart) states, the encoders' zeros, and a factor
+on the dry friction of each cart, which varies from run to run. They enter the residual almost
+linearly, so a QR factorisation of each run leaves a small problem in the shared parameters.
+All derivatives are differences, simulated in one batch per run.
+
+Reference: G. H. Golub, V. Pereyra, Inverse Problems 19 (2003), R1 (separable least squares);
+J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., section 10.3.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from pipeline.gap.runs import Run
+from pipeline.gap.structure import Structure
+from pipeline.plant.chain import Array
+from pipeline.plant.kernel import simulate_batch
+
+Mapper = Callable[..., Iterable]
+
+_SCATTER_START = 0.05  # spread of friction from run to run, before anything is known
+_SCATTER_FLOOR, _SCATTER_TOP = 0.004, 0.2
+_SCATTER_PRIOR = (3.0, 0.04)  # weight in runs, and spread, of the prior on that spread
+_LOCAL_STEP = 1e-3  # of the run's swing, for derivatives with respect to start states
+_DAMP, _RELAX, _STIFFEN = 1e-3, 6.0, 6.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Locals:
+    """What belongs to one run: start states (shots, n), zeros (n,), friction factors (n,)."""
+
+    x0: Array
+    v0: Array
+    zero: Array
+    scatter: Array
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Fit:
+    """A fitted model.
+
+    Attributes
+    ----------
+    theta : the vector of `structure`; covariance (size, size) of it, or None before the end.
+    locals_ : one for each run, in their order.
+    cost : sum of squared residuals over their noise, prior terms included.
+    chi_square : without the prior terms; n_points the residuals behind it.
+    run_chi : (runs,) chi-square per residual of each run.
+    """
+
+    structure: Structure
+    theta: Array
+    locals_: tuple[Locals, ...]
+    cost: float
+    chi_square: float
+    n_points: int
+    run_chi: Array
+    spread: Array
+    covariance: Array | None = field(default=None)
+    log_det: float = 0.0
+
+    @property
+    def chi(self) -> float:
+        """Chi-square per residual."""
+        return self.chi_square / self.n_points
+
+
+def fresh_locals(run: Run) -> Locals:
+    """Return a run's unknowns where they are expected."""
+    n = run.zero.size
+    free = np.array(run.free)
+    return Locals(
+        x0=np.where(free, run.shot_x - run.zero, 0.0),
+        v0=np.where(free, run.shot_v, 0.0),
+        zero=np.where(free, run.zero, 0.0),
+        scatter=np.ones(n),
+    )
+
+
+def simulate_run(
+    structure: Structure, thetas: Array, run: Run, own: Locals, *, refine: float = 1.0
+) -> Array:
+    """Return (b, rows, samples) readings of one run for many vectors, zeros included."""
+    cart, spring, drive = structure.tables(thetas)
+    b = len(thetas)
+    y = simulate_batch(
+        cart,
+        spring,
+        drive,
+        np.broadcast_to(own.x0, (b, *own.x0.shape)),
+        np.broadcast_to(own.v0, (b, *own.v0.shape)),
+        np.broadcast_to(own.scatter, (b, own.scatter.size)),
+        np.array(run.free),
+        run.t,
+        run.knots,
+        run.command,
+        np.array(run.shots),
+        refine,
+    )
+    return y[:, list(run.rows)] + own.zero[list(run.rows)][:, None]
+
+
+# ------------------------------------------------------------------- one run linearised
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Linear:
+    """One run's share of a step: what is left for the shared parameters, and the way back."""
+
+    reduced: Array  # (rows, size + 1) of R: shared parameters and residual
+    own: Array  # R of the run-wide locals: [own | shared | residual]
+    shots: Array  # (shots, ., .) R of each shot: [shot locals | own | shared | residual]
+    layout: "_Layout"
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Layout:
+    """Which local unknowns a run has: cart indices of each kind."""
+
+    x0: tuple[int, ...]
+    v0: tuple[int, ...]
+    zero: tuple[int, ...]
+    scatter: tuple[int, ...]
+    first_v0: bool
+
+
+def _layout(structure: Structure, run: Run, *, scatter_free: bool) -> _Layout:
+    free = tuple(i for i, moves in enumerate(run.free) if moves)
+    multiple = len(run.shots) > 2
+    dry = structure.dry if scatter_free else (False,) * structure.n
+    return _Layout(
+        x0=free,
+        v0=free if multiple or not run.at_rest else (),
+        zero=run.rows if any(structure.springs) else (),
+        scatter=tuple(i for i in free if dry[i]),
+        first_v0=not run.at_rest,
+    )
+
+
+def _blocks(residual: Array, run: Run) -> Array:
+    """Average (…, rows, samples) over blocks, scaled so that white noise keeps its size.
+
+    Returns (…, shots, rows * blocks), the shots padded with zeros to one length.
+    """
+    q = run.block
+    counts = np.diff(run.shots) // q
+    longest = int(counts.max())
+    out = np.zeros((*residual.shape[:-2], len(counts), residual.shape[-2], longest))
+    for s, (first, count) in enumerate(zip(run.shots[:-1], counts, strict=True)):
+        piece = residual[..., first : first + count * q]
+        if q > 1:
+            piece = piece.reshape(*piece.shape[:-1], count, q).sum(-1) / np.sqrt(q)
+        out[..., s, :, :count] = piece
+    return out.reshape(*out.shape[:-2], -1)
+
+
+def _residual_points(run: Run) -> int:
+    return int(len(run.rows) * (np.diff(run.shots) // run.block).sum())
+
+
+def _linearise(
+    structure: Structure,
+    theta: Array,
+    run: Run,
+    own: Locals,
+    *,
+    inflate: float,
+    spread: Array,
+    scatter_free: bool,
+    refine: float,
+) -> _Linear:
+    layout = _layout(structure, run, scatter_free=scatter_free)
+    n, P = structure.n, theta.size
+    shots = len(run.shots) - 1
+    steps = structure.steps()
+    size = np.array([max(1e-9, s) for s in run.swing])
+    by_cart = np.full(n, size.max())
+    by_cart[list(run.rows)] = size
+    lanes_x, lanes_v, lanes_g = len(layout.x0), len(layout.v0), len(layout.scatter)
+    b = 1 + P + lanes_x + lanes_v + lanes_g
+    thetas = np.repeat(theta[None], b, axis=0)
+    thetas[1 : P + 1] += np.diag(steps)
+    x0 = np.repeat(own.x0[None], b, axis=0)
+    v0 = np.repeat(own.v0[None], b, axis=0)
+    g = np.repeat(own.scatter[None], b, axis=0)
+    divisors = [*steps]
+    lane = P + 1
+    rate = np.sqrt(np.diag(structure.chain(theta).stiffness) / np.exp(theta[:n]))
+    rate = np.maximum(rate, 1.0)
+    for i in layout.x0:
+        divisors.append(_LOCAL_STEP * by_cart[i])
+        x0[lane, :, i] += divisors[-1]
+        lane += 1
+    for i in layout.v0:
+        divisors.append(_LOCAL_STEP * by_cart[i] * rate[i])
+        v0[lane, :, i] += divisors[-1]
+        lane += 1
+    for i in layout.scatter:
+        divisors.append(1e-3)
+        g[lane, i] += 1e-3
+        lane += 1
+    base = structure.tables(thetas[: P + 1])
+    tables = [np.concatenate([a, np.repeat(a[:1], b - P - 1, axis=0)]) for a in base]
+    y = simulate_batch(
+        *tables,
+        x0,
+        v0,
+        g,
+        np.array(run.free),
+        run.t,
+        run.knots,
+        run.command,
+        np.array(run.shots),
+        refine,
+    )[:, list(run.rows)]
+    sigma = run.sigma[:, None]
+    model = y[0] + own.zero[list(run.rows)][:, None]
+    residual = _blocks((run.y - model) / sigma, run)  # (shots, points)
+    jac = (y[1:] - y[0]) / sigma / np.array(divisors)[:, None, None]
+    jac = _blocks(jac, run)  # (b - 1, shots, points)
+    ones = np.zeros((len(layout.zero), len(run.rows), run.t.size))
+    for z, i in enumerate(layout.zero):
+        ones[z, run.rows.index(i)] = 1.0 / run.sigma[run.rows.index(i)]
+    zero_columns = _blocks(ones, run)
+    theta_columns, local_columns = jac[:P], jac[P:]
+    shot_columns = local_columns[: lanes_x + lanes_v]
+    scatter_columns = local_columns[lanes_x + lanes_v :]
+    wide = np.concatenate(
+        [shot_columns, scatter_columns, zero_columns, theta_columns, residual[None]]
+    )  # (columns, shots, points)
+    matrix = np.moveaxis(wide, 0, -1)  # (shots, points, columns)
+    lanes_s = lanes_x + lanes_v
+    # Weak priors keep what the data do not show from wandering: start states in units of the
+    # swing; where a run starts at rest, its first velocity stays zero.
+    prior = np.zeros((shots, lanes_s, matrix.shape[-1]))
+    for j in range(lanes_s):
+        i = (*layout.x0, *layout.v0)[j]
+        weight = 1.0 / (by_cart[i] * (1.0 if j < lanes_x else rate[i]))
+        prior[:, j, j] = weight * inflate * 1e-1
+        if j >= lanes_x and not layout.first_v0:
+            prior[0, j, j] = weight * 1e6
+    R = np.linalg.qr(np.concatenate([matrix, prior], axis=1), mode="r")
+    rest = R[:, lanes_s:, lanes_s:].reshape(-1, R.shape[-1] - lanes_s)
+    lanes_o = lanes_g + len(layout.zero)
+    own_prior = np.zeros((lanes_o, rest.shape[-1]))
+    for j, i in enumerate(layout.scatter):
+        own_prior[j, j] = inflate / spread[i]
+        own_prior[j, -1] = (1.0 - own.scatter[i]) * own_prior[j, j]
+    for j, i in enumerate(layout.zero, start=lanes_g):
+        own_prior[j, j] = inflate / run.zero_std[i]
+        own_prior[j, -1] = (run.zero[i] - own.zero[i]) * own_prior[j, j]
+    own_R = np.linalg.qr(np.concatenate([rest, own_prior]), mode="r")
+    return _Linear(
+        reduced=own_R[lanes_o:, lanes_o:], own=own_R[:lanes_o], shots=R[:, :lanes_s], layout=layout
+    )
+
+
+def _move_locals(linear: _Linear, own: Locals, delta: Array, scale: float = 1.0) -> Locals:
+    """Return the locals that go with a step of the shared parameters."""
+    layout = linear.layout
+    lanes_o = linear.own.shape[0]
+    tail = np.concatenate([-delta, [1.0]])
+    wide = np.zeros(0)
+    if lanes_o:
+        wide = np.linalg.solve(linear.own[:, :lanes_o], linear.own[:, lanes_o:] @ tail)
+    lanes_s = linear.shots.shape[1]
+    right = linear.shots[:, :, lanes_s:] @ np.concatenate([-wide, tail])
+    moved = np.linalg.solve(linear.shots[:, :, :lanes_s], right[..., None])[..., 0]
+    x0, v0 = own.x0.copy(), own.v0.copy()
+    zero, scatter = own.zero.copy(), own.scatter.copy()
+    x0[:, list(layout.x0)] += scale * moved[:, : len(layout.x0)]
+    if layout.v0:
+        change = scale * moved[:, len(layout.x0) :]
+        if not layout.first_v0:
+            change[0] = 0.0
+        v0[:, list(layout.v0)] += change
+    g = len(layout.scatter)
+    scatter[list(layout.scatter)] += scale * np.clip(wide[:g], -0.3, 0.3)
+    zero[list(layout.zero)] += scale * wide[g:]
+    return Locals(x0=x0, v0=v0, zero=zero, scatter=np.clip(scatter, 0.3, 3.0))
+
+
+def _run_cost(
+    structure: Structure,
+    theta: Array,
+    run: Run,
+    own: Locals,
+    *,
+    inflate: float,
+    spread: Array,
+    refine: float,
+) -> tuple[float, float]:
+    """Return chi-square of a run, and its prior terms."""
+    model = simulate_run(structure, theta[None], run, own, refine=refine)[0]
+    residual = _blocks((run.y - model) / run.sigma[:, None], run)
+    chi = float((residual**2).sum())
+    if not np.isfinite(chi):
+        return np.inf, 0.0
+    rows = list(run.rows)
+    prior = float((((own.zero - run.zero) / run.zero_std)[rows] ** 2).sum())
+    dry = np.array(structure.dry) & np.array(run.free)
+    prior += float((((own.scatter - 1.0) / spread)[dry] ** 2).sum())
+    return chi, prior * inflate**2
+
+
+def evaluate(
+    structure: Structure,
+    theta: Array,
+    runs: Sequence[Run],
+    locals_: Sequence[Locals],
+    *,
+    spread: Array,
+    inflate: float = 1.0,
+    refine: float = 1.0,
+    mapper: Mapper = map,
+) -> Fit:
+    """Return the fit at given parameters and locals, without moving either."""
+
+    def cost(pair: tuple[Run, Locals]) -> tuple[float, float]:
+        return _run_cost(
+            structure, theta, *pair, inflate=inflate, spread=spread, refine=refine
+        )
+
+    costs = np.array(list(mapper(cost, zip(runs, locals_, strict=True))))
+    points = np.array([_residual_points(run) for run in runs])
+    return Fit(
+        structure=structure,
+        theta=theta,
+        locals_=tuple(locals_),
+        cost=float(costs.sum()),
+        chi_square=float(costs[:, 0].sum()),
+        n_points=int(points.sum()),
+        run_chi=costs[:, 0] / points,
+        spread=spread,
+    )
+
+
+def fit_model(
+    structure: Structure,
+    theta: Array,
+    runs: Sequence[Run],
+    *,
+    locals_: Sequence[Locals] | None = None,
+    spread: Array | None = None,
+    iterations: int = 12,
+    fixed: Sequence[int] = (),
+    scatter_free: bool = True,
+    learn_spread: bool = False,
+    refine: float = 1.0,
+    tolerance: float = 1e-3,
+    mapper: Mapper = map,
+) -> Fit:
+    """Fit the shared parameters and every run's own unknowns.
+
+    Parameters
+    ----------
+    theta : (size,) start. `fixed` lists entries that stay (all of them: only locals move).
+    spread : (n,) expected spread of the dry friction from run to run; learnt if `learn_spread`.
+    tolerance : relative fall of the cost below which the fit has converged.
+    """
+    low, high = structure.bounds()
+    reach = structure.reach()
+    theta = np.clip(theta, low, high)
+    own = tuple(locals_) if locals_ is not None else tuple(fresh_locals(run) for run in runs)
+    spread = np.full(structure.n, _SCATTER_START) if spread is None else spread
+    moving = np.array([i for i in range(theta.size) if i not in set(fixed)], dtype=int)
+    damp = _DAMP
+    inflate = 1.0
+    best = evaluate(
+        structure, theta, runs, own, spread=spread, inflate=inflate, refine=refine, mapper=mapper
+    )
+    for iteration in range(iterations):
+        inflate = max(1.0, np.sqrt(best.chi)) if np.isfinite(best.chi) else 1.0
+        best = _reprice(best, runs, inflate)
+
+        def linearise(pair: tuple[Run, Locals], at: Fit = best, inflate: float = inflate) -> _Linear:
+            return _linearise(
+                structure,
+                at.theta,
+                *pair,
+                inflate=inflate,
+                spread=at.spread,
+                scatter_free=scatter_free,
+                refine=refine,
+            )
+
+        linear = list(mapper(linearise, zip(runs, best.locals_, strict=True)))
+        stacked = np.concatenate([part.reduced for part in linear])
+        if not np.all(np.isfinite(stacked)):
+            break
+        J, r = stacked[:, :-1], stacked[:, -1]
+        # At a bound, with the step pointing outward, a parameter stays.
+        delta = np.zeros(theta.size)
+        active = moving
+        accepted = False
+        for _attempt in range(5):
+            delta[:] = 0.0
+            active = moving
+            for _ in range(3):
+                if active.size == 0:
+                    break
+                scale = np.linalg.norm(J[:, active], axis=0)
+                scale = np.maximum(scale, 1e-9 * max(1e-30, scale.max()))
+                A = np.concatenate([J[:, active], np.diag(np.sqrt(damp) * scale)])
+                step = np.linalg.lstsq(A, np.concatenate([r, np.zeros(active.size)]), rcond=None)[0]
+                out = (best.theta[active] + step <= low[active]) & (best.theta[active] <= low[active])
+                out |= (best.theta[active] + step >= high[active]) & (
+                    best.theta[active] >= high[active]
+                )
+                if not out.any():
+                    delta[active] = step
+                    break
+                active = active[~out]
+            # One long step must not carry the others with it: each is clipped by itself.
+            delta = np.clip(delta, -reach, reach)
+            delta = np.clip(best.theta + delta, low, high) - best.theta
+            moved = tuple(
+                _move_locals(part, o, delta) for part, o in zip(linear, best.locals_, strict=True)
+            )
+            trial = evaluate(
+                structure,
+                best.theta + delta,
+                runs,
+                moved,
+                spread=best.spread,
+                inflate=inflate,
+                refine=refine,
+                mapper=mapper,
+            )
+            if trial.cost < best.cost:
+                accepted = True
+                break
+            damp *= _STIFFEN
+            damp = max(damp, 1e-3)
+        if not accepted:
+            break
+        fall = (best.cost - trial.cost) / best.cost
+        best = trial
+        damp = max(damp / _RELAX, 1e-9)
+        if learn_spread and iteration >= 1:
+            best = _learn_spread(best, runs, linear)
+        if fall < tolerance:
+            break
+    return best
+
+
+def _reprice(fit: Fit, runs: Sequence[Run], inflate: float) -> Fit:
+    """Return the fit with its prior terms weighed by a new assumed noise."""
+    prior = 0.0
+    dry = np.array(fit.structure.dry)
+    for run, own in zip(runs, fit.locals_, strict=True):
+        rows = list(run.rows)
+        prior += float((((own.zero - run.zero) / run.zero_std)[rows] ** 2).sum())
+        here = dry & np.array(run.free)
+        prior += float((((own.scatter - 1.0) / fit.spread)[here] ** 2).sum())
+    return replace(fit, cost=fit.chi_square + prior * inflate**2)
+
+
+def _learn_spread(fit: Fit, runs: Sequence[Run], linear: Sequence[_Linear]) -> Fit:
+    """Learn how much the friction of each cart varies, and move the mean into the force."""
+    spread = fit.spread.copy()
+    theta = fit.theta.copy()
+    factors = np.array([own.scatter for own in fit.locals_])
+    noise = max(1.0, fit.chi)
+    for i, dry in enumerate(fit.structure.dry):
+        if not dry:
+            continue
+        there = [
+            (r, linear[r].layout.scatter.index(i))
+            for r, run in enumerate(runs)
+            if i in linear[r].layout.scatter
+        ]
+        if not there:
+            continue
+        weight, prior = _SCATTER_PRIOR
+        total = weight * prior**2
+        for r, j in there:
+            column = linear[r].own[j, j]
+            variance = min(noise / column**2 if column else np.inf, spread[i] ** 2)
+            total += (factors[r, i] - 1.0) ** 2 + variance
+        spread[i] = np.clip(np.sqrt(total / (len(there) + weight)), _SCATTER_FLOOR, _SCATTER_TOP)
+    return replace(fit, spread=spread, theta=theta)
+
+
+def covariance(fit: Fit, runs: Sequence[Run], *, refine: float = 1.0, mapper: Mapper = map) -> Fit:
+    """Return the fit with the covariance of its parameters, scaled by its own misfit."""
+
+    def linearise(pair: tuple[Run, Locals]) -> _Linear:
+        return _linearise(
+            fit.structure,
+            fit.theta,
+            *pair,
+            inflate=1.0,
+            spread=fit.spread,
+            scatter_free=True,
+            refine=refine,
+        )
+
+    linear = list(mapper(linearise, zip(runs, fit.locals_, strict=True)))
+    J = np.concatenate([part.reduced for part in linear])[:, :-1]
+    _, s, vt = np.linalg.svd(J, full_matrices=False)
+    s = np.maximum(s, 1e-9 * s[0])
+    cov = (vt.T / s**2) @ vt * max(1.0, fit.chi)
+    log_det = float(
+        sum(
+            np.log(np.abs(np.diagonal(part.own[:, : part.own.shape[0]]))).sum() for part in linear
+        )
+    )
+    return replace(fit, covariance=cov, log_det=log_det)

@@ -1,0 +1,198 @@
+"""Records made ready for fitting: free motion only, rest and start found, noise estimated."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.plant.chain import Array
+from pipeline.plant.simulate import interpolate_band_limited
+from pipeline.results import Record
+
+_REST_SAMPLES = 5  # this many first samples that do not move: the run starts at rest
+_TAIL = 0.12  # share of a record that must lie still to tell the rest point
+_STILL = 2.6  # encoder steps, peak to peak, that count as lying still
+_FIT_RATE = 250.0  # Hz; faster records are averaged in blocks, model and measurement alike
+_HELD_SAMPLES = 4  # a release after fewer held samples is the start of the file
+_RELEASED = 0.85  # the hand is gone when the cart has left the held position by 15 %
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Run:
+    """One record as the fits see it.
+
+    Attributes
+    ----------
+    t (samples,), y (rows, samples) : times from the first sample used, and readings.
+    rows : (rows,) cart index (from 0) of each row; held carts are left out.
+    free : (n,) which carts move.
+    knots, command : the input, held from knot to knot.
+    at_rest : the carts do not move at the first sample.
+    start, slope : (n,) first reading and velocity of each cart.
+    zero, zero_std : (n,) where the encoder's zero is expected, and how far off it may be.
+    sigma : (rows,) noise of one sample.
+    block : samples averaged to one residual.
+    shots : (shots + 1,) bounds of the pieces that start afresh; (0, samples) is the whole run.
+    shot_x, shot_v : (shots, n) smoothed states at the start of each shot, zeros not taken off.
+    """
+
+    id: str
+    record: Record
+    t: Array
+    y: Array
+    rows: tuple[int, ...]
+    free: tuple[bool, ...]
+    knots: Array
+    command: Array
+    at_rest: bool
+    start: Array
+    slope: Array
+    zero: Array
+    zero_std: Array
+    sigma: Array
+    block: int
+    shots: tuple[int, ...]
+    shot_x: Array
+    shot_v: Array
+
+    @property
+    def n_points(self) -> int:
+        """Readings that enter the fit at full rate."""
+        return self.y.size
+
+    @property
+    def swing(self) -> Array:
+        """(rows,) root-mean-square of the reading about its rest."""
+        return np.sqrt(np.mean((self.y - self.zero[list(self.rows)][:, None]) ** 2, axis=1))
+
+
+def make_run(record: Record, *, n: int) -> Run:
+    """Prepare one record of a bench with n carts.
+
+    A decay starts after the hand has let go; a slow or held beginning is cut.
+    """
+    rows = tuple(cart - 1 for cart in record.carts if cart in record.free)
+    y = np.array([record.position(row + 1) for row in rows])
+    resolution = np.array([record.encoder_step(row + 1) for row in rows])
+    t, u = record.t, record.u if record.u is not None else np.zeros(record.t.size)
+    still = np.maximum(_STILL * resolution, 4.0 * _rough_noise(y))
+    tail = y[:, -max(3, int(_TAIL * t.size)) :]
+    settled = np.ptp(tail, axis=1) <= still
+    quiet_end = bool(np.all(u[-tail.shape[1] :] == 0.0))
+    if record.kind == "decay":
+        rest = np.where(settled, tail.mean(axis=1), np.median(y, axis=1))
+        first = _release(y - rest[:, None], still)
+        t, u, y = t[first:], u[first:], y[:, first:]
+    head = y[:, :_REST_SAMPLES]
+    # The input may already act between these samples: the first two are before its effect.
+    lies_still = np.ptp(head[:, :2], axis=1) <= still
+    at_rest = bool(np.all(lies_still)) and record.kind != "decay"
+    zero, zero_std = np.zeros(n), np.ones(n)
+    start, slope = np.zeros(n), np.zeros(n)
+    span = np.ptp(y, axis=1)
+    for j, row in enumerate(rows):
+        if settled[j] and quiet_end:
+            zero[row], zero_std[row] = tail[j].mean(), 0.02 * span[j]
+        elif at_rest and u[0] == 0.0:
+            zero[row], zero_std[row] = head[j, 0], 0.02 * span[j]
+        else:
+            zero[row], zero_std[row] = y[j].mean(), 0.2 * span[j]
+        zero_std[row] = max(zero_std[row], resolution[j], 1e-12)
+        start[row], slope[row] = _smooth_state(t, y[j], 0)
+        if at_rest:
+            start[row], slope[row] = y[j, 0], 0.0
+    if record.hold == "band_limited":
+        knots, command = interpolate_band_limited(t, u)
+    else:
+        knots, command = t, u
+    rate = 1.0 / float(np.median(np.diff(t)))
+    run = Run(
+        id=record.id,
+        record=record,
+        t=t,
+        y=y,
+        rows=rows,
+        free=tuple(i + 1 in record.free for i in range(n)),
+        knots=np.ascontiguousarray(knots),
+        command=np.ascontiguousarray(command),
+        at_rest=at_rest,
+        start=start,
+        slope=slope,
+        zero=zero,
+        zero_std=zero_std,
+        sigma=np.maximum(resolution / np.sqrt(12.0), 1e-9 * span),
+        block=max(1, int(rate / _FIT_RATE)),
+        shots=(0, t.size),
+        shot_x=start[None],
+        shot_v=slope[None],
+    )
+    return run
+
+
+def cut_shots(run: Run, *, length: float) -> Run:
+    """Cut a run into pieces of `length` s that each start from a state of their own."""
+    count = max(1, round(float(run.t[-1] - run.t[0]) / length))
+    bounds = np.linspace(0, run.t.size, count + 1).astype(int)
+    n = run.start.size
+    shot_x, shot_v = np.zeros((count, n)), np.zeros((count, n))
+    for s, first in enumerate(bounds[:-1]):
+        for j, row in enumerate(run.rows):
+            shot_x[s, row], shot_v[s, row] = _smooth_state(run.t, run.y[j], first)
+    shot_x[0], shot_v[0] = run.start, run.slope
+    return replace(run, shots=tuple(int(b) for b in bounds), shot_x=shot_x, shot_v=shot_v)
+
+
+def high_frequency_noise(residual: Array, *, half_width: int = 4) -> float:
+    """Estimate the white part of a residual: what a moving quadratic cannot follow."""
+    width = 2 * half_width + 1
+    if residual.size < 2 * width:
+        return float(residual.std())
+    offsets = np.arange(-half_width, half_width + 1.0)
+    basis = np.vander(offsets, 3)
+    smoother = np.linalg.pinv(basis)[-1]  # the fitted value in the middle
+    rest = residual - np.convolve(residual, smoother[::-1], mode="same")
+    rest = rest[half_width:-half_width]
+    gain = 1.0 - 2.0 * smoother[half_width] + float(smoother @ smoother)
+    return float(np.sqrt(np.mean(rest**2) / gain))
+
+
+def _rough_noise(y: Array) -> Array:
+    """Noise per row from fourth differences (smooth motion leaves almost nothing in them)."""
+    fourth = np.diff(y, n=4, axis=1)
+    return 1.4826 * np.median(np.abs(fourth), axis=1) / np.sqrt(70.0)
+
+
+def _release(offset: Array, still: Array) -> int:
+    """Return the first sample of free motion of a decay."""
+    leader = int(np.argmax(np.ptp(offset, axis=1) / np.maximum(still, 1e-12)))
+    motion = np.abs(offset[leader])
+    top = int(np.argmax(motion))
+    peak = motion[top]
+    held = np.flatnonzero(motion[top:] >= peak - still[leader] - 0.01 * peak)
+    gaps = np.flatnonzero(np.diff(held) > 1)
+    last = top + int(held[gaps[0]] if gaps.size else held[-1])
+    first_held = top
+    if top == 0 and last < _HELD_SAMPLES:
+        return 0
+    if last - first_held < _HELD_SAMPLES and first_held > 0:
+        # Shaken, not held: the largest swing is where the hand has gone.
+        return last
+    later = np.flatnonzero(motion[last:] < _RELEASED * peak)
+    return last + int(later[0]) if later.size else last
+
+
+def _smooth_state(t: Array, y: Array, at: int, *, window: float = 0.03) -> tuple[float, float]:
+    """Return position and velocity at one sample from a local cubic."""
+    half = max(3, round(window / float(t[1] - t[0])))
+    low, high = max(0, at - half), min(t.size, at + half + 1)
+    if high - low < 2 * half + 1:
+        low, high = (0, min(t.size, 2 * half + 1)) if low == 0 else (max(0, high - 2 * half - 1), high)
+    local = (t[low:high] - t[at]) / window
+    coefficients = np.polyfit(local, y[low:high], min(3, local.size - 1))
+    return float(coefficients[-1]), float(coefficients[-2] / window)
+
+
+def shift_equal(a: Sequence[float] | Array, b: Sequence[float] | Array) -> bool:
+    """Are two series the same samples?"""
+    a, b = np.asarray(a), np.asarray(b)
+    return a.shape == b.shape and bool(np.array_equal(a, b))

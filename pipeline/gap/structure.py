@@ -1,0 +1,234 @@
+"""The parameters of a model as one vector: logarithms of what is positive, multiples of the rest."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.plant.chain import Array, Chain
+from pipeline.plant.effects.base import AugmentedChain, Effect, Scales, Term, chain_scales
+from pipeline.plant.tables import Tables
+from pipeline.gap.runs import Run
+
+_SMALLEST = 1e-7  # of a parameter's scale; below, an effect is not there
+_LARGEST = 1e4
+_LOG_REACH = 14.0  # how far (in log) a chain parameter may go from where it starts
+
+
+@dataclass(frozen=True, kw_only=True)
+class Candidate:
+    """An effect at a place, with the signs its sided parameters keep and its typical sizes."""
+
+    effect: Effect
+    place: int
+    signs: tuple[float, ...]
+    scales: tuple[float, ...]
+
+    @property
+    def label(self) -> str:
+        """Effect and place, for messages."""
+        return self.effect.key + (f"@{self.place}" if self.place else "")
+
+    @property
+    def key(self) -> tuple[str, int]:
+        """Effect and place."""
+        return self.effect.key, self.place
+
+
+@dataclass(frozen=True, kw_only=True)
+class Structure:
+    """Which springs there are and which effects act: the shape of the parameter vector.
+
+    The vector holds log m, log c, log k (of the springs present; their sum for one cart), then
+    each effect's parameters: log |p| where the sign is known, p over its scale where it is not.
+    """
+
+    springs: tuple[bool, ...]
+    effects: tuple[Candidate, ...] = ()
+
+    @property
+    def n(self) -> int:
+        """Number of carts."""
+        return len(self.springs) - 1
+
+    @property
+    def rows(self) -> tuple[int, ...]:
+        """Rows of the spring table that are free parameters."""
+        present = tuple(j for j, there in enumerate(self.springs) if there)
+        return present[:1] if self.n == 1 else present
+
+    @property
+    def base_size(self) -> int:
+        """Parameters of the linear chain."""
+        return 2 * self.n + len(self.rows)
+
+    @property
+    def size(self) -> int:
+        """All parameters."""
+        return self.base_size + sum(len(c.effect.parameters) for c in self.effects)
+
+    @property
+    def dry(self) -> tuple[bool, ...]:
+        """(n,) on which carts dry friction acts."""
+        places = {c.place for c in self.effects if c.effect.family == "dry friction"}
+        places |= {c.place for c in self.effects if c.effect.key == "load_friction"}
+        return tuple(i + 1 in places for i in range(self.n))
+
+    def span(self, index: int) -> slice:
+        """Return where the parameters of an effect stand in the vector."""
+        start = self.base_size + sum(len(c.effect.parameters) for c in self.effects[:index])
+        return slice(start, start + len(self.effects[index].effect.parameters))
+
+    def with_effect(self, candidate: Candidate) -> "Structure":
+        """Return the structure with one more effect."""
+        return Structure(springs=self.springs, effects=(*self.effects, candidate))
+
+    def without(self, index: int) -> "Structure":
+        """Return the structure without one of its effects."""
+        kept = tuple(c for i, c in enumerate(self.effects) if i != index)
+        return Structure(springs=self.springs, effects=kept)
+
+    # ------------------------------------------------------------ the vector
+
+    def chain(self, theta: Array) -> Chain:
+        """Return the linear chain in a vector."""
+        n = self.n
+        k = np.zeros(n + 1)
+        k[list(self.rows)] = np.exp(theta[2 * n : self.base_size])
+        return Chain(m=np.exp(theta[:n]), c=np.exp(theta[n : 2 * n]), k=k)
+
+    def model(self, theta: Array) -> AugmentedChain:
+        """Return the chain and its effects in a vector."""
+        terms = []
+        for index, candidate in enumerate(self.effects):
+            coordinates = theta[self.span(index)]
+            terms.append(
+                Term(
+                    effect=candidate.effect,
+                    place=candidate.place,
+                    values=tuple(
+                        float(v)
+                        for v in _values(candidate, coordinates)
+                    ),
+                )
+            )
+        return AugmentedChain(chain=self.chain(theta), terms=tuple(terms))
+
+    def tables(self, thetas: Array) -> Tables:
+        """Return the simulator's tables for many vectors (b, size), stacked."""
+        stacked = [self.model(theta).tables() for theta in thetas]
+        return (
+            np.array([tables[0] for tables in stacked]),
+            np.array([tables[1] for tables in stacked]),
+            np.array([tables[2] for tables in stacked]),
+        )
+
+    def vector(self, chain: Chain, values: Sequence[Sequence[float]] = ()) -> Array:
+        """Return the vector of a chain and effect parameter values."""
+        tiny = 1e-3 * np.sqrt(chain.m * np.maximum(np.diag(chain.stiffness), 1e-12 * chain.m))
+        parts = [np.log(chain.m), np.log(np.maximum(chain.c, tiny))]
+        k = chain.k[list(self.rows)] if self.n > 1 else chain.k.sum(keepdims=True)[: len(self.rows)]
+        parts.append(np.log(np.maximum(k, 1e-4 * chain.k.max()))) if k.size else None
+        parts += [
+            _coordinates(candidate, value)
+            for candidate, value in zip(self.effects, values, strict=True)
+        ]
+        return np.concatenate(parts)
+
+    def bounds(self) -> tuple[Array, Array]:
+        """Return the lower and upper bounds of the vector."""
+        low, high = [np.full(self.base_size, -np.inf)], [np.full(self.base_size, np.inf)]
+        for c in self.effects:
+            for p, scale in zip(c.effect.parameters, c.scales, strict=True):
+                top = min(p.upper, _LARGEST) if np.isfinite(p.upper) else _LARGEST
+                if p.signed:
+                    low.append(np.array([-top]))
+                    high.append(np.array([top]))
+                else:
+                    low.append(np.array([np.log(_SMALLEST * scale)]))
+                    high.append(np.array([np.log(top * scale)]))
+        return np.concatenate(low), np.concatenate(high)
+
+    def steps(self) -> Array:
+        """Return the difference step of each parameter, for derivatives."""
+        steps = [np.full(self.base_size, 1e-4)]
+        for c in self.effects:
+            steps.append(np.array([2e-4 if p.signed else 1e-3 for p in c.effect.parameters]))
+        return np.concatenate(steps)
+
+    def reach(self) -> Array:
+        """Return how far each parameter may go in one step."""
+        reach = [np.full(self.base_size, 0.3)]
+        for c in self.effects:
+            reach.append(np.array([1.0 if p.signed else 0.4 for p in c.effect.parameters]))
+        return np.concatenate(reach)
+
+    def physical_derivative(self, theta: Array) -> Array:
+        """Return d(parameter)/d(coordinate) of the effects' parameters, chain parameters as logs."""
+        out = [np.ones(self.base_size)]
+        for index, c in enumerate(self.effects):
+            values = _values(c, theta[self.span(index)])
+            out.append(
+                np.array(
+                    [
+                        scale if p.signed else abs(value)
+                        for p, scale, value in zip(
+                            c.effect.parameters, c.scales, values, strict=True
+                        )
+                    ]
+                )
+            )
+        return np.concatenate(out)
+
+
+def _values(candidate: Candidate, coordinates: Array) -> list[float]:
+    return [
+        float(x) * scale if p.signed else sign * float(np.exp(x))
+        for p, x, sign, scale in zip(
+            candidate.effect.parameters, coordinates, candidate.signs, candidate.scales, strict=True
+        )
+    ]
+
+
+def _coordinates(candidate: Candidate, values: Sequence[float]) -> Array:
+    return np.array(
+        [
+            v / scale if p.signed else np.log(max(abs(v), _SMALLEST * scale))
+            for p, v, scale in zip(
+                candidate.effect.parameters, values, candidate.scales, strict=True
+            )
+        ]
+    )
+
+
+# ----------------------------------------------------------------- the sizes on this bench
+
+
+def bench_scales(runs: Sequence[Run], chain: Chain, *, effect: Effect, place: int) -> Scales:
+    """Return the typical sizes at one place, from the records and the linear model."""
+    n = chain.n
+    size = n if effect.place != "spring" else n + 1
+    position, velocity = np.full(size + 1, 1e-12), np.full(size + 1, 1e-12)
+    level, sample_time = 1e-12, np.inf
+    for run in runs:
+        x = np.zeros((n, run.t.size))
+        for j, row in enumerate(run.rows):
+            x[row] = run.y[j] - run.zero[row]
+        if effect.place == "spring":
+            x = np.vstack([x, np.zeros(run.t.size)]) - np.vstack([np.zeros(run.t.size), x])
+        half = max(1, round(0.02 / run.record.sample_time))
+        speed = (x[:, 2 * half :] - x[:, : -2 * half]) / (run.t[2 * half :] - run.t[: -2 * half])
+        position[: len(x)] = np.maximum(position[: len(x)], np.abs(x).max(axis=1))
+        velocity[: len(x)] = np.maximum(velocity[: len(x)], np.abs(speed).max(axis=1))
+        level = max(level, float(np.abs(run.command).max()))
+        sample_time = min(sample_time, run.record.sample_time)
+    # Time scales of a drive are physical, some milliseconds, however fast the sampling.
+    return chain_scales(
+        chain,
+        place=effect.place,
+        at=place,
+        position=position,
+        velocity=velocity,
+        input=level,
+        sample_time=max(sample_time, 0.005),
+    )

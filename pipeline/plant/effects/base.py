@@ -1,0 +1,229 @@
+"""What an effect is: a hypothesis about the bench, with an equation, a fingerprint and a test."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Literal
+
+import numpy as np
+
+from pipeline.errors import ConfigError
+from pipeline.plant.chain import Array, Chain
+from pipeline.plant.tables import Cart, Drive, Tables, linear_tables
+
+Place = Literal["cart", "spring", "input"]
+Axis = Literal["velocity", "position", "stretch", "input", "time", "frequency"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scales:
+    """Typical sizes at one place of one bench, from its records and its linear model.
+
+    Attributes
+    ----------
+    position, velocity : the largest of the cart, or of the spring's stretch.
+    input : the largest input; sample_time in s.
+    mass, damping, stiffness : of the cart (all its springs), or of the spring and its carts.
+    """
+
+    position: float
+    velocity: float
+    input: float
+    sample_time: float
+    mass: float
+    damping: float
+    stiffness: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parameter:
+    """One number of an effect.
+
+    Attributes
+    ----------
+    unit : in terms of "position", "input" and "s"; "" for a pure number.
+    scale : its typical size at a place; starts and steps are multiples of it.
+    trials : the multiples of `scale` to try first.
+    signed : may be of either sign. A sign that picks a side (`side`) stays as it started.
+    neutral : the value that gives the base model (where one exists).
+    lower, upper : bounds of the magnitude.
+    reported : False for a detail of the contact that the data need but nobody asks for.
+    """
+
+    name: str
+    symbol: str
+    unit: str
+    scale: Callable[[Scales], float]
+    trials: tuple[float, ...]
+    signed: bool = False
+    side: bool = False
+    neutral: float | None = None
+    lower: float = 0.0
+    upper: float = np.inf
+    reported: bool = True
+
+    def unit_text(self, *, position: str, input: str) -> str:
+        """Return the unit with the submission's own units in it."""
+        return self.unit.replace("position", position).replace("input", input)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Effect:
+    """One physical effect of the catalogue.
+
+    Attributes
+    ----------
+    key : its name in files; `sentence` tells a student what it is.
+    equation : TeX of the law, in the symbols of the parameters.
+    columns : the table columns the parameter values stand for.
+    fingerprint : what it does to the data; deciding_run: the experiment that settles it.
+    axis : what to plot the force (or reading) against, to see it.
+    between_carts : on a spring to a wall it would be part of the linear chain.
+    family : effects of one family exclude each other at one place.
+    grows_from : the simpler effect whose fit is the start of this one's.
+    equivalent : what the data cannot tell from it, and why.
+    """
+
+    key: str
+    title: str
+    sentence: str
+    place: Place
+    equation: str
+    parameters: tuple[Parameter, ...]
+    columns: Callable[[Mapping[str, float]], Mapping[IntEnum, float]]
+    fingerprint: str
+    deciding_run: str
+    reference: str
+    axis: Axis
+    family: str = ""
+    between_carts: bool = False
+    grows_from: str | None = None
+    equivalent: str = ""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The parameters' names, in order."""
+        return tuple(p.name for p in self.parameters)
+
+    def places(self, springs: Sequence[bool]) -> tuple[int, ...]:
+        """Return where it can sit on a bench: cart or spring numbers, or 0 for the input.
+
+        The two wall springs of a single cart only act through their sum, so one stands for both.
+        """
+        n = len(springs) - 1
+        if self.place == "input":
+            return (0,)
+        if self.place == "cart":
+            return tuple(range(1, n + 1))
+        present = tuple(j for j, there in enumerate(springs, start=1) if there)
+        if self.between_carts:
+            return tuple(j for j in present if 1 < j <= n)
+        return present[:1] if n == 1 else present
+
+    def where(self, place: int) -> dict[str, int]:
+        """Return the place as it is written to files: {"cart": 2}, {"spring": 1} or {}."""
+        return {} if self.place == "input" else {self.place: place}
+
+    def fill(self, tables: Tables, place: int, values: Sequence[float]) -> None:
+        """Write this effect into the simulator's tables."""
+        cart, spring, drive = tables
+        columns = self.columns(dict(zip(self.names, values, strict=True)))
+        for column, value in columns.items():
+            if isinstance(column, Drive):
+                drive[column] = value
+            elif isinstance(column, Cart):
+                cart[place - 1, column] = value
+            else:
+                spring[place - 1, column] = value
+
+
+@dataclass(frozen=True, kw_only=True)
+class Term:
+    """An effect at a place, with its parameter values in the effect's order."""
+
+    effect: Effect
+    place: int
+    values: tuple[float, ...]
+
+    @property
+    def where(self) -> dict[str, int]:
+        """The place as it is written to files."""
+        return self.effect.where(self.place)
+
+    @property
+    def label(self) -> str:
+        """Effect and place in one word, for messages."""
+        return self.effect.key + (f"@{self.place}" if self.place else "")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AugmentedChain:
+    """The linear chain and the effects that act on it."""
+
+    chain: Chain
+    terms: tuple[Term, ...] = ()
+
+    def tables(self) -> Tables:
+        """Return the simulator's tables."""
+        tables = linear_tables(self.chain)
+        for term in self.terms:
+            term.effect.fill(tables, term.place, term.values)
+        return tables
+
+
+def make_term(effect: Effect, *, place: int, values: Mapping[str, float], chain: Chain) -> Term:
+    """Make a term from named values; contact details not given get their usual size.
+
+    Raises
+    ------
+    ConfigError : a place or a parameter the effect does not have, or a missing one.
+    """
+    springs = tuple(bool(k > 0) for k in chain.k)
+    if place not in effect.places(springs) and not (effect.place == "spring" and chain.n == 1):
+        raise ConfigError(f"{effect.key}: no {effect.place} {place} on this bench")
+    unknown = [name for name in values if name not in effect.names]
+    if unknown:
+        raise ConfigError(f"{effect.key}: has {', '.join(effect.names)}, found {unknown[0]}")
+    scales = chain_scales(chain, place=effect.place, at=place)
+    chosen: list[float] = []
+    for parameter in effect.parameters:
+        if parameter.name in values:
+            chosen.append(float(values[parameter.name]))
+        elif parameter.reported:
+            raise ConfigError(f"{effect.key}: needs {parameter.name}")
+        else:
+            chosen.append(parameter.scale(scales) * parameter.trials[0])
+    return Term(effect=effect, place=place, values=tuple(chosen))
+
+
+def chain_scales(
+    chain: Chain,
+    *,
+    place: Place,
+    at: int,
+    position: Array | None = None,
+    velocity: Array | None = None,
+    input: float = 1.0,
+    sample_time: float = 0.01,
+) -> Scales:
+    """Return the typical sizes at a place.
+
+    `position` and `velocity` (n + 1,) are the largest of each cart or spring stretch; default 1.
+    """
+    position = np.ones(chain.n + 1) if position is None else position
+    velocity = np.ones(chain.n + 1) if velocity is None else velocity
+    i = max(at - 1, 0)
+    near = min(i, chain.n - 1)
+    stiffness = chain.k[i] if place == "spring" else float(np.diag(chain.stiffness)[near])
+    if stiffness <= 0.0:
+        # A cart without springs: what its inertia needs stands in for the spring force.
+        stiffness = chain.m[near] * (velocity[i] / position[i]) ** 2
+    return Scales(
+        position=float(position[i]),
+        velocity=float(velocity[i]),
+        input=input,
+        sample_time=sample_time,
+        mass=float(chain.m[near]),
+        damping=float(max(chain.c[near], 0.02 * np.sqrt(chain.m[near] * stiffness))),
+        stiffness=float(stiffness),
+    )

@@ -1,0 +1,74 @@
+"""What the simulator reads: three tables of numbers for the carts, the springs and the drive.
+
+An effect fills columns of one row; the neutral values of all columns are the linear chain.
+"""
+
+from enum import IntEnum
+
+import numpy as np
+
+from pipeline.plant.chain import Array, Chain
+
+
+class Cart(IntEnum):
+    """Columns of the cart table."""
+
+    MASS = 0
+    DAMPING = 1
+    COULOMB = 2  # sliding friction force
+    STATIC = 3  # what it holds at rest beyond the sliding force
+    STRIBECK = 4  # velocity over which the static excess decays
+    DAHL = 5  # presliding friction force
+    DISTANCE = 6  # over which it builds up
+    LOAD = 7  # friction per input
+    DRAG = 8  # quadratic drag
+    OFFSET = 9  # constant force
+    STOP = 10  # end stop: position, its sign is the side
+    STOP_STIFFNESS = 11
+    STOP_DAMPING = 12
+    GAIN = 13  # of the sensor
+    HIDDEN_MASS = 14
+    HIDDEN_STIFFNESS = 15
+    HIDDEN_DAMPING = 16
+
+
+class Spring(IntEnum):
+    """Columns of the spring table."""
+
+    STIFFNESS = 0
+    CUBIC = 1
+    CHANGE = 2  # relative change of the stiffness past …
+    STRETCH = 3  # … this stretch; its sign is the side
+    COUPLING = 4  # damper between the two carts
+
+
+class Drive(IntEnum):
+    """Columns of the drive table."""
+
+    DEAD_ZONE = 0
+    LIMIT = 1
+    DELAY = 2
+    LAG = 3
+    DAMPING = 4  # on cart 1 while the commanded input is on
+    GAP = 5  # whole free play between motor and cart 1
+    MOTOR_MASS = 6  # the share of cart 1's mass on the motor's side of the gap
+    CONTACT_STIFFNESS = 7
+    CONTACT_DAMPING = 8
+
+
+NO_LIMIT = 1e30  # a saturation nobody reaches
+
+Tables = tuple[Array, Array, Array]
+
+
+def linear_tables(chain: Chain) -> Tables:
+    """Return cart (n, 17), spring (n + 1, 5) and drive (9,) tables of a chain without effects."""
+    cart = np.zeros((chain.n, len(Cart)))
+    spring = np.zeros((chain.n + 1, len(Spring)))
+    drive = np.zeros(len(Drive))
+    cart[:, Cart.MASS], cart[:, Cart.DAMPING] = chain.m, chain.c
+    # Divisors and factors whose neutral value is not zero.
+    cart[:, [Cart.STRIBECK, Cart.DISTANCE, Cart.GAIN]] = 1.0
+    spring[:, Spring.STIFFNESS] = chain.k
+    drive[Drive.LIMIT] = NO_LIMIT
+    return cart, spring, drive

@@ -1,0 +1,231 @@
+"""A bench with known, hidden physics, simulated independently of `pipeline.plant`.
+
+Fine fixed steps (50 µs, velocity Verlet), dry friction as an inclusion solved at every step
+(Moreau's time stepping), penalty contacts, the delay as a look-up in the command's past. Slow
+and plain on purpose: it is what the workflow's simulator is judged by.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numba import njit
+
+STEP = 5e-5  # s
+
+# Numbers of one cart and one spring in the truth's own tables.
+_CART = (
+    "m c coulomb excess stribeck dahl delta mu drag offset stop stop_k stop_c gain hm hk hc"
+).split()
+_SPRING = "k cubic change stretch coupling".split()
+_DRIVE = "dead limit delay lag braking gap motor contact contact_c".split()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hidden:
+    """One effect hidden in the bench: its name, place (0 for the input) and parameters."""
+
+    effect: str
+    place: int = 0
+    parameters: Mapping[str, float] = field(default_factory=dict)
+
+
+@njit(cache=True)
+def _motion(cart, spring, drive, free, t, times, command, x0, v0, scatter, h):
+    n = cart.shape[0]
+    x, v, z = x0.copy(), v0.copy(), np.zeros(n)
+    xh, vh = x0.copy(), v0.copy()
+    lag = command[0]
+    xm, vm = x0[0], v0[0]
+    has_gap = drive[5] > 0.0
+    m1 = cart[0, 0] - (drive[6] if has_gap else 0.0)
+    out = np.zeros((n, t.size))
+    f = np.zeros(n)
+    now = t[0]
+    sample = 0
+    at = 0
+    on = 0
+    first = True
+    while sample < t.size:
+        # Read out: straight within one 50-µs step.
+        while sample < t.size and t[sample] <= now + h:
+            part = t[sample] - now
+            for i in range(n):
+                out[i, sample] = cart[i, 13] * (x[i] + part * v[i])
+            sample += 1
+        mid = now + 0.5 * h
+        while at < times.size - 1 and times[at + 1] <= mid - drive[2]:
+            at += 1
+        while on < times.size - 1 and times[on + 1] <= mid:
+            on += 1
+        u = command[at]
+        if abs(u) <= drive[0]:
+            u = 0.0
+        else:
+            u -= np.sign(u) * drive[0]
+        u = min(max(u, -drive[1]), drive[1])
+        if drive[3] > 0.0:
+            lag += h / drive[3] * (u - lag)
+            u = lag
+        for i in range(n):
+            if free[i]:
+                x[i] += 0.5 * h * v[i]
+            if cart[i, 14] > 0.0:
+                xh[i] += 0.5 * h * vh[i]
+            f[i] = cart[i, 9] - cart[i, 1] * v[i] - cart[i, 8] * abs(v[i]) * v[i]
+        xm += 0.5 * h * vm
+        for j in range(n + 1):
+            right = x[j] if j < n else 0.0
+            left = x[j - 1] if j > 0 else 0.0
+            rate = (v[j] if j < n else 0.0) - (v[j - 1] if j > 0 else 0.0)
+            d = right - left
+            tension = spring[j, 0] * d + spring[j, 1] * d**3 + spring[j, 4] * rate
+            if spring[j, 3] >= 0.0 and d > spring[j, 3]:
+                tension += spring[j, 2] * spring[j, 0] * (d - spring[j, 3])
+            if spring[j, 3] < 0.0 and d < spring[j, 3]:
+                tension += spring[j, 2] * spring[j, 0] * (d - spring[j, 3])
+            if j < n:
+                f[j] -= tension
+            if j > 0:
+                f[j - 1] += tension
+        if has_gap:
+            lead = xm - x[0]
+            push = 0.0
+            if lead > 0.5 * drive[5]:
+                push = max(drive[7] * (lead - 0.5 * drive[5]) + drive[8] * (vm - v[0]), 0.0)
+            elif lead < -0.5 * drive[5]:
+                push = min(drive[7] * (lead + 0.5 * drive[5]) + drive[8] * (vm - v[0]), 0.0)
+            f[0] += push
+            vm += h / drive[6] * (u - push)
+        else:
+            f[0] += u
+        if drive[4] != 0.0 and command[on] != 0.0:
+            f[0] -= drive[4] * v[0]
+        for i in range(n):
+            if cart[i, 11] > 0.0:
+                if cart[i, 10] > 0.0 and x[i] > cart[i, 10]:
+                    push = cart[i, 11] * (x[i] - cart[i, 10]) + cart[i, 12] * v[i]
+                    f[i] -= max(push, 0.0)
+                if cart[i, 10] < 0.0 and x[i] < cart[i, 10]:
+                    push = cart[i, 11] * (cart[i, 10] - x[i]) - cart[i, 12] * v[i]
+                    f[i] += max(push, 0.0)
+            if cart[i, 14] > 0.0:
+                pull = cart[i, 15] * (xh[i] - x[i]) + cart[i, 16] * (vh[i] - v[i])
+                f[i] += pull
+                vh[i] -= h / cart[i, 14] * pull
+            if not free[i]:
+                continue
+            m = m1 if i == 0 else cart[i, 0]
+            if cart[i, 5] > 0.0:
+                if first and v[i] == 0.0:
+                    z[i] = min(max(f[i] / (scatter[i] * cart[i, 5]), -1.0), 1.0)
+                f[i] -= scatter[i] * cart[i, 5] * z[i]
+                z[i] += h * (v[i] - abs(v[i]) * z[i]) / cart[i, 6]
+            # The inclusion: the impulse that stops the cart, or as much of it as friction has.
+            target = v[i] + h / m * f[i]
+            most = cart[i, 2] + cart[i, 7] * abs(u)
+            if cart[i, 3] > 0.0:
+                speed = v[i] / cart[i, 4]
+                most += cart[i, 3] * np.exp(-speed * speed)
+            most *= scatter[i] * h / m
+            if abs(target) <= most:
+                v[i] = 0.0
+            else:
+                v[i] = target - np.sign(target) * most
+        first = False
+        for i in range(n):
+            if free[i]:
+                x[i] += 0.5 * h * v[i]
+            if cart[i, 14] > 0.0:
+                xh[i] += 0.5 * h * vh[i]
+        xm += 0.5 * h * vm
+        now += h
+    return out
+
+
+def simulate_truth(
+    *,
+    m: Sequence[float],
+    c: Sequence[float],
+    k: Sequence[float],
+    hidden: Sequence[Hidden] = (),
+    t: np.ndarray,
+    u: np.ndarray,
+    free: Sequence[int],
+    x0: np.ndarray | None = None,
+    scatter: np.ndarray | None = None,
+    step: float = STEP,
+) -> np.ndarray:
+    """Return the true readings (n, samples), before noise and encoder.
+
+    `t` are the sample times; the input is held from sample to sample.
+    """
+    n = len(m)
+    cart, spring = np.zeros((n, len(_CART))), np.zeros((n + 1, len(_SPRING)))
+    drive = np.zeros(len(_DRIVE))
+    cart[:, 0], cart[:, 1], cart[:, 13] = m, c, 1.0
+    cart[:, 4] = cart[:, 6] = 1.0
+    spring[:, 0] = k
+    drive[1] = np.inf
+    for effect in hidden:
+        _hide(effect, cart, spring, drive)
+    return _motion(
+        cart,
+        spring,
+        drive,
+        np.array([i + 1 in free for i in range(n)]),
+        t,
+        t,
+        np.asarray(u, dtype=float),
+        np.zeros(n) if x0 is None else np.asarray(x0, dtype=float),
+        np.zeros(n),
+        np.ones(n) if scatter is None else scatter,
+        step,
+    )
+
+
+def _hide(effect: Hidden, cart: np.ndarray, spring: np.ndarray, drive: np.ndarray) -> None:
+    p, i = dict(effect.parameters), effect.place - 1
+    match effect.effect:
+        case "coulomb_friction":
+            cart[i, 2] = p["force"]
+        case "stiction":
+            cart[i, 2:5] = p["force"], p["static_force"] - p["force"], p["velocity"]
+        case "presliding_friction":
+            cart[i, 5:7] = p["force"], p["distance"]
+        case "load_friction":
+            cart[i, 7] = p["coefficient"]
+        case "quadratic_drag":
+            cart[i, 8] = p["coefficient"]
+        case "force_offset":
+            cart[i, 9] = p["force"]
+        case "end_stop":
+            # Its own contact law: a fifth of critical damping on the contact spring.
+            damping = 0.4 * np.sqrt(p["stiffness"] * cart[i, 0])
+            cart[i, 10:13] = p["position"], p["stiffness"], damping
+        case "sensor_gain":
+            cart[i, 13] = p["gain"]
+        case "extra_mode":
+            cart[i, 14:17] = p["mass"], p["stiffness"], p["damping"]
+        case "cubic_spring":
+            spring[i, 1] = p["coefficient"]
+        case "slack_spring":
+            spring[i, 2:4] = p["stiffness_change"], p["stretch"]
+        case "coupling_damper":
+            spring[i, 4] = p["coefficient"]
+        case "dead_zone":
+            drive[0] = p["width"]
+        case "saturation":
+            drive[1] = p["limit"]
+        case "input_delay":
+            drive[2] = p["delay"]
+        case "actuator_lag":
+            drive[3] = p["time_constant"]
+        case "drive_damping":
+            drive[4] = p["coefficient"]
+        case "backlash":
+            motor = 0.15 * cart[0, 0]
+            contact = 60.0 * float(spring[:2, 0].sum())
+            drive[5:9] = p["gap"], motor, contact, 0.3 * np.sqrt(contact * motor)
+        case other:
+            raise ValueError(f"the truth knows no {other}")

@@ -1,0 +1,253 @@
+"""Random benches with hidden effects, and what a class would record of them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.results import Record
+from tests.truth.bench import Hidden, simulate_truth
+
+COUNT = 0.00227  # cm, the encoder step
+RATES = (113.1, 200.0, 250.0, 500.0, 1000.0)  # Hz
+
+_M = ([1.98587e-4], [3.128204e-4, 1.737182e-4], [3.2732e-4, 2.516715e-4, 1.960671e-4])
+_C = ([5.2427e-4], [6.663748e-4, 4.408337e-4], [1.1e-3, 4.32763e-4, 3.40361e-4])
+_K = (
+    [0.0346021, 0.0],
+    [0.03, 0.1274783, 0.06085252],
+    [0.03, 0.1234592, 0.06648407, 0.06275727],
+)
+
+EFFECTS = (
+    "coulomb_friction",
+    "stiction",
+    "presliding_friction",
+    "load_friction",
+    "quadratic_drag",
+    "cubic_spring",
+    "slack_spring",
+    "coupling_damper",
+    "force_offset",
+    "drive_damping",
+    "dead_zone",
+    "saturation",
+    "input_delay",
+    "actuator_lag",
+    "backlash",
+    "end_stop",
+    "sensor_gain",
+    "extra_mode",
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """A bench, what is hidden in it, and its records."""
+
+    n: int
+    springs: tuple[bool, ...]
+    hidden: tuple[Hidden, ...]
+    records: tuple[Record, ...]
+    m: tuple[float, ...]
+    c: tuple[float, ...]
+    k: tuple[float, ...]
+
+
+def make_case(
+    *,
+    seed: int,
+    n: int,
+    effects: Sequence[str] = (),
+    severity: float = 1.0,
+    dirt: bool = False,
+    rate: float | None = None,
+) -> Case:
+    """Make a bench with the named effects at random places and sizes.
+
+    `dirt` adds what real benches do: friction that varies by 4 % from run to run, encoders
+    zeroed where the cart happens to rest, time stamps rounded to a tenth of a millisecond.
+    """
+    rng = np.random.default_rng(seed)
+    m = np.array(_M[n - 1]) * rng.uniform(0.8, 1.25, n)
+    c = np.array(_C[n - 1]) * rng.uniform(0.7, 1.4, n)
+    k = np.array(_K[n - 1]) * rng.uniform(0.8, 1.25, n + 1)
+    if n > 1 and rng.random() < 0.4:
+        k[0] = 0.0
+    rate = float(rng.choice(RATES)) if rate is None else rate
+    stiffness = np.diag(k[:-1] + k[1:]) - np.diag(k[1:-1], 1) - np.diag(k[1:-1], -1)
+    gain = float(np.linalg.inv(stiffness)[0, 0])
+    large = rng.uniform(1.0, 1.5) / gain  # moves cart 1 by 1 to 1.5 cm, with overshoot twice that
+    plan = _plan(n, large, rng, rate)
+    linear = [
+        simulate_truth(m=m, c=c, k=k, t=t, u=u, free=free, x0=x0, step=2e-4)
+        for _, _, t, u, free, x0 in plan
+    ]
+    hidden = tuple(
+        _draw(name, n, m, c, k, stiffness, large, rate, linear, severity, rng) for name in effects
+    )
+    records = []
+    for name, kind, t, u, free, x0 in plan:
+        scatter = 1.0 + (0.04 * rng.standard_normal(n) if dirt else np.zeros(n))
+        lead = 0.0
+        if dirt and kind != "decay":
+            # The cart was left somewhere inside its friction band, and zeroed there.
+            x0 = np.array([_rest_band(h, stiffness, i, rng) for i, h in _by_cart(hidden, n)])
+            x0 = np.where([i + 1 in free for i in range(n)], x0, 0.0)
+        y = simulate_truth(m=m, c=c, k=k, hidden=hidden, t=t, u=u, free=free, x0=x0, scatter=scatter)
+        y = y + 0.3 * COUNT * rng.standard_normal(y.shape) + lead
+        if dirt:
+            y -= y[:, :1] if kind != "decay" else y[:, -1:]
+        y = np.round(y / COUNT) * COUNT
+        stamps = np.round(t, 4) if dirt else t
+        records.append(
+            Record(
+                id=name,
+                kind=kind,
+                t=stamps,
+                u=u,
+                y=y,
+                carts=tuple(range(1, n + 1)),
+                free=free,
+                resolution=np.full(n, COUNT),
+            )
+        )
+    return Case(
+        n=n,
+        springs=tuple(bool(s > 0) for s in k),
+        hidden=hidden,
+        records=tuple(records),
+        m=tuple(m),
+        c=tuple(c),
+        k=tuple(k),
+    )
+
+
+def _by_cart(hidden, n):
+    dry = ("coulomb_friction", "stiction", "presliding_friction")
+    for i in range(n):
+        yield i, next((h for h in hidden if h.effect in dry and h.place == i + 1), None)
+
+
+def _rest_band(h, stiffness, i, rng):
+    return 0.0 if h is None else rng.uniform(-0.5, 0.5) * h.parameters["force"] / stiffness[i, i]
+
+
+def _plan(n, large, rng, rate):
+    """Steps of two sizes (one repeated), a sweep, hand-released decays."""
+    dt = 1.0 / rate
+    everything = tuple(range(1, n + 1))
+    plan = []
+
+    def step(name, size, seconds=6.0):
+        t = np.arange(round(seconds * rate)) * dt
+        on = (t >= 0.05) & (t < 0.05 + 0.5 * seconds)
+        plan.append((name, "step", t, np.where(on, size, 0.0), everything, np.zeros(n)))
+
+    step("step-a", large)
+    step("step-b", 0.5 * large)
+    step("step-c", large)
+    step("step-d", -0.75 * large)
+    t = np.arange(round(8.0 * rate)) * dt
+    rate_of_sweep = (8.0 - 0.5) / 8.0
+    chirp = np.sin(2 * np.pi * (0.5 + 0.5 * rate_of_sweep * t) * t)
+    plan.append(("sweep", "sweep", t, 0.45 * large * chirp, everything, np.zeros(n)))
+    for cart in everything:
+        for trial in range(2):
+            t = np.arange(round(5.0 * rate)) * dt
+            x0 = np.zeros(n)
+            x0[cart - 1] = rng.uniform(1.2, 2.2) * (1 if trial == 0 else -1)
+            plan.append((f"decay-{cart}{'ab'[trial]}", "decay", t, 0 * t, (cart,), x0))
+    return plan
+
+
+def _draw(name, n, m, c, k, stiffness, large, rate, linear, severity, rng) -> Hidden:
+    """Draw a place and sizes; `severity` scales how far the effect departs from the linear."""
+    s = severity
+    i = int(rng.integers(n))
+    present = [j for j in range(n + 1) if k[j] > 0]
+    j = int(rng.choice(present))
+    reach = max(float(np.abs(y[i]).max()) for y in linear)
+    steps = max(float(np.abs(y[i]).max()) for y in linear[:4])
+    speed = 0.5 * reach * np.sqrt(stiffness[i, i] / m[i])
+    force = s * float(rng.uniform(0.008, 0.03)) * stiffness[i, i]
+    stretch = max(
+        float(np.abs((y[j] if j < n else 0.0) - (y[j - 1] if j > 0 else 0.0)).max())
+        for y in linear
+    )
+    sign = float(rng.choice([-1.0, 1.0]))
+    draw = rng.uniform
+    match name:
+        case "coulomb_friction":
+            return Hidden(effect=name, place=i + 1, parameters={"force": force})
+        case "stiction":
+            parameters = {
+                "force": force,
+                "static_force": force * draw(1.5, 2.5),
+                "velocity": draw(0.5, 2.0),
+            }
+            return Hidden(effect=name, place=i + 1, parameters=parameters)
+        case "presliding_friction":
+            parameters = {"force": force, "distance": draw(0.01, 0.05)}
+            return Hidden(effect=name, place=i + 1, parameters=parameters)
+        case "load_friction":
+            return Hidden(effect=name, place=i + 1, parameters={"coefficient": s * draw(0.03, 0.1)})
+        case "quadratic_drag":
+            q = s * draw(0.5, 2.0) * c[i] / speed
+            return Hidden(effect=name, place=i + 1, parameters={"coefficient": q})
+        case "force_offset":
+            return Hidden(
+                effect=name,
+                place=i + 1,
+                parameters={"force": s * sign * draw(0.05, 0.2) * stiffness[i, i]},
+            )
+        case "cubic_spring":
+            size = draw(0.08, 0.3) if sign > 0 else draw(0.04, 0.12)
+            a = s * sign * size * k[j] / stretch**2
+            return Hidden(effect=name, place=j + 1, parameters={"coefficient": a})
+        case "slack_spring":
+            r = s * (draw(0.4, 1.5) if rng.random() < 0.6 else -draw(0.3, 0.6))
+            side = sign * draw(0.15, 0.5) * stretch
+            return Hidden(
+                effect=name, place=j + 1, parameters={"stiffness_change": r, "stretch": side}
+            )
+        case "coupling_damper":
+            inner = [p for p in present if 0 < p < n]
+            place = int(rng.choice(inner))
+            return Hidden(
+                effect=name,
+                place=place + 1,
+                parameters={"coefficient": s * draw(0.4, 1.5) * c[place]},
+            )
+        case "drive_damping":
+            return Hidden(effect=name, parameters={"coefficient": s * draw(0.2, 0.8) * c[0]})
+        case "dead_zone":
+            return Hidden(effect=name, parameters={"width": s * draw(0.05, 0.2) * large})
+        case "saturation":
+            return Hidden(effect=name, parameters={"limit": (1 - s * draw(0.1, 0.35)) * large})
+        case "input_delay":
+            return Hidden(effect=name, parameters={"delay": s * draw(0.006, 0.03)})
+        case "actuator_lag":
+            return Hidden(effect=name, parameters={"time_constant": s * draw(0.01, 0.04)})
+        case "backlash":
+            return Hidden(effect=name, parameters={"gap": s * draw(0.03, 0.12)})
+        case "end_stop":
+            side = 1.0 if linear[0][i].max() > -linear[0][i].min() else -1.0
+            parameters = {
+                "position": side * (1 - s * draw(0.1, 0.35)) * steps,
+                "stiffness": draw(10.0, 40.0) * stiffness[i, i],
+            }
+            return Hidden(effect=name, place=i + 1, parameters=parameters)
+        case "sensor_gain":
+            return Hidden(effect=name, place=i + 1, parameters={"gain": 1 + s * sign * draw(0.03, 0.1)})
+        case "extra_mode":
+            mass = s * draw(0.06, 0.2) * m[i]
+            omega = draw(0.6, 1.8) * np.sqrt(stiffness[i, i] / m[i])
+            parameters = {
+                "mass": mass,
+                "stiffness": mass * omega**2,
+                "damping": 2 * draw(0.01, 0.08) * mass * omega,
+            }
+            return Hidden(effect=name, place=i + 1, parameters=parameters)
+        case other:
+            raise ValueError(f"no effect {other}")
