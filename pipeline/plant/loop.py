@@ -155,6 +155,24 @@ def simulate_loop(
     return LoopRun(t=t, x=x + rest[:, None], u=efforts[held])
 
 
+def replay(
+    controller: Controller, *, t: Array, y: Array, reference: Array, free: Sequence[int]
+) -> Array:
+    """Return the effort (n,) the controller asks for at each reading of a recorded run.
+
+    `y` (f, n) are the readings of the `free` carts. Nothing is clipped or predicted: what the
+    stated law makes of what the carts did, to hold against the logged input.
+    """
+    T = float(t[-1] - t[0]) / (t.size - 1)
+    law = _law(controller, free=tuple(free), sample_time=T, y0=y[:, 0])
+    efforts = np.empty(t.size)
+    for i in range(t.size):
+        law.measure(y[:, i])
+        efforts[i] = law.effort(reference[i])
+        law.predict(0.0)
+    return efforts
+
+
 def discretise(
     chain: Chain, sample_time: float, *, free: Sequence[int] | None = None
 ) -> tuple[Array, Array]:

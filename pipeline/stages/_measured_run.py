@@ -1,0 +1,149 @@
+"""A record beside the chain that is to explain it: how it began, and where it steps."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import DataError
+from pipeline.plant.chain import Array, Chain
+from pipeline.plant.simulate import simulate_linear
+from pipeline.results import Record
+from pipeline.stages._signals import local_noise
+
+_STILL = 0.02  # of its range that a signal may vary while nothing happens
+_MIN_QUIET = 5  # samples at rest that show a rest; of a step or a closed loop one is believed
+_JUMP = 0.3  # of its range, within one sample: a step
+_MIN_STEP_SAMPLES = 10
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MeasuredRun:
+    """One record and how it began; rows are the free carts, ascending.
+
+    Attributes
+    ----------
+    y : (f, n) readings; zero where a free cart was not measured.
+    seen : (f,) which carts were measured.
+    noise : (f,) standard deviation of the readings from sample to sample, or a rounding step.
+    quiet : samples from the start until input or reference first change; at least one.
+    rest : (f,) readings at rest. x0 : (2f,) state at the start, about the rest.
+    """
+
+    record: Record
+    chain: Chain
+    free: tuple[int, ...]
+    y: Array
+    seen: NDArray[np.bool_]
+    noise: Array
+    quiet: int
+    rest: Array
+    x0: Array
+
+    @property
+    def driven(self) -> bool:
+        """There is a logged input, and it is not zero throughout."""
+        return self.record.u is not None and bool(np.any(self.record.u != 0))
+
+    def forced(self) -> Array:
+        """Return the response (f, n) of the chain, from rest, to the logged input."""
+        record = self.record
+        if record.u is None:
+            raise DataError(f"{record.id}: the hardware check needs a logged input, found none")
+        return simulate_linear(self.chain, record.t, record.u, free=self.free, hold=record.hold)
+
+    def unforced(self) -> Array:
+        """Return the readings (f, n) that the start alone would give."""
+        return self.rest[:, None] + self._ringing(self.x0)
+
+    def misfit(self, model: Array) -> float:
+        """Return the pooled NRMSE of readings `model` (f, n) over the measured carts."""
+        error, motion = self.y - model, self.y - self.rest[:, None]
+        return float(np.sqrt(np.sum(error[self.seen] ** 2) / np.sum(motion[self.seen] ** 2)))
+
+    def begun_in_motion(self) -> "MeasuredRun":
+        """Return the run with its rest and starting state fitted to the whole record.
+
+        Linear least squares, the input's factor free, so that a wrong one does not bend the start.
+        """
+        n = self.record.t.size
+        states = np.eye(2 * len(self.free))
+        columns = [self.forced(), *(self._ringing(state) for state in states)]
+        columns += [np.outer(cart, np.ones(n)) for cart in np.eye(len(self.free))]
+        rows = np.array([column[self.seen].ravel() for column in columns])
+        size = np.linalg.norm(rows, axis=1)
+        known = size > 0  # a cart that was not measured has no rest to be found
+        fitted = np.zeros(len(columns))
+        target = self.y[self.seen].ravel()
+        fitted[known] = np.linalg.lstsq((rows[known] / size[known, None]).T, target)[0]
+        fitted[known] /= size[known]
+        return replace(self, x0=fitted[1 : 1 + len(states)], rest=fitted[1 + len(states) :])
+
+    def step_window(self, signal: Array | None) -> slice | None:
+        """Return the samples from the first step of `signal` (n,) to the next, or None."""
+        if signal is None or not np.any(signal):
+            return None
+        # Before the record the signal was zero, so one that stands from the start steps there.
+        edges = np.flatnonzero(
+            np.abs(np.diff(signal, prepend=0.0)) > _JUMP * np.ptp([0.0, *signal])
+        )
+        if edges.size == 0:
+            return None
+        stop = int(edges[1]) if edges.size > 1 else signal.size
+        window = slice(int(edges[0]), stop)
+        return window if window.stop - window.start >= _MIN_STEP_SAMPLES else None
+
+    def _ringing(self, x0: Array) -> Array:
+        t = self.record.t
+        if not np.any(x0):
+            return np.zeros((len(self.free), t.size))
+        return simulate_linear(self.chain, t, np.zeros(t.size), free=self.free, x0=x0)
+
+
+def measured_run(record: Record, chain: Chain) -> MeasuredRun:
+    """Return the run, its rest read off its start or, where it begins in motion, fitted.
+
+    Raises
+    ------
+    DataError : cart 1 was held, or no free cart was measured or moved.
+    """
+    free = tuple(sorted(set(record.free)))
+    if 1 not in free:
+        raise DataError(
+            f"{record.id}: the hardware check needs cart 1, which the motor drives, to be free, "
+            f"found free {list(free)}"
+        )
+    t = record.t
+    seen = np.array([cart in record.carts for cart in free])
+    y = np.array([record.position(c) if c in record.carts else np.zeros(t.size) for c in free])
+    if not np.any(np.ptp(y, axis=1) > 0):
+        raise DataError(f"{record.id}: the hardware check needs a cart that moves, found none")
+    quiet = _quiet_samples(record)
+    noise = [local_noise(t, y[i]) if s else 0.0 for i, s in enumerate(seen)]
+    step = [record.encoder_step(c) if c in record.carts else 0.0 for c in free]
+    run = MeasuredRun(
+        record=record,
+        chain=chain,
+        free=free,
+        y=y,
+        seen=seen,
+        noise=np.maximum(noise, step),
+        quiet=quiet,
+        rest=y[:, :quiet].mean(axis=1),
+        x0=np.zeros(2 * len(free)),
+    )
+    # Six deviations, or as many encoder steps, of a rest are more than chance.
+    at_rest = np.all(np.ptp(y[:, :quiet], axis=1) <= 6 * run.noise)
+    shown = quiet >= _MIN_QUIET or record.kind in ("step", "closed_loop")
+    return run if (at_rest and shown) or not run.driven else run.begun_in_motion()
+
+
+def _quiet_samples(record: Record) -> int:
+    quiet = record.t.size
+    for signal in (record.u, record.reference):
+        if signal is not None:
+            changes = np.abs(signal - signal[0]) > _STILL * np.ptp(signal)
+            quiet = min(quiet, int(np.argmax(changes)) if changes.any() else quiet)
+            if abs(signal[0]) > _STILL * np.max(np.abs(signal)):
+                quiet = 1  # it acts from the first sample on
+    return max(quiet, 1)

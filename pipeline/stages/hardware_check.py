@@ -1,0 +1,289 @@
+"""Hold the identified chain against a run it was not fitted to: Figures 15-17.
+
+Two simulations per cart. "closed": the controller that ran, with its delay and saturation, closes
+the loop around the chain. "open": the measured input drives the chain, and the logged input's
+sign and scale are put to the test, since some benches change both when the loop is closed.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from pipeline import submission
+from pipeline.errors import DataError
+from pipeline.plant import step_response
+from pipeline.plant.chain import Array, Chain
+from pipeline.plant.loop import Controller, Pid, StateFeedback, replay, simulate_loop
+from pipeline.results import HardwareCheck, Record
+from pipeline.stages._measured_run import MeasuredRun, measured_run
+
+_SERVO_PERIOD = 0.000884  # s; of the ECP controller, whose log keeps one sample in several
+_COARSE_LOG = 3.0  # servo periods between logged samples, from where on the two differ
+_TRUSTED = 1.5  # a factor on the input within this is the model's error, not the log's
+_WORTH_IT = 0.6  # of the difference may stay where another sign or scale is believed
+_SETTLED_SHARE = 0.2  # of the time after a step, its end, whose mean is the steady state
+_SMALL_CHANGE = 0.05  # of the cart's largest motion; a smaller step has no overshoot to speak of
+_EXPLAINED = 0.7  # a simulation further off than this explains less than half of the motion
+_SAME = 1e-3  # of the largest input: the same value
+_BLOWN_UP = 10.0  # times the measured motion that a simulated loop is off by: it is unstable
+
+
+def check_hardware(
+    record: Record,
+    chain: Chain,
+    *,
+    controller: submission.Controller | None = None,
+    controlled_cart: int | None = None,
+    input_limit: float | None = None,
+) -> tuple[HardwareCheck, ...]:
+    """Compare the chain with one run, cart by cart: the closed loop first, then the open.
+
+    Any kind of run will do whose input was logged. `controller` is what ran on the hardware;
+    without one, or without its gains, the loop is not closed.
+
+    Parameters
+    ----------
+    controlled_cart : whose position a PID controller fed back, unless the controller says it.
+    input_limit : where the input saturates; a lower limit that shows in the log comes first.
+
+    Raises
+    ------
+    DataError : there is neither a logged input nor a controller with its reference and a stable
+        loop; cart 1 was held; no free cart was measured, or none moved.
+    """
+    run = measured_run(record, chain)
+    opened = _open(run) if run.driven else None
+    law = _plant_law(controller, controlled_cart)
+    closed, unstable = None, ""
+    if law is not None and record.reference is not None:
+        closed = _close(run, law, drive=opened.factor if opened else 1.0, limit=input_limit)
+        if closed is None:
+            unstable = "the stated controller makes the simulated loop unstable"
+    if opened is None and closed is None:
+        found = unstable or "found neither a logged input nor a controller with its reference"
+        raise DataError(
+            f"{record.id}: the hardware check needs a loop or an input to simulate: {found}"
+        )
+    checks = []
+    if closed is not None:
+        scale = opened.scale if opened else None
+        checks += _compare(run, replace(closed, scale=scale), loop="closed")
+    if opened is not None:
+        note = "; ".join(filter(None, (unstable, opened.note)))
+        checks += _compare(run, replace(opened, note=note), loop="open")
+    return tuple(checks)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Simulated:
+    """Readings (f, n) of the free carts, the factor used on the input, and the one found."""
+
+    y: Array
+    note: str
+    factor: float = 1.0
+    scale: float | None = None
+
+
+# -------------------------------------------------------------------- open loop
+
+
+def _open(run: MeasuredRun) -> _Simulated:
+    """Drive the chain with the logged input, times a factor where the log cannot be right."""
+    forced, unforced = run.forced(), run.unforced()
+    moved = (run.y - unforced)[run.seen]
+    scale = float(np.sum(moved * forced[run.seen]) / np.sum(forced[run.seen] ** 2))
+    as_logged, scaled = run.misfit(unforced + forced), run.misfit(unforced + scale * forced)
+    if _plausible(scale) or scaled > min(_WORTH_IT * as_logged, _EXPLAINED):
+        return _Simulated(y=unforced + forced, scale=scale, note="")
+    note = (
+        f"the logged input explains the motion only if taken {scale:.3g} times, so it is: "
+        f"the difference falls from {100 * as_logged:.0f} % to {100 * scaled:.0f} % "
+        "(sign and scale of this log are not those of the system's input)"
+    )
+    return _Simulated(y=unforced + scale * forced, factor=scale, scale=scale, note=note)
+
+
+def _plausible(factor: float) -> bool:
+    return 1 / _TRUSTED <= factor <= _TRUSTED
+
+
+# ------------------------------------------------------------------ closed loop
+
+
+def _plant_law(controller: submission.Controller | None, cart: int | None) -> Controller | None:
+    """Return the controller as the simulation knows it; None where there is nothing to simulate."""
+    if isinstance(controller, submission.Pid):
+        steered = controller.cart
+        if "cart" not in controller.model_fields_set and cart is not None:
+            steered = cart
+        return Pid(
+            kp=controller.kp,
+            ki=controller.ki,
+            kd=controller.kd,
+            scale=controller.scale,
+            cart=steered,
+        )
+    if controller is None or not controller.gains:
+        return None
+    return StateFeedback(gains=np.array(controller.gains), prefilter=controller.prefilter)
+
+
+def _close(
+    run: MeasuredRun, law: Controller, *, drive: float, limit: float | None
+) -> _Simulated | None:
+    """Close the loop around the chain; None where it is unstable.
+
+    How fast the bench's controller samples and acts, and whether it predicts, is not logged: of
+    the usual ways the one that comes nearest to the measurement is taken.
+    """
+    record = run.record
+    assert record.reference is not None
+    factor = _logged_per_stated(run, law)
+    law = _times(law, factor)
+    limit = min(np.inf if limit is None else limit, _plateau(record.u))
+    best, least = None, _BLOWN_UP
+    for law_as_run, sample_time, delay in _ways(run, law, drive=drive):
+        with np.errstate(over="ignore", invalid="ignore"):
+            y = simulate_loop(
+                run.chain,
+                law_as_run,
+                t=record.t,
+                reference=record.reference,
+                sample_time=sample_time,
+                delay=delay,
+                input_limit=limit,
+                drive=drive,
+                rest=run.rest,
+                x0=run.x0,
+                free=run.free,
+            ).x
+            misfit = run.misfit(y)
+        if misfit < least:
+            best, least = y, misfit
+    if best is None:
+        return None
+    note = ""
+    if factor == -1.0:
+        note = "the logged input has the opposite sign of what the stated controller asks for"
+    elif factor != 1.0:
+        note = f"the logged input is {factor:.3g} times what the stated controller asks for"
+    return _Simulated(y=best, note=note)
+
+
+def _ways(
+    run: MeasuredRun, law: Controller, *, drive: float
+) -> list[tuple[Controller, float | None, int]]:
+    """Return controllers, each with its sample time (None: the log's) and delay in ticks."""
+    ways: list[tuple[Controller, float | None, int]] = [(law, None, 1), (law, None, 0)]
+    if isinstance(law, StateFeedback):
+        # In units of the effort the chain is 1 / drive as heavy and as stiff.
+        chain = run.chain
+        model = Chain(m=chain.m / drive, c=chain.c / drive, k=chain.k / drive)
+        ways.insert(0, (replace(law, model=model), None, 1))
+    if run.record.sample_time > _COARSE_LOG * _SERVO_PERIOD:
+        ways.append((law, _SERVO_PERIOD, 1))
+    return ways
+
+
+def _logged_per_stated(run: MeasuredRun, law: Controller) -> float:
+    """Return the factor between the logged input and what the law asks for; 1 without a log.
+
+    The one with the least sum of absolute differences, a weighted median: samples where the
+    input saturates, or a velocity is mostly rounding, do not sway it.
+    """
+    record = run.record
+    if record.u is None or record.reference is None or not (run.driven and run.seen.all()):
+        return 1.0
+    stated = replay(law, t=record.t, y=run.y, reference=record.reference, free=run.free)
+    asked = np.flatnonzero(stated)
+    if asked.size == 0:
+        return 1.0
+    ratio, weight = record.u[asked] / stated[asked], np.abs(stated[asked])
+    order = np.argsort(ratio)
+    half = np.searchsorted(np.cumsum(weight[order]), weight.sum() / 2)
+    factor = float(ratio[order[half]])
+    if factor == 0 or _plausible(abs(factor)):
+        return 1.0 if factor >= 0 else -1.0
+    return factor
+
+
+def _plateau(u: Array | None) -> float:
+    """Return the largest input if the log stays at it for more than a sample, else infinity."""
+    if u is None:
+        return np.inf
+    size = np.abs(u)
+    return float(size.max()) if np.sum(size >= (1 - _SAME) * size.max()) > 1 else np.inf
+
+
+def _times(law: Controller, factor: float) -> Controller:
+    if isinstance(law, Pid):
+        return replace(law, scale=law.scale * factor)
+    return replace(law, gains=law.gains * factor, prefilter=law.prefilter * factor)
+
+
+# -------------------------------------------------------------------- comparing
+
+
+def _compare(
+    run: MeasuredRun, simulated: _Simulated, *, loop: Literal["closed", "open"]
+) -> list[HardwareCheck]:
+    """Return a check for each measured cart that moved; the note goes with the first."""
+    record, note = run.record, simulated.note
+    steps = record.reference if record.kind == "closed_loop" else record.u
+    window = run.step_window(steps) if record.kind in ("closed_loop", "step") else None
+    checks = []
+    for row in np.flatnonzero(run.seen).tolist():
+        measured, model, rest = run.y[row], simulated.y[row], run.rest[row]
+        motion = float(np.sum((measured - rest) ** 2))
+        if motion == 0:
+            continue
+        step_measured = _judge(run, measured, row=row, window=window, noise=3 * run.noise[row])
+        step_model = _judge(run, model, row=row, window=window, noise=0.0)
+        checks.append(
+            HardwareCheck(
+                experiment=record.id,
+                cart=run.free[row],
+                loop=loop,
+                nrmse=float(np.sqrt(np.sum((measured - model) ** 2) / motion)),
+                overshoot_model=step_model.overshoot,
+                overshoot_measured=step_measured.overshoot,
+                settling_model=step_model.settling,
+                settling_measured=step_measured.settling,
+                steady_state_model=step_model.level,
+                steady_state_measured=step_measured.level,
+                input_scale=simulated.scale,
+                t=record.t,
+                measured=measured,
+                model=model,
+                note=note,
+            )
+        )
+        note = ""
+    return checks
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Step:
+    """Overshoot in percent, settling time in s, level as read; None where there is none."""
+
+    overshoot: float | None = None
+    settling: float | None = None
+    level: float | None = None
+
+
+def _judge(run: MeasuredRun, y: Array, *, row: int, window: slice | None, noise: float) -> _Step:
+    """Judge the step of one cart's readings `y` (n,) in the window."""
+    if window is None:
+        return _Step()
+    t, after = run.record.t[window], y[window]
+    before = y[: window.start].mean() if window.start > 0 else run.rest[row]
+    level = after[-max(1, round(_SETTLED_SHARE * after.size)) :].mean()
+    if abs(level - before) <= max(noise, _SMALL_CHANGE * np.max(np.abs(y - before))):
+        return _Step(level=float(level))
+    settling = float(step_response.settling_time(t, after, before=before, level=level, noise=noise))
+    return _Step(
+        overshoot=float(step_response.overshoot_percent(after, before=before, level=level)),
+        settling=None if np.isnan(settling) else settling,
+        level=float(level),
+    )
