@@ -28,10 +28,14 @@ from pipeline.stages.time_window import Misfit, Window, compare, open_window
 # A fit that leaves more than this share of the motion's power unexplained has not found the
 # chain (dry friction leaves some 2 %): further starts are tried.
 _LOST = 0.1
+_NOISE_EXPLAINS = 2.0  # chi² per degree of freedom below which there is nothing more to find
 _NEGLIGIBLE = 0.05  # of its standard error: such a damping or wall spring is held at zero
 _REST_SIGMAS = 5.0  # how far beyond chance a free start must improve the fit to be kept
 _STRUCTURE_VALUES = 20  # independent values of the chain's own error in a record
 _DETERMINED = 1e-9  # smallest singular value of the scaled Jacobian over its largest
+# A damping or spring that is not there sends its logarithm towards minus infinity: e^-15 of a
+# start is nothing, and no step may overflow.
+_LOG_REACH = 15.0
 _MOST_EVALUATIONS = 60
 
 
@@ -76,7 +80,7 @@ def fit_records(
     ]
     found = _descend(windows, parametrisation, found.theta)
     covariance = found.covariance()
-    if zero := found.negligible(covariance):
+    while zero := found.negligible(covariance):
         parametrisation = parametrisation.holding_at_zero(*zero)
         theta = parametrisation.pack(found.chain)
         found = _descend(windows, parametrisation, theta)
@@ -168,19 +172,29 @@ def _search(
     """Return the best fit from as many starts as it takes, and their number."""
     springs = parametrisation.springs
     regressed = [regress_chain(windows, springs=springs, width=width) for width in WIDTHS]
-    starts = [parametrisation.pack(chain) for chain in (given, *regressed) if chain is not None]
-    starts.sort(key=lambda theta: _look(windows, parametrisation, theta).cost)
-    starts += [parametrisation.pack(chain) for chain in even_chains(windows, springs=springs)]
+    near = [parametrisation.pack(chain) for chain in (given, *regressed) if chain is not None]
+    near.sort(key=lambda theta: _look(windows, parametrisation, theta).cost)
     best: _Found | None = None
-    for tried, theta in enumerate(starts, start=1):
-        found = _descend(windows, parametrisation, theta)
-        if best is None or found.cost < best.cost:
-            best = found
+    tried = 0
+    for theta in near:
+        best, tried = _better(best, _descend(windows, parametrisation, theta)), tried + 1
         if best.lost < _LOST:
             return best, tried
+    # Even chains are far from the truth: the search may end beside it, so all are tried unless
+    # one explains the records down to their noise.
+    for chain in even_chains(windows, springs=springs):
+        theta = parametrisation.pack(chain)
+        best, tried = _better(best, _descend(windows, parametrisation, theta)), tried + 1
+        if best.cost < _NOISE_EXPLAINS * best.dof:
+            break
     if best is None:
-        raise DataError("time fit: no start found: the records show no motion that fits a chain")
-    return best, len(starts)
+        raise DataError("time fit: needs records that show a chain in motion, found no start")
+    return best, tried
+
+
+def _better(best: _Found | None, found: _Found) -> _Found:
+    """Return the fit that leaves less."""
+    return found if best is None or found.cost < best.cost else best
 
 
 def _look(windows: Sequence[Window], parametrisation: Parametrisation, theta: Array) -> _Found:
@@ -207,7 +221,9 @@ def _descend(windows: Sequence[Window], parametrisation: Parametrisation, theta:
         misfits = _look(windows, parametrisation, np.frombuffer(theta_bytes)).misfits
         return _triangle([_triangle_of(misfit) for misfit in misfits])
 
-    lower, upper = parametrisation.bounds
+    reach = np.where(parametrisation.logarithmic, _LOG_REACH, np.inf)
+    lower = np.maximum(parametrisation.bounds[0], theta - reach)
+    upper = np.minimum(parametrisation.bounds[1], theta + reach)
     solution = least_squares(
         lambda x: triangle(x.tobytes())[:, -1],
         np.clip(theta, lower, upper),

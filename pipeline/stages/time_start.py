@@ -14,7 +14,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from pipeline.errors import DataError
 from pipeline.plant.chain import Array, Chain
 from pipeline.stages.chain_parameters import START_ZETA, even_chain, physical_start
 from pipeline.stages.time_window import Window
@@ -137,15 +136,12 @@ def even_chains(windows: Sequence[Window], *, springs: Sequence[bool]) -> list[C
     swing = np.median([np.ptp(w.y[0]) / np.ptp(w.drive_u) for w in driven if w.drive_u is not None])
     slowest = 2 * np.pi * _FEWEST_PERIODS / max(w.t[-1] for w in driven)
     fastest = 2 * np.pi / (_FEWEST_PER_PERIOD * min(float(np.median(np.diff(w.t))) for w in driven))
-    if not swing > 0 or fastest <= slowest:
-        return []
+    if not swing > 0 or fastest <= slowest or not (springs[0] or springs[-1]):
+        return []  # with no spring to a wall nothing sets a gain
     n, ratio = len(springs) - 1, fastest / slowest
     count = int(np.log(ratio) / np.log(_FREQUENCY_STEP)) + 1
     chains = []
     for omega in slowest * ratio ** (np.arange(count + 1) / count):
         values = {"K_1": swing / _SWING_OVER_GAIN, "omega_a": omega}
-        try:
-            chains.append(even_chain(values, n=n, springs=springs))
-        except DataError:  # no spring to a wall: nothing sets a gain
-            return []
+        chains.append(even_chain(values, n=n, springs=springs))
     return chains
