@@ -1,0 +1,173 @@
+"""A report as plain data: sections of blocks, which HTML and PDF render alike.
+
+Content is decided once (`content.py`), so the two renderings cannot disagree, and every text is
+data: neither renderer ever takes a string for markup. `as_json` is what the PDF template reads.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, fields, is_dataclass
+from typing import Any, Literal
+
+from pipeline.report.mathematics import Math, Term
+
+
+@dataclass(frozen=True)
+class Span:
+    """A run of text in one style, a link (http, https or mailto only), or inline mathematics."""
+
+    text: str
+    style: Literal["plain", "strong", "em", "code"] = "plain"
+    url: str = ""
+    math: Term | None = None
+
+
+Spans = tuple[Span, ...]
+
+
+@dataclass(frozen=True)
+class Heading:
+    """A heading inside a section; level 3 or deeper."""
+
+    text: Spans
+    level: int = 3
+    kind: str = field(default="heading", init=False)
+
+
+@dataclass(frozen=True)
+class Paragraph:
+    """A paragraph."""
+
+    text: Spans
+    kind: str = field(default="paragraph", init=False)
+
+
+@dataclass(frozen=True)
+class Items:
+    """A list; each item is a tuple of blocks."""
+
+    items: tuple[tuple["Block", ...], ...]
+    ordered: bool = False
+    kind: str = field(default="items", init=False)
+
+
+@dataclass(frozen=True)
+class Quote:
+    """Quoted blocks."""
+
+    blocks: tuple["Block", ...]
+    kind: str = field(default="quote", init=False)
+
+
+@dataclass(frozen=True)
+class Code:
+    """Preformatted text."""
+
+    text: str
+    kind: str = field(default="code", init=False)
+
+
+@dataclass(frozen=True)
+class Formula:
+    """A displayed equation; `alt` reads it in words."""
+
+    math: Math
+    alt: str
+    kind: str = field(default="formula", init=False)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A table cell; `tone` colours what its text already says."""
+
+    text: Spans
+    tone: Literal["", "good", "bad", "quiet"] = ""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A numbered table; `align` has one of l, c, r for each column."""
+
+    number: int
+    caption: Spans
+    head: tuple[Cell, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+    align: str
+    kind: str = field(default="table", init=False)
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A numbered figure, drawn as SVG; `name` is its file in `figures/`."""
+
+    number: int
+    name: str
+    caption: Spans
+    alt: str
+    svg: str
+    width: float  # inches, as drawn
+    kind: str = field(default="picture", init=False)
+
+
+Block = Heading | Paragraph | Items | Quote | Code | Formula | Table | Picture
+
+
+@dataclass(frozen=True)
+class Section:
+    """A section; `id` is its anchor."""
+
+    id: str
+    title: str
+    blocks: tuple[Block, ...]
+
+
+@dataclass(frozen=True)
+class Document:
+    """A whole report."""
+
+    title: str
+    subtitle: str
+    authors: tuple[str, ...]
+    sections: tuple[Section, ...]
+    footer: str
+
+    def pictures(self) -> tuple[Picture, ...]:
+        """Return the figures, in order."""
+        blocks = (block for section in self.sections for block in section.blocks)
+        return tuple(block for block in blocks if isinstance(block, Picture))
+
+
+def spans(*parts: str | Span | Spans) -> Spans:
+    """Join strings, spans and tuples of spans."""
+    joined: list[Span] = []
+    for part in parts:
+        if isinstance(part, str):
+            joined.append(Span(part))
+        elif isinstance(part, Span):
+            joined.append(part)
+        else:
+            joined.extend(part)
+    return tuple(joined)
+
+
+def paragraph(*parts: str | Span | Spans) -> Paragraph:
+    """Return a paragraph of the joined parts."""
+    return Paragraph(spans(*parts))
+
+
+def bullet_list(items: Iterable[Spans]) -> Items:
+    """Return a list of one-paragraph items."""
+    return Items(tuple((Paragraph(item),) for item in items))
+
+
+def as_json(value: Any) -> Any:
+    """Return dataclasses and tuples as what `json` can write."""
+    if is_dataclass(value):
+        return {f.name: as_json(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, tuple):
+        return [as_json(item) for item in value]
+    return value
+
+
+def plain(text: Spans) -> str:
+    """Return the text alone, for titles, alt texts and attributes."""
+    return "".join(span.text for span in text)

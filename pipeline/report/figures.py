@@ -1,0 +1,203 @@
+"""One style for all figures, and the way from a figure to SVG text.
+
+Measured data are points (dark, diamonds for single values), models are lines (blue), so that a
+figure reads in grey and for the colour-blind. Text stays text: it can be searched and selected.
+"""
+
+import io
+import re
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path
+from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator, StrMethodFormatter
+
+from pipeline.plant.chain import Array
+
+WIDTH = 5.0  # inches: 8.5 pt text stays readable when a phone shows it at three quarters
+MEASURED = "#222222"
+MODEL = "#0072b2"  # blue and vermillion of Okabe and Ito, apart in grey too
+SECOND = "#d55e00"
+QUIET = "#8a8a8a"
+SHADE = "#ececec"
+CART_LINES = ("-", "--", "-.", ":")  # carts that share a panel differ by line style as well
+CART_COLOURS = (MODEL, SECOND, "#009e73", MEASURED)
+
+_BUCKETS = 320  # twice this many points a line: finer than print at this width shows
+_LEFT, _RIGHT = 0.62, 0.12  # inches left for tick labels and axis titles
+_TOP, _BOTTOM, _GAP = 0.14, 0.44, 0.13
+_X_LABEL, _Y_LABEL = 0.31, 0.46  # inches from the axes to the middle of their titles
+_COLUMN_GAP = 0.28  # of a panel's width
+_DECADE = (1, 2, 5)
+_DOT = 1.8  # points
+
+_STYLE = {
+    "font.family": ["DejaVu Sans"],  # comes with matplotlib, so the PDF has it too
+    "font.size": 8.5,
+    "axes.titlesize": 8.5,
+    "axes.labelsize": 8.5,
+    "xtick.labelsize": 7.5,
+    "ytick.labelsize": 7.5,
+    "legend.fontsize": 7.5,
+    "legend.frameon": False,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.7,
+    "axes.edgecolor": "#444444",
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.unicode_minus": True,
+    "grid.color": "#e4e4e4",
+    "grid.linewidth": 0.6,
+    "lines.linewidth": 1.2,
+    "text.parse_math": False,  # a dollar sign in a student's text is a dollar sign
+    "svg.fonttype": "none",
+    "figure.facecolor": "none",
+    "savefig.facecolor": "none",
+}
+
+
+@contextmanager
+def drawing() -> Iterator[None]:
+    """Draw in the report's style, whatever the user's own matplotlib settings are."""
+    with matplotlib.rc_context(), warnings.catch_warnings():
+        # A name in Chinese is fine: the reader's browser has the font that matplotlib lacks.
+        warnings.filterwarnings("ignore", message="Glyph .* missing from font")
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(_STYLE)
+        yield
+
+
+def panels(
+    *heights: float, columns: int = 1, share_x: bool = True, legend: bool = True
+) -> tuple[Figure, list[Axes]]:
+    """Return a figure with rows of the given heights (inches), its axes row by row.
+
+    Margins are set in inches, not searched for: a search draws every figure twice. Panels that
+    do not share their time axis each get room for tick labels and a title.
+    """
+    own_x = 0.0 if share_x else 0.46
+    top = _TOP + (0.2 if legend else 0.0)
+    gap = _GAP + own_x
+    height = sum(heights) + gap * (len(heights) - 1) + top + _BOTTOM
+    figure = Figure(figsize=(WIDTH, height))
+    grid = figure.add_gridspec(
+        len(heights),
+        columns,
+        height_ratios=heights,
+        left=_LEFT / WIDTH,
+        right=1 - _RIGHT / WIDTH,
+        top=1 - top / height,
+        bottom=_BOTTOM / height,
+        hspace=gap * len(heights) / sum(heights),
+        wspace=_COLUMN_GAP,
+    )
+    axes: list[Axes] = []
+    width = (WIDTH - _LEFT - _RIGHT) / (columns + (columns - 1) * _COLUMN_GAP)
+    for row in range(len(heights)):
+        for column in range(columns):
+            shared = axes[0] if share_x and axes else None
+            ax = figure.add_subplot(grid[row, column], sharex=shared)
+            if share_x and row < len(heights) - 1:
+                ax.tick_params(labelbottom=False, bottom=False)
+            # Given places for labels save a search among all tick labels, and line them up.
+            ax.yaxis.set_label_coords(-_Y_LABEL / width, 0.5)
+            ax.xaxis.set_label_coords(0.5, -_X_LABEL / heights[row])
+            ax.yaxis.set_major_locator(MaxNLocator(nbins=4, steps=[1, 2, 5, 10], min_n_ticks=2))
+            if not share_x or not axes:
+                bins = 7 if columns == 1 else 4
+                ax.xaxis.set_major_locator(MaxNLocator(nbins=bins, steps=[1, 2, 5, 10]))
+            axes.append(ax)
+    return figure, axes
+
+
+def log_frequency_axis(ax: Axes, omega: Array) -> None:
+    """Make x a logarithmic frequency axis with ticks at 1, 2, 5, 10 …, labelled in full."""
+    low, high = 0.9 * float(omega.min()), 1.1 * float(omega.max())
+    ax.set_xscale("log")
+    ax.set_xlim(low, high)
+    exponents = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
+    ticks = [m * 10.0**e for e in exponents for m in _DECADE if low <= m * 10.0**e <= high]
+    ax.xaxis.set_major_locator(FixedLocator(ticks))
+    ax.xaxis.set_minor_locator(NullLocator())
+    ax.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+
+
+def legend_above(ax: Axes, *, columns: int = 4) -> None:
+    """Put the legend above the axes, where it hides no data."""
+    ax.legend(
+        loc="lower left",
+        bbox_to_anchor=(0.0, 1.0),
+        ncols=columns,
+        borderpad=0.0,
+        borderaxespad=0.3,
+        handlelength=1.6,
+        columnspacing=1.4,
+    )
+
+
+def thin(t: Array, y: Array) -> tuple[Array, Array]:
+    """Keep the least and greatest value of each stretch of a long line, in their order in time.
+
+    What the eye sees stays: every peak, and the envelope of what is too fast to see.
+    """
+    if t.size <= 2 * _BUCKETS:
+        return t, y
+    starts = np.linspace(0, t.size, _BUCKETS + 1).astype(int)[:-1]
+    size = int(np.ceil(t.size / _BUCKETS)) + 1
+    index = np.minimum(
+        starts[:, None] + np.arange(size), np.append(starts[1:], t.size)[:, None] - 1
+    )
+    values = y[index]
+    rows = np.arange(_BUCKETS)
+    least, most = index[rows, values.argmin(1)], index[rows, values.argmax(1)]
+    keep = np.unique(np.concatenate([least, most]))
+    return t[keep], y[keep]
+
+
+def plot_measured(ax: Axes, t: Array, y: Array, *, label: str = "measured") -> None:
+    """Draw a measured time series as points."""
+    x, y = thin(t, y)
+    # Strokes of no length with round ends: one path for all points takes a fifth of the time and
+    # a third of the text that markers do. Added as an artist, or matplotlib walks every stroke.
+    points = np.column_stack([x, y])
+    strokes = Path(points.repeat(2, axis=0), np.tile([Path.MOVETO, Path.LINETO], x.size))
+    ax.add_artist(PathPatch(strokes, fill=False, color=MEASURED, lw=_DOT, capstyle="round"))
+    ax.update_datalim(points)
+    ax.plot([], [], ".", color=MEASURED, ms=2 * _DOT, mew=0, label=label)  # for the legend
+
+
+def plot_model(ax: Axes, t: Array, y: Array, *, label: str = "model") -> None:
+    """Draw a model as a line."""
+    ax.plot(*thin(t, y), color=MODEL, lw=1.2, label=label)
+
+
+# Names that matplotlib gives to groups: nobody refers to them, and each page needs them once.
+_GROUP_ID = re.compile(r' id="[a-zA-Z0-9]+_\d+"')
+_HEADER = re.compile(r"^.*?(?=<svg )", re.DOTALL)
+_METADATA = re.compile(r"\s*<metadata>.*?</metadata>", re.DOTALL)
+
+
+def to_svg(figure: Figure, *, name: str, alt: str) -> str:
+    """Return the figure as an SVG element, its alternative text inside; the same bytes each time.
+
+    The canvas is called directly: `savefig` would draw everything twice.
+    """
+    buffer = io.StringIO()
+    with matplotlib.rc_context({"svg.hashsalt": name}):
+        FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None})
+    svg = _METADATA.sub("", _HEADER.sub("", buffer.getvalue()))
+    svg = _GROUP_ID.sub("", svg).replace("'DejaVu Sans'", "'DejaVu Sans', sans-serif")
+    title = f"<title>{_escape(alt)}</title>"
+    return svg.replace("<svg ", '<svg role="img" ', 1).replace(">", f">{title}", 1)
+
+
+def _escape(text: str) -> str:
+    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")

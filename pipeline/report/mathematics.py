@@ -1,0 +1,184 @@
+"""Mathematics as a small tree, rendered as MathML, as plain text, or by the PDF template.
+
+A leaf is a string: a number ("24.3"), an operator ("+"), or an identifier ("ω", "s"); anything
+longer that is not a number is set upright. A node is `Math(kind, parts)`.
+"""
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Literal
+
+_NUMBER = re.compile(r"\d+(\.\d+)?")
+_OPERATORS = frozenset("+−=·,()[]≥<≈")
+_RELATIONS = frozenset("=≥<≈")
+
+Kind = Literal["row", "fraction", "sub", "sup", "dot", "ddot", "matrix", "parens", "lines"]
+
+
+@dataclass(frozen=True)
+class Math:
+    """A node; `columns` is the width of a matrix, whose parts go row by row."""
+
+    kind: Kind
+    parts: tuple["Term", ...]
+    columns: int = 0
+
+
+Term = Math | str
+
+
+def row(*parts: Term) -> Math:
+    """Return terms side by side."""
+    return Math("row", parts)
+
+
+def fraction(above: Term, below: Term) -> Math:
+    """Return a fraction."""
+    return Math("fraction", (above, below))
+
+
+def sub(base: Term, index: Term) -> Math:
+    """Return a term with an index."""
+    return Math("sub", (base, index))
+
+
+def power(base: Term, exponent: Term) -> Math:
+    """Return a term with an exponent."""
+    return Math("sup", (base, exponent))
+
+
+def dot(base: Term, *, order: int = 1) -> Math:
+    """Return the first or second time derivative."""
+    return Math("dot" if order == 1 else "ddot", (base,))
+
+
+def parens(*parts: Term) -> Math:
+    """Return terms in round brackets that grow with them."""
+    return Math("parens", parts)
+
+
+def matrix(rows: Iterable[Sequence[Term]]) -> Math:
+    """Return a matrix in square brackets."""
+    filled = [tuple(r) for r in rows]
+    return Math("matrix", tuple(term for r in filled for term in r), columns=len(filled[0]))
+
+
+def lines(equations: Iterable[Term]) -> Math:
+    """Return equations one below the other."""
+    return Math("lines", tuple(equations))
+
+
+def total(terms: Sequence[Term]) -> Term:
+    """Return the sum of terms."""
+    if len(terms) == 1:
+        return terms[0]
+    joined: list[Term] = [terms[0]]
+    for term in terms[1:]:
+        joined += ["+", term]
+    return row(*joined)
+
+
+def negative(term: Term) -> Math:
+    """Return the term with a minus sign before it."""
+    return row("−", term)
+
+
+def symbol(name: str) -> Term:
+    """Return a parameter name such as `omega_a`, `K_1` or `mass` as it is written by hand."""
+    base, _, index = name.partition("_")
+    base = GREEK.get(base, base)
+    return sub(base, index) if index else base
+
+
+GREEK = {"omega": "ω", "zeta": "ζ", "delta": "δ", "mass": "m", "damping": "c"}
+
+
+def number(text: str) -> Term:
+    """Return a formatted number ("−1.2 × 10⁻³") as a term that reads as one."""
+    unsigned = text.removeprefix("−")
+    mantissa, times, exponent = unsigned.partition(" × 10")
+    term: Term = mantissa
+    if times:
+        term = row(mantissa, "·", power("10", exponent.translate(_PLAIN_DIGITS)))
+    return negative(term) if unsigned != text else term
+
+
+_PLAIN_DIGITS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789−")
+
+
+# ------------------------------------------------------------------- renderers
+
+
+def to_mathml(math: Term, *, display: bool = False) -> str:
+    """Return the mathematics as MathML, every leaf escaped."""
+    mode = ' display="block"' if display else ""
+    return f"<math{mode}>{_mathml(math)}</math>"
+
+
+def _mathml(term: Term) -> str:
+    if isinstance(term, str):
+        return _mathml_leaf(term)
+    parts = [_mathml(part) for part in term.parts]
+    inside = "".join(parts)
+    match term.kind:
+        case "row":
+            return f"<mrow>{inside}</mrow>"
+        case "parens":
+            return f"<mrow><mo>(</mo><mrow>{inside}</mrow><mo>)</mo></mrow>"
+        case "fraction":
+            return f"<mfrac>{inside}</mfrac>"
+        case "sub":
+            return f"<msub>{inside}</msub>"
+        case "sup":
+            return f"<msup>{inside}</msup>"
+        case "dot" | "ddot":
+            mark = "˙" if term.kind == "dot" else "¨"
+            return f'<mover accent="true">{inside}<mo>{mark}</mo></mover>'
+        case "lines":
+            return "<mtable>" + "".join(f"<mtr><mtd>{p}</mtd></mtr>" for p in parts) + "</mtable>"
+        case "matrix":
+            cells = [f"<mtd>{part}</mtd>" for part in parts]
+            rows = [
+                "<mtr>" + "".join(cells[i : i + term.columns]) + "</mtr>"
+                for i in range(0, len(cells), term.columns)
+            ]
+            return f"<mrow><mo>[</mo><mtable>{''.join(rows)}</mtable><mo>]</mo></mrow>"
+
+
+def _mathml_leaf(leaf: str) -> str:
+    text = escape(leaf)
+    if _NUMBER.fullmatch(leaf):
+        return f"<mn>{text}</mn>"
+    if leaf in _OPERATORS:
+        return f"<mo>{text}</mo>"
+    return f"<mi>{text}</mi>"
+
+
+def to_text(term: Term) -> str:
+    """Return the mathematics in one line of text, for readers that cannot see it."""
+    if isinstance(term, str):
+        return f" {term} " if term in _RELATIONS or term in "+" else term
+    parts = [to_text(part) for part in term.parts]
+    match term.kind:
+        case "row":
+            return "".join(parts)
+        case "parens":
+            return f"({''.join(parts)})"
+        case "fraction":
+            return f"({parts[0]})/({parts[1]})"
+        case "sub":
+            return f"{parts[0]}_{parts[1]}"
+        case "sup":
+            return f"{parts[0]}^{parts[1]}"
+        case "dot":
+            return f"{parts[0]}′"
+        case "ddot":
+            return f"{parts[0]}″"
+        case "lines":
+            return "; ".join(parts)
+        case "matrix":
+            width = term.columns
+            rows = [", ".join(parts[i : i + width]) for i in range(0, len(parts), width)]
+            return f"[{'; '.join(rows)}]"

@@ -1,0 +1,77 @@
+"""How numbers are written: once, here, so that a report says the same everywhere."""
+
+import math
+
+_SUPERSCRIPT = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
+_PLAIN_RANGE = (1e-3, 1e5)  # sizes written without a power of ten
+NOTHING = "–"
+
+
+def significant(value: float | None, *, digits: int = 4) -> str:
+    """Return a number with `digits` significant digits; a dash where there is none."""
+    if value is None or not math.isfinite(value):
+        return NOTHING
+    if value == 0:
+        return "0"
+    exponent = _exponent(value, digits=digits)
+    if _is_plain(exponent):
+        return _fixed(value, digits - 1 - exponent)
+    return f"{_fixed(value / 10.0**exponent, digits - 1)} × 10{_superscript(exponent)}"
+
+
+def with_error(value: float, std: float | None) -> str:
+    """Return "value ± std", both to the decimal place of the second digit of the error."""
+    if std is None or not math.isfinite(std) or std <= 0 or not math.isfinite(value):
+        return significant(value)
+    size = _exponent(max(abs(value), std), digits=2)
+    if _is_plain(size):
+        decimals = 1 - _exponent(std, digits=2)
+        return f"{_fixed(value, decimals)} ± {_fixed(std, decimals)}"
+    scale = 10.0**size
+    decimals = 1 - _exponent(std / scale, digits=2)
+    inside = f"{_fixed(value / scale, decimals)} ± {_fixed(std / scale, decimals)}"
+    return f"({inside}) × 10{_superscript(size)}"
+
+
+def percent(value: float | None, *, signed: bool = False) -> str:
+    """Return a percentage: one decimal below 100 %, none above."""
+    if value is None or not math.isfinite(value):
+        return NOTHING
+    text = _fixed(value, 1 if abs(value) < 99.95 else 0)
+    return f"+{text} %" if signed and value > 0 else f"{text} %"
+
+
+def count(n: int, noun: str) -> str:
+    """Return "1 decay", "3 decays"."""
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
+
+
+def listing(items: list[str]) -> str:
+    """Return "a", "a and b", "a, b and c"."""
+    if len(items) < 2:
+        return "".join(items)
+    return f"{', '.join(items[:-1])} and {items[-1]}"
+
+
+def unit_text(unit: str) -> str:
+    """Return a unit with its powers raised: "V s^2/cm" as "V s²/cm"."""
+    return unit.replace("^2", "²")
+
+
+def _exponent(value: float, *, digits: int) -> int:
+    """Return the power of ten of `value` once it is rounded to `digits` digits."""
+    return int(f"{abs(value):.{digits - 1}e}".split("e")[1])
+
+
+def _is_plain(exponent: int) -> bool:
+    low, high = _PLAIN_RANGE
+    return low <= 10.0**exponent < high
+
+
+def _fixed(value: float, decimals: int) -> str:
+    rounded = round(value, decimals) + 0.0  # no minus zero
+    return f"{rounded:.{max(decimals, 0)}f}".replace("-", "−")
+
+
+def _superscript(exponent: int) -> str:
+    return str(exponent).translate(_SUPERSCRIPT)

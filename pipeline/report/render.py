@@ -1,0 +1,48 @@
+"""Write a report: one document, as HTML and as PDF, with its figures beside them."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from pipeline.report.content import build_document
+from pipeline.report.html import render_html
+from pipeline.report.pdf import missing_characters, render_pdf
+from pipeline.results import Analysis
+
+
+def render_report(
+    analysis: Analysis,
+    out: Path,
+    *,
+    pdf: bool = True,
+    progress: Callable[[str], None] | None = None,
+) -> None:
+    """Write `report.html`, `report.pdf` and `figures/*.svg` into the folder `out`.
+
+    The same analysis gives the same bytes. What the PDF's fonts cannot show is warned of, in the
+    report and through `progress`, which is also told of each section.
+    """
+    if pdf and (lost := missing_characters(_students_text(analysis))):
+        warning = f"report.pdf: no font there has {lost}; report.html shows them"
+        analysis = replace(analysis, warnings=(*analysis.warnings, warning))
+        if progress:
+            progress(warning)
+    document = build_document(analysis, progress=progress)
+    figures = out / "figures"
+    figures.mkdir(parents=True, exist_ok=True)
+    for picture in document.pictures():
+        (figures / f"{picture.name}.svg").write_text(picture.svg, encoding="utf-8", newline="\n")
+    (out / "report.html").write_text(render_html(document), encoding="utf-8", newline="\n")
+    if pdf:
+        if progress:
+            progress("report: pdf")
+        (out / "report.pdf").write_bytes(render_pdf(document))
+
+
+def _students_text(analysis: Analysis) -> str:
+    """Return all that students wrote and the report shows."""
+    authors = (part for author in analysis.authors for part in author)
+    records = (record.id for record in analysis.records)
+    units = (analysis.position_unit, analysis.input_unit)
+    notes = analysis.discussion or ""
+    return "".join((analysis.title, analysis.section, *authors, *records, *units, notes))

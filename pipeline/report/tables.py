@@ -1,0 +1,334 @@
+"""The tables of a report, as data: numbers formatted, parameter names as mathematics."""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from pipeline.report.document import Cell, Span, Spans, Table, spans
+from pipeline.report.numbers import NOTHING, percent, significant, unit_text, with_error
+from pipeline.report.words import SOURCES, clean, name_span, rich
+from pipeline.results import (
+    Analysis,
+    ChainFit,
+    Check,
+    Estimate,
+    FeedbackDesign,
+    HardwareCheck,
+    LogDecrement,
+    ParameterRow,
+    StepGain,
+)
+
+_OUTCOMES = {"pass": "passed", "fail": "failed", "skip": "not checked"}
+_TONES = {"pass": "good", "fail": "bad", "skip": "quiet"}
+
+
+def _cell(text: str | Spans | Span, tone: str = "") -> Cell:
+    return Cell(spans(text), tone)  # type: ignore[arg-type]
+
+
+def _table(
+    number: int,
+    caption: str | Spans,
+    head: Iterable[str | Spans],
+    rows: Iterable[Sequence[Cell]],
+    align: str,
+) -> Table:
+    return Table(
+        number=number,
+        caption=spans(caption),
+        head=tuple(_cell(text) for text in head),
+        rows=tuple(tuple(row) for row in rows),
+        align=align,
+    )
+
+
+# ------------------------------------------------------------------ parameters
+
+
+def parameter_table(rows: Sequence[ParameterRow], *, number: int, carts: int) -> Table:
+    """Return initial and final estimates as the paper's Tables 1-3, with errors and a verdict."""
+    words = {1: "one", 2: "two", 3: "three", 4: "four"}
+    return _table(
+        number,
+        f"Initial and final estimates of the parameters for the {words.get(carts, carts)} degree "
+        "of freedom model, with standard errors.",
+        ("Parameter", "Unit", "Initial estimate", "from", "Final estimate", "Change", "Verdict"),
+        [_parameter_row(row) for row in rows],
+        "llrlrrl",
+    )
+
+
+def _parameter_row(row: ParameterRow) -> list[Cell]:
+    source = SOURCES.get(row.initial.source, clean(row.initial.source)) if row.initial else ""
+    change = percent(row.change_percent, signed=True)
+    if row.change_sigmas is not None:
+        change += f" ({significant(row.change_sigmas, digits=2)} σ)"
+    return [
+        _cell(name_span(row.name)),
+        _cell(unit_text(clean(row.unit)) or "1"),
+        _cell(_estimate(row.initial)),
+        _cell(source, "quiet"),
+        _cell(_estimate(row.final)),
+        _cell(change),
+        _verdict(row.consistent),
+    ]
+
+
+def _estimate(estimate: Estimate | None) -> str:
+    return NOTHING if estimate is None else with_error(estimate.value, estimate.std)
+
+
+def _verdict(consistent: bool | None) -> Cell:
+    if consistent is None:
+        return _cell("not compared", "quiet")
+    return _cell("agree", "good") if consistent else _cell("differ", "bad")
+
+
+def parameter_notes(rows: Sequence[ParameterRow]) -> list[Spans]:
+    """Return the remarks on single parameters, equal remarks told once."""
+    by_note: dict[str, list[str]] = {}
+    for row in rows:
+        if row.note:
+            by_note.setdefault(row.note, []).append(row.name)
+    return [spans(rich(", ".join(names)), ": ", rich(clean(n))) for n, names in by_note.items()]
+
+
+def chain_table(fit: ChainFit, *, number: int, position_unit: str, input_unit: str) -> Table:
+    """Return masses, dampings and springs, each with its standard error where it was fitted."""
+    std = dict(zip(fit.names, np.sqrt(np.diag(fit.covariance)), strict=True))
+    chain = fit.chain
+    kinds = (
+        ("m", "mass", chain.m, f"{input_unit} s²/{position_unit}"),
+        ("c", "damping", chain.c, f"{input_unit} s/{position_unit}"),
+        ("k", "spring", chain.k, f"{input_unit}/{position_unit}"),
+    )
+    rows = []
+    for letter, noun, values, unit in kinds:
+        for i, value in enumerate(values, start=1):
+            if chain.n == 1 and letter == "k" and i > 1:
+                continue  # only the sum of a lone cart's springs is known
+            name = f"{letter}_{i}" if chain.n > 1 else letter
+            error = std.get(f"{letter}_{i}")
+            absent = value == 0 and not error
+            rows.append(
+                [
+                    _cell(name_span(name)),
+                    _cell(_where(noun, i, chain.n)),
+                    _cell("none" if absent else with_error(float(value), error)),
+                    _cell(clean(unit)),
+                ]
+            )
+    return _table(
+        number,
+        "The identified chain. The input gain is one, so masses, dampings and stiffnesses are in "
+        "input units.",
+        ("Symbol", "Meaning", "Value", "Unit"),
+        rows,
+        "llrl",
+    )
+
+
+def _where(noun: str, i: int, n: int) -> str:
+    if noun != "spring":
+        return f"{noun} of cart {i}" if n > 1 else f"{noun} of the cart"
+    if n == 1:
+        return "springs, together"
+    ends = "wall and cart 1" if i == 1 else f"cart {n} and wall"
+    return f"spring between {ends if i in (1, n + 1) else f'carts {i - 1} and {i}'}"
+
+
+# ---------------------------------------------------------------- single stages
+
+
+def decay_table(decays: Sequence[LogDecrement], *, number: int, position_unit: str) -> Table:
+    """Return frequency and damping of every decay, by both methods, with the friction test."""
+    rows = []
+    for decay in decays:
+        friction = decay.friction
+        if friction is None:
+            verdict = _cell("not tested", "quiet")
+        elif friction.present:
+            verdict = _cell(f"yes: d = {with_error(friction.drop, friction.drop_std)}", "bad")
+        else:
+            verdict = _cell("none seen", "good")
+        rows.append(
+            [
+                _cell(clean(decay.experiment)),
+                _cell(str(decay.cart)),
+                _cell(with_error(decay.omega_n, decay.omega_n_std)),
+                _cell(with_error(decay.zeta, decay.zeta_std)),
+                _cell(with_error(decay.zeta_peaks, decay.zeta_peaks_std)),
+                _cell(str(decay.peak_t.size)),
+                verdict,
+            ]
+        )
+    return _table(
+        number,
+        "Free decays of single carts: the fitted decay, and the logarithmic decrement of its "
+        f"extrema. d is half the width of the friction band, in {clean(position_unit)}.",
+        (
+            "Record", "Cart", spans(name_span("omega_n"), " [rad/s]"),
+            spans(name_span("zeta"), " of the fit"), spans(name_span("zeta"), " of the extrema"),
+            "Extrema", "Dry friction",
+        ),
+        rows,
+        "lcrrrcl",
+    )  # fmt: skip
+
+
+def step_table(gains: Sequence[StepGain], *, number: int, unit: str) -> Table:
+    """Return the static gain of every step record and cart."""
+    rows = []
+    for gain in gains:
+        value = with_error(gain.gain, gain.gain_std)
+        if gain.interval is not None:
+            low, high = (significant(v, digits=3) for v in gain.interval)
+            value = f"{low} to {high}"
+        rows.append(
+            [
+                _cell(clean(gain.experiment)),
+                _cell(str(gain.cart)),
+                _cell(str(len(gain.edges))),
+                _cell(value),
+                _cell(significant(gain.rest_shift, digits=2)),
+            ]
+        )
+    return _table(
+        number,
+        "Static gains from steps: change of level over change of input. An interval stands where "
+        "a cart sticks; the last column is how far its rest point moved.",
+        ("Record", "Cart", "Edges", f"K [{clean(unit)}]", "Rest moved by"),
+        rows,
+        "lccrr",
+    )
+
+
+def feedback_table(design: FeedbackDesign, *, number: int, units: tuple[str, str]) -> Table:
+    """Return gains, prefilter and what the simulated step does."""
+    position, drive = (clean(unit) for unit in units)
+    rows = []
+    for i, value in enumerate(design.gains):
+        speed = i % 2
+        of = "velocity" if speed else "position"
+        rows.append(
+            (
+                spans(f"gain on the {of} of cart {i // 2 + 1}"),
+                significant(value),
+                f"{drive} s/{position}" if speed else f"{drive}/{position}",
+            )
+        )
+    rows += [
+        (spans("prefilter"), significant(design.prefilter), f"{drive}/{position}"),
+        (spans("sample time"), significant(design.sample_time), "s"),
+        (spans("overshoot"), percent(design.overshoot_percent), ""),
+        (spans("settling time, 2 %"), significant(design.settling_time, digits=3), "s"),
+        (spans("largest input"), significant(design.peak_input, digits=3), drive),
+    ]
+    return _table(
+        number,
+        f"State feedback for cart {design.cart}, and its simulated step of "
+        f"{significant(design.reference)} {position}.",
+        ("Quantity", "Value", "Unit"),
+        [[_cell(what), _cell(value), _cell(unit)] for what, value, unit in rows],
+        "lrl",
+    )
+
+
+def pole_table(design: FeedbackDesign, *, number: int) -> Table:
+    """Return the closed-loop poles, beside the requested ones where some were."""
+    order = np.lexsort((design.poles.imag, np.abs(design.poles)))
+    poles = design.poles[order]
+    head = ["Pole [rad/s]", "Frequency [rad/s]", "Damping ratio"]
+    rows = [
+        [
+            _cell(_complex(pole)),
+            _cell(significant(abs(pole), digits=3)),
+            _cell(significant(-pole.real / abs(pole), digits=3) if pole != 0 else NOTHING),
+        ]
+        for pole in poles
+    ]
+    if (requested := design.requested_poles) is not None:
+        head.insert(0, "Requested [rad/s]")
+        requested = requested[np.lexsort((requested.imag, np.abs(requested)))]
+        for i, cells in enumerate(rows):
+            # A delay adds poles that nobody asked for.
+            cells.insert(0, _cell(_complex(requested[i]) if i < requested.size else NOTHING))
+    return _table(number, "Poles of the closed loop.", head, rows, "r" * len(head))
+
+
+def _complex(value: complex) -> str:
+    real = significant(value.real, digits=3)
+    if value.imag == 0:
+        return real
+    sign = "+" if value.imag > 0 else "−"
+    return f"{real} {sign} {significant(abs(value.imag), digits=3)} j"
+
+
+def hardware_table(checks: Sequence[HardwareCheck], *, number: int, position_unit: str) -> Table:
+    """Return model against measurement of every run and cart."""
+    rows = [
+        [
+            _cell(clean(check.experiment)),
+            _cell(str(check.cart)),
+            _cell("loop" if check.loop == "closed" else "measured input"),
+            _cell(percent(100 * check.nrmse)),
+            _cell(_pair(check.overshoot_model, check.overshoot_measured)),
+            _cell(_pair(check.settling_model, check.settling_measured)),
+            _cell(_pair(check.steady_state_model, check.steady_state_measured)),
+        ]
+        for check in checks
+    ]
+    return _table(
+        number,
+        "Model against measurement; pairs are model / measured. The difference is the root mean "
+        "square of measured minus model, over that of the measured motion.",
+        (
+            "Record", "Cart", "Simulated", "Difference", "Overshoot [%]", "Settling [s]",
+            f"Steady state [{clean(position_unit)}]",
+        ),
+        rows,
+        "lclrrrr",
+    )  # fmt: skip
+
+
+def _pair(model: float | None, measured: float | None) -> str:
+    if model is None and measured is None:
+        return NOTHING
+    return f"{significant(model, digits=3)} / {significant(measured, digits=3)}"
+
+
+# ----------------------------------------------------------------- housekeeping
+
+
+def check_table(checks: Sequence[Check], *, number: int) -> Table:
+    """Return every consistency check, failed ones first."""
+    order = {"fail": 0, "pass": 1, "skip": 2}
+    return _table(
+        number,
+        "Consistency checks.",
+        ("Outcome", "Check", "What was found"),
+        [
+            [
+                _cell(_OUTCOMES[check.outcome], _TONES[check.outcome]),
+                _cell(Span(clean(check.id), "code")),
+                _cell(rich(clean(check.message))),
+            ]
+            for check in sorted(checks, key=lambda check: order[check.outcome])
+        ],
+        "lll",
+    )
+
+
+def file_table(analysis: Analysis, *, number: int) -> Table:
+    """Return the data files with their SHA-256."""
+    return _table(
+        number,
+        "The data files this report was made from, with their SHA-256.",
+        ("File", "SHA-256"),
+        [
+            [_cell(Span(clean(name), "code")), _cell(Span(clean(digest), "code"))]
+            for name, digest in sorted(analysis.files.items())
+        ],
+        "ll",
+    )
