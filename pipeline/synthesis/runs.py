@@ -17,9 +17,10 @@ _LETTERS = "abcdefgh"
 _SETTLED = 6.0  # time constants: a transient is down to 0.25 %
 _SETTLED_DWELL = 7.0  # and to 0.1 %, since near a null it hides a small steady motion
 _LONGEST_WAIT = 12.0  # s; no student waits longer, however little damping there is
+_LONGEST_DECAY = 8.0  # s
 _CYCLES = 6.5  # of steady state in a dwell: room to see that six do not change any more
 _SHORTEST_DWELL = 1.4  # s of it, at high frequencies
-_WHOLE_EVERY = 7  # a session that saves space records one dwell in so many from rest
+_WHOLE_EVERY = 10  # a session that saves space records one dwell in so many from rest
 _REST = 0.5  # s of rest before a step and before a closed loop's
 
 
@@ -60,6 +61,8 @@ def decays(chain: Chain, session: Session, rng: np.random.Generator) -> list[Run
         if chain.k[cart - 1] + chain.k[cart] == 0:
             continue
         decay_rate = chain.c[cart - 1] / (2 * chain.m[cart - 1])
+        # After 4.5 time constants 1.5 cm have become 7 counts.
+        ringing = max(1.0, 4.5 / max(decay_rate, 4.5 / _LONGEST_DECAY))
         for repeat in range(session.repeats):
             side = 1 if rng.random() < 0.5 else -1
             hand = Hand(
@@ -69,8 +72,7 @@ def decays(chain: Chain, session: Session, rng: np.random.Generator) -> list[Run
                 fade=float(rng.uniform(0.01, 0.03)),
                 tremor=tuple(rng.uniform(0, 2 * np.pi, size=3).tolist()),
             )
-            # After 4.5 time constants 1.5 cm have become 7 counts.
-            t = session.clock(hand.release + np.clip(4.5 / decay_rate, 1.0, 8.0))
+            t = session.clock(hand.release + ringing)
             runs.append(
                 Run(
                     id=f"decay-{cart}{_LETTERS[repeat]}",
@@ -204,7 +206,7 @@ def _all(chain: Chain) -> tuple[int, ...]:
 def _wait(chain: Chain, time_constants: float) -> float:
     """Return how long a student waits for the transient, s."""
     slowest = float(np.min(-chain.poles.real))
-    if slowest <= 0:
+    if slowest <= 1e-9 * np.abs(chain.poles).max():  # zero but for rounding
         raise DataError("the carts never settle: a session needs damping and a spring to a wall")
     return min(time_constants / slowest, _LONGEST_WAIT)
 
