@@ -10,7 +10,8 @@ from pipeline.ingest.bode import Points, frequency_responses, read_points
 from pipeline.ingest.clock import Clock, read_clock
 from pipeline.ingest.columns import Column, assign_columns, conversion
 from pipeline.ingest.files import read_table
-from pipeline.ingest.signals import encoder_step, input_sign
+from pipeline.ingest.problems import channel_problems
+from pipeline.ingest.signals import encoder_step, input_sign, mirrors
 from pipeline.ingest.table import Table
 from pipeline.plant.chain import Array
 from pipeline.results import FrequencyResponse, Record
@@ -19,7 +20,6 @@ from pipeline.submission import Experiment, Submission, System
 DUTY_COUNT = 5 / 4096  # V; the UCSD bench's amplifier gives 5 V for 4096 counts
 _FEWEST_SAMPLES = 8
 _WINDOW_SLACK = 0.01  # of the record's length: "to the end" is often typed rounded up
-_MIRROR = 0.9  # of all samples equal to encoder 1: a commanded position that commands nothing
 _NEED_INPUT = ("step", "sine", "sweep")
 
 
@@ -135,6 +135,10 @@ def _read_record(table: Table, experiment: Experiment, system: System) -> Record
         for c, row, scale in zip(positions, y, scales, strict=True)
     ]
     u, input_scale = _input(table, columns, experiment, system, notes)
+    names = {column.name: row[keep] for column, row in zip(positions, y, strict=True)}
+    held = {c.name for c in positions if c.cart not in experiment.carts}
+    moving = {name: row for name, row in names.items() if name not in held}
+    notes += channel_problems(clock.t[keep], None if u is None else u[keep], moving)
     return Record(
         id=experiment.id,
         kind=experiment.kind,
@@ -322,12 +326,10 @@ def _reference(
     if column is None:
         return None
     values = table.values[column.index]
-    mirrored = columns.get("x1")
-    if mirrored is not None and np.ptp(values) > 0:
-        equal = np.mean(np.abs(values - table.values[mirrored.index]) <= 1.0)
-        if equal > _MIRROR:
-            notes.append(f"{column.name!r} only mirrors {mirrored.name!r} and is no reference")
-            return None
+    first = columns.get("x1")
+    if first is not None and mirrors(values, table.values[first.index]):
+        notes.append(f"{column.name!r} only mirrors {first.name!r} and is no reference")
+        return None
     return values[keep] * _position_scale(table, column, system, notes)
 
 

@@ -7,6 +7,7 @@ from pipeline.plant.chain import Array
 _MOST_LEVELS = 20_000  # an encoder on a lab cart has a few thousand counts over its travel
 _ON_GRID = 0.15  # of a step, rms: farther off, the values are not multiples of one step
 _LEAST_SHARE = 0.02  # of the work to and fro: less net work has no sure sign
+_MIRRORED = 0.75  # of the samples within one count; the copy lags encoder 1 at speed
 _BLOCKS = 12  # a record is cut into so many to look for rest; a lab step settles within a few
 _STILL = 0.02  # of the travel: the cart rests in a block that scatters less
 _RESTS, _SURE = 5, 0.9  # so many rests correlate with the input so well (squared) by chance in
@@ -36,6 +37,11 @@ def encoder_step(x: Array) -> float:
     step = float(counts @ at / (counts @ counts))
     off_grid = distances / step - np.round(distances / step)
     return step if np.sqrt(np.mean(off_grid**2)) < _ON_GRID else 0.0
+
+
+def mirrors(reference: Array, x1: Array) -> bool:
+    """Tell a commanded position that only repeats encoder 1, as an ECP logs it in open loop."""
+    return bool(np.ptp(reference) > 0 and np.mean(np.abs(reference - x1) <= 1.0) > _MIRRORED)
 
 
 def input_sign(u: Array, x1: Array, *, closed_loop: bool) -> int:

@@ -181,10 +181,9 @@ def _problems(submission: Submission, folder: Path) -> Iterator[tuple[Location, 
     """Yield (location, what is wrong) for what no single value shows."""
     n, springs = submission.system.carts, submission.system.springs
     if len(springs) != n + 1:
-        names = ["wall-1", *(f"{i}-{i + 1}" for i in range(1, n)), f"{n}-wall"]
         yield (
             ("system", "springs"),
-            f"expected {n + 1} values ({', '.join(names)}), found {len(springs)}",
+            f"expected {n + 1} values ({', '.join(spring_names(n))}), found {len(springs)}",
         )
     if submission.design is not None:
         yield from _in_range(("design", "cart"), submission.design.cart, n)
@@ -197,6 +196,11 @@ def _problems(submission: Submission, folder: Path) -> Iterator[tuple[Location, 
         for key, what in _experiment_problems(experiment, n, folder):
             yield ("experiments", i, *key), what
     yield from _reported_problems(submission)
+
+
+def spring_names(carts: int) -> list[str]:
+    """Return "wall-1", "1-2", …, the springs from one wall to the other."""
+    return ["wall-1", *(f"{i}-{i + 1}" for i in range(1, carts)), f"{carts}-wall"]
 
 
 def _in_range(at: Location, cart: int, n: int) -> Iterator[tuple[Location, str]]:

@@ -3,8 +3,9 @@
 from pathlib import Path
 
 from pipeline.errors import ConfigError
+from pipeline.plant.chain import parameter_names
 from pipeline.resources import TEMPLATES
-from pipeline.submission.load import NAME
+from pipeline.submission.load import NAME, spring_names
 
 _NOTES = """\
 <!-- What you write here becomes the discussion of the report (Markdown).
@@ -24,7 +25,7 @@ def new_submission(folder: Path, *, carts: int) -> None:
     folder = Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ConfigError(f"{folder}: is there already and not empty; name a new folder")
-    import jinja2
+    import jinja2  # costs 50 ms, and only a new submission needs it
 
     source = (TEMPLATES / f"{NAME}.j2").read_text(encoding="utf-8")
     environment = jinja2.Environment(
@@ -33,7 +34,14 @@ def new_submission(folder: Path, *, carts: int) -> None:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    text = environment.from_string(source).render(carts=carts)
+    text = environment.from_string(source).render(
+        carts=carts,
+        springs=["true"] * (carts + 1),
+        spring_names=spring_names(carts),
+        ratio_names=[f"x{i}" for i in range(1, carts + 1)],
+        zeros=["0.0"] * (2 * carts),
+        names=parameter_names(carts),
+    )
     (folder / "data").mkdir(parents=True, exist_ok=True)
     (folder / NAME).write_text(text, encoding="utf-8", newline="\n")
     (folder / "notes.md").write_text(_NOTES, encoding="utf-8", newline="\n")

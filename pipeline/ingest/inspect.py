@@ -1,0 +1,233 @@
+"""What a data file holds, before anything is made of it."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.errors import SubmissionError
+from pipeline.ingest.clock import Clock, read_clock
+from pipeline.ingest.columns import Column, assign_columns, conversion
+from pipeline.ingest.files import read_table
+from pipeline.ingest.problems import channel_problems
+from pipeline.ingest.signals import encoder_step, mirrors
+from pipeline.ingest.table import FORM_TITLES, Table
+from pipeline.plant.chain import Array
+from pipeline.results import Kind
+
+_UNEVEN = 0.01  # of the sample interval, rms
+_SLOW = 0.5  # s between samples; no bench records so slowly, a file in ms or in samples looks so
+_EDGE, _MOST_EDGES, _FLAT = 0.2, 20, 0.03  # of the input's range: an edge; between edges, its rms
+_ONE_LINE = 0.9  # share of the input's power in one spectral line
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColumnInspection:
+    """One column: its heading, the role it would play, its range and the encoder step seen."""
+
+    name: str
+    role: str | None
+    low: float
+    high: float
+    step: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inspection:
+    """A data file at a glance.
+
+    Attributes
+    ----------
+    duration, interval, jitter : s; jitter is the rms deviation of the sample interval.
+    rate : Hz. None, as the other times, where the file has no time column.
+    kind : the kind of experiment it looks like; `frequency` (Hz) of a sine dwell.
+    problems : what to look at before using the file.
+    """
+
+    file: str
+    format: str
+    columns: tuple[ColumnInspection, ...]
+    samples: int
+    duration: float | None
+    rate: float | None
+    interval: float | None
+    jitter: float | None
+    kind: Kind | None
+    frequency: float | None
+    problems: tuple[str, ...]
+
+    def to_dict(self) -> dict:
+        """Return the inspection as plain values for JSON."""
+        return asdict(self)
+
+
+def inspect_file(path: Path) -> Inspection:
+    """Look into one data file; what would stop a report is listed as a problem where it can be.
+
+    Raises
+    ------
+    SubmissionError : the file is missing, of no known form, or broken.
+    """
+    real = Path(path).resolve()  # a link is the caller's own business here
+    table, _ = read_table(real.parent, real.name)
+    problems = [f"{table.cut}: the file was cut short"] if table.cut else []
+    problems += table.notes
+    try:
+        columns, unused = assign_columns(table, explicit=None, free=(1,))
+    except SubmissionError as error:
+        columns, unused = {}, ()
+        problems.append(str(error).removeprefix(f"{table.source}: "))
+    if unused:
+        problems.append(f"no role for {', '.join(unused)}: name them in `columns` to use them")
+    clock = _clock(table, columns, problems) if "frequency" not in columns else None
+    kind, frequency = _guess(table, columns, clock, problems)
+    roles = {column.index: role for role, column in columns.items()}
+    return Inspection(
+        file=str(path),
+        format=FORM_TITLES[table.form],
+        columns=tuple(
+            ColumnInspection(
+                name=name,
+                role=roles.get(i),
+                low=float(values.min()),
+                high=float(values.max()),
+                step=encoder_step(values) or None if roles.get(i, " ")[0] == "x" else None,
+            )
+            for i, (name, values) in enumerate(zip(table.names, table.values, strict=True))
+        ),
+        samples=table.values.shape[1],
+        duration=float(clock.t[-1] - clock.t[0]) if clock else None,
+        rate=1 / clock.mean_interval if clock else None,
+        interval=clock.mean_interval if clock else None,
+        jitter=clock.jitter if clock else None,
+        kind=kind,
+        frequency=frequency,
+        problems=tuple(problems),
+    )
+
+
+def _clock(table: Table, columns: Mapping[str, Column], problems: list[str]) -> Clock | None:
+    """Return the clock, or None where there is none that runs; what is wrong goes to problems."""
+    column, n = columns.get("time"), table.values.shape[1]
+    factor = conversion(column.unit, "s") if column else None
+    if column is None or factor is None or n < 3:
+        problems.append("no time column: state `sample_rate`" if n >= 3 else f"only {n} samples")
+        return None
+    clock = read_clock(table.values[column.index] * factor)
+    if clock.stopped is not None:
+        back = clock.t[clock.stopped] < clock.t[clock.stopped - 1]
+        problems.append(
+            f"{table.place(clock.stopped)}: time "
+            + ("goes back: two records pasted together?" if back else "stands still")
+        )
+        return None
+    if clock.pieces:
+        problems.append(
+            f"time stamps are rounded to {clock.rounding:g} s; a clock of one sample every "
+            f"{1e3 * clock.mean_interval:.6g} ms explains them and is used"
+        )
+    elif clock.jitter > _UNEVEN * clock.mean_interval:
+        problems.append(
+            f"the sample interval varies by {clock.jitter / clock.mean_interval:.1%} (rms); "
+            "times are used as they are"
+        )
+    problems += [
+        f"time is missing between {clock.t[i - 1]:.4g} s and {clock.t[i]:.4g} s"
+        for i in clock.gaps[:5]
+    ]
+    if clock.mean_interval > _SLOW:
+        problems.append(
+            f"samples are {clock.mean_interval:.4g} s apart: is {column.name!r} in other units?"
+        )
+    return clock
+
+
+def _guess(
+    table: Table,
+    columns: Mapping[str, Column],
+    clock: Clock | None,
+    problems: list[str],
+) -> tuple[Kind | None, float | None]:
+    """Return the kind of experiment the signals look like, and the frequency of a dwell."""
+    if "frequency" in columns:
+        return "bode", None
+    signals = {role: table.values[column.index] for role, column in columns.items()}
+    positions = {c.name: signals[role] for role, c in columns.items() if role[0] == "x"}
+    if not positions:
+        problems.append("no column is a cart's position: name them in `columns`")
+        return None, None
+    u, reference = signals.get("input"), signals.get("reference")
+    samples = np.arange(table.values.shape[1], dtype=np.float64)
+    t = clock.t if clock else samples
+    problems += channel_problems(t, u, positions)
+    if reference is not None and "x1" in signals and mirrors(reference, signals["x1"]):
+        reference = None
+    if u is None or np.ptp(u) == 0.0:
+        if table.form != "bench_mat" or reference is None or np.ptp(reference) == 0.0:
+            return "decay", None
+        problems.append(
+            f"the input never changes, yet {columns['reference'].name!r} does: was it saved as "
+            "an unsigned integer, which cannot be negative?"
+        )
+        return "step", None
+    if reference is not None and np.any(reference != 0) and not _follows(u, reference):
+        return "closed_loop", None
+    if _is_stepped(u):
+        return "step", None
+    frequency = _line_frequency(t, u)
+    return ("sweep", None) if frequency is None else ("sine", frequency if clock else None)
+
+
+def _follows(u: Array, reference: Array) -> bool:
+    """Tell an open loop whose target is the commanded input itself."""
+    if np.ptp(reference) == 0.0:
+        return False
+    return bool(abs(np.corrcoef(u, reference)[0, 1]) > 0.999)
+
+
+def _is_stepped(u: Array) -> bool:
+    edges = np.flatnonzero(np.abs(np.diff(u)) > _EDGE * np.ptp(u)) + 1
+    if edges.size > _MOST_EDGES:
+        return False
+    pieces = np.split(u, edges)
+    spread = np.sqrt(sum(((piece - np.median(piece)) ** 2).sum() for piece in pieces) / u.size)
+    return bool(spread < _FLAT * np.ptp(u))
+
+
+def _line_frequency(t: Array, u: Array) -> float | None:
+    """Return the frequency (Hz) of an input that is one sine, else None."""
+    even = np.linspace(t[0], t[-1], t.size)
+    signal = np.interp(even, t, u)
+    power = np.abs(np.fft.rfft((signal - signal.mean()) * np.hanning(t.size))) ** 2
+    peak = int(np.argmax(power))
+    line = slice(max(peak - 2, 0), peak + 3)
+    if power[line].sum() < _ONE_LINE * power.sum():
+        return None
+    centre = float(np.arange(power.size)[line] @ power[line] / power[line].sum())
+    return centre / float(t[-1] - t[0]) * (t.size - 1) / t.size
+
+
+def format_inspection(inspection: Inspection) -> str:
+    """Return the inspection as plain text."""
+    lines = [inspection.file, f"  format    {inspection.format}"]
+    samples = f"{inspection.samples} samples"
+    if inspection.duration is not None and inspection.rate is not None:
+        jitter = inspection.jitter or 0.0
+        samples += f" over {inspection.duration:.4g} s, {inspection.rate:.5g} Hz, " + (
+            f"jitter {1e3 * jitter:.3g} ms rms" if jitter > 1e-9 else "even"
+        )
+    lines.append(f"  samples   {samples}")
+    looks = inspection.kind or "unknown"
+    if inspection.frequency is not None:
+        looks += f" at {inspection.frequency:.4g} Hz"
+    lines.append(f"  looks like {looks}")
+    width = max(len(column.name) for column in inspection.columns)
+    for column in inspection.columns:
+        step = f", step {column.step:.4g}" if column.step else ""
+        lines.append(
+            f"  {column.name:<{width}}  {column.role or '-':<9}  "
+            f"{column.low:.6g} to {column.high:.6g}{step}"
+        )
+    lines += [f"  ! {problem}" for problem in inspection.problems]
+    return "\n".join(lines)

@@ -1,0 +1,78 @@
+"""Signs that a channel did not record what happened: stuck encoders, inputs at their limit."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from pipeline.ingest.signals import encoder_step
+from pipeline.plant.chain import Array
+
+_ABRUPT = 5.0  # encoder steps a sample; no cart stops from that speed between two samples
+_STUCK_SAMPLES = 10
+_CLIPPED_SAMPLES = 3
+_FEW_LEVELS = 20  # a stepped input is at its extremes by design
+
+
+def stuck_spans(x: Array) -> list[tuple[int, int]]:
+    """Return (first, last) sample of every stretch in which a moving encoder stood still.
+
+    The reading freezes at speed and, if it comes back, comes back with a jump; a cart that stops
+    slows down first.
+    """
+    moves = np.abs(np.diff(x))
+    moving = moves[moves > 0]
+    if moving.size < 3:
+        return []
+    abrupt = _ABRUPT * (encoder_step(x) or float(np.median(moving)))
+    spans = []
+    for first, last in _runs(moves == 0.0):
+        from_speed = first > 0 and moves[first - 1] >= abrupt
+        with_jump = last == x.size - 1 or moves[last] >= abrupt
+        if last - first + 1 >= _STUCK_SAMPLES and from_speed and with_jump:
+            spans.append((first, last))
+    return spans
+
+
+def _runs(still: np.ndarray) -> Iterator[tuple[int, int]]:
+    """Yield (first, last) sample of each run of equal samples; still[i]: x[i] = x[i + 1]."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], still, [False]))))
+    for start, end in zip(edges[0::2], edges[1::2], strict=True):
+        yield int(start), int(end)
+
+
+def saturation(u: Array) -> float | None:
+    """Return the limit at which a varied input was clipped, or None.
+
+    Clipped: the extreme is entered with a jump, held and left with a jump (the smooth crest of a
+    rounded sine is not), or both extremes are the same to the last digit.
+    """
+    if np.unique(u).size <= _FEW_LEVELS:
+        return None
+    top, bottom = float(u.max()), float(u.min())
+    quantum = encoder_step(u)
+    if top == -bottom and np.count_nonzero(np.abs(u) == top) > 2:
+        return top
+    for limit in (top, bottom):
+        for first, last in _runs((u[:-1] == limit) & (u[1:] == limit)):
+            entry = abs(u[first] - u[first - 1]) if first > 0 else np.inf
+            leave = abs(u[last + 1] - u[last]) if last + 1 < u.size else np.inf
+            if last - first + 1 >= _CLIPPED_SAMPLES and min(entry, leave) > 3 * quantum:
+                return abs(limit)
+    return None
+
+
+def channel_problems(t: Array, u: Array | None, positions: dict[str, Array]) -> list[str]:
+    """Return in words what is wrong with the input and the positions (heading to values)."""
+    problems = []
+    moving = any(np.ptp(x) > 0 for x in positions.values())
+    for name, x in positions.items():
+        if np.ptp(x) == 0.0 and (moving or (u is not None and np.ptp(u) > 0)):
+            problems.append(f"{name!r} never changes: a held cart, or an encoder that is stuck")
+        problems += [
+            f"{name!r} stands still at speed from {t[first]:.4g} s to {t[last]:.4g} s: "
+            "the encoder stuck"
+            for first, last in stuck_spans(x)[:3]
+        ]
+    if u is not None and (limit := saturation(u)) is not None:
+        problems.append(f"the input is clipped at {limit:g}")
+    return problems
