@@ -180,7 +180,7 @@ def is_right(fit: ChainFit, chain: Chain) -> bool:
 
 def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Quality of the Bode fit.")
     parser.add_argument("--seeds", type=int, default=2000)
     seeds = parser.parse_args().seeds
     for preset, chain in PRESETS.items():

@@ -23,18 +23,20 @@ from pipeline.stages.chain_parameters import (
 )
 from pipeline.stages.staged_fit import LogMagnitude, StagedFit, fit_stage_by_stage
 
-Scale = Literal["log", "magnitude", "complex"]
+Scale = Literal["log", "magnitude", "polar"]
 
 _STARTS = 8  # random ones, tried where the first does not explain the data
 _GOOD_CHI_SQUARE = 2.0  # per degree of freedom: the data are explained
+_CONFIRMATIONS, _SAME_MINIMUM = 3, 1e-3  # the best chi² found so often, to this ratio
 _START_SPREAD = 0.5  # of ln m and ln k of a random start: half to double, mostly
 _START_ZETAS = (0.02, 0.3)
 _SEED = 2005  # of the random starts; any, but the same every time
+_EVALUATIONS = 100  # a fit that gets there takes about ten
 _LOG_ERROR = 0.05  # added to the error of ln|G|: on the way there no point should rule
 _TABLE_STD = 0.01  # of a magnitude that comes without an error
 _PHASE_AGREES = 3.0  # times as far off as the magnitudes are: a delay or a wrong sign is further
 _PHASE_KNOWN = 0.5  # rad; a worse phase tells nothing
-_VANISHING = 1e-4  # of its natural size: a damping or far spring that the data put at zero
+_VANISHING = 1e-4  # of its usual size: a damping or far spring that the data put at zero
 _RANK = 1e-8  # smallest singular value over the largest, columns in natural sizes
 # chi² exceeds its mean by more than this many of its standard deviations once in a thousand.
 _EXCESS_SIGMAS = 3.1
@@ -82,7 +84,7 @@ def fit_bode(
     notes = []
     if data.has_phase:
         if _phase_misfit(best, data) <= _PHASE_AGREES * max(1.0, best.chi_square_per_dof**0.5):
-            best = _hold_vanished(_solve(best.parametrisation, data, best.theta, "complex"), data)
+            best = _hold_vanished(_solve(best.parametrisation, data, best.theta, "polar"), data)
         else:
             notes.append("magnitudes alone: the phases do not agree with them")
     return _result(best, data, staged=staged, tried=tried, notes=notes)
@@ -266,13 +268,13 @@ def _residuals(
     if scale == "magnitude":
         return (size - data.magnitude) / data.std, radial / data.std[:, None]
     known = np.isfinite(data.phase_std)
-    turned, slopes = G * data.unit, data.unit[:, None] * dG
-    across_std = (data.magnitude * data.phase_std)[known]
-    along = np.where(known, turned.real, size) - data.magnitude
-    along_slopes = np.where(known[:, None], slopes.real, radial)
+    turn = (np.conj(G)[:, None] * dG).imag / size[:, None] ** 2  # d arg G / dp
+    phase_std = data.phase_std[known]
     return (
-        np.concatenate([along / data.std, turned.imag[known] / across_std]),
-        np.vstack([along_slopes / data.std[:, None], slopes.imag[known] / across_std[:, None]]),
+        np.concatenate(
+            [(size - data.magnitude) / data.std, np.angle(G * data.unit)[known] / phase_std]
+        ),
+        np.vstack([radial / data.std[:, None], turn[known] / phase_std[:, None]]),
     )
 
 
@@ -294,7 +296,13 @@ def _evaluator(
 
 def _solve(P: Parametrisation, data: _Points, theta: Array, scale: Scale) -> _Fitted:
     residuals, jacobian = _evaluator(P, data, scale)
-    solution = least_squares(residuals, theta, jac=jacobian, x_scale="jac")
+    solution = least_squares(
+        residuals,
+        theta,
+        jac=jacobian,  # pyright: ignore[reportArgumentType] - scipy's default is a string
+        x_scale="jac",
+        max_nfev=_EVALUATIONS,
+    )
     return _Fitted(
         parametrisation=P,
         theta=solution.x,
@@ -308,25 +316,33 @@ def _solve(P: Parametrisation, data: _Points, theta: Array, scale: Scale) -> _Fi
 def _fit_from_starts(
     P: Parametrisation, data: _Points, *, first: Chain, like: Chain
 ) -> tuple[_Fitted, int]:
-    """Fit from the first start, and from random ones while the data are not explained."""
-    best, tried = None, 0
-    for start in (first, *_random_starts(like, P.springs)):
-        tried += 1
+    """Fit from the first start, and from random ones while the data are not explained.
+
+    The best minimum found again and again is taken for the lowest: then the chain does not
+    describe the data, and further starts would not help.
+    """
+
+    def fit_from(start: Chain) -> _Fitted:
         near = _solve(P, data, P.pack(start), "log")
-        fitted = _solve(P, data, near.theta, "magnitude")
-        if best is None or fitted.chi_square < best.chi_square:
-            best = fitted
-        if best.chi_square_per_dof <= _GOOD_CHI_SQUARE:
+        return _solve(P, data, near.theta, "magnitude")
+
+    best = fit_from(first)
+    found = [best.chi_square]
+    starts = _random_starts(like, P.springs)
+    while best.chi_square_per_dof > _GOOD_CHI_SQUARE and (start := next(starts, None)):
+        fitted = fit_from(start)
+        found.append(fitted.chi_square)
+        best = min(best, fitted, key=lambda fit: fit.chi_square)
+        if sum(np.array(found) <= best.chi_square * (1 + _SAME_MINIMUM)) >= _CONFIRMATIONS:
             break
-    assert best is not None
-    return best, tried
+    return best, len(found)
 
 
 def _hold_vanished(fitted: _Fitted, data: _Points) -> _Fitted:
     """Fit again with every parameter at zero that the data put there or below."""
     P, chain = fitted.parametrisation, fitted.chain
     physical = P.physical(chain)
-    sizes = _natural_sizes(P, chain)
+    sizes = _natural_sizes(P, chain, data)
     vanished = [
         name
         for name, value, size in zip(P.names, physical, sizes, strict=True)
@@ -338,15 +354,11 @@ def _hold_vanished(fitted: _Fitted, data: _Points) -> _Fitted:
     return _solve(held, data, held.pack(fitted.chain), fitted.scale)
 
 
-def _natural_sizes(P: Parametrisation, chain: Chain) -> Array:
-    """Return what a parameter (n_p,) would be of order one of: damping 2mω, the stiffest spring."""
-    sizes = {"m": chain.m, "c": 2 * np.sqrt(chain.m * (np.abs(chain.k[:-1]) + chain.k[1:]))}
-    return np.array(
-        [
-            float(np.max(chain.k)) if name[0] == "k" else float(sizes[name[0]][int(name[2:]) - 1])
-            for name in P.names
-        ]
-    )
+def _natural_sizes(P: Parametrisation, chain: Chain, data: _Points) -> Array:
+    """Return of what order each parameter (n_p,) is: damping m ω, the stiffest spring."""
+    middle = float(np.median(data.omega[data.omega > 0]))
+    sizes = {"m": chain.m, "c": chain.m * middle, "k": np.full(chain.n + 1, np.max(chain.k))}
+    return np.array([sizes[name[0]][int(name[2:]) - 1] for name in P.names])
 
 
 def _phase_misfit(fitted: _Fitted, data: _Points) -> float:
@@ -373,7 +385,9 @@ def _result(
     physical = P.physical(chain)
     G, dG = _response(P, data, physical)
     _, J = _residuals(data, fitted.scale, G, dG)
-    covariance = _covariance(P, J, sizes=_natural_sizes(P, chain), carts=np.unique(data.cart) + 1)
+    covariance = _covariance(
+        P, J, sizes=_natural_sizes(P, chain, data), carts=np.unique(data.cart) + 1
+    )
     inflation, remark = _inflation(fitted, data)
     covariance = covariance * inflation
     standardised = (np.abs(G) - data.magnitude) / -data.std

@@ -17,7 +17,8 @@ from pipeline.plant.chain import Array, Chain
 from pipeline.results import Estimate
 
 START_ZETA = 0.05  # damping ratio of each cart alone to start from: what a cart on bearings has
-_DIFFERENCE = 1e-5  # relative step; central differences err by its square, rounding by 1e-16/step
+_DIFFERENCE = 1e-6  # relative step; a forward difference errs by as much, rounding by 1e-9
+_FARTHEST = 100.0  # of a logarithm: a step that goes astray must not overflow
 # A start must be a chain: what a measured table implies below this share of the largest spring
 # (or mass) is raised to it.
 _SMALLEST_SHARE = 0.02
@@ -98,7 +99,8 @@ class Parametrisation:
         return self.chain(self._physical_of(theta))
 
     def _physical_of(self, theta: Array) -> Array:
-        return np.where(self.logarithmic, np.exp(np.where(self.logarithmic, theta, 0.0)), theta)
+        exponent = np.clip(np.where(self.logarithmic, theta, 0.0), -_FARTHEST, _FARTHEST)
+        return np.where(self.logarithmic, np.exp(exponent), theta)
 
     def slopes(self, theta: Array) -> Array:
         """Return dp/dtheta (n_p,): p itself for a logarithm, 1 for the linear spring."""
@@ -106,7 +108,7 @@ class Parametrisation:
 
     @cached_property
     def directions(self) -> Array:
-        """b (n_p, n): parameter p enters the impedance as p s^order b bᵀ.
+        """Rows b (n_p, n): a parameter p enters the impedance as p s^order b bᵀ.
 
         b picks the cart of a mass or damper, and the stretch of a spring.
         """
@@ -163,17 +165,16 @@ def named_estimates(
 
 def _parameter_jacobian(chain: Chain, names: Sequence[str]) -> Array:
     """Return the derivative (n_named, n_p) of `Chain.parameters` by the physical parameters."""
+    base = np.array(list(chain.parameters().values()))
     columns = []
     for name in names:
         values: Array = getattr(chain, name[0])
         i = int(name[2:]) - 1
         step = _DIFFERENCE * (values[i] if values[i] > 0 else float(np.max(values)))
-        ends = []
-        for sign in (1.0, -1.0):
-            moved = {"m": chain.m.copy(), "c": chain.c.copy(), "k": chain.k.copy()}
-            moved[name[0]][i] += sign * step
-            ends.append(np.array(list(Chain(**moved).parameters().values())))
-        columns.append((ends[0] - ends[1]) / (2 * step))
+        moved = {"m": chain.m.copy(), "c": chain.c.copy(), "k": chain.k.copy()}
+        moved[name[0]][i] += step
+        there = np.array(list(Chain(**moved).parameters().values()))
+        columns.append((there - base) / step)
     return np.stack(columns, axis=1)
 
 

@@ -242,10 +242,10 @@ def _strongest(extrema: Sequence[_Extremum], count: int) -> list[_Extremum]:
 
 def _extrema(response: FrequencyResponse, *, sign: int) -> list[_Extremum]:
     """Find the maxima (sign 1) or minima (sign -1) of ln|G| that stand out of its errors."""
-    tiny = 1e-3 * float(np.max(response.magnitude, initial=0.0)) or 1.0
-    error = response.magnitude_std / np.maximum(response.magnitude, tiny)
-    level = sign * np.log(np.maximum(response.magnitude, np.minimum(response.magnitude_std, tiny)))
-    position = np.log(response.omega)
+    seen = (response.omega > 0) & (response.magnitude > 0)
+    omegas, magnitude = response.omega[seen], response.magnitude[seen]
+    error = response.magnitude_std[seen] / magnitude
+    level, position = sign * np.log(magnitude), np.log(omegas)
     found = []
     for i in range(1, level.size - 1):
         if not level[i - 1] < level[i] >= level[i + 1] or (sign > 0 and error[i] > _CLEAR):
@@ -255,8 +255,8 @@ def _extrema(response: FrequencyResponse, *, sign: int) -> list[_Extremum]:
         if prominence < max(_LEAST_PROMINENCE, 4 * np.max(error[i - 1 : i + 2])):
             continue
         curve = np.polyfit(position[i - 1 : i + 2] - position[i], level[i - 1 : i + 2], 2)
-        omega = response.omega[i] * np.exp(-curve[1] / (2 * curve[0]))
-        std = (response.omega[i + 1] - response.omega[i - 1]) / 2 / np.sqrt(12.0)
+        omega = omegas[i] * np.exp(-curve[1] / (2 * curve[0]))
+        std = (omegas[i + 1] - omegas[i - 1]) / 2 / np.sqrt(12.0)
         found.append(_Extremum(float(omega), float(std), float(prominence)))
     return found
 

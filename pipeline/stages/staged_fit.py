@@ -15,6 +15,7 @@ from scipy.optimize import least_squares
 from pipeline.plant.chain import Array, Chain, quadratic_factors, recover_chain
 
 _MODES = "abcdefgh"
+_EVALUATIONS = 100  # a stage that gets there takes about ten
 _ZETA_RANGE = (0.01, 1.0)  # of a start: outside it the fit would not find its way back
 
 
@@ -105,7 +106,12 @@ def _fit(
     start = np.concatenate([[np.log(gain)], factors.ravel()])
     if points.omega.size < start.size:
         return gain, factors  # too few points for this stage; the joint fit sees all carts
-    found = least_squares(residuals, start, jac=jacobian, method="trf", x_scale=1.0).x
+    found = least_squares(
+        residuals,
+        start,
+        jac=jacobian,  # pyright: ignore[reportArgumentType] - scipy's default is a string
+        max_nfev=_EVALUATIONS,
+    ).x
     return float(np.exp(found[0])), found[1:].reshape(shape)
 
 
@@ -122,8 +128,8 @@ def _polynomial(factors: Array) -> Array:
     """Multiply s² + 2ζωs + ω² out, monic, in falling powers."""
     product = np.array([1.0])
     for omega, zeta in np.exp(factors).T:
-        product = np.polymul(product, [1.0, 2 * zeta * omega, omega**2])
-    return product
+        product = np.polymul(product, np.array([1.0, 2 * zeta * omega, omega**2]))
+    return product.astype(np.float64)
 
 
 def _named(gains: Array, factors: list[Array], tails: list[Array]) -> dict[str, float]:
