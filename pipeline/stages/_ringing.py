@@ -9,7 +9,9 @@ from pipeline.plant.chain import Array, ComplexArray
 from pipeline.stages._signals import colour
 
 _PENCIL_SAMPLES = 300  # the matrix pencil only starts the fit; more samples would only cost time
+_OSCILLATES = 1e-3  # imaginary part over size: below, a pole is real but for rounding
 _MAX_EVALUATIONS = 100
+_MOST_GROWTH = 50.0  # of an exponent on the way to the fit: beyond, numbers run over
 _ALWAYS_DECAYS = 1e-6  # of the frequency: the least damping of a start
 
 
@@ -57,7 +59,8 @@ def fit_ringing(t: Array, y: Array, *, poles: ComplexArray, drift: bool) -> Ring
 
     def basis(p: Array) -> tuple[Array, Array, Array]:
         """Return the linear columns (n, n_lin), the cosines and the sines (n_modes, n)."""
-        wave = np.exp((-p[:n_modes, None] + 1j * p[n_modes:, None]) * scale * tau)
+        growth = np.minimum(-p[:n_modes, None] * scale * tau, _MOST_GROWTH)
+        wave = np.exp(growth + 1j * p[n_modes:, None] * scale * tau)
         return np.array([*level_columns, *wave.real, *wave.imag]).T, wave.real, wave.imag
 
     def solve(p: Array) -> tuple[Array, Array, Array, Array]:
@@ -105,16 +108,14 @@ def fit_ringing(t: Array, y: Array, *, poles: ComplexArray, drift: bool) -> Ring
 def find_poles(t: Array, y: Array, *, n_modes: int) -> ComplexArray:
     """Return rough poles of `n_modes` damped sinusoids about a level, upper half plane, rad/s.
 
-    Matrix pencil on evenly interpolated samples (Hua & Sarkar, IEEE Trans. ASSP 38, 1990): the
-    level is a known pole at zero and leaves with the first difference. Fewer poles come back
-    where the data do not oscillate in so many modes.
+    Matrix pencil on evenly interpolated samples (Hua & Sarkar, IEEE Trans. ASSP 38, 1990); the
+    level is one more pole, near zero. Fewer poles come back where the data do not oscillate in
+    so many modes.
     """
     n = min(t.size, _PENCIL_SAMPLES)
     grid = np.linspace(t[0], t[-1], n)
-    moves = np.diff(np.interp(grid, t, y))
-    columns = n // 3
-    hankel = np.lib.stride_tricks.sliding_window_view(moves, columns)
-    rows = np.linalg.svd(hankel, full_matrices=False)[2][: 2 * n_modes].T
+    hankel = np.lib.stride_tricks.sliding_window_view(np.interp(grid, t, y), n // 3)
+    rows = np.linalg.svd(hankel, full_matrices=False)[2][: 2 * n_modes + 1].T
     z = np.linalg.eigvals(np.linalg.lstsq(rows[:-1], rows[1:], rcond=None)[0])
     s = np.log(z.astype(np.complex128)) / (grid[1] - grid[0])
-    return s[s.imag > 1e-6 * np.abs(s)]
+    return s[s.imag > _OSCILLATES * np.abs(s)]

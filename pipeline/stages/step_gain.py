@@ -1,0 +1,339 @@
+"""Step: static gain from the levels a cart settles at before and after each edge."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from pipeline.errors import DataError
+from pipeline.plant.chain import Array
+from pipeline.results import Record, StepEdge, StepGain
+from pipeline.stages._ringing import find_poles, fit_ringing
+from pipeline.stages._signals import (
+    colour,
+    extrema,
+    grain,
+    noise_beyond_rounding,
+    plateaus,
+    rounding_left,
+)
+
+_MIN_SAMPLES = 12
+_STEADY_SHARE = 0.6  # of the record: with less of it at constant input this is no step run
+# Motion is counted in grains: encoder steps, or as much noise as would round as coarsely.
+_FLAT = 3.0  # a window that spans no more is level
+_MOVED = 6.0  # a cart that moved less has not moved
+_PROMINENCE = 6.0
+_NEARLY_FLAT = 0.02  # of the motion, where a window is not level to the noise
+_GOOD_FIT = 0.02  # of the motion: what an extrapolating fit may leave
+_GOOD_LEVEL = 0.02  # of the motion: the standard error it may have
+_STARTS_AT_REST = 0.1  # of the motion, per radian of the ringing: an initial velocity below this
+_DRIFT_SIGMAS, _DRIFT_AGREES = 5.0, 0.3
+_STICKS_SIGMAS = 4.0
+_SAME_INPUT = 0.02  # of the input's range
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Level:
+    """Where the cart came to rest at one input: value, error, and over which samples."""
+
+    first: int
+    stop: int
+    value: float
+    std: float
+    extrapolated: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Plateau:
+    """Samples [first, stop) at one input, and the level the cart settled at (None: it did not)."""
+
+    first: int
+    stop: int
+    u: float
+    level: _Level | None
+
+
+def fit_step_gain(record: Record, *, cart: int) -> StepGain:
+    """Estimate the static gain of one cart from every edge of a stepped input.
+
+    A level is the mean of the samples after which nothing moves any more. Where a record (or the
+    next edge) cuts the ringing short, the level is that of damped sinusoids fitted to it, one per
+    free cart. Valid for any number of carts on at least one spring, steps of any size and sign.
+
+    Raises
+    ------
+    DataError : no input column, no step in it, a cart that is held, does not move or never
+        settles.
+    """
+    t, y, step = record.t, record.position(cart), record.encoder_step(cart)
+    parts = _constant_parts(record)
+    if cart not in record.free:
+        raise DataError(f"{record.id}: step gain needs a cart that is free, cart {cart} is held")
+    size = grain(t, y, step=step)
+    found = [_settle(record, y, part, size=size, step=step) for part in parts]
+    drift = _drift(t, y, [p.level for p in found if p.level], size=size)
+    if drift:
+        y = y - drift * (t - t[0])
+        found = [_settle(record, y, part, size=size, step=step) for part in parts]
+    found, notes = _with_unseen_start(t, y, found, size=size, step=step)
+    if drift:
+        notes.append(f"a drift of {drift:.3g} per second is taken out")
+
+    edges = [
+        _edge(t, before, after, before.level, after.level)
+        for before, after in pairwise(found)
+        if before.level and after.level
+    ]
+    if not edges:
+        raise DataError(
+            f"{record.id}: step gain needs a step on whose two sides cart {cart} settles, found "
+            f"{len(found) - 1} edges, none with both"
+        )
+    moving = [edge for edge in edges if abs(edge.level_after - edge.level_before) > _MOVED * size]
+    if not moving:
+        raise DataError(
+            f"{record.id}: step gain needs cart {cart} to move by more than {_MOVED:.0f} encoder "
+            "steps, found less"
+        )
+    gain, gain_std = _combine(moving)
+    shift, shift_std = _rest_shift(found)
+    spread = [abs(edge.gain - gain) / edge.gain_std for edge in moving]
+    sticks = len(moving) < len(edges) or max(spread) > _STICKS_SIGMAS
+    sticks = sticks or (shift is not None and abs(shift) > _STICKS_SIGMAS * shift_std)
+    notes += _notes(found, moving, edges, shift=shift if sticks else None)
+    return StepGain(
+        experiment=record.id,
+        cart=cart,
+        edges=tuple(edges),
+        gain=gain,
+        gain_std=gain_std,
+        rest_shift=shift,
+        interval=_interval(moving, shift=shift or 0.0) if sticks else None,
+        note="; ".join(notes),
+    )
+
+
+# ------------------------------------------------------------- input and levels
+
+
+def _constant_parts(record: Record) -> list[tuple[int, int, float]]:
+    """Return (first, stop, input) of the stretches of constant input, edges in between."""
+    u = record.u
+    if u is None:
+        raise DataError(
+            f"{record.id}: step gain needs the input beside the positions, found no input column: "
+            "export it too, or name it under `columns`"
+        )
+    long = [(a, b) for a, b in plateaus(u) if b - a >= _MIN_SAMPLES or a == 0]
+    share = sum(b - a for a, b in long) / u.size
+    parts = [(a, b, float(np.mean(u[a:b]))) for a, b in long]
+    if share < _STEADY_SHARE or not any(value for _, _, value in parts):
+        raise DataError(
+            f"{record.id}: step gain needs an input that steps and then stays, found it constant "
+            f"and not zero for {100 * share if any(p[2] for p in parts) else 0:.0f} % of the record"
+        )
+    return parts
+
+
+def _settle(
+    record: Record, y: Array, part: tuple[int, int, float], *, size: float, step: float
+) -> _Plateau:
+    first, stop, u = part
+    level = _level(
+        record.t[first:stop], y[first:stop], n_modes=len(record.free), size=size, step=step
+    )
+    if level:
+        level = _Level(
+            first=first + level.first,
+            stop=first + level.stop,
+            value=level.value,
+            std=level.std,
+            extrapolated=level.extrapolated,
+        )
+    return _Plateau(first=first, stop=stop, u=u, level=level)
+
+
+def _level(t: Array, y: Array, *, n_modes: int, size: float, step: float) -> _Level | None:
+    """Return the level that y (n,) settles at, or None."""
+    motion, pace = float(np.ptp(y)), _pace(t, y, size=size)
+    flat = _flat_from(y, span=_FLAT * size)
+    if flat == 0 or t[-1] - t[flat] >= pace:
+        return _mean_level(y, flat, step=step)
+    ringing = _extrapolated(t, y, n_modes=n_modes, floor=size / np.sqrt(12))
+    if ringing:
+        return ringing
+    flat = _flat_from(y, span=_NEARLY_FLAT * motion)
+    if t[-1] - t[flat] >= pace:
+        return _mean_level(y, flat, step=step)
+    return None
+
+
+def _pace(t: Array, y: Array, *, size: float) -> float:
+    """Return how long a window must be to show that nothing moves: a period, or a rise, s."""
+    turning = extrema(y, prominence=_PROMINENCE * size)
+    if len(turning) > 3:  # the ends are no turning points
+        return 2 * float(np.max(np.diff(t[turning[1:-1]])))
+    risen = np.abs(y - y[0]) >= (1 - np.exp(-1)) * abs(y[-1] - y[0])
+    return 2 * float(t[int(np.argmax(risen))] - t[0])
+
+
+def _flat_from(y: Array, *, span: float) -> int:
+    """Return the first sample from which on y spans no more than `span`."""
+    backwards = y[::-1]
+    spans = np.maximum.accumulate(backwards) - np.minimum.accumulate(backwards)
+    return y.size - int(np.searchsorted(spans, span, side="right"))
+
+
+def _mean_level(y: Array, first: int, *, step: float) -> _Level:
+    """Return the mean from `first` on; rounding a still cart errs by up to half an encoder step."""
+    window = y[first:]
+    residual = window - window.mean()
+    rms = float(np.sqrt(np.mean(residual**2)))
+    scatter = rms * np.sqrt(colour(residual, angle=0.0) / window.size)
+    rounding = step / np.sqrt(12) * rounding_left(noise_beyond_rounding(rms, step=step), step=step)
+    return _Level(
+        first=first,
+        stop=y.size,
+        value=float(window.mean()),
+        std=float(np.hypot(scatter, rounding)),
+        extrapolated=False,
+    )
+
+
+def _extrapolated(t: Array, y: Array, *, n_modes: int, floor: float) -> _Level | None:
+    """Return the level about which y still rings, where damped sinusoids fit it well.
+
+    One for each free cart, or fewer where noise hides the smallest.
+    """
+    motion = float(np.ptp(y))
+    for n in range(n_modes, 0, -1):
+        if t.size < _MIN_SAMPLES * (n + 1):
+            continue
+        poles = find_poles(t, y, n_modes=n)
+        if poles.size < n:
+            continue
+        fit = fit_ringing(t, y, poles=poles, drift=False)
+        std = float(np.sqrt(fit.covariance[0, 0]))
+        left = max(2 * floor, _GOOD_FIT * motion)
+        if (
+            fit.converged
+            and bool(np.all(fit.poles.real < 0))
+            and fit.rms <= left
+            and std <= _GOOD_LEVEL * motion
+        ):
+            return _Level(first=0, stop=y.size, value=fit.level, std=std, extrapolated=True)
+    return None
+
+
+def _with_unseen_start(
+    t: Array, y: Array, found: list[_Plateau], *, size: float, step: float
+) -> tuple[list[_Plateau], list[str]]:
+    """Put a rest before a record that starts with the input on and the cart just setting off."""
+    head = found[0]
+    if head.u == 0 or not head.level or abs(head.level.value - y[0]) <= _MOVED * size:
+        return found, []
+    n = max(5, (head.stop - head.first) // 50)
+    pace = _pace(t[: head.stop], y[: head.stop], size=size) / (2 * np.pi)
+    velocity = np.polyfit(t[:n] - t[0], y[:n], 2)[1]
+    if abs(velocity) * pace > _STARTS_AT_REST * abs(head.level.value - y[0]):
+        return found, []
+    std = max(size, step) / np.sqrt(12)
+    level = _Level(first=0, stop=1, value=float(y[0]), std=float(std), extrapolated=False)
+    rest = _Plateau(first=0, stop=0, u=0.0, level=level)
+    return [rest, *found], ["the input is on from the first sample: taken as switched on there"]
+
+
+def _drift(t: Array, y: Array, levels: Sequence[_Level], *, size: float) -> float:
+    """Return the slope that every settled window shows alike, per second; 0 where they do not."""
+    slopes, errors = [], []
+    for level in levels:
+        if level.extrapolated or level.stop - level.first < _MIN_SAMPLES:
+            continue
+        tau = t[level.first : level.stop] - t[level.first : level.stop].mean()
+        window = y[level.first : level.stop]
+        slope = float(tau @ window / (tau @ tau))
+        residual = window - window.mean() - slope * tau
+        rms = max(float(np.sqrt(np.mean(residual**2))), size / np.sqrt(12))
+        slopes.append(slope)
+        errors.append(rms * np.sqrt(colour(residual, angle=0.0) / (tau @ tau)))
+    if len(slopes) < 2:
+        return 0.0
+    weight = 1 / np.square(errors)
+    drift = float(np.average(slopes, weights=weight))
+    seen = abs(drift) > _DRIFT_SIGMAS / np.sqrt(weight.sum())
+    alike = np.abs(np.array(slopes) - drift) <= _DRIFT_AGREES * abs(drift) + 3 * np.array(errors)
+    return drift if seen and bool(np.all(alike)) else 0.0
+
+
+# ----------------------------------------------------------------- edges to gain
+
+
+def _edge(t: Array, before: _Plateau, after: _Plateau, low: _Level, high: _Level) -> StepEdge:
+    change = after.u - before.u
+    return StepEdge(
+        t=float(t[after.first]),
+        u_before=before.u,
+        u_after=after.u,
+        level_before=low.value,
+        level_after=high.value,
+        window_before=(float(t[low.first]), float(t[low.stop - 1])),
+        window_after=(float(t[high.first]), float(t[high.stop - 1])),
+        gain=(high.value - low.value) / change,
+        gain_std=float(np.hypot(low.std, high.std)) / abs(change),
+    )
+
+
+def _combine(edges: Sequence[StepEdge]) -> tuple[float, float]:
+    """Return the weighted mean gain and its error.
+
+    Edges share their levels, and a cart at rest is rounded alike each time, so that the error
+    does not shrink with the number of edges; it is the spread's where that is larger.
+    """
+    gains = np.array([edge.gain for edge in edges])
+    std = np.array([edge.gain_std for edge in edges])
+    mean = float(np.average(gains, weights=std**-2))
+    spread = float(np.average((gains - mean) ** 2, weights=std**-2)) / max(len(edges) - 1, 1)
+    return mean, float(max(np.average(std, weights=std**-2), np.sqrt(spread)))
+
+
+def _rest_shift(found: Sequence[_Plateau]) -> tuple[float | None, float]:
+    """Return how far the cart rests from where it first did at the same input, and the error."""
+    span = max(p.u for p in found) - min(p.u for p in found)
+    settled = [p for p in found if p.level]
+    for last in reversed(settled[1:]):
+        if abs(last.u - settled[0].u) <= _SAME_INPUT * span and last.level and settled[0].level:
+            shift = last.level.value - settled[0].level.value
+            return shift, float(np.hypot(last.level.std, settled[0].level.std))
+    return None, 0.0
+
+
+def _interval(edges: Sequence[StepEdge], *, shift: float) -> tuple[float, float]:
+    """Return the gains that friction allows: each rest point may be off by half the shift."""
+    gains = [edge.gain for edge in edges]
+    slack = abs(shift) / (2 * min(abs(edge.u_after - edge.u_before) for edge in edges))
+    slack = max(slack, max(edge.gain_std for edge in edges))
+    return min(gains) - slack, max(gains) + slack
+
+
+def _notes(
+    found: Sequence[_Plateau],
+    moving: Sequence[StepEdge],
+    edges: Sequence[StepEdge],
+    *,
+    shift: float | None,
+) -> list[str]:
+    notes = []
+    if shift is not None:
+        notes.append(f"the rest point did not return by {shift:.3g}: the cart sticks")
+    notes += [
+        f"at the edge to {edge.u_after:.3g} the cart did not move: it sticks"
+        for edge in edges
+        if edge not in moving
+    ]
+    if any(p.level and p.level.extrapolated for p in found):
+        notes.append("still ringing where a level ends: it is that of damped sinusoids fitted")
+    if any(p.level is None for p in found):
+        notes.append("where the cart never settles, the edge is left out")
+    return notes
