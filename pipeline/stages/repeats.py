@@ -1,0 +1,138 @@
+"""Repeats of one experiment, and which of them stands off the others."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from pipeline.plant.chain import Array
+from pipeline.results import Record
+
+# Inputs count as the same where they differ by less than this share (root-mean-square): an edge
+# logged one sample early differs by 8 %, the next usual amplitude by 33 %.
+_SAME_INPUT = 0.2
+_SAME_DURATION = 0.8  # shorter over longer
+_MATERIAL = 0.05  # of the response; a smaller difference changes nothing anybody would act on
+_START_SAMPLES = 3  # their median is the start: too few to move, enough to outvote a spike
+# How many spreads of the others a repeat must stand off. Where all repeats differ by chance
+# (along one shape, normally distributed) this flags 5 % of the sets, and far fewer where they
+# differ in several ways; three repeats leave one difference to judge by, hence the caution.
+_SPREADS = {3: 30.0, 4: 8.0}
+_SPREADS_OF_MANY = 5.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutlierRepeat:
+    """A repeat whose response stands off that of the others.
+
+    Attributes
+    ----------
+    experiment, others : ids; the input was the same.
+    distance : root-mean-square difference from the others (their median), position units.
+    spread : the same among the others.
+    """
+
+    experiment: str
+    others: tuple[str, ...]
+    distance: float
+    spread: float
+
+
+def find_outlier_repeats(records: Sequence[Record]) -> tuple[OutlierRepeat, ...]:
+    """Find the repeats that do not belong with the others.
+
+    Repeats have the same kind, free and measured carts, and nearly the same input (the set point
+    in closed loop). Decays are left alone: a hand never releases twice from the same place. Never
+    flags one of two, nor more than a minority.
+    """
+    outliers: list[OutlierRepeat] = []
+    for group in _groups(records):
+        differences, size = _differences(group)
+        left = list(range(len(group)))
+        while len(left) > 2 and 2 * (len(group) - len(left) + 1) < len(group):
+            found = _farthest(differences, left, size=size)
+            if found is None:
+                break
+            index, distance, spread = found
+            left.remove(index)
+            others = tuple(group[i].id for i in left)
+            outliers.append(
+                OutlierRepeat(
+                    experiment=group[index].id, others=others, distance=distance, spread=spread
+                )
+            )
+    return tuple(outliers)
+
+
+def _groups(records: Sequence[Record]) -> list[list[Record]]:
+    """Group the repeats among the records, in the order of the records."""
+    groups: list[list[Record]] = []
+    for record in records:
+        if record.kind == "decay" or not np.any(_excitation(record)):
+            continue
+        home = next((group for group in groups if _is_repeat(group[0], record)), None)
+        if home is None:
+            groups.append([record])
+        else:
+            home.append(record)
+    return groups
+
+
+def _excitation(record: Record) -> Array:
+    """Return what drove the record (n,): its set point in closed loop, else its input."""
+    if record.kind == "closed_loop" and record.reference is not None:
+        return record.reference
+    return record.t * 0 if record.u is None else record.u
+
+
+def _is_repeat(first: Record, other: Record) -> bool:
+    """Tell whether two records are repeats of one experiment."""
+    spans = np.ptp(first.t), np.ptp(other.t)
+    if (first.kind, first.free, first.carts) != (other.kind, other.free, other.carts):
+        return False
+    if min(spans) < _SAME_DURATION * max(spans):
+        return False
+    t = _common_times(first, other)
+    a, b = _at(t, first, _excitation(first)), _at(t, other, _excitation(other))
+    size = np.sqrt(np.mean(a**2) + np.mean(b**2))
+    return bool(np.sqrt(2 * np.mean((a - b) ** 2)) <= _SAME_INPUT * size)
+
+
+def _common_times(*records: Record) -> Array:
+    """Return the times (from each record's start) of the shortest record."""
+    shortest = min(records, key=lambda record: np.ptp(record.t))
+    return shortest.t - shortest.t[0]
+
+
+def _at(t: Array, record: Record, signal: Array) -> Array:
+    """Return a signal of the record (…, n) at times t from its start."""
+    return np.stack([np.interp(t, record.t - record.t[0], row) for row in np.atleast_2d(signal)])
+
+
+def _differences(group: Sequence[Record]) -> tuple[Array, float]:
+    """Return how far the responses differ pair by pair, (n, n), and the size of a response.
+
+    Root-mean-squares over carts and time. Positions count from where the record starts, as the
+    encoders need not start at zero; where a cart comes to rest is part of its response.
+    """
+    t = _common_times(*group)
+    y = np.stack([_at(t, record, record.y) for record in group])  # (n, p, n_t)
+    y = y - np.median(y[:, :, :_START_SAMPLES], axis=2, keepdims=True)
+    differences = np.sqrt(np.mean((y[:, None] - y) ** 2, axis=(2, 3)))
+    return differences, float(np.median(np.sqrt(np.mean(y**2, axis=(1, 2)))))
+
+
+def _farthest(
+    differences: Array, left: Sequence[int], *, size: float
+) -> tuple[int, float, float] | None:
+    """Return index, distance and spread of the others of the repeat that stands off, if any."""
+    threshold = _SPREADS.get(len(left), _SPREADS_OF_MANY)
+    candidates = []
+    for index in left:
+        others = [i for i in left if i != index]
+        distance = float(np.median(differences[index, others]))
+        spread = float(np.median([differences[pair] for pair in combinations(others, 2)]))
+        if distance > max(threshold * spread, _MATERIAL * size):
+            candidates.append((index, distance, spread))
+    return max(candidates, key=lambda found: found[1], default=None)
