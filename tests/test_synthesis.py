@@ -345,6 +345,17 @@ def test_an_unknown_preset_names_the_known_ones(tmp_path):
         write_submission(tmp_path, chain="throne-4dof", seed=0)
 
 
+def test_a_cart_without_damping_of_its_own(tmp_path):
+    """Its decay is cut when a student would stop it; the chain as a whole still settles."""
+    chain = Chain(m=np.array([3e-4, 2e-4]), c=np.array([8e-4, 0.0]), k=np.array([0.05, 0.1, 0.05]))
+
+    write_submission(tmp_path, chain=chain, seed=7, compact=True)
+
+    last = experiments(tmp_path, "decay")[-1]
+    assert last["carts"] == [2]
+    assert 8.0 < table(tmp_path, last)["time"][-1] < 9.0
+
+
 def test_carts_that_never_settle_are_refused(tmp_path):
     """Without damping there is no steady state to record."""
     undamped = Chain(m=np.array([2e-4]), c=np.zeros(1), k=np.array([0.03, 0.0]))

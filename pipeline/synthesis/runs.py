@@ -16,6 +16,7 @@ FIGURE_FREQUENCY = 4.0  # Hz: the dwell of the paper's Figures 12-14
 _LETTERS = "abcdefgh"
 _SETTLED = 6.0  # time constants: a transient is down to 0.25 %
 _SETTLED_DWELL = 7.0  # and to 0.1 %, since near a null it hides a small steady motion
+_SETTLED_BEFOREHAND = 11.0  # nothing is left of it where the recorder starts late
 _LONGEST_WAIT = 12.0  # s; no student waits longer, however little damping there is
 _LONGEST_DECAY = 8.0  # s
 _CYCLES = 6.5  # of steady state in a dwell: room to see that six do not change any more
@@ -110,15 +111,15 @@ def steps(chain: Chain, session: Session) -> list[Run]:
 def dwells(chain: Chain, session: Session) -> list[Run]:
     """Dwell on one frequency after another, each with the input that moves the carts well."""
     runs = []
-    wait = _wait(chain, _SETTLED_DWELL)
     for number, hertz in enumerate(dwell_frequencies(chain, n=session.n_dwells), start=1):
+        whole = session.transients or hertz == FIGURE_FREQUENCY or number % _WHOLE_EVERY == 0
+        wait = _wait(chain, _SETTLED_DWELL if whole else _SETTLED_BEFOREHAND)
         t = session.clock(wait + max(_CYCLES / hertz, _SHORTEST_DWELL))
         shape = np.sin(2 * np.pi * hertz * t)
         unit = np.abs(simulate_linear(chain, t, shape))
         steady, furthest = float(np.max(unit[:, t >= wait])), float(np.max(unit))
         # Far above the resonances the carts swing out at first, then hardly move.
         amplitude = _typed(session.travel * min(0.8 / steady, 1.5 / furthest), session)
-        whole = session.transients or hertz == FIGURE_FREQUENCY or number % _WHOLE_EVERY == 0
         runs.append(
             Run(
                 id=f"sine-{number:02d}",
