@@ -6,15 +6,15 @@ logarithmic scale, to get near, then by maximum likelihood, each point by its st
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from pipeline.errors import DataError
-from pipeline.plant.chain import Array, Chain, ComplexArray, recover_chain
+from pipeline.plant.chain import Array, Chain, recover_chain
 from pipeline.results import ChainFit, FrequencyResponse
+from pipeline.stages._bode_points import Points, Scale, response_at, weighted_residuals
 from pipeline.stages.chain_parameters import (
     Parametrisation,
     even_chain,
@@ -23,8 +23,6 @@ from pipeline.stages.chain_parameters import (
 )
 from pipeline.stages.staged_fit import LogMagnitude, StagedFit, fit_stage_by_stage
 
-Scale = Literal["log", "magnitude", "polar"]
-
 _STARTS = 8  # random ones, tried where the first does not explain the data
 _GOOD_CHI_SQUARE = 2.0  # per degree of freedom: the data are explained
 _CONFIRMATIONS, _SAME_MINIMUM = 3, 1e-3  # the best chi² found so often, to this ratio
@@ -32,10 +30,7 @@ _START_SPREAD = 0.5  # of ln m and ln k of a random start: half to double, mostl
 _START_ZETAS = (0.02, 0.3)
 _SEED = 2005  # of the random starts; any, but the same every time
 _EVALUATIONS = 100  # a fit that gets there takes about ten
-_LOG_ERROR = 0.05  # added to the error of ln|G|: on the way there no point should rule
-_TABLE_STD = 0.01  # of a magnitude that comes without an error
 _PHASE_AGREES = 3.0  # times as far off as the magnitudes are: a delay or a wrong sign is further
-_PHASE_KNOWN = 0.5  # rad; a worse phase tells nothing
 _VANISHING = 1e-4  # of its usual size: a damping or far spring that the data put at zero
 _RANK = 1e-8  # smallest singular value over the largest, columns in natural sizes
 # chi² exceeds its mean by more than this many of its standard deviations once in a thousand.
@@ -71,98 +66,30 @@ def fit_bode(
     DataError : fewer points than parameters, or responses that do not determine them.
     """
     P = Parametrisation(n=n, springs=tuple(springs))
-    data = _Points.collect(responses, n=n)
+    data = Points.collect(responses, n=n)
     if data.size <= len(P.names):
         raise DataError(
             f"Bode fit: {n} cart{'s'[: n > 1]} with {len(P.names)} parameters "
             f"need more points than that, found {data.size}"
         )
-    like = _stand_in(data, initial or {}, n=n, springs=springs)
-    staged, start = _staged_start(data, initial or {}, n=n, springs=springs, like=like)
+    known = {name: value for name, value in (initial or {}).items() if value > 0}
+    like = _stand_in(data, known, n=n, springs=springs)
+    staged, start = _staged_start(data, known, n=n, springs=springs, like=like)
     best, tried = _fit_from_starts(P, data, first=start, like=like)
-    best = _hold_vanished(best, data)
-    notes = []
+    remark = ""
     if data.has_phase:
         if _phase_misfit(best, data) <= _PHASE_AGREES * max(1.0, best.chi_square_per_dof**0.5):
-            best = _hold_vanished(_solve(best.parametrisation, data, best.theta, "polar"), data)
+            best = _solve(P, data, best.theta, "polar")
         else:
-            notes.append("magnitudes alone: the phases do not agree with them")
-    return _result(best, data, staged=staged, tried=tried, notes=notes)
-
-
-# ------------------------------------------------------------------------ data
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Points:
-    """All measured points in one row (N,); `at` and `cart` index frequency and cart (from 0)."""
-
-    omega: Array  # (n_w,) the distinct frequencies
-    at: NDArray[np.intp]
-    cart: NDArray[np.intp]
-    magnitude: Array
-    std: Array
-    unit: ComplexArray  # exp(-i phase), 1 where not known
-    phase_std: Array  # infinite where not known
-    from_table: bool
-
-    @classmethod
-    def collect(cls, responses: Sequence[FrequencyResponse], *, n: int) -> "_Points":
-        if not responses:
-            raise DataError("Bode fit: needs a frequency response, found none")
-        for response in responses:
-            if not 1 <= response.cart <= n:
-                raise DataError(f"Bode fit: {n} carts, but a response of cart {response.cart}")
-        omega = np.concatenate([r.omega for r in responses])
-        magnitude = np.concatenate([r.magnitude for r in responses])
-        if not (np.all(np.isfinite(omega) & (omega >= 0)) and np.all(np.isfinite(magnitude))):
-            raise DataError("Bode fit: frequencies and magnitudes must be finite numbers")
-        std = np.concatenate([r.magnitude_std for r in responses])
-        stated = np.isfinite(std) & (std > 0)
-        std = np.where(stated, std, _TABLE_STD * np.maximum(magnitude, np.median(magnitude) / 1e3))
-        phase = [np.zeros(r.omega.size) if r.phase is None else r.phase for r in responses]
-        phase_std = [
-            np.full(r.omega.size, np.inf) if r.phase_std is None else r.phase_std for r in responses
-        ]
-        spread = np.concatenate(phase_std)
-        distinct, at = np.unique(omega, return_inverse=True)
-        return cls(
-            omega=distinct,
-            at=at,
-            cart=np.concatenate([np.full(r.omega.size, r.cart - 1) for r in responses]),
-            magnitude=magnitude,
-            std=std,
-            unit=np.exp(-1j * np.concatenate(phase)).astype(np.complex128),
-            phase_std=np.where((spread > 0) & (spread < _PHASE_KNOWN), spread, np.inf),
-            from_table=all(r.source == "table" for r in responses) or not stated.any(),
-        )
-
-    @property
-    def size(self) -> int:
-        return self.magnitude.size
-
-    @property
-    def has_phase(self) -> bool:
-        return bool(np.any(np.isfinite(self.phase_std)))
-
-    @property
-    def level(self) -> Array:
-        """ln|G|; a magnitude lost in its error counts as half that error."""
-        return np.log(np.maximum(self.magnitude, self.std / 2))
-
-    @property
-    def level_weight(self) -> Array:
-        return 1.0 / np.hypot(self.std / np.exp(self.level), _LOG_ERROR)
-
-    def of_cart(self, cart: int) -> NDArray[np.bool_]:
-        return self.cart == cart - 1
+            remark = "magnitudes alone: the phases do not agree with them"
+    return _result(_hold_vanished(best, data), data, staged=staged, tried=tried, remark=remark)
 
 
 # ---------------------------------------------------------------------- starts
 
 
 def _stand_in(
-    data: _Points, initial: Mapping[str, float], *, n: int, springs: Sequence[bool]
+    data: Points, known: Mapping[str, float], *, n: int, springs: Sequence[bool]
 ) -> Chain:
     """Return a chain of even carts with the right gain and mean frequency."""
     first = np.flatnonzero(data.cart == np.min(data.cart))
@@ -173,21 +100,17 @@ def _stand_in(
         m = 1.0 / (np.exp(data.level[highest]) * omega**2)
         return Chain(m=np.array([m]), c=np.array([0.1 * m * omega]), k=np.zeros(2))
     speed = np.exp(data.level[first]) * data.omega[data.at[first]]
-    seen = {
-        "K_1": float(np.exp(data.level[lowest])),
-        "omega_a": float(data.omega[data.at[first[np.argmax(speed)]]]),
-    }
-    known = {name: value for name, value in initial.items() if value > 0}
-    if not any(name.startswith(("omega_a", "omega_n")) for name in known):
-        known["omega_a"] = seen["omega_a"]
-    if "K" not in known and "K_1" not in known:
-        known["K_1"] = seen["K_1"]
-    return even_chain(known, n=n, springs=springs)
+    start = dict(known)
+    if "omega_n" not in known:
+        start.setdefault("omega_a", float(data.omega[data.at[first[np.argmax(speed)]]]))
+    if "K" not in known:
+        start.setdefault("K_1", float(np.exp(data.level[lowest])))
+    return even_chain(start, n=n, springs=springs)
 
 
 def _staged_start(
-    data: _Points,
-    initial: Mapping[str, float],
+    data: Points,
+    known: Mapping[str, float],
     *,
     n: int,
     springs: Sequence[bool],
@@ -206,7 +129,6 @@ def _staged_start(
                 level=data.level[of],
                 weight=data.level_weight[of],
             )
-    known = {name: value for name, value in initial.items() if value > 0}
     staged = fit_stage_by_stage(measured, n=n, initial=known, like=like)
     implied = recover_chain(staged.gains, staged.tails).chain()
     return staged, physical_start(implied, springs=springs)
@@ -242,44 +164,8 @@ class _Fitted:
         return self.chi_square / self.dof
 
 
-def _response(
-    P: Parametrisation, data: _Points, physical: Array
-) -> tuple[ComplexArray, ComplexArray]:
-    """Return G (N,) at the points and dG/dp (N, n_p) = -Z⁻¹ (∂Z/∂p) Z⁻¹ e_1."""
-    s = 1j * data.omega
-    b, powers = P.directions, s[:, None] ** P.orders  # (n_p, n), (n_w, n_p)
-    Z = np.einsum("wp,pi,pj->wij", powers * physical, b, b, optimize=True)
-    inverse = np.linalg.inv(Z)
-    G = inverse[:, :, 0]
-    stretch = (G @ b.T) * -powers  # (n_w, n_p)
-    slopes = (inverse @ b.T) * stretch[:, None, :]  # (n_w, n, n_p)
-    return G[data.at, data.cart], slopes[data.at, data.cart]
-
-
-def _residuals(
-    data: _Points, scale: Scale, G: ComplexArray, dG: ComplexArray
-) -> tuple[Array, Array]:
-    """Return the weighted residuals (model minus measured) and their slopes by p."""
-    size = np.abs(G)
-    radial = (np.conj(G)[:, None] * dG).real / size[:, None]  # d|G|/dp
-    if scale == "log":
-        weight = data.level_weight
-        return weight * (np.log(size) - data.level), (weight / size)[:, None] * radial
-    if scale == "magnitude":
-        return (size - data.magnitude) / data.std, radial / data.std[:, None]
-    known = np.isfinite(data.phase_std)
-    turn = (np.conj(G)[:, None] * dG).imag / size[:, None] ** 2  # d arg G / dp
-    phase_std = data.phase_std[known]
-    return (
-        np.concatenate(
-            [(size - data.magnitude) / data.std, np.angle(G * data.unit)[known] / phase_std]
-        ),
-        np.vstack([radial / data.std[:, None], turn[known] / phase_std[:, None]]),
-    )
-
-
 def _evaluator(
-    P: Parametrisation, data: _Points, scale: Scale
+    P: Parametrisation, data: Points, scale: Scale
 ) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
     """Return residuals and Jacobian by theta, each point computed once for both."""
     last: list[tuple[Array, Array, Array]] = []
@@ -287,14 +173,14 @@ def _evaluator(
     def evaluate(theta: Array) -> tuple[Array, Array]:
         if not last or not np.array_equal(last[0][0], theta):
             physical = P.physical(P.unpack(theta))
-            r, J = _residuals(data, scale, *_response(P, data, physical))
+            r, J = weighted_residuals(data, scale, *response_at(P, data, physical))
             last[:] = [(theta.copy(), r, J * P.slopes(theta))]
         return last[0][1], last[0][2]
 
     return lambda theta: evaluate(theta)[0], lambda theta: evaluate(theta)[1]
 
 
-def _solve(P: Parametrisation, data: _Points, theta: Array, scale: Scale) -> _Fitted:
+def _solve(P: Parametrisation, data: Points, theta: Array, scale: Scale) -> _Fitted:
     residuals, jacobian = _evaluator(P, data, scale)
     solution = least_squares(
         residuals,
@@ -314,7 +200,7 @@ def _solve(P: Parametrisation, data: _Points, theta: Array, scale: Scale) -> _Fi
 
 
 def _fit_from_starts(
-    P: Parametrisation, data: _Points, *, first: Chain, like: Chain
+    P: Parametrisation, data: Points, *, first: Chain, like: Chain
 ) -> tuple[_Fitted, int]:
     """Fit from the first start, and from random ones while the data are not explained.
 
@@ -338,7 +224,7 @@ def _fit_from_starts(
     return best, len(found)
 
 
-def _hold_vanished(fitted: _Fitted, data: _Points) -> _Fitted:
+def _hold_vanished(fitted: _Fitted, data: Points) -> _Fitted:
     """Fit again with every parameter at zero that the data put there or below."""
     P, chain = fitted.parametrisation, fitted.chain
     physical = P.physical(chain)
@@ -354,17 +240,17 @@ def _hold_vanished(fitted: _Fitted, data: _Points) -> _Fitted:
     return _solve(held, data, held.pack(fitted.chain), fitted.scale)
 
 
-def _natural_sizes(P: Parametrisation, chain: Chain, data: _Points) -> Array:
+def _natural_sizes(P: Parametrisation, chain: Chain, data: Points) -> Array:
     """Return of what order each parameter (n_p,) is: damping m ω, the stiffest spring."""
     middle = float(np.median(data.omega[data.omega > 0]))
     sizes = {"m": chain.m, "c": chain.m * middle, "k": np.full(chain.n + 1, np.max(chain.k))}
     return np.array([sizes[name[0]][int(name[2:]) - 1] for name in P.names])
 
 
-def _phase_misfit(fitted: _Fitted, data: _Points) -> float:
+def _phase_misfit(fitted: _Fitted, data: Points) -> float:
     """Return the root-mean-square distance of the measured phases from the fit's, in errors."""
     P = fitted.parametrisation
-    G, _ = _response(P, data, P.physical(fitted.chain))
+    G, _ = response_at(P, data, P.physical(fitted.chain))
     known = np.isfinite(data.phase_std)
     off = np.angle(G * data.unit)[known] / data.phase_std[known]
     return float(np.sqrt(np.mean(off**2)))
@@ -375,23 +261,25 @@ def _phase_misfit(fitted: _Fitted, data: _Points) -> float:
 
 def _result(
     fitted: _Fitted,
-    data: _Points,
+    data: Points,
     *,
     staged: StagedFit | None,
     tried: int,
-    notes: Sequence[str],
+    remark: str,
 ) -> ChainFit:
     P, chain = fitted.parametrisation, fitted.chain
     physical = P.physical(chain)
-    G, dG = _response(P, data, physical)
-    _, J = _residuals(data, fitted.scale, G, dG)
+    G, dG = response_at(P, data, physical)
+    _, J = weighted_residuals(data, fitted.scale, G, dG)
     covariance = _covariance(
         P, J, sizes=_natural_sizes(P, chain, data), carts=np.unique(data.cart) + 1
     )
-    inflation, remark = _inflation(fitted, data)
+    inflation, warning = _inflation(fitted, data)
     covariance = covariance * inflation
     standardised = (np.abs(G) - data.magnitude) / -data.std
-    remarks = [*notes, *(f"{name} is at its bound, zero" for name in P.zero), remark]
+    remarks = [remark, *(f"{name} is at its bound, zero" for name in P.zero), warning]
+    if not fitted.converged:
+        remarks.append(f"not converged after {_EVALUATIONS} evaluations")
     return ChainFit(
         method="bode_fit",
         chain=chain,
@@ -424,7 +312,7 @@ def _covariance(P: Parametrisation, J: Array, *, sizes: Array, carts: NDArray[np
     return root.T @ root
 
 
-def _inflation(fitted: _Fitted, data: _Points) -> tuple[float, str]:
+def _inflation(fitted: _Fitted, data: Points) -> tuple[float, str]:
     """Return the factor on the covariance for points whose errors are not what was stated."""
     ratio = fitted.chi_square_per_dof
     if data.from_table:

@@ -1,0 +1,120 @@
+"""What the Bode fit compares: the measured points in one row, and the chain's response at them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import DataError
+from pipeline.plant.chain import Array, ComplexArray
+from pipeline.results import FrequencyResponse
+from pipeline.stages.chain_parameters import Parametrisation
+
+Scale = Literal["log", "magnitude", "polar"]
+
+_LOG_ERROR = 0.05  # added to the error of ln|G|: on the way there no point should rule
+_TABLE_STD = 0.01  # of a magnitude that comes without an error
+_PHASE_KNOWN = 0.5  # rad; a worse phase tells nothing
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Points:
+    """All measured points in one row (N,); `at` and `cart` index frequency and cart (from 0)."""
+
+    omega: Array  # (n_w,) the distinct frequencies
+    at: NDArray[np.intp]
+    cart: NDArray[np.intp]
+    magnitude: Array
+    std: Array
+    unit: ComplexArray  # exp(-i phase), 1 where not known
+    phase_std: Array  # infinite where not known
+    from_table: bool
+
+    @classmethod
+    def collect(cls, responses: Sequence[FrequencyResponse], *, n: int) -> "Points":
+        if not responses:
+            raise DataError("Bode fit: needs a frequency response, found none")
+        for response in responses:
+            if not 1 <= response.cart <= n:
+                raise DataError(f"Bode fit: {n} carts, but a response of cart {response.cart}")
+        omega = np.concatenate([r.omega for r in responses])
+        magnitude = np.concatenate([r.magnitude for r in responses])
+        if not (np.all(np.isfinite(omega) & (omega >= 0)) and np.all(np.isfinite(magnitude))):
+            raise DataError("Bode fit: frequencies and magnitudes must be finite numbers")
+        std = np.concatenate([r.magnitude_std for r in responses])
+        stated = np.isfinite(std) & (std > 0)
+        std = np.where(stated, std, _TABLE_STD * np.maximum(magnitude, np.median(magnitude) / 1e3))
+        phase = [np.zeros(r.omega.size) if r.phase is None else r.phase for r in responses]
+        phase_std = [
+            np.full(r.omega.size, np.inf) if r.phase_std is None else r.phase_std for r in responses
+        ]
+        spread = np.concatenate(phase_std)
+        distinct, at = np.unique(omega, return_inverse=True)
+        return cls(
+            omega=distinct,
+            at=at,
+            cart=np.concatenate([np.full(r.omega.size, r.cart - 1) for r in responses]),
+            magnitude=magnitude,
+            std=std,
+            unit=np.exp(-1j * np.concatenate(phase)).astype(np.complex128),
+            phase_std=np.where((spread > 0) & (spread < _PHASE_KNOWN), spread, np.inf),
+            from_table=all(r.source == "table" for r in responses) or not stated.any(),
+        )
+
+    @property
+    def size(self) -> int:
+        return self.magnitude.size
+
+    @property
+    def has_phase(self) -> bool:
+        return bool(np.any(np.isfinite(self.phase_std)))
+
+    @property
+    def level(self) -> Array:
+        """ln|G|; a magnitude lost in its error counts as half that error."""
+        return np.log(np.maximum(self.magnitude, self.std / 2))
+
+    @property
+    def level_weight(self) -> Array:
+        return 1.0 / np.hypot(self.std / np.exp(self.level), _LOG_ERROR)
+
+    def of_cart(self, cart: int) -> NDArray[np.bool_]:
+        return self.cart == cart - 1
+
+
+def response_at(
+    P: Parametrisation, data: Points, physical: Array
+) -> tuple[ComplexArray, ComplexArray]:
+    """Return G (N,) at the points and dG/dp (N, n_p) = -Z⁻¹ (∂Z/∂p) Z⁻¹ e_1."""
+    s = 1j * data.omega
+    b, powers = P.directions, s[:, None] ** P.orders  # (n_p, n), (n_w, n_p)
+    Z = np.einsum("wp,pi,pj->wij", powers * physical, b, b, optimize=True)
+    inverse = np.linalg.inv(Z)
+    G = inverse[:, :, 0]
+    stretch = (G @ b.T) * -powers  # (n_w, n_p)
+    slopes = (inverse @ b.T) * stretch[:, None, :]  # (n_w, n, n_p)
+    return G[data.at, data.cart], slopes[data.at, data.cart]
+
+
+def weighted_residuals(
+    data: Points, scale: Scale, G: ComplexArray, dG: ComplexArray
+) -> tuple[Array, Array]:
+    """Return the weighted residuals (model minus measured) and their slopes by p."""
+    size = np.abs(G)
+    radial = (np.conj(G)[:, None] * dG).real / size[:, None]  # d|G|/dp
+    if scale == "log":
+        weight = data.level_weight
+        return weight * (np.log(size) - data.level), (weight / size)[:, None] * radial
+    if scale == "magnitude":
+        return (size - data.magnitude) / data.std, radial / data.std[:, None]
+    known = np.isfinite(data.phase_std)
+    turn = (np.conj(G)[:, None] * dG).imag / size[:, None] ** 2  # d arg G / dp
+    phase_std = data.phase_std[known]
+    return (
+        np.concatenate(
+            [(size - data.magnitude) / data.std, np.angle(G * data.unit)[known] / phase_std]
+        ),
+        np.vstack([radial / data.std[:, None], turn[known] / phase_std[:, None]]),
+    )
