@@ -18,7 +18,7 @@ _POSITION = re.compile(
 )
 _ONE_POSITION = re.compile(r"x|y|pos|position|displacement")
 _NO_ROLE = re.compile(r"|sample|samples|index|n|no|nr")  # known, and of no use
-_COUNTED = re.compile(r"enc|counts?\b|commanded pos", re.IGNORECASE)
+_COUNTED = re.compile(r"\benc|counts?\b|commanded pos", re.IGNORECASE)
 _UNIT = re.compile(r"[\[(]\s*([^\])]+?)\s*[\])]\s*$")
 
 # Factors to the SI unit of the same quantity.
@@ -70,6 +70,11 @@ class Column:
     def is_duty(self) -> bool:
         """The heading says that duty counts of the motor's amplifier stand here."""
         return "duty" in self.name.casefold()
+
+
+def holds_counts(table: Table, column: Column) -> bool:
+    """Tell encoder counts: whole numbers where the form or the heading speaks of an encoder."""
+    return table.whole[column.index] and (table.form != "csv" or column.is_counted)
 
 
 def conversion(found: str | None, wanted: str) -> float | None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.errors import SubmissionError
 from pipeline.ingest.clock import Clock, read_clock
-from pipeline.ingest.columns import Column, assign_columns, conversion
+from pipeline.ingest.columns import Column, assign_columns, conversion, holds_counts
 from pipeline.ingest.files import read_table
 from pipeline.ingest.problems import channel_problems
 from pipeline.ingest.signals import encoder_step, mirrors
@@ -161,8 +161,8 @@ def _guess(
     samples = np.arange(table.values.shape[1], dtype=np.float64)
     t = clock.t if clock else samples
     problems += channel_problems(t, u, positions)
-    if reference is not None and "x1" in signals and mirrors(reference, signals["x1"]):
-        reference = None
+    if reference is not None and "x1" in signals and holds_counts(table, columns["reference"]):
+        reference = None if mirrors(reference, signals["x1"]) else reference
     if u is None or np.ptp(u) == 0.0:
         if table.form != "bench_mat" or reference is None or np.ptp(reference) == 0.0:
             return "decay", None

@@ -10,6 +10,7 @@ from pipeline.plant.chain import Array
 _ABRUPT = 5.0  # encoder steps a sample; no cart stops from that speed between two samples
 _STUCK_SAMPLES = 10
 _CLIPPED_SAMPLES = 3
+_CLIPPED_SHARE = 5  # times as often as the next level; the rounded crest of a sine: 1.4 times
 _FEW_LEVELS = 20  # a stepped input is at its extremes by design
 
 
@@ -43,21 +44,22 @@ def _runs(still: np.ndarray) -> Iterator[tuple[int, int]]:
 def saturation(u: Array) -> float | None:
     """Return the limit at which a varied input was clipped, or None.
 
-    Clipped: the extreme is entered with a jump, held and left with a jump (the smooth crest of a
-    rounded sine is not), or both extremes are the same to the last digit.
+    A clipped input enters its extreme with a jump, holds it and leaves with a jump, and takes it
+    far more often than the next value; the crest of a sine, even if rounded to a few digits, and
+    a controller that creeps up to its last value do not.
     """
-    if np.unique(u).size <= _FEW_LEVELS:
+    levels, counts = np.unique(u, return_counts=True)
+    if levels.size <= _FEW_LEVELS:
         return None
-    top, bottom = float(u.max()), float(u.min())
-    quantum = encoder_step(u)
-    if top == -bottom and np.count_nonzero(np.abs(u) == top) > 2:
-        return top
-    for limit in (top, bottom):
+    for top, following in ((-1, -2), (0, 1)):
+        limit, gap = levels[top], abs(levels[top] - levels[following])
+        if limit == 0.0 or counts[top] < _CLIPPED_SHARE * counts[following]:
+            continue
         for first, last in _runs((u[:-1] == limit) & (u[1:] == limit)):
-            entry = abs(u[first] - u[first - 1]) if first > 0 else np.inf
-            leave = abs(u[last + 1] - u[last]) if last + 1 < u.size else np.inf
-            if last - first + 1 >= _CLIPPED_SAMPLES and min(entry, leave) > 3 * quantum:
-                return abs(limit)
+            entry = abs(limit - u[first - 1]) if first > 0 else np.inf
+            leave = abs(limit - u[last + 1]) if last + 1 < u.size else np.inf
+            if last - first + 1 >= _CLIPPED_SAMPLES and min(entry, leave) > 3 * gap:
+                return abs(float(limit))
     return None
 
 

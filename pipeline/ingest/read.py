@@ -8,7 +8,7 @@ import numpy as np
 from pipeline.errors import SubmissionError
 from pipeline.ingest.bode import Points, frequency_responses, read_points
 from pipeline.ingest.clock import Clock, read_clock
-from pipeline.ingest.columns import Column, assign_columns, conversion
+from pipeline.ingest.columns import Column, assign_columns, conversion, holds_counts
 from pipeline.ingest.files import read_table
 from pipeline.ingest.problems import channel_problems
 from pipeline.ingest.signals import encoder_step, input_sign, mirrors
@@ -131,7 +131,7 @@ def _read_record(table: Table, experiment: Experiment, system: System) -> Record
         [table.values[c.index] * scale for c, scale in zip(positions, scales, strict=True)]
     )
     resolution = [
-        scale if _holds_counts(table, c) else encoder_step(row)
+        scale if holds_counts(table, c) else encoder_step(row)
         for c, row, scale in zip(positions, y, scales, strict=True)
     ]
     u, input_scale = _input(table, columns, experiment, system, notes)
@@ -246,15 +246,10 @@ def _window(clock: Clock, experiment: Experiment) -> slice:
 # ------------------------------------------------------------------------ units and signs
 
 
-def _holds_counts(table: Table, column: Column) -> bool:
-    """Whole numbers where the form or the heading says that an encoder was read."""
-    return table.whole[column.index] and (table.form != "csv" or column.is_counted)
-
-
 def _position_scale(table: Table, column: Column, system: System, notes: list[str]) -> float:
     """Return position units per number in the file."""
     unit, per_count = system.position.unit, system.position.per_count
-    if _holds_counts(table, column):
+    if holds_counts(table, column):
         if per_count is not None:
             return per_count
         if unit.rstrip("s") == "count" or not (table.form == "ecp" or column.is_counted):
@@ -327,7 +322,11 @@ def _reference(
         return None
     values = table.values[column.index]
     first = columns.get("x1")
-    if first is not None and mirrors(values, table.values[first.index]):
+    if (
+        first is not None
+        and holds_counts(table, column)
+        and mirrors(values, table.values[first.index])
+    ):
         notes.append(f"{column.name!r} only mirrors {first.name!r} and is no reference")
         return None
     return values[keep] * _position_scale(table, column, system, notes)

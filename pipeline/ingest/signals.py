@@ -7,7 +7,7 @@ from pipeline.plant.chain import Array
 _MOST_LEVELS = 20_000  # an encoder on a lab cart has a few thousand counts over its travel
 _ON_GRID = 0.15  # of a step, rms: farther off, the values are not multiples of one step
 _LEAST_SHARE = 0.02  # of the work to and fro: less net work has no sure sign
-_MIRRORED = 0.75  # of the samples within one count; the copy lags encoder 1 at speed
+_MIRRORED = 0.8  # of the samples in motion
 _BLOCKS = 12  # a record is cut into so many to look for rest; a lab step settles within a few
 _STILL = 0.02  # of the travel: the cart rests in a block that scatters less
 _RESTS, _SURE = 5, 0.9  # so many rests correlate with the input so well (squared) by chance in
@@ -40,8 +40,17 @@ def encoder_step(x: Array) -> float:
 
 
 def mirrors(reference: Array, x1: Array) -> bool:
-    """Tell a commanded position that only repeats encoder 1, as an ECP logs it in open loop."""
-    return bool(np.ptp(reference) > 0 and np.mean(np.abs(reference - x1) <= 1.0) > _MIRRORED)
+    """Tell a commanded position that only repeats encoder 1, as an ECP logs it in open loop.
+
+    Both in counts. The copy is read a little later than the sample before and a little earlier
+    than the sample itself, so it lies between the two; a true reference leads or waits.
+    """
+    moving = np.flatnonzero(np.diff(x1)) + 1
+    if moving.size < 3 or np.ptp(reference) == 0.0:
+        return False
+    before, now, copy = x1[moving - 1], x1[moving], reference[moving]
+    between = (copy >= np.minimum(before, now) - 1.0) & (copy <= np.maximum(before, now) + 1.0)
+    return bool(np.mean(between) > _MIRRORED)
 
 
 def input_sign(u: Array, x1: Array, *, closed_loop: bool) -> int:
