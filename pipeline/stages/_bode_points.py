@@ -1,7 +1,7 @@
 """What the Bode fit compares: the measured points in one row, and the chain's response at them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -79,6 +79,14 @@ class Points:
     @property
     def level_weight(self) -> Array:
         return 1.0 / np.hypot(self.std / np.exp(self.level), _LOG_ERROR)
+
+    def widened(self, share: float) -> "Points":
+        """Return the points with a relative error added to those they have."""
+        return replace(
+            self,
+            std=np.hypot(self.std, share * self.magnitude),
+            phase_std=np.hypot(self.phase_std, share),
+        )
 
     def of_cart(self, cart: int) -> NDArray[np.bool_]:
         return self.cart == cart - 1

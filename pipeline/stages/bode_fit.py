@@ -33,6 +33,8 @@ _EVALUATIONS = 100  # a fit that gets there takes about ten
 _PHASE_AGREES = 3.0  # times as far off as the magnitudes are: a delay or a wrong sign is further
 _VANISHING = 1e-4  # of its usual size: a damping or far spring that the data put at zero
 _RANK = 1e-8  # smallest singular value over the largest, columns in natural sizes
+_SHARES, _SHARE_PRECISION = (1e-6, 10.0), 0.01  # where a missing relative error may lie; ratio
+_WIDENINGS = 3  # fits in turn with the error they call for: it settles to a per cent
 # chi² exceeds its mean by more than this many of its standard deviations once in a thousand.
 _EXCESS_SIGMAS = 3.1
 
@@ -48,9 +50,12 @@ def fit_bode(
 
     Phases are used where they are given and agree with the magnitudes, else magnitudes alone.
     A parameter that the data put at or below zero is held there and the others fitted again: the
-    standard errors then hold on both sides of the bound. Errors are scaled up where the misfit
-    is larger than the points' own errors allow, and to the misfit either way for a table that
-    states none.
+    standard errors then hold on both sides of the bound.
+
+    Where the misfit is larger than the points' errors allow, the chain does not describe the bench
+    to that precision: a relative error, the same for all points, is added until it does, and
+    the chain fitted once more. `chi_square_per_dof` and `standardised` keep the stated errors.
+    For a table, which states none, standard errors follow the misfit either way.
 
     Parameters
     ----------
@@ -82,7 +87,9 @@ def fit_bode(
             best = _solve(P, data, best.theta, "polar")
         else:
             remark = "magnitudes alone: the phases do not agree with them"
-    return _result(_hold_vanished(best, data), data, staged=staged, tried=tried, remark=remark)
+    best, share = _widen(best, data)
+    best = _hold_vanished(best, data.widened(share))
+    return _result(best, data, share=share, staged=staged, tried=tried, remark=remark)
 
 
 # ---------------------------------------------------------------------- starts
@@ -224,6 +231,37 @@ def _fit_from_starts(
     return best, len(found)
 
 
+def _widen(fitted: _Fitted, data: Points) -> tuple[_Fitted, float]:
+    """Fit again with the relative error that makes the misfit what the errors allow; 0 if it is."""
+    excess = fitted.chi_square_per_dof - 1
+    if data.from_table or excess <= _EXCESS_SIGMAS * np.sqrt(2 / fitted.dof):
+        return fitted, 0.0
+    share = 0.0
+    for _ in range(_WIDENINGS):
+        share = _missing_share(fitted, data)
+        widened = data.widened(share)
+        fitted = _solve(fitted.parametrisation, widened, fitted.theta, fitted.scale)
+    return fitted, share
+
+
+def _missing_share(fitted: _Fitted, data: Points) -> float:
+    """Return the relative error that brings chi² down to its degrees of freedom, by bisection."""
+    low, high = -np.log(_SHARES[1]), -np.log(_SHARES[0])
+    while high - low > _SHARE_PRECISION:
+        middle = (low + high) / 2
+        if _chi_square(fitted, data.widened(np.exp(-middle))) < fitted.dof:
+            low = middle
+        else:
+            high = middle
+    return float(np.exp(-low))
+
+
+def _chi_square(fitted: _Fitted, data: Points) -> float:
+    P = fitted.parametrisation
+    response = response_at(P, data, P.physical(fitted.chain))
+    return float(np.sum(weighted_residuals(data, fitted.scale, *response)[0] ** 2))
+
+
 def _hold_vanished(fitted: _Fitted, data: Points) -> _Fitted:
     """Fit again with every parameter at zero that the data put there or below."""
     P, chain = fitted.parametrisation, fitted.chain
@@ -263,21 +301,27 @@ def _result(
     fitted: _Fitted,
     data: Points,
     *,
+    share: float,
     staged: StagedFit | None,
     tried: int,
     remark: str,
 ) -> ChainFit:
     P, chain = fitted.parametrisation, fitted.chain
-    physical = P.physical(chain)
-    G, dG = response_at(P, data, physical)
-    _, J = weighted_residuals(data, fitted.scale, G, dG)
+    G, dG = response_at(P, data, P.physical(chain))
+    _, J = weighted_residuals(data.widened(share), fitted.scale, G, dG)
     covariance = _covariance(
         P, J, sizes=_natural_sizes(P, chain, data), carts=np.unique(data.cart) + 1
     )
-    inflation, warning = _inflation(fitted, data)
-    covariance = covariance * inflation
-    standardised = (np.abs(G) - data.magnitude) / -data.std
-    remarks = [remark, *(f"{name} is at its bound, zero" for name in P.zero), warning]
+    chi_square_per_dof = _chi_square(fitted, data) / fitted.dof
+    if data.from_table:
+        covariance *= chi_square_per_dof
+    standardised = (data.magnitude - np.abs(G)) / data.std
+    remarks = [remark, *(f"{name} is at its bound, zero" for name in P.zero)]
+    if share > 0:
+        remarks.append(
+            f"the points lie {100 * share:.2g} % off the model, beyond their errors: "
+            "the standard errors allow for it"
+        )
     if not fitted.converged:
         remarks.append(f"not converged after {_EVALUATIONS} evaluations")
     return ChainFit(
@@ -287,7 +331,7 @@ def _result(
         covariance=covariance,
         parameters=named_estimates(chain, names=P.names, covariance=covariance, source="bode_fit"),
         staged=staged.parameters if staged else {},
-        chi_square_per_dof=fitted.chi_square_per_dof,
+        chi_square_per_dof=chi_square_per_dof,
         dof=fitted.dof,
         n_points=data.size,
         n_starts=tried,
@@ -310,13 +354,3 @@ def _covariance(P: Parametrisation, J: Array, *, sizes: Array, carts: NDArray[np
         )
     root = (V / singular[:, None]) * sizes
     return root.T @ root
-
-
-def _inflation(fitted: _Fitted, data: Points) -> tuple[float, str]:
-    """Return the factor on the covariance for points whose errors are not what was stated."""
-    ratio = fitted.chi_square_per_dof
-    if data.from_table:
-        return ratio, ""
-    if ratio <= 1 + _EXCESS_SIGMAS * np.sqrt(2 / fitted.dof):
-        return 1.0, ""
-    return ratio, f"the misfit is {ratio**0.5:.1f} times the points' errors: errors scaled up"
