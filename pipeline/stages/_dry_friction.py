@@ -19,6 +19,7 @@ from pipeline.stages._signals import colour
 
 THRESHOLD = 10.8  # F(1, many) above this once in a thousand decays without friction
 _UNKNOWNS = 7
+_ONE_START = 1.5  # residual over noise without friction: up to here there is little, if any
 _LESS_DAMPING = (1.0, 0.3)  # starts: friction takes a share of the damping fitted without it
 
 
@@ -43,7 +44,8 @@ def fit_friction(
     t, y : (n,) one free decay.
     viscous : the fit without friction, to the same samples.
     turning : s, a turning point of the cart, about; `falling`: it moves to smaller y afterwards.
-    floor : the least residual (root-mean-square) that means anything.
+    floor : the least residual (root-mean-square) that means anything; a friction band within it
+        is not called present.
 
     Returns
     -------
@@ -69,7 +71,7 @@ def fit_friction(
             method="lm",
             x_scale=[1 / pole.imag, abs(pole), abs(pole)],
         )
-        for share in _LESS_DAMPING
+        for share in (_LESS_DAMPING if viscous.rms > _ONE_START * floor else _LESS_DAMPING[:1])
     ]
     best = min(fits, key=lambda fit: fit.cost)
     if not best.success or best.x[2] <= 0:
@@ -89,7 +91,7 @@ def fit_friction(
     test = FrictionTest(
         f_statistic=statistic,
         threshold=THRESHOLD,
-        present=statistic > THRESHOLD and drop > 0,
+        present=statistic > THRESHOLD and drop > floor,
         drop=drop,
         drop_std=float(np.sqrt(covariance[6, 6])),
         zeta=decay / omega_n,

@@ -151,28 +151,38 @@ def fit_decay(t: Array, y: Array, *, stretch: Stretch, run: list[int], floor: fl
         stop = int(np.searchsorted(t[: stretch.stop], t[run[-1]] + 2 * interval))
     pole = complex(-np.log(_ratio(y, run)) / interval, np.pi / interval)
 
-    def fit_from(first: int) -> FreeDecay:
-        return _fit(t, y, stretch=stretch, first=first, stop=stop, run=run, pole=pole, floor=floor)
+    def fit_from(first: int, *, last: bool = False) -> FreeDecay:
+        return _fit(
+            t,
+            y,
+            stretch=stretch,
+            first=first,
+            stop=stop,
+            run=run,
+            pole=pole,
+            floor=floor,
+            last=last,
+        )
 
     enough = max(stop - _MIN_SAMPLES, stretch.first)
-    later = run[min(_BASE_SKIPS, max(len(run) - _BASE_NEEDS, 0))]
-    latest = min(later, enough)
+    latest = min(run[min(_BASE_SKIPS, max(len(run) - _BASE_NEEDS, 0))], enough)
     decay = fit_from(latest)
     if decay.rms(t, y) > _ADEQUATE * floor:
         # How a real cart breaks away is no part of the model: from its first passage on.
         decay = fit_from(min(run[0], enough))
         passage = int(np.searchsorted(t, t[run[0]] - interval / 2))
         held = _carried_back(t, y, decay, latest=decay.first, share=_REAL_SHARE, floor=floor)
-        return fit_from(passage) if held <= passage < decay.first else decay
+        return fit_from(passage if held <= passage < decay.first else decay.first, last=True)
     for share in _BACK_SHARES:
         first = _carried_back(t, y, decay, latest=latest, share=share, floor=floor)
         if first == decay.first:
             break
         decay = fit_from(first)
-    if decay.first > stretch.first:
-        margin = t[decay.first] + _RELEASE_MARGIN * 2 * interval
-        decay = fit_from(min(int(np.searchsorted(t, margin)), latest))
-    return decay
+    first = decay.first
+    if first > stretch.first:
+        margin = t[first] + _RELEASE_MARGIN * 2 * interval
+        first = min(int(np.searchsorted(t, margin)), latest)
+    return fit_from(first, last=True)
 
 
 def _carried_back(
@@ -198,17 +208,24 @@ def _fit(
     run: list[int],
     pole: complex,
     floor: float,
+    last: bool,
 ) -> FreeDecay:
+    """Fit samples [first, stop), with dry friction where the viscous fit leaves more than noise.
+
+    The `last` fit always has it: its test is reported.
+    """
     t, y = t[:stop], y[:stop]
     fit = fit_ringing(t[first:], y[first:], poles=np.array([pole]), drift=True)
-    friction = fit_friction(
-        t[first:],
-        y[first:],
-        viscous=fit,
-        turning=float(t[run[0]]),
-        falling=bool(y[run[1]] < y[run[0]]),
-        floor=floor,
-    )
+    friction = None
+    if last or fit.rms > _ADEQUATE * floor:
+        friction = fit_friction(
+            t[first:],
+            y[first:],
+            viscous=fit,
+            turning=float(t[run[0]]),
+            falling=bool(y[run[1]] < y[run[0]]),
+            floor=floor,
+        )
     return FreeDecay(
         stretch=stretch,
         first=first,

@@ -12,10 +12,13 @@ from pipeline.stages._signals import grain
 
 _PEAKS_FOR_REGRESSION = 4  # two amplitudes
 _PEAK_HALF_WIDTH = 0.5  # rad: so near a turning point a cosine is nearly a parabola
-_NO_DECAY = 0.15  # of the motion: a fit that leaves more is of something else
-_DRIVEN_DIFFERS = 3.0  # standard errors
-_FIGURE_POINTS = 60  # per period
+_PARABOLA_ERROR = 1e-4  # of delta: what is left of the difference, with samples anywhere
+_NO_DECAY = 0.08  # of the motion: a fit that leaves more is of something else
 _MAX_FIGURE_POINTS = 3000
+_GROWS = 1.05  # damping ratio at large amplitudes over the mean, where it is worth a word
+_FIGURE_POINTS = 60  # per period
+_MAX_GROWS = 1.05  # damping ratio at large amplitudes over the mean, where it is worth a word
+_FIGURE_POINTS = 3000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -111,54 +114,54 @@ def _peaks(t: Array, y: Array, decay: FreeDecay, *, floor: float) -> _Peaks:
     """
     pole = complex(decay.fit.poles[0])
     located = [_vertex(t, y, i, half_width=_PEAK_HALF_WIDTH / pole.imag) for i in decay.turning]
-    peak_t, peak_y = (
-        (np.array(values) for values in zip(*located, strict=True))
-        if located
-        else (
-            np.empty(0),
-            np.empty(0),
-        )
-    )
+    peak_t, peak_y = np.array(located).reshape(-1, 2).T
     n = peak_t.size
-    if n < _PEAKS_FOR_REGRESSION:
-        errors = np.sqrt(np.diag(decay.fit.covariance)[2:])
-        return _Peaks(
-            t=peak_t,
-            y=peak_y,
-            amplitude=_half_swing(n) @ peak_y if n > 2 else np.empty(0),
-            delta=-2 * np.pi * pole.real / pole.imag,
-            delta_std=float(2 * np.pi * errors[0] / pole.imag),
-            omega_d=pole.imag,
-            omega_d_std=float(errors[1]),
-        )
     swing = _half_swing(n)
     signed = swing @ peak_y
     amplitude = np.abs(signed)
-    sigma = max(decay.fit.rms, floor)  # of one turning point, at worst
+    if n < _PEAKS_FOR_REGRESSION:
+        decay_std, omega_d_std = np.sqrt(np.diag(decay.fit.covariance)[2:])
+        return _Peaks(
+            t=peak_t,
+            y=peak_y,
+            amplitude=amplitude,
+            delta=-2 * np.pi * pole.real / pole.imag,
+            delta_std=float(2 * np.pi * decay_std / pole.imag),
+            omega_d=pole.imag,
+            omega_d_std=float(omega_d_std),
+        )
     # The noise is constant in A, so ln A is weighted by A²; the errors follow from those of the
     # turning points, which neighbouring A share.
-    root = np.vander(np.arange(n - 2.0), 2) * amplitude[:, None]
-    solve = np.linalg.pinv(root) * amplitude
-    slope = float((solve @ np.log(amplitude))[0])
-    per_y = (solve / signed) @ swing
-    index = np.vander(np.arange(float(n)), 2) * np.abs(np.gradient(peak_y))[:, None]
-    time = np.linalg.pinv(index) * np.abs(np.gradient(peak_y))
-    interval = float((time @ peak_t)[0])
-    scatter = peak_t - np.vander(np.arange(float(n)), 2) @ (time @ peak_t)
-    interval_std = float(np.linalg.norm(time[0] * scatter) * np.sqrt(n / (n - 2)))
+    per_log = _slope(amplitude)
+    loss = -float(per_log @ np.log(amplitude))  # per half cycle
+    sigma = max(decay.fit.rms, floor)  # of one turning point, at worst
+    noise = sigma * float(np.linalg.norm((per_log / signed) @ swing))
+    per_time = _slope(np.abs(np.gradient(peak_y)))
+    interval = float(per_time @ peak_t)
+    count = np.arange(n) - (n - 1) / 2
+    late = peak_t - peak_t.mean() - interval * count
+    interval_std = float(np.linalg.norm(per_time * late)) * np.sqrt(n / (n - 2))
     return _Peaks(
         t=peak_t,
         y=peak_y,
         amplitude=amplitude,
-        delta=-2 * slope,
-        delta_std=float(2 * sigma * np.linalg.norm(per_y[0])),
+        delta=2 * loss,
+        delta_std=2 * float(np.hypot(noise, _PARABOLA_ERROR * loss)),
         omega_d=np.pi / interval,
         omega_d_std=np.pi / interval**2 * interval_std,
     )
 
 
+def _slope(weight: Array) -> Array:
+    """Return what to multiply values (n,) by for the slope of their weighted line per step."""
+    line = np.vander(np.arange(float(weight.size)), 2)
+    return (np.linalg.pinv(line * weight[:, None]) * weight)[0]
+
+
 def _half_swing(n: int) -> Array:
     """Return the map (n - 2, n) from turning points to their distance from the moving middle."""
+    if n < 3:
+        return np.empty((0, n))
     return 0.5 * np.eye(n - 2, n, 1) - 0.25 * (np.eye(n - 2, n) + np.eye(n - 2, n, 2))
 
 
@@ -204,7 +207,7 @@ def _note(record: Record, decay: FreeDecay, *, zeta: float, n_peaks: int) -> str
             f"{test.drop:.3g} of its rest point. Viscous damping alone would be zeta = "
             f"{test.zeta:.3g}; the {zeta:.3g} fitted without it holds for these amplitudes only"
         )
-    elif test and test.f_statistic > test.threshold:
+    elif test and test.f_statistic > test.threshold and test.zeta > _GROWS * zeta:
         notes.append(
             "the decay is not exponential: the damping grows with the amplitude, and zeta is a mean"
         )
