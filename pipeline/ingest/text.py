@@ -293,7 +293,7 @@ def _sniff(sample: Sequence[str]) -> tuple[str | None, bool, bool, bool] | None:
     The delimiter that makes the most rows into numbers of one width wins; of equals the first,
     so that "0,5;1,2" is two numbers with decimal commas and "0,5" two whole ones.
     """
-    best, best_score = None, 0
+    best, best_score = None, 0.0
     for delimiter in ("\t", ";", ",", _SPACES):
         for decimal_comma in (False, True) if delimiter != "," else (False,):
             trailing = delimiter not in (None, "\t") and all(
@@ -305,8 +305,10 @@ def _sniff(sample: Sequence[str]) -> tuple[str | None, bool, bool, bool] | None:
             has_heading = not all(_is_number(field) for field in split[0])
             rows = split[1:] if has_heading else split
             width = len(split[0])
-            good = sum(len(row) == width and all(map(_is_number, row)) for row in rows)
-            score = good * (2 if width > 1 else 1)  # one column only where nothing else fits
+            numeric = [len(row) for row in rows if all(map(_is_number, row))]
+            # One column only where nothing else fits; numbers under a heading of another width
+            # only to say so.
+            score = numeric.count(width) * (2 if width > 1 else 1) + 0.01 * len(numeric)
             if score > best_score:
                 best, best_score = (delimiter, decimal_comma, has_heading, trailing), score
     return best

@@ -1,0 +1,231 @@
+"""`submission.toml` becomes a validated model, digits as typed, defaults filled in."""
+
+import re
+from decimal import Decimal
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.errors import ConfigError, SubmissionError
+from pipeline.ingest.read import read_data
+from pipeline.plant.chain import parameter_names
+from pipeline.submission import Pid, StateFeedback, load_submission, new_submission
+
+FULL = """\
+version = 1
+title = "Two carts · 弹簧"
+section = "03"
+[[authors]]
+id = "s1024"
+name = "Åsa"
+[system]
+carts = 2
+springs = [false, true, true]
+input = { unit = "V", sign = -1 }
+position = { unit = "cm", per_count = 0.00227 }
+[design]
+cart = 2
+reference = 1
+overshoot_percent = 10.0
+settling_time = 1.0
+input_limit = 5
+sample_time = 0.00884
+method = "poles"
+[[experiments]]
+id = "decay-1"
+kind = "decay"
+carts = [1]
+file = "data/a.csv"
+[[experiments]]
+id = "control"
+kind = "closed_loop"
+controlled_cart = 2
+controller = { type = "state_feedback", gains = [1, 2, 3, 4.5], prefilter = 2 }
+file = 'data\\a.csv'
+window = [0, 2.5]
+columns = { time = 1, x1 = "Encoder 1 Pos" }
+[[experiments]]
+id = "pid"
+kind = "closed_loop"
+controller = { type = "pid", kp = 0.05 }
+file = "./data/a.csv"
+[reported.initial]
+K_1 = 25
+zeta_a = 0.10
+[reported.final]
+omega_a = 1.0e1
+[reported.state_space]
+A = [[0, 1, 0, 0], [1, 2, 3, 4], [0, 0, 0, 1], [1, 2, 3, 4]]
+B = [[0], [3196.70], [0], [0]]
+[reported.feedback]
+gains = [0.10, 0.2, 0.3, 0.4]
+settling_time = 0.90
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A submission with every table of the format."""
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "a.csv").write_text("time,x1\n0,0\n")
+    (tmp_path / "submission.toml").write_text(FULL, encoding="utf-8")
+    return tmp_path
+
+
+def test_every_table_of_the_format_is_read(folder):
+    """Carts left out are all of them, paths are normalised, whole numbers serve as decimals."""
+    submission = load_submission(folder)
+
+    decay, control, pid = submission.experiments
+    assert submission.title == "Two carts · 弹簧"
+    assert submission.system.springs == (False, True, True)
+    assert submission.system.input.sign == -1
+    assert submission.design is not None
+    assert submission.design.input_limit == 5.0
+    assert (decay.carts, control.carts) == ((1,), (1, 2))
+    assert {e.file for e in submission.experiments} == {"data/a.csv"}
+    assert isinstance(control.controller, StateFeedback)
+    assert control.controller.gains == (1.0, 2.0, 3.0, 4.5)
+    assert isinstance(pid.controller, Pid)
+    assert pid.controller.cart == 1
+    assert control.window == (0.0, 2.5)
+    assert control.columns == {"time": 1, "x1": "Encoder 1 Pos"}
+
+
+def test_reported_numbers_keep_their_digits(folder):
+    """0.10 has two decimals, 25 none, 1.0e1 one: tolerances come from the last digit."""
+    reported = load_submission(folder).reported
+
+    assert reported is not None
+    assert str(reported.initial["zeta_a"]) == "0.10"
+    assert reported.initial["K_1"] == Decimal(25)
+    assert reported.final["omega_a"].as_tuple().digits == (1, 0)
+    assert reported.state_space is not None
+    assert str(reported.state_space.B[1]) == "3196.70"
+    assert reported.feedback is not None
+    assert str(reported.feedback.settling_time) == "0.90"
+
+
+@given(
+    st.decimals(min_value="1e-20", max_value="1e20", allow_nan=False, allow_infinity=False).filter(
+        lambda number: "E" not in str(number)
+    )
+)
+def test_any_typed_number_comes_back_as_typed(number):
+    """What a student typed under [reported] is the same text again."""
+    from pathlib import Path
+    from tempfile import TemporaryDirectory
+
+    text = str(number)
+    typed = text if "." in text else f"{text}.0"
+    with TemporaryDirectory() as name:
+        (Path(name) / "submission.toml").write_text(
+            f"version = 1\n[system]\ncarts = 1\n[reported.final]\nK = {typed}\n"
+        )
+        reported = load_submission(Path(name)).reported
+    assert reported is not None
+    assert str(reported.final["K"]) == typed
+
+
+@pytest.mark.parametrize("carts", [1, 2, 3, 4])
+def test_springs_left_out_are_all_there(carts, tmp_path):
+    """n carts have n + 1 springs from wall to wall."""
+    (tmp_path / "submission.toml").write_text(f"version = 1\n[system]\ncarts = {carts}\n")
+    assert load_submission(tmp_path).system.springs == (True,) * (carts + 1)
+
+
+def test_a_cart_without_springs_reports_mass_and_damping(tmp_path):
+    """[false, false] on one cart is a rigid body; its parameters have other names."""
+    head = "version = 1\n[system]\ncarts = 1\nsprings = [false, false]\n[reported.final]\n"
+    (tmp_path / "submission.toml").write_text(head + "mass = 2.0\ndamping = 0.1\n")
+    reported = load_submission(tmp_path).reported
+    assert reported is not None
+    assert set(reported.final) == {"mass", "damping"}
+    (tmp_path / "submission.toml").write_text(head + "K = 2.0\n")
+    with pytest.raises(SubmissionError, match=r"reported\.final\.K: unknown parameter; known: ma"):
+        load_submission(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "encode", [lambda t: b"\xef\xbb\xbf" + t, lambda t: t.replace(b"\n", b"\r\n")]
+)
+def test_windows_files_are_read(encode, folder):
+    """A byte-order mark and CR LF line ends change nothing."""
+    plain = load_submission(folder)
+    raw = (folder / "submission.toml").read_bytes()
+    (folder / "submission.toml").write_bytes(encode(raw))
+    assert load_submission(folder) == plain
+
+
+def test_the_toml_itself_may_be_named(folder):
+    """The folder, or the file in it."""
+    assert load_submission(folder / "submission.toml") == load_submission(folder)
+
+
+def test_notes_are_the_discussion(folder):
+    """`notes.md` is kept as written; one that holds only comments is none."""
+    assert load_submission(folder).discussion is None
+    (folder / "notes.md").write_text("<!-- hint\n -->\n", encoding="utf-8")
+    assert load_submission(folder).discussion is None
+    (folder / "notes.md").write_text("Friction *matters*.\n", encoding="utf-8")
+    assert load_submission(folder).discussion == "Friction *matters*.\n"
+
+
+def test_further_problems_are_counted(folder):
+    """The first problem is told, and how many more there are."""
+    text = FULL.replace("K_1 = 25", "K_7 = 25\nzeta_q = 1").replace(
+        "cart = 2\nref", "cart = 9\nref"
+    )
+    (folder / "submission.toml").write_text(text, encoding="utf-8")
+    with pytest.raises(
+        SubmissionError, match=r"design\.cart: there is no cart 9.* \(and 2 more\)$"
+    ):
+        load_submission(folder)
+
+
+@pytest.mark.parametrize("carts", [1, 2, 3, 4])
+def test_a_new_submission_loads_and_says_what_is_next(carts, tmp_path):
+    """As written it is valid; reading data asks for the first experiment."""
+    new_submission(tmp_path / "team", carts=carts)
+
+    submission = load_submission(tmp_path / "team")
+    assert submission.system.carts == carts
+    assert submission.discussion is None
+    assert (tmp_path / "team" / "data").is_dir()
+    with pytest.raises(SubmissionError, match=r"no \[\[experiments\]\] table yet"):
+        read_data(submission)
+
+
+@pytest.mark.parametrize("carts", [1, 2, 3, 4])
+def test_every_commented_key_of_a_new_submission_is_valid(carts, tmp_path):
+    """With each # before a key taken away and files in place, the whole template loads."""
+    folder = tmp_path / "team"
+    new_submission(folder, carts=carts)
+    text = (folder / "submission.toml").read_text(encoding="utf-8")
+    text = re.sub(r"^#(?=[\[a-zA-Z])", "", text, flags=re.MULTILINE)
+    text = re.sub(r"^(\w+) =\s*(#.*)?$", r"\1 = 1.0", text, flags=re.MULTILINE)
+    (folder / "submission.toml").write_text(text, encoding="utf-8")
+    for name in re.findall(r'^file = "(.*)"', text, flags=re.MULTILINE):
+        (folder / name).write_text("time,x1\n", encoding="utf-8")
+
+    submission = load_submission(folder)
+
+    kinds = {experiment.kind for experiment in submission.experiments}
+    assert kinds == {"decay", "step", "sine", "sweep", "bode", "closed_loop"}
+    assert submission.reported is not None
+    assert list(submission.reported.final) == parameter_names(carts)
+    assert submission.design is not None
+
+
+def test_a_new_submission_overwrites_nothing(tmp_path):
+    """A folder with anything in it is left alone."""
+    (tmp_path / "mine.txt").write_text("work")
+    with pytest.raises(ConfigError, match="not empty"):
+        new_submission(tmp_path, carts=2)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+    with pytest.raises(ConfigError, match="not empty"):
+        new_submission(tmp_path / "mine.txt", carts=2)
+    with pytest.raises(ConfigError, match="expected 1 to 4, found 5"):
+        new_submission(tmp_path / "new", carts=5)
+    assert not (tmp_path / "new").exists()
