@@ -178,7 +178,7 @@ def _step(chain: Chain, rng: np.random.Generator):
                 gain_std=0.01 * K,
                 rest_shift=0.003,
                 interval=None,
-            )  # fmt: skip
+            )
         )
     return record, tuple(gains)
 

@@ -9,6 +9,7 @@ import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -31,14 +32,17 @@ CART_LINES = ("-", "--", "-.", ":")  # carts that share a panel differ by line s
 CART_COLOURS = (MODEL, SECOND, "#009e73", MEASURED)
 
 _BUCKETS = 320  # twice this many points a line: finer than print at this width shows
-_LEFT, _RIGHT = 0.62, 0.12  # inches left for tick labels and axis titles
-_TOP, _BOTTOM, _GAP = 0.14, 0.44, 0.13
-_X_LABEL, _Y_LABEL = 0.31, 0.46  # inches from the axes to the middle of their titles
-_COLUMN_GAP = 0.28  # of a panel's width
+# Inches:
+_LEFT, _RIGHT = 0.62, 0.12  # for tick labels and axis titles
+_TOP, _BOTTOM = 0.26, 0.44  # for a legend or a title above, tick labels and title below
+_SHARED_GAP, _OWN_GAP = 0.13, 0.5  # between panels on one time axis, or each with its own
+_X_LABEL, _Y_LABEL = 0.31, 0.46  # from the axes to the middle of their titles
+_COLUMN_GAP = 0.5
 _DECADE = (1, 2, 5)
-_DOT = 1.8  # points
+_DOT = 1.3  # points
+_STROKE = 1e-4  # of the time span
 
-_STYLE = {
+_STYLE: dict[Any, Any] = {
     "font.family": ["DejaVu Sans"],  # comes with matplotlib, so the PDF has it too
     "font.size": 8.5,
     "axes.titlesize": 8.5,
@@ -75,18 +79,15 @@ def drawing() -> Iterator[None]:
         yield
 
 
-def panels(
-    *heights: float, columns: int = 1, share_x: bool = True, legend: bool = True
-) -> tuple[Figure, list[Axes]]:
+def panels(*heights: float, columns: int = 1, share_x: bool = True) -> tuple[Figure, list[Axes]]:
     """Return a figure with rows of the given heights (inches), its axes row by row.
 
     Margins are set in inches, not searched for: a search draws every figure twice. Panels that
     do not share their time axis each get room for tick labels and a title.
     """
-    own_x = 0.0 if share_x else 0.46
-    top = _TOP + (0.2 if legend else 0.0)
-    gap = _GAP + own_x
-    height = sum(heights) + gap * (len(heights) - 1) + top + _BOTTOM
+    gap = _SHARED_GAP if share_x else _OWN_GAP
+    height = sum(heights) + gap * (len(heights) - 1) + _TOP + _BOTTOM
+    width = (WIDTH - _LEFT - _RIGHT - _COLUMN_GAP * (columns - 1)) / columns
     figure = Figure(figsize=(WIDTH, height))
     grid = figure.add_gridspec(
         len(heights),
@@ -94,13 +95,12 @@ def panels(
         height_ratios=heights,
         left=_LEFT / WIDTH,
         right=1 - _RIGHT / WIDTH,
-        top=1 - top / height,
+        top=1 - _TOP / height,
         bottom=_BOTTOM / height,
         hspace=gap * len(heights) / sum(heights),
-        wspace=_COLUMN_GAP,
+        wspace=_COLUMN_GAP / width,
     )
     axes: list[Axes] = []
-    width = (WIDTH - _LEFT - _RIGHT) / (columns + (columns - 1) * _COLUMN_GAP)
     for row in range(len(heights)):
         for column in range(columns):
             shared = axes[0] if share_x and axes else None
@@ -132,7 +132,11 @@ def log_frequency_axis(ax: Axes, omega: Array) -> None:
 
 def legend_above(ax: Axes, *, columns: int = 4) -> None:
     """Put the legend above the axes, where it hides no data."""
+    handles, labels = ax.get_legend_handles_labels()
+    order = sorted(range(len(labels)), key=lambda i: labels[i] != "measured")  # first what is
     ax.legend(
+        [handles[i] for i in order],
+        [labels[i] for i in order],
         loc="lower left",
         bbox_to_anchor=(0.0, 1.0),
         ncols=columns,
@@ -165,13 +169,17 @@ def thin(t: Array, y: Array) -> tuple[Array, Array]:
 def plot_measured(ax: Axes, t: Array, y: Array, *, label: str = "measured") -> None:
     """Draw a measured time series as points."""
     x, y = thin(t, y)
-    # Strokes of no length with round ends: one path for all points takes a fifth of the time and
-    # a third of the text that markers do. Added as an artist, or matplotlib walks every stroke.
+    # Round-ended strokes too short to see as such: one path for all points takes a fifth of the
+    # time and a third of the text that markers do. (Some readers drop strokes of no length at
+    # all.) Added as an artist, or matplotlib walks every stroke.
     points = np.column_stack([x, y])
-    strokes = Path(points.repeat(2, axis=0), np.tile([Path.MOVETO, Path.LINETO], x.size))
-    ax.add_artist(PathPatch(strokes, fill=False, color=MEASURED, lw=_DOT, capstyle="round"))
+    strokes = points.repeat(2, axis=0)
+    strokes[1::2, 0] += _STROKE * (x[-1] - x[0])
+    path = Path(strokes, np.tile([Path.MOVETO, Path.LINETO], x.size))
+    dots = PathPatch(path, fill=False, color=MEASURED, lw=_DOT, capstyle="round", zorder=3)
+    ax.add_artist(dots)
     ax.update_datalim(points)
-    ax.plot([], [], ".", color=MEASURED, ms=2 * _DOT, mew=0, label=label)  # for the legend
+    ax.plot([], [], ".", color=MEASURED, ms=3 * _DOT, mew=0, label=label)  # for the legend
 
 
 def plot_model(ax: Axes, t: Array, y: Array, *, label: str = "model") -> None:

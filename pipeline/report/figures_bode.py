@@ -25,7 +25,7 @@ def bode_figure(
 ) -> Figure:
     """Return magnitude, phase (where measured) and what the fit leaves, one below the other."""
     has_phase = response.phase is not None
-    heights = [1.9, *([1.05] if has_phase else []), *([0.85] if chain else [])]
+    heights = [1.6, *([0.8] if has_phase else []), *([0.7] if chain else [])]
     figure, axes = panels(*heights)
     log_frequency_axis(axes[0], response.omega)
     plot_magnitude(
@@ -119,7 +119,7 @@ def _mark_modes(ax: Axes, omega: Array, chain: Chain) -> None:
         if omega.min() < mode < omega.max():
             ax.axvline(mode, color=QUIET, lw=0.8, ls=":")
             ax.annotate(
-                letter, (mode, 1.0), xycoords=("data", "axes fraction"), xytext=(2, -8),
+                letter, (mode, 0.0), xycoords=("data", "axes fraction"), xytext=(2, 2),
                 textcoords="offset points", color="#555555", fontsize=7.5,
             )  # fmt: skip
 

@@ -1,6 +1,7 @@
 """Records in time: decays, steps, sine dwells (Figures 12-14), closed loops (Figures 15-17)."""
 
 from collections.abc import Sequence
+from itertools import cycle
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -31,6 +32,8 @@ from pipeline.results import (
 
 _CYCLES_SHOWN = 10  # of the steady part: single cycles can still be seen
 _SETTLED_BAND = 0.02  # the 2 % of the settling time
+_ROOM = 1.12  # above the largest value
+_LONGEST_TITLE = 28  # characters above a panel of half the width
 
 
 # --------------------------------------------------------------------- decays
@@ -40,15 +43,10 @@ def decay_figure(
     decays: Sequence[LogDecrement], *, records: Sequence[Record], position_unit: str
 ) -> Figure:
     """Return the decays of one cart as small multiples, repeats side by side."""
-    rows, columns = _grid(len(decays))
-    figure, axes = panels(*[1.35 if columns > 1 else 1.7] * rows, columns=columns, share_x=False)
-    for ax, decay, record in zip(axes, decays, records, strict=False):
+    figure, axes = _small_multiples([decay.experiment for decay in decays])
+    for ax, decay, record in zip(axes, decays, records, strict=True):
         plot_decay(ax, decay, record=record)
-        ax.set_title(decay.experiment, loc="right", pad=2)
-    for ax in axes[len(decays) :]:
-        ax.set_visible(False)
-    _label_outer(axes, columns=columns, count=len(decays), y=f"x{decays[0].cart} [{position_unit}]")
-    legend_above(axes[0])
+    _label_outer(axes, y=f"x{decays[0].cart} [{position_unit}]")
     return figure
 
 
@@ -64,17 +62,27 @@ def plot_decay(ax: Axes, decay: LogDecrement, *, record: Record) -> None:
 
 
 def damping_figure(decays: Sequence[LogDecrement], *, position_unit: str) -> Figure:
-    """Return damping ratio against amplitude of all decays of one cart."""
-    figure, (ax,) = panels(1.5)
-    for decay, marker in zip(decays, "DosvPX^<>*" * len(decays), strict=False):
-        amplitude, zeta = decay.zeta_at_amplitude
-        ax.plot(amplitude, zeta, marker, ms=3.5, mfc="white", mec=MEASURED, mew=0.8,
-                ls="-", lw=0.6, color=QUIET, label=decay.experiment)  # fmt: skip
-    ax.set_xlabel(f"amplitude [{position_unit}]")
-    ax.set_ylabel("ζ")
-    ax.set_ylim(bottom=0.0)
-    legend_above(ax)
+    """Return damping ratio against amplitude, a panel for each cart, a marker for each record."""
+    carts = sorted({decay.cart for decay in decays})
+    figure, axes = panels(1.35, columns=len(carts), share_x=False)
+    for ax, cart in zip(axes, carts, strict=True):
+        own = [decay for decay in decays if decay.cart == cart]
+        for decay, marker in zip(own, cycle("Dosv^P"), strict=False):
+            plot_damping(ax, decay, marker=marker)
+        ax.set_title(f"cart {cart}", loc="left", y=1.0)
+        ax.set_xlabel(f"amplitude [{position_unit}]")
+        most = np.max([decay.zeta_at_amplitude.max(axis=1) for decay in own], axis=0)
+        ax.set_xlim(0.0, _ROOM * most[0])
+        ax.set_ylim(0.0, _ROOM * most[1])
+    axes[0].set_ylabel("ζ")
     return figure
+
+
+def plot_damping(ax: Axes, decay: LogDecrement, *, marker: str) -> None:
+    """Plot the local damping ratio against the amplitude it was seen at."""
+    amplitude, zeta = decay.zeta_at_amplitude
+    ax.plot(amplitude, zeta, marker, ms=3.2, mfc="white", mec=MEASURED, mew=0.8, ls="-", lw=0.6,
+            color=QUIET)  # fmt: skip
 
 
 # ---------------------------------------------------------------------- steps
@@ -84,15 +92,10 @@ def step_figure(
     steps: Sequence[Sequence[StepGain]], *, records: Sequence[Record], position_unit: str
 ) -> Figure:
     """Return step records as small multiples; each entry of `steps` is one record's carts."""
-    rows, columns = _grid(len(records))
-    figure, axes = panels(*[1.35 if columns > 1 else 1.9] * rows, columns=columns, share_x=False)
-    for ax, gains, record in zip(axes, steps, records, strict=False):
+    figure, axes = _small_multiples([record.id for record in records])
+    for ax, gains, record in zip(axes, steps, records, strict=True):
         plot_step(ax, gains, record=record)
-        ax.set_title(record.id, loc="right", pad=2)
-    for ax in axes[len(records) :]:
-        ax.set_visible(False)
-    _label_outer(axes, columns=columns, count=len(records), y=f"position [{position_unit}]")
-    legend_above(axes[0], columns=3 if columns > 1 else 5)
+    _label_outer(axes, y=f"position [{position_unit}]")
     return figure
 
 
@@ -101,8 +104,7 @@ def plot_step(ax: Axes, gains: Sequence[StepGain], *, record: Record) -> None:
     for gain in gains:
         y = record.position(gain.cart)
         style = (gain.cart - 1) % len(CART_LINES)
-        ax.plot(*thin(record.t, y), color=CART_COLOURS[style], ls=CART_LINES[style], lw=1.0,
-                label=f"x{gain.cart}")  # fmt: skip
+        ax.plot(*thin(record.t, y), color=CART_COLOURS[style], ls=CART_LINES[style], lw=1.0)
         for edge in gain.edges:
             for window, level in (
                 (edge.window_before, edge.level_before),
@@ -118,7 +120,7 @@ def plot_step(ax: Axes, gains: Sequence[StepGain], *, record: Record) -> None:
 
 def sine_figure(points: Sequence[SinePoint], *, record: Record, position_unit: str) -> Figure:
     """Return one dwell, a panel for each cart, the transient shaded."""
-    figure, axes = panels(*[1.15] * len(points))
+    figure, axes = panels(*[1.0] * len(points))
     for ax, point in zip(axes, points, strict=True):
         plot_sine(ax, point, record=record)
         ax.set_ylabel(f"x{point.cart} [{position_unit}]")
@@ -150,7 +152,7 @@ def plot_sine(ax: Axes, point: SinePoint, *, record: Record) -> None:
 
 def hardware_figure(checks: Sequence[Sequence[HardwareCheck]], *, position_unit: str) -> Figure:
     """Return one run, a panel for each cart; an entry holds the one or two models of a cart."""
-    figure, axes = panels(*[1.25] * len(checks))
+    figure, axes = panels(*[1.05] * len(checks))
     for ax, group in zip(axes, checks, strict=True):
         plot_hardware(ax, group)
         ax.set_ylabel(f"x{group[0].cart} [{position_unit}]")
@@ -172,7 +174,7 @@ def plot_hardware(ax: Axes, checks: Sequence[HardwareCheck]) -> None:
 
 def design_figure(design: FeedbackDesign, *, position_unit: str, input_unit: str) -> Figure:
     """Return the simulated step of the designed loop: positions above, input below."""
-    figure, (above, below) = panels(1.6, 0.9)
+    figure, (above, below) = panels(1.5, 0.8)
     plot_design(above, design)
     above.set_ylabel(f"position [{position_unit}]")
     legend_above(above, columns=5)
@@ -198,14 +200,25 @@ def plot_design(ax: Axes, design: FeedbackDesign) -> None:
 # -------------------------------------------------------------------- helpers
 
 
-def _grid(n: int) -> tuple[int, int]:
-    """Return rows and columns for n small multiples."""
-    return (n, 1) if n < 2 else (-(-n // 2), 2)
+def _small_multiples(titles: Sequence[str]) -> tuple[Figure, list[Axes]]:
+    """Return one panel for each title; more than one stand in two columns."""
+    n = len(titles)
+    columns = 1 if n == 1 else 2
+    rows = -(-n // columns)
+    figure, axes = panels(*[1.3] * rows, columns=columns, share_x=False)
+    for spare in axes[n:]:
+        figure.delaxes(spare)
+    for ax, title in zip(axes, titles, strict=False):
+        short = title if len(title) <= _LONGEST_TITLE else f"{title[: _LONGEST_TITLE - 1]}…"
+        ax.set_title(short, loc="left", y=1.0)
+    return figure, axes[:n]
 
 
-def _label_outer(axes: Sequence[Axes], *, columns: int, count: int, y: str) -> None:
-    for i, ax in enumerate(axes[:count]):
+def _label_outer(axes: Sequence[Axes], *, y: str) -> None:
+    """Title the axes at the left and at the lower end of each column."""
+    columns = 1 if len(axes) == 1 else 2
+    for i, ax in enumerate(axes):
         if i % columns == 0:
             ax.set_ylabel(y)
-        if i + columns >= count:
+        if i + columns >= len(axes):
             ax.set_xlabel("time [s]")

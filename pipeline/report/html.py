@@ -1,5 +1,7 @@
 """A document as one self-contained HTML file: no script, nothing loaded from anywhere."""
 
+import base64
+
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
@@ -19,7 +21,9 @@ def render_html(document: Document) -> str:
     )
     environment.filters["mathml"] = _mathml
     environment.filters["svg"] = _svg
-    return environment.get_template("report.html.j2").render(document=document)
+    return environment.get_template("report.html.j2").render(
+        document=document, math_font=_math_font()
+    )
 
 
 def _mathml(math: Term, display: bool = False) -> Markup:
@@ -28,3 +32,8 @@ def _mathml(math: Term, display: bool = False) -> Markup:
 
 def _svg(picture: Picture) -> Markup:
     return Markup(picture.svg)  # drawn by matplotlib, which escapes all text
+
+
+def _math_font() -> str:
+    """Return the font of the formulas: many phones have none, and brackets would not grow."""
+    return base64.b64encode((TEMPLATES / "fonts" / "mathematics.woff").read_bytes()).decode()

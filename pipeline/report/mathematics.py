@@ -126,18 +126,24 @@ def _mathml(term: Term) -> str:
         case "row":
             return f"<mrow>{inside}</mrow>"
         case "parens":
-            return f"<mrow><mo>(</mo><mrow>{inside}</mrow><mo>)</mo></mrow>"
+            # A bracket free to grow takes room even where it need not.
+            grow = "true" if any(map(_is_tall, term.parts)) else "false"
+            left, right = (f'<mo stretchy="{grow}">{bracket}</mo>' for bracket in "()")
+            return f"<mrow>{left}<mrow>{inside}</mrow>{right}</mrow>"
         case "fraction":
             return f"<mfrac>{inside}</mfrac>"
         case "sub":
             return f"<msub>{inside}</msub>"
         case "sup":
+            if isinstance(base := term.parts[0], Math) and base.kind == "sub":
+                return f"<msubsup>{''.join(map(_mathml, base.parts))}{parts[1]}</msubsup>"
             return f"<msup>{inside}</msup>"
         case "dot" | "ddot":
             mark = "˙" if term.kind == "dot" else "¨"
             return f'<mover accent="true">{inside}<mo>{mark}</mo></mover>'
         case "lines":
-            return "<mtable>" + "".join(f"<mtr><mtd>{p}</mtd></mtr>" for p in parts) + "</mtable>"
+            rows = "".join(f"<mtr>{_aligned(part)}</mtr>" for part in term.parts)
+            return f'<mtable class="lines" displaystyle="true">{rows}</mtable>'
         case "matrix":
             cells = [f"<mtd>{part}</mtd>" for part in parts]
             rows = [
@@ -145,6 +151,21 @@ def _mathml(term: Term) -> str:
                 for i in range(0, len(cells), term.columns)
             ]
             return f"<mrow><mo>[</mo><mtable>{''.join(rows)}</mtable><mo>]</mo></mrow>"
+
+
+def _is_tall(term: Term) -> bool:
+    if isinstance(term, str):
+        return False
+    return term.kind in ("fraction", "matrix") or any(map(_is_tall, term.parts))
+
+
+def _aligned(line: Term) -> str:
+    """Return a line in three cells, so that all lines meet at their equals sign."""
+    if not isinstance(line, Math) or "=" not in line.parts:
+        return f"<mtd>{_mathml(line)}</mtd>"
+    at = line.parts.index("=")
+    left, right = row(*line.parts[:at]), row(*line.parts[at + 1 :])
+    return "".join(f"<mtd>{_mathml(part)}</mtd>" for part in (left, "=", right))
 
 
 def _mathml_leaf(leaf: str) -> str:

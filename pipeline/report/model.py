@@ -64,10 +64,10 @@ def equations_of_motion(springs: Sequence[bool]) -> Formula:
     n = len(springs) - 1
     equations = []
     for i in range(1, n + 1):
-        x = sub("x", str(i))
+        x = _position(i)
         left: list[Term] = [
-            row(_indexed("m", i, n=n), dot(x, order=2)),
-            row(_indexed("c", i, n=n), dot(x)),
+            row(_indexed("m", i, n=n), _position(i, derivative=2)),
+            row(_indexed("c", i, n=n), _position(i, derivative=1)),
         ]
         held = _springs_at(i, springs)
         if held:
@@ -75,7 +75,7 @@ def equations_of_motion(springs: Sequence[bool]) -> Formula:
         equation: list[Term] = [total(left)]
         for neighbour in (i - 1, i + 1):
             if k := _between(i, neighbour, springs):
-                equation += ["−", k, sub("x", str(neighbour))]
+                equation += ["−", k, _position(neighbour)]
         equations.append(row(*equation, "=", "u" if i == 1 else "0"))
     return formula(lines(equations))
 
@@ -100,25 +100,14 @@ def symbolic_state_space(springs: Sequence[bool]) -> Formula:
             if k := _between(i, neighbour, springs):
                 A[speed][2 * neighbour - 2] = fraction(k, m)
     B[1][0] = fraction("1", _indexed("m", 1, n=n))
-    states: list[Term] = [x for i in range(1, n + 1) for x in _position_and_speed(i)]
-    return formula(
-        row(
-            matrix([[dot_of(x)] for x in states]), "=", matrix(A), matrix([[x] for x in states]),
-            "+", matrix(B), "u",
-        )
-    )  # fmt: skip
+    numbers = range(1, n + 1)
+    q = [[_position(i, derivative=order)] for i in numbers for order in (0, 1)]
+    q_dot = [[_position(i, derivative=order)] for i in numbers for order in (1, 2)]
+    return formula(row(matrix(q_dot), "=", matrix(A), matrix(q), "+", matrix(B), "u"))
 
 
-def _position_and_speed(i: int) -> tuple[Math, Math]:
-    x = sub("x", str(i))
-    return x, dot(x)
-
-
-def dot_of(term: Term) -> Math:
-    """Return the time derivative of x or x'."""
-    if isinstance(term, Math) and term.kind == "dot":
-        return dot(term.parts[0], order=2)
-    return dot(term)
+def _position(i: int, *, derivative: int = 0) -> Math:
+    return sub(dot("x", order=derivative) if derivative else "x", str(i))
 
 
 def numeric_state_space(chain: Chain) -> tuple[Formula, ...]:
@@ -129,7 +118,7 @@ def numeric_state_space(chain: Chain) -> tuple[Formula, ...]:
 
 
 def _numbers(values: Array) -> Math:
-    return matrix([[number(significant(v, digits=_DIGITS)) for v in line] for line in values])
+    return matrix([[_short(v) for v in line] for line in values])
 
 
 def _side_by_side(terms: Sequence[Math]) -> Math:
@@ -150,24 +139,13 @@ def symbolic_transfer_functions(springs: Sequence[bool]) -> Formula | None:
     n = len(springs) - 1
     if n > 3 or not all(springs[1:-1]) or not any(springs):
         return None
-    modes = ["n"] if n == 1 else list("abc"[:n])
-    nulls = {1: {1: []}, 2: {1: ["2"], 2: []}, 3: {1: ["x", "y"], 2: ["3"], 3: []}}[n]
-    below = [_symbolic_factor(mode, lone=n == 1) for mode in modes]
-    return formula(
-        lines(
-            row(
-                _ratio(i),
-                "=",
-                fraction(
-                    _product(
-                        [_indexed("K", i, n=n), *(parens(_symbolic_factor(z)) for z in nulls[i])]
-                    ),
-                    below[0] if n == 1 else _product([parens(factor) for factor in below]),
-                ),
-            )
-            for i in range(n, 0, -1)
-        )
-    )
+    nulls = {1: [[]], 2: [["2"], []], 3: [["x", "y"], ["3"], []]}[n]
+    if n == 1:
+        denominator = _symbolic_factor("n", lone=True)
+        return formula(row(_ratio(1), "=", fraction("K", denominator)))
+    above = [[_symbolic_factor(null) for null in of_cart] for of_cart in nulls]
+    gains: list[Term] = [sub("K", str(i)) for i in range(1, n + 1)]
+    return _over_common_denominator(gains, above, [_symbolic_factor(mode) for mode in "abc"[:n]])
 
 
 def numeric_transfer_functions(chain: Chain) -> Formula:
@@ -177,40 +155,34 @@ def numeric_transfer_functions(chain: Chain) -> Formula:
     """
     if not np.any(chain.k > 0) or np.min(np.abs(chain.poles)) == 0:
         return formula(lines(_polynomial_ratio(chain, i) for i in range(chain.n, 0, -1)))
-    gains = chain.static_gains()
+    gains = [_short(gain) for gain in chain.static_gains()]
     below = _numeric_factors(chain.poles)
-    return formula(
-        lines(
-            row(
-                _ratio(i),
-                "=",
-                fraction(
-                    _product(
-                        [
-                            _short(gains[i - 1]),
-                            *(parens(z) for z in _numeric_factors(chain.zeros(i))),
-                        ]
-                    ),
-                    below[0] if len(below) == 1 else _product([parens(f) for f in below]),
-                ),
-            )
-            for i in range(chain.n, 0, -1)
-        )
-    )
+    if chain.n == 1:
+        return formula(row(_ratio(1), "=", fraction(gains[0], below[0])))
+    above = [_numeric_factors(chain.zeros(i)) for i in range(1, chain.n + 1)]
+    return _over_common_denominator(gains, above, below)
+
+
+def _over_common_denominator(
+    gains: Sequence[Term], above: Sequence[Sequence[Math]], below: Sequence[Math]
+) -> Formula:
+    """Return every X_i/U over D(s), last cart first, and D(s): that they share it is the point."""
+    D = row("D", parens("s"))
+    equations = [
+        row(_ratio(i), "=", fraction(gains[i - 1], D), *map(parens, above[i - 1]))
+        for i in range(len(gains), 0, -1)
+    ]
+    return formula(lines([*equations, row(D, "=", *map(parens, below))]))
 
 
 def _ratio(i: int) -> Math:
     return fraction(row(sub("X", str(i)), parens("s")), row("U", parens("s")))
 
 
-def _product(factors: Sequence[Term]) -> Term:
-    return factors[0] if len(factors) == 1 else row(*factors)
-
-
 def _symbolic_factor(index: str, *, lone: bool = False) -> Math:
     omega = symbol(f"omega_{index}")
     zeta = "ζ" if lone else symbol(f"zeta_{index}")
-    return total_row(
+    return _factor(
         row(fraction("1", power(omega, "2")), power("s", "2")),
         row(fraction(row("2", zeta), omega), "s"),
     )
@@ -218,7 +190,7 @@ def _symbolic_factor(index: str, *, lone: bool = False) -> Math:
 
 def _numeric_factors(roots: ComplexArray) -> list[Math]:
     return [
-        total_row(
+        _factor(
             row(fraction("1", power(_short(omega), "2")), power("s", "2")),
             row(fraction(row("2", "·", _short(zeta)), _short(omega)), "s"),
         )
@@ -226,13 +198,14 @@ def _numeric_factors(roots: ComplexArray) -> list[Math]:
     ]
 
 
-def total_row(*terms: Term) -> Math:
+def _factor(*terms: Term) -> Math:
     """Return the terms plus one: a quadratic factor in the paper's form."""
     return row(total([*terms, "1"]))
 
 
 def _short(value: float) -> Term:
-    return number(significant(float(value), digits=_DIGITS))
+    exact = value in (0.0, 1.0, -1.0)
+    return number(significant(float(value), digits=1 if exact else _DIGITS))
 
 
 def _polynomial_ratio(chain: Chain, cart: int) -> Math:

@@ -54,8 +54,8 @@ def listing(items: list[str]) -> str:
 
 
 def unit_text(unit: str) -> str:
-    """Return a unit with its powers raised: "V s^2/cm" as "V s²/cm"."""
-    return unit.replace("^2", "²")
+    """Return a unit with its powers raised and unbroken: "V s^2/cm" as "V s²/cm"."""
+    return unit.replace("^2", "²").replace(" ", "\u00a0")
 
 
 def _exponent(value: float, *, digits: int) -> int:

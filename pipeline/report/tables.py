@@ -81,7 +81,7 @@ def _estimate(estimate: Estimate | None) -> str:
 
 def _verdict(consistent: bool | None) -> Cell:
     if consistent is None:
-        return _cell("not compared", "quiet")
+        return _cell(NOTHING, "quiet")
     return _cell("agree", "good") if consistent else _cell("differ", "bad")
 
 
@@ -131,11 +131,11 @@ def chain_table(fit: ChainFit, *, number: int, position_unit: str, input_unit: s
 
 def _where(noun: str, i: int, n: int) -> str:
     if noun != "spring":
-        return f"{noun} of cart {i}" if n > 1 else f"{noun} of the cart"
+        return f"{noun} of cart {i}" if n > 1 else noun
     if n == 1:
         return "springs, together"
-    ends = "wall and cart 1" if i == 1 else f"cart {n} and wall"
-    return f"spring between {ends if i in (1, n + 1) else f'carts {i - 1} and {i}'}"
+    left, right = ("wall" if i == 1 else str(i - 1)), ("wall" if i == n + 1 else str(i))
+    return f"spring {left}–{right}"
 
 
 # ---------------------------------------------------------------- single stages
@@ -147,11 +147,11 @@ def decay_table(decays: Sequence[LogDecrement], *, number: int, position_unit: s
     for decay in decays:
         friction = decay.friction
         if friction is None:
-            verdict = _cell("not tested", "quiet")
+            verdict, drop = _cell("not tested", "quiet"), NOTHING
         elif friction.present:
-            verdict = _cell(f"yes: d = {with_error(friction.drop, friction.drop_std)}", "bad")
+            verdict, drop = _cell("found", "bad"), with_error(friction.drop, friction.drop_std)
         else:
-            verdict = _cell("none seen", "good")
+            verdict, drop = _cell("none seen", "good"), NOTHING
         rows.append(
             [
                 _cell(clean(decay.experiment)),
@@ -161,19 +161,20 @@ def decay_table(decays: Sequence[LogDecrement], *, number: int, position_unit: s
                 _cell(with_error(decay.zeta_peaks, decay.zeta_peaks_std)),
                 _cell(str(decay.peak_t.size)),
                 verdict,
+                _cell(drop),
             ]
         )
     return _table(
         number,
         "Free decays of single carts: the fitted decay, and the logarithmic decrement of its "
-        f"extrema. d is half the width of the friction band, in {clean(position_unit)}.",
+        "extrema; d is half the width of the band in which dry friction holds the cart.",
         (
             "Record", "Cart", spans(name_span("omega_n"), " [rad/s]"),
             spans(name_span("zeta"), " of the fit"), spans(name_span("zeta"), " of the extrema"),
-            "Extrema", "Dry friction",
+            "Extrema", "Dry friction", f"d [{clean(position_unit)}]",
         ),
         rows,
-        "lcrrrcl",
+        "lcrrrclr",
     )  # fmt: skip
 
 

@@ -38,7 +38,7 @@ KINDS = {
 _GOOD_FIT = 2.0  # chi-square per degree of freedom that stated noise still explains
 _CLOSE = 0.10  # a simulation within 10 % of the motion is a good linear model's
 
-_NAME = re.compile(r"\b(?:omega|zeta|K|m|c|k)_(?:\d|[a-h]|[nxy])\b|\b(?:omega|zeta)\b")
+_NAME = re.compile(r"\b(?:omega|zeta|K|X|m|c|k)_(?:\d|[a-h]|[nxy])\b|\b(?:omega|zeta)\b")
 
 
 def rich(text: str) -> Spans:
@@ -100,13 +100,13 @@ def terminal_summary(analysis: Analysis) -> str:
 def _identified(analysis: Analysis) -> Block:
     kinds = Counter(record.kind for record in analysis.records)
     used = listing([count(kinds[kind], noun) for kind, noun in KINDS.items() if kinds[kind]])
-    carts = count(analysis.carts, "cart")
+    carts = "single cart" if analysis.carts == 1 else f"chain of {analysis.carts} carts"
     source = f"from {used}" if used else "from the data given"
     fit = analysis.fit
     if fit is None:
         return paragraph(
-            Span("No model could be identified ", "strong"),
-            f"for the {carts} {source}. The reasons stand under ",
+            Span("No model ", "strong"),
+            f"of the {carts} could be identified {source}. The reasons stand under ",
             Span("What was skipped", url="#skipped"),
             ".",
         )
@@ -121,7 +121,7 @@ def _identified(analysis: Analysis) -> Block:
     )
     converged = "" if fit.converged else f" The fit did not converge: {fit.message}."
     return paragraph(
-        Span(f"A chain of {carts} was identified ", "strong"),
+        Span(f"A {carts} was identified ", "strong"),
         f"{source}, by {how} ({fit.n_points} points; χ² per degree of freedom "
         f"{significant(fit.chi_square_per_dof, digits=3)}: {quality}).{converged} ",
         *_key_numbers(analysis),

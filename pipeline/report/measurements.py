@@ -1,0 +1,192 @@
+"""Sections on the measurements: frequency response, decays, steps, sine dwells."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeline.report.document import Block, paragraph
+from pipeline.report.figures_bode import bode_figure
+from pipeline.report.figures_time import damping_figure, decay_figure, sine_figure, step_figure
+from pipeline.report.numbers import count, listing, percent, significant, with_error
+from pipeline.report.page import Page, left_out
+from pipeline.report.tables import decay_table, step_table
+from pipeline.results import FrequencyResponse, SinePoint
+
+_MOST_PANELS = 6  # repeats drawn in one figure; the tables hold all
+_PAPER_DWELL = 2 * np.pi * 4.0  # rad/s: the 4 Hz of the paper's Figures 12-14
+_ORDINALS = {1: "first", 2: "second", 3: "third", 4: "fourth"}
+
+
+# ----------------------------------------------------------- frequency response
+
+
+def response_blocks(page: Page) -> list[Block]:
+    """Return a Bode figure for every cart, last cart first as the paper shows them."""
+    chain = page.analysis.chain
+    blocks: list[Block] = []
+    for response in sorted(page.analysis.frequency_responses, key=lambda r: -r.cart):
+        figure = bode_figure(
+            response, chain=chain, position_unit=page.position, input_unit=page.drive
+        )
+        modes = [f"omega_{m}" for m in "abcdefgh"[: page.analysis.carts]]
+        marks = listing(modes if page.analysis.carts > 1 else ["omega_n"])
+        caption = (
+            f"Measured frequency response (diamonds, with standard errors) and estimated transfer "
+            f"function (line) of the {_ordinal(response.cart)} cart, "
+            f"X_{response.cart}/U. Dotted: {marks}."
+            if chain
+            else f"Measured frequency response of the {_ordinal(response.cart)} cart."
+        )
+        blocks.append(
+            page.picture(
+                f"bode-cart-{response.cart}", figure, caption=caption, alt=_bode_alt(page, response)
+            )
+        )
+    if not blocks:
+        return []
+    return [paragraph(_response_source(page.analysis.frequency_responses)), *blocks]
+
+
+def _response_source(responses: Sequence[FrequencyResponse]) -> str:
+    sources = {
+        "dwells": "the steady amplitudes of the sine dwells",
+        "table": "the table of amplitude ratios that was handed in, which has no phase",
+        "records": "transforms of the step and sweep records, there being no dwells",
+    }
+    used = [text for key, text in sources.items() if any(r.source == key for r in responses)]
+    return (
+        f"Measured points come from {listing(used)}. The residual is measured over fitted "
+        "magnitude, less one."
+    )
+
+
+def _bode_alt(page: Page, response: FrequencyResponse) -> str:
+    peak = int(np.argmax(response.magnitude))
+    text = (
+        f"Bode plot of cart {response.cart}: {response.omega.size} measured points from "
+        f"{significant(float(response.omega[0]), digits=3)} to "
+        f"{significant(float(response.omega[-1]), digits=3)} rad/s, largest at "
+        f"{significant(float(response.omega[peak]), digits=3)} rad/s with "
+        f"{significant(float(response.magnitude[peak]), digits=3)} {page.position}/{page.drive}"
+    )
+    if chain := page.analysis.chain:
+        fitted = np.abs(chain.frequency_response(response.omega)[response.cart - 1])
+        middle = float(np.median(np.abs(100 * (response.magnitude / fitted - 1))))
+        text += f"; the fitted line differs by {percent(middle)} in the median"
+    return text + "."
+
+
+# ----------------------------------------------------------------- time records
+
+
+def decay_blocks(page: Page) -> list[Block]:
+    """Return the table of decays, their figures, and damping against amplitude."""
+    decays = page.analysis.log_decrements
+    if not decays:
+        return []
+    blocks: list[Block] = [
+        decay_table(decays, number=page.table_number(), position_unit=page.position)
+    ]
+    for cart in sorted({decay.cart for decay in decays}):
+        own = [decay for decay in decays if decay.cart == cart and decay.experiment in page.records]
+        drawn = own[:_MOST_PANELS]
+        if not drawn:
+            continue
+        records = [page.records[decay.experiment] for decay in drawn]
+        figure = decay_figure(drawn, records=records, position_unit=page.position)
+        blocks.append(
+            page.picture(
+                f"decay-cart-{cart}",
+                figure,
+                caption=f"Free decay of cart {cart}: measured points, the extrema used "
+                f"(diamonds), the fitted decay and its envelope (dashed); what lies before the "
+                f"release is shaded.{left_out(len(own) - len(drawn))}",
+                alt=f"Free decay of cart {cart} in {count(len(drawn), 'record')}: "
+                f"the swing falls from {significant(float(np.ptp(drawn[0].peak_y)), digits=2)} "
+                f"{page.position} peak to peak inside an envelope with damping ratio "
+                f"{with_error(drawn[0].zeta, drawn[0].zeta_std)}.",
+            )
+        )
+    rubbing = [d for d in decays if d.friction and d.friction.present and d.zeta_at_amplitude.size]
+    if rubbing:
+        blocks.append(
+            page.picture(
+                "damping",
+                damping_figure(rubbing, position_unit=page.position),
+                caption="Local damping ratio against amplitude, where dry friction was found. "
+                "Viscous damping alone gives a level line; dry friction makes it rise as the "
+                "amplitude falls.",
+                alt="Damping ratio against amplitude of the decays with dry friction, rising "
+                "towards small amplitudes.",
+            )
+        )
+    return blocks
+
+
+def step_blocks(page: Page) -> list[Block]:
+    """Return the static gains and the step responses they were read from."""
+    gains = page.analysis.step_gains
+    if not gains:
+        return []
+    unit = f"{page.position}/{page.drive}"
+    blocks: list[Block] = [step_table(gains, number=page.table_number(), unit=unit)]
+    runs = list(dict.fromkeys(g.experiment for g in gains if g.experiment in page.records))
+    if drawn := runs[:_MOST_PANELS]:
+        figure = step_figure(
+            [[g for g in gains if g.experiment == run] for run in drawn],
+            records=[page.records[run] for run in drawn],
+            position_unit=page.position,
+        )
+        blocks.append(
+            page.picture(
+                "steps",
+                figure,
+                caption="Step responses: cart 1 solid, 2 dashed, 3 dash-dotted, 4 dotted. Thick: "
+                "the levels read off, over the windows they were read from; vertical: edges of "
+                f"the input.{left_out(len(runs) - len(drawn))}",
+                alt=f"Step responses in {count(len(drawn), 'record')}, with the rest and settled "
+                "levels of every cart marked.",
+            )
+        )
+    return blocks
+
+
+def dwell_blocks(page: Page) -> list[Block]:
+    """Return one dwell, the transient told from the steady state."""
+    points = [p for p in page.analysis.sine_points if p.experiment in page.records]
+    if not points:
+        return []
+    chosen = min(points, key=_instructive)
+    own = sorted((p for p in points if p.experiment == chosen.experiment), key=lambda p: p.cart)
+    hertz = significant(chosen.omega / (2 * np.pi), digits=3)
+    figure = sine_figure(own, record=page.records[chosen.experiment], position_unit=page.position)
+    ratios = [f"cart {p.cart}: {with_error(p.gain, p.gain_std)}" for p in own]
+    unit = f"{page.position}/{page.drive}"
+    blocks: list[Block] = [
+        paragraph(
+            "Only the steady part counts for the frequency response: the transient, shaded, "
+            "still holds the free motion that the start of the sine set off. "
+            f"Amplitude ratios at {hertz} Hz in {unit}: {'; '.join(ratios)}."
+        ),
+        page.picture(
+            "sine",
+            figure,
+            caption=f"Motion of {'every cart' if len(own) > 1 else 'the cart'} when the system is "
+            f"excited by a {hertz} Hz sine wave ({chosen.experiment}): transient shaded, steady "
+            "amplitude as a pair of lines.",
+            alt=f"Response to a {hertz} Hz sine: transient up to "
+            f"{significant(chosen.steady_from, digits=3)} s, then a steady swing of "
+            + listing([f"{significant(p.amplitude, digits=3)} {page.position}" for p in own])
+            + " amplitude.",
+        ),
+    ]
+    return blocks
+
+
+def _instructive(point: SinePoint) -> tuple[bool, float]:
+    """Settled dwells first, then those nearest the paper's 4 Hz."""
+    return not point.settled, abs(float(np.log(point.omega / _PAPER_DWELL)))
+
+
+def _ordinal(cart: int) -> str:
+    return _ORDINALS.get(cart, f"{cart}th")
