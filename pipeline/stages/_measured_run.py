@@ -56,6 +56,11 @@ class MeasuredRun:
         """Return the readings (f, n) that the start alone would give."""
         return self.rest[:, None] + self._ringing(self.x0)
 
+    @property
+    def noise_floor(self) -> float:
+        """The misfit of a simulation that is off by the noise alone."""
+        return self.misfit(self.y + self.noise[:, None])
+
     def misfit(self, model: Array) -> float:
         """Return the pooled NRMSE of readings `model` (f, n) over the measured carts."""
         error, motion = self.y - model, self.y - self.rest[:, None]

@@ -161,6 +161,8 @@ def _close(
             misfit = run.misfit(y)
         if misfit < least:
             best, least = y, misfit
+        if least <= run.noise_floor:
+            break
     if best is None:
         return None
     note = ""

@@ -1,0 +1,425 @@
+"""The hardware check: simulated benches with a known truth, and a real one."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from pipeline import submission
+from pipeline.errors import DataError
+from pipeline.plant.chain import PRESETS, Array, Chain
+from pipeline.plant.loop import Controller, Pid, StateFeedback, simulate_loop
+from pipeline.plant.simulate import simulate_linear
+from pipeline.results import FeedbackDesign, HardwareCheck, Kind, Record
+from pipeline.stages.hardware_check import check_hardware
+from pipeline.stages.state_feedback import design_feedback
+
+T = 0.00884  # s
+COUNT = 0.00227  # cm
+NOISE = 0.001  # cm
+CLOCK = T * np.arange(700, dtype=np.float64)
+STEPS = np.where((CLOCK > 0.5) & (CLOCK < 3.5), 1.0, 0.0)  # cm
+FOUR = Chain(m=np.full(4, 3e-4), c=np.full(4, 4e-4), k=np.array([0.1, 0.12, 0.1, 0.09, 0.05]))
+PLANTS = {**PRESETS, "four": FOUR}
+LAST_CART = [(name, plant.n) for name, plant in PLANTS.items()]
+TWO = PRESETS["throne-2dof"]
+
+
+def encoder(x: Array, seed: int = 1) -> Array:
+    """Return noisy readings in whole counts."""
+    shaken = x + NOISE * np.random.default_rng(seed).standard_normal(x.shape)
+    return COUNT * np.round(shaken / COUNT)
+
+
+def noise_floor(y: Array) -> float:
+    """Return the NRMSE of a perfect model: noise and rounding over the motion."""
+    return float(np.sqrt((NOISE**2 + COUNT**2 / 12) / np.mean(y**2)))
+
+
+def record(
+    y: Array,
+    *,
+    u: Array | None,
+    t: Array = CLOCK,
+    reference: Array | None = None,
+    kind: Kind = "closed_loop",
+    free: tuple[int, ...] | None = None,
+) -> Record:
+    carts = tuple(range(1, len(y) + 1))
+    return Record(
+        id="control",
+        kind=kind,
+        t=t,
+        u=u,
+        y=y,
+        carts=carts,
+        free=carts if free is None else free,
+        reference=reference,
+        resolution=np.full(len(y), COUNT),
+    )
+
+
+def designed(chain: Chain, cart: int) -> FeedbackDesign:
+    return design_feedback(
+        chain, cart=cart, reference=1.0, overshoot_percent=10.0, settling_time=1.0
+    )
+
+
+def stated(design: FeedbackDesign, factor: float = 1.0) -> submission.StateFeedback:
+    return submission.StateFeedback(
+        type="state_feedback",
+        gains=tuple(factor * design.gains),
+        prefilter=factor * design.prefilter,
+    )
+
+
+def of(checks: tuple[HardwareCheck, ...], loop: str) -> dict[int, HardwareCheck]:
+    return {check.cart: check for check in checks if check.loop == loop}
+
+
+def known(value: float | None) -> float:
+    assert value is not None
+    return value
+
+
+def bench(
+    chain: Chain, law: Controller, *, sample_time: float | None = None, limit: float | None = None
+) -> tuple[Array, Array]:
+    """Return readings and logged input of a closed-loop run."""
+    run = simulate_loop(
+        chain,
+        law,
+        t=CLOCK,
+        reference=STEPS,
+        sample_time=sample_time,
+        input_limit=limit,
+        encoder_step=COUNT,
+    )
+    return encoder(run.x), run.u
+
+
+@pytest.mark.parametrize(("name", "cart"), LAST_CART)
+def test_a_true_model_leaves_the_noise(name, cart):
+    """Both simulations of a run come down to the noise, and agree on the step's figures."""
+    chain = PLANTS[name]
+    design = designed(chain, cart)
+    law = StateFeedback(gains=design.gains, prefilter=design.prefilter, model=chain)
+    y, u = bench(chain, law)
+
+    checks = check_hardware(
+        record(y, u=u, reference=STEPS), chain, controller=stated(design), controlled_cart=cart
+    )
+
+    assert [(c.loop, c.cart) for c in checks] == [
+        (loop, j) for loop in ("closed", "open") for j in range(1, chain.n + 1)
+    ]
+    for check in checks:
+        # The controller reacts to the rounding of its readings: up to a third more.
+        assert check.nrmse < 1.35 * noise_floor(y[check.cart - 1])
+        assert check.note == ""
+        # The scale's error is the noise's over the root of the 340 samples that move.
+        assert_allclose(known(check.input_scale), 1.0, atol=1e-3)
+        # A level that stands still is rounded by half a count, and the controller follows it.
+        assert_allclose(
+            known(check.steady_state_measured), known(check.steady_state_model), atol=COUNT
+        )
+    steered = of(checks, "closed")[cart]
+    assert_allclose(known(steered.steady_state_measured), 1.0, atol=COUNT)
+    # Noise adds to a maximum some three of its deviations, 0.4 % of a 1 cm step.
+    assert_allclose(known(steered.overshoot_measured), known(steered.overshoot_model), atol=0.8)
+    assert_allclose(known(steered.settling_measured), known(steered.settling_model), atol=0.05)
+
+
+@pytest.mark.parametrize(("name", "cart"), LAST_CART)
+@pytest.mark.parametrize("factor", [-0.5, -1.0, 3.0])
+def test_a_log_of_another_sign_and_scale_is_found_out(name, cart, factor):
+    """The factor the log wants is recovered, said, and used in both simulations."""
+    chain = PLANTS[name]
+    design = designed(chain, cart)
+    law = StateFeedback(gains=design.gains, prefilter=design.prefilter, model=chain)
+    y, u = bench(chain, law)
+
+    checks = check_hardware(
+        record(y, u=u / factor, reference=STEPS), chain, controller=stated(design, 1 / factor)
+    )
+
+    for check in checks:
+        assert_allclose(known(check.input_scale), factor, rtol=1e-3)
+        assert check.nrmse < 1.35 * noise_floor(y[check.cart - 1])
+    assert (
+        f"only if taken {known(of(checks, 'open')[1].input_scale):.3g} times"
+        in checks[chain.n].note
+    )
+
+
+def test_an_input_a_little_off_is_the_models_error():
+    """A gain 20 % off is reported as such and not mended."""
+    y = encoder(1.2 * simulate_linear(TWO, CLOCK, 0.06 * STEPS))
+
+    checks = check_hardware(record(y, u=0.06 * STEPS, kind="step"), TWO)
+
+    for check in checks:
+        assert check.note == ""
+        assert_allclose(known(check.input_scale), 1.2, atol=1e-3)
+        # A fifth of the level is missing: 0.2 of 1.2.
+        assert_allclose(check.nrmse, 0.2 / 1.2, rtol=0.02)
+        assert_allclose(
+            known(check.steady_state_measured), 1.2 * known(check.steady_state_model), rtol=0.01
+        )
+
+
+def test_a_stated_sign_that_the_log_contradicts_is_said():
+    """Where the log has the opposite sign of the stated law, the loop is closed the log's way."""
+    design = designed(TWO, 2)
+    law = StateFeedback(gains=design.gains, prefilter=design.prefilter, model=TWO)
+    y, u = bench(TWO, law)
+
+    checks = check_hardware(record(y, u=-u, reference=STEPS), TWO, controller=stated(design))
+
+    assert "opposite sign" in checks[0].note
+    assert_allclose(known(checks[0].input_scale), -1.0, atol=1e-3)
+    assert checks[0].nrmse < 1.35 * noise_floor(y[0])
+
+
+def test_a_stated_scale_that_the_log_contradicts_is_said():
+    """A PID whose scale was left out is closed with the factor the log shows."""
+    law = Pid(kp=2.0, kd=0.1, scale=0.009765625)
+    run = simulate_loop(TWO, law, t=CLOCK, reference=STEPS)
+    y = encoder(run.x)
+
+    checks = check_hardware(
+        record(y, u=run.u, reference=STEPS),
+        TWO,
+        controller=submission.Pid(type="pid", kp=2.0, kd=0.1),
+        controlled_cart=1,
+    )
+
+    # The middle one of many ratios of an input to one of rounded readings.
+    assert re.match(r"the logged input is 0\.0097\d times what the stated", checks[0].note)
+    assert checks[0].nrmse < 1.35 * noise_floor(y[0])
+
+
+@pytest.mark.parametrize(
+    ("law", "sample_time"),
+    [
+        (Pid(kp=0.02, ki=0.03, kd=0.001, cart=1), None),
+        (Pid(kp=0.02, kd=0.001, cart=1), 0.000884),
+        (StateFeedback(gains=np.array([0.03, 0.006, -0.03, 0.0]), prefilter=0.06), None),
+    ],
+)
+def test_the_timing_of_the_bench_is_found(law, sample_time):
+    """Slow and fast controllers, with and without a model, are all simulated to the noise."""
+    y, u = bench(TWO, law, sample_time=sample_time)
+    controller: submission.Controller
+    if isinstance(law, Pid):
+        controller = submission.Pid(type="pid", kp=law.kp, ki=law.ki, kd=law.kd, cart=law.cart)
+    else:
+        controller = submission.StateFeedback(
+            type="state_feedback", gains=tuple(law.gains), prefilter=law.prefilter
+        )
+
+    checks = check_hardware(record(y, u=u, reference=STEPS), TWO, controller=controller)
+
+    for check in of(checks, "closed").values():
+        # Differences of rounded readings make the controller restless: twice the noise.
+        assert check.nrmse < 2 * noise_floor(y[check.cart - 1])
+
+
+def test_saturation_is_read_off_the_log():
+    """A limit that nobody stated shows as a plateau and is simulated."""
+    law = Pid(kp=0.2, kd=0.01)
+    y, u = bench(TWO, law, limit=0.06)
+    assert np.sum(np.abs(u) >= 0.06) > 5
+
+    checks = check_hardware(
+        record(y, u=u, reference=STEPS),
+        TWO,
+        controller=submission.Pid(type="pid", kp=0.2, kd=0.01),
+        controlled_cart=1,
+    )
+
+    assert of(checks, "closed")[1].nrmse < 2 * noise_floor(y[0])
+
+
+def test_a_pid_is_closed_around_the_controlled_cart_unless_it_names_one():
+    """`controlled_cart` says where the PID's reading comes from; its own `cart` comes first."""
+    law = Pid(kp=0.008, kd=0.0008, cart=2)
+    y, u = bench(TWO, law)
+    run = record(y, u=u, reference=STEPS)
+    unnamed = submission.Pid(type="pid", kp=0.008, kd=0.0008)
+    named = submission.Pid(type="pid", kp=0.008, kd=0.0008, cart=2)
+
+    for controller, cart in ((unnamed, 2), (named, 1), (named, None)):
+        checks = check_hardware(run, TWO, controller=controller, controlled_cart=cart)
+        assert of(checks, "closed")[2].nrmse < 2 * noise_floor(y[1])
+
+
+def test_a_displaced_rest_is_no_error_of_the_model():
+    """Encoders zeroed off the rest leave the open check at the noise."""
+    y = encoder(simulate_linear(TWO, CLOCK, 0.06 * STEPS) + np.array([[3.0], [-2.0]]))
+
+    checks = check_hardware(record(y, u=0.06 * STEPS, kind="step"), TWO)
+
+    for check, rest in zip(checks, (3.0, -2.0), strict=True):
+        assert check.nrmse < 1.1 * noise_floor(y[check.cart - 1] - rest)
+        assert_allclose(
+            known(check.steady_state_measured), known(check.steady_state_model), atol=COUNT
+        )
+
+
+def test_a_record_that_begins_in_motion_has_its_start_fitted():
+    """A sweep cut out of a longer one leaves the noise, whatever its sign."""
+    u = -0.05 * np.sin(2 * np.pi * (0.5 * CLOCK + 0.4 * CLOCK**2))
+    x = simulate_linear(TWO, CLOCK, u) + 0.7
+    cut = slice(200, None)
+    y = encoder(x[:, cut])
+
+    checks = check_hardware(record(y, u=u[cut], t=CLOCK[cut], kind="sweep"), TWO)
+
+    for check in checks:
+        assert check.nrmse < 1.1 * noise_floor(y[check.cart - 1] - 0.7)
+        # Motion of 1 cm, noise of 0.0012 cm, 500 samples.
+        assert_allclose(known(check.input_scale), 1.0, atol=5e-4)
+        assert check.overshoot_measured is None
+
+
+def test_uneven_and_rounded_time_does_no_harm():
+    """Samples lost and stamps rounded to the millisecond leave a small difference."""
+    rng = np.random.default_rng(3)
+    kept = np.sort(rng.permutation(CLOCK.size)[:600])
+    t = np.round(CLOCK[kept], 3)
+    y = encoder(simulate_linear(TWO, t, 0.06 * STEPS[kept]))
+
+    checks = check_hardware(record(y, u=0.06 * STEPS[kept], t=t, kind="step"), TWO)
+
+    assert all(check.nrmse < 1.1 * noise_floor(y[check.cart - 1]) for check in checks)
+
+
+def test_a_cart_held_and_a_cart_not_measured_have_no_check():
+    """Only carts that were free and measured are reported; the held one is a wall."""
+    u = 0.06 * STEPS
+    held = simulate_linear(TWO, CLOCK, u, free=[1])
+    y = np.vstack([encoder(held), np.zeros((1, CLOCK.size))])
+    checks = check_hardware(record(y, u=u, kind="step", free=(1,)), TWO)
+    assert [check.cart for check in checks] == [1]
+    assert checks[0].nrmse < 1.1 * noise_floor(y[0])
+
+    first_only = record(encoder(simulate_linear(TWO, CLOCK, u))[:1], u=u, kind="step", free=(1, 2))
+    assert [check.cart for check in check_hardware(first_only, TWO)] == [1]
+
+
+def test_without_an_input_the_loop_alone_is_checked():
+    """A file without an input column still has its closed loop simulated."""
+    design = designed(TWO, 2)
+    law = StateFeedback(gains=design.gains, prefilter=design.prefilter, model=TWO)
+    y, _ = bench(TWO, law)
+
+    checks = check_hardware(record(y, u=None, reference=STEPS), TWO, controller=stated(design))
+
+    assert [check.loop for check in checks] == ["closed", "closed"]
+    assert all(check.input_scale is None for check in checks)
+    assert all(check.nrmse < 1.35 * noise_floor(y[check.cart - 1]) for check in checks)
+
+
+@pytest.mark.parametrize(
+    "controller", [None, submission.StateFeedback(type="state_feedback", gains=(), prefilter=1.0)]
+)
+def test_without_gains_the_measured_input_alone_is_checked(controller):
+    """Nothing stated, or a state feedback without gains: the open check only."""
+    law = Pid(kp=0.02, kd=0.001)
+    y, u = bench(TWO, law)
+
+    checks = check_hardware(record(y, u=u, reference=STEPS), TWO, controller=controller)
+
+    assert [check.loop for check in checks] == ["open", "open"]
+    assert all(check.overshoot_measured is not None for check in checks)
+
+
+def test_an_unstable_statement_is_said():
+    """Gains that cannot have run are said to be unstable, and the open check goes on."""
+    y, u = bench(TWO, Pid(kp=0.02, kd=0.001))
+    wild = submission.StateFeedback(
+        type="state_feedback", gains=(-1.0, -0.5, 0.0, 0.0), prefilter=1.0
+    )
+    stub = record(y, u=None, reference=STEPS)
+    with pytest.raises(DataError, match="makes the simulated loop unstable"):
+        check_hardware(stub, TWO, controller=wild)
+
+    pid = submission.Pid(type="pid", kp=-0.5, kd=-0.1, scale=1.0)
+    checks = check_hardware(record(y, u=u, reference=STEPS), TWO, controller=pid)
+    assert all(np.isfinite(check.nrmse) for check in checks)
+
+
+@pytest.mark.parametrize(
+    ("run", "message"),
+    [
+        (record(np.ones((2, 700)) * STEPS, u=None), "found neither a logged input nor"),
+        (record(np.ones((2, 700)) * STEPS, u=np.zeros(700)), "found neither a logged input nor"),
+        (record(np.ones((2, 700)), u=STEPS), "a cart that moves, found none"),
+        (record(np.ones((2, 700)) * STEPS, u=STEPS, free=(2,)), "cart 1, .*, found free \\[2\\]"),
+    ],
+)
+def test_runs_that_cannot_be_checked_are_refused(run, message):
+    """No input and no controller, no motion, or cart 1 held: an error that says so."""
+    with pytest.raises(DataError, match=f"control: .*{message}"):
+        check_hardware(run, TWO)
+
+
+# ------------------------------------------------------------------- a real bench
+
+
+def ucsd(folder: Path, name: str, *, sign: float) -> Record:
+    """Read one closed-loop log of the UCSD bench, in counts and volts."""
+    rows = [re.findall(r"-?\d+\.?\d*", line) for line in (folder / name).read_text().splitlines()]
+    _, stamp, reference, y1, y2, u = np.array([row for row in rows if len(row) == 6], float).T
+    index = np.arange(stamp.size)
+    return Record(
+        id=name,
+        kind="closed_loop",
+        t=index * np.polyfit(index, stamp, 1)[0],
+        u=sign * u,
+        y=np.array([y1, y2]),
+        carts=(1, 2),
+        free=(1, 2),
+        reference=reference,
+        resolution=np.ones(2),
+    )
+
+
+UCSD_MASS, UCSD_SPRING = np.array([5.5e-6, 3.7e-6]), np.array([1.79e-3, 1.03e-3, 0.0])
+UCSD = Chain(  # V, count, s; damping of about a tenth
+    m=UCSD_MASS, c=0.2 * UCSD_MASS * np.array([22.6, 16.6]), k=UCSD_SPRING
+)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(
+    ("name", "gains", "closed_limit"),
+    [
+        ("closed_loop_pid.csv", {"kp": 0.5, "ki": 0.5, "kd": 0.03}, 0.03),
+        ("closed_loop_kp.csv", {"kp": 0.05}, 0.15),
+        ("closed_loop_kd.csv", {"kp": 0.05, "kd": 0.0044}, 0.25),
+    ],
+)
+def test_the_ucsd_logs_differ_in_sign_and_scale(real_data, name, gains, closed_limit, sign):
+    """The closed-loop logs want two to four times the input, of the sign opposite to open loop."""
+    run = ucsd(real_data / "ecp210-ucsd", name, sign=sign)
+
+    checks = check_hardware(
+        run,
+        UCSD,
+        controller=submission.Pid(type="pid", scale=5 / 512, **gains),
+        controlled_cart=1,
+        input_limit=4.884,
+    )
+
+    closed, opened = of(checks, "closed")[1], of(checks, "open")[1]
+    assert 2.0 < sign * known(closed.input_scale) < 4.0
+    assert "the logged input explains the motion only if taken" in opened.note
+    assert ("opposite sign" in closed.note) == (sign < 0)
+    assert closed.nrmse < closed_limit
+    if name == "closed_loop_pid.csv":  # integral action: within a percent of 1000 counts
+        assert_allclose(known(closed.steady_state_measured), 1000.0, rtol=0.01)
+        assert_allclose(known(closed.steady_state_model), 1000.0, rtol=0.01)

@@ -1,0 +1,210 @@
+"""The sampled loop: its order of events, its exactness, its limits."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from pipeline.errors import DataError
+from pipeline.plant.chain import PRESETS, Array, Chain
+from pipeline.plant.loop import (
+    Pid,
+    StateFeedback,
+    discretise,
+    loop_matrix,
+    replay,
+    simulate_loop,
+)
+from pipeline.plant.simulate import simulate_linear
+
+T = 0.00884  # s
+TWO = PRESETS["throne-2dof"]
+GAINS = np.array([0.03, 0.007, -0.04, -0.001])
+CLOCK = T * np.arange(300.0)
+
+# Some 300 products of matrices of norm near one, each rounded to 1e-16.
+ROUNDING = 1e-11
+
+
+def feedback(chain: Chain, gains: Array = GAINS, prefilter: float = 0.07) -> StateFeedback:
+    return StateFeedback(gains=gains, prefilter=prefilter, model=chain)
+
+
+def test_without_gains_the_prefilter_drives_the_open_loop():
+    """With zero gains the run is the open-loop response to prefilter r, one sample late."""
+    run = simulate_loop(TWO, feedback(TWO, np.zeros(4)), t=CLOCK, reference=1.0)
+
+    assert_allclose(run.u[:2], [0.0, 0.07])
+    assert_allclose(run.x, simulate_linear(TWO, CLOCK, run.u), atol=ROUNDING)
+
+
+@pytest.mark.parametrize("delay", [0, 1])
+def test_an_exact_prediction_makes_the_delayed_loop_the_undelayed_one(delay):
+    """With the true model the loop runs as Phi - Gamma G does, later by the delay."""
+    run = simulate_loop(TWO, feedback(TWO), t=CLOCK, reference=1.0, delay=delay)
+
+    phi, gamma = discretise(TWO, T)
+    x, expected = np.zeros(4), np.zeros((2, CLOCK.size))
+    for tick in range(delay, CLOCK.size):
+        expected[:, tick] = x[0::2]
+        x = phi @ x + gamma * (0.07 - GAINS @ x)
+    assert_allclose(run.x, expected, atol=ROUNDING)
+
+
+@pytest.mark.parametrize("model", [None, PRESETS["throne-2dof"]])
+def test_the_loop_matrix_is_the_loop(model):
+    """Powers of the loop matrix give the run of a loop released from a displaced start."""
+    controller = StateFeedback(gains=GAINS, prefilter=1.0, model=model)
+    x0 = np.array([0.5, 3.0, -0.2, 1.0])
+    run = simulate_loop(TWO, controller, t=CLOCK, reference=0.0, x0=x0)
+
+    matrix = loop_matrix(TWO, controller, sample_time=T)
+    state = np.concatenate([x0, [0.5, 0.0, -0.2, 0.0], [0.0]])  # the observer starts at rest
+    for tick in range(CLOCK.size):
+        assert_allclose(run.x[:, tick], state[[0, 2]], atol=ROUNDING)
+        assert_allclose(run.u[tick], state[-1], atol=ROUNDING)
+        state = matrix @ state
+
+
+def test_an_exact_observer_adds_its_own_poles_and_moves_none():
+    """The poles of Phi - Gamma G are poles of the whole loop (separation)."""
+    phi, gamma = discretise(TWO, T)
+    wanted = np.linalg.eigvals(phi - np.outer(gamma, GAINS))
+    found = np.linalg.eigvals(loop_matrix(TWO, feedback(TWO), sample_time=T))
+
+    # A simple eigenvalue moves by the rounding times its condition number, below 1e4 here.
+    assert_allclose(np.abs(wanted[:, None] - found[None, :]).min(axis=1), 0.0, atol=1e-10)
+
+
+def test_the_input_stays_within_its_limit():
+    """A limit clips the input; one that is never reached changes nothing."""
+    free = simulate_loop(TWO, feedback(TWO), t=CLOCK, reference=1.0)
+    peak = np.abs(free.u).max()
+    roomy = simulate_loop(TWO, feedback(TWO), t=CLOCK, reference=1.0, input_limit=1.01 * peak)
+    tight = simulate_loop(TWO, feedback(TWO), t=CLOCK, reference=1.0, input_limit=0.5 * peak)
+
+    assert_allclose(roomy.x, free.x, rtol=0, atol=0)
+    assert np.abs(tight.u).max() == 0.5 * peak
+    # The observer knows what was applied, so the motion is that of the clipped input exactly.
+    assert_allclose(tight.x, simulate_linear(TWO, CLOCK, tight.u), atol=ROUNDING)
+
+
+def test_proportional_control_holds_a_share_of_the_reference():
+    """A proportional controller comes to rest at K kp / (1 + K kp) of the reference."""
+    chain, kp = PRESETS["throne-1dof"], 0.02
+    t = T * np.arange(1200.0)
+    run = simulate_loop(chain, Pid(kp=kp), t=t, reference=2.0, delay=0)
+
+    share = 28.9 * kp / (1 + 28.9 * kp)  # K of the preset is 28.9
+    # Its poles have a real part of -1.2 with the zero-order hold: exp(-12) is 6e-6 at the end.
+    assert_allclose(run.x[0, -1], 2.0 * share, rtol=1e-4)
+
+
+def test_the_pid_terms_are_sum_and_difference():
+    """The first two efforts follow the stated sums and differences of the error."""
+    pid = Pid(kp=0.3, ki=2.0, kd=0.004, scale=0.1)
+    run = simulate_loop(PRESETS["throne-1dof"], pid, t=CLOCK, reference=1.0, delay=0)
+
+    error = 1.0 - run.x[0, :2]
+    kick = 0.1 * (0.3 * error[0] + 2.0 * error[0] * T + 0.004 * error[0] / T)
+    second = 0.3 * error[1] + 2.0 * error.sum() * T + 0.004 * (error[1] - error[0]) / T
+    assert_allclose(run.u[:2], [kick, 0.1 * second], rtol=1e-12)
+
+
+def test_integral_action_removes_the_error():
+    """With integral action the cart ends at the reference, for a cart other than the first too."""
+    t = T * np.arange(4000.0)
+    run = simulate_loop(TWO, Pid(kp=0.002, ki=0.02, cart=2), t=t, reference=1.0)
+
+    # The slowest pole lies near -ki K = -0.3 rad/s: exp(-0.3 * 35) is 3e-5.
+    assert_allclose(run.x[1, -1], 1.0, atol=1e-3)
+
+
+def test_the_controller_sees_whole_encoder_steps():
+    """Proportional efforts are multiples of the gain times the encoder step."""
+    step = np.array([0.01, 0.0])
+    run = simulate_loop(TWO, Pid(kp=0.02), t=CLOCK, reference=1.0, encoder_step=step, delay=0)
+
+    counts = run.u / (0.02 * 0.01)
+    assert_allclose(counts, np.round(counts), atol=1e-9)
+    assert np.ptp(counts) > 50
+
+
+def test_positions_between_the_ticks_are_those_of_the_held_input():
+    """Logged five times a tick, the run is the exact response to the logged input."""
+    t = T / 5 * np.arange(1000.0)
+    run = simulate_loop(TWO, feedback(TWO), t=t, reference=1.0, sample_time=T)
+
+    assert np.count_nonzero(np.diff(run.u)) <= 200  # held over five samples
+    # Cubic interpolation errs by (omega T)^4 / 384 of the fast mode's share: 0.36^4 / 384 = 4e-5.
+    assert_allclose(run.x, simulate_linear(TWO, t, run.u), atol=5e-5)
+
+
+def test_a_controller_faster_than_the_log_acts_between_its_samples():
+    """A log of each tenth tick holds the same motion as the full one."""
+    fine = T / 10 * np.arange(2001.0)
+    full = simulate_loop(TWO, feedback(TWO), t=fine, reference=1.0)
+    logged = simulate_loop(TWO, feedback(TWO), t=fine[::10], reference=1.0, sample_time=T / 10)
+
+    assert_allclose(logged.x, full.x[:, ::10], atol=ROUNDING)
+    assert_allclose(logged.u, full.u[::10], atol=ROUNDING)
+
+
+def test_rounded_time_stamps_keep_the_reference_at_its_sample():
+    """Stamps rounded to the millisecond do not move the reference's edge by a sample."""
+    reference = np.where(np.arange(CLOCK.size) >= 57, 1.0, 0.0)
+    exact = simulate_loop(TWO, feedback(TWO), t=CLOCK, reference=reference)
+    rounded = simulate_loop(TWO, feedback(TWO), t=np.round(CLOCK, 3), reference=reference)
+
+    # A stamp is off by 0.5 ms at most, the carts move at up to 16 cm/s here; a sample is 8.84 ms.
+    assert np.abs(rounded.x - exact.x).max() < 0.0005 * np.abs(np.diff(exact.x)).max() / T * 1.1
+    assert_allclose(rounded.u, exact.u, atol=1e-3 * np.abs(exact.u).max())
+
+
+def test_a_drive_of_the_other_sign_wants_the_other_gains():
+    """Negative efforts through a negative drive are the same forces."""
+    mirrored = Pid(kp=-0.02, kd=-0.0005)
+    run = simulate_loop(TWO, Pid(kp=0.04, kd=0.001), t=CLOCK, reference=1.0)
+    other = simulate_loop(TWO, mirrored, t=CLOCK, reference=1.0, drive=-2.0)
+
+    assert_allclose(other.x, run.x, atol=ROUNDING)
+    assert_allclose(other.u, -run.u / 2, atol=ROUNDING)
+
+
+def test_the_rest_adds_to_the_readings():
+    """An encoder zeroed off the rest shifts the readings and what the controller makes of them."""
+    shift = np.array([0.3, -0.1])
+    run = simulate_loop(TWO, Pid(kp=0.02), t=CLOCK, reference=1.0, rest=shift)
+    same = simulate_loop(TWO, Pid(kp=0.02), t=CLOCK, reference=1.0 - 0.3)
+
+    assert_allclose(run.x, same.x + shift[:, None], atol=ROUNDING)
+
+
+def test_held_carts_are_walls():
+    """Two carts with the second held are one cart on both its springs."""
+    alone = Chain(m=TWO.m[:1], c=TWO.c[:1], k=TWO.k[:2])
+    pid = Pid(kp=0.02, kd=0.001)
+    run = simulate_loop(TWO, pid, t=CLOCK, reference=1.0, free=[1])
+
+    assert_allclose(run.x, simulate_loop(alone, pid, t=CLOCK, reference=1.0).x, atol=ROUNDING)
+
+
+def test_a_replay_gives_the_efforts_that_were_logged():
+    """On the readings of an undelayed PID run the law asks for the logged input."""
+    pid = Pid(kp=0.02, ki=0.01, kd=0.0004, scale=0.7, cart=2)
+    run = simulate_loop(TWO, pid, t=CLOCK, reference=1.0, delay=0)
+
+    stated = replay(pid, t=CLOCK, y=run.x, reference=np.ones(CLOCK.size), free=(1, 2))
+
+    assert_allclose(stated, run.u, atol=ROUNDING)
+
+
+def test_gains_that_do_not_fit_the_carts_are_refused():
+    """Two gains for two carts are an error that says how many are needed."""
+    with pytest.raises(DataError, match="2 carts needs 4 gains, found 2"):
+        simulate_loop(TWO, feedback(TWO, np.zeros(2)), t=CLOCK, reference=1.0)
+
+
+def test_a_pid_on_a_held_cart_is_refused():
+    """A controller cannot steer a cart that is held."""
+    with pytest.raises(DataError, match=r"its cart 2 free, found \[1\]"):
+        simulate_loop(TWO, Pid(kp=1.0, cart=2), t=CLOCK, reference=1.0, free=[1])

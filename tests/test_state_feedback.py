@@ -1,0 +1,329 @@
+"""State-feedback design: the gains against other programs, the design against its goal."""
+
+import control
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from scipy.optimize import linear_sum_assignment
+
+from pipeline.errors import DataError
+from pipeline.plant.chain import PRESETS, Array, Chain
+from pipeline.plant.feedback import lqr_gains, place_poles
+from pipeline.plant.loop import StateFeedback, discretise, loop_matrix, simulate_loop
+from pipeline.plant.robustness import MASS_SPRING_ERROR, level_error_percent, stays_stable
+from pipeline.plant.step_response import overshoot_percent, settling_time
+from pipeline.results import FeedbackDesign
+from pipeline.stages.state_feedback import Method, design_feedback
+
+T = 0.00884  # s
+RIGID = Chain(m=np.array([2e-4]), c=np.array([1e-4]), k=np.zeros(2))
+FREE_PAIR = Chain(m=np.full(2, 3e-4), c=np.full(2, 4e-4), k=np.array([0.0, 0.12, 0.0]))
+FOUR = Chain(m=np.full(4, 3e-4), c=np.full(4, 4e-4), k=np.array([0.1, 0.12, 0.1, 0.09, 0.05]))
+PLANTS = {**PRESETS, "rigid": RIGID, "free pair": FREE_PAIR, "four": FOUR}
+EVERY_CART = [(name, cart) for name, plant in PLANTS.items() for cart in range(1, plant.n + 1)]
+METHODS: tuple[Method, ...] = ("lqr", "poles")
+
+
+def design(
+    chain: Chain,
+    *,
+    cart: int = 1,
+    reference: float = 1.0,
+    overshoot: float = 10.0,
+    settling: float = 1.0,
+    limit: float | None = None,
+    sample_time: float | None = None,
+    method: Method = "lqr",
+) -> FeedbackDesign:
+    return design_feedback(
+        chain,
+        cart=cart,
+        reference=reference,
+        overshoot_percent=overshoot,
+        settling_time=settling,
+        input_limit=limit,
+        sample_time=sample_time,
+        method=method,
+    )
+
+
+def off_by(chain: Chain, rng: np.random.Generator) -> Chain:
+    """Return the chain with masses and springs up to 3 %, dampings up to 30 % off."""
+    return Chain(
+        m=chain.m * (1 + 0.03 * rng.uniform(-1, 1, chain.n)),
+        c=chain.c * (1 + 0.30 * rng.uniform(-1, 1, chain.n)),
+        k=chain.k * (1 + 0.03 * rng.uniform(-1, 1, chain.n + 1)),
+    )
+
+
+# ------------------------------------------------------------------ the algorithms
+
+
+@pytest.mark.parametrize("name", PLANTS)
+@pytest.mark.parametrize("weight", [1e-2, 1.0, 1e2])
+def test_lqr_gains_agree_with_control(name, weight):
+    """The doubling algorithm finds the gains that control.dlqr finds."""
+    phi, gamma = discretise(PLANTS[name], T)
+    gamma = gamma / np.abs(gamma).max()
+    Q = weight * np.diag(np.tile([1.0, 1e-3], PLANTS[name].n))
+
+    got = lqr_gains(phi, gamma, Q)
+
+    expected, _, _ = control.dlqr(phi, gamma[:, None], Q, np.eye(1))
+    # Either program solves a Riccati equation whose condition number is below 1e6 here.
+    assert_allclose(got, np.asarray(expected)[0], rtol=1e-8, atol=1e-10 * np.abs(got).max())
+
+
+def test_lqr_gains_of_many_weights_are_those_of_each():
+    """Weights in a stack do not disturb each other."""
+    phi, gamma = discretise(PRESETS["throne-3dof"], T)
+    weights = np.array([scale * np.eye(6) for scale in (1e-4, 1e-2, 1.0)])
+
+    together = lqr_gains(phi, gamma, weights)
+
+    for gains, Q in zip(together, weights, strict=True):
+        assert_allclose(gains, lqr_gains(phi, gamma, Q), rtol=1e-10)
+
+
+@pytest.mark.parametrize("name", PLANTS)
+@pytest.mark.parametrize("sample_time", [T, 0.001])
+def test_placed_poles_are_where_they_were_asked_for(name, sample_time):
+    """The eigenvalues of phi - gamma G match the request one to one."""
+    chain = PLANTS[name]
+    phi, gamma = discretise(chain, sample_time)
+    unit = np.tile([1.0, 20.0], chain.n)  # positions and velocities of one size
+    phi, gamma = phi * unit / unit[:, None], gamma / unit
+    decay, turn = np.linspace(-4, -10, chain.n), np.linspace(5, 45, chain.n)
+    wanted = np.exp(sample_time * np.array([decay + 1j * turn, decay - 1j * turn]).T.ravel())
+
+    got = np.linalg.eigvals(phi - np.outer(gamma, place_poles(phi, gamma, wanted)))
+
+    away = np.abs(wanted[:, None] - got[None, :])
+    rows, columns = linear_sum_assignment(away)
+    # Poles 0.4 T apart and more: eight of them have a condition number up to 1e8 at 1 ms.
+    assert away[rows, columns].max() < 1e-7
+
+
+def test_placed_gains_agree_with_control():
+    """Single-input gains are unique, so another algorithm's must be the same."""
+    phi, gamma = discretise(PRESETS["throne-2dof"], T)
+    gamma = gamma / np.abs(gamma).max()
+    wanted = np.exp(T * np.array([-5 + 6j, -5 - 6j, -8 + 30j, -8 - 30j]))
+
+    expected = control.place(phi, gamma[:, None], wanted)  # scipy's, inside
+
+    assert_allclose(place_poles(phi, gamma, wanted), np.asarray(expected)[0], rtol=1e-7)
+
+
+@pytest.mark.parametrize("name", ["throne-2dof", "throne-3dof", "four"])
+def test_level_error_is_what_wrong_springs_do(name):
+    """The stated error is the sum of what each spring, 3 % off, does to the level."""
+    chain, cart = PLANTS[name], 2
+    gains = design(chain, cart=cart, method="poles").gains
+
+    def level(k: Array) -> float:
+        K = Chain(m=chain.m, c=chain.c, k=k).stiffness.copy()
+        K[0] += gains[0::2]
+        return float(np.linalg.inv(K)[cart - 1, 0])
+
+    h = 1e-5
+    moved = [level(chain.k * (1 + h * spring)) - level(chain.k) for spring in np.eye(chain.n + 1)]
+    expected = 100 * MASS_SPRING_ERROR * np.abs(moved).sum() / h / abs(level(chain.k))
+
+    # A one-sided difference errs by h times the curvature, some ten times the slope here.
+    assert_allclose(level_error_percent(chain, gains, cart=cart), expected, rtol=1e-3)
+
+
+def test_robust_stability_sees_a_loop_on_the_edge():
+    """Gains that only just keep the model stable do not pass; the designed ones do."""
+    chain = PRESETS["throne-3dof"]
+    gains = design(chain, cart=3).gains
+    assert stays_stable(chain, StateFeedback(gains=gains, prefilter=1, model=chain), sample_time=T)
+
+    def times(scale: float) -> StateFeedback:
+        return StateFeedback(gains=scale * gains, prefilter=1.0, model=chain)
+
+    stable, unstable = 1.0, 100.0
+    while unstable / stable > 1.0001:
+        middle = np.sqrt(stable * unstable)
+        radius = np.abs(np.linalg.eigvals(loop_matrix(chain, times(middle), sample_time=T))).max()
+        stable, unstable = (middle, unstable) if radius < 1 else (stable, middle)
+    edge = times(stable)
+    assert not stays_stable(chain, edge, sample_time=T)
+
+
+# --------------------------------------------------------------------- the design
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(("name", "cart"), EVERY_CART)
+def test_the_design_meets_its_goal_on_the_true_plant(name, cart, method):
+    """The step of the designed loop, simulated finely, keeps overshoot and settling time."""
+    chain = PLANTS[name]
+    got = design(chain, cart=cart, method=method)
+
+    assert got.reachable
+    assert got.gains.shape == (2 * chain.n,)
+    t = T / 4 * np.arange(800.0)
+    controller = StateFeedback(gains=got.gains, prefilter=got.prefilter, model=chain)
+    y = simulate_loop(chain, controller, t=t, reference=1.0, sample_time=T).x[cart - 1]
+    overshoot = float(overshoot_percent(y, before=0.0, level=np.float64(1.0)))
+    settled = float(settling_time(t, y, before=0.0, level=np.float64(1.0)))
+    assert overshoot < 10.0
+    assert settled < 1.0
+    # The design looks at the ticks only; between them the step moves by little.
+    assert_allclose(overshoot, got.overshoot_percent, atol=0.2)
+    assert got.settling_time is not None
+    assert_allclose(settled, got.settling_time, atol=T)
+    assert_allclose(y[-1], 1.0, atol=2e-3)
+
+
+@pytest.mark.parametrize(("name", "cart"), [(n, c) for n, c in EVERY_CART if n in PRESETS])
+def test_lqr_hardly_overshoots_the_presets_and_forgives_model_error(name, cart):
+    """Overshoot is at most 0.6 %, and the loop is stable on plants a few percent off."""
+    chain, rng = PRESETS[name], np.random.default_rng(7)
+    got = design(chain, cart=cart)
+
+    assert got.overshoot_percent <= 0.6
+    assert got.settling_time is not None
+    assert got.settling_time <= 0.8
+    assert got.message == ""
+    controller = StateFeedback(gains=got.gains, prefilter=got.prefilter, model=chain)
+    for _ in range(60):
+        matrix = loop_matrix(off_by(chain, rng), controller, sample_time=T)
+        assert np.abs(np.linalg.eigvals(matrix)).max() < 1.0
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("name", PLANTS)
+def test_poles_and_prefilter_are_those_of_the_gains(name, method):
+    """The result's poles are the loop's eigenvalues, and the prefilter its inverse DC gain."""
+    chain = PLANTS[name]
+    got = design(chain, cart=chain.n, method=method)
+
+    phi, gamma = discretise(chain, got.sample_time)
+    loop = phi - np.outer(gamma, got.gains)
+    z = np.exp(got.poles * got.sample_time)
+    away = np.abs(z[:, None] - np.linalg.eigvals(loop)[None, :])
+    assert away[linear_sum_assignment(away)].max() < 1e-9
+    level = np.linalg.solve(np.eye(2 * chain.n) - loop, gamma)[2 * chain.n - 2]
+    assert_allclose(got.prefilter * level, 1.0, rtol=1e-9)
+    if got.requested_poles is None:
+        assert method == "lqr"
+    else:
+        assert method == "poles"
+        # Double real poles, of a pair without overshoot, move by the root of the rounding.
+        assert_allclose(got.poles, got.requested_poles, rtol=1e-4)
+
+
+@given(
+    position=st.floats(1e-4, 1e4),
+    force=st.floats(1e-4, 1e4),
+    method=st.sampled_from(METHODS),
+)
+@settings(max_examples=15, deadline=None)
+def test_units_do_not_matter(position, force, method):
+    """In other units of position and input the same controller comes out."""
+    chain = PRESETS["throne-2dof"]
+    other = Chain(**{name: getattr(chain, name) * force / position for name in ("m", "c", "k")})
+    base = design(chain, cart=2, limit=0.08, method=method)
+    same = design(other, cart=2, limit=0.08 * force, reference=position, method=method)
+
+    # The choice among candidates could flip on a rounding only if two were equal to 1e-12.
+    assert_allclose(same.gains, base.gains * force / position, rtol=1e-7)
+    assert_allclose(same.prefilter, base.prefilter * force / position, rtol=1e-7)
+    assert_allclose(same.overshoot_percent, base.overshoot_percent, atol=1e-6)
+    assert same.settling_time == base.settling_time
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_step_down_mirrors_the_step_up(method):
+    """A negative reference has the same gains and the mirrored step."""
+    up = design(PRESETS["throne-2dof"], cart=2, reference=0.5, method=method)
+    down = design(PRESETS["throne-2dof"], cart=2, reference=-0.5, method=method)
+
+    assert_allclose(down.gains, up.gains, rtol=0, atol=0)
+    assert_allclose(down.y, -up.y, rtol=0, atol=1e-15)
+    assert down.overshoot_percent == pytest.approx(up.overshoot_percent, abs=1e-9)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_input_limit_is_kept(method):
+    """With a limit that leaves room the goal is met within it."""
+    chain = PRESETS["throne-3dof"]
+    roomy = design(chain, cart=3, method=method)
+    got = design(chain, cart=3, limit=0.075, method=method)
+
+    assert got.reachable
+    assert got.peak_input <= 0.075
+    assert roomy.peak_input >= got.peak_input or roomy.peak_input <= 0.075
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_level_beyond_the_input_is_said_to_be_out_of_reach(method):
+    """Where the limit cannot even hold the step, the message says how far it can."""
+    chain = PRESETS["throne-2dof"]
+    got = design(chain, cart=2, limit=0.05, method=method)
+
+    assert not got.reachable
+    held = 0.05 * chain.static_gains()[1]
+    assert f"cannot hold cart 2 at 1: reachable is {held:.3g}" in got.message
+    assert np.abs(got.u).max() <= 0.05
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_settling_time_beyond_the_input_names_what_is_reachable(method):
+    """Too little input for the speed: the nearest design within it, and its figures."""
+    chain = PRESETS["throne-2dof"]
+    holding = 1 / chain.static_gains()[1]
+    got = design(chain, cart=2, settling=0.15, limit=1.05 * holding, method=method)
+
+    assert not got.reachable
+    assert "settling in 0.15 s within ±0.0639 of input cannot be met: reachable is" in got.message
+    assert got.peak_input <= 1.05 * holding + 1e-12
+
+
+def test_cancelling_gains_are_warned_of():
+    """Poles forced far from a soft plant's own are reported to make the level sensitive."""
+    got = design(FOUR, cart=4, settling=0.5, method="poles")
+
+    assert level_error_percent(FOUR, got.gains, cart=4) > 5.0
+    assert "errors of 3 % in the springs move the level by up to" in got.message
+
+
+def test_a_fast_plant_is_sampled_faster():
+    """Without a sample time the design takes one that follows the fastest mode."""
+    chain = PRESETS["throne-2dof"]
+    fast = Chain(m=chain.m / 400, c=chain.c / 20, k=chain.k)  # twenty times as fast
+    got = design(fast, cart=2, settling=0.05)
+
+    assert got.sample_time <= 0.5 / np.abs(fast.poles).max() * (1 + 1e-9)
+    assert got.reachable
+    assert design(chain, cart=2).sample_time == T
+    assert design(chain, cart=2, sample_time=0.002).sample_time == 0.002
+
+
+def test_no_overshoot_at_all_can_be_asked_for():
+    """A goal of no overshoot is met."""
+    assert design(PRESETS["throne-2dof"], cart=1, overshoot=0.0).overshoot_percent < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("chain", "cart", "reference", "message"),
+    [
+        (PRESETS["throne-2dof"], 3, 1.0, "a cart from 1 to 2, found 3"),
+        (PRESETS["throne-2dof"], 1, 0.0, "a reference other than 0"),
+        (
+            Chain(m=np.ones(3), c=np.ones(3), k=np.array([1.0, 1.0, 0.0, 1.0])),
+            1,
+            1.0,
+            "no spring between carts 2 and 3",
+        ),
+    ],
+)
+def test_impossible_tasks_are_refused(chain, cart, reference, message):
+    """A cart that is not there, no step, or a cart out of the motor's reach is an error."""
+    with pytest.raises(DataError, match=message):
+        design(chain, cart=cart, reference=reference)
