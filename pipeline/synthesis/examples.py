@@ -62,7 +62,7 @@ cart 2. That is why K_1 is larger than K_2.
   resonance this was a good guess, for the second it was three times too much.
 - The null of cart 1 lies at the frequency that cart 2 has on its own, as it should: there cart 2
   works as an absorber.
-- Above 6 Hz the second cart hardly moves, and the encoder's steps become visible.
+- Above the second resonance cart 2 moves less and less, so we had to turn the input up to 0.3 V.
 
 In closed loop cart 2 follows the step, while cart 1 goes half as far again to get it there.
 """,
