@@ -261,9 +261,8 @@ def _steady_part(t: Array, y: Array, *, omega: float, floor: float) -> _Steady:
     if len(last) < 2 or spread > tolerance:
         return _Steady(start=latest, settled=False, left=spread)
     start = _carry_back(t, y, latest, omega=omega, floor=floor, stretches=len(windows))
-    if start == 0:
-        return _Steady(start=0, settled=True, left=0.0)
-    start = min(start + (t.size - start) // _MARGIN, latest)
+    if start > 0:
+        start = min(start + (t.size - start) // _MARGIN, latest)
     start, left = _drop_drifting(t, y, start, latest=latest, omega=omega)
     return _Steady(start=start, settled=True, left=left)
 
