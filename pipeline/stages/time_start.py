@@ -15,7 +15,7 @@ from itertools import pairwise
 import numpy as np
 
 from pipeline.plant.chain import Array, Chain
-from pipeline.stages.chain_parameters import START_ZETA, even_chain, physical_start
+from pipeline.stages.chain_parameters import even_chain, physical_start
 from pipeline.stages.time_window import Window
 
 WIDTHS = (0.15, 0.3, 0.6, 1.2)  # s; a bump should span about one period of the carts
@@ -26,7 +26,7 @@ _FEWEST_PERIODS = 2  # of the slowest resonance worth looking for, in the longes
 _FEWEST_PER_PERIOD = 8  # samples in a period of the fastest
 _FREQUENCY_STEP = 1.5  # from one even chain to the next: the fit finds its way over a third
 _SWING_OVER_GAIN = 1.6  # of a lightly damped cart after a step
-_SMALLEST_ZETA = START_ZETA / 10  # noise may well make a regressed damping negative
+_SMALLEST_ZETA = 0.005  # noise may well make a regressed damping negative
 
 
 def regress_chain(
@@ -64,7 +64,8 @@ def regress_chain(
         if not m[cart - 1] > 0 or (cart < n and not k[cart] > 0):
             return None
     start = physical_start(Chain(m=m, c=c, k=k), springs=springs)
-    return Chain(m=start.m, c=np.maximum(c, start.c * (_SMALLEST_ZETA / START_ZETA)), k=start.k)
+    omega = np.maximum(start.omega_carts, 1 / width)
+    return Chain(m=start.m, c=np.maximum(c, 2 * _SMALLEST_ZETA * omega * start.m), k=start.k)
 
 
 def _tells_of(window: Window, cart: int, n: int) -> bool:

@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.errors import DataError
-from pipeline.plant.chain import Array
+from pipeline.plant.chain import Array, ComplexArray
 from pipeline.plant.simulate import OVERSAMPLING, interpolate_band_limited
-from pipeline.results import Record
+from pipeline.results import Kind, Record
 from pipeline.stages._signals import local_noise
 from pipeline.stages.modal_response import Modes, drive_modes
 
@@ -30,11 +30,13 @@ class Window:
     drive_t, drive_u : (n_d,) the held input, on a grid `stride` times finer than t; drive_u is
         None where no input acts on a free cart.
     carts, free : as in `Record`; the held carts are gone from both.
-    sigma : (p,) standard error of a position.
+    stated_sigma : (p,) standard error of a position, by encoder step and local noise.
+    sigma : (p,) standard error to weigh with; at least the stated one.
     at_rest : True where the carts start at rest, else position and speed at t = 0 are unknown.
     """
 
     id: str
+    kind: Kind
     t: Array
     y: Array
     drive_t: Array
@@ -42,16 +44,14 @@ class Window:
     stride: int
     carts: tuple[int, ...]
     free: tuple[int, ...]
+    stated_sigma: Array
     sigma: Array
     at_rest: bool
 
-    def resting(self) -> "Window":
-        """Return the same, taken to start at rest."""
-        return replace(self, at_rest=True)
-
-    def weighted(self, sigma: Array) -> "Window":
-        """Return the same with other standard errors (p,)."""
-        return replace(self, sigma=sigma)
+    def thinned(self, most: int) -> "Window":
+        """Return the same with at most twice as many samples as `most`; the input keeps all."""
+        step = max(self.t.size // most, 1)
+        return replace(self, t=self.t[::step], y=self.y[:, ::step], stride=self.stride * step)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -122,9 +122,11 @@ def open_window(record: Record) -> Window:
             drive_u = np.append((fine_u[1:] + fine_u[:-1]) / 2, fine_u[-1])
     steps = np.array([record.encoder_step(cart) for cart in carts])
     noise = np.array([local_noise(t, position) for position in y])
-    sigma = np.maximum(noise, steps / np.sqrt(12))
+    least = _NOISE_FREE * max(float(np.max(np.ptp(y, axis=1))), np.finfo(float).tiny)
+    sigma = np.maximum(np.maximum(noise, steps / np.sqrt(12)), least)
     return Window(
         id=record.id,
+        kind=record.kind,
         t=t - t[0],
         y=y,
         drive_t=drive_t,
@@ -132,7 +134,8 @@ def open_window(record: Record) -> Window:
         stride=stride,
         carts=carts,
         free=tuple(sorted(record.free)),
-        sigma=np.maximum(sigma, _NOISE_FREE * max(float(np.max(np.ptp(y, axis=1))), 1e-300)),
+        stated_sigma=sigma,
+        sigma=sigma,
         at_rest=False,
     )
 
@@ -196,7 +199,7 @@ def compare(window: Window, modes: Modes) -> Misfit:
     )
 
 
-def _real_part(weights: np.ndarray, signals: np.ndarray) -> Array:
+def _real_part(weights: ComplexArray, signals: ComplexArray) -> Array:
     """Return Re(weights @ signals) for (…, n_m) and (n_m, n), by one real product."""
     return np.concatenate([weights.real, -weights.imag], axis=-1) @ np.concatenate(
         [signals.real, signals.imag]

@@ -1,0 +1,175 @@
+"""Search for the chain that follows a set of windows: from a regression, by Gauss-Newton."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from pipeline.errors import DataError
+from pipeline.plant.chain import Array, Chain
+from pipeline.stages.chain_parameters import Parametrisation
+from pipeline.stages.modal_response import find_modes
+from pipeline.stages.time_start import WIDTHS, even_chains, regress_chain
+from pipeline.stages.time_window import Misfit, Window, compare
+
+# A chain that leaves more than this share of the motion's power unexplained is not the one
+# (carts with dry friction leave some 2 %), unless the rest is noise.
+_LOST = 0.1
+_NOISE_EXPLAINS = 2.0  # chi² per degree of freedom below which there is nothing more to find
+# A damping or spring that is not there sends its logarithm towards minus infinity: e^-15 of a
+# start is nothing, and no step may overflow.
+_LOG_REACH = 15.0
+# Relative change of the cost at which a search ends: with n samples, 1/n is one standard error.
+_SEARCH_TOLERANCE = 1e-6
+_MOST_EVALUATIONS = 60
+_SEARCH_SAMPLES = 700  # of a record; the search needs no more to come close
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Attempt:
+    """A chain held against all windows.
+
+    Attributes
+    ----------
+    theta : (n_p,), see `Parametrisation`.
+    misfits : one for each window.
+    converged : True where a search ended here by itself.
+    """
+
+    parametrisation: Parametrisation
+    theta: Array
+    windows: Sequence[Window]
+    misfits: Sequence[Misfit]
+    converged: bool = False
+
+    @property
+    def chain(self) -> Chain:
+        """The chain of theta."""
+        return self.parametrisation.unpack(self.theta)
+
+    @cached_property
+    def cost(self) -> float:
+        """The sum of squared standardised residuals."""
+        return float(sum(np.sum(misfit.residual**2) for misfit in self.misfits))
+
+    @property
+    def n_points(self) -> int:
+        """Number of positions."""
+        return sum(window.y.size for window in self.windows)
+
+    @property
+    def dof(self) -> int:
+        """Degrees of freedom: positions less all that was fitted, local unknowns included."""
+        return self.n_points - self.theta.size - sum(misfit.n_local for misfit in self.misfits)
+
+    @cached_property
+    def lost(self) -> float:
+        """Share of the motion's power (about its mean) that the chain does not explain."""
+        power = sum(
+            float(np.sum(((w.y - w.y.mean(axis=1, keepdims=True)) / w.sigma[:, None]) ** 2))
+            for w in self.windows
+        )
+        return self.cost / power if power > 0 else 1.0
+
+    @property
+    def follows(self) -> bool:
+        """True where the chain explains the motion, down to its noise or nearly all of it."""
+        return self.lost < _LOST or self.cost < _NOISE_EXPLAINS * self.dof
+
+
+def look(windows: Sequence[Window], parametrisation: Parametrisation, theta: Array) -> Attempt:
+    """Compare the chain of theta with all windows."""
+    chain, slopes = parametrisation.unpack(theta), parametrisation.slopes(theta)
+    modes = {
+        free: find_modes(chain, free=free, parametrisation=parametrisation, slopes=slopes)
+        for free in {window.free for window in windows}
+    }
+    misfits = [compare(window, modes[window.free]) for window in windows]
+    return Attempt(parametrisation=parametrisation, theta=theta, windows=windows, misfits=misfits)
+
+
+def descend(
+    windows: Sequence[Window],
+    parametrisation: Parametrisation,
+    theta: Array,
+    *,
+    tolerance: float = _SEARCH_TOLERANCE,
+) -> Attempt:
+    """Minimise the sum of squared residuals from theta on, to a relative `tolerance`."""
+
+    @lru_cache(maxsize=2)  # the residual and its Jacobian are asked for one after the other
+    def condensed(theta_bytes: bytes) -> Array:
+        return condense(look(windows, parametrisation, np.frombuffer(theta_bytes)).misfits)
+
+    def residual(x: Array) -> Array:
+        return condensed(x.tobytes())[:, -1]
+
+    def jacobian(x: Array) -> Array:
+        return condensed(x.tobytes())[:, :-1]
+
+    reach = np.where(parametrisation.logarithmic, _LOG_REACH, np.inf)
+    lower = np.maximum(parametrisation.bounds[0], theta - reach)
+    upper = np.minimum(parametrisation.bounds[1], theta + reach)
+    solution = least_squares(
+        residual,
+        np.clip(theta, lower, upper),
+        jac=jacobian,  # pyright: ignore[reportArgumentType]  # scipy's stub knows strings only
+        bounds=(lower, upper),
+        x_scale="jac",
+        ftol=tolerance,
+        max_nfev=_MOST_EVALUATIONS,
+    )
+    return replace(look(windows, parametrisation, solution.x), converged=solution.status > 0)
+
+
+def condense(misfits: Sequence[Misfit]) -> Array:
+    """Condense slopes and residuals to (n_p + 1, n_p + 1), the residuals in the last column.
+
+    The triangle of their QR decomposition: its columns have the products of the long ones, so
+    least squares sees the same problem with n_p + 1 residuals instead of thousands.
+    """
+    triangles = []
+    for misfit in misfits:
+        slopes = misfit.slopes.reshape(misfit.slopes.shape[0], -1)
+        columns = np.vstack([slopes, misfit.residual.reshape(1, -1)]).T
+        triangles.append(np.asarray(np.linalg.qr(columns, mode="r")))
+    return np.asarray(np.linalg.qr(np.concatenate(triangles), mode="r"))
+
+
+def search(
+    windows: Sequence[Window], parametrisation: Parametrisation, *, given: Chain | None
+) -> tuple[Attempt, int]:
+    """Return the best chain from as many starts as it takes, and their number.
+
+    Raises
+    ------
+    DataError : the records suggest no start at all.
+    """
+    full, windows = windows, [window.thinned(_SEARCH_SAMPLES) for window in windows]
+    springs = parametrisation.springs
+    regressed = [regress_chain(windows, springs=springs, width=width) for width in WIDTHS]
+    near = [parametrisation.pack(chain) for chain in (given, *regressed) if chain is not None]
+    near.sort(key=lambda theta: look(windows, parametrisation, theta).cost)
+    best: Attempt | None = None
+    tried = 0
+    for theta in near:
+        best, tried = _better(best, descend(windows, parametrisation, theta)), tried + 1
+        if best.follows:
+            return look(full, parametrisation, best.theta), tried
+    # Even chains are far from the truth: the search may end beside it, so all are tried unless
+    # one explains the records down to their noise.
+    for chain in even_chains(windows, springs=springs):
+        theta = parametrisation.pack(chain)
+        best, tried = _better(best, descend(windows, parametrisation, theta)), tried + 1
+        if best.cost < _NOISE_EXPLAINS * best.dof:
+            break
+    if best is None:
+        raise DataError("time fit: needs records that show a chain in motion, found no start")
+    return look(full, parametrisation, best.theta), tried
+
+
+def _better(best: Attempt | None, found: Attempt) -> Attempt:
+    """Return the one that leaves less."""
+    return found if best is None or found.cost < best.cost else best
