@@ -9,12 +9,15 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from pipeline import __version__
 from pipeline.errors import ConfigError, PipelineError
+
+if TYPE_CHECKING:
+    from pipeline.results import Analysis
 
 app = typer.Typer(
     name="cartlab",
@@ -140,7 +143,7 @@ def report(
         raise typer.Exit(1)
 
 
-def _run_report(folder: Path, *, out: Path, pdf: bool):  # noqa: ANN202
+def _run_report(folder: Path, *, out: Path, pdf: bool) -> "Analysis":
     from pipeline.report.render import render_report
     from pipeline.report.words import terminal_summary
     from pipeline.results_json import results_text

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import ParamSpec, TypeVar
 
 from pipeline.errors import DataError
 from pipeline.ingest.read import Ingested, read_data
@@ -10,7 +10,6 @@ from pipeline.plant.chain import parameter_names
 from pipeline.results import (
     Analysis,
     ChainFit,
-    Check,
     Estimate,
     FeedbackDesign,
     FrequencyResponse,
@@ -31,14 +30,18 @@ from pipeline.stages.frequency_response import (
 from pipeline.stages.hardware_check import check_hardware
 from pipeline.stages.initial import estimate_initially
 from pipeline.stages.log_decrement import fit_log_decrement
+from pipeline.stages.repeats import find_outlier_repeats
 from pipeline.stages.sine import fit_sine
 from pipeline.stages.state_feedback import design_feedback
 from pipeline.stages.step_gain import fit_step_gain
-from pipeline.stages.time_fit import find_outlier_repeats, fit_records
+from pipeline.stages.time_fit import fit_records
 from pipeline.submission import Design, Submission
 
+P = ParamSpec("P")
 T = TypeVar("T")
 Progress = Callable[[str], None]
+
+_LISTED = 4  # more runs than these are not named one by one
 
 
 def _silent(text: str) -> None:
@@ -52,10 +55,12 @@ class _Log:
     skipped: list[Skipped] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
-    def attempt(self, stage: str, call: Callable[[], T]) -> T | None:
+    def attempt(
+        self, stage: str, run: Callable[P, T], *args: P.args, **options: P.kwargs
+    ) -> T | None:
         """Run one stage; data that do not support it are a reason, not an end."""
         try:
-            return call()
+            return run(*args, **options)
         except DataError as error:
             self.skip(stage, str(error))
             return None
@@ -81,26 +86,36 @@ def analyse(submission: Submission, *, progress: Progress = _silent) -> Analysis
     progress("reading the data")
     data = read_data(submission)
     log.warn(data.warnings)
-    log.warn(f"{record.id}: {note}" for record in data.records for note in record.notes)
-    steps = _without_outliers(data.records, log)
+    log.warn(_by_note((record.id, note) for record in data.records for note in record.notes))
+    driven = _driven(data.records, n=n, log=log)
 
     progress("free decays: logarithmic decrement")
     decays = _log_decrements(data.records, n=n, log=log)
     progress("steps: static gains")
-    gains = _step_gains(steps, n=n, log=log)
+    gains = _step_gains(driven, log=log)
     progress("sine dwells: steady state")
     sines = _sine_points(data.records, log=log)
+    # What a check says of a decay or a step in full is not said twice.
+    log.warn(
+        _by_note(
+            [
+                *((f"{d.experiment}, cart {d.cart}", d.note) for d in decays if not _sticks(d)),
+                *((f"{g.experiment}, cart {g.cart}", g.note) for g in gains if not g.interval),
+                *((f"{p.experiment}, cart {p.cart}", p.note) for p in sines),
+            ]
+        )
+    )
     progress("frequency response")
-    responses = _frequency_response(data, sines=sines, steps=steps, n=n, log=log)
+    responses = _frequency_response(data, sines=sines, driven=driven, log=log)
 
-    found = log.attempt("resonances", lambda: find_resonances(responses, n=n)) or {}
+    found = log.attempt("resonances", find_resonances, responses, n=n) or {}
     initial, remarks = estimate_initially(
         carts=n, log_decrements=decays, step_gains=gains, from_response=found
     )
     log.warn(remarks)
 
     progress("fitting all carts at once")
-    fit = _fit(responses, steps=steps, initial=initial, n=n, springs=springs, log=log)
+    fit = _fit(responses, driven=driven, initial=initial, n=n, springs=springs, log=log)
     rows = compare(
         initial,
         final=fit.parameters if fit else {},
@@ -142,16 +157,36 @@ def analyse(submission: Submission, *, progress: Progress = _silent) -> Analysis
     )
 
 
-def _all_free(record: Record, n: int) -> bool:
-    return len(record.free) == n
+def _by_note(notes: Iterable[tuple[str, str]]) -> list[str]:
+    """Return one sentence a note, headed by all the runs it is about."""
+    runs: dict[str, list[str]] = {}
+    for run, note in notes:
+        if note:
+            runs.setdefault(note, []).append(run)
+    return [f"{_listed(list(dict.fromkeys(ids)))}: {note}" for note, ids in runs.items()]
 
 
-def _without_outliers(records: Sequence[Record], log: _Log) -> list[Record]:
-    """Return the step and sweep records, without a repeat that stands off the others."""
-    driven = [r for r in records if r.kind in ("step", "sweep") and r.u is not None]
-    outliers = find_outlier_repeats(driven)
-    log.warn(outliers.values())
-    return [record for record in driven if record.id not in outliers]
+def _listed(ids: Sequence[str]) -> str:
+    if len(ids) <= _LISTED:
+        return ", ".join(ids)
+    return f"{ids[0]}, {ids[1]} … {ids[-1]} ({len(ids)} runs)"
+
+
+def _driven(records: Sequence[Record], *, n: int, log: _Log) -> list[Record]:
+    """Return the steps and sweeps of all carts together, without repeats that stand off.
+
+    Runs of single carts are left to the initial estimates, so that initial and final estimates
+    come from different data and comparing them is a check.
+    """
+    runs = [r for r in records if r.kind in ("step", "sweep") and r.u is not None]
+    runs = [r for r in runs if len(r.free) == n]
+    outliers = {outlier.experiment: outlier for outlier in find_outlier_repeats(runs)}
+    log.warn(
+        f"{name}: moves otherwise than its repeats {', '.join(outlier.others)} "
+        f"({outlier.distance:.3g} from them, they {outlier.spread:.3g} from each other): left out"
+        for name, outlier in outliers.items()
+    )
+    return [record for record in runs if record.id not in outliers]
 
 
 def _log_decrements(records: Sequence[Record], *, n: int, log: _Log) -> list[LogDecrement]:
@@ -167,27 +202,27 @@ def _log_decrements(records: Sequence[Record], *, n: int, log: _Log) -> list[Log
             )
         for run in runs:
             decay = log.attempt(
-                f"log decrement, {run.id}, cart {cart}", lambda: fit_log_decrement(run, cart=cart)
+                f"log decrement, {run.id}, cart {cart}", fit_log_decrement, run, cart=cart
             )
             if decay:
                 decays.append(decay)
-                log.warn([decay.note and f"{run.id}, cart {cart}: {decay.note}"])
     return decays
 
 
-def _step_gains(steps: Sequence[Record], *, n: int, log: _Log) -> list[StepGain]:
-    runs = [r for r in steps if r.kind == "step" and _all_free(r, n)]
+def _sticks(decay: LogDecrement) -> bool:
+    return decay.friction is not None and decay.friction.present
+
+
+def _step_gains(driven: Sequence[Record], *, log: _Log) -> list[StepGain]:
+    runs = [record for record in driven if record.kind == "step"]
     if not runs:
         log.skip("step gain", "no step was recorded with all carts free")
     gains = []
     for run in runs:
         for cart in run.carts:
-            gain = log.attempt(
-                f"step gain, {run.id}, cart {cart}", lambda: fit_step_gain(run, cart=cart)
-            )
+            gain = log.attempt(f"step gain, {run.id}, cart {cart}", fit_step_gain, run, cart=cart)
             if gain:
                 gains.append(gain)
-                log.warn([gain.note and f"{run.id}, cart {cart}: {gain.note}"])
     return gains
 
 
@@ -196,11 +231,10 @@ def _sine_points(records: Sequence[Record], *, log: _Log) -> list[SinePoint]:
     for run in records:
         for cart in run.carts if run.kind == "sine" else ():
             point = log.attempt(
-                f"sine steady state, {run.id}, cart {cart}", lambda: fit_sine(run, cart=cart)
+                f"sine steady state, {run.id}, cart {cart}", fit_sine, run, cart=cart
             )
             if point:
                 points.append(point)
-                log.warn([point.note and f"{run.id}, cart {cart}: {point.note}"])
     return points
 
 
@@ -208,8 +242,7 @@ def _frequency_response(
     data: Ingested,
     *,
     sines: Sequence[SinePoint],
-    steps: Sequence[Record],
-    n: int,
+    driven: Sequence[Record],
     log: _Log,
 ) -> Sequence[FrequencyResponse]:
     """From dwells; else from the students' own table; else from steps and sweeps."""
@@ -218,11 +251,10 @@ def _frequency_response(
     if data.tables:
         return data.tables
     log.skip("sine steady state", "no sine dwells were recorded")
-    runs = [record for record in steps if _all_free(record, n)]
-    if not runs:
+    if not driven:
         log.skip("frequency response", "no dwells, no table, and no step or sweep to take it from")
         return ()
-    responses = log.attempt("frequency response", lambda: response_from_records(runs))
+    responses = log.attempt("frequency response", response_from_records, driven)
     if responses:
         log.warn(["the frequency response comes from the step and sweep records, not from dwells"])
     return responses or ()
@@ -231,7 +263,7 @@ def _frequency_response(
 def _fit(
     responses: Sequence[FrequencyResponse],
     *,
-    steps: Sequence[Record],
+    driven: Sequence[Record],
     initial: dict[str, Estimate],
     n: int,
     springs: tuple[bool, ...],
@@ -240,20 +272,18 @@ def _fit(
     """The Bode fit where dwells or a table allow it, else the joint fit on the time records."""
     if any(response.source != "records" for response in responses):
         values = {name: estimate.value for name, estimate in initial.items()}
-        fit = log.attempt(
-            "Bode fit", lambda: fit_bode(responses, n=n, springs=springs, initial=values)
-        )
+        fit = log.attempt("Bode fit", fit_bode, responses, n=n, springs=springs, initial=values)
         if fit:
             return fit
-    if not steps:
-        log.skip("final estimates", "no dwells, table, step or sweep to fit the carts to")
+    if not driven:
+        log.skip(
+            "final estimates", "no dwells, table, step or sweep with all carts free to fit them to"
+        )
         return None
-    return log.attempt("final estimates", lambda: fit_records(steps, n=n, springs=springs))
+    return log.attempt("final estimates", fit_records, driven, n=n, springs=springs)
 
 
-def _design(
-    submission: Submission, fit: ChainFit | None, *, log: _Log
-) -> FeedbackDesign | None:
+def _design(submission: Submission, fit: ChainFit | None, *, log: _Log) -> FeedbackDesign | None:
     if fit is None:
         log.skip("state feedback", "the carts are not identified")
         return None
@@ -268,16 +298,15 @@ def _design(
         )
     return log.attempt(
         "state feedback",
-        lambda: design_feedback(
-            fit.chain,
-            cart=task.cart,
-            reference=task.reference,
-            overshoot_percent=task.overshoot_percent,
-            settling_time=task.settling_time,
-            input_limit=task.input_limit,
-            sample_time=task.sample_time,
-            method=task.method,
-        ),
+        design_feedback,
+        fit.chain,
+        cart=task.cart,
+        reference=task.reference,
+        overshoot_percent=task.overshoot_percent,
+        settling_time=task.settling_time,
+        input_limit=task.input_limit,
+        sample_time=task.sample_time,
+        method=task.method,
     )
 
 
@@ -295,15 +324,17 @@ def _hardware(
     checks: list[HardwareCheck] = []
     for experiment in submission.experiments:
         if experiment.id in runs:
-            checks += log.attempt(
-                f"hardware check, {experiment.id}",
-                lambda: check_hardware(
+            checks += (
+                log.attempt(
+                    f"hardware check, {experiment.id}",
+                    check_hardware,
                     runs[experiment.id],
                     fit.chain,
                     controller=experiment.controller,
                     controlled_cart=experiment.controlled_cart,
                     input_limit=limit,
-                ),
-            ) or ()
-    log.warn(check.note and f"{check.experiment}, cart {check.cart}: {check.note}" for check in checks)
+                )
+                or ()
+            )
+    log.warn(_by_note((f"{check.experiment}, cart {check.cart}", check.note) for check in checks))
     return checks

@@ -14,8 +14,9 @@ LEVELS = (
     ("results", "submission"),
     ("ingest", "stages"),
     ("workflow", "synthesis", "results_json"),
-    ("report",),
+    ("report", "gap"),
     ("cli",),
+    ("__main__",),
 )
 HOMES = {
     "matplotlib": ("report",),

@@ -1,0 +1,5 @@
+"""`python -m pipeline` is `cartlab`."""
+
+from pipeline.cli import main
+
+main()

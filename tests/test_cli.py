@@ -1,0 +1,129 @@
+"""The command line as people meet it: real processes, exit codes, one clear line."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from pipeline.resources import EXAMPLES
+
+README = EXAMPLES.parent / "README.md"
+
+
+def cartlab(*arguments, cwd=None):
+    """Run the command line in a process of its own."""
+    return subprocess.run(
+        [sys.executable, "-m", "pipeline", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        encoding="utf-8",
+        cwd=cwd,
+        timeout=120,
+        check=False,
+    )
+
+
+def _commands():
+    from typer.main import get_command
+
+    from pipeline.cli import app
+
+    return sorted(get_command(app).commands)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+@pytest.mark.parametrize("command", _commands())
+def test_every_command_has_help_and_is_in_the_readme(command):
+    """`--help` works and says something; the README names the command."""
+    done = cartlab(command, "--help")
+    assert done.returncode == 0
+    assert "Usage" in done.stdout
+    if README.exists():  # absent only where the tests run against an installed wheel
+        assert f"`cartlab {command}" in README.read_text(encoding="utf-8")
+
+
+def test_help_imports_nothing_heavy():
+    """`--help` answers at once because numpy is not even loaded."""
+    code = "import sys, pipeline.cli; print('numpy' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+
+
+def test_report_writes_everything_and_ends_well(tmp_path):
+    """A consistent submission gives all files and exit status 0; stdout stays empty."""
+    done = cartlab("report", EXAMPLES / "one-cart", "--out", tmp_path / "out")
+    assert (done.returncode, done.stdout) == (0, "")
+    out = tmp_path / "out"
+    assert (out / "report.pdf").read_bytes().startswith(b"%PDF")
+    assert "<html" in (out / "report.html").read_text(encoding="utf-8")
+    assert (
+        json.loads((out / "results.json").read_text(encoding="utf-8"))["submission"]["carts"] == 1
+    )
+    assert list((out / "figures").glob("*.svg"))
+
+
+def test_report_prints_json_on_stdout(tmp_path):
+    """With --json stdout is the very text of results.json."""
+    done = cartlab("report", EXAMPLES / "one-cart", "--out", tmp_path, "--no-pdf", "--json")
+    assert done.stdout == (tmp_path / "results.json").read_text(encoding="utf-8")
+    assert not (tmp_path / "report.pdf").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["report", "no-such-folder"], "no-such-folder"),
+        (["inspect", "no-such-file.csv"], "no-such-file.csv"),
+        (["simulate", "--preset", "throne-9dof", "--out", "x"], "throne-3dof"),
+        (["report", str(EXAMPLES / "one-cart"), "--out", "blocked"], "is a file"),
+        (["new", "blocked", "--carts", "2"], "blocked"),
+    ],
+)
+def test_what_cannot_run_is_one_line_and_status_two(tmp_path, arguments, expected):
+    """A wrong name or a blocked path ends in one line on stderr that names it."""
+    (tmp_path / "blocked").write_text("in the way")
+    done = cartlab(*arguments, cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert expected in done.stderr
+    assert "Traceback" not in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_failed_checks_are_status_one(tmp_path):
+    """A submission whose steps have a wrong scale is reported, and the exit status says so."""
+    folder = tmp_path / "scaled"
+    import shutil
+
+    shutil.copytree(EXAMPLES / "one-cart", folder)
+    for file in (folder / "data").glob("step-*.csv"):
+        lines = file.read_text(encoding="utf-8").splitlines()
+        head = lines[0].split(",")
+        column = head.index("x1")
+        rows = [line.split(",") for line in lines[1:]]
+        for row in rows:
+            row[column] = f"{2 * float(row[column]):.5f}"
+        file.write_text("\n".join([lines[0], *map(",".join, rows)]) + "\n", encoding="utf-8")
+    done = cartlab("report", folder, "--no-pdf", "--json")
+    checks = {check["id"]: check["outcome"] for check in json.loads(done.stdout)["checks"]}
+    assert checks["initial_final.K"] == "fail"
+    assert done.returncode == 1
+
+
+def test_new_then_report_tells_what_to_do_next(tmp_path):
+    """A fresh folder cannot be reported yet; the message says what is missing."""
+    assert cartlab("new", tmp_path / "team", "--carts", "2").returncode == 0
+    done = cartlab("report", tmp_path / "team")
+    assert done.returncode == 2
+    assert "experiments" in done.stderr
+
+
+def test_simulate_makes_a_submission_that_report_takes(tmp_path):
+    """A simulated bench goes through the whole pipeline, reported values included."""
+    folder = tmp_path / "bench"
+    done = cartlab(
+        "simulate", "--preset", "throne-1dof", "--seed", 5, "--reported", "--out", folder
+    )
+    assert done.returncode == 0
+    assert "[reported.final]" in (folder / "submission.toml").read_text(encoding="utf-8")
+    assert cartlab("report", folder, "--no-pdf").returncode == 0

@@ -1,0 +1,97 @@
+"""results.json: the documented form, plain numbers only, the same bytes every time."""
+
+import json
+
+import pytest
+
+from pipeline.resources import EXAMPLES
+from pipeline.results_json import results_text
+from pipeline.submission import load_submission
+from pipeline.workflow import analyse
+
+
+@pytest.fixture(scope="module")
+def results():
+    def refuse(token):
+        raise AssertionError(f"{token} is not JSON")
+
+    text = results_text(analyse(load_submission(EXAMPLES / "two-cart")))
+    return json.loads(text, parse_constant=refuse)
+
+
+def test_it_has_every_documented_key(results):
+    """All top-level keys are there, in their order, under the schema's name."""
+    assert results["schema"] == "cartlab-results/1"
+    assert list(results) == [
+        "schema",
+        "submission",
+        "parameters",
+        "chain",
+        "state_space",
+        "fit",
+        "log_decrements",
+        "step_gains",
+        "frequency_response",
+        "checks",
+        "feedback",
+        "hardware",
+        "skipped",
+        "warnings",
+        "provenance",
+    ]
+
+
+def test_parameters_follow_the_papers_table(results):
+    """The rows stand in the order of Table 2, with units and both estimates."""
+    rows = results["parameters"]
+    assert [row["name"] for row in rows] == [
+        "K_1",
+        "K_2",
+        "omega_a",
+        "omega_b",
+        "zeta_a",
+        "zeta_b",
+        "omega_1",
+        "omega_2",
+        "zeta_1",
+        "zeta_2",
+    ]
+    first = rows[0]
+    assert (first["unit"], first["initial_from"], first["final_from"]) == (
+        "cm/V",
+        "step",
+        "bode_fit",
+    )
+    expected = 100 * (first["final"] / first["initial"] - 1)
+    assert first["change_percent"] == pytest.approx(expected, rel=1e-6)
+
+
+def test_shapes_agree_with_the_number_of_carts(results):
+    """Matrices, gains and poles have the sizes that two carts ask for."""
+    space = results["state_space"]
+    assert [len(space["A"]), len(space["A"][0]), len(space["B"]), len(space["B"][0])] == [
+        4,
+        4,
+        4,
+        1,
+    ]
+    assert len(results["feedback"]["gains"]) == 4
+    assert all(len(pole) == 2 for pole in results["feedback"]["poles"])
+    assert [len(results["chain"][key]) for key in "mck"] == [2, 2, 3]
+
+
+def test_hardware_has_one_entry_a_run_and_cart(results):
+    """The loop that ran and the plant driven by the measured input share one entry."""
+    keys = [(entry["experiment"], entry["cart"]) for entry in results["hardware"]]
+    assert len(keys) == len(set(keys)) == 2
+    assert all(entry["loop"] == "closed" for entry in results["hardware"])
+    assert all(entry["measured_input"]["nrmse"] < 0.05 for entry in results["hardware"])
+
+
+def test_every_data_file_has_its_hash(results):
+    """Provenance lists each file named in the submission with a SHA-256."""
+    files = results["provenance"]["files"]
+    assert {p.name for p in (EXAMPLES / "two-cart" / "data").iterdir()} == {
+        name.rpartition("/")[2] for name in files
+    }
+    assert all(len(digest) == 64 for digest in files.values())

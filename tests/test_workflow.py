@@ -1,0 +1,104 @@
+"""The straight line: the shipped examples, and submissions from which a part is missing."""
+
+import math
+import shutil
+
+import pytest
+from numpy.testing import assert_allclose
+
+from pipeline.plant.chain import PRESETS
+from pipeline.resources import EXAMPLES
+from pipeline.results_json import results_text
+from pipeline.submission import load_submission
+from pipeline.workflow import analyse
+
+PRESET_OF = {"one-cart": "throne-1dof", "two-cart": "throne-2dof", "three-cart": "throne-3dof"}
+
+
+@pytest.fixture(scope="module")
+def analyses():
+    return {name: analyse(load_submission(EXAMPLES / name)) for name in PRESET_OF}
+
+
+@pytest.mark.parametrize("name", PRESET_OF)
+def test_examples_give_back_the_carts_that_made_them(analyses, name):
+    """Every named parameter of the final column is the preset's, within four standard errors."""
+    truth = PRESETS[PRESET_OF[name]].parameters()
+    final = {row.name: row.final for row in analyses[name].rows}
+    assert list(final) == list(truth)
+    for parameter, estimate in final.items():
+        # Four sigma on 32 parameters: one in 500 fixed seeds would fail by chance.
+        assert abs(estimate.value - truth[parameter]) < 4 * estimate.std, parameter
+        # And the standard errors themselves are small: about 30 dwells at 0.1 %.
+        assert estimate.std < 2e-3 * truth[parameter], parameter
+
+
+@pytest.mark.parametrize("name", PRESET_OF)
+def test_examples_pass_every_check_and_skip_nothing(analyses, name):
+    """The shipped examples are whole and consistent: all stages ran, no check fails."""
+    analysis = analyses[name]
+    assert not analysis.skipped
+    assert [check.id for check in analysis.checks if check.outcome == "fail"] == []
+    assert {h.loop for h in analysis.hardware} == {"closed", "open"}
+    assert {row.name for row in analysis.rows if row.initial is None} == set()
+
+
+def test_same_input_gives_same_bytes(analyses):
+    """Analysing the same folder again gives the same results.json."""
+    again = analyse(load_submission(EXAMPLES / "two-cart"))
+    assert results_text(again) == results_text(analyses["two-cart"])
+
+
+def _without(tmp_path, *, kinds, example="two-cart"):
+    """Copy an example without the experiments of some kinds."""
+    folder = tmp_path / "part"
+    shutil.copytree(EXAMPLES / example, folder)
+    path = folder / "submission.toml"
+    head, *experiments = path.read_text(encoding="utf-8").split("[[experiments]]")
+    last, reported, tail = experiments[-1].partition("[reported")
+    experiments[-1] = last
+    kept = [e for e in experiments if not any(f'kind = "{kind}"' in e for kind in kinds)]
+    text = "[[experiments]]".join([head, *kept]) + reported + tail
+    path.write_text(text, encoding="utf-8")
+    return load_submission(folder)
+
+
+@pytest.mark.parametrize(
+    ("kind", "stage"),
+    [
+        ("decay", "log decrement, cart 1"),
+        ("step", "step gain"),
+        ("sine", "sine steady state"),
+        ("closed_loop", "hardware check"),
+    ],
+)
+def test_a_missing_experiment_is_skipped_with_its_reason_and_the_rest_goes_on(
+    tmp_path, kind, stage
+):
+    """Without one kind of experiment its stage is skipped; the carts are identified all the same."""
+    analysis = analyse(_without(tmp_path, kinds=[kind]))
+    assert stage in {skip.stage for skip in analysis.skipped}
+    truth = PRESETS["throne-2dof"]
+    # Without dwells the fit rests on steps and a sweep of encoder counts: percents, not per mille.
+    assert_allclose(analysis.chain.m, truth.m, rtol=0.01)
+    assert_allclose(analysis.chain.k[1:], truth.k[1:], rtol=0.01)
+
+
+def test_steps_alone_still_give_a_full_report(tmp_path):
+    """Without dwells and sweep the joint fit uses the step records, and the report says so."""
+    analysis = analyse(_without(tmp_path, kinds=["sine", "sweep"]))
+    assert analysis.fit.method == "time_fit"
+    assert_allclose(analysis.chain.m, PRESETS["throne-2dof"].m, rtol=0.02)
+    assert any("not from dwells" in warning for warning in analysis.warnings)
+    assert analysis.frequency_responses
+
+
+def test_decays_alone_end_in_reasons_not_in_a_crash(tmp_path):
+    """With decays only there is no final estimate; everything that needs one says why."""
+    analysis = analyse(_without(tmp_path, kinds=["sine", "sweep", "step", "closed_loop"]))
+    assert analysis.chain is None
+    stages = {skip.stage for skip in analysis.skipped}
+    assert {"final estimates", "state feedback", "hardware check"} <= stages
+    assert "null" in results_text(analysis)
+    rows = {row.name: row for row in analysis.rows}
+    assert math.isclose(rows["omega_2"].initial.value, 32.926, rel_tol=1e-3)
