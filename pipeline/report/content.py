@@ -11,6 +11,7 @@ from pipeline.report.document import (
     Span,
     bullet_list,
     paragraph,
+    plain,
     spans,
 )
 from pipeline.report.figures import drawing
@@ -168,7 +169,11 @@ def _checks(page: Page) -> list[Block]:
 
 
 def _discussion(page: Page) -> list[Block]:
-    return list(note_blocks(page.analysis.discussion or ""))
+    blocks = list(note_blocks(page.analysis.discussion or ""))
+    first = blocks[0] if blocks else None
+    if isinstance(first, Heading) and plain(first.text).strip().lower() == "discussion":
+        return blocks[1:]  # the section has that title already
+    return blocks
 
 
 def _warnings(page: Page) -> list[Block]:

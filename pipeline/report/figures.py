@@ -31,7 +31,8 @@ SHADE = "#ececec"
 CART_LINES = ("-", "--", "-.", ":")  # carts that share a panel differ by line style as well
 CART_COLOURS = (MODEL, SECOND, "#009e73", MEASURED)
 
-_BUCKETS = 320  # twice this many points a line: finer than print at this width shows
+_BUCKETS = 240  # twice this many points a line: finer than print at this width shows
+_MOST_POINTS = 200  # of one record: more would hide the line of the model
 # Inches:
 _LEFT, _RIGHT = 0.62, 0.12  # for tick labels and axis titles
 _TOP, _BOTTOM = 0.26, 0.44  # for a legend or a title above, tick labels and title below
@@ -39,7 +40,7 @@ _SHARED_GAP, _OWN_GAP = 0.13, 0.5  # between panels on one time axis, or each wi
 _X_LABEL, _Y_LABEL = 0.31, 0.46  # from the axes to the middle of their titles
 _COLUMN_GAP = 0.5
 _DECADE = (1, 2, 5)
-_DOT = 1.3  # points
+_DOT = 1.5  # points
 _STROKE = 1e-4  # of the time span
 
 _STYLE: dict[Any, Any] = {
@@ -166,9 +167,10 @@ def thin(t: Array, y: Array) -> tuple[Array, Array]:
     return t[keep], y[keep]
 
 
-def plot_measured(ax: Axes, t: Array, y: Array, *, label: str = "measured") -> None:
-    """Draw a measured time series as points."""
-    x, y = thin(t, y)
+def plot_measured(ax: Axes, t: Array, y: Array, *, most: int = _MOST_POINTS) -> None:
+    """Draw a measured time series as points, of a long one `most` spread evenly."""
+    shown = np.linspace(0, t.size - 1, min(t.size, most)).astype(int)
+    x, y = t[shown], y[shown]
     # Round-ended strokes too short to see as such: one path for all points takes a fifth of the
     # time and a third of the text that markers do. (Some readers drop strokes of no length at
     # all.) Added as an artist, or matplotlib walks every stroke.
@@ -179,7 +181,7 @@ def plot_measured(ax: Axes, t: Array, y: Array, *, label: str = "measured") -> N
     dots = PathPatch(path, fill=False, color=MEASURED, lw=_DOT, capstyle="round", zorder=3)
     ax.add_artist(dots)
     ax.update_datalim(points)
-    ax.plot([], [], ".", color=MEASURED, ms=3 * _DOT, mew=0, label=label)  # for the legend
+    ax.plot([], [], ".", color=MEASURED, ms=3 * _DOT, mew=0, label="measured")  # for the legend
 
 
 def plot_model(ax: Axes, t: Array, y: Array, *, label: str = "model") -> None:

@@ -31,6 +31,7 @@ from pipeline.results import (
 )
 
 _CYCLES_SHOWN = 10  # of the steady part: single cycles can still be seen
+_SINE_POINTS = 300
 _SETTLED_BAND = 0.02  # the 2 % of the settling time
 _ROOM = 1.12  # above the largest value
 _LONGEST_TITLE = 28  # characters above a panel of half the width
@@ -138,7 +139,7 @@ def plot_sine(ax: Axes, point: SinePoint, *, record: Record) -> None:
     t, y = record.t[shown], record.position(point.cart)[shown]
     steady = t >= point.steady_from
     ax.plot(*thin(t, y), color=QUIET, lw=0.7)
-    plot_measured(ax, t, y)
+    plot_measured(ax, t, y, most=_SINE_POINTS)
     ax.axvspan(float(t[0]), point.steady_from, color=SHADE, lw=0, label="transient")
     # The middle of the steady swing: mean over samples, near enough for ten cycles.
     middle = float(np.mean(y[steady])) if np.any(steady) else float(np.mean(y))

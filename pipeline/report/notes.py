@@ -19,7 +19,6 @@ from pipeline.report.document import (
     Span,
     Spans,
     Table,
-    plain,
 )
 from pipeline.report.words import clean
 
@@ -106,8 +105,3 @@ def _is_safe(address: str) -> bool:
         return urlsplit(address).scheme in _SCHEMES
     except ValueError:
         return False
-
-
-def is_empty(blocks: tuple[Block, ...]) -> bool:
-    """Say whether notes hold no text at all."""
-    return not any(plain(b.text).strip() if isinstance(b, Paragraph) else True for b in blocks)

@@ -147,11 +147,12 @@ def decay_table(decays: Sequence[LogDecrement], *, number: int, position_unit: s
     for decay in decays:
         friction = decay.friction
         if friction is None:
-            verdict, drop = _cell("not tested", "quiet"), NOTHING
+            verdict = _cell("not tested", "quiet")
         elif friction.present:
-            verdict, drop = _cell("found", "bad"), with_error(friction.drop, friction.drop_std)
+            drop = with_error(friction.drop, friction.drop_std)
+            verdict = _cell(f"d = {drop} {clean(position_unit)}", "bad")
         else:
-            verdict, drop = _cell("none seen", "good"), NOTHING
+            verdict = _cell("none seen", "good")
         rows.append(
             [
                 _cell(clean(decay.experiment)),
@@ -161,20 +162,19 @@ def decay_table(decays: Sequence[LogDecrement], *, number: int, position_unit: s
                 _cell(with_error(decay.zeta_peaks, decay.zeta_peaks_std)),
                 _cell(str(decay.peak_t.size)),
                 verdict,
-                _cell(drop),
             ]
         )
     return _table(
         number,
         "Free decays of single carts: the fitted decay, and the logarithmic decrement of its "
-        "extrema; d is half the width of the band in which dry friction holds the cart.",
+        "extrema; d is half the width of the band in which dry friction can hold the cart.",
         (
             "Record", "Cart", spans(name_span("omega_n"), " [rad/s]"),
             spans(name_span("zeta"), " of the fit"), spans(name_span("zeta"), " of the extrema"),
-            "Extrema", "Dry friction", f"d [{clean(position_unit)}]",
+            "Extrema", "Dry friction",
         ),
         rows,
-        "lcrrrclr",
+        "lcrrrcr",
     )  # fmt: skip
 
 
