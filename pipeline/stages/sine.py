@@ -25,6 +25,7 @@ _DRIVEN = 0.5  # of the input's amplitude: the dwell runs from its first to its 
 _FREQUENCY_SIGMAS, _FREQUENCY_RELATIVE = 5.0, 2e-4  # a stated frequency further off is not believed
 _FEW_COUNTS = 20  # an amplitude below this is known to a few percent only
 _FLOOR_ROUNDING = 0.111  # of the encoder step, times sqrt(step / amplitude): see `_rounding_std`
+_GAP = 3.0  # sample intervals; longer ones are gaps in the log
 _ITERATIONS = 20
 _PHASE_CONVERGED = 1e-9  # rad at the ends of the record
 
@@ -197,6 +198,7 @@ def _rounding_std(fit: _Sine, *, step: float) -> float:
 def _held(t: Array, *, omega: float) -> complex:
     """Return the factor from a sampled sine to the first harmonic of its held staircase."""
     dt = np.diff(t)
+    dt = dt[dt < _GAP * np.median(dt)]  # what the input did in a gap is not known
     return complex(np.sum(-np.expm1(-1j * omega * dt)) / (1j * omega * np.sum(dt)))
 
 
@@ -256,14 +258,14 @@ def _steady_part(t: Array, y: Array, *, omega: float, floor: float) -> _Steady:
     fits = [_fit(t[w], y[w], omega=omega) for w in last]
     z = np.array([fit.z for fit in fits])
     tolerance = max(_SPREAD * abs(z.mean()), 3 * max(fit.std for fit in fits), floor)
-    latest = last[0].start
+    latest = last[-1].start
     spread = float(np.max(np.abs(z - z.mean())))
     if len(last) < 2 or spread > tolerance:
         return _Steady(start=latest, settled=False, left=spread)
     start = _carry_back(t, y, latest, omega=omega, floor=floor, stretches=len(windows))
     if start > 0:
         start = min(start + (t.size - start) // _MARGIN, latest)
-    start, left = _drop_drifting(t, y, start, latest=latest, omega=omega)
+    start, left = _drop_drifting(t, y, start, latest=latest, omega=omega, floor=floor)
     return _Steady(start=start, settled=True, left=left)
 
 
@@ -279,7 +281,7 @@ def _carry_back(
         mean = -np.diff(square[edges]) / hop  # of the stretches before `start`, going back
         limit = max(steady.rms, floor) ** 2 * (1 + _BACK_SIGMAS * np.sqrt(2 / hop))
         worse = np.flatnonzero(mean > limit)
-        reached = int(edges[worse[0] if worse.size else -1])
+        reached = int(edges[worse[0]]) if worse.size else 0
         if reached == start:
             break
         start = reached
@@ -287,7 +289,7 @@ def _carry_back(
 
 
 def _drop_drifting(
-    t: Array, y: Array, start: int, *, latest: int, omega: float
+    t: Array, y: Array, start: int, *, latest: int, omega: float, floor: float
 ) -> tuple[int, float]:
     """Return a start, not after `latest`, from which the two halves agree; and what is left.
 
@@ -298,7 +300,8 @@ def _drop_drifting(
         middle = (start + t.size) // 2
         early = _fit(t[start:middle], y[start:middle], omega=omega)
         late = _fit(t[middle:], y[middle:], omega=omega)
-        difference, noise = abs(early.z - late.z), np.hypot(early.std, late.std)
+        difference = abs(early.z - late.z)
+        noise = max(np.hypot(early.std, late.std), floor / np.sqrt(t.size - start))
         if start == latest or difference <= _DRIFT_SIGMAS * noise:
             return start, float(np.sqrt(max(difference**2 - 4 * noise**2, 0.0))) / 2
         start = min(start + (t.size - start) // _DROP, latest)
