@@ -171,6 +171,7 @@ def _linearise(
     spread: Array,
     scatter_free: bool,
     refine: float,
+    extras: Array | None = None,
 ) -> _Linear:
     layout = _layout(structure, run, scatter_free=scatter_free)
     n, P = structure.n, theta.size
@@ -228,8 +229,9 @@ def _linearise(
     theta_columns, local_columns = jac[:P], jac[P:]
     shot_columns = local_columns[: lanes_x + lanes_v]
     scatter_columns = local_columns[lanes_x + lanes_v :]
+    further = [] if extras is None else [_blocks(extras / sigma, run)]
     wide = np.concatenate(
-        [shot_columns, scatter_columns, zero_columns, theta_columns, residual[None]]
+        [shot_columns, scatter_columns, zero_columns, theta_columns, *further, residual[None]]
     )  # (columns, shots, points)
     matrix = np.moveaxis(wide, 0, -1)  # (shots, points, columns)
     lanes_s = lanes_x + lanes_v
@@ -320,9 +322,7 @@ def evaluate(
     """Return the fit at given parameters and locals, without moving either."""
 
     def cost(pair: tuple[Run, Locals]) -> tuple[float, float]:
-        return _run_cost(
-            structure, theta, *pair, inflate=inflate, spread=spread, refine=refine
-        )
+        return _run_cost(structure, theta, *pair, inflate=inflate, spread=spread, refine=refine)
 
     costs = np.array(list(mapper(cost, zip(runs, locals_, strict=True))))
     points = np.array([_residual_points(run) for run in runs])
@@ -376,7 +376,9 @@ def fit_model(
         inflate = max(1.0, np.sqrt(best.chi)) if np.isfinite(best.chi) else 1.0
         best = _reprice(best, runs, inflate)
 
-        def linearise(pair: tuple[Run, Locals], at: Fit = best, inflate: float = inflate) -> _Linear:
+        def linearise(
+            pair: tuple[Run, Locals], at: Fit = best, inflate: float = inflate
+        ) -> _Linear:
             return _linearise(
                 structure,
                 at.theta,
@@ -406,7 +408,9 @@ def fit_model(
                 scale = np.maximum(scale, 1e-9 * max(1e-30, scale.max()))
                 A = np.concatenate([J[:, active], np.diag(np.sqrt(damp) * scale)])
                 step = np.linalg.lstsq(A, np.concatenate([r, np.zeros(active.size)]), rcond=None)[0]
-                out = (best.theta[active] + step <= low[active]) & (best.theta[active] <= low[active])
+                out = (best.theta[active] + step <= low[active]) & (
+                    best.theta[active] <= low[active]
+                )
                 out |= (best.theta[active] + step >= high[active]) & (
                     best.theta[active] >= high[active]
                 )
@@ -485,6 +489,41 @@ def _learn_spread(fit: Fit, runs: Sequence[Run], linear: Sequence[_Linear]) -> F
     return replace(fit, spread=spread, theta=theta)
 
 
+def project(
+    fit: Fit, runs: Sequence[Run], extras: Sequence[Array], *, mapper: Mapper = map
+) -> tuple[Array, Array]:
+    """Project changes of the readings off everything the fit can absorb.
+
+    Parameters
+    ----------
+    extras : per run (k, rows, samples): what k further effects would add to the readings.
+
+    Returns
+    -------
+    (rows, k) what is left of them, and (rows,) what is left of the residual.
+    """
+    inflate = max(1.0, np.sqrt(fit.chi))
+
+    def linearise(job: tuple[Run, Locals, Array]) -> _Linear:
+        run, own, extra = job
+        return _linearise(
+            fit.structure,
+            fit.theta,
+            run,
+            own,
+            inflate=inflate,
+            spread=fit.spread,
+            scatter_free=True,
+            refine=1.0,
+            extras=extra,
+        )
+
+    linear = list(mapper(linearise, zip(runs, fit.locals_, extras, strict=True)))
+    R = np.linalg.qr(np.concatenate([part.reduced for part in linear]), mode="r")
+    shared = fit.theta.size
+    return R[shared:, shared:-1], R[shared:, -1]
+
+
 def covariance(fit: Fit, runs: Sequence[Run], *, refine: float = 1.0, mapper: Mapper = map) -> Fit:
     """Return the fit with the covariance of its parameters, scaled by its own misfit."""
 
@@ -505,8 +544,6 @@ def covariance(fit: Fit, runs: Sequence[Run], *, refine: float = 1.0, mapper: Ma
     s = np.maximum(s, 1e-9 * s[0])
     cov = (vt.T / s**2) @ vt * max(1.0, fit.chi)
     log_det = float(
-        sum(
-            np.log(np.abs(np.diagonal(part.own[:, : part.own.shape[0]]))).sum() for part in linear
-        )
+        sum(np.log(np.abs(np.diagonal(part.own[:, : part.own.shape[0]]))).sum() for part in linear)
     )
     return replace(fit, covariance=cov, log_det=log_det)

@@ -102,7 +102,8 @@ def make_run(record: Record, *, n: int) -> Run:
         if at_rest:
             start[row], slope[row] = y[j, 0], 0.0
     if record.hold == "band_limited":
-        knots, command = interpolate_band_limited(t, u)
+        knots, smooth = interpolate_band_limited(t, u)
+        command = np.append(0.5 * (smooth[1:] + smooth[:-1]), smooth[-1])
     else:
         knots, command = t, u
     rate = 1.0 / float(np.median(np.diff(t)))
@@ -186,7 +187,9 @@ def _smooth_state(t: Array, y: Array, at: int, *, window: float = 0.03) -> tuple
     half = max(3, round(window / float(t[1] - t[0])))
     low, high = max(0, at - half), min(t.size, at + half + 1)
     if high - low < 2 * half + 1:
-        low, high = (0, min(t.size, 2 * half + 1)) if low == 0 else (max(0, high - 2 * half - 1), high)
+        low, high = (
+            (0, min(t.size, 2 * half + 1)) if low == 0 else (max(0, high - 2 * half - 1), high)
+        )
     local = (t[low:high] - t[at]) / window
     coefficients = np.polyfit(local, y[low:high], min(3, local.size - 1))
     return float(coefficients[-1]), float(coefficients[-2] / window)

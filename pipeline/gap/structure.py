@@ -106,10 +106,7 @@ class Structure:
                 Term(
                     effect=candidate.effect,
                     place=candidate.place,
-                    values=tuple(
-                        float(v)
-                        for v in _values(candidate, coordinates)
-                    ),
+                    values=tuple(float(v) for v in _values(candidate, coordinates)),
                 )
             )
         return AugmentedChain(chain=self.chain(theta), terms=tuple(terms))

@@ -1,0 +1,148 @@
+"""The linear chain fitted to all runs at once, so that only missing structure is left."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from pipeline.errors import DataError
+from pipeline.gap.fit import Fit, Mapper, fit_model, fresh_locals, simulate_run
+from pipeline.gap.runs import Run, cut_shots, high_frequency_noise
+from pipeline.gap.structure import Structure
+from pipeline.plant.chain import Array, Chain
+
+SHOT_LENGTH = 0.6  # s; a wrong structure does little harm over it
+_WINDOW = 0.3  # s, of the modulating functions
+_SMALLEST_ZETA = 0.002
+
+
+def first_chain(runs: Sequence[Run], *, springs: Sequence[bool]) -> Chain:
+    """Estimate masses, dampings and springs by modulating functions.
+
+    The equations of motion are multiplied by (s (1 - s))⁴ over windows and integrated by parts,
+    which moves all derivatives from the data to the window; what is left is linear.
+
+    Reference: M. Shinbrot, Trans. ASME 79 (1957), 579-588.
+
+    Raises
+    ------
+    DataError : no run has an input, so that forces have no scale.
+    """
+    n = len(springs) - 1
+    rows = [j for j, there in enumerate(springs) if there]
+    rows = rows[:1] if n == 1 else rows
+    columns = 2 * n + len(rows)
+    equations: list[Array] = []
+    right: list[float] = []
+    for run in runs:
+        step = max(1, round(0.05 / run.record.sample_time))
+        width = max(8, round(_WINDOW / run.record.sample_time))
+        x = np.zeros((n, run.t.size))
+        for j, row in enumerate(run.rows):
+            x[row] = run.y[j] - run.zero[row]
+        size = max(1e-12, float(np.abs(x).max()))
+        u = (
+            np.interp(run.t, run.knots, run.command)
+            if run.knots.size != run.t.size
+            else run.command
+        )
+        for first in range(0, run.t.size - width, step):
+            piece = slice(first, first + width)
+            t = run.t[piece]
+            span = t[-1] - t[0]
+            s = (t - t[0]) / span
+            w = (s * (1 - s)) ** 4
+            w1 = 4 * (s * (1 - s)) ** 3 * (1 - 2 * s) / span
+            w2 = (12 * (s * (1 - s)) ** 2 * (1 - 2 * s) ** 2 - 8 * (s * (1 - s)) ** 3) / span**2
+            local = x[:, piece]
+            stretch = np.vstack([local, np.zeros(width)]) - np.vstack([np.zeros(width), local])
+            for i in run.rows:
+                if not run.free[i]:
+                    continue
+                equation = np.zeros(columns)
+                equation[i] = np.trapezoid(local[i] * w2, t)
+                equation[n + i] = -np.trapezoid(local[i] * w1, t)
+                for at, j in enumerate(rows, start=2 * n):
+                    if j == i:
+                        equation[at] += np.trapezoid(stretch[j] * w, t)
+                    if j == i + 1:
+                        equation[at] -= np.trapezoid(stretch[j] * w, t)
+                equations.append(equation / size)
+                # A held input acts over the sample that follows.
+                force = 0.5 * (u[piece] + np.append(u[first], u[piece][:-1])) if i == 0 else 0 * t
+                right.append(float(np.trapezoid(force * w, t)) / size)
+    A, b = np.array(equations), np.array(right)
+    if not np.any(b):
+        raise DataError("gap: needs a run with an input, found free decays only")
+    scale = np.linalg.norm(A, axis=0)
+    p = np.linalg.lstsq(A / scale, b, rcond=None)[0] / scale
+    m = np.maximum(p[:n], 0.02 * max(1e-12, np.abs(p[:n]).max()))
+    k = np.zeros(n + 1)
+    k[rows] = np.maximum(p[2 * n :], 1e-3 * max(1e-12, np.abs(p[2 * n :]).max(initial=0.0)))
+    diagonal = k[:-1] + k[1:]
+    floor = 2 * _SMALLEST_ZETA * np.sqrt(m * np.maximum(diagonal, 1e-12))
+    return Chain(m=m, c=np.maximum(p[n : 2 * n], floor), k=k)
+
+
+def fit_baseline(
+    runs: Sequence[Run], *, springs: Sequence[bool], start: Chain | None, mapper: Mapper = map
+) -> tuple[Fit, list[Run]]:
+    """Fit the linear chain; returns it with the runs, their noise now measured.
+
+    Short pieces with states of their own first, then whole runs; the better of the stages'
+    chain and a first estimate of its own is kept.
+    """
+    structure = Structure(springs=tuple(springs))
+    shots = [cut_shots(run, length=SHOT_LENGTH) for run in runs]
+    starts = [chain for chain in (start,) if chain is not None]
+    try:
+        starts.append(first_chain(runs, springs=springs))
+    except DataError:
+        if not starts:
+            raise
+    fits = [
+        fit_model(structure, structure.vector(chain), shots, iterations=15, mapper=mapper)
+        for chain in starts
+    ]
+    best = min(fits, key=lambda fit: fit.cost)
+    noisy = measure_noise(best, shots, runs)
+    candidates = [best.theta]
+    full = [
+        fit_model(structure, theta, noisy, iterations=25, mapper=mapper) for theta in candidates
+    ]
+    return min(full, key=lambda fit: fit.cost), noisy
+
+
+def measure_noise(fit: Fit, shots: Sequence[Run], runs: Sequence[Run]) -> list[Run]:
+    """Return the runs with the noise of each cart: encoder step or high-frequency residual."""
+    found: dict[int, list[float]] = {}
+    for shot, own in zip(shots, fit.locals_, strict=True):
+        model = simulate_run(fit.structure, fit.theta[None], shot, own)[0]
+        for j, row in enumerate(shot.rows):
+            pieces = [
+                high_frequency_noise((shot.y - model)[j, a:b])
+                for a, b in zip(shot.shots[:-1], shot.shots[1:], strict=True)
+            ]
+            found.setdefault(row, []).append(float(np.median(pieces)))
+    out = []
+    for run in runs:
+        floor = np.array([run.record.encoder_step(row + 1) / np.sqrt(12.0) for row in run.rows])
+        measured = np.array([np.median(found[row]) for row in run.rows])
+        span = np.ptp(run.y, axis=1)
+        out.append(replace(run, sigma=np.maximum(np.maximum(floor, measured), 1e-7 * span)))
+    return out
+
+
+def fit_locals(fit: Fit, runs: Sequence[Run], *, refine: float = 1.0, mapper: Mapper = map) -> Fit:
+    """Fit only what belongs to the runs: for runs the model has not seen."""
+    return fit_model(
+        fit.structure,
+        fit.theta,
+        runs,
+        locals_=[fresh_locals(run) for run in runs],
+        spread=fit.spread,
+        fixed=range(fit.theta.size),
+        iterations=10,
+        refine=refine,
+        mapper=mapper,
+    )

@@ -1,0 +1,303 @@
+"""Search the catalogue: screen, refit the suspects, keep a few hypotheses, grow them, prune."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from pipeline.gap.baseline import SHOT_LENGTH, fit_locals
+from pipeline.gap.fit import Fit, Mapper, fit_model, simulate_run
+from pipeline.gap.runs import Run, cut_shots
+from pipeline.gap.screen import Suspect, candidates_at, extend, screen
+from pipeline.gap.structure import Candidate, Structure
+from pipeline.plant.chain import Array
+from pipeline.plant.effects import CATALOGUE
+from pipeline.plant.effects.base import Effect
+
+AT_FLOOR = 1.15  # chi-square per point below this is noise
+_SHORT_LIST = 9  # suspects refitted on pieces
+_FULL_LIST = 5  # of which the best are refitted on whole runs …
+_FULL_SCREEN = 3  # … with the best of a screen on whole runs
+_BEAM = 3
+_HOPELESS = 30.0  # a hypothesis with this many times the best one's chi-square is not grown
+_DEPTH = 3
+_BIC_DROP = 20.0
+_THINNING = 10.0  # neighbouring residuals are not independent: N / 10 count
+_HELD_OUT_GAIN = 0.95  # an effect must lower the held-out error by this factor …
+_RUN_GAIN, _RUN_SHARE = 0.97, 0.6  # … and by 3 % in 60 % of the runs
+_SEVERAL_STARTS = ("extra_mode", "end_stop", "backlash", "slack_spring")
+_CONTACT = ("end_stop", "backlash")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Hypothesis:
+    """A model with its fit on training runs and what it leaves on held-out ones.
+
+    `added` is the effect added last; `parent` the hypothesis it was added to.
+    """
+
+    fit: Fit
+    held: Fit
+    error: float
+    run_error: Array
+    bic: float
+    added: Candidate | None = None
+    parent: "Hypothesis | None" = None
+
+    @property
+    def key(self) -> frozenset[tuple[str, int]]:
+        """Which effects act where."""
+        return frozenset(c.key for c in self.fit.structure.effects)
+
+    @property
+    def at_floor(self) -> bool:
+        """Is nothing left but noise, on training and on held-out runs?"""
+        return self.fit.chi < AT_FLOOR and self.held.chi < AT_FLOOR
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Bench:
+    """What every step of the search needs: the runs, the springs, and who maps over runs."""
+
+    training: tuple[Run, ...]
+    held_out: tuple[Run, ...]
+    springs: tuple[bool, ...]
+    mapper: Mapper
+    tell: Callable[[str], None]
+
+
+def judge(
+    fit: Fit, bench: Bench, *, added: Candidate | None = None, parent: Hypothesis | None = None
+) -> Hypothesis:
+    """Return the hypothesis a fit stands for."""
+    held = fit_locals(fit, bench.held_out, mapper=bench.mapper)
+    errors, sizes = [], []
+    for run, own in zip(bench.held_out, held.locals_, strict=True):
+        model = simulate_run(fit.structure, fit.theta[None], run, own)[0]
+        errors.append(float(((run.y - model) ** 2).sum()))
+        sizes.append(float((run.swing**2).sum() * run.t.size))
+    effective = fit.n_points / _THINNING
+    bic = effective * np.log(fit.cost / fit.n_points) + fit.theta.size * np.log(effective)
+    return Hypothesis(
+        fit=fit,
+        held=held,
+        error=float(np.sqrt(sum(errors) / sum(sizes))),
+        run_error=np.sqrt(np.array(errors) / np.array(sizes)),
+        bic=float(bic),
+        added=added,
+        parent=parent,
+    )
+
+
+def search(baseline: Hypothesis, bench: Bench, *, depth: int = _DEPTH) -> list[Hypothesis]:
+    """Return every hypothesis judged, the baseline first."""
+    seen: dict[frozenset[tuple[str, int]], Hypothesis] = {baseline.key: baseline}
+    beam = [baseline]
+    for level in range(depth):
+        children: list[Hypothesis] = []
+        best = min(beam, key=lambda h: h.bic)
+        for parent in beam:
+            if parent.at_floor or parent.fit.chi > _HOPELESS * best.fit.chi:
+                continue
+            if parent.added and parent.added.effect.key == "end_stop" and level > 0:
+                continue  # what an end stop leaves is its contact law
+            for child in grow(parent, bench):
+                if child.key not in seen or child.bic < seen[child.key].bic:
+                    seen[child.key] = child
+                    if child.bic < parent.bic - _BIC_DROP:
+                        children.append(child)
+        if not children:
+            break
+        unique = {child.key: child for child in sorted(children, key=lambda h: -h.bic)}
+        beam = sorted(unique.values(), key=lambda h: h.bic)[:_BEAM]
+        bench.tell(f"{level + 1} effect{'s' * (level > 0)}: " + _names(beam[0]))
+        if beam[0].at_floor:
+            break
+    return list(seen.values())
+
+
+def _names(hypothesis: Hypothesis) -> str:
+    return " + ".join(c.label for c in hypothesis.fit.structure.effects)
+
+
+def grow(parent: Hypothesis, bench: Bench) -> list[Hypothesis]:
+    """Return the children of a hypothesis: one further effect each, fully refitted."""
+    fit_pieces = partial(fit_model, mapper=bench.mapper, scatter_free=False)
+    whole = bench.training
+    pieces = [cut_shots(run, length=SHOT_LENGTH) for run in whole]
+    start = fit_pieces(parent.fit.structure, parent.fit.theta, pieces, iterations=4)
+    look = partial(screen, whole=whole, springs=bench.springs, mapper=bench.mapper)
+    suspects = look(start, pieces)
+    short = [_short_refit(start, s, pieces, bench) for s in suspects[:_SHORT_LIST]]
+    short.sort(key=lambda pair: pair[1].cost)
+    chosen = {pair[0].key: pair for pair in reversed(short[:_FULL_LIST])}
+    for suspect in look(parent.fit, whole)[:_FULL_SCREEN]:
+        if suspect.candidate.key not in chosen:
+            pair = next((p for p in short if p[0].key == suspect.candidate.key), None)
+            chosen[suspect.candidate.key] = pair or _short_refit(start, suspect, pieces, bench)
+    children = []
+    for candidate, fit in chosen.values():
+        child = _full_refit(candidate, fit, parent, bench)
+        children.append(child)
+        if candidate.effect.family == "dry friction":
+            for effect in CATALOGUE:
+                if effect.grows_from == candidate.effect.key:
+                    children.append(_grown_friction(effect, child, parent, bench))
+    return children
+
+
+def _short_refit(
+    start: Fit, suspect: Suspect, pieces: Sequence[Run], bench: Bench
+) -> tuple[Candidate, Fit]:
+    """Refit a suspect on pieces; where the landscape is rugged, from several starts."""
+    several = suspect.candidate.effect.key in _SEVERAL_STARTS
+    fits = []
+    for values in suspect.starts[: 4 if several else 1]:
+        structure, theta = extend(start, suspect.candidate, values)
+        fits.append(
+            fit_model(
+                structure,
+                theta,
+                pieces,
+                iterations=3 if several else 5,
+                scatter_free=False,
+                mapper=bench.mapper,
+            )
+        )
+    best = min(fits, key=lambda fit: fit.cost)
+    if several:
+        best = fit_model(
+            best.structure,
+            best.theta,
+            pieces,
+            locals_=best.locals_,
+            iterations=6,
+            scatter_free=False,
+            mapper=bench.mapper,
+        )
+    return suspect.candidate, best
+
+
+def _full_refit(
+    candidate: Candidate, start: Fit, parent: Hypothesis, bench: Bench
+) -> Hypothesis:
+    fit = fit_whole(start.structure, start.theta, bench)
+    return judge(fit, bench, added=candidate, parent=parent)
+
+
+def fit_whole(structure: Structure, theta: Array, bench: Bench, *, refine: float = 1.0) -> Fit:
+    """Fit whole runs; friction first with one size for all runs, then run by run."""
+    whole = bench.training
+    dry = any(structure.dry)
+    fit = fit_model(
+        structure,
+        theta,
+        whole,
+        iterations=12,
+        scatter_free=False,
+        refine=refine,
+        mapper=bench.mapper,
+    )
+    if dry and fit.chi > AT_FLOOR:
+        fit = fit_model(
+            structure,
+            fit.theta,
+            whole,
+            locals_=fit.locals_,
+            iterations=12,
+            learn_spread=True,
+            refine=refine,
+            mapper=bench.mapper,
+        )
+    return fit
+
+
+def _grown_friction(
+    effect: Effect, simple: Hypothesis, parent: Hypothesis, bench: Bench
+) -> Hypothesis:
+    """Fit a richer friction law from the simpler one's fit."""
+    structure = simple.fit.structure
+    index = len(structure.effects) - 1
+    place = structure.effects[index].place
+    force = simple.fit.structure.model(simple.fit.theta).terms[index].values[0]
+    base = simple.fit.theta[: structure.span(index).start]
+    trials = candidates_at(
+        effect, place, runs=bench.training, chain=structure.chain(simple.fit.theta)
+    )
+    without = structure.without(index)
+    fits = []
+    tried = set()
+    for candidate, values in trials:
+        start = _friction_start(effect, force, values)
+        if start in tried:
+            continue
+        tried.add(start)
+        grown = without.with_effect(candidate)
+        theta = extend(replace(simple.fit, structure=without, theta=base), candidate, start)[1]
+        fits.append(
+            fit_model(
+                grown,
+                theta,
+                bench.training,
+                iterations=4,
+                scatter_free=False,
+                mapper=bench.mapper,
+            )
+        )
+    best = min(fits, key=lambda fit: fit.cost)
+    fit = fit_whole(best.structure, best.theta, bench)
+    return judge(fit, bench, added=best.structure.effects[-1], parent=parent)
+
+
+def _friction_start(
+    effect: Effect, force: float, values: tuple[float, ...]
+) -> tuple[float, ...]:
+    """Return start values: the simpler law's force, and trial values for what is new."""
+    start = []
+    for parameter, value in zip(effect.parameters, values, strict=True):
+        if parameter.name == "force":
+            start.append(force)
+        elif parameter.name == "static_force":
+            start.append(1.5 * force)
+        else:
+            start.append(value)
+    return tuple(start)
+
+
+# ----------------------------------------------------------------------- choosing
+
+
+def worth_it(child: Hypothesis, parent: Hypothesis) -> bool:
+    """Does a further effect help on runs the model has not seen?"""
+    if child.bic > parent.bic - _BIC_DROP or child.error > _HELD_OUT_GAIN * parent.error:
+        return False
+    better = child.run_error < _RUN_GAIN * parent.run_error
+    return bool(np.mean(better) >= _RUN_SHARE)
+
+
+def choose(found: Sequence[Hypothesis], baseline: Hypothesis) -> Hypothesis:
+    """Return the best hypothesis whose every effect is worth it, the smaller where in doubt."""
+    best = baseline
+    for size in range(1, _DEPTH + 1):
+        level = [h for h in found if len(h.key) == size]
+        level = [h for h in level if worth_it(h, best)]
+        if level:
+            best = min(level, key=lambda h: h.bic)
+    return best
+
+
+def prune(chosen: Hypothesis, bench: Bench) -> Hypothesis:
+    """Drop effects the others have made needless; reduce rich friction to Coulomb's."""
+    while len(chosen.key) > 1:
+        trials = []
+        for index in range(len(chosen.fit.structure.effects)):
+            structure = chosen.fit.structure.without(index)
+            theta = np.delete(chosen.fit.theta, np.r_[chosen.fit.structure.span(index)])
+            fit = fit_whole(structure, theta, bench)
+            trials.append(judge(fit, bench, added=structure.effects[-1], parent=chosen.parent))
+        smaller = min(trials, key=lambda h: h.bic)
+        if worth_it(chosen, smaller):
+            return chosen
+        chosen = smaller
+    return chosen
