@@ -208,7 +208,10 @@ def even_chain(values: Mapping[str, float], *, n: int, springs: Sequence[bool]) 
     ]
     gain = values.get("K", values.get("K_1"))
     if not omegas or gain is None:
-        raise DataError("a start needs the gain of cart 1 and a resonance, found neither or one")
+        raise DataError(
+            "fit: a start needs the gain of cart 1 and a resonance, "
+            f"found {', '.join(values) or 'nothing'}"
+        )
     present = [any(springs), False] if n == 1 else list(springs)
     unit = Chain(m=np.ones(n), c=np.zeros(n), k=np.array(present, dtype=float))
     own = np.sort(np.abs(unit.poles))[::2]  # each resonance stands twice, with its conjugate

@@ -24,10 +24,11 @@ _LARGEST_RELATIVE_STD = 0.2
 _GRID_RATIO = 1.02  # some five lines across the half-power width 2ζω of a mode with ζ = 0.05
 
 # Peaks and nulls
-_LEAST_PROMINENCE = 0.05  # of ln|G|; and four standard errors
+_LEAST_PROMINENCE = 0.05  # of ln|G|; and six standard errors: noise alone spans five in 40 points
 _CLEAR = 0.1  # relative error above which a point shows no peak
+_CLEAR_FALL = 3.0  # below the low-frequency level: a mode has been passed, twice its frequency
 _LOW_SHARE = 0.7  # of the first resonance: below, a gain can be told from the magnitude
-_SAME_PEAK = 0.1  # of ln(omega): carts share their resonances
+_SAME_PEAK = 0.15  # of ln(omega): carts share their resonances
 ASSUMED_ZETA = 0.1  # the paper's usual guess for a mode or a null
 
 
@@ -252,7 +253,7 @@ def _extrema(response: FrequencyResponse, *, sign: int) -> list[_Extremum]:
             continue
         left, right = level[:i][::-1], level[i + 1 :]
         prominence = level[i] - max(_saddle(left, level[i]), _saddle(right, level[i]))
-        if prominence < max(_LEAST_PROMINENCE, 4 * np.max(error[i - 1 : i + 2])):
+        if prominence < max(_LEAST_PROMINENCE, 6 * np.max(error[i - 1 : i + 2])):
             continue
         curve = np.polyfit(position[i - 1 : i + 2] - position[i], level[i - 1 : i + 2], 2)
         omega = omegas[i] * np.exp(-curve[1] / (2 * curve[0]))
@@ -295,15 +296,16 @@ def _with_damped_mode(response: FrequencyResponse, modes: Sequence[_Extremum]) -
     leave is 1/((omega/omega_0)² - 1).
     """
     top = max((mode.omega for mode in modes), default=0.0)
-    above = response.omega > 1.5 * top
-    if not above.any() or response.omega[0] > 0.7 * response.omega[above][-1]:
+    above = (response.omega > 1.5 * top) & (response.magnitude > 0)
+    starts_low = above.any() and response.omega[0] < _LOW_SHARE * response.omega[above][-1]
+    if not starts_low or response.magnitude[0] <= 0:
         return list(modes)
     omega, magnitude = response.omega[above], response.magnitude[above]
     fall = np.log(response.magnitude[0] / magnitude)
     for mode in modes:
         fall -= np.log(np.abs(1 - (omega / mode.omega) ** 2))
-    found = omega / np.sqrt(np.exp(fall) + 1)
-    usable = found[(fall > 0) & (found < 0.7 * omega)]
+    found = omega / np.sqrt(np.exp(np.maximum(fall, 0.0)) + 1)
+    usable = found[fall > np.log(_CLEAR_FALL)]
     if usable.size == 0:
         return list(modes)
     std = float(np.std(usable)) + 0.1 * float(np.median(usable))
