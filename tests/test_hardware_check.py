@@ -5,6 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from pipeline import submission
@@ -285,6 +287,22 @@ def test_a_record_that_begins_in_motion_has_its_start_fitted():
         assert check.overshoot_measured is None
 
 
+@pytest.mark.parametrize("start", [0, 30, 57, 90, 240])
+def test_a_closed_loop_cut_anywhere_is_checked_from_there(start):
+    """At rest, just after the step, or settled on it: the start is seen for what it is."""
+    design = designed(TWO, 2)
+    law = StateFeedback(gains=design.gains, prefilter=design.prefilter, model=TWO)
+    y, u = bench(TWO, law)
+    y, whole = y[:, start:], noise_floor(y[1])
+
+    run = record(y, u=u[start:], t=CLOCK[start:], reference=STEPS[start:])
+    opened = of(check_hardware(run, TWO, controller=stated(design)), "open")[2]
+
+    assert_allclose(known(opened.input_scale), 1.0, atol=0.01)
+    # A rest known from one reading is off by up to a count, all along.
+    assert opened.nrmse < 1.35 * whole + COUNT / np.sqrt(np.mean(y[1] ** 2))
+
+
 def test_uneven_and_rounded_time_does_no_harm():
     """Samples lost and stamps rounded to the millisecond leave a small difference."""
     rng = np.random.default_rng(3)
@@ -423,3 +441,65 @@ def test_the_ucsd_logs_differ_in_sign_and_scale(real_data, name, gains, closed_l
     if name == "closed_loop_pid.csv":  # integral action: within a percent of 1000 counts
         assert_allclose(known(closed.steady_state_measured), 1000.0, rtol=0.01)
         assert_allclose(known(closed.steady_state_model), 1000.0, rtol=0.01)
+
+
+# ----------------------------------------------------------------- anything goes
+
+
+@given(
+    n=st.integers(3, 60),
+    n_carts=st.integers(1, 3),
+    kind=st.sampled_from(["step", "sweep", "closed_loop", "sine", "decay"]),
+    shape=st.sampled_from(["noise", "step", "constant", "zero", "huge"]),
+    with_input=st.booleans(),
+    with_reference=st.booleans(),
+    controller=st.sampled_from(
+        [
+            None,
+            submission.Pid(type="pid", kp=1.0, ki=3.0, kd=-0.2),
+            submission.Pid(type="pid", kp=1.0, cart=3),
+            submission.StateFeedback(type="state_feedback", gains=(1.0, 1.0), prefilter=-2.0),
+            submission.StateFeedback(type="state_feedback", gains=(9.0,) * 4, prefilter=1e9),
+        ]
+    ),
+    seed=st.integers(0, 2**32 - 1),
+)
+@settings(max_examples=150, deadline=None)
+def test_whatever_is_recorded_gives_finite_numbers_or_a_clear_error(
+    n, n_carts, kind, shape, with_input, with_reference, controller, seed
+):
+    """Short, wild or senseless records never crash the check, and no result is NaN."""
+    rng = np.random.default_rng(seed)
+    t = np.cumsum(rng.uniform(1e-4, 0.02, n))
+    base = {
+        "noise": rng.standard_normal(n),
+        "step": np.where(np.arange(n) > n // 3, 1.0, 0.0),
+        "constant": np.ones(n),
+        "zero": np.zeros(n),
+        "huge": 1e9 * rng.standard_normal(n),
+    }[shape]
+    run = record(
+        rng.standard_normal((n_carts, 1)) * base,
+        u=base[rng.permutation(n)] if with_input else None,
+        t=t,
+        reference=base if with_reference else None,
+        kind=kind,
+    )
+    chain = PRESETS[f"throne-{n_carts}dof"]
+    try:
+        checks = check_hardware(run, chain, controller=controller, controlled_cart=1)
+    except DataError:
+        return
+    assert checks
+    for check in checks:
+        figures = [
+            check.nrmse,
+            check.overshoot_model,
+            check.overshoot_measured,
+            check.settling_model,
+            check.settling_measured,
+            check.steady_state_model,
+            check.steady_state_measured,
+            check.input_scale,
+        ]
+        assert all(np.isfinite(figure) for figure in figures if figure is not None)

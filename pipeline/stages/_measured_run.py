@@ -12,7 +12,8 @@ from pipeline.results import Record
 from pipeline.stages._signals import local_noise
 
 _STILL = 0.02  # of its range that a signal may vary while nothing happens
-_MIN_QUIET = 5  # samples at rest that show a rest; of a step or a closed loop one is believed
+_MIN_QUIET = 5  # samples at rest that show a rest
+_CLEARLY = 0.5  # of the misfit of a step from rest: what a start in motion must come down to
 _JUMP = 0.3  # of its range, within one sample: a step
 _MIN_STEP_SAMPLES = 10
 
@@ -42,8 +43,8 @@ class MeasuredRun:
 
     @property
     def driven(self) -> bool:
-        """There is a logged input, and it is not zero throughout."""
-        return self.record.u is not None and bool(np.any(self.record.u != 0))
+        """There is a logged input that moves the carts; its last sample comes too late to."""
+        return self.record.u is not None and bool(np.any(self.record.u[:-1] != 0))
 
     def forced(self) -> Array:
         """Return the response (f, n) of the chain, from rest, to the logged input."""
@@ -60,6 +61,16 @@ class MeasuredRun:
     def noise_floor(self) -> float:
         """The misfit of a simulation that is off by the noise alone."""
         return self.misfit(self.y + self.noise[:, None])
+
+    def input_scale(self) -> float:
+        """Return the factor on the logged input that explains the motion best."""
+        forced = self.forced()[self.seen]
+        moved = (self.y - self.unforced())[self.seen]
+        return float(np.sum(moved * forced) / np.sum(forced**2))
+
+    def best_misfit(self) -> float:
+        """Return the misfit of the open loop, its input taken times the best factor."""
+        return self.misfit(self.unforced() + self.input_scale() * self.forced())
 
     def misfit(self, model: Array) -> float:
         """Return the pooled NRMSE of readings `model` (f, n) over the measured carts."""
@@ -139,8 +150,11 @@ def measured_run(record: Record, chain: Chain) -> MeasuredRun:
     )
     # Six deviations, or as many encoder steps, of a rest are more than chance.
     at_rest = np.all(np.ptp(y[:, :quiet], axis=1) <= 6 * run.noise)
-    shown = quiet >= _MIN_QUIET or record.kind in ("step", "closed_loop")
-    return run if (at_rest and shown) or not run.driven else run.begun_in_motion()
+    if not run.driven or (at_rest and quiet >= _MIN_QUIET):
+        return run
+    moving = run.begun_in_motion()
+    usual = at_rest and record.kind in ("step", "closed_loop")
+    return run if usual and moving.best_misfit() > _CLEARLY * run.best_misfit() else moving
 
 
 def _quiet_samples(record: Record) -> int:

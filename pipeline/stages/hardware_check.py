@@ -90,9 +90,7 @@ class _Simulated:
 
 def _open(run: MeasuredRun) -> _Simulated:
     """Drive the chain with the logged input, times a factor where the log cannot be right."""
-    forced, unforced = run.forced(), run.unforced()
-    moved = (run.y - unforced)[run.seen]
-    scale = float(np.sum(moved * forced[run.seen]) / np.sum(forced[run.seen] ** 2))
+    forced, unforced, scale = run.forced(), run.unforced(), run.input_scale()
     as_logged, scaled = run.misfit(unforced + forced), run.misfit(unforced + scale * forced)
     if _plausible(scale) or scaled > min(_WORTH_IT * as_logged, _EXPLAINED):
         return _Simulated(y=unforced + forced, scale=scale, note="")
