@@ -14,6 +14,7 @@ from pipeline.results import Record
 _SAME_INPUT = 0.2
 _SAME_DURATION = 0.8  # shorter over longer
 _MATERIAL = 0.05  # of the response; a smaller difference changes nothing anybody would act on
+_AMPLIFICATION = 2.0  # of a relative difference of the inputs by a lightly damped chain
 _START_SAMPLES = 3  # their median is the start: too few to move, enough to outvote a spike
 # How many spreads of the others a repeat must stand off. Where all repeats differ by chance
 # (along one shape, normally distributed) this flags 5 % of the sets, and far fewer where they
@@ -48,10 +49,10 @@ def find_outlier_repeats(records: Sequence[Record]) -> tuple[OutlierRepeat, ...]
     """
     outliers: list[OutlierRepeat] = []
     for group in _groups(records):
-        differences, size = _differences(group)
+        differences, expected = _differences(group)
         left = list(range(len(group)))
         while len(left) > 2 and 2 * (len(group) - len(left) + 1) < len(group):
-            found = _farthest(differences, left, size=size)
+            found = _farthest(differences, left, expected=expected)
             if found is None:
                 break
             index, distance, spread = found
@@ -94,9 +95,8 @@ def _is_repeat(first: Record, other: Record) -> bool:
     if min(spans) < _SAME_DURATION * max(spans):
         return False
     t = _common_times(first, other)
-    a, b = _at(t, first, _excitation(first)), _at(t, other, _excitation(other))
-    size = np.sqrt(np.mean(a**2) + np.mean(b**2))
-    return bool(np.sqrt(2 * np.mean((a - b) ** 2)) <= _SAME_INPUT * size)
+    u = np.concatenate([_at(t, record, _excitation(record)) for record in (first, other)])
+    return bool(_rms(u[0] - u[1]) <= _SAME_INPUT * _rms(u))
 
 
 def _common_times(*records: Record) -> Array:
@@ -110,21 +110,27 @@ def _at(t: Array, record: Record, signal: Array) -> Array:
     return np.stack([np.interp(t, record.t - record.t[0], row) for row in np.atleast_2d(signal)])
 
 
-def _differences(group: Sequence[Record]) -> tuple[Array, float]:
-    """Return how far the responses differ pair by pair, (n, n), and the size of a response.
+def _rms(signal: Array) -> float:
+    return float(np.sqrt(np.mean(signal**2)))
+
+
+def _differences(group: Sequence[Record]) -> tuple[Array, Array]:
+    """Return how far the responses differ pair by pair, (n, n), and how far they may.
 
     Root-mean-squares over carts and time. Positions count from where the record starts, as the
     encoders need not start at zero; where a cart comes to rest is part of its response.
     """
     t = _common_times(*group)
+    u = np.concatenate([_at(t, record, _excitation(record)) for record in group])  # (n, n_t)
     y = np.stack([_at(t, record, record.y) for record in group])  # (n, p, n_t)
     y = y - np.median(y[:, :, :_START_SAMPLES], axis=2, keepdims=True)
+    by_input = np.sqrt(np.mean((u[:, None] - u) ** 2, axis=2)) / _rms(u)
     differences = np.sqrt(np.mean((y[:, None] - y) ** 2, axis=(2, 3)))
-    return differences, float(np.median(np.sqrt(np.mean(y**2, axis=(1, 2)))))
+    return differences, (_MATERIAL + _AMPLIFICATION * by_input) * _rms(y)
 
 
 def _farthest(
-    differences: Array, left: Sequence[int], *, size: float
+    differences: Array, left: Sequence[int], *, expected: Array
 ) -> tuple[int, float, float] | None:
     """Return index, distance and spread of the others of the repeat that stands off, if any."""
     threshold = _SPREADS.get(len(left), _SPREADS_OF_MANY)
@@ -133,6 +139,6 @@ def _farthest(
         others = [i for i in left if i != index]
         distance = float(np.median(differences[index, others]))
         spread = float(np.median([differences[pair] for pair in combinations(others, 2)]))
-        if distance > max(threshold * spread, _MATERIAL * size):
+        if distance > max(threshold * spread, float(np.median(expected[index, others]))):
             candidates.append((index, distance, spread))
     return max(candidates, key=lambda found: found[1], default=None)

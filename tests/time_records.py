@@ -1,0 +1,101 @@
+"""Simulated time records of a chain: steps and hand-released decays."""
+
+import numpy as np
+
+from pipeline.plant.chain import Array, Chain
+from pipeline.plant.simulate import simulate_linear
+from pipeline.results import Hold, Kind, Record
+
+COUNT = 0.00227  # cm, an ECP 210 encoder count
+RATE = 113.0  # Hz, the ECP's usual
+
+
+def measure(
+    y: Array,
+    t: Array,
+    u: Array | None,
+    *,
+    kind: Kind,
+    carts: tuple[int, ...],
+    rng: np.random.Generator,
+    noise: float,
+    count: float = COUNT,
+    hold: Hold = "zero_order",
+    id: str = "run",
+) -> Record:
+    """Return true positions as an encoder with white noise before its rounding reads them."""
+    read = y + noise * rng.standard_normal(y.shape)
+    if count:
+        read = np.round(read / count) * count
+    return Record(
+        id=id,
+        kind=kind,
+        t=t,
+        u=u,
+        y=read,
+        carts=carts,
+        free=carts,
+        resolution=np.full(len(carts), count),
+        hold=hold,
+    )
+
+
+def step_record(
+    chain: Chain,
+    *,
+    rng: np.random.Generator,
+    swing: float = 1.0,
+    duration: float = 6.0,
+    rate: float = RATE,
+    jitter: float = 0.0,
+    noise: float = 0.0005,
+    count: float = COUNT,
+    free: tuple[int, ...] | None = None,
+    x0: Array | None = None,
+    id: str = "step",
+) -> Record:
+    """Return a step on after 0.1 s and off at half time that moves cart 1 by `swing` cm."""
+    carts = free or tuple(range(1, chain.n + 1))
+    t = np.arange(int(duration * rate)) / rate
+    t = t + jitter / rate * rng.uniform(-0.5, 0.5, t.size)
+    u = np.where((t > 0.1) & (t < duration / 2), swing / chain.static_gains()[0], 0.0)
+    y = simulate_linear(chain, t, u, free=carts, x0=x0)
+    return measure(y, t, u, kind="step", carts=carts, rng=rng, noise=noise, count=count, id=id)
+
+
+def decay_record(
+    chain: Chain, *, free: tuple[int, ...], rng: np.random.Generator, id: str = "decay"
+) -> Record:
+    """Return carts pulled aside over 0.5 s, held for 1 s and let go; the encoder zero is off."""
+    t = np.arange(int(7.0 * RATE)) / RATE
+    x0 = np.zeros(2 * len(free))
+    x0[0::2] = rng.uniform(1.0, 2.0, len(free))  # cm
+    pull, hold = int(0.5 * RATE), int(1.0 * RATE)
+    after = t[: t.size - pull - hold]
+    y = np.concatenate(
+        [
+            x0[0::2, None] * np.linspace(0, 1, pull),
+            np.repeat(x0[0::2, None], hold, axis=1),
+            simulate_linear(chain, after, np.zeros(after.size), free=free, x0=x0),
+        ],
+        axis=1,
+    )
+    return measure(y + 0.3, t, None, kind="decay", carts=free, rng=rng, noise=0.0005, id=id)
+
+
+def random_chain(n: int, rng: np.random.Generator) -> tuple[Chain, tuple[bool, ...]]:
+    """Return a chain of n carts unlike its neighbours (cm, V), and which springs it has.
+
+    Carts alone at some 6 to 60 rad/s with damping ratios from 0.01 to 0.3; about half have no
+    spring to one of the walls.
+    """
+    omega = np.exp(rng.uniform(np.log(6), np.log(40)))
+    m = 2e-4 * np.exp(rng.uniform(-0.7, 0.7, n))
+    k = m.mean() * omega**2 * np.exp(rng.uniform(-0.9, 0.9, n + 1))
+    if n == 1:
+        k = np.array([k.sum(), 0.0])
+    elif rng.random() < 0.5:
+        k[rng.choice([0, n])] = 0.0
+    zeta = np.exp(rng.uniform(np.log(0.01), np.log(0.3), n))
+    c = 2 * zeta * np.sqrt((k[:-1] + k[1:]) * m)
+    return Chain(m=m, c=c, k=k), tuple(bool(stiffness > 0) for stiffness in k)
