@@ -1,6 +1,7 @@
 """The command line as people meet it: real processes, exit codes, one clear line."""
 
 import json
+import shutil
 import subprocess
 import sys
 
@@ -93,8 +94,6 @@ def test_what_cannot_run_is_one_line_and_status_two(tmp_path, arguments, expecte
 def test_failed_checks_are_status_one(tmp_path):
     """A submission whose steps have a wrong scale is reported, and the exit status says so."""
     folder = tmp_path / "scaled"
-    import shutil
-
     shutil.copytree(EXAMPLES / "one-cart", folder)
     for file in (folder / "data").glob("step-*.csv"):
         lines = file.read_text(encoding="utf-8").splitlines()

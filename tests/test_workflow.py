@@ -75,7 +75,7 @@ def _without(tmp_path, *, kinds, example="two-cart"):
 def test_a_missing_experiment_is_skipped_with_its_reason_and_the_rest_goes_on(
     tmp_path, kind, stage
 ):
-    """Without one kind of experiment its stage is skipped; the carts are identified all the same."""
+    """Without one kind of experiment its stage is skipped; the carts are still identified."""
     analysis = analyse(_without(tmp_path, kinds=[kind]))
     assert stage in {skip.stage for skip in analysis.skipped}
     truth = PRESETS["throne-2dof"]
