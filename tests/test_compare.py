@@ -1,0 +1,127 @@
+"""Comparison of estimates, and the laws of a real chain, on chains and on the paper's tables."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.plant.chain import PRESETS, Chain
+from pipeline.results import ChainFit, Estimate
+from pipeline.stages.compare import (
+    DAMPING_LIMIT,
+    GAIN_AND_FREQUENCY_LIMIT,
+    check_chain,
+    check_rows,
+    compare,
+)
+
+
+def _estimate(value, std=None, source="step"):
+    return Estimate(value=value, std=std, source=source)
+
+
+def _row(before, after, *, name="K", std=None, source="step"):
+    rows = compare(
+        {name: _estimate(before, std, source)},
+        final={name: _estimate(after, std, "bode_fit")},
+        names=[name],
+        position_unit="cm",
+        input_unit="V",
+    )
+    return rows[0]
+
+
+def _fit(chain, parameters=None):
+    values = parameters or chain.parameters()
+    names = (*(f"m_{i + 1}" for i in range(chain.n)), "k_1")
+    return ChainFit(
+        method="bode_fit",
+        chain=chain,
+        names=names,
+        covariance=np.diag(np.full(len(names), 1e-12)),
+        parameters={name: _estimate(value, 0.0, "bode_fit") for name, value in values.items()},
+        chi_square_per_dof=1.0,
+        dof=10,
+        n_points=30,
+        n_starts=1,
+        converged=True,
+        message="",
+    )
+
+
+def test_change_is_signed_and_in_percent_of_the_initial_value():
+    """Table 1's K: 30.6 to 28.9 is minus 5.6 percent."""
+    row = _row(30.6, 28.9)
+    assert row.change_percent == pytest.approx(100 * (28.9 - 30.6) / 30.6)
+    assert (row.unit, row.consistent) == ("cm/V", True)
+
+
+@pytest.mark.parametrize(
+    ("name", "limit"), [("omega_n", GAIN_AND_FREQUENCY_LIMIT), ("zeta", DAMPING_LIMIT)]
+)
+def test_limits_are_tight_for_frequencies_and_loose_for_damping(name, limit):
+    """Just inside the limit agrees, just outside disagrees."""
+    assert _row(1.0, 1.0 + 0.999 * limit / 100, name=name).consistent
+    assert not _row(1.0, 1.0 + 1.001 * limit / 100, name=name).consistent
+
+
+def test_a_large_change_within_three_standard_errors_is_chance():
+    """Two uncertain numbers may differ by more than the limit and still agree."""
+    # 30 % apart, combined standard error √2 · 0.1: 2.1 of them.
+    assert _row(1.0, 1.3, std=0.1).consistent
+    assert not _row(1.0, 1.3, std=0.05).consistent
+
+
+def test_an_assumed_value_is_never_judged():
+    """The paper's ζ = 0.1 is a guess: the change is shown, no verdict is given."""
+    row = _row(0.1, 0.03, name="zeta_b", source="assumed")
+    assert row.consistent is None
+    assert row.change_percent == pytest.approx(-70.0)
+    assert not check_rows([row])
+
+
+def test_a_disagreement_advises_what_to_look_at():
+    """The message of a failed check carries both the number and a hint."""
+    (check,) = check_rows([_row(0.1, 0.3, name="zeta_2")])
+    assert check.outcome == "fail"
+    assert "+200.0 %" in check.message
+    assert "larger amplitude" in check.message
+
+
+positive = st.floats(0.2, 5.0)
+
+
+@given(st.integers(2, 4), st.data())
+def test_real_chains_pass_every_law(n, data):
+    """Whatever the masses and springs, a real lightly damped chain breaks no law."""
+    draw = lambda size: np.array(data.draw(st.lists(positive, min_size=size, max_size=size)))  # noqa: E731
+    chain = Chain(m=draw(n), c=0.02 * draw(n), k=draw(n + 1))
+    checks = check_chain(_fit(chain), springs=(True,) * (n + 1))
+    assert [check.id for check in checks if check.outcome == "fail"] == []
+
+
+def test_a_negative_spring_is_named():
+    """A spring below zero by more than its standard error fails, by name."""
+    chain = PRESETS["throne-3dof"]
+    negative = replace(chain, k=np.array([-0.003, *chain.k[1:]]))
+    checks = {c.id: c for c in check_chain(_fit(negative), springs=(True,) * 4)}
+    assert checks["physical.signs"].outcome == "fail"
+    assert "k_1" in checks["physical.signs"].message
+
+
+def test_the_papers_third_table_breaks_the_laws_it_is_known_to_break():
+    """Printed Table 3: every ordering holds, the redundancies R4 and R5 do not."""
+    gains = {"K_1": 39.4, "K_2": 30.6, "K_3": 16.0}
+    modes = {"omega_a": 6.9, "omega_b": 24.1, "omega_c": 34.1}
+    dampings = {"zeta_a": 0.25, "zeta_b": 0.03, "zeta_c": 0.03}
+    nulls = {"omega_x": 20.2, "omega_y": 31.6, "zeta_x": 0.04, "zeta_y": 0.03}
+    carts = {"omega_1": 20.0, "omega_2": 27.2, "omega_3": 25.6}
+    alone = {"zeta_1": 0.08, "zeta_2": 0.02, "zeta_3": 0.04}
+    table = {**gains, **modes, **dampings, **nulls, **carts, **alone}
+    checks = check_chain(_fit(PRESETS["throne-3dof"], table), springs=(True,) * 4)
+    assert all(c.outcome == "pass" for c in checks if c.id.startswith("order."))
+    value = {c.id: c.value for c in checks}
+    assert value["redundancy.R4"] > 0.1
+    assert value["redundancy.R5"] > 0.02
