@@ -44,6 +44,12 @@ def record(t, u, y, *, omega, count=COUNT):
     )
 
 
+def cut(run, keep):
+    """Keep some of the samples."""
+    assert run.u is not None
+    return replace(run, t=run.t[keep], u=run.u[keep], y=run.y[:, keep])
+
+
 def sampled(duration, *, fs=FS):
     return np.arange(0, duration, 1 / fs)
 
@@ -67,7 +73,7 @@ def test_an_exact_steady_state_comes_back_exactly():
     """Without rounding, the response to the held staircase is the chain's to its sine."""
     run, truth = dwell(sampled(40.0), hertz=4.0, count=0.0)
     late = slice(int(30 * FS), None)  # 40 time constants: the transient is down to 1e-17
-    run = replace(run, t=run.t[late], u=run.u[late], y=run.y[:, late])
+    run = cut(run, late)
     got = fit_sine(run, cart=1)
     # A staircase also holds images about the sampling rate, which fold back onto the sine; the
     # plant passes (4/113)² of their 4/113: 5e-5 each.
@@ -113,7 +119,7 @@ def test_the_measured_times_are_used_as_they_are(clock):
     run, truth = dwell(sampled(9.0) if clock == "gap" else t, hertz=3.0)
     if clock == "gap":
         keep = np.delete(np.arange(run.t.size), np.arange(800, 840))
-        run = replace(run, t=run.t[keep], u=run.u[keep], y=run.y[:, keep])
+        run = cut(run, keep)
     got = fit_sine(run, cart=1)
     assert_allclose(got.gain, abs(truth[0]), rtol=2e-3)  # the held input is uneven, too
 
@@ -147,6 +153,7 @@ def test_a_noisy_input_leaves_the_stated_frequency():
     """Noise on the logged input is no reason to doubt the stated frequency."""
     rng = np.random.default_rng(4)
     run, truth = dwell(sampled(9.0), hertz=3.0)
+    assert run.u is not None
     noisy = run.u + 0.05 * np.ptp(run.u) * rng.normal(size=run.t.size)
     got = fit_sine(replace(run, u=noisy), cart=1)
     assert got.omega == run.omega
@@ -180,7 +187,7 @@ def test_two_cycles_of_steady_state_are_enough_for_an_estimate():
     """A record that begins in steady state may be as short as that."""
     run, truth = dwell(sampled(12.0), hertz=3.0)
     late = slice(int(11.3 * FS), None)
-    got = fit_sine(replace(run, t=run.t[late], u=run.u[late], y=run.y[:, late]), cart=1)
+    got = fit_sine(cut(run, late), cart=1)
     assert got.settled
     assert abs(got.gain - abs(truth[0])) < 4 * got.gain_std
 
@@ -205,7 +212,7 @@ def test_a_motion_that_is_no_sine_is_mentioned():
 def test_without_an_input_the_error_says_what_to_do():
     """Amplitude and phase are against the input: a file without it cannot be used."""
     run, _ = dwell(sampled(9.0))
-    with pytest.raises(DataError, match="needs the input beside the positions.*`columns`"):
+    with pytest.raises(DataError, match=r"needs the input beside the positions.*`columns`"):
         fit_sine(replace(run, u=None), cart=1)
 
 
@@ -242,8 +249,7 @@ def coverage(seeds, *, from_rest):
             rng=rng,
         )
         if not from_rest:
-            keep = t > wait
-            run = replace(run, t=t[keep], u=run.u[keep], y=run.y[:, keep])
+            run = cut(run, t > wait)
         got = fit_sine(run, cart=1)
         phase = np.angle(np.exp(1j * (got.phase - np.angle(truth[0]))))
         errors.append([(got.gain - abs(truth[0])) / got.gain_std, phase / got.phase_std])
