@@ -18,9 +18,9 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path
-from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator, StrMethodFormatter
 
 from pipeline.plant.chain import Array
+from pipeline.report.ticks import draw_ticks
 
 WIDTH = 5.0  # inches: 8.5 pt text stays readable when a phone shows it at three quarters
 MEASURED = "#222222"
@@ -39,7 +39,6 @@ _TOP, _BOTTOM = 0.26, 0.44  # for a legend or a title above, tick labels and tit
 _SHARED_GAP, _OWN_GAP = 0.13, 0.5  # between panels on one time axis, or each with its own
 _X_LABEL, _Y_LABEL = 0.31, 0.46  # from the axes to the middle of their titles
 _COLUMN_GAP = 0.5
-_DECADE = (1, 2, 5)
 _DOT = 1.5  # points
 _STROKE = 1e-4  # of the time span
 
@@ -48,19 +47,12 @@ _STYLE: dict[Any, Any] = {
     "font.size": 8.5,
     "axes.titlesize": 8.5,
     "axes.labelsize": 8.5,
-    "xtick.labelsize": 7.5,
-    "ytick.labelsize": 7.5,
     "legend.fontsize": 7.5,
     "legend.frameon": False,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.linewidth": 0.7,
     "axes.edgecolor": "#444444",
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.unicode_minus": True,
-    "grid.color": "#e4e4e4",
-    "grid.linewidth": 0.6,
     "lines.linewidth": 1.2,
     "text.parse_math": False,  # a dollar sign in a student's text is a dollar sign
     "svg.fonttype": "none",
@@ -106,29 +98,17 @@ def panels(*heights: float, columns: int = 1, share_x: bool = True) -> tuple[Fig
         for column in range(columns):
             shared = axes[0] if share_x and axes else None
             ax = figure.add_subplot(grid[row, column], sharex=shared)
-            if share_x and row < len(heights) - 1:
-                ax.tick_params(labelbottom=False, bottom=False)
             # Given places for labels save a search among all tick labels, and line them up.
             ax.yaxis.set_label_coords(-_Y_LABEL / width, 0.5)
             ax.xaxis.set_label_coords(0.5, -_X_LABEL / heights[row])
-            ax.yaxis.set_major_locator(MaxNLocator(nbins=4, steps=[1, 2, 5, 10], min_n_ticks=2))
-            if not share_x or not axes:
-                bins = 7 if columns == 1 else 4
-                ax.xaxis.set_major_locator(MaxNLocator(nbins=bins, steps=[1, 2, 5, 10]))
             axes.append(ax)
     return figure, axes
 
 
 def log_frequency_axis(ax: Axes, omega: Array) -> None:
-    """Make x a logarithmic frequency axis with ticks at 1, 2, 5, 10 …, labelled in full."""
-    low, high = 0.9 * float(omega.min()), 1.1 * float(omega.max())
+    """Make x a logarithmic frequency axis around the measured points."""
     ax.set_xscale("log")
-    ax.set_xlim(low, high)
-    exponents = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
-    ticks = [m * 10.0**e for e in exponents for m in _DECADE if low <= m * 10.0**e <= high]
-    ax.xaxis.set_major_locator(FixedLocator(ticks))
-    ax.xaxis.set_minor_locator(NullLocator())
-    ax.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    ax.set_xlim(0.9 * float(omega.min()), 1.1 * float(omega.max()))
 
 
 def legend_above(ax: Axes, *, columns: int = 4) -> None:
@@ -200,6 +180,10 @@ def to_svg(figure: Figure, *, name: str, alt: str) -> str:
 
     The canvas is called directly: `savefig` would draw everything twice.
     """
+    for ax in figure.axes:
+        # Panels on one time axis are labelled below the last.
+        lonely = len(ax.get_shared_x_axes().get_siblings(ax)) == 1
+        draw_ticks(ax, label_x=lonely or ax.get_subplotspec().is_last_row())
     buffer = io.StringIO()
     with matplotlib.rc_context({"svg.hashsalt": name}):
         FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None})
