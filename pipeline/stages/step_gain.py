@@ -20,6 +20,7 @@ from pipeline.stages._signals import (
 )
 
 _MIN_SAMPLES = 12
+_CREEP = 0.005  # of the input's range: two halves of a constant stretch differ by no more
 _STEADY_SHARE = 0.6  # of the record: with less of it at constant input this is no step run
 # Motion is counted in grains: encoder steps, or as much noise as would round as coarsely.
 _FLAT = 3.0  # a window that spans no more is level
@@ -30,6 +31,7 @@ _GOOD_FIT = 0.02  # of the motion: what an extrapolating fit may leave
 _GOOD_LEVEL = 0.02  # of the motion: the standard error it may have
 _STARTS_AT_REST = 0.1  # of the motion, per radian of the ringing: an initial velocity below this
 _DRIFT_SIGMAS, _DRIFT_AGREES = 5.0, 0.3
+_DRIFT_PASSES = 4
 _STICKS_SIGMAS = 4.0
 _SAME_INPUT = 0.02  # of the input's range
 
@@ -73,9 +75,13 @@ def fit_step_gain(record: Record, *, cart: int) -> StepGain:
         raise DataError(f"{record.id}: step gain needs a cart that is free, cart {cart} is held")
     size = grain(t, y, step=step)
     found = [_settle(record, y, part, size=size, step=step) for part in parts]
-    drift = _drift(t, y, [p.level for p in found if p.level], size=size)
-    if drift:
-        y = y - drift * (t - t[0])
+    drift = 0.0
+    for _ in range(_DRIFT_PASSES):  # with less drift the settled windows reach further
+        more = _drift(t, y, [p.level for p in found if p.level], size=size)
+        if not more:
+            break
+        drift += more
+        y = y - more * (t - t[0])
         found = [_settle(record, y, part, size=size, step=step) for part in parts]
     found, notes = _with_unseen_start(t, y, found, size=size, step=step)
     if drift:
@@ -126,7 +132,12 @@ def _constant_parts(record: Record) -> list[tuple[int, int, float]]:
             f"{record.id}: step gain needs the input beside the positions, found no input column: "
             "export it too, or name it under `columns`"
         )
-    long = [(a, b) for a, b in plateaus(u) if b - a >= _MIN_SAMPLES or a == 0]
+    creep = _CREEP * float(np.ptp(u))
+    long = [
+        (a, b)
+        for a, b in plateaus(u)
+        if a == 0 or (b - a >= _MIN_SAMPLES and abs(_halves_differ(u[a:b])) <= creep)
+    ]
     share = sum(b - a for a, b in long) / u.size
     parts = [(a, b, float(np.mean(u[a:b]))) for a, b in long]
     if share < _STEADY_SHARE or not any(value for _, _, value in parts):
@@ -135,6 +146,11 @@ def _constant_parts(record: Record) -> list[tuple[int, int, float]]:
             f"and not zero for {100 * share if any(p[2] for p in parts) else 0:.0f} % of the record"
         )
     return parts
+
+
+def _halves_differ(values: Array) -> float:
+    middle = values.size // 2
+    return float(values[middle:].mean() - values[:middle].mean())
 
 
 def _settle(
@@ -220,6 +236,7 @@ def _extrapolated(t: Array, y: Array, *, n_modes: int, floor: float) -> _Level |
         if (
             fit.converged
             and bool(np.all(fit.poles.real < 0))
+            and float(np.min(fit.poles.imag)) * (t[-1] - t[0]) >= np.pi  # half a period is seen
             and fit.rms <= left
             and std <= _GOOD_LEVEL * motion
         ):
@@ -234,10 +251,10 @@ def _with_unseen_start(
     head = found[0]
     if head.u == 0 or not head.level or abs(head.level.value - y[0]) <= _MOVED * size:
         return found, []
-    n = max(5, (head.stop - head.first) // 50)
-    pace = _pace(t[: head.stop], y[: head.stop], size=size) / (2 * np.pi)
+    radian = _pace(t[: head.stop], y[: head.stop], size=size) / (2 * np.pi)
+    n = max(5, int(np.searchsorted(t, t[0] + radian / 2)))
     velocity = np.polyfit(t[:n] - t[0], y[:n], 2)[1]
-    if abs(velocity) * pace > _STARTS_AT_REST * abs(head.level.value - y[0]):
+    if abs(velocity) * radian > _STARTS_AT_REST * abs(head.level.value - y[0]):
         return found, []
     std = max(size, step) / np.sqrt(12)
     level = _Level(first=0, stop=1, value=float(y[0]), std=float(std), extrapolated=False)
