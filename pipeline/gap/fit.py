@@ -525,7 +525,11 @@ def project(
 
 
 def covariance(fit: Fit, runs: Sequence[Run], *, refine: float = 1.0, mapper: Mapper = map) -> Fit:
-    """Return the fit with the covariance of its parameters, scaled by its own misfit."""
+    """Return the fit with the covariance of its parameters, scaled by its own misfit.
+
+    Where friction was fitted with one size for all runs, its spread is no part of the error.
+    """
+    scatter_free = any(np.any(own.scatter != 1.0) for own in fit.locals_)
 
     def linearise(pair: tuple[Run, Locals]) -> _Linear:
         return _linearise(
@@ -534,7 +538,7 @@ def covariance(fit: Fit, runs: Sequence[Run], *, refine: float = 1.0, mapper: Ma
             *pair,
             inflate=1.0,
             spread=fit.spread,
-            scatter_free=True,
+            scatter_free=scatter_free,
             refine=refine,
         )
 

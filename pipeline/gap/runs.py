@@ -1,6 +1,5 @@
 """Records made ready for fitting: free motion only, rest and start found, noise estimated."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,6 +28,7 @@ class Run:
     knots, command : the input, held from knot to knot.
     at_rest : the carts do not move at the first sample.
     start, slope : (n,) first reading and velocity of each cart.
+    rest : (n,) where the carts rest, as read.
     zero, zero_std : (n,) where the encoder's zero is expected, and how far off it may be.
     sigma : (rows,) noise of one sample.
     block : samples averaged to one residual.
@@ -47,6 +47,7 @@ class Run:
     at_rest: bool
     start: Array
     slope: Array
+    rest: Array
     zero: Array
     zero_std: Array
     sigma: Array
@@ -63,7 +64,7 @@ class Run:
     @property
     def swing(self) -> Array:
         """(rows,) root-mean-square of the reading about its rest."""
-        return np.sqrt(np.mean((self.y - self.zero[list(self.rows)][:, None]) ** 2, axis=1))
+        return np.sqrt(np.mean((self.y - self.rest[list(self.rows)][:, None]) ** 2, axis=1))
 
 
 def make_run(record: Record, *, n: int) -> Run:
@@ -107,7 +108,7 @@ def make_run(record: Record, *, n: int) -> Run:
     else:
         knots, command = t, u
     rate = 1.0 / float(np.median(np.diff(t)))
-    run = Run(
+    return Run(
         id=record.id,
         record=record,
         t=t,
@@ -119,6 +120,7 @@ def make_run(record: Record, *, n: int) -> Run:
         at_rest=at_rest,
         start=start,
         slope=slope,
+        rest=zero,
         zero=zero,
         zero_std=zero_std,
         sigma=np.maximum(resolution / np.sqrt(12.0), 1e-9 * span),
@@ -127,7 +129,6 @@ def make_run(record: Record, *, n: int) -> Run:
         shot_x=start[None],
         shot_v=slope[None],
     )
-    return run
 
 
 def cut_shots(run: Run, *, length: float) -> Run:
@@ -193,9 +194,3 @@ def _smooth_state(t: Array, y: Array, at: int, *, window: float = 0.03) -> tuple
     local = (t[low:high] - t[at]) / window
     coefficients = np.polyfit(local, y[low:high], min(3, local.size - 1))
     return float(coefficients[-1]), float(coefficients[-2] / window)
-
-
-def shift_equal(a: Sequence[float] | Array, b: Sequence[float] | Array) -> bool:
-    """Are two series the same samples?"""
-    a, b = np.asarray(a), np.asarray(b)
-    return a.shape == b.shape and bool(np.array_equal(a, b))

@@ -19,6 +19,7 @@ AT_FLOOR = 1.15  # chi-square per point below this is noise
 _SHORT_LIST = 9  # suspects refitted on pieces
 _FULL_LIST = 5  # of which the best are refitted on whole runs …
 _FULL_SCREEN = 3  # … with the best of a screen on whole runs
+_OUT_OF_SIGHT = 8.0  # a suspect that leaves this many times the best one's misfit is out
 _BEAM = 3
 _HOPELESS = 30.0  # a hypothesis with this many times the best one's chi-square is not grown
 _DEPTH = 3
@@ -129,13 +130,18 @@ def grow(parent: Hypothesis, bench: Bench) -> list[Hypothesis]:
     start = fit_pieces(parent.fit.structure, parent.fit.theta, pieces, iterations=4)
     look = partial(screen, whole=whole, springs=bench.springs, mapper=bench.mapper)
     suspects = look(start, pieces)
-    short = [_short_refit(start, s, pieces, bench) for s in suspects[:_SHORT_LIST]]
+    short = [_short_refit(start, s, pieces, bench) for s in _short_list(suspects)]
     short.sort(key=lambda pair: pair[1].cost)
-    chosen = {pair[0].key: pair for pair in reversed(short[:_FULL_LIST])}
-    for suspect in look(parent.fit, whole)[:_FULL_SCREEN]:
-        if suspect.candidate.key not in chosen:
-            pair = next((p for p in short if p[0].key == suspect.candidate.key), None)
-            chosen[suspect.candidate.key] = pair or _short_refit(start, suspect, pieces, bench)
+    within = _OUT_OF_SIGHT * short[0][1].cost
+    close = [pair for pair in short[:_FULL_LIST] if pair[1].cost < within]
+    chosen = {pair[0].key: pair for pair in close if pair[1].cost}
+    if short[0][1].chi > AT_FLOOR:
+        for suspect in look(parent.fit, whole)[:_FULL_SCREEN]:
+            if suspect.candidate.key not in chosen:
+                pair = next((p for p in short if p[0].key == suspect.candidate.key), None)
+                pair = pair or _short_refit(start, suspect, pieces, bench)
+                if pair[1].cost < within:
+                    chosen[suspect.candidate.key] = pair
     children = []
     for candidate, fit in chosen.values():
         child = _full_refit(candidate, fit, parent, bench)
@@ -145,6 +151,16 @@ def grow(parent: Hypothesis, bench: Bench) -> list[Hypothesis]:
                 if effect.grows_from == candidate.effect.key:
                     children.append(_grown_friction(effect, child, parent, bench))
     return children
+
+
+def _short_list(suspects: Sequence[Suspect]) -> list[Suspect]:
+    """Return who is worth a refit; contacts need fine steps, so only where they lead."""
+    top = suspects[0].share
+    return [
+        suspect
+        for suspect in suspects[:_SHORT_LIST]
+        if suspect.candidate.effect.key not in _CONTACT or suspect.share > 0.4 * top
+    ]
 
 
 def _short_refit(
@@ -179,9 +195,7 @@ def _short_refit(
     return suspect.candidate, best
 
 
-def _full_refit(
-    candidate: Candidate, start: Fit, parent: Hypothesis, bench: Bench
-) -> Hypothesis:
+def _full_refit(candidate: Candidate, start: Fit, parent: Hypothesis, bench: Bench) -> Hypothesis:
     fit = fit_whole(start.structure, start.theta, bench)
     return judge(fit, bench, added=candidate, parent=parent)
 
@@ -250,9 +264,7 @@ def _grown_friction(
     return judge(fit, bench, added=best.structure.effects[-1], parent=parent)
 
 
-def _friction_start(
-    effect: Effect, force: float, values: tuple[float, ...]
-) -> tuple[float, ...]:
+def _friction_start(effect: Effect, force: float, values: tuple[float, ...]) -> tuple[float, ...]:
     """Return start values: the simpler law's force, and trial values for what is new."""
     start = []
     for parameter, value in zip(effect.parameters, values, strict=True):

@@ -1,14 +1,14 @@
-"""The parameters of a model as one vector: logarithms of what is positive, multiples of the rest."""
+"""The parameters of a model as one vector: logarithms, or multiples where of either sign."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.gap.runs import Run
 from pipeline.plant.chain import Array, Chain
 from pipeline.plant.effects.base import AugmentedChain, Effect, Scales, Term, chain_scales
 from pipeline.plant.tables import Tables
-from pipeline.gap.runs import Run
 
 _SMALLEST = 1e-7  # of a parameter's scale; below, an effect is not there
 _LARGEST = 1e4
@@ -125,7 +125,7 @@ class Structure:
         tiny = 1e-3 * np.sqrt(chain.m * np.maximum(np.diag(chain.stiffness), 1e-12 * chain.m))
         parts = [np.log(chain.m), np.log(np.maximum(chain.c, tiny))]
         k = chain.k[list(self.rows)] if self.n > 1 else chain.k.sum(keepdims=True)[: len(self.rows)]
-        parts.append(np.log(np.maximum(k, 1e-4 * chain.k.max()))) if k.size else None
+        parts.append(np.log(np.maximum(k, 1e-4 * chain.k.max())))
         parts += [
             _coordinates(candidate, value)
             for candidate, value in zip(self.effects, values, strict=True)
@@ -161,7 +161,7 @@ class Structure:
         return np.concatenate(reach)
 
     def physical_derivative(self, theta: Array) -> Array:
-        """Return d(parameter)/d(coordinate) of the effects' parameters, chain parameters as logs."""
+        """Return d(parameter)/d(coordinate) of the effects; the chain stays in logs."""
         out = [np.ones(self.base_size)]
         for index, c in enumerate(self.effects):
             values = _values(c, theta[self.span(index)])

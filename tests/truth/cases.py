@@ -94,7 +94,9 @@ def make_case(
             # The cart was left somewhere inside its friction band, and zeroed there.
             x0 = np.array([_rest_band(h, stiffness, i, rng) for i, h in _by_cart(hidden, n)])
             x0 = np.where([i + 1 in free for i in range(n)], x0, 0.0)
-        y = simulate_truth(m=m, c=c, k=k, hidden=hidden, t=t, u=u, free=free, x0=x0, scatter=scatter)
+        y = simulate_truth(
+            m=m, c=c, k=k, hidden=hidden, t=t, u=u, free=free, x0=x0, scatter=scatter
+        )
         y = y + 0.3 * COUNT * rng.standard_normal(y.shape) + lead
         if dirt:
             y -= y[:, :1] if kind != "decay" else y[:, -1:]
@@ -172,8 +174,7 @@ def _draw(name, n, m, c, k, stiffness, large, rate, linear, severity, rng) -> Hi
     speed = 0.5 * reach * np.sqrt(stiffness[i, i] / m[i])
     force = s * float(rng.uniform(0.008, 0.03)) * stiffness[i, i]
     stretch = max(
-        float(np.abs((y[j] if j < n else 0.0) - (y[j - 1] if j > 0 else 0.0)).max())
-        for y in linear
+        float(np.abs((y[j] if j < n else 0.0) - (y[j - 1] if j > 0 else 0.0)).max()) for y in linear
     )
     sign = float(rng.choice([-1.0, 1.0]))
     draw = rng.uniform
@@ -239,7 +240,9 @@ def _draw(name, n, m, c, k, stiffness, large, rate, linear, severity, rng) -> Hi
             }
             return Hidden(effect=name, place=i + 1, parameters=parameters)
         case "sensor_gain":
-            return Hidden(effect=name, place=i + 1, parameters={"gain": 1 + s * sign * draw(0.03, 0.1)})
+            return Hidden(
+                effect=name, place=i + 1, parameters={"gain": 1 + s * sign * draw(0.03, 0.1)}
+            )
         case "extra_mode":
             mass = s * draw(0.06, 0.2) * m[i]
             omega = draw(0.6, 1.8) * np.sqrt(stiffness[i, i] / m[i])

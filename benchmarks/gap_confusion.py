@@ -1,0 +1,169 @@
+"""How often the gap workflow names what was hidden: confusion matrix, gaps, times.
+
+    python benchmarks/gap_confusion.py singles --count 300 --jobs 2 --out singles.jsonl
+
+Benches are random; the truth is simulated independently (tests/truth). Development and report
+seeds are apart: thresholds were never set on the seeds behind `--report`. A run that was stopped
+goes on where it left off, one JSON line a case.
+"""
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+DEVELOPMENT, REPORT = 10_000, 900_000
+SUITES = ("singles", "small", "tiny", "weak", "dirt", "pairs", "clean", "clean-dirt")
+SEVERITY = {"small": 0.3, "weak": 0.2, "tiny": 0.05}
+# What friction tests need: the effects that dirt (scatter of friction) bears on come first.
+DRY = ("coulomb_friction", "stiction", "presliding_friction")
+
+
+def plan(suite: str, index: int) -> tuple[int, tuple[str, ...], float, bool]:
+    """Return carts, effects, severity and dirt of a case."""
+    from tests.truth.cases import EFFECTS
+
+    rng = np.random.default_rng([SUITES.index(suite), index])
+    n = 1 + index % 3
+    pool = [e for e in EFFECTS if not (n == 1 and e in ("coupling_damper", "sensor_gain"))]
+    if suite.startswith("clean"):
+        return n, (), 1.0, suite == "clean-dirt"
+    if suite == "pairs":
+        while True:
+            first, second = rng.choice(pool, 2, replace=False)
+            if not (first in DRY and second in DRY) and "backlash" not in (first, second):
+                return n, (str(first), str(second)), 1.0, False
+    effect = pool[(index // 3) % len(pool)]
+    return n, (effect,), SEVERITY.get(suite, 1.0), suite == "dirt"
+
+
+def run_case(job: tuple[str, int, int]) -> dict:
+    """Make one case, explain it, and say how it went."""
+    suite, index, base = job
+    from pipeline.gap.explain import explain_gap
+    from tests.truth.cases import make_case
+
+    n, effects, severity, dirt = plan(suite, index)
+    case = make_case(seed=base + index, n=n, effects=effects, severity=severity, dirt=dirt)
+    wall, cpu = time.perf_counter(), time.process_time()
+    gap = explain_gap(case.records, springs=case.springs, workers=1)
+    truth = sorted((h.effect, h.place) for h in case.hidden)
+    found = sorted((f.effect.key, next(iter(f.where.values()), 0)) for f in gap.effects)
+    listed = set(found) | {
+        (r.effect.key, next(iter(r.where.values()), 0)) for f in gap.effects for r in f.rivals
+    }
+    z = []
+    for hidden in case.hidden:
+        for f in gap.effects:
+            if (f.effect.key, next(iter(f.where.values()), 0)) == (hidden.effect, hidden.place):
+                for name, true in hidden.parameters.items():
+                    value = f.parameters[name]
+                    z.append((value.value - float(true)) / value.std if value.std else None)
+    return {
+        "suite": suite,
+        "index": index,
+        "n": n,
+        "truth": truth,
+        "hidden": [{k: float(v) for k, v in h.parameters.items()} for h in case.hidden],
+        "found": found,
+        "verdict": gap.verdict,
+        "outcome": outcome(truth, found, listed, gap.verdict, gap.baseline / gap.noise_floor),
+        "baseline": gap.baseline / gap.noise_floor,
+        "final": gap.final / gap.noise_floor,
+        "z": z,
+        "rate": 1.0 / case.records[0].sample_time,
+        "wall": time.perf_counter() - wall,
+        "cpu": time.process_time() - cpu,
+    }
+
+
+def outcome(truth: list, found: list, listed: set, verdict: str, baseline: float) -> str:
+    """Classify a case; `equivalent` are the provable ones of the catalogue."""
+    if verdict == "unexplained":
+        return "unexplained"
+    if found == truth:
+        return "ambiguous, right first" if verdict == "ambiguous" else "exact"
+    if not found:
+        # Sensor gains a linear chain can absorb leave nothing to find.
+        invisible = all(effect == "sensor_gain" for effect, _ in truth)
+        return "equivalent" if invisible and baseline < 1.1 else "missed"
+    missing, extra = set(map(tuple, truth)) - set(found), set(found) - set(map(tuple, truth))
+    if {e for e, _ in missing} <= {"sensor_gain"} and {e for e, _ in extra} <= {"sensor_gain"}:
+        return "equivalent"
+    if verdict == "ambiguous" and missing <= listed and len(extra) == len(missing):
+        return "ambiguous, right listed"
+    if not missing:
+        return "spurious extra" if truth else "false positive"
+    return "partly" if len(missing) < len(truth) and not extra else "wrong"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("suite", choices=SUITES)
+    parser.add_argument("--count", type=int, default=48)
+    parser.add_argument("--start", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--report", action="store_true", help="the seeds results are quoted for")
+    parser.add_argument("--out", type=Path, required=True)
+    options = parser.parse_args()
+    os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
+    base = REPORT if options.report else DEVELOPMENT
+    rows = [json.loads(line) for line in options.out.open()] if options.out.exists() else []
+    done = {row["index"] for row in rows if row["suite"] == options.suite}
+    wanted = range(options.start, options.start + options.count)
+    jobs = [(options.suite, i, base) for i in wanted if i not in done]
+    with ProcessPoolExecutor(options.jobs) as pool, options.out.open("a") as out:
+        for row in pool.map(run_case, jobs):
+            out.write(json.dumps(row) + "\n")
+            out.flush()
+            rows.append(row)
+            if row["outcome"] != "exact":
+                print(
+                    row["index"],
+                    row["n"],
+                    row["outcome"],
+                    row["truth"],
+                    row["found"],
+                    f"x{row['baseline']:.1f} -> x{row['final']:.2f}",
+                    flush=True,
+                )
+    summarise([row for row in rows if row["suite"] == options.suite])
+
+
+def summarise(rows: list[dict]) -> None:
+    """Print outcomes by effect, the gap after, coverage of the standard errors and times."""
+    outcomes = Counter(row["outcome"] for row in rows)
+    print(f"\n{len(rows)} cases: " + ", ".join(f"{k} {v}" for k, v in outcomes.most_common()))
+    by_effect: dict[str, Counter] = {}
+    for row in rows:
+        name = " + ".join(effect for effect, _ in row["truth"]) or "nothing"
+        by_effect.setdefault(name, Counter())[row["outcome"]] += 1
+    if len(by_effect) < 25:
+        for name, counts in sorted(by_effect.items()):
+            print(f"  {name:22s} " + ", ".join(f"{k} {v}" for k, v in counts.most_common()))
+    final = np.array([row["final"] for row in rows if row["verdict"] in ("named", "ambiguous")])
+    if final.size:
+        print(
+            f"gap after / floor: median {np.median(final):.3f}, 90 % {np.quantile(final, 0.9):.3f}"
+        )
+    z = np.array(
+        [v for row in rows if row["outcome"] == "exact" for v in row["z"] if v is not None]
+    )
+    if z.size:
+        print(f"parameters within 2 standard errors: {np.mean(np.abs(z) < 2):.1%} of {z.size}")
+    for n in (1, 2, 3):
+        cpu = [row["cpu"] for row in rows if row["n"] == n]
+        if cpu:
+            print(f"{n} carts: median {np.median(cpu):.1f} s of one core, most {max(cpu):.1f} s")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,87 @@
+"""`gap.json`: what other programs read."""
+
+from typing import Any
+
+from pipeline.gap.types import FoundEffect, Gap, NamedValue
+from pipeline.plant.chain import Chain
+
+SCHEMA = "cartlab-gap/1"
+
+
+def gap_json(gap: Gap) -> dict[str, Any]:
+    """Return the gap as plain JSON data."""
+    return {
+        "schema": SCHEMA,
+        "verdict": gap.verdict,
+        "effects": [_effect(found) for found in gap.effects],
+        "gap": {"baseline": gap.baseline, "final": gap.final, "noise_floor": gap.noise_floor},
+        "repeatability": gap.repeatability,
+        "by_record": [
+            {
+                "experiment": r.experiment,
+                "cart": r.cart,
+                "held_out": r.held_out,
+                "baseline": r.baseline,
+                "final": r.final,
+                "noise_floor": r.noise_floor,
+            }
+            for r in gap.by_record
+        ],
+        "where": [
+            {
+                "experiment": w.experiment,
+                "cart": w.cart,
+                "from": w.start,
+                "to": w.end,
+                "what": w.what,
+                "share": w.share,
+            }
+            for w in gap.where
+        ],
+        "next_experiment": gap.next_experiment,
+        "training": list(gap.training),
+        "held_out": list(gap.held_out),
+        "friction_spread": {str(cart): spread for cart, spread in gap.spread.items()},
+        "linear": _chain(gap.linear.chain),
+        "model": {
+            "chain": _chain(gap.model.chain),
+            "effects": [
+                {
+                    "effect": term.effect.key,
+                    "where": term.where,
+                    "parameters": dict(zip(term.effect.names, term.values, strict=True)),
+                }
+                for term in gap.model.terms
+            ],
+        },
+        "notes": list(gap.notes),
+    }
+
+
+def _effect(found: FoundEffect) -> dict[str, Any]:
+    return {
+        "effect": found.effect.key,
+        "where": found.where,
+        "parameters": {name: _value(value) for name, value in found.parameters.items()},
+        "details": {name: _value(value) for name, value in found.details.items()},
+        "confidence": found.confidence,
+        "nrmse_before": found.nrmse_before,
+        "nrmse_after": found.nrmse_after,
+        "rivals": [
+            {
+                "effect": rival.effect.key,
+                "where": rival.where,
+                "nrmse_after": rival.nrmse_after,
+                "confidence": rival.confidence,
+            }
+            for rival in found.rivals
+        ],
+    }
+
+
+def _value(value: NamedValue) -> dict[str, Any]:
+    return {"value": value.value, "std": value.std, "unit": value.unit}
+
+
+def _chain(chain: Chain) -> dict[str, list[float]]:
+    return {"m": chain.m.tolist(), "c": chain.c.tolist(), "k": chain.k.tolist()}

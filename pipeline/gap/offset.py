@@ -1,0 +1,75 @@
+"""A constant force: what the rest points of differently held runs have in common.
+
+A constant force only displaces the rest of a linear chain, as a wrong encoder zero would; but
+the springs that carry it change with the carts that are held, and the force does not.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.gap.fit import Locals
+from pipeline.gap.runs import Run
+from pipeline.plant.chain import Array, Chain
+
+_SURE = 6.0  # standard errors
+_EXPLAINED = 0.8  # of the zeros' sum of squares
+_COUNTS = 1.5  # encoder steps the zeros must be away from the file's, root-mean-square
+
+
+@dataclass(frozen=True, kw_only=True)
+class Offset:
+    """A constant force on a cart, with its standard error over the runs."""
+
+    cart: int
+    force: float
+    std: float
+
+
+def find_offset(chain: Chain, runs: Sequence[Run], locals_: Sequence[Locals]) -> Offset | None:
+    """Return the constant force that the fitted zeros ask for, or None."""
+    if not np.any(chain.k > 0):
+        return None
+    best: tuple[float, Offset] | None = None
+    total, step = 0.0, 0.0
+    for run, own in zip(runs, locals_, strict=True):
+        zeros = own.zero[list(run.rows)]
+        total += float(zeros @ zeros)
+        step = max(step, float((run.sigma * np.sqrt(12.0)).max()))
+    count = sum(len(run.rows) for run in runs)
+    if np.sqrt(total / count) < _COUNTS * step:
+        return None
+    for cart in range(1, chain.n + 1):
+        gains = [_compliance(chain, run, cart) for run in runs]
+        pairs = [
+            (gain, own.zero[list(run.rows)])
+            for gain, run, own in zip(gains, runs, locals_, strict=True)
+            if np.any(gain)
+        ]
+        forces = np.array([gain @ zero / (gain @ gain) for gain, zero in pairs])
+        if forces.size < 3:
+            continue
+        left = total - sum(
+            float(zero @ zero - (zero - gain * forces.mean()) @ (zero - gain * forces.mean()))
+            for gain, zero in pairs
+        )
+        smallest = step / np.sqrt(12.0) / max(float(np.abs(g).max()) for g, _ in pairs)
+        std = max(float(forces.std(ddof=1)), smallest) / np.sqrt(forces.size)
+        sure = abs(float(forces.mean())) > _SURE * std
+        if sure and left < (1.0 - _EXPLAINED) * total and (best is None or left < best[0]):
+            best = (left, Offset(cart=cart, force=float(forces.mean()), std=std))
+    return best[1] if best else None
+
+
+def _compliance(chain: Chain, run: Run, cart: int) -> Array:
+    """Return the displacement of the measured carts under a unit force on one cart."""
+    free = [i for i, moves in enumerate(run.free) if moves]
+    if cart - 1 not in free:
+        return np.zeros(len(run.rows))
+    K = chain.stiffness[np.ix_(free, free)]
+    unit = np.array([1.0 if i == cart - 1 else 0.0 for i in free])
+    if np.linalg.cond(K) > 1e9:
+        return np.zeros(len(run.rows))
+    x = np.linalg.solve(K, unit)
+    return np.array([x[free.index(row)] for row in run.rows])

@@ -1,0 +1,118 @@
+"""What the gap workflow finds."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from pipeline.plant.chain import Array
+from pipeline.plant.effects.base import AugmentedChain, Effect
+
+Verdict = Literal["named", "none", "ambiguous", "unexplained"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class NamedValue:
+    """A parameter of an effect with its standard error (None where it could not be had)."""
+
+    value: float
+    std: float | None
+    unit: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rival:
+    """Another effect in the same role, fitted as fully; `where` as in `gap.json`."""
+
+    effect: Effect
+    where: dict[str, int]
+    nrmse_after: float
+    confidence: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class FoundEffect:
+    """One effect in the order found; errors are on held-out runs, before and after adding it.
+
+    `confidence` is its weight by the Bayesian information criterion among all fitted models of
+    the same size. Parameters that only describe a contact are in `details`.
+    """
+
+    effect: Effect
+    where: dict[str, int]
+    parameters: dict[str, NamedValue]
+    details: dict[str, NamedValue]
+    confidence: float
+    nrmse_before: float
+    nrmse_after: float
+    rivals: tuple[Rival, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordGap:
+    """Relative root-mean-square error of one cart in one run."""
+
+    experiment: str
+    cart: int
+    held_out: bool
+    baseline: float
+    final: float
+    noise_floor: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class GapWindow:
+    """Where a run departs from the linear model most: the window, what happens, its share."""
+
+    experiment: str
+    cart: int
+    start: float
+    end: float
+    what: str
+    share: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Trace:
+    """One cart in one run, for figures: measured, the linear model, the final model (n,)."""
+
+    experiment: str
+    cart: int
+    held_out: bool
+    t: Array
+    u: Array
+    measured: Array
+    baseline: Array
+    final: Array
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Gap:
+    """Where simulation and measurement disagree, why, and what is left.
+
+    Attributes
+    ----------
+    effects : in the order found. Under `ambiguous` the last one's rivals explain as much; under
+        `unexplained` they are suspects only.
+    baseline, final, noise_floor : relative errors pooled over the held-out runs.
+    repeatability : the same between runs with the same input, or None without repeats.
+    linear, model : the linear chain that fits best, and the chain with the effects.
+    training, held_out : ids of the runs.
+    spread : learnt run-to-run spread of the dry friction, per cart, where there is any.
+    notes : what a reader must know.
+    """
+
+    verdict: Verdict
+    effects: tuple[FoundEffect, ...]
+    baseline: float
+    final: float
+    noise_floor: float
+    repeatability: float | None
+    by_record: tuple[RecordGap, ...]
+    where: tuple[GapWindow, ...]
+    next_experiment: str
+    linear: AugmentedChain
+    model: AugmentedChain
+    training: tuple[str, ...]
+    held_out: tuple[str, ...]
+    traces: tuple[Trace, ...]
+    spread: dict[int, float] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()

@@ -1,0 +1,75 @@
+"""Where a run departs from the linear model: when, and what the cart was doing then."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeline.gap.fit import Fit, simulate_run
+from pipeline.gap.runs import Run
+from pipeline.gap.types import GapWindow
+from pipeline.plant.chain import Array
+
+_WINDOW = 0.15  # of the run
+_MOST = 8  # windows shown
+
+
+def find_windows(fit: Fit, runs: Sequence[Run]) -> tuple[GapWindow, ...]:
+    """Return the windows that hold most of the misfit, the worst first.
+
+    `share` is the window's part of that cart's squared misfit in that run.
+    """
+    found: list[tuple[float, GapWindow]] = []
+    for run, own in zip(runs, fit.locals_, strict=True):
+        model = simulate_run(fit.structure, fit.theta[None], run, own)[0]
+        for j, row in enumerate(run.rows):
+            energy = ((run.y[j] - model[j]) / run.sigma[j]) ** 2
+            total = float(energy.sum())
+            width = max(4, int(_WINDOW * run.t.size))
+            if total <= 0.0 or run.t.size <= width:
+                continue
+            inside = np.convolve(energy, np.ones(width), mode="valid")
+            first = int(np.argmax(inside))
+            window = GapWindow(
+                experiment=run.id,
+                cart=row + 1,
+                start=float(run.t[first]),
+                end=float(run.t[first + width - 1]),
+                what=_what(run, model[j] - run.rest[row], energy),
+                share=float(inside[first] / total),
+            )
+            found.append((float(inside[first]), window))
+    found.sort(key=lambda pair: -pair[0])
+    return tuple(window for _, window in found[:_MOST])
+
+
+def _what(run: Run, x: Array, energy: Array) -> str:
+    """Return what the cart does where the misfit grows, judged by its excess over chance."""
+    v = np.gradient(x, run.t)
+    u = np.interp(run.t, run.knots, run.command)
+    edges = np.flatnonzero(np.abs(np.diff(u)) > 0.2 * max(1e-12, float(np.ptp(u))))
+    since = np.full(run.t.size, np.inf)
+    for edge in edges:
+        late = run.t - run.t[edge]
+        since = np.where((late >= 0) & (late < since), late, since)
+    speed, reach = float(np.abs(v).max()), float(np.abs(x).max())
+    masks = {
+        "velocity near zero": np.abs(v) < 0.1 * speed,
+        "fast motion": np.abs(v) > 0.6 * speed,
+        "large displacement, positive side": x > 0.6 * reach,
+        "large displacement, negative side": x < -0.6 * reach,
+        "after an edge of the input": since < 0.3,
+        "input on": np.abs(u) > 0.05 * max(1e-12, float(np.abs(u).max())),
+        "input off": np.abs(u) <= 0.05 * max(1e-12, float(np.abs(u).max())),
+    }
+    if not np.any(u) or np.count_nonzero(np.diff(u)) > 0.3 * u.size:
+        del masks["input on"], masks["input off"]
+    if not edges.size or edges.size > 6:
+        del masks["after an edge of the input"]
+    total = float(energy.sum())
+    best, score = "throughout", 1.3  # a third above chance is worth a word
+    for what, mask in masks.items():
+        if 0.02 < mask.mean() < 0.98:
+            excess = float(energy[mask].sum()) / total / float(mask.mean())
+            if excess > score:
+                best, score = what, excess
+    return best
