@@ -305,6 +305,25 @@ def test_a_fast_plant_is_sampled_faster():
     assert design(chain, cart=2, sample_time=0.002).sample_time == 0.002
 
 
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("speed", [0.1, 10.0])
+def test_goals_much_slower_or_faster_than_the_plant_are_judged_rightly(method, speed):
+    """What the result says of its goal is what its own step shows, whatever the time scales."""
+    chain = PRESETS["throne-2dof"]
+    other = Chain(m=chain.m / speed**2, c=chain.c / speed, k=chain.k)
+    got = design(other, cart=2, settling=3.0, method=method)
+
+    step = got.y[1]
+    overshoot = overshoot_percent(step, before=0.0, level=np.float64(1.0))
+    settled = settling_time(got.t, step, before=0.0, level=np.float64(1.0))
+    assert_allclose(got.overshoot_percent, overshoot)
+    assert got.settling_time is not None
+    assert_allclose(got.settling_time, settled)
+    assert got.reachable == (overshoot <= 10.05 and settled <= 3.0 + got.sample_time)
+    assert got.reachable or "cannot be met: reachable is" in got.message
+    assert got.reachable or speed < 1
+
+
 def test_no_overshoot_at_all_can_be_asked_for():
     """A goal of no overshoot is met."""
     assert design(PRESETS["throne-2dof"], cart=1, overshoot=0.0).overshoot_percent < 1e-3

@@ -57,7 +57,13 @@ def check_hardware(
     law = _plant_law(controller, controlled_cart)
     closed, unstable = None, ""
     if law is not None and record.reference is not None:
-        closed = _close(run, law, drive=opened.factor if opened else 1.0, limit=input_limit)
+        closed = _close(
+            run,
+            law,
+            reference=record.reference,
+            drive=opened.factor if opened else 1.0,
+            limit=input_limit,
+        )
         if closed is None:
             unstable = "the stated controller makes the simulated loop unstable"
     if opened is None and closed is None:
@@ -128,7 +134,7 @@ def _plant_law(controller: submission.Controller | None, cart: int | None) -> Co
 
 
 def _close(
-    run: MeasuredRun, law: Controller, *, drive: float, limit: float | None
+    run: MeasuredRun, law: Controller, *, reference: Array, drive: float, limit: float | None
 ) -> _Simulated | None:
     """Close the loop around the chain; None where it is unstable.
 
@@ -136,8 +142,7 @@ def _close(
     the usual ways the one that comes nearest to the measurement is taken.
     """
     record = run.record
-    assert record.reference is not None
-    factor = _logged_per_stated(run, law)
+    factor = _logged_per_stated(run, law, reference=reference)
     law = _times(law, factor)
     limit = min(np.inf if limit is None else limit, _plateau(record.u))
     best, least = None, _BLOWN_UP
@@ -147,7 +152,7 @@ def _close(
                 run.chain,
                 law_as_run,
                 t=record.t,
-                reference=record.reference,
+                reference=reference,
                 sample_time=sample_time,
                 delay=delay,
                 input_limit=limit,
@@ -186,16 +191,16 @@ def _ways(
     return ways
 
 
-def _logged_per_stated(run: MeasuredRun, law: Controller) -> float:
+def _logged_per_stated(run: MeasuredRun, law: Controller, *, reference: Array) -> float:
     """Return the factor between the logged input and what the law asks for; 1 without a log.
 
     The one with the least sum of absolute differences, a weighted median: samples where the
     input saturates, or a velocity is mostly rounding, do not sway it.
     """
     record = run.record
-    if record.u is None or record.reference is None or not (run.driven and run.seen.all()):
+    if record.u is None or not (run.driven and run.seen.all()):
         return 1.0
-    stated = replay(law, t=record.t, y=run.y, reference=record.reference, free=run.free)
+    stated = replay(law, t=record.t, y=run.y, reference=reference, free=run.free)
     asked = np.flatnonzero(stated)
     if asked.size == 0:
         return 1.0

@@ -10,7 +10,7 @@ slowest, the further pairs at the plant's own frequencies but better damped, and
 take the gentlest candidates whose simulated step meets the goal, and of these the fastest.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Literal
 
@@ -35,16 +35,19 @@ Method = Literal["poles", "lqr"]
 _SAMPLE_TIME = 0.00884  # s; the laboratory's controller
 _RADIANS_PER_SAMPLE = 0.5  # of the fastest mode, at most: 12 samples a period
 _SAMPLES_TO_SETTLE = 25  # at least
-_HORIZON = 3.0  # settling times a candidate's step is followed for
+_HORIZON = 3.0  # settling times of the goal that a candidate's step is followed for
+_SHOWN = 2.0  # settling times of the chosen design's step in the result
+_LATEST = 10.0  # settling times of the goal at which a design that misses it is given up
 _POINTS = 512  # of a candidate's step; a power of two, as it is made by doubling
 
 # Shares of the goal (settling time, overshoot) to aim at, the best first: the plant is known to
 # a few percent only and should still meet the goal.
 _AIMS = ((0.8, 0.05), (0.8, 0.5), (1.0, 1.0))
-_ROUNDING = 1e-3  # percent of overshoot that is none
+_UNSEEN = 0.05  # percent of overshoot that nobody sees
 _PEAK_FREEDOM = 1.25  # times the gentlest candidate's peak input that a faster one may take
 
-_ALPHA = _BETA = np.logspace(-3, 4, 25)  # from no feedback to be seen, to all but deadbeat
+_WEIGHTS = np.logspace(-3, 4, 25)  # of energies: from no feedback to be seen to a stiff loop
+_HEAVY_WEIGHTS = np.logspace(-3, 12, 40)  # to all but deadbeat
 _DOMINANT_SETTLING = np.linspace(0.3, 1.0, 8)  # of the goal
 _FURTHER_ZETA = (0.0, 0.1, 0.2, 0.35, 0.5, 0.7)  # at least; a pair keeps its own if better
 _FURTHER_SPEED = (1.0, 1.25)  # of the plant's own frequency
@@ -100,16 +103,23 @@ def design_feedback(
     )
     plant = _Sampled.of(chain, cart=cart, settling=settling_time, sample_time=sample_time)
     if method == "lqr":
-        requested, gains = None, _lqr_candidates(plant)
+        requested = None
+        candidates = _try_step(plant, _lqr_candidates(plant, _WEIGHTS), goal)
+        best, met = _choose(plant, candidates, goal)
+        if not met:  # perhaps the goal is much faster than the plant
+            candidates = _try_step(plant, _lqr_candidates(plant, _HEAVY_WEIGHTS), goal)
+            best, met = _choose(plant, candidates, goal)
     else:
         requested = _pole_candidates(plant, goal)
-        gains = place_poles(plant.phi, plant.gamma, np.exp(requested * plant.sample_time))
-    best = _choose(plant, _try_step(plant, gains, goal), goal)
+        z = np.exp(requested * plant.sample_time)
+        candidates = _try_step(plant, place_poles(plant.phi, plant.gamma, z), goal)
+        best, met = _choose(plant, candidates, goal)
     return _finish(
         plant,
         goal,
-        gains=plant.to_units(gains[best]),
+        gains=plant.to_units(candidates.gains[best]),
         requested=None if requested is None else requested[best],
+        settling=float(candidates.settling[best]),
         method=method,
     )
 
@@ -123,7 +133,7 @@ class _Goal:
 
     def __str__(self) -> str:
         within = f" within ±{self.limit:.3g} of input" if np.isfinite(self.limit) else ""
-        return f"overshoot {self.overshoot:g} % and settling in {self.settling:g} s{within}"
+        return f"overshoot {self.overshoot:.3g} % and settling in {self.settling:.3g} s{within}"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -177,8 +187,8 @@ class _Sampled:
 # -------------------------------------------------------------- candidate gains
 
 
-def _lqr_candidates(plant: _Sampled) -> Array:
-    """Return gains (n_candidates, 2n) for a grid of energy weights."""
+def _lqr_candidates(plant: _Sampled, weights: Array) -> Array:
+    """Return gains (n_candidates, 2n) for a grid of weights of either energy."""
     chain, n = plant.chain, plant.chain.n
     stiffness = chain.stiffness / plant.stiffness
     if chain.k[0] == chain.k[-1] == 0:
@@ -187,7 +197,7 @@ def _lqr_candidates(plant: _Sampled) -> Array:
     potential, kinetic = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 * n))
     potential[0::2, 0::2] = stiffness
     kinetic[1::2, 1::2] = np.diag(chain.m) * plant.rate**2 / plant.stiffness
-    alpha, beta = (w.ravel()[:, None, None] for w in np.meshgrid(_ALPHA, _BETA, indexing="ij"))
+    alpha, beta = (w.ravel()[:, None, None] for w in np.meshgrid(weights, weights, indexing="ij"))
     return lqr_gains(plant.phi, plant.gamma, alpha * potential + beta * kinetic)
 
 
@@ -195,7 +205,7 @@ def _pole_candidates(plant: _Sampled, goal: _Goal) -> ComplexArray:
     """Return continuous pole sets (n_candidates, 2n), rad/s."""
     omega, zeta = quadratic_factors(plant.chain.poles)
     shares = np.array([overshoot for _, overshoot in _AIMS])
-    log = np.log(np.maximum(shares * goal.overshoot, _ROUNDING) / 100)
+    log = np.log(np.maximum(shares * goal.overshoot, _UNSEEN) / 100)
     dominant_zeta = -log / np.hypot(np.pi, log)
     z, settling, further_zeta, further_speed = (
         axis.ravel()
@@ -203,9 +213,13 @@ def _pole_candidates(plant: _Sampled, goal: _Goal) -> ComplexArray:
             dominant_zeta, goal.settling * _DOMINANT_SETTLING, _FURTHER_ZETA, _FURTHER_SPEED
         )
     )
-    pairs = [_pair(4 / (z * settling), z)]  # exp(-4) is the 2 % of the settling time
+    # exp(-4) is the 2 % of the settling time. No pair is made slower than the plant's own: that
+    # takes its stiffness away, and what is left is the small difference of large numbers.
+    dominant = np.maximum(4 / (z * settling), omega[0])
+    pairs = [_pair(dominant, z)]
     for own_omega, own_zeta in zip(omega[1:], zeta[1:], strict=True):
-        pairs.append(_pair(own_omega * further_speed, np.maximum(own_zeta, further_zeta)))
+        further = np.maximum(own_omega, dominant) * further_speed
+        pairs.append(_pair(further, np.maximum(own_zeta, further_zeta)))
     return np.concatenate(pairs, axis=-1)
 
 
@@ -231,9 +245,15 @@ class _Candidates:
 
 
 def _try_step(plant: _Sampled, gains: Array, goal: _Goal) -> _Candidates:
-    """Follow the step of every candidate at once; exact at the points looked at."""
+    """Follow the step of every candidate at once; exact at the points looked at.
+
+    They lie close enough to miss no peak, even if that ends the view before the goal's time:
+    settling is then estimated.
+    """
     loop = plant.phi - plant.gamma[:, None] * gains[:, None, :]
-    stride = max(1, round(_HORIZON * goal.settling / (_POINTS * plant.sample_time)))
+    fastest = np.abs(plant.chain.poles).max() + 4 / goal.settling
+    apart = min(_HORIZON * goal.settling / _POINTS, _RADIANS_PER_SAMPLE / fastest)
+    stride = max(1, round(apart / plant.sample_time))
     level = np.linalg.solve(np.eye(plant.gamma.size) - loop, plant.gamma[:, None])
     prefilter = 1 / level[:, plant.row]
     level = level * prefilter[:, None]
@@ -241,9 +261,8 @@ def _try_step(plant: _Sampled, gains: Array, goal: _Goal) -> _Candidates:
     to_go, ahead = -level, np.linalg.matrix_power(loop, stride)
     while to_go.shape[-1] < _POINTS:
         to_go, ahead = np.concatenate([to_go, ahead @ to_go], axis=-1), ahead @ ahead
-    t = plant.sample_time * (
-        1 + stride * np.arange(_POINTS, dtype=np.float64)
-    )  # the first sample is the delay
+    points = np.arange(_POINTS, dtype=np.float64)
+    t = plant.sample_time * (1 + stride * points)  # the first sample is the delay
     y = 1 + to_go[:, plant.row]
     # With the input that holds the level: a slow candidate may not be there yet.
     u = prefilter - np.einsum("ci,cin->cn", gains, np.append(to_go, 0 * level, axis=-1) + level)
@@ -261,34 +280,40 @@ def _try_step(plant: _Sampled, gains: Array, goal: _Goal) -> _Candidates:
     )
 
 
-def _choose(plant: _Sampled, candidates: _Candidates, goal: _Goal) -> int:
-    """Return the index of the best candidate; the nearest where none meets the goal."""
+def _choose(plant: _Sampled, candidates: _Candidates, goal: _Goal) -> tuple[int, bool]:
+    """Return the index of the best candidate and whether it meets the goal, or comes nearest."""
     within = candidates.peak <= goal.limit
     if not within.any():  # a step of this size is out of reach: design for a smaller one
         within = np.full_like(within, True)
     for level_error, (settling, overshoot) in product((_LEVEL_ERROR, np.inf), _AIMS):
         good = within & (candidates.level_error <= level_error)
         good &= candidates.settling <= settling * goal.settling
-        good &= candidates.overshoot <= max(overshoot * goal.overshoot, _ROUNDING)
+        good &= candidates.overshoot <= max(overshoot * goal.overshoot, _UNSEEN)
         if not good.any():
             continue
         good &= candidates.peak <= _PEAK_FREEDOM * candidates.peak[good].min()
         order = np.flatnonzero(good)[np.argsort(candidates.settling[good], kind="stable")]
         for index in order[:_SCREENED]:
             if plant.stays_stable(plant.to_units(candidates.gains[index])):
-                return int(index)
+                return int(index), True
     excess = np.maximum(
         candidates.settling / goal.settling,
         np.maximum(candidates.overshoot, 1.0) / max(goal.overshoot, 1.0),
     )
-    return int(np.argmin(np.where(within, excess, np.inf)))
+    return int(np.argmin(np.where(within, excess, np.inf))), False
 
 
 # ------------------------------------------------------------------- the result
 
 
 def _finish(
-    plant: _Sampled, goal: _Goal, *, gains: Array, requested: ComplexArray | None, method: Method
+    plant: _Sampled,
+    goal: _Goal,
+    *,
+    gains: Array,
+    requested: ComplexArray | None,
+    settling: float,
+    method: Method,
 ) -> FeedbackDesign:
     """Simulate the chosen design, the delay and the input limit included, and say how it does."""
     chain, T = plant.chain, plant.sample_time
@@ -300,7 +325,8 @@ def _finish(
     if requested is not None:
         away = np.abs(requested[None, :] - poles[:, None])
         requested = requested[linear_sum_assignment(away)[1]]
-    t = T * np.arange(np.ceil(_HORIZON * goal.settling / T) + 1, dtype=np.float64)
+    shown = _SHOWN * min(max(goal.settling, settling), _LATEST * goal.settling)
+    t = T * np.arange(np.ceil(shown / T) + 1, dtype=np.float64)
     run = simulate_loop(
         chain,
         StateFeedback(gains=gains, prefilter=prefilter, model=chain),
@@ -313,9 +339,8 @@ def _finish(
     judged = {"before": 0.0, "level": np.float64(goal.reference)}
     overshoot = float(step_response.overshoot_percent(y, **judged))
     settling = float(step_response.settling_time(t, y, **judged))
-    peak = float(np.abs(run.u).max())
-    met = overshoot <= goal.overshoot + _ROUNDING and settling <= goal.settling + T / 2
-    return FeedbackDesign(
+    met = overshoot <= goal.overshoot + _UNSEEN and settling <= goal.settling + T / 2
+    design = FeedbackDesign(
         cart=plant.cart,
         method=method,
         reference=goal.reference,
@@ -326,46 +351,40 @@ def _finish(
         sample_time=T,
         overshoot_percent=overshoot,
         settling_time=None if np.isnan(settling) else settling,
-        peak_input=peak,
+        peak_input=float(np.abs(run.u).max()),
         t=t,
         y=run.x,
         u=run.u,
         reachable=bool(met),
-        message=_message(plant, goal, gains, overshoot, settling, peak, met=met),
+        message="",
     )
+    return replace(design, message=_message(plant, goal, design))
 
 
-def _message(
-    plant: _Sampled,
-    goal: _Goal,
-    gains: Array,
-    overshoot: float,
-    settling: float,
-    peak: float,
-    *,
-    met: bool,
-) -> str:
+def _message(plant: _Sampled, goal: _Goal, design: FeedbackDesign) -> str:
     """Say what is reachable where the goal is not, and what model error does; often nothing."""
     said = []
     tied = plant.chain.k[0] > 0 or plant.chain.k[-1] > 0
     held = abs(plant.chain.static_gains()[plant.cart - 1]) * goal.limit if tied else np.inf
-    if not met and abs(goal.reference) > held:
+    if not design.reachable and abs(goal.reference) > held:
         said.append(
             f"an input of ±{goal.limit:.3g} cannot hold cart {plant.cart} at "
             f"{goal.reference:.3g}: reachable is {held:.3g}"
         )
-    elif not met:
-        settles = "no settling" if np.isnan(settling) else f"settling in {settling:.3g} s"
+    elif not design.reachable:
+        settling = design.settling_time
+        settles = "no settling" if settling is None else f"settling in {settling:.3g} s"
         said.append(
-            f"{goal} cannot be met: reachable is overshoot {overshoot:.2g} % and {settles} "
-            f"with an input of {peak:.3g}"
+            f"{goal} cannot be met: reachable is overshoot {design.overshoot_percent:.2g} % and "
+            f"{settles} with an input of {design.peak_input:.3g}"
         )
-    if not plant.stays_stable(gains):
+    if not plant.stays_stable(design.gains):
         said.append(
-            f"the loop is unstable where masses or springs are {100 * MASS_SPRING_ERROR:g} % or "
-            f"dampings {100 * DAMPING_ERROR:g} % off"
+            f"the loop may be unstable where masses or springs are {100 * MASS_SPRING_ERROR:g} % "
+            f"or dampings {100 * DAMPING_ERROR:g} % off"
         )
-    if (error := float(level_error_percent(plant.chain, gains, cart=plant.cart))) > _LEVEL_WARNING:
+    error = float(level_error_percent(plant.chain, design.gains, cart=plant.cart))
+    if error > _LEVEL_WARNING:
         said.append(
             f"these gains cancel much of the plant's own stiffness: errors of "
             f"{100 * MASS_SPRING_ERROR:g} % in the springs move the level by up to {error:.0f} %"
