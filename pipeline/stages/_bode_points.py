@@ -38,7 +38,9 @@ class Points:
             raise DataError("Bode fit: needs a frequency response, found none")
         for response in responses:
             if not 1 <= response.cart <= n:
-                raise DataError(f"Bode fit: {n} carts, but a response of cart {response.cart}")
+                raise DataError(
+                    f"Bode fit: a response of cart {response.cart}, with {n} in the system"
+                )
         omega = np.concatenate([r.omega for r in responses])
         magnitude = np.concatenate([r.magnitude for r in responses])
         if not (np.all(np.isfinite(omega) & (omega >= 0)) and np.all(np.isfinite(magnitude))):
@@ -99,7 +101,10 @@ def response_at(
     s = 1j * data.omega
     b, powers = P.directions, s[:, None] ** P.orders  # (n_p, n), (n_w, n_p)
     Z = np.einsum("wp,pi,pj->wij", powers * physical, b, b, optimize=True)
-    inverse = np.linalg.inv(Z)
+    try:
+        inverse = np.linalg.inv(Z)
+    except np.linalg.LinAlgError:  # a step of the fit that goes astray: no number, it steps back
+        inverse = np.full_like(Z, np.nan)
     G = inverse[:, :, 0]
     stretch = (G @ b.T) * -powers  # (n_w, n_p)
     slopes = (inverse @ b.T) * stretch[:, None, :]  # (n_w, n, n_p)

@@ -25,7 +25,6 @@ from pipeline.stages.staged_fit import LogMagnitude, StagedFit, fit_stage_by_sta
 
 _STARTS = 8  # random ones, tried where the first does not explain the data
 _GOOD_CHI_SQUARE = 2.0  # per degree of freedom: the data are explained
-_CONFIRMATIONS, _SAME_MINIMUM = 3, 1e-3  # the best chi² found so often, to this ratio
 _START_SPREAD = 0.5  # of ln m and ln k of a random start: half to double, mostly
 _START_ZETAS = (0.02, 0.3)
 _SEED = 2005  # of the random starts; any, but the same every time
@@ -189,13 +188,15 @@ def _evaluator(
 
 def _solve(P: Parametrisation, data: Points, theta: Array, scale: Scale) -> _Fitted:
     residuals, jacobian = _evaluator(P, data, scale)
-    solution = least_squares(
-        residuals,
-        theta,
-        jac=jacobian,  # pyright: ignore[reportArgumentType] - scipy's default is a string
-        x_scale="jac",
-        max_nfev=_EVALUATIONS,
-    )
+    # A step that goes astray may overflow; least_squares then takes a shorter one.
+    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+        solution = least_squares(
+            residuals,
+            theta,
+            jac=jacobian,  # pyright: ignore[reportArgumentType] - scipy's default is a string
+            x_scale="jac",
+            max_nfev=_EVALUATIONS,
+        )
     return _Fitted(
         parametrisation=P,
         theta=solution.x,
@@ -209,26 +210,14 @@ def _solve(P: Parametrisation, data: Points, theta: Array, scale: Scale) -> _Fit
 def _fit_from_starts(
     P: Parametrisation, data: Points, *, first: Chain, like: Chain
 ) -> tuple[_Fitted, int]:
-    """Fit from the first start, and from random ones while the data are not explained.
-
-    The best minimum found again and again is taken for the lowest: then the chain does not
-    describe the data, and further starts would not help.
-    """
-
-    def fit_from(start: Chain) -> _Fitted:
+    """Fit from the first start, and from random ones while the data are not explained."""
+    fits: list[_Fitted] = []
+    for start in (first, *_random_starts(like, P.springs)):
         near = _solve(P, data, P.pack(start), "log")
-        return _solve(P, data, near.theta, "magnitude")
-
-    best = fit_from(first)
-    found = [best.chi_square]
-    starts = _random_starts(like, P.springs)
-    while best.chi_square_per_dof > _GOOD_CHI_SQUARE and (start := next(starts, None)):
-        fitted = fit_from(start)
-        found.append(fitted.chi_square)
-        best = min(best, fitted, key=lambda fit: fit.chi_square)
-        if sum(np.array(found) <= best.chi_square * (1 + _SAME_MINIMUM)) >= _CONFIRMATIONS:
+        fits.append(_solve(P, data, near.theta, "magnitude"))
+        if fits[-1].chi_square_per_dof <= _GOOD_CHI_SQUARE:
             break
-    return best, len(found)
+    return min(fits, key=lambda fit: fit.chi_square), len(fits)
 
 
 def _widen(fitted: _Fitted, data: Points) -> tuple[_Fitted, float]:

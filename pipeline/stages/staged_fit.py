@@ -16,6 +16,8 @@ from pipeline.plant.chain import Array, Chain, quadratic_factors, recover_chain
 
 _MODES = "abcdefgh"
 _EVALUATIONS = 100  # a stage that gets there takes about ten
+_RUNAWAY = 7.0  # of a logarithm, a factor 1000: a stage that got there has lost its way
+_FARTHEST = 50.0  # of a logarithm: a step that goes astray must not overflow
 _ZETA_RANGE = (0.01, 1.0)  # of a start: outside it the fit would not find its way back
 
 
@@ -112,13 +114,16 @@ def _fit(
         jac=jacobian,  # pyright: ignore[reportArgumentType] - scipy's default is a string
         max_nfev=_EVALUATIONS,
     ).x
+    if np.max(np.abs(found - start)) > _RUNAWAY:
+        return gain, factors
     return float(np.exp(found[0])), found[1:].reshape(shape)
 
 
 def _log_factors(omega: Array, factors: Array) -> tuple[Array, Array]:
     """Return Σ ln|Q_j| (n_w,) and its slopes (n_w, 2 n_j) by ln omega_j, then by ln zeta_j."""
-    r = omega[:, None] / np.exp(factors[0])
-    damping = 2j * np.exp(factors[1]) * r
+    size, zeta = np.exp(np.clip(factors, -_FARTHEST, _FARTHEST))
+    r = omega[:, None] / size
+    damping = 2j * zeta * r
     Q = 1 - r**2 + damping
     slopes = np.hstack([((2 * r**2 - damping) / Q).real, (damping / Q).real])
     return np.sum(np.log(np.abs(Q)), axis=1), slopes
