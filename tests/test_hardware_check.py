@@ -362,12 +362,24 @@ def test_an_unstable_statement_is_said():
         type="state_feedback", gains=(-1.0, -0.5, 0.0, 0.0), prefilter=1.0
     )
     stub = record(y, u=None, reference=STEPS)
-    with pytest.raises(DataError, match="makes the simulated loop unstable"):
+    with pytest.raises(DataError, match="stated controller makes it unstable"):
         check_hardware(stub, TWO, controller=wild)
 
-    pid = submission.Pid(type="pid", kp=-0.5, kd=-0.1, scale=1.0)
-    checks = check_hardware(record(y, u=u, reference=STEPS), TWO, controller=pid)
+    # A log that contradicts even the sign of what is stated has the loop closed its way.
+    checks = check_hardware(record(y, u=u, reference=STEPS), TWO, controller=wild)
     assert all(np.isfinite(check.nrmse) for check in checks)
+    assert {check.loop for check in checks} >= {"open"}
+
+
+def test_gains_that_do_not_fit_leave_the_open_check():
+    """Two gains for two carts: the loop is not simulated, and the open check says why."""
+    y, u = bench(TWO, Pid(kp=0.02, kd=0.001))
+    short = submission.StateFeedback(type="state_feedback", gains=(0.1, 0.01), prefilter=0.1)
+
+    checks = check_hardware(record(y, u=u, reference=STEPS), TWO, controller=short)
+
+    assert [check.loop for check in checks] == ["open", "open"]
+    assert "the loop is not simulated: state feedback of 2 carts needs 4 gains" in checks[0].note
 
 
 @pytest.mark.parametrize(

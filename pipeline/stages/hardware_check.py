@@ -55,19 +55,20 @@ def check_hardware(
     run = measured_run(record, chain)
     opened = _open(run) if run.driven else None
     law = _plant_law(controller, controlled_cart)
-    closed, unstable = None, ""
+    closed, trouble = None, ""
     if law is not None and record.reference is not None:
-        closed = _close(
-            run,
-            law,
-            reference=record.reference,
-            drive=opened.factor if opened else 1.0,
-            limit=input_limit,
-        )
-        if closed is None:
-            unstable = "the stated controller makes the simulated loop unstable"
+        try:
+            closed = _close(
+                run,
+                law,
+                reference=record.reference,
+                drive=opened.factor if opened else 1.0,
+                limit=input_limit,
+            )
+        except DataError as error:
+            trouble = f"the loop is not simulated: {error}"
     if opened is None and closed is None:
-        found = unstable or "found neither a logged input nor a controller with its reference"
+        found = trouble or "found neither a logged input nor a controller with its reference"
         raise DataError(
             f"{record.id}: the hardware check needs a loop or an input to simulate: {found}"
         )
@@ -76,7 +77,7 @@ def check_hardware(
         scale = opened.scale if opened else None
         checks += _compare(run, replace(closed, scale=scale), loop="closed")
     if opened is not None:
-        note = "; ".join(filter(None, (unstable, opened.note)))
+        note = "; ".join(filter(None, (trouble, opened.note)))
         checks += _compare(run, replace(opened, note=note), loop="open")
     return tuple(checks)
 
@@ -135,11 +136,15 @@ def _plant_law(controller: submission.Controller | None, cart: int | None) -> Co
 
 def _close(
     run: MeasuredRun, law: Controller, *, reference: Array, drive: float, limit: float | None
-) -> _Simulated | None:
-    """Close the loop around the chain; None where it is unstable.
+) -> _Simulated:
+    """Close the loop around the chain.
 
     How fast the bench's controller samples and acts, and whether it predicts, is not logged: of
     the usual ways the one that comes nearest to the measurement is taken.
+
+    Raises
+    ------
+    DataError : the controller does not fit the free carts, or makes the loop unstable.
     """
     record = run.record
     factor = _logged_per_stated(run, law, reference=reference)
@@ -167,7 +172,7 @@ def _close(
         if least <= run.noise_floor:
             break
     if best is None:
-        return None
+        raise DataError("the stated controller makes it unstable")
     note = ""
     if factor == -1.0:
         note = "the logged input has the opposite sign of what the stated controller asks for"
