@@ -11,12 +11,17 @@ section 7.2 (the local polynomial method).
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from pipeline.plant.chain import Array, ComplexArray
 from pipeline.results import Record
 
 _LEAST_INPUT_SHARE = 0.01  # of its strongest line; below, the input does not excite the plant
+# … and of its strongest neighbour: in a null of the input's spectrum (every second harmonic of a
+# step on and off) whatever is not linear is divided by next to nothing.
+_LEAST_NEIGHBOUR_SHARE = 0.25
+_NEIGHBOURS = 2  # frequencies on each side
 _REST_SHARE = 0.1  # the part of a record at its end that must be at rest
 _REST_SWING = 0.01  # … to this share of the whole travel
 # A step at the first sample has moved its cart by u t²/2m after two: 3 % of the travel even with
@@ -101,7 +106,9 @@ def _at_rest_ratio(run: Record, u: Array, omega: Array) -> TransferRatio | None:
 
 
 def _ratio(Y: ComplexArray, U: ComplexArray, *, std: Array) -> TransferRatio:
-    excited = np.abs(U) > _LEAST_INPUT_SHARE * np.max(np.abs(U))
+    size = np.abs(U)
+    around = sliding_window_view(np.pad(size, _NEIGHBOURS), 2 * _NEIGHBOURS + 1).max(axis=-1)
+    excited = size > np.maximum(_LEAST_INPUT_SHARE * np.max(size), _LEAST_NEIGHBOUR_SHARE * around)
     U = np.where(excited, U, 1.0)
     return TransferRatio(G=Y / U, std=np.where(excited, std / np.abs(U), np.inf))
 
