@@ -220,8 +220,8 @@ def _mat(**variables: object) -> bytes:
 
 
 def _bomb() -> bytes:
-    """A compressed element of 300 MB zeros in a few hundred kB."""
-    compressor = zlib.compressobj(9)
+    """A compressed element of 300 MB of zeros in a small file."""
+    compressor = zlib.compressobj(1)
     packed = compressor.compress(struct.pack("<II", 14, 300_000_000))
     packed += b"".join(compressor.compress(bytes(10_000_000)) for _ in range(30))
     packed += compressor.flush()
@@ -242,6 +242,7 @@ BAD_DATA = {
     "nan": (_replaced(12, "0.1,1,nan,0.2"), r"line 12: 'x1' is not a finite number"),
     "infinity": (_replaced(12, "0.1,1,-inf,0.2"), r"line 12: 'x1' is not a finite number"),
     "overflow": (_replaced(12, "0.1,1,1e999,0.2"), r"line 12: 'x1' is not a finite number"),
+    "too large": (_replaced(12, "0.1,1,1e60,0.2"), r"line 12: 'x1' is too large"),
     "cut in a line": ("\n".join(good_rows()) + "\n0.4,1,0.", r"line 42: expected 4 .*cut short"),
     "decimal commas": (
         "time,x1\n" + "".join(f"0,0{i},1,5\n" for i in range(20)),

@@ -2,6 +2,8 @@
 
 import re
 from decimal import Decimal
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 from hypothesis import given
@@ -114,9 +116,6 @@ def test_reported_numbers_keep_their_digits(folder):
 )
 def test_any_typed_number_comes_back_as_typed(number):
     """What a student typed under [reported] is the same text again."""
-    from pathlib import Path
-    from tempfile import TemporaryDirectory
-
     text = str(number)
     typed = text if "." in text else f"{text}.0"
     with TemporaryDirectory() as name:
@@ -130,7 +129,7 @@ def test_any_typed_number_comes_back_as_typed(number):
 
 @pytest.mark.parametrize("carts", [1, 2, 3, 4])
 def test_springs_left_out_are_all_there(carts, tmp_path):
-    """n carts have n + 1 springs from wall to wall."""
+    """Between walls, n carts have n + 1 springs."""
     (tmp_path / "submission.toml").write_text(f"version = 1\n[system]\ncarts = {carts}\n")
     assert load_submission(tmp_path).system.springs == (True,) * (carts + 1)
 

@@ -7,6 +7,7 @@ import numpy as np
 from pipeline.plant.chain import Array
 
 _FINEST_DECIMAL = 9  # a file that prints time beyond the nanosecond has not rounded it
+_ON_STEP = 0.02  # of a step; a value farther off is no multiple
 _WORTH_STRAIGHTENING = 2e-3  # rounding below this share of the sample interval does no harm
 _ROUNDING_BAND = 0.65  # of the rounding step: half of it, and what the fit of a short piece errs
 _SHORTEST_PIECE = 32  # samples; a fit of fewer leaves the band by chance
@@ -85,7 +86,8 @@ def decimal_step(values: Array) -> float:
         step = 10.0**-digits
         multiples = values / step
         # A double near 1e5 s in steps of 1e-9 s is itself only good to a hundredth of the step.
-        if np.abs(multiples - np.round(multiples)).max() < 0.02:
+        rounding = 1e-6 + 4 * np.finfo(np.float64).eps * np.abs(multiples).max()
+        if np.abs(multiples - np.round(multiples)).max() < min(rounding, _ON_STEP):
             return step
     return 0.0
 

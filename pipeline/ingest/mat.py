@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.errors import SubmissionError
-from pipeline.ingest.table import Form, Table
+from pipeline.ingest.table import Form, Table, refuse_unusable
 
 _MAX_INFLATED_BYTES = 200_000_000
 _MAX_COLUMNS = 64
@@ -132,9 +132,7 @@ def _table(variables: list[_Variable], *, source: str) -> Table:
     columns = []
     for name, column in zip(names, arrays, strict=True):
         wide = column.astype(np.float64)
-        if not np.isfinite(wide).all():
-            row = int(np.argmin(np.isfinite(wide)))
-            raise SubmissionError(f"{source} sample {row + 1}: {name!r} is not a finite number")
+        refuse_unusable(wide[None, :], names=[name], place=lambda row: f"{source} sample {row + 1}")
         unwrapped = _unwrap(wide, column.dtype)
         if unwrapped is not wide:
             notes.append(f"{name}: a {column.dtype} counter that ran over was made continuous")

@@ -1,5 +1,6 @@
 """A data file as it stands: named columns of numbers, before any meaning or unit."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Literal
@@ -11,6 +12,8 @@ from pipeline.errors import SubmissionError
 from pipeline.plant.chain import Array
 
 Form = Literal["ecp", "bench_log", "bench_mat", "matrix", "variables", "csv"]
+
+_LARGEST = 1e50  # squares and products of what is read must not overflow
 
 FORM_TITLES: dict[Form, str] = {
     "ecp": 'ECP "Export Raw Data" text',
@@ -76,6 +79,20 @@ class Table:
         """Return the headings as one short line."""
         shown = ", ".join(self.names[:12])
         return shown + (", …" if len(self.names) > 12 else "")
+
+
+def refuse_unusable(values: Array, *, names: Sequence[str], place: Callable[[int], str]) -> None:
+    """Refuse NaN, infinity and numbers beyond any measurement; values are (n_columns, n).
+
+    Raises
+    ------
+    SubmissionError : names the column and, by `place`, the row.
+    """
+    usable = np.abs(values) < _LARGEST  # NaN compares as false
+    if not usable.all():
+        column, row = np.argwhere(~usable)[0]
+        what = "too large" if np.isfinite(values[column, row]) else "not a finite number"
+        raise SubmissionError(f"{place(int(row))}: {names[column]!r} is {what}")
 
 
 def _loosely(name: str) -> str:

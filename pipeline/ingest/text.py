@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.errors import SubmissionError
-from pipeline.ingest.table import Form, Table
+from pipeline.ingest.table import Form, Table, refuse_unusable
 
 _MAX_COLUMNS = 64
 _SNIFFED_ROWS = 40
@@ -88,11 +88,7 @@ def _parse(
             f"{source} {failure}" if failure else f"{source}: holds no rows of numbers"
         )
     values = np.frombuffer(numbers, dtype=np.float64).reshape(-1, width)
-    if not np.isfinite(values).all():
-        row, column = np.argwhere(~np.isfinite(values))[0]
-        raise SubmissionError(
-            f"{source} line {lines[row]}: {names[column]!r} is not a finite number"
-        )
+    refuse_unusable(values.T, names=names, place=lambda row: f"{source} line {lines[row]}")
     return _Rows(values=values, lines=np.array(lines), cut=failure)
 
 

@@ -1,0 +1,122 @@
+"""Sample times: true ones are kept, rounded ones straightened, broken ones found."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+from pipeline.ingest.clock import decimal_step, read_clock
+
+
+@settings(deadline=None)
+@given(
+    interval=st.floats(1e-3, 0.03),
+    start=st.floats(0.0, 5.0),
+    n=st.integers(200, 3000),
+    rounded_down=st.booleans(),
+)
+def test_a_rounded_even_clock_is_straightened(interval, start, n, rounded_down):
+    """Stamps in whole ms give back the even clock behind them."""
+    true = start + interval * np.arange(n, dtype=np.float64)
+    stamps = np.floor(true * 1e3 + 1e-6) / 1e3 if rounded_down else np.round(true, 3)
+
+    clock = read_clock(stamps)
+
+    assert clock.stopped is None
+    # The fit of n stamps with uniform errors of ±0.5 ms: slope to sqrt(12)·0.29 ms/n^1.5, five of
+    # those; a beat between clock and rounding is not random, so allow the worst, 1 ms over n.
+    assert_allclose(clock.mean_interval, interval, atol=1e-3 / n)
+    offset = np.median(clock.t - true)  # rounding down may shift all by a whole step
+    assert abs(offset) <= 1e-3
+    assert_allclose(clock.t - true, offset, atol=0.5e-3)
+
+
+def test_the_ecp_clock_is_found():
+    """8.854 ms in stamps of 1 ms, as the ECP prints them, to a nanosecond's worth of rate."""
+    true = 0.0088542 * np.arange(677, dtype=np.float64)
+    clock = read_clock(np.round(true, 3))
+    assert (clock.rounding, clock.pieces) == (1e-3, 1)
+    assert_allclose(clock.mean_interval, 0.0088542, atol=5 * 12**0.5 * 0.29e-3 / 677**1.5)
+
+
+def test_a_clock_that_missed_beats_is_straightened_in_pieces():
+    """Where a bench skipped samples, each stretch gets its own line within the rounding."""
+    steps = np.full(8000, 0.0011279)
+    steps[[1500, 4200, 6100]] += 0.004
+    true = np.cumsum(steps)
+
+    clock = read_clock(true.round(3))
+
+    assert clock.pieces > 1
+    assert np.abs(clock.t - true).max() < 1e-3  # never farther off than the stamps' own rounding
+    assert np.sqrt(np.mean((clock.t - true) ** 2)) < 1e-4  # stamps alone: 0.29 ms
+
+
+@pytest.mark.parametrize("digits", [9, 6, 5])
+def test_true_uneven_times_are_kept_as_they_are(digits):
+    """Jitter and drift of the clock are measured truth, not rounding."""
+    rng = np.random.default_rng(3)
+    steps = 0.005 * (1 + 0.05 * rng.standard_normal(2000) + np.linspace(0, 0.1, 2000))
+    stamps = np.round(np.cumsum(steps), digits)
+    clock = read_clock(stamps)
+    assert clock.pieces == 0
+    assert_array_equal(clock.t, stamps)
+    assert 0.04 < clock.jitter / clock.mean_interval < 0.08
+
+
+def test_a_jittering_clock_in_rounded_stamps_is_kept():
+    """Where no straight line lies within the rounding, the stamps are the best there is."""
+    rng = np.random.default_rng(4)
+    stamps = np.round(np.cumsum(0.005 + 0.001 * rng.standard_normal(2000)), 3)
+    clock = read_clock(stamps)
+    assert clock.pieces == 0
+    assert_array_equal(clock.t, stamps)
+
+
+def test_an_even_clock_needs_no_straightening():
+    """Stamps that are exact multiples are left alone."""
+    clock = read_clock(0.001 * np.arange(500, dtype=np.float64))
+    assert clock.pieces == 0
+    assert clock.jitter < 1e-12
+
+
+def test_several_samples_to_one_stamp_are_told_apart():
+    """A 2.3-kHz log in whole ms has equal stamps; the clock behind them still runs."""
+    true = np.arange(2000, dtype=np.float64) / 2300
+    clock = read_clock(np.floor(true * 1e3) / 1e3)
+    assert clock.stopped is None
+    assert (np.diff(clock.t) > 0).all()
+    assert_allclose(clock.mean_interval, 1 / 2300, rtol=1e-3)  # 1 ms of 870 ms
+
+
+@pytest.mark.parametrize("at", [1, 37, 99])
+def test_where_time_stops_or_turns_back_is_found(at):
+    """The first sample that does not advance is named."""
+    stamps = 0.01234567 * np.arange(100, dtype=np.float64)
+    still, back = stamps.copy(), stamps.copy()
+    still[at] = still[at - 1]
+    back[at:] -= 0.5
+    assert read_clock(still).stopped == at
+    assert read_clock(back).stopped == at
+
+
+def test_gaps_are_found():
+    """An interval of several usual ones is a gap, in even and in rounded stamps."""
+    for stamps in (
+        0.01 * np.arange(500, dtype=np.float64),
+        np.round(0.0088542 * np.arange(500, dtype=np.float64), 3),
+    ):
+        late = stamps.copy()
+        late[200:] += 0.5
+        assert read_clock(stamps).gaps == ()
+        assert read_clock(late).gaps == (200,)
+
+
+@pytest.mark.parametrize(
+    ("values", "step"),
+    [([0.0, 0.009, 0.018], 1e-3), ([1.5, 2.0], 0.1), ([3.0, 4.0], 1.0), ([0.1 / 3, 1.0], 0.0)],
+)
+def test_the_decimal_step_of_stamps(values, step):
+    """The last decimal place in use, none for full precision."""
+    assert decimal_step(np.array(values)) == step

@@ -1,0 +1,249 @@
+"""Every form of data file gives the same numbers: text of any dialect, `.mat` of any layout."""
+
+import hashlib
+from io import BytesIO
+
+import numpy as np
+import pytest
+import scipy.io
+from numpy.testing import assert_allclose, assert_array_equal
+
+from pipeline.errors import SubmissionError
+from pipeline.ingest.files import parse_table, read_table
+from pipeline.ingest.table import Table
+
+N = 50
+TIME = np.round(0.00884 * np.arange(N), 3)
+X1 = np.round(300 * np.sin(20 * TIME))
+X2 = np.round(-200 * np.sin(15 * TIME))
+U = np.round(0.5 * np.sign(np.sin(9 * TIME)), 4)
+HEADING = " Sample   Time     Commanded Pos   Encoder 1 Pos   Encoder 2 Pos   Control Effort"
+ROWS = [
+    f"{i:5d} {t:8.3f} {0:15d} {a:15.0f} {b:15.0f} {u:15.4f}"
+    for i, (t, a, b, u) in enumerate(zip(TIME, X1, X2, U, strict=True))
+]
+
+
+def table(content: str | bytes) -> Table:
+    """Parse what a file would hold."""
+    return parse_table(content.encode() if isinstance(content, str) else content, source="f")
+
+
+def column(of: Table, name: str) -> np.ndarray:
+    """Return a column by its heading."""
+    return of.values[of.index(name)]
+
+
+ECP = {
+    "as exported": HEADING + "\n\n[" + ";\n".join(ROWS) + "]\n",
+    "carriage returns": (HEADING + "\n\n[" + ";\n".join(ROWS) + "]\n").replace("\n", "\r\n"),
+    "mixed line ends": HEADING + "\r\n\n[" + ";\r\n".join(ROWS) + "]\r\n",
+    "old Macintosh": (HEADING + "\n\n[" + ";\n".join(ROWS) + "]\n").replace("\n", "\r"),
+    "a MATLAB script": "%" + HEADING + "\r\n\r\ndata =[" + ";\r\n".join(ROWS) + "];\r\n",
+    "spaces before": "\n\n%" + HEADING + "\n   data = [ " + ";\n".join(ROWS) + "\n ] ;\n\n",
+    "rows without semicolons": HEADING + "\n[\n" + "\n".join(ROWS) + "\n]",
+    "rows in one line": HEADING + "\n[" + "; ".join(ROWS) + "]",
+    "commas": HEADING + "\n[" + ";\n".join(",".join(row.split()) for row in ROWS) + "]",
+    "comments": HEADING + "\n[" + "; % tick\n".join(ROWS) + "]",
+    "single spaces": " ".join(HEADING.split()) + "\n[" + ";\n".join(ROWS) + "]",
+    "byte-order mark": "\ufeff" + HEADING + "\n[" + ";\n".join(ROWS) + "]",
+}
+
+
+@pytest.mark.parametrize("content", ECP.values(), ids=ECP.keys())
+def test_an_ecp_export_is_read_in_every_dialect(content):
+    """Brackets, semicolons, line ends and a script's frame around them change no number."""
+    got = table(content)
+
+    assert got.form == "ecp"
+    assert got.names[2:] == ("Commanded Pos", "Encoder 1 Pos", "Encoder 2 Pos", "Control Effort")
+    assert_array_equal(column(got, "Time"), TIME)
+    assert_array_equal(column(got, "Encoder 1 Pos"), X1)
+    assert_array_equal(column(got, "Control Effort"), U)
+    assert got.cut is None
+
+
+@pytest.mark.parametrize("keep", [(0, 1, 3, 5), (1, 2, 3, 4), (0, 1, 2, 4, 5), (0, 1, 2, 3, 4, 5)])
+def test_an_ecp_export_may_hold_any_of_its_columns(keep):
+    """The columns a student ticked, in the order of the export."""
+    names = ("Sample", "Time", "Commanded Pos", "Encoder 1 Pos", "Encoder 2 Pos", "Control Effort")
+    values = (np.arange(N), TIME, 0 * TIME, X1, X2, U)
+    rows = [" ".join(f"{values[k][i]:.4f}" for k in keep) for i in range(N)]
+
+    got = table("  ".join(names[k] for k in keep) + "\n[" + ";\n".join(rows) + "]\n")
+
+    assert got.names == tuple(names[k] for k in keep)
+    for row, k in enumerate(keep):
+        assert_array_equal(got.values[row], values[k])
+
+
+def test_lines_are_counted_as_an_editor_counts_them():
+    """A row's place is its line in the file, whatever ends the lines."""
+    got = table(ECP["a MATLAB script"])
+    assert (got.place(0), got.place(N - 1)) == ("line 3", f"line {N + 2}")
+
+
+def test_text_after_an_ecp_export_is_mentioned():
+    """A script that goes on after its data loses nothing in silence."""
+    got = table(ECP["a MATLAB script"] + "plot(data)\n")
+    assert got.notes == (f"text after line {N + 2} is not data and was not read",)
+
+
+def delimited(delimiter: str, decimal: str = ".", quote: str = "", end: str = "\n") -> str:
+    """Write the four signals as a table of text."""
+    lines = [delimiter.join(quote + name + quote for name in ("time", "input", "x1", "x2"))]
+    for row in zip(TIME, U, X1, X2, strict=True):
+        lines.append(delimiter.join(f"{value:.4f}".replace(".", decimal) for value in row))
+    return end.join(lines) + end
+
+
+CSV = {
+    "comma": delimited(","),
+    "semicolon": delimited(";"),
+    "tab": delimited("\t"),
+    "spaces": delimited("  "),
+    "comma and space": delimited(", "),
+    "decimal commas, semicolon": delimited(";", decimal=","),
+    "decimal commas, tab": delimited("\t", decimal=","),
+    "quoted headings": delimited(",", quote='"'),
+    "CR LF": delimited(",", end="\r\n"),
+    "Excel's first line": "sep=;\n" + delimited(";", decimal=","),
+    "comments before": "# bench 4\n% team 7\n" + delimited(","),
+    "comment as heading": "# " + delimited(","),
+    "delimiter at the line end": delimited(",").replace("\n", ",\n"),
+    "UTF-16": delimited("\t").encode("utf-16"),
+    "Windows letters": ("# 5 µm\n" + delimited(",")).encode("latin-1"),
+    "byte-order mark": "\ufeff" + delimited(";"),
+    "no last line end": delimited(",").rstrip("\n"),
+}
+
+
+@pytest.mark.parametrize("content", CSV.values(), ids=CSV.keys())
+def test_delimiter_and_decimal_mark_are_found(content):
+    """A table of text gives the same numbers however a spreadsheet wrote it."""
+    got = table(content)
+
+    assert got.form == "csv"
+    assert got.names == ("time", "input", "x1", "x2")
+    for row, expected in zip(got.values, (TIME, U, X1, X2), strict=True):
+        assert_array_equal(row, expected)
+
+
+def test_whole_numbers_with_decimal_commas_are_no_decimals():
+    """In a comma-separated table of whole numbers each comma separates."""
+    got = table("time,x1\n" + "".join(f"{i},{i % 3}\n" for i in range(20)))
+    assert_array_equal(got.values, [np.arange(20), np.arange(20) % 3])
+
+
+def test_columns_without_headings_are_numbered():
+    """A table without a heading is addressed by number."""
+    got = table("".join(f"{t} {x}\n" for t, x in zip(TIME, X1, strict=True)))
+    assert got.names == ("1", "2")
+    assert got.index(2) == 1
+    with pytest.raises(SubmissionError, match="no column 3, the file has 2"):
+        got.index(3)
+
+
+def test_one_column_alone_is_read():
+    """A single channel without time needs only its sample rate."""
+    got = table("displacement\n" + "\n".join(f"{x:g}" for x in X1))
+    assert got.names == ("displacement",)
+    assert_array_equal(got.values[0], X1)
+
+
+def test_the_bench_log_is_told_from_an_ecp_export():
+    """Same headings, tabs, no brackets, and the effort in duty counts."""
+    lines = ["Sample\tTime\tEncoder 1 Pos\tEncoder 2 Pos\tControl Effort"]
+    lines += [
+        f"{i + 1}\t{t:g}\t{a:g}\t{b:g}\t410"
+        for i, (t, a, b) in enumerate(zip(TIME, X1, X2, strict=True))
+    ]
+    got = table("\n".join(lines) + "\n")
+    assert got.form == "bench_log"
+    assert_array_equal(column(got, "encoder 2 pos"), X2)
+    assert got.whole == (True, False, True, True, True)
+
+
+def mat(version: str = "5", compress: bool = False, **variables: object) -> bytes:
+    """Write a .mat file as MATLAB would."""
+    stream = BytesIO()
+    scipy.io.savemat(stream, variables, format=version, do_compression=compress)
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize("compress", [False, True])
+@pytest.mark.parametrize("dtype", ["i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8"])
+def test_mat_vectors_of_every_number_type_are_read(dtype, compress):
+    """Short and unsigned integers come back as they were saved, as scipy's own reader says."""
+    values = np.arange(0, 100, 2).astype(dtype)
+    raw = mat(compress=compress, time=TIME[None, :], enc1=values, duty=values[:, None])
+
+    got = table(raw)
+
+    oracle = scipy.io.loadmat(BytesIO(raw), squeeze_me=True)
+    assert got.form == "bench_mat"
+    for name in ("time", "enc1", "duty"):
+        assert_array_equal(column(got, name), oracle[name])
+
+
+@pytest.mark.parametrize("dtype", ["u1", "i2", "u2", "i4", "f4", "f8"])
+def test_mat_version_4_is_read(dtype):
+    """Old files too."""
+    values = np.arange(0, 100, 2).astype(dtype)
+    got = table(mat(version="4", t=TIME, x1=values))
+    assert_array_equal(column(got, "x1"), values)
+    assert_array_equal(column(got, "t"), TIME)
+
+
+def test_a_big_endian_mat_file_is_read():
+    """A file of another processor: the same bytes turned round."""
+    header = b"MATLAB 5.0 MAT-file".ljust(124) + b"\x01\x00MI"
+    values = np.arange(9.0).astype(">f8").tobytes()
+    body = b"".join(
+        np.array(words, dtype=">u4").tobytes() + data
+        for words, data in (
+            ([6, 8, 6, 0], b""),
+            ([5, 8, 9, 1], b""),
+            ([1, 2], b"x1".ljust(8, b"\0")),
+            ([9, 72], values),
+        )
+    )
+    raw = header + np.array([14, len(body)], dtype=">u4").tobytes() + body
+    assert_array_equal(scipy.io.loadmat(BytesIO(raw))["x1"].ravel(), np.arange(9.0))
+    assert_array_equal(column(table(raw), "x1"), np.arange(9.0))
+
+
+def test_a_bare_matrix_has_numbered_columns():
+    """One matrix: its columns by number; one that lies on its side is turned, and said."""
+    matrix = np.column_stack([np.arange(N), TIME, X1, U])
+    upright, lying = table(mat(data=matrix)), table(mat(data=matrix.T))
+    assert upright.form == "matrix"
+    assert upright.names == ("1", "2", "3", "4")
+    assert_array_equal(upright.values, matrix.T)
+    assert_array_equal(lying.values, matrix.T)
+    assert "data lies on its side" in lying.notes[0]
+    assert upright.whole == (True, False, True, False)
+
+
+def test_what_a_mat_file_holds_besides_is_mentioned():
+    """Structs, text and single numbers are left out, and named."""
+    got = table(mat(time=TIME, x1=X1, run={"P": 1.0}, name="bench 4", rate=113.0))
+    assert got.names == ("time", "x1")
+    assert sorted(got.notes[0].removeprefix("not read: ").split(", ")) == [
+        "name (text)", "rate (float64)", "run (struct)",
+    ]  # fmt: skip
+
+
+def test_a_counter_that_ran_over_is_made_continuous():
+    """A 16-bit encoder count that passes its end goes on, and the record says so."""
+    true = 65_500 + 3 * np.arange(N)
+    got = table(mat(time=TIME, enc1=(true % 65_536).astype("u2"), duty=np.zeros(N, "i2")))
+    assert_allclose(np.diff(column(got, "enc1")), 3, rtol=0, atol=0)
+    assert any("ran over" in note for note in got.notes)
+
+
+def test_the_hash_is_of_the_bytes(tmp_path):
+    """The provenance names exactly the bytes that were read."""
+    (tmp_path / "a.csv").write_bytes(b"time,x1\n0,1\n1,2\n")
+    digest = hashlib.sha256(b"time,x1\n0,1\n1,2\n").hexdigest()
+    assert read_table(tmp_path, "a.csv")[1] == digest

@@ -1,0 +1,136 @@
+"""What `inspect` says of a file: form, columns, clock, kind, problems."""
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.errors import SubmissionError
+from pipeline.ingest.inspect import Inspection, format_inspection, inspect_file
+
+RATE = 200.0
+T = np.arange(2000) / RATE
+X = np.round(300 * np.exp(-0.5 * T) * np.cos(12 * T)) * 0.00227
+STEP = np.where((T > 1) & (T < 6), 1.0, 0.0)
+
+
+def inspect(folder: Path, **columns: np.ndarray) -> Inspection:
+    """Write columns as CSV and inspect the file."""
+    rows = zip(*columns.values(), strict=True)
+    text = ",".join(columns) + "\n" + "".join(",".join(f"{v:.7g}" for v in r) + "\n" for r in rows)
+    (folder / "a.csv").write_text(text)
+    return inspect_file(folder / "a.csv")
+
+
+def test_the_essentials_are_told(tmp_path):
+    """Form, samples, rate, duration, roles, ranges and the encoder step."""
+    got = inspect(tmp_path, time=T, input=STEP, x1=X, remark=0 * T)
+    assert got.format == "table of text (CSV)"
+    assert got.samples == 2000
+    assert got.rate == pytest.approx(RATE)
+    assert got.duration == pytest.approx(1999 / RATE)
+    assert got.jitter == pytest.approx(0.0, abs=1e-9)
+    assert [column.role for column in got.columns] == ["time", "input", "x1", None]
+    assert got.columns[2].high == pytest.approx(0.681)
+    assert got.columns[2].step == pytest.approx(0.00227, rel=1e-6)
+    assert got.problems == ("no role for remark: name them in `columns` to use them",)
+
+
+KINDS = {
+    "decay": {"input": 0 * T},
+    "step": {"input": STEP},
+    "sine": {"input": 0.3 * np.sin(2 * np.pi * 4.0 * T)},
+    "sweep": {"input": np.sin((1 + 3 * T) * T)},
+    "closed_loop": {"input": np.exp(-T) * np.sin(9 * T), "reference": STEP},
+}
+
+
+@pytest.mark.parametrize(("kind", "signals"), KINDS.items(), ids=KINDS.keys())
+def test_the_kind_is_guessed(kind, signals, tmp_path):
+    """The input's shape and a reference tell what was done."""
+    got = inspect(tmp_path, time=T, x1=X, **signals)
+    assert got.kind == kind
+    if kind == "sine":
+        assert got.frequency == pytest.approx(4.0, rel=0.01)  # a tenth of the 0.1 Hz lines
+    else:
+        assert got.frequency is None
+
+
+def test_a_bode_table_is_recognised(tmp_path):
+    """A frequency column makes a table of amplitude ratios."""
+    got = inspect(tmp_path, frequency=np.arange(1.0, 9.0), x1=np.ones(8))
+    assert got.kind == "bode"
+    assert (got.rate, got.duration, got.problems) == (None, None, ())
+
+
+def _frozen() -> np.ndarray:
+    x = np.round(300 * np.sin(8 * T))
+    x[500:540] = x[499]
+    return x
+
+
+uneven = np.cumsum(np.random.default_rng(1).uniform(0.003, 0.007, T.size))
+PROBLEMS = {
+    "stuck": ({"time": T, "x1": _frozen()}, "'x1' stands still at speed from 2.495 s to 2.695 s"),
+    "dead": ({"time": T, "x1": X, "x2": 0 * T}, "'x2' never changes"),
+    "clipped": (
+        {"time": T, "x1": X, "input": np.clip(2 * np.sin((2 + T) * T), -1.5, 1.5)},
+        "the input is clipped at 1.5",
+    ),
+    "gap": ({"time": T + (T > 5), "x1": X}, "time is missing between 5 s and 6.005 s"),
+    "rounding": ({"time": np.round(T * 1.013, 3), "x1": X}, "time stamps are rounded to 0.001 s"),
+    "uneven": ({"time": uneven, "x1": X}, "the sample interval varies by 2"),
+    "pasted": ({"time": np.r_[T, T], "x1": np.r_[X, X]}, "line 2002: time goes back"),
+    "still": ({"time": np.r_[T, T[-1]], "x1": np.r_[X, 0]}, "line 2002: time stands still"),
+    "milliseconds": ({"time": 1e3 * T, "x1": X}, "samples are 5 s apart"),
+    "no time": ({"input": STEP, "x1": X}, "no time column: state `sample_rate`"),
+    "no position": ({"time": T, "input": STEP}, "no column is a cart's position"),
+    "two of one": ({"time": T, "input": STEP, "u": STEP, "x1": X}, "both look like input"),
+    "few": ({"time": T[:2], "x1": X[:2]}, "only 2 samples"),
+}
+
+
+@pytest.mark.parametrize(("columns", "problem"), PROBLEMS.values(), ids=PROBLEMS.keys())
+def test_problems_are_named(columns, problem, tmp_path):
+    """What would spoil a report is said before it is made."""
+    got = inspect(tmp_path, **columns)
+    assert any(problem in said for said in got.problems), got.problems
+
+
+def test_a_cut_file_is_inspected_all_the_same(tmp_path):
+    """A half last line is a problem named by its line, not the end of the inspection."""
+    inspect(tmp_path, time=T, x1=X)
+    text = (tmp_path / "a.csv").read_text().rstrip("\n")
+    (tmp_path / "a.csv").write_text(text + "\n10.0")
+    got = inspect_file(tmp_path / "a.csv")
+    assert got.samples == 2000
+    assert got.problems == ("line 2002: expected 2 columns, found 1: the file was cut short",)
+
+
+def test_the_text_and_the_json_say_the_same(tmp_path):
+    """Every problem and column stands in both; the JSON has no NaN."""
+    got = inspect(tmp_path, time=np.round(T * 1.013, 3), input=0.3 * np.sin(25 * T), x1=_frozen())
+    text, plain = format_inspection(got), json.loads(json.dumps(got.to_dict(), allow_nan=False))
+    assert plain["kind"] == "sine"
+    assert plain["columns"][2]["role"] == "x1"
+    assert "looks like sine at 3.9" in text
+    assert all(problem in text for problem in plain["problems"])
+    assert len(plain["problems"]) == 2
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links need rights on Windows")
+def test_a_link_may_be_inspected(tmp_path):
+    """Looking at one's own file through a link is no harm."""
+    inspect(tmp_path, time=T, x1=X)
+    (tmp_path / "link").symlink_to(tmp_path / "a.csv")
+    assert inspect_file(tmp_path / "link").samples == 2000
+
+
+def test_what_is_no_data_file_is_one_line(tmp_path):
+    """A missing file and a folder are errors."""
+    with pytest.raises(SubmissionError, match=r"there is no file 'none\.csv'"):
+        inspect_file(tmp_path / "none.csv")
+    with pytest.raises(SubmissionError, match="is a folder"):
+        inspect_file(tmp_path)

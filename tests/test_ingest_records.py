@@ -1,0 +1,349 @@
+"""From tables to records: units, signs, windows, references, free carts, Bode tables."""
+
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+from numpy.testing import assert_allclose, assert_array_equal
+
+from pipeline.errors import SubmissionError
+from pipeline.ingest.read import DUTY_COUNT, Ingested, read_data
+from pipeline.plant.chain import PRESETS
+from pipeline.plant.simulate import simulate_linear
+from pipeline.submission import load_submission
+
+N = 600
+T = 0.0088542 * np.arange(N, dtype=np.float64)
+U = np.where((T > 0.5) & (T < 3.0), 0.01, 0.0)
+Y = 440 * simulate_linear(PRESETS["throne-2dof"], T, U)  # in counts of 1/440 cm
+X1, X2 = np.round(Y)
+
+
+def read(folder: Path, system: str, experiment: str, content: str | bytes) -> Ingested:
+    """Read a submission of two carts with one experiment."""
+    folder.mkdir(exist_ok=True)
+    toml = f'version = 1\n[system]\ncarts = 2\n{system}\n[[experiments]]\nid = "a"\n{experiment}\n'
+    (folder / "submission.toml").write_text(toml + 'file = "a.dat"\n', encoding="utf-8")
+    raw = content.encode() if isinstance(content, str) else content
+    (folder / "a.dat").write_bytes(raw)
+    return read_data(load_submission(folder))
+
+
+def csv(**columns: np.ndarray) -> str:
+    """Write columns as CSV; "__" in a name stands for a space and brackets its unit."""
+    heading = ",".join(name.replace("__", " [") + "]" if "__" in name else name for name in columns)
+    rows = zip(*columns.values(), strict=True)
+    return heading + "\n" + "".join(",".join(f"{v:.7g}" for v in row) + "\n" for row in rows)
+
+
+def ecp(*, reference: np.ndarray, x1: np.ndarray, effort: np.ndarray) -> str:
+    """Write an ECP export of one encoder."""
+    rows = [
+        f"{i} {t:.3f} {r:.0f} {a:.0f} {u:.4f}"
+        for i, (t, r, a, u) in enumerate(zip(T, reference, x1, effort, strict=True))
+    ]
+    head = " Sample   Time   Commanded Pos   Encoder 1 Pos   Control Effort\n\n["
+    return head + ";\n".join(rows) + "]\n"
+
+
+STEP = 'kind = "step"'
+LOOP = 'kind = "closed_loop"'
+CM = 'position = { unit = "cm", per_count = 0.00227 }'
+
+
+def test_counts_become_position_units_once(tmp_path):
+    """An ECP's encoder columns are multiplied by per_count; the step is one count."""
+    record = read(tmp_path, CM, STEP, ecp(reference=0 * X1, x1=X1, effort=U)).records[0]
+    assert_allclose(record.position(1), 0.00227 * X1, rtol=1e-15)
+    assert record.encoder_step(1) == 0.00227
+    assert record.position_scale == 0.00227
+    assert record.carts == (1,)
+    assert record.free == (1, 2)
+
+
+def test_positions_of_a_csv_are_in_the_unit_already(tmp_path):
+    """per_count never touches x1 … of a CSV, whole numbers or not."""
+    record = read(tmp_path, CM, STEP, csv(time=T, input=U, x2=X2, x1=X1)).records[0]
+    assert_array_equal(record.position(1), X1)
+    assert_array_equal(record.position(2), X2)
+
+
+def test_an_encoder_heading_in_a_csv_means_counts(tmp_path):
+    """A CSV that says it holds an encoder's counts is converted like an export."""
+    content = csv(time=T, input=U, x1=X1).replace("x1", "Encoder 1 Pos")
+    record = read(tmp_path, CM, STEP, content).records[0]
+    assert_allclose(record.position(1), 0.00227 * X1, rtol=1e-15)
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("mm", 0.1), ("m", 100.0), ("cm", 1.0)])
+def test_a_unit_in_the_heading_is_converted(unit, factor, tmp_path):
+    """Displacement in mm becomes cm, and the record says so."""
+    content = csv(**{"Time__us": np.round(1e6 * T), f"Displacement__{unit}": X1})
+    record = read(tmp_path, CM, 'kind = "decay"\ncarts = [2]', content).records[0]
+    assert record.carts == (2,)  # the one free cart
+    assert_allclose(record.position(2), factor * X1, rtol=1e-12)
+    assert_allclose(record.t, T, atol=0.5e-6)
+    assert any("converted" in note for note in record.notes) == (factor != 1.0)
+
+
+def test_one_displacement_of_several_free_carts_needs_a_name(tmp_path):
+    """Which cart a nameless column belongs to is not guessed."""
+    content = csv(**{"Time__us": np.round(1e6 * T), "Displacement__mm": X1})
+    with pytest.raises(
+        SubmissionError, match=r"no column is a cart's position; it has Time \[us\]"
+    ):
+        read(tmp_path, CM, 'kind = "decay"', content)
+    named = 'kind = "decay"\ncolumns = { x1 = "Displacement [mm]" }'
+    assert read(tmp_path, CM, named, content).records[0].carts == (1,)
+
+
+def test_whole_ecp_values_without_a_scale_are_counts(tmp_path):
+    """Without [system.position] the unit is the count."""
+    record = read(tmp_path, "", STEP, ecp(reference=0 * X1, x1=X1, effort=U)).records[0]
+    assert_array_equal(record.position(1), X1)
+
+
+def bench_log(effort: np.ndarray) -> str:
+    """Write the bench's own tab-separated log."""
+    lines = ["Sample\tTime\tEncoder 1 Pos\tEncoder 2 Pos\tControl Effort"]
+    rows = zip(T, X1, X2, effort, strict=True)
+    lines += [f"{i}\t{t:.3f}\t{a:g}\t{b:g}\t{u:g}" for i, (t, a, b, u) in enumerate(rows, start=1)]
+    return "\n".join(lines) + "\n"
+
+
+@pytest.mark.parametrize(
+    ("system", "scale"),
+    [("", DUTY_COUNT), ('input = { unit = "V", per_count = 0.002 }', 0.002)],
+)
+def test_duty_counts_become_input_units(system, scale, tmp_path):
+    """A bench log's effort counts 4096 to 5 V unless the submission says otherwise."""
+    duty = np.round(40_960 * U)
+    record = read(tmp_path, system, STEP, bench_log(duty)).records[0]
+    assert record.u is not None
+    assert_allclose(record.u, scale * duty, rtol=1e-15)
+    assert_allclose(record.input_scale, scale, rtol=1e-15)
+
+
+def test_an_effort_with_fractions_is_no_duty_count(tmp_path):
+    """The same log with volts in it stays in volts."""
+    record = read(tmp_path, "", STEP, bench_log(U)).records[0]
+    assert record.u is not None
+    assert_array_equal(record.u, U)
+
+
+def test_the_bench_mat_layouts_agree_with_its_log(tmp_path):
+    """Both .mat layouts and the text log of one run are one record."""
+    duty, reference = np.round(40_960 * U), np.where(T > 0.5, 300.0, 0.0)
+    stamps = np.round(T, 3)
+    stream, other = BytesIO(), BytesIO()
+    scipy.io.savemat(
+        stream,
+        {"enc1": X1.astype("i2"), "enc2": X2.astype("i2"), "target_v": reference.astype("u2"),
+         "duty": duty.astype("i2"), "time": stamps},
+    )  # fmt: skip
+    scipy.io.savemat(
+        other,
+        {"cart1pos": X1.astype("i4"), "cart2pos": X2.astype("i4"), "target_value": reference,
+         "duty_cycle": duty.astype("i2"), "t_received": stamps},
+    )  # fmt: skip
+    log = read(tmp_path, CM, STEP, bench_log(duty)).records[0]
+    for raw in (stream.getvalue(), other.getvalue()):
+        record = read(tmp_path, CM, LOOP, raw).records[0]
+        assert_array_equal(record.t, log.t)
+        assert_array_equal(record.y, log.y)
+        assert_array_equal(record.u, log.u)
+        assert record.reference is not None
+        assert_allclose(record.reference, 0.00227 * reference, rtol=1e-15)
+
+
+def test_a_bare_matrix_is_read_by_column_numbers(tmp_path):
+    """`columns` gives a bare matrix its meaning; whole positions are counts."""
+    stream = BytesIO()
+    scipy.io.savemat(stream, {"data": np.column_stack([np.arange(N), T, X1, X2, U])})
+    columns = STEP + "\ncolumns = { time = 2, x1 = 3, x2 = 4, input = 5 }"
+    record = read(tmp_path, CM, columns, stream.getvalue()).records[0]
+    assert_allclose(record.y, 0.00227 * np.array([X1, X2]), rtol=1e-15)
+    assert "columns not used: 1" in record.notes
+
+
+def test_a_sample_rate_stands_in_for_a_time_column(tmp_path):
+    """Without a time column samples follow each other at the stated rate."""
+    record = read(tmp_path, "", STEP + "\nsample_rate = 113.0", csv(u=U, x1=X1)).records[0]
+    assert_allclose(record.t, np.arange(N) / 113.0, rtol=1e-15)
+
+
+def test_a_sample_rate_against_the_time_column_is_mentioned(tmp_path):
+    """Measured time goes before a stated rate."""
+    record = read(tmp_path, "", STEP + "\nsample_rate = 200.0", csv(t=T, u=U, x1=X1)).records[0]
+    assert_allclose(record.t, T, atol=1e-6)
+    assert any("sample_rate = 200 Hz is not used" in note for note in record.notes)
+
+
+def test_a_window_keeps_its_part_of_the_times(tmp_path):
+    """Times stay the file's own; both ends are included; the end may be rounded up a little."""
+    record = read(tmp_path, "", STEP + "\nwindow = [1.0, 2.0]", csv(time=T, u=U, x1=X1)).records[0]
+    inside = (T >= 1.0) & (T <= 2.0)
+    assert_allclose(record.t, T[inside], atol=1e-6)
+    assert_array_equal(record.position(1), X1[inside])
+    end = STEP + f"\nwindow = [1.0, {T[-1] + 0.04:.3f}]"
+    assert read(tmp_path, "", end, csv(time=T, u=U, x1=X1)).records[0].t[-1] == pytest.approx(T[-1])
+
+
+def test_gaps_in_time_are_noted_and_nothing_is_dropped(tmp_path):
+    """A log that paused keeps all its samples, and the record says where it paused."""
+    late = T + np.where(T > 2.0, 0.7, 0.0)
+    record = read(tmp_path, "", STEP, csv(time=late, input=U, x1=X1)).records[0]
+    assert record.t.size == N
+    assert any(note.startswith("time is missing between 1.992 s and 2.70") for note in record.notes)
+
+
+def test_columns_that_are_not_used_are_mentioned(tmp_path):
+    """A third encoder on a bench of two carts, a column of another name."""
+    content = csv(time=T, input=U, x1=X1, x3=X2, temperature=0 * T)
+    record = read(tmp_path, "", STEP, content).records[0]
+    assert "columns not used: temperature, x3" in record.notes
+
+
+def test_a_broken_channel_is_noted(tmp_path):
+    """A stuck encoder and a clipped input stand in the record's notes."""
+    sweep = np.clip(1.5 * np.sin((3 + 2 * T) * T), -1.0, 1.0)
+    x = np.round(440 * 5 * np.sin(6 * T))
+    x[200:240] = x[199]
+    record = read(tmp_path, "", 'kind = "sweep"', csv(time=T, input=sweep, x1=x)).records[0]
+    assert any("'x1' stands still at speed from 1.76" in note for note in record.notes)
+    assert "the input is clipped at 1" in record.notes
+
+
+# ---------------------------------------------------------------- references and signs
+
+
+def test_a_commanded_position_is_the_reference_under_feedback_only(tmp_path):
+    """In a closed loop it is the set point, in position units; elsewhere there is none."""
+    content = ecp(reference=np.where(T > 0.5, 1000.0, 0.0), x1=X1, effort=U)
+    closed = read(tmp_path, CM, LOOP, content).records[0]
+    assert closed.reference is not None
+    assert (closed.reference.min(), closed.reference.max()) == (0.0, 2.27)
+    assert read(tmp_path, CM, STEP, content).records[0].reference is None
+
+
+def test_a_mirrored_commanded_position_is_no_reference(tmp_path):
+    """What an ECP logs in open loop is a copy of encoder 1."""
+    copy = np.round(0.5 * X1 + 0.5 * np.r_[0.0, X1[:-1]])
+    record = read(tmp_path, CM, LOOP, ecp(reference=copy, x1=X1, effort=U)).records[0]
+    assert record.reference is None
+    assert any("only mirrors 'Encoder 1 Pos'" in note for note in record.notes)
+
+
+def test_a_stated_reference_goes_before_the_file(tmp_path):
+    """`reference = 1.5` is in position units and constant."""
+    content = csv(time=T, input=U, x1=X1, reference=0 * T)
+    record = read(tmp_path, CM, LOOP + "\nreference = 1.5", content).records[0]
+    assert record.reference is not None
+    assert_array_equal(record.reference, 1.5)
+    assert read(tmp_path, CM, LOOP, csv(time=T, x1=X1)).records[0].reference is None
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_sign_not_stated_is_found_and_said(sign, tmp_path):
+    """The record's input pushes cart 1 towards positive x, whatever the log's sign."""
+    data = read(tmp_path, "", STEP, csv(time=T, input=sign * U, x1=X1))
+    assert_array_equal(data.records[0].u, U)
+    assert data.records[0].input_scale == sign
+    assert f"sign of the input found from the data: {sign:+d}" in data.warnings
+
+
+def test_a_stated_sign_is_used_and_a_doubtful_one_mentioned(tmp_path):
+    """What the students say goes before what the data say; a contradiction is told."""
+    content = csv(time=T, input=U, x1=X1)
+    data = read(tmp_path, 'input = { unit = "V", sign = -1 }', STEP, content)
+    assert_array_equal(data.records[0].u, -U)
+    assert data.warnings == ("a: the sign of the input is stated as -1, the data say +1",)
+    own = STEP + "\ninput = { sign = 1, per_count = 2.0 }"
+    data = read(tmp_path, 'input = { unit = "V", sign = -1 }', own, content)
+    assert_array_equal(data.records[0].u, 2 * U)
+    assert data.warnings == ()
+
+
+def test_signs_may_differ_between_experiments(tmp_path):
+    """A log that counts the other way is found; one that tells nothing follows its own sort."""
+    toml = "version = 1\n[system]\ncarts = 2\n"
+    runs = {
+        "step": ("step", csv(time=T, input=-U, x1=X1)),
+        "loop": ("closed_loop", csv(time=T, input=U, x1=X1)),
+        "blind": ("closed_loop", csv(time=T, input=U, x2=X2)),
+        "free": ("decay", csv(time=T, input=0 * U, x1=X1)),
+    }
+    for name, (kind, content) in runs.items():
+        toml += f'[[experiments]]\nid = "{name}"\nkind = "{kind}"\nfile = "{name}.csv"\n'
+        (tmp_path / f"{name}.csv").write_text(content)
+    (tmp_path / "submission.toml").write_text(toml)
+
+    data = read_data(load_submission(tmp_path))
+
+    assert [record.input_scale for record in data.records[:3]] == [-1.0, 1.0, 1.0]
+    (said,) = data.warnings
+    assert said == (
+        "sign of the input found from the data: +1, but -1 in step; "
+        "taken from the others where the data do not tell: blind"
+    )
+    assert list(data.files) == sorted(f"{name}.csv" for name in runs)
+
+
+def test_data_that_do_not_tell_the_sign_are_said_to(tmp_path):
+    """Where cart 1 is not measured the sign is taken as +1, and said."""
+    data = read(tmp_path, "", STEP, csv(time=T, input=U, x2=X2))
+    assert_array_equal(data.records[0].u, U)
+    assert "the data do not tell the sign of the input" in data.warnings[0]
+
+
+def test_a_dwell_carries_its_frequency(tmp_path):
+    """Hz in the submission, rad/s inside; left out it is left to the fit."""
+    content = csv(time=T, input=np.sin(10 * T), x1=X1)
+    with_f = read(tmp_path, "", 'kind = "sine"\nfrequency = 4.0', content).records[0]
+    assert with_f.omega == pytest.approx(8 * np.pi)
+    assert read(tmp_path, "", 'kind = "sine"', content).records[0].omega is None
+
+
+# ------------------------------------------------------------------------- Bode tables
+
+
+def test_a_bode_table_becomes_a_response_a_cart(tmp_path):
+    """Frequencies in Hz, ascending; without repeats 1 % is taken, and said."""
+    f = np.array([4.0, 1.0, 2.0])
+    data = read(tmp_path, "", 'kind = "bode"', csv(frequency=f, x1=f + 1, x2=f + 2))
+    first, second = data.tables
+    assert (first.cart, second.cart, first.source) == (1, 2, "table")
+    assert_allclose(first.omega, 2 * np.pi * np.array([1.0, 2.0, 4.0]), rtol=1e-9)
+    assert_allclose(first.magnitude, [2.0, 3.0, 5.0], rtol=1e-15)
+    assert_allclose(second.magnitude_std, 0.01 * second.magnitude, rtol=1e-15)
+    assert first.phase is None
+    assert "taken as 1%: the table has no repeats" in data.warnings[0]
+
+
+def test_repeats_in_a_bode_table_give_its_standard_errors(tmp_path):
+    """Repeated frequencies are averaged, and their spread is the error of all points."""
+    rng = np.random.default_rng(11)
+    f = np.repeat(np.geomspace(0.5, 8.0, 100), 4)
+    x = (1 + f) * np.exp(0.03 * rng.standard_normal(f.size))
+    (response,) = read(tmp_path, "", 'kind = "bode"', csv(frequency=f, x1=x)).tables
+    assert response.omega.size == 100
+    # A standard deviation from 300 degrees of freedom is good to 1/sqrt(600) = 4 %; three of those.
+    assert_allclose(response.magnitude_std / response.magnitude, 0.03 / 2, rtol=0.12)
+
+
+def test_a_bode_table_may_be_in_rad_per_s_and_db(tmp_path):
+    """Units in the headings are obeyed."""
+    content = csv(**{"omega__rad/s": np.array([10.0, 20.0]), "x1__dB": np.array([20.0, 0.0])})
+    (response,) = read(tmp_path, "", 'kind = "bode"', content).tables
+    assert_allclose(response.omega, [10.0, 20.0], rtol=1e-9)
+    assert_allclose(response.magnitude, [10.0, 1.0], rtol=1e-12)
+
+
+def test_a_bode_table_with_held_carts_is_left_out_and_said(tmp_path):
+    """A response of some carts only is another plant's."""
+    content = csv(frequency=np.array([1.0, 2.0]), x1=np.array([1.0, 2.0]))
+    data = read(tmp_path, "", 'kind = "bode"\ncarts = [1]', content)
+    assert data.tables == ()
+    assert "a: not used: a bode table is fitted with all carts free" in data.warnings[0]

@@ -1,0 +1,122 @@
+"""What the signals tell by themselves: encoder step, sign of the input, broken channels."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+from pipeline.ingest.problems import saturation, stuck_spans
+from pipeline.ingest.signals import encoder_step, input_sign, mirrors
+from pipeline.plant.chain import PRESETS
+from pipeline.plant.simulate import simulate_linear
+
+RATE = 113.0
+T = np.arange(900, dtype=np.float64) / RATE
+
+
+@settings(deadline=None)
+@given(
+    step=st.floats(1e-4, 10.0),
+    travel=st.integers(20, 3000),
+    decimals=st.integers(2, 15),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_the_encoder_step_is_recovered(step, travel, decimals, seed):
+    """Counts times any step, printed to a hundredth of it or finer, give the step back."""
+    rng = np.random.default_rng(seed)
+    counts = np.round(travel * np.sin(np.linspace(0, 20, 2000)) + rng.standard_normal(2000))
+    digits = decimals - int(np.floor(np.log10(step)))
+    x = np.round(step * counts, digits)
+    # Each level is off by half a printed digit, at most 0.005 of a step; the line through the
+    # levels spans at least 30 of them.
+    assert_allclose(encoder_step(x), step, rtol=1e-3)
+
+
+def test_a_signal_without_steps_has_no_encoder_step():
+    """Full-precision noise shows no step, nor does a constant."""
+    rng = np.random.default_rng(1)
+    assert encoder_step(rng.standard_normal(1000)) == 0.0
+    assert encoder_step(np.full(1000, 3.0)) == 0.0
+
+
+def respond(name: str, u: np.ndarray, sign: int) -> np.ndarray:
+    """Return cart 1's position in encoder counts, with noise, for a logged input of that sign."""
+    rng = np.random.default_rng(7)
+    y = simulate_linear(PRESETS[name], T, sign * u)[0]
+    y = y / np.ptp(y) + 0.001 * rng.standard_normal(y.size)
+    return np.rint(440 * y)
+
+
+CASES = {
+    "step on": np.where(T > 0.3, 1.0, 0.0),
+    "step on and off": np.where((T > 0.3) & (T < 4.0), -1.0, 0.0),
+    "dwell below": np.sin(2 * np.pi * 1.0 * T),
+    "dwell near": np.sin(2 * np.pi * 2.0 * T),
+    "sweep": np.sin(2 * np.pi * (0.3 + 0.3 * T) * T),
+    "random": np.repeat(np.random.default_rng(5).standard_normal(90), 10),
+}
+
+
+@pytest.mark.parametrize("preset", ["throne-1dof", "throne-2dof", "throne-3dof"])
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
+def test_the_sign_of_the_input_is_found(case, sign, preset):
+    """Whatever moves the cart from rest tells the direction in which the motor pushes."""
+    x = respond(preset, case, sign)
+    assert input_sign(case, x, closed_loop=False) == sign
+
+
+@pytest.mark.parametrize("frequency", np.geomspace(0.3, 20.0, 25))
+def test_the_sign_is_never_wrong_on_a_late_log(frequency):
+    """Far from resonance a log that is late by a sample leaves the sign open, never wrong."""
+    u = np.sin(2 * np.pi * frequency * T)
+    for preset in PRESETS:
+        for late in (0, 1):
+            x = np.roll(respond(preset, u, 1), late)
+            x[:late] = x[late]
+            assert input_sign(u, x, closed_loop=False) in (0, 1)
+
+
+def test_without_motion_or_input_there_is_no_sign():
+    """A decay or a locked cart tells nothing."""
+    decay = np.rint(440 * np.exp(-T) * np.cos(13 * T))
+    assert input_sign(np.zeros_like(T), decay, closed_loop=False) == 0
+    assert input_sign(np.sin(T), np.full_like(T, 3.0), closed_loop=False) == 0
+
+
+def test_a_mirrored_position_is_told_from_a_reference():
+    """A copy of encoder 1 read between two samples mirrors it; a set point does not."""
+    x = np.rint(440 * (1 - np.exp(-2 * T) * np.cos(13 * T)))
+    between = np.rint(0.5 * x + 0.5 * np.r_[x[0], x[:-1]])
+    assert mirrors(between, x)
+    assert not mirrors(np.where(T > 0.1, 440.0, 0.0), x)
+    assert not mirrors(np.rint(440 * np.sin(T)), np.rint(440 * np.sin(T - 0.1)))
+
+
+def test_a_stuck_encoder_is_found():
+    """A reading that freezes at speed and jumps back is stuck; a cart at its crest is not."""
+    x = np.rint(440 * np.sin(6 * T))
+    assert stuck_spans(x) == []
+    frozen = x.copy()
+    frozen[200:230] = frozen[199]
+    assert stuck_spans(frozen) == [(199, 229)]
+    dead = x.copy()
+    dead[600:] = dead[599]
+    assert stuck_spans(dead) == [(599, 899)]
+    assert stuck_spans(np.rint(440 * np.exp(-3 * T) * np.cos(20 * T))) == []
+
+
+@pytest.mark.parametrize("digits", [2, 3, 4, 9])
+def test_clipping_is_told_from_a_rounded_crest(digits):
+    """A sine rounded to a few digits dwells at its crest, but is not clipped."""
+    crest = np.round(0.8 * np.sin(7.3 * T), digits)
+    assert saturation(crest) is None
+    clipped = np.clip(np.round(1.6 * np.sin(7.3 * T), digits), -1.0, 1.0)
+    assert saturation(clipped) == 1.0
+
+
+def test_steps_and_slow_approaches_are_not_clipped():
+    """Inputs that are at their extreme by design or creep there are sound."""
+    assert saturation(np.where(T > 1, 1.0, 0.0)) is None
+    assert saturation((1 - np.exp(-2 * T)).round(4)) is None
