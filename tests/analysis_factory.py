@@ -3,6 +3,8 @@
 The numbers are what the stages would plausibly find: truth plus a small, seeded error.
 """
 
+from functools import cache
+
 import numpy as np
 
 from pipeline.plant.chain import PRESETS, Array, Chain, parameter_unit
@@ -32,6 +34,7 @@ _AMPLITUDE = 0.1  # V
 _PRESET = {1: "throne-1dof", 2: "throne-2dof", 3: "throne-3dof"}
 
 
+@cache
 def make_analysis(carts: int = 2, *, seed: int = 1, repeats: int = 2) -> Analysis:
     """Return everything `analyse` would find for the preset of 1, 2 or 3 carts."""
     rng = np.random.default_rng(seed)

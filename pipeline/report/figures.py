@@ -182,8 +182,8 @@ def to_svg(figure: Figure, *, name: str, alt: str) -> str:
     """
     for ax in figure.axes:
         # Panels on one time axis are labelled below the last.
-        lonely = len(ax.get_shared_x_axes().get_siblings(ax)) == 1
-        draw_ticks(ax, label_x=lonely or ax.get_subplotspec().is_last_row())
+        together = ax.get_shared_x_axes().get_siblings(ax)
+        draw_ticks(ax, label_x=ax is min(together, key=lambda other: other.get_position().y0))
     buffer = io.StringIO()
     with matplotlib.rc_context({"svg.hashsalt": name}):
         FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None})

@@ -21,6 +21,7 @@ from pipeline.report.figures import (
     plot_model,
     thin,
 )
+from pipeline.report.words import clean
 from pipeline.results import (
     FeedbackDesign,
     HardwareCheck,
@@ -209,7 +210,7 @@ def _small_multiples(titles: Sequence[str]) -> tuple[Figure, list[Axes]]:
     figure, axes = panels(*[1.3] * rows, columns=columns, share_x=False)
     for spare in axes[n:]:
         figure.delaxes(spare)
-    for ax, title in zip(axes, titles, strict=False):
+    for ax, title in zip(axes, map(clean, titles), strict=False):
         short = title if len(title) <= _LONGEST_TITLE else f"{title[: _LONGEST_TITLE - 1]}…"
         ax.set_title(short, loc="left", y=1.0)
     return figure, axes[:n]

@@ -137,7 +137,7 @@ def symbolic_transfer_functions(springs: Sequence[bool]) -> Formula | None:
     Named are one to three carts that some spring ties to a wall.
     """
     n = len(springs) - 1
-    if n > 3 or not all(springs[1:-1]) or not any(springs):
+    if n > 3 or not all(springs[1:-1]) or not (springs[0] or springs[-1]):
         return None
     nulls = {1: [[]], 2: [["2"], []], 3: [["x", "y"], ["3"], []]}[n]
     if n == 1:
@@ -153,7 +153,7 @@ def numeric_transfer_functions(chain: Chain) -> Formula:
 
     A chain that no wall holds has no static gain, so its polynomials are shown.
     """
-    if not np.any(chain.k > 0) or np.min(np.abs(chain.poles)) == 0:
+    if not chain.is_tied:
         return formula(lines(_polynomial_ratio(chain, i) for i in range(chain.n, 0, -1)))
     gains = [_short(gain) for gain in chain.static_gains()]
     below = _numeric_factors(chain.poles)

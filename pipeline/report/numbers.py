@@ -4,6 +4,8 @@ import math
 
 _SUPERSCRIPT = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 _PLAIN_RANGE = (1e-3, 1e5)  # sizes written without a power of ten
+_MOST_DIGITS = 8
+_FINEST = 1e-8  # an error this far below the value is that of exact data: its digits say nothing
 NOTHING = "–"
 
 
@@ -23,6 +25,8 @@ def with_error(value: float, std: float | None) -> str:
     """Return "value ± std", both to the decimal place of the second digit of the error."""
     if std is None or not math.isfinite(std) or std <= 0 or not math.isfinite(value):
         return significant(value)
+    if std < _FINEST * abs(value):
+        return significant(value, digits=_MOST_DIGITS)
     size = _exponent(max(abs(value), std), digits=2)
     if _is_plain(size):
         decimals = 1 - _exponent(std, digits=2)

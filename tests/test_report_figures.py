@@ -1,0 +1,165 @@
+"""Figures: what is drawn, at which ticks, and that the same data give the same bytes."""
+
+import subprocess
+import sys
+from itertools import pairwise
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from pipeline.report.figures import drawing, panels, plot_measured, thin, to_svg
+from pipeline.report.figures_bode import bode_figure
+from pipeline.report.figures_time import sine_figure
+from pipeline.report.ticks import linear_ticks, log_ticks, tick_labels
+from tests.analysis_factory import make_analysis
+
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+def bode_svg(carts: int = 2) -> str:
+    analysis = make_analysis(carts)
+    with drawing():
+        figure = bode_figure(
+            analysis.frequency_responses[0],
+            chain=analysis.chain,
+            position_unit="cm",
+            input_unit="V",
+        )
+        return to_svg(figure, name="bode", alt="Bode <plot>")
+
+
+def test_a_figure_is_well_formed_and_says_what_it_shows():
+    """The SVG parses, has its alternative text, and its labels are text."""
+    root = ElementTree.fromstring(bode_svg())
+    assert root.attrib["role"] == "img"
+    assert root.findtext(f"{SVG}title") == "Bode <plot>"
+    texts = ["".join(text.itertext()) for text in root.iter(f"{SVG}text")]
+    assert "ω [rad/s]" in texts
+    assert "|X1/U| [dB re 1 cm/V]" in texts
+    assert root.find(f"{SVG}metadata") is None
+
+
+def test_the_same_data_give_the_same_bytes():
+    """Neither a date, nor a random id, nor the order of drawing gets in."""
+    assert bode_svg() == bode_svg()
+
+
+def test_every_dwell_is_drawn_as_a_diamond():
+    """Three panels of 24 measured points each, and the one in the legend."""
+    root = ElementTree.fromstring(bode_svg())
+    marks = [use for use in root.iter(f"{SVG}use")]
+    assert len(marks) == 3 * 24 + 1
+
+
+def test_measured_phase_lies_on_the_branch_of_the_fit():
+    """A measured phase wrapped into (-π, π] is drawn beside the unwrapped model."""
+    analysis = make_analysis(3)
+    response = analysis.frequency_responses[2]  # cart 3 goes down to -540°
+    with drawing():
+        figure = bode_figure(response, chain=analysis.chain, position_unit="cm", input_unit="V")
+    _, phase, _ = figure.axes
+    line, points = (np.asarray(drawn.get_ydata(), dtype=float) for drawn in phase.lines[:2])
+    assert response.phase is not None
+    assert np.min(response.phase) > -np.pi
+    assert line.min() < -500
+    # Noise of 0.01 rad and a grid of 300 points on the line: well within 15°.
+    at = np.interp(response.omega, np.asarray(phase.lines[0].get_xdata(), dtype=float), line)
+    assert np.max(np.abs(points - at)) < 15
+
+
+def test_a_student_s_dollar_signs_are_no_formula():
+    """An id with dollar signs draws as it is."""
+    with drawing():
+        figure, (ax,) = panels(1.0)
+        plot_measured(ax, np.linspace(0, 1, 5), np.zeros(5))
+        ax.set_ylim(-1, 1)
+        ax.set_title("$\\frac{$ <b> 中文 &", loc="left")
+        svg = to_svg(figure, name="x", alt="")
+    assert "$\\frac{$ &lt;b&gt; 中文 &amp;" in svg
+
+
+def test_a_dwell_shades_the_transient():
+    """The shaded span ends where the steady part begins."""
+    analysis = make_analysis(2)
+    points = [p for p in analysis.sine_points if p.experiment == "sine-10"]
+    record = next(r for r in analysis.records if r.id == "sine-10")
+    with drawing():
+        figure = sine_figure(points, record=record, position_unit="cm")
+    for ax in figure.axes:
+        (span,) = (patch for patch in ax.patches if isinstance(patch, Rectangle))
+        span = span.get_extents().transformed(ax.transData.inverted())
+        assert span.x0 == pytest.approx(0.0, abs=1e-9)
+        assert span.x1 == pytest.approx(4.0)
+
+
+@given(
+    st.integers(10, 3000),
+    st.integers(0, 2**32 - 1),
+)
+def test_thinning_keeps_the_envelope(n, seed):
+    """The largest and smallest value stay, times ascend, and few points are left."""
+    rng = np.random.default_rng(seed)
+    t, y = np.sort(rng.uniform(0, 1, n)), rng.normal(size=n)
+    thin_t, thin_y = thin(t, y)
+    assert thin_y.max() == y.max()
+    assert thin_y.min() == y.min()
+    assert np.all(np.diff(thin_t) >= 0)
+    assert thin_t.size <= 480
+
+
+@given(st.floats(-1e6, 1e6), st.floats(1e-6, 1e6), st.integers(2, 9))
+def test_ticks_are_round_numbers_inside_the_axis(low, span, most):
+    """At least two ticks, evenly spaced by 1, 2 or 5 times a power of ten, none outside."""
+    high = low + span
+    assume(span > 1e-9 * abs(low))
+    ticks = linear_ticks(low, high, most=most)
+    step = ticks[1] - ticks[0]
+    assert ticks.size >= 2
+    assert ticks[0] >= low - 1e-8 * step
+    assert ticks[-1] <= high + 1e-8 * step
+    mantissa = step / 10.0 ** np.floor(np.log10(step * (1 + 1e-6)))
+    # Cancellation: the step is a difference of numbers up to 1e9 times larger.
+    assert min(abs(mantissa - m) for m in (1, 2, 5)) < 1e-5 * (1 + abs(low) / step * 1e-9)
+
+
+def test_tick_labels_share_their_decimals():
+    """Labels of one axis have one form, and a true minus sign."""
+    assert tick_labels(np.array([-0.5, 0.0, 0.5])) == ["−0.5", "0.0", "0.5"]
+    assert tick_labels(np.array([-200.0, 0.0])) == ["−200", "0"]
+    assert tick_labels(log_ticks(0.4, 7.0)) == ["0.5", "1", "2", "5"]
+    assert tick_labels(log_ticks(0.05, 900.0)) == ["0.1", "1", "10", "100"]
+    assert tick_labels(np.array([0.0, 5e-6])) == ["0", "5e−06"]
+
+
+def test_the_user_s_own_settings_do_not_matter(monkeypatch):
+    """A matplotlibrc with other fonts and colours changes nothing."""
+    import matplotlib
+
+    before = bode_svg()
+    with matplotlib.rc_context({"font.size": 30, "lines.linewidth": 9, "svg.fonttype": "path"}):
+        assert bode_svg() == before
+
+
+def test_the_report_imports_only_what_it_needs():
+    """No pyplot, no pandas, no control: they would cost a second before the first number."""
+    code = (
+        "import sys, pipeline.report.render; "
+        "print([m for m in ('matplotlib.pyplot', 'pandas', 'control', 'numba', 'scipy.signal') "
+        "if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_panels_leave_room_for_their_labels():
+    """Every panel lies inside the figure, below the one before."""
+    figure, axes = panels(1.0, 0.5, 0.7)
+    assert isinstance(figure, Figure)
+    boxes = [ax.get_position() for ax in axes]
+    assert all(0.05 < box.x0 < box.x1 < 1 and 0.05 < box.y0 < box.y1 < 1 for box in boxes)
+    assert all(lower.y1 < upper.y0 for upper, lower in pairwise(boxes))

@@ -1,0 +1,119 @@
+"""Students' notes: Markdown in, inert blocks out."""
+
+import re
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.report.document import (
+    Block,
+    Code,
+    Document,
+    Heading,
+    Items,
+    Paragraph,
+    Quote,
+    Section,
+    Span,
+    Table,
+    plain,
+)
+from pipeline.report.html import render_html
+from pipeline.report.notes import note_blocks
+
+
+def page(blocks: tuple[Block, ...]) -> str:
+    """Return the HTML of a report that holds only these blocks."""
+    return render_html(
+        Document(
+            title="t",
+            subtitle="",
+            authors=(),
+            sections=(Section("discussion", "Discussion", blocks),),
+            footer="",
+        )
+    )
+
+
+def test_markdown_becomes_blocks():
+    """Headings, emphasis, code, lists, quotes and tables keep their structure."""
+    blocks = note_blocks(
+        "# Result\n\nIt is **very** *soft*, `k = 3`.\n\n1. one\n   - inner\n2. two\n\n> quoted\n\n"
+        "```\ncode <b>\n```\n\n| a | b |\n|---|--:|\n| 1 | 2 |\n"
+    )
+
+    heading, text, items, quote, code, table = blocks
+    assert isinstance(heading, Heading)
+    assert heading.level == 3  # the report's own headings are above
+    assert isinstance(text, Paragraph)
+    assert text.text[1:] == (
+        Span("very", "strong"),
+        Span(" "),
+        Span("soft", "em"),
+        Span(", "),
+        Span("k = 3", "code"),
+        Span("."),
+    )
+    assert isinstance(items, Items)
+    assert items.ordered
+    assert len(items.items) == 2
+    assert isinstance(items.items[0][1], Items)
+    assert isinstance(quote, Quote)
+    assert code == Code("code <b>")
+    assert isinstance(table, Table)
+    assert table.align == "lr"
+    assert [plain(cell.text) for cell in table.rows[0]] == ["1", "2"]
+
+
+@pytest.mark.parametrize(
+    "markdown",
+    [
+        "<script>alert(1)</script>",
+        "text <img src=x onerror=alert(1)> text",
+        "[click](javascript:alert(1))",
+        "[click](data:text/html,<script>alert(1)</script>)",
+        "[click](//evil.example/x)",
+        "![tracker](https://evil.example/pixel.png)",
+        "<style>body{display:none}</style>",
+        '[a](https://ok.example/"onmouseover=alert(1)//)',
+        "&lt;script&gt;alert(1)&lt;/script&gt;",
+    ],
+)
+def test_hostile_markdown_stays_text(markdown):
+    """Nothing a student writes becomes a tag, an attribute, a script or a remote image."""
+    html = page(note_blocks(markdown)).split("<main>")[1]
+
+    tags = re.findall(r"<[^>]*>", html)
+    allowed = re.compile(
+        r"</?(p|section|h2|main|footer|body|html|em|strong)\b[^<>]*>"
+        r'|<a href="https://[^"]*" rel="noopener noreferrer nofollow">|</a>'
+    )
+    assert all(allowed.fullmatch(tag) for tag in tags), tags
+    assert "evil.example/pixel" not in html
+
+
+def test_web_and_mail_links_stay():
+    """A plain link keeps its address, marked so that it passes nothing on."""
+    (block,) = note_blocks("[paper](https://example.org/a?b=1&c=2) <mailto:a@example.org>")
+    assert isinstance(block, Paragraph)
+    assert [span.url for span in block.text if span.url] == [
+        "https://example.org/a?b=1&c=2",
+        "mailto:a@example.org",
+    ]
+
+
+def test_control_characters_are_replaced():
+    """Characters that no page can hold do not reach it."""
+    (block,) = note_blocks("a\x07b\ud800c\ufffe")
+    assert isinstance(block, Paragraph)
+    assert plain(block.text) == "a�b�c�"
+
+
+@given(st.text(alphabet=st.sampled_from("ab<>&\"'`*_[]()!#-|\n \\$:/h1.{}%~+="), max_size=80))
+def test_any_text_gives_a_page_without_foreign_tags(markdown):
+    """Whatever is written, the page's tags are those of its template."""
+    html = page(note_blocks(markdown)).split("<main>")[1]
+    names = set(re.findall(r"<\s*/?\s*([a-zA-Z][\w-]*)", html))
+    ours = "section h2 h3 h4 h5 h6 p ul ol li em strong code pre blockquote a div table thead tbody"
+    assert names <= {*ours.split(), "tr", "th", "td", "main", "footer", "body", "html"}
