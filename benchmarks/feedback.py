@@ -1,4 +1,4 @@
-"""How good and how forgiving the designed controllers are, and how much processor time it takes.
+"""How good and how forgiving the designed controllers are, and what processor time they take.
 
 For every cart of the presets and both methods, a 1 cm step to be followed with at most 10 %
 overshoot and within 1 s: the nominal step, then the worst of 60 plants whose masses and springs
