@@ -14,7 +14,7 @@ from pipeline.plant.chain import Array
 _GRID = "#e4e4e4"
 _SIZE = 7.5  # points, of the labels
 _PAD = 3.5 / 72  # inches, between axis and label
-_SPACING = (0.6, 0.18)  # inches at least between ticks along x and along y
+_SPACING = (0.45, 0.18)  # inches at least between ticks along x and along y
 _STEPS = (1.0, 2.0, 5.0, 10.0)
 _FEW = 6  # on a logarithmic axis too short for 1, 2, 5
 _ROUNDING = 1e-9  # of a step

@@ -16,7 +16,7 @@ from pipeline.report.document import (
     spans,
 )
 from pipeline.report.mathematics import GREEK, symbol
-from pipeline.report.numbers import count, listing, percent, significant, with_error
+from pipeline.report.numbers import count, listing, percent, significant, unit_text, with_error
 from pipeline.results import Analysis, HardwareCheck
 
 SOURCES = {
@@ -36,6 +36,7 @@ KINDS = {
     "bode": "table of amplitude ratios",
 }
 _GOOD_FIT = 2.0  # chi-square per degree of freedom that stated noise still explains
+_MOST_TOLD = 3  # of one kind: a summary is short
 _CLOSE = 0.10  # a simulation within 10 % of the motion is a good linear model's
 
 _NAME = re.compile(r"\b(?:omega|zeta|K|X|m|c|k)_(?:\d|[a-h]|[nxy])\b|\b(?:omega|zeta)\b")
@@ -104,25 +105,23 @@ def _identified(analysis: Analysis) -> Block:
     source = f"from {used}" if used else "from the data given"
     fit = analysis.fit
     if fit is None:
+        reasons = (Span(" The reasons stand "), Span("below", url="#skipped"), Span("."))
         return paragraph(
             Span("No model ", "strong"),
-            f"of the {carts} could be identified {source}. The reasons stand under ",
-            Span("What was skipped", url="#skipped"),
-            ".",
+            f"of the {carts} could be identified {source}.",
+            reasons if analysis.skipped else (),
         )
-    how = {
-        "bode_fit": "a joint fit to the frequency response of all carts",
-        "time_fit": "a joint fit to the records in time",
-    }[fit.method]
+    joint = "a fit" if analysis.carts == 1 else "a joint fit of all carts"
+    what = {"bode_fit": "the frequency response", "time_fit": "the records in time"}[fit.method]
     quality = (
         "model and stated noise explain the data"
         if fit.chi_square_per_dof <= _GOOD_FIT
         else "more than the stated noise is left, so the linear model misses something"
     )
-    converged = "" if fit.converged else f" The fit did not converge: {fit.message}."
+    converged = "" if fit.converged else f" The fit did not converge: {clean(fit.message)}."
     return paragraph(
         Span(f"A {carts} was identified ", "strong"),
-        f"{source}, by {how} ({fit.n_points} points; χ² per degree of freedom "
+        f"{source}, by {joint} to {what} ({fit.n_points} points; χ² per degree of freedom "
         f"{significant(fit.chi_square_per_dof, digits=3)}: {quality}).{converged} ",
         *_key_numbers(analysis),
     )
@@ -138,7 +137,7 @@ def _key_numbers(analysis: Analysis) -> Spans:
         row = finals.get(name)
         if row is None or row.final is None:
             continue
-        unit = f" {clean(row.unit)}" if row.unit else ""
+        unit = f" {unit_text(clean(row.unit))}" if row.unit else ""
         value = with_error(row.final.value, row.final.std)
         parts += [Span("; " if parts else ""), name_span(name), Span(f" = {value}{unit}")]
     return spans("It has ", tuple(parts), ".") if parts else ()
@@ -161,8 +160,9 @@ def _agreement(analysis: Analysis) -> Spans:
 
 
 def _checks(analysis: Analysis) -> Spans:
-    # The comparison of initial and final is told above; here are the laws of a chain.
-    laws = [c for c in analysis.checks if not c.id.startswith("initial_final")]
+    # Initial against final and dry friction are told on their own.
+    told = ("initial_final", "decay")
+    laws = [c for c in analysis.checks if not c.id.startswith(told)]
     failed = [c for c in laws if c.outcome == "fail"]
     done = [c for c in laws if c.outcome != "skip"]
     if not done:
@@ -172,10 +172,16 @@ def _checks(analysis: Analysis) -> Spans:
             Span("Consistent: ", "strong"),
             f"{count(len(done), 'check')} of what any real chain of carts obeys passed.",
         )
+    more = len(failed) > _MOST_TOLD
     return spans(
         Span("Inconsistent: ", "strong"),
         f"{len(failed)} of {count(len(done), 'check')} failed. ",
-        rich(" ".join(c.message for c in failed)),
+        rich(clean(" ".join(c.message for c in failed[:_MOST_TOLD]))),
+        *(
+            [Span(" The others are listed "), Span("below", url="#checks"), Span(".")]
+            if more
+            else []
+        ),
     )
 
 
@@ -227,7 +233,9 @@ def _range(best: HardwareCheck, worst: HardwareCheck) -> str:
 def _skipped(analysis: Analysis) -> Spans:
     if not analysis.skipped:
         return ()
-    stages = listing([stage_name(skip.stage) for skip in analysis.skipped])
+    names = list(dict.fromkeys(stage_name(skip.stage) for skip in analysis.skipped))
+    more = len(names) - _MOST_TOLD
+    stages = listing(names[:_MOST_TOLD] + ([f"{more} more"] if more > 0 else []))
     return spans(
         Span("Skipped: ", "strong"),
         f"{stages}; the reasons are ",
@@ -259,8 +267,11 @@ def _next(analysis: Analysis) -> Items:
     off = [row.name for row in analysis.rows if row.consistent is False]
     if off:
         advice.append(
-            spans("Look again at how ", names_spans(off), " came about: ")
-            + spans("the figures of the decays, steps and dwells show what was used.")
+            spans(
+                "Look again at how ",
+                names_spans(off),
+                " came about: the figures of the decays, steps and dwells show what was used.",
+            )
         )
     short = sorted({point.experiment for point in analysis.sine_points if not point.settled})
     if short:
