@@ -115,6 +115,7 @@ CSV = {
     "Windows letters": ("# 5 µm\n" + delimited(",")).encode("latin-1"),
     "byte-order mark": "\ufeff" + delimited(";"),
     "no last line end": delimited(",").rstrip("\n"),
+    "empty rows of a spreadsheet": delimited(",") + ",,,\n,,,\n",
 }
 
 
@@ -149,6 +150,16 @@ def test_one_column_alone_is_read():
     got = table("displacement\n" + "\n".join(f"{x:g}" for x in X1))
     assert got.names == ("displacement",)
     assert_array_equal(got.values[0], X1)
+
+
+def test_a_row_of_units_goes_into_the_headings():
+    """As oscilloscopes write them: names, units, an empty line, numbers."""
+    got = table(
+        "Time,Channel A\n(ms),(V)\n\n"
+        + "".join(f"{t},{x}\n" for t, x in zip(TIME, X1, strict=True))
+    )
+    assert got.names == ("Time [ms]", "Channel A [V]")
+    assert_array_equal(got.values[0], TIME)
 
 
 def test_the_bench_log_is_told_from_an_ecp_export():

@@ -88,6 +88,47 @@ def test_a_unit_in_the_heading_is_converted(unit, factor, tmp_path):
     assert any("converted" in note for note in record.notes) == (factor != 1.0)
 
 
+@pytest.mark.parametrize(
+    "headings",
+    [
+        ("t", "u", "x1", "x2"),
+        ("Time (s)", "Voltage [V]", "Cart 1 Position (cm)", "Cart 2 Position (cm)"),
+        ("time_s", "u_V", "x1_cm", "x_2_cm"),
+        ("TIME", "Control Effort", "pos1", "pos2"),
+        ("timestamp", "motor voltage", "Cart 1", "Cart 2"),
+        ("time_ms", "duty cycle", "x1_mm", "position 2 [m]"),
+    ],
+)
+def test_the_usual_headings_are_understood(headings, tmp_path):
+    """Time, input and positions under the names that students give them."""
+    record = read(
+        tmp_path, CM, STEP, csv(a=T, b=U, c=X1, d=X2).replace("a,b,c,d", ",".join(headings))
+    ).records[0]
+    milli = headings[0] == "time_ms"
+    assert_allclose(record.t, T * (1e-3 if milli else 1.0), atol=1e-6)
+    assert record.u is not None
+    assert_array_equal(record.u, U)
+    assert_allclose(record.position(1), X1 * (0.1 if milli else 1.0), rtol=1e-12)
+    assert_allclose(record.position(2), X2 * (100.0 if milli else 1.0), rtol=1e-12)
+
+
+def test_a_copied_file_is_no_repeat(tmp_path):
+    """Two experiments with the same bytes are pointed out."""
+    toml = "version = 1\n[system]\ncarts = 2\n"
+    for name in ("one", "two"):
+        toml += f'[[experiments]]\nid = "{name}"\nkind = "step"\nfile = "{name}.csv"\n'
+        (tmp_path / f"{name}.csv").write_text(csv(time=T, input=U, x1=X1))
+    (tmp_path / "submission.toml").write_text(toml)
+    warnings = read_data(load_submission(tmp_path)).warnings
+    assert "two.csv is a copy of one.csv: a repeat is a recording of its own" in warnings
+
+
+def test_time_in_other_units_is_suspected(tmp_path):
+    """Samples whole seconds apart are more likely milliseconds or sample numbers."""
+    record = read(tmp_path, "", STEP, csv(time=np.arange(N), input=U, x1=X1)).records[0]
+    assert any("samples are 1 s apart" in note for note in record.notes)
+
+
 def test_one_displacement_of_several_free_carts_needs_a_name(tmp_path):
     """Which cart a nameless column belongs to is not guessed."""
     content = csv(**{"Time__us": np.round(1e6 * T), "Displacement__mm": X1})

@@ -6,10 +6,12 @@ import numpy as np
 
 from pipeline.plant.chain import Array
 
+SLOW = 0.5  # s between samples; no bench records so slowly, a file in ms or in samples looks so
 _FINEST_DECIMAL = 9  # a file that prints time beyond the nanosecond has not rounded it
 _ON_STEP = 0.02  # of a step; a value farther off is no multiple
 _WORTH_STRAIGHTENING = 2e-3  # rounding below this share of the sample interval does no harm
 _ROUNDING_BAND = 0.65  # of the rounding step: half of it, and what the fit of a short piece errs
+_ROUNDING_REACH, _IN_BAND = 1.5, 0.99  # a rare stamp may be a step off: a late tick, a beat
 _SHORTEST_PIECE = 32  # samples; a fit of fewer leaves the band by chance
 _MOSTLY = 0.8  # share of samples on straight pieces below which the clock itself is uneven
 _GAP = 4.0  # a gap is an interval of so many usual ones
@@ -99,7 +101,8 @@ def _straighten(stamps: Array, rounding: float) -> tuple[Array, int]:
     while waiting:
         start, end = waiting.pop()
         line = _line(stamps[start:end])
-        if np.abs(line - stamps[start:end]).max() <= _ROUNDING_BAND * rounding:
+        off = np.abs(line - stamps[start:end]) / rounding
+        if off.max() <= _ROUNDING_REACH and np.mean(off <= _ROUNDING_BAND) >= _IN_BAND:
             t[start:end] = line
             on_lines, pieces = on_lines + end - start, pieces + 1
         elif end - start >= 2 * _SHORTEST_PIECE:

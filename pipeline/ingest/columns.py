@@ -19,7 +19,10 @@ _POSITION = re.compile(
 _ONE_POSITION = re.compile(r"x|y|pos|position|displacement")
 _NO_ROLE = re.compile(r"|sample|samples|index|n|no|nr")  # known, and of no use
 _COUNTED = re.compile(r"\benc|counts?\b|commanded pos", re.IGNORECASE)
-_UNIT = re.compile(r"[\[(]\s*([^\])]+?)\s*[\])]\s*$")
+# "time [ms]", "x1 (cm)", "x1_cm"; not every unit, for "u_in" is no inch.
+_UNIT = re.compile(
+    r"[\[(]\s*([^\])]+?)\s*[\])]\s*$|(?<=[a-z0-9])_(s|ms|us|m|cm|mm|V|mV|N|counts?|Hz|dB)$"
+)
 
 # Factors to the SI unit of the same quantity.
 _SI: dict[str, tuple[str, float]] = {
@@ -123,7 +126,7 @@ def assign_columns(
 def _column(table: Table, index: int, role: str) -> Column:
     name = table.names[index]
     unit = _UNIT.search(name)
-    return Column(role=role, index=index, name=name, unit=unit[1] if unit else None)
+    return Column(role=role, index=index, name=name, unit=(unit[1] or unit[2]) if unit else None)
 
 
 def _plain(name: str) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.errors import SubmissionError
-from pipeline.ingest.clock import Clock, read_clock
+from pipeline.ingest.clock import SLOW, Clock, read_clock
 from pipeline.ingest.columns import Column, assign_columns, conversion, holds_counts
 from pipeline.ingest.files import read_table
 from pipeline.ingest.problems import channel_problems
@@ -17,7 +17,6 @@ from pipeline.plant.chain import Array
 from pipeline.results import Kind
 
 _UNEVEN = 0.01  # of the sample interval, rms
-_SLOW = 0.5  # s between samples; no bench records so slowly, a file in ms or in samples looks so
 _EDGE, _MOST_EDGES, _FLAT = 0.2, 20, 0.03  # of the input's range: an edge; between edges, its rms
 _ONE_LINE = 0.9  # share of the input's power in one spectral line
 
@@ -136,7 +135,7 @@ def _clock(table: Table, columns: Mapping[str, Column], problems: list[str]) -> 
         f"time is missing between {clock.t[i - 1]:.4g} s and {clock.t[i]:.4g} s"
         for i in clock.gaps[:5]
     ]
-    if clock.mean_interval > _SLOW:
+    if clock.mean_interval > SLOW:
         problems.append(
             f"samples are {clock.mean_interval:.4g} s apart: is {column.name!r} in other units?"
         )

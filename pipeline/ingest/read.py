@@ -7,7 +7,7 @@ import numpy as np
 
 from pipeline.errors import SubmissionError
 from pipeline.ingest.bode import Points, frequency_responses, read_points
-from pipeline.ingest.clock import Clock, read_clock
+from pipeline.ingest.clock import SLOW, Clock, read_clock
 from pipeline.ingest.columns import Column, assign_columns, conversion, holds_counts
 from pipeline.ingest.files import read_table
 from pipeline.ingest.problems import channel_problems
@@ -74,8 +74,18 @@ def read_data(submission: Submission) -> Ingested:
         records=tuple(records),
         tables=responses,
         files={name: digest for name, (_, digest) in sorted(tables.items())},
-        warnings=(*warnings, *found, *((spread,) if responses else ())),
+        warnings=(*warnings, *_copies(tables), *found, *((spread,) if responses else ())),
     )
+
+
+def _copies(tables: Mapping[str, tuple[Table, str]]) -> list[str]:
+    """Return a warning for every file that is a copy of another."""
+    first: dict[str, str] = {}
+    return [
+        f"{name} is a copy of {original}: a repeat is a recording of its own"
+        for name, (_, digest) in tables.items()
+        if (original := first.setdefault(digest, name)) != name
+    ]
 
 
 def _read_bode(
@@ -202,6 +212,10 @@ def _clock(
         raise SubmissionError(
             f"{table.source} {table.place(i)}: time {what}, from {before:g} s to {after:g} s{hint}"
         )
+    if clock.mean_interval > SLOW:
+        notes.append(
+            f"samples are {clock.mean_interval:.4g} s apart: is {column.name!r} in other units?"
+        )
     if clock.pieces:
         even = "" if clock.pieces == 1 else f", in {clock.pieces} pieces"
         notes.append(
@@ -258,9 +272,14 @@ def _position_scale(table: Table, column: Column, system: System, notes: list[st
             f"{table.source}: {column.name!r} holds encoder counts; state how many {unit} one "
             f"count is: position = {{ unit = {unit!r}, per_count = … }}"
         )
+    return _unit_scale(column, unit, notes)
+
+
+def _unit_scale(column: Column, unit: str, notes: list[str]) -> float:
+    """Return the factor from the heading's unit to the submission's, and say what was done."""
     factor = conversion(column.unit, unit)
     if factor is None:
-        notes.append(f"{column.name!r} is taken to be in {unit}")
+        notes.append(f"{column.name!r} is taken to be in {unit}, the unit of the submission")
         return 1.0
     if factor != 1.0:
         notes.append(f"{column.name!r} was converted from {column.unit} to {unit}")
@@ -297,9 +316,7 @@ def _input(
         if system.input.per_count is None:
             notes.append(f"{column.name!r} is taken as duty counts of 5/4096 {system.input.unit}")
     else:
-        scale = conversion(column.unit, system.input.unit) or 1.0
-        if scale != 1.0:
-            notes.append(f"{column.name!r} was converted to {system.input.unit}")
+        scale = _unit_scale(column, system.input.unit, notes)
     return table.values[column.index] * scale, scale
 
 

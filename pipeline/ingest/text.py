@@ -3,7 +3,7 @@
 import re
 from array import array
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,7 +17,8 @@ _HEADING_WORDS = re.compile(
     r"encoder\s*\d+\s+(?:pos|vel|acc)\w*|commanded\s+\w+|control\s+effort|[^\s,;]+", re.IGNORECASE
 )
 _OPENING = re.compile(r"^[^\S\n]*(?:[A-Za-z]\w*\s*=\s*)?\[", re.MULTILINE)
-_SPACES = None  # `str.split(None)`: any run of white space
+_LONGEST_UNIT = 8  # characters: "counts", "rad/s"
+_QUOTES = " \"'"
 
 
 def read_text(raw: bytes, *, source: str) -> Table:
@@ -94,7 +95,7 @@ def _parse(
 
 def _what_is_wrong(fields: Sequence[str], names: Sequence[str]) -> str:
     """Return why a row does not fit its heading."""
-    if [field.strip(" \"'").casefold() for field in fields] == [n.casefold() for n in names]:
+    if [field.strip(_QUOTES).casefold() for field in fields] == [n.casefold() for n in names]:
         return "a second heading: two records pasted together"
     if len(fields) != len(names):
         return f"expected {len(names)} columns, found {len(fields)}"
@@ -145,7 +146,7 @@ def _checked_names(names: Sequence[str], *, source: str, line: int) -> list[str]
     """Return headings without quotes; an empty one becomes its number."""
     if len(names) > _MAX_COLUMNS:
         raise SubmissionError(f"{source} line {line}: more than {_MAX_COLUMNS} columns")
-    clean = [name.strip().strip("\"'").strip() or str(i) for i, name in enumerate(names, start=1)]
+    clean = [name.strip(_QUOTES) or str(i) for i, name in enumerate(names, start=1)]
     clean = [name if name.isprintable() else repr(name)[1:-1] for name in clean]
     seen: set[str] = set()
     for name in clean:
@@ -215,57 +216,86 @@ def _ecp_heading(head: str) -> tuple[list[str], int]:
 # ----------------------------------------------------------------------------- delimited text
 
 
+@dataclass(frozen=True)
+class _Layout:
+    """How the lines of a table are to be split: `delimiter` None is any run of white space."""
+
+    delimiter: str | None
+    decimal_comma: bool
+    has_heading: bool
+    trailing: bool  # a delimiter ends each row
+
+    def fields(self, line: str) -> list[str]:
+        """Return the fields of one line."""
+        if self.delimiter is None:
+            words = _HEADING_WORDS.findall(line)
+            return words if any(word[0].isalpha() for word in words) else line.split()
+        fields = line.strip(" " if self.delimiter == "\t" else None).split(self.delimiter)
+        return fields[:-1] if self.trailing and not fields[-1].strip() else fields
+
+
 def _delimited(text: str, source: str) -> Table:
     """Read a heading and rows; the delimiter and the decimal mark are found."""
-    lines = [(i, line) for i, line in enumerate(text.split("\n"), start=1) if line.strip()]
-    start, comment = 0, None
-    while start < len(lines) and (
-        lines[start][1].lstrip().startswith(("#", "%")) or lines[start][1].startswith("sep=")
-    ):
-        comment, start = lines[start], start + 1
+    # A spreadsheet leaves rows of nothing but delimiters after its last.
+    lines = [(i, line) for i, line in enumerate(text.split("\n"), start=1) if line.strip(' \t;,"')]
+    start = 0
+    while start < len(lines) and lines[start][1].lstrip().startswith(("#", "%", "sep=")):
+        start += 1
     if start == len(lines):
         raise SubmissionError(
             f"{source}: the file is empty" if not lines else f"{source}: holds no rows of numbers"
         )
-    sample = [line for _, line in lines[start : start + _SNIFFED_ROWS + 1]]
-    found = _sniff(sample)
-    if found is None:
+    layout = _sniff([line for _, line in lines[start : start + _SNIFFED_ROWS + 1]])
+    if layout is None:
         number, line = lines[min(start + 1, len(lines) - 1)]
         raise SubmissionError(
             f"{source} line {number}: not a table of numbers, found {line.strip()[:40]!r}"
         )
-    delimiter, decimal_comma, has_heading, trailing = found
-
-    def fields_of(line: str) -> list[str]:
-        return _fields(line, delimiter, trailing)
-
-    heading = fields_of(sample[0]) if has_heading else None
-    first = start + 1 if has_heading else start
-    typed = fields_of(lines[first][1])
-    heading_line = lines[start][0]
-    if heading is None and comment is not None:  # "# time, x1"
-        names = _fields(comment[1].strip().lstrip("%#").strip(), delimiter, trailing=False)
-        heading, heading_line = (names, comment[0]) if len(names) == len(typed) else (None, 0)
+    heading, first = _heading(lines, start, layout)
+    typed = layout.fields(lines[first][1])
     names = _checked_names(
-        heading or [str(i) for i in range(1, len(typed) + 1)], source=source, line=heading_line
+        heading or [str(i) for i in range(1, len(typed) + 1)], source=source, line=lines[start][0]
     )
     rows = _parse(
-        ((number, fields_of(line)) for number, line in lines[first:]),
+        ((number, layout.fields(line)) for number, line in lines[first:]),
         names=names,
         source=source,
-        decimal_comma=decimal_comma,
+        decimal_comma=layout.decimal_comma,
     )
     return _table(
         rows,
         source=source,
-        form="bench_log" if _is_bench_log(names, delimiter) else "csv",
+        form="bench_log" if _is_bench_log(names) else "csv",
         names=names,
         typed=typed if len(typed) == len(names) else [""] * len(names),
         cut=None,
     )
 
 
-def _is_bench_log(names: Sequence[str], delimiter: str | None) -> bool:
+def _heading(
+    lines: Sequence[tuple[int, str]], start: int, layout: _Layout
+) -> tuple[list[str] | None, int]:
+    """Return the headings, or None, and the index of the first row of numbers.
+
+    The last comment before a bare table may be its heading; a row of units below the heading
+    ("ms", "V") goes into the names, "time [ms]".
+    """
+    if not layout.has_heading:
+        width = len(layout.fields(lines[start][1]))
+        above = lines[start - 1][1].lstrip(" %#") if start else ""
+        names = layout.fields(above)
+        return (names if len(names) == width else None), start
+    names = layout.fields(lines[start][1])
+    if start + 2 < len(lines):
+        units = [unit.strip(' ()[]"') for unit in layout.fields(lines[start + 1][1])]
+        words = all(re.fullmatch(rf"[^\d]{{1,{_LONGEST_UNIT}}}", unit) for unit in units)
+        if words and len(units) == len(names) and units != names:
+            named = zip(names, units, strict=True)
+            return [f"{name.strip(_QUOTES)} [{unit}]" for name, unit in named], start + 2
+    return names, start + 1
+
+
+def _is_bench_log(names: Sequence[str]) -> bool:
     """Tell the bench's own log: an ECP's headings, but no commanded position and no brackets."""
     words = {name.casefold() for name in names}
     return (
@@ -275,36 +305,28 @@ def _is_bench_log(names: Sequence[str], delimiter: str | None) -> bool:
     )
 
 
-def _fields(line: str, delimiter: str | None, trailing: bool) -> list[str]:
-    if delimiter is None:
-        words = _HEADING_WORDS.findall(line)
-        return words if any(w[0].isalpha() for w in words) else line.split()
-    fields = line.strip(" \n" if delimiter == "\t" else None).split(delimiter)
-    return fields[:-1] if trailing and fields and not fields[-1].strip() else fields
+def _sniff(sample: Sequence[str]) -> _Layout | None:
+    """Return the layout that makes the most lines into rows of numbers of one width, or None.
 
-
-def _sniff(sample: Sequence[str]) -> tuple[str | None, bool, bool, bool] | None:
-    """Return (delimiter, decimal comma, has a heading, a delimiter ends each row), or None.
-
-    The delimiter that makes the most rows into numbers of one width wins; of equals the first,
-    so that "0,5;1,2" is two numbers with decimal commas and "0,5" two whole ones.
+    Of equals the first wins, so that "0,5;1,2" is two numbers with decimal commas and "0,5" two
+    whole ones.
     """
     best, best_score = None, 0.0
-    for delimiter in ("\t", ";", ",", _SPACES):
+    for delimiter in ("\t", ";", ",", None):
         for decimal_comma in (False, True) if delimiter != "," else (False,):
             trailing = delimiter not in (None, "\t") and all(
                 line.rstrip().endswith(delimiter) for line in sample[1:] or sample
             )
-            split = [_fields(line, delimiter, trailing) for line in sample]
+            layout = _Layout(delimiter, decimal_comma, has_heading=False, trailing=trailing)
+            split = [layout.fields(line) for line in sample]
             if decimal_comma:
                 split = [[field.replace(",", ".") for field in fields] for fields in split]
-            has_heading = not all(_is_number(field) for field in split[0])
-            rows = split[1:] if has_heading else split
+            has_heading = not all(map(_is_number, split[0]))
             width = len(split[0])
-            numeric = [len(row) for row in rows if all(map(_is_number, row))]
+            numeric = [len(row) for row in split[has_heading:] if all(map(_is_number, row))]
             # One column only where nothing else fits; numbers under a heading of another width
             # only to say so.
             score = numeric.count(width) * (2 if width > 1 else 1) + 0.01 * len(numeric)
             if score > best_score:
-                best, best_score = (delimiter, decimal_comma, has_heading, trailing), score
+                best, best_score = replace(layout, has_heading=has_heading), score
     return best
