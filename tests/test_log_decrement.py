@@ -63,7 +63,7 @@ def released(*, zeta, fs=FS, duration=None, count=COUNT, noise=0.0, rng=None, **
     return record(t, y, count=count)
 
 
-def tested(got):
+def friction_of(got):
     """The outcome of the friction test."""
     assert got.friction is not None
     return got.friction
@@ -85,7 +85,7 @@ def test_recovers_the_damping_that_made_the_data(zeta, fs, start):
     assert_allclose(got.zeta_peaks, zeta, rtol=1e-2)
     assert_allclose(got.omega_n_peaks, OMEGA, rtol=4e-3)
     assert_allclose(got.delta, 2 * np.pi * zeta / np.sqrt(1 - zeta**2), rtol=1e-2)
-    assert not tested(got).present
+    assert not friction_of(got).present
     assert got.note == ""
 
 
@@ -257,11 +257,11 @@ def test_a_small_decay_is_measured_within_its_error():
 def test_dry_friction_is_found_and_taken_out(d, zeta):
     """The friction band, and the viscous damping that is left, come back; the note says so."""
     got = fit_log_decrement(released(zeta=zeta, d=d, duration=4.0), cart=1)
-    assert tested(got).present
-    assert abs(tested(got).drop - d) < 4 * tested(got).drop_std + 1e-5
-    assert abs(tested(got).zeta - zeta) < 4 * tested(got).zeta_std + 1e-5
-    assert_allclose(tested(got).drop, d, rtol=0.15)
-    assert got.zeta > tested(got).zeta  # viscous damping alone claims the friction's share
+    assert friction_of(got).present
+    assert abs(friction_of(got).drop - d) < 4 * friction_of(got).drop_std + 1e-5
+    assert abs(friction_of(got).zeta - zeta) < 4 * friction_of(got).zeta_std + 1e-5
+    assert_allclose(friction_of(got).drop, d, rtol=0.15)
+    assert got.zeta > friction_of(got).zeta  # viscous damping alone claims the friction's share
     assert "dry friction" in got.note
     # As friction's share of the loss grows, so does the damping from swing to swing.
     local = got.zeta_at_amplitude
@@ -278,7 +278,7 @@ def test_damping_that_grows_with_amplitude_is_no_friction():
         x += 1e-4 * v
     t = fine[::90]
     got = fit_log_decrement(record(t, y[::90]), cart=1)
-    assert not tested(got).present
+    assert not friction_of(got).present
     assert "the damping grows with the amplitude" in got.note
 
 
@@ -297,7 +297,7 @@ def flags(seeds, *, d):
             noise=rng.choice([0.0, 0.2, 0.5]) * COUNT,
             rng=rng,
         )
-        found.append(tested(fit_log_decrement(run, cart=1)).present)
+        found.append(friction_of(fit_log_decrement(run, cart=1)).present)
     return np.array(found)
 
 
@@ -423,7 +423,7 @@ def test_the_real_second_cart_pulled_by_hand(real_records, repeat):
     """Dry friction is found in each repeat; with it little viscous damping is left."""
     got = fit_log_decrement(real_records[f"alone-2-{repeat}"], cart=2)
     assert 15.6 <= got.omega_n <= 15.9
-    assert tested(got).present
-    assert 0.02 <= tested(got).zeta <= 0.035
-    assert 24 <= tested(got).drop <= 34  # encoder counts
+    assert friction_of(got).present
+    assert 0.02 <= friction_of(got).zeta <= 0.035
+    assert 24 <= friction_of(got).drop <= 34  # encoder counts
     assert 0.06 <= got.zeta <= 0.08

@@ -271,3 +271,18 @@ def test_the_standard_errors_are_about_right():
     """Over 60 dwells the standardised errors spread by about one."""
     spread = np.sqrt(np.mean(coverage(60, from_rest=False) ** 2, axis=0))
     assert np.all((0.75 < spread) & (spread < 1.35))  # 1 ± 4/sqrt(120)
+
+
+def test_another_signal_is_refused():
+    """Random input is no dwell, whatever the experiment is called."""
+    t = sampled(5.0)
+    u = np.random.default_rng(0).normal(size=t.size)
+    with pytest.raises(DataError, match="needs an input of one frequency"):
+        fit_sine(record(t, u, u[None], omega=9.0), cart=1)
+
+
+def test_a_cart_that_does_not_move_is_refused():
+    """An unplugged encoder has no phase."""
+    run, _ = dwell(sampled(5.0))
+    with pytest.raises(DataError, match="cart 1 does not move"):
+        fit_sine(replace(run, y=np.zeros_like(run.y)), cart=1)

@@ -284,8 +284,10 @@ def test_a_cart_that_does_not_move_is_refused():
     """An unplugged encoder is no gain of zero."""
     t = seconds(8.0)
     u = staircase(t, (0.5, 0.03), (4.0, 0.0))
-    with pytest.raises(DataError, match="needs cart 1 to move by more than 6 encoder steps"):
+    with pytest.raises(DataError, match="needs motion, cart 1 does not move"):
         fit_step_gain(record(t, u, np.zeros((1, t.size))), cart=1)
+    with pytest.raises(DataError, match="needs cart 1 to move by more than 6 encoder steps"):
+        fit_step_gain(record(t, u, COUNT * (u > 0)[None]), cart=1)
 
 
 # -------------------------------------------------------------------- real carts

@@ -19,6 +19,8 @@ from pipeline.stages._signals import colour
 
 THRESHOLD = 10.8  # F(1, many) above this once in a thousand decays without friction
 _UNKNOWNS = 7
+_MAX_EVALUATIONS = 200  # a decay takes some 30, derivatives included
+_MOST_LOSS = 50.0  # of an exponent on the way to the fit: beyond, numbers run over
 _ONE_START = 1.5  # residual over noise without friction: up to here there is little, if any
 _LESS_DAMPING = (1.0, 0.3)  # starts: friction takes a share of the damping fitted without it
 
@@ -51,9 +53,9 @@ def fit_friction(
     -------
     None where the samples do not carry the further unknowns or the fit does not converge.
     """
-    if t.size <= _UNKNOWNS + 1:
-        return None
     pole = complex(viscous.poles[0])
+    if t.size <= _UNKNOWNS + 1 or pole.imag <= 0:
+        return None
     direction = -1.0 if falling else 1.0
 
     def columns(p: Array, at: Array) -> Array:
@@ -69,6 +71,7 @@ def fit_friction(
             lambda p: project(p)[1],
             [turning, -pole.real * share, pole.imag],
             method="lm",
+            max_nfev=_MAX_EVALUATIONS,
             x_scale=[1 / pole.imag, abs(pole), abs(pole)],
         )
         for share in (_LESS_DAMPING if viscous.rms > _ONE_START * floor else _LESS_DAMPING[:1])
@@ -82,8 +85,9 @@ def fit_friction(
     variance = max(float(residual @ residual) / dof, floor**2) * colour(residual, angle=angle)
     gained = viscous.rms**2 * t.size - float(residual @ residual)
     full = np.column_stack([_per_nonlinear(best.x, t, linear, columns), columns(best.x, t)])
-    size = np.linalg.norm(full, axis=0)
-    covariance = variance * np.linalg.pinv((full / size).T @ (full / size)) / np.outer(size, size)
+    size = np.maximum(np.linalg.norm(full, axis=0), np.finfo(float).tiny)
+    inverse = np.linalg.pinv(np.linalg.qr(full / size, mode="r")) / size[:, None]
+    covariance = variance * (inverse @ inverse.T)
     decay, omega_d = float(best.x[1]), float(best.x[2])
     omega_n = float(np.hypot(decay, omega_d))
     per_pole = np.array([omega_d**2, -decay * omega_d]) / omega_n**3  # of zeta = decay / omega_n
@@ -108,13 +112,15 @@ def _columns(t: Array, *, turning: float, decay: float, omega_d: float, directio
     half = np.pi / omega_d
     k = np.floor((t - turning) / half)  # half cycles; negative before the turning point
     tau = t - turning - k * half
-    swing = np.exp(-decay * tau) * (np.cos(omega_d * tau) + decay / omega_d * np.sin(omega_d * tau))
-    loss = decay * half  # rho = exp(-loss)
-    rho = np.exp(-loss)
+    swing = np.exp(np.clip(-decay * tau, -_MOST_LOSS, _MOST_LOSS)) * (
+        np.cos(omega_d * tau) + decay / omega_d * np.sin(omega_d * tau)
+    )
+    loss = np.clip(decay * half, -_MOST_LOSS, _MOST_LOSS)  # rho = exp(-loss)
+    rho, lost = np.exp(-loss), np.clip(-loss * k, -_MOST_LOSS, _MOST_LOSS)
     # (1 - rho^k) / (1 - rho), which is k without viscous damping
-    geometric = np.expm1(-loss * k) / np.expm1(-loss) if loss else k
+    geometric = np.expm1(lost) / np.expm1(-loss) if loss else k
     sign = np.where(k % 2 == 0, 1.0, -1.0)
-    amplitude = sign * np.exp(-loss * k) * swing
+    amplitude = sign * np.exp(lost) * swing
     friction = direction * sign * ((1 + (1 + rho) * geometric) * swing - 1)
     return np.column_stack([np.ones_like(t), t - turning, amplitude, friction])
 

@@ -81,16 +81,22 @@ def fit_ringing(t: Array, y: Array, *, poles: ComplexArray, drift: bool) -> Ring
         return J - Q @ (Q.T @ J)
 
     start = np.concatenate([np.maximum(-poles.real / scale, _ALWAYS_DECAYS), poles.imag / scale])
-    fit = least_squares(residual, start, jac=jacobian, method="lm", max_nfev=_MAX_EVALUATIONS)
+    fit = least_squares(
+        residual,
+        start,
+        jac=jacobian,  # pyright: ignore[reportArgumentType] - scipy's default is a string
+        method="lm",
+        max_nfev=_MAX_EVALUATIONS,
+    )
     _, left, J, linear = solve(fit.x)
     k = len(level_columns)
     full = np.column_stack([np.array(level_columns).T, J / scale, basis(fit.x)[0][:, k:]])
     kept = [0, 1] if drift else [0]
     kept += list(range(k, k + 2 * n_modes))
-    unscaled = np.linalg.pinv(full.T @ full)[np.ix_(kept, kept)]
+    inverse = np.linalg.pinv(np.linalg.qr(full, mode="r"))[kept]
     angle = float(np.median(fit.x[n_modes:])) * scale * (tau[-1] / (t.size - 1))
     variance = float(left @ left) / max(t.size - full.shape[1], 1) * colour(left, angle=angle)
-    covariance = variance * unscaled
+    covariance = variance * (inverse @ inverse.T)
     if not drift:
         covariance = np.insert(np.insert(covariance, 1, 0.0, axis=0), 1, 0.0, axis=1)
     return Ringing(

@@ -1,7 +1,7 @@
 """Sine dwell: amplitude and phase of the steady state, and where it begins."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,6 +25,8 @@ _DRIVEN = 0.5  # of the input's amplitude: the dwell runs from its first to its 
 _FREQUENCY_SIGMAS, _FREQUENCY_RELATIVE = 5.0, 2e-4  # a stated frequency further off is not believed
 _FEW_COUNTS = 20  # an amplitude below this is known to a few percent only
 _FLOOR_ROUNDING = 0.111  # of the encoder step, times sqrt(step / amplitude): see `_rounding_std`
+_PEAK_LINES = 4  # of the padded spectrum: a sine's frequency is no further from its peak
+_NO_SINE = 0.5  # of the input's amplitude: a residual above this is another signal
 _GAP = 3.0  # sample intervals; longer ones are gaps in the log
 _ITERATIONS = 20
 _PHASE_CONVERGED = 1e-9  # rad at the ends of the record
@@ -76,23 +78,27 @@ def fit_sine(record: Record, *, cart: int) -> SinePoint:
     ------
     DataError : no input column, an input that does not oscillate, or less than a full cycle.
     """
-    u, t, y = _input_of(record), record.t, record.position(cart)
-    omega, frequency_note = _frequency(record, u)
-    driven = _driven_part(u)
-    t, u, y = t[driven], u[driven], y[driven]
+    u, driven = _driven(record)
+    t, y, step = record.t[driven], record.position(cart)[driven], record.encoder_step(cart)
+    if np.ptp(y) == 0:
+        raise DataError(f"{record.id}: a sine fit needs motion, cart {cart} does not move")
+    omega, frequency_note = _frequency(record, t, u)
     cycles = omega * (t[-1] - t[0]) / (2 * np.pi)
-    if cycles < 1 or t.size < _MIN_SAMPLES:
+    if cycles < 1:
         raise DataError(
-            f"{record.id}: a sine fit needs a full cycle of driven motion and {_MIN_SAMPLES} "
-            f"samples, found {cycles:.2f} cycles in {t.size} samples"
+            f"{record.id}: a sine fit needs a full cycle of driven motion, found {cycles:.2f}"
         )
-    step = record.encoder_step(cart)
     floor = grain(t, y, step=step) / np.sqrt(12)
     steady = _steady_part(t, y, omega=omega, floor=floor)
     t, u, y = t[steady.start :], u[steady.start :], y[steady.start :]
 
     position = _fit(t, y, omega=omega)
     drive = _fit(t, u, omega=omega)
+    if drive.rms >= _NO_SINE * abs(drive.z):
+        raise DataError(
+            f"{record.id}: a sine dwell needs an input of one frequency, found an amplitude of "
+            f"{abs(drive.z):.3g} at {omega / (2 * np.pi):.4g} Hz and {drive.rms:.3g} (rms) besides"
+        )
     amplitude, input_amplitude = abs(position.z), abs(drive.z)
     held = _held(t, omega=omega) if record.hold == "zero_order" else 1.0
     rounding = _rounding_std(position, step=step)  # leaves the phase alone
@@ -120,20 +126,6 @@ def fit_sine(record: Record, *, cart: int) -> SinePoint:
     )
 
 
-def _input_of(record: Record) -> Array:
-    if record.u is None:
-        raise DataError(
-            f"{record.id}: a sine dwell needs the input beside the positions, found no input "
-            "column: export it too, or name it under `columns`"
-        )
-    if np.ptp(record.u) == 0:
-        raise DataError(
-            f"{record.id}: a sine dwell needs an input that oscillates, found {record.u[0]:g} "
-            "throughout"
-        )
-    return record.u
-
-
 # ------------------------------------------------------------------- the fits
 
 
@@ -154,7 +146,7 @@ def _fit(t: Array, y: Array, *, omega: float, free_frequency: bool = False) -> _
             break
     X = np.array(columns).T
     residual = y - X @ coefficients
-    inverse = np.linalg.inv(np.linalg.qr(X, mode="r"))
+    inverse = np.linalg.pinv(np.linalg.qr(X, mode="r"))
     spread = float(residual @ residual) / max(t.size - X.shape[1], 1)
     variance = spread * colour(residual, angle=omega * 2 * half / (t.size - 1))
     covariance = variance * (inverse @ inverse.T)
@@ -192,7 +184,7 @@ def _rounding_std(fit: _Sine, *, step: float) -> float:
     if step == 0:
         return 0.0
     left = rounding_left(noise_beyond_rounding(fit.rms, step=step), step=step)
-    return _FLOOR_ROUNDING * step * float(np.sqrt(min(step / abs(fit.z), 1.0))) * left
+    return _FLOOR_ROUNDING * step * float(np.sqrt(step / max(abs(fit.z), step))) * left
 
 
 def _held(t: Array, *, omega: float) -> complex:
@@ -205,15 +197,41 @@ def _held(t: Array, *, omega: float) -> complex:
 # -------------------------------------------------------- what the record holds
 
 
-def _frequency(record: Record, u: Array) -> tuple[float, str]:
+def _driven(record: Record) -> tuple[Array, slice]:
+    """Return the input where it oscillates, and which samples these are."""
+    u = record.u
+    if u is None:
+        raise DataError(
+            f"{record.id}: a sine dwell needs the input beside the positions, found no input "
+            "column: export it too, or name it under `columns`"
+        )
+    if np.ptp(u) == 0:
+        raise DataError(
+            f"{record.id}: a sine dwell needs an input that oscillates, found {u[0]:g} throughout"
+        )
+    offset = (np.max(u) + np.min(u)) / 2
+    first, last = np.flatnonzero(np.abs(u - offset) > _DRIVEN * np.ptp(u) / 2)[[0, -1]]
+    driven = slice(int(first), int(last) + 1)
+    if last + 1 - first < _MIN_SAMPLES:
+        raise DataError(
+            f"{record.id}: a sine fit needs {_MIN_SAMPLES} samples of driven motion, found "
+            f"{last + 1 - first}"
+        )
+    return u[driven], driven
+
+
+def _frequency(record: Record, t: Array, u: Array) -> tuple[float, str]:
     """Return the frequency, rad/s: as stated, unless the input clearly says otherwise."""
-    t, stated = record.t, record.omega
+    stated = record.omega
     grid = np.linspace(t[0], t[-1], t.size)
     even = np.interp(grid, t, u - np.mean(u))
     n = 4 * t.size  # padded: the peak is found to a quarter of a line
     spectrum = np.abs(np.fft.rfft(even * np.hanning(t.size), n))
     line = 2 * np.pi / (n * (grid[1] - grid[0]))
-    fitted = _fit(t, u, omega=line * (1 + int(np.argmax(spectrum[1:]))), free_frequency=True)
+    peak = line * (1 + int(np.argmax(spectrum[1:])))
+    fitted = _fit(t, u, omega=peak, free_frequency=True)
+    if abs(fitted.omega - peak) > _PEAK_LINES * line:  # no sine, which the caller will see
+        fitted = replace(fitted, omega=peak)
     if stated is None:
         return fitted.omega, ""
     off = abs(fitted.omega - stated)
@@ -234,17 +252,13 @@ def _windows(t: Array, *, omega: float) -> list[slice]:
     if length + (_LAST_WINDOWS - 1) * hop > duration:  # short record: single cycles
         length, hop = period, max(period / 2, (duration - period) / _LAST_WINDOWS)
     ends = t[-1] - hop * np.arange(int((duration - length) / hop + 1e-9) + 1)
+    first, stop = np.searchsorted(t, ends - length), np.searchsorted(t, ends, side="right")
+    whole = [slice(0, t.size)]
     return [
-        slice(int(np.searchsorted(t, end - length)), int(np.searchsorted(t, end, side="right")))
-        for end in ends[::-1]
-    ]
-
-
-def _driven_part(u: Array) -> slice:
-    """Return the part of the record in which the input oscillates."""
-    offset = (np.max(u) + np.min(u)) / 2
-    first, last = np.flatnonzero(np.abs(u - offset) > _DRIVEN * np.ptp(u) / 2)[[0, -1]]
-    return slice(int(first), int(last) + 1)
+        slice(int(a), int(b))
+        for a, b in zip(first[::-1], stop[::-1], strict=True)
+        if b - a >= _MIN_SAMPLES
+    ] or whole
 
 
 def _steady_part(t: Array, y: Array, *, omega: float, floor: float) -> _Steady:
@@ -298,6 +312,8 @@ def _drop_drifting(
     """
     while True:
         middle = (start + t.size) // 2
+        if t.size - middle < _MIN_SAMPLES:
+            return start, 0.0
         early = _fit(t[start:middle], y[start:middle], omega=omega)
         late = _fit(t[middle:], y[middle:], omega=omega)
         difference = abs(early.z - late.z)

@@ -26,6 +26,7 @@ _STEADY_SHARE = 0.6  # of the record: with less of it at constant input this is 
 _FLAT = 3.0  # a window that spans no more is level
 _MOVED = 6.0  # a cart that moved less has not moved
 _PROMINENCE = 6.0
+_ARITHMETIC = 1e-3  # the scatter of a level without noise or rounding
 _NEARLY_FLAT = 0.02  # of the motion, where a window is not level to the noise
 _GOOD_FIT = 0.02  # of the motion: what an extrapolating fit may leave
 _GOOD_LEVEL = 0.02  # of the motion: the standard error it may have
@@ -73,6 +74,8 @@ def fit_step_gain(record: Record, *, cart: int) -> StepGain:
     parts = _constant_parts(record)
     if cart not in record.free:
         raise DataError(f"{record.id}: step gain needs a cart that is free, cart {cart} is held")
+    if np.ptp(y) == 0:
+        raise DataError(f"{record.id}: step gain needs motion, cart {cart} does not move")
     size = grain(t, y, step=step)
     found = [_settle(record, y, part, size=size, step=step) for part in parts]
     drift = 0.0
@@ -87,10 +90,11 @@ def fit_step_gain(record: Record, *, cart: int) -> StepGain:
     if drift:
         notes.append(f"a drift of {drift:.3g} per second is taken out")
 
+    same = _SAME_INPUT * float(np.ptp([p.u for p in found]))
     edges = [
         _edge(t, before, after, before.level, after.level)
         for before, after in pairwise(found)
-        if before.level and after.level
+        if before.level and after.level and abs(after.u - before.u) > same
     ]
     if not edges:
         raise DataError(
@@ -176,13 +180,13 @@ def _level(t: Array, y: Array, *, n_modes: int, size: float, step: float) -> _Le
     motion, pace = float(np.ptp(y)), _pace(t, y, size=size)
     flat = _flat_from(y, span=_FLAT * size)
     if flat == 0 or t[-1] - t[flat] >= pace:
-        return _mean_level(y, flat, step=step)
+        return _mean_level(y, flat, step=step, arithmetic=_ARITHMETIC * size)
     ringing = _extrapolated(t, y, n_modes=n_modes, floor=size / np.sqrt(12))
     if ringing:
         return ringing
     flat = _flat_from(y, span=_NEARLY_FLAT * motion)
     if t[-1] - t[flat] >= pace:
-        return _mean_level(y, flat, step=step)
+        return _mean_level(y, flat, step=step, arithmetic=_ARITHMETIC * size)
     return None
 
 
@@ -202,12 +206,12 @@ def _flat_from(y: Array, *, span: float) -> int:
     return y.size - int(np.searchsorted(spans, span, side="right"))
 
 
-def _mean_level(y: Array, first: int, *, step: float) -> _Level:
+def _mean_level(y: Array, first: int, *, step: float, arithmetic: float) -> _Level:
     """Return the mean from `first` on; rounding a still cart errs by up to half an encoder step."""
     window = y[first:]
     residual = window - window.mean()
     rms = float(np.sqrt(np.mean(residual**2)))
-    scatter = rms * np.sqrt(colour(residual, angle=0.0) / window.size)
+    scatter = max(rms, arithmetic) * np.sqrt(colour(residual, angle=0.0) / window.size)
     rounding = step / np.sqrt(12) * rounding_left(noise_beyond_rounding(rms, step=step), step=step)
     return _Level(
         first=first,
