@@ -100,9 +100,9 @@ def response_at(
     """Return G (N,) at the points and dG/dp (N, n_p) = -Z⁻¹ (∂Z/∂p) Z⁻¹ e_1."""
     s = 1j * data.omega
     b, powers = P.directions, s[:, None] ** P.orders  # (n_p, n), (n_w, n_p)
-    Z = np.einsum("wp,pi,pj->wij", powers * physical, b, b, optimize=True)
+    Z = ((powers * physical)[:, None, :] * b.T) @ b  # Σ p s^order b bᵀ
     try:
-        inverse = np.linalg.inv(Z)
+        inverse = np.linalg.inv(Z).astype(np.complex128, copy=False)
     except np.linalg.LinAlgError:  # a step of the fit that goes astray: no number, it steps back
         inverse = np.full_like(Z, np.nan)
     G = inverse[:, :, 0]

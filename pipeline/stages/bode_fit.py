@@ -28,6 +28,7 @@ _GOOD_CHI_SQUARE = 2.0  # per degree of freedom: the data are explained
 _START_SPREAD = 0.5  # of ln m and ln k of a random start: half to double, mostly
 _START_ZETAS = (0.02, 0.3)
 _SEED = 2005  # of the random starts; any, but the same every time
+_NEAR, _PRECISION = 1e-3, 1e-8  # change of the cost to stop at: on the way there, and at the end
 _EVALUATIONS = 100  # a fit that gets there takes about ten
 _PHASE_AGREES = 3.0  # times as far off as the magnitudes are: a delay or a wrong sign is further
 _VANISHING = 1e-4  # of its usual size: a damping or far spring that the data put at zero
@@ -195,6 +196,7 @@ def _solve(P: Parametrisation, data: Points, theta: Array, scale: Scale) -> _Fit
             theta,
             jac=jacobian,  # pyright: ignore[reportArgumentType] - scipy's default is a string
             x_scale="jac",
+            ftol=_NEAR if scale == "log" else _PRECISION,
             max_nfev=_EVALUATIONS,
         )
     return _Fitted(
