@@ -149,9 +149,10 @@ def steps() -> None:
 
 def speed() -> None:
     print("\ntime per call, median of 20 (113 Hz)")
-    chain, t = PRESETS["throne-1dof"], np.arange(0, 8, 0.00884)
+    chain, t = PRESETS["throne-1dof"], np.arange(0, 8, 0.00884, dtype=np.float64)
     rng = np.random.default_rng(0)
-    sine, step = 0.03 * np.sin(19 * t), 0.03 * ((t > 0.5) & (t < 4))
+    sine = 0.03 * np.sin(19 * t, dtype=np.float64)
+    step = 0.03 * np.asarray((t > 0.5) & (t < 4), dtype=np.float64)
     runs = {
         "sine": record(t, simulate_linear(chain, t, sine), kind="sine", u=sine, omega=19.0),
         "step gain": record(t, simulate_linear(chain, t, step), kind="step", u=step),

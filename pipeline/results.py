@@ -141,7 +141,7 @@ class FrictionTest:
     ----------
     f_statistic, threshold : the F-test of one further parameter; `present` if above.
     drop : d = F/k, the friction band's half width, position units.
-    zeta, omega_n : of the decay once friction is taken out.
+    zeta : of the decay once friction is taken out.
     """
 
     f_statistic: float

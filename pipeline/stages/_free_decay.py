@@ -92,7 +92,7 @@ def _stretches(record: Record) -> list[list[Stretch]]:
         return [[whole]]
     u = record.u
     parts = [
-        Stretch(first=max(a - 1, 0), stop=b, level=float(np.mean(u[a:b])))
+        Stretch(first=a, stop=b, level=float(np.mean(u[a:b])))
         for a, b in plateaus(u)
         if b - a >= _MIN_SAMPLES
     ]
@@ -105,8 +105,8 @@ def _stretches(record: Record) -> list[list[Stretch]]:
 def _decaying_run(t: Array, y: Array, stretch: Stretch, *, size: float) -> list[int]:
     """Return the turning points of the largest run of ever smaller swings in equal times."""
     part = y[stretch.first : stretch.stop]
-    # The first is where the stretch begins, no turning point; the last is kept, where it came to
-    # rest in time.
+    # The first is where the stretch begins, no turning point. The last is where the cart came to
+    # rest, and counts if it did so in time.
     turning = [i + stretch.first for i in extrema(part, prominence=_PROMINENCE * size)][1:]
     swings = np.abs(np.diff(y[turning]))
     times = np.diff(t[turning])
