@@ -1,7 +1,7 @@
 """From the files of a submission to records in its units: every conversion happens here."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,7 +11,8 @@ from pipeline.ingest.clock import SLOW, Clock, read_clock
 from pipeline.ingest.columns import Column, assign_columns, conversion, holds_counts
 from pipeline.ingest.files import read_table
 from pipeline.ingest.problems import channel_problems
-from pipeline.ingest.signals import encoder_step, input_sign, mirrors
+from pipeline.ingest.signals import encoder_step, mirrors
+from pipeline.ingest.signs import with_signs
 from pipeline.ingest.table import Table
 from pipeline.plant.chain import Array
 from pipeline.results import FrequencyResponse, Record
@@ -68,7 +69,7 @@ def read_data(submission: Submission) -> Ingested:
                 records.append(_read_record(table, experiment, submission.system))
         except SubmissionError as error:
             raise SubmissionError(f"{experiment.id}: {error}") from None
-    records, found = _with_signs(records, submission)
+    records, found = with_signs(records, submission)
     responses, spread = frequency_responses(points)
     return Ingested(
         records=tuple(records),
@@ -347,66 +348,3 @@ def _reference(
         notes.append(f"{column.name!r} only mirrors {first.name!r} and is no reference")
         return None
     return values[keep] * _position_scale(table, column, system, notes)
-
-
-def _with_signs(records: list[Record], submission: Submission) -> tuple[list[Record], list[str]]:
-    """Return the records with signed inputs, and what is to be said about the signs.
-
-    Where a record does not tell, it takes the sign of most others of its sort (under feedback or
-    not: a controller's log may count the other way), else of most others.
-    """
-    stated: dict[str, int] = {}
-    for experiment in submission.experiments:
-        own = experiment.input.sign if experiment.input is not None else None
-        if (sign := own or submission.system.input.sign) is not None:
-            stated[experiment.id] = sign
-    driven = [r for r in records if r.u is not None and np.ptp(r.u) > 0]
-    found = {
-        r.id: input_sign(r.u, r.position(1), closed_loop=r.kind == "closed_loop")
-        for r in driven
-        if r.u is not None and 1 in r.carts and 1 in r.free
-    }
-
-    def usual(record: Record) -> int:
-        alike = [r for r in driven if (r.kind == "closed_loop") == (record.kind == "closed_loop")]
-        votes = [
-            sum(stated.get(r.id) or found.get(r.id, 0) for r in group) for group in (alike, driven)
-        ]
-        return next((1 if vote > 0 else -1 for vote in votes if vote), 1)
-
-    signs = {r.id: stated.get(r.id) or found.get(r.id) or usual(r) for r in records}
-    signed = [
-        record
-        if record.u is None or signs[record.id] == 1
-        else replace(record, u=0.0 - record.u, input_scale=-record.input_scale)
-        for record in records
-    ]
-    return signed, _say_signs([r.id for r in driven], stated=stated, found=found, signs=signs)
-
-
-def _say_signs(
-    driven: list[str], *, stated: dict[str, int], found: dict[str, int], signs: dict[str, int]
-) -> list[str]:
-    """Return what was found, what was only taken, and where the data contradict the students."""
-    says = [
-        f"{name}: the sign of the input is stated as {stated[name]:+d}, "
-        f"the data say {found[name]:+d}"
-        for name in driven
-        if name in stated and found.get(name, 0) == -stated[name]
-    ]
-    searched = [name for name in driven if name not in stated]
-    if not searched:
-        return says
-    if not any(found.get(name) for name in searched):
-        return [
-            *says,
-            "the data do not tell the sign of the input: it is taken as "
-            f"{signs[searched[0]]:+d}; state it if it is not",
-        ]
-    usual = 1 if sum(signs[name] for name in searched) >= 0 else -1
-    text = f"sign of the input found from the data: {usual:+d}"
-    if others := [name for name in searched if signs[name] != usual]:
-        text += f", but {-usual:+d} in {', '.join(others)}"
-    if unsure := [name for name in searched if not found.get(name)]:
-        text += f"; taken from the others where the data do not tell: {', '.join(unsure)}"
-    return [*says, text]
