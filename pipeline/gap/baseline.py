@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.errors import DataError
 from pipeline.gap.fit import Fit, Mapper, fit_model, fresh_locals, simulate_run
 from pipeline.gap.runs import Run, cut_shots, high_frequency_noise
 from pipeline.gap.structure import Structure
@@ -13,6 +12,7 @@ from pipeline.plant.chain import Array, Chain
 
 SHOT_LENGTH = 0.6  # s; a wrong structure does little harm over it
 _WINDOW = 0.3  # s, of the modulating functions
+_FIRST_MASS = 1e3  # weight of the equation m_1 = 1, where nothing else sets a scale
 _SMALLEST_ZETA = 0.002
 
 
@@ -24,9 +24,7 @@ def first_chain(runs: Sequence[Run], *, springs: Sequence[bool]) -> Chain:
 
     Reference: M. Shinbrot, Trans. ASME 79 (1957), 579-588.
 
-    Raises
-    ------
-    DataError : no run has an input, so that forces have no scale.
+    Without any input the first mass is one.
     """
     n = len(springs) - 1
     rows = [j for j, there in enumerate(springs) if there]
@@ -73,7 +71,9 @@ def first_chain(runs: Sequence[Run], *, springs: Sequence[bool]) -> Chain:
                 right.append(float(np.trapezoid(force * w, t)) / size)
     A, b = np.array(equations), np.array(right)
     if not np.any(b):
-        raise DataError("gap: needs a run with an input, found free decays only")
+        # Free decays alone: forces are per unit of the first mass.
+        A, b = np.vstack([A, np.zeros(columns)]), np.append(b, 0.0)
+        A[-1, 0] = b[-1] = _FIRST_MASS * float(np.abs(A[:, 0]).max())
     scale = np.linalg.norm(A, axis=0)
     p = np.linalg.lstsq(A / scale, b, rcond=None)[0] / scale
     m = np.maximum(p[:n], 0.02 * max(1e-12, np.abs(p[:n]).max()))
@@ -95,22 +95,14 @@ def fit_baseline(
     structure = Structure(springs=tuple(springs))
     shots = [cut_shots(run, length=SHOT_LENGTH) for run in runs]
     starts = [chain for chain in (start,) if chain is not None]
-    try:
-        starts.append(first_chain(runs, springs=springs))
-    except DataError:
-        if not starts:
-            raise
+    starts.append(first_chain(runs, springs=springs))
     fits = [
         fit_model(structure, structure.vector(chain), shots, iterations=15, mapper=mapper)
         for chain in starts
     ]
     best = min(fits, key=lambda fit: fit.cost)
     noisy = measure_noise(best, shots, runs)
-    candidates = [best.theta]
-    full = [
-        fit_model(structure, theta, noisy, iterations=25, mapper=mapper) for theta in candidates
-    ]
-    return min(full, key=lambda fit: fit.cost), noisy
+    return fit_model(structure, best.theta, noisy, iterations=25, mapper=mapper), noisy
 
 
 def measure_noise(fit: Fit, shots: Sequence[Run], runs: Sequence[Run]) -> list[Run]:

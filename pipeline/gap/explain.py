@@ -31,9 +31,11 @@ from pipeline.results import Record
 
 _LAST_SHARE = 0.4  # of a single run is held out
 _MOST_DWELLS = 4  # sine dwells used; they say little beyond their frequency
+_LEAST_MOTION = 8.0  # encoder steps
 _WINDOW = 0.5  # s; a chain without springs drifts, so it is judged over windows
 _CLOSE_ERROR, _CLOSE_GAIN, _CLOSE_BIC = 1.15, 0.10, 40.0
 _REFUSED_SHARE, _REFUSED_FLOOR = 0.5, 1.5
+_DECISIVE_SHARE, _DECISIVE_RIVAL = 0.8, 1.2
 _CONTACT = ("end_stop", "backlash")
 _CONTACT_REFINE = 3.0  # the force in a contact is held over a step: shorter ones for the last fit
 
@@ -61,7 +63,7 @@ def explain_gap(
 
     Raises
     ------
-    DataError : no usable record, or none with an input (forces then have no scale).
+    DataError : no usable record.
     """
     notes: list[str] = []
     runs = _prepare(records, springs=tuple(springs), notes=notes)
@@ -141,7 +143,14 @@ def _prepare(
         usable = [r for r in usable if r.id not in left_out]
     if not usable:
         raise DataError("gap: needs a time record with a cart free to move, found none")
-    runs = [make_run(record, n=n) for record in usable]
+    moving = [r for r in usable if _moves(r)]
+    if len(moving) < len(usable):
+        notes.append(f"{len(usable) - len(moving)} runs without motion left out")
+    if not moving:
+        raise DataError("gap: needs a run in which a free cart moves, found none")
+    runs = [make_run(record, n=n) for record in moving]
+    if not any(np.any(run.command) for run in runs):
+        notes.append("no run has an input: forces are per unit of the first mass")
     kept = without_twins(runs)
     if len(kept) < len(runs):
         notes.append(f"{len(runs) - len(kept)} duplicate files left out")
@@ -149,6 +158,12 @@ def _prepare(
         notes.append("no springs: judged over windows of half a second, not by the drift")
         kept = [cut_shots(run, length=_WINDOW) for run in kept]
     return kept
+
+
+def _moves(record: Record) -> bool:
+    spans = [np.ptp(record.position(c)) for c in record.carts if c in record.free]
+    steps = [record.encoder_step(c) for c in record.carts if c in record.free]
+    return any(span > _LEAST_MOTION * step for span, step in zip(spans, steps, strict=True))
 
 
 def _sides(runs: list[Run], *, notes: list[str]) -> tuple[list[Run], list[Run]]:
@@ -211,7 +226,7 @@ def _with_offset(
 ) -> tuple[Hypothesis, tuple[Hypothesis, ...], Bench]:
     """Return everything with a constant force added, where the rest points ask for one.
 
-    With the force in the model the encoders' zeros are those of the file, before and after.
+    With the force in the model the encoders' zeros are those of the file, within half a noise.
     """
     structure = chosen.fit.structure
     runs = [*bench.training, *bench.held_out]
@@ -219,10 +234,13 @@ def _with_offset(
     offset = find_offset(structure.chain(chosen.fit.theta), runs, own)
     if offset is None or any(structure.dry):
         return chosen, path, bench
-    pinned = replace(
-        bench,
-        training=tuple(_pin(run) for run in bench.training),
-        held_out=tuple(_pin(run) for run in bench.held_out),
+    pinned, loose = (
+        replace(
+            bench,
+            training=tuple(_pin(run, width_in_sigma=width) for run in bench.training),
+            held_out=tuple(_pin(run, width_in_sigma=width) for run in bench.held_out),
+        )
+        for width in (1e-4, 0.5)
     )
     effect = find_effect("force_offset")
     candidate = Candidate(
@@ -239,17 +257,17 @@ def _with_offset(
     )
     grown = structure.with_effect(candidate)
     theta = np.append(chosen.fit.theta, np.sign(offset.force))
-    fit = fit_whole(grown, theta, pinned)
-    final = judge(fit, pinned, added=candidate, parent=without[-1])
+    fit = fit_whole(grown, theta, loose)
+    final = judge(fit, loose, added=candidate, parent=without[-1])
     if final.error > 0.9 * without[-1].error:
         return chosen, path, bench
-    return final, (*without, final), pinned
+    return final, (*without, final), loose
 
 
-def _pin(run: Run) -> Run:
+def _pin(run: Run, *, width_in_sigma: float) -> Run:
     """Return a run whose encoders' zeros are those of the file."""
     width = np.full(run.zero.size, 1.0)
-    width[list(run.rows)] = np.sqrt(12.0) * run.sigma
+    width[list(run.rows)] = width_in_sigma * run.sigma
     return replace(run, zero=np.zeros(run.zero.size), zero_std=width)
 
 
@@ -266,7 +284,9 @@ def _verdict(
 ) -> tuple[Verdict, list[Hypothesis]]:
     if not chosen.key:
         return ("none" if baseline.at_floor else "unexplained"), []
-    if chosen.error > _REFUSED_SHARE * baseline.error and chosen.error > _REFUSED_FLOOR * floor:
+    refused = chosen.error > _REFUSED_SHARE * baseline.error
+    refused &= chosen.error > _REFUSED_FLOOR * floor
+    if refused and not _decisive(chosen, baseline, found):
         return "unexplained", []
     gain = baseline.bic - chosen.bic
     close = [
@@ -279,6 +299,19 @@ def _verdict(
         and not _same_thing(rival, chosen, sample_time=sample_time)
     ]
     return ("ambiguous" if close else "named"), close
+
+
+def _decisive(chosen: Hypothesis, baseline: Hypothesis, found: Sequence[Hypothesis]) -> bool:
+    """Is the name beyond doubt although much of the gap remains?
+
+    It must help clearly, and every rival of another kind must leave clearly more.
+    """
+    if chosen.error > _DECISIVE_SHARE * baseline.error or len(chosen.key) > 1:
+        return False
+    family = chosen.fit.structure.effects[0].effect.family
+    rivals = [h for h in found if len(h.key) == 1 and h.key != chosen.key]
+    others = [h for h in rivals if h.fit.structure.effects[0].effect.family != family or not family]
+    return all(h.error > _DECISIVE_RIVAL * chosen.error for h in others)
 
 
 def _same_thing(rival: Hypothesis, chosen: Hypothesis, *, sample_time: float) -> bool:

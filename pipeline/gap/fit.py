@@ -25,6 +25,7 @@ _SCATTER_START = 0.05  # spread of friction from run to run, before anything is 
 _SCATTER_FLOOR, _SCATTER_TOP = 0.004, 0.2
 _SCATTER_PRIOR = (3.0, 0.04)  # weight in runs, and spread, of the prior on that spread
 _LOCAL_STEP = 1e-3  # of the run's swing, for derivatives with respect to start states
+_ANCHOR = 1e6  # standard errors per unit of log mass
 _DAMP, _RELAX, _STIFFEN = 1e-3, 6.0, 6.0
 
 
@@ -390,7 +391,7 @@ def fit_model(
             )
 
         linear = list(mapper(linearise, zip(runs, best.locals_, strict=True)))
-        stacked = np.concatenate([part.reduced for part in linear])
+        stacked = np.concatenate([*(part.reduced for part in linear), _anchor(runs, theta.size)])
         if not np.all(np.isfinite(stacked)):
             break
         J, r = stacked[:, :-1], stacked[:, -1]
@@ -449,6 +450,15 @@ def fit_model(
         if fall < tolerance:
             break
     return best
+
+
+def _anchor(runs: Sequence[Run], size: int) -> Array:
+    """Return a row that holds the first mass where no run has an input to give forces a scale."""
+    if any(np.any(run.command) for run in runs):
+        return np.zeros((0, size + 1))
+    row = np.zeros((1, size + 1))
+    row[0, 0] = _ANCHOR
+    return row
 
 
 def _reprice(fit: Fit, runs: Sequence[Run], inflate: float) -> Fit:
@@ -536,14 +546,15 @@ def covariance(fit: Fit, runs: Sequence[Run], *, refine: float = 1.0, mapper: Ma
             fit.structure,
             fit.theta,
             *pair,
-            inflate=1.0,
+            inflate=max(1.0, np.sqrt(fit.chi)),
             spread=fit.spread,
             scatter_free=scatter_free,
             refine=refine,
         )
 
     linear = list(mapper(linearise, zip(runs, fit.locals_, strict=True)))
-    J = np.concatenate([part.reduced for part in linear])[:, :-1]
+    parts = [*(part.reduced for part in linear), _anchor(runs, fit.theta.size)]
+    J = np.concatenate(parts)[:, :-1]
     _, s, vt = np.linalg.svd(J, full_matrices=False)
     s = np.maximum(s, 1e-9 * s[0])
     cov = (vt.T / s**2) @ vt * max(1.0, fit.chi)

@@ -13,7 +13,6 @@ _TAIL = 0.12  # share of a record that must lie still to tell the rest point
 _STILL = 2.6  # encoder steps, peak to peak, that count as lying still
 _FIT_RATE = 250.0  # Hz; faster records are averaged in blocks, model and measurement alike
 _HELD_SAMPLES = 4  # a release after fewer held samples is the start of the file
-_RELEASED = 0.85  # the hand is gone when the cart has left the held position by 15 %
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -82,7 +81,7 @@ def make_run(record: Record, *, n: int) -> Run:
     quiet_end = bool(np.all(u[-tail.shape[1] :] == 0.0))
     if record.kind == "decay":
         rest = np.where(settled, tail.mean(axis=1), np.median(y, axis=1))
-        first = _release(y - rest[:, None], still)
+        first = min(_release(y - rest[:, None], still), t.size // 2)
         t, u, y = t[first:], u[first:], y[:, first:]
     head = y[:, :_REST_SAMPLES]
     # The input may already act between these samples: the first two are before its effect.
@@ -179,8 +178,9 @@ def _release(offset: Array, still: Array) -> int:
     if last - first_held < _HELD_SAMPLES and first_held > 0:
         # Shaken, not held: the largest swing is where the hand has gone.
         return last
-    later = np.flatnonzero(motion[last:] < _RELEASED * peak)
-    return last + int(later[0]) if later.size else last
+    # The first turning point after the release: no hand follows that far.
+    side = np.sign(offset[leader, top])
+    return last + int(np.argmin(side * offset[leader, last:]))
 
 
 def _smooth_state(t: Array, y: Array, at: int, *, window: float = 0.03) -> tuple[float, float]:

@@ -20,9 +20,9 @@ _SHORT_LIST = 9  # suspects refitted on pieces
 _FULL_LIST = 5  # of which the best are refitted on whole runs …
 _FULL_SCREEN = 3  # … with the best of a screen on whole runs
 _OUT_OF_SIGHT = 8.0  # a suspect that leaves this many times the best one's misfit is out
-_BEAM = 3
+_BEAM = (3, 1, 1)  # hypotheses kept after one, two, three effects
 _HOPELESS = 30.0  # a hypothesis with this many times the best one's chi-square is not grown
-_DEPTH = 3
+_DEPTH = len(_BEAM)
 _BIC_DROP = 20.0
 _THINNING = 10.0  # neighbouring residuals are not independent: N / 10 count
 _HELD_OUT_GAIN = 0.95  # an effect must lower the held-out error by this factor …
@@ -111,7 +111,7 @@ def search(baseline: Hypothesis, bench: Bench, *, depth: int = _DEPTH) -> list[H
         if not children:
             break
         unique = {child.key: child for child in sorted(children, key=lambda h: -h.bic)}
-        beam = sorted(unique.values(), key=lambda h: h.bic)[:_BEAM]
+        beam = sorted(unique.values(), key=lambda h: h.bic)[: _BEAM[level]]
         bench.tell(f"{level + 1} effect{'s' * (level > 0)}: " + _names(beam[0]))
         if beam[0].at_floor:
             break

@@ -31,6 +31,12 @@ class Hidden:
 
 
 @njit(cache=True)
+def _limited(u, dead, limit):
+    past = abs(u) - dead
+    return min(max(np.sign(u) * past, -limit), limit) if past > 0.0 else 0.0
+
+
+@njit(cache=True)
 def _motion(cart, spring, drive, free, t, times, command, x0, v0, scatter, h):
     n = cart.shape[0]
     x, v, z = x0.copy(), v0.copy(), np.zeros(n)
@@ -54,19 +60,21 @@ def _motion(cart, spring, drive, free, t, times, command, x0, v0, scatter, h):
                 out[i, sample] = cart[i, 13] * (x[i] + part * v[i])
             sample += 1
         mid = now + 0.5 * h
-        while at < times.size - 1 and times[at + 1] <= mid - drive[2]:
-            at += 1
         while on < times.size - 1 and times[on + 1] <= mid:
             on += 1
-        u = command[at]
-        if abs(u) <= drive[0]:
-            u = 0.0
-        else:
-            u -= np.sign(u) * drive[0]
-        u = min(max(u, -drive[1]), drive[1])
+        # The delayed command over this step: steps are far shorter than samples, so at most one
+        # edge falls inside, and counts by the part of the step that is left.
+        begin = now - drive[2]
+        while at < times.size - 1 and times[at + 1] <= begin:
+            at += 1
+        u = _limited(command[at], drive[0], drive[1])
+        if at < times.size - 1 and times[at + 1] < begin + h:
+            late = (begin + h - times[at + 1]) / h
+            u += late * (_limited(command[at + 1], drive[0], drive[1]) - u)
         if drive[3] > 0.0:
-            lag += h / drive[3] * (u - lag)
-            u = lag
+            before = lag
+            lag = u + (lag - u) * np.exp(-h / drive[3])
+            u = 0.5 * (before + lag)
         for i in range(n):
             if free[i]:
                 x[i] += 0.5 * h * v[i]

@@ -1,0 +1,241 @@
+"""The compiled simulator against exact solutions, an event-driven one, and the fine-step truth."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from pipeline.plant.chain import PRESETS, Chain
+from pipeline.plant.effects import AugmentedChain, find_effect, make_term
+from pipeline.plant.kernel import simulate_batch
+from pipeline.plant.simulate import simulate_linear
+from pipeline.plant.tables import Cart, Tables, linear_tables
+from tests.truth.bench import Hidden, simulate_truth
+
+COUNT = 0.00227  # cm, the encoder step
+
+
+def simulate(tables: Tables, t, u, *, x0=None, v0=None, free=None, refine=1.0):
+    """Return (n, samples) readings of one run that starts once."""
+    n = tables[0].shape[0]
+    x0 = np.zeros(n) if x0 is None else np.asarray(x0, dtype=float)
+    v0 = np.zeros(n) if v0 is None else np.asarray(v0, dtype=float)
+    return simulate_batch(
+        *(table[None] for table in tables),
+        x0[None, None],
+        v0[None, None],
+        np.ones((1, n)),
+        np.array([free is None or i + 1 in free for i in range(n)]),
+        t,
+        t,
+        np.asarray(u, dtype=float),
+        np.array([0, t.size]),
+        refine,
+    )[0]
+
+
+@pytest.mark.parametrize("preset", list(PRESETS))
+@pytest.mark.parametrize("irregular", [False, True])
+def test_linear_chain_is_exact(preset, irregular):
+    """Without effects the simulator agrees with the matrix exponential, at any sample times."""
+    chain = PRESETS[preset]
+    rng = np.random.default_rng(1)
+    t = np.arange(600) * 0.00884
+    if irregular:
+        t = t + rng.uniform(-0.002, 0.002, t.size)
+    u = 0.03 * rng.standard_normal(t.size)
+
+    got = simulate(linear_tables(chain), t, u)
+
+    # The series' remainder, (omega h)^6 / 720 of a step's motion with omega h <= 0.2, is 1e-7
+    # a step and changes sign with the motion; 1e-6 is what is promised.
+    assert_allclose(got, simulate_linear(chain, t, u), atol=1e-6 * np.abs(got).max())
+
+
+def test_held_cart_is_a_wall():
+    """A held cart does not move, and the others swing as against a wall."""
+    chain = PRESETS["throne-2dof"]
+    t = np.arange(400) * 0.005
+
+    got = simulate(linear_tables(chain), t, 0 * t, x0=[0.0, 1.0], free=(2,))
+
+    assert np.all(got[0] == 0.0)
+    exact = simulate_linear(chain, t, 0 * t, free=(2,), x0=np.array([1.0, 0.0]))
+    assert_allclose(got[1:], exact, atol=1e-6)
+
+
+def friction_decay(m, k, force, x0, t):
+    """Return the decay of one cart with dry friction only, half swing by half swing, exactly."""
+    omega, x, y, start = np.sqrt(k / m), x0, np.empty(t.size), 0.0
+    centre = force / k  # the rest point of a half swing lies on the side of the motion's start
+    while True:
+        side = np.sign(x)
+        inside = (t >= start) & (t <= start + np.pi / omega)
+        swing = x - side * centre
+        y[inside] = side * centre + swing * np.cos(omega * (t[inside] - start))
+        start, x = start + np.pi / omega, side * centre - swing
+        if abs(x) <= centre:
+            y[t > start] = x
+            return y
+
+
+@pytest.mark.parametrize("rate", [113.1, 250.0, 1000.0])
+def test_friction_decay_follows_the_events(rate):
+    """Dry friction alone gives the exact half swings, and the cart then rests where it stopped."""
+    m, k, force = 2e-4, 0.035, 0.004
+    chain = Chain(m=np.array([m]), c=np.array([0.0]), k=np.array([k, 0.0]))
+    tables = linear_tables(chain)
+    tables[0][0, Cart.COULOMB] = force
+    t = np.arange(round(4 * rate)) / rate
+
+    got = simulate(tables, t, 0 * t, x0=[2.0])[0]
+
+    # 0.5 count is what is asked; reversals are found to the root of the velocity.
+    assert np.abs(got - friction_decay(m, k, force, 2.0, t)).max() < 0.05 * COUNT
+    assert np.ptp(got[-50:]) == 0.0
+
+
+def test_cart_stays_where_friction_holds_it():
+    """A force below the dry friction moves nothing at all; one above it does."""
+    tables = linear_tables(PRESETS["throne-1dof"])
+    tables[0][0, Cart.COULOMB] = 0.01
+    t = np.arange(500) * 0.004
+
+    assert np.all(simulate(tables, t, np.full(t.size, 0.0099)) == 0.0)
+    assert np.abs(simulate(tables, t, np.full(t.size, 0.0101))).max() > 0.0
+
+
+PARAMETERS = {
+    "coulomb_friction": {"force": 0.001},
+    "stiction": {"force": 0.001, "static_force": 0.002, "velocity": 1.0},
+    "presliding_friction": {"force": 0.001, "distance": 0.02},
+    "load_friction": {"coefficient": 0.05},
+    "quadratic_drag": {"coefficient": 3e-5},
+    "force_offset": {"force": 0.004},
+    "cubic_spring": {"coefficient": 0.02},
+    "slack_spring": {"stiffness_change": 0.8, "stretch": 0.15},
+    "coupling_damper": {"coefficient": 3e-4},
+    "drive_damping": {"coefficient": 3e-4},
+    "dead_zone": {"width": 0.005},
+    "saturation": {"limit": 0.03},
+    "input_delay": {"delay": 0.0123},
+    "actuator_lag": {"time_constant": 0.015},
+    "sensor_gain": {"gain": 1.05},
+    "extra_mode": {"mass": 3e-5, "stiffness": 0.03, "damping": 5e-5},
+    "end_stop": {"position": 0.8, "stiffness": 2.0},
+    "backlash": {"gap": 0.05},
+}
+
+
+@pytest.mark.parametrize("key", list(PARAMETERS))
+def test_every_effect_agrees_with_the_fine_step_truth(key):
+    """Each law, simulated here and by the independent 50-µs simulator, gives the same readings."""
+    chain = PRESETS["throne-2dof"]
+    effect = find_effect(key)
+    place = {"cart": 1, "spring": 2, "input": 0}[effect.place]
+    values = dict(PARAMETERS[key])
+    m1, contact = chain.m[0], 60.0 * (chain.k[0] + chain.k[1])
+    if key == "end_stop":
+        values["damping"] = 0.4 * np.sqrt(values["stiffness"] * m1)
+    if key == "backlash":
+        values |= {
+            "motor_mass": 0.15 * m1,
+            "contact_stiffness": contact,
+            "contact_damping": 0.3 * np.sqrt(contact * 0.15 * m1),
+        }
+    term = make_term(effect, place=place, values=values, chain=chain)
+    t = np.arange(450) * 0.00884
+    u = np.where((t > 0.05) & (t < 2.0), 0.06, 0.0)
+
+    got = simulate(AugmentedChain(chain=chain, terms=(term,)).tables(), t, u, refine=3.0)
+    truth = simulate_truth(
+        m=chain.m,
+        c=chain.c,
+        k=chain.k,
+        hidden=[Hidden(effect=key, place=place, parameters=PARAMETERS[key])],
+        t=t,
+        u=u,
+        free=(1, 2),
+    )
+
+    # The truth's own steps leave 0.1 count; a contact's end is softer
+    # by what one step of it moves.
+    limit = {"end_stop": 1.5, "backlash": 0.6}.get(key, 0.25)
+    assert np.sqrt(np.mean((got - truth) ** 2)) < limit * COUNT
+    linear = simulate(linear_tables(chain), t, u)
+    assert np.sqrt(np.mean((linear - truth) ** 2)) > 2.0 * limit * COUNT
+
+
+DISSIPATIVE = ("coulomb_friction", "stiction", "presliding_friction", "quadratic_drag", "end_stop")
+
+
+@pytest.mark.parametrize("key", DISSIPATIVE)
+def test_energy_never_grows_without_input(key):
+    """Swings that nothing drives only shrink, whatever the effect."""
+    chain = PRESETS["throne-1dof"]
+    effect = find_effect(key)
+    term = make_term(effect, place=1, values=PARAMETERS[key], chain=chain)
+    t = np.arange(4000) * 1e-3
+
+    y = simulate(AugmentedChain(chain=chain, terms=(term,)).tables(), t, 0 * t, x0=[1.5])[0]
+
+    v = np.gradient(y, t)
+    peaks = np.abs(y[1:-1][np.diff(np.sign(v[1:])) != 0])
+    # A stop's spring stores energy past its position, so peaks on its side are not comparable.
+    peaks = peaks[::2] if key == "end_stop" else peaks
+    assert peaks.size > 3
+    assert np.all(np.diff(peaks) < 1e-3)
+
+
+def test_delay_shifts_the_response():
+    """A delay of whole samples shifts the readings by as many, a negative one forwards."""
+    chain = PRESETS["throne-2dof"]
+    t = np.arange(500) * 0.005
+    u = np.where(t > 0.1, 0.03, 0.0)
+    plain = simulate(linear_tables(chain), t, u)
+    for delay, shift in ((0.02, 4), (-0.02, -4)):
+        term = make_term(find_effect("input_delay"), place=0, values={"delay": delay}, chain=chain)
+
+        late = simulate(AugmentedChain(chain=chain, terms=(term,)).tables(), t, u)
+
+        assert_allclose(late[:, 100:400], plain[:, 100 - shift : 400 - shift], atol=1e-6)
+
+
+def test_diverging_model_is_reported_as_nan():
+    """A softening spring that gives way yields NaN, not an endless run or a crash."""
+    chain = PRESETS["throne-1dof"]
+    term = make_term(
+        find_effect("cubic_spring"), place=1, values={"coefficient": -0.5}, chain=chain
+    )
+    t = np.arange(600) * 0.005
+
+    got = simulate(AugmentedChain(chain=chain, terms=(term,)).tables(), t, np.full(t.size, 0.05))
+
+    assert np.all(np.isnan(got))
+
+
+def test_batch_gives_what_single_runs_give():
+    """Variants simulated together do not disturb each other."""
+    chain = PRESETS["throne-1dof"]
+    t = np.arange(300) * 0.005
+    u = np.where(t > 0.1, 0.03, 0.0)
+    tables = linear_tables(chain)
+    forces = (0.0, 0.001, 0.003)
+    carts = np.repeat(tables[0][None], 3, axis=0)
+    carts[:, 0, Cart.COULOMB] = forces
+    together = simulate_batch(
+        carts,
+        np.repeat(tables[1][None], 3, axis=0),
+        np.repeat(tables[2][None], 3, axis=0),
+        np.zeros((3, 1, 1)),
+        np.zeros((3, 1, 1)),
+        np.ones((3, 1)),
+        np.array([True]),
+        t,
+        t,
+        u,
+        np.array([0, t.size]),
+        1.0,
+    )
+    for i, force in enumerate(forces):
+        tables[0][0, Cart.COULOMB] = force
+        assert np.array_equal(together[i], simulate(tables, t, u))
