@@ -1,6 +1,7 @@
 """Write a report: one document, as HTML and as PDF, with its figures beside them."""
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,15 +29,18 @@ def render_report(
         if progress:
             progress(warning)
     document = build_document(analysis, progress=progress)
-    figures = out / "figures"
-    figures.mkdir(parents=True, exist_ok=True)
-    for picture in document.pictures():
-        (figures / f"{picture.name}.svg").write_text(picture.svg, encoding="utf-8", newline="\n")
-    (out / "report.html").write_text(render_html(document), encoding="utf-8", newline="\n")
-    if pdf:
-        if progress:
-            progress("report: pdf")
-        (out / "report.pdf").write_bytes(render_pdf(document))
+    (out / "figures").mkdir(parents=True, exist_ok=True)
+    with ThreadPoolExecutor(max_workers=1) as beside:  # typst works outside the interpreter's lock
+        printed = beside.submit(render_pdf, document) if pdf else None
+        _write_text(out / "report.html", render_html(document))
+        for picture in document.pictures():
+            _write_text(out / "figures" / f"{picture.name}.svg", picture.svg)
+        if printed:
+            (out / "report.pdf").write_bytes(printed.result())
+
+
+def _write_text(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8", newline="\n")
 
 
 def _students_text(analysis: Analysis) -> str:
