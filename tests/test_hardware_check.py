@@ -1,6 +1,7 @@
 """The hardware check: simulated benches with a known truth, and a real one."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -256,6 +257,16 @@ def test_a_pid_is_closed_around_the_controlled_cart_unless_it_names_one():
     for controller, cart in ((unnamed, 2), (named, 1), (named, None)):
         checks = check_hardware(run, TWO, controller=controller, controlled_cart=cart)
         assert of(checks, "closed")[2].nrmse < 2 * noise_floor(y[1])
+
+
+def test_a_pid_acts_on_the_files_own_counts():
+    """Gains stated per count close the same loop as gains per cm, whatever unit ingest made."""
+    law = Pid(kp=0.008, kd=0.0008, cart=2)
+    y, u = bench(TWO, law)
+    run = replace(record(y, u=u, reference=STEPS), position_scale=COUNT)
+    per_count = submission.Pid(type="pid", kp=0.008 * COUNT, kd=0.0008 * COUNT, cart=2)
+    checks = check_hardware(run, TWO, controller=per_count)
+    assert of(checks, "closed")[2].nrmse < 2 * noise_floor(y[1])
 
 
 def test_a_displaced_rest_is_no_error_of_the_model():

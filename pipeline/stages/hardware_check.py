@@ -54,7 +54,7 @@ def check_hardware(
     """
     run = measured_run(record, chain)
     opened = _open(run) if run.driven else None
-    law = _plant_law(controller, controlled_cart)
+    law = _plant_law(controller, controlled_cart, position_scale=record.position_scale)
     closed, trouble = None, ""
     if law is not None and record.reference is not None:
         try:
@@ -116,8 +116,13 @@ def _plausible(factor: float) -> bool:
 # ------------------------------------------------------------------ closed loop
 
 
-def _plant_law(controller: submission.Controller | None, cart: int | None) -> Controller | None:
-    """Return the controller as the simulation knows it; None where there is nothing to simulate."""
+def _plant_law(
+    controller: submission.Controller | None, cart: int | None, *, position_scale: float
+) -> Controller | None:
+    """Return the controller as the simulation knows it; None where there is nothing to simulate.
+
+    A PID acts on the error in the file's own counts, which `position_scale` made positions of.
+    """
     if isinstance(controller, submission.Pid):
         steered = controller.cart
         if "cart" not in controller.model_fields_set and cart is not None:
@@ -126,7 +131,7 @@ def _plant_law(controller: submission.Controller | None, cart: int | None) -> Co
             kp=controller.kp,
             ki=controller.ki,
             kd=controller.kd,
-            scale=controller.scale,
+            scale=controller.scale / position_scale,
             cart=steered,
         )
     if controller is None or not controller.gains:
