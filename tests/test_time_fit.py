@@ -192,6 +192,21 @@ def test_a_cart_that_was_not_measured_is_still_found():
     assert np.max(np.abs(errors(fit, chain))) < 4
 
 
+def test_a_long_fast_sweep_is_fitted_whole():
+    """Twenty seconds at 1 kHz are fitted from the first start, and every sample counts."""
+    rng = np.random.default_rng(17)
+    chain = PRESETS["throne-2dof"]
+    t = np.arange(20_000) / 1000.0
+    u = 0.02 * np.sin(2 * np.pi * (0.2 * t + 0.17 * t**2))  # 0.2 to 7 Hz
+    y = simulate_linear(chain, t, u)
+    record = measure(y, t, u, kind="sweep", carts=(1, 2), rng=rng, noise=0.001)
+    fit = fit_records([record], n=2, springs=(True,) * 3)
+    assert fit.converged
+    assert fit.n_starts == 1
+    assert fit.n_points == 2 * t.size
+    assert np.max(np.abs(errors(fit, chain))) < 4
+
+
 def test_a_body_on_no_spring_has_mass_and_damping():
     """One cart without springs is fitted as a rigid body, also where springs were expected."""
     truth = Chain(m=np.array([2e-4]), c=np.array([5e-4]), k=np.zeros(2))

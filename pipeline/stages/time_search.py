@@ -147,9 +147,9 @@ def search(
     ------
     DataError : the records suggest no start at all.
     """
-    full, windows = windows, [window.thinned(_SEARCH_SAMPLES) for window in windows]
     springs = parametrisation.springs
     regressed = [regress_chain(windows, springs=springs, width=width) for width in WIDTHS]
+    full, windows = windows, [window.thinned(_SEARCH_SAMPLES) for window in windows]
     near = [parametrisation.pack(chain) for chain in (given, *regressed) if chain is not None]
     near.sort(key=lambda theta: look(windows, parametrisation, theta).cost)
     best: Attempt | None = None
