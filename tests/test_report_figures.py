@@ -132,6 +132,7 @@ def test_tick_labels_share_their_decimals():
     assert tick_labels(np.array([-0.5, 0.0, 0.5])) == ["−0.5", "0.0", "0.5"]
     assert tick_labels(np.array([-200.0, 0.0])) == ["−200", "0"]
     assert tick_labels(log_ticks(0.4, 7.0)) == ["0.5", "1", "2", "5"]
+    assert tick_labels(log_ticks(8.0, 27.0)) == ["10", "15", "20"]
     assert tick_labels(log_ticks(0.05, 900.0)) == ["0.1", "1", "10", "100"]
     assert tick_labels(np.array([0.0, 5e-6])) == ["0", "5e−06"]
 

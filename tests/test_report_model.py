@@ -111,24 +111,19 @@ def test_numeric_transfer_functions_are_those_of_the_chain(chain):
 
 
 def assert_responses(math: Math, values, *, chain: Chain, rtol: float) -> None:
+    """Evaluate each printed line, gain over D(s) times the zeros, against the chain."""
     omega = 11.0  # rad/s, between the resonances
-    s = 1j * omega
-    lines = math.parts if math.kind == "lines" else (math,)
-    sides = [line.parts for line in lines if isinstance(line, Math)]
-    values = {**values, "s": s}
-    if chain.n > 1:
-        *sides, (_, _, *denominator) = sides
-        values["D"] = evaluate(row(*denominator), values)
-        values["s"] = s
+    values = {**values, "s": 1j * omega}
+    *lines, (_, _, *denominator) = [line.parts for line in math.parts if isinstance(line, Math)]
+    divisor = evaluate(row(*denominator), values)
     got = []
-    for _, equals, *right in sides:
+    for _, equals, quotient, *zeros in lines:
         assert equals == "="
-        first, *rest = right
-        assert isinstance(first, Math)
-        above, below = first.parts
-        # D(s) is a name, not a product.
-        divisor = values["D"] if chain.n > 1 else evaluate(below, values)
-        got.append(evaluate(above, values) / divisor * evaluate(row(*rest, "1"), values))
+        assert isinstance(quotient, Math)
+        assert to_text(quotient.parts[1]) == "D(s)"
+        got.append(
+            evaluate(quotient.parts[0], values) / divisor * evaluate(row(*zeros, "1"), values)
+        )
     expected = chain.frequency_response(np.array([omega]))[::-1, 0]
     assert_allclose(np.array(got), expected, rtol=rtol)
 

@@ -141,7 +141,7 @@ def _parameters(page: Page) -> list[Block]:
 def _staged_differences(page: Page) -> Block | None:
     """Say where the fit cart by cart ended up elsewhere than the joint fit."""
     fit = page.analysis.fit
-    if fit is None or not fit.staged:
+    if fit is None or fit.chain.n == 1:
         return None
     finals = {name: estimate.value for name, estimate in fit.parameters.items()}
     changes = {

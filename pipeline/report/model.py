@@ -140,12 +140,10 @@ def symbolic_transfer_functions(springs: Sequence[bool]) -> Formula | None:
     if n > 3 or not all(springs[1:-1]) or not (springs[0] or springs[-1]):
         return None
     nulls = {1: [[]], 2: [["2"], []], 3: [["x", "y"], ["3"], []]}[n]
-    if n == 1:
-        denominator = _symbolic_factor("n", lone=True)
-        return formula(row(_ratio(1), "=", fraction("K", denominator)))
     above = [[_symbolic_factor(null) for null in of_cart] for of_cart in nulls]
-    gains: list[Term] = [sub("K", str(i)) for i in range(1, n + 1)]
-    return _over_common_denominator(gains, above, [_symbolic_factor(mode) for mode in "abc"[:n]])
+    below = [_symbolic_factor(mode) for mode in (["n"] if n == 1 else "abc"[:n])]
+    gains = [_indexed("K", i, n=n) for i in range(1, n + 1)]
+    return _over_common_denominator(gains, above, below)
 
 
 def numeric_transfer_functions(chain: Chain) -> Formula:
@@ -157,8 +155,6 @@ def numeric_transfer_functions(chain: Chain) -> Formula:
         return formula(lines(_polynomial_ratio(chain, i) for i in range(chain.n, 0, -1)))
     gains = [_short(gain) for gain in chain.static_gains()]
     below = _numeric_factors(chain.poles)
-    if chain.n == 1:
-        return formula(row(_ratio(1), "=", fraction(gains[0], below[0])))
     above = [_numeric_factors(chain.zeros(i)) for i in range(1, chain.n + 1)]
     return _over_common_denominator(gains, above, below)
 
@@ -172,16 +168,17 @@ def _over_common_denominator(
         row(_ratio(i), "=", fraction(gains[i - 1], D), *map(parens, above[i - 1]))
         for i in range(len(gains), 0, -1)
     ]
-    return formula(lines([*equations, row(D, "=", *map(parens, below))]))
+    factors = below if len(below) == 1 else [parens(factor) for factor in below]
+    return formula(lines([*equations, row(D, "=", *factors)]))
 
 
 def _ratio(i: int) -> Math:
     return fraction(row(sub("X", str(i)), parens("s")), row("U", parens("s")))
 
 
-def _symbolic_factor(index: str, *, lone: bool = False) -> Math:
+def _symbolic_factor(index: str) -> Math:
     omega = symbol(f"omega_{index}")
-    zeta = "ζ" if lone else symbol(f"zeta_{index}")
+    zeta = "ζ" if index == "n" else symbol(f"zeta_{index}")  # a lone cart's, as in Table 1
     return _factor(
         row(fraction("1", power(omega, "2")), power("s", "2")),
         row(fraction(row("2", zeta), omega), "s"),

@@ -116,7 +116,7 @@ def chain_table(fit: ChainFit, *, number: int, position_unit: str, input_unit: s
                     _cell(name_span(name)),
                     _cell(_where(noun, i, chain.n)),
                     _cell("none" if absent else with_error(float(value), error)),
-                    _cell(clean(unit)),
+                    _cell(unit_text(clean(unit))),
                 ]
             )
     return _table(

@@ -16,6 +16,11 @@ _SIZE = 7.5  # points, of the labels
 _PAD = 3.5 / 72  # inches, between axis and label
 _SPACING = (0.45, 0.18)  # inches at least between ticks along x and along y
 _STEPS = (1.0, 2.0, 5.0, 10.0)
+_LOG_FACTORS = (
+    (200.0, (1.0,)),
+    (7.0, (1.0, 2.0, 5.0)),
+    (0.0, (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0)),
+)
 _FEW = 6  # on a logarithmic axis too short for 1, 2, 5
 _ROUNDING = 1e-9  # of a step
 _PLAIN = 4  # decimals, or digits before the point, beyond which powers of ten are clearer
@@ -76,9 +81,9 @@ def linear_ticks(low: float, high: float, *, most: int) -> Array:
 
 
 def log_ticks(low: float, high: float) -> Array:
-    """Return 1, 2, 5, 10 … between two limits; whole decades where there are more than two."""
+    """Return 1, 2, 5, 10 … between two limits; fewer over many decades, more within one."""
     exponents = np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
-    factors = (1.0,) if high > 200 * low else (1.0, 2.0, 5.0)
+    factors = next(f for span, f in _LOG_FACTORS if high > span * low)
     ticks = np.sort(np.outer(10.0**exponents, factors).ravel())
     inside = ticks[(ticks >= low) & (ticks <= high)]
     return inside if inside.size > 1 else linear_ticks(low, high, most=_FEW)
