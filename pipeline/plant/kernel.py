@@ -22,10 +22,10 @@ from numba import njit
 
 _SERIES_REACH = 0.2  # omega h: the series' sixth order then leaves 1e-8 after seconds
 _LONGEST_LINEAR = 4.5e-3  # s; springs, dampers and dry friction are exact at any step
-_CONTACT_REACH = 0.25  # omega h inside a contact, whose force is held over the step
+_CONTACT_REACH = 0.4  # omega h inside a contact
 _DAHL_STEP = 2.3e-3  # s; the presliding state is held over half of it
 _LONGEST_STEP = 2.5e-3  # s; nonlinear forces are held over it
-_MAX_PIECES = 12  # events in one substep; more would be chatter
+_MOST_EVENTS = 12  # in one substep; more would be chatter
 _BLOWN_UP = 1e9  # positions beyond this are a diverged model
 
 
@@ -38,9 +38,9 @@ DEAD, LIMIT, DELAY, LAG, DRIVE_C, GAP, MOTOR, CONTACT_K, CONTACT_D = (int(i) for
 # Rows of the state table: position, velocity, presliding state, last acceleration, inverse mass,
 # state in the middle of the step, force, time derivatives 2 to 6 of the position, and the dry
 # friction's direction, the inverse mass it leaves (0 for a cart that sticks), and the decay of the
-# presliding state over half a step.
-X, V, Z, ACC, INV, MID_X, MID_V, FORCE, D2, D3, D4, D5, D6, SIDE, GRIP, DECAY = range(16)
-ROWS = 16
+# presliding state over half a step; constant forces of closed contacts.
+X, V, Z, ACC, INV, MID_X, MID_V, FORCE, D2, D3, D4, D5, D6, SIDE, GRIP, DECAY, FIX = range(17)
+ROWS = 17
 
 _jit = njit(
     cache=True, nogil=True, fastmath={"contract", "reassoc", "arcp", "nsz"}, error_model="numpy"
@@ -102,45 +102,97 @@ def _assemble(cart, spring, drive, free, s, K, C):
 
 
 @_jit
-def _nonlinear(cart, spring, drive, n, motor, s, at_x, at_v):
-    """Set FORCE to the smooth and contact forces beyond the linear ones, friction excepted."""
+def _smooth_forces(cart, spring, n, s):
+    """Add the forces that are neither linear nor dry, at the state in the middle of the step."""
     for i in range(n):
-        f = cart[i, OFFSET]
+        s[FORCE, i] += cart[i, OFFSET]
         if cart[i, DRAG] != 0.0:
-            f -= cart[i, DRAG] * s[at_v, i] * abs(s[at_v, i])
-        if cart[i, STOP_K] > 0.0:
-            side = 1.0 if cart[i, STOP] > 0.0 else -1.0
-            depth = side * (s[at_x, i] - cart[i, STOP])
-            if depth > 0.0:
-                push = cart[i, STOP_K] * depth + cart[i, STOP_D] * side * s[at_v, i]
-                f -= side * max(push, 0.0)
-        s[FORCE, i] = f
+            s[FORCE, i] -= cart[i, DRAG] * s[MID_V, i] * abs(s[MID_V, i])
     for j in range(n + 1):
-        a, r = spring[j, CUBIC], spring[j, CHANGE]
-        if a == 0.0 and r == 0.0:
-            continue
-        stretch = (s[at_x, j] if j < n else 0.0) - (s[at_x, j - 1] if j > 0 else 0.0)
-        f = a * stretch * stretch * stretch
-        if r != 0.0:
-            side = 1.0 if spring[j, STRETCH] >= 0.0 else -1.0
-            beyond = stretch - spring[j, STRETCH]
-            if side * beyond > 0.0:
-                f += r * spring[j, STIFF] * beyond
+        if spring[j, CUBIC] != 0.0:
+            stretch = (s[MID_X, j] if j < n else 0.0) - (s[MID_X, j - 1] if j > 0 else 0.0)
+            f = spring[j, CUBIC] * stretch * stretch * stretch
+            if j < n:
+                s[FORCE, j] -= f
+            if j > 0:
+                s[FORCE, j - 1] += f
+
+
+@_jit
+def _position(s, i, h):
+    return s[X, i] + h * (
+        s[V, i]
+        + h / 2.0 * (s[D2, i] + h / 3.0 * (s[D3, i] + h / 4.0 * (s[D4, i] + h / 5.0 * s[D5, i])))
+    )
+
+
+@_jit
+def _rate(s, i, h):
+    return s[V, i] + h * (
+        s[D2, i] + h / 2.0 * (s[D3, i] + h / 3.0 * (s[D4, i] + h / 4.0 * s[D5, i]))
+    )
+
+
+@_jit
+def _guard(which, active, cart, spring, drive, n, motor, s, h):
+    """Return how far past its switch a contact or slack is, h from now; positive: it switches.
+
+    Switches 0 to n - 1 are end stops, n to 2n springs, 2n + 1 and 2n + 2 the two sides of the
+    gap. A contact begins where the bodies meet and push, and ends where the push does.
+    """
+    if n <= which <= 2 * n:
+        j = which - n
+        stretch = (_position(s, j, h) if j < n else 0.0) - (
+            _position(s, j - 1, h) if j > 0 else 0.0
+        )
+        side = 1.0 if spring[j, STRETCH] >= 0.0 else -1.0
+        beyond = side * (stretch - spring[j, STRETCH])
+        return -beyond if active else beyond
+    if which < n:
+        side = 1.0 if cart[which, STOP] > 0.0 else -1.0
+        depth = cart[which, STOP_K] * side * (_position(s, which, h) - cart[which, STOP])
+        push = depth + cart[which, STOP_D] * side * _rate(s, which, h)
+    else:
+        side = 1.0 if which == 2 * n + 1 else -1.0
+        lead = _position(s, motor, h) - _position(s, 0, h)
+        depth = drive[CONTACT_K] * (side * lead - 0.5 * drive[GAP])
+        push = depth + drive[CONTACT_D] * side * (_rate(s, motor, h) - _rate(s, 0, h))
+    return -push if active else min(depth, push)
+
+
+@_jit
+def _switch(which, sign, cart, spring, drive, n, motor, s, K, C):
+    """Put a contact or slack into the linear matrices (sign 1) or take it out (sign -1)."""
+    if which < n:
+        K[which, which] += sign * cart[which, STOP_K]
+        C[which, which] += sign * cart[which, STOP_D]
+        s[FIX, which] += sign * cart[which, STOP_K] * cart[which, STOP]
+    elif which <= 2 * n:
+        j = which - n
+        k = sign * spring[j, CHANGE] * spring[j, STIFF]
         if j < n:
-            s[FORCE, j] -= f
+            K[j, j] += k
+            s[FIX, j] += k * spring[j, STRETCH]
         if j > 0:
-            s[FORCE, j - 1] += f
-    if motor >= 0:
-        s[FORCE, motor] = 0.0
-        lead = s[at_x, motor] - s[at_x, 0]
-        half = 0.5 * drive[GAP]
-        if abs(lead) > half:
-            side = 1.0 if lead > 0.0 else -1.0
-            push = drive[CONTACT_K] * (side * lead - half)
-            push += drive[CONTACT_D] * side * (s[at_v, motor] - s[at_v, 0])
-            if push > 0.0:
-                s[FORCE, 0] += side * push
-                s[FORCE, motor] -= side * push
+            K[j - 1, j - 1] += k
+            s[FIX, j - 1] -= k * spring[j, STRETCH]
+        if 0 < j < n:
+            K[j, j - 1] -= k
+            K[j - 1, j] -= k
+    else:
+        side = 1.0 if which == 2 * n + 1 else -1.0
+        k, c = sign * drive[CONTACT_K], sign * drive[CONTACT_D]
+        half = 0.5 * drive[GAP] * side
+        K[0, 0] += k
+        K[motor, motor] += k
+        K[0, motor] -= k
+        K[motor, 0] -= k
+        C[0, 0] += c
+        C[motor, motor] += c
+        C[0, motor] -= c
+        C[motor, 0] -= c
+        s[FIX, 0] -= k * half
+        s[FIX, motor] += k * half
 
 
 @_inl
@@ -165,25 +217,50 @@ def _taylor(s, K, C, N):
 
 
 @_inl
-def _advance(cart, spring, drive, n, N, motor, s, K, C, scatter, u, drive_c, h, dry, smooth):
+def _advance(
+    cart,
+    spring,
+    drive,
+    n,
+    N,
+    motor,
+    s,
+    K,
+    C,
+    scatter,
+    u,
+    drive_c,
+    h,
+    dry,
+    smooth,
+    switches,
+    active,
+    contact_step,
+):
     """Advance x, v and the presliding state z by h, from friction event to friction event."""
     driven = motor if motor >= 0 else 0
     left = h
-    for _piece in range(_MAX_PIECES):
+    events = 0
+    while left > 1e-12:
+        step = left
+        for e in range(switches.size):
+            # Inside a stiff contact the series needs shorter steps.
+            if active[e] and not n <= switches[e] <= 2 * n:
+                step = min(step, contact_step)
         for i in range(N):
-            s[MID_X, i] = s[X, i] + 0.5 * left * (s[V, i] + 0.25 * left * s[ACC, i])
-            s[MID_V, i] = s[V, i] + 0.5 * left * s[ACC, i]
-            s[FORCE, i] = 0.0
+            s[MID_X, i] = s[X, i] + 0.5 * step * (s[V, i] + 0.25 * step * s[ACC, i])
+            s[MID_V, i] = s[V, i] + 0.5 * step * s[ACC, i]
+            s[FORCE, i] = s[FIX, i]
             s[GRIP, i] = s[INV, i]
         if not smooth:
-            _nonlinear(cart, spring, drive, n, motor, s, MID_X, MID_V)
+            _smooth_forces(cart, spring, n, s)
         s[FORCE, driven] += u
         s[FORCE, 0] -= drive_c * s[MID_V, 0]
         if dry:
             for i in range(n):
                 if cart[i, DAHL] > 0.0 and s[INV, i] > 0.0:
                     sign = 1.0 if s[MID_V, i] > 0.0 else -1.0
-                    path = 0.5 * abs(s[MID_V, i]) * left / cart[i, DISTANCE]
+                    path = 0.5 * abs(s[MID_V, i]) * step / cart[i, DISTANCE]
                     s[DECAY, i] = np.exp(-path)
                     held = sign + (s[Z, i] - sign) * s[DECAY, i]
                     s[FORCE, i] -= scatter[i] * cart[i, DAHL] * held
@@ -201,7 +278,7 @@ def _advance(cart, spring, drive, n, N, motor, s, K, C, scatter, u, drive_c, h, 
                         s[GRIP, i] = 0.0
                         continue
                     s[SIDE, i] = 1.0 if net > 0.0 else -1.0
-                    speed = 0.5 * left * (abs(net) - scatter[i] * slide) * s[INV, i]
+                    speed = 0.5 * step * (abs(net) - scatter[i] * slide) * s[INV, i]
                 else:
                     s[SIDE, i] = 1.0 if s[V, i] > 0.0 else -1.0
                     speed = abs(s[MID_V, i])
@@ -218,9 +295,10 @@ def _advance(cart, spring, drive, n, N, motor, s, K, C, scatter, u, drive_c, h, 
             _taylor(s, K, C, 3)
         else:
             _taylor(s, K, C, N)
-        step = left
+        whole = step
         stopping = -1
-        if dry:
+        switching = -1
+        if dry and events < _MOST_EVENTS:
             for i in range(n):
                 if s[SIDE, i] == 0.0:
                     continue
@@ -239,6 +317,26 @@ def _advance(cart, spring, drive, n, N, motor, s, K, C, scatter, u, drive_c, h, 
                             high, v_high = guess, value
                     step = low + (high - low) * v_low / (v_low - v_high)
                     stopping = i
+        if events < _MOST_EVENTS:
+            for e in range(switches.size):
+                end = _guard(switches[e], active[e], cart, spring, drive, n, motor, s, step)
+                if end > 0.0:
+                    low, high = 0.0, step
+                    g_low = _guard(switches[e], active[e], cart, spring, drive, n, motor, s, 0.0)
+                    g_low, g_high = min(g_low, -1e-300), end
+                    # The root by the Illinois method, taken on its far side.
+                    for _ in range(8):
+                        guess = low + (high - low) * g_low / (g_low - g_high)
+                        value = _guard(
+                            switches[e], active[e], cart, spring, drive, n, motor, s, guess
+                        )
+                        if value > 0.0:
+                            high, g_high, g_low = guess, value, 0.5 * g_low
+                        else:
+                            low, g_low, g_high = guess, min(value, -1e-300), 0.5 * g_high
+                    step = high
+                    switching = e
+                    stopping = -1
         for i in range(N):
             s[X, i] += step * (
                 s[V, i]
@@ -261,18 +359,21 @@ def _advance(cart, spring, drive, n, N, motor, s, K, C, scatter, u, drive_c, h, 
                 if cart[i, DAHL] > 0.0:
                     sign = 1.0 if s[MID_V, i] > 0.0 else -1.0
                     decay = s[DECAY, i] * s[DECAY, i]
-                    if stopping >= 0:
+                    if step < whole:
                         decay = np.exp(-abs(s[MID_V, i]) * step / cart[i, DISTANCE])
                     s[Z, i] = sign + (s[Z, i] - sign) * decay
                 if s[SIDE, i] != 0.0 and s[SIDE, i] * s[V, i] < 0.0:
                     s[V, i] = 0.0
-        if stopping < 0:
-            return
-        s[V, stopping] = 0.0
-        s[ACC, stopping] = 0.0
+        if stopping >= 0:
+            s[V, stopping] = 0.0
+            s[ACC, stopping] = 0.0
+            events += 1
+        if switching >= 0:
+            active[switching] = not active[switching]
+            sign = 1.0 if active[switching] else -1.0
+            _switch(switches[switching], sign, cart, spring, drive, n, motor, s, K, C)
+            events += 1
         left -= step
-        if left <= 1e-12:
-            return
 
 
 @_jit
@@ -300,7 +401,7 @@ def _simulate(cart, spring, drive, x0, v0, scatter, free, t, knots, command, sta
     N, motor, parent = _assemble(cart, spring, drive, free, s, K, C)
 
     dry = False
-    smooth = motor < 0
+    smooth = True
     presliding = False
     fastest = 0.0
     contact = 0.0
@@ -313,10 +414,9 @@ def _simulate(cart, spring, drive, x0, v0, scatter, free, t, knots, command, sta
         dry = dry or cart[i, COULOMB] + cart[i, STATIC] + cart[i, LOAD] + cart[i, DAHL] > 0.0
         presliding = presliding or cart[i, DAHL] > 0.0
         smooth = smooth and cart[i, OFFSET] == 0.0 and cart[i, DRAG] == 0.0
-        smooth = smooth and cart[i, STOP_K] == 0.0
         contact = max(contact, cart[i, STOP_K] * s[INV, i])
     for j in range(n + 1):
-        smooth = smooth and spring[j, CUBIC] == 0.0 and spring[j, CHANGE] == 0.0
+        smooth = smooth and spring[j, CUBIC] == 0.0
         if spring[j, CHANGE] > 0.0:
             # A spring that hardens past its gap is the faster one.
             extra = spring[j, CHANGE] * spring[j, STIFF]
@@ -328,10 +428,24 @@ def _simulate(cart, spring, drive, x0, v0, scatter, free, t, knots, command, sta
     if presliding:
         longest = min(longest, _DAHL_STEP)
     if motor >= 0:
-        rate = drive[CONTACT_K] * (s[INV, 0] + s[INV, motor])
-        longest = min(longest, _CONTACT_REACH / np.sqrt(rate))
+        contact = max(contact, drive[CONTACT_K] * (s[INV, 0] + s[INV, motor]))
     longest /= refine
     contact_step = _CONTACT_REACH / np.sqrt(contact) / refine if contact > 0.0 else longest
+    count = 0
+    switches = np.zeros(2 * n + 3, dtype=np.int64)
+    for i in range(n):
+        if cart[i, STOP_K] > 0.0:
+            switches[count] = i
+            count += 1
+    for j in range(n + 1):
+        if spring[j, CHANGE] != 0.0:
+            switches[count] = n + j
+            count += 1
+    if motor >= 0:
+        switches[count], switches[count + 1] = 2 * n + 1, 2 * n + 2
+        count += 2
+    switches = switches[:count]
+    active = np.zeros(count, dtype=np.bool_)
 
     u = np.empty(command.size)
     total = np.zeros(command.size)
@@ -358,9 +472,17 @@ def _simulate(cart, spring, drive, x0, v0, scatter, free, t, knots, command, sta
                         s[V, j] += v0[shot, i] - s[V, i]
                 s[X, i], s[V, i] = x0[shot, i], v0[shot, i]
                 s[ACC, i] = 0.0
+        for e in range(switches.size):
+            # The state is new: a contact may be open or closed from the start.
+            if _guard(switches[e], active[e], cart, spring, drive, n, motor, s, 0.0) > 0.0:
+                active[e] = not active[e]
+                sign = 1.0 if active[e] else -1.0
+                _switch(switches[e], sign, cart, spring, drive, n, motor, s, K, C)
         past, at = _integral(t[first] - drive[DELAY], knots, u, total, at)
         if shot == 0 and presliding:
-            _nonlinear(cart, spring, drive, n, motor, s, X, V)
+            for i in range(N):
+                s[MID_X, i], s[MID_V, i], s[FORCE, i] = s[X, i], s[V, i], s[FIX, i]
+            _smooth_forces(cart, spring, n, s)
             for i in range(n):
                 if cart[i, DAHL] > 0.0:
                     net = s[FORCE, i] + (u[0] if i == 0 else 0.0)
@@ -376,14 +498,6 @@ def _simulate(cart, spring, drive, x0, v0, scatter, free, t, knots, command, sta
                 break
             interval = t[sample + 1] - t[sample]
             count = int(np.ceil(interval / longest - 1e-9))
-            if contact > 0.0:
-                for i in range(n):
-                    if cart[i, STOP_K] > 0.0:
-                        side = 1.0 if cart[i, STOP] > 0.0 else -1.0
-                        reach = side * (s[X, i] - cart[i, STOP]) + 1.5 * interval * abs(s[V, i])
-                        reach += interval * interval * abs(s[ACC, i])
-                        if reach > 0.0:
-                            count = max(count, int(np.ceil(interval / contact_step)))
             h = interval / count
             for sub in range(count):
                 now = t[sample] + sub * h
@@ -416,6 +530,9 @@ def _simulate(cart, spring, drive, x0, v0, scatter, free, t, knots, command, sta
                     h,
                     dry,
                     smooth,
+                    switches,
+                    active,
+                    contact_step,
                 )
             if not abs(s[X, 0]) + abs(s[X, n - 1]) < _BLOWN_UP:
                 return False
