@@ -18,6 +18,7 @@ GAIN_AND_FREQUENCY_LIMIT = 15.0  # percent
 DAMPING_LIMIT = 70.0  # percent
 SIGMA_LIMIT = 3.0  # combined standard errors: below, a difference is chance
 REDUNDANCY_LIMIT = 1e-9  # two routes to one number through unrounded values
+CHI_SQUARE_LIMIT = 2.0  # by chance under 1.5 with 30 points and more; errors of 40 % give 2
 HEAVY_DAMPING = 0.3  # above it the orderings, exact without damping, may bend
 
 
@@ -149,16 +150,41 @@ def check_steps(steps: Sequence[StepGain]) -> list[Check]:
 
 
 def check_chain(fit: ChainFit, *, springs: Sequence[bool]) -> list[Check]:
-    """Check the fitted chain against the laws of a real one: redundancies, signs, orderings."""
+    """Check the fit, and its chain against the laws of a real one: signs, redundancies, orders."""
     chain = fit.chain
     values = {name: estimate.value for name, estimate in fit.parameters.items()}
-    checks = [_sign_check(fit, springs=springs)]
+    checks = [*_fit_checks(fit), _sign_check(fit, springs=springs)]
     if chain.n in (2, 3) and "omega_a" in values and all(springs[1:-1]):
         checks += _redundancy_checks(values)
     if chain.n >= 2 and "omega_a" in values:
         checks.append(_gain_order_check(values, chain=chain))
         checks += _frequency_order_checks(values, n=chain.n)
     return checks
+
+
+def _fit_checks(fit: ChainFit) -> list[Check]:
+    explained = fit.chi_square_per_dof <= CHI_SQUARE_LIMIT
+    return [
+        Check(
+            id="fit.converged",
+            outcome="pass" if fit.converged else "fail",
+            value=None,
+            limit=None,
+            message="The fit converged." if fit.converged else f"The fit failed: {fit.message}.",
+        ),
+        Check(
+            id="fit.explains_data",
+            outcome="pass" if explained else "fail",
+            value=fit.chi_square_per_dof,
+            limit=CHI_SQUARE_LIMIT,
+            message=f"χ² per degree of freedom is {fit.chi_square_per_dof:.3g}: the linear carts "
+            + (
+                "and the noise explain the data."
+                if explained
+                else "leave more than the noise; look where model and measurement part."
+            ),
+        ),
+    ]
 
 
 def _sign_check(fit: ChainFit, *, springs: Sequence[bool]) -> Check:

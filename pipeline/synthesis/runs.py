@@ -15,6 +15,7 @@ FIGURE_FREQUENCY = 4.0  # Hz: the dwell of the paper's Figures 12-14
 
 _LETTERS = "abcdefgh"
 _SETTLED = 7.0  # time constants: a transient of 1 cm is down to half a count
+_SETTLED_DWELL = 9.0  # … to a tenth: at a resonance it hides in the amplitude
 _SETTLED_BEFOREHAND = 11.0  # nothing is left of it where the recorder starts late
 _LONGEST_WAIT = 12.0  # s; no student waits longer, however little damping there is
 _LONGEST_DECAY = 8.0  # s
@@ -112,7 +113,7 @@ def dwells(chain: Chain, session: Session) -> list[Run]:
     runs = []
     for number, hertz in enumerate(dwell_frequencies(chain, n=session.n_dwells), start=1):
         whole = session.transients or hertz == FIGURE_FREQUENCY or number % _WHOLE_EVERY == 0
-        wait = _wait(chain, _SETTLED if whole else _SETTLED_BEFOREHAND)
+        wait = _wait(chain, _SETTLED_DWELL if whole else _SETTLED_BEFOREHAND)
         t = session.clock(wait + max(_CYCLES / hertz, _SHORTEST_DWELL))
         shape = np.sin(2 * np.pi * hertz * t)
         unit = np.abs(simulate_linear(chain, t, shape))
