@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 from itertools import pairwise
 from xml.etree import ElementTree
 
@@ -14,7 +15,7 @@ from matplotlib.patches import Rectangle
 
 from pipeline.report.figures import drawing, panels, plot_measured, thin, to_svg
 from pipeline.report.figures_bode import bode_figure
-from pipeline.report.figures_time import sine_figure
+from pipeline.report.figures_time import hardware_figure, sine_figure
 from pipeline.report.ticks import linear_ticks, log_ticks, tick_labels
 from tests.analysis_factory import make_analysis
 
@@ -81,6 +82,34 @@ def test_a_student_s_dollar_signs_are_no_formula():
         ax.set_title("$\\frac{$ <b> 中文 &", loc="left")
         svg = to_svg(figure, name="x", alt="")
     assert "$\\frac{$ &lt;b&gt; 中文 &amp;" in svg
+
+
+def test_an_unstable_model_does_not_hide_the_measurement():
+    """A model that runs away is cut one span beyond what was measured."""
+    check = make_analysis(1).hardware[0]
+    growth = np.append(np.exp(np.linspace(0, 700, check.t.size - 1)), np.inf)
+    for model in (1e12 * check.model, growth):
+        with drawing():
+            figure = hardware_figure([[replace(check, model=model)]], position_unit="cm")
+            to_svg(figure, name="x", alt="")
+        low, high = figure.axes[0].get_ylim()
+        assert high - low <= 3.01 * np.ptp(check.measured)
+
+
+def test_a_zero_in_a_table_of_ratios_is_left_out():
+    """A logarithmic axis has no place for zero; the other points are drawn."""
+    (response,) = make_analysis(1).frequency_responses
+    magnitude = response.magnitude.copy()
+    magnitude[3] = 0.0
+    with drawing():
+        figure = bode_figure(
+            replace(response, magnitude=magnitude, phase=None, phase_std=None),
+            chain=None,
+            position_unit="cm",
+            input_unit="V",
+        )
+        root = ElementTree.fromstring(to_svg(figure, name="x", alt=""))
+    assert len(list(root.iter(f"{SVG}use"))) == 23 + 1  # and the one in the legend
 
 
 def test_a_dwell_shades_the_transient():

@@ -42,6 +42,8 @@ from pipeline.report.tables import (
 from pipeline.report.words import clean, names_spans, rich, stage_name, summary
 from pipeline.results import Analysis
 
+_NO_CHANGE = 0.05  # percent: nothing to speak of
+
 
 def build_document(analysis: Analysis, *, progress: Callable[[str], None] | None) -> Document:
     """Return the report of an analysis; sections that have nothing to show are left out."""
@@ -152,6 +154,8 @@ def _staged_differences(page: Page) -> Block | None:
     if not changes:
         return None
     worst = max(changes, key=lambda name: abs(changes[name]))
+    if abs(changes[worst]) < _NO_CHANGE:
+        return paragraph("The fit cart by cart, the last one first, gives the same numbers.")
     return paragraph(
         "The fit cart by cart, the last one first, differs from the joint fit of all carts by up "
         f"to {percent(abs(changes[worst]))}, most in ",

@@ -1,5 +1,7 @@
 """Frequency response of one cart, measured and fitted (the paper's Figures 4, 6, 7, 9-11)."""
 
+from dataclasses import replace
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -23,7 +25,11 @@ _WIDEST_BAR = 0.9  # of the magnitude: an error bar in decibels cannot reach dow
 def bode_figure(
     response: FrequencyResponse, *, chain: Chain | None, position_unit: str, input_unit: str
 ) -> Figure:
-    """Return magnitude, phase (where measured) and what the fit leaves, one below the other."""
+    """Return magnitude, phase (where measured) and what the fit leaves, one below the other.
+
+    Zero magnitudes, which a logarithm cannot show, are left out.
+    """
+    response = _positive(response)
     has_phase = response.phase is not None
     heights = [1.6, *([0.8] if has_phase else []), *([0.7] if chain else [])]
     figure, axes = panels(*heights)
@@ -94,6 +100,18 @@ def plot_residual(ax: Axes, response: FrequencyResponse, *, chain: Chain) -> Non
         100 * response.magnitude_std / fitted,
     )
     ax.set_ylabel("residual [%]")
+
+
+def _positive(response: FrequencyResponse) -> FrequencyResponse:
+    keep = (response.magnitude > 0) & (response.omega > 0)
+    if keep.all():
+        return response
+    kept = {
+        name: values[keep]
+        for name in ("omega", "magnitude", "magnitude_std", "phase", "phase_std")
+        if (values := getattr(response, name)) is not None
+    }
+    return replace(response, **kept)
 
 
 def _points(ax: Axes, x: Array, y: Array, error: Array | None, *, label: str = "") -> None:

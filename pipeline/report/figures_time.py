@@ -165,13 +165,19 @@ def hardware_figure(checks: Sequence[Sequence[HardwareCheck]], *, position_unit:
 
 def plot_hardware(ax: Axes, checks: Sequence[HardwareCheck]) -> None:
     """Plot measured points against the simulated loop, and the model under the measured input."""
-    plot_measured(ax, checks[0].t, checks[0].measured)
+    measured = checks[0].measured
+    plot_measured(ax, checks[0].t, measured)
     for check in checks:
         if check.loop == "closed":
             plot_model(ax, check.t, check.model, label="model of the loop")
         else:
             ax.plot(*thin(check.t, check.model), color=SECOND, ls="--", lw=1.1,
                     label="model with the measured input")  # fmt: skip
+    # An unstable model may leave any axis: it is shown to one span beyond what was measured.
+    low, high = float(np.min(measured)), float(np.max(measured))
+    span = high - low or 1.0
+    bottom, top = ax.get_ylim()
+    ax.set_ylim(max(low - span, bottom), min(high + span, top))
 
 
 def design_figure(design: FeedbackDesign, *, position_unit: str, input_unit: str) -> Figure:

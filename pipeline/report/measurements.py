@@ -25,6 +25,8 @@ def response_blocks(page: Page) -> list[Block]:
     chain = page.analysis.chain
     blocks: list[Block] = []
     for response in sorted(page.analysis.frequency_responses, key=lambda r: -r.cart):
+        if not np.any(response.magnitude > 0):
+            continue
         figure = bode_figure(
             response, chain=chain, position_unit=page.position, input_unit=page.drive
         )
@@ -128,8 +130,8 @@ def step_blocks(page: Page) -> list[Block]:
     gains = page.analysis.step_gains
     if not gains:
         return []
-    unit = f"{page.position}/{page.drive}"
-    blocks: list[Block] = [step_table(gains, number=page.table_number(), unit=unit)]
+    units = (page.position, page.drive)
+    blocks: list[Block] = [step_table(gains, number=page.table_number(), units=units)]
     runs = list(dict.fromkeys(g.experiment for g in gains if g.experiment in page.records))
     if drawn := runs[:_MOST_PANELS]:
         figure = step_figure(

@@ -178,8 +178,9 @@ def decay_table(decays: Sequence[LogDecrement], *, number: int, position_unit: s
     )  # fmt: skip
 
 
-def step_table(gains: Sequence[StepGain], *, number: int, unit: str) -> Table:
+def step_table(gains: Sequence[StepGain], *, number: int, units: tuple[str, str]) -> Table:
     """Return the static gain of every step record and cart."""
+    position, drive = (clean(unit) for unit in units)
     rows = []
     for gain in gains:
         value = with_error(gain.gain, gain.gain_std)
@@ -199,7 +200,7 @@ def step_table(gains: Sequence[StepGain], *, number: int, unit: str) -> Table:
         number,
         "Static gains from steps: change of level over change of input. An interval stands where "
         "a cart sticks; the last column is how far its rest point moved.",
-        ("Record", "Cart", "Edges", f"K [{clean(unit)}]", "Rest moved by"),
+        ("Record", "Cart", "Edges", f"K [{position}/{drive}]", f"Rest moved by [{position}]"),
         rows,
         "lccrr",
     )
@@ -274,7 +275,7 @@ def hardware_table(checks: Sequence[HardwareCheck], *, number: int, position_uni
             _cell(str(check.cart)),
             _cell("loop" if check.loop == "closed" else "measured input"),
             _cell(percent(100 * check.nrmse)),
-            _cell(_pair(check.overshoot_model, check.overshoot_measured)),
+            _cell(_overshoots(check)),
             _cell(_pair(check.settling_model, check.settling_measured)),
             _cell(_pair(check.steady_state_model, check.steady_state_measured)),
         ]
@@ -291,6 +292,13 @@ def hardware_table(checks: Sequence[HardwareCheck], *, number: int, position_uni
         rows,
         "lclrrrr",
     )  # fmt: skip
+
+
+def _overshoots(check: HardwareCheck) -> str:
+    pair = (check.overshoot_model, check.overshoot_measured)
+    if pair == (None, None):
+        return NOTHING
+    return " / ".join(percent(value).removesuffix(" %") for value in pair)
 
 
 def _pair(model: float | None, measured: float | None) -> str:
