@@ -23,7 +23,6 @@ HOMES = {
     "jinja2": ("report", "submission"),
     "typst": ("report",),
     "markdown_it": ("report",),
-    "nh3": ("report",),
     "typer": ("cli",),
     "rich": ("cli",),
     "control": ("plant", "stages"),
