@@ -36,8 +36,6 @@ _WINDOW = 0.5  # s; a chain without springs drifts, so it is judged over windows
 _CLOSE_ERROR, _CLOSE_GAIN, _CLOSE_BIC = 1.15, 0.10, 40.0
 _REFUSED_SHARE, _REFUSED_FLOOR = 0.5, 1.5
 _DECISIVE_SHARE, _DECISIVE_RIVAL = 0.8, 1.2
-_CONTACT = ("end_stop", "backlash")
-_CONTACT_REFINE = 3.0  # the force in a contact is held over a step: shorter ones for the last fit
 
 
 def explain_gap(
@@ -87,10 +85,6 @@ def explain_gap(
             tell(f"linear model: error {baseline.error:.1%} of the motion on held-out runs")
             found = search(baseline, bench)
             chosen = prune(choose(found, baseline), bench)
-        if any(c.effect.key in _CONTACT for c in chosen.fit.structure.effects):
-            fine = fit_whole(chosen.fit.structure, chosen.fit.theta, bench, refine=_CONTACT_REFINE)
-            better = judge(fine, bench, added=chosen.added, parent=chosen.parent)
-            chosen = better if better.bic < chosen.bic else chosen
         path = _path(chosen, found, bench)
         chosen, path, bench = _with_offset(chosen, path, bench)
         final = covariance(chosen.fit, bench.training, mapper=pool.map)

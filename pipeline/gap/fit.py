@@ -25,6 +25,7 @@ _SCATTER_START = 0.05  # spread of friction from run to run, before anything is 
 _SCATTER_FLOOR, _SCATTER_TOP = 0.004, 0.2
 _SCATTER_PRIOR = (3.0, 0.04)  # weight in runs, and spread, of the prior on that spread
 _LOCAL_STEP = 1e-3  # of the run's swing, for derivatives with respect to start states
+_LOCAL_SCALES = (1.0, 0.3, 0.05)  # of a run's own step, where the whole one raises its cost
 _ANCHOR = 1e6  # standard errors per unit of log mass
 _DAMP, _RELAX, _STIFFEN = 1e-3, 6.0, 6.0
 
@@ -49,7 +50,7 @@ class Fit:
     locals_ : one for each run, in their order.
     cost : sum of squared residuals over their noise, prior terms included.
     chi_square : without the prior terms; n_points the residuals behind it.
-    run_chi : (runs,) chi-square per residual of each run.
+    run_chi : (runs,) chi-square per residual of each run; run_prior its prior terms.
     """
 
     structure: Structure
@@ -59,6 +60,8 @@ class Fit:
     chi_square: float
     n_points: int
     run_chi: Array
+    run_prior: Array
+    run_points: Array
     spread: Array
     covariance: Array | None = field(default=None)
     log_det: float = 0.0
@@ -292,7 +295,6 @@ def _run_cost(
     run: Run,
     own: Locals,
     *,
-    inflate: float,
     spread: Array,
     refine: float,
 ) -> tuple[float, float]:
@@ -306,7 +308,7 @@ def _run_cost(
     prior = float((((own.zero - run.zero) / run.zero_std)[rows] ** 2).sum())
     dry = np.array(structure.dry) & np.array(run.free)
     prior += float((((own.scatter - 1.0) / spread)[dry] ** 2).sum())
-    return chi, prior * inflate**2
+    return chi, prior
 
 
 def evaluate(
@@ -323,18 +325,33 @@ def evaluate(
     """Return the fit at given parameters and locals, without moving either."""
 
     def cost(pair: tuple[Run, Locals]) -> tuple[float, float]:
-        return _run_cost(structure, theta, *pair, inflate=inflate, spread=spread, refine=refine)
+        return _run_cost(structure, theta, *pair, spread=spread, refine=refine)
 
     costs = np.array(list(mapper(cost, zip(runs, locals_, strict=True))))
+    return _fit_at(structure, theta, runs, locals_, costs, spread=spread, inflate=inflate)
+
+
+def _fit_at(
+    structure: Structure,
+    theta: Array,
+    runs: Sequence[Run],
+    locals_: Sequence[Locals],
+    costs: Array,
+    *,
+    spread: Array,
+    inflate: float,
+) -> Fit:
     points = np.array([_residual_points(run) for run in runs])
     return Fit(
         structure=structure,
         theta=theta,
         locals_=tuple(locals_),
-        cost=float(costs.sum()),
+        cost=float(costs[:, 0].sum() + inflate**2 * costs[:, 1].sum()),
         chi_square=float(costs[:, 0].sum()),
         n_points=int(points.sum()),
         run_chi=costs[:, 0] / points,
+        run_prior=costs[:, 1],
+        run_points=points,
         spread=spread,
     )
 
@@ -375,7 +392,7 @@ def fit_model(
     )
     for iteration in range(iterations):
         inflate = max(1.0, np.sqrt(best.chi)) if np.isfinite(best.chi) else 1.0
-        best = _reprice(best, runs, inflate)
+        best = replace(best, cost=best.chi_square + inflate**2 * float(best.run_prior.sum()))
 
         def linearise(
             pair: tuple[Run, Locals], at: Fit = best, inflate: float = inflate
@@ -422,18 +439,37 @@ def fit_model(
             # One long step must not carry the others with it: each is clipped by itself.
             delta = np.clip(delta, -reach, reach)
             delta = np.clip(best.theta + delta, low, high) - best.theta
-            moved = tuple(
-                _move_locals(part, o, delta) for part, o in zip(linear, best.locals_, strict=True)
-            )
-            trial = evaluate(
+            there = best.theta + delta
+
+            def follow(
+                job: tuple[_Linear, Run, Locals, float],
+                at: Fit = best,
+                delta: Array = delta,
+                there: Array = there,
+                inflate: float = inflate,
+            ) -> tuple[Locals, tuple[float, float]]:
+                """Move a run's own unknowns with the step, less far where that is no gain."""
+                part, run, own, before = job
+                tried = []
+                for scale in _LOCAL_SCALES:
+                    moved = _move_locals(part, own, delta, scale)
+                    cost = _run_cost(structure, there, run, moved, spread=at.spread, refine=refine)
+                    tried.append((cost[0] + inflate**2 * cost[1], moved, cost))
+                    if tried[-1][0] <= before:
+                        break
+                _, moved, cost = min(tried, key=lambda t: t[0])
+                return moved, cost
+
+            before = best.run_chi * best.run_points + inflate**2 * best.run_prior
+            followed = list(mapper(follow, zip(linear, runs, best.locals_, before, strict=True)))
+            trial = _fit_at(
                 structure,
-                best.theta + delta,
+                there,
                 runs,
-                moved,
+                [moved for moved, _ in followed],
+                np.array([cost for _, cost in followed]),
                 spread=best.spread,
                 inflate=inflate,
-                refine=refine,
-                mapper=mapper,
             )
             if trial.cost < best.cost:
                 accepted = True
@@ -459,18 +495,6 @@ def _anchor(runs: Sequence[Run], size: int) -> Array:
     row = np.zeros((1, size + 1))
     row[0, 0] = _ANCHOR
     return row
-
-
-def _reprice(fit: Fit, runs: Sequence[Run], inflate: float) -> Fit:
-    """Return the fit with its prior terms weighed by a new assumed noise."""
-    prior = 0.0
-    dry = np.array(fit.structure.dry)
-    for run, own in zip(runs, fit.locals_, strict=True):
-        rows = list(run.rows)
-        prior += float((((own.zero - run.zero) / run.zero_std)[rows] ** 2).sum())
-        here = dry & np.array(run.free)
-        prior += float((((own.scatter - 1.0) / fit.spread)[here] ** 2).sum())
-    return replace(fit, cost=fit.chi_square + prior * inflate**2)
 
 
 def _learn_spread(fit: Fit, runs: Sequence[Run], linear: Sequence[_Linear]) -> Fit:

@@ -23,6 +23,8 @@ from pipeline.plant.effects.base import Effect, Parameter
 _MOST = 3.0  # a multiple beyond this is no longer what was simulated
 _LEAST = 0.1  # … and one below starts a fit where it has no slope
 _STARTS = 8
+_ELITE, _SCATTERED = 5, 32
+_ZOOM = (0.6, 0.35, 0.2, 0.1)  # spread of the trials, in logarithms or scales
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,6 +100,37 @@ def screen(
         starts = tuple(start for _, c, start in trials_here if c.signs == candidate.signs)
         suspects.append(Suspect(candidate=candidate, share=share, starts=starts[:_STARTS]))
     return sorted(suspects, key=lambda s: -s.share)
+
+
+def zoom(fit: Fit, runs: Sequence[Run], suspect: Suspect, *, mapper: Mapper = map) -> Suspect:
+    """Return the suspect with better starts, where the misfit has many valleys.
+
+    Trial values are scattered about the best so far, ever closer (a cross-entropy search); what
+    the model would absorb of each is projected off, so only the effect itself is searched.
+
+    Reference: R. Y. Rubinstein, Methodology and Computing in Applied Probability 1 (1999).
+    """
+    # The same scatter every time: a verdict must not depend on chance.
+    rng = np.random.default_rng(0)
+    candidate = suspect.candidate
+    signed = np.array([p.signed for p in candidate.effect.parameters])
+    scales = np.array(candidate.scales)
+    elite = [np.array(start) for start in suspect.starts[:_ELITE]]
+    best: list[tuple[float, Array]] = []
+    for width in _ZOOM:
+        trials = [*elite] if not best else []
+        for _ in range(_SCATTERED):
+            value = elite[rng.integers(len(elite))]
+            step = width * rng.standard_normal(value.size)
+            trials.append(np.where(signed, value + step * scales, value * np.exp(step)))
+        signals = _signals(fit, runs, [(candidate, tuple(v)) for v in trials], mapper=mapper)
+        directions, residual = project(fit, runs, signals, mapper=mapper)
+        left = ((residual[:, None] - directions) ** 2).sum(axis=0)
+        best += [(float(cost), value) for cost, value in zip(left, trials, strict=True)]
+        best.sort(key=lambda pair: pair[0])
+        elite = [value for _, value in best[:_ELITE]]
+    starts = tuple(tuple(float(v) for v in value) for value in elite)
+    return Suspect(candidate=candidate, share=suspect.share, starts=starts)
 
 
 def _grown(parameter: Parameter, value: float, multiple: float) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.gap.baseline import SHOT_LENGTH, fit_locals
 from pipeline.gap.fit import Fit, Mapper, fit_model, simulate_run
 from pipeline.gap.runs import Run, cut_shots
-from pipeline.gap.screen import Suspect, candidates_at, extend, screen
+from pipeline.gap.screen import Suspect, candidates_at, extend, screen, zoom
 from pipeline.gap.structure import Candidate, Structure
 from pipeline.plant.chain import Array
 from pipeline.plant.effects import CATALOGUE
@@ -26,6 +26,7 @@ _DEPTH = len(_BEAM)
 _BIC_DROP = 20.0
 _THINNING = 10.0  # neighbouring residuals are not independent: N / 10 count
 _HELD_OUT_GAIN = 0.95  # an effect must lower the held-out error by this factor …
+_CONTACT_GAIN = 0.5  # what a contact leaves is its contact law: no effect to mop it up
 _RUN_GAIN, _RUN_SHARE = 0.97, 0.6  # … and by 3 % in 60 % of the runs
 _SEVERAL_STARTS = ("extra_mode", "end_stop", "backlash", "slack_spring")
 _CONTACT = ("end_stop", "backlash")
@@ -101,8 +102,6 @@ def search(baseline: Hypothesis, bench: Bench, *, depth: int = _DEPTH) -> list[H
         for parent in beam:
             if parent.at_floor or parent.fit.chi > _HOPELESS * best.fit.chi:
                 continue
-            if parent.added and parent.added.effect.key == "end_stop" and level > 0:
-                continue  # what an end stop leaves is its contact law
             for child in grow(parent, bench):
                 if child.key not in seen or child.bic < seen[child.key].bic:
                     seen[child.key] = child
@@ -168,8 +167,10 @@ def _short_refit(
 ) -> tuple[Candidate, Fit]:
     """Refit a suspect on pieces; where the landscape is rugged, from several starts."""
     several = suspect.candidate.effect.key in _SEVERAL_STARTS
+    if several:
+        suspect = zoom(start, pieces, suspect, mapper=bench.mapper)
     fits = []
-    for values in suspect.starts[: 4 if several else 1]:
+    for values in suspect.starts[: 3 if several else 1]:
         structure, theta = extend(start, suspect.candidate, values)
         fits.append(
             fit_model(
@@ -204,11 +205,12 @@ def fit_whole(structure: Structure, theta: Array, bench: Bench, *, refine: float
     """Fit whole runs; friction first with one size for all runs, then run by run."""
     whole = bench.training
     dry = any(structure.dry)
+    contact = any(c.effect.key in _CONTACT for c in structure.effects)
     fit = fit_model(
         structure,
         theta,
         whole,
-        iterations=12,
+        iterations=25 if contact else 12,
         scatter_free=False,
         refine=refine,
         mapper=bench.mapper,
@@ -282,7 +284,9 @@ def _friction_start(effect: Effect, force: float, values: tuple[float, ...]) -> 
 
 def worth_it(child: Hypothesis, parent: Hypothesis) -> bool:
     """Does a further effect help on runs the model has not seen?"""
-    if child.bic > parent.bic - _BIC_DROP or child.error > _HELD_OUT_GAIN * parent.error:
+    contact = any(effect in _CONTACT for effect, _ in parent.key)
+    gain = _CONTACT_GAIN if contact else _HELD_OUT_GAIN
+    if child.bic > parent.bic - _BIC_DROP or child.error > gain * parent.error:
         return False
     better = child.run_error < _RUN_GAIN * parent.run_error
     return bool(np.mean(better) >= _RUN_SHARE)

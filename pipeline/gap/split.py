@@ -43,8 +43,8 @@ def split(runs: Sequence[Run]) -> tuple[list[int], list[int]]:
             held += cluster[1::2]
         left = [cluster[0] for cluster in clusters]
         if len(left) >= 3:
-            by_magnitude = sorted(left, key=lambda i: abs(sizes[i]))
-            held.append(by_magnitude[len(left) // 2])
+            # In order of signed size: the extremes of both signs teach.
+            held.append(left[len(left) // 2])
         elif len(left) == 2 and kind == "decay" and len(members) == 2:
             held.append(min(left, key=lambda i: abs(sizes[i])))
         elif len(left) == 2:

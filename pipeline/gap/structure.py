@@ -150,7 +150,9 @@ class Structure:
         """Return the difference step of each parameter, for derivatives."""
         steps = [np.full(self.base_size, 1e-4)]
         for c in self.effects:
-            steps.append(np.array([2e-4 if p.signed else 1e-3 for p in c.effect.parameters]))
+            # Contacts answer to small changes with noise of their own.
+            fine = 1.0 if all(p.reported for p in c.effect.parameters) else 5.0
+            steps.append(fine * np.array([2e-4 if p.signed else 1e-3 for p in c.effect.parameters]))
         return np.concatenate(steps)
 
     def reach(self) -> Array:
