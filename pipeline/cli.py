@@ -66,10 +66,10 @@ def _progress() -> Iterator[Callable[[str], None]]:
         yield lambda text: status.update(text)
 
 
-def _output_folder(out: Path) -> Path:
+def _refuse_file(out: Path) -> Path:
+    """Return the output folder, unless something else is in its place."""
     if out.exists() and not out.is_dir():
         raise ConfigError(f"--out {out}: is a file; name a folder")
-    out.mkdir(parents=True, exist_ok=True)
     return out
 
 
@@ -95,7 +95,7 @@ def demo(
     """Run the whole job on the shipped three-cart example."""
     from pipeline.resources import EXAMPLES
 
-    _run_report(EXAMPLES / "three-cart", out=_output_folder(out) / "report", pdf=True)
+    _run_report(EXAMPLES / "three-cart", out=_refuse_file(out) / "report", pdf=True)
 
 
 @app.command()
@@ -118,11 +118,20 @@ def inspect(
     """Show what a data file holds: format, columns, rate, duration, kind, problems."""
     from pipeline.ingest.inspect import format_inspection, inspect_file
 
-    inspections = [inspect_file(file) for file in files]
+    inspections, unreadable = [], []
+    for file in files:  # one broken file does not hide the others
+        try:
+            inspections.append(inspect_file(file))
+        except PipelineError as error:
+            unreadable.append(str(error))
     if as_json:
         typer.echo(json.dumps([i.to_dict() for i in inspections], indent=1, ensure_ascii=False))
-    else:
+    elif inspections:
         typer.echo("\n\n".join(format_inspection(i) for i in inspections))
+    for message in unreadable:
+        say(f"cartlab: {message}")
+    if unreadable:
+        raise typer.Exit(2)
 
 
 @app.command()
@@ -151,9 +160,10 @@ def _run_report(folder: Path, *, out: Path, pdf: bool) -> "Analysis":
     from pipeline.workflow import analyse
 
     submission = load_submission(folder)
-    _output_folder(out)
+    _refuse_file(out)
     with _progress() as progress:
         analysis = analyse(submission, progress=progress)
+        out.mkdir(parents=True, exist_ok=True)
         (out / "results.json").write_text(results_text(analysis), encoding="utf-8", newline="\n")
         render_report(analysis, out, pdf=pdf, progress=progress)
     say(terminal_summary(analysis))

@@ -1,15 +1,20 @@
 """Broken submissions: each is one clear line that names the file and what is wrong in it."""
 
 import gzip
+import io
 import os
 import struct
+import sys
 import zlib
+from contextlib import redirect_stderr
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
 import scipy.io
 
+from pipeline.cli import main
 from pipeline.errors import SubmissionError
 from pipeline.ingest.read import read_data
 from pipeline.submission import load_submission
@@ -50,11 +55,21 @@ def write(folder: Path, toml: str | bytes = GOOD, **files: str | bytes) -> Path:
 
 
 def one_line(folder: Path, pattern: str) -> None:
-    """Load and read, and expect one line that matches."""
+    """Load and read, and expect one line that matches; the command line says it with status 2."""
     with pytest.raises(SubmissionError, match=pattern) as caught:
         read_data(load_submission(folder))
-    assert len(str(caught.value).splitlines()) == 1
-    assert str(folder) not in str(caught.value)  # a report does not tell where it was made
+    message = str(caught.value)
+    assert len(message.splitlines()) == 1
+    assert str(folder) not in message  # a report does not tell where it was made
+    said = io.StringIO()
+    with (
+        mock.patch.object(sys, "argv", ["cartlab", "report", str(folder)]),
+        redirect_stderr(said),
+        pytest.raises(SystemExit) as left,
+    ):
+        main()
+    assert (left.value.code, said.getvalue()) == (2, f"cartlab: {message}\n")
+    assert not (folder / "report").exists()  # nothing half-made is left behind
 
 
 def test_the_good_one_is_read(tmp_path):
