@@ -108,6 +108,7 @@ def explain_gap(
         training=tuple(run.id for run in bench.training),
         held_out=tuple(run.id for run in bench.held_out),
         traces=_traces(path[0], chosen, bench),
+        chain_std=_chain_std(final),
         spread={
             i + 1: float(chosen.fit.spread[i])
             for i, dry in enumerate(chosen.fit.structure.dry)
@@ -412,6 +413,19 @@ def _named_values(
     }
 
 
+def _chain_std(fit: Fit) -> dict[str, float]:
+    """Return the standard error of every mass, damping and spring by its name."""
+    if fit.covariance is None:
+        return {}
+    structure, chain = fit.structure, fit.structure.chain(fit.theta)
+    values = {f"{letter}_{i}": v for letter, row in (("m", chain.m), ("c", chain.c))
+              for i, v in enumerate(row, start=1)}  # fmt: skip
+    values |= {f"k_{j + 1}": chain.k[j] for j in structure.rows}
+    # The vector holds their logarithms, whose errors are relative.
+    relative = np.sqrt(np.diag(fit.covariance))[: structure.base_size]
+    return {name: float(v * r) for (name, v), r in zip(values.items(), relative, strict=True)}
+
+
 # ---------------------------------------------------------------------- the figures
 
 
@@ -448,6 +462,7 @@ def _traces(before: Hypothesis, after: Hypothesis, bench: Bench) -> tuple[Trace,
                 measured=run.y[j],
                 baseline=linear[j],
                 final=final[j],
+                zero=float(own_after.zero[row]),
             )
             for j, row in enumerate(run.rows)
         ]

@@ -72,7 +72,10 @@ class GapWindow:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Trace:
-    """One cart in one run, for figures: measured, the linear model, the final model (n,)."""
+    """One cart in one run, for figures: measured, the linear model, the final model (n,).
+
+    `zero` is the encoder's zero in that run, as the final model has it.
+    """
 
     experiment: str
     cart: int
@@ -82,6 +85,7 @@ class Trace:
     measured: Array
     baseline: Array
     final: Array
+    zero: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -95,6 +99,7 @@ class Gap:
     baseline, final, noise_floor : relative errors pooled over the held-out runs.
     repeatability : the same between runs with the same input, or None without repeats.
     linear, model : the linear chain that fits best, and the chain with the effects.
+    chain_std : standard errors of the latter's "m_1", "c_1", "k_1", …
     training, held_out : ids of the runs.
     spread : learnt run-to-run spread of the dry friction, per cart, where there is any.
     notes : what a reader must know.
@@ -114,5 +119,6 @@ class Gap:
     training: tuple[str, ...]
     held_out: tuple[str, ...]
     traces: tuple[Trace, ...]
+    chain_std: dict[str, float] = field(default_factory=dict)
     spread: dict[int, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
