@@ -21,7 +21,14 @@ from pipeline.results import (
     StepGain,
 )
 from pipeline.stages.bode_fit import fit_bode
-from pipeline.stages.compare import check_chain, check_decays, check_rows, check_steps, compare
+from pipeline.stages.compare import (
+    check_chain,
+    check_decays,
+    check_rows,
+    check_setup,
+    check_steps,
+    compare,
+)
 from pipeline.stages.frequency_response import (
     collect_dwells,
     find_resonances,
@@ -87,7 +94,7 @@ def analyse(submission: Submission, *, progress: Progress = _silent) -> Analysis
     data = read_data(submission)
     log.warn(data.warnings)
     log.warn(_by_note((record.id, note) for record in data.records for note in record.notes))
-    driven = _driven(data.records, n=n, log=log)
+    driven = _driven(data.records, n=n, unit=system.position.unit, log=log)
 
     progress("free decays: logarithmic decrement")
     decays = _log_decrements(data.records, n=n, log=log)
@@ -109,10 +116,11 @@ def analyse(submission: Submission, *, progress: Progress = _silent) -> Analysis
     responses = _frequency_response(data, sines=sines, driven=driven, log=log)
 
     found = log.attempt("resonances", find_resonances, responses, n=n) or {}
-    initial, remarks = estimate_initially(
+    initial, left_out = estimate_initially(
         carts=n, log_decrements=decays, step_gains=gains, from_response=found
     )
-    log.warn(remarks)
+    log.warn(_by_note(left_out.items()))
+    driven = [record for record in driven if record.id not in left_out]
 
     progress("fitting all carts at once")
     fit = _fit(responses, driven=driven, initial=initial, n=n, springs=springs, log=log)
@@ -123,12 +131,24 @@ def analyse(submission: Submission, *, progress: Progress = _silent) -> Analysis
         position_unit=system.position.unit,
         input_unit=system.input.unit,
     )
-    checks = [*check_rows(rows), *check_decays(decays), *check_steps(gains)]
+    checks = [
+        *check_setup(data.records),
+        *check_rows(rows),
+        *check_decays(decays, position_unit=system.position.unit),
+        *check_steps(gains, gain_unit=f"{system.position.unit}/{system.input.unit}"),
+    ]
     if fit:
         checks += check_chain(fit, springs=springs)
 
     progress("state feedback")
     feedback = _design(submission, fit, log=log)
+    if feedback and _is_reversed(data.records):
+        log.warn(
+            [
+                "state feedback: the gains are for an input that pushes cart 1 towards positive x; "
+                "the bench's own input pushes the other way, so negate what the controller sends"
+            ]
+        )
     progress("hardware against model")
     hardware = _hardware(submission, data.records, fit, log=log)
 
@@ -166,13 +186,17 @@ def _by_note(notes: Iterable[tuple[str, str]]) -> list[str]:
     return [f"{_listed(list(dict.fromkeys(ids)))}: {note}" for note, ids in runs.items()]
 
 
+def _counted(carts: Sequence[int]) -> str:
+    return ("cart " if len(carts) == 1 else "carts ") + ", ".join(map(str, carts))
+
+
 def _listed(ids: Sequence[str]) -> str:
     if len(ids) <= _LISTED:
         return ", ".join(ids)
     return f"{ids[0]}, {ids[1]} … {ids[-1]} ({len(ids)} runs)"
 
 
-def _driven(records: Sequence[Record], *, n: int, log: _Log) -> list[Record]:
+def _driven(records: Sequence[Record], *, n: int, unit: str, log: _Log) -> list[Record]:
     """Return the steps and sweeps of all carts together, without repeats that stand off.
 
     Runs of single carts are left to the initial estimates, so that initial and final estimates
@@ -180,10 +204,18 @@ def _driven(records: Sequence[Record], *, n: int, log: _Log) -> list[Record]:
     """
     runs = [r for r in records if r.kind in ("step", "sweep") and r.u is not None]
     runs = [r for r in runs if len(r.free) == n]
+    log.warn(
+        _by_note(
+            (run.id, f"all carts are free, but of {n} only {_counted(run.carts)} was recorded")
+            for run in runs
+            if len(run.carts) < n
+        )
+    )
     outliers = {outlier.experiment: outlier for outlier in find_outlier_repeats(runs)}
     log.warn(
-        f"{name}: moves otherwise than its repeats {', '.join(outlier.others)} "
-        f"({outlier.distance:.3g} from them, they {outlier.spread:.3g} from each other): left out"
+        f"{name}: does not move as its repeats {', '.join(outlier.others)} do "
+        f"({outlier.distance:.3g} {unit} root mean square from them; they differ by "
+        f"{outlier.spread:.3g} {unit} among themselves): left out"
         for name, outlier in outliers.items()
     )
     return [record for record in runs if record.id not in outliers]
@@ -308,6 +340,12 @@ def _design(submission: Submission, fit: ChainFit | None, *, log: _Log) -> Feedb
         sample_time=task.sample_time,
         method=task.method,
     )
+
+
+def _is_reversed(records: Sequence[Record]) -> bool:
+    """Whether a positive input, as the bench counts it, drives cart 1 towards negative x."""
+    signs = [r.input_scale for r in records if r.u is not None and r.kind != "closed_loop"]
+    return sum(1 if sign > 0 else -1 for sign in signs) < 0
 
 
 def _hardware(

@@ -143,14 +143,19 @@ def step_blocks(page: Page) -> list[Block]:
             page.picture(
                 "steps",
                 figure,
-                caption="Step responses: cart 1 solid, 2 dashed, 3 dash-dotted, 4 dotted. Thick: "
-                "the levels read off, over the windows they were read from; vertical: edges of "
-                f"the input.{left_out(len(runs) - len(drawn))}",
+                caption=f"Step responses: {_line_styles(page.analysis.carts)}. Thick: the levels "
+                "read off, over the windows they were read from; vertical: edges of the input."
+                f"{left_out(len(runs) - len(drawn))}",
                 alt=f"Step responses in {count(len(drawn), 'record')}, with the rest and settled "
                 "levels of every cart marked.",
             )
         )
     return blocks
+
+
+def _line_styles(carts: int) -> str:
+    styles = zip(range(1, carts + 1), ("solid", "dashed", "dash-dotted", "dotted"), strict=False)
+    return ", ".join(f"cart {cart} {style}" for cart, style in styles)
 
 
 def dwell_blocks(page: Page) -> list[Block]:

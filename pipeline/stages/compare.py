@@ -10,7 +10,15 @@ from itertools import pairwise
 import numpy as np
 
 from pipeline.plant.chain import Chain, parameter_unit, recover_from_parameters
-from pipeline.results import ChainFit, Check, Estimate, LogDecrement, ParameterRow, StepGain
+from pipeline.results import (
+    ChainFit,
+    Check,
+    Estimate,
+    LogDecrement,
+    ParameterRow,
+    Record,
+    StepGain,
+)
 
 # The paper's own tables: gains and frequencies change by up to 14 % between the two estimates
 # (one null, read off by eye, by 29 %), damping ratios by up to 70 %.
@@ -19,6 +27,7 @@ DAMPING_LIMIT = 70.0  # percent
 SIGMA_LIMIT = 3.0  # combined standard errors: below, a difference is chance
 REDUNDANCY_LIMIT = 1e-9  # two routes to one number through unrounded values
 CHI_SQUARE_LIMIT = 2.0  # by chance under 1.5 with 30 points and more; errors of 40 % give 2
+HELD_SHARE = 0.2  # of a held cart's swing: a free one that moves less is not the free one
 HEAVY_DAMPING = 0.3  # above it the orderings, exact without damping, may bend
 
 
@@ -107,7 +116,7 @@ def _advice(row: ParameterRow) -> str:
     return " Look at the peaks of the decay and at the dwells near this frequency."
 
 
-def check_decays(decays: Sequence[LogDecrement]) -> list[Check]:
+def check_decays(decays: Sequence[LogDecrement], *, position_unit: str) -> list[Check]:
     """Ask of every decay whether viscous damping alone explains it."""
     return [
         Check(
@@ -117,11 +126,14 @@ def check_decays(decays: Sequence[LogDecrement]) -> list[Check]:
             limit=decay.friction.threshold,
             message=f"{decay.experiment}: the decay of cart {decay.cart} "
             + (
-                "is not exponential: dry friction holds it within "
-                f"±{decay.friction.drop:.3g} of its rest, and ζ = {decay.zeta:.3g} from the "
-                f"envelope is biased (ζ = {decay.friction.zeta:.3g} once friction is taken out)."
+                "is not exponential: dry friction can hold the cart within "
+                f"±{decay.friction.drop:.3g} {position_unit} of its rest. The envelope's "
+                f"ζ = {decay.zeta:.3g} is biased; ζ = {decay.friction.zeta:.3g} once friction is "
+                "taken out."
                 if decay.friction.present
-                else "is exponential: no dry friction is seen."
+                else "is as exponential as its noise lets one see "
+                f"(F = {decay.friction.f_statistic:.1f}, dry friction from "
+                f"{decay.friction.threshold:.1f} on)."
             ),
         )
         for decay in decays
@@ -129,7 +141,7 @@ def check_decays(decays: Sequence[LogDecrement]) -> list[Check]:
     ]
 
 
-def check_steps(steps: Sequence[StepGain]) -> list[Check]:
+def check_steps(steps: Sequence[StepGain], *, gain_unit: str) -> list[Check]:
     """Ask whether every step has one gain: a cart that sticks has an interval of them."""
     return [
         Check(
@@ -142,11 +154,41 @@ def check_steps(steps: Sequence[StepGain]) -> list[Check]:
                 "settles where its springs put it."
                 if step.interval is None
                 else "sticks: its static gain is only known to lie between "
-                f"{step.interval[0]:.4g} and {step.interval[1]:.4g}."
+                f"{step.interval[0]:.4g} and {step.interval[1]:.4g} {gain_unit}."
             ),
         )
         for step in steps
     ]
+
+
+def check_setup(records: Sequence[Record]) -> list[Check]:
+    """Ask whether the carts that should be free are those that move (where all were measured)."""
+    checks = []
+    for record in records:
+        swing = {cart: float(np.ptp(record.position(cart))) for cart in record.carts}
+        free = max((swing[cart] for cart in record.carts if cart in record.free), default=0.0)
+        held = {cart: swing[cart] for cart in record.carts if cart not in record.free}
+        if not held or not any(cart in record.free for cart in record.carts):
+            continue
+        mover = max(held, key=lambda cart: held[cart])
+        good = free >= HELD_SHARE * held[mover]
+        named = ", ".join(map(str, record.free))
+        checks.append(
+            Check(
+                id=f"setup.{record.id}",
+                outcome="pass" if good else "fail",
+                value=held[mover] / free if free > 0 else None,
+                limit=1 / HELD_SHARE,
+                message=f"{record.id}: "
+                + (
+                    f"the carts said to be free ({named}) are those that move."
+                    if good
+                    else f"cart {mover} moves and cart {named} does not, but cart {named} is said "
+                    "to be free: is `carts` right?"
+                ),
+            )
+        )
+    return checks
 
 
 def check_chain(fit: ChainFit, *, springs: Sequence[bool]) -> list[Check]:

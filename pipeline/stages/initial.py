@@ -59,14 +59,14 @@ def estimate_initially(
     log_decrements: Sequence[LogDecrement],
     step_gains: Sequence[StepGain],
     from_response: Mapping[str, Estimate],
-) -> tuple[dict[str, Estimate], list[str]]:
-    """Collect the initial estimates by parameter name; also name repeats that were left out.
+) -> tuple[dict[str, Estimate], dict[str, str]]:
+    """Collect the initial estimates by parameter name; also the runs left out, with the reason.
 
     Gains come from steps, single-cart frequencies and dampings from decays, resonances and nulls
     (and gains, without steps) from the measured frequency response, other dampings are assumed.
     """
     estimates: dict[str, Estimate] = {}
-    remarks: list[str] = []
+    left_out: dict[str, str] = {}
     for cart in range(1, carts + 1):
         suffix = "" if carts == 1 else f"_{cart}"
         decays = [d for d in log_decrements if d.cart == cart]
@@ -75,7 +75,7 @@ def estimate_initially(
         for name, attribute in names.items():
             _add(
                 estimates,
-                remarks,
+                left_out,
                 name=name,
                 runs=[d.experiment for d in decays],
                 values=[getattr(d, attribute) for d in decays],
@@ -84,19 +84,19 @@ def estimate_initially(
             )
         _add(
             estimates,
-            remarks,
+            left_out,
             name=f"K{suffix}",
             runs=[s.experiment for s in steps],
             values=[s.gain for s in steps],
             std=[s.gain_std for s in steps],
             source="step",
         )
-    return {**from_response, **estimates}, remarks
+    return {**from_response, **estimates}, left_out
 
 
 def _add(
     estimates: dict[str, Estimate],
-    remarks: list[str],
+    left_out: dict[str, str],
     *,
     name: str,
     runs: Sequence[str],
@@ -108,8 +108,8 @@ def _add(
         return
     repeats = combine_repeats(values, std=std, source=source)
     estimates[name] = repeats.estimate
-    remarks += [
-        f"{runs[i]}: {name} = {values[i]:.4g} stands off the other repeats "
-        f"({repeats.estimate.value:.4g}) and is left out of the initial estimate"
+    left_out |= {
+        runs[i]: f"{name} = {values[i]:.4g} stands off the other repeats "
+        f"({repeats.estimate.value:.4g}): the run is left out"
         for i in repeats.outliers
-    ]
+    }
