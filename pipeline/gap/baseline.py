@@ -11,7 +11,7 @@ from pipeline.gap.structure import Structure
 from pipeline.plant.chain import Array, Chain
 
 SHOT_LENGTH = 0.6  # s; a wrong structure does little harm over it
-_WINDOW = 0.3  # s, of the modulating functions
+_WINDOW, _HOP = 0.3, 0.05  # s, of the modulating functions, at the usual pace
 _FIRST_MASS = 1e3  # weight of the equation m_1 = 1, where nothing else sets a scale
 _SMALLEST_ZETA = 0.002
 
@@ -33,8 +33,8 @@ def first_chain(runs: Sequence[Run], *, springs: Sequence[bool]) -> Chain:
     equations: list[Array] = []
     right: list[float] = []
     for run in runs:
-        step = max(1, round(0.05 / run.record.sample_time))
-        width = max(8, round(_WINDOW / run.record.sample_time))
+        step = max(1, round(_HOP * run.pace / run.record.sample_time))
+        width = max(8, round(_WINDOW * run.pace / run.record.sample_time))
         x = np.zeros((n, run.t.size))
         for j, row in enumerate(run.rows):
             x[row] = run.y[j] - run.zero[row]

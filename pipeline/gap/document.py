@@ -8,8 +8,8 @@ from pipeline.plant.chain import Chain
 SCHEMA = "cartlab-gap/1"
 
 
-def gap_json(gap: Gap) -> dict[str, Any]:
-    """Return the gap as plain JSON data."""
+def gap_json(gap: Gap, *, position_unit: str = "cm", input_unit: str = "V") -> dict[str, Any]:
+    """Return the gap as plain JSON data; the units are those of the submission."""
     return {
         "schema": SCHEMA,
         "verdict": gap.verdict,
@@ -42,6 +42,7 @@ def gap_json(gap: Gap) -> dict[str, Any]:
         "training": list(gap.training),
         "held_out": list(gap.held_out),
         "friction_spread": {str(cart): spread for cart, spread in gap.spread.items()},
+        "units": {"position": position_unit, "input": input_unit},
         "linear": _chain(gap.linear.chain),
         "model": {
             "chain": _chain(gap.model.chain),

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.errors import DataError
-from pipeline.gap.baseline import fit_baseline
-from pipeline.gap.fit import Fit, Locals, covariance, simulate_run
+from pipeline.gap.baseline import fit_baseline, measure_noise
+from pipeline.gap.fit import Fit, Locals, covariance, fit_model, simulate_run
 from pipeline.gap.offset import find_offset
 from pipeline.gap.runs import Run, cut_shots, make_run
 from pipeline.gap.search import (
@@ -31,6 +31,7 @@ from pipeline.results import Record
 
 _LAST_SHARE = 0.4  # of a single run is held out
 _MOST_DWELLS = 4  # sine dwells used; they say little beyond their frequency
+_NOISE_ROUNDS, _TOO_GOOD = 3, 0.7  # chi-square per point no fit to true noise falls to
 _LEAST_MOTION = 8.0  # encoder steps
 _WINDOW = 0.5  # s; a chain without springs drifts, so it is judged over windows
 _CLOSE_ERROR, _CLOSE_GAIN, _CLOSE_BIC = 1.15, 0.10, 40.0
@@ -78,13 +79,19 @@ def explain_gap(
             mapper=pool.map,
             tell=tell,
         )
-        baseline = judge(fit, bench)
-        found = [baseline]
-        chosen = baseline
-        if not baseline.at_floor:
-            tell(f"linear model: error {baseline.error:.1%} of the motion on held-out runs")
-            found = search(baseline, bench)
-            chosen = prune(choose(found, baseline), bench)
+        for _ in range(_NOISE_ROUNDS):
+            baseline = judge(fit, bench)
+            found = [baseline]
+            chosen = baseline
+            if not baseline.at_floor:
+                tell(f"linear model: error {baseline.error:.1%} of the motion on held-out runs")
+                found = search(baseline, bench)
+                chosen = prune(choose(found, baseline), bench)
+            if chosen.fit.chi > _TOO_GOOD:
+                break
+            # Less is left than was taken for noise: the misfit of the linear model was in it.
+            bench = _quieter(bench, chosen)
+            fit = fit_model(fit.structure, fit.theta, bench.training, mapper=pool.map)
         path = _path(chosen, found, bench)
         chosen, path, bench = _with_offset(chosen, path, bench)
         final = covariance(chosen.fit, bench.training, mapper=pool.map)
@@ -186,6 +193,14 @@ def _sides(runs: list[Run], *, notes: list[str]) -> tuple[list[Run], list[Run]]:
         pieces.append(moving if len(run.shots) == 2 else cut_shots(moving, length=_WINDOW))
     others = [r for i, r in enumerate(runs) if i != longest]
     return [*others, pieces[0]], [pieces[1]]
+
+
+def _quieter(bench: Bench, best: Hypothesis) -> Bench:
+    """Return the bench with the noise that the best model leaves."""
+    training = measure_noise(best.fit, bench.training, bench.training)
+    sigma = {row: s for run in training for row, s in zip(run.rows, run.sigma, strict=True)}
+    held_out = tuple(_with_noise(run, sigma) for run in bench.held_out)
+    return replace(bench, training=tuple(training), held_out=held_out)
 
 
 def _with_noise(run: Run, sigma: dict[int, float]) -> Run:

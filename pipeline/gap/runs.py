@@ -12,6 +12,8 @@ _REST_SAMPLES = 5  # this many first samples that do not move: the run starts at
 _TAIL = 0.12  # share of a record that must lie still to tell the rest point
 _STILL = 2.6  # encoder steps, peak to peak, that count as lying still
 _FIT_RATE = 250.0  # Hz; faster records are averaged in blocks, model and measurement alike
+_USUAL_FREQUENCY = 8.0  # Hz; carts on a bench swing no faster
+_SMOOTHING = 0.03  # s, half width of a local cubic, at the usual pace
 _HELD_SAMPLES = 4  # a release after fewer held samples is the start of the file
 
 
@@ -31,6 +33,7 @@ class Run:
     zero, zero_std : (n,) where the encoder's zero is expected, and how far off it may be.
     sigma : (rows,) noise of one sample.
     block : samples averaged to one residual.
+    pace : 1 for a bench of carts, less in proportion for what swings faster.
     shots : (shots + 1,) bounds of the pieces that start afresh; (0, samples) is the whole run.
     shot_x, shot_v : (shots, n) smoothed states at the start of each shot, zeros not taken off.
     """
@@ -51,6 +54,7 @@ class Run:
     zero_std: Array
     sigma: Array
     block: int
+    pace: float
     shots: tuple[int, ...]
     shot_x: Array
     shot_v: Array
@@ -87,6 +91,7 @@ def make_run(record: Record, *, n: int) -> Run:
     # The input may already act between these samples: the first two are before its effect.
     lies_still = np.ptp(head[:, :2], axis=1) <= still
     at_rest = bool(np.all(lies_still)) and record.kind != "decay"
+    pace = min(1.0, _USUAL_FREQUENCY / _dominant_frequency(t, y))
     zero, zero_std = np.zeros(n), np.ones(n)
     start, slope = np.zeros(n), np.zeros(n)
     span = np.ptp(y, axis=1)
@@ -98,7 +103,7 @@ def make_run(record: Record, *, n: int) -> Run:
         else:
             zero[row], zero_std[row] = y[j].mean(), 0.2 * span[j]
         zero_std[row] = max(zero_std[row], resolution[j], 1e-12)
-        start[row], slope[row] = _smooth_state(t, y[j], 0)
+        start[row], slope[row] = _smooth_state(t, y[j], 0, window=_SMOOTHING * pace)
         if at_rest:
             start[row], slope[row] = y[j, 0], 0.0
     if record.hold == "band_limited":
@@ -123,7 +128,8 @@ def make_run(record: Record, *, n: int) -> Run:
         zero=zero,
         zero_std=zero_std,
         sigma=np.maximum(resolution / np.sqrt(12.0), 1e-9 * span),
-        block=max(1, int(rate / _FIT_RATE)),
+        block=max(1, int(rate * pace / _FIT_RATE)),
+        pace=pace,
         shots=(0, t.size),
         shot_x=start[None],
         shot_v=slope[None],
@@ -131,14 +137,19 @@ def make_run(record: Record, *, n: int) -> Run:
 
 
 def cut_shots(run: Run, *, length: float) -> Run:
-    """Cut a run into pieces of `length` s that each start from a state of their own."""
-    count = max(1, round(float(run.t[-1] - run.t[0]) / length))
+    """Cut a run into pieces that each start from a state of their own.
+
+    `length` is in s at the usual pace.
+    """
+    count = max(1, round(float(run.t[-1] - run.t[0]) / (length * run.pace)))
     bounds = np.linspace(0, run.t.size, count + 1).astype(int)
     n = run.start.size
     shot_x, shot_v = np.zeros((count, n)), np.zeros((count, n))
     for s, first in enumerate(bounds[:-1]):
         for j, row in enumerate(run.rows):
-            shot_x[s, row], shot_v[s, row] = _smooth_state(run.t, run.y[j], first)
+            shot_x[s, row], shot_v[s, row] = _smooth_state(
+                run.t, run.y[j], first, window=_SMOOTHING * run.pace
+            )
     shot_x[0], shot_v[0] = run.start, run.slope
     return replace(run, shots=tuple(int(b) for b in bounds), shot_x=shot_x, shot_v=shot_v)
 
@@ -163,6 +174,19 @@ def _rough_noise(y: Array) -> Array:
     return 1.4826 * np.median(np.abs(fourth), axis=1) / np.sqrt(70.0)
 
 
+def _dominant_frequency(t: Array, y: Array) -> float:
+    """Return the frequency (Hz) at which the velocity is strongest."""
+    uniform = np.linspace(t[0], t[-1], t.size)
+    best, peak = 1.0, 0.0
+    for row in y:
+        velocity = np.gradient(np.interp(uniform, t, row), uniform)
+        power = np.abs(np.fft.rfft(velocity * np.hanning(t.size))) ** 2
+        at = int(np.argmax(power[1:])) + 1
+        if power[at] > peak:
+            best, peak = at / (uniform[-1] - uniform[0]), float(power[at])
+    return best
+
+
 def _release(offset: Array, still: Array) -> int:
     """Return the first sample of free motion of a decay."""
     leader = int(np.argmax(np.ptp(offset, axis=1) / np.maximum(still, 1e-12)))
@@ -183,7 +207,7 @@ def _release(offset: Array, still: Array) -> int:
     return last + int(np.argmin(side * offset[leader, last:]))
 
 
-def _smooth_state(t: Array, y: Array, at: int, *, window: float = 0.03) -> tuple[float, float]:
+def _smooth_state(t: Array, y: Array, at: int, *, window: float) -> tuple[float, float]:
     """Return position and velocity at one sample from a local cubic."""
     half = max(3, round(window / float(t[1] - t[0])))
     low, high = max(0, at - half), min(t.size, at + half + 1)

@@ -79,6 +79,7 @@ class Effect:
     fingerprint : what it does to the data; deciding_run: the experiment that settles it.
     axis : what to plot the force (or reading) against, to see it.
     between_carts : on a spring to a wall it would be part of the linear chain.
+    fewest_carts : with fewer it is part of the linear chain.
     family : effects of one family exclude each other at one place.
     grows_from : the simpler effect whose fit is the start of this one's.
     equivalent : what the data cannot tell from it, and why.
@@ -97,6 +98,7 @@ class Effect:
     axis: Axis
     family: str = ""
     between_carts: bool = False
+    fewest_carts: int = 1
     grows_from: str | None = None
     equivalent: str = ""
 
@@ -111,6 +113,8 @@ class Effect:
         The two wall springs of a single cart only act through their sum, so one stands for both.
         """
         n = len(springs) - 1
+        if n < self.fewest_carts:
+            return ()
         if self.place == "input":
             return (0,)
         if self.place == "cart":
@@ -179,7 +183,9 @@ def make_term(effect: Effect, *, place: int, values: Mapping[str, float], chain:
     ConfigError : a place or a parameter the effect does not have, or a missing one.
     """
     springs = tuple(bool(k > 0) for k in chain.k)
-    if place not in effect.places(springs) and not (effect.place == "spring" and chain.n == 1):
+    # Either wall spring of a single cart will do: they act through their sum.
+    either_wall = effect.place == "spring" and chain.n == 1 and place in (1, 2)
+    if place not in effect.places(springs) and not either_wall:
         raise ConfigError(f"{effect.key}: no {effect.place} {place} on this bench")
     unknown = [name for name in values if name not in effect.names]
     if unknown:

@@ -59,7 +59,7 @@ SENSOR_GAIN = Effect(
             symbol="g",
             unit="",
             scale=lambda s: 1.0,
-            trials=(1.03,),
+            trials=(1.03, 0.97),
             neutral=1.0,
         ),
     ),
@@ -68,6 +68,7 @@ SENSOR_GAIN = Effect(
     deciding_run="Move the carts by a ruler and read the encoders.",
     reference="statics of the chain",
     axis="position",
+    fewest_carts=2,
     equivalent="Another cart's gain: only ratios show, and none without a spring at both ends.",
 )
 
@@ -93,7 +94,7 @@ EXTRA_MODE = Effect(
             unit="input/position",
             # Tuned to the cart's own frequency, like the mass of the first trial.
             scale=lambda s: 0.1 * s.stiffness,
-            trials=(0.4, 1.0, 2.5, 6.0),
+            trials=(0.25, 0.5, 0.8, 1.2, 1.8, 3.0, 6.0),
             upper=3000.0,
         ),
         Parameter(

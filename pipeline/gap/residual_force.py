@@ -1,0 +1,194 @@
+"""The force on each cart that masses, dampings and springs do not account for.
+
+Measured positions give no acceleration worth having. The equation of motion is averaged over a
+short window instead, with a weight that vanishes at the window's ends, and integrated by parts:
+the derivatives move from the data to the weight. What comes out is the exact mean of the force
+over the window, with the mean velocity, position and input beside it.
+
+Reference: M. Shinbrot, Trans. ASME 79 (1957), 579-588.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.gap.runs import high_frequency_noise
+from pipeline.gap.types import Gap, Trace
+from pipeline.plant.chain import Array, Chain
+from pipeline.plant.effects.base import AugmentedChain
+from pipeline.plant.tables import Drive
+
+_WINDOWS = (0.05, 0.07, 0.1, 0.15, 0.2, 0.3)  # s; half of one weighs anything
+_FEWEST = 9  # samples in a window
+_NOISE = 0.02  # of the force's range that noise may make
+_MOST = 400  # windows a record
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ResidualForce:
+    """One cart in one run; all (n,) are weighted means over one window each.
+
+    Attributes
+    ----------
+    measured, model : what the linear part leaves of the measured motion, and of the motion that
+        the model with its effects gives: alike where the effects are right.
+    u : the logged input, on cart 1; 0 elsewhere.
+    arriving : what the model's dead zone and saturation leave of it, which is taken off the forces.
+    velocity, position : of the measured cart, its encoder's zero taken off.
+    neighbours : (2, n) positions of the carts before and after, 0 for a wall or a held cart.
+    neighbours_velocity : (2, n) their velocities.
+    """
+
+    experiment: str
+    cart: int
+    held_out: bool
+    t: Array
+    measured: Array
+    model: Array
+    u: Array
+    arriving: Array
+    velocity: Array
+    position: Array
+    neighbours: Array
+    neighbours_velocity: Array
+
+
+def residual_forces(gap: Gap, *, free: Mapping[str, Sequence[int]]) -> tuple[ResidualForce, ...]:
+    """Return the residual force of every cart in every run whose neighbours were measured.
+
+    `free` tells which carts move in each run.
+    """
+    runs: dict[tuple[str, bool], dict[int, Trace]] = {}
+    for trace in gap.traces:
+        runs.setdefault((trace.experiment, trace.held_out), {})[trace.cart] = trace
+    found = []
+    for (experiment, _), carts in runs.items():
+        moving = set(free[experiment])
+        for cart in carts:
+            if moving & {cart - 1, cart + 1} <= set(carts):
+                found.append(_one(carts, cart, gap.model))
+    return tuple(found)
+
+
+def _one(carts: Mapping[int, Trace], cart: int, model: AugmentedChain) -> ResidualForce:
+    own = carts[cart]
+    t = own.t
+    around = [carts.get(cart - 1), own, carts.get(cart + 1)]
+    zero = np.zeros(t.size)
+    measured = np.array([zero if c is None else c.measured - c.zero for c in around])
+    simulated = np.array([zero if c is None else c.final - c.zero for c in around])
+    u = own.u if cart == 1 else zero
+    inputs = np.array([u, _arriving(u, model)])
+    noise = high_frequency_noise(own.measured - own.final)
+    chain = model.chain
+    best = None
+    for length in _WINDOWS:
+        windows = _cut(t, length=length)
+        if windows is None:
+            continue
+        best = _average(
+            windows, t, measured, simulated, inputs, chain=chain, cart=cart, noise=noise
+        )
+        if best.noise <= _NOISE * np.ptp(best.force):
+            break
+    if best is None:
+        windows = np.arange(t.size)[None]
+        best = _average(
+            windows, t, measured, simulated, inputs, chain=chain, cart=cart, noise=noise
+        )
+    return ResidualForce(
+        experiment=own.experiment,
+        cart=cart,
+        held_out=own.held_out,
+        t=best.t,
+        measured=best.force,
+        model=best.model,
+        u=best.inputs[0],
+        arriving=best.inputs[1],
+        velocity=best.velocity[1],
+        position=best.position[1],
+        neighbours=best.position[[0, 2]],
+        neighbours_velocity=best.velocity[[0, 2]],
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Means:
+    t: Array
+    force: Array
+    model: Array
+    inputs: Array
+    position: Array
+    velocity: Array
+    noise: float
+
+
+def _arriving(u: Array, model: AugmentedChain) -> Array:
+    """Return what the drive passes on of the input, delays and lags apart."""
+    _, _, drive = model.tables()
+    past = np.maximum(np.abs(u) - drive[Drive.DEAD_ZONE], 0.0)
+    return np.sign(u) * np.minimum(past, drive[Drive.LIMIT])
+
+
+def _cut(t: Array, *, length: float) -> np.ndarray | None:
+    """Return the sample numbers (windows, samples) of overlapping windows, None if too short."""
+    width = round(length * (t.size - 1) / float(t[-1] - t[0])) + 1
+    if width < _FEWEST or width > t.size:
+        return None
+    count = min(t.size - width + 1, _MOST)
+    first = np.linspace(0, t.size - width, count).astype(int)
+    return first[:, None] + np.arange(width)
+
+
+def _average(
+    windows: np.ndarray,
+    t: Array,
+    measured: Array,
+    simulated: Array,
+    inputs: Array,
+    *,
+    chain: Chain,
+    cart: int,
+    noise: float,
+) -> _Means:
+    local = t[windows]
+    span = local[:, -1:] - local[:, :1]
+    s = (local - local[:, :1]) / span
+    hump = s * (1 - s)
+    slope = 1 - 2 * s
+    # The weight, its first and second derivative by time, and the share of time of each sample.
+    w = hump**4
+    w1 = 4 * hump**3 * slope / span
+    w2 = (12 * hump**2 * slope**2 - 8 * hump**3) / span**2
+    dt = np.gradient(local, axis=1)
+    size = (w * dt).sum(1, keepdims=True)
+    w, w1, w2 = (weight * dt / size for weight in (w, w1, w2))
+    # An input is held over the interval that follows its sample: the weight's exact share of it.
+    held = np.diff(_rise(s), axis=1)
+    pushes = np.array([(held * u[windows[:, :-1]]).sum(1) for u in inputs])
+    i = cart - 1
+    m, c = chain.m[i], chain.c[i]
+    before, after = chain.k[i], chain.k[i + 1]
+
+    own = m * w2 - c * w1 + (before + after) * w
+
+    def force(x: Array) -> Array:
+        springs = (w * (before * x[0] + after * x[2])[windows]).sum(1)
+        return (own * x[1][windows]).sum(1) - springs - pushes[1]
+
+    return _Means(
+        t=(w * local).sum(1),
+        force=force(measured),
+        model=force(simulated),
+        inputs=pushes,
+        position=np.array([(w * x[windows]).sum(1) for x in measured]),
+        velocity=np.array([-(w1 * x[windows]).sum(1) for x in measured]),
+        noise=noise * float(np.sqrt(np.median((own**2).sum(1)))),
+    )
+
+
+def _rise(s: Array) -> Array:
+    """Return the integral of the weight from 0 to s, over that from 0 to 1."""
+    powers = s**5 / 5 - 4 * s**6 / 6 + 6 * s**7 / 7 - 4 * s**8 / 8 + s**9 / 9
+    return 630.0 * powers
