@@ -14,7 +14,8 @@ LEVELS = (
     ("results", "submission"),
     ("ingest", "stages"),
     ("workflow", "synthesis", "results_json"),
-    ("report", "gap"),
+    ("gap",),
+    ("report",),
     ("cli",),
     ("__main__",),
 )

@@ -57,21 +57,23 @@ class ResidualForce:
 def residual_forces(gap: Gap, *, free: Mapping[str, Sequence[int]]) -> tuple[ResidualForce, ...]:
     """Return the residual force of every cart in every run whose neighbours were measured.
 
+    A run sampled too slowly for the longest window has none.
+
     `free` tells which carts move in each run.
     """
     runs: dict[tuple[str, bool], dict[int, Trace]] = {}
     for trace in gap.traces:
         runs.setdefault((trace.experiment, trace.held_out), {})[trace.cart] = trace
-    found = []
+    found: list[ResidualForce | None] = []
     for (experiment, _), carts in runs.items():
         moving = set(free[experiment])
         for cart in carts:
             if moving & {cart - 1, cart + 1} <= set(carts):
                 found.append(_one(carts, cart, gap.model))
-    return tuple(found)
+    return tuple(force for force in found if force is not None)
 
 
-def _one(carts: Mapping[int, Trace], cart: int, model: AugmentedChain) -> ResidualForce:
+def _one(carts: Mapping[int, Trace], cart: int, model: AugmentedChain) -> ResidualForce | None:
     own = carts[cart]
     t = own.t
     around = [carts.get(cart - 1), own, carts.get(cart + 1)]
@@ -81,22 +83,17 @@ def _one(carts: Mapping[int, Trace], cart: int, model: AugmentedChain) -> Residu
     u = own.u if cart == 1 else zero
     inputs = np.array([u, _arriving(u, model)])
     noise = high_frequency_noise(own.measured - own.final)
-    chain = model.chain
     best = None
     for length in _WINDOWS:
-        windows = _cut(t, length=length)
-        if windows is None:
+        if (windows := _cut(t, length=length)) is None:
             continue
         best = _average(
-            windows, t, measured, simulated, inputs, chain=chain, cart=cart, noise=noise
+            windows, t, measured, simulated, inputs, chain=model.chain, cart=cart, noise=noise
         )
         if best.noise <= _NOISE * np.ptp(best.force):
             break
     if best is None:
-        windows = np.arange(t.size)[None]
-        best = _average(
-            windows, t, measured, simulated, inputs, chain=chain, cart=cart, noise=noise
-        )
+        return None
     return ResidualForce(
         experiment=own.experiment,
         cart=cart,
@@ -164,6 +161,13 @@ def _average(
     dt = np.gradient(local, axis=1)
     size = (w * dt).sum(1, keepdims=True)
     w, w1, w2 = (weight * dt / size for weight in (w, w1, w2))
+    # Few samples integrate w'' badly: made exact for parabolas, whatever their place and slope.
+    tau = local - (w * local).sum(1, keepdims=True)
+    spread = (w * tau**2).sum(1, keepdims=True)
+    w2 = w2 - w * w2.sum(1, keepdims=True) - w * tau * (w2 * tau).sum(1, keepdims=True) / spread
+    w2 = 2 * w2 / (w2 * tau**2).sum(1, keepdims=True)
+    w1 = w1 - w * w1.sum(1, keepdims=True)
+    w1 = -w1 / (w1 * tau).sum(1, keepdims=True)
     # An input is held over the interval that follows its sample: the weight's exact share of it.
     held = np.diff(_rise(s), axis=1)
     pushes = np.array([(held * u[windows[:, :-1]]).sum(1) for u in inputs])

@@ -11,8 +11,8 @@ from html import escape
 from typing import Literal
 
 _NUMBER = re.compile(r"\d+(\.\d+)?")
-_OPERATORS = frozenset("+−=·,()[]≥<≈")
-_RELATIONS = frozenset("=≥<≈")
+_OPERATORS = frozenset("+−=·,()[]≥≤<≈≠→")
+_RELATIONS = frozenset("=≥≤<≈≠→")
 
 Kind = Literal["row", "fraction", "sub", "sup", "dot", "ddot", "matrix", "parens", "lines"]
 

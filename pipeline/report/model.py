@@ -59,8 +59,13 @@ def _between(cart: int, neighbour: int, springs: Sequence[bool]) -> Term | None:
     return sub("k", str(j)) if inside and springs[j - 1] else None
 
 
-def equations_of_motion(springs: Sequence[bool]) -> Formula:
-    """Return Newton's law for every cart, with the springs that are there."""
+def equations_of_motion(
+    springs: Sequence[bool], *, forces: Sequence[Term] | None = None
+) -> Formula:
+    """Return Newton's law for every cart, with the springs that are there.
+
+    `forces` stand on the right, one for each cart; default: the input on the first.
+    """
     n = len(springs) - 1
     equations = []
     for i in range(1, n + 1):
@@ -76,7 +81,8 @@ def equations_of_motion(springs: Sequence[bool]) -> Formula:
         for neighbour in (i - 1, i + 1):
             if k := _between(i, neighbour, springs):
                 equation += ["−", k, _position(neighbour)]
-        equations.append(row(*equation, "=", "u" if i == 1 else "0"))
+        force = forces[i - 1] if forces else "u" if i == 1 else "0"
+        equations.append(row(*equation, "=", force))
     return formula(lines(equations))
 
 

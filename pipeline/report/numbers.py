@@ -59,7 +59,7 @@ def listing(items: list[str]) -> str:
 
 def unit_text(unit: str) -> str:
     """Return a unit with its powers raised and unbroken: "V s^2/cm" as "V s²/cm"."""
-    return unit.replace("^2", "²").replace(" ", "\u00a0")
+    return unit.replace("^2", "²").replace("^3", "³").replace(" ", "\u00a0")
 
 
 def _exponent(value: float, *, digits: int) -> int:

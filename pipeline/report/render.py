@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from pipeline.report.content import build_document
+from pipeline.report.document import Document
 from pipeline.report.html import render_html
 from pipeline.report.pdf import missing_characters, render_pdf
 from pipeline.results import Analysis
@@ -28,15 +29,19 @@ def render_report(
         analysis = replace(analysis, warnings=(*analysis.warnings, warning))
         if progress:
             progress(warning)
-    document = build_document(analysis, progress=progress)
+    write_document(build_document(analysis, progress=progress), out, name="report", pdf=pdf)
+
+
+def write_document(document: Document, out: Path, *, name: str, pdf: bool) -> None:
+    """Write a document as `name.html`, `name.pdf` and `figures/*.svg` into the folder `out`."""
     (out / "figures").mkdir(parents=True, exist_ok=True)
     with ThreadPoolExecutor(max_workers=1) as beside:  # typst works outside the interpreter's lock
         printed = beside.submit(render_pdf, document) if pdf else None
-        _write_text(out / "report.html", render_html(document))
+        _write_text(out / f"{name}.html", render_html(document))
         for picture in document.pictures():
             _write_text(out / "figures" / f"{picture.name}.svg", picture.svg)
         if printed:
-            (out / "report.pdf").write_bytes(printed.result())
+            (out / f"{name}.pdf").write_bytes(printed.result())
 
 
 def _write_text(path: Path, text: str) -> None:

@@ -33,6 +33,8 @@ def draw_ticks(ax: Axes, *, label_x: bool) -> None:
     sizes = ax.get_position().size * figure.get_size_inches()
     for direction, size in enumerate(sizes):
         axis = (ax.xaxis, ax.yaxis)[direction]
+        if not axis.get_visible():
+            continue
         low, high = sorted((ax.get_xlim, ax.get_ylim)[direction]())
         scale = (ax.get_xscale, ax.get_yscale)[direction]()
         most = max(2, int(size / _SPACING[direction]))

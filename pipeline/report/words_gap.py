@@ -1,0 +1,213 @@
+"""The gap in plain words: what explains it, how well, and what to do next."""
+
+from collections.abc import Mapping
+
+from pipeline.gap.types import FoundEffect, Gap, NamedValue, Rival
+from pipeline.plant.effects.base import Effect
+from pipeline.report.document import Block, Span, Spans, bullet_list, paragraph, spans
+from pipeline.report.numbers import listing, significant, unit_text, with_error
+from pipeline.report.words import clean
+
+_AS_GOOD = 1.15  # times the error: a rival that the data do not tell from what was chosen
+_NEGLIGIBLE = 1e-3  # of a value: an error this small stands in the table alone
+_ALL = 1.5  # times the noise, or the difference of repeats: nothing to speak of is left
+
+
+def verdict_title(gap: Gap) -> str:
+    """Return the verdict in a few words."""
+    return {
+        "none": "The linear model is enough",
+        "named": "The gap has a name",
+        "ambiguous": "Two explanations fit alike",
+        "unexplained": "A gap that nothing in the catalogue explains",
+    }[gap.verdict]
+
+
+def verdict_blocks(gap: Gap) -> list[Block]:
+    """Say what explains the gap and how well; under `ambiguous`, both explanations."""
+    match gap.verdict:
+        case "none":
+            return [
+                paragraph(
+                    Span("The linear model explains the data. ", "strong"),
+                    f"On runs it had not seen it is off by {share(gap.baseline)} of the motion; "
+                    f"noise alone makes {share(gap.noise_floor)}. No effect is needed.",
+                )
+            ]
+        case "named":
+            return [_named(gap)]
+        case "ambiguous":
+            return _ambiguous(gap)
+        case "unexplained":
+            return [_unexplained(gap)]
+
+
+def next_block(gap: Gap) -> list[Block]:
+    """Say which experiment comes next, nothing where none is needed."""
+    if not gap.next_experiment:
+        return []
+    lead = {
+        "named": "The experiment that would confirm it. ",
+        "ambiguous": "What would tell them apart. ",
+    }.get(gap.verdict, "What to measure next. ")
+    return [paragraph(Span(lead, "strong"), clean(gap.next_experiment))]
+
+
+def terminal_verdict(gap: Gap) -> str:
+    """Return the verdict as a few lines of plain text."""
+    lines = [verdict_title(gap)]
+    for block in (*verdict_blocks(gap), *next_block(gap)):
+        lines += _lines(block)
+    return "\n".join(lines)
+
+
+def _lines(block: Block) -> list[str]:
+    if block.kind == "paragraph":
+        return ["".join(span.text for span in block.text)]
+    if block.kind == "items":
+        return [f"- {line}" for item in block.items for inner in item for line in _lines(inner)]
+    return []
+
+
+# ------------------------------------------------------------------- the verdicts
+
+
+def _named(gap: Gap) -> Block:
+    names = [effect_name(found.effect, found.where) for found in gap.effects]
+    sizes = "; ".join(sizes_text(found.parameters) for found in gap.effects)
+    verb = "explains" if len(names) == 1 else "together explain"
+    return paragraph(
+        Span(f"{_capital(listing(names))} {verb} what the linear model leaves out: ", "strong"),
+        f"{sizes}. {' '.join(found.effect.sentence for found in gap.effects)} ",
+        _errors(gap),
+    )
+
+
+def _ambiguous(gap: Gap) -> list[Block]:
+    last, rival = contenders(gap)
+    others = [effect_name(f.effect, f.where) for f in gap.effects if f is not last]
+    beside = f", beside {listing(others)}" if others else ""
+    return [
+        paragraph(
+            Span(
+                f"{_capital(effect_name(last.effect, last.where))}, or "
+                f"{effect_name(rival.effect, rival.where)}{beside}: "
+                "these data cannot tell which. ",
+                "strong",
+            )
+            if rival
+            else Span(
+                f"{_capital(effect_name(last.effect, last.where))}{beside}, "
+                "or another effect that these data cannot tell from it. ",
+                "strong",
+            ),
+            _errors(gap),
+        ),
+        bullet_list(
+            [
+                _explanation(last.effect, last.where, gap.final, sizes_text(last.parameters)),
+                *(
+                    [_explanation(rival.effect, rival.where, rival.nrmse_after, "")]
+                    if rival
+                    else []
+                ),
+            ]
+        ),
+    ]
+
+
+def _explanation(effect: Effect, where: Mapping[str, int], error: float, sizes: str) -> Spans:
+    values = f" ({sizes})" if sizes else ""
+    return spans(
+        Span(_capital(effect_name(effect, where)), "strong"),
+        f"{values}: leaves {share(error)} of the motion. {effect.sentence} {effect.fingerprint}",
+    )
+
+
+def _unexplained(gap: Gap) -> Block:
+    if not gap.effects:
+        return paragraph(
+            Span("Something is missing, and nothing in the catalogue explains it. ", "strong"),
+            f"On runs it had not seen the linear model is off by {share(gap.baseline)} of the "
+            f"motion; noise alone makes {share(gap.noise_floor)}. No effect shrinks that enough "
+            "to be believed.",
+        )
+    suspects = listing([effect_name(found.effect, found.where) for found in gap.effects])
+    return paragraph(
+        Span("Something is missing that nothing in the catalogue explains. ", "strong"),
+        f"The best suspect is {suspects}: with it the error on runs the model had not seen falls "
+        f"from {share(gap.baseline)} of the motion to {share(gap.final)}, but noise alone makes "
+        f"{share(gap.noise_floor)}. Too much is left for a name.",
+    )
+
+
+def _errors(gap: Gap) -> str:
+    text = (
+        "On runs the model had not seen the error falls from "
+        f"{share(gap.baseline)} of the motion to {share(gap.final)}; noise alone makes "
+        f"{share(gap.noise_floor)}"
+    )
+    if gap.repeatability is not None:
+        text += f", and repeats of one run differ by {share(gap.repeatability)}"
+    least = max(gap.noise_floor, gap.repeatability or 0.0)
+    if gap.final > _ALL * least:
+        times = significant(gap.final / least, digits=2)
+        return f"{text}. So {times} times what noise makes is left: this is the main effect, " \
+            "not all of it."  # fmt: skip
+    return f"{text}."
+
+
+def contenders(gap: Gap) -> tuple[FoundEffect, Rival | None]:
+    """Return the two explanations that the data do not tell apart: chosen effect and rival."""
+    close = [
+        (rival.confidence, i, found, rival)
+        for i, found in enumerate(gap.effects)
+        for rival in found.rivals
+        if rival.nrmse_after <= _AS_GOOD * gap.final and rival.effect.grows_from != found.effect.key
+    ]
+    if not close:
+        return gap.effects[-1], None
+    _, _, found, rival = max(close, key=lambda entry: entry[:2])
+    return found, rival
+
+
+# ----------------------------------------------------------------------- phrases
+
+
+def effect_name(effect: Effect, where: Mapping[str, int]) -> str:
+    """Return "dry (Coulomb) friction on cart 2", as it stands inside a sentence."""
+    title = effect.title[:1].lower() + effect.title[1:]
+    place = place_name(where)
+    if not place:
+        return title
+    named = any(kind in title for kind in where)  # "a hidden mass on a cart"
+    return f"{title} ({place})" if named else f"{title} on {place}"
+
+
+def place_name(where: Mapping[str, int]) -> str:
+    """Return "cart 2" or "spring 1"; "" for the input."""
+    return " ".join(f"{kind} {number}" for kind, number in where.items())
+
+
+def sizes_text(parameters: Mapping[str, NamedValue]) -> str:
+    """Return "force 0.41 ± 0.01 V, distance 0.02 ± 0.01 cm", for a sentence."""
+    return ", ".join(
+        f"{name.replace('_', ' ')} {_size(value)}" for name, value in parameters.items()
+    )
+
+
+def _size(value: NamedValue) -> str:
+    unit = unit_text(clean(value.unit))
+    exact = value.std is not None and value.std < _NEGLIGIBLE * abs(value.value)
+    text = significant(value.value) if exact else with_error(value.value, value.std)
+    return text + (f" {unit}" if unit else "")
+
+
+def share(value: float) -> str:
+    """Return a share of the motion in percent, with as many digits as matter."""
+    digits = 3 if value >= 0.0995 else 2
+    return f"{significant(100 * value, digits=digits)} %"
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
