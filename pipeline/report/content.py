@@ -33,9 +33,9 @@ from pipeline.report.notes import note_blocks
 from pipeline.report.numbers import count, percent
 from pipeline.report.page import Page, remarks
 from pipeline.report.tables import (
-    chain_table,
     check_table,
     file_table,
+    fitted_chain_table,
     parameter_notes,
     parameter_table,
 )
@@ -111,7 +111,7 @@ def _model(page: Page) -> list[Block]:
         blocks += [paragraph("With the identified numbers:"), numeric_transfer_functions(chain)]
     if analysis.fit:
         blocks.append(
-            chain_table(
+            fitted_chain_table(
                 analysis.fit,
                 number=page.table_number(),
                 position_unit=page.position,

@@ -1,9 +1,10 @@
 """The tables of a report, as data: numbers formatted, parameter names as mathematics."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
+from pipeline.plant.chain import Chain
 from pipeline.report.document import Cell, Span, Spans, Table, spans
 from pipeline.report.numbers import NOTHING, percent, significant, unit_text, with_error
 from pipeline.report.words import SOURCES, clean, name_span, rich
@@ -23,21 +24,23 @@ _OUTCOMES = {"pass": "passed", "fail": "failed", "skip": "not checked"}
 _TONES = {"pass": "good", "fail": "bad", "skip": "quiet"}
 
 
-def _cell(text: str | Spans | Span, tone: str = "") -> Cell:
+def cell(text: str | Spans | Span, tone: str = "") -> Cell:
+    """Return a table cell."""
     return Cell(spans(text), tone)  # type: ignore[arg-type]
 
 
-def _table(
+def make_table(
     number: int,
     caption: str | Spans,
     head: Iterable[str | Spans],
     rows: Iterable[Sequence[Cell]],
     align: str,
 ) -> Table:
+    """Return a table; `align` has one of l, c, r for each column."""
     return Table(
         number=number,
         caption=spans(caption),
-        head=tuple(_cell(text) for text in head),
+        head=tuple(cell(text) for text in head),
         rows=tuple(tuple(row) for row in rows),
         align=align,
     )
@@ -49,7 +52,7 @@ def _table(
 def parameter_table(rows: Sequence[ParameterRow], *, number: int, carts: int) -> Table:
     """Return initial and final estimates as the paper's Tables 1-3, with errors and a verdict."""
     words = {1: "one", 2: "two", 3: "three", 4: "four"}
-    return _table(
+    return make_table(
         number,
         f"Initial and final estimates of the parameters for the {words.get(carts, carts)} degree "
         "of freedom model, with standard errors.",
@@ -65,12 +68,12 @@ def _parameter_row(row: ParameterRow) -> list[Cell]:
     if row.change_sigmas is not None:
         change += f" ({significant(row.change_sigmas, digits=2)} σ)"
     return [
-        _cell(name_span(row.name)),
-        _cell(unit_text(clean(row.unit)) or "1"),
-        _cell(_estimate(row.initial)),
-        _cell(source, "quiet"),
-        _cell(_estimate(row.final)),
-        _cell(change),
+        cell(name_span(row.name)),
+        cell(unit_text(clean(row.unit)) or "1"),
+        cell(_estimate(row.initial)),
+        cell(source, "quiet"),
+        cell(_estimate(row.final)),
+        cell(change),
         _verdict(row.consistent),
     ]
 
@@ -81,8 +84,8 @@ def _estimate(estimate: Estimate | None) -> str:
 
 def _verdict(consistent: bool | None) -> Cell:
     if consistent is None:
-        return _cell(NOTHING, "quiet")
-    return _cell("agree", "good") if consistent else _cell("differ", "bad")
+        return cell(NOTHING, "quiet")
+    return cell("agree", "good") if consistent else cell("differ", "bad")
 
 
 def parameter_notes(rows: Sequence[ParameterRow]) -> list[Spans]:
@@ -94,10 +97,18 @@ def parameter_notes(rows: Sequence[ParameterRow]) -> list[Spans]:
     return [spans(rich(", ".join(names)), ": ", rich(clean(n))) for n, names in by_note.items()]
 
 
-def chain_table(fit: ChainFit, *, number: int, position_unit: str, input_unit: str) -> Table:
-    """Return masses, dampings and springs, each with its standard error where it was fitted."""
+def fitted_chain_table(fit: ChainFit, *, number: int, position_unit: str, input_unit: str) -> Table:
+    """Return masses, dampings and springs of a joint fit."""
     std = dict(zip(fit.names, np.sqrt(np.diag(fit.covariance)), strict=True))
-    chain = fit.chain
+    return chain_table(
+        fit.chain, std=std, number=number, position_unit=position_unit, input_unit=input_unit
+    )
+
+
+def chain_table(
+    chain: Chain, *, std: Mapping[str, float], number: int, position_unit: str, input_unit: str
+) -> Table:
+    """Return masses, dampings and springs, each with its standard error where it was fitted."""
     kinds = (
         ("m", "mass", chain.m, f"{input_unit} s²/{position_unit}"),
         ("c", "damping", chain.c, f"{input_unit} s/{position_unit}"),
@@ -113,13 +124,13 @@ def chain_table(fit: ChainFit, *, number: int, position_unit: str, input_unit: s
             absent = value == 0 and not error
             rows.append(
                 [
-                    _cell(name_span(name)),
-                    _cell(_where(noun, i, chain.n)),
-                    _cell("none" if absent else with_error(float(value), error)),
-                    _cell(unit_text(clean(unit))),
+                    cell(name_span(name)),
+                    cell(_where(noun, i, chain.n)),
+                    cell("none" if absent else with_error(float(value), error)),
+                    cell(unit_text(clean(unit))),
                 ]
             )
-    return _table(
+    return make_table(
         number,
         "The identified chain. The input gain is one, so masses, dampings and stiffnesses are in "
         "input units.",
@@ -147,24 +158,24 @@ def decay_table(decays: Sequence[LogDecrement], *, number: int, position_unit: s
     for decay in decays:
         friction = decay.friction
         if friction is None:
-            verdict = _cell("not tested", "quiet")
+            verdict = cell("not tested", "quiet")
         elif friction.present:
             drop = with_error(friction.drop, friction.drop_std)
-            verdict = _cell(f"d = {drop} {clean(position_unit)}", "bad")
+            verdict = cell(f"d = {drop} {clean(position_unit)}", "bad")
         else:
-            verdict = _cell("none seen", "good")
+            verdict = cell("none seen", "good")
         rows.append(
             [
-                _cell(clean(decay.experiment)),
-                _cell(str(decay.cart)),
-                _cell(with_error(decay.omega_n, decay.omega_n_std)),
-                _cell(with_error(decay.zeta, decay.zeta_std)),
-                _cell(with_error(decay.zeta_peaks, decay.zeta_peaks_std)),
-                _cell(str(decay.peak_t.size)),
+                cell(clean(decay.experiment)),
+                cell(str(decay.cart)),
+                cell(with_error(decay.omega_n, decay.omega_n_std)),
+                cell(with_error(decay.zeta, decay.zeta_std)),
+                cell(with_error(decay.zeta_peaks, decay.zeta_peaks_std)),
+                cell(str(decay.peak_t.size)),
                 verdict,
             ]
         )
-    return _table(
+    return make_table(
         number,
         "Free decays of single carts: the fitted decay, and the logarithmic decrement of its "
         "extrema; d is half the width of the band in which dry friction can hold the cart.",
@@ -189,14 +200,14 @@ def step_table(gains: Sequence[StepGain], *, number: int, units: tuple[str, str]
             value = f"{low} to {high}"
         rows.append(
             [
-                _cell(clean(gain.experiment)),
-                _cell(str(gain.cart)),
-                _cell(str(len(gain.edges))),
-                _cell(value),
-                _cell(significant(gain.rest_shift, digits=2)),
+                cell(clean(gain.experiment)),
+                cell(str(gain.cart)),
+                cell(str(len(gain.edges))),
+                cell(value),
+                cell(significant(gain.rest_shift, digits=2)),
             ]
         )
-    return _table(
+    return make_table(
         number,
         "Static gains from steps: change of level over change of input. An interval stands where "
         "a cart sticks; the last column is how far its rest point moved.",
@@ -227,12 +238,12 @@ def feedback_table(design: FeedbackDesign, *, number: int, units: tuple[str, str
         (spans("settling time, 2 %"), significant(design.settling_time, digits=3), "s"),
         (spans("largest input"), significant(design.peak_input, digits=3), drive),
     ]
-    return _table(
+    return make_table(
         number,
         f"State feedback for cart {design.cart}, and its simulated step of "
         f"{significant(design.reference)} {position}.",
         ("Quantity", "Value", "Unit"),
-        [[_cell(what), _cell(value), _cell(unit)] for what, value, unit in rows],
+        [[cell(what), cell(value), cell(unit)] for what, value, unit in rows],
         "lrl",
     )
 
@@ -244,9 +255,9 @@ def pole_table(design: FeedbackDesign, *, number: int) -> Table:
     head = ["Pole [rad/s]", "Frequency [rad/s]", "Damping ratio"]
     rows = [
         [
-            _cell(_complex(pole)),
-            _cell(significant(abs(pole), digits=3)),
-            _cell(significant(-pole.real / abs(pole), digits=3) if pole != 0 else NOTHING),
+            cell(_complex(pole)),
+            cell(significant(abs(pole), digits=3)),
+            cell(significant(-pole.real / abs(pole), digits=3) if pole != 0 else NOTHING),
         ]
         for pole in poles
     ]
@@ -255,8 +266,8 @@ def pole_table(design: FeedbackDesign, *, number: int) -> Table:
         requested = requested[np.lexsort((requested.imag, np.abs(requested)))]
         for i, cells in enumerate(rows):
             # A delay adds poles that nobody asked for.
-            cells.insert(0, _cell(_complex(requested[i]) if i < requested.size else NOTHING))
-    return _table(number, "Poles of the closed loop.", head, rows, "r" * len(head))
+            cells.insert(0, cell(_complex(requested[i]) if i < requested.size else NOTHING))
+    return make_table(number, "Poles of the closed loop.", head, rows, "r" * len(head))
 
 
 def _complex(value: complex) -> str:
@@ -271,17 +282,17 @@ def hardware_table(checks: Sequence[HardwareCheck], *, number: int, position_uni
     """Return model against measurement of every run and cart."""
     rows = [
         [
-            _cell(clean(check.experiment)),
-            _cell(str(check.cart)),
-            _cell("loop" if check.loop == "closed" else "measured input"),
-            _cell(percent(100 * check.nrmse)),
-            _cell(_overshoots(check)),
-            _cell(_pair(check.settling_model, check.settling_measured)),
-            _cell(_pair(check.steady_state_model, check.steady_state_measured)),
+            cell(clean(check.experiment)),
+            cell(str(check.cart)),
+            cell("loop" if check.loop == "closed" else "measured input"),
+            cell(percent(100 * check.nrmse)),
+            cell(_overshoots(check)),
+            cell(_pair(check.settling_model, check.settling_measured)),
+            cell(_pair(check.steady_state_model, check.steady_state_measured)),
         ]
         for check in checks
     ]
-    return _table(
+    return make_table(
         number,
         "Model against measurement; pairs are model / measured. The difference is the root mean "
         "square of measured minus model, over that of the measured motion.",
@@ -313,15 +324,15 @@ def _pair(model: float | None, measured: float | None) -> str:
 def check_table(checks: Sequence[Check], *, number: int) -> Table:
     """Return every consistency check, failed ones first."""
     order = {"fail": 0, "pass": 1, "skip": 2}
-    return _table(
+    return make_table(
         number,
         "Consistency checks.",
         ("Outcome", "Check", "What was found"),
         [
             [
-                _cell(_OUTCOMES[check.outcome], _TONES[check.outcome]),
-                _cell(Span(clean(check.id), "code")),
-                _cell(rich(clean(check.message))),
+                cell(_OUTCOMES[check.outcome], _TONES[check.outcome]),
+                cell(Span(clean(check.id), "code")),
+                cell(rich(clean(check.message))),
             ]
             for check in sorted(checks, key=lambda check: order[check.outcome])
         ],
@@ -331,12 +342,12 @@ def check_table(checks: Sequence[Check], *, number: int) -> Table:
 
 def file_table(analysis: Analysis, *, number: int) -> Table:
     """Return the data files with their SHA-256."""
-    return _table(
+    return make_table(
         number,
         "The data files this report was made from, with their SHA-256.",
         ("File", "SHA-256"),
         [
-            [_cell(Span(clean(name), "code")), _cell(Span(clean(digest), "code"))]
+            [cell(Span(clean(name), "code")), cell(Span(clean(digest), "code"))]
             for name, digest in sorted(analysis.files.items())
         ],
         "ll",
