@@ -174,16 +174,30 @@ def _run_report(folder: Path, *, out: Path, pdf: bool) -> "Analysis":
 @app.command()
 def simulate(
     out: Annotated[Path, typer.Option(help="The submission folder to write.")],
-    preset: Annotated[str, typer.Option(help="throne-1dof, throne-2dof or throne-3dof.")],
+    preset: Annotated[
+        str | None, typer.Option(help="throne-1dof, throne-2dof or throne-3dof.")
+    ] = None,
+    model: Annotated[
+        Path | None, typer.Option(help="A gap.json whose chain and effects to simulate.")
+    ] = None,
+    hide: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="EFFECT[:key=value,…]", help="Hide an effect (see `cartlab effects`); repeat."
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Random seed: same seed, same bytes.")] = 0,
     reported: Annotated[
         bool, typer.Option("--reported", help="Add what an honest student would report.")
     ] = False,
 ) -> None:
     """Write a synthetic submission: decays, steps, sine dwells, a sweep, a closed-loop step."""
-    from pipeline.synthesis import write_submission
+    from pipeline.synthesis.hidden import prepare_bench, write_bench
 
+    bench = prepare_bench(preset=preset, model=model, hide=hide or ())
+    for sentence in bench.told:
+        say(f"hidden: {sentence}")
     with _progress() as progress:
         progress("simulating the experiments")
-        write_submission(out, chain=preset, seed=seed, reported=reported)
+        write_bench(out, bench, seed=seed, reported=reported)
     say(f"wrote {out}: try `cartlab report {out}`")

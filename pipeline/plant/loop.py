@@ -86,6 +86,19 @@ class LoopRun:
     u: Array
 
 
+class MovingPlant(Protocol):
+    """What may stand for the chain in a loop: it moves on by a sample and keeps its state."""
+
+    @property
+    def state(self) -> Array:
+        """State (x1, v1, x2, v2, …) of the free carts as the sensors read it, (2f,)."""
+        ...
+
+    def step(self, u: float, *, following: float, interval: float) -> None:
+        """Move on by `interval` s under the input `u`; `following` is the one that comes next."""
+        ...
+
+
 def simulate_loop(
     chain: Chain,
     controller: Controller,
@@ -100,6 +113,7 @@ def simulate_loop(
     rest: Array | None = None,
     x0: Array | None = None,
     free: Sequence[int] | None = None,
+    plant: MovingPlant | None = None,
 ) -> LoopRun:
     """Simulate the free carts under a sampled controller.
 
@@ -114,6 +128,7 @@ def simulate_loop(
     encoder_step : what the controller's readings are rounded to, one number or (f,).
     rest : (f,) readings of the carts at rest without input; default 0.
     x0 : (2f,) state (x1, v1, x2, v2, …) at t[0], about the rest; default at rest.
+    plant : moves in the chain's place, from the state it is in.
 
     Raises
     ------
@@ -128,6 +143,8 @@ def simulate_loop(
     r = np.broadcast_to(np.asarray(reference, dtype=np.float64), t.shape)
     nearest = np.searchsorted((t[1:] + t[:-1]) / 2, t[0] + T * ticks)
     rest = np.zeros(len(free)) if rest is None else np.asarray(rest, dtype=np.float64)
+    if plant is not None:
+        x0 = plant.state
     x0 = np.zeros(2 * len(free)) if x0 is None else np.asarray(x0, dtype=np.float64)
     step = np.zeros(len(free)) if encoder_step is None else encoder_step
     encoder = _Encoder(rest=rest, step=np.broadcast_to(np.asarray(step, np.float64), rest.shape))
@@ -147,7 +164,12 @@ def simulate_loop(
             applied = min(max(law.effort(set_point), -limit), limit)
             law.predict(applied)
         states[tick], efforts[tick] = x, applied
-        x = phi @ x + gamma * (drive * applied)
+        if plant is None:
+            x = phi @ x + gamma * (drive * applied)
+        else:
+            following = acting if delay else applied
+            plant.step(drive * applied, following=drive * following, interval=T)
+            x = plant.state
 
     elapsed = (t - t[0]) / T
     x = _hermite(elapsed, states[:, 0::2].T, T * states[:, 1::2].T)

@@ -8,6 +8,7 @@ import numpy as np
 
 from pipeline.errors import ConfigError
 from pipeline.plant.chain import PRESETS, Chain
+from pipeline.plant.effects import Term
 from pipeline.plant.loop import StateFeedback
 from pipeline.results import FeedbackDesign
 from pipeline.stages.state_feedback import design_feedback
@@ -29,6 +30,7 @@ def write_submission(
     *,
     chain: Chain | str,
     seed: int,
+    effects: Sequence[Term] = (),
     title: str | None = None,
     section: str = "01",
     authors: Sequence[str] = ("s1001", "s1002"),
@@ -50,6 +52,8 @@ def write_submission(
     ----------
     folder : made if need be; files of the same names are replaced.
     chain : the true plant, or a preset's name.
+    effects : what the bench does beyond the linear chain. Nothing written tells of it, and the
+        students believe in a linear chain.
     springs : which springs the students say there are; default: those of the chain.
     sample_time : s, of the controller and the log; `time_decimals` of its stamps (3 gives the
         rounded ones of an ECP export).
@@ -62,11 +66,11 @@ def write_submission(
     Raises
     ------
     ConfigError : there is no such preset.
-    DataError : the chain never settles, or has no static gain.
+    DataError : the chain never settles, has no static gain, or runs away with its effects.
     """
     if isinstance(chain, str):
         title = title or f"Simulated bench, {chain}, seed {seed}"
-        chain = _preset(chain)
+        chain = preset_chain(chain)
     rng = np.random.default_rng(seed)
     session = runs.Session(
         sample_time=sample_time,
@@ -83,6 +87,7 @@ def write_submission(
         count=count,
         noise=_NOISE_COUNTS * count,
         zero_error=_ZERO_ERROR_COUNTS * count,
+        effects=tuple(effects),
     )
     believed = claims.believed_chain(chain, rng)
     task = Design(
@@ -112,12 +117,13 @@ def write_submission(
         ),
     ]
 
-    (folder / "data").mkdir(parents=True, exist_ok=True)
+    logs = {}
     for run in programme:
         motion = bench.move(run)
         y = bench.read(motion, run=run, rng=rng)
-        text = csv_text(run, u=motion.u, y=y, time_decimals=time_decimals, count=count)
-        _write(folder / _data_file(run), text)
+        logs[_data_file(run)] = csv_text(
+            run, u=motion.u, y=y, time_decimals=time_decimals, count=count
+        )
     sections = [
         toml_section("", {"version": 1, "title": title or "Simulated bench", "section": section}),
         *(toml_section("[[authors]]", {"id": author}) for author in authors),
@@ -143,12 +149,21 @@ def write_submission(
             toml_section("[reported.state_space]", claims.state_space(believed)),
             toml_section("[reported.feedback]", claims.feedback(design)),
         ]
+    (folder / "data").mkdir(parents=True, exist_ok=True)
+    for file, text in logs.items():
+        _write(folder / file, text)
     _write(folder / "submission.toml", "\n".join(sections))
     if notes is not None:
         _write(folder / "notes.md", notes)
 
 
-def _preset(name: str) -> Chain:
+def preset_chain(name: str) -> Chain:
+    """Return a preset by its name.
+
+    Raises
+    ------
+    ConfigError : there is no such preset.
+    """
     if name not in PRESETS:
         raise ConfigError(f"no preset {name!r}: there are {', '.join(PRESETS)}")
     return PRESETS[name]

@@ -1,18 +1,23 @@
 """The virtual bench: how the carts move in one run, and what the encoders say of it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pipeline.plant.chain import Array, Chain
+from pipeline.plant.effects import AugmentedChain, Term
 from pipeline.plant.loop import StateFeedback, simulate_loop
 from pipeline.plant.simulate import propagate, simulate_linear
+from pipeline.plant.tables import Cart
 from pipeline.results import Kind
 
 # A hand trembles by hundredths of a millimetre at these rates; it is not a clamp.
 _TREMOR_HZ = np.array([1.3, 4.1, 8.7])
 _TREMOR_AMPLITUDE = np.array([4e-3, 2e-3, 1e-3])  # of the distance the cart is held at
+_PULL_TIME = 1.5  # s a hand takes to pull a cart out, before the recorder starts
+_BEFORE_STOP = 0.9  # of the way to an end stop: no hand pulls a cart into it
+_FADE_STEPS = 10  # steps a sample in which the hand's force falls
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +75,10 @@ class Run:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Motion:
-    """What truly happened: the input (n,) and the positions (n_carts, n) from rest."""
+    """What truly happened: the input (n,) and the positions (n_carts, n) from the springs' rest.
+
+    Where a sensor has a scale of its own, positions are as it scales them.
+    """
 
     u: Array
     x: Array
@@ -82,6 +90,7 @@ class Bench:
 
     Attributes
     ----------
+    effects : what the plant does beyond the linear chain; without any nothing is compiled.
     sample_time : s, of the controller, the input and the log.
     count : the encoder step, position units.
     noise : standard deviation of what shakes a free cart's encoder, position units.
@@ -93,9 +102,17 @@ class Bench:
     count: float
     noise: float
     zero_error: float
+    effects: tuple[Term, ...] = ()
 
     def move(self, run: Run) -> Motion:
-        """Return how the carts move: the one place that knows the law of motion."""
+        """Return how the carts move: the one place that knows the law of motion.
+
+        Raises
+        ------
+        DataError : the effects make the carts run away.
+        """
+        if self.effects:
+            return self._move_with_effects(run)
         chain, x = self.chain, np.zeros((self.chain.n, run.t.size))
         rows = [cart - 1 for cart in run.free]
         if run.controller is not None and run.reference is not None:
@@ -116,6 +133,32 @@ class Bench:
         else:
             x[rows] = simulate_linear(chain, run.t, run.u, free=run.free)
         return Motion(u=run.u, x=x)
+
+    def _move_with_effects(self, run: Run) -> Motion:
+        from pipeline.plant.augmented import SteppedBench, simulate_augmented
+
+        model = AugmentedChain(chain=self.chain, terms=self.effects)
+        if run.controller is not None and run.reference is not None:
+            plant = SteppedBench(model, free=run.free)
+            rest = -plant.state[0::2]  # where the encoders are zeroed
+            loop = simulate_loop(
+                self.chain,
+                run.controller,
+                t=run.t,
+                reference=run.reference,
+                sample_time=self.sample_time,
+                input_limit=run.input_limit,
+                encoder_step=self.count,
+                rest=rest,
+                free=run.free,
+                plant=plant,
+            )
+            x = np.zeros((self.chain.n, run.t.size))
+            x[[cart - 1 for cart in run.free]] = loop.x
+            return Motion(u=loop.u, x=x)
+        if run.hand is not None:
+            return Motion(u=run.u, x=_release_with_effects(model, run, run.hand))
+        return Motion(u=run.u, x=simulate_augmented(model, run.t, run.u, free=run.free))
 
     def read(self, motion: Motion, *, run: Run, rng: np.random.Generator) -> Array:
         """Return the encoder readings (n_carts, n), whole counts in position units."""
@@ -148,3 +191,44 @@ def _release(chain: Chain, t: Array, hand: Hand, *, free: Sequence[int]) -> Arra
     force = stiffness * position * np.clip(1 - (t[start:] - t[start]) / hand.fade, 0.0, 1.0)
     x[:, start:] = C @ propagate(A, push, t[start:], force, x0=state, linear=True)
     return x
+
+
+def _release_with_effects(model: AugmentedChain, run: Run, hand: Hand) -> Array:
+    """Return the readings (n_carts, n) of a run with a hand in it, as `_release` does.
+
+    The hand pulls the cart out before the recorder starts, so friction and hidden masses are
+    where that leaves them; it then follows its tremor, and lets go as in the linear chain.
+    """
+    from pipeline.plant.augmented import SteppedBench
+
+    hand = _before_stop(hand, model)
+    bench, t, cart = SteppedBench(model, free=run.free), run.t, hand.cart
+    start = int(np.searchsorted(t, hand.release))
+    x = np.zeros((model.chain.n, t.size))
+    pull = np.linspace(0.0, np.pi, round(_PULL_TIME / float(t[1] - t[0])))
+    path = np.append(hand.hold(t[0])[0] * (1 - np.cos(pull)) / 2, hand.hold(t[: start + 1])[0])
+    for sample, position in enumerate(path, start=-pull.size):
+        bench.carry(cart, to=float(position), interval=float(t[1] - t[0]))
+        if sample >= 0:
+            x[:, sample] = bench.readings
+    force = bench.let_go(cart, velocity=float(hand.hold(t[start])[1]))
+    ramp = force * np.clip(1 - (t - t[start]) / hand.fade, 0.0, 1.0)
+    for sample in range(start, t.size - 1):
+        # Between the samples the force runs straight; each short step takes its mean.
+        steps = _FADE_STEPS if ramp[sample] != 0.0 else 1
+        for share in (np.arange(steps) + 0.5) / steps:
+            push = float((1 - share) * ramp[sample] + share * ramp[sample + 1])
+            bench.push(cart, push)
+            bench.step(0.0, following=0.0, interval=float(t[sample + 1] - t[sample]) / steps)
+            bench.push(cart, -push)
+        x[:, sample + 1] = bench.readings
+    return x
+
+
+def _before_stop(hand: Hand, model: AugmentedChain) -> Hand:
+    """Return a hand that holds its cart on the near side of the end stop, if there is one."""
+    row = model.tables()[0][hand.cart - 1]
+    stiff = row[Cart.STOP_STIFFNESS] > model.chain.stiffness[hand.cart - 1, hand.cart - 1]
+    furthest = _BEFORE_STOP * float(row[Cart.STOP])
+    beyond = hand.position * furthest > furthest**2
+    return replace(hand, position=furthest) if stiff and beyond else hand

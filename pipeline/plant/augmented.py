@@ -1,0 +1,292 @@
+"""Simulate the chain with effects: whole runs at once, or sample by sample under a controller.
+
+What the sensors read is what comes out, a sensor's own scale included. Importing this module
+compiles; the linear chain never needs it.
+"""
+
+from collections import deque
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import DataError
+from pipeline.plant import kernel
+from pipeline.plant.chain import Array
+from pipeline.plant.effects.base import AugmentedChain
+from pipeline.plant.tables import Cart, Drive, Spring, Tables
+
+_REFINE = 4.0  # divides the kernel's step: this is what others are judged by
+_LONGEST_STEP = 5e-4  # s, of the stepped bench
+_SERIES_REACH = 0.2  # omega h, as in the kernel
+_CONTACT_REACH = 0.4  # omega h inside a contact, as in the kernel
+_TO_REST = 40.0  # periods of the slowest motion, heavily damped: nothing is left of the start
+_DRY = [Cart.COULOMB, Cart.STATIC, Cart.LOAD, Cart.DAHL]
+_IN_HAND = 1e-30  # inverse mass of a carried cart: no force moves it, yet its friction is felt
+_RUN_AWAY = "with these effects the carts run away: a spring softens too much, or a force is huge"
+
+
+def simulate_augmented(
+    model: AugmentedChain,
+    t: Array,
+    u: Array,
+    *,
+    free: Sequence[int] | None = None,
+    x0: Array | None = None,
+) -> Array:
+    """Simulate one run that starts without velocity.
+
+    Parameters
+    ----------
+    t, u : (n,) s and input, held from sample to sample.
+    free : the carts free to move; default all. The others are held at zero.
+    x0 : (n_carts,) positions at the start; default where the carts rest.
+
+    Returns
+    -------
+    (n_carts, n) readings.
+
+    Raises
+    ------
+    DataError : the carts run away.
+    """
+    n = model.chain.n
+    free = _all(n) if free is None else free
+    x0 = rest_positions(model, free=free) if x0 is None else np.asarray(x0, dtype=np.float64)
+    return _simulate(model.tables(), t, u, free=free, x0=x0, refine=_REFINE)
+
+
+def rest_positions(model: AugmentedChain, *, free: Sequence[int] | None = None) -> Array:
+    """Return where the carts rest without input and without dry friction, (n_carts,).
+
+    They are let go at zero with their dampings so large that they creep to their rest. Carts that
+    no spring ties to a wall rest anywhere: zero.
+    """
+    cart, spring, drive = model.tables()
+    n = model.chain.n
+    if not (np.any(cart[:, Cart.OFFSET]) and model.chain.is_tied):
+        return np.zeros(n)
+    cart[:, _DRY] = 0.0
+    cart[:, Cart.GAIN] = 1.0
+    stiffness, m = model.chain.stiffness, model.chain.m
+    cart[:, Cart.DAMPING] = 2.0 * np.sqrt(np.diag(stiffness) * m)
+    slowest = np.sqrt(np.linalg.eigvals(stiffness / m[:, None]).real.min())
+    t = np.array([0.0, _TO_REST * 2 * np.pi / slowest])
+    free = _all(n) if free is None else free
+    tables, x0 = (cart, spring, drive), np.zeros(n)
+    return _simulate(tables, t, np.zeros(2), free=free, x0=x0, refine=1.0)[:, -1]
+
+
+def _simulate(
+    tables: Tables, t: Array, u: Array, *, free: Sequence[int], x0: Array, refine: float
+) -> Array:
+    n = x0.size
+    t = np.ascontiguousarray(t, dtype=np.float64)
+    cart, spring, drive = tables
+    y = kernel.simulate_batch(
+        cart[None],
+        spring[None],
+        drive[None],
+        x0[None, None],
+        np.zeros((1, 1, n)),
+        np.ones((1, n)),
+        np.isin(_all(n), free),
+        t,
+        t,
+        np.ascontiguousarray(u, dtype=np.float64),
+        np.array([0, t.size]),
+        refine,
+    )[0]
+    if not np.all(np.isfinite(y)):
+        raise DataError(_RUN_AWAY)
+    return y
+
+
+def _all(n: int) -> tuple[int, ...]:
+    return tuple(range(1, n + 1))
+
+
+class SteppedBench:
+    """A bench that moves on by one interval at a time and keeps all of its state.
+
+    Friction, contacts, hidden masses, the delay line and the drive's lag carry over from call to
+    call. A hand may carry a cart, let it go, and push.
+    """
+
+    def __init__(
+        self, model: AugmentedChain, *, free: Sequence[int] | None = None, x0: Array | None = None
+    ) -> None:
+        """Put the bench at rest at `x0` (n_carts,), default where the carts rest."""
+        n = model.chain.n
+        free = _all(n) if free is None else sorted(set(free))
+        x0 = rest_positions(model, free=free) if x0 is None else np.asarray(x0, dtype=np.float64)
+        self._cart, self._spring, self._drive = model.tables()
+        self._n, self._rows = n, [cart - 1 for cart in free]
+        self._free = np.isin(_all(n), free)
+        size = 2 * n + 1
+        self._state = np.zeros((kernel.ROWS, size))
+        self._K, self._C = np.zeros((size, size)), np.zeros((size, size))
+        self._N, self._motor, parents = kernel._assemble(
+            self._cart, self._spring, self._drive, self._free, self._state, self._K, self._C
+        )
+        self._inverse_mass = self._state[kernel.INV].copy()
+        self._state[kernel.X, :n] = np.where(self._free, x0, 0.0)
+        for i in range(n, self._N):
+            parent = 0 if i == self._motor else parents[i]
+            self._state[kernel.X, i] = self._state[kernel.X, parent]
+        self._step, self._contact_step = self._step_lengths()
+        self._switches = self._possible_switches()
+        self._active = np.zeros(self._switches.size, dtype=np.bool_)
+        self._close_contacts()
+        self._bend_presliding()
+        self._now = 0.0
+        self._inputs: deque[tuple[float, float]] = deque([(-np.inf, 0.0)])
+        self._lagged = 0.0
+
+    # ------------------------------------------------------------------ what it shows
+
+    @property
+    def readings(self) -> Array:
+        """What the sensors of all carts read, (n_carts,)."""
+        return self._cart[:, Cart.GAIN] * self._state[kernel.X, : self._n]
+
+    @property
+    def state(self) -> Array:
+        """State of the free carts as sensors would read it: (x1, v1, x2, v2, …), (2f,)."""
+        return (self._cart[:, Cart.GAIN] * self._state[: kernel.V + 1, : self._n])[
+            :, self._rows
+        ].T.ravel()
+
+    # ------------------------------------------------------------------ what moves it
+
+    def step(self, u: float, *, following: float, interval: float) -> None:
+        """Move on by `interval` s under the input `u`; `following` is the one that comes next.
+
+        The next input is needed where a drive leads its log (a negative delay).
+
+        Raises
+        ------
+        DataError : the carts run away, or the drive leads by more than the interval.
+        """
+        if -self._drive[Drive.DELAY] > interval * (1 + 1e-9):
+            raise DataError("in a closed loop the input cannot lead its log by over one sample")
+        self._inputs.append((self._now, self._shaped(u)))
+        upcoming = (self._now + interval, self._shaped(following))
+        braking = float(self._drive[Drive.DAMPING]) if u != 0.0 else 0.0
+        count = max(1, int(np.ceil(interval / self._step - 1e-9)))
+        h = interval / count
+        for sub in range(count):
+            start = self._now + sub * h
+            self._advance(self._force(start, start + h, upcoming), braking=braking, h=h)
+        self._now += interval
+        while len(self._inputs) > 1 and self._inputs[1][0] <= self._now - self._drive[Drive.DELAY]:
+            self._inputs.popleft()
+        if not np.all(np.abs(self._state[kernel.X]) < kernel._BLOWN_UP):
+            raise DataError(_RUN_AWAY)
+
+    def carry(self, cart: int, *, to: float, interval: float) -> None:
+        """Move one cart by hand to a position in `interval` s, the other free carts held."""
+        self._state[kernel.INV, self._rows] = _IN_HAND
+        self._state[kernel.V, self._rows] = 0.0
+        self._state[kernel.V, cart - 1] = (to - self._state[kernel.X, cart - 1]) / interval
+        self.step(0.0, following=0.0, interval=interval)
+
+    def let_go(self, cart: int, *, velocity: float) -> float:
+        """Free all carts again, this one at a velocity; returns the force that held its springs."""
+        self._state[kernel.INV] = self._inverse_mass
+        self._state[kernel.V, self._rows] = 0.0
+        self._state[kernel.V, cart - 1] = velocity
+        return -float(self._static_forces()[cart - 1])
+
+    def push(self, cart: int, force: float) -> None:
+        """Add a steady force on one cart, until it is taken off again."""
+        self._state[kernel.FIX, cart - 1] += force
+
+    # ------------------------------------------------------------------ inside
+
+    def _advance(self, force: float, *, braking: float, h: float) -> None:
+        kernel._advance(
+            self._cart,
+            self._spring,
+            self._drive,
+            self._n,
+            self._N,
+            self._motor,
+            self._state,
+            self._K,
+            self._C,
+            np.ones(self._n),
+            force,
+            braking,
+            h,
+            bool(np.any(self._cart[:, _DRY])),
+            False,  # smooth forces are looked for: a few more additions
+            self._switches,
+            self._active,
+            self._contact_step,
+        )
+
+    def _shaped(self, command: float) -> float:
+        """Return the input behind the dead zone and the saturation."""
+        past = max(abs(command) - self._drive[Drive.DEAD_ZONE], 0.0)
+        return float(np.sign(command) * min(past, self._drive[Drive.LIMIT]))
+
+    def _force(self, start: float, end: float, upcoming: tuple[float, float]) -> float:
+        """Return the mean of the delayed and lagged input from start to end, exactly."""
+        if self._lagged == 0.0 and upcoming[1] == 0.0 and not any(u for _, u in self._inputs):
+            return 0.0
+        delay = float(self._drive[Drive.DELAY])
+        inputs = [*self._inputs, upcoming, (np.inf, 0.0)]
+        mean = 0.0
+        for (since, value), (until, _) in pairwise(inputs):
+            overlap = min(end - delay, until) - max(start - delay, since)
+            mean += value * max(overlap, 0.0) / (end - start)
+        lag = float(self._drive[Drive.LAG])
+        if lag > 0.0:
+            decay = float(np.exp(-(end - start) / lag))
+            target, off = mean, self._lagged - mean
+            mean = target + off * lag / (end - start) * (1.0 - decay)
+            self._lagged = target + off * decay
+        return mean
+
+    def _static_forces(self) -> Array:
+        """Return the forces on all bodies but friction and the drive, as if they stood still."""
+        s = self._state
+        s[kernel.MID_X], s[kernel.MID_V], s[kernel.FORCE] = s[kernel.X], 0.0, s[kernel.FIX]
+        kernel._smooth_forces(self._cart, self._spring, self._n, s)
+        return s[kernel.FORCE] - self._K @ s[kernel.X]
+
+    def _close_contacts(self) -> None:
+        """Put the contacts that are closed from the start into the matrices."""
+        kinds = (self._cart, self._spring, self._drive, self._n, self._motor, self._state)
+        for e, which in enumerate(self._switches):
+            if kernel._guard(which, False, *kinds, 0.0) > 0.0:
+                self._active[e] = True
+                kernel._switch(which, 1.0, *kinds, self._K, self._C)
+
+    def _bend_presliding(self) -> None:
+        """Bend the presliding friction as far as it holds what acts on the carts at rest."""
+        net = self._static_forces()
+        for i in np.flatnonzero(self._cart[:, Cart.DAHL]):
+            self._state[kernel.Z, i] = np.clip(net[i] / self._cart[i, Cart.DAHL], -1.0, 1.0)
+
+    def _step_lengths(self) -> tuple[float, float]:
+        """Return the longest substep, and the longest inside a contact, s."""
+        inverse = self._inverse_mass[: self._N]
+        change = 1.0 + max(float(self._spring[:, Spring.CHANGE].max()), 0.0)
+        fastest = float(np.max(np.abs(self._K[: self._N, : self._N]).sum(1) * inverse)) * change
+        step = min(_LONGEST_STEP, _SERIES_REACH / np.sqrt(max(fastest, 1e-12)))
+        contact = float(np.max(self._cart[:, Cart.STOP_STIFFNESS] * inverse[: self._n]))
+        if self._motor >= 0:
+            both = float(inverse[0] + inverse[self._motor])
+            contact = max(contact, self._drive[Drive.CONTACT_STIFFNESS] * both)
+        return step, _CONTACT_REACH / np.sqrt(contact) if contact > 0.0 else step
+
+    def _possible_switches(self) -> NDArray[np.int64]:
+        """Return the kernel's numbers of the contacts and slack springs there are."""
+        n = self._n
+        stops = np.flatnonzero(self._cart[:, Cart.STOP_STIFFNESS])
+        slack = n + np.flatnonzero(self._spring[:, Spring.CHANGE])
+        gap = [2 * n + 1, 2 * n + 2] if self._motor >= 0 else []
+        return np.array([*stops, *slack, *gap], dtype=np.int64)

@@ -1,0 +1,330 @@
+"""What is hidden in a bench: effects named by the user, or the model that a `gap.json` found."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import ConfigError
+from pipeline.plant.chain import Chain
+from pipeline.plant.effects import CATALOGUE, Effect, Parameter, Term
+from pipeline.plant.effects.base import Scales, chain_scales
+from pipeline.plant.simulate import simulate_linear
+from pipeline.submission.complaints import nearest
+from pipeline.synthesis import COUNT, SAMPLE_TIME, preset_chain, write_submission
+
+_LARGE_STEP = 0.9  # of the travel, as in a session's larger steps
+_RING = 6.0  # periods of the slowest motion: the first swings are the largest
+_PER_CM = {"cm": 1.0, "mm": 10.0, "m": 0.01, "in": 1 / 2.54, "count": 1 / COUNT}
+_INPUT_LIMIT = 5.0  # input units
+_INPUT_RESERVE = 4.0  # times the input that holds a cart at its travel
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HiddenBench:
+    """A bench and what is hidden in it.
+
+    Attributes
+    ----------
+    name : of the preset or the model's file.
+    travel, count : how far the carts move and the encoder's step, position units.
+    told : one sentence for each effect, with its parameters; not for the submission.
+    """
+
+    chain: Chain
+    name: str
+    position_unit: str = "cm"
+    input_unit: str = "V"
+    travel: float = 1.0
+    count: float = COUNT
+    input_limit: float = _INPUT_LIMIT
+    effects: tuple[Term, ...] = ()
+    told: tuple[str, ...] = ()
+
+
+def prepare_bench(
+    *, preset: str | None = None, model: Path | None = None, hide: Sequence[str] = ()
+) -> HiddenBench:
+    """Return a preset, or the model of a `gap.json`, with further effects hidden in it.
+
+    Parameters
+    ----------
+    hide : each `EFFECT` or `EFFECT:key=value,…`; keys are `cart` or `spring` and the parameters
+        of the law. What is left out gets a size that shows.
+
+    Raises
+    ------
+    ConfigError : neither or both of preset and model, or what they or an effect say is wrong.
+    """
+    if (preset is None) == (model is None):
+        raise ConfigError("name a bench: either --preset or --model")
+    bench = (
+        _read_model(model)
+        if model is not None
+        else HiddenBench(chain=preset_chain(preset or ""), name=preset or "")
+    )
+    for text in hide:
+        term, given = _named_effect(text, bench)
+        _refuse_second(term, bench.effects, where=f"--hide {text}")
+        told = _told(term, bench, given=given)
+        bench = replace(bench, effects=(*bench.effects, term), told=(*bench.told, told))
+    return bench
+
+
+def write_bench(folder: Path, bench: HiddenBench, *, seed: int, reported: bool = False) -> None:
+    """Write the submission of students who measured this bench; nothing in it names an effect."""
+    write_submission(
+        folder,
+        chain=bench.chain,
+        effects=bench.effects,
+        seed=seed,
+        title=f"Simulated bench, {bench.name}, seed {seed}",
+        position_unit=bench.position_unit,
+        input_unit=bench.input_unit,
+        travel=bench.travel,
+        count=bench.count,
+        input_limit=bench.input_limit,
+        reported=reported,
+    )
+
+
+def default_values(effect: Effect, chain: Chain, *, place: int, travel: float) -> dict[str, float]:
+    """Return sizes at which the effect shows in a session: the middle ones a search would try."""
+    scales, side = _session_scales(effect, chain, place=place, travel=travel)
+    return {
+        p.name: float(f"{p.scale(scales) * p.trials[len(p.trials) // 2]:.3g}")
+        * (side if p.side else 1.0)
+        for p in effect.parameters
+    }
+
+
+# ---------------------------------------------------------------- named by the user
+
+
+def _named_effect(text: str, bench: HiddenBench) -> tuple[Term, frozenset[str]]:
+    """Return the effect of one `--hide`, and which parameters it gives."""
+    where = f"--hide {text}"
+    key, _, assignments = text.partition(":")
+    effect = _effect(key.strip(), where=where)
+    places = () if effect.place == "input" else (effect.place,)
+    given: dict[str, float] = {}
+    for assignment in filter(None, (part.strip() for part in assignments.split(","))):
+        name, equals, value = (part.strip() for part in assignment.partition("="))
+        if name not in (*places, *effect.names):
+            known = nearest(name, [*places, *effect.names])
+            raise ConfigError(f"{where}: {effect.key} has no {name!r}{known}")
+        if name in given:
+            raise ConfigError(f"{where}: {name} is given twice")
+        if not equals:
+            raise ConfigError(f"{where}: write {name}=VALUE")
+        given[name] = _number(value, where=f"{where}: {name}")
+    place = _place(effect, bench.chain, given.pop(effect.place, None), where=where)
+    for parameter in effect.parameters:
+        if parameter.name in given:
+            _refuse_impossible(parameter, given[parameter.name], where=where)
+    values = default_values(effect, bench.chain, place=place, travel=bench.travel) | given
+    _refuse_weak_hold(effect, values, where=where)
+    return _term(effect, place, values), frozenset(given)
+
+
+def _effect(key: str, *, where: str) -> Effect:
+    for effect in CATALOGUE:
+        if effect.key == key:
+            return effect
+    raise ConfigError(f"{where}: no effect {key!r}{nearest(key, [e.key for e in CATALOGUE])}")
+
+
+def _number(text: str, *, where: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ConfigError(f"{where} needs a number, found {text!r}")
+    return value
+
+
+def _term(effect: Effect, place: int, values: Mapping[str, float]) -> Term:
+    return Term(effect=effect, place=place, values=tuple(values[name] for name in effect.names))
+
+
+def _place(effect: Effect, chain: Chain, at: float | None, *, where: str) -> int:
+    """Return the cart or spring, or the usual one: cart 1, spring 2, or the only one there is.
+
+    Any that exists will do, also where no data could tell the effect from the linear chain.
+    """
+    if effect.place == "input":
+        return 0
+    if effect.place == "cart":
+        places = list(range(1, chain.n + 1))
+    else:
+        places = [j for j, k in enumerate(chain.k, start=1) if k > 0]
+    if at is None:
+        usual = 2 if effect.place == "spring" else 1
+        return usual if usual in places else places[0]
+    if at not in places:
+        there = ", ".join(map(str, places))
+        raise ConfigError(
+            f"{where}: no {effect.place} {at:g} on this bench; there is {effect.place} {there}"
+        )
+    return int(at)
+
+
+def _is_hard_to_tell(term: Term, chain: Chain) -> bool:
+    return term.place not in term.effect.places(tuple(bool(k > 0) for k in chain.k))
+
+
+def _refuse_impossible(parameter: Parameter, value: float, *, where: str) -> None:
+    """Refuse a size the law has no meaning for."""
+    if parameter.signed or parameter.side:
+        return
+    if value < parameter.lower or (value == 0.0 and parameter.neutral != 0.0):
+        least = "positive" if parameter.neutral != 0.0 else f"at least {parameter.lower:g}"
+        raise ConfigError(f"{where}: {parameter.name} must be {least}")
+
+
+def _refuse_weak_hold(effect: Effect, values: Mapping[str, float], *, where: str) -> None:
+    """Refuse friction that holds a cart at rest with less than it drags it in motion."""
+    held, sliding = values.get("static_force"), values.get("force")
+    if held is not None and sliding is not None and held < sliding:
+        raise ConfigError(
+            f"{where}: {effect.key} holds with static_force {held:g}, which is below the sliding "
+            f"force {sliding:g}"
+        )
+
+
+def _refuse_second(term: Term, present: Sequence[Term], *, where: str) -> None:
+    """Refuse an effect where the same, or another of its family, is already hidden."""
+    for other in present:
+        related = other.effect.family and other.effect.family == term.effect.family
+        if other.place == term.place and (other.effect is term.effect or related):
+            raise ConfigError(
+                f"{where}: {_at(other) or 'the input'} already has {other.effect.key}"
+            )
+
+
+def _session_scales(
+    effect: Effect, chain: Chain, *, place: int, travel: float
+) -> tuple[Scales, float]:
+    """Return typical sizes at a place from a session's larger step, and the side it goes to."""
+    u = _LARGE_STEP * travel / float(np.max(np.abs(chain.static_gains())))
+    slowest = float(np.abs(chain.poles).min())
+    t = SAMPLE_TIME * np.arange(max(2.0, _RING * 2 * np.pi / (slowest * SAMPLE_TIME)))
+    # The larger step of a session goes to the negative side.
+    x = simulate_linear(chain, t, np.full(t.size, -u))
+    if effect.place == "spring":
+        walls = np.zeros((1, t.size))
+        x = np.diff(np.concatenate([walls, x, walls]), axis=0)
+    extreme = x[np.arange(x.shape[0]), np.argmax(np.abs(x), axis=1)]
+    scales = chain_scales(
+        chain,
+        place=effect.place,
+        at=place,
+        position=np.abs(extreme),
+        velocity=np.max(np.abs(np.diff(x, axis=1)), axis=1) / SAMPLE_TIME,
+        input=u,
+        sample_time=SAMPLE_TIME,
+    )
+    return scales, float(np.sign(extreme[max(place - 1, 0)]))
+
+
+def _at(term: Term) -> str:
+    return f"{term.effect.place} {term.place}" if term.place else ""
+
+
+def _told(term: Term, bench: HiddenBench, *, given: frozenset[str] | None = None) -> str:
+    """Return the effect with its place and parameters in one sentence."""
+    sizes = []
+    for parameter, value in zip(term.effect.parameters, term.values, strict=True):
+        unit = parameter.unit_text(position=bench.position_unit, input=bench.input_unit)
+        note = "" if given is None or parameter.name in given else "(default)"
+        sizes.append(" ".join(filter(None, [parameter.name, f"{value:.4g}", unit, note])))
+    place = f" on {_at(term)}" if term.place else ""
+    doubt = "; here the linear chain can do the same" if _is_hard_to_tell(term, bench.chain) else ""
+    return f"{term.effect.key}{place}: {', '.join(sizes)}{doubt}"
+
+
+# ---------------------------------------------------------------- read from a file
+
+
+def _read_model(path: Path) -> HiddenBench:
+    """Read the model of a `gap.json`: a chain, and the effects that act on it."""
+    where = f"--model {path}"
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, ValueError) as error:
+        raise ConfigError(f"{where}: no JSON: {error}") from None
+    except OSError as error:
+        raise ConfigError(f"{where}: {error.strerror}") from None
+    document = _mapping(document, where=where)
+    model = _mapping(document.get("model", document), where=f"{where}: model")
+    chain = _chain(model.get("chain"), where=f"{where}: chain")
+    units = _mapping(document.get("units", {}), where=f"{where}: units")
+    position, drive = str(units.get("position", "cm")), str(units.get("input", "V"))
+    per_cm = _PER_CM.get(position, 1.0)
+    hold = per_cm / float(np.max(np.abs(chain.static_gains())))
+    bench = HiddenBench(
+        chain=chain,
+        name=path.name,
+        position_unit=position,
+        input_unit=drive,
+        travel=per_cm,
+        count=COUNT * per_cm,
+        input_limit=max(_INPUT_LIMIT, float(f"{_INPUT_RESERVE * hold:.2g}")),
+    )
+    effects = model.get("effects", [])
+    if not isinstance(effects, list):
+        raise ConfigError(f"{where}: effects must be a list")
+    for number, entry in enumerate(effects, start=1):
+        term = _stored_effect(entry, bench, where=f"{where}: effects[{number}]")
+        _refuse_second(term, bench.effects, where=f"{where}: effects[{number}]")
+        told = (*bench.told, _told(term, bench))
+        bench = replace(bench, effects=(*bench.effects, term), told=told)
+    return bench
+
+
+def _chain(entry: object, *, where: str) -> Chain:
+    fields = _mapping(entry, where=where)
+    try:
+        chain = Chain(m=fields["m"], c=fields["c"], k=fields["k"])
+    except (KeyError, TypeError, ValueError) as error:
+        reason = f"needs {error}" if isinstance(error, KeyError) else error
+        raise ConfigError(f"{where}: {reason}") from None
+    numbers = np.concatenate([chain.m, chain.c, chain.k])
+    if not (np.all(np.isfinite(numbers)) and np.all(chain.m > 0) and np.all(numbers >= 0)):
+        raise ConfigError(f"{where}: m must be positive, c and k at least zero")
+    return chain
+
+
+def _stored_effect(entry: object, bench: HiddenBench, *, where: str) -> Term:
+    """Return one effect; parameter values are numbers, or objects with a `value`.
+
+    Details of a contact that are not in the file get their usual size.
+    """
+    fields = _mapping(entry, where=where)
+    effect = _effect(str(fields.get("effect")), where=where)
+    stored = _mapping(fields.get("parameters"), where=f"{where}.parameters")
+    stored = {**stored, **_mapping(fields.get("details", {}), where=f"{where}.details")}
+    values: dict[str, float] = {}
+    for name, value in stored.items():
+        number = value.get("value") if isinstance(value, dict) else value
+        values[name] = _number(str(number), where=f"{where}.parameters.{name}")
+    if unknown := [name for name in values if name not in effect.names]:
+        known = nearest(unknown[0], effect.names)
+        raise ConfigError(f"{where}: {effect.key} has no {unknown[0]!r}{known}")
+    if missing := [p.name for p in effect.parameters if p.reported and p.name not in values]:
+        raise ConfigError(f"{where}: {effect.key} needs {missing[0]}")
+    at = _mapping(fields.get("where", {}), where=f"{where}.where").get(effect.place, 0)
+    place = _place(effect, bench.chain, _number(str(at), where=f"{where}.where"), where=where)
+    usual = default_values(effect, bench.chain, place=place, travel=bench.travel)
+    return _term(effect, place, usual | values)
+
+
+def _mapping(value: object, *, where: str) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise ConfigError(f"{where}: missing, or no JSON object")
+    return value
