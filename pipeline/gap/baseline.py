@@ -5,7 +5,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.gap.fit import Fit, Mapper, fit_model, fresh_locals, simulate_run
+from pipeline.gap.fit import (
+    Fit,
+    Locals,
+    Mapper,
+    fit_model,
+    fresh_locals,
+    restart_runs,
+    simulate_run,
+)
 from pipeline.gap.runs import Run, cut_shots, high_frequency_noise
 from pipeline.gap.structure import Structure
 from pipeline.plant.chain import Array, Chain
@@ -127,14 +135,21 @@ def measure_noise(fit: Fit, shots: Sequence[Run], runs: Sequence[Run]) -> list[R
 
 def fit_locals(fit: Fit, runs: Sequence[Run], *, refine: float = 1.0, mapper: Mapper = map) -> Fit:
     """Fit only what belongs to the runs: for runs the model has not seen."""
-    return fit_model(
-        fit.structure,
-        fit.theta,
-        runs,
-        locals_=[fresh_locals(run) for run in runs],
-        spread=fit.spread,
-        fixed=range(fit.theta.size),
-        iterations=10,
-        refine=refine,
-        mapper=mapper,
-    )
+    own: Sequence[Locals] = [fresh_locals(run) for run in runs]
+    for _ in range(2):
+        found = fit_model(
+            fit.structure,
+            fit.theta,
+            runs,
+            locals_=own,
+            spread=fit.spread,
+            fixed=range(fit.theta.size),
+            iterations=10,
+            refine=refine,
+            mapper=mapper,
+        )
+        if not any(fit.structure.dry) or found.chi < fit.chi:
+            break
+        found = restart_runs(found, runs, refine=refine, mapper=mapper)
+        own = found.locals_
+    return found

@@ -18,6 +18,7 @@ from pipeline.gap.runs import Run
 from pipeline.gap.structure import Structure
 from pipeline.plant.chain import Array
 from pipeline.plant.kernel import simulate_batch
+from pipeline.plant.tables import Cart
 
 Mapper = Callable[..., Iterable]
 
@@ -26,6 +27,8 @@ _SCATTER_FLOOR, _SCATTER_TOP = 0.004, 0.2
 _SCATTER_PRIOR = (3.0, 0.04)  # weight in runs, and spread, of the prior on that spread
 _LOCAL_STEP = 1e-3  # of the run's swing, for derivatives with respect to start states
 _LOCAL_SCALES = (1.0, 0.3, 0.05)  # of a run's own step, where the whole one raises its cost
+_BAD_RUN, _BAD_SHARE = 1.5, 2.0  # chi-square, or share of the median run's, to start a run anew
+_RESTARTS = ((0.8, 1.0), (-0.8, 1.0), (1.6, 1.0), (-1.6, 1.0), (0.0, 0.94), (0.0, 1.06))
 _ANCHOR = 1e6  # standard errors per unit of log mass
 _DAMP, _RELAX, _STIFFEN = 1e-3, 6.0, 6.0
 
@@ -521,6 +524,74 @@ def _learn_spread(fit: Fit, runs: Sequence[Run], linear: Sequence[_Linear]) -> F
             total += (factors[r, i] - 1.0) ** 2 + variance
         spread[i] = np.clip(np.sqrt(total / (len(there) + weight)), _SCATTER_FLOOR, _SCATTER_TOP)
     return replace(fit, spread=spread, theta=theta)
+
+
+def restart_runs(
+    fit: Fit, runs: Sequence[Run], *, refine: float = 1.0, mapper: Mapper = map
+) -> Fit:
+    """Start the worst runs' own unknowns anew from elsewhere in the friction band.
+
+    A cart rests anywhere inside the band, and is zeroed there, so a run's misfit has several
+    valleys in zero and friction. Shared parameters stay.
+    """
+    if not any(fit.structure.dry):
+        return fit
+    worst = fit.run_chi > max(_BAD_RUN, _BAD_SHARE * float(np.median(fit.run_chi)))
+    band = _rest_band(fit)
+    rest = np.array(fit.structure.dry)
+
+    def again(job: tuple[Run, Locals, bool, float]) -> Locals:
+        run, own, bad, chi = job
+        if not bad:
+            return own
+        free = np.array(run.free)
+        best, lowest = own, chi * _residual_points(run)
+        for shift, factor in _RESTARTS:
+            move = np.where(free, shift * band, 0.0)
+            start = Locals(
+                x0=own.x0 - move if run.at_rest else own.x0,
+                v0=own.v0,
+                zero=np.where(free, run.zero, 0.0) + move,
+                scatter=np.where(rest & free, factor, 1.0),
+            )
+            trial = fit_model(
+                fit.structure,
+                fit.theta,
+                [run],
+                locals_=[start],
+                spread=fit.spread,
+                fixed=range(fit.theta.size),
+                iterations=6,
+                refine=refine,
+            )
+            if trial.chi_square < lowest:
+                best, lowest = trial.locals_[0], trial.chi_square
+        return best
+
+    jobs = zip(runs, fit.locals_, worst, fit.run_chi, strict=True)
+    locals_ = tuple(mapper(again, jobs))
+    inflate = max(1.0, float(np.sqrt(fit.chi)))
+    return evaluate(
+        fit.structure,
+        fit.theta,
+        runs,
+        locals_,
+        spread=fit.spread,
+        inflate=inflate,
+        refine=refine,
+        mapper=mapper,
+    )
+
+
+def _rest_band(fit: Fit) -> Array:
+    """Return (n,) how far from equilibrium dry friction may leave each cart, about one sigma."""
+    chain = fit.structure.chain(fit.theta)
+    cart = fit.structure.tables(fit.theta[None])[0][0]
+    force = cart[:, Cart.COULOMB] + cart[:, Cart.STATIC] + cart[:, Cart.DAHL]
+    if not np.any(chain.k > 0):
+        return np.zeros(chain.n)
+    compliance = np.abs(np.linalg.pinv(chain.stiffness))
+    return np.sqrt(((0.5 * compliance * force) ** 2).sum(axis=1))
 
 
 def project(

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from pipeline.gap.baseline import SHOT_LENGTH, fit_locals
-from pipeline.gap.fit import Fit, Mapper, fit_model, simulate_run
+from pipeline.gap.fit import Fit, Mapper, fit_model, restart_runs, simulate_run
 from pipeline.gap.runs import Run, cut_shots
 from pipeline.gap.screen import Suspect, candidates_at, extend, screen, zoom
 from pipeline.gap.structure import Candidate, Structure
@@ -25,6 +25,7 @@ _HOPELESS = 30.0  # a hypothesis with this many times the best one's chi-square 
 _DEPTH = len(_BEAM)
 _BIC_DROP = 20.0
 _THINNING = 10.0  # neighbouring residuals are not independent: N / 10 count
+_FRICTION_ROUNDS = 2  # of run-by-run friction, the worst runs started anew before each
 _HELD_OUT_GAIN = 0.95  # an effect must lower the held-out error by this factor …
 _CONTACT_GAIN = 0.5  # what a contact leaves is its contact law: no effect to mop it up
 _RUN_GAIN, _RUN_SHARE = 0.97, 0.6  # … and by 3 % in 60 % of the runs
@@ -215,12 +216,16 @@ def fit_whole(structure: Structure, theta: Array, bench: Bench, *, refine: float
         refine=refine,
         mapper=bench.mapper,
     )
-    if dry and fit.chi > AT_FLOOR:
+    for _ in range(_FRICTION_ROUNDS):
+        if not dry or fit.chi < AT_FLOOR:
+            break
+        fit = restart_runs(fit, whole, refine=refine, mapper=bench.mapper)
         fit = fit_model(
             structure,
             fit.theta,
             whole,
             locals_=fit.locals_,
+            spread=fit.spread,
             iterations=12,
             learn_spread=True,
             refine=refine,
