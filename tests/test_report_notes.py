@@ -117,3 +117,17 @@ def test_any_text_gives_a_page_without_foreign_tags(markdown):
     names = set(re.findall(r"<\s*/?\s*([a-zA-Z][\w-]*)", html))
     ours = "section h2 h3 h4 h5 h6 p ul ol li em strong code pre blockquote a div table thead tbody"
     assert names <= {*ours.split(), "tr", "th", "td", "main", "footer", "body", "html"}
+
+
+@pytest.mark.parametrize("nest", ["> " * 20, "> " * 90, "- " * 40, "1. " * 30])
+def test_deep_nesting_is_set_flat(nest):
+    """However deep a quotation or list is nested, both the page and the PDF can be made."""
+    blocks = note_blocks(f"{nest}deep")
+    assert "deep" in str(blocks)
+    assert str(blocks).count("kind='quote'") <= 6
+
+
+@pytest.mark.parametrize("nest", ["> " * 3000, "*" * 5000 + "x" + "*" * 5000, "[" * 3000])
+def test_nesting_beyond_sense_is_survived(nest):
+    """What only a machine would write does not end in a crash."""
+    assert isinstance(note_blocks(nest), tuple)

@@ -24,22 +24,30 @@ from pipeline.report.words import clean
 
 _DEEPEST_HEADING = 6
 _TOP_HEADING = 3  # the report's own headings are above
+_DEEPEST_READ = 200  # levels; the parser leaves out what is nested further
+_DEEPEST_NESTING = 6  # lists and quotations further in are set flat: nobody reads them, and a page
+# has no room for them
 _SCHEMES = ("http", "https", "mailto")
 _ALIGN = {"text-align:center": "c", "text-align:right": "r"}
 
 
 def note_blocks(markdown: str) -> tuple[Block, ...]:
-    """Return Markdown as blocks of inert text."""
-    parser = MarkdownIt("commonmark", {"html": False}).enable("table")
-    tree = SyntaxTreeNode(parser.parse(clean(markdown)))
-    return _blocks(tree)
+    """Return Markdown as blocks of inert text; nested beyond sense, it is shown as written."""
+    text = clean(markdown)
+    parser = MarkdownIt("commonmark", {"html": False, "maxNesting": _DEEPEST_READ}).enable("table")
+    try:
+        return _blocks(SyntaxTreeNode(parser.parse(text)))
+    except RecursionError:
+        return (Code(text),)
 
 
-def _blocks(node: SyntaxTreeNode) -> tuple[Block, ...]:
-    return tuple(block for child in node.children for block in _block(child))
+def _blocks(node: SyntaxTreeNode, depth: int = 0) -> tuple[Block, ...]:
+    return tuple(block for child in node.children for block in _block(child, depth))
 
 
-def _block(node: SyntaxTreeNode) -> list[Block]:
+def _block(node: SyntaxTreeNode, depth: int) -> list[Block]:
+    if depth >= _DEEPEST_NESTING and node.type in ("bullet_list", "ordered_list", "blockquote"):
+        return [Paragraph((Span(_plain(node)),))]
     match node.type:
         case "heading":
             level = min(int(node.tag[1]) + _TOP_HEADING - 1, _DEEPEST_HEADING)
@@ -47,16 +55,21 @@ def _block(node: SyntaxTreeNode) -> list[Block]:
         case "paragraph":
             return [Paragraph(_inline(node))]
         case "bullet_list" | "ordered_list":
-            items = tuple(_blocks(item) for item in node.children)
+            items = tuple(_blocks(item, depth + 1) for item in node.children)
             return [Items(items, ordered=node.type == "ordered_list")]
         case "blockquote":
-            return [Quote(_blocks(node))]
+            return [Quote(_blocks(node, depth + 1))]
         case "fence" | "code_block":
             return [Code(node.content.rstrip("\n"))]
         case "table":
             return [_table(node)]
         case _:  # a rule between paragraphs says nothing here
             return []
+
+
+def _plain(node: SyntaxTreeNode) -> str:
+    """Return all text below a node, without a call per level: there may be a thousand."""
+    return " ".join(n.content for n in node.walk() if n.type in ("text", "code_inline", "fence"))
 
 
 def _table(node: SyntaxTreeNode) -> Table:

@@ -69,9 +69,9 @@ class Design(_Model):
     cart: int = 1
     reference: Finite = 1.0
     overshoot_percent: Annotated[float, Field(ge=0, lt=100)] = 10.0
-    settling_time: Positive = 1.0
+    settling_time: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)] = 1.0  # s
     input_limit: Positive | None = None
-    sample_time: Positive | None = None
+    sample_time: Annotated[float, Field(ge=1e-4, le=1, allow_inf_nan=False)] | None = None  # s
     method: Literal["poles", "lqr"] = "lqr"
 
 

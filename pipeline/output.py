@@ -1,0 +1,47 @@
+"""Writing results: whole files or none, and never through a link that a submission brought."""
+
+from pathlib import Path
+
+from pipeline.errors import ConfigError
+
+
+def check_folder(out: Path) -> Path:
+    """Return the folder, there or not yet.
+
+    Raises
+    ------
+    ConfigError : something else is in its place.
+    """
+    if out.exists() and not out.is_dir():
+        raise ConfigError(f"{out}: is a file; name a folder with --out")
+    return out
+
+
+def own_folder(parent: Path, name: str) -> Path:
+    """Return a folder of ours inside another, there or not yet.
+
+    Raises
+    ------
+    ConfigError : a file or a link is in its place; what a link points at may be anybody's.
+    """
+    folder = parent / name
+    if folder.is_symlink():
+        raise ConfigError(f"{folder}: is a link; name another folder with --out")
+    return check_folder(folder)
+
+
+def write_file(path: Path, content: str | bytes) -> None:
+    """Write a file whole or not at all; a link in its place is replaced, not followed."""
+    raw = content.encode() if isinstance(content, str) else content
+    part = path.with_name(f".{path.name}.part")
+    part.unlink(missing_ok=True)  # left by a run that was stopped
+    with part.open("xb") as file:
+        file.write(raw)
+    part.replace(path)
+
+
+def clear_files(folder: Path, pattern: str) -> None:
+    """Remove what an earlier run wrote, so that nothing stale stands beside the new."""
+    for path in folder.glob(pattern):
+        if path.is_file() or path.is_symlink():
+            path.unlink()
