@@ -78,6 +78,9 @@ def test_report_prints_json_on_stdout(tmp_path):
         (["simulate", "--preset", "throne-9dof", "--out", "x"], "throne-3dof"),
         (["report", str(EXAMPLES / "one-cart"), "--out", "blocked"], "is a file"),
         (["new", "blocked", "--carts", "2"], "blocked"),
+        (["new", "team", "--carts", "9"], "--carts"),
+        (["report"], "DIR"),
+        (["rport"], "rport"),
     ],
 )
 def test_what_cannot_run_is_one_line_and_status_two(tmp_path, arguments, expected):
