@@ -106,7 +106,7 @@ def outcome(truth: list, found: list, listed: set, verdict: str, baseline: float
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Confusion matrix of the gap workflow.")
     parser.add_argument("suite", choices=SUITES)
     parser.add_argument("--count", type=int, default=48)
     parser.add_argument("--start", type=int, default=0)

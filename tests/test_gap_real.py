@@ -20,7 +20,7 @@ def ecp_record(path: Path, *, column: int, kind: str) -> Record:
     lines = [line.strip(" [];\n") for line in path.read_text().splitlines()]
     rows = np.array([line.split() for line in lines if line and line[0].isdigit()], dtype=float)
     # Stamps are rounded to a millisecond: the clock itself is even.
-    t = np.polyval(np.polyfit(rows[:, 0], rows[:, 1], 1), rows[:, 0])
+    t = np.asarray(np.polyval(np.polyfit(rows[:, 0], rows[:, 1], 1), rows[:, 0]), dtype=np.float64)
     return Record(
         id=path.stem,
         kind="step" if kind == "step" else "decay",
@@ -73,7 +73,7 @@ def test_silverbox_has_a_hardening_spring(real_data):
         return Record(
             id=name,
             kind="sweep",
-            t=np.arange(count) * interval,
+            t=np.asarray(np.arange(count) * interval, dtype=np.float64),
             u=u[part],
             y=y[None, part],
             carts=(1,),

@@ -136,8 +136,9 @@ def measure_noise(fit: Fit, shots: Sequence[Run], runs: Sequence[Run]) -> list[R
 def fit_locals(fit: Fit, runs: Sequence[Run], *, refine: float = 1.0, mapper: Mapper = map) -> Fit:
     """Fit only what belongs to the runs: for runs the model has not seen."""
     own: Sequence[Locals] = [fresh_locals(run) for run in runs]
-    for _ in range(2):
-        found = fit_model(
+
+    def follow(own: Sequence[Locals]) -> Fit:
+        return fit_model(
             fit.structure,
             fit.theta,
             runs,
@@ -148,8 +149,9 @@ def fit_locals(fit: Fit, runs: Sequence[Run], *, refine: float = 1.0, mapper: Ma
             refine=refine,
             mapper=mapper,
         )
-        if not any(fit.structure.dry) or found.chi < fit.chi:
-            break
-        found = restart_runs(found, runs, refine=refine, mapper=mapper)
-        own = found.locals_
+
+    found = follow(own)
+    if any(fit.structure.dry) and found.chi > fit.chi:
+        again = restart_runs(found, runs, refine=refine, mapper=mapper)
+        found = follow(again.locals_)
     return found

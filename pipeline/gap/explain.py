@@ -31,7 +31,7 @@ from pipeline.results import Record
 
 _LAST_SHARE = 0.4  # of a single run is held out
 _MOST_DWELLS = 4  # sine dwells used; they say little beyond their frequency
-_NOISE_ROUNDS, _TOO_GOOD = 3, 0.7  # chi-square per point no fit to true noise falls to
+_NOISE_ROUNDS, _TOO_GOOD = 2, 0.7  # chi-square per point no fit to true noise falls to
 _LEAST_MOTION = 8.0  # encoder steps
 _WINDOW = 0.5  # s; a chain without springs drifts, so it is judged over windows
 _CLOSE_ERROR, _CLOSE_GAIN, _CLOSE_BIC = 1.15, 0.10, 40.0
@@ -79,23 +79,20 @@ def explain_gap(
             mapper=pool.map,
             tell=tell,
         )
+        chosen, found = _investigate(fit, bench)
         for _ in range(_NOISE_ROUNDS):
-            baseline = judge(fit, bench)
-            found = [baseline]
-            chosen = baseline
-            if not baseline.at_floor:
-                tell(f"linear model: error {baseline.error:.1%} of the motion on held-out runs")
-                found = search(baseline, bench)
-                chosen = prune(choose(found, baseline), bench)
             if chosen.fit.chi > _TOO_GOOD:
                 break
             # Less is left than was taken for noise: the misfit of the linear model was in it.
             bench = _quieter(bench, chosen)
             fit = fit_model(fit.structure, fit.theta, bench.training, mapper=pool.map)
+            chosen, found = _investigate(fit, bench)
         path = _path(chosen, found, bench)
         chosen, path, bench = _with_offset(chosen, path, bench)
         final = covariance(chosen.fit, bench.training, mapper=pool.map)
     floor = _pooled_floor(bench.held_out)
+    if chosen.key and chosen.error > _REFUSED_FLOOR * floor:
+        notes.append(f"{chosen.error / floor:.1f} times the noise is left: something small remains")
     sample_time = max(run.record.sample_time for run in bench.training)
     verdict, close = _verdict(chosen, path[0], found, floor=floor, sample_time=sample_time)
     effects = _effects(path, final, found, position_unit=position_unit, input_unit=input_unit)
@@ -210,6 +207,16 @@ def _with_noise(run: Run, sigma: dict[int, float]) -> Run:
 
 
 # -------------------------------------------------------------------- the hypotheses
+
+
+def _investigate(fit: Fit, bench: Bench) -> tuple[Hypothesis, list[Hypothesis]]:
+    """Return the hypothesis chosen and all that were judged, the linear one first."""
+    baseline = judge(fit, bench)
+    if baseline.at_floor:
+        return baseline, [baseline]
+    bench.tell(f"linear model: error {baseline.error:.1%} of the motion on held-out runs")
+    found = search(baseline, bench)
+    return prune(choose(found, baseline), bench), found
 
 
 def _path(chosen: Hypothesis, found: Sequence[Hypothesis], bench: Bench) -> tuple[Hypothesis, ...]:

@@ -168,6 +168,12 @@ def _residual_points(run: Run) -> int:
     return int(len(run.rows) * (np.diff(run.shots) // run.block).sum())
 
 
+def _triangle(matrix: Array) -> Array:
+    """Return R of the QR factorisation of one matrix or a stack of them."""
+    R: Array = np.linalg.qr(matrix, mode="r")  # pyright: ignore[reportAssignmentType]
+    return R
+
+
 def _linearise(
     structure: Structure,
     theta: Array,
@@ -211,9 +217,11 @@ def _linearise(
         g[lane, i] += 1e-3
         lane += 1
     base = structure.tables(thetas[: P + 1])
-    tables = [np.concatenate([a, np.repeat(a[:1], b - P - 1, axis=0)]) for a in base]
+    cart, spring, drive = (np.concatenate([a, np.repeat(a[:1], b - P - 1, axis=0)]) for a in base)
     y = simulate_batch(
-        *tables,
+        cart,
+        spring,
+        drive,
         x0,
         v0,
         g,
@@ -251,7 +259,7 @@ def _linearise(
         prior[:, j, j] = weight * inflate * 1e-1
         if j >= lanes_x and not layout.first_v0:
             prior[0, j, j] = weight * 1e6
-    R = np.linalg.qr(np.concatenate([matrix, prior], axis=1), mode="r")
+    R = _triangle(np.concatenate([matrix, prior], axis=1))
     rest = R[:, lanes_s:, lanes_s:].reshape(-1, R.shape[-1] - lanes_s)
     lanes_o = lanes_g + len(layout.zero)
     own_prior = np.zeros((lanes_o, rest.shape[-1]))
@@ -261,7 +269,7 @@ def _linearise(
     for j, i in enumerate(layout.zero, start=lanes_g):
         own_prior[j, j] = inflate / run.zero_std[i]
         own_prior[j, -1] = (run.zero[i] - own.zero[i]) * own_prior[j, j]
-    own_R = np.linalg.qr(np.concatenate([rest, own_prior]), mode="r")
+    own_R = _triangle(np.concatenate([rest, own_prior]))
     return _Linear(
         reduced=own_R[lanes_o:, lanes_o:], own=own_R[:lanes_o], shots=R[:, :lanes_s], layout=layout
     )
@@ -418,7 +426,7 @@ def fit_model(
         # At a bound, with the step pointing outward, a parameter stays.
         delta = np.zeros(theta.size)
         active = moving
-        accepted = False
+        accepted: Fit | None = None
         for _attempt in range(5):
             delta[:] = 0.0
             active = moving
@@ -475,14 +483,14 @@ def fit_model(
                 inflate=inflate,
             )
             if trial.cost < best.cost:
-                accepted = True
+                accepted = trial
                 break
             damp *= _STIFFEN
             damp = max(damp, 1e-3)
-        if not accepted:
+        if accepted is None:
             break
-        fall = (best.cost - trial.cost) / best.cost
-        best = trial
+        fall = (best.cost - accepted.cost) / best.cost
+        best = accepted
         damp = max(damp / _RELAX, 1e-9)
         if learn_spread and iteration >= 1:
             best = _learn_spread(best, runs, linear)
@@ -624,7 +632,7 @@ def project(
         )
 
     linear = list(mapper(linearise, zip(runs, fit.locals_, extras, strict=True)))
-    R = np.linalg.qr(np.concatenate([part.reduced for part in linear]), mode="r")
+    R = _triangle(np.concatenate([part.reduced for part in linear]))
     shared = fit.theta.size
     return R[shared:, shared:-1], R[shared:, -1]
 

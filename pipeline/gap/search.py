@@ -26,6 +26,7 @@ _DEPTH = len(_BEAM)
 _BIC_DROP = 20.0
 _THINNING = 10.0  # neighbouring residuals are not independent: N / 10 count
 _FRICTION_ROUNDS = 2  # of run-by-run friction, the worst runs started anew before each
+_NEARLY_RIGHT = 6.0  # chi-square of the better runs, below which the bad ones are worth a new start
 _HELD_OUT_GAIN = 0.95  # an effect must lower the held-out error by this factor …
 _CONTACT_GAIN = 0.5  # what a contact leaves is its contact law: no effect to mop it up
 _RUN_GAIN, _RUN_SHARE = 0.97, 0.6  # … and by 3 % in 60 % of the runs
@@ -216,10 +217,13 @@ def fit_whole(structure: Structure, theta: Array, bench: Bench, *, refine: float
         refine=refine,
         mapper=bench.mapper,
     )
-    for _ in range(_FRICTION_ROUNDS):
+    for attempt in range(_FRICTION_ROUNDS):
         if not dry or fit.chi < AT_FLOOR:
             break
-        fit = restart_runs(fit, whole, refine=refine, mapper=bench.mapper)
+        if np.quantile(fit.run_chi, 0.25) < _NEARLY_RIGHT:
+            fit = restart_runs(fit, whole, refine=refine, mapper=bench.mapper)
+        elif attempt:
+            break
         fit = fit_model(
             structure,
             fit.theta,

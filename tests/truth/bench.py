@@ -153,9 +153,9 @@ def _motion(cart, spring, drive, free, t, times, command, x0, v0, scatter, h):
 
 def simulate_truth(
     *,
-    m: Sequence[float],
-    c: Sequence[float],
-    k: Sequence[float],
+    m: Sequence[float] | np.ndarray,
+    c: Sequence[float] | np.ndarray,
+    k: Sequence[float] | np.ndarray,
     hidden: Sequence[Hidden] = (),
     t: np.ndarray,
     u: np.ndarray,

@@ -1,0 +1,138 @@
+"""`gap.json` as a file: written with the model's units and the data's hashes, and read back."""
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from pipeline import __version__
+from pipeline.errors import ConfigError, PipelineError
+from pipeline.gap.document import SCHEMA, gap_json
+from pipeline.gap.types import FoundEffect, Gap, GapWindow, NamedValue, RecordGap, Rival
+from pipeline.plant.chain import Chain
+from pipeline.plant.effects import AugmentedChain, Term, find_effect
+from pipeline.results import Analysis
+from pipeline.results_json import plain_json
+
+_VERDICTS = ("named", "none", "ambiguous", "unexplained")
+
+
+def gap_text(gap: Gap, analysis: Analysis) -> str:
+    """Return `gap.json` as text, numbers at ten significant digits: same input, same bytes."""
+    position, drive = analysis.position_unit, analysis.input_unit
+    chain = gap.model.chain
+    document = gap_json(gap, position_unit=position, input_unit=drive) | {
+        "submission": {"title": analysis.title, "carts": analysis.carts},
+        "springs": list(analysis.springs),
+        "chain": {
+            "m": chain.m,
+            "c": chain.c,
+            "k": chain.k,
+            "units": {
+                "m": f"{drive} s^2/{position}",
+                "c": f"{drive} s/{position}",
+                "k": f"{drive}/{position}",
+            },
+        },
+        "chain_std": gap.chain_std,
+        "provenance": {"version": __version__, "files": dict(sorted(analysis.files.items()))},
+    }
+    return json.dumps(plain_json(document), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def read_gap(text: str) -> tuple[Gap, dict[str, str]]:
+    """Return the gap, without its traces, and the SHA-256 of each data file it is about.
+
+    Raises
+    ------
+    ConfigError : the text is no `gap.json`, or its model is not of this catalogue.
+    """
+    try:
+        document = json.loads(text)
+        if document["schema"] != SCHEMA or document["verdict"] not in _VERDICTS:
+            raise ConfigError(f"needs the schema {SCHEMA}, found {document['schema']!r}")
+        return _gap(document), dict(document["provenance"]["files"])
+    except PipelineError:
+        raise
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ConfigError(f"not what cartlab gap writes: {error!r}") from None
+
+
+def _gap(document: Mapping[str, Any]) -> Gap:
+    errors, model = document["gap"], document["model"]
+    return Gap(
+        verdict=document["verdict"],
+        effects=tuple(_effect(entry) for entry in document["effects"]),
+        baseline=float(errors["baseline"]),
+        final=float(errors["final"]),
+        noise_floor=float(errors["noise_floor"]),
+        repeatability=_or_none(document["repeatability"]),
+        by_record=tuple(RecordGap(**entry) for entry in document["by_record"]),
+        where=tuple(
+            GapWindow(
+                experiment=entry["experiment"],
+                cart=entry["cart"],
+                start=entry["from"],
+                end=entry["to"],
+                what=entry["what"],
+                share=entry["share"],
+            )
+            for entry in document["where"]
+        ),
+        next_experiment=str(document["next_experiment"]),
+        linear=AugmentedChain(chain=_chain(document["linear"])),
+        model=AugmentedChain(
+            chain=_chain(model["chain"]), terms=tuple(_term(entry) for entry in model["effects"])
+        ),
+        training=tuple(document["training"]),
+        held_out=tuple(document["held_out"]),
+        traces=(),
+        chain_std=dict(document["chain_std"]),
+        spread={int(cart): value for cart, value in document["friction_spread"].items()},
+        notes=tuple(document["notes"]),
+    )
+
+
+def _effect(entry: Mapping[str, Any]) -> FoundEffect:
+    return FoundEffect(
+        effect=find_effect(entry["effect"]),
+        where=dict(entry["where"]),
+        parameters=_values(entry["parameters"]),
+        details=_values(entry["details"]),
+        confidence=float(entry["confidence"]),
+        nrmse_before=float(entry["nrmse_before"]),
+        nrmse_after=float(entry["nrmse_after"]),
+        rivals=tuple(
+            Rival(
+                effect=find_effect(rival["effect"]),
+                where=dict(rival["where"]),
+                nrmse_after=float(rival["nrmse_after"]),
+                confidence=float(rival["confidence"]),
+            )
+            for rival in entry["rivals"]
+        ),
+    )
+
+
+def _values(entries: Mapping[str, Any]) -> dict[str, NamedValue]:
+    return {
+        name: NamedValue(
+            value=float(entry["value"]), std=_or_none(entry["std"]), unit=str(entry["unit"])
+        )
+        for name, entry in entries.items()
+    }
+
+
+def _or_none(value: Any) -> float | None:
+    return None if value is None else float(value)
+
+
+def _term(entry: Mapping[str, Any]) -> Term:
+    effect = find_effect(entry["effect"])
+    values = tuple(float(entry["parameters"][name]) for name in effect.names)
+    return Term(effect=effect, place=int(next(iter(entry["where"].values()), 0)), values=values)
+
+
+def _chain(entry: Mapping[str, Any]) -> Chain:
+    return Chain(m=np.array(entry["m"]), c=np.array(entry["c"]), k=np.array(entry["k"]))
