@@ -201,3 +201,30 @@ def simulate(
         progress("simulating the experiments")
         write_bench(out, bench, seed=seed, reported=reported)
     say(f"wrote {out}: try `cartlab report {out}`")
+
+
+@app.command()
+def effects(
+    name: Annotated[
+        str | None, typer.Argument(metavar="[NAME]", help="One effect; default: all.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Write effects.html here, with pictures of each.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """List what a bench may do beyond the linear chain: law, fingerprint, what decides."""
+    from pipeline.plant.effects import CATALOGUE, find_effect
+    from pipeline.report.words_effects import catalogue_data, catalogue_text
+
+    chosen = [find_effect(name)] if name else CATALOGUE
+    if out:
+        from pipeline.output import check_folder
+        from pipeline.report.effects import render_effects
+
+        render_effects(chosen, check_folder(out))
+        say(f"wrote {out / 'effects.html'}")
+    if as_json:
+        typer.echo(json.dumps(catalogue_data(chosen), indent=1, ensure_ascii=False))
+    elif not out:
+        typer.echo(catalogue_text(chosen))

@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.errors import ConfigError
 from pipeline.plant.chain import Chain
-from pipeline.plant.effects import CATALOGUE, Effect, Parameter, Term
+from pipeline.plant.effects import Effect, Parameter, Term, find_effect
 from pipeline.plant.effects.base import Scales, chain_scales
 from pipeline.plant.simulate import simulate_linear
 from pipeline.submission.complaints import nearest
@@ -92,6 +92,12 @@ def write_bench(folder: Path, bench: HiddenBench, *, seed: int, reported: bool =
     )
 
 
+def usual_term(effect: Effect, chain: Chain, *, travel: float = 1.0) -> Term:
+    """Return the effect at its usual place, at a size that shows."""
+    place = _place(effect, chain, None, where=effect.key)
+    return _term(effect, place, default_values(effect, chain, place=place, travel=travel))
+
+
 def default_values(effect: Effect, chain: Chain, *, place: int, travel: float) -> dict[str, float]:
     """Return sizes at which the effect shows in a session: the middle ones a search would try."""
     scales, side = _session_scales(effect, chain, place=place, travel=travel)
@@ -132,10 +138,10 @@ def _named_effect(text: str, bench: HiddenBench) -> tuple[Term, frozenset[str]]:
 
 
 def _effect(key: str, *, where: str) -> Effect:
-    for effect in CATALOGUE:
-        if effect.key == key:
-            return effect
-    raise ConfigError(f"{where}: no effect {key!r}{nearest(key, [e.key for e in CATALOGUE])}")
+    try:
+        return find_effect(key)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from None
 
 
 def _number(text: str, *, where: str) -> float:

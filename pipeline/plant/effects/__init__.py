@@ -3,6 +3,8 @@
 To add one: write an `Effect` in a file here and list it below.
 """
 
+from difflib import get_close_matches
+
 from pipeline.errors import ConfigError
 from pipeline.plant.effects import actuator, friction, springs, structure
 from pipeline.plant.effects.base import AugmentedChain, Effect, Parameter, Term, make_term
@@ -36,9 +38,12 @@ def find_effect(key: str) -> Effect:
 
     Raises
     ------
-    ConfigError : no such effect.
+    ConfigError : no such effect; the message has the nearest name, or all.
     """
     for effect in CATALOGUE:
         if effect.key == key:
             return effect
-    raise ConfigError(f"no effect {key!r}; known: {', '.join(e.key for e in CATALOGUE)}")
+    keys = [effect.key for effect in CATALOGUE]
+    close = get_close_matches(key, keys, n=1, cutoff=0.5)
+    known = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(keys)}"
+    raise ConfigError(f"no effect {key!r}; {known}")
