@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer.exceptions import TyperException
 
 from pipeline import __version__
-from pipeline.errors import ConfigError, PipelineError
+from pipeline.errors import PipelineError
 
 if TYPE_CHECKING:
     from pipeline.results import Analysis
@@ -23,7 +24,6 @@ app = typer.Typer(
     name="cartlab",
     help="Lab reports and identification for carts on springs: from raw bench data to the plant, "
     "a controller and a report.",
-    no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
@@ -36,12 +36,14 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON o
 def main() -> None:
     """Run the command line; an error that a person can act on is one line and exit status 2."""
     try:
-        app()
+        sys.exit(app(sys.argv[1:] or ["--help"], standalone_mode=False))
+    except TyperException as error:  # a wrong option or argument
+        _fail(f"{error.format_message()} (cartlab --help explains)")
     except PipelineError as error:
         _fail(str(error))
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
-        _fail(f"{where}{error.strerror or error}")
+        _fail(f"{where}{error.strerror or error}: choose another place, for example with --out")
 
 
 def _fail(message: str) -> None:
@@ -66,13 +68,6 @@ def _progress() -> Iterator[Callable[[str], None]]:
         yield lambda text: status.update(text)
 
 
-def _refuse_file(out: Path) -> Path:
-    """Return the output folder, unless something else is in its place."""
-    if out.exists() and not out.is_dir():
-        raise ConfigError(f"--out {out}: is a file; name a folder")
-    return out
-
-
 def _version(value: bool) -> None:
     if value:
         typer.echo(f"cartlab {__version__}")
@@ -93,9 +88,10 @@ def demo(
     out: Annotated[Path, typer.Option(help="Where to write.")] = Path("cartlab-demo"),
 ) -> None:
     """Run the whole job on the shipped three-cart example."""
+    from pipeline.output import check_folder
     from pipeline.resources import EXAMPLES
 
-    _run_report(EXAMPLES / "three-cart", out=_refuse_file(out) / "report", pdf=True)
+    _run_report(EXAMPLES / "three-cart", out=check_folder(out) / "report", pdf=True)
 
 
 @app.command()
@@ -123,7 +119,7 @@ def inspect(
         try:
             inspections.append(inspect_file(file))
         except PipelineError as error:
-            unreadable.append(str(error))
+            unreadable.append(str(error).replace(file.name, str(file), 1))
     if as_json:
         typer.echo(json.dumps([i.to_dict() for i in inspections], indent=1, ensure_ascii=False))
     elif inspections:
@@ -142,7 +138,7 @@ def report(
     as_json: AsJson = False,
 ) -> None:
     """Identify the carts, design the controller, check the hardware, write the report."""
-    analysis = _run_report(folder, out=out or folder / "report", pdf=pdf)
+    analysis = _run_report(folder, out=out, pdf=pdf)
     if as_json:
         from pipeline.results_json import results_text
 
@@ -152,7 +148,9 @@ def report(
         raise typer.Exit(1)
 
 
-def _run_report(folder: Path, *, out: Path, pdf: bool) -> "Analysis":
+def _run_report(folder: Path, *, out: Path | None, pdf: bool) -> "Analysis":
+    from pipeline.output import check_folder, own_folder, write_file
+    from pipeline.report.known_gap import with_gap
     from pipeline.report.render import render_report
     from pipeline.report.words import terminal_summary
     from pipeline.results_json import results_text
@@ -160,15 +158,45 @@ def _run_report(folder: Path, *, out: Path, pdf: bool) -> "Analysis":
     from pipeline.workflow import analyse
 
     submission = load_submission(folder)
-    _refuse_file(out)
+    out = check_folder(out) if out else own_folder(submission.folder, "report")
     with _progress() as progress:
-        analysis = analyse(submission, progress=progress)
+        analysis, gap = with_gap(analyse(submission, progress=progress), submission.folder)
         out.mkdir(parents=True, exist_ok=True)
-        (out / "results.json").write_text(results_text(analysis), encoding="utf-8", newline="\n")
-        render_report(analysis, out, pdf=pdf, progress=progress)
+        write_file(out / "results.json", results_text(analysis))
+        render_report(analysis, out, gap=gap, pdf=pdf, progress=progress)
     say(terminal_summary(analysis))
     say(f"wrote {out / 'report.html'}" + (f" and {out / 'report.pdf'}" if pdf else ""))
     return analysis
+
+
+@app.command()
+def gap(
+    folder: Folder,
+    out: Annotated[Path | None, typer.Option(help="Where to write; default: DIR/gap.")] = None,
+    pdf: Annotated[bool, typer.Option("--pdf/--no-pdf", help="Write the PDF too.")] = True,
+    as_json: AsJson = False,
+) -> None:
+    """Find what the linear model leaves out, name it, and show the gap shrink on held-out runs."""
+    from pipeline.gap.stored import gap_text
+    from pipeline.output import check_folder, own_folder, write_file
+    from pipeline.report.gap import render_gap
+    from pipeline.report.words_gap import terminal_verdict
+    from pipeline.submission import load_submission
+    from pipeline.workflow import analyse
+
+    submission = load_submission(folder)
+    out = check_folder(out) if out else own_folder(submission.folder, "gap")
+    with _progress() as progress:
+        analysis = analyse(submission, progress=progress)
+        from pipeline.gap.investigate import investigate  # loads the compiled simulator
+
+        found = investigate(analysis, progress=progress)
+        out.mkdir(parents=True, exist_ok=True)
+        write_file(out / "gap.json", text := gap_text(found, analysis))
+        render_gap(found, analysis, out, pdf=pdf, progress=progress)
+    say(f"{terminal_verdict(found)}\nwrote {out / 'gap.html'}")
+    if as_json:
+        typer.echo(text, nl=False)
 
 
 @app.command()

@@ -81,7 +81,7 @@ def results_dict(analysis: Analysis) -> dict[str, Any]:
 
 def results_text(analysis: Analysis) -> str:
     """Return `results.json` as text, numbers at ten significant digits."""
-    plain = _plain(results_dict(analysis))
+    plain = plain_json(results_dict(analysis))
     return json.dumps(plain, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
@@ -195,15 +195,15 @@ def _hardware(checks: tuple[HardwareCheck, ...]) -> list[dict[str, Any]]:
     return [entries[key] for key in sorted(entries)]
 
 
-def _plain(value: Any) -> Any:
+def plain_json(value: Any) -> Any:
     """Return JSON's own types, floats at `_DIGITS` significant digits, NaN and infinity as None."""
     match value:
         case dict():
-            return {key: _plain(item) for key, item in value.items()}
+            return {key: plain_json(item) for key, item in value.items()}
         case list() | tuple():
-            return [_plain(item) for item in value]
+            return [plain_json(item) for item in value]
         case np.ndarray():
-            return _plain(value.tolist())
+            return plain_json(value.tolist())
         case bool() | None | str() | int():
             return value
         case np.bool_():

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 
 from pipeline import __version__
+from pipeline.gap.types import Gap
 from pipeline.report.document import (
     Block,
     Document,
@@ -15,6 +16,7 @@ from pipeline.report.document import (
     spans,
 )
 from pipeline.report.figures import drawing
+from pipeline.report.known_gap import augmented_hardware_blocks, gap_blocks, gap_in_short
 from pipeline.report.loops import feedback_blocks, hardware_blocks
 from pipeline.report.measurements import (
     decay_blocks,
@@ -45,8 +47,13 @@ from pipeline.results import Analysis
 _NO_CHANGE = 0.05  # percent: nothing to speak of
 
 
-def build_document(analysis: Analysis, *, progress: Callable[[str], None] | None) -> Document:
-    """Return the report of an analysis; sections that have nothing to show are left out."""
+def build_document(
+    analysis: Analysis, *, gap: Gap | None = None, progress: Callable[[str], None] | None
+) -> Document:
+    """Return the report of an analysis; sections that have nothing to show are left out.
+
+    `gap` is the gap analysis of the same data, where there is one.
+    """
     page = Page(
         analysis=analysis,
         records={record.id: record for record in analysis.records},
@@ -54,7 +61,7 @@ def build_document(analysis: Analysis, *, progress: Callable[[str], None] | None
         drive=clean(analysis.input_unit),
     )
     parts: Sequence[tuple[str, str, Callable[[Page], list[Block]]]] = (
-        ("summary", "Summary", lambda page: summary(page.analysis)),
+        ("summary", "Summary", lambda page: [*summary(page.analysis), *gap_in_short(gap)]),
         ("model", "The model", _model),
         ("parameters", "Initial and final estimates", _parameters),
         ("frequency-response", "Frequency response", response_blocks),
@@ -62,7 +69,8 @@ def build_document(analysis: Analysis, *, progress: Callable[[str], None] | None
         ("steps", "Steps and static gains", step_blocks),
         ("steady-state", "Sinusoidal steady state", dwell_blocks),
         ("feedback", "State feedback", feedback_blocks),
-        ("hardware", "Model and measurement", hardware_blocks),
+        ("hardware", "Model and measurement", lambda page: _hardware(page, gap)),
+        ("gap", "What the linear model leaves out", lambda page: gap_blocks(page, gap)),
         ("checks", "Consistency checks", _checks),
         ("discussion", "Discussion", _discussion),
         ("warnings", "Warnings", _warnings),
@@ -162,6 +170,10 @@ def _staged_differences(page: Page) -> Block | None:
         names_spans([worst]),
         ". The joint fit is the one reported: its numbers belong to one chain and agree.",
     )
+
+
+def _hardware(page: Page, gap: Gap | None) -> list[Block]:
+    return [*hardware_blocks(page), *augmented_hardware_blocks(page, gap)]
 
 
 # ----------------------------------------------------------------- housekeeping

@@ -5,6 +5,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
+from pipeline.gap.types import Gap
+from pipeline.output import clear_files, own_folder, write_file
 from pipeline.report.content import build_document
 from pipeline.report.document import Document
 from pipeline.report.html import render_html
@@ -16,6 +18,7 @@ def render_report(
     analysis: Analysis,
     out: Path,
     *,
+    gap: Gap | None = None,
     pdf: bool = True,
     progress: Callable[[str], None] | None = None,
 ) -> None:
@@ -29,23 +32,23 @@ def render_report(
         analysis = replace(analysis, warnings=(*analysis.warnings, warning))
         if progress:
             progress(warning)
-    write_document(build_document(analysis, progress=progress), out, name="report", pdf=pdf)
+    document = build_document(analysis, gap=gap, progress=progress)
+    write_document(document, out, name="report", pdf=pdf)
 
 
 def write_document(document: Document, out: Path, *, name: str, pdf: bool) -> None:
     """Write a document as `name.html`, `name.pdf` and `figures/*.svg` into the folder `out`."""
-    (out / "figures").mkdir(parents=True, exist_ok=True)
+    figures = own_folder(out, "figures")
+    figures.mkdir(parents=True, exist_ok=True)
+    clear_files(figures, "*.svg")
+    clear_files(out, f"{name}.pdf")
     with ThreadPoolExecutor(max_workers=1) as beside:  # typst works outside the interpreter's lock
         printed = beside.submit(render_pdf, document) if pdf else None
-        _write_text(out / f"{name}.html", render_html(document))
+        write_file(out / f"{name}.html", render_html(document))
         for picture in document.pictures():
-            _write_text(out / "figures" / f"{picture.name}.svg", picture.svg)
+            write_file(figures / f"{picture.name}.svg", picture.svg)
         if printed:
-            (out / f"{name}.pdf").write_bytes(printed.result())
-
-
-def _write_text(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8", newline="\n")
+            write_file(out / f"{name}.pdf", printed.result())
 
 
 def _students_text(analysis: Analysis) -> str:

@@ -3,6 +3,7 @@
 import re
 import unicodedata
 from collections import Counter
+from collections.abc import Iterable
 
 from pipeline.report.document import (
     Block,
@@ -88,8 +89,13 @@ def summary(analysis: Analysis) -> list[Block]:
 
 def terminal_summary(analysis: Analysis) -> str:
     """Return the summary as a few lines of plain text."""
+    return plain_lines(summary(analysis))
+
+
+def plain_lines(blocks: Iterable[Block]) -> str:
+    """Return paragraphs and lists as lines of plain text."""
     lines = []
-    for block in summary(analysis):
+    for block in blocks:
         if isinstance(block, Paragraph):
             lines.append(plain(block.text))
         elif isinstance(block, Items):

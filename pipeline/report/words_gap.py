@@ -6,7 +6,7 @@ from pipeline.gap.types import FoundEffect, Gap, NamedValue, Rival
 from pipeline.plant.effects.base import Effect
 from pipeline.report.document import Block, Span, Spans, bullet_list, paragraph, spans
 from pipeline.report.numbers import listing, significant, unit_text, with_error
-from pipeline.report.words import clean
+from pipeline.report.words import clean, plain_lines
 
 _AS_GOOD = 1.15  # times the error: a rival that the data do not tell from what was chosen
 _NEGLIGIBLE = 1e-3  # of a value: an error this small stands in the table alone
@@ -55,18 +55,7 @@ def next_block(gap: Gap) -> list[Block]:
 
 def terminal_verdict(gap: Gap) -> str:
     """Return the verdict as a few lines of plain text."""
-    lines = [verdict_title(gap)]
-    for block in (*verdict_blocks(gap), *next_block(gap)):
-        lines += _lines(block)
-    return "\n".join(lines)
-
-
-def _lines(block: Block) -> list[str]:
-    if block.kind == "paragraph":
-        return ["".join(span.text for span in block.text)]
-    if block.kind == "items":
-        return [f"- {line}" for item in block.items for inner in item for line in _lines(inner)]
-    return []
+    return plain_lines([paragraph(verdict_title(gap)), *verdict_blocks(gap), *next_block(gap)])
 
 
 # ------------------------------------------------------------------- the verdicts
