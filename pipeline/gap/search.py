@@ -31,6 +31,7 @@ _HELD_OUT_GAIN = 0.95  # an effect must lower the held-out error by this factor 
 _CONTACT_GAIN = 0.5  # what a contact leaves is its contact law: no effect to mop it up
 _RUN_GAIN, _RUN_SHARE = 0.97, 0.6  # … and by 3 % in 60 % of the runs
 _SEVERAL_STARTS = ("extra_mode", "end_stop", "backlash", "slack_spring")
+_ZOOM_SHARE = 0.15  # of the first suspect's, below which one start must do
 _CONTACT = ("end_stop", "backlash")
 
 
@@ -131,7 +132,9 @@ def grow(parent: Hypothesis, bench: Bench) -> list[Hypothesis]:
     start = fit_pieces(parent.fit.structure, parent.fit.theta, pieces, iterations=4)
     look = partial(screen, whole=whole, springs=bench.springs, mapper=bench.mapper)
     suspects = look(start, pieces)
-    short = [_short_refit(start, s, pieces, bench) for s in _short_list(suspects)]
+    short = [
+        _short_refit(start, s, pieces, bench, top=suspects[0].share) for s in _short_list(suspects)
+    ]
     short.sort(key=lambda pair: pair[1].cost)
     within = _OUT_OF_SIGHT * short[0][1].cost
     close = [pair for pair in short[:_FULL_LIST] if pair[1].cost < within]
@@ -140,7 +143,7 @@ def grow(parent: Hypothesis, bench: Bench) -> list[Hypothesis]:
         for suspect in look(parent.fit, whole)[:_FULL_SCREEN]:
             if suspect.candidate.key not in chosen:
                 pair = next((p for p in short if p[0].key == suspect.candidate.key), None)
-                pair = pair or _short_refit(start, suspect, pieces, bench)
+                pair = pair or _short_refit(start, suspect, pieces, bench, top=0.0)
                 if pair[1].cost < within:
                     chosen[suspect.candidate.key] = pair
     children = []
@@ -165,11 +168,14 @@ def _short_list(suspects: Sequence[Suspect]) -> list[Suspect]:
 
 
 def _short_refit(
-    start: Fit, suspect: Suspect, pieces: Sequence[Run], bench: Bench
+    start: Fit, suspect: Suspect, pieces: Sequence[Run], bench: Bench, *, top: float
 ) -> tuple[Candidate, Fit]:
-    """Refit a suspect on pieces; where the landscape is rugged, from several starts."""
+    """Refit a suspect on pieces; where the landscape is rugged, from several starts.
+
+    `top` is the share of the gap the first suspect explains.
+    """
     several = suspect.candidate.effect.key in _SEVERAL_STARTS
-    if several:
+    if several and suspect.share > _ZOOM_SHARE * top:
         suspect = zoom(start, pieces, suspect, mapper=bench.mapper)
     fits = []
     for values in suspect.starts[: 3 if several else 1]:
