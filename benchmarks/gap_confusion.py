@@ -16,7 +16,10 @@ from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
-import numpy as np
+# Cases run side by side: one BLAS thread each, set before numpy is loaded.
+os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
+
+import numpy as np  # noqa: E402
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -114,7 +117,6 @@ def main() -> None:
     parser.add_argument("--report", action="store_true", help="the seeds results are quoted for")
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
-    os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
     base = REPORT if options.report else DEVELOPMENT
     rows = [json.loads(line) for line in options.out.open()] if options.out.exists() else []
     done = {row["index"] for row in rows if row["suite"] == options.suite}
