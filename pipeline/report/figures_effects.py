@@ -18,6 +18,7 @@ _DURATION = 4.0  # s
 _STEP = (0.1, 2.1)  # s, on and off
 _RELEASE = 1.4  # of the travel
 _HEIGHT = 1.75  # inches
+_LABEL = -0.2  # of the right panel's width, where its title has room
 _EDGE = (-0.02, 0.08)  # s about an edge of the input
 _RING_OUT = 12.0  # s: nothing is left of a pulse
 _PULSE = 20  # samples, short against every period
@@ -68,6 +69,7 @@ def effect_figure(term: Term, chain: Chain) -> Figure:
     right.plot(t, without, color=SECOND, ls="--", lw=1.0, label="without")
     right.plot(t, with_it, color=MODEL, lw=1.1, label="with it")
     right.set_ylabel(f"x{cart} [{POSITION}]")
+    right.yaxis.set_label_coords(_LABEL, 0.5)
     right.set_xlabel(f"{shown.name}: time [s]")
     legend_above(right)
     return figure
