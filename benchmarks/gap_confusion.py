@@ -19,7 +19,7 @@ from pathlib import Path
 # Cases run side by side: one BLAS thread each, set before numpy is loaded.
 os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
 
-import numpy as np  # noqa: E402
+import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
