@@ -156,11 +156,15 @@ def test_the_linear_path_compiles_nothing():
 def test_next_to_nothing_is_the_linear_bench(key, make_run):
     """With its size a hundred-thousandth, each effect leaves every kind of run within a count."""
     term = usual(key)
-    # These two have a second size, without a neutral value of its own.
-    second = {"stiction": "static_force", "end_stop": "damping"}.get(key)
+    # These have further sizes, without a neutral value of their own.
+    further = {
+        "stiction": ("static_force",),
+        "end_stop": ("damping",),
+        "extra_mode": ("stiffness", "damping"),
+    }.get(key, ())
     values = [
         (p.neutral or 0.0) + 1e-5 * (value - (p.neutral or 0.0))
-        if p.neutral is not None or p.name == second
+        if p.neutral is not None or p.name in further
         else value
         for p, value in zip(term.effect.parameters, term.values, strict=True)
     ]

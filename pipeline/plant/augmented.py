@@ -20,6 +20,7 @@ from pipeline.plant.tables import Cart, Drive, Spring, Tables
 _REFINE = 4.0  # divides the kernel's step: this is what others are judged by
 _LONGEST_STEP = 5e-4  # s, of the stepped bench
 _SERIES_REACH = 0.2  # omega h, as in the kernel
+_DAMPED_REACH = 1.0  # c h / m: a light hidden mass may be damped faster than it swings
 _CONTACT_REACH = 0.4  # omega h inside a contact, as in the kernel
 _TO_REST = 40.0  # periods of the slowest motion, heavily damped: nothing is left of the start
 _DRY = [Cart.COULOMB, Cart.STATIC, Cart.LOAD, Cart.DAHL]
@@ -273,10 +274,12 @@ class SteppedBench:
 
     def _step_lengths(self) -> tuple[float, float]:
         """Return the longest substep, and the longest inside a contact, s."""
-        inverse = self._inverse_mass[: self._N]
+        inverse, N = self._inverse_mass[: self._N], self._N
         change = 1.0 + max(float(self._spring[:, Spring.CHANGE].max()), 0.0)
-        fastest = float(np.max(np.abs(self._K[: self._N, : self._N]).sum(1) * inverse)) * change
+        fastest = float(np.max(np.abs(self._K[:N, :N]).sum(1) * inverse)) * change
+        damped = float(np.max(np.abs(self._C[:N, :N]).sum(1) * inverse))
         step = min(_LONGEST_STEP, _SERIES_REACH / np.sqrt(max(fastest, 1e-12)))
+        step = min(step, _DAMPED_REACH / max(damped, 1e-12))
         contact = float(np.max(self._cart[:, Cart.STOP_STIFFNESS] * inverse[: self._n]))
         if self._motor >= 0:
             both = float(inverse[0] + inverse[self._motor])
