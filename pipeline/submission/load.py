@@ -247,7 +247,7 @@ def _reported_problems(submission: Submission) -> Iterator[tuple[Location, str]]
     reported, n = submission.reported, submission.system.carts
     if reported is None:
         return
-    names = parameter_names(n, rigid=n == 1 and not any(submission.system.springs))
+    names = parameter_names(n, rigid=submission.system.rigid)
     for table in ("initial", "final"):
         for name in getattr(reported, table):
             if name not in names:

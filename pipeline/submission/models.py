@@ -62,6 +62,16 @@ class System(_Model):
                 return {**table, "springs": (True,) * (carts + 1)}
         return table
 
+    @property
+    def rigid(self) -> bool:
+        """Whether there is one cart without a spring: a mass and a damping, no gain."""
+        return self.carts == 1 and not any(self.springs)
+
+    @property
+    def tied(self) -> bool:
+        """Whether a spring ties the carts to a wall: else no constant input has a rest position."""
+        return self.springs[0] or self.springs[-1]
+
 
 class Design(_Model):
     """The state-feedback task."""
