@@ -13,7 +13,16 @@ from numpy.testing import assert_allclose
 from pipeline.errors import ConfigError
 from pipeline.gap.residual_force import residual_forces
 from pipeline.gap.stored import gap_text, read_gap
-from pipeline.gap.types import FoundEffect, Gap, GapWindow, NamedValue, RecordGap, Rival, Trace
+from pipeline.gap.types import (
+    FoundEffect,
+    Gap,
+    GapWindow,
+    NamedValue,
+    RecordGap,
+    Rival,
+    Trace,
+    Verdict,
+)
 from pipeline.plant.augmented import simulate_augmented
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.effects import CATALOGUE, AugmentedChain, Term, find_effect, make_term
@@ -48,7 +57,7 @@ def usual_values(effect, place):
     return {p.name: p.scale(scales) * p.trials[0] for p in effect.parameters}
 
 
-def make_gap(verdict="named", keys=("coulomb_friction",)) -> Gap:
+def make_gap(verdict: Verdict = "named", keys=("coulomb_friction",)) -> Gap:
     """Return what the workflow could find on the two-cart bench; the first cart's runs drawn."""
     terms: list[Term] = []
     for key in keys:
