@@ -149,6 +149,7 @@ def test_intervals_cover_the_truth(preset, phases):
 
 
 @pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.parametrize("phases", [False, True], ids=["magnitudes", "phases"])
 @pytest.mark.parametrize("preset", PRESETS)
 def test_the_fit_is_efficient_and_its_errors_honest(preset, phases):
@@ -164,6 +165,7 @@ def test_the_fit_is_efficient_and_its_errors_honest(preset, phases):
 
 
 @pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.parametrize(("kind", "least"), [("paper", 0.995), ("random", 0.99), ("wide", 0.94)])
 @pytest.mark.parametrize("preset", PRESETS)
 def test_the_fit_gets_there_from_poor_starts(preset, kind, least):

@@ -302,12 +302,14 @@ def flags(seeds, *, d):
 
 
 @pytest.mark.slow
+@pytest.mark.sample
 def test_friction_is_not_seen_where_there_is_none():
     """At most 1 % of 600 clean decays are called friction."""
     assert flags(600, d=0.0).mean() <= 0.01
 
 
 @pytest.mark.slow
+@pytest.mark.sample
 def test_friction_of_a_tenth_of_a_millimetre_is_always_seen():
     """At least 99 % of 400 decays with d = 0.01 cm are called friction."""
     assert flags(400, d=0.01).mean() >= 0.99
