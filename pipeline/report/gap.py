@@ -82,10 +82,11 @@ def build_gap_document(
     ]
     for i, found in enumerate(gap.effects):
         name = effect_name(found.effect, found.where)
+        title = f"Suspect: {name}" if gap.verdict == "unexplained" else name
         parts.append(
             (
                 f"effect-{i + 1}",
-                name[:1].upper() + name[1:],
+                title[:1].upper() + title[1:],
                 lambda i=i: _effect(page, gap, i, forces=forces),
             )
         )

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from pipeline.gap.types import FoundEffect, Gap, GapWindow
 from pipeline.report.document import Cell, Table
-from pipeline.report.numbers import percent, significant, unit_text, with_error
+from pipeline.report.numbers import percent, unit_text, with_error
 from pipeline.report.tables import cell, make_table
 from pipeline.report.words import clean
 from pipeline.report.words_gap import effect_name, share
@@ -46,8 +46,8 @@ def window_table(windows: Sequence[GapWindow], *, number: int) -> Table:
             [
                 cell(clean(w.experiment)),
                 cell(str(w.cart)),
-                cell(significant(w.start, digits=3)),
-                cell(significant(w.end, digits=3)),
+                cell(f"{w.start:.2f}"),
+                cell(f"{w.end:.2f}"),
                 cell(clean(w.what)),
                 cell(percent(100 * w.share)),
             ]

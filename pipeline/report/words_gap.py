@@ -122,11 +122,15 @@ def _unexplained(gap: Gap) -> Block:
             "to be believed.",
         )
     suspects = listing([effect_name(found.effect, found.where) for found in gap.effects])
+    are = "suspect is" if len(gap.effects) == 1 else "suspects, together, are"
+    repeats = (
+        f" and repeats of one run differ by {share(gap.repeatability)}" if gap.repeatability else ""
+    )
     return paragraph(
         Span("Something is missing that nothing in the catalogue explains. ", "strong"),
-        f"The best suspect is {suspects}: with it the error on runs the model had not seen falls "
-        f"from {share(gap.baseline)} of the motion to {share(gap.final)}, but noise alone makes "
-        f"{share(gap.noise_floor)}. Too much is left for a name.",
+        f"The best {are} {suspects}. The error on runs the model had not seen then falls from "
+        f"{share(gap.baseline)} of the motion to {share(gap.final)}, but noise alone makes "
+        f"{share(gap.noise_floor)}{repeats}. Too much is left for a name.",
     )
 
 
