@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pipeline.ingest.clock import decimal_step, read_clock
+from pipeline.ingest.clock import decimal_step, read_clock, read_clocks
 
 
 @settings(deadline=None)
@@ -120,3 +120,73 @@ def test_gaps_are_found():
 def test_the_decimal_step_of_stamps(values, step):
     """The last decimal place in use, none for full precision."""
     assert decimal_step(np.array(values)) == step
+
+
+def a_session(interval: float, *, n: int = 15, jitter: float = 0.0) -> list[np.ndarray]:
+    """Return stamps in whole ms of records of 1 s to 15 s, begun at any time."""
+    rng = np.random.default_rng(7)
+    sizes = np.linspace(1, 15, n) / interval
+    true = [rng.uniform(0, 1) + interval * np.arange(int(size)) for size in sizes]
+    return [np.round(t + jitter * rng.standard_normal(t.size), 3) for t in true]
+
+
+@pytest.mark.parametrize(
+    ("interval", "error"),
+    # 15 s hold several beats between clock and stamps: each pins the phase to a sample's advance
+    # in it, 0.3 µs. Less than one: the rounding over the length of all records, 1 ms in 120 s,
+    # twice that, for most of them show no jump.
+    [(1.00031e-3, 3e-7 / 15), (0.99987e-3, 3e-7 / 15), (1.000047e-3, 2e-3 / 120)],
+)
+def test_the_records_of_a_session_share_one_period(interval, error):
+    """Near 1 kHz a record alone is off by up to a stamp in its length; together they are not."""
+    stamps = a_session(interval)
+
+    clocks = read_clocks(stamps)
+
+    assert len({clock.period for clock in clocks}) == 1
+    assert all(clock.pieces == 1 for clock in clocks)
+    assert_allclose(clocks[0].mean_interval, interval, rtol=error)
+    assert_allclose([clock.mean_interval for clock in clocks], clocks[0].mean_interval, rtol=1e-9)
+
+
+@pytest.mark.parametrize("interval", [1.00031e-3, 0.99987e-3])
+def test_ticks_that_are_late_at_times_leave_one_period(interval):
+    """Jitter far below the rounding makes stamps flicker and does not tear the session apart."""
+    clocks = read_clocks(a_session(interval, jitter=2e-5))
+    assert len({clock.period for clock in clocks}) == 1
+    # 20 µs of jitter, three deviations of it at either end of the longest record, 15 s.
+    assert_allclose(clocks[0].mean_interval, interval, rtol=6 * 2e-5 / 15)
+
+
+def test_clocks_that_differ_stay_apart():
+    """Two benches in one session keep their own periods, and full-precision stamps stay."""
+    one, other = a_session(1.00031e-3, n=4), a_session(0.0088542, n=4)
+    exact = 0.00500001 * np.arange(900, dtype=np.float64)
+
+    clocks = read_clocks([*one, *other, exact])
+
+    for clock, interval in zip(clocks[:8], [1.00031e-3] * 4 + [0.0088542] * 4, strict=True):
+        assert clock.period == pytest.approx(interval, rel=1e-3 / 32)
+    assert clocks[8].pieces == 0
+    assert_array_equal(clocks[8].t, exact)
+
+
+def test_a_session_of_even_stamps_is_left_alone():
+    """Where nothing shows a period other than that of the stamps, they are the times."""
+    stamps = a_session(1e-3)
+    for clock, kept in zip(read_clocks(stamps), stamps, strict=True):
+        assert clock.pieces == 0
+        assert_array_equal(clock.t, kept)
+
+
+def test_dropped_samples_do_not_bend_the_shared_period():
+    """A record that lost samples is straightened in pieces, each with the session's period."""
+    stamps = a_session(0.0011279)
+    lost = np.delete(stamps[9], [2000, 2001, 2002, 6000, 6001, 6002, 6003])
+
+    clocks = read_clocks([*stamps[:9], lost, *stamps[10:]])
+
+    assert clocks[9].pieces > 1
+    assert {clock.period for clock in clocks} == {clocks[0].period}
+    assert clocks[0].period == pytest.approx(0.0011279, rel=1e-3 / 120)
+    assert np.abs(clocks[9].t - lost).max() < 1e-3

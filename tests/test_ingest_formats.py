@@ -258,3 +258,9 @@ def test_the_hash_is_of_the_bytes(tmp_path):
     (tmp_path / "a.csv").write_bytes(b"time,x1\n0,1\n1,2\n")
     digest = hashlib.sha256(b"time,x1\n0,1\n1,2\n").hexdigest()
     assert read_table(tmp_path, "a.csv")[1] == digest
+
+
+def test_a_file_of_blanks_of_any_sort_is_empty():
+    """A next-line mark alone, as some mainframes end lines, is no row without columns."""
+    with pytest.raises(SubmissionError, match="the file is empty"):
+        table(b"\x85")

@@ -1,8 +1,14 @@
-"""Sample times: checked, and straightened where the file had rounded them."""
+"""Sample times: checked, and straightened where the file had rounded them.
 
-from dataclasses import dataclass
+Near 1 kHz the stamps of a millisecond clock hardly tell its period: a short record looks perfectly
+even. The records of a session were made by one clock, so together they do.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.plant.chain import Array
 
@@ -12,8 +18,13 @@ _ON_STEP = 0.02  # of a step; a value farther off is no multiple
 _WORTH_STRAIGHTENING = 2e-3  # rounding below this share of the sample interval does no harm
 _ROUNDING_BAND = 0.65  # of the rounding step: half of it, and what the fit of a short piece errs
 _ROUNDING_REACH, _IN_BAND = 1.5, 0.99  # a rare stamp may be a step off: a late tick, a beat
+_WHOLE_STEP = 0.9  # of the rounding step off the line: more is a stamp that did not advance
 _SHORTEST_PIECE = 32  # samples; a fit of fewer leaves the band by chance
 _MOSTLY = 0.8  # share of samples on straight pieces below which the clock itself is uneven
+_BANDS = (1.0, 1.02, 1.05, 1.1, 1.2, 2 * _ROUNDING_BAND)  # rounding steps all stamps lie within;
+# one where nothing but the rounding moves them, more where the clock's ticks are late at times
+_HAIR = 1e-6  # of a rounding step: what doubles err
+_NO_ROOM = 10 * _HAIR  # a strip this sure of its slope is held by stamps that flicker, not by time
 _GAP = 4.0  # a gap is an interval of so many usual ones
 
 
@@ -26,6 +37,7 @@ class Clock:
     t : (n,) s; straightened where `pieces` is not 0.
     rounding : s; the decimal step all stamps are multiples of, 0 where there is none.
     pieces : how many straight lines replaced the rounded stamps; 0: the stamps as they are.
+    period : s; the interval of those lines where they have one, which is the session's; or None.
     stopped : sample (from 0) where time does not advance, or None.
     gaps : samples (from 0) before which time is missing.
     """
@@ -33,6 +45,7 @@ class Clock:
     t: Array
     rounding: float
     pieces: int
+    period: float | None
     stopped: int | None
     gaps: tuple[int, ...]
 
@@ -55,20 +68,29 @@ class Clock:
 
 
 def read_clock(stamps: Array) -> Clock:
-    """Check time stamps and undo their rounding where a straight clock explains them.
+    """Check the time stamps (n,) of one record and undo their rounding."""
+    return read_clocks([stamps])[0]
+
+
+def read_clocks(session: Sequence[Array]) -> list[Clock]:
+    """Check the time stamps of every record of a session and undo their rounding.
 
     Stamps rounded to a step that matters against the sample interval are replaced by straight
     lines (one where the clock is even; more where it drifts or missed a beat) that stay within
-    the rounding. A clock that no such lines explain is uneven in truth: its stamps are kept.
+    the rounding, all with one period where one explains them. A clock that no such lines explain
+    is uneven in truth: its stamps are kept.
     """
-    rounding = decimal_step(stamps)
-    t, pieces = stamps, 0
-    mean = (stamps[-1] - stamps[0]) / (stamps.size - 1)
-    steps = np.diff(stamps)
-    uneven = np.ptp(steps) > 1e-6 * abs(mean)
-    backwards = bool((steps < 0).any())
-    if uneven and not backwards and 0 < mean and rounding > _WORTH_STRAIGHTENING * mean:
-        t, pieces = _straighten(stamps, rounding)
+    rounded = [_rounded(stamps) for stamps in session]
+    clocks: list[Clock] = []
+    for record, period in zip(rounded, _periods(rounded), strict=True):
+        t, pieces = record.straight(period)
+        if (np.diff(t) <= 0).any():
+            t, pieces = record.stamps, 0
+        clocks.append(_checked(t, record.rounding, pieces=pieces, period=period))
+    return clocks
+
+
+def _checked(t: Array, rounding: float, *, pieces: int, period: float | None) -> Clock:
     steps = np.diff(t)
     stopped = int(np.argmax(steps <= 0)) + 1 if (steps <= 0).any() else None
     usual = np.median(steps)
@@ -77,6 +99,7 @@ def read_clock(stamps: Array) -> Clock:
         t=t,
         rounding=rounding,
         pieces=pieces,
+        period=period if pieces else None,
         stopped=stopped,
         gaps=tuple(int(i) for i in gaps),
     )
@@ -94,26 +117,147 @@ def decimal_step(values: Array) -> float:
     return 0.0
 
 
-def _straighten(stamps: Array, rounding: float) -> tuple[Array, int]:
-    """Return straight times and the number of lines, or the stamps and 0."""
-    t, on_lines, pieces = stamps.copy(), 0, 0
+# ------------------------------------------------------------------- one record
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Rounded:
+    """The stamps of a record, and the stretches (start, end) that a straight line explains.
+
+    `even`: the stamps lie on a line as they are, so there is nothing to straighten unless other
+    records know the period better.
+    """
+
+    stamps: Array
+    rounding: float
+    stretches: tuple[tuple[int, int], ...]
+    even: bool
+
+    def straight(self, period: float | None) -> tuple[Array, int]:
+        """Return the times and the number of lines, their slope `period` or each its own."""
+        if self.even and period is None:
+            return self.stamps, 0
+        t = self.stamps.copy()
+        for start, end in self.stretches:
+            t[start:end] = _line(self.stamps[start:end], slope=period)
+        return t, len(self.stretches)
+
+    def slopes(self, band: float) -> tuple[float, float]:
+        """Return the least and the greatest period all stretches allow; least > greatest: none.
+
+        With its usual stamps all within `band` rounding steps of one line.
+        """
+        least, greatest = 0.0, np.inf
+        for start, end in self.stretches:
+            stamps = self.stamps[start:end]
+            usual = _usual(stamps, self.rounding)
+            low, high = _slopes(stamps, usual, width=band * self.rounding)
+            if (high - low) * stamps.size < _NO_ROOM * self.rounding:
+                return np.inf, 0.0
+            least, greatest = max(least, low), min(greatest, high)
+        return least, greatest
+
+
+def _rounded(stamps: Array) -> _Rounded:
+    rounding = decimal_step(stamps)
+    record = _Rounded(stamps=stamps, rounding=rounding, stretches=(), even=False)
+    mean = (stamps[-1] - stamps[0]) / (stamps.size - 1)
+    steps = np.diff(stamps)
+    if (steps < 0).any() or mean <= 0 or rounding <= _WORTH_STRAIGHTENING * mean:
+        return record
+    if np.ptp(steps) <= 1e-6 * mean:
+        return replace(record, stretches=((0, stamps.size),), even=True)
+    return replace(record, stretches=_stretches(stamps, rounding))
+
+
+def _stretches(stamps: Array, rounding: float) -> tuple[tuple[int, int], ...]:
+    """Return the stretches of the record that straight lines explain; none if it is not most."""
+    found = []
     waiting = [(0, stamps.size)]
     while waiting:
         start, end = waiting.pop()
-        line = _line(stamps[start:end])
-        off = np.abs(line - stamps[start:end]) / rounding
-        if off.max() <= _ROUNDING_REACH and np.mean(off <= _ROUNDING_BAND) >= _IN_BAND:
-            t[start:end] = line
-            on_lines, pieces = on_lines + end - start, pieces + 1
+        if _usual(stamps[start:end], rounding).any():
+            found.append((start, end))
         elif end - start >= 2 * _SHORTEST_PIECE:
             middle = (start + end) // 2
             waiting += [(start, middle), (middle, end)]
-    if on_lines < _MOSTLY * stamps.size or (np.diff(t) <= 0).any():
-        return stamps, 0
-    return t, pieces
+    explained = sum(end - start for start, end in found)
+    return tuple(sorted(found)) if explained >= _MOSTLY * stamps.size else ()
 
 
-def _line(stamps: Array) -> Array:
+def _usual(stamps: Array, rounding: float) -> NDArray[np.bool_]:
+    """Return which stamps (n,) lie within the rounding of one line: all but a few late, or none."""
+    off = np.abs(_line(stamps) - stamps) / rounding
+    near = off <= _ROUNDING_BAND
+    if off.max() <= _ROUNDING_REACH and near.mean() >= _IN_BAND:
+        return near
+    # A least-squares line leans where few stamps jump; a strip of the rounding's width does not.
+    every = np.ones(stamps.size, dtype=np.bool_)
+    low, high = _slopes(stamps, every, width=_BANDS[-1] * rounding)
+    return every & (low <= high and off.max() < _WHOLE_STEP)
+
+
+def _line(stamps: Array, *, slope: float | None = None) -> Array:
     """Return the least-squares straight line through the stamps, at each sample."""
     i = np.arange(stamps.size) - (stamps.size - 1) / 2
-    return stamps.mean() + i * (i @ stamps) / (i @ i)
+    return stamps.mean() + i * ((i @ stamps) / (i @ i) if slope is None else slope)
+
+
+# ------------------------------------------------------------------- the session
+
+
+def _periods(records: Sequence[_Rounded]) -> list[float | None]:
+    """Return the period of each record's clock: one for all records that allow it.
+
+    Each record confines its period to an interval; the shorter the record, the wider. Records
+    are taken from the surest on and join the first whose period they allow, in the narrowest
+    band that does. None: the stamps are to be kept, or no one period explains the record.
+    """
+    groups: list[tuple[float, float, list[int]]] = []
+    told = {
+        i: [record.slopes(band) for band in _BANDS]
+        for i, record in enumerate(records)
+        if record.stretches
+    }
+    for i, bounds in sorted(told.items(), key=lambda item: item[1][-1][1] - item[1][-1][0]):
+        for j, (least, greatest, members) in enumerate(groups):
+            shared = [(max(least, low), min(greatest, high)) for low, high in bounds]
+            allowed = [(low, high) for low, high in shared if low <= high]
+            if allowed and records[members[0]].rounding == records[i].rounding:
+                groups[j] = (*allowed[0], [*members, i])
+                break
+        else:
+            groups += [(low, high, [i]) for low, high in bounds if low <= high][:1]
+    periods: list[float | None] = [None] * len(records)
+    for least, greatest, members in groups:
+        if not all(records[i].even for i in members):
+            for i in members:
+                periods[i] = (least + greatest) / 2
+    return periods
+
+
+def _slopes(stamps: Array, usual: NDArray[np.bool_], *, width: float) -> tuple[float, float]:
+    """Return the least and greatest slope of a strip of this width over the usual stamps."""
+    index = np.flatnonzero(usual).astype(np.float64)
+    low, high = (_extreme_slope(index, stamps[usual], width=width, side=side) for side in (-1, 1))
+    return low, high
+
+
+def _extreme_slope(index: Array, stamps: Array, *, width: float, side: int) -> float:
+    """Return the least (side -1) or greatest (1) slope of a strip of this width over all stamps.
+
+    The strip's width is a convex function of its slope, piecewise straight: Newton's method from
+    outside reaches the bound exactly. Past it, on the far side, where there is no such strip.
+    """
+    slope = (stamps[-1] - stamps[0] + side * 2 * width) / (index[-1] - index[0])
+    hair = _HAIR * width + 8 * np.finfo(np.float64).eps * np.abs(stamps).max()
+    while True:
+        off = stamps - slope * index
+        top, bottom = int(np.argmax(off)), int(np.argmin(off))
+        excess = off[top] - off[bottom] - width
+        run = index[bottom] - index[top]
+        if excess <= hair:
+            return slope
+        if run * side <= 0:
+            return -side * np.inf
+        slope -= excess / run

@@ -1,25 +1,27 @@
 """From the files of a submission to records in its units: every conversion happens here."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
 
 from pipeline.errors import SubmissionError
 from pipeline.ingest.bode import Points, frequency_responses, read_points
-from pipeline.ingest.clock import SLOW, Clock, read_clock
+from pipeline.ingest.clock import Clock, read_clocks
 from pipeline.ingest.columns import Column, assign_columns, conversion, holds_counts
 from pipeline.ingest.files import read_table
 from pipeline.ingest.problems import channel_problems
 from pipeline.ingest.signals import encoder_step, mirrors
 from pipeline.ingest.signs import with_signs
 from pipeline.ingest.table import Table
+from pipeline.ingest.times import FEWEST_SAMPLES, clock_notes, time_stamps
 from pipeline.plant.chain import Array
 from pipeline.results import FrequencyResponse, Record
 from pipeline.submission import Experiment, Submission, System
 
 DUTY_COUNT = 5 / 4096  # V; the UCSD bench's amplifier gives 5 V for 4096 counts
-_FEWEST_SAMPLES = 8
+_FEW_COUNTS = 10  # a motor does not move at so few; whole numbers up to it are volts, typed in
 _WINDOW_SLACK = 0.01  # of the record's length: "to the end" is often typed rounded up
 _NEED_INPUT = ("step", "sine", "sweep")
 
@@ -55,20 +57,24 @@ def read_data(submission: Submission) -> Ingested:
             "table yet; add one for each data file"
         )
     tables: dict[str, tuple[Table, str]] = {}
-    records: list[Record] = []
+    opened: list[_Opened] = []
     points: Points = {}
     warnings: list[str] = []
     for experiment in submission.experiments:
-        try:
+        with _named(experiment):
             if experiment.file not in tables:
                 tables[experiment.file] = read_table(submission.folder, experiment.file)
             table, _ = tables[experiment.file]
             if experiment.kind == "bode":
                 _read_bode(table, experiment, submission.system, points, warnings)
             else:
-                records.append(_read_record(table, experiment, submission.system))
-        except SubmissionError as error:
-            raise SubmissionError(f"{experiment.id}: {error}") from None
+                opened.append(_open(table, experiment, submission.system))
+    records: list[Record] = []
+    clocks = read_clocks([o.stamps for o in opened])  # one clock made them all
+    for one, clock in zip(opened, clocks, strict=True):
+        with _named(one.experiment):
+            records.append(_read_record(one, clock, submission.system))
+    warnings += _unused_scale(records, submission.system)
     records, found = with_signs(records, submission)
     responses, spread = frequency_responses(points)
     return Ingested(
@@ -77,6 +83,27 @@ def read_data(submission: Submission) -> Ingested:
         files={name: digest for name, (_, digest) in sorted(tables.items())},
         warnings=(*warnings, *_copies(tables), *found, *((spread,) if responses else ())),
     )
+
+
+@contextmanager
+def _named(experiment: Experiment) -> Iterator[None]:
+    """Let errors begin with the experiment they are about."""
+    try:
+        yield
+    except SubmissionError as error:
+        raise SubmissionError(f"{experiment.id}: {error}") from None
+
+
+def _unused_scale(records: Sequence[Record], system: System) -> list[str]:
+    """Return a warning if the input's scale is stated and no record's input is in counts."""
+    per_count = system.input.per_count
+    driven = [record for record in records if record.u is not None and np.any(record.u)]
+    if per_count is None or not driven or any(r.input_scale == per_count for r in driven):
+        return []
+    return [
+        f"system.input.per_count = {per_count:g} is not used: no input holds counts (whole "
+        f"numbers beyond ±{_FEW_COUNTS:g}); every input is taken to be in {system.input.unit}"
+    ]
 
 
 def _copies(tables: Mapping[str, tuple[Table, str]]) -> list[str]:
@@ -122,20 +149,46 @@ def _refuse_cut(table: Table) -> None:
 # ------------------------------------------------------------------------------ one record
 
 
-def _read_record(table: Table, experiment: Experiment, system: System) -> Record:
-    """Return the record with the input's scale applied, but not yet a sign that must be found."""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Opened:
+    """A file, its columns told apart; `positions` by cart, `stamps` (n,) s as they stand in it."""
+
+    table: Table
+    experiment: Experiment
+    columns: dict[str, Column]
+    positions: list[Column]
+    unused: tuple[str, ...]
+    stamps: Array
+
+
+def _open(table: Table, experiment: Experiment, system: System) -> _Opened:
     _refuse_cut(table)
-    notes = list(table.notes)
     columns, unused = assign_columns(table, explicit=experiment.columns, free=experiment.carts)
     positions = sorted(
         (c for role, c in columns.items() if role[0] == "x" and c.cart <= system.carts),
         key=lambda column: column.cart,
     )
     _check_carts(table, experiment, positions)
+    return _Opened(
+        table=table,
+        experiment=experiment,
+        columns=columns,
+        positions=positions,
+        unused=unused,
+        stamps=time_stamps(table, columns.get("time"), sample_rate=experiment.sample_rate),
+    )
+
+
+def _read_record(opened: _Opened, clock: Clock, system: System) -> Record:
+    """Return the record with the input's scale applied, but not yet a sign that must be found."""
+    table, experiment, columns = opened.table, opened.experiment, opened.columns
+    positions = opened.positions
+    notes = list(table.notes)
     extra = [c.name for role, c in columns.items() if role[0] == "x" and c not in positions]
-    if unused or extra:
-        notes.append(f"columns not used: {', '.join([*unused, *extra])}")
-    clock = _clock(table, columns, experiment, notes)
+    if opened.unused or extra:
+        notes.append(f"columns not used: {', '.join([*opened.unused, *extra])}")
+    if (time := columns.get("time")) is not None:
+        notes += clock_notes(table, time, clock, sample_rate=experiment.sample_rate)
     keep = _window(clock, experiment)
     scales = [_position_scale(table, column, system, notes) for column in positions]
     y = np.array(
@@ -183,59 +236,6 @@ def _check_carts(table: Table, experiment: Experiment, positions: list[Column]) 
         )
 
 
-def _clock(
-    table: Table, columns: Mapping[str, Column], experiment: Experiment, notes: list[str]
-) -> Clock:
-    column = columns.get("time")
-    n = table.values.shape[1]
-    if n < _FEWEST_SAMPLES:
-        raise SubmissionError(
-            f"{table.source}: expected at least {_FEWEST_SAMPLES} samples, found {n}"
-        )
-    if column is None:
-        if experiment.sample_rate is None:
-            raise SubmissionError(
-                f"{table.source}: no time column; it has {table.headings()}; name it in "
-                "`columns`, or state `sample_rate` in Hz"
-            )
-        return read_clock(np.arange(n) / experiment.sample_rate)
-    factor = conversion(column.unit, "s")
-    if factor is None:
-        raise SubmissionError(
-            f"{table.source}: {column.name!r} is in {column.unit}, which is no unit of time"
-        )
-    clock = read_clock(table.values[column.index] * factor)
-    if clock.stopped is not None:
-        i = clock.stopped
-        before, after = clock.t[i - 1], clock.t[i]
-        what = "stands still" if after == before else "goes back"
-        hint = "; two records pasted together?" if after < before else ""
-        raise SubmissionError(
-            f"{table.source} {table.place(i)}: time {what}, from {before:g} s to {after:g} s{hint}"
-        )
-    if clock.mean_interval > SLOW:
-        notes.append(
-            f"samples are {clock.mean_interval:.4g} s apart: is {column.name!r} in other units?"
-        )
-    if clock.pieces:
-        even = "" if clock.pieces == 1 else f", in {clock.pieces} pieces"
-        notes.append(
-            f"time stamps rounded to {clock.rounding:g} s were straightened: "
-            f"one sample every {1e3 * clock.mean_interval:.6g} ms{even}"
-        )
-    for i in clock.gaps[:3]:
-        notes.append(f"time is missing between {clock.t[i - 1]:.4g} s and {clock.t[i]:.4g} s")
-    if len(clock.gaps) > 3:
-        notes.append(f"and {len(clock.gaps) - 3} more gaps in time")
-    stated = experiment.sample_rate
-    if stated is not None and abs(stated * clock.mean_interval - 1) > _WINDOW_SLACK:
-        notes.append(
-            f"sample_rate = {stated:g} Hz is not used: the time column says "
-            f"{1 / clock.mean_interval:.5g} Hz"
-        )
-    return clock
-
-
 def _window(clock: Clock, experiment: Experiment) -> slice:
     """Return the samples inside the experiment's window; all of them without one."""
     if experiment.window is None:
@@ -250,10 +250,10 @@ def _window(clock: Clock, experiment: Experiment) -> slice:
         )
     half = 0.5 * clock.rounding if clock.pieces else 1e-9
     inside = np.flatnonzero((clock.t >= start - half) & (clock.t <= end + half))
-    if inside.size < _FEWEST_SAMPLES:
+    if inside.size < FEWEST_SAMPLES:
         raise SubmissionError(
             f"submission.toml: window = [{start:g}, {end:g}] holds {inside.size} samples of "
-            f"{experiment.file}, {_FEWEST_SAMPLES} are needed"
+            f"{experiment.file}, {FEWEST_SAMPLES} are needed"
         )
     return slice(int(inside[0]), int(inside[-1]) + 1)
 
@@ -304,21 +304,26 @@ def _input(
             )
         return None, 1.0
     override = experiment.input
-    whole = table.whole[column.index]
-    in_counts = whole and (
+    values, per_count = table.values[column.index], system.input.per_count
+    in_counts = table.whole[column.index] and (
         table.form in ("bench_log", "bench_mat")
         or column.is_duty
-        or (table.form in ("matrix", "variables") and system.input.per_count is not None)
+        or (per_count is not None and (table.form in ("matrix", "variables") or column.is_counted))
+        or (per_count is not None and column.unit is None and _beyond_volts(values))
     )
     if override is not None and override.per_count is not None:
         scale = override.per_count
     elif in_counts:
-        scale = system.input.per_count or DUTY_COUNT
-        if system.input.per_count is None:
+        scale = per_count or DUTY_COUNT
+        if per_count is None:
             notes.append(f"{column.name!r} is taken as duty counts of 5/4096 {system.input.unit}")
     else:
         scale = _unit_scale(column, system.input.unit, notes)
-    return table.values[column.index] * scale, scale
+    return values * scale, scale
+
+
+def _beyond_volts(whole: Array) -> bool:
+    return bool(np.abs(whole).max() > _FEW_COUNTS)
 
 
 def _reference(

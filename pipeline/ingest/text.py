@@ -237,7 +237,8 @@ class _Layout:
 def _delimited(text: str, source: str) -> Table:
     """Read a heading and rows; the delimiter and the decimal mark are found."""
     # A spreadsheet leaves rows of nothing but delimiters after its last.
-    lines = [(i, line) for i, line in enumerate(text.split("\n"), start=1) if line.strip(' \t;,"')]
+    numbered = enumerate(text.split("\n"), start=1)
+    lines = [(i, line) for i, line in numbered if line.strip().strip(' \t;,"')]
     start = 0
     while start < len(lines) and lines[start][1].lstrip().startswith(("#", "%", "sep=")):
         start += 1
