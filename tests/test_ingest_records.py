@@ -167,6 +167,35 @@ def test_duty_counts_become_input_units(system, scale, tmp_path):
     assert_allclose(record.input_scale, scale, rtol=1e-15)
 
 
+PER_COUNT = 'input = { unit = "V", sign = 1, per_count = 1e-4 }'
+
+
+def test_duty_counts_of_a_csv_become_input_units(tmp_path):
+    """Whole numbers no voltage reaches are counts where the submission says what one is."""
+    duty = np.round(3000 * U)
+    data = read(tmp_path, PER_COUNT, STEP, csv(time=T, input=duty, x1=X1))
+    assert_allclose(data.records[0].u, 1e-4 * duty, rtol=1e-15)
+    assert data.records[0].input_scale == 1e-4
+    assert data.warnings == ()
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        csv(time=T, input=100 * U, x1=X1),
+        csv(time=T, input=U, x1=X1),
+        csv(time=T, input__V=3000 * U, x1=X1),
+    ],
+    ids=["a step of one volt", "fractions", "a heading in volts"],
+)
+def test_a_scale_that_no_input_needs_is_said(content, tmp_path):
+    """Volts stay volts, and a per_count that nothing uses is named."""
+    data = read(tmp_path, PER_COUNT, STEP, content)
+    assert data.records[0].input_scale == 1.0
+    (said,) = data.warnings
+    assert said.startswith("system.input.per_count = 0.0001 is not used: no input holds counts")
+
+
 def test_an_effort_with_fractions_is_no_duty_count(tmp_path):
     """The same log with volts in it stays in volts."""
     record = read(tmp_path, "", STEP, bench_log(U)).records[0]
@@ -300,11 +329,27 @@ def test_a_stated_sign_is_used_and_a_doubtful_one_mentioned(tmp_path):
     content = csv(time=T, input=U, x1=X1)
     data = read(tmp_path, 'input = { unit = "V", sign = -1 }', STEP, content)
     assert_array_equal(data.records[0].u, -U)
-    assert data.warnings == ("a: the sign of the input is stated as -1, the data say +1",)
+    assert data.warnings == (
+        "the sign of the input is stated as -1, the data say +1 in a (all that tell): "
+        "set sign = 1 there, or leave it out",
+    )
     own = STEP + "\ninput = { sign = 1, per_count = 2.0 }"
     data = read(tmp_path, 'input = { unit = "V", sign = -1 }', own, content)
     assert_array_equal(data.records[0].u, 2 * U)
     assert data.warnings == ()
+
+
+def test_a_wrong_sign_of_a_session_is_one_sentence(tmp_path):
+    """Every record that contradicts the stated sign is named in one warning, with the remedy."""
+    toml = 'version = 1\n[system]\ncarts = 2\ninput = { unit = "V", sign = 1 }\n'
+    for name, scale in {"one": -1, "two": -2, "right": 1}.items():
+        toml += f'[[experiments]]\nid = "{name}"\nkind = "step"\nfile = "{name}.csv"\n'
+        (tmp_path / f"{name}.csv").write_text(csv(time=T, input=scale * U, x1=abs(scale) * X1))
+    (tmp_path / "submission.toml").write_text(toml)
+    assert read_data(load_submission(tmp_path)).warnings == (
+        "the sign of the input is stated as +1, the data say -1 in one, two (2 of 3): "
+        "set sign = -1 there, or leave it out",
+    )
 
 
 def test_signs_may_differ_between_experiments(tmp_path):

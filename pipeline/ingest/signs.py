@@ -48,12 +48,7 @@ def _say_signs(
     driven: list[str], *, stated: dict[str, int], found: dict[str, int], signs: dict[str, int]
 ) -> list[str]:
     """Return what was found, what was only taken, and where the data contradict the students."""
-    says = [
-        f"{name}: the sign of the input is stated as {stated[name]:+d}, "
-        f"the data say {found[name]:+d}"
-        for name in driven
-        if name in stated and found.get(name, 0) == -stated[name]
-    ]
+    says = _contradictions(driven, stated=stated, found=found)
     searched = [name for name in driven if name not in stated]
     if not searched:
         return says
@@ -70,3 +65,20 @@ def _say_signs(
     if unsure := [name for name in searched if not found.get(name)]:
         text += f"; taken from the others where the data do not tell: {', '.join(unsure)}"
     return [*says, text]
+
+
+def _contradictions(
+    driven: list[str], *, stated: dict[str, int], found: dict[str, int]
+) -> list[str]:
+    """Return a sentence for each stated sign that records contradict, and what to do."""
+    says = []
+    for sign in (1, -1):
+        told = [name for name in driven if stated.get(name) == sign and found.get(name)]
+        contrary = [name for name in told if found[name] == -sign]
+        if contrary:
+            those = "all that tell" if contrary == told else f"{len(contrary)} of {len(told)}"
+            says.append(
+                f"the sign of the input is stated as {sign:+d}, the data say {-sign:+d} in "
+                f"{', '.join(contrary)} ({those}): set sign = {-sign} there, or leave it out"
+            )
+    return says
