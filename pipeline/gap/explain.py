@@ -5,6 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from pipeline.errors import DataError
 from pipeline.gap.baseline import fit_baseline, measure_noise
@@ -67,7 +68,8 @@ def explain_gap(
     notes: list[str] = []
     runs = _prepare(records, springs=tuple(springs), notes=notes)
     training, held_out = _sides(runs, notes=notes)
-    with ThreadPoolExecutor(max_workers=workers) as pool:
+    # Its matrices are small: BLAS with threads of its own only gets in the workers' way.
+    with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(max_workers=workers) as pool:
         tell("fitting the linear chain")
         fit, training = fit_baseline(training, springs=springs, start=chain, mapper=pool.map)
         sigma = {row: s for run in training for row, s in zip(run.rows, run.sigma, strict=True)}
