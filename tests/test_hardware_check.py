@@ -204,6 +204,27 @@ def test_a_stated_scale_that_the_log_contradicts_is_said():
     assert checks[0].nrmse < 1.35 * noise_floor(y[0])
 
 
+def test_noise_at_a_fast_sample_is_no_scale_of_the_log():
+    """At 1 kHz the velocity from noisy readings is mostly noise; the true controller stays."""
+    t = 0.001 * np.arange(4000, dtype=np.float64)
+    steps = np.where((t > 0.2) & (t < 2.5), 1.0, 0.0)
+    design = design_feedback(
+        TWO, cart=2, reference=1.0, overshoot_percent=10.0, settling_time=1.0, sample_time=0.001
+    )
+    law = StateFeedback(gains=design.gains, prefilter=design.prefilter, model=TWO)
+    run = simulate_loop(TWO, law, t=t, reference=steps, encoder_step=COUNT)
+    y = run.x + 0.01 * np.random.default_rng(5).standard_normal(run.x.shape)
+
+    checks = check_hardware(
+        record(y, u=run.u, t=t, reference=steps), TWO, controller=stated(design)
+    )
+
+    for check in checks:
+        assert check.note == ""
+        # The noise over the motion; of 4000 samples, good to 1/sqrt(8000), 1 %.
+        assert check.nrmse < 1.05 * 0.01 / np.sqrt(np.mean(y[check.cart - 1] ** 2))
+
+
 @pytest.mark.parametrize(
     ("law", "sample_time"),
     [
