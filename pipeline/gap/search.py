@@ -33,6 +33,7 @@ _RUN_GAIN, _RUN_SHARE = 0.97, 0.6  # … and by 3 % in 60 % of the runs
 _SEVERAL_STARTS = ("extra_mode", "end_stop", "backlash", "slack_spring")
 _ZOOM_SHARE = 0.15  # of the first suspect's, below which one start must do
 _CONTACT = ("end_stop", "backlash")
+_BOUND_MARGIN = 0.01  # in logarithms, or in scales
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -54,6 +55,21 @@ class Hypothesis:
     def key(self) -> frozenset[tuple[str, int]]:
         """Which effects act where."""
         return frozenset(c.key for c in self.fit.structure.effects)
+
+    @property
+    def sound(self) -> bool:
+        """Is every effect what its name says, and no estimate at a bound of the search?"""
+        structure, theta = self.fit.structure, self.fit.theta
+        low, high = structure.bounds()
+        at_bound = (theta <= low + _BOUND_MARGIN) | (theta >= high - _BOUND_MARGIN)
+        for index, term in enumerate(structure.model(theta).terms):
+            reported = np.array([p.reported for p in term.effect.parameters])
+            values = dict(zip(term.effect.names, term.values, strict=True))
+            if np.any(at_bound[structure.span(index)] & reported):
+                return False
+            if not term.effect.genuine(values):
+                return False
+        return True
 
     @property
     def at_floor(self) -> bool:
@@ -106,6 +122,8 @@ def search(baseline: Hypothesis, bench: Bench, *, depth: int = _DEPTH) -> list[H
             if parent.at_floor or parent.fit.chi > _HOPELESS * best.fit.chi:
                 continue
             for child in grow(parent, bench):
+                if not child.sound:
+                    continue
                 if child.key not in seen or child.bic < seen[child.key].bic:
                     seen[child.key] = child
                     if child.bic < parent.bic - _BIC_DROP:

@@ -83,6 +83,7 @@ class Effect:
     family : effects of one family exclude each other at one place.
     grows_from : the simpler effect whose fit is the start of this one's.
     equivalent : what the data cannot tell from it, and why.
+    genuine : False where the values have degenerated into another law.
     """
 
     key: str
@@ -101,6 +102,7 @@ class Effect:
     fewest_carts: int = 1
     grows_from: str | None = None
     equivalent: str = ""
+    genuine: Callable[[Mapping[str, float]], bool] = lambda p: True
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -3,6 +3,8 @@
 from pipeline.plant.effects.base import Effect, Parameter, Scales
 from pipeline.plant.tables import Cart
 
+_LEAST_SLIDING = 0.01  # of the force at rest
+
 
 def _spring_force(s: Scales) -> float:
     return s.stiffness * s.position
@@ -70,6 +72,8 @@ STICTION = Effect(
     axis="velocity",
     family="dry friction",
     grows_from="coulomb_friction",
+    # Without a drop it is Coulomb's law; without sliding friction no dry surface behaves like it.
+    genuine=lambda p: _LEAST_SLIDING * p["static_force"] < p["force"] < p["static_force"],
 )
 
 PRESLIDING = Effect(
