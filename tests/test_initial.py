@@ -59,8 +59,8 @@ def _step(experiment, gain, cart=1):
 
 
 def test_steps_win_over_the_lowest_dwell_and_outliers_are_reported():
-    """A gain measured by steps replaces that of the frequency response; the run left out is named."""
-    gains = [_step(f"step-{i}", g) for i, g in enumerate([2.0, 2.01, 1.99, 2.0, 3.0], start=1)]
+    """A gain measured by steps replaces that of the response; the run left out is named."""
+    gains = [_step(f"step-{i}", g) for i, g in enumerate([2.0, 2.01, 1.99, 2.0, 3.0], 1)]
     response = {"K_1": Estimate(value=1.8, std=0.1, source="frequency_response")}
     response["omega_a"] = Estimate(value=9.0, std=0.1, source="frequency_response")
     estimates, left_out = estimate_initially(
