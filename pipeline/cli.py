@@ -119,7 +119,7 @@ def inspect(
         try:
             inspections.append(inspect_file(file))
         except PipelineError as error:
-            unreadable.append(str(error).replace(file.name, str(file), 1))
+            unreadable.append(str(error))
     if as_json:
         typer.echo(json.dumps([i.to_dict() for i in inspections], indent=1, ensure_ascii=False))
     elif inspections:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.io
 
 from pipeline.errors import SubmissionError
 from pipeline.ingest.inspect import Inspection, format_inspection, inspect_file
@@ -120,6 +121,27 @@ def test_the_text_and_the_json_say_the_same(tmp_path):
     assert len(plain["problems"]) == 2
 
 
+def test_columns_without_names_get_a_line_to_use(tmp_path):
+    """A bare matrix in the order of an ECP export: the clock, encoders and effort are guessed."""
+    counts = np.round(300 * np.sin(8 * T))
+    copy = np.round(0.5 * counts + 0.5 * np.r_[0.0, counts[:-1]])
+    matrix = np.column_stack([np.arange(T.size), T, copy, counts, -counts, -0.5 * STEP])
+    scipy.io.savemat(tmp_path / "a.mat", {"data": matrix})
+    got = inspect_file(tmp_path / "a.mat")
+    (said,) = [problem for problem in got.problems if "submission.toml" in problem]
+    assert said.endswith("perhaps columns = { time = 2, input = 6, x1 = 4, x2 = 5 }")
+    assert [column.name for column in got.columns] == ["1", "2", "3", "4", "5", "6"]
+    assert "-0 " not in format_inspection(got)
+    assert not format_inspection(got).endswith("-0")
+
+
+def test_columns_without_a_clock_get_no_suggestion(tmp_path):
+    """Where no column advances as time does, only the need of names is said."""
+    scipy.io.savemat(tmp_path / "a.mat", {"data": np.column_stack([X, STEP, np.sin(9 * T)])})
+    problems = inspect_file(tmp_path / "a.mat").problems
+    assert "the columns have no names: say in submission.toml which is what" in problems
+
+
 @pytest.mark.skipif(os.name == "nt", reason="links need rights on Windows")
 def test_a_link_may_be_inspected(tmp_path):
     """Looking at one's own file through a link is no harm."""
@@ -130,7 +152,13 @@ def test_a_link_may_be_inspected(tmp_path):
 
 def test_what_is_no_data_file_is_one_line(tmp_path):
     """A missing file and a folder are errors."""
-    with pytest.raises(SubmissionError, match=r"there is no file 'none\.csv'"):
-        inspect_file(tmp_path / "none.csv")
+    typed = tmp_path / "none.csv"
+    with pytest.raises(SubmissionError, match=r"there is no file 'none\.csv'") as caught:
+        inspect_file(typed)
+    assert str(caught.value).startswith(f"{typed}: ")
+    (tmp_path / "words.csv").write_text("no numbers here")
+    with pytest.raises(SubmissionError, match="not a table of numbers") as caught:
+        inspect_file(tmp_path / "words.csv")
+    assert str(caught.value).startswith(f"{tmp_path / 'words.csv'} line 1: ")
     with pytest.raises(SubmissionError, match="is a folder"):
         inspect_file(tmp_path)

@@ -21,20 +21,23 @@ _STRANGERS = (
 )
 
 
-def read_table(folder: Path, name: str) -> tuple[Table, str]:
+def read_table(folder: Path, name: str, *, shown: str | None = None) -> tuple[Table, str]:
     """Return the columns of a data file and the SHA-256 of its bytes.
+
+    Messages call the file `shown`, by default its name.
 
     Raises
     ------
     SubmissionError : outside the folder, missing, of no known form or broken; names the line.
     """
     if (problem := outside(folder, name)) is not None:
-        raise SubmissionError(problem)
+        raise SubmissionError(problem if shown is None else f"{shown}: {problem}")
+    source = shown or name
     try:
         raw = (folder / name).read_bytes()
     except OSError as error:
-        raise SubmissionError(f"{name}: cannot be read ({error.strerror})") from None
-    return parse_table(raw, source=name), hashlib.sha256(raw).hexdigest()
+        raise SubmissionError(f"{source}: cannot be read ({error.strerror})") from None
+    return parse_table(raw, source=source), hashlib.sha256(raw).hexdigest()
 
 
 def parse_table(raw: bytes, *, source: str) -> Table:

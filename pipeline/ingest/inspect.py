@@ -12,6 +12,7 @@ from pipeline.ingest.columns import Column, assign_columns, conversion, holds_co
 from pipeline.ingest.files import read_table
 from pipeline.ingest.problems import channel_problems
 from pipeline.ingest.signals import encoder_step, mirrors
+from pipeline.ingest.suggest import suggest_columns
 from pipeline.ingest.table import FORM_TITLES, Table
 from pipeline.plant.chain import Array
 from pipeline.results import Kind
@@ -66,10 +67,10 @@ def inspect_file(path: Path) -> Inspection:
 
     Raises
     ------
-    SubmissionError : the file is missing, of no known form, or broken.
+    SubmissionError : the file is missing, of no known form, or broken; names the path as given.
     """
     real = Path(path).resolve()  # a link is the caller's own business here
-    table, _ = read_table(real.parent, real.name)
+    table, _ = read_table(real.parent, real.name, shown=str(path))
     problems = [f"{table.cut}: the file was cut short"] if table.cut else []
     problems += table.notes
     try:
@@ -77,7 +78,13 @@ def inspect_file(path: Path) -> Inspection:
     except SubmissionError as error:
         columns, unused = {}, ()
         problems.append(str(error).removeprefix(f"{table.source}: "))
-    if unused:
+    if not columns and all(name.isdigit() for name in table.names):
+        line = suggest_columns(table)
+        problems.append(
+            "the columns have no names: say in submission.toml which is what"
+            + (f", perhaps {line}" if line else "")
+        )
+    elif unused:
         problems.append(f"no role for {', '.join(unused)}: name them in `columns` to use them")
     clock = _clock(table, columns, problems) if "frequency" not in columns else None
     kind, frequency = _guess(table, columns, clock, problems)
@@ -89,8 +96,8 @@ def inspect_file(path: Path) -> Inspection:
             ColumnInspection(
                 name=name,
                 role=roles.get(i),
-                low=float(values.min()),
-                high=float(values.max()),
+                low=float(values.min()) + 0.0,  # never "-0"
+                high=float(values.max()) + 0.0,
                 step=encoder_step(values) or None if roles.get(i, " ")[0] == "x" else None,
             )
             for i, (name, values) in enumerate(zip(table.names, table.values, strict=True))
