@@ -1,0 +1,178 @@
+"""The account of a search: effects with their errors, rivals, traces, errors by record."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeline.gap.fit import Fit, Locals, simulate_run
+from pipeline.gap.runs import Run
+from pipeline.gap.search import Bench, Hypothesis
+from pipeline.gap.types import FoundEffect, NamedValue, RecordGap, Rival, Trace
+from pipeline.plant.effects import find_effect
+from pipeline.plant.effects.base import Term
+
+
+def list_effects(
+    path: Sequence[Hypothesis],
+    final: Fit,
+    found: Sequence[Hypothesis],
+    *,
+    position_unit: str,
+    input_unit: str,
+) -> tuple[FoundEffect, ...]:
+    """Return the effects of the final fit, each with its step on the path and its rivals."""
+    structure = final.structure
+    terms = structure.model(final.theta).terms
+    chosen = path[-1]
+    same_size = {h.key: h for h in found if len(h.key) == len(chosen.key)} | {chosen.key: chosen}
+    lowest = min(h.bic for h in same_size.values())
+    weight = {key: float(np.exp(-0.5 * (h.bic - lowest))) for key, h in same_size.items()}
+    total = sum(weight.values())
+    slopes = structure.physical_derivative(final.theta)
+    std = np.sqrt(np.diag(final.covariance)) * slopes if final.covariance is not None else None
+    out = []
+    for index, (candidate, term) in enumerate(zip(structure.effects, terms, strict=True)):
+        rest = chosen.key - {candidate.key}
+        rivals = sorted(
+            ((key, h) for key, h in same_size.items() if rest < key and key != chosen.key),
+            key=lambda pair: pair[1].bic,
+        )
+        values = _named_values(
+            term,
+            None if std is None else std[structure.span(index)],
+            position_unit=position_unit,
+            input_unit=input_unit,
+        )
+        reported = {p.name for p in term.effect.parameters if p.reported}
+        out.append(
+            FoundEffect(
+                effect=term.effect,
+                where=term.where,
+                parameters={k: v for k, v in values.items() if k in reported},
+                details={k: v for k, v in values.items() if k not in reported},
+                confidence=sum(w for key, w in weight.items() if candidate.key in key) / total,
+                nrmse_before=path[index].error,
+                nrmse_after=path[index + 1].error,
+                rivals=tuple(
+                    Rival(
+                        effect=find_effect(next(iter(key - rest))[0]),
+                        where=_where(next(iter(key - rest))),
+                        nrmse_after=h.error,
+                        confidence=weight[key] / total,
+                    )
+                    for key, h in rivals[:4]
+                ),
+            )
+        )
+    return tuple(out)
+
+
+def _where(key: tuple[str, int]) -> dict[str, int]:
+    return find_effect(key[0]).where(key[1])
+
+
+def _named_values(
+    term: Term, std: np.ndarray | None, *, position_unit: str, input_unit: str
+) -> dict[str, NamedValue]:
+    return {
+        p.name: NamedValue(
+            value=float(value),
+            std=None if std is None else float(std[i]),
+            unit=p.unit_text(position=position_unit, input=input_unit),
+        )
+        for i, (p, value) in enumerate(zip(term.effect.parameters, term.values, strict=True))
+    }
+
+
+def chain_std(fit: Fit) -> dict[str, float]:
+    """Return the standard error of every mass, damping and spring by its name."""
+    if fit.covariance is None:
+        return {}
+    structure, chain = fit.structure, fit.structure.chain(fit.theta)
+    values = {f"{letter}_{i}": v for letter, row in (("m", chain.m), ("c", chain.c))
+              for i, v in enumerate(row, start=1)}  # fmt: skip
+    values |= {f"k_{j + 1}": chain.k[j] for j in structure.rows}
+    # The vector holds their logarithms, whose errors are relative.
+    relative = np.sqrt(np.diag(fit.covariance))[: structure.base_size]
+    return {name: float(v * r) for (name, v), r in zip(values.items(), relative, strict=True)}
+
+
+def pooled_floor(runs: Sequence[Run]) -> float:
+    """Return the noise relative to the motion, over all runs."""
+    noise = sum(float((run.sigma**2).sum()) * run.t.size for run in runs)
+    motion = sum(float((run.swing**2).sum()) * run.t.size for run in runs)
+    return float(np.sqrt(noise / motion))
+
+
+def _sides_of(hypothesis: Hypothesis, bench: Bench) -> list[tuple[Run, Locals, bool]]:
+    """Return every run with its own unknowns, and whether it was held out."""
+    training = zip(bench.training, hypothesis.fit.locals_, strict=True)
+    held_out = zip(bench.held_out, hypothesis.held.locals_, strict=True)
+    return [(run, own, False) for run, own in training] + [
+        (run, own, True) for run, own in held_out
+    ]
+
+
+def make_traces(before: Hypothesis, after: Hypothesis, bench: Bench) -> tuple[Trace, ...]:
+    """Return every cart of every run beside the model before and after."""
+    out = []
+    for (run, own_before, held), (_, own_after, _) in zip(
+        _sides_of(before, bench), _sides_of(after, bench), strict=True
+    ):
+        linear = simulate_run(before.fit.structure, before.fit.theta[None], run, own_before)[0]
+        final = simulate_run(after.fit.structure, after.fit.theta[None], run, own_after)[0]
+        u = run.record.u[-run.t.size :] if run.record.u is not None else np.zeros(run.t.size)
+        out += [
+            Trace(
+                experiment=run.id,
+                cart=row + 1,
+                held_out=held,
+                t=run.t,
+                u=u,
+                measured=run.y[j],
+                baseline=linear[j],
+                final=final[j],
+                zero=float(own_after.zero[row]),
+            )
+            for j, row in enumerate(run.rows)
+        ]
+    return tuple(out)
+
+
+def compare_by_record(before: Hypothesis, after: Hypothesis, bench: Bench) -> tuple[RecordGap, ...]:
+    """Return the relative error of every cart in every run, before and after."""
+    runs = {run.id: run for run in (*bench.training, *bench.held_out)}
+    out = []
+    for trace in make_traces(before, after, bench):
+        run = runs[trace.experiment]
+        j = run.rows.index(trace.cart - 1)
+        size = max(float(run.swing[j]), 1e-12)
+
+        def error(model: np.ndarray, trace: Trace = trace, size: float = size) -> float:
+            return float(np.sqrt(np.mean((trace.measured - model) ** 2))) / size
+
+        out.append(
+            RecordGap(
+                experiment=trace.experiment,
+                cart=trace.cart,
+                held_out=trace.held_out,
+                baseline=error(trace.baseline),
+                final=error(trace.final),
+                noise_floor=float(run.sigma[j]) / size,
+            )
+        )
+    return tuple(out)
+
+
+def repeatability(runs: Sequence[Run]) -> float | None:
+    """Return the relative difference of runs with the same input, or None without such."""
+    squares, sizes = 0.0, 0.0
+    for i, a in enumerate(runs):
+        for b in runs[:i]:
+            alike = a.free == b.free and a.t.size == b.t.size and np.any(a.command)
+            if not alike or not np.array_equal(a.command, b.command):
+                continue
+            offset = (a.y - a.rest[list(a.rows)][:, None]) - (b.y - b.rest[list(b.rows)][:, None])
+            squares += float((offset**2).sum()) / 2.0
+            sizes += float((a.swing**2).sum()) * a.t.size
+    return float(np.sqrt(squares / sizes)) if sizes else None

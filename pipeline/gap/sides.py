@@ -1,0 +1,87 @@
+"""Which records are used, cut to what the fits need, and which of them judge."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from pipeline.errors import DataError
+from pipeline.gap.runs import Run, cut_shots, make_run
+from pipeline.gap.split import split, without_twins
+from pipeline.results import Record
+
+_LAST_SHARE = 0.4  # of a single run is held out
+_MOST_DWELLS = 4  # sine dwells used; they say little beyond their frequency
+_LEAST_MOTION = 8.0  # encoder steps
+_WINDOW = 0.5  # s; a chain without springs drifts, so it is judged over windows
+
+
+def prepare(records: Sequence[Record], *, springs: tuple[bool, ...], notes: list[str]) -> list[Run]:
+    """Return the runs worth fitting; what is left out is noted.
+
+    Raises
+    ------
+    DataError : no record with a free cart that moves.
+    """
+    n = len(springs) - 1
+    usable = [r for r in records if r.kind != "bode" and r.t.size >= 50 and r.free]
+    open_loop = [r for r in usable if r.kind != "closed_loop"]
+    if open_loop and len(open_loop) < len(usable):
+        notes.append("runs under feedback are left out: open-loop runs tell more")
+        usable = open_loop
+    dwells = [r for r in usable if r.kind == "sine"]
+    if len(dwells) > _MOST_DWELLS:
+        dwells.sort(key=lambda r: r.omega or 0.0)
+        picked = {round(i) for i in np.linspace(0, len(dwells) - 1, _MOST_DWELLS)}
+        left_out = {r.id for i, r in enumerate(dwells) if i not in picked}
+        usable = [r for r in usable if r.id not in left_out]
+    if not usable:
+        raise DataError("gap: needs a time record with a cart free to move, found none")
+    moving = [r for r in usable if _moves(r)]
+    if len(moving) < len(usable):
+        notes.append(f"{len(usable) - len(moving)} runs without motion left out")
+    if not moving:
+        raise DataError("gap: needs a run in which a free cart moves, found none")
+    runs = [make_run(record, n=n) for record in moving]
+    if not any(np.any(run.command) for run in runs):
+        notes.append("no run has an input: forces are per unit of the first mass")
+    kept = without_twins(runs)
+    if len(kept) < len(runs):
+        notes.append(f"{len(runs) - len(kept)} duplicate files left out")
+    if not any(springs):
+        notes.append("no springs: judged over windows of half a second, not by the drift")
+        kept = [cut_shots(run, length=_WINDOW) for run in kept]
+    return kept
+
+
+def _moves(record: Record) -> bool:
+    spans = [np.ptp(record.position(c)) for c in record.carts if c in record.free]
+    steps = [record.encoder_step(c) for c in record.carts if c in record.free]
+    return any(span > _LEAST_MOTION * step for span, step in zip(spans, steps, strict=True))
+
+
+def take_sides(runs: list[Run], *, notes: list[str]) -> tuple[list[Run], list[Run]]:
+    """Return training and held-out runs; a single run is cut in time."""
+    teach, judge_by = split(runs)
+    if judge_by:
+        return [runs[i] for i in teach], [runs[i] for i in judge_by]
+    notes.append("one run of each kind: the last 40 % of the longest is held out")
+    longest = max(range(len(runs)), key=lambda i: runs[i].t[-1] - runs[i].t[0])
+    run = runs[longest]
+    cut = int((1.0 - _LAST_SHARE) * run.t.size)
+    pieces = []
+    for piece in (slice(0, cut), slice(cut, None)):
+        record = replace(
+            run.record,
+            # A later piece of a decay has no hand in it.
+            kind=run.record.kind if piece.start == 0 and run.record.kind != "decay" else "sweep",
+            t=run.t[piece],
+            u=None if run.record.u is None else run.record.u[-run.t.size :][piece],
+            y=np.array([run.record.y[j][-run.t.size :][piece] for j in range(len(run.record.y))]),
+            reference=None,
+        )
+        part = make_run(record, n=run.zero.size)
+        moving = replace(part, zero=run.zero, zero_std=run.zero_std, rest=run.rest)
+        pieces.append(moving if len(run.shots) == 2 else cut_shots(moving, length=_WINDOW))
+    others = [r for i, r in enumerate(runs) if i != longest]
+    return [*others, pieces[0]], [pieces[1]]
