@@ -170,10 +170,13 @@ def test_duty_counts_become_input_units(system, scale, tmp_path):
 PER_COUNT = 'input = { unit = "V", sign = 1, per_count = 1e-4 }'
 
 
-def test_duty_counts_of_a_csv_become_input_units(tmp_path):
+@pytest.mark.parametrize("written", ["512", "512.0"])
+def test_duty_counts_of_a_csv_become_input_units(written, tmp_path):
     """Whole numbers no voltage reaches are counts where the submission says what one is."""
-    duty = np.round(3000 * U)
-    data = read(tmp_path, PER_COUNT, STEP, csv(time=T, input=duty, x1=X1))
+    duty = np.round(51_200 * U)
+    content = csv(time=T, input=duty, x1=X1).replace(",512,", f",{written},")
+    assert f",{written}," in content
+    data = read(tmp_path, PER_COUNT, STEP, content)
     assert_allclose(data.records[0].u, 1e-4 * duty, rtol=1e-15)
     assert data.records[0].input_scale == 1e-4
     assert data.warnings == ()
@@ -330,7 +333,7 @@ def test_a_stated_sign_is_used_and_a_doubtful_one_mentioned(tmp_path):
     data = read(tmp_path, 'input = { unit = "V", sign = -1 }', STEP, content)
     assert_array_equal(data.records[0].u, -U)
     assert data.warnings == (
-        "the sign of the input is stated as -1, the data say +1 in a (all that tell): "
+        "the sign of the input is stated as -1, the data say +1 in a (all that tell it): "
         "set sign = 1 there, or leave it out",
     )
     own = STEP + "\ninput = { sign = 1, per_count = 2.0 }"
@@ -347,8 +350,8 @@ def test_a_wrong_sign_of_a_session_is_one_sentence(tmp_path):
         (tmp_path / f"{name}.csv").write_text(csv(time=T, input=scale * U, x1=abs(scale) * X1))
     (tmp_path / "submission.toml").write_text(toml)
     assert read_data(load_submission(tmp_path)).warnings == (
-        "the sign of the input is stated as +1, the data say -1 in one, two (2 of 3): "
-        "set sign = -1 there, or leave it out",
+        "the sign of the input is stated as +1, the data say -1 in one, two "
+        "(2 of the 3 that tell it): set sign = -1 there, or leave it out",
     )
 
 

@@ -309,8 +309,9 @@ def _input(
         table.form in ("bench_log", "bench_mat")
         or column.is_duty
         or (per_count is not None and (table.form in ("matrix", "variables") or column.is_counted))
-        or (per_count is not None and column.unit is None and _beyond_volts(values))
     )
+    if per_count is not None and column.unit is None:
+        in_counts = in_counts or _beyond_volts(values)
     if override is not None and override.per_count is not None:
         scale = override.per_count
     elif in_counts:
@@ -322,8 +323,9 @@ def _input(
     return values * scale, scale
 
 
-def _beyond_volts(whole: Array) -> bool:
-    return bool(np.abs(whole).max() > _FEW_COUNTS)
+def _beyond_volts(values: Array) -> bool:
+    """Tell counts from volts typed in: whole numbers, perhaps written "512.0", and large ones."""
+    return bool(np.all(values == np.round(values)) and np.abs(values).max() > _FEW_COUNTS)
 
 
 def _reference(

@@ -8,6 +8,8 @@ from pipeline.ingest.signals import input_sign
 from pipeline.results import Record
 from pipeline.submission import Submission
 
+_FEW_NAMES = 6  # more are not listed one by one
+
 
 def with_signs(records: list[Record], submission: Submission) -> tuple[list[Record], list[str]]:
     """Return the records with signed inputs, and what is to be said about the signs.
@@ -61,9 +63,9 @@ def _say_signs(
     usual = 1 if sum(signs[name] for name in searched) >= 0 else -1
     text = f"sign of the input found from the data: {usual:+d}"
     if others := [name for name in searched if signs[name] != usual]:
-        text += f", but {-usual:+d} in {', '.join(others)}"
+        text += f", but {-usual:+d} in {_some(others)}"
     if unsure := [name for name in searched if not found.get(name)]:
-        text += f"; taken from the others where the data do not tell: {', '.join(unsure)}"
+        text += f"; taken from the others where the data do not tell: {_some(unsure)}"
     return [*says, text]
 
 
@@ -76,9 +78,17 @@ def _contradictions(
         told = [name for name in driven if stated.get(name) == sign and found.get(name)]
         contrary = [name for name in told if found[name] == -sign]
         if contrary:
-            those = "all that tell" if contrary == told else f"{len(contrary)} of {len(told)}"
+            those = "all" if contrary == told else f"{len(contrary)} of the {len(told)}"
+            those += " that tell it"
             says.append(
                 f"the sign of the input is stated as {sign:+d}, the data say {-sign:+d} in "
-                f"{', '.join(contrary)} ({those}): set sign = {-sign} there, or leave it out"
+                f"{_some(contrary)} ({those}): set sign = {-sign} there, or leave it out"
             )
     return says
+
+
+def _some(names: list[str]) -> str:
+    """Return the names, the middle of a long list left out."""
+    if len(names) <= _FEW_NAMES:
+        return ", ".join(names)
+    return f"{', '.join(names[:2])} … {names[-1]} ({len(names)} runs)"
