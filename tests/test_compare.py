@@ -122,6 +122,6 @@ def test_the_papers_third_table_breaks_the_laws_it_is_known_to_break():
     table = {**gains, **modes, **dampings, **nulls, **carts, **alone}
     checks = check_chain(_fit(PRESETS["throne-3dof"], table), springs=(True,) * 4)
     assert all(c.outcome == "pass" for c in checks if c.id.startswith("order."))
-    value = {c.id: c.value for c in checks}
+    value = {c.id: c.value for c in checks if c.value is not None}
     assert value["redundancy.R4"] > 0.1
     assert value["redundancy.R5"] > 0.02

@@ -13,13 +13,13 @@ def test_the_mean_of_repeats_has_the_error_of_their_spread():
     values = [1.00, 1.02, 0.98, 1.01, 0.99]
     got = combine_repeats(values, std=[1e-4] * 5, source="step").estimate
     assert_allclose(got.value, 1.0, rtol=1e-12)
-    assert_allclose(got.std, np.std(values, ddof=1) / np.sqrt(5), rtol=1e-12)
+    assert got.std == pytest.approx(np.std(values, ddof=1) / np.sqrt(5), rel=1e-12)
 
 
 def test_errors_that_are_larger_than_the_spread_win():
     """Repeats that agree by luck are not more certain than each of them claims."""
     got = combine_repeats([1.0, 1.0], std=[0.3, 0.4], source="step").estimate
-    assert_allclose(got.std, 0.25, rtol=1e-12)  # √(0.3² + 0.4²) / 2
+    assert got.std == pytest.approx(0.25, rel=1e-12)  # √(0.3² + 0.4²) / 2
 
 
 def test_one_repeat_far_off_is_left_out():
