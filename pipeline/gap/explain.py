@@ -16,10 +16,11 @@ from pipeline.gap.account import (
     repeatability,
 )
 from pipeline.gap.baseline import fit_baseline, measure_noise
-from pipeline.gap.fit import Fit, covariance, fit_model
+from pipeline.gap.fit import Fit, covariance, fit_model, simulate_run
 from pipeline.gap.offset import find_offset
 from pipeline.gap.runs import Run
 from pipeline.gap.search import (
+    THINNING,
     Bench,
     Hypothesis,
     choose,
@@ -98,7 +99,9 @@ def explain_gap(
     if chosen.key and chosen.error > _REFUSED_FLOOR * floor:
         notes.append(f"{chosen.error / floor:.1f} times the noise is left: something small remains")
     sample_time = max(run.record.sample_time for run in bench.training)
-    verdict, close = _verdict(chosen, path[0], found, floor=floor, sample_time=sample_time)
+    verdict, close = _verdict(
+        chosen, path[0], found, bench=bench, floor=floor, sample_time=sample_time
+    )
     effects = list_effects(path, final, found, position_unit=position_unit, input_unit=input_unit)
     order = [*bench.training, *bench.held_out]
     return Gap(
@@ -233,6 +236,7 @@ def _verdict(
     baseline: Hypothesis,
     found: Sequence[Hypothesis],
     *,
+    bench: Bench,
     floor: float,
     sample_time: float,
 ) -> tuple[Verdict, list[Hypothesis]]:
@@ -249,10 +253,41 @@ def _verdict(
         if len(rival.key) == len(chosen.key)
         and len(rival.key - chosen.key) == 1
         and rival.error < _CLOSE_ERROR * chosen.error
-        and rival.bic - chosen.bic < min(_CLOSE_GAIN * gain, _CLOSE_BIC)
+        and _evidence(chosen, rival, bench) < min(_CLOSE_GAIN * gain, _CLOSE_BIC)
         and not _same_thing(rival, chosen, sample_time=sample_time)
     ]
     return ("ambiguous" if close else "named"), close
+
+
+def _evidence(chosen: Hypothesis, rival: Hypothesis, bench: Bench) -> float:
+    """Return by how much the chosen is the likelier, in units of the criterion.
+
+    What a model leaves that is not noise swings with the carts: far fewer of its points are
+    independent than the criterion counts, and much of the difference may be chance.
+    """
+    difference = rival.bic - chosen.bic
+    if chosen.fit.chi < _REFUSED_FLOOR**2:
+        return difference
+    counted = chosen.fit.n_points / THINNING
+    return difference * min(1.0, _independent_points(chosen, bench) / counted)
+
+
+def _independent_points(hypothesis: Hypothesis, bench: Bench) -> float:
+    """Return how many residuals would tell as much, were they independent.
+
+    Reference: M. S. Bartlett, Journal of the Royal Statistical Society 98 (1935), 536-543: a
+    mean square of n correlated points is as sure as one of n / (1 + 2 Σ ρ²).
+    """
+    total = 0.0
+    fit = hypothesis.fit
+    for run, own in zip(bench.training, fit.locals_, strict=True):
+        model = simulate_run(fit.structure, fit.theta[None], run, own)[0]
+        for row in run.y - model:
+            power = np.abs(np.fft.rfft(row - row.mean(), 2 * row.size)) ** 2
+            covariance = np.fft.irfft(power)[: row.size]
+            correlation = covariance / max(covariance[0], 1e-300)
+            total += row.size / (1.0 + 2.0 * float((correlation[1:] ** 2).sum()))
+    return total
 
 
 def _decisive(chosen: Hypothesis, baseline: Hypothesis, found: Sequence[Hypothesis]) -> bool:

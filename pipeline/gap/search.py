@@ -24,7 +24,7 @@ _BEAM = (3, 1, 1)  # hypotheses kept after one, two, three effects
 _HOPELESS = 30.0  # a hypothesis with this many times the best one's chi-square is not grown
 _DEPTH = len(_BEAM)
 _BIC_DROP = 20.0
-_THINNING = 10.0  # neighbouring residuals are not independent: N / 10 count
+THINNING = 10.0  # neighbouring residuals are not independent: N / 10 count
 _FRICTION_ROUNDS = 2  # of run-by-run friction, the worst runs started anew before each
 _NEARLY_RIGHT = 6.0  # chi-square of the better runs, below which the bad ones are worth a new start
 _HELD_OUT_GAIN = 0.95  # an effect must lower the held-out error by this factor …
@@ -98,7 +98,7 @@ def judge(
         model = simulate_run(fit.structure, fit.theta[None], run, own)[0]
         errors.append(float(((run.y - model) ** 2).sum()))
         sizes.append(float((run.swing**2).sum() * run.t.size))
-    effective = fit.n_points / _THINNING
+    effective = fit.n_points / THINNING
     bic = effective * np.log(fit.cost / fit.n_points) + fit.theta.size * np.log(effective)
     return Hypothesis(
         fit=fit,
