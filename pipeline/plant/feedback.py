@@ -12,6 +12,10 @@ def lqr_gains(phi: Array, gamma: Array, weights: Array) -> Array:
     The doubling algorithm: after i steps H is the cost of the next 2^i samples. Many weights at
     once cost little more than one.
 
+    Raises
+    ------
+    LinAlgError : the plant's numbers lie too many orders of magnitude apart.
+
     Reference: E. K. Chu, H. Fan, W. Lin, Linear Algebra Appl. 396 (2005) 55-80.
     """
     eye = np.eye(gamma.size)

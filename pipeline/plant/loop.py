@@ -36,6 +36,7 @@ from pipeline.plant.chain import Array, Chain, frozen_array
 # Share of the prediction error at a tick that is put down to the velocity. A half keeps three
 # quarters of the encoder's rounding noise out of v and forgets a wrong start in a few ticks.
 VELOCITY_CORRECTION = 0.5
+MOST_TICKS = 200_000  # of a run: over three minutes at 1 kHz, and some seconds to simulate
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -132,12 +133,13 @@ def simulate_loop(
 
     Raises
     ------
-    DataError : the controller does not fit the free carts.
+    DataError : the controller does not fit the free carts, or ticks too often for such a run.
     """
     t = np.asarray(t, dtype=np.float64)
     free = tuple(range(1, chain.n + 1) if free is None else sorted(set(free)))
     interval = (t[-1] - t[0]) / (t.size - 1)
     T = interval if sample_time is None else sample_time
+    check_ticks(float(t[-1] - t[0]), T)
     # Time stamps are rounded and jitter: an instant belongs to the nearest sample.
     ticks = np.arange(int(np.floor((t[-1] - t[0]) / T + 0.5)) + 2)
     r = np.broadcast_to(np.asarray(reference, dtype=np.float64), t.shape)
@@ -175,6 +177,15 @@ def simulate_loop(
     x = _hermite(elapsed, states[:, 0::2].T, T * states[:, 1::2].T)
     held = np.floor(elapsed + 0.5 * min(1.0, interval / T)).astype(int)
     return LoopRun(t=t, x=x + rest[:, None], u=efforts[held])
+
+
+def check_ticks(duration: float, sample_time: float) -> None:
+    """Raise DataError where a run has more ticks than a simulation can go through."""
+    if not duration <= MOST_TICKS * sample_time:
+        raise DataError(
+            f"a loop needs at most {MOST_TICKS:,} ticks to be simulated, found "
+            f"{duration / sample_time:.3g} in {duration:.3g} s at {sample_time:.3g} s a tick"
+        )
 
 
 def replay(

@@ -21,7 +21,7 @@ from pipeline.errors import DataError
 from pipeline.plant import step_response
 from pipeline.plant.chain import Array, Chain, ComplexArray, quadratic_factors
 from pipeline.plant.feedback import lqr_gains, place_poles
-from pipeline.plant.loop import StateFeedback, discretise, simulate_loop
+from pipeline.plant.loop import StateFeedback, check_ticks, discretise, simulate_loop
 from pipeline.plant.robustness import (
     DAMPING_ERROR,
     MASS_SPRING_ERROR,
@@ -83,7 +83,8 @@ def design_feedback(
 
     Raises
     ------
-    DataError : there is no such cart or no step, or a missing spring leaves a cart out of reach.
+    DataError : there is no such cart or no step, a missing spring leaves a cart out of reach, the
+        chain is none that a computer can design for, or the run takes too many ticks to simulate.
     """
     if not 1 <= cart <= chain.n:
         raise DataError(f"state feedback needs a cart from 1 to {chain.n}, found {cart}")
@@ -101,7 +102,24 @@ def design_feedback(
         limit=np.inf if input_limit is None else input_limit,
         reference=reference,
     )
-    plant = _Sampled.of(chain, cart=cart, settling=settling_time, sample_time=sample_time)
+    try:
+        # A candidate may well be unstable and run away; it is judged by the numbers it ends in.
+        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+            plant = _Sampled.of(chain, cart=cart, settling=settling_time, sample_time=sample_time)
+            return _design(plant, goal, method=method)
+    except np.linalg.LinAlgError:
+        raise DataError(
+            "state feedback needs carts alike in mass, damping and springs to some ten orders of "
+            f"magnitude, found m {_range(chain.m)}, c {_range(chain.c)}, k {_range(chain.k)}"
+        ) from None
+
+
+def _range(values: Array) -> str:
+    return f"{values.min():.1e} to {values.max():.1e}"
+
+
+def _design(plant: "_Sampled", goal: "_Goal", *, method: Method) -> FeedbackDesign:
+    """Choose among the candidates of a method and simulate the one chosen."""
     if method == "lqr":
         requested = None
         candidates = _try_step(plant, _lqr_candidates(plant, _WEIGHTS), goal)
@@ -161,6 +179,8 @@ class _Sampled:
         tied = chain.k[0] > 0 or chain.k[-1] > 0
         stiffness = 1 / chain.static_gains()[0] if tied else chain.m.sum() * rate**2
         phi, gamma = discretise(chain, sample_time)
+        if not (np.all(np.isfinite(phi)) and np.all(np.isfinite(gamma * stiffness))):
+            raise np.linalg.LinAlgError("the sampled plant is not finite")
         unit = np.tile([1.0, rate], chain.n)
         return cls(
             chain=chain,
@@ -300,7 +320,7 @@ def _choose(plant: _Sampled, candidates: _Candidates, goal: _Goal) -> tuple[int,
         candidates.settling / goal.settling,
         np.maximum(candidates.overshoot, 1.0) / max(goal.overshoot, 1.0),
     )
-    return int(np.argmin(np.where(within, excess, np.inf))), False
+    return int(np.argmin(np.where(within & ~np.isnan(excess), excess, np.inf))), False
 
 
 # ------------------------------------------------------------------- the result
@@ -326,6 +346,7 @@ def _finish(
         away = np.abs(requested[None, :] - poles[:, None])
         requested = requested[linear_sum_assignment(away)[1]]
     shown = _SHOWN * min(max(goal.settling, settling), _LATEST * goal.settling)
+    check_ticks(shown, T)
     t = T * np.arange(np.ceil(shown / T) + 1, dtype=np.float64)
     run = simulate_loop(
         chain,
