@@ -134,7 +134,9 @@ def even_chains(windows: Sequence[Window], *, springs: Sequence[bool]) -> list[C
     frequencies is what the records can hold.
     """
     driven = [window for window in windows if window.drive_u is not None]
-    swing = np.median([np.ptp(w.y[0]) / np.ptp(w.drive_u) for w in driven if w.drive_u is not None])
+    # The input may stand from the first sample on: it counts from zero.
+    ranges = [np.ptp(np.append(0.0, w.drive_u)) for w in driven if w.drive_u is not None]
+    swing = np.median([np.ptp(w.y[0]) / u for w, u in zip(driven, ranges, strict=True)])
     slowest = 2 * np.pi * _FEWEST_PERIODS / max(w.t[-1] for w in driven)
     fastest = 2 * np.pi / (_FEWEST_PER_PERIOD * min(float(np.median(np.diff(w.t))) for w in driven))
     if not swing > 0 or fastest <= slowest or not (springs[0] or springs[-1]):

@@ -102,7 +102,8 @@ def open_window(record: Record) -> Window:
 
     Raises
     ------
-    DataError : no free cart was measured, or too few samples are usable.
+    DataError : no free cart was measured, one of them stands still (it sticks, or its encoder is
+        dead), or too few samples are usable.
     """
     carts = tuple(cart for cart in record.carts if cart in record.free)
     used = usable_segment(record)
@@ -112,6 +113,9 @@ def open_window(record: Record) -> Window:
             f"{record.id}: time fit needs {_FEWEST_SAMPLES} samples of a free cart, found "
             f"{t.size if carts else 0}"
         )
+    for cart, position in zip(carts, y, strict=True):
+        if not np.ptp(position) > record.encoder_step(cart):
+            raise DataError(f"{record.id}: time fit needs carts that move, cart {cart} does not")
     drive_t, drive_u, stride = t - t[0], None, 1
     if 1 in record.free and record.u is not None and np.any(record.u[used]):
         drive_u = record.u[used]
@@ -122,7 +126,7 @@ def open_window(record: Record) -> Window:
             drive_u = np.append((fine_u[1:] + fine_u[:-1]) / 2, fine_u[-1])
     steps = np.array([record.encoder_step(cart) for cart in carts])
     noise = np.array([local_noise(t, position) for position in y])
-    least = _NOISE_FREE * max(float(np.max(np.ptp(y, axis=1))), np.finfo(float).tiny)
+    least = _NOISE_FREE * float(np.max(np.ptp(y, axis=1)))
     sigma = np.maximum(np.maximum(noise, steps / np.sqrt(12)), least)
     return Window(
         id=record.id,
