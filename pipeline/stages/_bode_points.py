@@ -70,8 +70,9 @@ class Points:
         return self.magnitude.size
 
     @property
-    def has_phase(self) -> bool:
-        return bool(np.any(np.isfinite(self.phase_std)))
+    def n_phases(self) -> int:
+        """How many points have a phase to go by."""
+        return int(np.count_nonzero(np.isfinite(self.phase_std)))
 
     @property
     def level(self) -> Array:

@@ -68,25 +68,31 @@ def fit_bode(
 
     Raises
     ------
-    DataError : fewer points than parameters, or responses that do not determine them.
+    DataError : too few amplitudes and phases for the parameters, responses that do not determine
+        them, or none of the starts leads anywhere.
     """
     P = Parametrisation(n=n, springs=tuple(springs))
     data = Points.collect(responses, n=n)
-    if data.size <= len(P.names):
+    if data.size + data.n_phases <= len(P.names):
         raise DataError(
-            f"Bode fit: {n} cart{'s'[: n > 1]} with {len(P.names)} parameters "
-            f"need more points than that, found {data.size}"
+            f"Bode fit: {n} cart{'s'[: n > 1]} with {len(P.names)} parameters need more "
+            f"amplitudes and phases than that, found {data.size} and {data.n_phases}"
         )
     known = {name: value for name, value in (initial or {}).items() if value > 0}
     like = _stand_in(data, known, n=n, springs=springs)
     staged, start = _staged_start(data, known, n=n, springs=springs, like=like)
     best, tried = _fit_from_starts(P, data, first=start, like=like)
     remark = ""
-    if data.has_phase:
+    if data.n_phases:
         if _phase_misfit(best, data) <= _PHASE_AGREES * max(1.0, best.chi_square_per_dof**0.5):
             best = _solve(P, data, best.theta, "polar")
         else:
             remark = "magnitudes alone: the phases do not agree with them"
+    if best.dof <= 0:
+        raise DataError(
+            f"Bode fit: {len(P.names)} parameters need more amplitudes than that, or phases "
+            f"that agree with them, found {data.size} amplitudes"
+        )
     best, share = _widen(best, data)
     best = _hold_vanished(best, data.widened(share))
     return _result(best, data, share=share, staged=staged, tried=tried, remark=remark)
@@ -168,7 +174,8 @@ class _Fitted:
 
     @property
     def chi_square_per_dof(self) -> float:
-        return self.chi_square / self.dof
+        """Near 1 for a good fit; of magnitudes alone there may be too few to tell, then near 0."""
+        return self.chi_square / max(self.dof, 1)
 
 
 def _evaluator(
@@ -181,7 +188,10 @@ def _evaluator(
         if not last or not np.array_equal(last[0][0], theta):
             physical = P.physical(P.unpack(theta))
             r, J = weighted_residuals(data, scale, *response_at(P, data, physical))
-            last[:] = [(theta.copy(), r, J * P.slopes(theta))]
+            J = J * P.slopes(theta)
+            if not np.isfinite(np.sum(J**2)):  # without slopes no step could go on from here
+                r = np.full_like(r, np.nan)
+            last[:] = [(theta.copy(), r, J)]
         return last[0][1], last[0][2]
 
     return lambda theta: evaluate(theta)[0], lambda theta: evaluate(theta)[1]
@@ -191,6 +201,8 @@ def _solve(P: Parametrisation, data: Points, theta: Array, scale: Scale) -> _Fit
     residuals, jacobian = _evaluator(P, data, scale)
     # A step that goes astray may overflow; least_squares then takes a shorter one.
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+        if not np.isfinite(np.sum(residuals(theta) ** 2)):
+            raise DataError("Bode fit: no chain comes near responses as far apart as these")
         solution = least_squares(
             residuals,
             theta,
@@ -214,12 +226,19 @@ def _fit_from_starts(
 ) -> tuple[_Fitted, int]:
     """Fit from the first start, and from random ones while the data are not explained."""
     fits: list[_Fitted] = []
+    failed: list[DataError] = []
     for start in (first, *_random_starts(like, P.springs)):
-        near = _solve(P, data, P.pack(start), "log")
-        fits.append(_solve(P, data, near.theta, "magnitude"))
+        try:
+            near = _solve(P, data, P.pack(start), "log")
+            fits.append(_solve(P, data, near.theta, "magnitude"))
+        except DataError as error:
+            failed.append(error)
+            continue
         if fits[-1].chi_square_per_dof <= _GOOD_CHI_SQUARE:
             break
-    return min(fits, key=lambda fit: fit.chi_square), len(fits)
+    if not fits:
+        raise failed[0]
+    return min(fits, key=lambda fit: fit.chi_square), len(fits) + len(failed)
 
 
 def _widen(fitted: _Fitted, data: Points) -> tuple[_Fitted, float]:

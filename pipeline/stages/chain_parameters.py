@@ -182,12 +182,14 @@ def physical_start(found: Chain, *, springs: Sequence[bool], zeta: float = START
     """Return a proper chain near one that a measured table implies.
 
     `found` may hold what no real chain has (a negative spring, a mass far too small): such values
-    are clipped. Dampings are set from `zeta`, as a table's are too uncertain to keep.
+    are clipped. Dampings are set from `zeta`, as a table's are too uncertain to keep; but a cart
+    on no spring keeps its own.
     """
     present = [any(springs), False] if found.n == 1 else list(springs)
     k = np.where(present, _raised(found.k), 0.0)
     m = _raised(found.m)
-    return Chain(m=m, c=2 * zeta * np.sqrt(m * (k[:-1] + k[1:])), k=k)
+    held = k[:-1] + k[1:]
+    return Chain(m=m, c=np.where(held > 0, 2 * zeta * np.sqrt(m * held), found.c), k=k)
 
 
 def _raised(values: Array) -> Array:
