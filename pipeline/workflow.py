@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import ParamSpec, TypeVar
 
 from pipeline.errors import DataError
@@ -31,6 +32,7 @@ from pipeline.stages.compare import (
 )
 from pipeline.stages.frequency_response import (
     collect_dwells,
+    dwell_fault,
     find_resonances,
     response_from_records,
 )
@@ -42,13 +44,14 @@ from pipeline.stages.sine import fit_sine
 from pipeline.stages.state_feedback import design_feedback
 from pipeline.stages.step_gain import fit_step_gain
 from pipeline.stages.time_fit import fit_records
-from pipeline.submission import Design, Submission
+from pipeline.submission import Design, Submission, System
 
 P = ParamSpec("P")
 T = TypeVar("T")
 Progress = Callable[[str], None]
 
 _LISTED = 4  # more runs than these are not named one by one
+_UNTIED = "no spring ties the carts to a wall: they rest anywhere and have no static gain"
 
 
 def _silent(text: str) -> None:
@@ -97,9 +100,9 @@ def analyse(submission: Submission, *, progress: Progress = _silent) -> Analysis
     driven = _driven(data.records, n=n, unit=system.position.unit, log=log)
 
     progress("free decays: logarithmic decrement")
-    decays = _log_decrements(data.records, n=n, log=log)
+    decays = _log_decrements(data.records, springs=springs, log=log)
     progress("steps: static gains")
-    gains = _step_gains(driven, log=log)
+    gains = _step_gains(driven, system=system, log=log)
     progress("sine dwells: steady state")
     sines = _sine_points(data.records, log=log)
     # What a check says of a decay or a step in full is not said twice.
@@ -115,7 +118,7 @@ def analyse(submission: Submission, *, progress: Progress = _silent) -> Analysis
     progress("frequency response")
     responses = _frequency_response(data, sines=sines, driven=driven, log=log)
 
-    found = log.attempt("resonances", find_resonances, responses, n=n) or {}
+    found = _resonances(responses, system=system, log=log)
     initial, left_out = estimate_initially(
         carts=n, log_decrements=decays, step_gains=gains, from_response=found
     )
@@ -124,10 +127,13 @@ def analyse(submission: Submission, *, progress: Progress = _silent) -> Analysis
 
     progress("fitting all carts at once")
     fit = _fit(responses, driven=driven, initial=initial, n=n, springs=springs, log=log)
+    final = fit.parameters if fit else {}
+    if fit and not final:
+        log.skip("named parameters", _UNTIED)
     rows = compare(
         initial,
-        final=fit.parameters if fit else {},
-        names=list(fit.parameters) if fit else parameter_names(n, rigid=not any(springs)),
+        final=final,
+        names=list(final) or parameter_names(n, rigid=system.rigid),
         position_unit=system.position.unit,
         input_unit=system.input.unit,
     )
@@ -221,10 +227,15 @@ def _driven(records: Sequence[Record], *, n: int, unit: str, log: _Log) -> list[
     return [record for record in runs if record.id not in outliers]
 
 
-def _log_decrements(records: Sequence[Record], *, n: int, log: _Log) -> list[LogDecrement]:
+def _log_decrements(
+    records: Sequence[Record], *, springs: Sequence[bool], log: _Log
+) -> list[LogDecrement]:
     """Each cart alone: its decays, or the ring-down of its steps where there is no decay."""
     decays = []
-    for cart in range(1, n + 1):
+    for cart, (before, after) in enumerate(pairwise(springs), start=1):
+        if not (before or after):
+            log.skip(f"log decrement, cart {cart}", f"no spring holds cart {cart}: it cannot swing")
+            continue
         alone = [r for r in records if r.free == (cart,) and cart in r.carts]
         runs = [r for r in alone if r.kind == "decay"] or [r for r in alone if r.kind == "step"]
         if not runs:
@@ -245,7 +256,10 @@ def _sticks(decay: LogDecrement) -> bool:
     return decay.friction is not None and decay.friction.present
 
 
-def _step_gains(driven: Sequence[Record], *, log: _Log) -> list[StepGain]:
+def _step_gains(driven: Sequence[Record], *, system: System, log: _Log) -> list[StepGain]:
+    if not system.tied:
+        log.skip("step gain", _UNTIED)
+        return []
     runs = [record for record in driven if record.kind == "step"]
     if not runs:
         log.skip("step gain", "no step was recorded with all carts free")
@@ -262,10 +276,11 @@ def _sine_points(records: Sequence[Record], *, log: _Log) -> list[SinePoint]:
     points = []
     for run in records:
         for cart in run.carts if run.kind == "sine" else ():
-            point = log.attempt(
-                f"sine steady state, {run.id}, cart {cart}", fit_sine, run, cart=cart
-            )
-            if point:
+            stage = f"sine steady state, {run.id}, cart {cart}"
+            point = log.attempt(stage, fit_sine, run, cart=cart)
+            if point and (fault := dwell_fault(point)):
+                log.skip(stage, fault)
+            elif point:
                 points.append(point)
     return points
 
@@ -282,14 +297,26 @@ def _frequency_response(
         return collect_dwells(sines)
     if data.tables:
         return data.tables
-    log.skip("sine steady state", "no sine dwells were recorded")
+    if not any(record.kind == "sine" for record in data.records):
+        log.skip("sine steady state", "no sine dwells were recorded")
     if not driven:
-        log.skip("frequency response", "no dwells, no table, and no step or sweep to take it from")
+        log.skip(
+            "frequency response", "no usable dwell, no table, and no step or sweep to take it from"
+        )
         return ()
     responses = log.attempt("frequency response", response_from_records, driven)
     if responses:
         log.warn(["the frequency response comes from the step and sweep records, not from dwells"])
     return responses or ()
+
+
+def _resonances(
+    responses: Sequence[FrequencyResponse], *, system: System, log: _Log
+) -> dict[str, Estimate]:
+    if not system.tied:
+        log.skip("resonances", f"{_UNTIED}, and the slowest mode is no resonance")
+        return {}
+    return log.attempt("resonances", find_resonances, responses, n=system.carts) or {}
 
 
 def _fit(
@@ -302,15 +329,15 @@ def _fit(
     log: _Log,
 ) -> ChainFit | None:
     """The Bode fit where dwells or a table allow it, else the joint fit on the time records."""
-    if any(response.source != "records" for response in responses):
+    has_points = any(response.source != "records" for response in responses)
+    if has_points:
         values = {name: estimate.value for name, estimate in initial.items()}
         fit = log.attempt("Bode fit", fit_bode, responses, n=n, springs=springs, initial=values)
         if fit:
             return fit
     if not driven:
-        log.skip(
-            "final estimates", "no dwells, table, step or sweep with all carts free to fit them to"
-        )
+        found = "the Bode fit gave none, and there is no" if has_points else "no dwells, table,"
+        log.skip("final estimates", f"{found} step or sweep with all carts free to fit them to")
         return None
     return log.attempt("final estimates", fit_records, driven, n=n, springs=springs)
 
@@ -318,6 +345,9 @@ def _fit(
 def _design(submission: Submission, fit: ChainFit | None, *, log: _Log) -> FeedbackDesign | None:
     if fit is None:
         log.skip("state feedback", "the carts are not identified")
+        return None
+    if not fit.converged:
+        log.skip("state feedback", f"the fit of the carts did not converge: {fit.message}")
         return None
     task = submission.design
     if task is None:

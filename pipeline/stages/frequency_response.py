@@ -35,17 +35,30 @@ ASSUMED_ZETA = 0.1  # the paper's usual guess for a mode or a null
 # ---------------------------------------------------------------------- dwells
 
 
+def dwell_fault(point: SinePoint) -> str:
+    """Return why a dwell gives no point of a frequency response, or ""."""
+    if not point.input_amplitude > 0:
+        return "a frequency response needs a sinusoidal input, found none"
+    if not all(np.isfinite(x) and x > 0 for x in (point.omega, point.gain, point.gain_std)):
+        return (
+            "a frequency response needs a frequency and an amplitude ratio with its error, found "
+            f"{point.omega:.3g} rad/s and {point.gain:.3g} ± {point.gain_std:.3g}"
+        )
+    return ""
+
+
 def collect_dwells(points: Sequence[SinePoint]) -> tuple[FrequencyResponse, ...]:
     """Collect dwells to one frequency response per cart; repeats of a frequency become one point.
 
     Repeats combine to their weighted mean; its standard error grows where they scatter more than
-    theirs allow. A dwell that did not settle stays, with an error of 5 % added.
+    theirs allow. A dwell that did not settle stays, with an error of 5 % added; one with a
+    `dwell_fault` does not count.
 
     Raises
     ------
-    DataError : no dwell has an input to compare with.
+    DataError : no dwell gives a point.
     """
-    usable = [p for p in points if p.input_amplitude > 0]
+    usable = [p for p in points if not dwell_fault(p)]
     if not usable:
         raise DataError("frequency response: dwells need a sinusoidal input, found none with one")
     return tuple(
