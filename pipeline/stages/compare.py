@@ -106,6 +106,8 @@ def check_rows(rows: Sequence[ParameterRow]) -> list[Check]:
 
 
 def _advice(row: ParameterRow) -> str:
+    if row.initial and row.final and row.initial.value * row.final.value < 0:
+        return " Their signs differ: is the sign of the input in submission.toml right?"
     if row.name.startswith("zeta"):
         return (
             " Damping ratios differ where dry friction is at work: a dwell of amplitude A sees "
