@@ -220,8 +220,10 @@ def simulate(
     ] = False,
 ) -> None:
     """Write a synthetic submission: decays, steps, sine dwells, a sweep, a closed-loop step."""
+    from pipeline.output import new_folder
     from pipeline.synthesis.hidden import prepare_bench, write_bench
 
+    new_folder(out)
     bench = prepare_bench(preset=preset, model=model, hide=hide or ())
     for sentence in bench.told:
         say(f"hidden: {sentence}")

@@ -17,6 +17,18 @@ def check_folder(out: Path) -> Path:
     return out
 
 
+def new_folder(out: Path) -> Path:
+    """Return the folder, not yet there or empty.
+
+    Raises
+    ------
+    ConfigError : there is something in it, which a new submission would be mixed with.
+    """
+    if check_folder(out).is_dir() and any(out.iterdir()):
+        raise ConfigError(f"{out}: is not empty; name a new folder with --out")
+    return out
+
+
 def own_folder(parent: Path, name: str) -> Path:
     """Return a folder of ours inside another, there or not yet.
 

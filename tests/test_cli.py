@@ -129,3 +129,5 @@ def test_simulate_makes_a_submission_that_report_takes(tmp_path):
     assert done.returncode == 0
     assert "[reported.final]" in (folder / "submission.toml").read_text(encoding="utf-8")
     assert cartlab("report", folder, "--no-pdf").returncode == 0
+    again = cartlab("simulate", "--preset", "throne-1dof", "--out", folder)
+    assert (again.returncode, "is not empty" in again.stderr) == (2, True)

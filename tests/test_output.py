@@ -3,7 +3,7 @@
 import pytest
 
 from pipeline.errors import ConfigError
-from pipeline.output import check_folder, clear_files, own_folder, write_file
+from pipeline.output import check_folder, clear_files, new_folder, own_folder, write_file
 
 
 def test_a_file_is_replaced_whole(tmp_path):
@@ -51,3 +51,12 @@ def test_stale_files_go(tmp_path):
     (tmp_path / "b.svg").mkdir()
     clear_files(tmp_path, "*.svg")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["b.svg", "keep.txt"]
+
+
+def test_a_folder_with_something_in_it_is_not_new(tmp_path):
+    """A submission is never written over another; an empty folder will do."""
+    assert new_folder(tmp_path / "fresh") == tmp_path / "fresh"
+    assert new_folder(tmp_path) == tmp_path
+    (tmp_path / "submission.toml").write_text("")
+    with pytest.raises(ConfigError, match="is not empty"):
+        new_folder(tmp_path)
