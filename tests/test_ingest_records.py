@@ -177,7 +177,9 @@ def test_duty_counts_of_a_csv_become_input_units(written, tmp_path):
     content = csv(time=T, input=duty, x1=X1).replace(",512,", f",{written},")
     assert f",{written}," in content
     data = read(tmp_path, PER_COUNT, STEP, content)
-    assert_allclose(data.records[0].u, 1e-4 * duty, rtol=1e-15)
+    u = data.records[0].u
+    assert u is not None
+    assert_allclose(u, 1e-4 * duty, rtol=1e-15)
     assert data.records[0].input_scale == 1e-4
     assert data.warnings == ()
 

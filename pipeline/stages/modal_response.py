@@ -66,7 +66,7 @@ def find_modes(
     poles, V = poles.astype(np.complex128), V.astype(np.complex128)
     W = np.asarray(np.linalg.inv(V), dtype=np.complex128)
     # No mode of a passive chain grows: what rounding leaves above zero would do so all the same.
-    poles = np.minimum(poles.real, 0.0) + 1j * poles.imag
+    poles = poles - np.maximum(poles.real, 0.0)
     inner = W @ dA @ V
     gap = poles - poles[:, None]
     F = np.divide(inner, gap, out=np.zeros_like(inner), where=gap != 0)
