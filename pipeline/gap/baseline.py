@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -22,6 +23,7 @@ SHOT_LENGTH = 0.6  # s; a wrong structure does little harm over it
 _WINDOW, _HOP = 0.3, 0.05  # s, of the modulating functions, at the usual pace
 _FIRST_MASS = 1e3  # weight of the equation m_1 = 1, where nothing else sets a scale
 _SMALLEST_ZETA = 0.002
+_MOVING = 0.9  # mean weight of the readings of a piece in which a cart moves
 
 
 def first_chain(runs: Sequence[Run], *, springs: Sequence[bool]) -> Chain:
@@ -116,18 +118,19 @@ def fit_baseline(
 def measure_noise(fit: Fit, shots: Sequence[Run], runs: Sequence[Run]) -> list[Run]:
     """Return the runs with the noise of each cart: encoder step or high-frequency residual."""
     found: dict[int, list[float]] = {}
+    resting: dict[int, list[float]] = {}
     for shot, own in zip(shots, fit.locals_, strict=True):
         model = simulate_run(fit.structure, fit.theta[None], shot, own)[0]
         for j, row in enumerate(shot.rows):
-            pieces = [
-                high_frequency_noise((shot.y - model)[j, a:b])
-                for a, b in zip(shot.shots[:-1], shot.shots[1:], strict=True)
-            ]
-            found.setdefault(row, []).append(float(np.median(pieces)))
+            for part in (slice(a, b) for a, b in pairwise(shot.shots)):
+                # An encoder at rest repeats itself: only a moving one shows its noise.
+                moving = np.mean(shot.weight[j, part] ** 2) > _MOVING
+                side = found if moving else resting
+                side.setdefault(row, []).append(high_frequency_noise((shot.y - model)[j, part]))
     out = []
     for run in runs:
         floor = np.array([run.record.encoder_step(row + 1) / np.sqrt(12.0) for row in run.rows])
-        measured = np.array([np.median(found[row]) for row in run.rows])
+        measured = np.array([np.median(found.get(row) or resting[row]) for row in run.rows])
         span = np.ptp(run.y, axis=1)
         out.append(replace(run, sigma=np.maximum(np.maximum(floor, measured), 1e-7 * span)))
     return out

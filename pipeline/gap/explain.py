@@ -34,7 +34,8 @@ from pipeline.gap.structure import Candidate
 from pipeline.gap.types import Gap, Verdict
 from pipeline.gap.where import find_windows
 from pipeline.plant.chain import Chain
-from pipeline.plant.effects import find_effect
+from pipeline.plant.effects import CATALOGUE, find_effect
+from pipeline.plant.effects.base import Effect
 from pipeline.results import Record
 
 _NOISE_ROUNDS, _TOO_GOOD = 2, 0.7  # chi-square per point no fit to true noise falls to
@@ -48,6 +49,7 @@ def explain_gap(
     *,
     springs: Sequence[bool],
     chain: Chain | None = None,
+    catalogue: Sequence[Effect] = CATALOGUE,
     position_unit: str = "cm",
     input_unit: str = "V",
     workers: int = 2,
@@ -61,6 +63,7 @@ def explain_gap(
         under feedback are left out.
     springs : (n + 1,) which springs there are, wall-1 to n-wall.
     chain : the stages' estimate, as one start of the fit.
+    catalogue : the effects that may be named.
     workers : threads.
     tell : takes a line of progress.
 
@@ -81,6 +84,8 @@ def explain_gap(
             training=tuple(training),
             held_out=tuple(held_out),
             springs=tuple(springs),
+            catalogue=tuple(catalogue),
+            repeatability=repeatability([*training, *held_out]) or 0.0,
             mapper=pool.map,
             tell=tell,
         )
@@ -95,7 +100,7 @@ def explain_gap(
         path = _path(chosen, found, bench)
         chosen, path, bench = _with_offset(chosen, path, bench)
         final = covariance(chosen.fit, bench.training, mapper=pool.map)
-    floor = pooled_floor(bench.held_out)
+    floor = max(pooled_floor(bench.held_out), bench.repeatability)
     if chosen.key and chosen.error > _REFUSED_FLOOR * floor:
         notes.append(f"{chosen.error / floor:.1f} times the noise is left: something small remains")
     sample_time = max(run.record.sample_time for run in bench.training)
@@ -103,14 +108,13 @@ def explain_gap(
         chosen, path[0], found, bench=bench, floor=floor, sample_time=sample_time
     )
     effects = list_effects(path, final, found, position_unit=position_unit, input_unit=input_unit)
-    order = [*bench.training, *bench.held_out]
     return Gap(
         verdict=verdict,
         effects=effects,
         baseline=path[0].error,
         final=chosen.error,
         noise_floor=floor,
-        repeatability=repeatability(order),
+        repeatability=bench.repeatability or None,
         by_record=compare_by_record(path[0], chosen, bench),
         where=find_windows(path[0].fit, bench.training) if verdict != "none" else (),
         next_experiment=_next_experiment(verdict, chosen, close),

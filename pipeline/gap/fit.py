@@ -61,7 +61,7 @@ class Fit:
     locals_: tuple[Locals, ...]
     cost: float
     chi_square: float
-    n_points: int
+    n_points: float
     run_chi: Array
     run_prior: Array
     run_points: Array
@@ -148,11 +148,12 @@ def _layout(structure: Structure, run: Run, *, scatter_free: bool) -> _Layout:
 
 
 def _blocks(residual: Array, run: Run) -> Array:
-    """Average (…, rows, samples) over blocks, scaled so that white noise keeps its size.
+    """Weigh (…, rows, samples) and average over blocks, so that white noise keeps its size.
 
     Returns (…, shots, rows * blocks), the shots padded with zeros to one length.
     """
     q = run.block
+    residual = residual * run.weight
     counts = np.diff(run.shots) // q
     longest = int(counts.max())
     out = np.zeros((*residual.shape[:-2], len(counts), residual.shape[-2], longest))
@@ -164,8 +165,10 @@ def _blocks(residual: Array, run: Run) -> Array:
     return out.reshape(*out.shape[:-2], -1)
 
 
-def _residual_points(run: Run) -> int:
-    return int(len(run.rows) * (np.diff(run.shots) // run.block).sum())
+def _residual_points(run: Run) -> float:
+    q = run.block
+    pieces = zip(run.shots[:-1], np.diff(run.shots) // q, strict=True)
+    return sum(float((run.weight[:, a : a + m * q] ** 2).sum()) / q for a, m in pieces)
 
 
 def _triangle(matrix: Array) -> Array:
@@ -310,6 +313,8 @@ def _run_cost(
     refine: float,
 ) -> tuple[float, float]:
     """Return chi-square of a run, and its prior terms."""
+    if not structure.visible(theta):
+        return np.inf, 0.0
     model = simulate_run(structure, theta[None], run, own, refine=refine)[0]
     residual = _blocks((run.y - model) / run.sigma[:, None], run)
     chi = float((residual**2).sum())
@@ -359,7 +364,7 @@ def _fit_at(
         locals_=tuple(locals_),
         cost=float(costs[:, 0].sum() + inflate**2 * costs[:, 1].sum()),
         chi_square=float(costs[:, 0].sum()),
-        n_points=int(points.sum()),
+        n_points=float(points.sum()),
         run_chi=costs[:, 0] / points,
         run_prior=costs[:, 1],
         run_points=points,

@@ -15,6 +15,8 @@ _FIT_RATE = 250.0  # Hz; faster records are averaged in blocks, model and measur
 _USUAL_FREQUENCY = 8.0  # Hz; carts on a bench swing no faster
 _SMOOTHING = 0.03  # s, half width of a local cubic, at the usual pace
 _HELD_SAMPLES = 4  # a release after fewer held samples is the start of the file
+_RESTING = 1.5  # encoder steps within which a cart at rest reads …
+_ONE_READING = 0.07  # … and the time (s, at the usual pace) of which counts as independent
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -32,6 +34,7 @@ class Run:
     rest : (n,) where the carts rest, as read.
     zero, zero_std : (n,) where the encoder's zero is expected, and how far off it may be.
     sigma : (rows,) noise of one sample.
+    weight : (rows, samples) square root of how much each sample counts, at most 1.
     block : samples averaged to one residual.
     pace : 1 for a bench of carts, less in proportion for what swings faster.
     shots : (shots + 1,) bounds of the pieces that start afresh; (0, samples) is the whole run.
@@ -53,16 +56,12 @@ class Run:
     zero: Array
     zero_std: Array
     sigma: Array
+    weight: Array
     block: int
     pace: float
     shots: tuple[int, ...]
     shot_x: Array
     shot_v: Array
-
-    @property
-    def n_points(self) -> int:
-        """Readings that enter the fit at full rate."""
-        return self.y.size
 
     @property
     def swing(self) -> Array:
@@ -128,12 +127,37 @@ def make_run(record: Record, *, n: int) -> Run:
         zero=zero,
         zero_std=zero_std,
         sigma=np.maximum(resolution / np.sqrt(12.0), 1e-9 * span),
+        weight=np.array(
+            [
+                _weight(row, step=step, length=max(2, round(_ONE_READING * pace * rate)))
+                for row, step in zip(y, resolution, strict=True)
+            ]
+        ),
         block=max(1, int(rate * pace / _FIT_RATE)),
         pace=pace,
         shots=(0, t.size),
         shot_x=start[None],
         shot_v=slope[None],
     )
+
+
+def _weight(readings: Array, *, step: float, length: int) -> Array:
+    """Return the weight of each reading of one encoder.
+
+    A cart at rest repeats one rounding error: however long it lies there, that counts as
+    `length` readings.
+    """
+    weight = np.ones(readings.size)
+    if step <= 0.0:
+        return weight
+    first = 0
+    low = high = float(readings[0])
+    for at, reading in enumerate([*readings.tolist(), np.inf]):
+        low, high = min(low, reading), max(high, reading)
+        if high - low > _RESTING * step:
+            weight[first:at] = np.sqrt(min(1.0, length / (at - first)))
+            first, low, high = at, reading, reading
+    return weight
 
 
 def cut_shots(run: Run, *, length: float) -> Run:

@@ -17,7 +17,6 @@ from pipeline.gap.fit import Fit, Locals, Mapper, project, simulate_run
 from pipeline.gap.runs import Run
 from pipeline.gap.structure import Candidate, Structure, bench_scales
 from pipeline.plant.chain import Array, Chain
-from pipeline.plant.effects import CATALOGUE
 from pipeline.plant.effects.base import Effect, Parameter
 
 _MOST = 3.0  # a multiple beyond this is no longer what was simulated
@@ -58,7 +57,7 @@ def screen(
     *,
     whole: Sequence[Run],
     springs: Sequence[bool],
-    catalogue: Sequence[Effect] = CATALOGUE,
+    catalogue: Sequence[Effect],
     skip: Sequence[str] = ("force_offset",),
     mapper: Mapper = map,
 ) -> list[Suspect]:

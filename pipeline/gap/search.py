@@ -1,6 +1,6 @@
 """Search the catalogue: screen, refit the suspects, keep a few hypotheses, grow them, prune."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -12,10 +12,10 @@ from pipeline.gap.runs import Run, cut_shots
 from pipeline.gap.screen import Suspect, candidates_at, extend, screen, zoom
 from pipeline.gap.structure import Candidate, Structure
 from pipeline.plant.chain import Array
-from pipeline.plant.effects import CATALOGUE
 from pipeline.plant.effects.base import Effect
 
 AT_FLOOR = 1.15  # chi-square per point below this is noise
+AS_REPEATS = 1.1  # an error below this many times what repeats differ by is theirs
 _SHORT_LIST = 9  # suspects refitted on pieces
 _FULL_LIST = 5  # of which the best are refitted on whole runs …
 _FULL_SCREEN = 3  # … with the best of a screen on whole runs
@@ -24,6 +24,7 @@ _BEAM = (3, 1, 1)  # hypotheses kept after one, two, three effects
 _HOPELESS = 30.0  # a hypothesis with this many times the best one's chi-square is not grown
 _DEPTH = len(_BEAM)
 _BIC_DROP = 20.0
+_HINT = 2.0  # what the criterion must fall by, by the screen's estimate, to be worth a refit
 THINNING = 10.0  # neighbouring residuals are not independent: N / 10 count
 _FRICTION_ROUNDS = 2  # of run-by-run friction, the worst runs started anew before each
 _NEARLY_RIGHT = 6.0  # chi-square of the better runs, below which the bad ones are worth a new start
@@ -40,7 +41,9 @@ _BOUND_MARGIN = 0.01  # in logarithms, or in scales
 class Hypothesis:
     """A model with its fit on training runs and what it leaves on held-out ones.
 
-    `added` is the effect added last; `parent` the hypothesis it was added to.
+    `at_floor`: nothing is left but noise, on training and on held-out runs, or no more than
+    repeats differ by among themselves. `added` is the effect added last; `parent` the hypothesis
+    it was added to.
     """
 
     fit: Fit
@@ -48,6 +51,7 @@ class Hypothesis:
     error: float
     run_error: Array
     bic: float
+    at_floor: bool
     added: Candidate | None = None
     parent: "Hypothesis | None" = None
 
@@ -71,19 +75,19 @@ class Hypothesis:
                 return False
         return True
 
-    @property
-    def at_floor(self) -> bool:
-        """Is nothing left but noise, on training and on held-out runs?"""
-        return self.fit.chi < AT_FLOOR and self.held.chi < AT_FLOOR
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Bench:
-    """What every step of the search needs: the runs, the springs, and who maps over runs."""
+    """What every step of the search needs: runs, springs, catalogue, and who maps over runs.
+
+    `repeatability` is the relative error between runs with the same input, 0 without any.
+    """
 
     training: tuple[Run, ...]
     held_out: tuple[Run, ...]
     springs: tuple[bool, ...]
+    catalogue: tuple[Effect, ...]
+    repeatability: float
     mapper: Mapper
     tell: Callable[[str], None]
 
@@ -100,12 +104,15 @@ def judge(
         sizes.append(float((run.swing**2).sum() * run.t.size))
     effective = fit.n_points / THINNING
     bic = effective * np.log(fit.cost / fit.n_points) + fit.theta.size * np.log(effective)
+    error = float(np.sqrt(sum(errors) / sum(sizes)))
+    only_noise = fit.chi < AT_FLOOR and held.chi < AT_FLOOR
     return Hypothesis(
         fit=fit,
         held=held,
-        error=float(np.sqrt(sum(errors) / sum(sizes))),
+        error=error,
         run_error=np.sqrt(np.array(errors) / np.array(sizes)),
         bic=float(bic),
+        at_floor=only_noise or error < AS_REPEATS * bench.repeatability,
         added=added,
         parent=parent,
     )
@@ -131,11 +138,23 @@ def search(baseline: Hypothesis, bench: Bench, *, depth: int = _DEPTH) -> list[H
         if not children:
             break
         unique = {child.key: child for child in sorted(children, key=lambda h: -h.bic)}
-        beam = sorted(unique.values(), key=lambda h: h.bic)[: _BEAM[level]]
+        worthy = [child for child in unique.values() if not _needlessly_rich(child, unique)]
+        beam = sorted(worthy, key=lambda h: h.bic)[: _BEAM[level]]
         bench.tell(f"{level + 1} effect{'s' * (level > 0)}: " + _names(beam[0]))
         if beam[0].at_floor:
             break
     return list(seen.values())
+
+
+def _needlessly_rich(
+    child: Hypothesis, others: Mapping[frozenset[tuple[str, int]], Hypothesis]
+) -> bool:
+    """Does a simpler law in the place of the effect added last explain no less?"""
+    added = child.added
+    if added is None or added.effect.grows_from is None:
+        return False
+    simpler = others.get(child.key - {added.key} | {(added.effect.grows_from, added.place)})
+    return simpler is not None and simpler.bic < child.bic
 
 
 def _names(hypothesis: Hypothesis) -> str:
@@ -148,8 +167,16 @@ def grow(parent: Hypothesis, bench: Bench) -> list[Hypothesis]:
     whole = bench.training
     pieces = [cut_shots(run, length=SHOT_LENGTH) for run in whole]
     start = fit_pieces(parent.fit.structure, parent.fit.theta, pieces, iterations=4)
-    look = partial(screen, whole=whole, springs=bench.springs, mapper=bench.mapper)
-    suspects = look(start, pieces)
+    look = partial(
+        screen,
+        whole=whole,
+        springs=bench.springs,
+        catalogue=bench.catalogue,
+        mapper=bench.mapper,
+    )
+    suspects = [s for s in look(start, pieces) if _promises(s, start)]
+    if not suspects:
+        return []
     short = [
         _short_refit(start, s, pieces, bench, top=suspects[0].share) for s in _short_list(suspects)
     ]
@@ -159,6 +186,8 @@ def grow(parent: Hypothesis, bench: Bench) -> list[Hypothesis]:
     chosen = {pair[0].key: pair for pair in close if pair[1].cost}
     if short[0][1].chi > AT_FLOOR:
         for suspect in look(parent.fit, whole)[:_FULL_SCREEN]:
+            if not _promises(suspect, parent.fit):
+                break
             if suspect.candidate.key not in chosen:
                 pair = next((p for p in short if p[0].key == suspect.candidate.key), None)
                 pair = pair or _short_refit(start, suspect, pieces, bench, top=0.0)
@@ -169,10 +198,15 @@ def grow(parent: Hypothesis, bench: Bench) -> list[Hypothesis]:
         child = _full_refit(candidate, fit, parent, bench)
         children.append(child)
         if candidate.effect.family == "dry friction":
-            for effect in CATALOGUE:
+            for effect in bench.catalogue:
                 if effect.grows_from == candidate.effect.key:
                     children.append(_grown_friction(effect, child, parent, bench))
     return children
+
+
+def _promises(suspect: Suspect, fit: Fit) -> bool:
+    """Would the suspect, as screened, lower the criterion at all?"""
+    return -fit.n_points / THINNING * np.log1p(-min(suspect.share, 0.999)) > _HINT
 
 
 def _short_list(suspects: Sequence[Suspect]) -> list[Suspect]:

@@ -8,11 +8,11 @@ import numpy as np
 from pipeline.gap.runs import Run
 from pipeline.plant.chain import Array, Chain
 from pipeline.plant.effects.base import AugmentedChain, Effect, Scales, Term, chain_scales
-from pipeline.plant.tables import Tables
+from pipeline.plant.tables import Cart, Tables
 
 _SMALLEST = 1e-7  # of a parameter's scale; below, an effect is not there
 _LARGEST = 1e4
-_LOG_REACH = 14.0  # how far (in log) a chain parameter may go from where it starts
+_FASTEST_HIDDEN = 20.0  # times its cart's frequency: a faster hidden mass moves as one with it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,17 +132,27 @@ class Structure:
         ]
         return np.concatenate(parts)
 
+    def visible(self, theta: Array) -> bool:
+        """Do the hidden masses, if any, swing slowly enough to be told from the carts?"""
+        cart, _, _ = self.model(theta).tables()
+        hidden = cart[:, Cart.HIDDEN_MASS] > 0.0
+        if not hidden.any():
+            return True
+        own = np.diag(self.chain(theta).stiffness) / cart[:, Cart.MASS]
+        rate = cart[hidden, Cart.HIDDEN_STIFFNESS] / cart[hidden, Cart.HIDDEN_MASS]
+        return bool(np.all((own[hidden] == 0.0) | (rate < _FASTEST_HIDDEN**2 * own[hidden])))
+
     def bounds(self) -> tuple[Array, Array]:
         """Return the lower and upper bounds of the vector."""
         low, high = [np.full(self.base_size, -np.inf)], [np.full(self.base_size, np.inf)]
         for c in self.effects:
             for p, scale in zip(c.effect.parameters, c.scales, strict=True):
-                top = min(p.upper, _LARGEST) if np.isfinite(p.upper) else _LARGEST
+                top = min(p.upper, _LARGEST)
                 if p.signed:
                     low.append(np.array([-top]))
                     high.append(np.array([top]))
                 else:
-                    low.append(np.array([np.log(_SMALLEST * scale)]))
+                    low.append(np.array([np.log(max(p.lower, _SMALLEST) * scale)]))
                     high.append(np.array([np.log(top * scale)]))
         return np.concatenate(low), np.concatenate(high)
 

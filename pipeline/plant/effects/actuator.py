@@ -144,6 +144,8 @@ BACKLASH = Effect(
             unit="input s^2/position",
             scale=lambda s: s.mass,
             trials=(0.1, 0.3),
+            lower=0.02,
+            upper=0.9,
             reported=False,
         ),
         Parameter(
@@ -152,7 +154,8 @@ BACKLASH = Effect(
             unit="input/position",
             scale=lambda s: s.stiffness,
             trials=(30.0,),
-            upper=3000.0,
+            lower=3.0,
+            upper=1000.0,
             reported=False,
         ),
         Parameter(
@@ -162,6 +165,8 @@ BACKLASH = Effect(
             # A third of critical for the motor's share of the mass on the usual contact.
             scale=lambda s: (s.stiffness * s.mass) ** 0.5,
             trials=(1.0,),
+            lower=0.02,
+            upper=30.0,
             reported=False,
         ),
     ),

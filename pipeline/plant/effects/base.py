@@ -46,7 +46,7 @@ class Parameter:
     trials : the multiples of `scale` to try first.
     signed : may be of either sign. A sign that picks a side (`side`) stays as it started.
     neutral : the value that gives the base model (where one exists).
-    lower, upper : bounds of the magnitude.
+    lower, upper : bounds of the magnitude, in multiples of `scale`.
     reported : False for a detail of the contact that the data need but nobody asks for.
     """
 

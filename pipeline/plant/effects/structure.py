@@ -85,6 +85,7 @@ EXTRA_MODE = Effect(
             unit="input s^2/position",
             scale=lambda s: s.mass,
             trials=(0.1,),
+            lower=1e-3,
             upper=3.0,
             neutral=0.0,
         ),
