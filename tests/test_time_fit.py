@@ -15,6 +15,7 @@ from pipeline.stages.chain_parameters import Parametrisation
 from pipeline.stages.modal_response import find_modes
 from pipeline.stages.residual_colour import long_run_variance, score_covariance
 from pipeline.stages.time_fit import fit_records
+from pipeline.stages.time_search import search
 from pipeline.stages.time_window import compare, open_window, usable_segment
 from pipeline.submission import load_submission
 from tests.time_records import decay_record, measure, random_chain, step_record
@@ -286,6 +287,24 @@ def test_an_input_that_explains_nothing_is_not_called_a_fit():
     fit = fit_records([replace(record, u=-record.u)], n=1, springs=(True, True))
     assert not fit.converged
     assert "no chain was found that follows the records" in fit.message
+
+
+def test_a_search_that_nothing_ends_is_cut_short_with_the_best_so_far():
+    """Beyond the comparisons it may take no start is tried; what was found first is returned."""
+    rng = np.random.default_rng(12)
+    record = step_record(PRESETS["throne-1dof"], rng=rng)
+    assert record.u is not None
+    windows = [open_window(replace(record, u=-record.u))]
+    P = Parametrisation(n=1, springs=(True, True))
+    whole, short = (
+        search(windows, P, given=None),
+        search(windows, P, given=None, most_comparisons=1),
+    )
+    assert not whole.cut_short
+    assert not whole.best.follows
+    assert short.cut_short
+    assert short.n_starts == 1 < whole.n_starts
+    assert short.best.cost >= whole.best.cost
 
 
 def test_a_decay_is_used_from_its_release_on():

@@ -165,7 +165,6 @@ def check(case: Case) -> None:
 
 
 quick = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.data_too_large])
-pytestmark = pytest.mark.slow  # minutes: spoilt records send the time fit through all its starts
 
 
 @quick

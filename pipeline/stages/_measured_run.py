@@ -51,7 +51,7 @@ class MeasuredRun:
         record = self.record
         if record.u is None:
             raise DataError(f"{record.id}: the hardware check needs a logged input, found none")
-        return simulate_linear(self.chain, record.t, record.u, free=self.free, hold=record.hold)
+        return self._simulated(record.u, x0=np.zeros(2 * len(self.free)))
 
     def unforced(self) -> Array:
         """Return the readings (f, n) that the start alone would give."""
@@ -113,7 +113,21 @@ class MeasuredRun:
         t = self.record.t
         if not np.any(x0):
             return np.zeros((len(self.free), t.size))
-        return simulate_linear(self.chain, t, np.zeros(t.size), free=self.free, x0=x0)
+        return self._simulated(np.zeros(t.size), x0=x0)
+
+    def _simulated(self, u: Array, *, x0: Array) -> Array:
+        """Return the chain's positions (f, n) under an input u (n,).
+
+        Raises
+        ------
+        DataError : they are beyond arithmetic, as of a chain that fits nothing.
+        """
+        record = self.record
+        with np.errstate(over="ignore", invalid="ignore"):
+            y = simulate_linear(self.chain, record.t, u, x0=x0, free=self.free, hold=record.hold)
+        if not np.all(np.isfinite(y)):
+            raise DataError(f"{record.id}: the identified carts cannot be simulated over this run")
+        return y
 
 
 def measured_run(record: Record, chain: Chain) -> MeasuredRun:

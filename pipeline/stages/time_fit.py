@@ -54,8 +54,8 @@ def fit_records(
     """
     parametrisation = Parametrisation(n=n, springs=springs)
     windows, remarks = _open(records)
-    attempt, n_starts = search(windows, parametrisation, given=start)
-    explained = attempt.follows
+    found = search(windows, parametrisation, given=start)
+    attempt, explained = found.best, found.best.follows
     windows = [_informed(attempt, index) for index in range(len(windows))]
     attempt = descend(windows, parametrisation, attempt.theta, tolerance=_TOLERANCE)
     covariance = _covariance(attempt)
@@ -66,9 +66,15 @@ def fit_records(
         covariance = _covariance(attempt)
     if not explained:
         remarks.insert(0, "no chain was found that follows the records")
+    elif found.cut_short:
+        remarks.insert(
+            0, f"the search was ended after {found.n_starts} starts: another may do better"
+        )
     elif not attempt.converged:
         remarks.insert(0, "the search did not settle")
-    return _result(attempt, covariance, explained=explained, n_starts=n_starts, remarks=remarks)
+    return _result(
+        attempt, covariance, explained=explained, n_starts=found.n_starts, remarks=remarks
+    )
 
 
 def _open(records: Sequence[Record]) -> tuple[list[Window], list[str]]:
