@@ -48,7 +48,8 @@ def fit_bode(
 ) -> ChainFit:
     """Fit the chain of n carts to measured frequency responses; carts may be missing.
 
-    Phases are used where they are given and agree with the magnitudes, else magnitudes alone.
+    Phases are used where they are given and agree with the magnitudes, else magnitudes alone;
+    they are used unasked where the magnitudes are no more than the parameters.
     A parameter that the data put at or below zero is held there and the others fitted again: the
     standard errors then hold on both sides of the bound.
 
@@ -84,15 +85,12 @@ def fit_bode(
     best, tried = _fit_from_starts(P, data, first=start, like=like)
     remark = ""
     if data.n_phases:
-        if _phase_misfit(best, data) <= _PHASE_AGREES * max(1.0, best.chi_square_per_dof**0.5):
+        # As few magnitudes as parameters say nothing about what the phases should be.
+        limit = _PHASE_AGREES * max(1.0, best.chi_square_per_dof**0.5)
+        if best.dof <= 0 or _phase_misfit(best, data) <= limit:
             best = _solve(P, data, best.theta, "polar")
         else:
             remark = "magnitudes alone: the phases do not agree with them"
-    if best.dof <= 0:
-        raise DataError(
-            f"Bode fit: {len(P.names)} parameters need more amplitudes than that, or phases "
-            f"that agree with them, found {data.size} amplitudes"
-        )
     best, share = _widen(best, data)
     best = _hold_vanished(best, data.widened(share))
     return _result(best, data, share=share, staged=staged, tried=tried, remark=remark)
