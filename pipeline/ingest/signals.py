@@ -53,17 +53,19 @@ def mirrors(reference: Array, x1: Array) -> bool:
     return bool(np.mean(between) > _MIRRORED)
 
 
-def input_sign(u: Array, x1: Array, *, closed_loop: bool) -> int:
-    """Return the sign of the input that a passive plant on springs allows, 0 where unsure.
+def input_sign(u: Array, x1: Array, *, closed_loop: bool, tied: bool = True) -> int:
+    """Return the sign of the input that a passive plant allows, 0 where unsure.
 
-    Where the cart comes to rest under different inputs, a larger input must hold it farther out.
-    Else the motor's work ∫ u dx_1, from rest and on springs and dampers, must be positive: the
-    sum over held inputs is exact, it has to stand out from the work to and fro, and a log that
-    is early or late by a sample must not change its sign (a feedback law is never early).
+    Where the cart comes to rest under different inputs, a larger input must hold it farther out,
+    if springs tie it to a wall or a held cart: on none it may rest anywhere. Else the motor's
+    work ∫ u dx_1, from rest and on springs and dampers, must be positive: the sum over held inputs
+    is exact, it has to stand out from the work to and fro, and a log that is early or late by a
+    sample must not change its sign (a feedback law is never early).
     """
     if np.ptp(u) == 0.0 or np.ptp(x1) == 0.0 or u.size < 2 * _BLOCKS:
         return 0
-    return _sign_at_rest(u, x1) or _sign_of_work(u, x1, closed_loop=closed_loop)
+    at_rest = _sign_at_rest(u, x1) if tied else 0
+    return at_rest or _sign_of_work(u, x1, closed_loop=closed_loop)
 
 
 def _sign_at_rest(u: Array, x1: Array) -> int:

@@ -24,7 +24,12 @@ def with_signs(records: list[Record], submission: Submission) -> tuple[list[Reco
             stated[experiment.id] = sign
     driven = [r for r in records if r.u is not None and np.ptp(r.u) > 0]
     found = {
-        r.id: input_sign(r.u, r.position(1), closed_loop=r.kind == "closed_loop")
+        r.id: input_sign(
+            r.u,
+            r.position(1),
+            closed_loop=r.kind == "closed_loop",
+            tied=submission.system.tied or len(r.free) < submission.system.carts,
+        )
         for r in driven
         if r.u is not None and 1 in r.carts and 1 in r.free
     }
