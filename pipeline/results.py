@@ -335,6 +335,7 @@ class FeedbackDesign:
     gains : (2n,); prefilter = 1 / DC gain of the loop for the chosen cart.
     poles : closed-loop poles as continuous equivalents (log z / sample_time), rad/s.
     requested_poles : what pole placement was asked for; None with LQR.
+    Q (2n, 2n), R : the weights of LQR's cost, the sum of x'Q x + R u²; None with pole placement.
     sample_time : s; the one-sample delay is part of the model the gains are made for.
     overshoot_percent, settling_time (s, 2 %), peak_input : of the simulated step.
     t, y (n_carts, n), u : that step.
@@ -348,6 +349,8 @@ class FeedbackDesign:
     prefilter: float
     poles: ComplexArray
     requested_poles: ComplexArray | None
+    Q: Array | None = None
+    R: float | None = None
     sample_time: float
     overshoot_percent: float
     settling_time: float | None

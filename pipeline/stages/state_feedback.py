@@ -121,18 +121,19 @@ def _range(values: Array) -> str:
 def _design(plant: "_Sampled", goal: "_Goal", *, method: Method) -> FeedbackDesign:
     """Choose among the candidates of a method and simulate the one chosen."""
     if method == "lqr":
-        requested = None
-        candidates = _try_step(plant, _lqr_candidates(plant, _WEIGHTS), goal)
+        requested, costs = None, _energies(plant, _WEIGHTS)
+        candidates = _try_step(plant, lqr_gains(plant.phi, plant.gamma, costs), goal)
         best, met = _choose(plant, candidates, goal)
         if not met:  # perhaps the goal is much faster than the plant
-            candidates = _try_step(plant, _lqr_candidates(plant, _HEAVY_WEIGHTS), goal)
+            costs = _energies(plant, _HEAVY_WEIGHTS)
+            candidates = _try_step(plant, lqr_gains(plant.phi, plant.gamma, costs), goal)
             best, met = _choose(plant, candidates, goal)
     else:
-        requested = _pole_candidates(plant, goal)
+        requested, costs = _pole_candidates(plant, goal), None
         z = np.exp(requested * plant.sample_time)
         candidates = _try_step(plant, place_poles(plant.phi, plant.gamma, z), goal)
         best, met = _choose(plant, candidates, goal)
-    return _finish(
+    design = _finish(
         plant,
         goal,
         gains=plant.to_units(candidates.gains[best]),
@@ -140,6 +141,9 @@ def _design(plant: "_Sampled", goal: "_Goal", *, method: Method) -> FeedbackDesi
         settling=float(candidates.settling[best]),
         method=method,
     )
+    if costs is None:
+        return design
+    return replace(design, Q=plant.cost_to_units(costs[best]), R=1 / plant.stiffness)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,6 +203,11 @@ class _Sampled:
     def to_units(self, gains: Array) -> Array:
         return gains * self.stiffness / np.tile([1.0, self.rate], self.chain.n)
 
+    def cost_to_units(self, weights: Array) -> Array:
+        """Return Q of the cost in which the input's square is weighed by 1/stiffness."""
+        unit = np.tile([1.0, self.rate], self.chain.n)
+        return self.stiffness * weights / np.outer(unit, unit)
+
     def stays_stable(self, gains: Array) -> bool:
         controller = StateFeedback(gains=gains, prefilter=1.0, model=self.chain)
         return stays_stable(self.chain, controller, sample_time=self.sample_time)
@@ -207,8 +216,8 @@ class _Sampled:
 # -------------------------------------------------------------- candidate gains
 
 
-def _lqr_candidates(plant: _Sampled, weights: Array) -> Array:
-    """Return gains (n_candidates, 2n) for a grid of weights of either energy."""
+def _energies(plant: _Sampled, weights: Array) -> Array:
+    """Return Q (n_candidates, 2n, 2n) for a grid of weights of either energy, R being one."""
     chain, n = plant.chain, plant.chain.n
     stiffness = chain.stiffness / plant.stiffness
     if chain.k[0] == chain.k[-1] == 0:
@@ -218,7 +227,7 @@ def _lqr_candidates(plant: _Sampled, weights: Array) -> Array:
     potential[0::2, 0::2] = stiffness
     kinetic[1::2, 1::2] = np.diag(chain.m) * plant.rate**2 / plant.stiffness
     alpha, beta = (w.ravel()[:, None, None] for w in np.meshgrid(weights, weights, indexing="ij"))
-    return lqr_gains(plant.phi, plant.gamma, alpha * potential + beta * kinetic)
+    return alpha * potential + beta * kinetic
 
 
 def _pole_candidates(plant: _Sampled, goal: _Goal) -> ComplexArray:
