@@ -42,8 +42,8 @@ def test_entry_says_all_a_student_needs(effect):
     for text in (effect.sentence, effect.equation, effect.fingerprint, effect.deciding_run):
         assert len(text) >= len("f = F")
     assert effect.reference
+    assert effect.trial_points
     for parameter in effect.parameters:
-        assert parameter.trials
         assert parameter.unit.count("position") + parameter.unit.count("input") <= 2
 
 

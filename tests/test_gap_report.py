@@ -54,7 +54,10 @@ U = np.where((T > 0.1) & (T < 2.0), 0.05, 0.0)
 def usual_values(effect, place):
     """Return parameter values of a usual size."""
     scales = chain_scales(CHAIN, place=effect.place, at=place, input=0.05)
-    return {p.name: p.scale(scales) * p.trials[0] for p in effect.parameters}
+    return {
+        p.name: p.scale(scales) * multiple
+        for p, multiple in zip(effect.parameters, effect.trial_points[0], strict=True)
+    }
 
 
 def make_gap(verdict: Verdict = "named", keys=("coulomb_friction",)) -> Gap:

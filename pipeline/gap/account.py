@@ -172,7 +172,9 @@ def repeatability(runs: Sequence[Run]) -> float | None:
             alike = a.free == b.free and a.t.size == b.t.size and np.any(a.command)
             if not alike or not np.array_equal(a.command, b.command):
                 continue
-            offset = (a.y - a.rest[list(a.rows)][:, None]) - (b.y - b.rest[list(b.rows)][:, None])
-            squares += float((offset**2).sum()) / 2.0
+            difference = a.y - b.y
+            # Encoders are zeroed for every run: a constant is no difference.
+            difference -= difference.mean(axis=1, keepdims=True)
+            squares += float((difference**2).sum()) / 2.0
             sizes += float((a.swing**2).sum()) * a.t.size
     return float(np.sqrt(squares / sizes)) if sizes else None

@@ -14,7 +14,8 @@ _STILL = 2.6  # encoder steps, peak to peak, that count as lying still
 _FIT_RATE = 250.0  # Hz; faster records are averaged in blocks, model and measurement alike
 _USUAL_FREQUENCY = 8.0  # Hz; carts on a bench swing no faster
 _SMOOTHING = 0.03  # s, half width of a local cubic, at the usual pace
-_HELD_SAMPLES = 4  # a release after fewer held samples is the start of the file
+_HELD_SAMPLES = 4  # fewer samples at the top are no hold …
+_HELD_TIME = 2.0  # … nor is a stay there within this many times what free motion takes
 _RESTING = 1.5  # encoder steps within which a cart at rest reads …
 _ONE_READING = 0.07  # … and the time (s, at the usual pace) of which counts as independent
 
@@ -82,15 +83,16 @@ def make_run(record: Record, *, n: int) -> Run:
     tail = y[:, -max(3, int(_TAIL * t.size)) :]
     settled = np.ptp(tail, axis=1) <= still
     quiet_end = bool(np.all(u[-tail.shape[1] :] == 0.0))
+    pace = min(1.0, _USUAL_FREQUENCY / _dominant_frequency(t, y))
     if record.kind == "decay":
         rest = np.where(settled, tail.mean(axis=1), np.median(y, axis=1))
-        first = min(_release(y - rest[:, None], still), t.size // 2)
+        free = 2 * np.pi * _dominant_frequency(t, y) * record.sample_time
+        first = min(_release(y - rest[:, None], still, radians=free), t.size // 2)
         t, u, y = t[first:], u[first:], y[:, first:]
     head = y[:, :_REST_SAMPLES]
     # The input may already act between these samples: the first two are before its effect.
     lies_still = np.ptp(head[:, :2], axis=1) <= still
     at_rest = bool(np.all(lies_still)) and record.kind != "decay"
-    pace = min(1.0, _USUAL_FREQUENCY / _dominant_frequency(t, y))
     zero, zero_std = np.zeros(n), np.ones(n)
     start, slope = np.zeros(n), np.zeros(n)
     span = np.ptp(y, axis=1)
@@ -211,21 +213,20 @@ def _dominant_frequency(t: Array, y: Array) -> float:
     return best
 
 
-def _release(offset: Array, still: Array) -> int:
-    """Return the first sample of free motion of a decay."""
+def _release(offset: Array, still: Array, *, radians: float) -> int:
+    """Return the first sample of free motion of a decay that turns by `radians` a sample."""
     leader = int(np.argmax(np.ptp(offset, axis=1) / np.maximum(still, 1e-12)))
     motion = np.abs(offset[leader])
     top = int(np.argmax(motion))
     peak = motion[top]
-    held = np.flatnonzero(motion[top:] >= peak - still[leader] - 0.01 * peak)
+    slack = still[leader] + 0.01 * peak
+    held = np.flatnonzero(motion[top:] >= peak - slack)
     gaps = np.flatnonzero(np.diff(held) > 1)
     last = top + int(held[gaps[0]] if gaps.size else held[-1])
-    first_held = top
-    if top == 0 and last < _HELD_SAMPLES:
-        return 0
-    if last - first_held < _HELD_SAMPLES and first_held > 0:
-        # Shaken, not held: the largest swing is where the hand has gone.
-        return last
+    passing = _HELD_TIME * np.sqrt(2.0 * slack / peak) / radians
+    if last - top < max(_HELD_SAMPLES, passing):
+        # Shaken, or let go as the file begins: the largest swing is where the hand has gone.
+        return last if top > 0 else 0
     # The first turning point after the release: no hand follows that far.
     side = np.sign(offset[leader, top])
     return last + int(np.argmin(side * offset[leader, last:]))

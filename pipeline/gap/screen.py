@@ -42,7 +42,7 @@ def candidates_at(
     scales = bench_scales(runs, chain, effect=effect, place=place)
     sizes = tuple(p.scale(scales) for p in effect.parameters)
     trials = []
-    for multiples in product(*(p.trials for p in effect.parameters)):
+    for multiples in effect.trial_points:
         sided = [(1.0, -1.0) if p.side else (1.0,) for p in effect.parameters]
         for signs in product(*sided):
             values = tuple(m * s * g for m, s, g in zip(multiples, sizes, signs, strict=True))

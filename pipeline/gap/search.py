@@ -34,6 +34,7 @@ _RUN_GAIN, _RUN_SHARE = 0.97, 0.6  # … and by 3 % in 60 % of the runs
 _SEVERAL_STARTS = ("extra_mode", "end_stop", "backlash", "slack_spring")
 _ZOOM_SHARE = 0.15  # of the first suspect's, below which one start must do
 _CONTACT = ("end_stop", "backlash")
+_LEADING = 0.4  # of the first suspect's share, for what is dear to refit
 _BOUND_MARGIN = 0.01  # in logarithms, or in scales
 
 
@@ -163,38 +164,8 @@ def _names(hypothesis: Hypothesis) -> str:
 
 def grow(parent: Hypothesis, bench: Bench) -> list[Hypothesis]:
     """Return the children of a hypothesis: one further effect each, fully refitted."""
-    fit_pieces = partial(fit_model, mapper=bench.mapper, scatter_free=False)
-    whole = bench.training
-    pieces = [cut_shots(run, length=SHOT_LENGTH) for run in whole]
-    start = fit_pieces(parent.fit.structure, parent.fit.theta, pieces, iterations=4)
-    look = partial(
-        screen,
-        whole=whole,
-        springs=bench.springs,
-        catalogue=bench.catalogue,
-        mapper=bench.mapper,
-    )
-    suspects = [s for s in look(start, pieces) if _promises(s, start)]
-    if not suspects:
-        return []
-    short = [
-        _short_refit(start, s, pieces, bench, top=suspects[0].share) for s in _short_list(suspects)
-    ]
-    short.sort(key=lambda pair: pair[1].cost)
-    within = _OUT_OF_SIGHT * short[0][1].cost
-    close = [pair for pair in short[:_FULL_LIST] if pair[1].cost < within]
-    chosen = {pair[0].key: pair for pair in close if pair[1].cost}
-    if short[0][1].chi > AT_FLOOR:
-        for suspect in look(parent.fit, whole)[:_FULL_SCREEN]:
-            if not _promises(suspect, parent.fit):
-                break
-            if suspect.candidate.key not in chosen:
-                pair = next((p for p in short if p[0].key == suspect.candidate.key), None)
-                pair = pair or _short_refit(start, suspect, pieces, bench, top=0.0)
-                if pair[1].cost < within:
-                    chosen[suspect.candidate.key] = pair
     children = []
-    for candidate, fit in chosen.values():
+    for candidate, fit in _starts(parent, bench):
         child = _full_refit(candidate, fit, parent, bench)
         children.append(child)
         if candidate.effect.family == "dry friction":
@@ -202,6 +173,52 @@ def grow(parent: Hypothesis, bench: Bench) -> list[Hypothesis]:
                 if effect.grows_from == candidate.effect.key:
                     children.append(_grown_friction(effect, child, parent, bench))
     return children
+
+
+def _starts(parent: Hypothesis, bench: Bench) -> list[tuple[Candidate, Fit]]:
+    """Return the suspects worth a full refit, each with a fit to start from.
+
+    Pieces forgive a wrong structure, so most suspects come from them; whole runs show what adds
+    up over a run, such as a light hidden mass in resonance.
+    """
+    look = partial(
+        screen,
+        whole=bench.training,
+        springs=bench.springs,
+        catalogue=bench.catalogue,
+        mapper=bench.mapper,
+    )
+    pieces = [cut_shots(run, length=SHOT_LENGTH) for run in bench.training]
+    loose = fit_model(
+        parent.fit.structure,
+        parent.fit.theta,
+        pieces,
+        iterations=4,
+        scatter_free=False,
+        mapper=bench.mapper,
+    )
+    suspects = [s for s in look(loose, pieces) if _promises(s, loose)]
+    if not suspects:
+        return []
+    short = [
+        _short_refit(loose, s, pieces, bench, top=suspects[0].share) for s in _short_list(suspects)
+    ]
+    short.sort(key=lambda pair: pair[1].cost)
+    within = _OUT_OF_SIGHT * short[0][1].cost
+    chosen = [pair for pair in short[:_FULL_LIST] if pair[1].cost < within]
+    if short[0][1].chi < AT_FLOOR:
+        return chosen
+    suspects = [s for s in look(parent.fit, bench.training) if _promises(s, parent.fit)]
+    for suspect in suspects[:_FULL_SCREEN]:
+        key, top = suspect.candidate.key, suspects[0].share
+        if suspect.candidate.effect.key in _SEVERAL_STARTS and suspect.share > _LEADING * top:
+            chosen.append(_short_refit(parent.fit, suspect, bench.training, bench, top=top))
+        elif key not in (candidate.key for candidate, _ in chosen):
+            pair = next((p for p in short if p[0].key == key), None)
+            pair = pair or _short_refit(loose, suspect, pieces, bench, top=0.0)
+            if pair[1].cost < within:
+                chosen.append(pair)
+    return chosen
 
 
 def _promises(suspect: Suspect, fit: Fit) -> bool:
@@ -215,7 +232,7 @@ def _short_list(suspects: Sequence[Suspect]) -> list[Suspect]:
     return [
         suspect
         for suspect in suspects[:_SHORT_LIST]
-        if suspect.candidate.effect.key not in _CONTACT or suspect.share > 0.4 * top
+        if suspect.candidate.effect.key not in _CONTACT or suspect.share > _LEADING * top
     ]
 
 

@@ -99,12 +99,11 @@ def usual_term(effect: Effect, chain: Chain, *, travel: float = 1.0) -> Term:
 
 
 def default_values(effect: Effect, chain: Chain, *, place: int, travel: float) -> dict[str, float]:
-    """Return sizes at which the effect shows in a session: the middle ones a search would try."""
+    """Return sizes at which the effect shows in a session."""
     scales, side = _session_scales(effect, chain, place=place, travel=travel)
     return {
-        p.name: float(f"{p.scale(scales) * p.trials[len(p.trials) // 2]:.3g}")
-        * (side if p.side else 1.0)
-        for p in effect.parameters
+        p.name: float(f"{p.scale(scales) * multiple:.3g}") * (side if p.side else 1.0)
+        for p, multiple in zip(effect.parameters, effect.typical, strict=True)
     }
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from itertools import product
 from typing import Literal
 
 import numpy as np
@@ -43,7 +44,7 @@ class Parameter:
     ----------
     unit : in terms of "position", "input" and "s"; "" for a pure number.
     scale : its typical size at a place; starts and steps are multiples of it.
-    trials : the multiples of `scale` to try first.
+    trials : the multiples of `scale` to try first, all combinations; or see the effect's.
     signed : may be of either sign. A sign that picks a side (`side`) stays as it started.
     neutral : the value that gives the base model (where one exists).
     lower, upper : bounds of the magnitude, in multiples of `scale`.
@@ -54,7 +55,7 @@ class Parameter:
     symbol: str
     unit: str
     scale: Callable[[Scales], float]
-    trials: tuple[float, ...]
+    trials: tuple[float, ...] = ()
     signed: bool = False
     side: bool = False
     neutral: float | None = None
@@ -76,6 +77,7 @@ class Effect:
     key : its name in files; `sentence` tells a student what it is.
     equation : TeX of the law, in the symbols of the parameters.
     columns : the table columns the parameter values stand for.
+    trials : multiples of all scales to try first, where not all combinations make sense.
     fingerprint : what it does to the data; deciding_run: the experiment that settles it.
     axis : what to plot the force (or reading) against, to see it.
     between_carts : on a spring to a wall it would be part of the linear chain.
@@ -97,12 +99,25 @@ class Effect:
     deciding_run: str
     reference: str
     axis: Axis
+    trials: tuple[tuple[float, ...], ...] = ()
     family: str = ""
     between_carts: bool = False
     fewest_carts: int = 1
     grows_from: str | None = None
     equivalent: str = ""
     genuine: Callable[[Mapping[str, float]], bool] = lambda p: True
+
+    @property
+    def trial_points(self) -> tuple[tuple[float, ...], ...]:
+        """The multiples of the parameters' scales to try first."""
+        return self.trials or tuple(product(*(p.trials for p in self.parameters)))
+
+    @property
+    def typical(self) -> tuple[float, ...]:
+        """Multiples of the parameters' scales that make the effect plain to see."""
+        if self.trials:
+            return self.trials[len(self.trials) // 2]
+        return tuple(p.trials[len(p.trials) // 2] for p in self.parameters)
 
     @property
     def names(self) -> tuple[str, ...]:

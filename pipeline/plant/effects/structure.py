@@ -84,7 +84,6 @@ EXTRA_MODE = Effect(
             symbol="m",
             unit="input s^2/position",
             scale=lambda s: s.mass,
-            trials=(0.1,),
             lower=1e-3,
             upper=3.0,
             neutral=0.0,
@@ -93,18 +92,21 @@ EXTRA_MODE = Effect(
             name="stiffness",
             symbol="k",
             unit="input/position",
-            # Tuned to the cart's own frequency, like the mass of the first trial.
-            scale=lambda s: 0.1 * s.stiffness,
-            trials=(0.25, 0.5, 0.8, 1.2, 1.8, 3.0, 6.0),
-            upper=3000.0,
+            scale=lambda s: s.stiffness,
+            upper=300.0,
         ),
         Parameter(
             name="damping",
             symbol="c",
             unit="input s/position",
-            scale=lambda s: 0.1 * (s.stiffness * s.mass) ** 0.5,
-            trials=(0.1,),
+            scale=lambda s: (s.stiffness * s.mass) ** 0.5,
         ),
+    ),
+    # Light and heavy, from slower to faster than the cart itself, with 3 % of critical damping.
+    trials=tuple(
+        (mass, mass * omega**2, 0.06 * mass * omega)
+        for omega in (0.45, 0.6, 0.75, 0.9, 1.05, 1.2, 1.4, 1.7, 2.3)
+        for mass in (0.02, 0.1)
     ),
     columns=lambda p: {
         Cart.HIDDEN_MASS: p["mass"],
