@@ -152,7 +152,7 @@ def _run_report(folder: Path, *, out: Path | None, pdf: bool) -> "Analysis":
     from pipeline.output import check_folder, own_folder, write_file
     from pipeline.report.known_gap import with_gap
     from pipeline.report.render import render_report
-    from pipeline.report.words import terminal_summary
+    from pipeline.report.summary import terminal_summary
     from pipeline.results_json import results_text
     from pipeline.submission import load_submission
     from pipeline.workflow import analyse

@@ -76,11 +76,11 @@ def page(tmp_path_factory):
 
 
 def test_the_page_stands_alone(page):
-    """One file without scripts or anything loaded, with a picture of each effect."""
+    """One file that loads nothing, with a picture of each effect."""
     html = (page / "effects.html").read_text(encoding="utf-8")
 
     assert html.count("<svg ") == len(CATALOGUE)
-    assert "<script" not in html
+    assert html.count("<script>") == 1
     assert not re.search(r'(src|href)="(?!#|data:)', html)
     for effect in CATALOGUE:
         assert f'id="{effect.key}"' in html

@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from pipeline.report.figures import drawing, panels, plot_measured, thin, to_svg
+from pipeline.report.figures import drawing, panels, plot_measured, thin
 from pipeline.report.figures_bode import bode_figure
 from pipeline.report.figures_time import hardware_figure, sine_figure
+from pipeline.report.svg import plain_svg, to_svg
 from pipeline.report.ticks import linear_ticks, log_ticks, tick_labels
 from tests.analysis_factory import make_analysis
 
@@ -41,7 +42,7 @@ def test_a_figure_is_well_formed_and_says_what_it_shows():
     assert root.findtext(f"{SVG}title") == "Bode <plot>"
     texts = ["".join(text.itertext()) for text in root.iter(f"{SVG}text")]
     assert "ω [rad/s]" in texts
-    assert "|X1/U| [dB re 1 cm/V]" in texts
+    assert "|X₁/U| [dB re 1 cm/V]" in texts
     assert root.find(f"{SVG}metadata") is None
 
 

@@ -6,6 +6,7 @@ from pipeline import __version__
 from pipeline.gap.types import Gap
 from pipeline.report.document import (
     Block,
+    Details,
     Document,
     Heading,
     Section,
@@ -31,9 +32,10 @@ from pipeline.report.model import (
     symbolic_state_space,
     symbolic_transfer_functions,
 )
-from pipeline.report.notes import note_blocks
+from pipeline.report.notes import even_headings, note_blocks
 from pipeline.report.numbers import count, percent
 from pipeline.report.page import Page, remarks
+from pipeline.report.summary import summary
 from pipeline.report.tables import (
     check_table,
     file_table,
@@ -41,18 +43,25 @@ from pipeline.report.tables import (
     parameter_notes,
     parameter_table,
 )
-from pipeline.report.words import clean, names_spans, rich, stage_name, summary
+from pipeline.report.words import clean, names_spans, rich, stage_name
 from pipeline.results import Analysis
+
+Part = tuple[str, str, Callable[[Page], list[Block]]]  # anchor, title, blocks
 
 _NO_CHANGE = 0.05  # percent: nothing to speak of
 
 
 def build_document(
-    analysis: Analysis, *, gap: Gap | None = None, progress: Callable[[str], None] | None
+    analysis: Analysis,
+    *,
+    gap: Gap | None = None,
+    worked: Sequence[Part] = (),
+    progress: Callable[[str], None] | None,
 ) -> Document:
     """Return the report of an analysis; sections that have nothing to show are left out.
 
-    `gap` is the gap analysis of the same data, where there is one.
+    `gap` is the gap analysis of the same data, where there is one; `worked` are sections that
+    stand in the place of the one on the model.
     """
     page = Page(
         analysis=analysis,
@@ -60,9 +69,9 @@ def build_document(
         position=clean(analysis.position_unit),
         drive=clean(analysis.input_unit),
     )
-    parts: Sequence[tuple[str, str, Callable[[Page], list[Block]]]] = (
+    parts: Sequence[Part] = (
         ("summary", "Summary", lambda page: [*summary(page.analysis), *gap_in_short(gap)]),
-        ("model", "The model", _model),
+        *(worked or (("model", "The model", _model),)),
         ("parameters", "Initial and final estimates", _parameters),
         ("frequency-response", "Frequency response", response_blocks),
         ("decays", "Free decays", decay_blocks),
@@ -180,16 +189,34 @@ def _hardware(page: Page, gap: Gap | None) -> list[Block]:
 
 
 def _checks(page: Page) -> list[Block]:
+    """Return what failed in sight, and the rest under a line that can be opened."""
     checks = page.analysis.checks
-    return [check_table(checks, number=page.table_number())] if checks else []
+    failed = [check for check in checks if check.outcome == "fail"]
+    others = [check for check in checks if check.outcome != "fail"]
+    passed = sum(check.outcome == "pass" for check in others)
+    blocks: list[Block] = []
+    if failed:
+        blocks.append(
+            check_table(failed, "Consistency checks that failed.", number=page.table_number())
+        )
+    if others:
+        title = f"{count(passed, 'check')} passed"
+        if unchecked := len(others) - passed:
+            title += f", {unchecked} could not be done"
+        table = check_table(
+            others, "Consistency checks that passed or could not be done.",
+            number=page.table_number(),
+        )  # fmt: skip
+        blocks.append(Details(spans(title), (table,)))
+    return blocks
 
 
 def _discussion(page: Page) -> list[Block]:
     blocks = list(note_blocks(page.analysis.discussion or ""))
     first = blocks[0] if blocks else None
     if isinstance(first, Heading) and plain(first.text).strip().lower() == "discussion":
-        return blocks[1:]  # the section has that title already
-    return blocks
+        blocks = blocks[1:]  # the section has that title already
+    return list(even_headings(blocks))
 
 
 def _warnings(page: Page) -> list[Block]:
@@ -212,4 +239,5 @@ def _provenance(page: Page) -> list[Block]:
     made = paragraph(f"Made by cartlab {__version__}. The same input gives the same report.")
     if not page.analysis.files:
         return [made]
-    return [made, file_table(page.analysis, number=page.table_number())]
+    files = file_table(page.analysis, number=page.table_number())
+    return [made, Details(spans(count(len(page.analysis.files), "data file")), (files,))]

@@ -4,11 +4,13 @@ Content is decided once (`content.py`), so the two renderings cannot disagree, a
 data: neither renderer ever takes a string for markup. `as_json` is what the PDF template reads.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any, Literal
 
 from pipeline.report.mathematics import Math, Term
+
+Tone = Literal["", "good", "bad", "quiet"]
 
 
 @dataclass(frozen=True)
@@ -68,24 +70,29 @@ class Code:
 
 @dataclass(frozen=True)
 class Formula:
-    """A displayed equation; `alt` reads it in words."""
+    """A displayed equation; `alt` reads it in words, `copy` can be pasted elsewhere."""
 
     math: Math
     alt: str
+    copy: str = ""
     kind: str = field(default="formula", init=False)
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A table cell; `tone` colours what its text already says."""
+    """A table cell; `tone` colours what its text already says.
+
+    In a column aligned on the decimal mark `parts` is the text before it, and from it on.
+    """
 
     text: Spans
-    tone: Literal["", "good", "bad", "quiet"] = ""
+    tone: Tone = ""
+    parts: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class Table:
-    """A numbered table; `align` has one of l, c, r for each column."""
+    """A numbered table; `align` has one of l, c, r or d (on the decimal mark) for each column."""
 
     number: int
     caption: Spans
@@ -108,7 +115,35 @@ class Picture:
     kind: str = field(default="picture", init=False)
 
 
-Block = Heading | Paragraph | Items | Quote | Code | Formula | Table | Picture
+@dataclass(frozen=True)
+class Tile:
+    """One fact on a board: what it is, its value, and what it means; `url` leads to its section."""
+
+    label: Spans
+    value: Spans
+    note: Spans = ()
+    tone: Tone = ""
+    url: str = ""
+
+
+@dataclass(frozen=True)
+class Tiles:
+    """A board of facts, seen at a glance."""
+
+    tiles: tuple[Tile, ...]
+    kind: str = field(default="tiles", init=False)
+
+
+@dataclass(frozen=True)
+class Details:
+    """Blocks that a page hides until they are asked for; print shows them all."""
+
+    title: Spans
+    blocks: tuple["Block", ...]
+    kind: str = field(default="details", init=False)
+
+
+Block = Heading | Paragraph | Items | Quote | Code | Formula | Table | Picture | Tiles | Details
 
 
 @dataclass(frozen=True)
@@ -132,8 +167,21 @@ class Document:
 
     def pictures(self) -> tuple[Picture, ...]:
         """Return the figures, in order."""
-        blocks = (block for section in self.sections for block in section.blocks)
-        return tuple(block for block in blocks if isinstance(block, Picture))
+        return tuple(
+            block
+            for section in self.sections
+            for block in flat(section.blocks)
+            if isinstance(block, Picture)
+        )
+
+
+def flat(blocks: Iterable[Block]) -> Iterator[Block]:
+    """Yield blocks in order, those inside `Details` too."""
+    for block in blocks:
+        if isinstance(block, Details):
+            yield from flat(block.blocks)
+        else:
+            yield block
 
 
 def spans(*parts: str | Span | Spans) -> Spans:

@@ -17,11 +17,12 @@ from pipeline.report.document import (
     paragraph,
     spans,
 )
-from pipeline.report.figures import WIDTH, drawing, to_svg
+from pipeline.report.figures import WIDTH, drawing
 from pipeline.report.figures_effects import effect_figure, fingerprint_words
 from pipeline.report.model import formula
 from pipeline.report.numbers import significant
 from pipeline.report.render import write_document
+from pipeline.report.svg import to_svg
 from pipeline.report.tables import cell, make_table
 from pipeline.report.tex import from_tex
 from pipeline.report.words_effects import INPUT, POSITION, parameter_text

@@ -15,6 +15,8 @@ from pipeline.report.figures import (
     log_frequency_axis,
     panels,
 )
+from pipeline.report.numbers import subscript
+from pipeline.report.svg import tell
 from pipeline.results import FrequencyResponse
 
 _LINE_POINTS = 300
@@ -68,7 +70,7 @@ def plot_magnitude(
         magnitude = np.abs(chain.frequency_response(omega)[response.cart - 1])
         ax.plot(omega, _decibel(magnitude), color=MODEL, label="fit")
         _mark_modes(ax, response.omega, chain)
-    ax.set_ylabel(f"|X{response.cart}/U| [dB re 1 {position_unit}/{input_unit}]")
+    ax.set_ylabel(f"|X{subscript(response.cart)}/U| [dB re 1 {position_unit}/{input_unit}]")
 
 
 def plot_phase(ax: Axes, response: FrequencyResponse, *, chain: Chain | None) -> None:
@@ -79,7 +81,8 @@ def plot_phase(ax: Axes, response: FrequencyResponse, *, chain: Chain | None) ->
         omega = _dense(response.omega, chain)
         line = np.unwrap(np.angle(chain.frequency_response(omega)[response.cart - 1]))
         line -= 2 * np.pi * np.round(line[0] / (2 * np.pi))
-        ax.plot(omega, np.degrees(line), color=MODEL)
+        (drawn,) = ax.plot(omega, np.degrees(line), color=MODEL)
+        tell(drawn, omega, np.degrees(line), name="fit")
         near = np.interp(response.omega, omega, line)
         phase = near + (phase - near + np.pi) % (2 * np.pi) - np.pi
     error = (
@@ -115,10 +118,11 @@ def _positive(response: FrequencyResponse) -> FrequencyResponse:
 
 
 def _points(ax: Axes, x: Array, y: Array, error: Array | None, *, label: str = "") -> None:
-    ax.errorbar(
+    drawn = ax.errorbar(
         x, y, error, fmt="D", ms=3.2, mew=0.8, mfc="white", color=MEASURED, elinewidth=0.7,
         label=label or None, zorder=3,
     )  # fmt: skip
+    tell(drawn.lines[0], x, y, name="measured")
 
 
 def _dense(omega: Array, chain: Chain) -> Array:
@@ -138,7 +142,7 @@ def _mark_modes(ax: Axes, omega: Array, chain: Chain) -> None:
             ax.axvline(mode, color=QUIET, lw=0.8, ls=":")
             ax.annotate(
                 letter, (mode, 0.0), xycoords=("data", "axes fraction"), xytext=(2, 2),
-                textcoords="offset points", color="#555555", fontsize=7.5,
+                textcoords="offset points", color="#555555", fontsize=7.5, gid="mark",
             )  # fmt: skip
 
 

@@ -10,7 +10,15 @@ from matplotlib.figure import Figure
 from pipeline.plant.augmented import rest_positions, simulate_augmented
 from pipeline.plant.chain import Array, Chain
 from pipeline.plant.effects import AugmentedChain, Effect, Term
-from pipeline.report.figures import MODEL, QUIET, SECOND, legend_above, panels
+from pipeline.report.figures import (
+    MODEL,
+    QUIET,
+    SECOND,
+    legend_above,
+    panels,
+    position_label,
+)
+from pipeline.report.numbers import subscript
 from pipeline.report.words_effects import INPUT, POSITION
 
 _RATE = 1000.0  # Hz: differences of the positions are then velocities and accelerations
@@ -68,7 +76,7 @@ def effect_figure(term: Term, chain: Chain) -> Figure:
     )
     right.plot(t, without, color=SECOND, ls="--", lw=1.0, label="without")
     right.plot(t, with_it, color=MODEL, lw=1.1, label="with it")
-    right.set_ylabel(f"x{cart} [{POSITION}]")
+    right.set_ylabel(position_label(cart, POSITION))
     right.yaxis.set_label_coords(_LABEL, 0.5)
     right.set_xlabel(f"{shown.name}: time [s]")
     legend_above(right)
@@ -231,7 +239,7 @@ def _over_frequency(ax: Axes, term: Term, chain: Chain, run: _Run, *, cart: int)
     ax.set_xscale("log")
     ax.set_yscale("log")
     ax.set_xlabel("frequency [Hz]")
-    ax.set_ylabel(f"x{cart}/u [{POSITION}/{INPUT}]")
+    ax.set_ylabel(f"x{subscript(cart)}/u [{POSITION}/{INPUT}]")
 
 
 def _against_truth(ax: Axes, run: _Run, *, cart: int) -> None:

@@ -17,10 +17,13 @@ from pipeline.report.figures import (
     SHADE,
     legend_above,
     panels,
+    plot_left,
     plot_measured,
     plot_model,
-    thin,
+    plot_second,
+    position_label,
 )
+from pipeline.report.numbers import subscript
 from pipeline.report.words import clean
 
 _ROW = 0.19  # inches, of one run in the overview
@@ -40,21 +43,22 @@ def before_after_figure(trace: Trace, *, noise: float, position_unit: str) -> Fi
     """Return one cart in one run: measured, both models, and what each leaves below."""
     figure, (above, below) = panels(1.5, 1.0)
     plot_measured(above, trace.t, trace.measured)
-    above.plot(*thin(trace.t, trace.baseline), color=SECOND, ls="--", lw=1.0, label="linear model")
+    plot_second(above, trace.t, trace.baseline, label="linear model")
     plot_model(above, trace.t, trace.final, label="with the effects")
-    above.set_ylabel(f"x{trace.cart} [{position_unit}]")
+    above.set_ylabel(position_label(trace.cart, position_unit))
     legend_above(above)
-    plot_left(below, trace, noise=noise)
+    below.axhspan(-2 * noise, 2 * noise, color=SHADE, lw=0)
+    plot_left(
+        below,
+        trace.t,
+        {
+            "with the effects": trace.measured - trace.final,
+            "linear model": trace.measured - trace.baseline,
+        },
+    )
     below.set_ylabel(f"left [{position_unit}]")
     below.set_xlabel("time [s]")
     return figure
-
-
-def plot_left(ax: Axes, trace: Trace, *, noise: float) -> None:
-    """Plot measured minus simulated, before and after, over the band of the noise."""
-    ax.axhspan(-2 * noise, 2 * noise, color=SHADE, lw=0)
-    ax.plot(*thin(trace.t, trace.measured - trace.baseline), color=SECOND, ls="--", lw=0.8)
-    ax.plot(*thin(trace.t, trace.measured - trace.final), color=MODEL, lw=0.8)
 
 
 # ------------------------------------------------------------------- run by run
@@ -93,7 +97,7 @@ def plot_by_record(ax: Axes, rows: Sequence[RecordGap]) -> None:
     for at, row in zip(y, rows, strict=True):
         name = clean(row.experiment)
         short = name if len(name) <= _LONGEST_NAME else f"{name[: _LONGEST_NAME - 1]}…"
-        text = f"{short}, x{row.cart}"
+        text = f"{short}, x{subscript(row.cart)}"
         ax.text(-0.02, at, text, transform=ax.get_yaxis_transform(), fontsize=7.5, ha="right",
                 va="center", color=MEASURED if row.held_out else QUIET)  # fmt: skip
 

@@ -9,6 +9,7 @@ from pipeline.gap.types import FoundEffect, Gap, RecordGap, Trace
 from pipeline.plant.effects.base import Term
 from pipeline.report.document import (
     Block,
+    Details,
     Document,
     Section,
     Span,
@@ -353,9 +354,10 @@ def _method(gap: Gap) -> list[Block]:
 
 
 def _provenance(page: Page) -> list[Block]:
+    files = file_table(page.analysis, number=page.table_number())
     return [
         paragraph(f"Made by cartlab {__version__}. The same input gives the same report."),
-        file_table(page.analysis, number=page.table_number()),
+        Details(spans(count(len(page.analysis.files), "data file")), (files,)),
     ]
 
 

@@ -1,17 +1,30 @@
-"""A document as one self-contained HTML file: no script, nothing loaded from anywhere."""
+"""A document as one self-contained HTML file: nothing loaded from anywhere, one script of ours."""
 
 import base64
+import hashlib
+import math
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
-from pipeline.report.document import Document, Picture
+from pipeline.report.document import Document, Picture, Table, Tiles, plain
+from pipeline.report.figures import MEASURED, MODEL, QUIET, SECOND, SHADE, THIRD
 from pipeline.report.mathematics import Term, to_mathml
+from pipeline.report.ticks import GRID
 from pipeline.resources import TEMPLATES
+
+_SCRIPTS = ("page.js", "explore.js")
+# The style sheet says what each colour is in light and in dark.
+_ROLES = {
+    MEASURED: "ink", MODEL: "model", SECOND: "second", THIRD: "third", QUIET: "quiet",
+    SHADE: "shade", GRID: "grid", "#444444": "axis", "#555555": "mark",
+}  # fmt: skip
+_NARROW = " .,()"  # half a digit wide
+_WIDE = "±×%"  # wider than a digit
 
 
 def render_html(document: Document) -> str:
-    """Return the page; every text is escaped, only our own SVG and MathML are not."""
+    """Return the page; every text is escaped, only our own SVG, MathML and script are not."""
     environment = Environment(
         loader=FileSystemLoader(TEMPLATES),
         autoescape=True,
@@ -19,19 +32,50 @@ def render_html(document: Document) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["mathml"] = _mathml
-    environment.filters["svg"] = _svg
+    environment.filters |= {"mathml": _mathml, "svg": _svg, "tails": _tails, "longest": _longest}
+    script = "".join((TEMPLATES / name).read_text(encoding="utf-8") for name in _SCRIPTS)
     return environment.get_template("report.html.j2").render(
-        document=document, math_font=_math_font()
+        document=document,
+        math_font=_math_font(),
+        script=Markup(script),
+        script_hash=Markup(_hash(script)),
     )
 
 
-def _mathml(math: Term, display: bool = False) -> Markup:
-    return Markup(to_mathml(math, display=display))  # every leaf is escaped
+def _mathml(term: Term, display: bool = False, alt: str = "") -> Markup:
+    mathml = to_mathml(term, display=display)  # every leaf is escaped
+    return Markup(mathml.replace("<math", f'<math alttext="{escape(alt)}"', 1))
 
 
 def _svg(picture: Picture) -> Markup:
-    return Markup(picture.svg)  # drawn by matplotlib, which escapes all text
+    """Return the drawing, which matplotlib has escaped, in the colours of the page."""
+    svg = picture.svg.replace("#ffffff", "var(--paper)")
+    for colour, role in _ROLES.items():
+        svg = svg.replace(colour, f"var(--f-{role})")
+    return Markup(svg)
+
+
+def _tails(table: Table) -> list[str]:
+    """Return how wide the part from the decimal mark on is in each column, "" where none is."""
+    columns = zip(*table.rows, strict=True)
+    return [
+        f"{math.ceil(max(_digits_wide(cell.parts[1]) for cell in column))}ch" if how == "d" else ""
+        for how, column in zip(table.align, columns, strict=False)
+    ]
+
+
+def _longest(board: Tiles) -> int:
+    """Return the letters of the longest value on a board."""
+    return max(len(plain(tile.value)) for tile in board.tiles)
+
+
+def _digits_wide(text: str) -> float:
+    return sum(0.5 if c in _NARROW else 1.5 if c in _WIDE else 1.0 for c in text)
+
+
+def _hash(script: str) -> str:
+    """Return the hash by which the page's policy knows its one script."""
+    return f"sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}"
 
 
 def _math_font() -> str:

@@ -14,7 +14,15 @@ from pipeline.gap.types import Gap
 from pipeline.plant.chain import Array
 from pipeline.plant.effects import AugmentedChain
 from pipeline.report.document import Block, Span, paragraph
-from pipeline.report.figures import MODEL, SECOND, legend_above, panels, plot_measured, thin
+from pipeline.report.figures import (
+    keep_in_sight,
+    legend_above,
+    panels,
+    plot_measured,
+    plot_model,
+    plot_second,
+    position_label,
+)
 from pipeline.report.model_gap import augmented_equations, law
 from pipeline.report.numbers import listing
 from pipeline.report.page import Page
@@ -133,7 +141,7 @@ def augmented_hardware_blocks(page: Page, gap: Gap | None) -> list[Block]:
                 ]
                 for replay in every
             ],
-            "lcrr",
+            "lcdd",
         ),
     ]
     drawn = [(run, found) for run, found in replays.items() if found][:_MOST_RUNS]
@@ -192,7 +200,7 @@ def _replay_figure(replays: Sequence[_Replay], *, position_unit: str) -> Figure:
     figure, axes = panels(*[1.05] * len(replays))
     for ax, replay in zip(axes, replays, strict=True):
         _plot_replay(ax, replay)
-        ax.set_ylabel(f"x{replay.check.cart} [{position_unit}]")
+        ax.set_ylabel(position_label(replay.check.cart, position_unit))
     legend_above(axes[0])
     axes[-1].set_xlabel("time [s]")
     return figure
@@ -201,9 +209,6 @@ def _replay_figure(replays: Sequence[_Replay], *, position_unit: str) -> Figure:
 def _plot_replay(ax: Axes, replay: _Replay) -> None:
     check = replay.check
     plot_measured(ax, check.t, check.measured)
-    ax.plot(*thin(check.t, check.model), color=SECOND, ls="--", lw=1.1, label="linear model")
-    ax.plot(*thin(check.t, replay.model), color=MODEL, lw=1.2, label="with the effects")
-    low, high = float(np.min(check.measured)), float(np.max(check.measured))
-    span = high - low or 1.0
-    bottom, top = ax.get_ylim()
-    ax.set_ylim(max(bottom, low - span), min(top, high + span))
+    plot_second(ax, check.t, check.model, label="linear model")
+    plot_model(ax, check.t, replay.model, label="with the effects")
+    keep_in_sight(ax, check.measured)

@@ -18,6 +18,11 @@ def feedback_blocks(page: Page) -> list[Block]:
         return []
     method = {"lqr": "a linear quadratic regulator", "poles": "pole placement"}[design.method]
     goal = f"{significant(design.reference)} {page.position}"
+    settled = (
+        f"settles in {significant(design.settling_time, digits=3)} s (dotted)"
+        if design.settling_time is not None
+        else "does not settle here"
+    )
     return [
         paragraph(
             f"Designed by {method}, with the controller's sampling and one sample of delay in the "
@@ -28,8 +33,10 @@ def feedback_blocks(page: Page) -> list[Block]:
         page.picture(
             "feedback",
             design_figure(design, position_unit=page.position, input_unit=page.drive),
-            caption=f"Simulated step of {goal} with the designed feedback: positions (cart "
-            f"{design.cart} thick, its 2 % band shaded, dotted where it has settled) and input.",
+            caption=f"Simulated step of {goal} with the designed feedback: cart {design.cart} "
+            f"(thick) {settled} with {percent(design.overshoot_percent)} overshoot, and the input "
+            f"peaks at {significant(design.peak_input, digits=3)} {page.drive}. Shaded: its 2 % "
+            "band.",
             alt=f"Simulated step response: cart {design.cart} reaches {goal} with "
             f"{percent(design.overshoot_percent)} overshoot; the input peaks at "
             f"{significant(design.peak_input, digits=3)} {page.drive}.",
@@ -57,8 +64,10 @@ def hardware_blocks(page: Page) -> list[Block]:
             page.picture(
                 f"hardware-{i}",
                 figure,
-                caption=f"Response of the real system (points) and of the model (line) in {run}, "
-                f"cart by cart.{left_out(len(runs) - _MOST_RUNS) if i == _MOST_RUNS else ''}",
+                caption=f"{run}: the real system (points) and the model, cart by cart; below each, "
+                f"what the model leaves. Most is left at cart {worst.cart}: "
+                f"{percent(100 * worst.nrmse)} of the motion (root mean square)."
+                f"{left_out(len(runs) - _MOST_RUNS) if i == _MOST_RUNS else ''}",
                 alt=f"Measured and modelled motion of {count(len(carts), 'cart')} in {run}; the "
                 f"largest difference is {percent(100 * worst.nrmse)} of the motion, at cart "
                 f"{worst.cart}.",

@@ -10,7 +10,8 @@ from pipeline.report.figures_time import damping_figure, decay_figure, sine_figu
 from pipeline.report.numbers import count, listing, percent, significant, with_error
 from pipeline.report.page import Page, left_out
 from pipeline.report.tables import decay_table, step_table
-from pipeline.results import FrequencyResponse, SinePoint
+from pipeline.report.words import clean
+from pipeline.results import FrequencyResponse, LogDecrement, SinePoint
 
 _MOST_PANELS = 6  # repeats drawn in one figure; the tables hold all
 _PAPER_DWELL = 2 * np.pi * 4.0  # rad/s: the 4 Hz of the paper's Figures 12-14
@@ -30,15 +31,7 @@ def response_blocks(page: Page) -> list[Block]:
         figure = bode_figure(
             response, chain=chain, position_unit=page.position, input_unit=page.drive
         )
-        modes = [f"omega_{m}" for m in "abcdefgh"[: page.analysis.carts]]
-        marks = listing(modes if page.analysis.carts > 1 else ["omega_n"])
-        caption = (
-            f"Measured frequency response (diamonds, with standard errors) and estimated transfer "
-            f"function (line) of the {_ordinal(response.cart)} cart, "
-            f"X_{response.cart}/U. Dotted: {marks}."
-            if chain
-            else f"Measured frequency response of the {_ordinal(response.cart)} cart."
-        )
+        caption = _bode_caption(page, response)
         blocks.append(
             page.picture(
                 f"bode-cart-{response.cart}", figure, caption=caption, alt=_bode_alt(page, response)
@@ -47,6 +40,28 @@ def response_blocks(page: Page) -> list[Block]:
     if not blocks:
         return []
     return [paragraph(_response_source(page.analysis.frequency_responses)), *blocks]
+
+
+def _bode_caption(page: Page, response: FrequencyResponse) -> str:
+    """Say how near the fit is, and where it is farthest off."""
+    points = "the measured points (diamonds, with standard errors)"
+    chain, n = page.analysis.chain, page.analysis.carts
+    cart = f"X_{response.cart}/U, the {_ordinal(response.cart)} cart" if n > 1 else "X/U"
+    if chain is None:
+        return f"{cart}: {points}."
+    shown = response.magnitude > 0
+    omega, measured = response.omega[shown], response.magnitude[shown]
+    off = 100 * (measured / np.abs(chain.frequency_response(omega)[response.cart - 1]) - 1)
+    worst = int(np.argmax(np.abs(off)))
+    marks = listing([f"omega_{mode}" for mode in "abcdefgh"[:n]] if n > 1 else ["omega_n"])
+    half, most = (
+        significant(float(v), digits=2) for v in (np.median(np.abs(off)), abs(off[worst]))
+    )
+    return (
+        f"{cart}: half of {points} lie within {half} % of the fit (line); the farthest, at "
+        f"{significant(float(omega[worst]), digits=3)} rad/s, lies {most} % "
+        f"{'above' if off[worst] > 0 else 'below'} it. Dotted: {marks}."
+    )
 
 
 def _response_source(responses: Sequence[FrequencyResponse]) -> str:
@@ -100,9 +115,10 @@ def decay_blocks(page: Page) -> list[Block]:
             page.picture(
                 f"decay-cart-{cart}",
                 figure,
-                caption=f"Free decay of cart {cart}: measured points, the extrema used "
-                f"(diamonds), the fitted decay and its envelope (dashed); what lies before the "
-                f"release is shaded.{left_out(len(own) - len(drawn))}",
+                caption=f"Cart {cart} let go: its swing (points) shrinks inside the fitted "
+                f"envelope (dashed) with zeta = {with_error(drawn[0].zeta, drawn[0].zeta_std)} in "
+                f"{clean(drawn[0].experiment)}.{_sticking(drawn)} Diamonds: the extrema used; time "
+                f"counts from the release, before it is shaded.{left_out(len(own) - len(drawn))}",
                 alt=f"Free decay of cart {cart} in {count(len(drawn), 'record')}: "
                 f"the swing falls from {significant(float(np.ptp(drawn[0].peak_y)), digits=2)} "
                 f"{page.position} peak to peak inside an envelope with damping ratio "
@@ -115,14 +131,19 @@ def decay_blocks(page: Page) -> list[Block]:
             page.picture(
                 "damping",
                 damping_figure(rubbing, position_unit=page.position),
-                caption="Local damping ratio against amplitude, where dry friction was found. "
-                "Viscous damping alone gives a level line; dry friction makes it rise as the "
-                "amplitude falls.",
+                caption="The damping ratio rises as the swing falls, which is what dry friction "
+                "does; viscous damping alone would give a level line. A marker for each record.",
                 alt="Damping ratio against amplitude of the decays with dry friction, rising "
                 "towards small amplitudes.",
             )
         )
     return blocks
+
+
+def _sticking(decays: Sequence[LogDecrement]) -> str:
+    if any(decay.friction and decay.friction.present for decay in decays):
+        return " Its last swings die sooner than the envelope says: dry friction."
+    return ""
 
 
 def step_blocks(page: Page) -> list[Block]:
@@ -143,8 +164,9 @@ def step_blocks(page: Page) -> list[Block]:
             page.picture(
                 "steps",
                 figure,
-                caption=f"Step responses: {_line_styles(page.analysis.carts)}. Thick: the levels "
-                "read off, over the windows they were read from; vertical: edges of the input."
+                caption="Between two levels (thick, over the windows they were read from) a cart "
+                "moves by its static gain times the step. "
+                f"{_line_styles(page.analysis.carts)}; dotted: edges of the input."
                 f"{left_out(len(runs) - len(drawn))}",
                 alt=f"Step responses in {count(len(drawn), 'record')}, with the rest and settled "
                 "levels of every cart marked.",
@@ -155,7 +177,7 @@ def step_blocks(page: Page) -> list[Block]:
 
 def _line_styles(carts: int) -> str:
     styles = zip(range(1, carts + 1), ("solid", "dashed", "dash-dotted", "dotted"), strict=False)
-    return ", ".join(f"cart {cart} {style}" for cart, style in styles)
+    return ", ".join(f"cart {cart} {style}" for cart, style in styles).capitalize()
 
 
 def dwell_blocks(page: Page) -> list[Block]:
@@ -178,9 +200,10 @@ def dwell_blocks(page: Page) -> list[Block]:
         page.picture(
             "sine",
             figure,
-            caption=f"Motion of {'every cart' if len(own) > 1 else 'the cart'} when the system is "
-            f"excited by a {hertz} Hz sine wave ({chosen.experiment}): transient shaded, steady "
-            "amplitude as a pair of lines.",
+            caption=f"Driven by a {hertz} Hz sine ({clean(chosen.experiment)}), "
+            f"{'every cart' if len(own) > 1 else 'the cart'} swings evenly, between the two lines, "
+            f"only after {significant(chosen.steady_from, digits=3)} s; an amplitude read in the "
+            "shaded transient would be wrong.",
             alt=f"Response to a {hertz} Hz sine: transient up to "
             f"{significant(chosen.steady_from, digits=3)} s, then a steady swing of "
             + listing([f"{significant(p.amplitude, digits=3)} {page.position}" for p in own])

@@ -29,11 +29,12 @@ from pipeline.report.mathematics import (
 from pipeline.report.numbers import significant
 
 _DIGITS = 4
+_ALL_DIGITS = 10  # as in results.json
 
 
-def formula(math: Math) -> Formula:
+def formula(math: Math, *, copy: str = "") -> Formula:
     """Return a displayed equation with its reading in plain text."""
-    return Formula(math=math, alt=to_text(math))
+    return Formula(math=math, alt=to_text(math), copy=copy)
 
 
 # ------------------------------------------------------------------- symbols
@@ -119,11 +120,30 @@ def _position(i: int, *, derivative: int = 0) -> Math:
 def numeric_state_space(chain: Chain) -> tuple[Formula, ...]:
     """Return A, B, C and D with numbers, in s, position and input units."""
     A, B, C, D = chain.state_space()
-    small = [row("B", "=", _numbers(B)), row("C", "=", _numbers(C)), row("D", "=", _numbers(D))]
-    return formula(row("A", "=", _numbers(A))), formula(_side_by_side(small))
+    small = [
+        row("B", "=", number_matrix(B)),
+        row("C", "=", number_matrix(C)),
+        row("D", "=", number_matrix(D)),
+    ]
+    return (
+        formula(row("A", "=", number_matrix(A)), copy=matlab_matrix("A", A)),
+        formula(
+            _side_by_side(small),
+            copy="\n".join(matlab_matrix(name, M) for name, M in (("B", B), ("C", C), ("D", D))),
+        ),
+    )
 
 
-def _numbers(values: Array) -> Math:
+def matlab_matrix(name: str, values: Array) -> str:
+    """Return "A = [0 1; −2 −3];" with all digits: MATLAB, Octave and Julia read it."""
+    rows = "; ".join(
+        " ".join(f"{value + 0.0:.{_ALL_DIGITS}g}" for value in line) for line in values
+    )
+    return f"{name} = [{rows}];"
+
+
+def number_matrix(values: Array) -> Math:
+    """Return a matrix of numbers with four digits."""
     return matrix([[_short(v) for v in line] for line in values])
 
 

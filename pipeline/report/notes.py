@@ -3,6 +3,7 @@
 Raw HTML is text, images leave their description, links keep only web and mail addresses.
 """
 
+from collections.abc import Iterable
 from urllib.parse import urlsplit
 
 from markdown_it import MarkdownIt
@@ -39,6 +40,25 @@ def note_blocks(markdown: str) -> tuple[Block, ...]:
         return _blocks(SyntaxTreeNode(parser.parse(text)))
     except RecursionError:
         return (Code(text),)
+
+
+def even_headings(blocks: Iterable[Block]) -> tuple[Block, ...]:
+    """Return blocks whose headings go down one level at a time, as an outline needs."""
+    above = _TOP_HEADING - 1
+
+    def even(block: Block) -> Block:
+        nonlocal above
+        match block:
+            case Heading(text=text, level=level):
+                above = min(level, above + 1)
+                return Heading(text, level=above)
+            case Quote(blocks=inner):
+                return Quote(tuple(even(b) for b in inner))
+            case Items(items=items, ordered=ordered):
+                return Items(tuple(tuple(even(b) for b in i) for i in items), ordered=ordered)
+        return block
+
+    return tuple(even(block) for block in blocks)
 
 
 def _blocks(node: SyntaxTreeNode, depth: int = 0) -> tuple[Block, ...]:

@@ -1,12 +1,18 @@
 """How numbers are written: once, here, so that a report says the same everywhere."""
 
 import math
+import re
 
 _SUPERSCRIPT = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
+_SUBSCRIPT = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 _PLAIN_RANGE = (1e-3, 1e5)  # sizes written without a power of ten
 _MOST_DIGITS = 8
 _FINEST = 1e-8  # an error this far below the value is that of exact data: its digits say nothing
 NOTHING = "–"
+_WHOLE = re.compile(r"[^\w]*\d+(?=\D|$)")
+_EXPONENT = re.compile(r"(?<![\w.])(-?\d+(?:\.\d+)?)e([+-]\d+)\b")
+_HYPHEN = re.compile(r"(?<![\w.)\]])-(?=\d)")
+_SIGNED_ZERO = re.compile(r"[+−]0\.0 %")
 
 
 def significant(value: float | None, *, digits: int = 4) -> str:
@@ -42,7 +48,20 @@ def percent(value: float | None, *, signed: bool = False) -> str:
     if value is None or not math.isfinite(value):
         return NOTHING
     text = _fixed(value, 1 if abs(value) < 99.95 else 0)
-    return f"+{text} %" if signed and value > 0 else f"{text} %"
+    return f"+{text} %" if signed and value > 0 and text != "0.0" else f"{text} %"
+
+
+def at_decimal(text: str) -> tuple[str, str]:
+    """Return a number as written, cut before its decimal mark: "−1", ".4 % (1.6 σ)"."""
+    match = _WHOLE.match(text)
+    return (match[0], text[match.end() :]) if match else (text, "")
+
+
+def typeset(text: str) -> str:
+    """Return a sentence with true minus signs and powers of ten, and no signed zero."""
+    text = _EXPONENT.sub(lambda m: f"{m[1]} × 10{_superscript(int(m[2]))}", text)
+    text = _HYPHEN.sub("−", text)
+    return _SIGNED_ZERO.sub("0.0 %", text)
 
 
 def count(n: int, noun: str) -> str:
@@ -55,6 +74,11 @@ def listing(items: list[str]) -> str:
     if len(items) < 2:
         return "".join(items)
     return f"{', '.join(items[:-1])} and {items[-1]}"
+
+
+def subscript(n: int) -> str:
+    """Return "₁" for 1, for texts that have no other way to set an index."""
+    return str(n).translate(_SUBSCRIPT)
 
 
 def unit_text(unit: str) -> str:

@@ -7,8 +7,9 @@ from itertools import count as counter
 from matplotlib.figure import Figure
 
 from pipeline.report.document import Block, Picture, bullet_list
-from pipeline.report.figures import WIDTH, to_svg
+from pipeline.report.figures import WIDTH
 from pipeline.report.numbers import count
+from pipeline.report.svg import to_svg
 from pipeline.report.words import clean, rich
 from pipeline.results import Analysis, Record
 

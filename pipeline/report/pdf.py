@@ -10,6 +10,7 @@ from matplotlib import get_data_path
 from matplotlib.ft2font import FT2Font
 
 from pipeline.report.document import Document, as_json
+from pipeline.report.svg import plain_svg
 from pipeline.report.words import clean
 from pipeline.resources import TEMPLATES
 
@@ -19,15 +20,15 @@ _SHOWN_IN_WARNING = 20
 
 
 def render_pdf(document: Document) -> bytes:
-    """Return the PDF (A-2b), made with no font but those that come with typst and matplotlib."""
-    data = _showable(as_json(document))
+    """Return the PDF (archival A-2a, accessible UA-1), with fonts that come with its makers only."""
+    data = _printable(as_json(document))
     pdf = typst.compile(
         TEMPLATES / "report.typ",
         root=TEMPLATES,
         font_paths=[_font_folder()],
         ignore_system_fonts=True,  # another machine must give the same pages
         sys_inputs={"document": json.dumps(data, ensure_ascii=False, allow_nan=False)},
-        pdf_standards="a-2b",
+        pdf_standards=["a-2a", "ua-1"],
         timestamp=_TIMESTAMP,
         format="pdf",
     )
@@ -42,8 +43,8 @@ def missing_characters(text: str) -> str:
     return " ".join(lost[:_SHOWN_IN_WARNING]) + more
 
 
-def _showable(value: Any) -> Any:
-    """Return JSON with the characters that no font has replaced.
+def _printable(value: Any) -> Any:
+    """Return JSON with the characters that no font has replaced, and drawings without data.
 
     Left as they are they would become empty boxes without a word, and the file no valid PDF/A.
     """
@@ -51,9 +52,12 @@ def _showable(value: Any) -> Any:
         lost = _lost(value)
         return "".join(_MISSING if c in lost else c for c in value) if lost else value
     if isinstance(value, dict):
-        return {key: _showable(item) for key, item in value.items()}
+        return {
+            key: _printable(plain_svg(item) if key == "svg" else item)
+            for key, item in value.items()
+        }
     if isinstance(value, list):
-        return [_showable(item) for item in value]
+        return [_printable(item) for item in value]
     return value
 
 

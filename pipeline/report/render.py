@@ -11,6 +11,7 @@ from pipeline.report.content import build_document
 from pipeline.report.document import Document
 from pipeline.report.html import render_html
 from pipeline.report.pdf import missing_characters, render_pdf
+from pipeline.report.svg import plain_svg
 from pipeline.results import Analysis
 
 
@@ -46,7 +47,7 @@ def write_document(document: Document, out: Path, *, name: str, pdf: bool) -> No
         printed = beside.submit(render_pdf, document) if pdf else None
         write_file(out / f"{name}.html", render_html(document))
         for picture in document.pictures():
-            write_file(figures / f"{picture.name}.svg", picture.svg)
+            write_file(figures / f"{picture.name}.svg", plain_svg(picture.svg))
         if printed:
             write_file(out / f"{name}.pdf", printed.result())
 

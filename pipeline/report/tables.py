@@ -1,12 +1,20 @@
 """The tables of a report, as data: numbers formatted, parameter names as mathematics."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from pipeline.plant.chain import Chain
-from pipeline.report.document import Cell, Span, Spans, Table, spans
-from pipeline.report.numbers import NOTHING, percent, significant, unit_text, with_error
+from pipeline.report.document import Cell, Span, Spans, Table, plain, spans
+from pipeline.report.numbers import (
+    NOTHING,
+    at_decimal,
+    percent,
+    significant,
+    unit_text,
+    with_error,
+)
 from pipeline.report.words import SOURCES, clean, name_span, rich
 from pipeline.results import (
     Analysis,
@@ -36,14 +44,21 @@ def make_table(
     rows: Iterable[Sequence[Cell]],
     align: str,
 ) -> Table:
-    """Return a table; `align` has one of l, c, r for each column."""
+    """Return a table; `align` has one of l, c, r or d (on the decimal mark) for each column."""
     return Table(
         number=number,
         caption=spans(caption),
         head=tuple(cell(text) for text in head),
-        rows=tuple(tuple(row) for row in rows),
+        rows=tuple(
+            tuple(_cut(c) if how == "d" else c for c, how in zip(row, align, strict=True))
+            for row in rows
+        ),
         align=align,
     )
+
+
+def _cut(content: Cell) -> Cell:
+    return replace(content, parts=at_decimal(plain(content.text)))
 
 
 # ------------------------------------------------------------------ parameters
@@ -58,7 +73,7 @@ def parameter_table(rows: Sequence[ParameterRow], *, number: int, carts: int) ->
         "of freedom model, with standard errors.",
         ("Parameter", "Unit", "Initial estimate", "from", "Final estimate", "Change", "Verdict"),
         [_parameter_row(row) for row in rows],
-        "llrlrrl",
+        "lldlddl",
     )
 
 
@@ -79,7 +94,11 @@ def _parameter_row(row: ParameterRow) -> list[Cell]:
 
 
 def _estimate(estimate: Estimate | None) -> str:
-    return NOTHING if estimate is None else with_error(estimate.value, estimate.std)
+    if estimate is None:
+        return NOTHING
+    if estimate.source == "assumed":  # a guess has no more digits than were thought of
+        return significant(estimate.value, digits=2)
+    return with_error(estimate.value, estimate.std)
 
 
 def _verdict(consistent: bool | None) -> Cell:
@@ -136,7 +155,7 @@ def chain_table(
         "input units.",
         ("Symbol", "Meaning", "Value", "Unit"),
         rows,
-        "llrl",
+        "lldl",
     )
 
 
@@ -160,8 +179,7 @@ def decay_table(decays: Sequence[LogDecrement], *, number: int, position_unit: s
         if friction is None:
             verdict = cell("not tested", "quiet")
         elif friction.present:
-            drop = with_error(friction.drop, friction.drop_std)
-            verdict = cell(f"d = {drop} {clean(position_unit)}", "bad")
+            verdict = cell(with_error(friction.drop, friction.drop_std), "bad")
         else:
             verdict = cell("none seen", "good")
         rows.append(
@@ -182,10 +200,10 @@ def decay_table(decays: Sequence[LogDecrement], *, number: int, position_unit: s
         (
             "Record", "Cart", spans(name_span("omega_n"), " [rad/s]"),
             spans(name_span("zeta"), " of the fit"), spans(name_span("zeta"), " of the extrema"),
-            "Extrema", "Dry friction",
+            "Extrema", f"Dry friction d [{clean(position_unit)}]",
         ),
         rows,
-        "lcrrrcr",
+        "lcdddcr",
     )  # fmt: skip
 
 
@@ -213,7 +231,7 @@ def step_table(gains: Sequence[StepGain], *, number: int, units: tuple[str, str]
         "a cart sticks; the last column is how far its rest point moved.",
         ("Record", "Cart", "Edges", f"K [{position}/{drive}]", f"Rest moved by [{position}]"),
         rows,
-        "lccrr",
+        "lccdd",
     )
 
 
@@ -243,8 +261,8 @@ def feedback_table(design: FeedbackDesign, *, number: int, units: tuple[str, str
         f"State feedback for cart {design.cart}, and its simulated step of "
         f"{significant(design.reference)} {position}.",
         ("Quantity", "Value", "Unit"),
-        [[cell(what), cell(value), cell(unit)] for what, value, unit in rows],
-        "lrl",
+        [[cell(what), cell(value), cell(unit_text(unit))] for what, value, unit in rows],
+        "ldl",
     )
 
 
@@ -301,7 +319,7 @@ def hardware_table(checks: Sequence[HardwareCheck], *, number: int, position_uni
             f"Steady state [{clean(position_unit)}]",
         ),
         rows,
-        "lclrrrr",
+        "lcldrrr",
     )  # fmt: skip
 
 
@@ -321,12 +339,12 @@ def _pair(model: float | None, measured: float | None) -> str:
 # ----------------------------------------------------------------- housekeeping
 
 
-def check_table(checks: Sequence[Check], *, number: int) -> Table:
-    """Return every consistency check, failed ones first."""
+def check_table(checks: Sequence[Check], caption: str, *, number: int) -> Table:
+    """Return consistency checks, failed ones first."""
     order = {"fail": 0, "pass": 1, "skip": 2}
     return make_table(
         number,
-        "Consistency checks.",
+        caption,
         ("Outcome", "Check", "What was found"),
         [
             [

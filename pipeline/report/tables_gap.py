@@ -31,7 +31,7 @@ def error_table(gap: Gap, *, number: int) -> Table:
         "over that of the motion.",
         ("Model", "Error"),
         rows,
-        "lr",
+        "ld",
     )
 
 
@@ -53,7 +53,7 @@ def window_table(windows: Sequence[GapWindow], *, number: int) -> Table:
             ]
             for w in windows
         ],
-        "lcrrlr",
+        "lcddld",
     )
 
 
@@ -75,7 +75,7 @@ def effect_parameter_table(found: FoundEffect, *, number: int) -> Table:
         f"{found.effect.title}: parameters with standard errors.",
         ("Symbol", "Parameter", "Value", "Unit"),
         rows,
-        "llrl",
+        "lldl",
     )
 
 
@@ -98,5 +98,5 @@ def rival_table(found: FoundEffect, gap: Gap, *, number: int) -> Table:
                 for r in found.rivals
             ),
         ],
-        "lrr",
+        "ldd",
     )

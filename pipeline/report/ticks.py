@@ -11,7 +11,9 @@ from matplotlib.transforms import ScaledTranslation
 
 from pipeline.plant.chain import Array
 
-_GRID = "#e4e4e4"
+# What a page that zooms draws anew or moves: grids, tick labels, letters that mark a place.
+TAGS = ("grid-x", "grid-y", "tick-x", "tick-y", "mark")
+GRID = "#e4e4e4"
 _SIZE = 7.5  # points, of the labels
 _PAD = 3.5 / 72  # inches, between axis and label
 _SPACING = (0.45, 0.18)  # inches at least between ticks along x and along y
@@ -26,7 +28,7 @@ _ROUNDING = 1e-9  # of a step
 _PLAIN = 4  # decimals, or digits before the point, beyond which powers of ten are clearer
 
 
-def draw_ticks(ax: Axes, *, label_x: bool) -> None:
+def draw_ticks(ax: Axes, *, label_x: bool, label_y: bool = True) -> None:
     """Draw grid and labels of both axes, at the limits the data have set by now."""
     figure = ax.get_figure(root=True)
     assert figure is not None
@@ -42,7 +44,7 @@ def draw_ticks(ax: Axes, *, label_x: bool) -> None:
         for set_locator in (axis.set_major_locator, axis.set_minor_locator):
             set_locator(NullLocator())
         _grid(ax, ticks, direction=direction)
-        if direction == 1 or label_x:
+        if (label_x, label_y)[direction]:
             shift = ScaledTranslation(
                 *((0.0, -_PAD) if direction == 0 else (-_PAD, 0.0)), figure.dpi_scale_trans
             )
@@ -54,17 +56,20 @@ def _grid(ax: Axes, ticks: Array, *, direction: int) -> None:
     across = np.tile([0.0, 1.0, np.nan], ticks.size)
     x, y = (along, across) if direction == 0 else (across, along)
     transform = ax.get_xaxis_transform() if direction == 0 else ax.get_yaxis_transform()
-    ax.add_artist(Line2D(x, y, transform=transform, color=_GRID, lw=0.6, zorder=0.5))
+    grid = Line2D(x, y, transform=transform, color=GRID, lw=0.6, zorder=0.5)
+    grid.set_gid(TAGS[direction])
+    ax.add_artist(grid)
 
 
 def _labels(ax: Axes, ticks: Array, *, direction: int, shift: ScaledTranslation) -> None:
     for tick, label in zip(ticks, tick_labels(ticks), strict=True):
         if direction == 0:
-            ax.text(tick, 0.0, label, transform=ax.get_xaxis_transform() + shift, fontsize=_SIZE,
-                    ha="center", va="top")  # fmt: skip
+            text = ax.text(tick, 0.0, label, transform=ax.get_xaxis_transform() + shift,
+                           fontsize=_SIZE, ha="center", va="top")  # fmt: skip
         else:
-            ax.text(0.0, tick, label, transform=ax.get_yaxis_transform() + shift, fontsize=_SIZE,
-                    ha="right", va="center_baseline")  # fmt: skip
+            text = ax.text(0.0, tick, label, transform=ax.get_yaxis_transform() + shift,
+                           fontsize=_SIZE, ha="right", va="center_baseline")  # fmt: skip
+        text.set_gid(TAGS[2 + direction])
 
 
 def linear_ticks(low: float, high: float, *, most: int) -> Array:
