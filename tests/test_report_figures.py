@@ -16,7 +16,7 @@ from matplotlib.patches import Rectangle
 from pipeline.report.figures import drawing, panels, plot_measured, thin
 from pipeline.report.figures_bode import bode_figure
 from pipeline.report.figures_time import hardware_figure, sine_figure
-from pipeline.report.svg import plain_svg, to_svg
+from pipeline.report.svg import to_svg
 from pipeline.report.ticks import linear_ticks, log_ticks, tick_labels
 from tests.analysis_factory import make_analysis
 
