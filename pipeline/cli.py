@@ -135,10 +135,14 @@ def report(
     folder: Folder,
     out: Annotated[Path | None, typer.Option(help="Where to write; default: DIR/report.")] = None,
     pdf: Annotated[bool, typer.Option("--pdf/--no-pdf", help="Write the PDF too.")] = True,
+    compare: Annotated[
+        Path | None,
+        typer.Option(metavar="RESULTS", help="An earlier results.json: say what changed."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Identify the carts, design the controller, check the hardware, write the report."""
-    analysis = _run_report(folder, out=out, pdf=pdf)
+    analysis = _run_report(folder, out=out, pdf=pdf, compare=compare)
     if as_json:
         from pipeline.results_json import results_text
 
@@ -148,8 +152,11 @@ def report(
         raise typer.Exit(1)
 
 
-def _run_report(folder: Path, *, out: Path | None, pdf: bool) -> "Analysis":
+def _run_report(
+    folder: Path, *, out: Path | None, pdf: bool, compare: Path | None = None
+) -> "Analysis":
     from pipeline.output import check_folder, own_folder, write_file
+    from pipeline.report.compare import changes_line, compare_drafts, read_results
     from pipeline.report.known_gap import with_gap
     from pipeline.report.render import render_report
     from pipeline.report.summary import terminal_summary
@@ -159,14 +166,44 @@ def _run_report(folder: Path, *, out: Path | None, pdf: bool) -> "Analysis":
 
     submission = load_submission(folder)
     out = check_folder(out) if out else own_folder(submission.folder, "report")
+    earlier = read_results(compare) if compare else None
+    with _progress() as progress:
+        analysis, gap = with_gap(analyse(submission, progress=progress), submission.folder)
+        changes = compare_drafts(earlier, analysis) if earlier else None
+        out.mkdir(parents=True, exist_ok=True)
+        write_file(out / "results.json", results_text(analysis))
+        render_report(analysis, out, gap=gap, changes=changes, pdf=pdf, progress=progress)
+    say(terminal_summary(analysis))
+    if changes:
+        say(changes_line(changes))
+    say(f"wrote {out / 'report.html'}" + (f" and {out / 'report.pdf'}" if pdf else ""))
+    return analysis
+
+
+@app.command()
+def solution(
+    folder: Folder,
+    out: Annotated[Path | None, typer.Option(help="Where to write; default: DIR/solution.")] = None,
+    pdf: Annotated[bool, typer.Option("--pdf/--no-pdf", help="Write the PDF too.")] = True,
+    as_json: AsJson = False,
+) -> None:
+    """Write the instructor's reference: derivations, numbers put in, what to expect."""
+    from pipeline.output import check_folder, own_folder, write_file
+    from pipeline.report.known_gap import with_gap
+    from pipeline.report.solution import render_solution, solution_text
+    from pipeline.submission import load_submission
+    from pipeline.workflow import analyse
+
+    submission = load_submission(folder)
+    out = check_folder(out) if out else own_folder(submission.folder, "solution")
     with _progress() as progress:
         analysis, gap = with_gap(analyse(submission, progress=progress), submission.folder)
         out.mkdir(parents=True, exist_ok=True)
-        write_file(out / "results.json", results_text(analysis))
-        render_report(analysis, out, gap=gap, pdf=pdf, progress=progress)
-    say(terminal_summary(analysis))
-    say(f"wrote {out / 'report.html'}" + (f" and {out / 'report.pdf'}" if pdf else ""))
-    return analysis
+        write_file(out / "solution.json", text := solution_text(analysis))
+        render_solution(analysis, out, gap=gap, pdf=pdf, progress=progress)
+    say(f"wrote {out / 'solution.html'}" + (f" and {out / 'solution.pdf'}" if pdf else ""))
+    if as_json:
+        typer.echo(text, nl=False)
 
 
 @app.command()
@@ -258,3 +295,15 @@ def effects(
         typer.echo(json.dumps(catalogue_data(chosen), indent=1, ensure_ascii=False))
     elif not out:
         typer.echo(catalogue_text(chosen))
+
+
+@app.command()
+def schema(
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="results, gap or solution.")
+    ] = "results",
+) -> None:
+    """Print the JSON Schema of results.json, gap.json or solution.json."""
+    from pipeline.schemas.export import schema_text
+
+    typer.echo(schema_text(name), nl=False)

@@ -10,7 +10,7 @@ PIPELINE = Path(__file__).parents[1] / "pipeline"
 # From the ground up; a module imports from its own level (same package only) or below.
 LEVELS = (
     ("__init__", "errors", "resources"),
-    ("output",),
+    ("output", "schemas"),
     ("plant",),
     ("results", "submission"),
     ("ingest", "stages"),

@@ -1,18 +1,29 @@
 """The worked reference: every formula it prints is a true one, and its numbers are the model's."""
 
+import json
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 import sympy
-from hypothesis import given
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from sympy.parsing.sympy_parser import parse_expr
 
+from pipeline.plant.chain import PRESETS, Chain
 from pipeline.report import derivation
 from pipeline.report.derivation import work_state_model
-from pipeline.report.derivation_algebra import evaluate, shown, shown_with
+from pipeline.report.derivation_algebra import evaluate, shown, shown_with, value_term, work_out
+from pipeline.report.document import Formula
+from pipeline.report.mathematics import to_text
+from pipeline.report.solution import build_solution, solution_text
+from pipeline.report.solution_design import work_design
+from pipeline.report.solution_expected import expected_model, expected_parameters
+from pipeline.stages.state_feedback import design_feedback
+from tests.analysis_factory import make_analysis
 from tests.test_chain import chains
 
 s = sympy.Symbol("s")
@@ -76,7 +87,7 @@ class Truth:
             found["k" if n == 1 else f"k_{j}"] = stiffness if n > 1 else k[0]
         for i, letter in enumerate("dnr"[: max(n - 1, 0)], start=1):
             whole = self.polynomial(i)
-            found[letter.upper()] = whole
+            found[("Delta", "N", "R")[i - 1]] = whole
             found |= {f"{letter}_{p}": whole.coeff(s, p) for p in range(2 * (n - i + 1))}
         if n == 1:
             found |= {"K": 1 / k[0], "omega_n": sympy.sqrt(k[0] / m[0])}
@@ -172,7 +183,7 @@ def test_numbers_put_in_step_by_step_end_in_the_state_model(chain):
 # ----------------------------------------------------------- what is shown is what is true
 
 WRITTEN = {
-    "ω": "omega", "ζ": "zeta", "κ": "kappa", "·": "*",
+    "ω": "omega", "ζ": "zeta", "κ": "kappa", "Δ": "Delta", "·": "*",
 }  # fmt: skip
 
 
@@ -223,7 +234,7 @@ def test_a_formula_reads_as_the_text_it_is_made_from(springs):
         }
     spelt |= {
         "inverse_m": 1 / sympy.Symbol("m"),
-        **{x: sympy.Symbol(x) for x in (*"DNRUs", "zeta")},
+        **{x: sympy.Symbol(x) for x in ("Delta", *"NRUs", "zeta")},
     }
     for text in (side for equation in equations for side in (equation.left, equation.right)):
         seen = parsed(read_back(shown(text)), spelt)
@@ -236,3 +247,129 @@ def test_numbers_put_in_are_worked_out_as_written():
     for text in ("a*b-c", "(a-b)/c", "c-a*(b+a)", "-a**2+c", "a-(b-c)", "a/b*c"):
         seen = parsed(read_back(shown_with(text, values)))
         assert_allclose(float(seen), evaluate(text, values), rtol=1e-4)
+
+
+# ------------------------------------------------------------------------- the design
+
+
+@pytest.mark.parametrize("method", ["lqr", "poles"])
+@pytest.mark.parametrize("preset", ["throne-1dof", "throne-2dof", "throne-3dof"])
+def test_the_worked_gains_are_the_designed_ones(preset, method):
+    """Riccati's equation and Ackermann's formula give the gains that the design stage found."""
+    chain = PRESETS[preset]
+    design = design_feedback(
+        chain, cart=chain.n, reference=1.0, overshoot_percent=10, settling_time=1.0, method=method
+    )
+    worked = work_design(chain, design)
+    # Six poles near 1: the controllability matrix of six states loses some nine digits.
+    assert_allclose(worked.gains, design.gains, rtol=1e-5, atol=1e-6 * np.abs(design.gains).max())
+    assert_allclose(worked.prefilter, design.prefilter, rtol=1e-6)
+    if worked.P is not None and design.Q is not None and design.R is not None:
+        R, P, phi = design.R, worked.P, worked.phi
+        G = worked.gains
+        residual = (
+            design.Q
+            + phi.T @ P @ phi
+            - P
+            - (R + worked.gamma @ P @ worked.gamma) * (np.outer(G, G))
+        )
+        assert_allclose(residual, 0.0, atol=1e-9 * np.abs(P).max())
+
+
+def test_ackermann_is_exact_in_symbols():
+    """For any two-state plant the formula gives phi - gamma G the polynomial asked for."""
+    a, b, c, d, e, f, p, q = sympy.symbols("a:f p q")
+    phi, gamma, z = sympy.Matrix([[a, b], [c, d]]), sympy.Matrix([e, f]), sympy.Symbol("z")
+    reach = sympy.Matrix.hstack(gamma, phi * gamma)
+    G = sympy.Matrix([[0, 1]]) * reach.inv() * (phi**2 + p * phi + q * sympy.eye(2))
+    loop = (z * sympy.eye(2) - phi + gamma * G).det()
+    assert sympy.simplify(loop - (z**2 + p * z + q)) == 0
+
+
+# ---------------------------------------------------------------------- what is expected
+
+
+def test_the_reference_passes_its_own_tolerances_and_a_slip_does_not():
+    """Every expected value lies within, a frequency in Hz or a doubled gain far outside."""
+    for p in expected_parameters(make_analysis(3)):
+        assert p.tolerance > 0
+        if p.name.startswith("omega"):
+            assert abs(p.value / (2 * np.pi) - p.value) > p.tolerance
+        if p.name.startswith("K"):
+            assert abs(2 * p.value - p.value) > p.tolerance
+
+
+@given(chains(min_carts=2, max_carts=3), st.integers(0, 2**32 - 1))
+@settings(max_examples=20)
+def test_entry_tolerances_cover_tables_that_are_off_as_accepted(chain, seed):
+    """A table off by a third of its tolerances, at random, moves most entries within theirs."""
+    rng = np.random.default_rng(seed)
+    table = derivation.given(chain)
+    tolerances = {name: 1e-3 * value for name, value in table.items()}
+    model = expected_model(chain, tolerances)
+    rows, _ = derivation.state_entries(chain.n)
+    inside = []
+    for _ in range(20):
+        moved = {
+            name: value * (1 + 1e-3 / 3 * rng.standard_normal()) for name, value in table.items()
+        }
+        worked = work_out(derivation.state_steps(chain.n), moved)
+        A = np.array([[evaluate(text, worked) for text in line] for line in rows])
+        inside.append(np.abs(A - model.A) <= model.A_tolerance + 1e-6 * np.abs(model.A))
+    # A third of the tolerance is one standard error: three hold 99.7 %.
+    assert np.mean(inside) > 0.97
+
+
+# ------------------------------------------------------------------------- the document
+
+
+@pytest.mark.parametrize("carts", [1, 2, 3])
+def test_the_document_works_everything_out(carts):
+    """Each worked section is there, and the model's numbers stand in it."""
+    analysis = make_analysis(carts)
+    document = build_solution(analysis)
+    ids = [section.id for section in document.sections]
+    assert ids[:6] == [
+        "summary", "motion", "transfer-functions", "state-model", "worked-design", "expected",
+    ]  # fmt: skip
+    alts = " ".join(
+        block.alt for section in document.sections for block in section.blocks
+        if isinstance(block, Formula)
+    )  # fmt: skip
+    assert analysis.chain is not None
+    A, B, _, _ = analysis.chain.state_space()
+    for value in (*A[(A != 0) & (A != 1)], *B[B != 0]):
+        assert to_text(value_term(float(abs(value)))) in alts
+
+
+def test_what_has_no_table_is_left_out():
+    """Without a fit only the derivation stands; a rigid cart has its own, short one."""
+    bare = replace(make_analysis(2), fit=None, rows=(), feedback=None)
+    ids = [section.id for section in build_solution(bare).sections]
+    assert ids[1:3] == ["motion", "transfer-functions"]
+    assert not {"state-model", "worked-design", "expected"} & set(ids)
+    rigid = analyse_rigid()
+    document = build_solution(rigid)
+    assert {"motion", "transfer-functions", "state-model"} <= {s.id for s in document.sections}
+
+
+def analyse_rigid():
+    analysis = make_analysis(1)
+    assert analysis.fit is not None
+    chain = Chain(m=np.array([2e-4]), c=np.array([5e-4]), k=np.zeros(2))
+    fit = replace(
+        analysis.fit, chain=chain, names=("m_1", "c_1"), covariance=1e-12 * np.eye(2), parameters={}
+    )
+    return replace(analysis, springs=(False, False), fit=fit, rows=(), feedback=None)
+
+
+def test_solution_json_is_the_reference_for_programs():
+    """All parameters with tolerances, A and B with theirs, and the gains; the same text twice."""
+    analysis = make_analysis(2)
+    text = solution_text(analysis)
+    assert text == solution_text(analysis)
+    found = json.loads(text)
+    assert found["schema"] == "cartlab-solution/1"
+    assert {p["name"] for p in found["parameters"]} == {row.name for row in analysis.rows}
+    assert np.shape(found["state_space"]["A_tolerance"]) == (4, 4)
+    assert len(found["feedback"]["gains"]) == 4

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 
 from pipeline import __version__
 from pipeline.gap.types import Gap
+from pipeline.report.compare import DraftChanges, change_blocks
 from pipeline.report.document import (
     Block,
     Details,
@@ -56,12 +57,13 @@ def build_document(
     *,
     gap: Gap | None = None,
     worked: Sequence[Part] = (),
+    changes: DraftChanges | None = None,
     progress: Callable[[str], None] | None,
 ) -> Document:
     """Return the report of an analysis; sections that have nothing to show are left out.
 
     `gap` is the gap analysis of the same data, where there is one; `worked` are sections that
-    stand in the place of the one on the model.
+    stand in the place of the one on the model; `changes` is what an earlier draft had otherwise.
     """
     page = Page(
         analysis=analysis,
@@ -71,6 +73,7 @@ def build_document(
     )
     parts: Sequence[Part] = (
         ("summary", "Summary", lambda page: [*summary(page.analysis), *gap_in_short(gap)]),
+        ("changes", "Since the earlier draft", lambda page: change_blocks(page, changes)),
         *(worked or (("model", "The model", _model),)),
         ("parameters", "Initial and final estimates", _parameters),
         ("frequency-response", "Frequency response", response_blocks),

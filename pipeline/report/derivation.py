@@ -3,9 +3,10 @@
 All equations are text that `derivation_algebra` shows and works out; the tests check each of them
 against the impedance matrix with a computer algebra system.
 
-D(s) is the monic characteristic polynomial of the whole chain, N(s) of carts 2 to n, R(s) of carts
-3 to n, each with the carts before it held; P_i(s) belongs to cart i alone. With three carts N(s)
-is the paper's numerator of cart 1. Coefficients are d_0, d_1, …; n_0, …; r_0, ….
+Delta(s) is the monic characteristic polynomial of the whole chain, N(s) of carts 2 to n, R(s) of
+carts 3 to n, each with the carts before it held; P_i(s) belongs to cart i alone. The paper's common
+denominator is Delta(s) over its constant term, and with three carts N(s) over its own is the
+paper's numerator of cart 1. Coefficients are d_0, d_1, …; n_0, …; r_0, ….
 """
 
 from collections.abc import Sequence
@@ -15,7 +16,8 @@ from pipeline.plant.chain import Chain
 from pipeline.report.derivation_algebra import Equation, work_out
 
 MOST_CARTS = 4  # letters for the polynomials of more are not made
-_LETTERS = "dnr"
+_LETTERS = "dnr"  # of the coefficients
+_POLYNOMIALS = ("Delta", "N", "R")
 _MODES = "abcd"
 _NULLS = "xy"
 
@@ -35,7 +37,7 @@ def newton(springs: Sequence[bool]) -> list[Equation]:
 def _forces(i: int, springs: Sequence[bool]) -> list[str]:
     n = len(springs) - 1
     forces = ["u"] if i == 1 else []
-    forces.append(f"-{_of('c', i, n)}*dx_{i}")
+    forces.append(f"-({_of('c', i, n)}*dx_{i})")
     if n == 1:
         return [*forces, *(["-k*x_1"] if any(springs) else [])]
     if springs[i - 1]:
@@ -96,10 +98,10 @@ def per_mass(n: int) -> list[Equation]:
 
 
 def tail(i: int, n: int) -> str:
-    """Return the polynomial of carts i to n alone: D, N, R, P_n, and 1 beyond the last."""
+    """Return the polynomial of carts i to n alone: Delta, N, R, P_n, and 1 beyond the last."""
     if i > n:
         return "1"
-    return f"P_{n}" if i == n else _LETTERS[i - 1].upper()
+    return f"P_{n}" if i == n else _POLYNOMIALS[i - 1]
 
 
 def elimination(n: int) -> list[Equation]:
@@ -108,8 +110,8 @@ def elimination(n: int) -> list[Equation]:
     for i in range(n, 1, -1):
         if i < n:
             equations += _tail_equations(i, n)
-        above = "" if i == n else f"*{tail(i + 1, n)}"
-        equations.append(Equation(f"X_{i}", f"left_{i}{above}/{tail(i, n)}*X_{i - 1}"))
+        above = "" if i == n else f"{tail(i + 1, n)}*"
+        equations.append(Equation(f"X_{i}", f"left_{i}*({above}X_{i - 1}/{tail(i, n)})"))
     return [*equations, *_tail_equations(1, n)]
 
 
@@ -126,20 +128,19 @@ def transfer(n: int) -> list[Equation]:
     equations, chain = [], "inverse_m_1"
     for i in range(1, n + 1):
         chain += f"*left_{i}" if i > 1 else ""
-        above = chain if i == n else f"{chain}*{tail(i + 1, n)}"
-        equations.append(Equation(f"X_{i}/U", f"{above}/D"))
+        equations.append(Equation(f"X_{i}/U", f"{chain}*({tail(i + 1, n)}/Delta)"))
     return equations
 
 
 def static_gains(n: int) -> list[Equation]:
     """Return the gains at s = 0, one after the other."""
-    first = Equation("K_1", f"inverse_m_1*{_constant(2, n)}/d_0")
+    first = Equation("K_1", f"inverse_m_1*({_constant(2, n)}/d_0)")
     return [first] + [
         Equation(
             f"K_{i}",
-            f"K_{i - 1}*left_{i}"
+            f"left_{i}*(K_{i - 1}"
             + (f"*{_constant(i + 1, n)}" if i < n else "")
-            + f"/{_constant(i, n)}",
+            + f"/{_constant(i, n)})",
         )
         for i in range(2, n + 1)
     ]
@@ -154,7 +155,7 @@ def _constant(i: int, n: int) -> str:
 
 
 def coefficients(n: int) -> list[Equation]:
-    """Return the coefficients of D(s) and N(s) from the frequencies and dampings of the table."""
+    """Return the coefficients of Delta(s) and N(s) from the table's frequencies and dampings."""
     groups = [("d", _MODES[:n])] if n > 1 else []
     groups += [("n", _NULLS)] if n == 3 else []
     equations = [
@@ -218,8 +219,8 @@ def couplings(n: int) -> list[Equation]:
     first = Equation("inverse_m_1", f"K_1*d_0/{_constant(2, n)}")
     lefts = []
     for i in range(n, 1, -1):
-        below = "" if i == n else f"/{_constant(i + 1, n)}"
-        lefts.append(Equation(f"left_{i}", f"K_{i}/K_{i - 1}*{_constant(i, n)}{below}"))
+        constant = _constant(i, n) if i == n else f"({_constant(i, n)}/{_constant(i + 1, n)})"
+        lefts.append(Equation(f"left_{i}", f"K_{i}/K_{i - 1}*{constant}"))
     rights = [Equation(f"right_{i}", f"kappa_{i + 1}/left_{i + 1}") for i in range(n - 1, 0, -1)]
     return [first, *lefts, *rights]
 
@@ -239,9 +240,12 @@ def given(chain: Chain) -> dict[str, float]:
 
 def work_state_model(chain: Chain) -> dict[str, float]:
     """Return every quantity on the way from the named parameters to the entries of A and B."""
-    n = chain.n
-    steps = [*coefficients(n), *(carts_alone(n) if n > 1 else []), *couplings(n)]
-    return work_out(steps, given(chain))
+    return work_out(state_steps(chain.n), given(chain))
+
+
+def state_steps(n: int) -> list[Equation]:
+    """Return all steps from the named parameters to the entries of A and B."""
+    return [*coefficients(n), *(carts_alone(n) if n > 1 else []), *couplings(n)]
 
 
 def physical(springs: Sequence[bool]) -> list[Equation]:

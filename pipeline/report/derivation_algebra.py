@@ -26,7 +26,7 @@ from pipeline.report.mathematics import (
 from pipeline.report.numbers import significant
 
 DIGITS = 5  # shown; all are carried
-_POLYNOMIALS = ("D", "N", "R")  # names that stand for a polynomial in s
+_IN_S = ("Delta", "N", "R", "P", "X", "U")  # names that stand for functions of s
 
 
 @dataclass(frozen=True)
@@ -78,6 +78,15 @@ def _value(node: ast.expr, values: Mapping[str, float]) -> float:
     raise ValueError(f"no arithmetic: {ast.unparse(node)}")
 
 
+def addends(text: str) -> list[str]:
+    """Return the terms of a sum."""
+    node, found = _parse(text), []
+    while isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
+        found.insert(0, ast.unparse(node.right))
+        node = node.left
+    return [ast.unparse(node), *found]
+
+
 # ------------------------------------------------------------------- as mathematics
 
 
@@ -110,13 +119,12 @@ def name_term(name: str) -> Term:
             return sub(dot("x", order=base.count("d")), index)
         case "inverse":  # inverse_m_1
             return fraction("1", name_term(index))
-        case _ if base in _POLYNOMIALS or base in ("P", "X", "U"):
-            return row(sub(base, index) if index else base, parens("s"))
     letter = _GREEK.get(base, base)
-    return sub(letter, index) if index else letter
+    term = sub(letter, index) if index else letter
+    return row(term, parens("s")) if base in _IN_S else term
 
 
-_GREEK = {**GREEK, "kappa": "κ"}
+_GREEK = {**GREEK, "kappa": "κ", "Delta": "Δ"}
 
 _SUM, _PRODUCT, _POWER = 1, 2, 3  # how tightly an operation binds
 

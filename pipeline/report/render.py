@@ -7,6 +7,7 @@ from pathlib import Path
 
 from pipeline.gap.types import Gap
 from pipeline.output import clear_files, own_folder, write_file
+from pipeline.report.compare import DraftChanges
 from pipeline.report.content import build_document
 from pipeline.report.document import Document
 from pipeline.report.html import render_html
@@ -20,6 +21,7 @@ def render_report(
     out: Path,
     *,
     gap: Gap | None = None,
+    changes: DraftChanges | None = None,
     pdf: bool = True,
     progress: Callable[[str], None] | None = None,
 ) -> None:
@@ -33,7 +35,7 @@ def render_report(
         analysis = replace(analysis, warnings=(*analysis.warnings, warning))
         if progress:
             progress(warning)
-    document = build_document(analysis, gap=gap, progress=progress)
+    document = build_document(analysis, gap=gap, changes=changes, progress=progress)
     write_document(document, out, name="report", pdf=pdf)
 
 

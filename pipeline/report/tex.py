@@ -8,6 +8,7 @@ _TOKEN = re.compile(r"\\[a-zA-Z]+|\\.|\d+(?:\.\d+)?|[^\s]")
 _GREEK = {
     "alpha": "α", "beta": "β", "gamma": "γ", "delta": "δ", "zeta": "ζ", "mu": "μ", "omega": "ω",
     "tau": "τ", "theta": "θ", "phi": "φ", "lambda": "λ", "rho": "ρ", "sigma": "σ", "pi": "π",
+    "Gamma": "Γ", "Phi": "Φ",
 }  # fmt: skip
 _SIGNS = {
     "le": "≤", "ge": "≥", "ne": "≠", "to": "→", "cdot": "·", "approx": "≈", "infty": "∞",

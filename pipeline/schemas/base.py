@@ -1,0 +1,68 @@
+"""What all JSON files share."""
+
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
+
+Number = float | None  # null: could not be had
+Numbers = tuple[float, ...]
+Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+
+
+class Document(BaseModel):
+    """A table of a JSON file; unknown keys are let through, as later versions may add some."""
+
+    model_config = ConfigDict(frozen=True)
+
+
+class Units(Document):
+    """The submission's own units."""
+
+    position: str
+    input: str
+
+
+class ChainUnits(Document):
+    """Units of masses, dampings and stiffnesses."""
+
+    m: str
+    c: str
+    k: str
+
+
+class Chain(Document):
+    """Carts and springs; the input gain is one, so all are in input units."""
+
+    m: Annotated[Numbers, Field(description="masses, cart 1 first")]
+    c: Annotated[Numbers, Field(description="dampings, cart 1 first")]
+    k: Annotated[
+        Numbers,
+        Field(description="springs wall-1, 1-2, …, n-wall; one cart: their sum, then 0"),
+    ]
+
+
+class ChainWithUnits(Chain):
+    """Carts and springs with their units."""
+
+    units: ChainUnits
+
+
+class Provenance(Document):
+    """What made the file, and of what."""
+
+    version: Annotated[str, Field(description="of cartlab")]
+    files: Annotated[dict[str, Sha256], Field(description="SHA-256 of every data file")]
+
+
+def json_schema(model: type[Document], *, title: str) -> dict[str, Any]:
+    """Return the JSON Schema of a model's files, its definitions in alphabetical order."""
+    schema = model.model_json_schema(by_alias=True, mode="serialization")
+    definitions = schema.pop("$defs", {})
+    return {
+        "$schema": DIALECT,
+        **schema,
+        "title": title,
+        "$defs": dict(sorted(definitions.items())),
+    }

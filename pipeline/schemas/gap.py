@@ -1,0 +1,122 @@
+"""`gap.json`, schema `cartlab-gap/1`."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from pipeline.schemas.base import Chain, ChainWithUnits, Document, Number, Provenance, Units
+
+Place = Annotated[
+    dict[str, int], Field(description='{"cart": 1} or {"spring": 2}; empty: the input')
+]
+
+
+class Value(Document):
+    """A parameter of an effect, with its standard error."""
+
+    value: float
+    std: Number
+    unit: str
+
+
+class Rival(Document):
+    """Another effect in the same role, fitted as fully."""
+
+    effect: str
+    where: Place
+    nrmse_after: Number
+    confidence: Number
+
+
+class Effect(Document):
+    """One effect, in the order found; errors are on held-out runs."""
+
+    effect: Annotated[str, Field(description="its name in the catalogue")]
+    where: Place
+    parameters: dict[str, Value]
+    details: Annotated[dict[str, Value], Field(description="what only describes a contact")]
+    confidence: Annotated[
+        Number, Field(description="weight by the Bayesian information criterion among all fitted")
+    ]
+    nrmse_before: Number
+    nrmse_after: Number
+    rivals: tuple[Rival, ...]
+
+
+class Errors(Document):
+    """Relative root-mean-square errors, pooled over the held-out runs."""
+
+    baseline: Annotated[Number, Field(description="of the linear model")]
+    final: Annotated[Number, Field(description="of the model with all effects found")]
+    noise_floor: Number
+
+
+class RecordErrors(Document):
+    """The same for one cart in one run."""
+
+    experiment: str
+    cart: int
+    held_out: bool
+    baseline: Number
+    final: Number
+    noise_floor: Number
+
+
+class Window(Document):
+    """Where a run departs from the linear model most."""
+
+    experiment: str
+    cart: int
+    from_: Annotated[float, Field(alias="from", description="s")]
+    to: Annotated[float, Field(description="s")]
+    what: str
+    share: Annotated[float, Field(description="of the run's squared error")]
+
+
+class Term(Document):
+    """An effect of the model with its numbers."""
+
+    effect: str
+    where: Place
+    parameters: dict[str, float]
+
+
+class Model(Document):
+    """The chain and its effects, to be simulated."""
+
+    chain: Chain
+    effects: tuple[Term, ...]
+
+
+class GapSubmission(Document):
+    """Which submission it is about."""
+
+    title: str
+    carts: int
+
+
+class Gap(Document):
+    """What the linear model leaves out. A number that could not be had is null."""
+
+    schema_: Annotated[Literal["cartlab-gap/1"], Field(alias="schema")]
+    verdict: Literal["named", "none", "ambiguous", "unexplained"]
+    effects: tuple[Effect, ...]
+    gap: Errors
+    repeatability: Annotated[Number, Field(description="between runs of the same input")]
+    by_record: tuple[RecordErrors, ...]
+    where: tuple[Window, ...]
+    next_experiment: str
+    training: tuple[str, ...]
+    held_out: tuple[str, ...]
+    friction_spread: Annotated[
+        dict[str, float], Field(description="run-to-run spread of the dry friction, by cart")
+    ]
+    units: Units
+    linear: Annotated[Chain, Field(description="the linear chain that fits best")]
+    model: Model
+    notes: tuple[str, ...]
+    submission: GapSubmission
+    springs: tuple[bool, ...]
+    chain: ChainWithUnits
+    chain_std: dict[str, Number]
+    provenance: Provenance

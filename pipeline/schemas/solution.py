@@ -1,0 +1,60 @@
+"""`solution.json`, schema `cartlab-solution/1`."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from pipeline.schemas.base import Document, Number, Numbers, Provenance, Units
+
+
+class Bench(Document):
+    """Which submission it was made from."""
+
+    title: str
+    carts: int
+    springs: tuple[bool, ...]
+    units: Units
+
+
+class ExpectedParameter(Document):
+    """A parameter with the half-width of what is accepted, both in its unit."""
+
+    name: str
+    unit: str
+    value: float
+    std: Number
+    tolerance: float
+
+
+class ExpectedStateSpace(Document):
+    """The state model, and how far each entry moves within the parameters' tolerances."""
+
+    A: tuple[Numbers, ...]
+    A_tolerance: tuple[Numbers, ...]
+    B: tuple[Numbers, ...]
+    B_tolerance: tuple[Numbers, ...]
+
+
+class ReferenceFeedback(Document):
+    """The reference design; gains are not unique, so others may be as right."""
+
+    cart: int
+    method: Literal["poles", "lqr"]
+    sample_time: float
+    gains: Numbers
+    prefilter: Number
+    poles: Annotated[tuple[tuple[Number, Number], ...], Field(description="[re, im], rad/s")]
+    overshoot_percent: Number
+    settling_time: Number
+    peak_input: Number
+
+
+class Solution(Document):
+    """What a rubric would expect, with tolerances."""
+
+    schema_: Annotated[Literal["cartlab-solution/1"], Field(alias="schema")]
+    submission: Bench
+    parameters: tuple[ExpectedParameter, ...]
+    state_space: ExpectedStateSpace | None
+    feedback: ReferenceFeedback | None
+    provenance: Provenance

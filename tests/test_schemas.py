@@ -1,0 +1,92 @@
+"""The JSON files and their schemas: what is shipped is what is written."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import jsonschema
+import pytest
+
+from pipeline.errors import ConfigError
+from pipeline.gap.stored import gap_text
+from pipeline.report.solution import solution_text
+from pipeline.resources import EXAMPLES
+from pipeline.results_json import results_text
+from pipeline.schemas.base import DIALECT
+from pipeline.schemas.export import MODELS, schema_text
+from pipeline.submission import load_submission
+from pipeline.workflow import analyse
+from tests.analysis_factory import make_analysis
+from tests.test_gap_report import make_gap
+
+DOCS = Path(__file__).parents[1] / "docs"
+
+
+def assert_fits(name: str, text: str) -> None:
+    """Insist that a file obeys the shipped schema, and that the model knows each of its keys."""
+    shipped = json.loads((DOCS / f"{name}.schema.json").read_text(encoding="utf-8"))
+    jsonschema.Draft202012Validator(shipped).validate(json.loads(text))
+    back = MODELS[name].model_validate_json(text).model_dump_json(by_alias=True)
+    assert json.loads(back) == json.loads(text)
+
+
+@pytest.mark.parametrize("name", sorted(MODELS))
+def test_the_shipped_schema_is_the_models_own(name):
+    """`docs/NAME.schema.json` is what `cartlab schema NAME` prints, and a valid schema."""
+    text = (DOCS / f"{name}.schema.json").read_text(encoding="utf-8")
+    assert text == schema_text(name)
+    schema = json.loads(text)
+    assert schema["$schema"] == DIALECT
+    jsonschema.Draft202012Validator.check_schema(schema)
+
+
+@pytest.fixture(scope="module", params=["one-cart", "two-cart", "three-cart"])
+def example(request):
+    return analyse(load_submission(EXAMPLES / request.param))
+
+
+def test_real_results_obey_the_schema(example):
+    """Results and reference of every shipped example fit, with no key that the schema lacks."""
+    assert_fits("results", results_text(example))
+    assert_fits("solution", solution_text(example))
+
+
+@pytest.mark.parametrize("carts", [1, 2, 3])
+def test_results_with_gaps_obey_the_schema(carts):
+    """What could not be had is null, and allowed to be."""
+    analysis = make_analysis(carts)
+    for poorer in (analysis, replace(analysis, fit=None, rows=(), feedback=None, hardware=())):
+        assert_fits("results", results_text(poorer))
+        assert_fits("solution", solution_text(poorer))
+
+
+@pytest.mark.parametrize("verdict", ["named", "none", "ambiguous", "unexplained"])
+def test_gaps_obey_the_schema(verdict):
+    """Every verdict's file fits, effects, rivals and windows included."""
+    keys = () if verdict == "none" else ("coulomb_friction", "cubic_spring")
+    assert_fits("gap", gap_text(make_gap(verdict, keys), make_analysis(2)))
+
+
+def test_a_broken_file_does_not_obey():
+    """The schema refuses an unknown outcome, a text for a number and a missing key."""
+    schema = json.loads(schema_text("results"))
+    validator = jsonschema.Draft202012Validator(schema)
+    good = json.loads(results_text(make_analysis(1)))
+    validator.validate(good)
+    for change in (
+        {"checks": [{**good["checks"][0], "outcome": "maybe"}]},
+        {"parameters": [{**good["parameters"][0], "final": "24.3"}]},
+    ):
+        assert not validator.is_valid({**good, **change})
+    assert not validator.is_valid({key: value for key, value in good.items() if key != "checks"})
+
+
+def test_the_command_prints_it():
+    """`cartlab schema gap` is the shipped text; another name is refused with those there are."""
+    command = [sys.executable, "-m", "pipeline", "schema"]
+    done = subprocess.run([*command, "gap"], capture_output=True, encoding="utf-8", check=True)
+    assert done.stdout == (DOCS / "gap.schema.json").read_text(encoding="utf-8")
+    with pytest.raises(ConfigError, match="there are results, gap, solution"):
+        schema_text("report")
