@@ -20,7 +20,7 @@ _SHOWN_IN_WARNING = 20
 
 
 def render_pdf(document: Document) -> bytes:
-    """Return the PDF (archival A-2a, accessible UA-1), with fonts that come with its makers only."""
+    """Return the PDF (archival A-2a, accessible UA-1), with its own fonts only."""
     data = _printable(as_json(document))
     pdf = typst.compile(
         TEMPLATES / "report.typ",
