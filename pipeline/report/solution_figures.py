@@ -2,62 +2,57 @@
 
 from collections.abc import Sequence
 
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import FancyArrowPatch, Rectangle
 
 from pipeline.report.figures import MEASURED, MODEL, QUIET, WIDTH
 from pipeline.report.numbers import subscript
 
-_CART, _HIGH = 1.5, 1.5  # width and height of a cart
-_REACH = 1.9  # length of an arrow
-_APART = 1.9  # between the arrows of one side
-_ROW = 2.5  # height of the figure, in its own units, for a cart
-_INCH = 0.36  # a unit of the drawing
+# Inches:
+_CART = 0.54  # width and height of a cart
+_REACH = 0.68  # length of an arrow
+_GAP = 0.05  # between an arrow and what it is called
+_ABOVE = 0.08  # from a cart to the arrow of its position
+_ROW = 0.9  # height of the figure for a cart
+_HEAD = 8.0  # size of an arrow's head, points
 
 
 def free_body_figure(springs: Sequence[bool]) -> Figure:
-    """Draw each cart alone: what pushes it, what pulls it back, which way is positive."""
+    """Draw each cart alone: what pushes it, what pulls it back, which way is positive.
+
+    Drawn on the figure itself, without axes: there is nothing to zoom into.
+    """
     n = len(springs) - 1
-    height = _ROW * n * _INCH
-    figure = Figure(figsize=(WIDTH, height))
-    ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    ax.set_axis_off()
-    ax.grid(visible=False)
-    half = WIDTH / _INCH / 2
-    ax.set_xlim(-half, half)
-    ax.set_ylim(-_ROW * n, 0.0)
+    figure = Figure(figsize=(WIDTH, _ROW * n))
     for i in range(1, n + 1):
-        _draw_cart(ax, i, springs, y=-_ROW * (i - 0.5) - 0.15)
+        _draw_cart(figure, i, springs, y=_ROW * (n - i) + 0.4 * _ROW)
     return figure
 
 
-def _draw_cart(ax: Axes, i: int, springs: Sequence[bool], *, y: float) -> None:
+def _draw_cart(figure: Figure, i: int, springs: Sequence[bool], *, y: float) -> None:
     n = len(springs) - 1
-    index = "" if n == 1 else subscript(i)
-    half = _CART / 2
-    ax.fill(
-        [-half, half, half, -half],
-        [y - _HIGH / 2, y - _HIGH / 2, y + _HIGH / 2, y + _HIGH / 2],
+    middle, half = WIDTH / 2, _CART / 2
+    cart = Rectangle(
+        (middle - half, y - half),
+        _CART,
+        _CART,
         facecolor="#ececec",
         edgecolor=MEASURED,
         lw=1.0,
+        transform=figure.dpi_scale_trans,
     )
-    ax.text(0.0, y, f"m{index}", ha="center", va="center")
-    _arrow(ax, (-0.5, y + _HIGH / 2 + 0.22), (0.5, y + _HIGH / 2 + 0.22), colour=QUIET)
-    ax.text(0.65, y + _HIGH / 2 + 0.22, _x(i, n), ha="left", va="center", color=QUIET)
-    left, right = _left_forces(i, springs), _right_forces(i, springs)
-    for k, label in enumerate(left):
-        level = _level(k, len(left), y)
-        _arrow(ax, (-half, level), (-half - _REACH, level), colour=MODEL)
-        ax.text(-half - _REACH - 0.15, level, label, ha="right", va="center")
-    for k, label in enumerate(right):
-        level = _level(k, len(right), y)
-        _arrow(ax, (half, level), (half + _REACH, level), colour=MODEL)
-        ax.text(half + _REACH + 0.15, level, label, ha="left", va="center")
-
-
-def _level(k: int, count: int, y: float) -> float:
-    return y if count == 1 else y + _HIGH * (0.36 - 0.72 * k / (count - 1))
+    figure.add_artist(cart)
+    _write(figure, middle, y, f"m{'' if n == 1 else subscript(i)}", "center")
+    top = y + half + _ABOVE
+    _arrow(figure, (middle - half / 2, top), half, colour=QUIET)
+    _write(figure, middle + half / 2 + _GAP, top, _x(i), "left", colour=QUIET)
+    for sign, forces in ((-1, _left_forces(i, springs)), (1, _right_forces(i, springs))):
+        for k, label in enumerate(forces):
+            level = y + (0.5 - (k + 0.5) / len(forces)) * _CART
+            start = middle + sign * half
+            _arrow(figure, (start, level), sign * _REACH, colour=MODEL)
+            side = "left" if sign > 0 else "right"
+            _write(figure, start + sign * (_REACH + _GAP), level, label, side)
 
 
 def _left_forces(i: int, springs: Sequence[bool]) -> list[str]:
@@ -69,10 +64,10 @@ def _left_forces(i: int, springs: Sequence[bool]) -> list[str]:
         forces += ["k x₁"] if any(springs) else []
     elif springs[i - 1]:
         k = f"k{subscript(i)}"
-        forces.append(f"{k} x₁" if i == 1 else f"{k} ({_x(i, n)} − {_x(i - 1, n)})")
-    forces.append(f"c{index} d{_x(i, n)}/dt")
+        forces.append(f"{k} x₁" if i == 1 else f"{k} ({_x(i)} − {_x(i - 1)})")
+    forces.append(f"c{index} d{_x(i)}/dt")
     if n > 1 and i == n and springs[n]:
-        forces.append(f"k{subscript(n + 1)} {_x(i, n)}")
+        forces.append(f"k{subscript(n + 1)} {_x(i)}")
     return forces
 
 
@@ -81,18 +76,30 @@ def _right_forces(i: int, springs: Sequence[bool]) -> list[str]:
     forces = ["u"] if i == 1 else []
     if i < n and springs[i]:
         k = f"k{subscript(i + 1)}"
-        forces.append(f"{k} ({_x(i + 1, n)} − {_x(i, n)})")
+        forces.append(f"{k} ({_x(i + 1)} − {_x(i)})")
     return forces
 
 
-def _x(i: int, n: int) -> str:
+def _x(i: int) -> str:
     return f"x{subscript(i)}"
 
 
-def _arrow(ax: Axes, start: tuple[float, float], end: tuple[float, float], *, colour: str) -> None:
-    ax.annotate(
-        "",
-        xy=end,
-        xytext=start,
-        arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 1.2, "shrinkA": 0, "shrinkB": 0},
+def _arrow(figure: Figure, start: tuple[float, float], length: float, *, colour: str) -> None:
+    arrow = FancyArrowPatch(
+        start,
+        (start[0] + length, start[1]),
+        arrowstyle="-|>",
+        mutation_scale=_HEAD,
+        color=colour,
+        lw=1.2,
+        shrinkA=0,
+        shrinkB=0,
+        transform=figure.dpi_scale_trans,
     )
+    figure.add_artist(arrow)
+
+
+def _write(
+    figure: Figure, x: float, y: float, text: str, side: str, *, colour: str = MEASURED
+) -> None:
+    figure.text(x, y, text, ha=side, va="center", color=colour, transform=figure.dpi_scale_trans)
