@@ -12,6 +12,8 @@ import numpy as np
 from numba import njit
 
 STEP = 5e-5  # s
+CONTACT_STEP = 2e-6  # s; bounces multiply the error of each impact
+_CONTACTS = ("backlash", "end_stop")
 
 # Numbers of one cart and one spring in the truth's own tables.
 _CART = (
@@ -162,12 +164,15 @@ def simulate_truth(
     free: Sequence[int],
     x0: np.ndarray | None = None,
     scatter: np.ndarray | None = None,
-    step: float = STEP,
+    step: float | None = None,
 ) -> np.ndarray:
     """Return the true readings (n, samples), before noise and encoder.
 
-    `t` are the sample times; the input is held from sample to sample.
+    `t` are the sample times; the input is held from sample to sample. `step` (s) defaults to
+    what the effects need.
     """
+    if step is None:
+        step = CONTACT_STEP if any(e.effect in _CONTACTS for e in hidden) else STEP
     n = len(m)
     cart, spring = np.zeros((n, len(_CART))), np.zeros((n + 1, len(_SPRING)))
     drive = np.zeros(len(_DRIVE))
