@@ -126,8 +126,8 @@
         .filter((p) => !owned.has(p) && !p.closest('.grid-x, .grid-y, defs'))
         .map((node) => [node, node.getAttribute('d')]);
       this.uses = [...group.querySelectorAll('[clip-path] use')]
-        .map((node) => [node, +node.getAttribute('x'), +node.getAttribute('y')]);
-      this.marks = [...group.querySelectorAll('.mark text')].map((node) => [node, +node.getAttribute('x')]);
+        .map((node) => [node, node.getAttribute('x'), node.getAttribute('y')]);
+      this.marks = [...group.querySelectorAll('.mark text')].map((node) => [node, node.getAttribute('x'), node.getAttribute('transform')]);
       this.labels = { x: [...group.querySelectorAll('.tick-x')], y: [...group.querySelectorAll('.tick-y')] };
       this.grids = ['x', 'y'].map((k) => group.querySelector(`.grid-${k} path`));
       this.drawnGrids = this.grids.map((g) => g?.getAttribute('d'));
@@ -140,13 +140,14 @@
       for (const [node, d] of this.paths)
         node.setAttribute('d', whole ? d : d.replace(PAIR, (_, a, b) => `${x.moved(+a).toFixed(2)} ${y.moved(+b).toFixed(2)}`));
       for (const [node, a, b] of this.uses) {
-        node.setAttribute('x', x.moved(a));
-        node.setAttribute('y', y.moved(b));
+        node.setAttribute('x', whole ? a : x.moved(+a));
+        node.setAttribute('y', whole ? b : y.moved(+b));
       }
-      for (const [node, a] of this.marks) {
-        const place = x.moved(a);
-        node.setAttribute('x', place);
-        node.removeAttribute('transform');
+      for (const [node, a, turned] of this.marks) {
+        const place = x.moved(+a);
+        node.setAttribute('x', whole ? a : place);
+        if (whole && turned) node.setAttribute('transform', turned);
+        else node.removeAttribute('transform');
         node.style.display = x.holds(place) ? '' : 'none';
       }
       for (const series of this.series)
