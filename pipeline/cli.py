@@ -63,9 +63,13 @@ def _progress() -> Iterator[Callable[[str], None]]:
         yield lambda text: None
         return
     from rich.console import Console
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-    with Console(stderr=True).status("starting") as status:
-        yield lambda text: status.update(text)
+    text_column = TextColumn("{task.description}", markup=False)  # a record may be called "[b]"
+    columns = SpinnerColumn(), text_column, TimeElapsedColumn()
+    with Progress(*columns, console=Console(stderr=True), transient=True) as shown:
+        task = shown.add_task("starting", total=None)
+        yield lambda text: shown.update(task, description=text)
 
 
 def _version(value: bool) -> None:
@@ -158,6 +162,7 @@ def _run_report(
     from pipeline.output import check_folder, own_folder, write_file
     from pipeline.report.compare import changes_line, compare_drafts, read_results
     from pipeline.report.known_gap import with_gap
+    from pipeline.report.questions import open_line
     from pipeline.report.render import render_report
     from pipeline.report.summary import terminal_summary
     from pipeline.results_json import results_text
@@ -174,8 +179,9 @@ def _run_report(
         write_file(out / "results.json", results_text(analysis))
         render_report(analysis, out, gap=gap, changes=changes, pdf=pdf, progress=progress)
     say(terminal_summary(analysis))
-    if changes:
-        say(changes_line(changes))
+    for line in (changes and changes_line(changes), open_line(analysis)):
+        if line:
+            say(line)
     say(f"wrote {out / 'report.html'}" + (f" and {out / 'report.pdf'}" if pdf else ""))
     return analysis
 
@@ -289,7 +295,8 @@ def effects(
         from pipeline.output import check_folder
         from pipeline.report.effects import render_effects
 
-        render_effects(chosen, check_folder(out))
+        with _progress() as progress:
+            render_effects(chosen, check_folder(out), progress=progress)
         say(f"wrote {out / 'effects.html'}")
     if as_json:
         typer.echo(json.dumps(catalogue_data(chosen), indent=1, ensure_ascii=False))

@@ -143,7 +143,7 @@ def test_no_word_of_the_pdf_is_cut_or_covered(made):
     pages = re.findall(r'<page width="(.*?)" height="(.*?)">(.*?)</page>', boxes, re.DOTALL)
     assert len(pages) >= 4
     for width, height, body in pages:
-        words = [Box(*map(float, m.groups()[:4]), m[5]) for m in _WORD.finditer(body)]
+        words = [Box._make([*map(float, m.groups()[:4]), m[5]]) for m in _WORD.finditer(body)]
         page = Box(0.0, 0.0, float(width), float(height), "")
         assert [word for word in words if not word.lies_in(page)] == []
         assert covered(words) == []
@@ -242,14 +242,12 @@ def test_no_text_is_cut_or_covered(made, size, show):
     boxes = [(Box(*box), scrolled) for *box, scrolled in page.evaluate(BOXES)]
     assert len(boxes) > 100
     # Half a pixel: boxes of letters are rounded outwards.
-    out = [
-        b for b, scrolled in boxes if not scrolled and (b.left < -0.5 or b.right > size[0] + 0.5)
-    ]
-    assert out == []
+    fixed = [box for box, scrolled in boxes if not scrolled]
+    assert [box for box in fixed if box.left < -0.5 or box.right > size[0] + 0.5] == []
     assert covered([box for box, _ in boxes]) == []
     for edge, texts in page.evaluate(DRAWN):
         drawn = [Box(*text) for text in texts]
-        assert [text for text in drawn if not text.lies_in(Box(*edge, ""))] == []
+        assert [text for text in drawn if not text.lies_in(Box._make([*edge, ""]))] == []
         assert covered(drawn) == []
 
 

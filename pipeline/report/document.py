@@ -10,6 +10,9 @@ from typing import Any, Literal
 
 from pipeline.report.mathematics import Math, Term
 
+_LONG = 16  # letters of a value for which a tile is wide
+_WIDE_TILES, _MOST_TILES = 3, 5  # side by side
+
 Tone = Literal["", "good", "bad", "quiet"]
 
 
@@ -131,7 +134,18 @@ class Tiles:
     """A board of facts, seen at a glance."""
 
     tiles: tuple[Tile, ...]
+    across: int = field(init=False)
     kind: str = field(default="tiles", init=False)
+
+    def __post_init__(self) -> None:
+        most = _WIDE_TILES if self.longest > _LONG else _MOST_TILES
+        rows = -(-len(self.tiles) // most)
+        object.__setattr__(self, "across", -(-len(self.tiles) // rows))  # rows of one length
+
+    @property
+    def longest(self) -> int:
+        """Return the letters of the longest value."""
+        return max(len(plain(tile.value)) for tile in self.tiles)
 
 
 @dataclass(frozen=True)
@@ -143,7 +157,29 @@ class Details:
     kind: str = field(default="details", init=False)
 
 
-Block = Heading | Paragraph | Items | Quote | Code | Formula | Table | Picture | Tiles | Details
+@dataclass(frozen=True)
+class Question:
+    """A question to the students and their answer; without one, a place is marked for it."""
+
+    id: str
+    text: Spans
+    answer: tuple["Block", ...] = ()
+    kind: str = field(default="question", init=False)
+
+
+Block = (
+    Heading
+    | Paragraph
+    | Items
+    | Quote
+    | Code
+    | Formula
+    | Table
+    | Picture
+    | Tiles
+    | Details
+    | Question
+)
 
 
 @dataclass(frozen=True)

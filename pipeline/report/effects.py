@@ -1,6 +1,6 @@
 """The catalogue of effects as a page: what each is, how it looks in data, what decides."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from pipeline import __version__
@@ -31,18 +31,24 @@ from pipeline.synthesis.hidden import usual_term
 _BENCH = "throne-2dof"  # the smallest with a spring between two carts
 
 
-def render_effects(effects: Sequence[Effect], out: Path) -> None:
+def render_effects(
+    effects: Sequence[Effect], out: Path, *, progress: Callable[[str], None] | None = None
+) -> None:
     """Write `effects.html` and `figures/*.svg` into the folder `out`; same bytes each time."""
-    write_document(build_gallery(effects), out, name="effects", pdf=False)
+    write_document(build_gallery(effects, progress=progress), out, name="effects", pdf=False)
 
 
-def build_gallery(effects: Sequence[Effect]) -> Document:
+def build_gallery(
+    effects: Sequence[Effect], *, progress: Callable[[str], None] | None = None
+) -> Document:
     """Return the catalogue with a picture of each effect on a simulated bench."""
+    entries = []
     with drawing():
-        entries = [
-            Section(effect.key, effect.title, tuple(_entry(effect, number=number)))
-            for number, effect in enumerate(effects, start=1)
-        ]
+        for number, effect in enumerate(effects, start=1):
+            if progress:
+                progress(f"{number} of {len(effects)}: {effect.title}")
+            blocks = tuple(_entry(effect, number=number))
+            entries.append(Section(effect.key, effect.title, blocks))
     return Document(
         title="What a bench may do beyond the linear chain",
         subtitle="The catalogue of effects",

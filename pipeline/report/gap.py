@@ -40,6 +40,7 @@ from pipeline.report.words import clean
 from pipeline.report.words_gap import (
     contenders,
     effect_name,
+    error_board,
     next_block,
     place_name,
     share,
@@ -120,7 +121,7 @@ def build_gap_document(
 
 
 def _summary(page: Page, gap: Gap, worst: Sequence[Trace]) -> list[Block]:
-    blocks = [*verdict_blocks(gap), error_table(gap, number=page.table_number())]
+    blocks = [*verdict_blocks(gap), error_board(gap), error_table(gap, number=page.table_number())]
     blocks += [_before_after(page, gap, trace, number=1) for trace in worst]
     return blocks + next_block(gap)
 

@@ -7,7 +7,7 @@ import math
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-from pipeline.report.document import Document, Picture, Table, Tiles, plain
+from pipeline.report.document import Document, Picture, Table, Tiles
 from pipeline.report.figures import MEASURED, MODEL, QUIET, SECOND, SHADE, THIRD
 from pipeline.report.mathematics import Term, to_mathml
 from pipeline.report.ticks import GRID
@@ -32,7 +32,7 @@ def render_html(document: Document) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"mathml": _mathml, "svg": _svg, "tails": _tails, "longest": _longest}
+    environment.filters |= {"mathml": _mathml, "svg": _svg, "tails": _tails, "board": _board}
     script = "".join((TEMPLATES / name).read_text(encoding="utf-8") for name in _SCRIPTS)
     return environment.get_template("report.html.j2").render(
         document=document,
@@ -64,9 +64,9 @@ def _tails(table: Table) -> list[str]:
     ]
 
 
-def _longest(board: Tiles) -> int:
-    """Return the letters of the longest value on a board."""
-    return max(len(plain(tile.value)) for tile in board.tiles)
+def _board(board: Tiles) -> str:
+    """Return how a board is laid out: letters of the longest value, and tiles side by side."""
+    return f"--least:{board.longest}ch;--across:{board.across}"
 
 
 def _digits_wide(text: str) -> float:

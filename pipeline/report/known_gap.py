@@ -29,7 +29,14 @@ from pipeline.report.page import Page
 from pipeline.report.tables import cell, make_table
 from pipeline.report.tables_gap import error_table
 from pipeline.report.words import clean
-from pipeline.report.words_gap import effect_name, next_block, share, verdict_blocks, verdict_title
+from pipeline.report.words_gap import (
+    effect_name,
+    error_board,
+    next_block,
+    share,
+    verdict_blocks,
+    verdict_title,
+)
 from pipeline.results import Analysis, HardwareCheck, Record
 from pipeline.stages._measured_run import measured_run
 
@@ -87,7 +94,7 @@ def gap_blocks(page: Page, gap: Gap | None) -> list[Block]:
     """Return the verdict, its errors, and the equations with the effects."""
     if gap is None:
         return []
-    blocks = [*verdict_blocks(gap), error_table(gap, number=page.table_number())]
+    blocks = [*verdict_blocks(gap), error_board(gap), error_table(gap, number=page.table_number())]
     terms = gap.model.terms
     if terms:
         blocks.append(augmented_equations(page.analysis.springs, terms))

@@ -161,7 +161,7 @@ def _verdict_board(analysis: Analysis) -> tuple[Tile, ...]:
         tiles.append(
             Tile(
                 label=spans("Bench against model"),
-                value=spans(_range(best, worst)),
+                value=spans(_range(best, worst).replace(" to ", "–")),
                 note=spans("of the motion apart"),
                 tone=_tone(worst.nrmse <= _CLOSE),
                 url="#hardware",

@@ -4,8 +4,17 @@ from collections.abc import Mapping
 
 from pipeline.gap.types import FoundEffect, Gap, NamedValue, Rival
 from pipeline.plant.effects.base import Effect
-from pipeline.report.document import Block, Span, Spans, bullet_list, paragraph, spans
-from pipeline.report.numbers import listing, significant, unit_text, with_error
+from pipeline.report.document import (
+    Block,
+    Span,
+    Spans,
+    Tile,
+    Tiles,
+    bullet_list,
+    paragraph,
+    spans,
+)
+from pipeline.report.numbers import count, listing, significant, unit_text, with_error
 from pipeline.report.words import clean, plain_lines
 
 _AS_GOOD = 1.15  # times the error: a rival that the data do not tell from what was chosen
@@ -21,6 +30,28 @@ def verdict_title(gap: Gap) -> str:
         "ambiguous": "Two explanations fit alike",
         "unexplained": "A gap that nothing in the catalogue explains",
     }[gap.verdict]
+
+
+def error_board(gap: Gap) -> Tiles:
+    """Return the error on runs no fit has seen: before, after, and what noise alone makes."""
+    effects = count(len(gap.effects), "effect") if gap.effects else "no effect"
+    tiles = [
+        Tile(spans("Linear model"), spans(share(gap.baseline)), spans("of the motion is left")),
+        Tile(
+            spans(f"With {effects}"),
+            spans(share(gap.final)),
+            spans("is left"),
+            "good" if gap.verdict in ("none", "named") else "bad",
+        ),
+        Tile(spans("Noise alone"), spans(share(gap.noise_floor)), spans("cannot be explained")),
+    ]
+    if gap.repeatability is not None:
+        tiles.append(
+            Tile(
+                spans("Repeats differ by"), spans(share(gap.repeatability)), spans("of the motion")
+            )
+        )
+    return Tiles(tuple(tiles))
 
 
 def verdict_blocks(gap: Gap) -> list[Block]:
