@@ -432,7 +432,7 @@ class Analysis:
     skipped: tuple[Skipped, ...]
     warnings: tuple[str, ...]
     files: dict[str, str]
-    discussion: str | None  # notes.md, as written
+    discussion: str | None  # notes.md, without its comments
 
     @property
     def chain(self) -> Chain | None:

@@ -14,7 +14,6 @@ from pipeline.report.document import (
     Span,
     bullet_list,
     paragraph,
-    plain,
     spans,
 )
 from pipeline.report.figures import drawing
@@ -33,9 +32,10 @@ from pipeline.report.model import (
     symbolic_state_space,
     symbolic_transfer_functions,
 )
-from pipeline.report.notes import even_headings, note_blocks
+from pipeline.report.notes import discussion_blocks
 from pipeline.report.numbers import count, percent
 from pipeline.report.page import Page, remarks
+from pipeline.report.questions import ask, open_questions, placed, split_notes
 from pipeline.report.summary import summary
 from pipeline.report.tables import (
     check_table,
@@ -71,6 +71,8 @@ def build_document(
         position=clean(analysis.position_unit),
         drive=clean(analysis.input_unit),
     )
+    asked = ask(analysis)
+    answers, rest = split_notes(discussion_blocks(analysis.discussion or ""), asked)
     parts: Sequence[Part] = (
         ("summary", "Summary", lambda page: [*summary(page.analysis), *gap_in_short(gap)]),
         ("changes", "Since the earlier draft", lambda page: change_blocks(page, changes)),
@@ -84,7 +86,7 @@ def build_document(
         ("hardware", "Model and measurement", lambda page: _hardware(page, gap)),
         ("gap", "What the linear model leaves out", lambda page: gap_blocks(page, gap)),
         ("checks", "Consistency checks", _checks),
-        ("discussion", "Discussion", _discussion),
+        ("discussion", "Discussion", lambda page: [*open_questions(asked, answers), *rest]),
         ("warnings", "Warnings", _warnings),
         ("skipped", "What was skipped", _skipped),
         ("provenance", "Provenance", _provenance),
@@ -101,7 +103,7 @@ def build_document(
         title=clean(analysis.title).strip() or f"Identification of {count(analysis.carts, 'cart')}",
         subtitle=f"{section}Identification and control of {count(analysis.carts, 'cart')}",
         authors=tuple(clean(f"{name} ({id_})" if name else id_) for id_, name in analysis.authors),
-        sections=tuple(sections),
+        sections=placed(sections, asked, answers),
         footer=f"cartlab {__version__}",
     )
 
@@ -212,14 +214,6 @@ def _checks(page: Page) -> list[Block]:
         )  # fmt: skip
         blocks.append(Details(spans(title), (table,)))
     return blocks
-
-
-def _discussion(page: Page) -> list[Block]:
-    blocks = list(note_blocks(page.analysis.discussion or ""))
-    first = blocks[0] if blocks else None
-    if isinstance(first, Heading) and plain(first.text).strip().lower() == "discussion":
-        blocks = blocks[1:]  # the section has that title already
-    return list(even_headings(blocks))
 
 
 def _warnings(page: Page) -> list[Block]:

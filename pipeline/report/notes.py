@@ -20,6 +20,7 @@ from pipeline.report.document import (
     Span,
     Spans,
     Table,
+    plain,
 )
 from pipeline.report.words import clean
 
@@ -42,16 +43,26 @@ def note_blocks(markdown: str) -> tuple[Block, ...]:
         return (Code(text),)
 
 
+def discussion_blocks(markdown: str) -> tuple[Block, ...]:
+    """Return the notes as a section, which has a title already."""
+    blocks = note_blocks(markdown)
+    first = blocks[0] if blocks else None
+    if isinstance(first, Heading) and plain(first.text).strip().lower() == "discussion":
+        return blocks[1:]
+    return blocks
+
+
 def even_headings(blocks: Iterable[Block]) -> tuple[Block, ...]:
     """Return blocks whose headings go down one level at a time, as an outline needs."""
-    above = _TOP_HEADING - 1
+    above: list[int] = []  # the levels, as written, of the headings that this one is under
 
     def even(block: Block) -> Block:
-        nonlocal above
         match block:
             case Heading(text=text, level=level):
-                above = min(level, above + 1)
-                return Heading(text, level=above)
+                while above and above[-1] >= level:
+                    above.pop()
+                above.append(level)
+                return Heading(text, level=_TOP_HEADING + len(above) - 1)
             case Quote(blocks=inner):
                 return Quote(tuple(even(b) for b in inner))
             case Items(items=items, ordered=ordered):

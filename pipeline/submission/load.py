@@ -164,14 +164,14 @@ def _raise_first(problems: list[str], where: str) -> None:
 
 
 def _notes(folder: Path) -> str | None:
-    """Return `notes.md`, or None where it is absent or holds nothing but comments."""
+    """Return `notes.md` without its comments, or None where there is nothing else in it."""
     path, where = folder / "notes.md", f"{folder.resolve().name}/notes.md"
     if not path.exists() and not path.is_symlink():
         return None
     if (problem := outside(folder, "notes.md")) is not None:
         raise SubmissionError(f"{where}: {problem}")
-    text = _text(path, where=where, limit=MAX_NOTES_BYTES)
-    return text if _COMMENT.sub("", text).strip() else None
+    text = _COMMENT.sub("", _text(path, where=where, limit=MAX_NOTES_BYTES))
+    return text if text.strip() else None
 
 
 # ------------------------------------------------- what the tables say about one another

@@ -8,8 +8,15 @@ from pipeline.resources import TEMPLATES
 from pipeline.submission.load import NAME, spring_names
 
 _NOTES = """\
-<!-- What you write here becomes the discussion of the report (Markdown).
-     Why do initial and final values differ? What limits the model? What would you record next? -->
+<!-- What you write here becomes the discussion of the report (Markdown). Comments like this do not.
+
+     `cartlab report` asks what your data raise, say about zeta_b. Answer under a heading of that
+     name; the answer then stands beside the question:
+
+     ## zeta_b
+     The decay saw …
+
+     All else is free text: what limits the model? What would you record next? -->
 """
 
 

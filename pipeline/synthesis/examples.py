@@ -86,6 +86,11 @@ their own frequencies on top of the 4 Hz, and reading an amplitude there gives a
 
 We controlled cart 2. It follows the 1 cm step well; cart 3 goes only half as far, which no
 controller can change, because at rest the springs alone decide where cart 3 stands.
+
+## zeta_a
+
+Below 7 rad/s all three carts show it: they rise to only about twice their static gain there. With
+0.10 they would have risen to five times, so the two or three dwells nearest to 7 rad/s would do.
 """,
     ),
 )
