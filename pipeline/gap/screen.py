@@ -22,8 +22,6 @@ from pipeline.plant.effects.base import Effect, Parameter
 _MOST = 3.0  # a multiple beyond this is no longer what was simulated
 _LEAST = 0.1  # … and one below starts a fit where it has no slope
 _STARTS = 8
-_ELITE, _SCATTERED = 5, 32
-_ZOOM = (0.6, 0.35, 0.2, 0.1)  # spread of the trials, in logarithms or scales
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +74,7 @@ def screen(
             if (effect.key, place) in taken or (effect.family == "dry friction" and place in dry):
                 continue
             trials += candidates_at(effect, place, runs=whole, chain=chain)
-    signals = _signals(fit, runs, trials, mapper=mapper)
+    signals = added_signals(fit, runs, trials, mapper=mapper)
     directions, residual = project(fit, runs, signals, mapper=mapper)
     total = float(residual @ residual)
     # A direction the model absorbs almost whole says nothing; keep rounding out of it.
@@ -101,37 +99,6 @@ def screen(
     return sorted(suspects, key=lambda s: -s.share)
 
 
-def zoom(fit: Fit, runs: Sequence[Run], suspect: Suspect, *, mapper: Mapper = map) -> Suspect:
-    """Return the suspect with better starts, where the misfit has many valleys.
-
-    Trial values are scattered about the best so far, ever closer (a cross-entropy search); what
-    the model would absorb of each is projected off, so only the effect itself is searched.
-
-    Reference: R. Y. Rubinstein, Methodology and Computing in Applied Probability 1 (1999).
-    """
-    # The same scatter every time: a verdict must not depend on chance.
-    rng = np.random.default_rng(0)
-    candidate = suspect.candidate
-    signed = np.array([p.signed for p in candidate.effect.parameters])
-    scales = np.array(candidate.scales)
-    elite = [np.array(start) for start in suspect.starts[:_ELITE]]
-    best: list[tuple[float, Array]] = []
-    for width in _ZOOM:
-        trials = [*elite] if not best else []
-        for _ in range(_SCATTERED):
-            value = elite[rng.integers(len(elite))]
-            step = width * rng.standard_normal(value.size)
-            trials.append(np.where(signed, value + step * scales, value * np.exp(step)))
-        signals = _signals(fit, runs, [(candidate, tuple(v)) for v in trials], mapper=mapper)
-        directions, residual = project(fit, runs, signals, mapper=mapper)
-        left = ((residual[:, None] - directions) ** 2).sum(axis=0)
-        best += [(float(cost), value) for cost, value in zip(left, trials, strict=True)]
-        best.sort(key=lambda pair: pair[0])
-        elite = [value for _, value in best[:_ELITE]]
-    starts = tuple(tuple(float(v) for v in value) for value in elite)
-    return Suspect(candidate=candidate, share=suspect.share, starts=starts)
-
-
 def _grown(parameter: Parameter, value: float, multiple: float) -> float:
     """Return the trial value moved to the multiple of itself that the data ask for."""
     if parameter.neutral is None:
@@ -140,14 +107,17 @@ def _grown(parameter: Parameter, value: float, multiple: float) -> float:
     return parameter.neutral + multiple * (value - parameter.neutral)
 
 
-def _signals(
+def added_signals(
     fit: Fit,
     runs: Sequence[Run],
     trials: Sequence[tuple[Candidate, tuple[float, ...]]],
     *,
     mapper: Mapper,
 ) -> list[Array]:
-    """Return per run (k, rows, samples): the change of the readings under each trial."""
+    """Return per run (k, rows, samples): the change of the readings under each trial.
+
+    A trial is a candidate with the values of its parameters; a diverged one changes nothing.
+    """
     vectors = [(fit.structure.with_effect(candidate), values) for candidate, values in trials]
 
     def change(pair: tuple[Run, Locals]) -> Array:

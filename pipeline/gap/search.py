@@ -8,8 +8,9 @@ import numpy as np
 
 from pipeline.gap.baseline import SHOT_LENGTH, fit_locals
 from pipeline.gap.fit import Fit, Mapper, fit_model, restart_runs, simulate_run
+from pipeline.gap.rugged import polish, zoom
 from pipeline.gap.runs import Run, cut_shots
-from pipeline.gap.screen import Suspect, candidates_at, extend, screen, zoom
+from pipeline.gap.screen import Suspect, candidates_at, extend, screen
 from pipeline.gap.structure import Candidate, Structure
 from pipeline.plant.chain import Array
 from pipeline.plant.effects.base import Effect
@@ -275,6 +276,8 @@ def _short_refit(
 
 def _full_refit(candidate: Candidate, start: Fit, parent: Hypothesis, bench: Bench) -> Hypothesis:
     fit = fit_whole(start.structure, start.theta, bench)
+    if candidate.effect.key in _CONTACT:
+        fit = polish(fit, bench.training, enough=AT_FLOOR, mapper=bench.mapper)
     return judge(fit, bench, added=candidate, parent=parent)
 
 
