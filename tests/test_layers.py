@@ -17,7 +17,7 @@ LEVELS = (
     ("workflow", "synthesis", "results_json"),
     ("gap",),
     ("report",),
-    ("cli",),
+    ("cli", "notebook"),
     ("__main__",),
 )
 HOMES = {

@@ -3,11 +3,12 @@
 import base64
 import hashlib
 import math
+from collections.abc import Sequence
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-from pipeline.report.document import Document, Picture, Table, Tiles
+from pipeline.report.document import Block, Document, Picture, Table, Tiles
 from pipeline.report.figures import MEASURED, MODEL, QUIET, SECOND, SHADE, THIRD
 from pipeline.report.mathematics import Term, to_mathml
 from pipeline.report.ticks import GRID
@@ -25,6 +26,25 @@ _WIDE = "±×%"  # wider than a digit
 
 def render_html(document: Document) -> str:
     """Return the page; every text is escaped, only our own SVG, MathML and script are not."""
+    script = "".join((TEMPLATES / name).read_text(encoding="utf-8") for name in _SCRIPTS)
+    return (
+        _environment()
+        .get_template("report.html.j2")
+        .render(
+            document=document,
+            math_font=_math_font(),
+            script=Markup(script),
+            script_hash=Markup(_hash(script)),
+        )
+    )
+
+
+def render_fragment(blocks: Sequence[Block]) -> str:
+    """Return blocks as a piece of a page that is not ours, such as a notebook; no script."""
+    return _environment().get_template("fragment.html.j2").render(blocks=blocks)
+
+
+def _environment() -> Environment:
     environment = Environment(
         loader=FileSystemLoader(TEMPLATES),
         autoescape=True,
@@ -33,13 +53,7 @@ def render_html(document: Document) -> str:
         lstrip_blocks=True,
     )
     environment.filters |= {"mathml": _mathml, "svg": _svg, "tails": _tails, "board": _board}
-    script = "".join((TEMPLATES / name).read_text(encoding="utf-8") for name in _SCRIPTS)
-    return environment.get_template("report.html.j2").render(
-        document=document,
-        math_font=_math_font(),
-        script=Markup(script),
-        script_hash=Markup(_hash(script)),
-    )
+    return environment
 
 
 def _mathml(term: Term, display: bool = False, alt: str = "") -> Markup:
