@@ -2,21 +2,38 @@
 
 import subprocess
 import sys
+from base64 import b64decode
 from dataclasses import replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from matplotlib.text import Text
 
-from pipeline.report.figures import drawing, panels, plot_measured, thin
+from pipeline.report.figures import (
+    drawing,
+    panels,
+    plot_measured,
+    plot_model,
+    small_multiples,
+    thin,
+)
 from pipeline.report.figures_bode import bode_figure
-from pipeline.report.figures_time import hardware_figure, sine_figure
-from pipeline.report.svg import to_svg
+from pipeline.report.figures_time import (
+    damping_figure,
+    decay_figure,
+    design_figure,
+    hardware_figure,
+    sine_figure,
+    step_figure,
+)
+from pipeline.report.svg import plain_svg, to_svg
 from pipeline.report.ticks import linear_ticks, log_ticks, tick_labels
 from tests.analysis_factory import make_analysis
 
@@ -194,3 +211,105 @@ def test_panels_leave_room_for_their_labels():
     boxes = [ax.get_position() for ax in axes]
     assert all(0.05 < box.x0 < box.x1 < 1 and 0.05 < box.y0 < box.y1 < 1 for box in boxes)
     assert all(lower.y1 < upper.y0 for upper, lower in pairwise(boxes))
+
+
+_TOUCH = 2.0  # points of the canvas: boxes hold room above and below the letters
+
+
+def figures_of(carts: int) -> dict[str, Figure]:
+    """Return every kind of figure of a report, with long and odd names of records."""
+    analysis = make_analysis(carts)
+    records = {r.id: replace(r, id=f"{r.id} the second try of Tuesday") for r in analysis.records}
+    long = {id_: record.id for id_, record in records.items()}
+    decays = [replace(d, experiment=long[d.experiment]) for d in analysis.log_decrements]
+    own = [decay for decay in decays if decay.cart == 1]
+    runs = list(dict.fromkeys(gain.experiment for gain in analysis.step_gains))
+    dwell = analysis.sine_points[-1].experiment
+    checks = [[c for c in analysis.hardware if c.cart == cart] for cart in range(1, carts + 1)]
+    assert analysis.feedback is not None
+    return {
+        "bode": bode_figure(
+            analysis.frequency_responses[0], chain=analysis.chain, position_unit="count",
+            input_unit="V",
+        ),
+        "decay": decay_figure(
+            own, records=[next(r for r in records.values() if r.id == d.experiment) for d in own],
+            position_unit="count",
+        ),
+        "damping": damping_figure(
+            [d for d in decays if d.zeta_at_amplitude.size], position_unit="count"
+        ),
+        "steps": step_figure(
+            [[g for g in analysis.step_gains if g.experiment == run] for run in runs],
+            records=[records[run] for run in runs], position_unit="count",
+        ),
+        "sine": sine_figure(
+            [p for p in analysis.sine_points if p.experiment == dwell], record=records[dwell],
+            position_unit="count",
+        ),
+        "hardware": hardware_figure(checks, position_unit="count"),
+        "feedback": design_figure(analysis.feedback, position_unit="count", input_unit="V"),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("carts", [1, 2, 3])
+def test_no_text_of_a_figure_is_cut_or_covered(carts):
+    """Every text lies on the canvas, and no two overlap, as matplotlib measures them."""
+    with drawing():
+        for name, figure in figures_of(carts).items():
+            to_svg(figure, name=name, alt="")  # draws the ticks
+            canvas = FigureCanvasAgg(figure)
+            renderer = canvas.get_renderer()
+            canvas.draw()
+            texts = [
+                text for text in figure.findobj(Text)
+                if isinstance(text, Text) and text.get_visible() and text.get_text()
+            ]  # fmt: skip
+            boxes = [(t.get_text(), t.get_window_extent(renderer)) for t in texts]
+            assert len(boxes) > 8
+            for text, box in boxes:
+                inside = (box.min >= 0).all() and (box.max <= figure.bbox.max).all()
+                assert inside, (name, text)
+            for (text, box), (other, near) in combinations(boxes, 2):
+                apart = np.maximum(box.min, near.min) >= np.minimum(box.max, near.max) - _TOUCH
+                assert apart.any(), (name, text, other)
+
+
+def test_every_series_carries_all_its_data():
+    """A page gets what was measured whole, however few points are drawn; files and print do not."""
+    rng = np.random.default_rng(3)
+    t = np.linspace(0.0, 9.0, 5001)
+    y = rng.normal(size=t.size)
+    uneven = np.sort(rng.uniform(0.0, 9.0, 40))
+    with drawing():
+        figure, (ax,) = panels(1.0)
+        plot_measured(ax, t, y)
+        plot_model(ax, uneven, np.sin(uneven), label="\"quoted\" <b> 'model'")
+        svg = to_svg(figure, name="x", alt="")
+
+    series = [g.attrib for g in ElementTree.fromstring(svg).iter() if "data-x" in g.attrib]
+    model, measured = sorted(series, key=lambda attributes: attributes["data-name"])
+    assert measured["data-name"] == "measured"
+    assert measured["data-x"] == "0 9"
+    # Numbers travel as float32.
+    np.testing.assert_allclose(unpacked(measured["data-y"]), y, rtol=1e-6)
+    assert model["data-name"] == "\"quoted\" <b> 'model'"
+    np.testing.assert_allclose(unpacked(model["data-x"]), uneven, rtol=1e-6)
+    assert "data-" not in plain_svg(svg)
+    assert len(plain_svg(svg)) < 40_000
+
+
+def unpacked(text: str) -> np.ndarray:
+    return np.frombuffer(b64decode(text), dtype="<f4")
+
+
+def test_repeats_stand_on_one_time_axis():
+    """Small multiples share time; a panel is titled once, the axis below each column."""
+    with drawing():
+        figure, axes = small_multiples(list("abcde"), height=1.0, share_y=True)
+        axes[0].set_xlim(0, 3)
+    assert len(axes) == 5
+    assert len({ax.get_xlim() for ax in axes}) == 1
+    assert len({round(ax.get_position().x0, 6) for ax in axes}) == 3
+    assert [ax.get_title(loc="left") for ax in axes] == list("abcde")
+    assert len(figure.axes) == 5

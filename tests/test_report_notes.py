@@ -3,7 +3,7 @@
 import re
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.report.document import (
@@ -20,20 +20,24 @@ from pipeline.report.document import (
     plain,
 )
 from pipeline.report.html import render_html
-from pipeline.report.notes import note_blocks
+from pipeline.report.notes import even_headings, note_blocks
+from pipeline.report.pdf import render_pdf
+
+
+def document_of(blocks: tuple[Block, ...]) -> Document:
+    """Return a report that holds only these blocks."""
+    return Document(
+        title="t",
+        subtitle="",
+        authors=(),
+        sections=(Section("discussion", "Discussion", blocks),),
+        footer="",
+    )
 
 
 def page(blocks: tuple[Block, ...]) -> str:
     """Return the HTML of a report that holds only these blocks."""
-    return render_html(
-        Document(
-            title="t",
-            subtitle="",
-            authors=(),
-            sections=(Section("discussion", "Discussion", blocks),),
-            footer="",
-        )
-    )
+    return render_html(document_of(blocks))
 
 
 def test_markdown_becomes_blocks():
@@ -117,6 +121,23 @@ def test_any_text_gives_a_page_without_foreign_tags(markdown):
     names = set(re.findall(r"<\s*/?\s*([a-zA-Z][\w-]*)", html))
     ours = "section h2 h3 h4 h5 h6 p ul ol li em strong code pre blockquote a div table thead tbody"
     assert names <= {*ours.split(), "tr", "th", "td", "main", "footer", "body", "html"}
+
+
+@settings(max_examples=20)
+@given(st.text(alphabet=st.sampled_from("ab#->*1._`|\n "), max_size=60))
+def test_any_notes_give_an_accessible_pdf(markdown):
+    """Whatever headings, lists and tables there are, the outline has no gap: PDF/UA is kept."""
+    blocks = even_headings(note_blocks(markdown))
+
+    assert render_pdf(document_of(blocks)).startswith(b"%PDF")
+
+
+def test_headings_go_down_one_level_at_a_time():
+    """A heading that skips levels is raised to the next one; those beside it stay beside it."""
+    blocks = even_headings(note_blocks("### a\n\n###### b\n\n###### c\n\n# d\n\n## e"))
+
+    levels = [block.level for block in blocks if isinstance(block, Heading)]
+    assert levels == [3, 4, 4, 3, 4]
 
 
 @pytest.mark.parametrize("nest", ["> " * 20, "> " * 90, "- " * 40, "1. " * 30])

@@ -65,12 +65,7 @@ def build_document(
     `gap` is the gap analysis of the same data, where there is one; `worked` are sections that
     stand in the place of the one on the model; `changes` is what an earlier draft had otherwise.
     """
-    page = Page(
-        analysis=analysis,
-        records={record.id: record for record in analysis.records},
-        position=clean(analysis.position_unit),
-        drive=clean(analysis.input_unit),
-    )
+    page = Page.of(analysis)
     asked = ask(analysis)
     answers, rest = split_notes(discussion_blocks(analysis.discussion or ""), asked)
     parts: Sequence[Part] = (
@@ -98,13 +93,10 @@ def build_document(
                 progress(f"report: {title.lower()}")
             if blocks := blocks_of(page):
                 sections.append(Section(id=id_, title=title, blocks=tuple(blocks)))
-    section = f"Section {clean(analysis.section)} · " if analysis.section else ""
-    return Document(
-        title=clean(analysis.title).strip() or f"Identification of {count(analysis.carts, 'cart')}",
-        subtitle=f"{section}Identification and control of {count(analysis.carts, 'cart')}",
-        authors=tuple(clean(f"{name} ({id_})" if name else id_) for id_, name in analysis.authors),
-        sections=placed(sections, asked, answers),
-        footer=f"cartlab {__version__}",
+    return page.document(
+        placed(sections, asked, answers),
+        about=f"Identification and control of {count(analysis.carts, 'cart')}",
+        untitled=f"Identification of {count(analysis.carts, 'cart')}",
     )
 
 

@@ -35,8 +35,8 @@ _BUCKETS = 240  # twice this many points a line: finer than print at this width 
 _MOST_POINTS = 200  # of one record: more would hide the line of the model
 # Inches:
 _LEFT, _RIGHT = 0.62, 0.12  # for tick labels and axis titles
-_TOP, _BOTTOM = 0.26, 0.44  # for a legend or a title above, tick labels and title below
-_SHARED_GAP, _OWN_GAP = 0.13, 0.5  # between panels on one time axis, or each with its own
+_TOP, _BOTTOM = 0.26, 0.47  # for a legend or a title above, tick labels and title below
+_SHARED_GAP, _OWN_GAP = 0.13, 0.53  # between panels on one time axis, or each with its own
 _X_LABEL, _Y_LABEL = 0.31, 0.46  # from the axes to the middle of their titles
 _COLUMN_GAP, _TITLE_GAP = 0.5, 0.24
 LIFT = 0.22  # of a legend above the titles of panels
@@ -206,14 +206,13 @@ def thin(t: Array, y: Array) -> tuple[Array, Array]:
 def plot_measured(ax: Axes, t: Array, y: Array, *, most: int = _MOST_POINTS) -> None:
     """Draw a measured time series as points, of a long one `most` spread evenly."""
     shown = np.linspace(0, t.size - 1, min(t.size, most)).astype(int)
-    x, y = t[shown], y[shown]
     # Round-ended strokes too short to see as such: one path for all points takes a fifth of the
     # time and a third of the text that markers do. (Some readers drop strokes of no length at
     # all.) Added as an artist, or matplotlib walks every stroke.
-    points = np.column_stack([x, y])
+    points = np.column_stack([t[shown], y[shown]])
     strokes = points.repeat(2, axis=0)
-    strokes[1::2, 0] += _STROKE * (x[-1] - x[0])
-    path = Path(strokes, np.tile([Path.MOVETO, Path.LINETO], x.size))
+    strokes[1::2, 0] += _STROKE * (points[-1, 0] - points[0, 0])
+    path = Path(strokes, np.tile([Path.MOVETO, Path.LINETO], shown.size))
     dots = PathPatch(path, fill=False, color=MEASURED, lw=_DOT, capstyle="round", zorder=3)
     tell(dots, t, y, name="measured")
     ax.add_artist(dots)

@@ -95,7 +95,7 @@ def damping_figure(decays: Sequence[LogDecrement], *, position_unit: str) -> Fig
         for decay, marker in zip(own, cycle("Dosv^P"), strict=False):
             plot_damping(ax, decay, marker=marker)
         ax.set_title(f"cart {cart}", loc="left", y=1.0)
-        ax.set_xlabel(f"amplitude [{position_unit}]")
+        ax.set_xlabel(f"swing [{position_unit}]")
         most = np.max([decay.zeta_at_amplitude.max(axis=1) for decay in own], axis=0)
         ax.set_xlim(0.0, _ROOM * most[0])
         ax.set_ylim(0.0, _ROOM * most[1])

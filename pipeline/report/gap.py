@@ -70,12 +70,7 @@ def build_gap_document(
     gap: Gap, analysis: Analysis, *, progress: Callable[[str], None] | None = None
 ) -> Document:
     """Return the gap report; sections that have nothing to show are left out."""
-    page = Page(
-        analysis=analysis,
-        records={record.id: record for record in analysis.records},
-        position=clean(analysis.position_unit),
-        drive=clean(analysis.input_unit),
-    )
+    page = Page.of(analysis)
     worst = _worst_first(gap)
     forces = residual_forces(gap, free={record.id: record.free for record in analysis.records})
     parts: list[tuple[str, str, Callable[[], list[Block]]]] = [
@@ -107,13 +102,10 @@ def build_gap_document(
                 progress(f"gap report: {title.lower()}")
             if blocks := blocks_of():
                 sections.append(Section(id=id_, title=title, blocks=tuple(blocks)))
-    section = f"Section {clean(analysis.section)} · " if analysis.section else ""
-    return Document(
-        title=clean(analysis.title).strip() or f"The gap of {count(analysis.carts, 'cart')}",
-        subtitle=f"{section}What the linear model leaves out",
-        authors=tuple(clean(f"{name} ({id_})" if name else id_) for id_, name in analysis.authors),
-        sections=tuple(sections),
-        footer=f"cartlab {__version__}",
+    return page.document(
+        sections,
+        about="What the linear model leaves out",
+        untitled=f"The gap of {count(analysis.carts, 'cart')}",
     )
 
 

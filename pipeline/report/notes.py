@@ -82,7 +82,8 @@ def _block(node: SyntaxTreeNode, depth: int) -> list[Block]:
     match node.type:
         case "heading":
             level = min(int(node.tag[1]) + _TOP_HEADING - 1, _DEEPEST_HEADING)
-            return [Heading(_inline(node), level=level)]
+            text = _inline(node)
+            return [Heading(text, level=level)] if plain(text).strip() else []
         case "paragraph":
             return [Paragraph(_inline(node))]
         case "bullet_list" | "ordered_list":

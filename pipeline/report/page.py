@@ -1,12 +1,13 @@
 """What all sections of a report share: the analysis, running numbers, figures as blocks."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import count as counter
 
 from matplotlib.figure import Figure
 
-from pipeline.report.document import Block, Picture, bullet_list
+from pipeline import __version__
+from pipeline.report.document import Block, Document, Picture, Section, bullet_list
 from pipeline.report.figures import WIDTH
 from pipeline.report.numbers import count
 from pipeline.report.svg import to_svg
@@ -24,6 +25,29 @@ class Page:
     drive: str
     _figures: counter = field(default_factory=lambda: counter(1))
     _tables: counter = field(default_factory=lambda: counter(1))
+
+    @classmethod
+    def of(cls, analysis: Analysis) -> "Page":
+        """Return the page of an analysis, nothing numbered yet."""
+        return cls(
+            analysis=analysis,
+            records={record.id: record for record in analysis.records},
+            position=clean(analysis.position_unit),
+            drive=clean(analysis.input_unit),
+        )
+
+    def document(self, sections: Iterable[Section], *, about: str, untitled: str) -> Document:
+        """Return the sections under title, authors and what the document is about."""
+        analysis = self.analysis
+        section = f"Section {clean(analysis.section)} · " if analysis.section else ""
+        people = analysis.authors
+        return Document(
+            title=clean(analysis.title).strip() or untitled,
+            subtitle=f"{section}{about}",
+            authors=tuple(clean(f"{name} ({id_})" if name else id_) for id_, name in people),
+            sections=tuple(sections),
+            footer=f"cartlab {__version__}",
+        )
 
     def table_number(self) -> int:
         """Return the next table's number."""

@@ -56,7 +56,7 @@ def _grid(ax: Axes, ticks: Array, *, direction: int) -> None:
     across = np.tile([0.0, 1.0, np.nan], ticks.size)
     x, y = (along, across) if direction == 0 else (across, along)
     transform = ax.get_xaxis_transform() if direction == 0 else ax.get_yaxis_transform()
-    grid = Line2D(x, y, transform=transform, color=GRID, lw=0.6, zorder=0.5)
+    grid = Line2D(x, y, transform=transform, color=GRID, lw=0.5, zorder=0.5)
     grid.set_gid(TAGS[direction])
     ax.add_artist(grid)
 
