@@ -15,6 +15,8 @@ from pipeline.resources import EXAMPLES
 from pipeline.results import Analysis, Estimate
 from pipeline.results_json import results_text
 from pipeline.schemas.results import Results
+from pipeline.submission import load_submission
+from pipeline.workflow import analyse
 from tests.analysis_factory import make_analysis
 
 
@@ -135,18 +137,15 @@ def test_other_benches_are_not_compared():
 
 def test_the_command_tells_the_change_in_one_line_of_stderr(tmp_path):
     """`--compare` with a results.json whose gain was edited says so, in the page and on stderr."""
-    command = [sys.executable, "-m", "pipeline", "report", str(EXAMPLES / "one-cart"), "--no-pdf"]
-    first, second = tmp_path / "first", tmp_path / "second"
-    run = {"capture_output": True, "encoding": "utf-8", "check": False}
-    subprocess.run([*command, "--out", str(first)], **run)
-    path = first / "results.json"
-    earlier = json.loads(path.read_text(encoding="utf-8"))
+    earlier = json.loads(results_text(analyse(load_submission(EXAMPLES / "one-cart"))))
     earlier["parameters"][0]["final"] *= 0.9
+    path = tmp_path / "earlier.json"
     path.write_text(json.dumps(earlier), encoding="utf-8")
-    done = subprocess.run([*command, "--out", str(second), "--compare", str(path)], **run)
-    assert done.returncode == 0
+    arguments = ["report", str(EXAMPLES / "one-cart"), "--no-pdf", "--out", str(tmp_path / "out")]
+    done = subprocess.run(
+        [sys.executable, "-m", "pipeline", *arguments, "--compare", str(path)],
+        capture_output=True, encoding="utf-8", check=True,
+    )  # fmt: skip
     (line,) = [text for text in done.stderr.splitlines() if text.startswith("since the earlier")]
     assert "1 final estimate moved, K most (+11.1 %" in line
-    assert 'id="changes"' in (second / "report.html").read_text(encoding="utf-8")
-    wrong = subprocess.run([*command, "--compare", str(tmp_path / "no.json")], **run)
-    assert (wrong.returncode, len(wrong.stderr.splitlines())) == (2, 1)
+    assert 'id="changes"' in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
