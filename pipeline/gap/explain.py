@@ -41,6 +41,7 @@ from pipeline.results import Record
 _NOISE_ROUNDS, _TOO_GOOD = 2, 0.7  # chi-square per point no fit to true noise falls to
 _CLOSE_ERROR, _CLOSE_GAIN, _CLOSE_BIC = 1.15, 0.10, 40.0
 _REFUSED_SHARE, _REFUSED_FLOOR = 0.5, 1.5
+_NOTHING = 1.05  # times the noise: too little to speak of
 _DECISIVE_SHARE, _DECISIVE_RIVAL = 0.8, 1.2
 
 
@@ -245,7 +246,8 @@ def _verdict(
     sample_time: float,
 ) -> tuple[Verdict, list[Hypothesis]]:
     if not chosen.key:
-        return ("none" if baseline.at_floor else "unexplained"), []
+        nothing = baseline.at_floor or baseline.error < _NOTHING * floor
+        return ("none" if nothing else "unexplained"), []
     refused = chosen.error > _REFUSED_SHARE * baseline.error
     refused &= chosen.error > _REFUSED_FLOOR * floor
     if refused and not _decisive(chosen, baseline, found):

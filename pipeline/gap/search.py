@@ -32,7 +32,7 @@ _NEARLY_RIGHT = 6.0  # chi-square of the better runs, below which the bad ones a
 _HELD_OUT_GAIN = 0.95  # an effect must lower the held-out error by this factor …
 _CONTACT_GAIN = 0.5  # what a contact leaves is its contact law: no effect to mop it up
 _RUN_GAIN, _RUN_SHARE = 0.97, 0.6  # … and by 3 % in 60 % of the runs
-_SEVERAL_STARTS = ("extra_mode", "end_stop", "backlash", "slack_spring")
+_RUGGED = ("extra_mode", "end_stop", "backlash", "slack_spring")
 _ZOOM_SHARE = 0.15  # of the first suspect's, below which one start must do
 _CONTACT = ("end_stop", "backlash")
 _LEADING = 0.4  # of the first suspect's share, for what is dear to refit
@@ -51,7 +51,6 @@ class Hypothesis:
     fit: Fit
     held: Fit
     error: float
-    run_error: Array
     bic: float
     at_floor: bool
     added: Candidate | None = None
@@ -112,7 +111,6 @@ def judge(
         fit=fit,
         held=held,
         error=error,
-        run_error=np.sqrt(np.array(errors) / np.array(sizes)),
         bic=float(bic),
         at_floor=only_noise or error < AS_REPEATS * bench.repeatability,
         added=added,
@@ -199,20 +197,18 @@ def _starts(parent: Hypothesis, bench: Bench) -> list[tuple[Candidate, Fit]]:
         mapper=bench.mapper,
     )
     suspects = [s for s in look(loose, pieces) if _promises(s, loose)]
-    if not suspects:
-        return []
     short = [
         _short_refit(loose, s, pieces, bench, top=suspects[0].share) for s in _short_list(suspects)
     ]
     short.sort(key=lambda pair: pair[1].cost)
-    within = _OUT_OF_SIGHT * short[0][1].cost
+    within = _OUT_OF_SIGHT * short[0][1].cost if short else np.inf
     chosen = [pair for pair in short[:_FULL_LIST] if pair[1].cost < within]
-    if short[0][1].chi < AT_FLOOR:
+    if short and short[0][1].chi < AT_FLOOR:
         return chosen
     suspects = [s for s in look(parent.fit, bench.training) if _promises(s, parent.fit)]
     for suspect in suspects[:_FULL_SCREEN]:
         key, top = suspect.candidate.key, suspects[0].share
-        if suspect.candidate.effect.key in _SEVERAL_STARTS and suspect.share > _LEADING * top:
+        if _needs_starts(suspect.candidate) and suspect.share > _LEADING * top:
             chosen.append(_short_refit(parent.fit, suspect, bench.training, bench, top=top))
         elif key not in (candidate.key for candidate, _ in chosen):
             pair = next((p for p in short if p[0].key == key), None)
@@ -229,12 +225,18 @@ def _promises(suspect: Suspect, fit: Fit) -> bool:
 
 def _short_list(suspects: Sequence[Suspect]) -> list[Suspect]:
     """Return who is worth a refit; contacts need fine steps, so only where they lead."""
-    top = suspects[0].share
+    top = suspects[0].share if suspects else 0.0
     return [
         suspect
         for suspect in suspects[:_SHORT_LIST]
         if suspect.candidate.effect.key not in _CONTACT or suspect.share > _LEADING * top
     ]
+
+
+def _needs_starts(candidate: Candidate) -> bool:
+    """Would one start not do? The screen cannot scale a trial of a limit to the data either."""
+    effect = candidate.effect
+    return effect.key in _RUGGED or effect.parameters[0].neutral is None
 
 
 def _short_refit(
@@ -244,8 +246,8 @@ def _short_refit(
 
     `top` is the share of the gap the first suspect explains.
     """
-    several = suspect.candidate.effect.key in _SEVERAL_STARTS
-    if several and suspect.share > _ZOOM_SHARE * top:
+    several = _needs_starts(suspect.candidate)
+    if suspect.candidate.effect.key in _RUGGED and suspect.share > _ZOOM_SHARE * top:
         suspect = zoom(start, pieces, suspect, mapper=bench.mapper)
     fits = []
     for values in suspect.starts[: 3 if several else 1]:
@@ -373,10 +375,12 @@ def worth_it(child: Hypothesis, parent: Hypothesis) -> bool:
     """Does a further effect help on runs the model has not seen?"""
     contact = any(effect in _CONTACT for effect, _ in parent.key)
     gain = _CONTACT_GAIN if contact else _HELD_OUT_GAIN
-    if child.bic > parent.bic - _BIC_DROP or child.error > gain * parent.error:
+    if child.bic > parent.bic - _BIC_DROP or child.held.chi > gain**2 * parent.held.chi:
         return False
-    better = child.run_error < _RUN_GAIN * parent.run_error
-    return bool(np.mean(better) >= _RUN_SHARE)
+    better = child.held.run_chi < _RUN_GAIN**2 * parent.held.run_chi
+    # A run with nothing but noise left cannot become better.
+    open_runs = parent.held.run_chi > AT_FLOOR
+    return bool(np.mean(better[open_runs] if open_runs.any() else better) >= _RUN_SHARE)
 
 
 def choose(found: Sequence[Hypothesis], baseline: Hypothesis) -> Hypothesis:
