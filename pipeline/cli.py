@@ -276,6 +276,22 @@ def simulate(
     say(f"wrote {out}: try `cartlab report {out}`")
 
 
+@app.command("check-rubric")
+def check_rubric(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A rubric, or a shipped name.")],
+    as_json: AsJson = False,
+) -> None:
+    """Validate a rubric and show what it asks of a submission."""
+    from pipeline.grading.describe import rubric_dict, rubric_text
+    from pipeline.grading.load import load_rubric
+
+    rubric = load_rubric(file)
+    if as_json:
+        typer.echo(json.dumps(rubric_dict(rubric), indent=1, ensure_ascii=False))
+    else:
+        typer.echo(rubric_text(rubric))
+
+
 @app.command()
 def effects(
     name: Annotated[

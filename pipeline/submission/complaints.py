@@ -1,7 +1,7 @@
 """What is wrong with a submission, in one line a student can act on."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 
 from pydantic_core import ErrorDetails
@@ -94,17 +94,26 @@ def dotted(location: Location, document: object) -> str:
     return path + name
 
 
-def explain(error: ErrorDetails, document: dict) -> str:
-    """Return one pydantic error as `key: what was expected, what was found, what is near`."""
+def explain(
+    error: ErrorDetails,
+    document: dict,
+    *,
+    tables: Mapping[str, type[models.BaseModel]] = _TABLES,
+    top_level: Sequence[str] = TOP_LEVEL,
+) -> str:
+    """Return one pydantic error as `key: what was expected, what was found, what is near`.
+
+    `tables` are the models of a format by their dotted path, what selects a model included.
+    """
     location = [part for part in error["loc"] if not isinstance(part, str) or part != "str"]
     table = ".".join(part for part in location[:-1] if isinstance(part, str))
-    location = _without_tag(location)
+    location = without_tag(location, document)
     where, found = dotted(location, document), error["input"]
     kind, context = error["type"], error.get("ctx", {})
     if kind == "missing":
         return f"{where}: is required and not there"
     if kind == "extra_forbidden":
-        keys = tuple(_TABLES[table].model_fields) if table in _TABLES else TOP_LEVEL
+        keys = tuple(tables[table].model_fields) if table in tables else top_level
         return f"{where}: unknown key{nearest(location[-1], keys)}"
     if kind not in _EXPECTED:
         return f"{where}: {error['msg']}, found {quote(found)}"
@@ -115,10 +124,17 @@ def explain(error: ErrorDetails, document: dict) -> str:
     return text
 
 
-def _without_tag(location: list[int | str]) -> list[int | str]:
-    """Drop what pydantic adds for a controller's type: it is no key of the file."""
-    return [
-        part
-        for i, part in enumerate(location)
-        if not (i > 0 and location[i - 1] == "controller" and part in ("pid", "state_feedback"))
-    ]
+def without_tag(location: Location, document: object) -> list[int | str]:
+    """Drop what pydantic adds for the model a table's own key selects: it is no key of the file."""
+    kept: list[int | str] = []
+    here = document
+    for i, part in enumerate(location):
+        selected = isinstance(here, dict) and part in here.values() and part not in here
+        if selected and i < len(location) - 1:
+            continue
+        kept.append(part)
+        try:
+            here = here[part]  # type: ignore[index]
+        except (KeyError, IndexError, TypeError):
+            here = None
+    return kept
