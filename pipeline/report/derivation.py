@@ -226,16 +226,20 @@ def couplings(n: int) -> list[Equation]:
 
 
 def given(chain: Chain) -> dict[str, float]:
-    """Return what the steps start from: the named parameters of a chain that a wall holds.
+    """Return what the steps start from: the named parameters of a chain that a wall holds."""
+    return chain.parameters() | unnamed(chain)
 
-    Four carts have no names for the polynomials between the first and the last: their
-    coefficients stand in.
-    """
-    values = chain.parameters()
+
+def unnamed(chain: Chain) -> dict[str, float]:
+    """Return coefficients in the place of names, which the inner carts of four do not have."""
+    found = {}
     for i in range(2, chain.n) if chain.n > 3 else ():
-        falling = chain.tails()[i - 1][::-1]
-        values |= {f"{_LETTERS[i - 1]}_{k}": float(v) for k, v in enumerate(falling[:-1])}
-    return values
+        falling = chain.tails()[i - 1]
+        degree = falling.size - 1
+        found |= {
+            f"{_LETTERS[i - 1]}_{degree - j}": float(falling[j]) for j in range(1, degree + 1)
+        }
+    return found
 
 
 def work_state_model(chain: Chain) -> dict[str, float]:

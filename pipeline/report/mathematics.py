@@ -160,7 +160,12 @@ def _is_tall(term: Term) -> bool:
 
 
 def _aligned(line: Term) -> str:
-    """Return a line in three cells, so that all lines meet at their equals sign."""
+    """Return a line in three cells, so that all lines meet at their equals sign.
+
+    A line that begins with a plus sign goes on with the one above.
+    """
+    if isinstance(line, Math) and line.parts[:1] == ("+",):
+        return f"<mtd></mtd><mtd></mtd><mtd>{_mathml(line)}</mtd>"
     if not isinstance(line, Math) or "=" not in line.parts:
         return f"<mtd>{_mathml(line)}</mtd>"
     at = line.parts.index("=")

@@ -13,7 +13,7 @@ from pipeline.report.derivation_algebra import (
     work_out,
 )
 from pipeline.report.document import Block, Formula, Heading, Paragraph, paragraph, spans
-from pipeline.report.mathematics import Math, Term, lines, matrix, row
+from pipeline.report.mathematics import Math, Term, lines, matrix, row, total
 from pipeline.report.model import formula, symbolic_transfer_functions
 from pipeline.report.page import Page
 from pipeline.report.solution_figures import free_body_figure
@@ -21,6 +21,7 @@ from pipeline.report.tables import fitted_chain_table
 from pipeline.report.words import rich
 
 _MOST_ADDENDS = 3  # of a sum whose products are written out with numbers
+_A_LINE = 7  # terms of a sum
 
 
 def motion_blocks(page: Page) -> list[Block]:
@@ -136,6 +137,12 @@ def state_blocks(page: Page) -> list[Block]:
             f"{page.position}, s and {page.drive}."
         )
     ]
+    if unnamed := derivation.unnamed(chain):
+        known: list[Math] = [row(shown(k), "=", value_term(v)) for k, v in unnamed.items()]
+        blocks += [
+            paragraph("The zeros of the inner carts have no names, but coefficients in the fit:"),
+            _together(known),
+        ]
     for title, words, equations in _steps(n):
         blocks += [Heading(spans(title)), *([rich_paragraph(words)] if words else [])]
         blocks += worked(equations, values)
@@ -156,8 +163,7 @@ def _steps(n: int) -> Iterable[tuple[str, str, Sequence[Equation]]]:
         what = "Δ(s) and N(s)" if n == 3 else "Δ(s)"
         yield (
             f"Coefficients of {what}",
-            "Multiply the quadratic factors out; g stands for 2ζω of its factor."
-            + (" The coefficients of N(s) and R(s) are those of the fit." if n > 3 else ""),
+            "Multiply the quadratic factors out; g stands for 2ζω of its factor.",
             derivation.coefficients(n),
         )
         yield (
@@ -230,7 +236,6 @@ def worked(equations: Sequence[Equation], values: Mapping[str, float]) -> list[B
     for equation in equations:
         terms = addends(equation.right)
         left, right = shown(equation.left), shown(equation.right)
-        named = (left, "=", right)
         result = value_term(evaluate(equation.right, values))
         if len(terms) == 1 and "-" not in equation.right:
             put_in = row(shown_with(equation.right, values), "≈", result)
@@ -239,20 +244,30 @@ def worked(equations: Sequence[Equation], values: Mapping[str, float]) -> list[B
             continue
         blocks += [_together(short)] if short else []
         short = []
-        blocks.append(
-            formula(
-                lines([row(*named), row("=", _put_in(equation.right, terms, values), "≈", result)])
-            )
-        )
+        blocks.append(formula(lines(_long(left, terms, equation.right, values, result))))
     return [*blocks, *([_together(short)] if short else [])]
 
 
-def _put_in(text: str, terms: Sequence[str], values: Mapping[str, float]) -> Term:
-    """Return numbers for names; the products of a long sum are worked out first."""
+def _long(
+    left: Term, terms: Sequence[str], text: str, values: Mapping[str, float], result: Term
+) -> list[Math]:
+    """Return a sum in lines of a few terms, then with numbers, then what it comes to."""
     if len(terms) <= _MOST_ADDENDS:
-        return shown_with(text, values)
-    worked_out = {f"t_{i}": evaluate(term, values) for i, term in enumerate(terms)}
-    return shown_with("+".join(worked_out), worked_out)
+        put_in = row("=", shown_with(text, values), "≈", result)
+        return [row(left, "=", shown(text)), put_in]
+    # The products of a long sum are worked out first, so that it can be read.
+    numbers = [value_term(evaluate(term, values)) for term in terms]
+    return [
+        *_broken((left, "="), [shown(term) for term in terms]),
+        *_broken(("=",), numbers),
+        row("=", result),
+    ]
+
+
+def _broken(head: Sequence[Term], terms: Sequence[Term]) -> list[Math]:
+    """Return a sum over as many lines as it needs."""
+    rows = [total(terms[i : i + _A_LINE]) for i in range(0, len(terms), _A_LINE)]
+    return [row(*head, rows[0]), *(row("+", terms) for terms in rows[1:])]
 
 
 def _together(equations: Sequence[Math]) -> Formula:
