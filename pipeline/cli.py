@@ -8,6 +8,7 @@ import json
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,6 +19,7 @@ from pipeline import __version__
 from pipeline.errors import PipelineError
 
 if TYPE_CHECKING:
+    from pipeline.report.changes import DraftChanges
     from pipeline.results import Analysis
 
 app = typer.Typer(
@@ -160,7 +162,7 @@ def _run_report(
     folder: Path, *, out: Path | None, pdf: bool, compare: Path | None = None
 ) -> "Analysis":
     from pipeline.output import check_folder, own_folder, write_file
-    from pipeline.report.compare import changes_line, compare_drafts, read_results
+    from pipeline.report.changes import changes_line
     from pipeline.report.known_gap import with_gap
     from pipeline.report.questions import open_line
     from pipeline.report.render import render_report
@@ -171,10 +173,10 @@ def _run_report(
 
     submission = load_submission(folder)
     out = check_folder(out) if out else own_folder(submission.folder, "report")
-    earlier = read_results(compare) if compare else None
+    compared = _comparison(compare)
     with _progress() as progress:
         analysis, gap = with_gap(analyse(submission, progress=progress), submission.folder)
-        changes = compare_drafts(earlier, analysis) if earlier else None
+        changes = compared(analysis)
         out.mkdir(parents=True, exist_ok=True)
         write_file(out / "results.json", results_text(analysis))
         render_report(analysis, out, gap=gap, changes=changes, pdf=pdf, progress=progress)
@@ -184,6 +186,15 @@ def _run_report(
             say(line)
     say(f"wrote {out / 'report.html'}" + (f" and {out / 'report.pdf'}" if pdf else ""))
     return analysis
+
+
+def _comparison(earlier: Path | None) -> "Callable[[Analysis], DraftChanges | None]":
+    """Return what compares an analysis with an earlier draft, which is read at once."""
+    if earlier is None:
+        return lambda analysis: None
+    from pipeline.report.compare import compare_drafts, read_results
+
+    return partial(compare_drafts, read_results(earlier))
 
 
 @app.command()

@@ -8,7 +8,8 @@ from dataclasses import replace
 import pytest
 
 from pipeline.errors import ConfigError
-from pipeline.report.compare import changes_line, compare_drafts, read_results
+from pipeline.report.changes import changes_line
+from pipeline.report.compare import compare_drafts, read_results
 from pipeline.report.content import build_document
 from pipeline.report.document import Table, plain
 from pipeline.resources import EXAMPLES

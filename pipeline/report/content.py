@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 
 from pipeline import __version__
 from pipeline.gap.types import Gap
-from pipeline.report.compare import DraftChanges, change_blocks
+from pipeline.report.changes import DraftChanges, change_blocks
 from pipeline.report.document import (
     Block,
     Details,

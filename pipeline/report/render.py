@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pipeline.gap.types import Gap
 from pipeline.output import clear_files, own_folder, write_file
-from pipeline.report.compare import DraftChanges
+from pipeline.report.changes import DraftChanges
 from pipeline.report.content import build_document
 from pipeline.report.document import Document
 from pipeline.report.html import render_html
