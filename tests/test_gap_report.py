@@ -213,7 +213,8 @@ def test_every_effect_has_its_page(effect):
     assert f"The evidence for {effect.title[:1].lower()}" in page.text
     assert "\\" not in page.text
     assert not re.search(r"\b(None|nan|inf)\b", page.text)
-    alts = [alt for alt in re.findall(r"Evidence for[^<]*", page.text) if effect.fingerprint in alt]
+    alts = [alt for alt in page.values("aria-label") if alt.startswith("Evidence for")]
+    alts = [alt for alt in alts if effect.fingerprint in alt]
     assert alts
 
 

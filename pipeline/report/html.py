@@ -3,6 +3,7 @@
 import base64
 import hashlib
 import math
+import re
 from collections.abc import Sequence
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -20,6 +21,7 @@ _ROLES = {
     MEASURED: "ink", MODEL: "model", SECOND: "second", THIRD: "third", QUIET: "quiet",
     SHADE: "shade", GRID: "grid", "#444444": "axis", "#555555": "mark",
 }  # fmt: skip
+_TITLE = re.compile(r"<title>.*?</title>", re.DOTALL)
 _NARROW = " .,()"  # half a digit wide
 _WIDE = "±×%"  # wider than a digit
 
@@ -62,8 +64,13 @@ def _mathml(term: Term, display: bool = False, alt: str = "") -> Markup:
 
 
 def _svg(picture: Picture) -> Markup:
-    """Return the drawing, which matplotlib has escaped, in the colours of the page."""
-    svg = picture.svg.replace("#ffffff", "var(--paper)")
+    """Return the drawing, which matplotlib has escaped, in the colours of the page.
+
+    Its title becomes a label: browsers show a title wherever the pointer rests.
+    """
+    named = f'<svg aria-label="{escape(picture.alt)}" '
+    svg = _TITLE.sub("", picture.svg, count=1).replace("<svg ", named, 1)
+    svg = svg.replace("#ffffff", "var(--paper)")
     for colour, role in _ROLES.items():
         svg = svg.replace(colour, f"var(--f-{role})")
     return Markup(svg)
