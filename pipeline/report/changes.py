@@ -111,7 +111,7 @@ def change_blocks(page: Page, changes: DraftChanges | None) -> list[Block]:
                 page.table_number(),
                 "Numbers that moved. The change in brackets is in combined standard errors (σ); "
                 "below one it is chance.",
-                ("Quantity", "", "Unit", "Earlier draft", "This draft", "Change"),
+                ("Quantity", "Kind", "Unit", "Earlier draft", "This draft", "Change"),
                 [_number_row(change) for change in changes.numbers],
                 "lllrrr",
             )
