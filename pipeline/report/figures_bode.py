@@ -33,7 +33,7 @@ def bode_figure(
     """
     response = _positive(response)
     has_phase = response.phase is not None
-    heights = [1.6, *([0.8] if has_phase else []), *([0.7] if chain else [])]
+    heights = [1.4, *([0.65] if has_phase else []), *([0.55] if chain else [])]
     figure, axes = panels(*heights)
     log_frequency_axis(axes[0], response.omega)
     plot_magnitude(
