@@ -179,9 +179,9 @@ def _guess(
         return "step", None
     if reference is not None and np.any(reference != 0) and not _follows(u, reference):
         return "closed_loop", None
-    if _is_stepped(u):
+    if is_stepped(u):
         return "step", None
-    frequency = _line_frequency(t, u)
+    frequency = line_frequency(t, u)
     return ("sweep", None) if frequency is None else ("sine", frequency if clock else None)
 
 
@@ -192,7 +192,7 @@ def _follows(u: Array, reference: Array) -> bool:
     return bool(abs(np.corrcoef(u, reference)[0, 1]) > 0.999)
 
 
-def _is_stepped(u: Array) -> bool:
+def is_stepped(u: Array) -> bool:
     edges = np.flatnonzero(np.abs(np.diff(u)) > _EDGE * np.ptp(u)) + 1
     if edges.size > _MOST_EDGES:
         return False
@@ -201,7 +201,7 @@ def _is_stepped(u: Array) -> bool:
     return bool(spread < _FLAT * np.ptp(u))
 
 
-def _line_frequency(t: Array, u: Array) -> float | None:
+def line_frequency(t: Array, u: Array) -> float | None:
     """Return the frequency (Hz) of an input that is one sine, else None."""
     even = np.linspace(t[0], t[-1], t.size)
     signal = np.interp(even, t, u)

@@ -1,0 +1,93 @@
+"""What no real chain of carts can do, whatever the data: signs and orders of reported numbers."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from decimal import Decimal
+from itertools import pairwise
+
+from pipeline.grading.grade import Flag
+from pipeline.grading.tolerance import half_digit
+
+# How far an order may be broken: fitted numbers are good to some percent, and first estimates of
+# resonances and nulls are read off a plot.
+_FINAL_SLACK = 1.05
+_INITIAL_SLACK = 1.2
+_HEAVY_DAMPING = 0.3  # above it the orders, exact without damping, may bend
+
+
+@dataclass(frozen=True, kw_only=True)
+class BrokenOrder:
+    """The law `lesser ≤ greater`, broken by two numbers of a table."""
+
+    lesser: str
+    greater: str
+    reason: str
+
+    @property
+    def names(self) -> tuple[str, str]:
+        """Both parameters."""
+        return self.lesser, self.greater
+
+    def flag(self, table: Mapping[str, Decimal], label: str) -> Flag:
+        """Return the flag for it."""
+        low, high = table[self.lesser], table[self.greater]
+        return Flag(
+            code="physically_impossible",
+            parameters=self.names,
+            message=f"{self.lesser} = {low} cannot be above {self.greater} = {high}: "
+            f"{self.reason}.",
+            evidence={
+                "table": label,
+                "reported": {self.lesser: float(low), self.greater: float(high)},
+                "ratio": float(low / high),
+            },
+        )
+
+
+def not_positive(table: Mapping[str, Decimal]) -> list[str]:
+    """Return the parameters that are zero or negative; all of a real chain are above."""
+    return [name for name, typed in table.items() if typed <= 0]
+
+
+def orders(names: Sequence[str]) -> list[tuple[str, str, str]]:
+    """Return (lesser, greater, why) of every order that the named parameters obey."""
+    gains = [name for name in names if name.startswith("K_")]
+    modes = [n for n in names if n.startswith("omega_") and n[-1] in "abcdefgh"]
+    alone = [n for n in names if n.startswith("omega_") and n[-1].isdigit()]
+    found = [
+        (far, near, "a cart further from the motor is moved less by a constant input")
+        for near, far in pairwise(gains)
+    ]
+    found += [(a, b, "the resonances are listed in rising order") for a, b in pairwise(modes)]
+    if modes:
+        why = "a cart alone swings faster than all together at the first resonance, and slower "
+        why += "than at the last"
+        found += [(modes[0], name, why) for name in alone]
+        found += [(name, modes[-1], why) for name in alone]
+    if {"omega_x", "omega_y"} <= set(names) and len(modes) == 3:
+        why = "each null of cart 1 lies between two resonances"
+        a, b, c = modes
+        found += [(a, "omega_x", why), ("omega_x", b, why), (b, "omega_y", why)]
+        found += [("omega_y", c, why)]
+        why = "carts 2 and 3 alone lie between the nulls of cart 1"
+        for name in ("omega_2", "omega_3"):
+            found += [("omega_x", name, why), (name, "omega_y", why)] * (name in names)
+    return found
+
+
+def broken_orders(table: Mapping[str, Decimal], *, initial: bool) -> list[BrokenOrder]:
+    """Return the orders that a table breaks by more than rounding and honest error."""
+    slack = _INITIAL_SLACK if initial else _FINAL_SLACK
+    heavy = any(v > _HEAVY_DAMPING for n, v in table.items() if n.startswith("zeta"))
+    broken = []
+    for lesser, greater, reason in orders(list(table)):
+        if heavy and lesser.startswith("omega"):
+            continue
+        low, high = table[lesser], table[greater]
+        if low <= 0 or high <= 0:
+            continue
+        least = low - Decimal(float(half_digit(low)))
+        most = high + Decimal(float(half_digit(high)))
+        if float(least) > slack * float(most):
+            broken.append(BrokenOrder(lesser=lesser, greater=greater, reason=reason))
+    return broken

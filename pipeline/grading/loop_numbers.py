@@ -1,0 +1,78 @@
+"""What reported gains and prefilter do on a chain: stable, overshoot, settling, static gain."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.plant import step_response
+from pipeline.plant.chain import Array, Chain, ComplexArray
+from pipeline.plant.loop import discretise
+
+_SAMPLE_TIME = 0.00884  # s, of the ECP controller, where none is stated
+_HORIZON = 6.0  # times the settling time asked for
+_MOST_SAMPLES = 4000
+_BLOWN_UP = 1e6  # times the reference
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LoopNumbers:
+    """The sampled loop with its one-sample delay predicted.
+
+    Attributes
+    ----------
+    poles : continuous equivalents, rad/s.
+    overshoot : percent; settling_time : s, None if it does not settle in view.
+    prefilter : one over the loop's static gain: what makes the steady state right.
+    """
+
+    stable: bool
+    poles: ComplexArray
+    overshoot: float
+    settling_time: float | None
+    prefilter: float
+
+
+def loop_numbers(
+    chain: Chain, gains: Array, *, cart: int, settling: float, sample_time: float | None
+) -> LoopNumbers | None:
+    """Return what gains (2n,) do on a chain; None where the numbers run over."""
+    T = sample_time or _SAMPLE_TIME
+    row, size = 2 * (cart - 1), 2 * chain.n
+    with np.errstate(all="ignore"):
+        phi, gamma = discretise(chain, T)
+        loop = phi - np.outer(gamma, gains)
+        if not np.all(np.isfinite(loop)):
+            return None
+        z = np.linalg.eigvals(loop).astype(np.complex128)
+        try:
+            static = np.linalg.solve(np.eye(size) - loop, gamma)
+        except np.linalg.LinAlgError:
+            return None
+        poles = np.asarray(np.log(z) / T, dtype=np.complex128)
+        stable = bool(np.abs(z).max() < 1)
+        count = min(int(_HORIZON * settling / T) + 2, _MOST_SAMPLES)
+        y = _step(loop, gamma / static[row], row=row, count=count)
+    overshoot, settles = np.inf, np.nan
+    if stable and np.abs(y).max() < _BLOWN_UP:
+        t = T * np.arange(y.size, dtype=np.float64)
+        judged = {"before": 0.0, "level": np.float64(1.0)}
+        overshoot = float(step_response.overshoot_percent(y, **judged))
+        settles = float(step_response.settling_time(t, y, **judged))
+    return LoopNumbers(
+        stable=stable,
+        poles=poles,
+        overshoot=overshoot,
+        settling_time=None if np.isnan(settles) else settles,
+        prefilter=float(1 / static[row]),
+    )
+
+
+def _step(loop: Array, drive: Array, *, row: int, count: int) -> Array:
+    """Return the unit step's response (count,); the first sample is the delay."""
+    states = np.zeros((drive.size, 1))
+    power, offset = loop, drive[:, None]
+    # x_{k+1} = L x_k + d: each pass doubles the samples known.
+    while states.shape[1] < count:
+        states = np.hstack([states, power @ states + offset])
+        offset, power = offset + power @ offset, power @ power
+    return np.concatenate([[0.0], states[row, : count - 1]])

@@ -1,0 +1,359 @@
+"""The known mistakes, tried on the student's own data: what each would make of every number."""
+
+import itertools
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.grading.grade import Code
+from pipeline.grading.reference import Reference
+from pipeline.grading.rubric import is_damping
+from pipeline.results import Analysis, Record, StepGain
+
+_TURN = 2 * math.pi
+_LOG10 = math.log10(math.e)
+_OWN = "0123456789n"  # what the symbol of a cart alone ends in
+# Counted k periods where there were k ± 1. With many the ratios lie close together, so that they
+# only count where damping, or another cart, tells the same story.
+_FEW_PERIODS = range(1, 5)
+_MANY_PERIODS = range(5, 11)
+
+_GAIN_OR_FREQUENCY = 0.03  # an honest reading after one slip: relative
+_COUNTED = 0.015
+_DAMPING = 0.16
+_CLEARLY_OFF = 0.06  # of a gain: another extremum of the step as near as this says nothing
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mistake:
+    """One or two mistakes, and what they make of the numbers of a table.
+
+    Attributes
+    ----------
+    predicted : by parameter name; the bounds within which the mistaken number lies.
+    tolerance : relative, around those bounds.
+    whole : all of the predicted that were reported must be met for it to be believed.
+    least : so many numbers must be explained for it to be believed.
+    help : a sentence with {name}, {reported} and {recomputed} to fill in.
+    """
+
+    codes: tuple[Code, ...]
+    predicted: dict[str, Reference]
+    tolerance: float
+    help: str
+    whole: bool = False
+    least: int = 1
+
+
+def known_mistakes(references: Mapping[str, Reference], analysis: Analysis) -> list[Mistake]:
+    """Return every mistake that can be tried on a table, single ones before combined ones."""
+    gains = {n: r for n, r in references.items() if n.startswith("K")}
+    omegas = {n: r for n, r in references.items() if n.startswith("omega")}
+    own_omegas = {n: r for n, r in omegas.items() if n[-1] in _OWN}
+    own_zetas = {
+        n: r for n, r in references.items() if n == "zeta" or (is_damping(n) and n[-1] in _OWN)
+    }
+    hertz, scales = _hertz(omegas), _gain_mistakes(gains, analysis)
+    log10 = [
+        Mistake(
+            codes=("log10_for_ln",),
+            predicted=_times(own_zetas, _LOG10),
+            tolerance=_DAMPING,
+            help="{reported} is {recomputed}/2.303: the logarithmic decrement takes the natural "
+            "logarithm, and this looks like log10",
+        )
+    ]
+    single = [*hertz, *scales, *log10, *_miscounts(own_omegas, own_zetas)]
+    swaps = [*_swaps(gains), *_swaps(own_omegas), *_swaps(own_zetas)]
+    pairs = [*_swapped(hertz, own_omegas), *_swapped(scales, gains), *_swapped(log10, own_zetas)]
+    pairs += list(_in_counts(scales))
+    for miscount in _miscounts(own_omegas, own_zetas, periods=_FEW_PERIODS):
+        pairs += _miscount_and(miscount, own_omegas, own_zetas)
+    return [m for m in (*single, *swaps, *pairs) if m.predicted]
+
+
+def _times(references: Mapping[str, Reference], factor: float) -> dict[str, Reference]:
+    return {name: reference.times(factor) for name, reference in references.items()}
+
+
+# -------------------------------------------------------------------- frequencies
+
+
+def _hertz(omegas: Mapping[str, Reference]) -> list[Mistake]:
+    return [
+        Mistake(
+            codes=("hz_for_rad_s",),
+            predicted=_times(omegas, 1 / _TURN),
+            tolerance=_GAIN_OR_FREQUENCY,
+            help="{reported} is {recomputed}/2π: this looks like Hz where rad/s is asked, "
+            "so multiply by 2π",
+        ),
+        Mistake(
+            codes=("hz_for_rad_s",),
+            predicted=_times(omegas, _TURN),
+            tolerance=_GAIN_OR_FREQUENCY,
+            help="{reported} is 2π·{recomputed}: this was in rad/s already and looks converted "
+            "from Hz once more",
+        ),
+    ]
+
+
+def _miscounts(
+    omegas: Mapping[str, Reference],
+    zetas: Mapping[str, Reference],
+    *,
+    periods: Sequence[int] | None = None,
+) -> list[Mistake]:
+    """One period too many or too few: ω is off by their ratio, and a decrement by its inverse."""
+    found = []
+    for name, omega in omegas.items():
+        zeta = "zeta" if name == "omega_n" else name.replace("omega", "zeta")
+        for k in periods or (*_FEW_PERIODS, *_MANY_PERIODS):
+            for counted, there in ((k + 1, k), (k, k + 1)):
+                help_ = (
+                    f"{{reported}} is {{recomputed}}·{counted}/{there}: {counted} periods counted "
+                    f"where there are {there}? From one peak to the n-th there are n − 1 periods"
+                )
+                both = {name: omega.times(counted / there)}
+                if zeta in zetas:
+                    both[zeta] = _miscounted_damping(zetas[zeta], there / counted)
+                    found.append(_miscount(both, help_, whole=True, least=2))
+                if k in _FEW_PERIODS:
+                    found.append(_miscount({name: both[name]}, help_))
+    for zeta, reference in zetas.items():
+        for factor, words in ((0.5, "half"), (2.0, "twice")):
+            # The decrement alone: taken over half a period, or over two.
+            found.append(
+                Mistake(
+                    codes=("peak_count",),
+                    predicted={zeta: reference.times(factor)},
+                    tolerance=_GAIN_OR_FREQUENCY,
+                    help=f"{{reported}} is {words} of {{recomputed}}: δ is the logarithm of the "
+                    "ratio of two peaks a whole period apart, divided by the number of periods",
+                )
+            )
+    return found
+
+
+def _miscounted_damping(zeta: Reference, factor: float) -> Reference:
+    """Return the bounds of a damping so miscounted, up to where it is as near to the right one."""
+    mistaken, middle = zeta.times(factor), zeta.times(math.sqrt(factor))
+    if factor < 1:
+        return replace(mistaken, low=mistaken.low / (1 + _DAMPING), high=middle.high)
+    return replace(mistaken, low=middle.low, high=mistaken.high * (1 + _DAMPING))
+
+
+def _miscount(
+    predicted: dict[str, Reference], help_: str, *, whole: bool = False, least: int = 1
+) -> Mistake:
+    return Mistake(
+        codes=("peak_count",),
+        predicted=predicted,
+        tolerance=_COUNTED,
+        help=help_,
+        whole=whole,
+        least=least,
+    )
+
+
+def _miscount_and(
+    miscount: Mistake, omegas: Mapping[str, Reference], zetas: Mapping[str, Reference]
+) -> Iterator[Mistake]:
+    """A miscount in Hz, or one whose decrement was taken with log10."""
+    omega = {n: r for n, r in miscount.predicted.items() if n in omegas}
+    zeta = {n: r for n, r in miscount.predicted.items() if n in zetas}
+    if omega:
+        yield Mistake(
+            codes=("hz_for_rad_s", "peak_count"),
+            predicted={**_times(omega, 1 / _TURN), **zeta},
+            tolerance=_COUNTED,
+            help=f"{miscount.help}; and it is in Hz where rad/s is asked",
+            whole=True,
+        )
+    if omega and zeta:
+        yield Mistake(
+            codes=("peak_count", "log10_for_ln"),
+            predicted={**omega, **_times(zeta, _LOG10)},
+            tolerance=_COUNTED,
+            help=f"{miscount.help}; and the decrement looks taken with log10",
+            whole=True,
+            least=2,
+        )
+
+
+# -------------------------------------------------------------------------- gains
+
+
+def _gain_mistakes(gains: Mapping[str, Reference], analysis: Analysis) -> list[Mistake]:
+    found = [
+        Mistake(
+            codes=("peak_to_peak",),
+            predicted=_times(gains, 2.0),
+            tolerance=_GAIN_OR_FREQUENCY,
+            help="{reported} is twice {recomputed}: an amplitude is half of the distance from peak "
+            "to peak",
+        ),
+        Mistake(
+            codes=("peak_to_peak",),
+            predicted=_times(gains, 0.5),
+            tolerance=_GAIN_OR_FREQUENCY,
+            help="{reported} is half of {recomputed}: was the input taken from peak to peak and "
+            "the position not?",
+        ),
+    ]
+    extremes = {name: _step_extremes(name, analysis) for name in gains}
+    found.append(
+        Mistake(
+            codes=("peak_for_steady_state",),
+            predicted={n: e[0] for n, e in extremes.items() if e},
+            tolerance=_GAIN_OR_FREQUENCY,
+            help="{reported} is what the step peaks at: the static gain is the level it settles "
+            "at, {recomputed}, per unit of input",
+        )
+    )
+    for turn in (1, 2):
+        later = {n: e[turn] for n, e in extremes.items() if len(e) > turn}
+        later = {n: e for n, e in later.items() if _is_off(e, gains[n])}
+        found.append(
+            Mistake(
+                codes=("transient_used",),
+                predicted=later,
+                tolerance=_GAIN_OR_FREQUENCY,
+                help="{reported} is where the cart turns while it still swings: wait until it has "
+                "settled, at {recomputed} per unit of input",
+                whole=True,
+                least=min(2, len(gains)),
+            )
+        )
+    found += [
+        Mistake(
+            codes=("counts_for_length",),
+            predicted={n: r.times(1 / _count(n, analysis)) for n, r in gains.items()},
+            tolerance=_GAIN_OR_FREQUENCY,
+            help="{reported} is {recomputed} in encoder counts: multiply by the length of a count",
+        )
+    ] * all(_count(n, analysis) > 0 for n in gains)
+    return found
+
+
+def _count(name: str, analysis: Analysis) -> float:
+    """Return the encoder step of the gain's cart in position units; 0 where it says nothing."""
+    cart = 1 if name == "K" else int(name.removeprefix("K_"))
+    steps = [r.encoder_step(cart) for r in analysis.records if cart in r.carts and cart in r.free]
+    step = float(np.median(steps)) if steps else 0.0
+    return 0.0 if step == 1.0 else step  # positions in counts
+
+
+def _in_counts(mistakes: Sequence[Mistake]) -> Iterator[Mistake]:
+    """Yield the other gain mistakes, read in counts."""
+    counted = [m for m in mistakes if m.codes == ("counts_for_length",)]
+    twice = next(m for m in mistakes if m.codes == ("peak_to_peak",))
+    for mistake in mistakes if counted else ():
+        if mistake.codes in (("peak_to_peak",), ("peak_for_steady_state",)):
+            in_counts = counted[0].predicted
+            per_length = {n: 2 * r.value / twice.predicted[n].value for n, r in in_counts.items()}
+            yield Mistake(
+                codes=(*mistake.codes, "counts_for_length"),
+                predicted={n: r.times(per_length[n]) for n, r in mistake.predicted.items()},
+                tolerance=_GAIN_OR_FREQUENCY,
+                help=f"{mistake.help}; and it is in encoder counts",
+            )
+
+
+def _is_off(extreme: Reference, gain: Reference) -> bool:
+    return extreme.high < gain.low * (1 - _CLEARLY_OFF) or extreme.low > gain.high * (
+        1 + _CLEARLY_OFF
+    )
+
+
+def _step_extremes(name: str, analysis: Analysis) -> list[Reference]:
+    """Return the first peak, trough and peak of the steps, per unit of input."""
+    cart = 1 if name == "K" else int(name.removeprefix("K_"))
+    records = {record.id: record for record in analysis.records}
+    readings = [
+        turns
+        for step in analysis.step_gains
+        if step.cart == cart
+        for turns in _edge_extremes(step, records[step.experiment])
+    ]
+    found = []
+    for turn in range(3):
+        values = [turns[turn] for turns in readings if len(turns) > turn]
+        if not values or min(values) <= 0:
+            break
+        found.append(
+            Reference(
+                value=float(np.median(values)),
+                low=min(values),
+                high=max(values),
+                std=0.0,
+                source="step",
+            )
+        )
+    return found
+
+
+def _edge_extremes(step: StepGain, record: Record) -> Iterator[list[float]]:
+    """Yield, for every edge, where the cart turns first, next and after that, per unit of input."""
+    y = record.position(step.cart)
+    for edge in step.edges:
+        change = edge.u_after - edge.u_before
+        inside = (record.t >= edge.t) & (record.t <= edge.window_after[1])
+        moved = (y[inside] - edge.level_before) / change
+        level = (edge.level_after - edge.level_before) / change
+        turns, side = [], 1.0
+        while moved.size and len(turns) < 3:
+            # Up to where it crosses its level again, its furthest point is where it turns.
+            beyond = side * (moved - level) > 0
+            first = int(np.argmax(beyond)) if beyond.any() else moved.size
+            back = np.flatnonzero(~beyond[first:])
+            last = first + int(back[0]) if back.size else moved.size
+            if first == last:
+                break
+            stretch = moved[first:last]
+            turns.append(float(stretch[np.argmax(side * stretch)]))
+            moved, side = moved[last:], -side
+        yield turns
+
+
+# -------------------------------------------------------------------- carts swapped
+
+
+def _permutations(names: Sequence[str]) -> Iterator[dict[str, str]]:
+    for order in itertools.permutations(names):
+        if list(order) != list(names):
+            yield dict(zip(names, order, strict=True))
+
+
+def _swaps(references: Mapping[str, Reference]) -> Iterator[Mistake]:
+    for source in _permutations(list(references)):
+        moved = {name: other for name, other in source.items() if name != other}
+        tolerance = _DAMPING if is_damping(next(iter(moved))) else _GAIN_OR_FREQUENCY
+        yield Mistake(
+            codes=("carts_swapped",),
+            predicted={name: references[other] for name, other in moved.items()},
+            tolerance=tolerance,
+            help="{reported} is what your recordings give for another cart, not {recomputed}: "
+            "cart 1 is the one at the motor",
+            whole=True,
+            least=2,
+        )
+
+
+def _swapped(mistakes: Sequence[Mistake], references: Mapping[str, Reference]) -> Iterator[Mistake]:
+    """Yield each mistake on swapped carts."""
+    for mistake in mistakes:
+        if mistake.codes == ("transient_used",) or not set(references) <= set(mistake.predicted):
+            continue
+        for source in _permutations(list(references)):
+            moved = {name: other for name, other in source.items() if name != other}
+            yield Mistake(
+                codes=(*mistake.codes, "carts_swapped"),
+                predicted={name: mistake.predicted[other] for name, other in moved.items()},
+                tolerance=mistake.tolerance,
+                help=f"{mistake.help}; and the carts look swapped",
+                whole=True,
+                least=2,
+            )

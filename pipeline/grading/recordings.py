@@ -1,0 +1,144 @@
+"""Recordings that do not hold what they should: stuck, clipped, cut, or another experiment."""
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from pipeline.grading.grade import Flag
+from pipeline.ingest.inspect import is_stepped, line_frequency
+from pipeline.ingest.problems import saturation, stuck_spans
+from pipeline.results import Analysis, Record
+
+_FREQUENCY = 0.08  # relative: a stated frequency further from that of the input is another run's
+_CUT = 0.5  # of the usual length of the repeats
+_SEEN_COUNTS = 20.0  # encoder steps that a cart must be expected to move before it is called stuck
+_SEEN_SHARE = 0.3  # … and of its motion in other runs: less may be friction that holds it
+_DRIVEN = 1e-3  # of the largest input of any run: a decay with more is driven
+
+
+def bad_runs(analysis: Analysis, *, unreadable: Mapping[str, str]) -> dict[str, str]:
+    """Return the runs that do not hold what they should, each with what is wrong, in words."""
+    found = dict(unreadable)
+    usual = _usual_motion(analysis.records)
+    setups = {
+        check.id.removeprefix("setup."): check.message.split(": ", 1)[-1]
+        for check in analysis.checks
+        if check.id.startswith("setup.") and check.outcome == "fail"
+    }
+    largest = max(
+        (float(np.abs(r.u).max()) for r in analysis.records if r.u is not None), default=0
+    )
+    for record in analysis.records:
+        if record.id in setups:
+            found[record.id] = setups[record.id]
+            continue
+        for problem in _problems(record, analysis, usual=usual, largest=largest):
+            found.setdefault(record.id, problem)
+    for record, problem in _copies(analysis):
+        found.setdefault(record, problem)
+    return found
+
+
+def data_flag(bad: Mapping[str, str]) -> Flag:
+    """Return the flag for the runs that do not hold what they should."""
+    first, problem = next(iter(bad.items()))
+    more = f" ({len(bad) - 1} more runs have a problem)" if len(bad) > 1 else ""
+    return Flag(
+        code="data_problem",
+        parameters=tuple(bad),
+        message=f"{first}: {problem.rstrip('.')}{more}.",
+        evidence={"problems": dict(bad)},
+    )
+
+
+def _problems(
+    record: Record, analysis: Analysis, *, usual: Mapping[int, float], largest: float
+) -> Iterator[str]:
+    t, u = record.t, record.u
+    for cart in record.carts:
+        if cart not in record.free:
+            continue
+        y = record.position(cart)
+        for first, last in stuck_spans(y)[:1]:
+            yield (
+                f"the encoder of cart {cart} stands still at speed from {t[first]:.4g} s to "
+                f"{t[last]:.4g} s: it stuck"
+            )
+        if np.ptp(y) == 0 and _should_move(record, cart, analysis, usual=usual):
+            yield f"cart {cart} is said to be free and its encoder never changes"
+        elif record.kind in ("sine", "sweep") and (limit := saturation(y)) is not None:
+            yield f"the position of cart {cart} is clipped at {limit:.4g}"
+    if u is not None and record.kind != "closed_loop":
+        yield from _input_problems(record, u, largest=largest)
+    siblings = [
+        float(other.t[-1] - other.t[0])
+        for other in analysis.records
+        if other.kind == record.kind and other.free == record.free and other is not record
+    ]
+    length = float(t[-1] - t[0])
+    if record.kind in ("decay", "step") and len(siblings) >= 1:
+        typical = float(np.median(siblings))
+        if length < _CUT * typical:
+            yield f"it lasts {length:.3g} s, its repeats {typical:.3g} s: the file looks cut"
+
+
+def _input_problems(record: Record, u: np.ndarray, *, largest: float) -> Iterator[str]:
+    """Yield where the input is not that of the kind of run."""
+    if (limit := saturation(u)) is not None:
+        yield f"the input is clipped at {limit:.4g}"
+    moves = float(np.ptp(u)) > 0
+    if record.kind == "step" and not (np.any(u) and is_stepped(u)):
+        yield "the input is no step: is it the file of another experiment?"
+    if record.kind == "sine":
+        hertz = line_frequency(record.t, u) if moves else None
+        if hertz is None:
+            yield "the input is no sine: is it the file of another experiment?"
+        elif record.omega is not None:
+            stated = record.omega / (2 * np.pi)
+            resolution = 1.0 / float(record.t[-1] - record.t[0])
+            if abs(hertz - stated) > max(_FREQUENCY * stated, resolution):
+                yield (
+                    f"the input has {hertz:.3g} Hz, {stated:.3g} Hz is stated: is it the file of "
+                    "another experiment?"
+                )
+    if record.kind == "decay":
+        late = u[u.size // 2 :]
+        if float(np.ptp(late)) > _DRIVEN * largest and largest > 0:
+            yield "the input is at work in what should be a free decay"
+
+
+def _usual_motion(records: Sequence[Record]) -> dict[int, float]:
+    """Return the largest motion of every cart in any run in which it is free."""
+    motion: dict[int, float] = {}
+    for record in records:
+        for cart in set(record.carts) & set(record.free):
+            motion[cart] = max(motion.get(cart, 0.0), float(np.ptp(record.position(cart))))
+    return motion
+
+
+def _should_move(
+    record: Record, cart: int, analysis: Analysis, *, usual: Mapping[int, float]
+) -> bool:
+    """Whether a cart that did not move should have: a cart that friction holds need not."""
+    if record.kind == "decay":
+        return True
+    if analysis.chain is None or record.u is None or usual.get(cart, 0.0) == 0:
+        return record.u is not None and bool(np.ptp(record.u) > 0)
+    omega = record.omega if record.kind == "sine" and record.omega else 0.0
+    try:
+        gain = abs(analysis.chain.frequency_response(np.array([omega]))[cart - 1, 0])
+    except np.linalg.LinAlgError:
+        return True
+    expected = float(gain * np.ptp(record.u))
+    steps = [r.encoder_step(cart) for r in analysis.records if cart in r.carts]
+    return expected > max(_SEEN_SHARE * usual[cart], _SEEN_COUNTS * max(steps, default=0.0))
+
+
+def _copies(analysis: Analysis) -> Iterator[tuple[str, str]]:
+    """Yield every run whose file is a copy of another run's."""
+    first: dict[str, Record] = {}
+    for record in analysis.records:
+        digest = analysis.files.get(record.source, record.source)
+        original = first.setdefault(digest, record)
+        if original.source != record.source:
+            yield record.id, f"{record.source} is a copy of {original.source}"

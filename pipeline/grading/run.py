@@ -1,0 +1,263 @@
+"""Grade one submission: its own recordings are analysed anew, nothing it brings is believed."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from fractions import Fraction
+
+from pipeline.errors import SubmissionError
+from pipeline.grading.checks import Work, judge
+from pipeline.grading.controller import diagnose_controller, reported_controller
+from pipeline.grading.diagnose import diagnose_tables
+from pipeline.grading.grade import CODES, Criterion, Flag, Grade, Outcome
+from pipeline.grading.pieces import missing_flag, missing_pieces
+from pipeline.grading.recordings import bad_runs, data_flag
+from pipeline.grading.reference import recompute
+from pipeline.grading.rubric import Late, Rubric
+from pipeline.grading.state_model import diagnose_state_space
+from pipeline.grading.tolerance import exact
+from pipeline.ingest.columns import conversion
+from pipeline.ingest.read import read_data
+from pipeline.results import Analysis
+from pipeline.submission import Submission, System
+from pipeline.workflow import analyse
+
+_CENTS = 100  # points are given to the hundredth
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Graded:
+    """A grade, and the analysis of the student's recordings it rests on (None where it failed)."""
+
+    grade: Grade
+    analysis: Analysis | None
+
+
+def grade_submission(
+    submission: Submission,
+    *,
+    rubric: Rubric,
+    name: str,
+    days_late: float = 0.0,
+    progress: Callable[[str], None] | None = None,
+) -> Graded:
+    """Analyse a submission's recordings under the rubric's system and grade what it reports.
+
+    Recordings that cannot be read are left out, and flagged. Where none can be, or the carts are
+    not as many as the rubric's, the grade is `failed` with its reason.
+    """
+    count = submission.system.carts
+    if count != rubric.system.carts:
+        reason = f"the submission is for {count} carts, the rubric for {rubric.system.carts}"
+        return _failed(submission, rubric, name=name, reason=reason, days_late=days_late)
+    submission, notes = under_rubric(submission, rubric)
+    try:
+        analysis, unreadable = _analyse(submission, progress)
+    except SubmissionError as error:
+        return _failed(submission, rubric, name=name, reason=str(error), days_late=days_late)
+    grade = grade_analysis(
+        submission,
+        analysis,
+        rubric=rubric,
+        name=name,
+        days_late=days_late,
+        unreadable=unreadable,
+    )
+    return Graded(grade=replace(grade, notes=(*notes, *grade.notes)), analysis=analysis)
+
+
+def grade_analysis(
+    submission: Submission,
+    analysis: Analysis,
+    *,
+    rubric: Rubric,
+    name: str,
+    days_late: float = 0.0,
+    unreadable: Mapping[str, str] | None = None,
+) -> Grade:
+    """Grade a submission against the analysis of its own recordings: a pure function.
+
+    Parameters
+    ----------
+    submission : under the rubric's system, see `under_rubric`.
+    unreadable : experiments that the analysis had to do without, each with the reason.
+    """
+    work = Work(
+        submission=submission,
+        analysis=analysis,
+        rubric=rubric,
+        references=recompute(analysis),
+        controller=reported_controller(submission, analysis, goal=rubric.design),
+        bad=bad_runs(analysis, unreadable=unreadable or {}),
+    )
+    criteria = _criteria(work)
+    earned = sum(Fraction(str(c.points)) for c in criteria)
+    deducted = _late(earned, rubric.late, days_late)
+    return Grade(
+        submission=name,
+        authors=tuple(author.id for author in submission.authors),
+        status="graded",
+        points=float(earned - deducted),
+        out_of=rubric.out_of,
+        days_late=days_late,
+        deducted=float(deducted),
+        criteria=criteria,
+        flags=tuple(sorted(_flags(work), key=lambda flag: CODES.index(flag.code))),
+    )
+
+
+def under_rubric(submission: Submission, rubric: Rubric) -> tuple[Submission, tuple[str, ...]]:
+    """Return the submission with the rubric's system in the place of its own, and what to note.
+
+    Where the rubric leaves a sign or a calibration open the submission's own stands. A length
+    unit other than the rubric's is kept, as the students' numbers are in it; the calibration is
+    converted.
+    """
+    own, set_ = submission.system, rubric.system
+    notes = []
+    unit, per_count = set_.position.unit, set_.position.per_count
+    factor = None if own.position.unit == "count" else conversion(unit, own.position.unit)
+    if factor is not None and own.position.unit != unit:
+        unit = own.position.unit
+        per_count = None if per_count is None else per_count * factor
+        notes.append(f"lengths are in {unit}, as handed in; the rubric has {set_.position.unit}")
+    if own.springs != set_.springs:
+        notes.append("the springs are the rubric's, not those of the submission")
+    system = System(
+        carts=set_.carts,
+        springs=set_.springs,
+        input=set_.input.model_copy(
+            update={
+                "sign": set_.input.sign or own.input.sign,
+                "per_count": set_.input.per_count or own.input.per_count,
+            }
+        ),
+        position=set_.position.model_copy(
+            update={"unit": unit, "per_count": per_count or own.position.per_count}
+        ),
+    )
+    update = {"system": system, "design": rubric.design or submission.design}
+    return submission.model_copy(update=update), tuple(notes)
+
+
+# --------------------------------------------------------------------- the analysis
+
+
+def _analyse(
+    submission: Submission, progress: Callable[[str], None] | None
+) -> tuple[Analysis, dict[str, str]]:
+    """Analyse what can be read; return also the experiments left out, with the reason.
+
+    Raises
+    ------
+    SubmissionError : nothing can be read.
+    """
+    say = progress or (lambda text: None)
+    try:
+        return analyse(submission, progress=say), {}
+    except SubmissionError as error:
+        unreadable = {}
+        for experiment in submission.experiments:
+            try:
+                read_data(submission.model_copy(update={"experiments": (experiment,)}))
+            except SubmissionError as own:
+                unreadable[experiment.id] = str(own).removeprefix(f"{experiment.id}: ")
+        left = tuple(e for e in submission.experiments if e.id not in unreadable)
+        if not left or not unreadable:
+            raise error
+        return analyse(
+            submission.model_copy(update={"experiments": left}), progress=say
+        ), unreadable
+
+
+def _failed(
+    submission: Submission, rubric: Rubric, *, name: str, reason: str, days_late: float
+) -> Graded:
+    grade = Grade(
+        submission=name,
+        authors=tuple(author.id for author in submission.authors),
+        status="failed",
+        points=0.0,
+        out_of=rubric.out_of,
+        days_late=days_late,
+        reason=reason,
+    )
+    return Graded(grade=grade, analysis=None)
+
+
+# ------------------------------------------------------------------ criteria and flags
+
+
+def _criteria(work: Work) -> tuple[Criterion, ...]:
+    done: dict[str, Criterion] = {}
+    for asked in work.rubric.criteria:
+        parents = [p for p in asked.requires if done[p].outcome in ("fail", "skip")]
+        if parents:
+            title = done[parents[0]].title or parents[0]
+            found = Criterion(
+                id=asked.id,
+                title=asked.title,
+                outcome="skip",
+                points=0.0,
+                out_of=asked.points,
+                message=f"Not checked: it builds on {parents[0]!r} ({title}), "
+                f"which was {'not passed' if done[parents[0]].outcome == 'fail' else 'skipped'}.",
+                expected={},
+                found={},
+            )
+        else:
+            verdict = judge(asked, work)
+            points = _points(verdict.share, asked.points)
+            outcome = _outcome(verdict.share)
+            more = f" {asked.message}" if asked.message and outcome in ("partial", "fail") else ""
+            found = Criterion(
+                id=asked.id,
+                title=asked.title,
+                outcome=outcome,
+                points=points,
+                out_of=asked.points,
+                message=verdict.message + more,
+                expected=verdict.expected,
+                found=verdict.found,
+            )
+        done[asked.id] = found
+    return tuple(done.values())
+
+
+def _outcome(share: Fraction | None) -> Outcome:
+    if share is None:
+        return "skip"
+    return "pass" if share == 1 else "fail" if share == 0 else "partial"
+
+
+def _points(share: Fraction | None, points: float) -> float:
+    """Return the points to the hundredth, halves up: exact, so that no share loses its order."""
+    return float(
+        Fraction(math.floor((share or 0) * exact(points) * _CENTS + Fraction(1, 2)), _CENTS)
+    )
+
+
+def _late(earned: Fraction, late: Late, days_late: float) -> Fraction:
+    """Return what lateness takes off: so much for every day begun after the grace."""
+    days = max(0, math.ceil(days_late - late.grace_days))
+    share = min(exact(late.percent_per_day) * days, exact(late.most_percent)) / 100
+    return Fraction(math.floor(earned * share * _CENTS + Fraction(1, 2)), _CENTS)
+
+
+def _flags(work: Work) -> list[Flag]:
+    submission, analysis, reported = work.submission, work.analysis, work.reported
+    flags = diagnose_tables(reported, references=work.references, analysis=analysis)
+    if reported.state_space is not None and reported.state_space.A:
+        flags += diagnose_state_space(
+            reported.state_space,
+            final=reported.final,
+            chain=analysis.chain,
+            n=work.rubric.system.carts,
+        )
+    if work.controller is not None:
+        flags += diagnose_controller(work.controller)
+    if missing := missing_pieces(submission, work.rubric):
+        flags.append(missing_flag(missing))
+    if work.bad:
+        flags.append(data_flag(work.bad))
+    return flags

@@ -1,0 +1,53 @@
+"""How far off a number is, and what that earns: exact arithmetic, so that an edge is an edge."""
+
+from decimal import Decimal
+from fractions import Fraction
+
+from pipeline.grading.reference import Reference
+
+_NO_CREDIT = Fraction(10**6)  # percent; of a number with the wrong sign
+
+
+def half_digit(typed: Decimal) -> Fraction:
+    """Return half a unit of the last digit as typed: 0.005 for 0.10, 0.5 for 29."""
+    exponent = typed.as_tuple().exponent
+    if not isinstance(exponent, int):
+        raise ValueError(f"{typed} is no finite number")
+    return Fraction(10) ** exponent / 2
+
+
+def exact(value: float) -> Fraction:
+    """Return a number of a rubric as its author typed it: 0.1 is a tenth."""
+    return Fraction(repr(value))
+
+
+def percent_off(typed: Decimal, reference: Reference, *, sigmas: float) -> Fraction:
+    """Return how far a number is off its reference, in percent of the smaller of the two.
+
+    5 % is a factor of 1.05 either way. Half a unit of the last digit typed and `sigmas` standard
+    errors of the reference come off first; any value between the reference's bounds is right.
+    """
+    slack = exact(sigmas) * Fraction(reference.std)
+    low, high = Fraction(reference.low) - slack, Fraction(reference.high) + slack
+    half = half_digit(typed)
+    least, most = Fraction(typed) - half, Fraction(typed) + half
+    if most < low:
+        above, below = low, most
+    elif least > high:
+        above, below = least, high
+    else:
+        return Fraction(0)
+    return min(100 * (above / below - 1), _NO_CREDIT) if below > 0 else _NO_CREDIT
+
+
+def credit(error: Fraction, *, full: float, none: float) -> Fraction:
+    """Return the share of the points: all up to and at `full`, none from `none`, a line between.
+
+    Where the two are the same, an error of exactly that much still earns all.
+    """
+    top, bottom = exact(full), exact(none)
+    if error <= top:
+        return Fraction(1)
+    if error >= bottom:
+        return Fraction(0)
+    return (bottom - error) / (bottom - top)
