@@ -48,9 +48,10 @@ def recompute(analysis: Analysis) -> References:
 
     Where a cart sticks, dry friction adds to every damping ratio, the more the smaller the
     motion; a student who took it out is right too, so the lower bound is without it. An initial
-    estimate is right anywhere between the recomputed initial and final ones.
+    estimate is right anywhere between the recomputed initial and final ones; where the linear
+    carts do not explain the data, so is a final one, as then the fit itself may be off.
     """
-    final = {row.name: _final(row.final, row.name, analysis) for row in analysis.rows if row.final}
+    final = {row.name: _final(row.final, row, analysis) for row in analysis.rows if row.final}
     initial = {}
     for row in analysis.rows:
         reference = _initial(row, final.get(row.name), analysis)
