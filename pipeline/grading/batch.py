@@ -1,0 +1,108 @@
+"""What the runner and the gradebook share: an outcome per submission, the store, the batch."""
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Literal, Protocol
+
+from pydantic import TypeAdapter
+
+from pipeline.grading.grade import Flag, Grade
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What one submission came to by itself, before it is compared with the others.
+
+    Attributes
+    ----------
+    submission : its id, unique in the batch.
+    key : hash of all the outcome depends on: the files as handed in, rubric, code, name, lateness.
+    status : `failed` where it could not be graded, for the one-line `reason`.
+    settled : False where a limit or a crash ended it: another run tries again.
+    grade : `grade.json` without what other submissions add (shared data, overrides).
+    fingerprints : of its recordings, to find them in other submissions; see `shared.py`.
+    figures : (file name, SVG) for the feedback.
+    owner : who handed it in, as the learning platform calls them, or "".
+    detail : for whoever mends the grader: the traceback of an error of its own, or "".
+    """
+
+    submission: str
+    authors: tuple[str, ...] = ()
+    key: str
+    status: Literal["graded", "failed"]
+    reason: str = ""
+    settled: bool = True
+    days_late: float = 0.0
+    grade: str
+    fingerprints: bytes = field(default=b"", repr=False)
+    figures: tuple[tuple[str, str], ...] = ()
+    owner: str = ""
+    detail: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prints:
+    """The fingerprints of one stored outcome and whose recordings they are of."""
+
+    submission: str
+    authors: tuple[str, ...]
+    fingerprints: bytes
+
+
+class Store(Protocol):
+    """Where outcomes are kept: the gradebook."""
+
+    def known(self, key: str) -> Outcome | None:
+        """Return the stored outcome of this key, None where there is none."""
+        ...
+
+    def put(self, outcome: Outcome) -> None:
+        """Store an outcome durably, in the place of one with the same key."""
+        ...
+
+    def prints(self) -> Iterator[Prints]:
+        """Yield the fingerprints of the newest outcome of every (submission, authors)."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Batch:
+    """A batch that ran to its end; the outcomes themselves stay in the store.
+
+    Attributes
+    ----------
+    keys : of the outcomes, in the order of the submissions' ids.
+    shared : by submission, the flag for recordings that stand in another submission too.
+    """
+
+    keys: tuple[str, ...]
+    shared: Mapping[str, Flag]
+
+    def grades(self, store: Store) -> Iterator[tuple[Outcome, Grade]]:
+        """Yield every outcome with its grade, shared data flagged; one at a time in memory."""
+        for key in self.keys:
+            outcome = store.known(key)
+            if outcome is None:
+                raise KeyError(key)
+            grade = read_grade(outcome.grade)
+            flag = self.shared.get(outcome.submission)
+            yield outcome, grade.with_flags(flag) if flag else grade
+
+
+def read_grade(text: str) -> Grade:
+    """Return the grade that a `grade.json` holds.
+
+    Raises
+    ------
+    ValueError : it is none.
+    """
+    document = json.loads(text)
+    document.pop("schema", None)
+    return _grades().validate_python(document)
+
+
+@cache
+def _grades() -> TypeAdapter[Grade]:
+    return TypeAdapter(Grade)
