@@ -136,7 +136,7 @@ def measure_noise(fit: Fit, shots: Sequence[Run], runs: Sequence[Run]) -> list[R
     return out
 
 
-def fit_locals(fit: Fit, runs: Sequence[Run], *, refine: float = 1.0, mapper: Mapper = map) -> Fit:
+def fit_locals(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
     """Fit only what belongs to the runs: for runs the model has not seen."""
     own: Sequence[Locals] = [fresh_locals(run) for run in runs]
 
@@ -149,12 +149,11 @@ def fit_locals(fit: Fit, runs: Sequence[Run], *, refine: float = 1.0, mapper: Ma
             spread=fit.spread,
             fixed=range(fit.theta.size),
             iterations=10,
-            refine=refine,
             mapper=mapper,
         )
 
     found = follow(own)
     if any(fit.structure.dry) and found.chi > fit.chi:
-        again = restart_runs(found, runs, refine=refine, mapper=mapper)
+        again = restart_runs(found, runs, mapper=mapper)
         found = follow(again.locals_)
     return found

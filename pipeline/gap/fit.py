@@ -87,9 +87,7 @@ def fresh_locals(run: Run) -> Locals:
     )
 
 
-def simulate_run(
-    structure: Structure, thetas: Array, run: Run, own: Locals, *, refine: float = 1.0
-) -> Array:
+def simulate_run(structure: Structure, thetas: Array, run: Run, own: Locals) -> Array:
     """Return (b, rows, samples) readings of one run for many vectors, zeros included."""
     cart, spring, drive = structure.tables(thetas)
     b = len(thetas)
@@ -105,7 +103,7 @@ def simulate_run(
         run.knots,
         run.command,
         np.array(run.shots),
-        refine,
+        1.0,  # the simulator chooses its steps
     )
     return y[:, list(run.rows)] + own.zero[list(run.rows)][:, None]
 
@@ -186,7 +184,6 @@ def _linearise(
     inflate: float,
     spread: Array,
     scatter_free: bool,
-    refine: float,
     extras: Array | None = None,
 ) -> _Linear:
     layout = _layout(structure, run, scatter_free=scatter_free)
@@ -233,7 +230,7 @@ def _linearise(
         run.knots,
         run.command,
         np.array(run.shots),
-        refine,
+        1.0,  # the simulator chooses its steps
     )[:, list(run.rows)]
     sigma = run.sigma[:, None]
     model = y[0] + own.zero[list(run.rows)][:, None]
@@ -310,12 +307,11 @@ def _run_cost(
     own: Locals,
     *,
     spread: Array,
-    refine: float,
 ) -> tuple[float, float]:
     """Return chi-square of a run, and its prior terms."""
     if not structure.visible(theta):
         return np.inf, 0.0
-    model = simulate_run(structure, theta[None], run, own, refine=refine)[0]
+    model = simulate_run(structure, theta[None], run, own)[0]
     residual = _blocks((run.y - model) / run.sigma[:, None], run)
     chi = float((residual**2).sum())
     if not np.isfinite(chi):
@@ -335,13 +331,12 @@ def evaluate(
     *,
     spread: Array,
     inflate: float = 1.0,
-    refine: float = 1.0,
     mapper: Mapper = map,
 ) -> Fit:
     """Return the fit at given parameters and locals, without moving either."""
 
     def cost(pair: tuple[Run, Locals]) -> tuple[float, float]:
-        return _run_cost(structure, theta, *pair, spread=spread, refine=refine)
+        return _run_cost(structure, theta, *pair, spread=spread)
 
     costs = np.array(list(mapper(cost, zip(runs, locals_, strict=True))))
     return _fit_at(structure, theta, runs, locals_, costs, spread=spread, inflate=inflate)
@@ -383,7 +378,6 @@ def fit_model(
     fixed: Sequence[int] = (),
     scatter_free: bool = True,
     learn_spread: bool = False,
-    refine: float = 1.0,
     tolerance: float = 1e-3,
     mapper: Mapper = map,
 ) -> Fit:
@@ -403,9 +397,7 @@ def fit_model(
     moving = np.array([i for i in range(theta.size) if i not in set(fixed)], dtype=int)
     damp = _DAMP
     inflate = 1.0
-    best = evaluate(
-        structure, theta, runs, own, spread=spread, inflate=inflate, refine=refine, mapper=mapper
-    )
+    best = evaluate(structure, theta, runs, own, spread=spread, inflate=inflate, mapper=mapper)
     for iteration in range(iterations):
         inflate = max(1.0, np.sqrt(best.chi)) if np.isfinite(best.chi) else 1.0
         best = replace(best, cost=best.chi_square + inflate**2 * float(best.run_prior.sum()))
@@ -420,7 +412,6 @@ def fit_model(
                 inflate=inflate,
                 spread=at.spread,
                 scatter_free=scatter_free,
-                refine=refine,
             )
 
         linear = list(mapper(linearise, zip(runs, best.locals_, strict=True)))
@@ -469,7 +460,7 @@ def fit_model(
                 tried = []
                 for scale in _LOCAL_SCALES:
                     moved = _move_locals(part, own, delta, scale)
-                    cost = _run_cost(structure, there, run, moved, spread=at.spread, refine=refine)
+                    cost = _run_cost(structure, there, run, moved, spread=at.spread)
                     tried.append((cost[0] + inflate**2 * cost[1], moved, cost))
                     if tried[-1][0] <= before:
                         break
@@ -539,9 +530,7 @@ def _learn_spread(fit: Fit, runs: Sequence[Run], linear: Sequence[_Linear]) -> F
     return replace(fit, spread=spread, theta=theta)
 
 
-def restart_runs(
-    fit: Fit, runs: Sequence[Run], *, refine: float = 1.0, mapper: Mapper = map
-) -> Fit:
+def restart_runs(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
     """Start the worst runs' own unknowns anew from elsewhere in the friction band.
 
     A cart rests anywhere inside the band, and is zeroed there, so a run's misfit has several
@@ -575,7 +564,6 @@ def restart_runs(
                 spread=fit.spread,
                 fixed=range(fit.theta.size),
                 iterations=6,
-                refine=refine,
             )
             if trial.chi_square < lowest:
                 best, lowest = trial.locals_[0], trial.chi_square
@@ -591,7 +579,6 @@ def restart_runs(
         locals_,
         spread=fit.spread,
         inflate=inflate,
-        refine=refine,
         mapper=mapper,
     )
 
@@ -632,7 +619,6 @@ def project(
             inflate=inflate,
             spread=fit.spread,
             scatter_free=True,
-            refine=1.0,
             extras=extra,
         )
 
@@ -642,7 +628,7 @@ def project(
     return R[shared:, shared:-1], R[shared:, -1]
 
 
-def covariance(fit: Fit, runs: Sequence[Run], *, refine: float = 1.0, mapper: Mapper = map) -> Fit:
+def covariance(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
     """Return the fit with the covariance of its parameters, scaled by its own misfit.
 
     Where friction was fitted with one size for all runs, its spread is no part of the error.
@@ -657,7 +643,6 @@ def covariance(fit: Fit, runs: Sequence[Run], *, refine: float = 1.0, mapper: Ma
             inflate=max(1.0, np.sqrt(fit.chi)),
             spread=fit.spread,
             scatter_free=scatter_free,
-            refine=refine,
         )
 
     linear = list(mapper(linearise, zip(runs, fit.locals_, strict=True)))

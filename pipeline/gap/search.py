@@ -283,7 +283,7 @@ def _full_refit(candidate: Candidate, start: Fit, parent: Hypothesis, bench: Ben
     return judge(fit, bench, added=candidate, parent=parent)
 
 
-def fit_whole(structure: Structure, theta: Array, bench: Bench, *, refine: float = 1.0) -> Fit:
+def fit_whole(structure: Structure, theta: Array, bench: Bench) -> Fit:
     """Fit whole runs; friction first with one size for all runs, then run by run."""
     whole = bench.training
     dry = any(structure.dry)
@@ -294,14 +294,13 @@ def fit_whole(structure: Structure, theta: Array, bench: Bench, *, refine: float
         whole,
         iterations=25 if contact else 12,
         scatter_free=False,
-        refine=refine,
         mapper=bench.mapper,
     )
     for attempt in range(_FRICTION_ROUNDS):
         if not dry or fit.chi < AT_FLOOR:
             break
         if np.quantile(fit.run_chi, 0.25) < _NEARLY_RIGHT:
-            fit = restart_runs(fit, whole, refine=refine, mapper=bench.mapper)
+            fit = restart_runs(fit, whole, mapper=bench.mapper)
         elif attempt:
             break
         fit = fit_model(
@@ -312,7 +311,6 @@ def fit_whole(structure: Structure, theta: Array, bench: Bench, *, refine: float
             spread=fit.spread,
             iterations=12,
             learn_spread=True,
-            refine=refine,
             mapper=bench.mapper,
         )
     return fit

@@ -24,6 +24,7 @@ _SERIES_REACH = 0.2  # omega h: the series' sixth order then leaves 1e-8 after s
 _LONGEST_LINEAR = 4.5e-3  # s; springs, dampers and dry friction are exact at any step
 _CONTACT_REACH = 0.4  # omega h inside a contact
 _DAHL_STEP = 2.3e-3  # s; the presliding state is held over half of it
+_STRIBECK_STEP = 1.2e-3  # s; the drop of friction from its static force is over in few of them
 _LONGEST_STEP = 2.5e-3  # s; nonlinear forces are held over it
 _MOST_EVENTS = 12  # in one substep; more would be chatter
 _BLOWN_UP = 1e9  # positions beyond this are a diverged model
@@ -403,6 +404,7 @@ def _simulate(cart, spring, drive, x0, v0, scatter, free, t, knots, command, sta
     dry = False
     smooth = True
     presliding = False
+    stribeck = False
     fastest = 0.0
     contact = 0.0
     for i in range(N):
@@ -413,6 +415,7 @@ def _simulate(cart, spring, drive, x0, v0, scatter, free, t, knots, command, sta
     for i in range(n):
         dry = dry or cart[i, COULOMB] + cart[i, STATIC] + cart[i, LOAD] + cart[i, DAHL] > 0.0
         presliding = presliding or cart[i, DAHL] > 0.0
+        stribeck = stribeck or cart[i, STATIC] > 0.0
         smooth = smooth and cart[i, OFFSET] == 0.0 and cart[i, DRAG] == 0.0
         contact = max(contact, cart[i, STOP_K] * s[INV, i])
     for j in range(n + 1):
@@ -427,6 +430,8 @@ def _simulate(cart, spring, drive, x0, v0, scatter, free, t, knots, command, sta
     )
     if presliding:
         longest = min(longest, _DAHL_STEP)
+    if stribeck:
+        longest = min(longest, _STRIBECK_STEP)
     if motor >= 0:
         contact = max(contact, drive[CONTACT_K] * (s[INV, 0] + s[INV, motor]))
     longest /= refine

@@ -215,7 +215,10 @@ def _refuse_second(term: Term, present: Sequence[Term], *, where: str) -> None:
 def _session_scales(
     effect: Effect, chain: Chain, *, place: int, travel: float
 ) -> tuple[Scales, float]:
-    """Return typical sizes at a place from a session's larger step, and the side it goes to."""
+    """Return typical sizes at a place in a session, and the side its larger step goes to.
+
+    They are those of the step; a spring is stretched further by the release of a cart.
+    """
     u = _LARGE_STEP * travel / float(np.max(np.abs(chain.static_gains())))
     slowest = float(np.abs(chain.poles).min())
     t = SAMPLE_TIME * np.arange(max(2.0, _RING * 2 * np.pi / (slowest * SAMPLE_TIME)))
@@ -224,12 +227,13 @@ def _session_scales(
     if effect.place == "spring":
         walls = np.zeros((1, t.size))
         x = np.diff(np.concatenate([walls, x, walls]), axis=0)
+    least = travel if effect.place == "spring" else 0.0
     extreme = x[np.arange(x.shape[0]), np.argmax(np.abs(x), axis=1)]
     scales = chain_scales(
         chain,
         place=effect.place,
         at=place,
-        position=np.abs(extreme),
+        position=np.maximum(np.abs(extreme), least),
         velocity=np.max(np.abs(np.diff(x, axis=1)), axis=1) / SAMPLE_TIME,
         input=u,
         sample_time=SAMPLE_TIME,
