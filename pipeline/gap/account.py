@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline.gap.fit import Fit, Locals, simulate_run
 from pipeline.gap.runs import Run
-from pipeline.gap.search import Bench, Hypothesis
+from pipeline.gap.search import AT_FLOOR, CONTACT, Bench, Hypothesis
 from pipeline.gap.types import FoundEffect, NamedValue, RecordGap, Rival, Trace
 from pipeline.plant.effects import find_effect
 from pipeline.plant.effects.base import Term
@@ -37,9 +37,11 @@ def list_effects(
             ((key, h) for key, h in same_size.items() if rest < key and key != chosen.key),
             key=lambda pair: pair[1].bic,
         )
+        # In one of many narrow valleys the curvature says nothing of the error.
+        rugged = term.effect.key in CONTACT and final.chi > AT_FLOOR
         values = _named_values(
             term,
-            None if std is None else std[structure.span(index)],
+            None if std is None or rugged else std[structure.span(index)],
             position_unit=position_unit,
             input_unit=input_unit,
         )

@@ -34,7 +34,7 @@ _CONTACT_GAIN = 0.5  # what a contact leaves is its contact law: no effect to mo
 _RUN_GAIN, _RUN_SHARE = 0.97, 0.6  # … and by 3 % in 60 % of the runs
 _RUGGED = ("extra_mode", "end_stop", "backlash", "slack_spring")
 _ZOOM_SHARE = 0.15  # of the first suspect's, below which one start must do
-_CONTACT = ("end_stop", "backlash")
+CONTACT = ("end_stop", "backlash")
 _LEADING = 0.4  # of the first suspect's share, for what is dear to refit
 _BOUND_MARGIN = 0.01  # in logarithms, or in scales
 
@@ -229,7 +229,7 @@ def _short_list(suspects: Sequence[Suspect]) -> list[Suspect]:
     return [
         suspect
         for suspect in suspects[:_SHORT_LIST]
-        if suspect.candidate.effect.key not in _CONTACT or suspect.share > _LEADING * top
+        if suspect.candidate.effect.key not in CONTACT or suspect.share > _LEADING * top
     ]
 
 
@@ -278,7 +278,7 @@ def _short_refit(
 
 def _full_refit(candidate: Candidate, start: Fit, parent: Hypothesis, bench: Bench) -> Hypothesis:
     fit = fit_whole(start.structure, start.theta, bench)
-    if candidate.effect.key in _CONTACT:
+    if candidate.effect.key in CONTACT:
         fit = polish(fit, bench.training, enough=AT_FLOOR, mapper=bench.mapper)
     return judge(fit, bench, added=candidate, parent=parent)
 
@@ -287,7 +287,7 @@ def fit_whole(structure: Structure, theta: Array, bench: Bench) -> Fit:
     """Fit whole runs; friction first with one size for all runs, then run by run."""
     whole = bench.training
     dry = any(structure.dry)
-    contact = any(c.effect.key in _CONTACT for c in structure.effects)
+    contact = any(c.effect.key in CONTACT for c in structure.effects)
     fit = fit_model(
         structure,
         theta,
@@ -371,7 +371,7 @@ def _friction_start(effect: Effect, force: float, values: tuple[float, ...]) -> 
 
 def worth_it(child: Hypothesis, parent: Hypothesis) -> bool:
     """Does a further effect help on runs the model has not seen?"""
-    contact = any(effect in _CONTACT for effect, _ in parent.key)
+    contact = any(effect in CONTACT for effect, _ in parent.key)
     gain = _CONTACT_GAIN if contact else _HELD_OUT_GAIN
     if child.bic > parent.bic - _BIC_DROP or child.held.chi > gain**2 * parent.held.chi:
         return False
