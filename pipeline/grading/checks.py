@@ -16,6 +16,7 @@ from pipeline.grading.reference import Reference, References
 from pipeline.grading.rubric import Rubric, is_damping, matching
 from pipeline.grading.state_model import compare_entries
 from pipeline.grading.tolerance import credit, exact, percent_off
+from pipeline.plant.chain import Array
 from pipeline.results import Analysis
 from pipeline.submission import Reported, Submission
 
@@ -29,6 +30,7 @@ class Work:
 
     Attributes
     ----------
+    state_models : what [A B] may rightly be.
     bad : runs that do not hold what they should, each with what is wrong.
     """
 
@@ -37,6 +39,7 @@ class Work:
     rubric: Rubric
     references: References
     controller: Controller | None
+    state_models: Sequence[Array]
     bad: Mapping[str, str]
 
     @property
@@ -229,12 +232,7 @@ def _state_space(criterion: asked.StateModel, work: Work) -> Verdict:
     space = work.reported.state_space
     if space is None or not (space.A and space.B):
         return Verdict(share=_NONE, message="A and B are not both reported.")
-    entries = compare_entries(
-        space,
-        final=work.reported.final,
-        chain=work.analysis.chain,
-        n=work.rubric.system.carts,
-    )
+    entries = compare_entries(space, models=work.state_models, n=work.rubric.system.carts)
     if not entries:
         return Verdict(
             share=None, message="Not checked: neither a table nor a fit to compare with."

@@ -1,7 +1,7 @@
 """The reported controller: do its gains reach the goal, are the claims theirs, is N 1/DC gain?"""
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 
@@ -87,21 +87,27 @@ class Controller:
 
 
 def reported_controller(
-    submission: Submission, analysis: Analysis, *, goal: Design | None
+    submission: Submission,
+    analysis: Analysis,
+    *,
+    chain: Chain | None,
+    tables: Sequence[Mapping[str, float]],
 ) -> Controller | None:
-    """Return the controller of a submission; None without one, or nothing to judge it by."""
-    reported = submission.reported
-    feedback = reported.feedback if reported else None
+    """Return the controller of a submission; None without one, or nothing to judge it by.
+
+    Parameters
+    ----------
+    chain : the reference, if there is one.
+    tables : the student's final table, as typed and with the mistakes found in it undone.
+    """
+    feedback = submission.reported.feedback if submission.reported else None
     n = submission.system.carts
-    if reported is None or feedback is None:
+    own = [own_chain(values, n=n) for values in tables]
+    models = [chain, *(c for c in own if c is not None and min(*c.k, *c.c) >= 0)]
+    models = [model for model in models if model is not None]
+    if feedback is None or not models:
         return None
-    models = [analysis.chain] if analysis.chain is not None else []
-    own = own_chain({k: float(v) for k, v in reported.final.items()}, n=n)
-    if own is not None and np.all(own.k >= 0) and np.all(own.c >= 0):
-        models.append(own)
-    if not models:
-        return None
-    goal = goal or submission.design or Design(cart=n)
+    goal = submission.design or Design(cart=n)
     design = analysis.feedback
     if design is not None and not design.reachable and design.settling_time is not None:
         goal = goal.model_copy(

@@ -1,8 +1,9 @@
 """Name the mistake behind a wrong number, where one reproduces it and the others do not."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from decimal import Decimal
+from typing import Literal
 
 from pipeline.grading.grade import CODES, Code, Flag
 from pipeline.grading.impossible import broken_orders, not_positive
@@ -22,12 +23,18 @@ _OFF_FINAL = 7.0
 _OFF_INITIAL = 10.0
 _OFF_BY_EYE = 30.0  # resonances and nulls before any fit
 _OFF_DAMPING = 80.0
+_SUSPECT_DAMPING = 40.0  # enough to look for a known mistake, not for a remark of its own
 _OFF_EACH_OTHER = 25.0
 _SIGMAS = 3.0
 # Of two explanations the other is out where it is this much further off, as share of what it may.
 _MARGIN = 0.35
 
+# What comes of reading a decay or a step; in a final table only where it was taken over.
+_FROM_TIME_RECORDS = {"peak_count", "log10_for_ln", "peak_for_steady_state"}
+_TAKEN_OVER = Decimal("0.05")
+
 Table = Mapping[str, Decimal]
+Label = Literal["initial", "final"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,37 +42,45 @@ class Explained:
     """Numbers of one table that a mistake explains."""
 
     mistake: Mistake
-    table: str
+    table: Label
     names: tuple[str, ...]
 
 
-def diagnose_tables(
-    reported: Reported, *, references: References, analysis: Analysis
-) -> list[Flag]:
+@dataclass(frozen=True, kw_only=True)
+class Diagnosis:
+    """The flags of the tables, and the final table with the named mistakes undone."""
+
+    flags: tuple[Flag, ...]
+    corrected: dict[str, float]
+
+
+def diagnose_tables(reported: Reported, *, references: References, analysis: Analysis) -> Diagnosis:
     """Return the flags of the two tables of parameters."""
-    tables: dict[str, Table] = {"initial": reported.initial, "final": reported.final}
+    tables: dict[Label, Table] = {"initial": reported.initial, "final": reported.final}
     copied = copied_final(reported, references=references)
     flags: list[Flag] = []
     explained: list[Explained] = []
-    left: dict[str, list[str]] = {}
+    left: dict[Label, list[str]] = {}
     for label, table in tables.items():
         known: dict[str, Reference] = getattr(references, label)
         impossible = not_positive(table)
-        off = [
-            name
-            for name, typed in table.items()
-            if name in known
-            and name not in impossible
-            and not (label == "final" and name in copied)
-            and percent_off(typed, known[name], sigmas=_SIGMAS) > limit(name, label)
-        ]
         if impossible:
             flags.append(_impossible_flag(table, impossible, known, label))
-        found, rest = explain(table, off=off, mistakes=known_mistakes(known, analysis))
-        explained += [replace(one, table=label) for one in found]
-        if label == "final" and rest:
-            whole, rest = explain(table, off=rest, mistakes=transient_fits(analysis, table, known))
-            explained += [replace(one, table=label) for one in whole]
+        taken = {*impossible, *(copied if label == "final" else ())}
+        errors = {
+            name: float(percent_off(typed, known[name], sigmas=_SIGMAS))
+            for name, typed in table.items()
+            if name in known and name not in taken
+        }
+        suspect = [n for n, e in errors.items() if e > min(limit(n, label), _SUSPECT_DAMPING)]
+        mistakes = known_mistakes(known, analysis)
+        if label == "final":
+            mistakes = [m for m in mistakes if _may_be_final(m, reported)]
+            if len(suspect) >= min(2, analysis.carts):
+                mistakes += transient_fits(analysis, table, known)
+        found, rest = explain(table, off=suspect, mistakes=mistakes, label=label)
+        explained += found
+        rest = [name for name in rest if errors[name] > limit(name, label)]
         broken = [
             law
             for law in broken_orders(table, initial=label == "initial")
@@ -85,7 +100,31 @@ def diagnose_tables(
     ]
     named = {name for flag in flags for name in flag.parameters}
     flags += _disagreements(reported, references, named=named)
-    return flags
+    return Diagnosis(
+        flags=tuple(flags), corrected=_corrected(reported.final, explained, references.final)
+    )
+
+
+def _may_be_final(mistake: Mistake, reported: Reported) -> bool:
+    """Whether a mistake can be in a final table: one of a decay or a step only if taken over."""
+    if not _FROM_TIME_RECORDS & set(mistake.codes):
+        return True
+    both = [n for n in mistake.predicted if n in reported.final and n in reported.initial]
+    return all(
+        abs(reported.final[n] - reported.initial[n]) <= _TAKEN_OVER * abs(reported.initial[n])
+        for n in both
+    )
+
+
+def _corrected(
+    final: Table, explained: Sequence[Explained], known: Mapping[str, Reference]
+) -> dict[str, float]:
+    """Return the final table as it would be without the mistakes found in it."""
+    corrected = {name: float(typed) for name, typed in final.items()}
+    for one in explained:
+        for name in one.names if one.table == "final" else ():
+            corrected[name] *= known[name].value / one.mistake.predicted[name].value
+    return corrected
 
 
 def limit(name: str, table: str) -> float:
@@ -102,7 +141,7 @@ def limit(name: str, table: str) -> float:
 
 
 def explain(
-    table: Table, *, off: Sequence[str], mistakes: Sequence[Mistake]
+    table: Table, *, off: Sequence[str], mistakes: Sequence[Mistake], label: Label
 ) -> tuple[list[Explained], list[str]]:
     """Find the fewest mistakes that reproduce the numbers that are off; return also the rest.
 
@@ -133,7 +172,8 @@ def explain(
         if rivals:
             left += names
         else:
-            found.append(Explained(mistake=best, table="", names=tuple(names)))
+            names = remaining if best.table_wide else names
+            found.append(Explained(mistake=best, table=label, names=tuple(names)))
         remaining = [name for name in remaining if name not in names]
     return found, [name for name in off if name in {*left, *remaining}]
 

@@ -22,7 +22,7 @@ _MANY_PERIODS = range(5, 11)
 
 _GAIN_OR_FREQUENCY = 0.03  # an honest reading after one slip: relative
 _COUNTED = 0.015
-_DAMPING = 0.16
+_DAMPING = 0.2
 _CLEARLY_OFF = 0.06  # of a gain: another extremum of the step as near as this says nothing
 
 
@@ -36,6 +36,7 @@ class Mistake:
     tolerance : relative, around those bounds.
     whole : all of the predicted that were reported must be met for it to be believed.
     least : so many numbers must be explained for it to be believed.
+    table_wide : believed, it explains every other wrong number of the table too.
     help : a sentence with {name}, {reported} and {recomputed} to fill in.
     """
 
@@ -45,6 +46,7 @@ class Mistake:
     help: str
     whole: bool = False
     least: int = 1
+    table_wide: bool = False
 
 
 def known_mistakes(references: Mapping[str, Reference], analysis: Analysis) -> list[Mistake]:

@@ -8,7 +8,7 @@ from pipeline.submission import Reported
 # How far an initial and a final estimate of one number usually lie apart, relative.
 _APART = 0.01
 _APART_DAMPING = 0.15
-_CHANCE = 1e-4  # of a table that a fit gave agreeing so by coincidence
+_CHANCE = 1e-3  # of a table that a fit gave agreeing so by coincidence
 _FITTED_BY_EYE = "abcdefghxy"  # symbols of resonances and nulls: only a fit gives those
 _SHARE = 0.75  # of the numbers in both tables
 

@@ -3,8 +3,11 @@
 from dataclasses import dataclass
 
 from pipeline.grading.rubric import is_damping
+from pipeline.plant.chain import Chain
 from pipeline.results import Analysis, Estimate, ParameterRow
 from pipeline.stages.compare import CHI_SQUARE_LIMIT
+
+_ASTRAY = 1.3  # a fitted frequency that far from the measured one: the fit has gone astray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,18 +49,42 @@ class References:
 def recompute(analysis: Analysis) -> References:
     """Return the references of both tables.
 
-    Where a cart sticks, dry friction adds to every damping ratio, the more the smaller the
-    motion; a student who took it out is right too, so the lower bound is without it. An initial
-    estimate is right anywhere between the recomputed initial and final ones; where the linear
-    carts do not explain the data, so is a final one, as then the fit itself may be off.
+    Where a cart sticks, dry friction adds to every damping ratio; a student who took it out is
+    right too, so the lower bound is without it. An initial estimate is right anywhere between the
+    recomputed initial and final ones; where the linear carts do not explain the data, so is a
+    final one, as then the fit itself may be off.
     """
-    final = {row.name: _final(row.final, row, analysis) for row in analysis.rows if row.final}
-    initial = {}
+    trusted = trusted_chain(analysis) is not None
+    final, initial = {}, {}
     for row in analysis.rows:
-        reference = _initial(row, final.get(row.name), analysis)
-        if reference is not None:
-            initial[row.name] = reference
+        fitted = _final(row.final, row, analysis) if row.final and trusted else None
+        measured = _initial(row, fitted, analysis)
+        if measured is not None:
+            initial[row.name] = measured
+        if fitted is not None or (measured is not None and row.final is not None):
+            final[row.name] = fitted or initial[row.name]
     return References(initial=initial, final=final)
+
+
+def trusted_chain(analysis: Analysis) -> Chain | None:
+    """Return the fitted chain; None where dry friction or worse has led the fit astray.
+
+    A fit that does not explain the data must at least find the frequencies that were measured
+    without it.
+    """
+    if analysis.fit is None or _explained(analysis):
+        return analysis.chain
+    apart = [
+        max(row.final.value / row.initial.value, row.initial.value / row.final.value)
+        for row in analysis.rows
+        if row.name.startswith("omega") and row.initial and row.final
+        if row.initial.value > 0 and row.final.value > 0
+    ]
+    return analysis.chain if max(apart, default=1.0) <= _ASTRAY else None
+
+
+def _explained(analysis: Analysis) -> bool:
+    return analysis.fit is None or analysis.fit.chi_square_per_dof <= CHI_SQUARE_LIMIT
 
 
 def friction_share(analysis: Analysis) -> float:
@@ -71,12 +98,12 @@ def friction_share(analysis: Analysis) -> float:
 
 
 def _final(estimate: Estimate, row: ParameterRow, analysis: Analysis) -> Reference:
-    # A dwell moves less than a decay and sees about twice the friction: the share twice.
-    share = friction_share(analysis) ** 2 if is_damping(row.name) else 1.0
+    share = friction_share(analysis) if is_damping(row.name) else 1.0
     bounds = [estimate.value, estimate.value * (share if estimate.value > 0 else 1.0)]
-    explained = analysis.fit is None or analysis.fit.chi_square_per_dof <= CHI_SQUARE_LIMIT
-    if row.initial is not None and row.initial.source != "assumed" and not explained:
-        bounds.append(row.initial.value)
+    if not _explained(analysis):
+        bounds += _readings(row.name, analysis)
+        if row.initial is not None and row.initial.source != "assumed":
+            bounds.append(row.initial.value)
     return Reference(
         value=estimate.value,
         low=min(bounds),
@@ -92,7 +119,7 @@ def _initial(row: ParameterRow, final: Reference | None, analysis: Analysis) -> 
         return None
     if measured is None:
         return final
-    bounds = [measured.value, *_spread(row.name, analysis)]
+    bounds = [measured.value, *_readings(row.name, analysis)]
     if final is not None:
         bounds += [final.low, final.high]
     return Reference(
@@ -104,13 +131,20 @@ def _initial(row: ParameterRow, final: Reference | None, analysis: Analysis) -> 
     )
 
 
-def _spread(name: str, analysis: Analysis) -> list[float]:
-    """Return the single readings of a gain: a student may well quote one of them."""
-    if not name.startswith("K"):
+def _readings(name: str, analysis: Analysis) -> list[float]:
+    """Return the single readings of a gain or a cart's own damping: a student may quote any."""
+    symbol, _, suffix = name.partition("_")
+    if not (suffix.isdigit() or suffix == ""):
         return []
-    cart = 1 if name == "K" else int(name.removeprefix("K_"))
+    cart = int(suffix or 1)
     readings: list[float] = []
-    for step in analysis.step_gains:
-        if step.cart == cart:
-            readings += [step.gain, *(step.interval or ())]
+    if symbol == "K":
+        for step in analysis.step_gains:
+            if step.cart == cart:
+                readings += [step.gain, *(step.interval or ())]
+    if symbol == "zeta":
+        for decay in analysis.log_decrements:
+            if decay.cart == cart:
+                without = decay.friction.zeta if decay.friction and decay.friction.present else None
+                readings += [decay.zeta, *([without] if without and without > 0 else [])]
     return readings

@@ -12,14 +12,14 @@ from pipeline.grading.diagnose import diagnose_tables
 from pipeline.grading.grade import CODES, Criterion, Flag, Grade, Outcome
 from pipeline.grading.pieces import missing_flag, missing_pieces
 from pipeline.grading.recordings import bad_runs, data_flag
-from pipeline.grading.reference import recompute
+from pipeline.grading.reference import recompute, trusted_chain
 from pipeline.grading.rubric import Late, Rubric
-from pipeline.grading.state_model import diagnose_state_space
+from pipeline.grading.state_model import diagnose_state_space, state_models
 from pipeline.grading.tolerance import exact
 from pipeline.ingest.columns import conversion
 from pipeline.ingest.read import read_data
 from pipeline.results import Analysis
-from pipeline.submission import Submission, System
+from pipeline.submission import Reported, Submission, System
 from pipeline.workflow import analyse
 
 _CENTS = 100  # points are given to the hundredth
@@ -82,16 +82,23 @@ def grade_analysis(
     submission : under the rubric's system, see `under_rubric`.
     unreadable : experiments that the analysis had to do without, each with the reason.
     """
+    reported, n = submission.reported or Reported(), rubric.system.carts
+    references, chain = recompute(analysis), trusted_chain(analysis)
+    diagnosis = diagnose_tables(reported, references=references, analysis=analysis)
+    tables = [{name: float(typed) for name, typed in reported.final.items()}]
+    if diagnosis.corrected != tables[0]:
+        tables.append(diagnosis.corrected)
     work = Work(
         submission=submission,
         analysis=analysis,
         rubric=rubric,
-        references=recompute(analysis),
-        controller=reported_controller(submission, analysis, goal=rubric.design),
+        references=references,
+        controller=reported_controller(submission, analysis, chain=chain, tables=tables),
+        state_models=state_models(tables, chain=chain, n=n),
         bad=bad_runs(analysis, unreadable=unreadable or {}),
     )
     criteria = _criteria(work)
-    earned = sum(Fraction(str(c.points)) for c in criteria)
+    earned = sum((Fraction(str(c.points)) for c in criteria), Fraction(0))
     deducted = _late(earned, rubric.late, days_late)
     return Grade(
         submission=name,
@@ -102,7 +109,9 @@ def grade_analysis(
         days_late=days_late,
         deducted=float(deducted),
         criteria=criteria,
-        flags=tuple(sorted(_flags(work), key=lambda flag: CODES.index(flag.code))),
+        flags=tuple(
+            sorted([*diagnosis.flags, *_flags(work)], key=lambda flag: CODES.index(flag.code))
+        ),
     )
 
 
@@ -245,18 +254,14 @@ def _late(earned: Fraction, late: Late, days_late: float) -> Fraction:
 
 
 def _flags(work: Work) -> list[Flag]:
-    submission, analysis, reported = work.submission, work.analysis, work.reported
-    flags = diagnose_tables(reported, references=work.references, analysis=analysis)
-    if reported.state_space is not None and reported.state_space.A:
-        flags += diagnose_state_space(
-            reported.state_space,
-            final=reported.final,
-            chain=analysis.chain,
-            n=work.rubric.system.carts,
-        )
+    """Return the flags beside those of the parameter tables."""
+    flags, space = [], work.reported.state_space
+    if space is not None and space.A:
+        n = work.rubric.system.carts
+        flags += diagnose_state_space(space, models=work.state_models, n=n)
     if work.controller is not None:
         flags += diagnose_controller(work.controller)
-    if missing := missing_pieces(submission, work.rubric):
+    if missing := missing_pieces(work.submission, work.rubric):
         flags.append(missing_flag(missing))
     if work.bad:
         flags.append(data_flag(work.bad))

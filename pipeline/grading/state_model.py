@@ -1,6 +1,6 @@
 """The reported A and B: every entry against the student's own table or the reference."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
@@ -38,20 +38,13 @@ class Entry:
         return self.error > _WRONG[self.kind]
 
 
-def compare_entries(
-    space: StateSpace, *, final: Mapping[str, Decimal], chain: Chain | None, n: int
-) -> list[Entry]:
-    """Compare every entry with what the student's own table gives and with the reference.
+def compare_entries(space: StateSpace, *, models: Sequence[Array], n: int) -> list[Entry]:
+    """Compare every entry with what the right A and B may be.
 
-    An entry is as good as its better match: an A that follows from a wrong table is right.
+    An entry is as good as its best match: an A that follows from a wrong table is right.
     """
-    models = candidates(final, chain=chain, n=n)
-    if not models:
-        return []
-    kinds = _kinds(n)
-    typed = _matrix(space, n)
-    entries = []
-    for (i, j), number in typed.items():
+    kinds, entries = _kinds(n), []
+    for (i, j), number in _matrix(space, n).items():
         right = tuple(float(model[i, j]) for model in models if np.isfinite(model[i, j]))
         if not right:
             continue
@@ -62,25 +55,28 @@ def compare_entries(
     return entries
 
 
-def candidates(final: Mapping[str, Decimal], *, chain: Chain | None, n: int) -> list[Array]:
-    """Return [A B] (2n, 2n + 1) of the reference and of the student's table, NaN where unknown."""
+def state_models(
+    tables: Sequence[Mapping[str, float]], *, chain: Chain | None, n: int
+) -> list[Array]:
+    """Return [A B] (2n, 2n + 1) of the reference and of the student's tables, NaN where unknown.
+
+    A table gives a cart's own terms directly; its couplings only as differences of large numbers.
+    """
+    chains = [chain, *(own_chain(values, n=n) for values in tables)]
     models = []
-    if chain is not None:
-        A, B, _, _ = chain.state_space()
-        models.append(np.hstack([A, B]))
-    values = {name: float(typed) for name, typed in final.items()}
-    recovered = own_chain(values, n=n)
-    if recovered is not None:
-        A, B, _, _ = recovered.state_space()
-        models.append(np.hstack([A, B]))
-    direct = np.full((2 * n, 2 * n + 1), np.nan)
-    for i in range(n):
-        omega, zeta = (("omega_n", "zeta"), (f"omega_{i + 1}", f"zeta_{i + 1}"))[n > 1]
-        if omega in values:
-            direct[2 * i + 1, 2 * i] = -(values[omega] ** 2)
-            if zeta in values:
-                direct[2 * i + 1, 2 * i + 1] = -2 * values[zeta] * values[omega]
-    models.append(direct)
+    for one in chains:
+        if one is not None:
+            A, B, _, _ = one.state_space()
+            models.append(np.hstack([A, B]))
+    for values in tables:
+        direct = np.full((2 * n, 2 * n + 1), np.nan)
+        for i in range(n):
+            omega, zeta = ("omega_n", "zeta") if n == 1 else (f"omega_{i + 1}", f"zeta_{i + 1}")
+            if omega in values:
+                direct[2 * i + 1, 2 * i] = -(values[omega] ** 2)
+                if zeta in values:
+                    direct[2 * i + 1, 2 * i + 1] = -2 * values[zeta] * values[omega]
+        models.append(direct)
     return models
 
 
@@ -126,15 +122,12 @@ def _entry_error(typed: Decimal, right: float, kind: Kind) -> Fraction:
 # ------------------------------------------------------------------------- the flag
 
 
-def diagnose_state_space(
-    space: StateSpace, *, final: Mapping[str, Decimal], chain: Chain | None, n: int
-) -> list[Flag]:
+def diagnose_state_space(space: StateSpace, *, models: Sequence[Array], n: int) -> list[Flag]:
     """Return a flag where entries are wrong, with the slip that explains them all, if any."""
-    entries = compare_entries(space, final=final, chain=chain, n=n)
-    wrong = [entry for entry in entries if entry.wrong]
+    wrong = [entry for entry in compare_entries(space, models=models, n=n) if entry.wrong]
     if not wrong:
         return []
-    slip = _slip(space, final=final, chain=chain, n=n)
+    slip = _slip(space, models=models, n=n)
     worst = max(wrong, key=lambda entry: entry.error)
     names = ", ".join(entry.name for entry in wrong[:4]) + (" …" if len(wrong) > 4 else "")
     what = slip or "derive the row again from the equation of motion of its cart"
@@ -153,10 +146,10 @@ def diagnose_state_space(
     ]
 
 
-def _slip(space: StateSpace, *, final: Mapping[str, Decimal], chain: Chain | None, n: int) -> str:
+def _slip(space: StateSpace, *, models: Sequence[Array], n: int) -> str:
     """Return the first known slip that turns the right [A B] into the one reported, or ""."""
     typed, kinds = _matrix(space, n), _kinds(n)
-    for model in candidates(final, chain=chain, n=n):
+    for model in models:
         if not np.all(np.isfinite(model)):
             continue
         for text, slipped, moved in _slips(model, n):

@@ -46,6 +46,7 @@ def transient_fits(
                     help="{reported} is what a fit to amplitudes of the first swings gives; after "
                     "the transient the same recordings give {recomputed}",
                     least=max(2, round(_MET * len(asked))),
+                    table_wide=True,
                 )
             )
     return found
