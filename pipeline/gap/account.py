@@ -11,6 +11,8 @@ from pipeline.gap.types import FoundEffect, NamedValue, RecordGap, Rival, Trace
 from pipeline.plant.effects import find_effect
 from pipeline.plant.effects.base import Term
 
+_MOST_RIVALS = 4  # listed
+
 
 def list_effects(
     path: Sequence[Hypothesis],
@@ -62,11 +64,31 @@ def list_effects(
                         nrmse_after=h.error,
                         confidence=weight[key] / total,
                     )
-                    for key, h in rivals[:4]
+                    for key, h in rivals[:_MOST_RIVALS]
                 ),
             )
         )
     return tuple(out)
+
+
+def list_suspects(found: Sequence[Hypothesis], effects: Sequence[FoundEffect]) -> tuple[Rival, ...]:
+    """Return the single effects beyond `effects` that would help most, the best first."""
+    baseline = next(h for h in found if not h.key)
+    listed = {(f.effect.key, next(iter(f.where.values()), 0)) for f in effects}
+    singles = sorted(
+        (h for h in found if len(h.key) == 1 and h.bic < baseline.bic and not h.key <= listed),
+        key=lambda h: h.bic,
+    )
+    weights = [float(np.exp(-0.5 * (h.bic - singles[0].bic))) for h in singles]
+    return tuple(
+        Rival(
+            effect=find_effect(next(iter(h.key))[0]),
+            where=_where(next(iter(h.key))),
+            nrmse_after=h.error,
+            confidence=weight / sum(weights),
+        )
+        for h, weight in zip(singles[:_MOST_RIVALS], weights, strict=False)
+    )
 
 
 def _where(key: tuple[str, int]) -> dict[str, int]:

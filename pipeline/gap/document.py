@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from pipeline.gap.types import FoundEffect, Gap, NamedValue
+from pipeline.gap.types import FoundEffect, Gap, NamedValue, Rival
 from pipeline.plant.chain import Chain
 
 SCHEMA = "cartlab-gap/1"
@@ -14,6 +14,7 @@ def gap_json(gap: Gap, *, position_unit: str = "cm", input_unit: str = "V") -> d
         "schema": SCHEMA,
         "verdict": gap.verdict,
         "effects": [_effect(found) for found in gap.effects],
+        "suspects": [_rival(rival) for rival in gap.suspects],
         "gap": {"baseline": gap.baseline, "final": gap.final, "noise_floor": gap.noise_floor},
         "repeatability": gap.repeatability,
         "by_record": [
@@ -68,15 +69,16 @@ def _effect(found: FoundEffect) -> dict[str, Any]:
         "confidence": found.confidence,
         "nrmse_before": found.nrmse_before,
         "nrmse_after": found.nrmse_after,
-        "rivals": [
-            {
-                "effect": rival.effect.key,
-                "where": rival.where,
-                "nrmse_after": rival.nrmse_after,
-                "confidence": rival.confidence,
-            }
-            for rival in found.rivals
-        ],
+        "rivals": [_rival(rival) for rival in found.rivals],
+    }
+
+
+def _rival(rival: Rival) -> dict[str, Any]:
+    return {
+        "effect": rival.effect.key,
+        "where": rival.where,
+        "nrmse_after": rival.nrmse_after,
+        "confidence": rival.confidence,
     }
 
 

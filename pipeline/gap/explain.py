@@ -11,6 +11,7 @@ from pipeline.gap.account import (
     chain_std,
     compare_by_record,
     list_effects,
+    list_suspects,
     make_traces,
     pooled_floor,
     repeatability,
@@ -130,6 +131,7 @@ def explain_gap(
             for i, dry in enumerate(chosen.fit.structure.dry)
             if dry
         },
+        suspects=list_suspects(found, effects) if verdict == "unexplained" else (),
         notes=tuple(notes),
     )
 

@@ -90,6 +90,7 @@ def _gap(document: Mapping[str, Any]) -> Gap:
         traces=(),
         chain_std=dict(document["chain_std"]),
         spread={int(cart): value for cart, value in document["friction_spread"].items()},
+        suspects=tuple(_rival(entry) for entry in document["suspects"]),
         notes=tuple(document["notes"]),
     )
 
@@ -103,15 +104,16 @@ def _effect(entry: Mapping[str, Any]) -> FoundEffect:
         confidence=float(entry["confidence"]),
         nrmse_before=float(entry["nrmse_before"]),
         nrmse_after=float(entry["nrmse_after"]),
-        rivals=tuple(
-            Rival(
-                effect=find_effect(rival["effect"]),
-                where=dict(rival["where"]),
-                nrmse_after=float(rival["nrmse_after"]),
-                confidence=float(rival["confidence"]),
-            )
-            for rival in entry["rivals"]
-        ),
+        rivals=tuple(_rival(rival) for rival in entry["rivals"]),
+    )
+
+
+def _rival(entry: Mapping[str, Any]) -> Rival:
+    return Rival(
+        effect=find_effect(entry["effect"]),
+        where=dict(entry["where"]),
+        nrmse_after=float(entry["nrmse_after"]),
+        confidence=float(entry["confidence"]),
     )
 
 

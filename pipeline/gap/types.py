@@ -20,7 +20,10 @@ class NamedValue:
 
 @dataclass(frozen=True, kw_only=True)
 class Rival:
-    """Another effect in the same role, fitted as fully; `where` as in `gap.json`."""
+    """Another effect in the same role, fitted as fully; `where` as in `gap.json`.
+
+    `confidence` is its weight among the models it is listed with.
+    """
 
     effect: Effect
     where: dict[str, int]
@@ -97,7 +100,9 @@ class Gap:
     effects : in the order found. Under `ambiguous` the last one's rivals explain as much; under
         `unexplained` they are suspects only.
     baseline, final, noise_floor : relative errors pooled over the held-out runs.
-    repeatability : the same between runs with the same input, or None without repeats.
+    repeatability : the same between runs with the same input, or None without repeats; the
+        noise floor is at least as high.
+    suspects : under `unexplained`, the single effects that help most, the best first.
     linear, model : the linear chain that fits best, and the chain with the effects.
     chain_std : standard errors of the latter's "m_1", "c_1", "k_1", …
     training, held_out : ids of the runs.
@@ -121,4 +126,5 @@ class Gap:
     traces: tuple[Trace, ...]
     chain_std: dict[str, float] = field(default_factory=dict)
     spread: dict[int, float] = field(default_factory=dict)
+    suspects: tuple[Rival, ...] = ()
     notes: tuple[str, ...] = ()

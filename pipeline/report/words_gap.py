@@ -149,33 +149,44 @@ def _unexplained(gap: Gap) -> Block:
         return paragraph(
             Span("Something is missing, and nothing in the catalogue explains it. ", "strong"),
             f"On runs it had not seen the linear model is off by {share(gap.baseline)} of the "
-            f"motion; noise alone makes {share(gap.noise_floor)}. No effect shrinks that enough "
-            "to be believed.",
+            f"motion; {_noise(gap)}. No effect shrinks that enough to be believed."
+            + _suspicion(gap),
         )
     suspects = listing([effect_name(found.effect, found.where) for found in gap.effects])
     are = "suspect is" if len(gap.effects) == 1 else "suspects, together, are"
-    repeats = (
-        f" and repeats of one run differ by {share(gap.repeatability)}" if gap.repeatability else ""
-    )
     return paragraph(
         Span("Something is missing that nothing in the catalogue explains. ", "strong"),
         f"The best {are} {suspects}. The error on runs the model had not seen then falls from "
-        f"{share(gap.baseline)} of the motion to {share(gap.final)}, but noise alone makes "
-        f"{share(gap.noise_floor)}{repeats}. Too much is left for a name.",
+        f"{share(gap.baseline)} of the motion to {share(gap.final)}, but {_noise(gap)}. "
+        f"Too much is left for a name.{_suspicion(gap)}",
     )
+
+
+def _suspicion(gap: Gap) -> str:
+    """Return who else is suspected, as a further sentence."""
+    if not gap.suspects:
+        return ""
+    named = [
+        f"{effect_name(s.effect, s.where)} (leaves {share(s.nrmse_after)})" for s in gap.suspects
+    ]
+    also = "Also suspected" if gap.effects else "Suspected, though not proven"
+    return f" {also}: {listing(named)}."
+
+
+def _noise(gap: Gap) -> str:
+    """Return what no model can be better than, as a clause."""
+    if gap.repeatability is not None and gap.repeatability >= gap.noise_floor:
+        return f"repeats of one run differ by {share(gap.repeatability)}"
+    return f"noise alone makes {share(gap.noise_floor)}"
 
 
 def _errors(gap: Gap) -> str:
     text = (
         "On runs the model had not seen the error falls from "
-        f"{share(gap.baseline)} of the motion to {share(gap.final)}; noise alone makes "
-        f"{share(gap.noise_floor)}"
+        f"{share(gap.baseline)} of the motion to {share(gap.final)}; {_noise(gap)}"
     )
-    if gap.repeatability is not None:
-        text += f", and repeats of one run differ by {share(gap.repeatability)}"
-    least = max(gap.noise_floor, gap.repeatability or 0.0)
-    if gap.final > _ALL * least:
-        times = significant(gap.final / least, digits=2)
+    if gap.final > _ALL * gap.noise_floor:
+        times = significant(gap.final / gap.noise_floor, digits=2)
         return f"{text}. So {times} times what noise makes is left: this is the main effect, " \
             "not all of it."  # fmt: skip
     return f"{text}."

@@ -101,6 +101,10 @@ class Gap(Document):
     schema_: Annotated[Literal["cartlab-gap/1"], Field(alias="schema")]
     verdict: Literal["named", "none", "ambiguous", "unexplained"]
     effects: tuple[Effect, ...]
+    suspects: Annotated[
+        tuple[Rival, ...],
+        Field(description="under `unexplained`, the single effects that help most"),
+    ]
     gap: Errors
     repeatability: Annotated[Number, Field(description="between runs of the same input")]
     by_record: tuple[RecordErrors, ...]
