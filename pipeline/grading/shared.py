@@ -1,0 +1,267 @@
+"""Recordings that stand in two submissions: found by their noise, named on both sides.
+
+A copy has the noise of its original, whatever noise was added on top: the regression of one
+residual on the other, brought to one scale, has slope one. Two honest runs share at most what the
+motion and the encoder's rounding leave in the residuals, a slope well below a half.
+"""
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.grading.batch import Prints
+from pipeline.grading.grade import Flag
+from pipeline.grading.shared_prints import PASSED, Print, unpack
+
+_WIDTH = 512  # samples around an anchor that are compared at first
+_BEFORE = 128  # of them before it
+_GALLERY = 8  # anchors of each recording that all anchors of the others are held against
+_BLOCK = 2048  # anchors compared in one product
+_WORTH_A_LOOK = 3.8  # sigmas at first sight: one in ten thousand by chance
+_LEAST_OVERLAP = 80  # samples that say something in both
+_LEAST_SLOPE = 0.5
+_NEARBY = 50  # shifts to either side that show how well chance does here
+_OWN_WIDTH = 2  # shifts next to the right one see the same match
+_COUNTS = 4.75  # sigmas of a recording that counts with others
+_ALONE = 6.5  # … by itself: a class of 200 offers 1e9 comparisons, chance reaches 6.1 in them
+_TOGETHER = 7.5  # root of the summed squares of several
+
+
+@dataclass(frozen=True, kw_only=True)
+class SharedRecord:
+    """A recording of one submission that is one of another's, too.
+
+    `sigmas` says how far above chance they agree.
+    """
+
+    experiment: str
+    other: str
+    other_experiment: str
+    sigmas: float
+
+
+_Match = tuple[float, str, str]  # sigmas, the experiment in the one and in the other submission
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Entry:
+    """A fingerprint and the submission (by number) it is of."""
+
+    owner: int
+    print: Print
+
+
+def find_shared(
+    batch: Sequence[Prints],
+    *,
+    earlier: Iterable[Prints] = (),
+    examples: Iterable[bytes] = (),
+) -> dict[str, tuple[SharedRecord, ...]]:
+    """Return, by submission of the batch, its recordings that stand in another submission.
+
+    Parameters
+    ----------
+    earlier : of earlier batches; only held against the batch, not against one another.
+    examples : packed fingerprints of recordings that were handed out: those may be shared.
+    """
+    everyone = [*batch, *earlier]
+    owners = [*everyone, *(_handed_out(packed) for packed in examples)]
+    groups: dict[str, list[_Entry]] = defaultdict(list)
+    for owner, prints in enumerate(owners):
+        for one in unpack(prints.fingerprints):
+            groups[one.group].append(_Entry(owner=owner, print=one))
+    matches: dict[tuple[int, int], list[_Match]] = defaultdict(list)
+    for _, entries in sorted(groups.items()):
+        for a, b, sigmas in _matches(entries, first_batch=len(batch), owners=owners):
+            matches[a.owner, b.owner].append((sigmas, a.print.experiment, b.print.experiment))
+    given = {
+        (a, experiment)
+        for (a, b), found in matches.items()
+        if b >= len(everyone)
+        for sigmas, experiment, _ in found
+        if sigmas >= _ALONE
+    }
+    shared: dict[str, list[SharedRecord]] = defaultdict(list)
+    for (a, b), found in sorted(matches.items()):
+        if b >= len(everyone):
+            continue
+        own = [m for m in found if (a, m[1]) not in given and (b, m[2]) not in given]
+        for sigmas, in_a, in_b in _decisive(own):
+            for owner, other, mine, theirs in ((a, b, in_a, in_b), (b, a, in_b, in_a)):
+                if owner < len(batch):
+                    record = SharedRecord(
+                        experiment=mine,
+                        other=everyone[other].submission,
+                        other_experiment=theirs,
+                        sigmas=sigmas,
+                    )
+                    shared[everyone[owner].submission].append(record)
+    return {
+        submission: tuple(sorted(found, key=lambda r: (r.other, r.experiment, r.other_experiment)))
+        for submission, found in sorted(shared.items())
+    }
+
+
+def _handed_out(packed: bytes) -> Prints:
+    return Prints(submission="", authors=(), fingerprints=packed)
+
+
+def shared_flag(records: Sequence[SharedRecord]) -> Flag:
+    """Return the flag of one submission: which recordings, and where else they stand."""
+    experiments = tuple(dict.fromkeys(record.experiment for record in records))
+    others = list(dict.fromkeys(record.other for record in records))
+    named = ", ".join(experiments[:4]) + (
+        f" and {len(experiments) - 4} more" if len(experiments) > 4 else ""
+    )
+    stand = "stands" if len(experiments) == 1 else "stand"
+    return Flag(
+        code="shared_data",
+        parameters=experiments,
+        message=f"{named} also {stand} in {', '.join(others)}: the noise of the recordings is the "
+        "same. That does not say whose they are; if they were shared for a reason, say so.",
+        evidence={
+            "submissions": others,
+            "recordings": [
+                {
+                    "experiment": record.experiment,
+                    "submission": record.other,
+                    "other_experiment": record.other_experiment,
+                    "sigmas": round(record.sigmas, 1),
+                }
+                for record in records
+            ],
+        },
+    )
+
+
+def same_team(a: Prints, b: Prints) -> bool:
+    """Tell whether two submissions have an author in common; without authors, the same name."""
+    if a.authors and b.authors:
+        return bool(set(a.authors) & set(b.authors))
+    return a.submission == b.submission
+
+
+def _decisive(found: Sequence[_Match]) -> list[_Match]:
+    """Return the matches of one pair of submissions, one for each recording, if they suffice."""
+    chosen: list[_Match] = []
+    for match in sorted(found, key=lambda m: (-m[0], m[1:])):
+        if all(match[1] != c[1] and match[2] != c[2] for c in chosen):
+            chosen.append(match)
+    together = float(np.sqrt(sum(sigmas**2 for sigmas, _, _ in chosen)))
+    enough = chosen and (chosen[0][0] >= _ALONE or together >= _TOGETHER)
+    return chosen if enough else []
+
+
+# ------------------------------------------------------------------- candidates
+
+
+def _matches(
+    entries: Sequence[_Entry], *, first_batch: int, owners: Sequence[Prints]
+) -> Iterator[tuple[_Entry, _Entry, float]]:
+    """Yield pairs of recordings of different teams that share their noise, with the sigmas."""
+    best: dict[tuple[int, int], float] = {}
+    seen: set[tuple[int, int, int]] = set()
+    apart: dict[tuple[int, int], bool] = {}
+    for i, anchor_i, j, anchor_j in _candidates(entries):
+        a, b = entries[i], entries[j]
+        pair = (min(a.owner, b.owner), max(a.owner, b.owner))
+        if pair not in apart:
+            apart[pair] = pair[0] < first_batch and not same_team(*(owners[o] for o in pair))
+        if not apart[pair]:
+            continue
+        if a.owner > b.owner:
+            i, anchor_i, j, anchor_j, a, b = j, anchor_j, i, anchor_i, b, a
+        shift = int(b.print.anchors[anchor_j] - a.print.anchors[anchor_i])
+        if (i, j, shift) in seen:
+            continue
+        seen.add((i, j, shift))
+        in_a, in_b = a.print.swing[anchor_i], b.print.swing[anchor_j]
+        scale = float(in_b / in_a) if in_a and in_b else None
+        sigmas = _agreement(a.print, b.print, shift=shift, scale=scale)
+        if sigmas >= _COUNTS:
+            best[i, j] = max(sigmas, best.get((i, j), 0.0))
+    for (i, j), sigmas in sorted(best.items()):
+        yield entries[i], entries[j], sigmas
+
+
+def _candidates(entries: Sequence[_Entry]) -> Iterator[tuple[int, int, int, int]]:
+    """Yield (entry, its anchor, other entry, its anchor) whose surroundings look alike."""
+    places = [(i, k) for i, entry in enumerate(entries) for k in range(entry.print.anchors.size)]
+    gallery = [(i, k) for i, k in places if k < _GALLERY]
+    if not gallery:
+        return
+    columns, column_counts = _windows(entries, gallery)
+    owner = np.array([entry.owner for entry in entries])
+    column_owner = owner[[i for i, _ in gallery]]
+    for start in range(0, len(places), _BLOCK):
+        block = places[start : start + _BLOCK]
+        rows, row_counts = _windows(entries, block)
+        least = np.minimum(row_counts[:, None], column_counts[None, :])
+        threshold = _WORTH_A_LOOK / np.sqrt(PASSED * np.maximum(least, 1))
+        alike = np.abs(rows @ columns.T) >= threshold
+        alike &= (least >= _LEAST_OVERLAP) & (
+            owner[[i for i, _ in block]][:, None] != column_owner[None, :]
+        )
+        for row, column in np.argwhere(alike).tolist():
+            yield *block[row], *gallery[column]
+
+
+def _windows(
+    entries: Sequence[_Entry], places: Sequence[tuple[int, int]]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the residuals around anchors, (n, n_free * _WIDTH) of unit length, and their counts.
+
+    The count is that of the samples that say something.
+    """
+    n_free = entries[0].print.residual.shape[0]
+    windows = np.zeros((len(places), n_free, _WIDTH), dtype=np.float32)
+    for window, (i, k) in zip(windows, places, strict=True):
+        residual, start = entries[i].print.residual, int(entries[i].print.anchors[k]) - _BEFORE
+        part = residual[:, max(start, 0) : start + _WIDTH]
+        window[:, max(-start, 0) : max(-start, 0) + part.shape[1]] = part
+    flat = windows.reshape(len(places), -1)
+    counts = np.count_nonzero(flat, axis=1)
+    length = np.sqrt(np.einsum("ij,ij->i", flat, flat))
+    return flat / np.maximum(length, 1.0)[:, None], counts
+
+
+# ----------------------------------------------------------------------- verdict
+
+
+def _agreement(a: Print, b: Print, *, shift: int, scale: float | None) -> float:
+    """Return by how many sigmas the noise of two recordings agrees; 0 where it is not one's own.
+
+    Sample i of `a` is sample i + shift of `b`, `scale` times as large. Where the motion does not
+    tell the scale, that of the noise itself is taken: less further noise is then seen through.
+    """
+    first, last = max(0, -shift), min(a.residual.shape[1], b.residual.shape[1] - shift)
+    if last - first < _LEAST_OVERLAP:
+        return 0.0
+    # In units of b's noise, so that every cart has its say.
+    factor = np.ones(b.step.size) if scale is None else scale * a.step / b.step
+    in_a = a.residual[:, first:last] * factor[:, None]
+    in_b = b.residual[:, first + shift : last + shift].astype(np.float64)
+    in_b, in_a = in_b * (in_a != 0), in_a * (in_b != 0)
+    common = np.count_nonzero(in_a)
+    power_a, power_b = float(np.sum(in_a**2)), float(np.sum(in_b**2))
+    if common < _LEAST_OVERLAP:
+        return 0.0
+    product = float(np.sum(in_a * in_b))
+    product = abs(product) if scale is None else product
+    if product < _LEAST_SLOPE * min(power_a, power_b):
+        return 0.0
+    chance = np.sqrt(power_a * power_b / (PASSED * common))
+    if product < _COUNTS * chance:
+        return 0.0
+    return product / max(chance, _chance_nearby(in_a, in_b))
+
+
+def _chance_nearby(in_a: np.ndarray, in_b: np.ndarray) -> float:
+    """Return the root-mean-square product at other shifts: rounding repeats where motion does."""
+    n = in_a.shape[1]
+    shifts = [s for s in range(_OWN_WIDTH + 1, _NEARBY + 1) if s < n // 2]
+    products = [float(np.sum(in_a[:, s:] * in_b[:, : n - s])) for s in shifts]
+    products += [float(np.sum(in_a[:, : n - s] * in_b[:, s:])) for s in shifts]
+    return float(np.sqrt(np.mean(np.square(products)))) if products else 0.0

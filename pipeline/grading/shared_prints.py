@@ -1,0 +1,190 @@
+"""Fingerprints of recordings: what no second run on the same bench repeats.
+
+Two honest teams that step the same bench get the same response, so the motion proves nothing. Its
+noise and the rounding of its encoder do: they are what a high-pass filter leaves, and they stay
+where a record is cut, shifted in time, rescaled, renamed or buried in further noise.
+"""
+
+import json
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+
+from pipeline.plant.chain import Array
+from pipeline.results import Record
+
+# The filter passes what is faster than 0.4 of the Nyquist frequency: a bench logged at 113 Hz
+# moves below 12 Hz. A Kaiser window of 7 lets less than 1e-3 of the motion through.
+PASSED = 0.6  # of the band
+_TAPS, _WINDOW = 41, 7.0
+MARGIN = _TAPS // 2  # samples lost at either end
+
+_LEVELS = 5  # a residual is kept as -5 … 5, in steps of two thirds of a standard deviation
+_STEPS_PER_SIGMA = 1.5
+_KINK = 4.5  # standard deviations: more is the motion's own kink (a step, a stop), not noise
+_MAD_TO_SIGMA = 1.4826
+
+_LEAST_SWING = 0.25  # of the largest: smaller swings move with the noise
+_MOST_ANCHORS = 12  # in the motion
+_NOISE_ANCHORS, _APART = 6, 5  # samples
+_FEWEST_SAMPLES = 60
+_MOST_SAMPLES = 8192  # of one record; more does not make it surer
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Print:
+    """The fingerprint of one recording.
+
+    Attributes
+    ----------
+    group : what was done: only recordings of the same kind of run are compared.
+    residual : (n_free, n) whole numbers -5 … 5; 0 also where the motion has a kink.
+    step : (n_free,) what 1 stands for, in the record's position unit.
+    anchors : (n_anchors,) samples that are found again in a copy, the surest first, and so tell
+        how it is shifted: where the motion passes the middle between two extrema (they stand
+        much noise), in turn with where the noise is loudest (they stand any cut).
+    swing : (n_anchors,) from extremum to extremum, signed: it tells how two recordings are
+        scaled; 0 for an anchor in the noise.
+    """
+
+    experiment: str
+    group: str
+    residual: np.ndarray
+    step: Array
+    anchors: np.ndarray
+    swing: Array
+
+
+def fingerprint(records: Sequence[Record]) -> bytes:
+    """Return the fingerprints of a submission's recordings, packed; b"" where there are none."""
+    prints = [found for record in records if (found := _print(record)) is not None]
+    if not prints:
+        return b""
+    heads = [
+        {
+            "experiment": one.experiment,
+            "group": one.group,
+            "shape": one.residual.shape,
+            "step": one.step.tolist(),
+            "anchors": one.anchors.tolist(),
+            "swing": one.swing.tolist(),
+        }
+        for one in prints
+    ]
+    body = b"".join(one.residual.tobytes() for one in prints)
+    return zlib.compress(json.dumps(heads).encode() + b"\0" + body)
+
+
+def unpack(packed: bytes) -> tuple[Print, ...]:
+    """Return the fingerprints that `fingerprint` packed."""
+    if not packed:
+        return ()
+    head, _, body = zlib.decompress(packed).partition(b"\0")
+    prints, at = [], 0
+    for entry in json.loads(head):
+        rows, columns = entry["shape"]
+        residual = np.frombuffer(body, np.int8, rows * columns, at).reshape(rows, columns)
+        at += residual.size
+        prints.append(
+            Print(
+                experiment=entry["experiment"],
+                group=entry["group"],
+                residual=residual,
+                step=np.array(entry["step"]),
+                anchors=np.array(entry["anchors"], dtype=np.int64),
+                swing=np.array(entry["swing"]),
+            )
+        )
+    return tuple(prints)
+
+
+def _print(record: Record) -> Print | None:
+    """Return the fingerprint of a recording, None where nothing moves or it is too short."""
+    carts = [cart for cart in record.free if cart in record.carts]
+    if not carts or record.t.size < _FEWEST_SAMPLES + 2 * MARGIN:
+        return None
+    y = np.array([record.position(cart) for cart in carts])[:, : _MOST_SAMPLES + 2 * MARGIN]
+    noise = np.array([np.convolve(row, _high_pass(), "valid") for row in y])
+    sigma = _MAD_TO_SIGMA * np.median(np.abs(noise), axis=1)
+    sigma = np.where(sigma > 0, sigma, np.sqrt(np.mean(noise**2, axis=1)))
+    if not np.all(np.isfinite(sigma)) or not np.all(sigma > 0):
+        return None
+    sigmas = noise / sigma[:, None]
+    telling = np.abs(sigmas) < _KINK
+    anchors, swing = _in_turn(
+        _motion_anchors(y[0, MARGIN:-MARGIN] - noise[0]),
+        _noise_anchors(np.abs(sigmas).sum(axis=0)),
+    )
+    levels = np.clip(np.round(_STEPS_PER_SIGMA * sigmas), -_LEVELS, _LEVELS)
+    frequency = "" if record.omega is None else f"{record.omega / (2 * np.pi):.3g} Hz"
+    return Print(
+        experiment=record.id,
+        group=f"{record.kind} {','.join(map(str, carts))} {frequency}",
+        residual=np.where(telling, levels, 0).astype(np.int8),
+        step=sigma / _STEPS_PER_SIGMA,
+        anchors=anchors,
+        swing=swing,
+    )
+
+
+@cache
+def _high_pass() -> Array:
+    """Return the taps of the filter: 1 less a low pass, and nothing of a constant."""
+    cut = 1 - PASSED
+    lag = np.arange(_TAPS) - MARGIN
+    taps = -cut * np.sinc(cut * lag) * np.kaiser(_TAPS, _WINDOW)
+    taps[MARGIN] += 1.0
+    return taps - taps.mean()
+
+
+def _in_turn(
+    first: tuple[np.ndarray, Array], second: tuple[np.ndarray, Array]
+) -> tuple[np.ndarray, Array]:
+    """Return two lists of anchors and swings as one, taking from them in turn."""
+    rank = np.concatenate([np.arange(anchors.size) for anchors, _ in (first, second)])
+    order = np.argsort(rank, kind="stable")
+    return np.concatenate([first[0], second[0]])[order], np.concatenate([first[1], second[1]])[
+        order
+    ]
+
+
+def _noise_anchors(loudness: Array) -> tuple[np.ndarray, Array]:
+    """Return the samples where the residual (n,) is loudest, a kink of the motion included."""
+    peak = np.max(np.lib.stride_tricks.sliding_window_view(loudness, 2 * _APART + 1), axis=1)
+    peaks = _APART + np.flatnonzero(loudness[_APART:-_APART] == peak)
+    loudest = peaks[np.argsort(-loudness[peaks], kind="stable")[:_NOISE_ANCHORS]]
+    return loudest, np.zeros(loudest.size)
+
+
+def _motion_anchors(motion: Array) -> tuple[np.ndarray, Array]:
+    """Return where the motion (n,) passes the middle of its larger swings, and those swings."""
+    turns = _turning_points(motion, least=_LEAST_SWING * float(np.ptp(motion)))
+    swings = np.diff(motion[turns])
+    places = []
+    for start, end in pairwise(turns.tolist()):
+        rising = motion[start : end + 1] * np.sign(motion[end] - motion[start])
+        places.append(start + int(np.argmax(rising >= 0.5 * (rising[0] + rising[-1]))))
+    largest = np.argsort(-np.abs(swings), kind="stable")[:_MOST_ANCHORS]
+    return np.array(places, dtype=np.int64)[largest], swings[largest]
+
+
+def _turning_points(motion: Array, *, least: float) -> np.ndarray:
+    """Return the extrema between which the motion swings by at least so much."""
+    if not least > 0:
+        return np.zeros(0, dtype=np.int64)
+    slope = np.sign(np.diff(motion))
+    extrema = np.flatnonzero(slope[:-1] * slope[1:] <= 0) + 1
+    turns: list[int] = []
+    for at in (0, *extrema.tolist(), motion.size - 1):
+        if (
+            len(turns) > 1
+            and (motion[at] - motion[turns[-1]]) * (motion[turns[-1]] - motion[turns[-2]]) > 0
+        ):
+            turns[-1] = at  # the same swing goes on
+        elif not turns or abs(motion[at] - motion[turns[-1]]) >= least:
+            turns.append(at)
+    return np.array(turns, dtype=np.int64)
