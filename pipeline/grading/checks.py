@@ -1,61 +1,25 @@
 """The checks of a rubric: each gives a share of the points, and says why."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from decimal import Decimal
 from fractions import Fraction
-from typing import Any
-
-import numpy as np
 
 from pipeline.grading import rubric as asked
-from pipeline.grading.controller import Controller
+from pipeline.grading.checks_loop import (
+    judge_claims,
+    judge_gains,
+    judge_hardware,
+    judge_prefilter,
+)
 from pipeline.grading.laws import judge_laws
 from pipeline.grading.pieces import asked_pieces, missing_pieces
-from pipeline.grading.reference import Reference, References
-from pipeline.grading.rubric import Rubric, is_damping, matching
+from pipeline.grading.reference import Reference
+from pipeline.grading.rubric import is_damping, matching
 from pipeline.grading.state_model import compare_entries
-from pipeline.grading.tolerance import credit, exact, percent_off
-from pipeline.plant.chain import Array
-from pipeline.results import Analysis
-from pipeline.submission import Reported, Submission
+from pipeline.grading.tolerance import credit, half_digit, percent_off
+from pipeline.grading.work import ALL, NONE, Verdict, Work, mean_share
 
-_ALL, _NONE = Fraction(1), Fraction(0)
 _NAMED = 4  # so many are named in a message
-
-
-@dataclass(frozen=True, kw_only=True)
-class Work:
-    """All that a check may look at.
-
-    Attributes
-    ----------
-    state_models : what [A B] may rightly be.
-    bad : runs that do not hold what they should, each with what is wrong.
-    """
-
-    submission: Submission
-    analysis: Analysis
-    rubric: Rubric
-    references: References
-    controller: Controller | None
-    state_models: Sequence[Array]
-    bad: Mapping[str, str]
-
-    @property
-    def reported(self) -> Reported:
-        """What the students claim; empty where they claim nothing."""
-        return self.submission.reported or Reported()
-
-
-@dataclass(frozen=True, kw_only=True)
-class Verdict:
-    """The share of the points; None where nothing could be judged, and `message` says why."""
-
-    share: Fraction | None
-    message: str
-    expected: dict[str, Any] = field(default_factory=dict)
-    found: dict[str, Any] = field(default_factory=dict)
 
 
 def judge(criterion: asked.Criterion, work: Work) -> Verdict:
@@ -74,17 +38,13 @@ def judge(criterion: asked.Criterion, work: Work) -> Verdict:
         case asked.StateModel():
             return _state_space(criterion, work)
         case asked.Gains():
-            return _gains(criterion, work)
+            return judge_gains(criterion, work)
         case asked.Claims():
-            return _claims(criterion, work)
+            return judge_claims(criterion, work)
         case asked.Prefilter():
-            return _prefilter(criterion, work)
+            return judge_prefilter(criterion, work)
         case asked.Hardware():
-            return _hardware(criterion, work)
-
-
-def _mean(shares: Sequence[Fraction]) -> Fraction:
-    return sum(shares, _NONE) / len(shares)
+            return judge_hardware(criterion, work)
 
 
 def _listed(names: Sequence[str]) -> str:
@@ -98,9 +58,9 @@ def _listed(names: Sequence[str]) -> str:
 def _required(work: Work) -> Verdict:
     pieces, missing = asked_pieces(work.rubric), missing_pieces(work.submission, work.rubric)
     if not pieces:
-        return Verdict(share=_ALL, message="Nothing in particular was asked for.")
+        return Verdict(share=ALL, message="Nothing in particular was asked for.")
     return Verdict(
-        share=_ALL - Fraction(len(missing), len(pieces)),
+        share=ALL - Fraction(len(missing), len(pieces)),
         message=f"Missing: {_listed(missing)}." if missing else "All that was asked for is here.",
         expected={"pieces": pieces},
         found={"missing": missing},
@@ -111,7 +71,7 @@ def _data(work: Work) -> Verdict:
     runs = len(work.submission.experiments)
     bad = work.bad
     return Verdict(
-        share=_ALL - Fraction(min(len(bad), runs), runs) if runs else _NONE,
+        share=ALL - Fraction(min(len(bad), runs), runs) if runs else NONE,
         message="; ".join(f"{run}: {why.rstrip('.')}" for run, why in list(bad.items())[:_NAMED])
         + "."
         if bad
@@ -137,7 +97,7 @@ def _parameters(criterion: asked.Parameters, work: Work) -> Verdict:
     shares, off = [], []
     for name in judged:
         if name not in table:
-            shares.append(_NONE)
+            shares.append(NONE)
             off.append(f"{name} is not reported")
             continue
         error = (
@@ -152,7 +112,7 @@ def _parameters(criterion: asked.Parameters, work: Work) -> Verdict:
     left = f" Not judged: {_listed(guessed)}." if guessed and criterion.check == "final" else ""
     message = f"{'; '.join(off[:_NAMED])}." if off else "As your own recordings say."
     return Verdict(
-        share=_mean(shares),
+        share=mean_share(shares),
         message=message + left,
         expected={n: known[n].value for n in judged if n in known},
         found={n: float(table[n]) for n in judged if n in table},
@@ -184,7 +144,7 @@ def _initial_final(criterion: asked.InitialFinal, work: Work) -> Verdict:
         if shares[-1] < 1:
             apart.append(f"{name}: first {initial[name]}, then {final[name]}")
     return Verdict(
-        share=_mean(shares),
+        share=mean_share(shares),
         message=f"{'; '.join(apart[:_NAMED])}." if apart else "Both estimates agree.",
         expected={n: float(initial[n]) for n in both},
         found={n: float(final[n]) for n in both},
@@ -193,15 +153,9 @@ def _initial_final(criterion: asked.InitialFinal, work: Work) -> Verdict:
 
 def between(initial: Decimal, final: Decimal) -> Fraction:
     """Return how far two typed numbers are apart, in percent, half the last digit of each off."""
-    value = float(initial)
-    point = Reference(value=value, low=value, high=value, std=0.0, source="initial")
-    # The wider rounding of the two would count for both: take each once.
-    from pipeline.grading.tolerance import half_digit
-
-    widened = Reference(
-        value=value, low=value, high=value, std=float(half_digit(initial)), source="initial"
-    )
-    return percent_off(final, widened if value > 0 else point, sigmas=1.0)
+    value, half = float(initial), float(half_digit(initial))
+    reference = Reference(value=value, low=value, high=value, std=half, source="initial")
+    return percent_off(final, reference, sigmas=1.0)
 
 
 def _laws(criterion: asked.Laws, work: Work) -> Verdict:
@@ -213,10 +167,10 @@ def _laws(criterion: asked.Laws, work: Work) -> Verdict:
     )
     if laws is None:
         return Verdict(share=None, message="Not checked: the final table is not complete.")
-    shares = [_ALL if law.within_rounding else Fraction(law.within_tolerance, 2) for law in laws]
+    shares = [ALL if law.within_rounding else Fraction(law.within_tolerance, 2) for law in laws]
     broken = [law for law in laws if not law.within_rounding]
     return Verdict(
-        share=_mean(shares),
+        share=mean_share(shares),
         message="; ".join(f"{law.name} fails ({law.meaning})" for law in broken[:_NAMED]) + "."
         if broken
         else f"All {len(laws)} laws hold within the rounding.",
@@ -231,7 +185,7 @@ def _laws(criterion: asked.Laws, work: Work) -> Verdict:
 def _state_space(criterion: asked.StateModel, work: Work) -> Verdict:
     space = work.reported.state_space
     if space is None or not (space.A and space.B):
-        return Verdict(share=_NONE, message="A and B are not both reported.")
+        return Verdict(share=NONE, message="A and B are not both reported.")
     entries = compare_entries(space, models=work.state_models, n=work.rubric.system.carts)
     if not entries:
         return Verdict(
@@ -255,161 +209,11 @@ def _state_space(criterion: asked.StateModel, work: Work) -> Verdict:
     ]
     off = [e for e, share in zip(entries, shares, strict=True) if share < 1]
     return Verdict(
-        share=_mean(counted),
+        share=mean_share(counted),
         message="; ".join(f"{e.name} = {e.typed}, expected {e.right[0]:.4g}" for e in off[:_NAMED])
         + "."
         if off
         else "A and B follow from the table.",
         expected={e.name: e.right[0] for e in entries if e.kind != "exact" or e in off},
         found={e.name: float(e.typed) for e in entries if e.kind != "exact" or e in off},
-    )
-
-
-def _needs_gains(work: Work) -> Verdict | None:
-    feedback = work.reported.feedback
-    if feedback is None or not feedback.gains:
-        return Verdict(share=_NONE, message="No gains are reported.")
-    if work.controller is None:
-        return Verdict(share=None, message="Not checked: the carts are not identified.")
-    return None
-
-
-def _gains(criterion: asked.Gains, work: Work) -> Verdict:
-    if (missing := _needs_gains(work)) is not None:
-        return missing
-    assert work.controller is not None
-    assert work.controller.gains is not None
-    goal = work.controller.goal
-    best, found = _NONE, {}
-    for numbers in work.controller.numbers(work.controller.gains):
-        share = _NONE
-        if numbers.stable and numbers.settling_time is not None:
-            over = Fraction(max(numbers.overshoot - goal.overshoot_percent, 0.0))
-            late = Fraction(100 * max(numbers.settling_time / goal.settling_time - 1, 0.0))
-            share = min(
-                credit(over, full=criterion.overshoot_full, none=criterion.overshoot_none),
-                credit(
-                    late,
-                    full=criterion.settling_full_percent,
-                    none=criterion.settling_none_percent,
-                ),
-            )
-        if not found or share > best:
-            best = share
-            found = {
-                "stable": numbers.stable,
-                "overshoot_percent": numbers.overshoot if np.isfinite(numbers.overshoot) else None,
-                "settling_time": numbers.settling_time,
-                "poles": [[p.real, p.imag] for p in numbers.poles],
-            }
-    if not found:
-        return Verdict(share=_NONE, message="These gains cannot be simulated.")
-    overshoot, settling = found["overshoot_percent"], found["settling_time"]
-    does = (
-        "the loop is unstable"
-        if not found["stable"]
-        else f"overshoot {overshoot:.3g} %, "
-        + (f"settling in {settling:.3g} s" if settling is not None else "no settling in sight")
-    )
-    return Verdict(
-        share=best,
-        message=f"On your carts: {does}; the goal is {goal.overshoot_percent:g} % and "
-        f"{goal.settling_time:g} s.",
-        expected={
-            "overshoot_percent": goal.overshoot_percent,
-            "settling_time": goal.settling_time,
-        },
-        found=found,
-    )
-
-
-def _claims(criterion: asked.Claims, work: Work) -> Verdict:
-    if (missing := _needs_gains(work)) is not None:
-        return missing
-    assert work.controller is not None
-    assert work.controller.gains is not None
-    controller = work.controller
-    claims = {"overshoot_percent": controller.overshoot, "settling_time": controller.settling}
-    best, expected = None, {}
-    for numbers in controller.numbers(controller.gains):
-        shares = [_NONE, _NONE]
-        if controller.overshoot is not None and np.isfinite(numbers.overshoot):
-            off = abs(Fraction(controller.overshoot) - Fraction(numbers.overshoot))
-            shares[0] = credit(off, full=criterion.overshoot_full, none=criterion.overshoot_none)
-        if controller.settling is not None and numbers.settling_time is not None:
-            point = numbers.settling_time
-            reference = Reference(value=point, low=point, high=point, std=0.0, source="")
-            shares[1] = credit(
-                percent_off(controller.settling, reference, sigmas=0.0),
-                full=criterion.settling_full_percent,
-                none=criterion.settling_none_percent,
-            )
-        if best is None or _mean(shares) > best:
-            best = _mean(shares)
-            expected = {
-                "overshoot_percent": numbers.overshoot if np.isfinite(numbers.overshoot) else None,
-                "settling_time": numbers.settling_time,
-            }
-    return Verdict(
-        share=best if best is not None else _NONE,
-        message="What the gains give."
-        if best == 1
-        else "Simulated on your carts these gains give "
-        + ", ".join(f"{k} {v:.3g}" for k, v in expected.items() if v is not None)
-        + ".",
-        expected=expected,
-        found={name: float(v) for name, v in claims.items() if v is not None},
-    )
-
-
-def _prefilter(criterion: asked.Prefilter, work: Work) -> Verdict:
-    if (missing := _needs_gains(work)) is not None:
-        return missing
-    assert work.controller is not None
-    assert work.controller.gains is not None
-    typed = work.controller.prefilter
-    if typed is None:
-        return Verdict(share=_NONE, message="No prefilter is reported.")
-    best, right = _NONE, None
-    for numbers in work.controller.numbers(work.controller.gains):
-        size = abs(numbers.prefilter)
-        reference = Reference(value=size, low=size, high=size, std=0.0, source="")
-        signed = typed if numbers.prefilter > 0 else -typed
-        error = percent_off(signed, reference, sigmas=0.0)
-        share = credit(error, full=criterion.full_percent, none=criterion.none_percent)
-        if right is None or share > best:
-            best, right = share, numbers.prefilter
-    if right is None:
-        return Verdict(share=_NONE, message="These gains cannot be simulated.")
-    return Verdict(
-        share=best,
-        message="One over the static gain of the loop, as it should be."
-        if best == 1
-        else f"These gains need {right:.4g}, you report {typed}.",
-        expected={"prefilter": right},
-        found={"prefilter": float(typed)},
-    )
-
-
-def _hardware(criterion: asked.Hardware, work: Work) -> Verdict:
-    """The closed loop that ran, simulated; the best of several runs counts."""
-    runs = {e.id for e in work.submission.experiments if e.kind == "closed_loop"}
-    if not runs:
-        return Verdict(share=_NONE, message="No closed-loop run was handed in.")
-    closed: dict[str, list[float]] = {}
-    for check in work.analysis.hardware:
-        if check.experiment in runs and check.loop == "closed":
-            closed.setdefault(check.experiment, []).append(check.nrmse)
-    if not closed:
-        reasons = [s.reason for s in work.analysis.skipped if s.stage.startswith("hardware")]
-        why = reasons[0] if reasons else "the controller that ran is not stated"
-        return Verdict(share=_NONE, message=f"The loop cannot be compared: {why}.")
-    errors = {run: 100 * float(np.sqrt(np.mean(np.square(e)))) for run, e in closed.items()}
-    run = min(errors, key=lambda name: errors[name])
-    error = exact(errors[run])
-    return Verdict(
-        share=credit(error, full=criterion.full_percent, none=criterion.none_percent),
-        message=f"{run}: model and measurement differ by {errors[run]:.3g} % of the motion.",
-        expected={"nrmse_percent": criterion.full_percent},
-        found={"nrmse_percent": errors[run]},
     )

@@ -9,6 +9,7 @@ import numpy as np
 
 from pipeline.grading.grade import Flag
 from pipeline.grading.loop_numbers import LoopNumbers, loop_numbers
+from pipeline.grading.reference import is_explained
 from pipeline.grading.state_model import own_chain
 from pipeline.grading.tolerance import half_digit
 from pipeline.plant.chain import Array, Chain
@@ -19,7 +20,7 @@ from pipeline.submission import Design, StateFeedback, Submission
 _OVERSHOOT = 20.0  # percentage points above the goal
 _SETTLING = 2.0  # times the goal
 _CLAIM_OVERSHOOT, _CLAIM_SETTLING = 12.0, 1.6  # percentage points, times
-_PREFILTER = 0.10  # relative
+_PREFILTER, _PREFILTER_BLURRED = 0.10, 0.20  # relative
 _SAME_GAINS = 0.02  # relative to the largest of its kind: typed again with fewer digits
 
 
@@ -33,6 +34,7 @@ class Controller:
     ran : (2n,) gains stated for a closed-loop run, if any.
     models : the reference chain and the student's own.
     goal : what must be met; what the reference reaches where that is less.
+    blurred : the reference's gains are as uncertain as friction makes them.
     """
 
     gains: Array | None
@@ -42,6 +44,7 @@ class Controller:
     ran: Array | None
     models: tuple[Chain, ...]
     goal: Design
+    blurred: bool
 
     def numbers(self, gains: Array) -> list[LoopNumbers]:
         """Return what gains do on each of the models."""
@@ -83,7 +86,8 @@ class Controller:
         if self.prefilter is None:
             return True
         off = abs(float(self.prefilter) - numbers.prefilter) - float(half_digit(self.prefilter))
-        return off <= _PREFILTER * abs(numbers.prefilter)
+        allowed = _PREFILTER_BLURRED if self.blurred else _PREFILTER
+        return off <= allowed * abs(numbers.prefilter)
 
 
 def reported_controller(
@@ -103,8 +107,7 @@ def reported_controller(
     feedback = submission.reported.feedback if submission.reported else None
     n = submission.system.carts
     own = [own_chain(values, n=n) for values in tables]
-    models = [chain, *(c for c in own if c is not None and min(*c.k, *c.c) >= 0)]
-    models = [model for model in models if model is not None]
+    models = [model for model in (chain, *own) if model is not None]
     if feedback is None or not models:
         return None
     goal = submission.design or Design(cart=n)
@@ -129,6 +132,7 @@ def reported_controller(
         ran=np.array(ran[0]) if ran else None,
         models=tuple(models),
         goal=goal,
+        blurred=not is_explained(analysis),
     )
 
 

@@ -122,7 +122,8 @@ def _corrected(
     """Return the final table as it would be without the mistakes found in it."""
     corrected = {name: float(typed) for name, typed in final.items()}
     for one in explained:
-        for name in one.names if one.table == "final" else ():
+        inside = [n for n in one.names if n in one.mistake.predicted]
+        for name in inside if one.table == "final" else ():
             corrected[name] *= known[name].value / one.mistake.predicted[name].value
     return corrected
 
@@ -184,7 +185,9 @@ def _explains(mistake: Mistake, table: Table, remaining: Sequence[str]) -> list[
     met = [name for name in asked if _off_by(mistake, table, name) <= 1]
     if len(met) < mistake.least or (mistake.whole and len(met) < len(asked)):
         return []
-    return [name for name in remaining if name in met]
+    wrong = [name for name in remaining if name in met]
+    # Of two carts swapped both numbers are wrong, not only near the other's.
+    return [] if "carts_swapped" in mistake.codes and len(wrong) < mistake.least else wrong
 
 
 def _off_by(mistake: Mistake, table: Table, name: str) -> float:
@@ -210,7 +213,7 @@ def _evidence(name: str, typed: Decimal, reference: Reference | None, table: str
 
 
 def _specific_flags(
-    explained: Sequence[Explained], tables: Mapping[str, Table], references: References
+    explained: Sequence[Explained], tables: Mapping[Label, Table], references: References
 ) -> list[Flag]:
     """Return one flag a code, over both tables; the first number stands for all in the text."""
     flags = []
@@ -220,7 +223,8 @@ def _specific_flags(
             continue
         names = list(dict.fromkeys(name for one in mine for name in one.names))
         first = min(mine, key=lambda one: len(one.mistake.codes))
-        name, typed = first.names[0], tables[first.table][first.names[0]]
+        name = next(name for name in first.names if name in first.mistake.predicted)
+        typed = tables[first.table][name]
         reference: Reference = getattr(references, first.table)[name]
         predicted = first.mistake.predicted[name]
         evidence = _evidence(name, typed, reference, first.table)
@@ -305,6 +309,8 @@ def _disagreements(reported: Reported, references: References, *, named: set[str
             continue
         bounds = [float(final)]
         if name in references.initial and name in references.final:
+            if references.final[name].low <= 0:
+                continue
             # The data's own two estimates may differ as much.
             ratio = references.initial[name].value / references.final[name].value
             bounds.append(float(final) * ratio)

@@ -10,7 +10,7 @@ from pipeline.grading.tolerance import half_digit
 
 # How far an order may be broken: fitted numbers are good to some percent, and first estimates of
 # resonances and nulls are read off a plot.
-_FINAL_SLACK = 1.05
+_FINAL_SLACK = 1.1
 _INITIAL_SLACK = 1.2
 _HEAVY_DAMPING = 0.3  # above it the orders, exact without damping, may bend
 

@@ -23,6 +23,7 @@ _MANY_PERIODS = range(5, 11)
 _GAIN_OR_FREQUENCY = 0.03  # an honest reading after one slip: relative
 _COUNTED = 0.015
 _DAMPING = 0.2
+_SHARP = 1.05  # high over low of a reference that friction does not blur
 _CLEARLY_OFF = 0.06  # of a gain: another extremum of the step as near as this says nothing
 
 
@@ -51,6 +52,7 @@ class Mistake:
 
 def known_mistakes(references: Mapping[str, Reference], analysis: Analysis) -> list[Mistake]:
     """Return every mistake that can be tried on a table, single ones before combined ones."""
+    references = {n: r for n, r in references.items() if r.low > 0}
     gains = {n: r for n, r in references.items() if n.startswith("K")}
     omegas = {n: r for n, r in references.items() if n.startswith("omega")}
     own_omegas = {n: r for n, r in omegas.items() if n[-1] in _OWN}
@@ -71,8 +73,9 @@ def known_mistakes(references: Mapping[str, Reference], analysis: Analysis) -> l
     swaps = [*_swaps(gains), *_swaps(own_omegas), *_swaps(own_zetas)]
     pairs = [*_swapped(hertz, own_omegas), *_swapped(scales, gains), *_swapped(log10, own_zetas)]
     pairs += list(_in_counts(scales))
-    for miscount in _miscounts(own_omegas, own_zetas, periods=_FEW_PERIODS):
-        pairs += _miscount_and(miscount, own_omegas, own_zetas)
+    for miscount in single:
+        if miscount.codes == ("peak_count",):
+            pairs += _miscount_and(miscount, own_omegas, own_zetas)
     return [m for m in (*single, *swaps, *pairs) if m.predicted]
 
 
@@ -105,14 +108,12 @@ def _hertz(omegas: Mapping[str, Reference]) -> list[Mistake]:
 def _miscounts(
     omegas: Mapping[str, Reference],
     zetas: Mapping[str, Reference],
-    *,
-    periods: Sequence[int] | None = None,
 ) -> list[Mistake]:
     """One period too many or too few: ω is off by their ratio, and a decrement by its inverse."""
     found = []
     for name, omega in omegas.items():
         zeta = "zeta" if name == "omega_n" else name.replace("omega", "zeta")
-        for k in periods or (*_FEW_PERIODS, *_MANY_PERIODS):
+        for k in (*_FEW_PERIODS, *_MANY_PERIODS):
             for counted, there in ((k + 1, k), (k, k + 1)):
                 help_ = (
                     f"{{reported}} is {{recomputed}}·{counted}/{there}: {counted} periods counted "
@@ -189,21 +190,25 @@ def _miscount_and(
 
 
 def _gain_mistakes(gains: Mapping[str, Reference], analysis: Analysis) -> list[Mistake]:
+    twice = (
+        "{reported} is twice {recomputed}: an amplitude is half of the distance from peak to peak"
+    )
+    half = (
+        "{reported} is half of {recomputed}: was the input taken from peak to peak, and the "
+        "position not?"
+    )
+    # Who reads from peak to peak does so for every cart; of one alone a sharp reference tells.
+    sharp = {n: r for n, r in gains.items() if r.high <= r.low * _SHARP}
     found = [
         Mistake(
             codes=("peak_to_peak",),
-            predicted=_times(gains, 2.0),
+            predicted=_times(some, factor),
             tolerance=_GAIN_OR_FREQUENCY,
-            help="{reported} is twice {recomputed}: an amplitude is half of the distance from peak "
-            "to peak",
-        ),
-        Mistake(
-            codes=("peak_to_peak",),
-            predicted=_times(gains, 0.5),
-            tolerance=_GAIN_OR_FREQUENCY,
-            help="{reported} is half of {recomputed}: was the input taken from peak to peak and "
-            "the position not?",
-        ),
+            help=text,
+            whole=some is gains,
+        )
+        for some in (gains, sharp)
+        for factor, text in ((2.0, twice), (0.5, half))
     ]
     extremes = {name: _step_extremes(name, analysis) for name in gains}
     found.append(

@@ -31,7 +31,7 @@ def copied_final(reported: Reported, *, references: References) -> list[str]:
         apart = _APART_DAMPING if is_damping(name) else _APART
         reference = references.final.get(name)
         typed = reported.final[name]
-        if name in fitted and reference is not None and not is_damping(name):
+        if name in fitted and reference and reference.low > 0 and not is_damping(name):
             apart = max(apart, abs(float(typed) / reference.value - 1))
         step = 2 * float(half_digit(typed)) / abs(float(typed)) if typed else 1.0
         chance *= min(1.0, step / (apart * 3.5))  # the density of a normal difference at zero

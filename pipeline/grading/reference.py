@@ -8,6 +8,8 @@ from pipeline.results import Analysis, Estimate, ParameterRow
 from pipeline.stages.compare import CHI_SQUARE_LIMIT
 
 _ASTRAY = 1.3  # a fitted frequency that far from the measured one: the fit has gone astray
+# A resonance or null read off the dwells, and where friction blurs even those: factors.
+_BY_EYE, _BY_EYE_ASTRAY = 1.1, 1.6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +60,7 @@ def recompute(analysis: Analysis) -> References:
     final, initial = {}, {}
     for row in analysis.rows:
         fitted = _final(row.final, row, analysis) if row.final and trusted else None
-        measured = _initial(row, fitted, analysis)
+        measured = _initial(row, fitted, analysis, trusted=trusted)
         if measured is not None:
             initial[row.name] = measured
         if fitted is not None or (measured is not None and row.final is not None):
@@ -72,7 +74,7 @@ def trusted_chain(analysis: Analysis) -> Chain | None:
     A fit that does not explain the data must at least find the frequencies that were measured
     without it.
     """
-    if analysis.fit is None or _explained(analysis):
+    if analysis.fit is None or is_explained(analysis):
         return analysis.chain
     apart = [
         max(row.final.value / row.initial.value, row.initial.value / row.final.value)
@@ -83,7 +85,8 @@ def trusted_chain(analysis: Analysis) -> Chain | None:
     return analysis.chain if max(apart, default=1.0) <= _ASTRAY else None
 
 
-def _explained(analysis: Analysis) -> bool:
+def is_explained(analysis: Analysis) -> bool:
+    """Whether linear carts and noise explain the data; without a fit nothing says otherwise."""
     return analysis.fit is None or analysis.fit.chi_square_per_dof <= CHI_SQUARE_LIMIT
 
 
@@ -100,7 +103,7 @@ def friction_share(analysis: Analysis) -> float:
 def _final(estimate: Estimate, row: ParameterRow, analysis: Analysis) -> Reference:
     share = friction_share(analysis) if is_damping(row.name) else 1.0
     bounds = [estimate.value, estimate.value * (share if estimate.value > 0 else 1.0)]
-    if not _explained(analysis):
+    if not is_explained(analysis):
         bounds += _readings(row.name, analysis)
         if row.initial is not None and row.initial.source != "assumed":
             bounds.append(row.initial.value)
@@ -113,20 +116,26 @@ def _final(estimate: Estimate, row: ParameterRow, analysis: Analysis) -> Referen
     )
 
 
-def _initial(row: ParameterRow, final: Reference | None, analysis: Analysis) -> Reference | None:
+def _initial(
+    row: ParameterRow, final: Reference | None, analysis: Analysis, *, trusted: bool
+) -> Reference | None:
     measured = row.initial
     if measured is not None and measured.source == "assumed":
         return None
     if measured is None:
         return final
-    bounds = [measured.value, *_readings(row.name, analysis)]
+    readings = _readings(row.name, analysis)
+    bounds = [measured.value, *readings]
     if final is not None:
         bounds += [final.low, final.high]
+    spread = 1.0
+    if measured.source == "frequency_response":
+        spread = _BY_EYE if trusted else _BY_EYE_ASTRAY
     return Reference(
         value=measured.value,
-        low=min(bounds),
-        high=max(bounds),
-        std=measured.std or 0.0,
+        low=min(bounds) / spread,
+        high=max(bounds) * spread,
+        std=0.0 if len(readings) > 1 else measured.std or 0.0,  # the readings show their scatter
         source=measured.source,
     )
 

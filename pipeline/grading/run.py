@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 
 from pipeline.errors import SubmissionError
-from pipeline.grading.checks import Work, judge
+from pipeline.grading.checks import judge
 from pipeline.grading.controller import diagnose_controller, reported_controller
 from pipeline.grading.diagnose import diagnose_tables
 from pipeline.grading.grade import CODES, Criterion, Flag, Grade, Outcome
@@ -16,6 +16,7 @@ from pipeline.grading.reference import recompute, trusted_chain
 from pipeline.grading.rubric import Late, Rubric
 from pipeline.grading.state_model import diagnose_state_space, state_models
 from pipeline.grading.tolerance import exact
+from pipeline.grading.work import Work
 from pipeline.ingest.columns import conversion
 from pipeline.ingest.read import read_data
 from pipeline.results import Analysis

@@ -15,7 +15,7 @@ from pipeline.stages.bode_fit import fit_bode
 
 _TOLERANCE = 0.04  # the fit of a student weighs the points its own way
 _DAMPING = 0.2
-_MET = 0.75  # of the numbers: a wrong response has no exact fit, so not every one is met
+_MET = 0.65  # of the numbers: a wrong response has no exact fit, so not every one is met
 _NEW = 0.05  # a fit that moves no number by as much tells nothing
 
 Reading = Callable[[Record, Array], float]
@@ -34,7 +34,7 @@ def transient_fits(
         moved = [
             name
             for name, r in predicted.items()
-            if name in known and abs(r.value / known[name].value - 1) > _NEW
+            if name in known and known[name].low > 0 and abs(r.value / known[name].value - 1) > _NEW
         ]
         asked = [name for name in predicted if name in table]
         if moved and asked:
@@ -100,6 +100,8 @@ def _refit(
         return {}
     references = {}
     for name, estimate in fit.parameters.items():
+        if estimate.value <= 0:
+            continue
         slack = _DAMPING if name.startswith("zeta") else 0.0
         reference = Reference(
             value=estimate.value,

@@ -1,0 +1,61 @@
+"""The laws of a final table: the paper's own tables, and tables of real chains."""
+
+from decimal import Decimal
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.grading.laws import judge_laws
+from pipeline.plant.chain import Chain
+
+TABLE_2 = {
+    "K_1": "24.3", "K_2": "16.4", "omega_a": "10.1", "omega_b": "37.3", "zeta_a": "0.11",
+    "zeta_b": "0.03", "omega_1": "19.8", "omega_2": "32.9", "zeta_1": "0.05", "zeta_2": "0.04",
+}  # fmt: skip
+TABLE_3 = {
+    "K_1": "39.4", "K_2": "30.6", "K_3": "16.0", "omega_a": "6.9", "omega_b": "24.1",
+    "omega_c": "34.1", "zeta_a": "0.25", "zeta_b": "0.03", "zeta_c": "0.03", "omega_x": "20.2",
+    "omega_y": "31.6", "zeta_x": "0.04", "zeta_y": "0.03", "omega_1": "20.0", "omega_2": "27.2",
+    "omega_3": "25.6", "zeta_1": "0.08", "zeta_2": "0.02", "zeta_3": "0.04",
+}  # fmt: skip
+
+
+def broken(table: dict[str, str], *, n: int) -> set[str]:
+    typed = {name: Decimal(value) for name, value in table.items()}
+    laws = judge_laws(typed, n=n, frequency_percent=3.0, damping_percent=30.0)
+    assert laws is not None
+    return {law.name for law in laws if not law.within_rounding}
+
+
+def test_table_2_of_the_paper_passes_but_for_its_first_cart():
+    """R1 holds within the rounding; ω_1 = 19.8 lies below the recomputed 20.07 to 20.49."""
+    assert broken(TABLE_2, n=2) == {"recomputed.omega_1"}
+
+
+def test_table_3_of_the_paper_fails_where_it_is_known_to():
+    """R1 to R3 hold, R4 and R5 do not, the wall spring comes out negative, ω_2 is off."""
+    failed = {"redundancy.R4", "redundancy.R5", "sign.k_1", "recomputed.omega_2"}
+    assert broken(TABLE_3, n=3) == failed
+
+
+@pytest.mark.parametrize("n", [2, 3])
+@given(data=st.data())
+def test_a_rounded_table_of_a_real_chain_obeys_every_law(n, data):
+    """However few digits a real chain's table is typed with, the box of its rounding holds it."""
+    sizes = st.floats(0.5, 2.0)
+    digits = data.draw(st.integers(2, 5))
+    chain = Chain(
+        m=np.array([data.draw(sizes) for _ in range(n)]) * 3e-4,
+        c=np.array([data.draw(sizes) for _ in range(n)]) * 5e-4,
+        k=np.array([data.draw(sizes) for _ in range(n + 1)]) * 0.1,
+    )
+    table = {name: f"{value:#.{digits}g}" for name, value in chain.parameters().items()}
+    assert broken({k: v.removesuffix(".") for k, v in table.items()}, n=n) == set()
+
+
+def test_an_incomplete_table_is_not_judged():
+    """Without one of the parameters there is nothing to propagate."""
+    typed = {name: Decimal(value) for name, value in TABLE_2.items() if name != "K_1"}
+    assert judge_laws(typed, n=2, frequency_percent=3.0, damping_percent=30.0) is None

@@ -1,0 +1,124 @@
+"""Rubrics: those shipped are valid; every mistake in one is named with its line."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from pipeline.errors import ConfigError
+from pipeline.grading.describe import rubric_dict, rubric_text
+from pipeline.grading.load import load_rubric
+from pipeline.resources import RUBRICS
+
+SHIPPED = sorted(RUBRICS.glob("*.toml"))
+GOOD = """\
+version = 1
+
+[system]
+carts = 2
+springs = [false, true, true]
+input = { unit = "V" }
+
+[required]
+final = ["K_*"]
+
+[[required.experiments]]
+kind = "step"
+
+[[criteria]]
+id = "gains"
+points = 2
+check = "final"
+parameters = ["K_*"]
+
+[[criteria]]
+id = "model"
+points = 1.5
+check = "state_space"
+requires = ["gains"]
+"""
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "lab.toml"
+    path.write_text(text, encoding="utf-8", newline="\n")
+    return path
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_shipped_rubrics_are_valid_and_worth_twenty_points(path):
+    """Every shipped rubric loads, by path and by name, and says what it asks."""
+    rubric = load_rubric(path)
+    assert load_rubric(Path(path.stem)) == rubric
+    assert rubric.out_of == 20
+    text = rubric_text(rubric)
+    assert all(criterion.id in text for criterion in rubric.criteria)
+    assert json.loads(json.dumps(rubric_dict(rubric)))["out_of"] == 20
+
+
+def test_four_rubrics_are_shipped():
+    """One for each of the paper's systems, and one for a bench in counts."""
+    names = {path.stem for path in SHIPPED}
+    assert names == {"throne-1dof", "throne-2dof", "throne-3dof", "ucsd-mae171a"}
+
+
+def test_a_pattern_is_written_out(tmp_path):
+    """`K_*` stands for every gain of the system."""
+    plain = rubric_dict(load_rubric(write(tmp_path, GOOD)))
+    assert plain["criteria"][0]["parameters"] == ["K_1", "K_2"]
+    assert plain["required"]["final"] == ["K_1", "K_2"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "what"),
+    [
+        ('unit = "V"', 'unti = "V"', 6, r"system\.input\.unti: unknown key; did you mean 'unit'"),
+        ("points = 2", "pionts = 2", 16, r"criteria\[1\]\.pionts \(gains\): unknown key; did you"),
+        ("points = 2", "points = 0", 16, r"points \(gains\): expected more than 0"),
+        ('check = "final"', 'check = "finla"', 17, r"no such check 'finla'; did you mean 'final'"),
+        ('"K_*"]\n\n[[r', '"K_9"]\n\n[[r', 9, r"required\.final: no parameter 'K_9'"),
+        ('parameters = ["K_*"]', 'parameters = ["L_*"]', 18, r"no parameter 'L_\*'"),
+        ('kind = "step"', 'kind = "stop"', 12, r"kind: expected .*did you mean 'step'"),
+        ('requires = ["gains"]', 'requires = ["gians"]', 24, r"'gians' is no criterion; did you"),
+        ('id = "model"', 'id = "gains"', 21, r"'gains' is used before"),
+        ("[false, true, true]", "[true]", 5, r"expected 3 values \(wall-1, 1-2, 2-wall\), found 1"),
+        ("version = 1", "version = 2", 1, r"version: expected 1, found 2"),
+        ("points = 1.5", "points = 1.5\nfull_percent = 30", 23, r"full_percent .*more than none"),
+    ],
+)
+def test_a_mistake_is_named_with_its_line(tmp_path, old, new, line, what):
+    """An author is told file, line, key, and what was expected or is near."""
+    assert old in GOOD
+    path = write(tmp_path, GOOD.replace(old, new, 1))
+    with pytest.raises(ConfigError, match=rf"lab\.toml line {line}: .*{what}"):
+        load_rubric(path)
+
+
+def test_every_mistake_has_its_own_line(tmp_path):
+    """Three mistakes are three lines, in the order of the file."""
+    text = GOOD.replace("points = 2", "points = -2").replace("version", "vresion")
+    text = text.replace('kind = "step"', 'kind = "stop"')
+    with pytest.raises(ConfigError) as caught:
+        load_rubric(write(tmp_path, text))
+    lines = [int(line.split()[2].rstrip(":")) for line in str(caught.value).splitlines()]
+    assert lines == sorted(lines)
+    assert {1, 12, 16} <= set(lines)
+
+
+def test_a_criterion_may_only_build_on_an_earlier_one(tmp_path):
+    """A criterion that requires a later one is refused, so there are no circles."""
+    text = GOOD.replace('parameters = ["K_*"]', 'requires = ["model"]')
+    with pytest.raises(ConfigError, match="'model' comes later"):
+        load_rubric(write(tmp_path, text))
+
+
+def test_a_rubric_that_is_not_there_names_the_shipped_ones():
+    """A misspelt name is answered with the nearest shipped rubric."""
+    with pytest.raises(ConfigError, match="did you mean 'throne-2dof'"):
+        load_rubric(Path("throne-2dofs"))
+
+
+def test_toml_that_is_none_says_where(tmp_path):
+    """A syntax error keeps the line that the parser gives."""
+    with pytest.raises(ConfigError, match=r"not valid TOML: .*line 2"):
+        load_rubric(write(tmp_path, "version = 1\ntitle = \n"))

@@ -1,0 +1,81 @@
+"""Errors and credit: exact at the edge, monotone in the error, rounding taken off."""
+
+from decimal import Decimal
+from fractions import Fraction
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.grading.reference import Reference
+from pipeline.grading.tolerance import credit, half_digit, percent_off
+
+percents = st.decimals("0", "500", places=2).map(float)
+
+
+def at(value: float, *, std: float = 0.0) -> Reference:
+    return Reference(value=value, low=value, high=value, std=std, source="test")
+
+
+@pytest.mark.parametrize(
+    ("typed", "half"),
+    [("0.10", "0.005"), ("29", "0.5"), ("2.90e1", "0.05"), ("-3.5", "0.05"), ("0", "0.5")],
+)
+def test_half_a_digit_is_that_of_the_typed_number(typed, half):
+    """0.10 was typed to hundredths, 29 to units."""
+    assert half_digit(Decimal(typed)) == Fraction(half)
+
+
+@given(full=percents, width=percents)
+def test_the_edges_belong_to_the_tolerance(full, width):
+    """At exactly `full` all points are earned; at exactly `none` none, unless it is `full` too."""
+    none = float(Decimal(str(full)) + Decimal(str(width)))
+    assert credit(Fraction(str(full)), full=full, none=none) == 1
+    assert credit(Fraction(str(none)), full=full, none=none) == (0 if none > full else 1)
+    just_above = Fraction(str(full)) + Fraction(1, 10**30)
+    assert credit(just_above, full=full, none=none) < 1
+
+
+@given(first=st.fractions(0, 500), second=st.fractions(0, 500), full=percents, width=percents)
+def test_credit_never_rises_with_the_error(first, second, full, width):
+    """The larger of two errors never earns more, and every credit is between none and all."""
+    none = full + width
+    small, large = sorted((first, second))
+    assert 1 >= credit(small, full=full, none=none) >= credit(large, full=full, none=none) >= 0
+
+
+@given(
+    value=st.floats(1e-3, 1e3),
+    steps=st.tuples(st.integers(0, 400), st.integers(0, 400)),
+    sign=st.sampled_from([-1, 1]),
+)
+def test_the_error_grows_with_the_distance(value, steps, sign):
+    """Further from the reference on one side is never a smaller error."""
+    near, far = sorted(steps)
+    typed = [Decimal(round(value, 4)).quantize(Decimal("0.0001")) for _ in range(2)]
+    errors = [
+        percent_off(number + sign * Decimal(step) * Decimal("0.001"), at(value), sigmas=0.0)
+        for number, step in zip(typed, (near, far), strict=True)
+    ]
+    assert errors[0] <= errors[1]
+
+
+def test_rounding_and_standard_errors_come_off_first():
+    """105 to the unit is 4.5 off 100; with a standard error of 1 and 3 sigmas 1.5/103 is left."""
+    assert percent_off(Decimal("105"), at(100.0), sigmas=3.0) == Fraction(9, 2)
+    error = percent_off(Decimal("105"), at(100.0, std=1.0), sigmas=3.0)
+    assert error == 100 * (Fraction(209, 2) / 103 - 1)
+
+
+def test_five_percent_is_the_same_factor_either_way():
+    """A number too small by a factor is as wrong as one too large by it."""
+    high = percent_off(Decimal("120.0000"), at(100.0), sigmas=0.0)
+    low = percent_off(Decimal("83.33333"), at(100.0), sigmas=0.0)
+    # The digits typed differ: half of a unit in 1e-4 and 1e-5 is 1e-4 percent.
+    assert abs(high - low) < Fraction(2, 10**4)
+
+
+def test_a_wrong_sign_earns_nothing():
+    """No tolerance is wide enough for a negative gain."""
+    error = percent_off(Decimal("-24.3"), at(24.3), sigmas=3.0)
+    assert credit(error, full=1000.0, none=1000.0) == 0
