@@ -9,6 +9,7 @@ from pipeline.errors import DataError
 from pipeline.gap.document import gap_json
 from pipeline.gap.explain import explain_gap
 from pipeline.gap.types import Gap
+from pipeline.plant.effects import CATALOGUE
 from pipeline.results import Record
 from tests.truth.cases import make_case
 
@@ -77,6 +78,18 @@ def test_friction_that_varies_from_run_to_run_stays_one_effect():
     assert names(gap) == [("coulomb_friction", 1)]
     # 4 % was put in; seven runs tell a spread within a factor of two.
     assert 0.02 < gap.spread[1] < 0.08
+
+
+def test_what_the_catalogue_lacks_is_not_misnamed():
+    """With the true effect struck from the catalogue nothing is named, and suspects are listed."""
+    case = make_case(seed=10700, n=1, effects=["cubic_spring"], rate=113.1)
+    known = [e for e in CATALOGUE if e.key not in ("cubic_spring", "slack_spring")]
+
+    gap = explain(case, catalogue=known)
+
+    assert gap.verdict == "unexplained"
+    assert gap.suspects
+    assert all(s.nrmse_after > 0.5 * gap.baseline for s in gap.suspects)
 
 
 def test_two_effects_are_found_together():

@@ -17,6 +17,7 @@ LEVELS = (
     ("workflow", "synthesis", "results_json"),
     ("gap",),
     ("report",),
+    ("grading",),
     ("cli", "notebook"),
     ("__main__",),
 )

@@ -4,9 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.gap.fit import Fit, Locals, simulate_run
+from pipeline.gap.fit import Fit
+from pipeline.gap.hypothesis import AT_FLOOR, CONTACT, Bench, Hypothesis
+from pipeline.gap.linearise import Locals, simulate_run
 from pipeline.gap.runs import Run
-from pipeline.gap.search import AT_FLOOR, CONTACT, Bench, Hypothesis
 from pipeline.gap.types import FoundEffect, NamedValue, RecordGap, Rival, Trace
 from pipeline.plant.effects import find_effect
 from pipeline.plant.effects.base import Term

@@ -6,15 +6,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from pipeline.gap.fit import (
-    Fit,
-    Locals,
-    Mapper,
-    fit_model,
-    fresh_locals,
-    restart_runs,
-    simulate_run,
-)
+from pipeline.gap.fit import Fit, Mapper, fit_model
+from pipeline.gap.linearise import Locals, fresh_locals, simulate_run
+from pipeline.gap.restart import restart_runs
 from pipeline.gap.runs import Run, cut_shots, high_frequency_noise
 from pipeline.gap.structure import Structure
 from pipeline.plant.chain import Array, Chain

@@ -1,12 +1,6 @@
 """Fit a model to all runs at once: Levenberg-Marquardt, with each run's own unknowns eliminated.
 
-A run's own unknowns are the carts' start (and restart) states, the encoders' zeros, and a factor
-on the dry friction of each cart, which varies from run to run. They enter the residual almost
-linearly, so a QR factorisation of each run leaves a small problem in the shared parameters.
-All derivatives are differences, simulated in one batch per run.
-
-Reference: G. H. Golub, V. Pereyra, Inverse Problems 19 (2003), R1 (separable least squares);
-J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., section 10.3.
+Reference: J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., section 10.3.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -14,33 +8,28 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from pipeline.gap.linearise import (
+    Linear,
+    Locals,
+    fresh_locals,
+    linearise,
+    move_locals,
+    residual_points,
+    run_cost,
+    triangle,
+)
 from pipeline.gap.runs import Run
 from pipeline.gap.structure import Structure
 from pipeline.plant.chain import Array
-from pipeline.plant.kernel import simulate_batch
-from pipeline.plant.tables import Cart
 
 Mapper = Callable[..., Iterable]
 
 _SCATTER_START = 0.05  # spread of friction from run to run, before anything is known
 _SCATTER_FLOOR, _SCATTER_TOP = 0.004, 0.2
 _SCATTER_PRIOR = (3.0, 0.04)  # weight in runs, and spread, of the prior on that spread
-_LOCAL_STEP = 1e-3  # of the run's swing, for derivatives with respect to start states
 _LOCAL_SCALES = (1.0, 0.3, 0.05)  # of a run's own step, where the whole one raises its cost
-_BAD_RUN, _BAD_SHARE = 1.5, 2.0  # chi-square, or share of the median run's, to start a run anew
-_RESTARTS = ((0.8, 1.0), (-0.8, 1.0), (1.6, 1.0), (-1.6, 1.0), (0.0, 0.94), (0.0, 1.06))
 _ANCHOR = 1e6  # standard errors per unit of log mass
 _DAMP, _RELAX, _STIFFEN = 1e-3, 6.0, 6.0
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Locals:
-    """What belongs to one run: start states (shots, n), zeros (n,), friction factors (n,)."""
-
-    x0: Array
-    v0: Array
-    zero: Array
-    scatter: Array
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -75,254 +64,6 @@ class Fit:
         return self.chi_square / self.n_points
 
 
-def fresh_locals(run: Run) -> Locals:
-    """Return a run's unknowns where they are expected."""
-    n = run.zero.size
-    free = np.array(run.free)
-    return Locals(
-        x0=np.where(free, run.shot_x - run.zero, 0.0),
-        v0=np.where(free, run.shot_v, 0.0),
-        zero=np.where(free, run.zero, 0.0),
-        scatter=np.ones(n),
-    )
-
-
-def simulate_run(structure: Structure, thetas: Array, run: Run, own: Locals) -> Array:
-    """Return (b, rows, samples) readings of one run for many vectors, zeros included."""
-    cart, spring, drive = structure.tables(thetas)
-    b = len(thetas)
-    y = simulate_batch(
-        cart,
-        spring,
-        drive,
-        np.broadcast_to(own.x0, (b, *own.x0.shape)),
-        np.broadcast_to(own.v0, (b, *own.v0.shape)),
-        np.broadcast_to(own.scatter, (b, own.scatter.size)),
-        np.array(run.free),
-        run.t,
-        run.knots,
-        run.command,
-        np.array(run.shots),
-        1.0,  # the simulator chooses its steps
-    )
-    return y[:, list(run.rows)] + own.zero[list(run.rows)][:, None]
-
-
-# ------------------------------------------------------------------- one run linearised
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Linear:
-    """One run's share of a step: what is left for the shared parameters, and the way back."""
-
-    reduced: Array  # (rows, size + 1) of R: shared parameters and residual
-    own: Array  # R of the run-wide locals: [own | shared | residual]
-    shots: Array  # (shots, ., .) R of each shot: [shot locals | own | shared | residual]
-    layout: "_Layout"
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Layout:
-    """Which local unknowns a run has: cart indices of each kind."""
-
-    x0: tuple[int, ...]
-    v0: tuple[int, ...]
-    zero: tuple[int, ...]
-    scatter: tuple[int, ...]
-    first_v0: bool
-
-
-def _layout(structure: Structure, run: Run, *, scatter_free: bool) -> _Layout:
-    free = tuple(i for i, moves in enumerate(run.free) if moves)
-    multiple = len(run.shots) > 2
-    dry = structure.dry if scatter_free else (False,) * structure.n
-    return _Layout(
-        x0=free,
-        v0=free if multiple or not run.at_rest else (),
-        zero=run.rows if any(structure.springs) else (),
-        scatter=tuple(i for i in free if dry[i]),
-        first_v0=not run.at_rest,
-    )
-
-
-def _blocks(residual: Array, run: Run) -> Array:
-    """Weigh (…, rows, samples) and average over blocks, so that white noise keeps its size.
-
-    Returns (…, shots, rows * blocks), the shots padded with zeros to one length.
-    """
-    q = run.block
-    residual = residual * run.weight
-    counts = np.diff(run.shots) // q
-    longest = int(counts.max())
-    out = np.zeros((*residual.shape[:-2], len(counts), residual.shape[-2], longest))
-    for s, (first, count) in enumerate(zip(run.shots[:-1], counts, strict=True)):
-        piece = residual[..., first : first + count * q]
-        if q > 1:
-            piece = piece.reshape(*piece.shape[:-1], count, q).sum(-1) / np.sqrt(q)
-        out[..., s, :, :count] = piece
-    return out.reshape(*out.shape[:-2], -1)
-
-
-def _residual_points(run: Run) -> float:
-    q = run.block
-    pieces = zip(run.shots[:-1], np.diff(run.shots) // q, strict=True)
-    return sum(float((run.weight[:, a : a + m * q] ** 2).sum()) / q for a, m in pieces)
-
-
-def _triangle(matrix: Array) -> Array:
-    """Return R of the QR factorisation of one matrix or a stack of them."""
-    R: Array = np.linalg.qr(matrix, mode="r")  # pyright: ignore[reportAssignmentType]
-    return R
-
-
-def _linearise(
-    structure: Structure,
-    theta: Array,
-    run: Run,
-    own: Locals,
-    *,
-    inflate: float,
-    spread: Array,
-    scatter_free: bool,
-    extras: Array | None = None,
-) -> _Linear:
-    layout = _layout(structure, run, scatter_free=scatter_free)
-    n, P = structure.n, theta.size
-    shots = len(run.shots) - 1
-    steps = structure.steps()
-    size = np.array([max(1e-9, s) for s in run.swing])
-    by_cart = np.full(n, size.max())
-    by_cart[list(run.rows)] = size
-    lanes_x, lanes_v, lanes_g = len(layout.x0), len(layout.v0), len(layout.scatter)
-    b = 1 + P + lanes_x + lanes_v + lanes_g
-    thetas = np.repeat(theta[None], b, axis=0)
-    thetas[1 : P + 1] += np.diag(steps)
-    x0 = np.repeat(own.x0[None], b, axis=0)
-    v0 = np.repeat(own.v0[None], b, axis=0)
-    g = np.repeat(own.scatter[None], b, axis=0)
-    divisors = [*steps]
-    lane = P + 1
-    rate = np.sqrt(np.diag(structure.chain(theta).stiffness) / np.exp(theta[:n]))
-    rate = np.maximum(rate, 1.0)
-    for i in layout.x0:
-        divisors.append(_LOCAL_STEP * by_cart[i])
-        x0[lane, :, i] += divisors[-1]
-        lane += 1
-    for i in layout.v0:
-        divisors.append(_LOCAL_STEP * by_cart[i] * rate[i])
-        v0[lane, :, i] += divisors[-1]
-        lane += 1
-    for i in layout.scatter:
-        divisors.append(1e-3)
-        g[lane, i] += 1e-3
-        lane += 1
-    base = structure.tables(thetas[: P + 1])
-    cart, spring, drive = (np.concatenate([a, np.repeat(a[:1], b - P - 1, axis=0)]) for a in base)
-    y = simulate_batch(
-        cart,
-        spring,
-        drive,
-        x0,
-        v0,
-        g,
-        np.array(run.free),
-        run.t,
-        run.knots,
-        run.command,
-        np.array(run.shots),
-        1.0,  # the simulator chooses its steps
-    )[:, list(run.rows)]
-    sigma = run.sigma[:, None]
-    model = y[0] + own.zero[list(run.rows)][:, None]
-    residual = _blocks((run.y - model) / sigma, run)  # (shots, points)
-    jac = (y[1:] - y[0]) / sigma / np.array(divisors)[:, None, None]
-    jac = _blocks(jac, run)  # (b - 1, shots, points)
-    ones = np.zeros((len(layout.zero), len(run.rows), run.t.size))
-    for z, i in enumerate(layout.zero):
-        ones[z, run.rows.index(i)] = 1.0 / run.sigma[run.rows.index(i)]
-    zero_columns = _blocks(ones, run)
-    theta_columns, local_columns = jac[:P], jac[P:]
-    shot_columns = local_columns[: lanes_x + lanes_v]
-    scatter_columns = local_columns[lanes_x + lanes_v :]
-    further = [] if extras is None else [_blocks(extras / sigma, run)]
-    wide = np.concatenate(
-        [shot_columns, scatter_columns, zero_columns, theta_columns, *further, residual[None]]
-    )  # (columns, shots, points)
-    matrix = np.moveaxis(wide, 0, -1)  # (shots, points, columns)
-    lanes_s = lanes_x + lanes_v
-    # Weak priors keep what the data do not show from wandering: start states in units of the
-    # swing; where a run starts at rest, its first velocity stays zero.
-    prior = np.zeros((shots, lanes_s, matrix.shape[-1]))
-    for j in range(lanes_s):
-        i = (*layout.x0, *layout.v0)[j]
-        weight = 1.0 / (by_cart[i] * (1.0 if j < lanes_x else rate[i]))
-        prior[:, j, j] = weight * inflate * 1e-1
-        if j >= lanes_x and not layout.first_v0:
-            prior[0, j, j] = weight * 1e6
-    R = _triangle(np.concatenate([matrix, prior], axis=1))
-    rest = R[:, lanes_s:, lanes_s:].reshape(-1, R.shape[-1] - lanes_s)
-    lanes_o = lanes_g + len(layout.zero)
-    own_prior = np.zeros((lanes_o, rest.shape[-1]))
-    for j, i in enumerate(layout.scatter):
-        own_prior[j, j] = inflate / spread[i]
-        own_prior[j, -1] = (1.0 - own.scatter[i]) * own_prior[j, j]
-    for j, i in enumerate(layout.zero, start=lanes_g):
-        own_prior[j, j] = inflate / run.zero_std[i]
-        own_prior[j, -1] = (run.zero[i] - own.zero[i]) * own_prior[j, j]
-    own_R = _triangle(np.concatenate([rest, own_prior]))
-    return _Linear(
-        reduced=own_R[lanes_o:, lanes_o:], own=own_R[:lanes_o], shots=R[:, :lanes_s], layout=layout
-    )
-
-
-def _move_locals(linear: _Linear, own: Locals, delta: Array, scale: float = 1.0) -> Locals:
-    """Return the locals that go with a step of the shared parameters."""
-    layout = linear.layout
-    lanes_o = linear.own.shape[0]
-    tail = np.concatenate([-delta, [1.0]])
-    wide = np.zeros(0)
-    if lanes_o:
-        wide = np.linalg.solve(linear.own[:, :lanes_o], linear.own[:, lanes_o:] @ tail)
-    lanes_s = linear.shots.shape[1]
-    right = linear.shots[:, :, lanes_s:] @ np.concatenate([-wide, tail])
-    moved = np.linalg.solve(linear.shots[:, :, :lanes_s], right[..., None])[..., 0]
-    x0, v0 = own.x0.copy(), own.v0.copy()
-    zero, scatter = own.zero.copy(), own.scatter.copy()
-    x0[:, list(layout.x0)] += scale * moved[:, : len(layout.x0)]
-    if layout.v0:
-        change = scale * moved[:, len(layout.x0) :]
-        if not layout.first_v0:
-            change[0] = 0.0
-        v0[:, list(layout.v0)] += change
-    g = len(layout.scatter)
-    scatter[list(layout.scatter)] += scale * np.clip(wide[:g], -0.3, 0.3)
-    zero[list(layout.zero)] += scale * wide[g:]
-    return Locals(x0=x0, v0=v0, zero=zero, scatter=np.clip(scatter, 0.3, 3.0))
-
-
-def _run_cost(
-    structure: Structure,
-    theta: Array,
-    run: Run,
-    own: Locals,
-    *,
-    spread: Array,
-) -> tuple[float, float]:
-    """Return chi-square of a run, and its prior terms."""
-    if not structure.visible(theta):
-        return np.inf, 0.0
-    model = simulate_run(structure, theta[None], run, own)[0]
-    residual = _blocks((run.y - model) / run.sigma[:, None], run)
-    chi = float((residual**2).sum())
-    if not np.isfinite(chi):
-        return np.inf, 0.0
-    rows = list(run.rows)
-    prior = float((((own.zero - run.zero) / run.zero_std)[rows] ** 2).sum())
-    dry = np.array(structure.dry) & np.array(run.free)
-    prior += float((((own.scatter - 1.0) / spread)[dry] ** 2).sum())
-    return chi, prior
-
-
 def evaluate(
     structure: Structure,
     theta: Array,
@@ -336,7 +77,7 @@ def evaluate(
     """Return the fit at given parameters and locals, without moving either."""
 
     def cost(pair: tuple[Run, Locals]) -> tuple[float, float]:
-        return _run_cost(structure, theta, *pair, spread=spread)
+        return run_cost(structure, theta, *pair, spread=spread)
 
     costs = np.array(list(mapper(cost, zip(runs, locals_, strict=True))))
     return _fit_at(structure, theta, runs, locals_, costs, spread=spread, inflate=inflate)
@@ -352,7 +93,7 @@ def _fit_at(
     spread: Array,
     inflate: float,
 ) -> Fit:
-    points = np.array([_residual_points(run) for run in runs])
+    points = np.array([residual_points(run) for run in runs])
     return Fit(
         structure=structure,
         theta=theta,
@@ -402,10 +143,8 @@ def fit_model(
         inflate = max(1.0, np.sqrt(best.chi)) if np.isfinite(best.chi) else 1.0
         best = replace(best, cost=best.chi_square + inflate**2 * float(best.run_prior.sum()))
 
-        def linearise(
-            pair: tuple[Run, Locals], at: Fit = best, inflate: float = inflate
-        ) -> _Linear:
-            return _linearise(
+        def share(pair: tuple[Run, Locals], at: Fit = best, inflate: float = inflate) -> Linear:
+            return linearise(
                 structure,
                 at.theta,
                 *pair,
@@ -414,7 +153,7 @@ def fit_model(
                 scatter_free=scatter_free,
             )
 
-        linear = list(mapper(linearise, zip(runs, best.locals_, strict=True)))
+        linear = list(mapper(share, zip(runs, best.locals_, strict=True)))
         stacked = np.concatenate([*(part.reduced for part in linear), _anchor(runs, theta.size)])
         if not np.all(np.isfinite(stacked)):
             break
@@ -449,7 +188,7 @@ def fit_model(
             there = best.theta + delta
 
             def follow(
-                job: tuple[_Linear, Run, Locals, float],
+                job: tuple[Linear, Run, Locals, float],
                 at: Fit = best,
                 delta: Array = delta,
                 there: Array = there,
@@ -459,8 +198,8 @@ def fit_model(
                 part, run, own, before = job
                 tried = []
                 for scale in _LOCAL_SCALES:
-                    moved = _move_locals(part, own, delta, scale)
-                    cost = _run_cost(structure, there, run, moved, spread=at.spread)
+                    moved = move_locals(part, own, delta, scale)
+                    cost = run_cost(structure, there, run, moved, spread=at.spread)
                     tried.append((cost[0] + inflate**2 * cost[1], moved, cost))
                     if tried[-1][0] <= before:
                         break
@@ -504,7 +243,7 @@ def _anchor(runs: Sequence[Run], size: int) -> Array:
     return row
 
 
-def _learn_spread(fit: Fit, runs: Sequence[Run], linear: Sequence[_Linear]) -> Fit:
+def _learn_spread(fit: Fit, runs: Sequence[Run], linear: Sequence[Linear]) -> Fit:
     """Learn how much the friction of each cart varies, and move the mean into the force."""
     spread = fit.spread.copy()
     theta = fit.theta.copy()
@@ -530,70 +269,6 @@ def _learn_spread(fit: Fit, runs: Sequence[Run], linear: Sequence[_Linear]) -> F
     return replace(fit, spread=spread, theta=theta)
 
 
-def restart_runs(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
-    """Start the worst runs' own unknowns anew from elsewhere in the friction band.
-
-    A cart rests anywhere inside the band, and is zeroed there, so a run's misfit has several
-    valleys in zero and friction. Shared parameters stay.
-    """
-    if not any(fit.structure.dry):
-        return fit
-    worst = fit.run_chi > max(_BAD_RUN, _BAD_SHARE * float(np.median(fit.run_chi)))
-    band = _rest_band(fit)
-    rest = np.array(fit.structure.dry)
-
-    def again(job: tuple[Run, Locals, bool, float]) -> Locals:
-        run, own, bad, chi = job
-        if not bad:
-            return own
-        free = np.array(run.free)
-        best, lowest = own, chi * _residual_points(run)
-        for shift, factor in _RESTARTS:
-            move = np.where(free, shift * band, 0.0)
-            start = Locals(
-                x0=own.x0 - move if run.at_rest else own.x0,
-                v0=own.v0,
-                zero=np.where(free, run.zero, 0.0) + move,
-                scatter=np.where(rest & free, factor, 1.0),
-            )
-            trial = fit_model(
-                fit.structure,
-                fit.theta,
-                [run],
-                locals_=[start],
-                spread=fit.spread,
-                fixed=range(fit.theta.size),
-                iterations=6,
-            )
-            if trial.chi_square < lowest:
-                best, lowest = trial.locals_[0], trial.chi_square
-        return best
-
-    jobs = zip(runs, fit.locals_, worst, fit.run_chi, strict=True)
-    locals_ = tuple(mapper(again, jobs))
-    inflate = max(1.0, float(np.sqrt(fit.chi)))
-    return evaluate(
-        fit.structure,
-        fit.theta,
-        runs,
-        locals_,
-        spread=fit.spread,
-        inflate=inflate,
-        mapper=mapper,
-    )
-
-
-def _rest_band(fit: Fit) -> Array:
-    """Return (n,) how far from equilibrium dry friction may leave each cart, about one sigma."""
-    chain = fit.structure.chain(fit.theta)
-    cart = fit.structure.tables(fit.theta[None])[0][0]
-    force = cart[:, Cart.COULOMB] + cart[:, Cart.STATIC] + cart[:, Cart.DAHL]
-    if not np.any(chain.k > 0):
-        return np.zeros(chain.n)
-    compliance = np.abs(np.linalg.pinv(chain.stiffness))
-    return np.sqrt(((0.5 * compliance * force) ** 2).sum(axis=1))
-
-
 def project(
     fit: Fit, runs: Sequence[Run], extras: Sequence[Array], *, mapper: Mapper = map
 ) -> tuple[Array, Array]:
@@ -609,9 +284,9 @@ def project(
     """
     inflate = max(1.0, np.sqrt(fit.chi))
 
-    def linearise(job: tuple[Run, Locals, Array]) -> _Linear:
+    def share(job: tuple[Run, Locals, Array]) -> Linear:
         run, own, extra = job
-        return _linearise(
+        return linearise(
             fit.structure,
             fit.theta,
             run,
@@ -622,8 +297,8 @@ def project(
             extras=extra,
         )
 
-    linear = list(mapper(linearise, zip(runs, fit.locals_, extras, strict=True)))
-    R = _triangle(np.concatenate([part.reduced for part in linear]))
+    linear = list(mapper(share, zip(runs, fit.locals_, extras, strict=True)))
+    R = triangle(np.concatenate([part.reduced for part in linear]))
     shared = fit.theta.size
     return R[shared:, shared:-1], R[shared:, -1]
 
@@ -635,8 +310,8 @@ def covariance(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
     """
     scatter_free = any(np.any(own.scatter != 1.0) for own in fit.locals_)
 
-    def linearise(pair: tuple[Run, Locals]) -> _Linear:
-        return _linearise(
+    def share(pair: tuple[Run, Locals]) -> Linear:
+        return linearise(
             fit.structure,
             fit.theta,
             *pair,
@@ -645,7 +320,7 @@ def covariance(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
             scatter_free=scatter_free,
         )
 
-    linear = list(mapper(linearise, zip(runs, fit.locals_, strict=True)))
+    linear = list(mapper(share, zip(runs, fit.locals_, strict=True)))
     parts = [*(part.reduced for part in linear), _anchor(runs, fit.theta.size)]
     J = np.concatenate(parts)[:, :-1]
     _, s, vt = np.linalg.svd(J, full_matrices=False)

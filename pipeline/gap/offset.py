@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.gap.fit import Locals
+from pipeline.gap.linearise import Locals
 from pipeline.gap.runs import Run
 from pipeline.plant.chain import Array, Chain
 

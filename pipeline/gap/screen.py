@@ -13,7 +13,8 @@ from itertools import product
 
 import numpy as np
 
-from pipeline.gap.fit import Fit, Locals, Mapper, project, simulate_run
+from pipeline.gap.fit import Fit, Mapper, project
+from pipeline.gap.linearise import Locals, simulate_run
 from pipeline.gap.runs import Run
 from pipeline.gap.structure import Candidate, Structure, bench_scales
 from pipeline.plant.chain import Array, Chain

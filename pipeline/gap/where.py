@@ -4,7 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.gap.fit import Fit, simulate_run
+from pipeline.gap.fit import Fit
+from pipeline.gap.linearise import simulate_run
 from pipeline.gap.runs import Run
 from pipeline.gap.types import GapWindow
 from pipeline.plant.chain import Array

@@ -1,0 +1,114 @@
+"""A hypothesis: effects at places, fitted, and judged on runs the fit has not seen."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.gap.baseline import fit_locals
+from pipeline.gap.fit import Fit, Mapper
+from pipeline.gap.linearise import simulate_run
+from pipeline.gap.runs import Run
+from pipeline.gap.structure import Candidate
+from pipeline.plant.effects.base import Effect
+
+AT_FLOOR = 1.15  # chi-square per point below this is noise
+AS_REPEATS = 1.1  # an error below this many times what repeats differ by is theirs
+THINNING = 10.0  # neighbouring residuals are not independent: N / 10 count
+BIC_DROP = 20.0  # by which the criterion must fall for one more effect
+CONTACT = ("end_stop", "backlash")
+_HELD_OUT_GAIN = 0.95  # an effect must lower the held-out error by this factor …
+_CONTACT_GAIN = 0.5  # what a contact leaves is its contact law: no effect to mop it up
+_RUN_GAIN, _RUN_SHARE = 0.97, 0.6  # … and by 3 % in 60 % of the runs
+_BOUND_MARGIN = 0.01  # in logarithms, or in scales
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Hypothesis:
+    """A model with its fit on training runs and what it leaves on held-out ones.
+
+    `at_floor`: nothing is left but noise, on training and on held-out runs, or no more than
+    repeats differ by among themselves. `added` is the effect added last; `parent` the hypothesis
+    it was added to.
+    """
+
+    fit: Fit
+    held: Fit
+    error: float
+    bic: float
+    at_floor: bool
+    added: Candidate | None = None
+    parent: "Hypothesis | None" = None
+
+    @property
+    def key(self) -> frozenset[tuple[str, int]]:
+        """Which effects act where."""
+        return frozenset(c.key for c in self.fit.structure.effects)
+
+    @property
+    def sound(self) -> bool:
+        """Is every effect what its name says, and no estimate at a bound of the search?"""
+        structure, theta = self.fit.structure, self.fit.theta
+        low, high = structure.bounds()
+        at_bound = (theta <= low + _BOUND_MARGIN) | (theta >= high - _BOUND_MARGIN)
+        for index, term in enumerate(structure.model(theta).terms):
+            reported = np.array([p.reported for p in term.effect.parameters])
+            values = dict(zip(term.effect.names, term.values, strict=True))
+            if np.any(at_bound[structure.span(index)] & reported):
+                return False
+            if not term.effect.genuine(values):
+                return False
+        return True
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Bench:
+    """What every step of the search needs: runs, springs, catalogue, and who maps over runs.
+
+    `repeatability` is the relative error between runs with the same input, 0 without any.
+    """
+
+    training: tuple[Run, ...]
+    held_out: tuple[Run, ...]
+    springs: tuple[bool, ...]
+    catalogue: tuple[Effect, ...]
+    repeatability: float
+    mapper: Mapper
+    tell: Callable[[str], None]
+
+
+def judge(
+    fit: Fit, bench: Bench, *, added: Candidate | None = None, parent: Hypothesis | None = None
+) -> Hypothesis:
+    """Return the hypothesis a fit stands for."""
+    held = fit_locals(fit, bench.held_out, mapper=bench.mapper)
+    errors, sizes = [], []
+    for run, own in zip(bench.held_out, held.locals_, strict=True):
+        model = simulate_run(fit.structure, fit.theta[None], run, own)[0]
+        errors.append(float(((run.y - model) ** 2).sum()))
+        sizes.append(float((run.swing**2).sum() * run.t.size))
+    effective = fit.n_points / THINNING
+    bic = effective * np.log(fit.cost / fit.n_points) + fit.theta.size * np.log(effective)
+    error = float(np.sqrt(sum(errors) / sum(sizes)))
+    only_noise = fit.chi < AT_FLOOR and held.chi < AT_FLOOR
+    return Hypothesis(
+        fit=fit,
+        held=held,
+        error=error,
+        bic=float(bic),
+        at_floor=only_noise or error < AS_REPEATS * bench.repeatability,
+        added=added,
+        parent=parent,
+    )
+
+
+def worth_it(child: Hypothesis, parent: Hypothesis) -> bool:
+    """Does a further effect help on runs the model has not seen?"""
+    contact = any(effect in CONTACT for effect, _ in parent.key)
+    gain = _CONTACT_GAIN if contact else _HELD_OUT_GAIN
+    if child.bic > parent.bic - BIC_DROP or child.held.chi > gain**2 * parent.held.chi:
+        return False
+    better = child.held.run_chi < _RUN_GAIN**2 * parent.held.run_chi
+    # A run with nothing but noise left cannot become better.
+    open_runs = parent.held.run_chi > AT_FLOOR
+    return bool(np.mean(better[open_runs] if open_runs.any() else better) >= _RUN_SHARE)

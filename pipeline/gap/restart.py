@@ -1,0 +1,78 @@
+"""Start the worst runs' own unknowns anew, from elsewhere in the friction band."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeline.gap.fit import Fit, Mapper, evaluate, fit_model
+from pipeline.gap.linearise import Locals, residual_points
+from pipeline.gap.runs import Run
+from pipeline.plant.chain import Array
+from pipeline.plant.tables import Cart
+
+_BAD_RUN, _BAD_SHARE = 1.5, 2.0  # chi-square, or share of the median run's, to start a run anew
+_RESTARTS = ((0.8, 1.0), (-0.8, 1.0), (1.6, 1.0), (-1.6, 1.0), (0.0, 0.94), (0.0, 1.06))
+
+
+def restart_runs(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
+    """Start the worst runs' own unknowns anew from elsewhere in the friction band.
+
+    A cart rests anywhere inside the band, and is zeroed there, so a run's misfit has several
+    valleys in zero and friction. Shared parameters stay.
+    """
+    if not any(fit.structure.dry):
+        return fit
+    worst = fit.run_chi > max(_BAD_RUN, _BAD_SHARE * float(np.median(fit.run_chi)))
+    band = _rest_band(fit)
+    rest = np.array(fit.structure.dry)
+
+    def again(job: tuple[Run, Locals, bool, float]) -> Locals:
+        run, own, bad, chi = job
+        if not bad:
+            return own
+        free = np.array(run.free)
+        best, lowest = own, chi * residual_points(run)
+        for shift, factor in _RESTARTS:
+            move = np.where(free, shift * band, 0.0)
+            start = Locals(
+                x0=own.x0 - move if run.at_rest else own.x0,
+                v0=own.v0,
+                zero=np.where(free, run.zero, 0.0) + move,
+                scatter=np.where(rest & free, factor, 1.0),
+            )
+            trial = fit_model(
+                fit.structure,
+                fit.theta,
+                [run],
+                locals_=[start],
+                spread=fit.spread,
+                fixed=range(fit.theta.size),
+                iterations=6,
+            )
+            if trial.chi_square < lowest:
+                best, lowest = trial.locals_[0], trial.chi_square
+        return best
+
+    jobs = zip(runs, fit.locals_, worst, fit.run_chi, strict=True)
+    locals_ = tuple(mapper(again, jobs))
+    inflate = max(1.0, float(np.sqrt(fit.chi)))
+    return evaluate(
+        fit.structure,
+        fit.theta,
+        runs,
+        locals_,
+        spread=fit.spread,
+        inflate=inflate,
+        mapper=mapper,
+    )
+
+
+def _rest_band(fit: Fit) -> Array:
+    """Return (n,) how far from equilibrium dry friction may leave each cart, about one sigma."""
+    chain = fit.structure.chain(fit.theta)
+    cart = fit.structure.tables(fit.theta[None])[0][0]
+    force = cart[:, Cart.COULOMB] + cart[:, Cart.STATIC] + cart[:, Cart.DAHL]
+    if not np.any(chain.k > 0):
+        return np.zeros(chain.n)
+    compliance = np.abs(np.linalg.pinv(chain.stiffness))
+    return np.sqrt(((0.5 * compliance * force) ** 2).sum(axis=1))
