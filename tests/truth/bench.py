@@ -45,6 +45,9 @@ def _motion(cart, spring, drive, free, t, times, command, x0, v0, scatter, h):
     xh, vh = x0.copy(), v0.copy()
     lag = command[0]
     xm, vm = x0[0], v0[0]
+    # Velocities in the middle of a step, continued from the last one: second order.
+    v_last, vh_last = v0.copy(), v0.copy()
+    w, wh = v0.copy(), v0.copy()
     has_gap = drive[5] > 0.0
     m1 = cart[0, 0] - (drive[6] if has_gap else 0.0)
     out = np.zeros((n, t.size))
@@ -82,12 +85,15 @@ def _motion(cart, spring, drive, free, t, times, command, x0, v0, scatter, h):
                 x[i] += 0.5 * h * v[i]
             if cart[i, 14] > 0.0:
                 xh[i] += 0.5 * h * vh[i]
-            f[i] = cart[i, 9] - cart[i, 1] * v[i] - cart[i, 8] * abs(v[i]) * v[i]
+            w[i] = 1.5 * v[i] - 0.5 * v_last[i]
+            wh[i] = 1.5 * vh[i] - 0.5 * vh_last[i]
+            v_last[i], vh_last[i] = v[i], vh[i]
+            f[i] = cart[i, 9] - cart[i, 1] * w[i] - cart[i, 8] * abs(w[i]) * w[i]
         xm += 0.5 * h * vm
         for j in range(n + 1):
             right = x[j] if j < n else 0.0
             left = x[j - 1] if j > 0 else 0.0
-            rate = (v[j] if j < n else 0.0) - (v[j - 1] if j > 0 else 0.0)
+            rate = (w[j] if j < n else 0.0) - (w[j - 1] if j > 0 else 0.0)
             d = right - left
             tension = spring[j, 0] * d + spring[j, 1] * d**3 + spring[j, 4] * rate
             if spring[j, 3] >= 0.0 and d > spring[j, 3]:
@@ -110,7 +116,7 @@ def _motion(cart, spring, drive, free, t, times, command, x0, v0, scatter, h):
         else:
             f[0] += u
         if drive[4] != 0.0 and command[on] != 0.0:
-            f[0] -= drive[4] * v[0]
+            f[0] -= drive[4] * w[0]
         for i in range(n):
             if cart[i, 11] > 0.0:
                 if cart[i, 10] > 0.0 and x[i] > cart[i, 10]:
@@ -120,7 +126,7 @@ def _motion(cart, spring, drive, free, t, times, command, x0, v0, scatter, h):
                     push = cart[i, 11] * (cart[i, 10] - x[i]) - cart[i, 12] * v[i]
                     f[i] += max(push, 0.0)
             if cart[i, 14] > 0.0:
-                pull = cart[i, 15] * (xh[i] - x[i]) + cart[i, 16] * (vh[i] - v[i])
+                pull = cart[i, 15] * (xh[i] - x[i]) + cart[i, 16] * (wh[i] - w[i])
                 f[i] += pull
                 vh[i] -= h / cart[i, 14] * pull
             if not free[i]:
@@ -129,8 +135,9 @@ def _motion(cart, spring, drive, free, t, times, command, x0, v0, scatter, h):
             if cart[i, 5] > 0.0:
                 if first and v[i] == 0.0:
                     z[i] = min(max(f[i] / (scatter[i] * cart[i, 5]), -1.0), 1.0)
-                f[i] -= scatter[i] * cart[i, 5] * z[i]
-                z[i] += h * (v[i] - abs(v[i]) * z[i]) / cart[i, 6]
+                rise = h * (w[i] - abs(w[i]) * z[i]) / cart[i, 6]
+                f[i] -= scatter[i] * cart[i, 5] * (z[i] + 0.5 * rise)
+                z[i] += rise
             # The inclusion: the impulse that stops the cart, or as much of it as friction has.
             target = v[i] + h / m * f[i]
             most = cart[i, 2] + cart[i, 7] * abs(u)
