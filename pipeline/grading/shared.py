@@ -67,6 +67,10 @@ def find_shared(
     examples : packed fingerprints of recordings that were handed out: those may be shared.
     """
     everyone = [*batch, *earlier]
+    names = [
+        prints.submission if number < len(batch) else f"{prints.submission} (an earlier batch)"
+        for number, prints in enumerate(everyone)
+    ]
     owners = [*everyone, *(_handed_out(packed) for packed in examples)]
     groups: dict[str, list[_Entry]] = defaultdict(list)
     for owner, prints in enumerate(owners):
@@ -93,11 +97,11 @@ def find_shared(
                 if owner < len(batch):
                     record = SharedRecord(
                         experiment=mine,
-                        other=everyone[other].submission,
+                        other=names[other],
                         other_experiment=theirs,
                         sigmas=sigmas,
                     )
-                    shared[everyone[owner].submission].append(record)
+                    shared[names[owner]].append(record)
     return {
         submission: tuple(sorted(found, key=lambda r: (r.other, r.experiment, r.other_experiment)))
         for submission, found in sorted(shared.items())

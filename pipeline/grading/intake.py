@@ -1,0 +1,267 @@
+"""Find the hand-ins in what a TA has: folders, trees, zip files, a platform's download."""
+
+import re
+import unicodedata
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+
+from pipeline.errors import ConfigError, SubmissionError
+from pipeline.grading.lms_names import Upload, current, gradescope_owners, parse_name
+from pipeline.grading.unpack import CLASS, is_debris, member_names, unpack
+from pipeline.submission.load import NAME
+
+_DAYS_OF_A_LATE_MARK = 1.0  # Canvas marks lateness without saying how much: a day begun
+_LONGEST_ID = 100  # a folder's name, on every system
+_NOT_IN_NAMES = re.compile(r'[<>:"/\\|?*\x00-\x1f\x7f-\x9f]')
+_RESERVED = re.compile(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?")
+
+
+@dataclass(frozen=True, kw_only=True)
+class HandIn:
+    """What one team handed in, not opened yet.
+
+    Attributes
+    ----------
+    id : unique in the batch, fit for a folder's name.
+    sources : one folder, or files of which archives are to be unpacked.
+    owner : who handed it in, as the learning platform calls them, or "".
+    problem : why it cannot be opened, where that is plain already.
+    """
+
+    id: str
+    sources: tuple[Path, ...]
+    owner: str = ""
+    days_late: float = 0.0
+    problem: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Found:
+    """A hand-in before its id is settled: its name, and that of the folder around it."""
+
+    name: str
+    parent: str
+    sources: tuple[Path, ...]
+    owner: str = ""
+    days_late: float = 0.0
+    problem: str = ""
+
+
+def find_hand_ins(
+    paths: Iterable[Path], *, scratch: Path, skip: Iterable[Path] = ()
+) -> tuple[HandIn, ...]:
+    """Return the hand-ins in folders, trees and archives, in the order of their ids.
+
+    Parameters
+    ----------
+    scratch : where archives of a whole class are unpacked.
+    skip : folders that are no hand-ins, such as the one results go to.
+
+    Raises
+    ------
+    ConfigError : a path is not there, or there is nothing in it.
+    """
+    skipped = {path.resolve() for path in skip} | {scratch.resolve()}
+    found: list[_Found] = []
+    for number, path in enumerate(dict.fromkeys(path.resolve() for path in paths)):
+        here = _at(path, scratch=scratch / f"class-{number}", skip=skipped)
+        if not here:
+            raise ConfigError(
+                f"{path}: nothing to grade in it: no folder or zip file with a {NAME}"
+            )
+        found += here
+    return tuple(sorted(_with_ids(found), key=lambda hand_in: hand_in.id))
+
+
+def _at(path: Path, *, scratch: Path, skip: set[Path]) -> list[_Found]:
+    if path.name == NAME:
+        path = path.parent
+    if path.is_dir():
+        return _in_folder(path, skip=skip, top=True)
+    if not path.is_file():
+        raise ConfigError(f"{path}: there is no such file or folder")
+    if path.suffix.lower() != ".zip":
+        raise ConfigError(f"{path}: neither a folder nor a zip file")
+    if not _holds_a_class(path):
+        return [_archive(path)]
+    folder = scratch / path.stem
+    try:
+        refused = unpack(path, folder, limits=CLASS)
+    except SubmissionError as error:
+        raise ConfigError(str(error)) from None
+    found = _in_folder(folder, skip=skip, top=True)
+    hand_ins = {source.name for one in found for source in one.sources}
+    lost = [_Found(name=name, parent=path.stem, sources=(), problem=why) for name, why in
+            sorted(refused.items()) if name not in hand_ins]  # fmt: skip
+    return lost + [
+        replace(one, problem=refused[source.name])
+        if (source := one.sources[0]).name in refused
+        else one
+        for one in found
+    ]
+
+
+def _holds_a_class(archive: Path) -> bool:
+    """Tell a download of many hand-ins from the archive of one student."""
+    names = member_names(archive, limits=CLASS)
+    tops = {path.parts[0] for path in names} | {path.parts[1] for path in names if path.parts[1:]}
+    return (
+        sum(path.name == NAME for path in names) > 1
+        or any(parse_name(top) is not None for top in tops)
+        or (
+            sum(path.suffix.lower() == ".zip" for path in names) > 1
+            and not any(path.name == NAME for path in names)
+        )
+    )
+
+
+# ------------------------------------------------------------------------ folders
+
+
+def _in_folder(folder: Path, *, skip: set[Path], top: bool) -> list[_Found]:
+    if _is_submission(folder):
+        return [_Found(name=folder.name, parent=folder.parent.name, sources=(folder,))]
+    entries = [
+        entry
+        for entry in sorted(folder.iterdir())
+        if not is_debris(PurePosixPath(entry.name))
+        and not entry.name.startswith(".")
+        and entry.resolve() not in skip
+    ]
+    uploads = {entry: upload for entry in entries if (upload := parse_name(entry.name))}
+    if uploads:
+        rest = [entry for entry in entries if entry not in uploads and _may_be_one(entry)]
+        return _from_platform(folder, uploads) + [_single(entry) for entry in rest]
+    entries = [entry for entry in entries if _may_be_one(entry)]
+    if len(entries) == 1 and entries[0].is_dir() and not entries[0].is_symlink():
+        deeper = _in_folder(entries[0], skip=skip, top=top)
+        return deeper or [_single(entries[0])]
+    found, without = [], []
+    for entry in entries:
+        if entry.is_symlink() or not entry.is_dir():
+            found.append(_single(entry))
+        elif here := _in_folder(entry, skip=skip, top=False):
+            found += here
+        else:
+            without.append(_single(entry))
+    # Beside one submission, a folder without any is a student's own pictures or drafts.
+    return found + without if top or len(found) > 1 else found
+
+
+def _is_submission(folder: Path) -> bool:
+    toml = folder / NAME
+    return toml.is_symlink() or toml.exists()
+
+
+def _may_be_one(entry: Path) -> bool:
+    return entry.is_dir() or entry.is_symlink() or entry.suffix.lower() == ".zip"
+
+
+def _single(entry: Path) -> _Found:
+    """Return a folder or archive that is one hand-in."""
+    if entry.is_symlink():
+        return _Found(
+            name=entry.stem,
+            parent=entry.parent.name,
+            sources=(),
+            problem=f"{entry.name} is a link; hand in the files themselves",
+        )
+    if entry.is_dir():
+        return _Found(name=entry.name, parent=entry.parent.name, sources=(entry,))
+    return _archive(entry)
+
+
+def _archive(path: Path) -> _Found:
+    name = _folder_inside(path)
+    return _Found(
+        name=name or path.stem, parent=path.stem if name else path.parent.name, sources=(path,)
+    )
+
+
+def _folder_inside(archive: Path) -> str:
+    """Return the name of the folder in an archive that is the submission, "" for its top."""
+    tomls = [path for path in member_names(archive) if path.name == NAME]
+    return min(tomls, key=lambda path: (len(path.parts), path)).parent.name if tomls else ""
+
+
+# ---------------------------------------------------------------- learning platforms
+
+
+def _from_platform(folder: Path, uploads: dict[Path, Upload]) -> list[_Found]:
+    """Return a hand-in for every student, whatever number of files they uploaded."""
+    owners = gradescope_owners(folder)
+    by_student: dict[tuple[str, str], dict[Path, Upload]] = defaultdict(dict)
+    for path, upload in uploads.items():
+        by_student[upload.owner, upload.user][path] = upload
+    found = []
+    for (owner, _), files in sorted(by_student.items()):
+        sources = tuple(current(files))
+        inside = _name_inside(sources)
+        shown = owners.get(owner, owner)
+        found.append(
+            _Found(
+                name=inside or shown,
+                parent=shown if inside else folder.name,
+                sources=sources,
+                owner=shown,
+                days_late=_DAYS_OF_A_LATE_MARK if any(u.late for u in files.values()) else 0.0,
+                problem="it is a link" if any(path.is_symlink() for path in sources) else "",
+            )
+        )
+    return found
+
+
+def _name_inside(sources: Sequence[Path]) -> str:
+    """Return the name of the folder that the student packed or uploaded, "" without one."""
+    for source in sources:
+        if source.is_dir():
+            tomls = [path for path in sorted(source.rglob(NAME)) if path.parent != source]
+            if tomls and not _is_submission(source):
+                return min(tomls, key=lambda path: len(path.parts)).parent.name
+            sources_in = [path for path in sorted(source.glob("*.zip")) if path.is_file()]
+            if not tomls and not _is_submission(source) and len(sources_in) == 1:
+                return _folder_inside(sources_in[0])
+        elif source.suffix.lower() == ".zip" and (name := _folder_inside(source)):
+            return name
+    return ""
+
+
+# ---------------------------------------------------------------------------- ids
+
+
+def _with_ids(found: Sequence[_Found]) -> list[HandIn]:
+    """Give every hand-in its folder's name; where two are the same, the parent's before it."""
+    names = [_fit(one.name) for one in found]
+    often = Counter(name.casefold() for name in names)
+    names = [
+        _fit(f"{one.parent}-{one.name}") if often[name.casefold()] > 1 else name
+        for one, name in zip(found, names, strict=True)
+    ]
+    taken: set[str] = set()
+    hand_ins = []
+    for one, name in zip(found, names, strict=True):
+        unique, number = name, 1
+        while unique.casefold() in taken:
+            number += 1
+            unique = f"{name}-{number}"
+        taken.add(unique.casefold())
+        hand_ins.append(
+            HandIn(
+                id=unique,
+                sources=one.sources,
+                owner=one.owner,
+                days_late=one.days_late,
+                problem=one.problem,
+            )
+        )
+    return hand_ins
+
+
+def _fit(name: str) -> str:
+    """Return a name that is a folder's on every system, and nothing but text on a terminal."""
+    text = unicodedata.normalize("NFC", name)
+    text = _NOT_IN_NAMES.sub("_", text.encode("utf-8", "replace").decode())
+    text = "".join(c if c.isprintable() else "_" for c in text)[:_LONGEST_ID].strip(" .")
+    return f"_{text}" if not text or _RESERVED.fullmatch(text) else text
