@@ -29,6 +29,7 @@ HOMES = {
     "typer": ("cli",),
     "rich": ("cli",),
     "control": ("plant", "stages"),
+    "sqlalchemy": ("grading",),
     "pandas": ("ingest", "report", "grading"),
 }
 MODULES = sorted(PIPELINE.rglob("*.py"))

@@ -1,0 +1,341 @@
+"""The gradebook: every grading kept, what counts now, and points given by hand.
+
+Grading puts each submission in as it comes, in a transaction of its own; a batch that ran to its
+end becomes the class list. Results carry no dates: those are here, and in `cartlab history`.
+"""
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from datetime import UTC, datetime
+from difflib import get_close_matches
+from pathlib import Path
+
+from sqlalchemy import Connection, Row, func, insert, select
+
+from pipeline.errors import ConfigError
+from pipeline.grading.batch import Batch, Outcome, Prints, read_grade
+from pipeline.grading.gradebook_rows import (
+    Entry,
+    add_row,
+    class_list,
+    final_entry,
+    newest_of,
+    put_parts,
+    read_figures,
+    read_flag,
+    read_rubric,
+    storable,
+)
+from pipeline.grading.history import Event, read_events
+from pipeline.grading.override import Override
+from pipeline.grading.rubric import Rubric
+from pipeline.grading.schema import (
+    Database,
+    batches,
+    entries,
+    gradings,
+    overrides,
+    submissions,
+)
+
+_PAGE = 100  # rows read at a time: memory stays flat, and a writer need not wait long
+
+
+class Gradebook:
+    """A store of outcomes (see `batch.Store`) and the class list made of them.
+
+    Parameters
+    ----------
+    place : a folder, a SQLite file or any SQLAlchemy URL.
+    assignment : whose class list it is about, so that one database can hold several; default: the
+        one that was graded last.
+    create : make a gradebook where there is none.
+    now : the clock that says when something was put in.
+
+    Raises
+    ------
+    ConfigError : the place cannot be reached or holds no gradebook.
+    """
+
+    def __init__(
+        self,
+        place: str | Path,
+        *,
+        assignment: str | None = None,
+        create: bool = False,
+        now: Callable[[], datetime] = lambda: datetime.now(UTC),
+    ) -> None:
+        self._database = Database(place, create=create)
+        self._now = now
+        self._assignment = assignment
+
+    def close(self) -> None:
+        """Let go of the database."""
+        self._database.close()
+
+    def __enter__(self) -> "Gradebook":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # ------------------------------------------------------------------ while grading
+
+    def known(self, key: str) -> Outcome | None:
+        """Return the newest outcome of this key, None where there is none."""
+        newest = (
+            select(gradings, submissions.c.name)
+            .join(submissions)
+            .where(gradings.c.key == key)
+            .order_by(gradings.c.id.desc())
+            .limit(1)
+        )
+        with self._database.reading() as connection:
+            row = connection.execute(newest).one_or_none()
+            if row is None:
+                return None
+            drawn = read_figures(connection, row.id)
+        return Outcome(
+            submission=row.name,
+            authors=tuple(json.loads(row.authors)),
+            key=row.key,
+            status=row.status,
+            reason=row.reason,
+            settled=row.settled,
+            days_late=row.days_late,
+            grade=row.grade,
+            fingerprints=row.fingerprints,
+            figures=drawn,
+            owner=row.owner,
+            detail=row.detail,
+        )
+
+    def put(self, outcome: Outcome) -> None:
+        """Add an outcome: durable on return, and nothing of it there before.
+
+        Raises
+        ------
+        ValueError : its grade is none.
+        """
+        grade = read_grade(outcome.grade)
+        with self._database.writing() as connection:
+            number = self._submission(connection, outcome.submission)
+            row = {
+                "submission_id": number,
+                "at": self._at(),
+                "key": outcome.key,
+                "status": outcome.status,
+                "reason": storable(outcome.reason),
+                "settled": outcome.settled,
+                "points": grade.points,
+                "out_of": grade.out_of,
+                "days_late": outcome.days_late,
+                "deducted": grade.deducted,
+                "authors": json.dumps(outcome.authors),
+                "owner": storable(outcome.owner),
+                "detail": storable(outcome.detail),
+                "grade": storable(outcome.grade),
+                "fingerprints": outcome.fingerprints,
+            }
+            grading = add_row(connection, gradings, row)
+            put_parts(connection, grading, grade, outcome.figures)
+
+    def prints(self) -> Iterator[Prints]:
+        """Yield the fingerprints of the newest outcome of every (submission, authors)."""
+        newest = select(func.max(gradings.c.id)).group_by(
+            gradings.c.submission_id, gradings.c.authors
+        )
+        with self._database.reading() as connection:
+            numbers = sorted(connection.scalars(newest))
+        of_page = select(submissions.c.name, gradings.c.authors, gradings.c.fingerprints)
+        for page in _pages(numbers):
+            with self._database.reading() as connection:
+                wanted = of_page.join(submissions).where(gradings.c.id.in_(page))
+                rows = connection.execute(wanted.order_by(gradings.c.id)).all()
+            for name, authors, fingerprints in rows:
+                yield Prints(
+                    submission=name, authors=tuple(json.loads(authors)), fingerprints=fingerprints
+                )
+
+    def finish(self, batch: Batch, *, rubric: Rubric) -> None:
+        """Make a batch that ran to its end the class list; one that changes nothing adds nothing.
+
+        Raises
+        ------
+        KeyError : an outcome of the batch was never put in.
+        """
+        listed = []
+        with self._database.writing() as connection:
+            for position, key in enumerate(batch.keys):
+                row = newest_of(connection, key)
+                shared = batch.shared.get(row.name)
+                grade = final_entry(connection, row, shared=shared, rubric=rubric).grade
+                listed.append(
+                    {
+                        "position": position,
+                        "submission_id": row.submission_id,
+                        "grading_id": row.id,
+                        "shared": json.dumps(asdict(shared)) if shared else "",
+                        "points": grade.points,
+                        "out_of": grade.out_of,
+                    }
+                )
+            text = rubric.model_dump_json()
+            if self._unchanged(connection, listed, text):
+                return
+            new = {"assignment": self._assignment or "", "at": self._at(), "rubric": text}
+            number = add_row(connection, batches, new)
+            if listed:
+                connection.execute(insert(entries), [{"batch_id": number, **e} for e in listed])
+
+    # ---------------------------------------------------------------- what counts now
+
+    @property
+    def rubric(self) -> Rubric:
+        """The rubric of the class list.
+
+        Raises
+        ------
+        ConfigError : no batch ran to its end yet.
+        """
+        with self._database.reading() as connection:
+            return read_rubric(self._last(connection))
+
+    def entries(self) -> Iterator[Entry]:
+        """Yield the class list in the order of its submissions, some at a time in memory."""
+        with self._database.reading() as connection:
+            last = self._last(connection)
+            of_batch = select(entries.c.position).where(entries.c.batch_id == last.id)
+            positions = sorted(connection.scalars(of_batch))
+        rubric = read_rubric(last)
+        for page in _pages(positions):
+            with self._database.reading() as connection:
+                rows = connection.execute(
+                    class_list().where(entries.c.batch_id == last.id, entries.c.position.in_(page))
+                ).all()
+                found = [
+                    final_entry(connection, r, shared=read_flag(r.shared), rubric=rubric)
+                    for r in rows
+                ]
+            yield from found
+
+    def entry(self, team: str) -> Entry:
+        """Return the line of a submission, named by its id or by one of its authors.
+
+        Raises
+        ------
+        ConfigError : there is none, or several.
+        """
+        with self._database.reading() as connection:
+            last, row = self._find(connection, team)
+            return final_entry(
+                connection, row, shared=read_flag(row.shared), rubric=read_rubric(last)
+            )
+
+    def figures(self, entry: Entry) -> tuple[tuple[str, str], ...]:
+        """Return the figures of a submission's feedback: file names and SVG."""
+        with self._database.reading() as connection:
+            return read_figures(connection, entry.grading)
+
+    def history(self, team: str) -> tuple[str, list[Event]]:
+        """Return the submission's id and all that ever happened to it.
+
+        Raises
+        ------
+        ConfigError : there is no such submission, or several.
+        """
+        with self._database.reading() as connection:
+            _, row = self._find(connection, team)
+            return row.name, read_events(connection, row.submission_id)
+
+    def override(
+        self, team: str, criterion: str, points: float | None, *, why: str, by: str
+    ) -> Override:
+        """Give a criterion points by hand, which every later grading keeps; None takes them back.
+
+        Raises
+        ------
+        ConfigError : there is no such submission or criterion, the points are none that it can
+            have, or who and why are not said.
+        """
+        why, by = storable(why).strip(), storable(by).strip()
+        if not why or not by:
+            raise ConfigError("an override needs a reason (--why) and a name (--by)")
+        with self._database.writing() as connection:
+            last, row = self._find(connection, team)
+            out_of = {c.id: c.points for c in read_rubric(last).criteria}
+            if criterion not in out_of:
+                hint = _nearest(criterion, list(out_of))
+                raise ConfigError(f"{criterion}: the rubric has no such criterion; {hint}")
+            if points is not None and not 0 <= points <= out_of[criterion]:
+                raise ConfigError(f"{criterion}: has 0 to {out_of[criterion]:g} points")
+            given = Override(
+                criterion=criterion,
+                points=points,
+                why=why,
+                by=by,
+                at=self._at(),
+                authors=tuple(json.loads(row.authors)),
+            )
+            values = {**asdict(given), "authors": row.authors, "submission_id": row.submission_id}
+            add_row(connection, overrides, values)
+        return given
+
+    # ----------------------------------------------------------------------- in parts
+
+    def _at(self) -> str:
+        return self._now().astimezone(UTC).isoformat(timespec="microseconds")
+
+    def _submission(self, connection: Connection, name: str) -> int:
+        """Return the number of a submission, new or not."""
+        values = {"assignment": self._assignment or "", "name": storable(name)}
+        mine = select(submissions.c.id).filter_by(**values)
+        number = connection.scalar(mine)
+        return add_row(connection, submissions, values) if number is None else number
+
+    def _last(self, connection: Connection) -> Row:
+        """Return the last batch that ran to its end."""
+        newest = select(batches).order_by(batches.c.id.desc()).limit(1)
+        if self._assignment is not None:
+            newest = newest.where(batches.c.assignment == self._assignment)
+        row = connection.execute(newest).one_or_none()
+        if row is None:
+            what = f"no grading of {self._assignment!r}" if self._assignment else "no grading"
+            raise ConfigError(
+                f"{self._database.name}: {what} ran to its end yet: run cartlab grade again"
+            )
+        return row
+
+    def _find(self, connection: Connection, team: str) -> tuple[Row, Row]:
+        """Return the last batch and the line of a team in it."""
+        last = self._last(connection)
+        of_batch = class_list(detail=False).where(entries.c.batch_id == last.id)
+        rows = connection.execute(of_batch).all()
+        exact = [r.position for r in rows if r.name == team]
+        found = exact or [r.position for r in rows if team in json.loads(r.authors)]
+        if len(found) != 1:
+            hint = f"no such submission; {_nearest(team, [row.name for row in rows])}"
+            raise ConfigError(f"{team}: {'is in several submissions: name one' if found else hint}")
+        line = class_list().where(entries.c.batch_id == last.id, entries.c.position == found[0])
+        return last, connection.execute(line).one()
+
+    def _unchanged(self, connection: Connection, listed: list[dict], rubric: str) -> bool:
+        newest = select(batches).where(batches.c.assignment == (self._assignment or ""))
+        last = connection.execute(newest.order_by(batches.c.id.desc()).limit(1)).one_or_none()
+        if last is None or last.rubric != rubric:
+            return False
+        names = [name for name in entries.c.keys() if name != "batch_id"]
+        columns = [entries.c[name] for name in names]
+        mine = select(*columns).where(entries.c.batch_id == last.id).order_by(entries.c.position)
+        before = [tuple(row) for row in connection.execute(mine)]
+        return before == [tuple(line[name] for name in names) for line in listed]
+
+
+def _pages(numbers: list[int]) -> Iterator[list[int]]:
+    return (numbers[i : i + _PAGE] for i in range(0, len(numbers), _PAGE))
+
+
+def _nearest(word: str, words: list[str]) -> str:
+    near = get_close_matches(word, words, n=3, cutoff=0.4) or words[:8]
+    return f"there is {', '.join(near)}" if near else "there is none at all"

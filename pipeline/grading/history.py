@@ -1,0 +1,108 @@
+"""All that ever happened to a submission, in order: graded, listed, overridden."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from datetime import datetime
+from typing import Any, Literal
+
+from sqlalchemy import Connection, select
+
+from pipeline.grading.schema import batches, entries, flags, gradings, overrides
+
+
+@dataclass(frozen=True, kw_only=True)
+class Event:
+    """One line of a history.
+
+    Attributes
+    ----------
+    at : ISO 8601, UTC.
+    what : `graded`: by the rubric alone; `listed`: in a class list, with shared data and
+        overrides; `override`: by hand, `points` None where it was taken back.
+    points, out_of : of the submission, or of the one criterion that an override is about.
+    text : flags, or why.
+    by : who, of an override.
+    """
+
+    at: str
+    what: Literal["graded", "listed", "override"]
+    points: float | None
+    out_of: float | None = None
+    criterion: str = ""
+    text: str = ""
+    by: str = ""
+
+
+def read_events(connection: Connection, submission: int) -> list[Event]:
+    """Return the events of one submission, oldest first."""
+    found = [
+        *_graded(connection, submission),
+        *_overridden(connection, submission),
+        *_listed(connection, submission),
+    ]
+    return sorted(found, key=lambda event: event.at)
+
+
+def _graded(connection: Connection, submission: int) -> Iterator[Event]:
+    codes: dict[int, list[str]] = {}
+    of_grading = select(flags.c.grading_id, flags.c.code).join(gradings)
+    mine = gradings.c.submission_id == submission
+    for grading, code in connection.execute(of_grading.where(mine).order_by(flags.c.position)):
+        codes.setdefault(grading, []).append(code)
+    for row in connection.execute(select(gradings).where(mine).order_by(gradings.c.id)):
+        failed = row.status == "failed"
+        text = f"could not be graded: {row.reason}" if failed else ", ".join(codes.get(row.id, ()))
+        yield Event(at=row.at, what="graded", points=row.points, out_of=row.out_of, text=text)
+
+
+def _overridden(connection: Connection, submission: int) -> Iterator[Event]:
+    mine = select(overrides).where(overrides.c.submission_id == submission)
+    for row in connection.execute(mine.order_by(overrides.c.id)):
+        yield Event(
+            at=row.at,
+            what="override",
+            points=row.points,
+            criterion=row.criterion,
+            text=row.why,
+            by=row.by,
+        )
+
+
+def _listed(connection: Connection, submission: int) -> Iterator[Event]:
+    """Yield the class lists in which something was new."""
+    columns = batches.c.at, entries.c.points, entries.c.out_of, entries.c.shared
+    mine = select(*columns).join(batches).where(entries.c.submission_id == submission)
+    before = None
+    for at, points, out_of, shared in connection.execute(mine.order_by(batches.c.id)):
+        if (points, out_of, shared) != before:
+            text = "shared_data" if shared else ""
+            yield Event(at=at, what="listed", points=points, out_of=out_of, text=text)
+        before = (points, out_of, shared)
+
+
+def history_dict(submission: str, events: Sequence[Event]) -> dict[str, Any]:
+    """Return a history as plain data."""
+    return {
+        "schema": "cartlab-history/1",
+        "submission": submission,
+        "events": [asdict(event) for event in events],
+    }
+
+
+def history_text(submission: str, events: Sequence[Event]) -> str:
+    """Return a history as lines to read."""
+    return "\n".join(
+        [submission, *(f"{_to_the_second(event.at)}  {_words(event)}" for event in events)]
+    )
+
+
+def _to_the_second(at: str) -> str:
+    return datetime.fromisoformat(at).strftime("%Y-%m-%d %H:%M:%S UTC")
+
+
+def _words(event: Event) -> str:
+    if event.what == "override":
+        points = "automatic points again" if event.points is None else f"{event.points:g} by hand"
+        return f"override  {event.criterion}: {points}, by {event.by}: {event.text}"
+    note = f"  ({event.text})" if event.text else ""
+    return f"{event.what:8}  {event.points:g} of {event.out_of:g}{note}"

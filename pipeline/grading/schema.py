@@ -1,0 +1,285 @@
+"""The tables of a gradebook, and how to reach the database they are in.
+
+Every table is append-only: what once was graded, overridden or listed stays, and where the engine
+has triggers (SQLite, PostgreSQL) it refuses to change or delete a row. The newest is what counts.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from sqlalchemy import (
+    DDL,
+    URL,
+    Boolean,
+    Column,
+    Connection,
+    Engine,
+    Float,
+    ForeignKey,
+    Index,
+    Integer,
+    LargeBinary,
+    MetaData,
+    String,
+    Table,
+    Text,
+    UniqueConstraint,
+    create_engine,
+    event,
+    insert,
+    make_url,
+    select,
+)
+from sqlalchemy.exc import ArgumentError, NoSuchModuleError, SQLAlchemyError
+
+from pipeline.errors import ConfigError
+
+FILE = "gradebook.sqlite"
+_SUFFIXES = (".sqlite", ".sqlite3", ".db")  # of files; anything else is a folder
+_VERSION = "1"
+_PATIENCE = 60.0  # s, for a lock that another process holds; a commit takes milliseconds
+
+metadata = MetaData()
+
+settings = Table(
+    "settings",
+    metadata,
+    Column("name", String(60), primary_key=True),
+    Column("value", Text, nullable=False),
+)
+
+submissions = Table(
+    "submissions",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("assignment", String(255), nullable=False),
+    Column("name", String(510), nullable=False),  # two folder names at most
+    UniqueConstraint("assignment", "name"),
+)
+
+# One row each time a submission is graded; `key` is of all that the grade depends on.
+gradings = Table(
+    "gradings",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("submission_id", ForeignKey("submissions.id"), nullable=False),
+    Column("at", Text, nullable=False),
+    Column("key", String(255), nullable=False),
+    Column("status", Text, nullable=False),
+    Column("reason", Text, nullable=False),
+    Column("settled", Boolean, nullable=False),
+    Column("points", Float, nullable=False),
+    Column("out_of", Float, nullable=False),
+    Column("days_late", Float, nullable=False),
+    Column("deducted", Float, nullable=False),
+    Column("authors", Text, nullable=False),
+    Column("owner", Text, nullable=False),
+    Column("detail", Text, nullable=False),
+    Column("grade", Text, nullable=False),
+    Column("fingerprints", LargeBinary, nullable=False),
+    Index("gradings_by_key", "key"),
+    Index("gradings_by_submission", "submission_id"),
+)
+
+criteria = Table(
+    "criteria",
+    metadata,
+    Column("grading_id", ForeignKey("gradings.id"), primary_key=True),
+    Column("criterion", String(60), primary_key=True),
+    Column("position", Integer, nullable=False),
+    Column("title", Text, nullable=False),
+    Column("outcome", Text, nullable=False),
+    Column("points", Float, nullable=False),
+    Column("out_of", Float, nullable=False),
+    Column("message", Text, nullable=False),
+)
+
+flags = Table(
+    "flags",
+    metadata,
+    Column("grading_id", ForeignKey("gradings.id"), primary_key=True),
+    Column("position", Integer, primary_key=True),
+    Column("code", Text, nullable=False),
+    Column("parameters", Text, nullable=False),
+    Column("message", Text, nullable=False),
+    Column("evidence", Text, nullable=False),
+)
+
+figures = Table(
+    "figures",
+    metadata,
+    Column("grading_id", ForeignKey("gradings.id"), primary_key=True),
+    Column("position", Integer, primary_key=True),
+    Column("name", Text, nullable=False),
+    Column("svg", LargeBinary, nullable=False),  # deflated
+)
+
+# A batch that ran to its end, and its class list: for each submission the grading that counts,
+# the flag for data shared with others, and the points given out at the time.
+batches = Table(
+    "batches",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("assignment", Text, nullable=False),
+    Column("at", Text, nullable=False),
+    Column("rubric", Text, nullable=False),
+)
+
+entries = Table(
+    "entries",
+    metadata,
+    Column("batch_id", ForeignKey("batches.id"), primary_key=True),
+    Column("position", Integer, primary_key=True),
+    Column("submission_id", ForeignKey("submissions.id"), nullable=False),
+    Column("grading_id", ForeignKey("gradings.id"), nullable=False),
+    Column("shared", Text, nullable=False),
+    Column("points", Float, nullable=False),
+    Column("out_of", Float, nullable=False),
+    Index("entries_by_submission", "submission_id"),
+)
+
+# The newest of a criterion counts; no points: the automatic ones hold again.
+overrides = Table(
+    "overrides",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("submission_id", ForeignKey("submissions.id"), nullable=False),
+    Column("at", Text, nullable=False),
+    Column("criterion", Text, nullable=False),
+    Column("points", Float),
+    Column("why", Text, nullable=False),
+    Column("by", Text, nullable=False),
+    Column("authors", Text, nullable=False),
+    Index("overrides_by_submission", "submission_id"),
+)
+
+_REFUSE = "a gradebook is only added to"
+event.listen(
+    metadata,
+    "before_create",
+    DDL(
+        "CREATE OR REPLACE FUNCTION cartlab_append_only() RETURNS trigger LANGUAGE plpgsql AS "
+        f"$$ BEGIN RAISE EXCEPTION '{_REFUSE}'; END $$"
+    ).execute_if(dialect="postgresql"),
+)
+for _table in metadata.sorted_tables:
+    for _verb in ("UPDATE", "DELETE"):
+        event.listen(
+            _table,
+            "after_create",
+            DDL(
+                f"CREATE TRIGGER {_table.name}_no_{_verb.lower()} BEFORE {_verb} ON {_table.name} "
+                f"BEGIN SELECT RAISE(ABORT, '{_REFUSE}'); END"
+            ).execute_if(dialect="sqlite"),
+        )
+    event.listen(
+        _table,
+        "after_create",
+        DDL(
+            f"CREATE TRIGGER {_table.name}_append_only BEFORE UPDATE OR DELETE OR TRUNCATE "
+            f"ON {_table.name} EXECUTE FUNCTION cartlab_append_only()"
+        ).execute_if(dialect="postgresql"),
+    )
+
+
+class Database:
+    """A database with the tables of a gradebook; every call is one transaction.
+
+    Parameters
+    ----------
+    place : a folder that holds `gradebook.sqlite`, such a file, or any SQLAlchemy URL.
+    create : make the tables where there are none; else a gradebook must be there.
+
+    Raises
+    ------
+    ConfigError : the place cannot be reached, holds no gradebook, or one of another version.
+    """
+
+    def __init__(self, place: str | Path, *, create: bool) -> None:
+        self._engine = _engine(place, create=create)
+        self._writer = self._engine.execution_options(writes=True)
+        with self._translated(), (self._writer if create else self._engine).begin() as connection:
+            if create:
+                metadata.create_all(connection)
+            elif not self._engine.dialect.has_table(connection, settings.name):
+                raise ConfigError(f"{self.name}: holds no gradebook")
+            _check_version(connection, name=self.name)
+
+    @property
+    def name(self) -> str:
+        """Where it is, without any password."""
+        url = self._engine.url
+        if url.get_backend_name() == "sqlite":
+            return url.database or ""
+        return url.render_as_string(hide_password=True)
+
+    @contextmanager
+    def reading(self) -> Iterator[Connection]:
+        """Read; keep it short, a writer waits for it."""
+        with self._translated(), self._engine.begin() as connection:
+            yield connection
+
+    @contextmanager
+    def writing(self) -> Iterator[Connection]:
+        """Write all or nothing; durable once it ends."""
+        with self._translated(), self._writer.begin() as connection:
+            yield connection
+
+    def close(self) -> None:
+        """Let go of the connections."""
+        self._engine.dispose()
+
+    @contextmanager
+    def _translated(self) -> Iterator[None]:
+        try:
+            yield
+        except SQLAlchemyError as error:
+            cause = str(getattr(error, "orig", None) or error).strip().splitlines()
+            raise ConfigError(f"{self.name}: {cause[0] if cause else error}") from error
+
+
+def _engine(place: str | Path, *, create: bool) -> Engine:
+    if isinstance(place, Path) or "://" not in place:
+        file = Path(place) if Path(place).suffix in _SUFFIXES else Path(place) / FILE
+        if not create and not file.is_file():
+            raise ConfigError(f"{place}: holds no {FILE}; name the --out folder of cartlab grade")
+        address = URL.create("sqlite", database=str(file))
+    else:
+        address = place
+    try:
+        url = make_url(address)
+    except ArgumentError as error:
+        raise ConfigError(f"the gradebook's address is no database URL: {error}") from error
+    try:
+        if url.drivername == "postgresql":  # what is called so depends on SQLAlchemy's version
+            url = url.set(drivername="postgresql+psycopg")
+        if url.get_backend_name() != "sqlite":
+            return create_engine(url, pool_pre_ping=True)
+        engine = create_engine(url, connect_args={"timeout": _PATIENCE})
+    except (NoSuchModuleError, ModuleNotFoundError) as error:
+        shown = url.render_as_string(hide_password=True)
+        raise ConfigError(f"{shown}: no driver for it is installed ({error})") from error
+    event.listen(engine, "connect", _prepare_sqlite)
+    event.listen(engine, "begin", _begin_sqlite)
+    return engine
+
+
+def _prepare_sqlite(connection, _record) -> None:
+    connection.isolation_level = None  # we begin transactions ourselves, DDL included
+    connection.execute("PRAGMA foreign_keys = ON")
+    connection.execute("PRAGMA synchronous = FULL")  # what was put outlives a power cut
+
+
+def _begin_sqlite(connection: Connection) -> None:
+    """Take the write lock at once: two that read and then both write would wait for each other."""
+    writes = connection.get_execution_options().get("writes", False)
+    connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
+
+
+def _check_version(connection: Connection, *, name: str) -> None:
+    found = connection.scalar(select(settings.c.value).where(settings.c.name == "schema"))
+    if found is None:
+        connection.execute(insert(settings).values(name="schema", value=_VERSION))
+    elif found != _VERSION:
+        raise ConfigError(f"{name}: is a gradebook of version {found}, this cartlab has {_VERSION}")

@@ -1,0 +1,56 @@
+"""A PostgreSQL server of the tests' own: its folder, its socket, no network."""
+
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+
+
+def missing() -> str:
+    """Return why no server can be started here, or ""."""
+    if os.name != "posix":
+        return "PostgreSQL is started on POSIX only"
+    if _binaries() is None:
+        return "no PostgreSQL in /usr/lib/postgresql: apt-get install postgresql"
+    if find_spec("psycopg") is None:
+        return "no psycopg: pip install 'cartlab[postgresql]'"
+    return ""
+
+
+def _binaries() -> Path | None:
+    found = Path("/usr/lib/postgresql").glob("*/bin/initdb")
+    newest = max(found, key=lambda path: float(path.parts[-3]), default=None)
+    return newest and newest.parent
+
+
+@contextmanager
+def running() -> Iterator[str]:
+    """Start a server and yield the URL of its database; it is gone afterwards."""
+    binaries = _binaries()
+    assert binaries is not None
+    # Not in pytest's folder: only its owner can enter that, and a server never runs as root.
+    folder = Path(tempfile.mkdtemp(prefix="pg-"))
+    data = folder / "data"
+    user = {}
+    if os.getuid() == 0:
+        shutil.chown(folder, "postgres", "postgres")
+        user = {"user": "postgres", "group": "postgres", "extra_groups": []}
+
+    def run(*command: str | Path) -> None:
+        subprocess.run(command, check=True, cwd=folder, stdout=subprocess.DEVNULL, **user)
+
+    try:
+        run(binaries / "initdb", "-D", data, "-U", "cartlab", "-A", "trust", "-E", "UTF8", "-N")
+        options = f"-c listen_addresses='' -c unix_socket_directories={folder}"
+        log = ("-l", folder / "log")
+        run(binaries / "pg_ctl", "start", "-w", "-D", data, *log, "-o", options)
+        try:
+            yield f"postgresql://cartlab@/postgres?host={folder}"
+        finally:
+            run(binaries / "pg_ctl", "stop", "-w", "-m", "immediate", "-D", data)
+    finally:
+        shutil.rmtree(folder)
