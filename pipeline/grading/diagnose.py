@@ -146,37 +146,72 @@ def explain(
 ) -> tuple[list[Explained], list[str]]:
     """Find the fewest mistakes that reproduce the numbers that are off; return also the rest.
 
-    One that explains more numbers comes first, then a single one before two at once. Where
-    another code explains the same numbers about as well, none is named.
+    The codes that explain most numbers come first, then one before two at once. Where another
+    code explains the same numbers about as well, none is named.
     """
-    remaining, left = list(off), []
+    remaining, left, codes = list(off), [], frozenset[Code]()
     found: list[Explained] = []
     while remaining:
-        fits = [(m, names) for m in mistakes if (names := _explains(m, table, remaining))]
-        if not fits:
+        covers = [
+            _cover(codes | more, table, remaining, mistakes)
+            for more in dict.fromkeys(frozenset(m.codes) for m in mistakes)
+        ]
+        covers = [cover for cover in covers if cover.distances]
+        if not covers:
             break
-
-        def rank(fit: tuple[Mistake, list[str]]) -> tuple[int, int, float]:
-            mistake, names = fit
-            return -len(names), len(mistake.codes), _distance(mistake, table, names)
-
-        best, names = min(fits, key=rank)
-        distance = _distance(best, table, names)
+        best = min(covers, key=lambda c: (-len(c.distances), len(c.codes), c.distance))
         rivals = [
-            m
-            for m, explained in fits
-            if m.codes != best.codes
-            and len(m.codes) <= len(best.codes)
-            and set(names) <= set(explained)
-            and _distance(m, table, names) < distance + _MARGIN
+            cover
+            for cover in covers
+            if not best.codes <= cover.codes
+            and len(cover.codes) <= len(best.codes)
+            and best.distances.keys() <= cover.distances.keys()
+            and cover.distance < best.distance + _MARGIN
         ]
         if rivals:
-            left += names
+            left += best.distances
         else:
-            names = remaining if best.table_wide else names
-            found.append(Explained(mistake=best, table=label, names=tuple(names)))
-        remaining = [name for name in remaining if name not in names]
-    return found, [name for name in off if name in {*left, *remaining}]
+            codes = best.codes
+            for mistake, names in best.fits:
+                own = remaining if mistake.table_wide else names
+                found.append(Explained(mistake=mistake, table=label, names=tuple(own)))
+        wide = any(m.table_wide for m, _ in best.fits) and not rivals
+        remaining = [n for n in remaining if n not in best.distances and not wide]
+    explained = {name for one in found for name in one.names}
+    return found, [name for name in off if name not in explained]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Cover:
+    """What some codes explain: each number by the mistake that comes nearest to it."""
+
+    codes: frozenset[Code]
+    fits: tuple[tuple[Mistake, list[str]], ...]
+    distances: dict[str, float]
+
+    @property
+    def distance(self) -> float:
+        return sum(self.distances.values()) / len(self.distances)
+
+
+def _cover(
+    codes: frozenset[Code], table: Table, remaining: Sequence[str], mistakes: Sequence[Mistake]
+) -> _Cover:
+    """Explain what these codes can, with mistakes that explain more numbers first."""
+    fits: list[tuple[Mistake, list[str]]] = []
+    distances: dict[str, float] = {}
+    usable = [m for m in mistakes if codes.issuperset(m.codes)]
+    while True:
+        open_ = [name for name in remaining if name not in distances]
+        tried = [(m, names) for m in usable if (names := _explains(m, table, open_))]
+        if not tried:
+            return _Cover(codes=codes, fits=tuple(fits), distances=distances)
+        mistake, names = min(
+            tried,
+            key=lambda fit: (-len(fit[1]), len(fit[0].codes), _distance(fit[0], table, fit[1])),
+        )
+        fits.append((mistake, names))
+        distances |= {name: _off_by(mistake, table, name) for name in names}
 
 
 def _explains(mistake: Mistake, table: Table, remaining: Sequence[str]) -> list[str]:

@@ -21,7 +21,7 @@ _FEW_PERIODS = range(1, 5)
 _MANY_PERIODS = range(5, 11)
 
 _GAIN_OR_FREQUENCY = 0.03  # an honest reading after one slip: relative
-_COUNTED = 0.015
+_COUNTED = 0.02
 _DAMPING = 0.2
 _SHARP = 1.05  # high over low of a reference that friction does not blur
 _CLEARLY_OFF = 0.06  # of a gain: another extremum of the step as near as this says nothing

@@ -153,14 +153,25 @@ def _slip(space: StateSpace, *, models: Sequence[Array], n: int) -> str:
         if not np.all(np.isfinite(model)):
             continue
         for text, slipped, moved in _slips(model, n):
-            met = all(
-                _entry_error(number, float(slipped[at]), kinds[moved[at[0]]][_column(moved, at[1])])
-                <= _EXPLAINED[kinds[moved[at[0]]][_column(moved, at[1])]]
-                for at, number in typed.items()
-            )
-            if met:
+            of_states = [[kinds[i][_column(moved, j)] for j in range(2 * n + 1)] for i in moved]
+            # Who orders the states anew in A may have left B as it was.
+            if _met(typed, slipped, of_states) or (
+                moved != sorted(moved)
+                and _met({at: x for at, x in typed.items() if at[1] < 2 * n}, slipped, of_states)
+                and _met({at: x for at, x in typed.items() if at[1] == 2 * n}, model, kinds)
+            ):
                 return text
     return ""
+
+
+def _met(
+    typed: Mapping[tuple[int, int], Decimal], slipped: Array, kinds: Sequence[Sequence[Kind]]
+) -> bool:
+    """Whether all typed entries are those of a slipped [A B]."""
+    return all(
+        _entry_error(number, float(slipped[i, j]), kinds[i][j]) <= _EXPLAINED[kinds[i][j]]
+        for (i, j), number in typed.items()
+    )
 
 
 def _column(moved: list[int], column: int) -> int:

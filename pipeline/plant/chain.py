@@ -118,11 +118,18 @@ class Chain:
 
         Raises
         ------
-        DataError : no spring holds the carts, so a constant force has no rest position.
+        DataError : no spring holds the carts, so a constant force has no rest position; or springs
+            so far apart in stiffness that the numbers cannot tell.
         """
         if not self.is_tied:
             raise DataError("no spring ties the carts to a wall: there is no static gain")
-        return np.linalg.solve(self.stiffness, np.eye(self.n)[:, 0]).astype(np.float64)
+        try:
+            return np.linalg.solve(self.stiffness, np.eye(self.n)[:, 0]).astype(np.float64)
+        except np.linalg.LinAlgError:
+            raise DataError(
+                f"static gains need springs of comparable stiffness, found {self.k.min():.1e} to "
+                f"{self.k.max():.1e}"
+            ) from None
 
     @property
     def is_tied(self) -> bool:

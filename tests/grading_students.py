@@ -1,0 +1,94 @@
+"""Simulated students, honest until a test changes what they report; analysed once."""
+
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from decimal import Decimal
+from functools import cache
+from pathlib import Path
+from types import MappingProxyType
+
+from pipeline.grading.grade import Grade
+from pipeline.grading.load import load_rubric
+from pipeline.grading.rubric import Rubric
+from pipeline.grading.run import grade_analysis, under_rubric
+from pipeline.results import Analysis
+from pipeline.submission import Feedback, Reported, StateSpace, Submission, load_submission
+from pipeline.synthesis import write_submission
+from pipeline.synthesis.hidden import prepare_bench
+from pipeline.workflow import analyse
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Student:
+    """A submission and the analysis of its recordings, under the rubric of its carts."""
+
+    submission: Submission
+    analysis: Analysis
+    rubric: Rubric
+
+    @property
+    def reported(self) -> Reported:
+        """What the student claims."""
+        assert self.submission.reported is not None
+        return self.submission.reported
+
+    def value(self, table: str, name: str) -> float:
+        """Return a reported parameter."""
+        return float(getattr(self.reported, table)[name])
+
+    def reporting(
+        self,
+        *,
+        initial: Mapping[str, float] | Mapping[str, Decimal] = MappingProxyType({}),
+        final: Mapping[str, float] | Mapping[str, Decimal] = MappingProxyType({}),
+        state_space: StateSpace | None = None,
+        feedback: Feedback | None = None,
+    ) -> "Student":
+        """Return the student with other numbers in the tables, typed to three digits."""
+        update: dict = {
+            label: {**getattr(self.reported, label), **{k: typed(v) for k, v in numbers.items()}}
+            for label, numbers in (("initial", initial), ("final", final))
+        }
+        update |= {"state_space": state_space} if state_space else {}
+        update |= {"feedback": feedback} if feedback else {}
+        reported = self.reported.model_copy(update=update)
+        return replace(self, submission=self.submission.model_copy(update={"reported": reported}))
+
+    def without(self, table: str, *names: str) -> "Student":
+        """Return the student with parameters left out of a table."""
+        left = {k: v for k, v in getattr(self.reported, table).items() if k not in names}
+        reported = self.reported.model_copy(update={table: left})
+        return replace(self, submission=self.submission.model_copy(update={"reported": reported}))
+
+    def grade(self, *, days_late: float = 0.0) -> Grade:
+        """Grade what is reported against the recordings."""
+        return grade_analysis(
+            self.submission, self.analysis, rubric=self.rubric, name="team-07", days_late=days_late
+        )
+
+
+def typed(value: float | Decimal) -> Decimal:
+    """Return a number as typed to three digits; one that is typed stays."""
+    if isinstance(value, Decimal):
+        return value
+    return Decimal(f"{value:#.3g}".removesuffix("."))
+
+
+@cache
+def student(carts: int, *, seed: int = 3, hide: tuple[str, ...] = ()) -> Student:
+    """Return an honest student of a preset's bench, with effects hidden in it."""
+    preset = f"throne-{carts}dof"
+    bench = prepare_bench(preset=preset, hide=hide)
+    rubric = load_rubric(Path(preset))
+    with tempfile.TemporaryDirectory() as folder:
+        write_submission(
+            Path(folder),
+            chain=bench.chain,
+            effects=bench.effects,
+            seed=seed,
+            compact=True,
+            reported=True,
+        )
+        submission, _ = under_rubric(load_submission(Path(folder)), rubric)
+        return Student(submission=submission, analysis=analyse(submission), rubric=rubric)

@@ -1,0 +1,161 @@
+"""Grading a submission from its folder: points, parents, lateness, and nothing believed unseen."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from pipeline.grading.grade import CODES, Flag, Grade, grade_text
+from pipeline.grading.load import load_rubric
+from pipeline.grading.run import grade_submission
+from pipeline.submission import load_submission
+from pipeline.synthesis import write_submission
+from tests.grading_students import student
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """One cart's submission on disk."""
+    path = tmp_path_factory.mktemp("grading") / "team-07"
+    write_submission(path, chain="throne-1dof", seed=3, compact=True, reported=True)
+    return path
+
+
+def grade(path: Path) -> Grade:
+    rubric = load_rubric(Path("throne-1dof"))
+    return grade_submission(load_submission(path), rubric=rubric, name=path.name).grade
+
+
+def test_the_same_submission_gives_the_same_bytes(folder):
+    """`grade.json` holds what the contract says, byte for byte the same each time."""
+    text = grade_text(grade(folder))
+    assert text == grade_text(grade(folder))
+    document = json.loads(text)
+    assert document["schema"] == "cartlab-grade/1"
+    assert document["status"] == "graded"
+    assert document["points"] == document["out_of"] == 20
+    assert {"id", "outcome", "points", "out_of", "message", "expected", "found"} <= set(
+        document["criteria"][0]
+    )
+
+
+def test_results_that_a_submission_brings_along_are_not_believed(folder, tmp_path):
+    """A planted results.json and gap.json change nothing."""
+    planted = tmp_path / "team-07"
+    shutil.copytree(folder, planted)
+    for name in ("results.json", "gap.json", "grade.json", "report/results.json", "gap/gap.json"):
+        (planted / name).parent.mkdir(exist_ok=True)
+        (planted / name).write_text('{"schema": "cartlab-results/1", "points": 20}', "utf-8")
+    assert grade_text(grade(planted)) == grade_text(grade(folder))
+
+
+def test_the_rubric_s_system_wins(folder, tmp_path):
+    """A submission that says no spring is there, and another sign, is read as the rubric says."""
+    other = tmp_path / "team-07"
+    shutil.copytree(folder, other)
+    toml = other / "submission.toml"
+    text = toml.read_text("utf-8")
+    changed = text.replace("springs = [true, false]", "springs = [false, true]")
+    changed = changed.replace("sign = 1", "sign = -1")
+    assert changed != text
+    toml.write_text(changed, "utf-8", newline="\n")
+    assert grade(other).points == grade(folder).points
+    assert grade(other).flags == ()
+
+
+def test_a_submission_for_another_bench_fails_with_its_reason(folder):
+    """One cart under the rubric for two: no grade, and why."""
+    rubric = load_rubric(Path("throne-2dof"))
+    failed = grade_submission(load_submission(folder), rubric=rubric, name="team-07").grade
+    assert (failed.status, failed.points, failed.out_of) == ("failed", 0.0, 20)
+    assert "is for 1 carts, the rubric for 2" in failed.reason
+
+
+def test_a_cut_file_costs_its_own_run_only(folder, tmp_path):
+    """The rest is graded; the run is named with the line at which its file breaks off."""
+    cut = tmp_path / "team-07"
+    shutil.copytree(folder, cut)
+    path = cut / "data" / "sine-05.csv"
+    text = path.read_text("utf-8")
+    path.write_text(text[: len(text) // 2].rsplit(",", 1)[0], "utf-8", newline="\n")
+    found = grade(cut)
+    (flag,) = found.flags
+    assert (flag.code, flag.parameters) == ("data_problem", ("sine-05",))
+    assert "line" in flag.message
+    assert found.status == "graded"
+    assert found.points > 19
+
+
+def test_a_copied_file_and_another_experiment_s_are_seen(folder, tmp_path):
+    """A decay in the place of a step: the copy and the missing step are one remark."""
+    other = tmp_path / "team-07"
+    shutil.copytree(folder, other)
+    shutil.copyfile(other / "data" / "decay-1a.csv", other / "data" / "step-1.csv")
+    (flag,) = grade(other).flags
+    assert flag.code == "data_problem"
+    assert "step-1" in flag.parameters
+
+
+def test_what_builds_on_a_failed_criterion_is_skipped_and_says_so():
+    """Unstable gains fail; the claims about them are skipped, and the parent is named."""
+    one = student(2)
+    feedback = one.reported.feedback
+    assert feedback is not None
+    reversed_ = feedback.model_copy(update={"gains": tuple(-g for g in feedback.gains)})
+    graded = one.reporting(feedback=reversed_).grade()
+    outcomes = {c.id: c for c in graded.criteria}
+    assert outcomes["feedback"].outcome == "fail"
+    assert outcomes["feedback-claims"].outcome == "skip"
+    assert outcomes["feedback-claims"].points == 0
+    assert "builds on 'feedback'" in outcomes["feedback-claims"].message
+
+
+@pytest.mark.parametrize("table", ["initial", "final"])
+@pytest.mark.parametrize("side", [1, -1])
+def test_points_never_rise_with_the_error(table, side):
+    """A gain further and further off never earns more; far off it earns nothing of its share."""
+    one = student(1)
+    right = one.value(table, "K")
+    errors = (0.0, 0.02, 0.06, 0.08, 0.1, 0.15, 0.2, 0.3, 0.5)
+    name = f"{table}-gains"
+    points = []
+    for error in errors:
+        wrong = {"K": right * (1 + error) ** side}
+        other = one.reporting(initial=wrong) if table == "initial" else one.reporting(final=wrong)
+        points.append(next(c.points for c in other.grade().criteria if c.id == name))
+    assert points == sorted(points, reverse=True)
+    assert (points[0], points[-1]) == (
+        next(c.points for c in one.rubric.criteria if c.id == name),
+        0,
+    )
+
+
+def test_lateness_takes_its_share_for_every_day_begun():
+    """Ten percent a day, after an hour of grace, at most half."""
+    one = student(1)
+    full = one.grade().points
+    for days, share in ((0.0, 0), (0.04, 0), (0.5, 0.1), (1.04, 0.1), (2.0, 0.2), (30.0, 0.5)):
+        graded = one.grade(days_late=days)
+        assert graded.deducted == pytest.approx(share * full, abs=0.005)  # to the hundredth
+        assert graded.points == pytest.approx(full - graded.deducted)
+
+
+def test_a_submission_that_reports_nothing_is_graded_for_its_recordings():
+    """Without [reported] everything reported is missing, and the recordings still earn theirs."""
+    one = student(2)
+    silent = replace(one, submission=one.submission.model_copy(update={"reported": None}))
+    graded = silent.grade()
+    assert [flag.code for flag in graded.flags] == ["missing"]
+    earned = {c.id: c.points for c in graded.criteria if c.points}
+    assert set(earned) == {"pieces", "data", "hardware"}
+
+
+def test_further_flags_keep_the_order_of_the_codes():
+    """What the batch adds stands where its code does."""
+    graded = student(2).without("final", "zeta_b").grade()
+    flag = Flag(code="shared_data", parameters=("step-1",), message="…", evidence={})
+    data = Flag(code="data_problem", parameters=("step-1",), message="…", evidence={})
+    codes = [f.code for f in graded.with_flags(data, flag).flags]
+    assert codes == sorted(codes, key=CODES.index) == ["missing", "shared_data", "data_problem"]
