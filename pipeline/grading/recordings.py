@@ -5,14 +5,18 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from pipeline.grading.grade import Flag
+from pipeline.grading.reference import is_explained
 from pipeline.ingest.inspect import is_stepped, line_frequency
 from pipeline.ingest.problems import saturation, stuck_spans
+from pipeline.plant.chain import Array
 from pipeline.results import Analysis, Record
 
 _FREQUENCY = 0.08  # relative: a stated frequency further from that of the input is another run's
 _CUT = 0.5  # of the usual length of the repeats
 _SEEN_COUNTS = 20.0  # encoder steps that a cart must be expected to move before it is called stuck
 _SEEN_SHARE = 0.3  # … and of its motion in other runs: less may be friction that holds it
+_FASTEST = 0.98  # quantile of the steps from sample to sample: the odd jump does not count
+_AT_SPEED, _AWAY = 0.6, 1.5  # of the fastest
 _DRIVEN = 1e-3  # of the largest input of any run: a decay with more is driven
 
 
@@ -59,7 +63,7 @@ def _problems(
         if cart not in record.free:
             continue
         y = record.position(cart)
-        for first, last in stuck_spans(y)[:1]:
+        for first, last in _stuck(y, sticky=not is_explained(analysis))[:1]:
             yield (
                 f"the encoder of cart {cart} stands still at speed from {t[first]:.4g} s to "
                 f"{t[last]:.4g} s: it stuck"
@@ -82,7 +86,24 @@ def _problems(
             yield f"it lasts {length:.3g} s, its repeats {typical:.3g} s: the file looks cut"
 
 
-def _input_problems(record: Record, u: np.ndarray, *, largest: float) -> Iterator[str]:
+def _stuck(y: Array, *, sticky: bool) -> list[tuple[int, int]]:
+    """Return where an encoder stuck; of a cart that may stick itself, only what no cart can do.
+
+    Static friction stops a cart from a crawl; it does not stop one at speed, nor is it elsewhere
+    when it moves on.
+    """
+    moves = np.abs(np.diff(y))
+    fastest = float(np.quantile(moves, _FASTEST))
+    return [
+        (first, last)
+        for first, last in stuck_spans(y)
+        if not sticky
+        or moves[first - 1] >= _AT_SPEED * fastest
+        or (last < moves.size and moves[last] >= _AWAY * fastest)
+    ]
+
+
+def _input_problems(record: Record, u: Array, *, largest: float) -> Iterator[str]:
     """Yield where the input is not that of the kind of run."""
     if (limit := saturation(u)) is not None:
         yield f"the input is clipped at {limit:.4g}"

@@ -153,7 +153,9 @@ def _slip(space: StateSpace, *, models: Sequence[Array], n: int) -> str:
         if not np.all(np.isfinite(model)):
             continue
         for text, slipped, moved in _slips(model, n):
-            of_states = [[kinds[i][_column(moved, j)] for j in range(2 * n + 1)] for i in moved]
+            of_states: list[list[Kind]] = [
+                [kinds[i][_column(moved, j)] for j in range(2 * n + 1)] for i in moved
+            ]
             # Who orders the states anew in A may have left B as it was.
             if _met(typed, slipped, of_states) or (
                 moved != sorted(moved)
