@@ -234,14 +234,17 @@ def _gain_mistakes(gains: Mapping[str, Reference], analysis: Analysis) -> list[M
                 least=min(2, len(gains)),
             )
         )
-    found += [
-        Mistake(
-            codes=("counts_for_length",),
-            predicted={n: r.times(1 / _count(n, analysis)) for n, r in gains.items()},
-            tolerance=_GAIN_OR_FREQUENCY,
-            help="{reported} is {recomputed} in encoder counts: multiply by the length of a count",
+    counts = {name: _count(name, analysis) for name in gains}
+    if all(counts.values()):
+        found.append(
+            Mistake(
+                codes=("counts_for_length",),
+                predicted={n: r.times(1 / counts[n]) for n, r in gains.items()},
+                tolerance=_GAIN_OR_FREQUENCY,
+                help="{reported} is {recomputed} in encoder counts: multiply by the length of a "
+                "count",
+            )
         )
-    ] * all(_count(n, analysis) > 0 for n in gains)
     return found
 
 

@@ -58,19 +58,21 @@ def data_flag(bad: Mapping[str, str]) -> Flag:
 def _problems(
     record: Record, analysis: Analysis, *, usual: Mapping[int, float], largest: float
 ) -> Iterator[str]:
-    t, u = record.t, record.u
+    t, u, sticky = record.t, record.u, not is_explained(analysis)
     for cart in record.carts:
         if cart not in record.free:
             continue
         y = record.position(cart)
-        for first, last in _stuck(y, sticky=not is_explained(analysis))[:1]:
+        for first, last in _stuck(y, sticky=sticky)[:1]:
             yield (
                 f"the encoder of cart {cart} stands still at speed from {t[first]:.4g} s to "
                 f"{t[last]:.4g} s: it stuck"
             )
         if np.ptp(y) == 0 and _should_move(record, cart, analysis, usual=usual):
             yield f"cart {cart} is said to be free and its encoder never changes"
-        elif record.kind in ("sine", "sweep") and (limit := saturation(y)) is not None:
+        # A cart that sticks rests where it turns, which looks like a clipped reading.
+        limit = None if sticky or record.kind not in ("sine", "sweep") else saturation(y)
+        if limit is not None:
             yield f"the position of cart {cart} is clipped at {limit:.4g}"
     if u is not None and record.kind != "closed_loop":
         yield from _input_problems(record, u, largest=largest)
