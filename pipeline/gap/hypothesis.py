@@ -13,7 +13,6 @@ from pipeline.gap.structure import Candidate
 from pipeline.plant.effects.base import Effect
 
 AT_FLOOR = 1.15  # chi-square per point below this is noise
-AS_REPEATS = 1.1  # an error below this many times what repeats differ by is theirs
 THINNING = 10.0  # neighbouring residuals are not independent: N / 10 count
 BIC_DROP = 20.0  # by which the criterion must fall for one more effect
 CONTACT = ("end_stop", "backlash")
@@ -27,9 +26,8 @@ _BOUND_MARGIN = 0.01  # in logarithms, or in scales
 class Hypothesis:
     """A model with its fit on training runs and what it leaves on held-out ones.
 
-    `at_floor`: nothing is left but noise, on training and on held-out runs, or no more than
-    repeats differ by among themselves. `added` is the effect added last; `parent` the hypothesis
-    it was added to.
+    `at_floor`: nothing is left but noise, on training and on held-out runs. `added` is the effect
+    added last; `parent` the hypothesis it was added to.
     """
 
     fit: Fit
@@ -90,13 +88,12 @@ def judge(
     effective = fit.n_points / THINNING
     bic = effective * np.log(fit.cost / fit.n_points) + fit.theta.size * np.log(effective)
     error = float(np.sqrt(sum(errors) / sum(sizes)))
-    only_noise = fit.chi < AT_FLOOR and held.chi < AT_FLOOR
     return Hypothesis(
         fit=fit,
         held=held,
         error=error,
         bic=float(bic),
-        at_floor=only_noise or error < AS_REPEATS * bench.repeatability,
+        at_floor=fit.chi < AT_FLOOR and held.chi < AT_FLOOR,
         added=added,
         parent=parent,
     )

@@ -71,8 +71,13 @@ def _rest_band(fit: Fit) -> Array:
     """Return (n,) how far from equilibrium dry friction may leave each cart, about one sigma."""
     chain = fit.structure.chain(fit.theta)
     cart = fit.structure.tables(fit.theta[None])[0][0]
-    force = cart[:, Cart.COULOMB] + cart[:, Cart.STATIC] + cart[:, Cart.DAHL]
+    force = dry_force(cart)
     if not np.any(chain.k > 0):
         return np.zeros(chain.n)
     compliance = np.abs(np.linalg.pinv(chain.stiffness))
     return np.sqrt(((0.5 * compliance * force) ** 2).sum(axis=1))
+
+
+def dry_force(cart: Array) -> Array:
+    """Return (n,) the largest force at which dry friction still holds each cart, from its table."""
+    return cart[:, Cart.COULOMB] + cart[:, Cart.STATIC] + cart[:, Cart.DAHL]

@@ -93,13 +93,16 @@ def make_run(record: Record, *, n: int) -> Run:
     # The input may already act between these samples: the first two are before its effect.
     lies_still = np.ptp(head[:, :2], axis=1) <= still
     at_rest = bool(np.all(lies_still)) and record.kind != "decay"
+    # What moves before the input does was not in equilibrium, only held.
+    before = y[:, : max(2, int(np.argmax(u != 0.0)) + 1)]
+    balanced = at_rest and bool(np.all(np.ptp(before, axis=1) <= still))
     zero, zero_std = np.zeros(n), np.ones(n)
     start, slope = np.zeros(n), np.zeros(n)
     span = np.ptp(y, axis=1)
     for j, row in enumerate(rows):
         if settled[j] and quiet_end:
             zero[row], zero_std[row] = tail[j].mean(), 0.02 * span[j]
-        elif at_rest and u[0] == 0.0:
+        elif balanced and u[0] == 0.0:
             zero[row], zero_std[row] = head[j, 0], 0.02 * span[j]
         else:
             zero[row], zero_std[row] = y[j].mean(), 0.2 * span[j]

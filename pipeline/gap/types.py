@@ -100,8 +100,7 @@ class Gap:
     effects : in the order found. Under `ambiguous` the last one's rivals explain as much; under
         `unexplained` they are suspects only.
     baseline, final, noise_floor : relative errors pooled over the held-out runs.
-    repeatability : the same between runs with the same input, or None without repeats; the
-        noise floor is at least as high.
+    repeatability : the same between runs with the same input, or None without repeats.
     suspects : under `unexplained`, the single effects that help most, the best first.
     linear, model : the linear chain that fits best, and the chain with the effects.
     chain_std : standard errors of the latter's "m_1", "c_1", "k_1", …

@@ -12,6 +12,7 @@ from pipeline.plant.effects import find_effect
 _CLOSE_ERROR, _CLOSE_GAIN, _CLOSE_BIC = 1.15, 0.10, 40.0
 _REFUSED_SHARE, REFUSED_FLOOR = 0.5, 1.5
 _NOTHING = 1.05  # times the noise: too little to speak of
+AS_REPEATS = 1.1  # an error below this many times what repeats differ by is theirs
 _DECISIVE_SHARE, _DECISIVE_RIVAL = 0.8, 1.2
 
 
@@ -29,7 +30,8 @@ def reach_verdict(
     `found` are all hypotheses judged; `floor` the relative error of noise alone.
     """
     if not chosen.key:
-        nothing = baseline.at_floor or baseline.error < _NOTHING * floor
+        least = max(_NOTHING * floor, AS_REPEATS * bench.repeatability)
+        nothing = baseline.at_floor or baseline.error < least
         return ("none" if nothing else "unexplained"), []
     refused = chosen.error > _REFUSED_SHARE * baseline.error
     refused &= chosen.error > REFUSED_FLOOR * floor

@@ -20,9 +20,11 @@ def error_table(gap: Gap, *, number: int) -> Table:
         ]
         for found in gap.effects
     ]
-    repeats = gap.repeatability is not None and gap.repeatability >= gap.noise_floor
-    least = "repeats of one run differ by" if repeats else "noise alone"
-    rows.append([cell(least, "quiet"), cell(share(gap.noise_floor), "quiet")])
+    rows.append([cell("noise alone", "quiet"), cell(share(gap.noise_floor), "quiet")])
+    if gap.repeatability is not None:
+        rows.append(
+            [cell("repeats of one run differ by", "quiet"), cell(share(gap.repeatability), "quiet")]
+        )
     return make_table(
         number,
         "Error on runs that were not used to fit: root mean square of measured minus simulated, "

@@ -185,8 +185,9 @@ def _errors(gap: Gap) -> str:
         "On runs the model had not seen the error falls from "
         f"{share(gap.baseline)} of the motion to {share(gap.final)}; {_noise(gap)}"
     )
-    if gap.final > _ALL * gap.noise_floor:
-        times = significant(gap.final / gap.noise_floor, digits=2)
+    least = max(gap.noise_floor, gap.repeatability or 0.0)
+    if gap.final > _ALL * least:
+        times = significant(gap.final / least, digits=2)
         return f"{text}. So {times} times what noise makes is left: this is the main effect, " \
             "not all of it."  # fmt: skip
     return f"{text}."
