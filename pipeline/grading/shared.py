@@ -17,14 +17,14 @@ from pipeline.grading.shared_prints import PASSED, Print, unpack
 
 _WIDTH = 512  # samples around an anchor that are compared at first
 _BEFORE = 128  # of them before it
-_GALLERY = 8  # anchors of each recording that all anchors of the others are held against
+_FIRST_IN_MOTION, _FIRST_IN_NOISE = 2, 1  # anchors that all of the others are held against
 _BLOCK = 2048  # anchors compared in one product
-_WORTH_A_LOOK = 3.8  # sigmas at first sight: one in ten thousand by chance
+_WORTH_A_LOOK = 3.2  # sigmas at first sight: one in a thousand by chance
 _LEAST_OVERLAP = 80  # samples that say something in both
 _LEAST_SLOPE = 0.5
 _NEARBY = 50  # shifts to either side that show how well chance does here
 _OWN_WIDTH = 2  # shifts next to the right one see the same match
-_COUNTS = 4.75  # sigmas of a recording that counts with others
+_COUNTS = 4.5  # sigmas of a recording that counts with others
 _ALONE = 6.5  # … by itself: a class of 200 offers 1e9 comparisons, chance reaches 6.1 in them
 _TOGETHER = 7.5  # root of the summed squares of several
 
@@ -191,33 +191,32 @@ def _matches(
 
 
 def _candidates(entries: Sequence[_Entry]) -> Iterator[tuple[int, int, int, int]]:
-    """Yield (entry, its anchor, other entry, its anchor) whose surroundings look alike."""
-    places = [(i, k) for i, entry in enumerate(entries) for k in range(entry.print.anchors.size)]
-    gallery = [(i, k) for i, k in places if k < _GALLERY]
-    if not gallery:
-        return
-    columns, column_counts = _windows(entries, gallery)
-    owner = np.array([entry.owner for entry in entries])
-    column_owner = owner[[i for i, _ in gallery]]
-    for start in range(0, len(places), _BLOCK):
-        block = places[start : start + _BLOCK]
-        rows, row_counts = _windows(entries, block)
-        least = np.minimum(row_counts[:, None], column_counts[None, :])
-        threshold = _WORTH_A_LOOK / np.sqrt(PASSED * np.maximum(least, 1))
-        alike = np.abs(rows @ columns.T) >= threshold
-        alike &= (least >= _LEAST_OVERLAP) & (
-            owner[[i for i, _ in block]][:, None] != column_owner[None, :]
-        )
-        for row, column in np.argwhere(alike).tolist():
-            yield *block[row], *gallery[column]
+    """Yield (entry, its anchor, other entry, its anchor) whose surroundings look alike.
+
+    All anchors are held against the first ones, in the motion and in the noise apart.
+    """
+    for in_motion, n_first in ((True, _FIRST_IN_MOTION), (False, _FIRST_IN_NOISE)):
+        places, first = [], []
+        for i, entry in enumerate(entries):
+            anchors = np.flatnonzero((entry.print.swing != 0) == in_motion).tolist()
+            places += [(i, k) for k in anchors]
+            first += [(i, k) for k in anchors[:n_first]]
+        if not places:
+            continue
+        columns = _windows(entries, first).T
+        for start in range(0, len(places), _BLOCK):
+            block = places[start : start + _BLOCK]
+            alike = np.abs(_windows(entries, block) @ columns) >= _WORTH_A_LOOK
+            for row, column in np.argwhere(alike).tolist():
+                i, j = block[row][0], first[column][0]
+                if entries[i].owner != entries[j].owner:
+                    yield *block[row], *first[column]
 
 
-def _windows(
-    entries: Sequence[_Entry], places: Sequence[tuple[int, int]]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the residuals around anchors, (n, n_free * _WIDTH) of unit length, and their counts.
+def _windows(entries: Sequence[_Entry], places: Sequence[tuple[int, int]]) -> np.ndarray:
+    """Return the residuals around anchors, (n, n_free * _WIDTH).
 
-    The count is that of the samples that say something.
+    Scaled so that a product of two is in sigmas, at first sight.
     """
     n_free = entries[0].print.residual.shape[0]
     windows = np.zeros((len(places), n_free, _WIDTH), dtype=np.float32)
@@ -227,8 +226,9 @@ def _windows(
         window[:, max(-start, 0) : max(-start, 0) + part.shape[1]] = part
     flat = windows.reshape(len(places), -1)
     counts = np.count_nonzero(flat, axis=1)
-    length = np.sqrt(np.einsum("ij,ij->i", flat, flat))
-    return flat / np.maximum(length, 1.0)[:, None], counts
+    power = np.einsum("ij,ij->i", flat, flat)
+    factor = (PASSED * counts) ** 0.25 / np.sqrt(np.maximum(power, 1.0))
+    return flat * np.where(counts >= _LEAST_OVERLAP, factor, 0.0).astype(np.float32)[:, None]
 
 
 # ----------------------------------------------------------------------- verdict
