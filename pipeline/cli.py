@@ -5,6 +5,7 @@ Everything heavy is imported by the command that needs it, so that `--help` answ
 """
 
 import json
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -93,11 +94,15 @@ def _options(
 def demo(
     out: Annotated[Path, typer.Option(help="Where to write.")] = Path("cartlab-demo"),
 ) -> None:
-    """Run the whole job on the shipped three-cart example."""
+    """Run the whole job: the shipped three-cart example, then a bench that hides friction."""
     from pipeline.output import check_folder
     from pipeline.resources import EXAMPLES
 
     _run_report(EXAMPLES / "three-cart", out=check_folder(out) / "report", pdf=True)
+    bench = out / "bench"
+    if not (bench / "submission.toml").exists():
+        simulate(out=bench, preset="throne-2dof", hide=["coulomb_friction"])
+    gap(bench, out=out / "gap")
 
 
 @app.command()
@@ -285,6 +290,80 @@ def simulate(
         progress("simulating the experiments")
         write_bench(out, bench, seed=seed, reported=reported)
     say(f"wrote {out}: try `cartlab report {out}`")
+
+
+@app.command()
+def grade(
+    paths: Annotated[
+        list[Path],
+        typer.Argument(metavar="PATH…", help="Submission folders, trees of them, or zip files."),
+    ],
+    rubric: Annotated[Path, typer.Option(metavar="FILE", help="A rubric, or a shipped name.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Where the gradebook is or will be.")],
+    jobs: Annotated[int, typer.Option(min=1, help="Processes; default: one a core.")] = (
+        os.cpu_count() or 1
+    ),
+    cluster: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler, tcp://HOST:PORT.")
+    ] = None,
+    time_limit: Annotated[float, typer.Option(min=1, help="s for each submission.")] = 120.0,
+    memory_limit: Annotated[float, typer.Option(min=0.1, help="GB for each submission.")] = 1.0,
+    figures: Annotated[
+        bool, typer.Option("--figures/--no-figures", help="Draw those of the feedback.")
+    ] = True,
+) -> None:
+    """Grade a class: gradebook, grades.csv, a page of the class, feedback for each student."""
+    from pipeline.grading.batch_run import grade_class
+    from pipeline.grading.runner import Limits
+
+    with _batch_progress() as progress:
+        done = grade_class(
+            paths,
+            rubric_file=rubric,
+            out=out,
+            jobs=jobs,
+            cluster=cluster,
+            limits=Limits(time=time_limit, memory=round(memory_limit * 1e9)),
+            figures=figures,
+            progress=progress,
+        )
+    for submission, reason in done.failed:
+        say(f"{submission}: {reason}")
+    shared = f", {done.sharing} with recordings that another has too" if done.sharing else ""
+    say(f"{done.total - len(done.failed)} of {done.total} graded{shared}; wrote {out}")
+    if done.failed:
+        raise typer.Exit(1)
+
+
+@contextmanager
+def _batch_progress() -> Iterator[Callable[[int, int, str], None]]:
+    """Show how many are done and how long the others will take; silent where nobody looks."""
+    if not sys.stderr.isatty():
+        yield lambda done, total, last: None
+        return
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        MofNCompleteColumn(),
+        BarColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        TextColumn("{task.description}", markup=False),  # a submission may be called "[b]"
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as shown:
+        task = shown.add_task("opening", total=None)
+        yield lambda done, total, last: shown.update(
+            task, completed=done, total=total, description=last
+        )
 
 
 @app.command("check-rubric")
