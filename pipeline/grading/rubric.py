@@ -178,6 +178,8 @@ class Rubric(_Model):
     ----------
     system, design : win over the submission's own; without `design` the submission's is used.
     anonymous : names stay out of what is written unless asked for.
+    examples : submission folders handed out with the task, from the rubric's own folder: their
+        recordings may stand in anybody's submission.
     """
 
     version: Literal[1]
@@ -187,6 +189,7 @@ class Rubric(_Model):
     required: Required = Required()
     late: Late = Late()
     anonymous: bool = False
+    examples: tuple[str, ...] = ()
     criteria: tuple[Criterion, ...]
 
     @property

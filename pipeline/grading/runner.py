@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pipeline
 from pipeline.grading.batch import Batch, Outcome, Prints, Store
-from pipeline.grading.grade import SCHEMA
+from pipeline.grading.grade import SCHEMA, Flag
 from pipeline.grading.intake import HandIn
 from pipeline.grading.intake_files import digest
 from pipeline.grading.rubric import Rubric
@@ -45,7 +45,8 @@ def grade_batch(
     scratch: Path,
     execute: Executor,
     limits: Limits | None = None,
-    examples: Iterable[bytes] = (),
+    figures: bool = False,
+    examples: Callable[[], Iterable[bytes]] = tuple,
     progress: Progress = _silent,
 ) -> Batch:
     """Grade what the store does not know yet; every outcome is in the store as soon as it is had.
@@ -55,7 +56,9 @@ def grade_batch(
     Parameters
     ----------
     execute : what runs the tasks: `run_here(jobs=…)` or `cluster.run_on(address)`.
-    examples : packed fingerprints of recordings that were handed out with the task.
+    figures : draw those of the feedback, too.
+    examples : packed fingerprints of recordings that were handed out with the task; asked for
+        only where recordings are shared.
     progress : called with how many are done, of how many, and what was done last.
     """
     limits = limits or Limits()
@@ -63,7 +66,7 @@ def grade_batch(
     text = rubric.model_dump_json()
     tasks, hopeless = [], []
     for hand_in in hand_ins:
-        task = _task(hand_in, rubric=text, code=code)
+        task = _task(hand_in, basis=(code, text, figures))
         (hopeless if hand_in.problem else tasks).append((task, hand_in.problem))
     for task, problem in hopeless:
         if store.known(task.key) is None:
@@ -78,6 +81,7 @@ def grade_batch(
             time_limit=limits.time,
             memory_limit=limits.memory,
             scratch=str(scratch.resolve()),
+            figures=figures,
         )
         for outcome in execute(new, setup, rubric.out_of):
             store.put(outcome)
@@ -149,10 +153,10 @@ def code_version() -> str:
     return total.hexdigest()
 
 
-def _task(hand_in: HandIn, *, rubric: str, code: str) -> Task:
+def _task(hand_in: HandIn, *, basis: tuple[str, str, bool]) -> Task:
     """Return the task of a hand-in; its key covers all that the outcome depends on."""
     plain = asdict(hand_in) | {"sources": digest(hand_in.sources)}
-    everything = json.dumps([SCHEMA, code, rubric, plain], sort_keys=True)
+    everything = json.dumps([SCHEMA, *basis, plain], sort_keys=True)
     return Task(
         id=hand_in.id,
         key=hashlib.sha256(everything.encode("utf-8", "surrogateescape")).hexdigest(),
@@ -166,7 +170,9 @@ def _is_settled(outcome: Outcome | None) -> bool:
     return outcome is not None and outcome.settled
 
 
-def _shared(keys: Sequence[str], store: Store, *, examples: Iterable[bytes]) -> dict:
+def _shared(
+    keys: Sequence[str], store: Store, *, examples: Callable[[], Iterable[bytes]]
+) -> dict[str, Flag]:
     """Return the flags for recordings that stand in two submissions of this or earlier batches."""
     batch = [
         Prints(
@@ -185,5 +191,7 @@ def _shared(keys: Sequence[str], store: Store, *, examples: Iterable[bytes]) -> 
         # What a team handed in before, or this very batch graded otherwise, is not news.
         and not (prints.submission in names and same_team(prints, names[prints.submission]))
     ]
-    found = find_shared(batch, earlier=earlier, examples=examples)
+    found = find_shared(batch, earlier=earlier)
+    if found and (handed_out := tuple(examples())):
+        found = find_shared(batch, earlier=earlier, examples=handed_out)
     return {submission: shared_flag(records) for submission, records in found.items()}

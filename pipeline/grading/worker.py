@@ -21,9 +21,9 @@ from pipeline.grading.batch import Outcome
 from pipeline.grading.grade import Grade, grade_text
 from pipeline.grading.intake_files import open_submission
 from pipeline.grading.rubric import Rubric
-from pipeline.grading.run import grade_submission
+from pipeline.grading.run import Graded, grade_submission
 from pipeline.grading.shared_prints import fingerprint
-from pipeline.submission import load_submission
+from pipeline.submission import Submission, load_submission
 from pipeline.submission.complaints import quote
 
 _GRACE = 30.0  # s; a worker without a parent to stop it ends by itself so long after the limit
@@ -39,12 +39,14 @@ class Setup:
     rubric : as JSON.
     time_limit : s for each hand-in; memory_limit : bytes beyond what the worker needs itself.
     scratch : where hand-ins are copied to while they are graded.
+    figures : draw those of the feedback, too.
     """
 
     rubric: str
     time_limit: float
     memory_limit: int
     scratch: str
+    figures: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +60,7 @@ class Task:
     days_late: float = 0.0
 
 
-def grade_task(task: Task, *, rubric: Rubric, scratch: Path) -> Outcome:
+def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = False) -> Outcome:
     """Open, analyse and grade one hand-in; whatever is wrong with it is the outcome's reason."""
     authors: tuple[str, ...] = ()
     reason = detail = ""
@@ -83,6 +85,7 @@ def grade_task(task: Task, *, rubric: Rubric, scratch: Path) -> Outcome:
                 days_late=task.days_late,
                 grade=grade_text(graded.grade),
                 fingerprints=fingerprint(records),
+                figures=_figures(submission, graded) if figures else (),
                 owner=task.owner,
             )
         except PipelineError as error:
@@ -97,6 +100,12 @@ def grade_task(task: Task, *, rubric: Rubric, scratch: Path) -> Outcome:
     return failed(
         task, reason, authors=authors, out_of=rubric.out_of, settled=settled, detail=detail
     )
+
+
+def _figures(submission: Submission, graded: Graded) -> tuple[tuple[str, str], ...]:
+    from pipeline.grading.feedback_figures import draw_figures  # costs half a second at first
+
+    return draw_figures(graded.analysis, submission.reported) if graded.analysis else ()
 
 
 def failed(
@@ -178,7 +187,9 @@ def main() -> None:
         plain = json.loads(line)
         task = Task(**{**plain, "sources": tuple(plain["sources"])})
         faulthandler.dump_traceback_later(setup.time_limit + _GRACE, exit=True)
-        outcome = grade_task(task, rubric=rubric, scratch=Path(setup.scratch))
+        outcome = grade_task(
+            task, rubric=rubric, scratch=Path(setup.scratch), figures=setup.figures
+        )
         faulthandler.cancel_dump_traceback_later()
         answers.write(outcome_line(outcome))
         answers.flush()

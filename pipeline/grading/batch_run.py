@@ -1,0 +1,100 @@
+"""The whole of `cartlab grade`: intake, grading, the gradebook, and what is written from it."""
+
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.errors import ConfigError, PipelineError
+from pipeline.grading.gradebook import Gradebook
+from pipeline.grading.intake import find_hand_ins
+from pipeline.grading.load import load_rubric
+from pipeline.grading.rubric import Rubric
+from pipeline.grading.runner import Executor, Limits, Progress, grade_batch, run_here
+from pipeline.grading.shared_prints import fingerprint
+from pipeline.ingest.read import read_data
+from pipeline.output import check_folder, own_folder
+from pipeline.resources import EXAMPLES
+from pipeline.submission import load_submission
+
+_SCRATCH = ".scratch"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Summary:
+    """How many there were, which could not be graded (id, reason), how many share recordings."""
+
+    total: int
+    failed: tuple[tuple[str, str], ...]
+    sharing: int
+
+
+def grade_class(
+    paths: Sequence[Path],
+    *,
+    rubric_file: Path,
+    out: Path,
+    jobs: int,
+    cluster: str | None,
+    limits: Limits,
+    figures: bool,
+    progress: Progress,
+) -> Summary:
+    """Grade everything in `paths` into the folder `out`.
+
+    Raises
+    ------
+    ConfigError : the rubric, a path, the folder or the cluster cannot be used.
+    """
+    rubric = load_rubric(rubric_file)
+    check_folder(out).mkdir(parents=True, exist_ok=True)
+    scratch = own_folder(out, _SCRATCH)
+    shutil.rmtree(scratch, ignore_errors=True)  # of a run that was stopped
+    scratch.mkdir(exist_ok=True)
+    try:
+        hand_ins = find_hand_ins(paths, scratch=scratch, skip=[out])
+        with Gradebook(out, create=True) as book:
+            batch = grade_batch(
+                hand_ins,
+                rubric=rubric,
+                store=book,
+                scratch=scratch,
+                execute=_executor(jobs=jobs, cluster=cluster),
+                limits=limits,
+                figures=figures,
+                examples=lambda: list(_handed_out(rubric, folder=rubric_file.parent)),
+                progress=progress,
+            )
+            book.finish(batch, rubric=rubric)
+            failed = tuple(
+                (outcome.submission, outcome.reason)
+                for outcome in map(book.known, batch.keys)
+                if outcome is not None and outcome.status == "failed"
+            )
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+    return Summary(total=len(hand_ins), failed=failed, sharing=len(batch.shared))
+
+
+def _executor(*, jobs: int, cluster: str | None) -> Executor:
+    if cluster is None:
+        return run_here(jobs=jobs)
+    try:
+        from pipeline.grading.cluster import run_on
+    except ModuleNotFoundError as error:
+        raise ConfigError(f"--cluster needs {error.name}: pip install 'cartlab[cluster]'") from None
+    return run_on(cluster)
+
+
+def _handed_out(rubric: Rubric, *, folder: Path) -> Iterator[bytes]:
+    """Yield the fingerprints of the rubric's examples and of those shipped for as many carts."""
+    for example in rubric.examples:
+        try:
+            yield fingerprint(read_data(load_submission(folder / example)).records)
+        except PipelineError as error:
+            raise ConfigError(f"the rubric's example {example}: {error}") from None
+    for shipped in sorted(EXAMPLES.iterdir()):
+        if (shipped / "submission.toml").is_file():
+            submission = load_submission(shipped)
+            if submission.system.carts == rubric.system.carts:
+                yield fingerprint(read_data(submission).records)
