@@ -6,8 +6,9 @@ the beginning of a file's name, `Jane Doe_1024_assignsubmission_file_`. Gradesco
 """
 
 import re
+from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -30,7 +31,7 @@ _MOST_METADATA = 10_000_000  # bytes
 class Upload:
     """What a name says: whose, late or not, and the file's name as the student had it.
 
-    `order` grows from an attempt to the next one.
+    `number` is the platform's for this upload, larger for a later one.
     """
 
     platform: Platform
@@ -38,7 +39,7 @@ class Upload:
     user: str
     late: bool = False
     file: str = ""
-    order: tuple[int, int] = field(default=(0, 0))
+    number: int = 0
 
 
 def parse_name(name: str) -> Upload | None:
@@ -52,15 +53,13 @@ def parse_name(name: str) -> Upload | None:
         file = name if found["file"] else ""
         return Upload(platform="gradescope", owner=found["owner"], user=user, file=file)
     if found := _CANVAS.fullmatch(name) or _CANVAS_TEXT.fullmatch(name):
-        upload = int(found["upload"]) if "upload" in found.groupdict() else 0
-        attempt = _ATTEMPT.fullmatch(found["file"])
         return Upload(
             platform="canvas",
             owner=found["owner"],
             user=found["user"],
             late=found["late"] is not None,
             file=found["file"],
-            order=(int(attempt["attempt"]) if attempt else 0, upload),
+            number=int(found.groupdict().get("upload", 0)),
         )
     return None
 
@@ -70,14 +69,17 @@ def current(uploads: Mapping[Path, Upload]) -> list[Path]:
 
     Canvas appends `-1`, `-2` to the name of a file that is handed in again.
     """
-    newest: dict[str, Path] = {}
     names = {upload.file for upload in uploads.values()}
-    for path, upload in sorted(uploads.items(), key=lambda item: item[1].order):
-        attempt = _ATTEMPT.fullmatch(upload.file)
-        first = f"{attempt['stem']}{attempt['suffix']}" if attempt else upload.file
+    attempts: dict[str, list[tuple[int, int, Path]]] = defaultdict(list)
+    for path, upload in uploads.items():
+        again = _ATTEMPT.fullmatch(upload.file)
+        first = f"{again['stem']}{again['suffix']}" if again else upload.file
         # `run-2.csv` is a second attempt only where `run.csv` is there as well.
-        newest[first if first in names else upload.file] = path
-    return sorted(newest.values())
+        if again and first in names:
+            attempts[first].append((int(again["attempt"]), upload.number, path))
+        else:
+            attempts[upload.file].append((0, upload.number, path))
+    return sorted(max(files)[-1] for files in attempts.values())
 
 
 def gradescope_owners(folder: Path) -> dict[str, str]:

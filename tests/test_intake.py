@@ -1,0 +1,239 @@
+"""Hand-ins as teachers have them: folders, trees, and what learning platforms pack."""
+
+import os
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.errors import ConfigError, SubmissionError
+from pipeline.grading.intake import find_hand_ins
+from pipeline.grading.intake_files import digest, open_submission, packed, unpacked
+from pipeline.grading.lms_names import parse_name
+from pipeline.grading.unpack import HAND_IN
+
+TOML = "version = 1\n"
+
+
+def tree(folder, files):
+    """Write text files into a folder."""
+    for name, text in files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    return folder
+
+
+def archive(path, files):
+    """Write a zip archive; values are texts or bytes."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with zipfile.ZipFile(path, "w") as opened:
+        for name, content in files.items():
+            opened.writestr(name, content)
+    return path
+
+
+def zip_bytes(tmp_path, files):
+    return archive(tmp_path / "inner.zip", files).read_bytes()
+
+
+def hand_ins(tmp_path, *paths):
+    return find_hand_ins(paths, scratch=tmp_path / "scratch")
+
+
+def opened(tmp_path, hand_in):
+    """Return the files of a hand-in's submission, relative to it."""
+    folder = open_submission(hand_in.sources, tmp_path / "opened" / hand_in.id)
+    return sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
+
+
+def test_a_tree_gives_a_row_for_every_team(tmp_path):
+    """Sections, wrapping folders, zip files and a folder without a submission all have a row."""
+    tree(
+        tmp_path / "class",
+        {
+            "section-1/team-01/submission.toml": TOML,
+            "section-1/team-02/submission.toml": TOML,
+            "section-1/team-03/notes.txt": "we forgot",
+            "section-2/team-04/lab/submission.toml": TOML,
+            "section-2/team-05/submission.toml": TOML,
+            "section-2/team-05/old/submission.toml": TOML,
+            ".git/config": "",
+        },
+    )
+    archive(tmp_path / "class" / "section-2" / "team-06.zip", {"submission.toml": TOML})
+    found = hand_ins(tmp_path, tmp_path / "class")
+    assert [h.id for h in found] == ["lab", "team-01", "team-02", "team-03", "team-05", "team-06"]
+    with pytest.raises(SubmissionError, match=r"no submission\.toml in it, only notes\.txt"):
+        opened(tmp_path, found[3])
+    assert opened(tmp_path, found[5]) == ["submission.toml"]
+
+
+def test_two_of_one_name_have_the_parents_before_it(tmp_path):
+    """An id is the folder's name, and the parent's before it where two are the same."""
+    tree(tmp_path, {f"c/{s}/lab/submission.toml": TOML for s in ("ann", "bob")})
+    tree(tmp_path, {"c/carl/submission.toml": TOML})
+    assert [h.id for h in hand_ins(tmp_path, tmp_path / "c")] == ["ann-lab", "bob-lab", "carl"]
+
+
+def test_a_canvas_download(tmp_path):
+    """Names, late marks, resubmissions and several files of one student are understood."""
+    inner = zip_bytes(tmp_path, {"lab3/submission.toml": TOML, "lab3/data/a.csv": "1"})
+    download = archive(
+        tmp_path / "submissions.zip",
+        {
+            "doejane_1024_77001_team-07.zip": zip_bytes(
+                tmp_path, {"team-07/submission.toml": "old", "team-07/x.csv": "1"}
+            ),
+            "doejane_1024_77009_team-07-1.zip": zip_bytes(
+                tmp_path, {"team-07/submission.toml": TOML}
+            ),
+            "roeric_LATE_1025_77002_lab3.zip": inner,
+            "poeann_1026_77003_lab3.zip": inner,
+            "loose_1027_77004_submission.toml": TOML,
+            "loose_1027_77005_step.csv": "1,2",
+            "empty_1028_text.html": "<p>sorry</p>",
+        },
+    )
+    found = {h.id: h for h in hand_ins(tmp_path, download)}
+    assert sorted(found) == ["empty", "loose", "poeann-lab3", "roeric-lab3", "team-07"]
+    assert opened(tmp_path, found["team-07"]) == ["submission.toml"]  # of the later attempt
+    assert opened(tmp_path, found["loose"]) == ["step.csv", "submission.toml"]
+    assert found["roeric-lab3"].days_late == 1.0
+    assert found["poeann-lab3"].days_late == 0.0
+    assert found["roeric-lab3"].owner == "roeric"
+    with pytest.raises(SubmissionError, match="no submission"):
+        opened(tmp_path, found["empty"])
+
+
+def test_a_moodle_download(tmp_path):
+    """A folder a student, with a zip file or the files themselves in it."""
+    inner = zip_bytes(tmp_path, {"submission.toml": TOML})
+    download = archive(
+        tmp_path / "Lab 3.zip",
+        {
+            "Jane Doe_1024_assignsubmission_file_/work.zip": inner,
+            "Zoë Ünal_1025_assignsubmission_file_/submission.toml": TOML,
+            "Ann Poe_1026_assignsubmission_file_submission.toml": TOML,
+        },
+    )
+    found = {h.id: h for h in hand_ins(tmp_path, download)}
+    assert sorted(found) == ["Ann Poe", "Jane Doe", "Zoë Ünal"]
+    assert all(opened(tmp_path, h) for h in found.values())
+
+
+def test_a_gradescope_download(tmp_path):
+    """Names come from the metadata; a folder it does not know keeps its own."""
+    metadata = (
+        "submission_77:\n  :submitters:\n  - :name: Jane Doe\n    :sid: A1\n"
+        "  - :name: Ric Roe\n  :created_at: 2026-11-20 10:00:00 -08:00\n"
+    )
+    download = archive(
+        tmp_path / "export.zip",
+        {
+            "assignment_9_export/submission_metadata.yml": metadata,
+            "assignment_9_export/submission_77/submission.toml": TOML,
+            "assignment_9_export/submission_78/submission.toml": TOML,
+        },
+    )
+    assert [h.id for h in hand_ins(tmp_path, download)] == ["Jane Doe, Ric Roe", "submission_78"]
+
+
+def test_one_students_zip_is_one_hand_in(tmp_path):
+    """A zip file that is no class is itself the hand-in, and a broken one has its row."""
+    good = archive(tmp_path / "team-07.zip", {"submission.toml": TOML})
+    bad = tmp_path / "team-08.zip"
+    bad.write_bytes(b"PK\x03\x04 no more")
+    first, second = hand_ins(tmp_path, good, bad)
+    assert (first.id, second.id) == ("team-07", "team-08")
+    with pytest.raises(SubmissionError, match="not a whole zip archive"):
+        opened(tmp_path, second)
+
+
+def test_archives_in_archives_are_opened_to_a_depth(tmp_path):
+    """A zip in a zip is opened; the tenth in the ninth is not."""
+    content = zip_bytes(tmp_path, {"submission.toml": TOML})
+    nested = zip_bytes(tmp_path, {"inner.zip": content})
+    (found,) = hand_ins(tmp_path, archive(tmp_path / "a.zip", {"b.zip": nested}))
+    assert opened(tmp_path, found) == ["submission.toml"]
+    for _ in range(9):
+        content = zip_bytes(tmp_path, {"inner.zip": content})
+    (found,) = hand_ins(tmp_path, archive(tmp_path / "deep.zip", {"x.zip": content}))
+    with pytest.raises(SubmissionError, match="no submission"):
+        opened(tmp_path, found)
+
+
+def test_many_nested_archives_share_one_limit(tmp_path):
+    """Ten archives in one may not hold ten times what one may."""
+    part = zip_bytes(tmp_path, {str(i): "" for i in range(HAND_IN.members // 5)})
+    whole = archive(tmp_path / "a.zip", {f"{i}.zip": part for i in range(10)})
+    with pytest.raises(SubmissionError, match="files"):
+        open_submission([whole], tmp_path / "opened")
+
+
+def test_two_submissions_in_one_hand_in_are_a_question(tmp_path):
+    """Which of two is meant is not guessed; one that lies higher is meant."""
+    files = {"a/submission.toml": TOML, "b/submission.toml": TOML}
+    folder = tree(tmp_path / "t", files)
+    with pytest.raises(SubmissionError, match=r"which one.*a/submission\.toml and b/"):
+        open_submission([folder], tmp_path / "opened")
+    tree(folder, {"submission.toml": TOML})
+    assert open_submission([folder], tmp_path / "again") == tmp_path / "again"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="links and pipes need rights on Windows")
+def test_links_and_pipes_are_not_followed(tmp_path):
+    """A link to a file of ours is not copied, a pipe is not waited for, a linked folder a row."""
+    secret = tree(tmp_path / "ours", {"secret.csv": "secret"})
+    folder = tree(tmp_path / "c/team/", {"submission.toml": TOML})
+    (folder / "data").symlink_to(secret)
+    (folder / "link.csv").symlink_to(secret / "secret.csv")
+    os.mkfifo(folder / "pipe.csv")
+    (tmp_path / "c" / "elsewhere").symlink_to(secret)
+    linked, team = hand_ins(tmp_path, tmp_path / "c")
+    assert "is a link" in linked.problem
+    assert opened(tmp_path, team) == ["submission.toml"]
+    assert len(digest(team.sources)) == 64
+
+
+def test_a_hand_in_travels_whole(tmp_path):
+    """What is packed for another machine is what would be graded here, and the hash knows it."""
+    folder = tree(tmp_path / "t", {"submission.toml": TOML, "data/ü.csv": "1", ".DS_Store": "x"})
+    unpacked(packed([folder]), tmp_path / "there")
+    assert digest([tmp_path / "there"]) == digest([folder])
+    before = digest([folder])
+    tree(folder, {"data/ü.csv": "2"})
+    assert digest([folder]) != before
+
+
+def test_nothing_to_grade_is_said(tmp_path):
+    """A folder without anything, or no folder at all, cannot be graded."""
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ConfigError, match="nothing to grade"):
+        hand_ins(tmp_path, tmp_path / "empty")
+    with pytest.raises(ConfigError, match="no such"):
+        hand_ins(tmp_path, tmp_path / "absent")
+
+
+@given(st.lists(st.text(min_size=1, max_size=30), min_size=1, max_size=6))
+def test_any_name_becomes_a_folders(tmp_path_factory, names):
+    """Ids are different, printable, not too long, and lie where they should."""
+    from pipeline.grading.intake import _Found, _with_ids
+
+    found = [_Found(name=name, parent="p", sources=()) for name in names]
+    ids = [hand_in.id for hand_in in _with_ids(found)]
+    assert len({i.casefold() for i in ids}) == len(names)
+    for i in ids:
+        assert i.isprintable()
+        assert len(i) <= 110
+        assert Path("feedback", i).parent == Path("feedback")
+
+
+@given(st.text(max_size=60))
+def test_any_name_is_a_platforms_or_not(name):
+    """Reading a name never fails."""
+    found = parse_name(name)
+    assert found is None or found.owner

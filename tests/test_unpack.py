@@ -1,0 +1,144 @@
+"""Hostile archives: nothing outside the folder, nothing too large, one line of reason."""
+
+import struct
+import zipfile
+from contextlib import suppress
+from pathlib import PurePosixPath
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.errors import SubmissionError
+from pipeline.grading.unpack import HAND_IN, Limits, is_debris, member_names, unpack
+
+SMALL = Limits(members=20, total=100_000, ratio=200.0, directory=10_000)
+
+
+def zipped(path, members, *, mode=None):
+    """Write an archive of names and texts; `mode` is put into every member's Unix attributes."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, text in members.items():
+            info = zipfile.ZipInfo(name)
+            if mode is not None:
+                info.create_system, info.external_attr = 3, mode << 16
+            archive.writestr(info, text, zipfile.ZIP_DEFLATED)
+    return path
+
+
+def files_below(folder):
+    return sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
+
+
+def test_what_was_packed_comes_out_without_debris(tmp_path):
+    """Files come out as packed; what macOS and Windows leave behind does not."""
+    members = {
+        "team/submission.toml": "x",
+        "team/data/step.csv": "1,2",
+        "__MACOSX/team/._submission.toml": "junk",
+        "team/.DS_Store": "junk",
+        "team/Thumbs.db": "junk",
+    }
+    assert unpack(zipped(tmp_path / "a.zip", members), tmp_path / "out", limits=HAND_IN) == {}
+    assert files_below(tmp_path / "out") == ["team/data/step.csv", "team/submission.toml"]
+
+
+@pytest.mark.parametrize(
+    "name", ["../x", "a/../../x", "/etc/x", "C:/x", "..\\x", "a\\..\\..\\x", "\\\\host\\share\\x"]
+)
+def test_a_path_that_leaves_the_archive_is_refused(tmp_path, name):
+    """A member that would land outside is not written; the others are."""
+    archive = zipped(tmp_path / "a.zip", {name: "evil", "good.txt": "good"})
+    refused = unpack(archive, tmp_path / "in" / "out", limits=SMALL)
+    assert "leaves the archive" in "".join(refused.values())
+    assert files_below(tmp_path) == ["a.zip", "in/out/good.txt"]
+
+
+@pytest.mark.parametrize(
+    ("mode", "reason"), [(0o120777, "is a link"), (0o010644, "regular"), (0o020644, "regular")]
+)
+def test_links_pipes_and_devices_are_refused(tmp_path, mode, reason):
+    """Only regular files are written, whatever Unix calls the member."""
+    archive = zipped(tmp_path / "a.zip", {"t/x": "/etc/passwd"}, mode=mode)
+    (refused,) = unpack(archive, tmp_path / "out", limits=SMALL).values()
+    assert reason in refused
+    assert files_below(tmp_path / "out") == []
+
+
+@pytest.mark.parametrize(
+    ("members", "reason"),
+    [
+        ({"zeros": "0" * 90_000_000}, "unpacks to more than"),
+        ({"zeros": "0" * 2_000_000}, "unpacks to more than"),
+        ({str(i): "" for i in range(21)}, "more than 20 files"),
+        ({"x" * 600 + str(i): "" for i in range(19)}, "table of contents"),
+    ],
+)
+def test_bombs_do_not_go_off(tmp_path, members, reason):
+    """Size, ratio, number and table of contents are all limited, by what truly comes out."""
+    archive = zipped(tmp_path / "bomb.zip", members)
+    with pytest.raises(SubmissionError, match=reason):
+        unpack(archive, tmp_path / "out", limits=SMALL)
+    assert sum(p.stat().st_size for p in tmp_path.rglob("*") if p.suffix != ".zip") <= 100_000
+
+
+def test_the_ratio_counts_where_the_size_would_still_do(tmp_path):
+    """A file that unpacks to hundreds of times its size is refused below the limit of size."""
+    archive = zipped(tmp_path / "bomb.zip", {"zeros": "0" * 20_000_000})
+    with pytest.raises(SubmissionError, match="200 times its size"):
+        unpack(archive, tmp_path / "out", limits=HAND_IN)
+
+
+def test_a_header_that_lies_about_the_size_does_not_help(tmp_path):
+    """A bomb whose headers claim ten bytes is a broken archive, not a full disk."""
+    archive = zipped(tmp_path / "a.zip", {"x": "0" * 3_000_000})
+    raw = archive.read_bytes().replace(struct.pack("<L", 3_000_000), struct.pack("<L", 10))
+    archive.write_bytes(raw)
+    with pytest.raises(SubmissionError, match=r"a\.zip"):
+        unpack(archive, tmp_path / "out", limits=SMALL)
+
+
+def test_an_encrypted_archive_says_so(tmp_path):
+    """A password is named as the reason."""
+    archive = zipped(tmp_path / "a.zip", {"x": "secret"})
+    raw = bytearray(archive.read_bytes())
+    raw[6] |= 1  # the local header's flags, and those of the table of contents
+    raw[raw.find(b"PK\x01\x02") + 8] |= 1
+    archive.write_bytes(raw)
+    with pytest.raises(SubmissionError, match="encrypted"):
+        unpack(archive, tmp_path / "out", limits=SMALL)
+
+
+def test_names_are_read_as_they_were_meant(tmp_path):
+    """UTF-8 that does not say so is read as such, and letters with accents are one character."""
+    path = tmp_path / "a.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("mu\u0308ller/x.txt", "1")  # u and a combining diaeresis
+    raw = path.read_bytes()
+    for signature, at in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
+        where = raw.find(signature) + at
+        raw = raw[:where] + b"\0\0" + raw[where + 2 :]  # the flag that says UTF-8
+    path.write_bytes(raw)
+    assert member_names(path) == [PurePosixPath("m\u00fcller/x.txt")]
+    unpack(path, tmp_path / "out", limits=SMALL)
+    assert files_below(tmp_path / "out") == ["m\u00fcller/x.txt"]
+
+
+@given(st.binary(max_size=400), st.integers(0, 300), st.binary(max_size=8))
+def test_any_bytes_are_unpacked_or_refused(tmp_path_factory, junk, at, patch):
+    """Broken archives end in the error that is said to the student, never in another."""
+    folder = tmp_path_factory.mktemp("zip")
+    good = zipped(folder / "good.zip", {"a/b.txt": "hello" * 20, "c.txt": "x"}).read_bytes()
+    for number, raw in enumerate((junk, good[:at] + patch + good[at + len(patch) :], good[:-at])):
+        path = folder / f"{number}.zip"
+        path.write_bytes(raw)
+        member_names(path)
+        with suppress(SubmissionError):
+            unpack(path, folder / str(number), limits=SMALL)
+
+
+def test_debris_is_told_from_work():
+    """Hidden halves of macOS files are debris, a file that merely looks odd is not."""
+    assert is_debris(PurePosixPath("a/._step.csv"))
+    assert is_debris(PurePosixPath("__MACOSX/a"))
+    assert not is_debris(PurePosixPath("a/_step.csv"))
