@@ -48,7 +48,7 @@ class Explained:
 
 @dataclass(frozen=True, kw_only=True)
 class Diagnosis:
-    """The flags of the tables, and the final table with the named mistakes undone."""
+    """The flags of the tables, and the final table with what is off in it put right."""
 
     flags: tuple[Flag, ...]
     corrected: dict[str, float]
@@ -100,9 +100,9 @@ def diagnose_tables(reported: Reported, *, references: References, analysis: Ana
     ]
     named = {name for flag in flags for name in flag.parameters}
     flags += _disagreements(reported, references, named=named)
-    return Diagnosis(
-        flags=tuple(flags), corrected=_corrected(reported.final, explained, references.final)
-    )
+    corrected = _corrected(reported.final, explained, references.final)
+    corrected |= {name: references.final[name].value for name in left["final"]}
+    return Diagnosis(flags=tuple(flags), corrected=corrected)
 
 
 def _may_be_final(mistake: Mistake, reported: Reported) -> bool:

@@ -7,7 +7,8 @@ from pipeline.plant.chain import Chain
 from pipeline.results import Analysis, Estimate, ParameterRow
 from pipeline.stages.compare import CHI_SQUARE_LIMIT
 
-_ASTRAY = 1.3  # a fitted frequency that far from the measured one: the fit has gone astray
+# A fitted frequency or gain that far from the measured one: the fit has gone astray; factors.
+_ASTRAY, _ASTRAY_GAIN = 1.3, 1.6
 # A resonance or null read off the dwells, and where friction blurs even those: factors.
 _BY_EYE, _BY_EYE_ASTRAY = 1.1, 1.6
 
@@ -71,18 +72,19 @@ def recompute(analysis: Analysis) -> References:
 def trusted_chain(analysis: Analysis) -> Chain | None:
     """Return the fitted chain; None where dry friction or worse has led the fit astray.
 
-    A fit that does not explain the data must at least find the frequencies that were measured
-    without it.
+    A fit that does not explain the data must at least find the frequencies and gains that were
+    measured without it.
     """
     if analysis.fit is None or is_explained(analysis):
         return analysis.chain
-    apart = [
-        max(row.final.value / row.initial.value, row.initial.value / row.final.value)
-        for row in analysis.rows
-        if row.name.startswith("omega") and row.initial and row.final
-        if row.initial.value > 0 and row.final.value > 0
-    ]
-    return analysis.chain if max(apart, default=1.0) <= _ASTRAY else None
+    for row in analysis.rows:
+        if row.initial is None or row.final is None or is_damping(row.name):
+            continue
+        before, after = row.initial.value, row.final.value
+        limit = _ASTRAY if row.name.startswith("omega") else _ASTRAY_GAIN
+        if min(before, after) <= 0 or max(before / after, after / before) > limit:
+            return None
+    return analysis.chain
 
 
 def is_explained(analysis: Analysis) -> bool:
