@@ -269,6 +269,7 @@ def _in_counts(mistakes: Sequence[Mistake]) -> Iterator[Mistake]:
                 predicted={n: r.times(per_length[n]) for n, r in mistake.predicted.items()},
                 tolerance=_GAIN_OR_FREQUENCY,
                 help=f"{mistake.help}; and it is in encoder counts",
+                whole=mistake.whole,
             )
 
 
