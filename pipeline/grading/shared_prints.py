@@ -27,8 +27,10 @@ _LEVELS = 5  # a residual is kept as -5 … 5, in steps of two thirds of a stand
 _STEPS_PER_SIGMA = 1.5
 _KINK = 4.5  # standard deviations: more is the motion's own kink (a step, a stop), not noise
 _MAD_TO_SIGMA = 1.4826
+_NOTHING = 1e-7  # of the travel: rounding in the filter
 
 _LEAST_SWING = 0.25  # of the largest: smaller swings move with the noise
+_FEW_TURNS, _PARTS = 5, (0.5, 0.3, 0.7)  # of a swing, where there are few of them
 _MOST_ANCHORS = 12  # in the motion
 _NOISE_ANCHORS, _APART = 6, 5  # samples
 _FEWEST_SAMPLES = 60
@@ -109,9 +111,10 @@ def _print(record: Record) -> Print | None:
         return None
     y = np.array([record.position(cart) for cart in carts])[:, : _MOST_SAMPLES + 2 * MARGIN]
     noise = np.array([np.convolve(row, _high_pass(), "valid") for row in y])
-    sigma = _MAD_TO_SIGMA * np.median(np.abs(noise), axis=1)
-    sigma = np.where(sigma > 0, sigma, np.sqrt(np.mean(noise**2, axis=1)))
-    if not np.all(np.isfinite(sigma)) or not np.all(sigma > 0):
+    sigma = np.array(
+        [_sigma(one, travel=float(np.ptp(row))) for one, row in zip(noise, y, strict=True)]
+    )
+    if not np.all(sigma > 0):
         return None
     sigmas = noise / sigma[:, None]
     telling = np.abs(sigmas) < _KINK
@@ -129,6 +132,15 @@ def _print(record: Record) -> Print | None:
         anchors=anchors,
         swing=swing,
     )
+
+
+def _sigma(noise: Array, *, travel: float) -> float:
+    """Return the standard deviation of a residual (n,) where there is any; 0 where there is none.
+
+    A cart at rest reads the same count for seconds: that would only tell how long it rested.
+    """
+    there = np.abs(noise[np.abs(noise) > _NOTHING * travel])
+    return _MAD_TO_SIGMA * float(np.median(there)) if there.size >= _FEWEST_SAMPLES else 0.0
 
 
 @cache
@@ -161,15 +173,17 @@ def _noise_anchors(loudness: Array) -> tuple[np.ndarray, Array]:
 
 
 def _motion_anchors(motion: Array) -> tuple[np.ndarray, Array]:
-    """Return where the motion (n,) passes the middle of its larger swings, and those swings."""
+    """Return where the motion (n,) passes through its larger swings, and those swings."""
     turns = _turning_points(motion, least=_LEAST_SWING * float(np.ptp(motion)))
-    swings = np.diff(motion[turns])
-    places = []
+    parts = (0.5,) if turns.size > _FEW_TURNS else _PARTS
+    places, swings = [], []
     for start, end in pairwise(turns.tolist()):
-        rising = motion[start : end + 1] * np.sign(motion[end] - motion[start])
-        places.append(start + int(np.argmax(rising >= 0.5 * (rising[0] + rising[-1]))))
+        swing = float(motion[end] - motion[start])
+        done = (motion[start : end + 1] - motion[start]) / swing
+        places += [start + int(np.argmax(done >= part)) for part in parts]
+        swings += [swing] * len(parts)
     largest = np.argsort(-np.abs(swings), kind="stable")[:_MOST_ANCHORS]
-    return np.array(places, dtype=np.int64)[largest], swings[largest]
+    return np.array(places, dtype=np.int64)[largest], np.array(swings)[largest]
 
 
 def _turning_points(motion: Array, *, least: float) -> np.ndarray:

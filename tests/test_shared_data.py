@@ -1,0 +1,144 @@
+"""Shared recordings: found however disguised, and never where two teams only used one bench."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.grading.batch import Prints
+from pipeline.grading.shared import find_shared, shared_flag
+from pipeline.grading.shared_prints import fingerprint, unpack
+from pipeline.ingest.read import read_data
+from pipeline.submission import load_submission
+from pipeline.synthesis import COUNT, write_submission
+from tests.ucsd import write_two_cart_submission
+
+
+@pytest.fixture(scope="module")
+def teams(tmp_path_factory):
+    """The recordings of four teams that used the same bench in the same way."""
+    folder = tmp_path_factory.mktemp("teams")
+    for seed in range(4):
+        write_submission(folder / str(seed), chain="throne-2dof", seed=seed, compact=True)
+    return [read_data(load_submission(folder / str(seed))).records for seed in range(4)]
+
+
+def prints(name, records, authors=None):
+    return Prints(
+        submission=name, authors=authors or (f"s-{name}",), fingerprints=fingerprint(records)
+    )
+
+
+def disguised(record, rng, *, noise=0.0, scale=1.0, keep=1.0, later=0.0):
+    """Return a copy: cut, shifted in time, rescaled, renamed and with noise (in counts) added."""
+    n = record.t.size
+    start = int(rng.integers(0, round((1 - keep) * n) + 1))
+    part = slice(start, start + round(keep * n))
+    y = (np.array(record.y) + noise * COUNT * rng.standard_normal(record.y.shape)) * scale
+    return replace(
+        record,
+        id=f"{record.id} mine",
+        t=record.t[part] + later,
+        u=None if record.u is None else record.u[part],
+        y=y[:, part],
+        reference=None if record.reference is None else record.reference[part],
+    )
+
+
+def of_kind(records, kind):
+    return next(record for record in records if record.kind == kind)
+
+
+def test_honest_teams_on_one_bench_share_nothing(teams):
+    """The same carts under the same inputs move alike; their noise does not."""
+    assert find_shared([prints(str(i), records) for i, records in enumerate(teams)]) == {}
+
+
+@pytest.mark.parametrize("kind", ["decay", "step", "sweep", "closed_loop"])
+@pytest.mark.parametrize(
+    "disguise",
+    [
+        {},
+        {"scale": -10.0, "later": 3.0},
+        {"scale": 1.07, "keep": 0.75},
+        {"noise": 0.4},
+        {"noise": 0.3, "scale": 2.54, "keep": 0.9, "later": 1.0},
+    ],
+    ids=str,
+)
+def test_one_copied_recording_is_found_however_disguised(teams, kind, disguise):
+    """A single recording among honest ones is found, and named on both sides."""
+    rng = np.random.default_rng(7)
+    copied = disguised(of_kind(teams[0], kind), rng, **disguise)
+    found = find_shared([prints("a", teams[0]), prints("b", [*teams[1], copied])])
+    (mine,), (theirs,) = found["b"], found["a"]
+    assert (mine.other, mine.other_experiment) == ("a", theirs.experiment)
+    assert (theirs.other, theirs.other_experiment) == ("b", mine.experiment)
+    assert mine.experiment == copied.id
+
+
+def test_a_whole_copy_is_found_under_much_noise(teams):
+    """Noise of six times the encoder's own hides single recordings, not all of them."""
+    rng = np.random.default_rng(8)
+    copied = [disguised(r, rng, noise=1.5, scale=0.9, keep=0.8) for r in teams[0]]
+    found = find_shared(
+        [prints("a", teams[0]), prints("b", copied), *(prints(str(i), teams[i]) for i in (1, 2))]
+    )
+    assert set(found) == {"a", "b"}
+    assert {record.other for record in found["a"]} == {"b"}
+
+
+def test_teammates_and_repeats_do_not_count(teams):
+    """Who has an author in common, or hands in one recording twice, shares with nobody."""
+    twice = [*teams[0], replace(of_kind(teams[0], "step"), id="again")]
+    a = prints("a", twice, authors=("ann", "bob"))
+    b = prints("b", teams[0], authors=("bob", "carl"))
+    assert find_shared([a, b]) == {}
+
+
+def test_what_was_handed_out_may_be_used_by_all(teams):
+    """Recordings of an example are nobody's; one that is not among them is still found."""
+    given, own = teams[0][:-1], teams[0][-1]
+    example = fingerprint(given)
+    batch = [prints("a", teams[0]), prints("b", [*teams[1][:3], *given])]
+    assert find_shared(batch, examples=[example]) == {}
+    batch.append(prints("c", [own]))
+    found = find_shared(batch, examples=[example])
+    assert {name: [r.experiment for r in records] for name, records in found.items()} == {
+        "a": [own.id],
+        "c": [own.id],
+    }
+
+
+def test_earlier_batches_count(teams):
+    """A recording of last year is found, and said to be; last year's copies are no news."""
+    old = [prints("x", teams[0]), prints("y", teams[0])]
+    found = find_shared([prints("a", teams[0][:4])], earlier=old)
+    assert set(found) == {"a"}
+    assert {r.other for r in found["a"]} == {"x (an earlier batch)", "y (an earlier batch)"}
+    flag = shared_flag(found["a"])
+    assert flag.parameters == tuple(r.id for r in teams[0][:4])
+    assert "does not say whose" in flag.message
+
+
+@pytest.mark.parametrize("kind", ["step", "decay"])
+def test_real_repeats_on_one_bench_are_not_shared(real_data, tmp_path, kind):
+    """Real runs of one experiment on one real bench, as if by as many teams, are no copies."""
+    folder = write_two_cart_submission(tmp_path / "s", real_data, steps=(1, 2, 3, 4, 5))
+    records = [r for r in read_data(load_submission(folder)).records if r.kind == kind]
+    teams = [prints(str(i), [record]) for i, record in enumerate(records)]
+    assert find_shared(teams) == {}
+    copy = disguised(records[2], np.random.default_rng(3), scale=0.5, keep=0.8)
+    found = find_shared([*teams, prints("copy", [copy])])
+    assert {r.other for r in found["copy"]} == {"2"}
+
+
+def test_still_or_short_recordings_have_no_fingerprint(teams):
+    """Where nothing moves there is nothing to compare; packing keeps what there is."""
+    record = of_kind(teams[0], "step")
+    still = replace(record, y=np.zeros_like(record.y))
+    short = replace(record, t=record.t[:50], u=record.u[:50], y=record.y[:, :50])
+    assert fingerprint([still, short]) == b""
+    (kept,) = unpack(fingerprint([still, record]))
+    assert kept.experiment == record.id
+    assert np.abs(kept.residual).max() <= 5
