@@ -1,0 +1,230 @@
+"""The batch: one row each whatever happens, the same in any order, nothing done twice."""
+
+import json
+import random
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import psutil
+import pytest
+
+from pipeline.grading.grade import grade_text
+from pipeline.grading.gradebook import Gradebook
+from pipeline.grading.intake import find_hand_ins
+from pipeline.grading.load import load_rubric
+from pipeline.grading.runner import Limits, grade_batch, run_here
+from pipeline.grading.worker import Setup, Task
+from pipeline.grading.worker_process import Worker
+from pipeline.synthesis import write_submission
+
+RUBRIC = load_rubric(Path("throne-1dof"))
+
+
+@pytest.fixture(scope="module")
+def school(tmp_path_factory):
+    """A small class: three teams, one of which has another's step, and a broken hand-in."""
+    folder = tmp_path_factory.mktemp("class")
+    for number in range(3):
+        write_submission(
+            folder / f"team-{number}",
+            chain="throne-1dof",
+            seed=number,
+            authors=(f"s{number}",),
+            compact=True,
+            reported=True,
+        )
+    step = (folder / "team-0" / "data" / "step-1.csv").read_bytes()
+    (folder / "team-2" / "data" / "step-2.csv").write_bytes(step)
+    (folder / "team-3").mkdir()
+    (folder / "team-3" / "submission.toml").write_text("version = [", encoding="utf-8")
+    return folder
+
+
+def run(paths, out, *, jobs=1, limits=None, execute=None, progress=lambda *_: None):
+    """Grade into a gradebook of our own; return the batch, and outcomes and grades by id."""
+    scratch = out / "scratch"
+    scratch.mkdir(parents=True, exist_ok=True)
+    with Gradebook(out, create=True) as book:
+        batch = grade_batch(
+            find_hand_ins(paths, scratch=scratch),
+            rubric=RUBRIC,
+            store=book,
+            scratch=scratch,
+            execute=execute or run_here(jobs=jobs),
+            limits=limits,
+            progress=progress,
+        )
+        return batch, {o.submission: (o, grade_text(g)) for o, g in batch.grades(book)}
+
+
+def test_a_class_is_graded_and_sharing_is_flagged(school, tmp_path):
+    """Every hand-in has a row in the order of ids; the copied step is flagged on both sides."""
+    seen = []
+    batch, rows = run([school], tmp_path, jobs=2, progress=lambda *what: seen.append(what[0]))
+    assert list(rows) == ["team-0", "team-1", "team-2", "team-3"]
+    assert [outcome.status for outcome, _ in rows.values()] == ["graded"] * 3 + ["failed"]
+    assert "not valid TOML" in rows["team-3"][0].reason
+    assert set(batch.shared) == {"team-0", "team-2"}
+    (flag,) = [f for f in json.loads(rows["team-2"][1])["flags"] if f["code"] == "shared_data"]
+    assert flag["parameters"] == ["step-2"]
+    assert flag["evidence"]["recordings"][0]["other_experiment"] == "step-1"
+    assert seen == [0, 1, 2, 3, 4, 4]
+
+    _, alone = run([school], tmp_path / "alone", jobs=1)
+    assert alone == rows  # neither the number of processes nor their order shows
+
+
+def test_only_what_changed_is_graded_again(school, tmp_path):
+    """A second run starts no process; a changed file costs its own submission only."""
+
+    def nobody(tasks, setup, out_of):
+        raise AssertionError([task.id for task in tasks])
+
+    copy = shutil.copytree(school, tmp_path / "class")
+    _, first = run([copy], tmp_path / "out")
+    _, second = run([copy], tmp_path / "out", execute=nobody)
+    assert second == first
+    (copy / "team-1" / "notes.md").write_text("one more word", encoding="utf-8")
+    with pytest.raises(AssertionError, match=r"\['team-1'\]"):
+        run([copy], tmp_path / "out", execute=nobody)
+
+
+@pytest.fixture
+def task(school):
+    return Task(id="team-0", key="k", sources=(str(school / "team-0"),))
+
+
+@pytest.fixture
+def setup(tmp_path):
+    return Setup(
+        rubric=RUBRIC.model_dump_json(),
+        time_limit=120.0,
+        memory_limit=1_000_000_000,
+        scratch=str(tmp_path),
+    )
+
+
+def test_a_crash_costs_one_row_and_the_worker_is_replaced(task, setup):
+    """A worker that dies in the middle of a task is that task's reason; the next one is graded."""
+    worker = Worker(setup, out_of=RUBRIC.out_of)
+    assert worker.run(task).status == "graded"
+    (process,) = [c for c in psutil.Process().children() if "worker" in " ".join(c.cmdline())]
+    process.suspend()  # so that it dies with the task begun
+    killer = threading.Timer(1.0, process.kill)
+    killer.start()
+    outcome = worker.run(task)
+    killer.join()
+    assert (outcome.status, outcome.settled) == ("failed", False)
+    assert "the grader crashed" in outcome.reason
+    assert worker.run(task).status == "graded"
+    worker.close()
+
+
+def test_a_hang_is_stopped(task, setup):
+    """Past the time limit the worker is ended and the reason says so."""
+    worker = Worker(replace(setup, time_limit=0.01), out_of=RUBRIC.out_of)
+    outcome = worker.run(task)
+    assert outcome.reason == "stopped after 0.01 s"
+    assert not outcome.settled
+    worker.close()
+
+
+def test_memory_is_limited(school, setup, tmp_path):
+    """A hand-in that needs more than the limit is a row that says so; the next one is graded."""
+    large = shutil.copytree(school / "team-0", tmp_path / "large")
+    rows = "".join(f"{i / 1000:.3f},1,{i % 7}\n" for i in range(3_000_000))
+    (large / "data" / "step-1.csv").write_text("time,input,x1\n" + rows, encoding="utf-8")
+    worker = Worker(replace(setup, memory_limit=100_000_000), out_of=RUBRIC.out_of)
+    outcome = worker.run(Task(id="large", key="k", sources=(str(large),)))
+    assert outcome.reason == "needed more than 0.1 GB of memory"
+    assert not outcome.settled
+    assert worker.run(Task(id="t", key="k", sources=(str(school / "team-0"),))).status == "graded"
+    worker.close()
+
+
+def test_what_a_limit_ended_is_tried_again(school, tmp_path):
+    """A hang is a row now, and graded by the next run that gives it more time."""
+    _, hung = run([school / "team-0"], tmp_path, limits=Limits(time=0.01))
+    assert hung["team-0"][0].reason == "stopped after 0.01 s"
+    _, graded = run([school / "team-0"], tmp_path)
+    assert graded["team-0"][0].status == "graded"
+
+
+def killed_at(seconds, arguments):
+    """Run the command line and kill it, and what it started, after so many seconds."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "pipeline", *arguments],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    time.sleep(seconds)
+    process.kill()
+    return process.wait()
+
+
+def kept(out):
+    """Return what a gradebook's class list holds, without when it was put in."""
+    with Gradebook(out) as book:
+        return [(entry.submission, grade_text(entry.grade)) for entry in book.entries()]
+
+
+@pytest.mark.parametrize(
+    "kills", [2, pytest.param(30, marks=[pytest.mark.slow, pytest.mark.sample])]
+)
+def test_killed_at_any_moment_it_goes_on(school, tmp_path, kills):
+    """Killed again and again at random times, a run ends as one that was left alone."""
+    arguments = [str(school), "--rubric", "throne-1dof", "--jobs", "2", "--no-figures", "--out"]
+    times = random.Random(kills)
+    for _ in range(kills):
+        killed_at(times.uniform(0.2, 5.0), ["grade", *arguments, str(tmp_path / "killed")])
+    for name in ("killed", "whole"):
+        done = subprocess.run(
+            [sys.executable, "-m", "pipeline", "grade", *arguments, str(tmp_path / name)],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 1, done.stderr  # team-3 could not be graded
+        assert "team-3: team-3/submission.toml line 1" in done.stderr
+    assert kept(tmp_path / "killed") == kept(tmp_path / "whole")
+    for file in (p for p in (tmp_path / "whole").rglob("*") if p.is_file()):
+        if file.suffix != ".sqlite":
+            other = tmp_path / "killed" / file.relative_to(tmp_path / "whole")
+            assert other.read_bytes() == file.read_bytes(), file.name
+
+
+HOSTILE = {
+    "giant number": "version = 1\n[system]\ncarts = 1\n[reported.final]\nK = 1" + "0" * 5000,
+    "deep lists": "x = " + "[" * 20_000,
+    "deep keys": "a." * 5_000 + "b = 1",
+    "not text": "\x00\x01\x02",
+    "empty": "",
+    "<script>alert(1)</script>": 'version = 1\ntitle = "<script>"\n[system]\ncarts = 1\n',
+    "=cmd|'/c calc'!A1": "version = 1\n[system]\ncarts = 1\n",
+    "#import sys; $x$ *b*": "version = 1\n[system]\ncarts = 1\n",
+    "leaves": 'version = 1\n[system]\ncarts = 1\n[[experiments]]\nid = "a"\nkind = "step"\n'
+    'file = "../../../../etc/passwd"\n',
+    "mat junk": 'version = 1\n[system]\ncarts = 1\n[[experiments]]\nid = "a"\nkind = "step"\n'
+    'file = "junk.mat"\n',
+}
+
+
+def test_hostile_submissions_are_rows(tmp_path):
+    """Whatever is handed in has a row with one line of reason, and nothing of it gets out."""
+    for name, text in HOSTILE.items():
+        folder = tmp_path / "class" / name.replace("/", "_")
+        folder.mkdir(parents=True)
+        (folder / "submission.toml").write_bytes(text.encode())
+        (folder / "junk.mat").write_bytes(b"MATLAB 5.0 MAT-file" + bytes(range(256)) * 8)
+    _, rows = run([tmp_path / "class"], tmp_path / "out")
+    assert len(rows) == len(HOSTILE)
+    for outcome, _ in rows.values():
+        assert outcome.status == "failed"
+        assert outcome.reason.isprintable()
+        assert not outcome.detail, outcome.detail
+        assert "root:" not in outcome.reason
