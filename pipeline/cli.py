@@ -9,6 +9,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from enum import StrEnum
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -311,6 +312,13 @@ def grade(
     figures: Annotated[
         bool, typer.Option("--figures/--no-figures", help="Draw those of the feedback.")
     ] = True,
+    anonymous: Annotated[
+        bool, typer.Option("--anonymous", help="Leave names out; anonymous-key.csv reveals them.")
+    ] = False,
+    gradebook: Annotated[
+        str | None,
+        typer.Option(metavar="URL", help="A database; default: gradebook.sqlite in --out."),
+    ] = None,
 ) -> None:
     """Grade a class: gradebook, grades.csv, a page of the class, feedback for each student."""
     from pipeline.grading.batch_run import grade_class
@@ -326,6 +334,8 @@ def grade(
             limits=Limits(time=time_limit, memory=round(memory_limit * 1e9)),
             figures=figures,
             progress=progress,
+            anonymous=anonymous,
+            gradebook=gradebook,
         )
     for submission, reason in done.failed:
         say(f"{submission}: {reason}")
@@ -364,6 +374,109 @@ def _batch_progress() -> Iterator[Callable[[int, int, str], None]]:
         yield lambda done, total, last: shown.update(
             task, completed=done, total=total, description=last
         )
+
+
+Grades = Annotated[
+    str, typer.Argument(metavar="GRADES", help="The --out folder of `cartlab grade`, or a URL.")
+]
+Team = Annotated[str, typer.Argument(metavar="TEAM", help="A submission, or one of its authors.")]
+Lab = Annotated[
+    str | None,
+    typer.Option("--assignment", help="A rubric's name, where the gradebook has several."),
+]
+
+
+@app.command()
+def override(
+    grades: Grades,
+    team: Team,
+    criterion: Annotated[str, typer.Argument(metavar="CRITERION", help="Its id in the rubric.")],
+    points: Annotated[
+        str, typer.Argument(metavar="POINTS", help="A number, or auto: the automatic ones again.")
+    ],
+    why: Annotated[str, typer.Option(help="The reason, which the student reads.")],
+    by: Annotated[str, typer.Option(metavar="NAME", help="Who says so.")],
+    assignment: Lab = None,
+) -> None:
+    """Give a criterion points by hand, which every later grading keeps."""
+    from pipeline.grading.gradebook import Gradebook
+    from pipeline.grading.outputs import write_outputs
+    from pipeline.grading.override import read_points
+
+    with Gradebook(grades, assignment=assignment) as book:
+        book.override(team, criterion, read_points(points), why=why, by=by)
+        folder = Path(grades)
+        if folder.is_dir():
+            write_outputs(book, folder)
+        grade = book.entry(team).grade
+    say(f"{grade.submission}: {grade.points:g} of {grade.out_of:g} points")
+
+
+@app.command()
+def history(grades: Grades, team: Team, assignment: Lab = None, as_json: AsJson = False) -> None:
+    """Show every grade and change of a team, with who, when and why."""
+    from pipeline.grading.gradebook import Gradebook
+    from pipeline.grading.history import history_dict, history_text
+
+    with Gradebook(grades, assignment=assignment) as book:
+        submission, events = book.history(team)
+    if as_json:
+        typer.echo(json.dumps(history_dict(submission, events), indent=1, ensure_ascii=False))
+    else:
+        typer.echo(history_text(submission, events))
+
+
+class Platform(StrEnum):
+    """A learning platform."""
+
+    CANVAS = "canvas"
+    MOODLE = "moodle"
+    GRADESCOPE = "gradescope"
+
+
+@app.command("export")
+def export_grades(
+    grades: Grades,
+    lms: Annotated[Platform, typer.Option(help="The learning platform.")],
+    out: Annotated[Path | None, typer.Option(help="Where to write; default: GRADES.")] = None,
+    roster: Annotated[
+        Path | None, typer.Option(metavar="CSV", help="The platform's own table, to be filled in.")
+    ] = None,
+    title: Annotated[
+        str | None, typer.Option(help="Of the assignment there; default: the rubric's.")
+    ] = None,
+    assignment: Lab = None,
+) -> None:
+    """Write the class grades for import into a learning platform."""
+    from pipeline.grading.export import export
+    from pipeline.grading.gradebook import Gradebook
+    from pipeline.output import check_folder
+
+    folder = Path(grades)
+    with Gradebook(grades, assignment=assignment) as book:
+        to = check_folder(out or (folder if folder.is_dir() else Path()))
+        done = export(book, lms.value, to, title=title, roster=roster)
+    for remark in done.remarks:
+        say(remark)
+    first, *more = done.files
+    say(f"wrote {first}" + (f" and {len(more)} more" if more else ""))
+
+
+@app.command()
+def survey(
+    file: Annotated[Path, typer.Argument(metavar="CSV", help="Answers, a row a student.")],
+    as_json: AsJson = False,
+) -> None:
+    """Make the tables of opinions and of knowledge and confidence from a questionnaire."""
+    from pipeline.grading.survey import read_survey, survey_dict, survey_text
+
+    found = read_survey(file)
+    if found.left_out:
+        say(f"left out, no question of either table: {', '.join(found.left_out)}")
+    if as_json:
+        typer.echo(json.dumps(survey_dict(found), indent=1, ensure_ascii=False))
+    else:
+        typer.echo(survey_text(found))
 
 
 @app.command("check-rubric")

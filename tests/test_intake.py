@@ -104,7 +104,7 @@ def test_a_canvas_download(tmp_path):
     assert opened(tmp_path, found["loose"]) == ["step.csv", "submission.toml"]
     assert found["roeric-lab3"].days_late == 1.0
     assert found["poeann-lab3"].days_late == 0.0
-    assert found["roeric-lab3"].owner == "roeric"
+    assert found["roeric-lab3"].owner == "roeric (1025)"
     with pytest.raises(SubmissionError, match="no submission"):
         opened(tmp_path, found["empty"])
 

@@ -9,6 +9,7 @@ from pipeline.errors import ConfigError, PipelineError
 from pipeline.grading.gradebook import Gradebook
 from pipeline.grading.intake import find_hand_ins
 from pipeline.grading.load import load_rubric
+from pipeline.grading.outputs import write_outputs
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.runner import Executor, Limits, Progress, grade_batch, run_here
 from pipeline.grading.shared_prints import fingerprint
@@ -18,6 +19,7 @@ from pipeline.resources import EXAMPLES
 from pipeline.submission import load_submission
 
 _SCRATCH = ".scratch"
+_MEMORY = ".compared.json"  # may be removed at any time
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,8 +41,15 @@ def grade_class(
     limits: Limits,
     figures: bool,
     progress: Progress,
+    anonymous: bool = False,
+    gradebook: str | None = None,
 ) -> Summary:
     """Grade everything in `paths` into the folder `out`.
+
+    Parameters
+    ----------
+    anonymous : leave names out of what is written, as a rubric may ask for itself.
+    gradebook : a database URL; default: `gradebook.sqlite` in `out`.
 
     Raises
     ------
@@ -53,7 +62,8 @@ def grade_class(
     scratch.mkdir(exist_ok=True)
     try:
         hand_ins = find_hand_ins(paths, scratch=scratch, skip=[out])
-        with Gradebook(out, create=True) as book:
+        # The rubric's file says which assignment it is: its title may be mended on the way.
+        with Gradebook(gradebook or out, assignment=rubric_file.stem, create=True) as book:
             batch = grade_batch(
                 hand_ins,
                 rubric=rubric,
@@ -63,17 +73,16 @@ def grade_class(
                 limits=limits,
                 figures=figures,
                 examples=lambda: list(_handed_out(rubric, folder=rubric_file.parent)),
+                memory=out / _MEMORY,
                 progress=progress,
             )
-            book.finish(batch, rubric=rubric)
-            failed = tuple(
-                (outcome.submission, outcome.reason)
-                for outcome in map(book.known, batch.keys)
-                if outcome is not None and outcome.status == "failed"
-            )
+            hidden = rubric.anonymous or anonymous
+            book.finish(batch, rubric=rubric.model_copy(update={"anonymous": hidden}))
+            total = len(hand_ins)
+            write_outputs(book, out, progress=lambda what: progress(total, total, what))
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
-    return Summary(total=len(hand_ins), failed=failed, sharing=len(batch.shared))
+    return Summary(total=len(hand_ins), failed=batch.failed, sharing=len(batch.shared))
 
 
 def _executor(*, jobs: int, cluster: str | None) -> Executor:

@@ -31,6 +31,7 @@ class Entry:
     grade : with shared data flagged, points given by hand, and lateness off those.
     overrides : by criterion, those in force.
     owner : who handed it in, as the learning platform calls them, or "".
+    key : of all that it depends on, as handed in.
     grading : its number in the gradebook.
     first_key : of what was first handed in under this name: unknown to who has not seen it.
     """
@@ -39,6 +40,7 @@ class Entry:
     grade: Grade
     overrides: Mapping[str, Override]
     owner: str
+    key: str
     grading: int
     first_key: str
 
@@ -85,6 +87,7 @@ def read_figures(connection: Connection, grading: int) -> tuple[tuple[str, str],
 _COLUMNS = (
     gradings.c.id,
     gradings.c.submission_id,
+    gradings.c.key,
     gradings.c.authors,
     gradings.c.owner,
     gradings.c.grade,
@@ -141,6 +144,7 @@ def final_entry(connection: Connection, row: Row, *, shared: Flag | None, rubric
         grade=with_overrides(grade, given, rubric=rubric),
         overrides=given,
         owner=row.owner,
+        key=row.key,
         grading=row.id,
         first_key=connection.scalar(first.order_by(gradings.c.id).limit(1)) or "",
     )

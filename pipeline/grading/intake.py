@@ -26,7 +26,8 @@ class HandIn:
     ----------
     id : unique in the batch, fit for a folder's name.
     sources : one folder, or files of which archives are to be unpacked.
-    owner : who handed it in, as the learning platform calls them, or "".
+    owner : who handed it in, as the learning platform calls them, with the number that it knows
+        them by: "Jane Doe (1024)"; or "".
     problem : why it cannot be opened, where that is plain already.
     """
 
@@ -196,7 +197,7 @@ def _from_platform(folder: Path, uploads: dict[Path, Upload]) -> list[_Found]:
     for path, upload in uploads.items():
         by_student[upload.owner, upload.user][path] = upload
     found = []
-    for (owner, _), files in sorted(by_student.items()):
+    for (owner, user), files in sorted(by_student.items()):
         sources = tuple(current(files))
         inside = _name_inside(sources)
         shown = owners.get(owner, owner)
@@ -205,7 +206,7 @@ def _from_platform(folder: Path, uploads: dict[Path, Upload]) -> list[_Found]:
                 name=inside or shown,
                 parent=shown if inside else folder.name,
                 sources=sources,
-                owner=shown,
+                owner=shown if owner in owners else f"{shown} ({user})",
                 days_late=_DAYS_OF_A_LATE_MARK if any(u.late for u in files.values()) else 0.0,
                 problem="it is a link" if any(path.is_symlink() for path in sources) else "",
             )

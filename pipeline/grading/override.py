@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
+from pipeline.errors import ConfigError
 from pipeline.grading.grade import Criterion, Grade
 from pipeline.grading.lateness import late_deduction
 from pipeline.grading.rubric import Rubric
@@ -34,6 +35,21 @@ class Override:
         A submission that cannot be read names no authors: then its name decides.
         """
         return not authors or not self.authors or not set(authors).isdisjoint(self.authors)
+
+
+def read_points(text: str) -> float | None:
+    """Return points as typed, None for "auto".
+
+    Raises
+    ------
+    ConfigError : it is neither.
+    """
+    if text.strip().casefold() == "auto":
+        return None
+    try:
+        return float(text.replace(",", "."))
+    except ValueError:
+        raise ConfigError(f"{text}: points are a number, or auto") from None
 
 
 def with_overrides(grade: Grade, overrides: Mapping[str, Override], *, rubric: Rubric) -> Grade:

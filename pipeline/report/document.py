@@ -18,7 +18,10 @@ Tone = Literal["", "good", "bad", "quiet"]
 
 @dataclass(frozen=True)
 class Span:
-    """A run of text in one style, a link (http, https or mailto only), or inline mathematics."""
+    """A run of text in one style, a link, or inline mathematics.
+
+    Links of students are http, https or mailto; our own also lead into the page or beside it.
+    """
 
     text: str
     style: Literal["plain", "strong", "em", "code"] = "plain"
@@ -95,13 +98,17 @@ class Cell:
 
 @dataclass(frozen=True)
 class Table:
-    """A numbered table; `align` has one of l, c, r or d (on the decimal mark) for each column."""
+    """A numbered table; `align` has one of l, c, r or d (on the decimal mark) for each column.
+
+    A page lets its reader search and sort it where it is a `finder`.
+    """
 
     number: int
     caption: Spans
     head: tuple[Cell, ...]
     rows: tuple[tuple[Cell, ...], ...]
     align: str
+    finder: bool = False
     kind: str = field(default="table", init=False)
 
 

@@ -5,17 +5,17 @@ import hashlib
 import math
 import re
 from collections.abc import Sequence
+from functools import cache
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-from pipeline.report.document import Block, Document, Picture, Table, Tiles
+from pipeline.report.document import Block, Document, Picture, Table, Tiles, flat
 from pipeline.report.figures import MEASURED, MODEL, QUIET, SECOND, SHADE, THIRD
 from pipeline.report.mathematics import Term, to_mathml
 from pipeline.report.ticks import GRID
 from pipeline.resources import TEMPLATES
 
-_SCRIPTS = ("page.js", "explore.js")
 # The style sheet says what each colour is in light and in dark.
 _ROLES = {
     MEASURED: "ink", MODEL: "model", SECOND: "second", THIRD: "third", QUIET: "quiet",
@@ -28,7 +28,7 @@ _WIDE = "±×%"  # wider than a digit
 
 def render_html(document: Document) -> str:
     """Return the page; every text is escaped, only our own SVG, MathML and script are not."""
-    script = "".join((TEMPLATES / name).read_text(encoding="utf-8") for name in _SCRIPTS)
+    script = "".join(_script(name) for name in _scripts(document))
     return (
         _environment()
         .get_template("report.html.j2")
@@ -46,6 +46,23 @@ def render_fragment(blocks: Sequence[Block]) -> str:
     return _environment().get_template("fragment.html.j2").render(blocks=blocks)
 
 
+def _scripts(document: Document) -> list[str]:
+    """Return the scripts that a page has something for."""
+    blocks = [block for section in document.sections for block in flat(section.blocks)]
+    names = ["page.js"]
+    if any(isinstance(block, Picture) for block in blocks):
+        names.append("explore.js")
+    if any(isinstance(block, Table) and block.finder for block in blocks):
+        names.append("finder.js")
+    return names
+
+
+@cache
+def _script(name: str) -> str:
+    return (TEMPLATES / name).read_text(encoding="utf-8")
+
+
+@cache
 def _environment() -> Environment:
     environment = Environment(
         loader=FileSystemLoader(TEMPLATES),
@@ -99,6 +116,7 @@ def _hash(script: str) -> str:
     return f"sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}"
 
 
+@cache
 def _math_font() -> str:
     """Return the font of the formulas: many phones have none, and brackets would not grow."""
     return base64.b64encode((TEMPLATES / "fonts" / "mathematics.woff").read_bytes()).decode()

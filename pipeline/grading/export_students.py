@@ -1,0 +1,72 @@
+"""The students of a class list, each with a grade."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from pipeline.grading.feedback_words import points_text
+from pipeline.grading.grade import Grade
+from pipeline.grading.gradebook_rows import Entry
+
+_OWNER = re.compile(r"(?P<name>.*?)(?: \((?P<number>\d+)\))?", re.DOTALL)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Student:
+    """One student's grade.
+
+    Attributes
+    ----------
+    id : as the submission names the author, or "".
+    name, number : as the learning platform calls who handed it in, or "".
+    """
+
+    id: str
+    name: str
+    number: str
+    grade: Grade
+    by_hand: bool
+
+    @property
+    def points(self) -> str:
+        """The points, "" where nobody has graded it yet: a zero would say that somebody had."""
+        ungraded = self.grade.status == "failed" and not self.by_hand
+        return "" if ungraded else points_text(self.grade.points)
+
+    @property
+    def called(self) -> str:
+        """What to call the student in a message."""
+        return self.id or self.name or self.grade.submission
+
+
+def students_of(entries: Sequence[Entry]) -> tuple[list[Student], list[str]]:
+    """Return every student once, and what to say about it."""
+    found: dict[str, Student] = {}
+    twice: dict[str, list[str]] = {}
+    for entry in entries:
+        owner = _OWNER.fullmatch(entry.owner)
+        assert owner is not None
+        authors = entry.grade.authors
+        alone = len(authors) < 2  # of several, which one handed it in is not said
+        for id_ in authors or ("",):
+            student = Student(
+                id=id_,
+                name=owner["name"] if alone else "",
+                number=(owner["number"] or "") if alone else "",
+                grade=entry.grade,
+                by_hand=bool(entry.overrides),
+            )
+            key = id_ or f"\0{entry.submission}"  # nobody's id
+            if key in found:
+                twice.setdefault(id_, [found[key].grade.submission]).append(entry.submission)
+                if found[key].grade.points >= student.grade.points:
+                    continue
+            found[key] = student
+    remarks = [
+        f"{id_} is in {' and '.join(names)}: the higher points are exported"
+        for id_, names in twice.items()
+    ]
+    blank = dict.fromkeys(s.grade.submission for s in found.values() if not s.points)
+    if blank:
+        remarks.append(f"could not be graded, left blank: {', '.join(blank)}")
+    return list(found.values()), remarks
