@@ -75,10 +75,12 @@ class Batch:
     ----------
     keys : of the outcomes, in the order of the submissions' ids.
     shared : by submission, the flag for recordings that stand in another submission too.
+    failed : (submission, reason) of those that could not be graded.
     """
 
     keys: tuple[str, ...]
     shared: Mapping[str, Flag]
+    failed: tuple[tuple[str, str], ...] = ()
 
     def grades(self, store: Store) -> Iterator[tuple[Outcome, Grade]]:
         """Yield every outcome with its grade, shared data flagged; one at a time in memory."""

@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from pydantic import TypeAdapter
+
 import pipeline
 from pipeline.grading.batch import Batch, Outcome, Prints, Store
 from pipeline.grading.grade import SCHEMA, Flag
@@ -17,6 +19,7 @@ from pipeline.grading.rubric import Rubric
 from pipeline.grading.shared import find_shared, same_team, shared_flag
 from pipeline.grading.worker import Setup, Task, failed
 from pipeline.grading.worker_process import Worker
+from pipeline.output import write_file
 
 TIME_LIMIT = 120.0  # s for each hand-in
 MEMORY_LIMIT = 1_000_000_000  # bytes
@@ -47,6 +50,7 @@ def grade_batch(
     limits: Limits | None = None,
     figures: bool = False,
     examples: Callable[[], Iterable[bytes]] = tuple,
+    memory: Path | None = None,
     progress: Progress = _silent,
 ) -> Batch:
     """Grade what the store does not know yet; every outcome is in the store as soon as it is had.
@@ -59,22 +63,25 @@ def grade_batch(
     figures : draw those of the feedback, too.
     examples : packed fingerprints of recordings that were handed out with the task; asked for
         only where recordings are shared.
+    memory : a file that remembers which recordings were compared last, and with what result.
     progress : called with how many are done, of how many, and what was done last.
     """
     limits = limits or Limits()
-    code = code_version()
-    text = rubric.model_dump_json()
-    tasks, hopeless = [], []
+    code, text = code_version(), rubric.model_dump_json()
+    rows: dict[str, _Row] = {}
+    new = []
     for hand_in in hand_ins:
         task = _task(hand_in, basis=(code, text, figures))
-        (hopeless if hand_in.problem else tasks).append((task, hand_in.problem))
-    for task, problem in hopeless:
-        if store.known(task.key) is None:
-            store.put(failed(task, problem, out_of=rubric.out_of))
-    new = [task for task, _ in tasks if not _is_settled(store.known(task.key))]
+        outcome = store.known(task.key)
+        if outcome is None and hand_in.problem:
+            outcome = failed(task, hand_in.problem, out_of=rubric.out_of)
+            store.put(outcome)
+        if outcome is None or not outcome.settled:
+            new.append(task)
+        else:
+            rows[task.id] = _Row.of(outcome)
     total = len(hand_ins)
-    done = total - len(new)
-    progress(done, total, "")
+    progress(len(rows), total, "")
     if new:
         setup = Setup(
             rubric=text,
@@ -85,14 +92,36 @@ def grade_batch(
         )
         for outcome in execute(new, setup, rubric.out_of):
             store.put(outcome)
-            done += 1
-            progress(done, total, outcome.submission)
-    keys = {task.id: task.key for task, _ in (*tasks, *hopeless)}
-    progress(done, total, "comparing the recordings")
+            rows[outcome.submission] = _Row.of(outcome)
+            progress(len(rows), total, outcome.submission)
+    progress(total, total, "comparing the recordings")
+    in_order = [rows[name] for name in sorted(rows)]
     return Batch(
-        keys=tuple(keys[name] for name in sorted(keys)),
-        shared=_shared([keys[name] for name in sorted(keys)], store, examples=examples),
+        keys=tuple(row.key for row in in_order),
+        shared=_shared(in_order, store, basis=(code, text), memory=memory, examples=examples),
+        failed=tuple((row.prints.submission, row.reason) for row in in_order if row.reason),
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Row:
+    """What the batch itself needs of an outcome: all else stays in the store."""
+
+    key: str
+    prints: Prints
+    reason: str
+
+    @classmethod
+    def of(cls, outcome: Outcome) -> "_Row":
+        return cls(
+            key=outcome.key,
+            prints=Prints(
+                submission=outcome.submission,
+                authors=outcome.authors,
+                fingerprints=outcome.fingerprints,
+            ),
+            reason=outcome.reason if outcome.status == "failed" else "",
+        )
 
 
 def run_here(*, jobs: int) -> Executor:
@@ -166,23 +195,16 @@ def _task(hand_in: HandIn, *, basis: tuple[str, str, bool]) -> Task:
     )
 
 
-def _is_settled(outcome: Outcome | None) -> bool:
-    return outcome is not None and outcome.settled
-
-
 def _shared(
-    keys: Sequence[str], store: Store, *, examples: Callable[[], Iterable[bytes]]
+    rows: Sequence[_Row],
+    store: Store,
+    *,
+    basis: Sequence[str],
+    memory: Path | None,
+    examples: Callable[[], Iterable[bytes]],
 ) -> dict[str, Flag]:
     """Return the flags for recordings that stand in two submissions of this or earlier batches."""
-    batch = [
-        Prints(
-            submission=outcome.submission,
-            authors=outcome.authors,
-            fingerprints=outcome.fingerprints,
-        )
-        for outcome in map(store.known, keys)
-        if outcome is not None and outcome.fingerprints
-    ]
+    batch = [row.prints for row in rows if row.prints.fingerprints]
     names = {prints.submission: prints for prints in batch}
     earlier = [
         prints
@@ -191,7 +213,36 @@ def _shared(
         # What a team handed in before, or this very batch graded otherwise, is not news.
         and not (prints.submission in names and same_team(prints, names[prints.submission]))
     ]
+    compared = _digest(basis, batch, earlier)
+    if memory is not None and (flags := _remembered(memory, compared)) is not None:
+        return flags
     found = find_shared(batch, earlier=earlier)
     if found and (handed_out := tuple(examples())):
         found = find_shared(batch, earlier=earlier, examples=handed_out)
-    return {submission: shared_flag(records) for submission, records in found.items()}
+    flags = {submission: shared_flag(records) for submission, records in found.items()}
+    if memory is not None:
+        plain = {name: asdict(flag) for name, flag in flags.items()}
+        write_file(memory, json.dumps({"compared": compared, "flags": plain}))
+    return flags
+
+
+def _digest(head: Sequence[str], *groups: Sequence[Prints]) -> str:
+    """Return a hash of everything that a comparison of recordings depends on."""
+    total = hashlib.sha256(json.dumps(head).encode())
+    for group in groups:
+        total.update(b"group")
+        for prints in group:
+            own = hashlib.sha256(prints.fingerprints).hexdigest()
+            total.update(json.dumps([prints.submission, prints.authors, own]).encode())
+    return total.hexdigest()
+
+
+def _remembered(memory: Path, compared: str) -> dict[str, Flag] | None:
+    """Return the flags of the last comparison if it was this one."""
+    try:
+        document = json.loads(memory.read_text(encoding="utf-8"))
+        if document["compared"] != compared:
+            return None
+        return TypeAdapter(dict[str, Flag]).validate_python(document["flags"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
