@@ -176,3 +176,58 @@ def test_no_motion_is_one_clear_error():
 
     with pytest.raises(DataError, match="free cart moves, found none"):
         explain_gap([still], springs=(True, False))
+
+
+def positioning_stage(*, friction: float, seed: int, reference) -> Record:
+    """Return one run of a cart on no spring under PD feedback, stepped at 20 µs.
+
+    u = 0.05 e + 0.004 de/dt (V, cm), sampled at 250 Hz; m = 2e-4, c = 5e-4 in V, s, cm.
+    """
+    m, c, h, count = 2e-4, 5e-4, 2e-5, 0.00227
+    rng = np.random.default_rng(seed)
+    t = np.arange(1500) / 250.0
+    x = v = last = 0.0
+    y, u = np.zeros(t.size), np.zeros(t.size)
+    for k in range(t.size):
+        y[k] = np.round((x + 0.3 * count * rng.standard_normal()) / count) * count
+        error = float(reference(t[k])) - y[k]
+        u[k] = 0.05 * error + 0.004 * (error - last) * 250.0 * (k > 0)
+        last = error
+        for _ in range(200):
+            target = v + h / m * (u[k] - c * v)
+            most = friction * h / m
+            v = 0.0 if abs(target) <= most else target - np.sign(target) * most
+            x += h * v
+    return Record(
+        id=f"run-{seed}",
+        kind="closed_loop",
+        t=t,
+        u=u,
+        y=y[None],
+        carts=(1,),
+        free=(1,),
+        resolution=np.array([count]),
+    )
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.003])
+def test_a_rigid_body_under_feedback(friction):
+    """Without any spring friction is found (or not) from feedback runs, judged over windows."""
+    references = (
+        lambda t: 1.0 * (t > 0.2) - 1.5 * (t > 2.0) + 1.0 * (t > 4.0),
+        lambda t: 0.8 * np.sin(2 * np.pi * 0.7 * t),
+        lambda t: -0.7 * (t > 0.2) + 1.2 * (t > 2.5),
+        lambda t: 0.6 * np.sin(2 * np.pi * (0.3 + 0.15 * t) * t),
+    )
+    records = [
+        positioning_stage(friction=friction, seed=i, reference=r) for i, r in enumerate(references)
+    ]
+
+    gap = explain_gap(records, springs=(False, False))
+
+    assert any("windows" in note for note in gap.notes)
+    if friction:
+        assert names(gap) == [("coulomb_friction", 1)]
+        assert gap.effects[0].parameters["force"].value == pytest.approx(friction, rel=0.03)
+    else:
+        assert gap.verdict == "none"

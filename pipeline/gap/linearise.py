@@ -115,7 +115,7 @@ def _blocks(residual: Array, run: Run) -> Array:
         if q > 1:
             piece = piece.reshape(*piece.shape[:-1], count, q).sum(-1) / np.sqrt(q)
         out[..., s, :, :count] = piece
-    return out.reshape(*out.shape[:-2], -1)
+    return out.reshape(*out.shape[:-2], out.shape[-2] * longest)
 
 
 def residual_points(run: Run) -> float:
