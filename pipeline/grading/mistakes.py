@@ -126,8 +126,10 @@ def _miscounts(
                 if k in _FEW_PERIODS:
                     found.append(_miscount({name: both[name]}, help_))
     for zeta, reference in zetas.items():
+        if reference.high > reference.low * _SHARP:
+            continue
         for factor, words in ((0.5, "half"), (2.0, "twice")):
-            # The decrement alone: taken over half a period, or over two.
+            # The decrement alone, not blurred by friction: over half a period, or over two.
             found.append(
                 Mistake(
                     codes=("peak_count",),
