@@ -1,0 +1,119 @@
+"""The same batch on a real Dask cluster on this machine, one worker of which is killed."""
+
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pipeline.errors import ConfigError
+from pipeline.grading.cluster import run_on
+from pipeline.grading.gradebook import Gradebook
+from pipeline.grading.intake import find_hand_ins
+from pipeline.grading.load import load_rubric
+from pipeline.grading.runner import grade_batch, run_here
+from pipeline.grading.worker import Setup, Task
+from pipeline.synthesis import write_submission
+
+RUBRIC = load_rubric(Path("throne-1dof"))
+
+
+def _dask(*arguments):
+    """Start a part of a cluster, without a page of its own and its own supervisor."""
+    return subprocess.Popen(
+        [sys.executable, "-m", *map(str, arguments), "--no-dashboard"],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, "DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT": "60s"},
+    )
+
+
+@pytest.fixture
+def cluster(tmp_path):
+    """A scheduler and two workers; yields the address and the workers' processes."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    address = f"tcp://127.0.0.1:{port}"
+    scheduler = _dask("distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", port)
+    workers = [
+        _dask(
+            "distributed.cli.dask_worker",
+            address,
+            "--nthreads",
+            1,
+            "--no-nanny",
+            "--local-directory",
+            tmp_path / str(i),
+        )
+        for i in range(2)
+    ]
+    yield address, workers
+    for process in (*workers, scheduler):
+        process.kill()
+        process.wait()
+
+
+def grade(folder, out, execute, progress=lambda *_: None):
+    (out / "scratch").mkdir(parents=True)
+    with Gradebook(out, create=True) as book:
+        batch = grade_batch(
+            find_hand_ins([folder], scratch=out / "scratch"),
+            rubric=RUBRIC,
+            store=book,
+            scratch=out / "scratch",
+            execute=execute,
+            progress=progress,
+        )
+        return batch, [book.known(key) for key in batch.keys]
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_a_cluster_grades_as_this_machine_does_though_a_worker_dies(cluster, tmp_path):
+    """Hand-ins travel to two workers; one is killed in the middle, and no row is another."""
+    address, workers = cluster
+    for number in range(5):
+        write_submission(
+            tmp_path / "class" / f"team-{number}",
+            chain="throne-1dof",
+            seed=number,
+            authors=(f"s{number}",),
+            compact=True,
+            reported=True,
+        )
+    (tmp_path / "class" / "team-9").mkdir()
+    seen = []
+
+    def progress(done, total, last):
+        seen.append(done)
+        if done == 2 and workers[0].poll() is None:
+            workers[0].kill()
+
+    batch, rows = grade(tmp_path / "class", tmp_path / "there", run_on(address), progress)
+    assert workers[0].wait(10) != 0
+    assert seen[-1] == 6
+    here, expected = grade(tmp_path / "class", tmp_path / "here", run_here(jobs=1))
+    assert rows == expected
+    assert batch == here
+
+
+def test_an_address_that_is_no_schedulers_is_refused():
+    """Only a scheduler's address will do, and only an encrypted one beyond this machine."""
+    with pytest.raises(ConfigError, match="expected a scheduler's address"):
+        run_on("http://localhost:8786")
+    with pytest.raises(ConfigError, match=r"tls://"):
+        run_on("tcp://192.0.2.1:8786")
+
+
+def test_nobody_there_is_said(monkeypatch):
+    """Where no scheduler listens the batch does not begin."""
+    monkeypatch.setattr("pipeline.grading.cluster._CONNECT_LIMIT", 1)
+    setup = Setup(rubric="", time_limit=1.0, memory_limit=1, scratch="")
+    with socket.socket() as bound:  # a port that answers nobody
+        bound.bind(("127.0.0.1", 0))
+        execute = run_on(f"tcp://127.0.0.1:{bound.getsockname()[1]}")
+        with pytest.raises(ConfigError, match="no scheduler answers"):
+            list(execute([Task(id="t", key="k", sources=())], setup, 1.0))
