@@ -3,11 +3,20 @@
 from pathlib import Path
 from typing import Any
 
-from pipeline.grading.batch import Outcome
+import numpy as np
+
+from pipeline.grading.batch import Batch, Outcome
 from pipeline.grading.grade import Criterion, Flag, Grade, grade_text
+from pipeline.grading.gradebook import Gradebook
 from pipeline.grading.load import load_rubric
+from pipeline.grading.outputs import write_outputs
 from pipeline.grading.rubric import Rubric
+from pipeline.plant.chain import PRESETS, transfer_functions
+from pipeline.report.figures import drawing
+from pipeline.report.figures_grading import reported_bode_figure
+from pipeline.report.svg import to_svg
 from pipeline.resources import RUBRICS
+from pipeline.results import FrequencyResponse
 
 
 def two_cart_rubric() -> Rubric:
@@ -84,6 +93,45 @@ def make_outcome(grade: Grade, *, key: str = "", **changes: Any) -> Outcome:
     return Outcome(**{**fields, **changes})
 
 
-def read_text(path: Path) -> str:
-    """Return a file's text as written, line ends included."""
-    return path.read_bytes().decode()
+def write_class(folder: Path) -> Path:
+    """Write the pages of a class of all sorts into a folder, figures and hostile names included."""
+    rubric = two_cart_rubric()
+    names = [f"team-{n:02d}" for n in range(1, 13)]
+    names += ["Ünal 学生 & co", "a-name-without-end-" * 5, "=cmd'C'!A0"]
+    outcomes = []
+    for n, name in enumerate(names):
+        flags = (hertz_flag(),) if n % 3 == 0 else ()
+        authors = (f"s{n}", "<script>alert(1)</script>") if n == 4 else (f"s{n}",)
+        grade = make_grade(
+            name, share=round(1 - n / 20, 2), days_late=n % 2, flags=flags, authors=authors
+        )
+        outcomes.append(make_outcome(grade, figures=_figure(name) if n < 2 else ()))
+    broken = failed_grade("broken", "submission.toml line 3: <b>cart</b> is no key")
+    outcomes.append(make_outcome(broken))
+    shared = {"team-02": shared_flag("team-03"), "team-03": shared_flag("team-02")}
+    with Gradebook(folder, assignment="lab", create=True) as book:
+        for outcome in outcomes:
+            book.put(outcome)
+        keys = tuple(o.key for o in sorted(outcomes, key=lambda o: o.submission))
+        book.finish(Batch(keys=keys, shared=shared), rubric=rubric)
+        book.override("team-02", "laws", 1.0, why="right, <i>as told</i>", by="Ada")
+        write_outputs(book, folder)
+    return folder
+
+
+def _figure(name: str) -> tuple[tuple[str, str], ...]:
+    """Return a response with a fit and the curve of a reported table that is off."""
+    chain = PRESETS["throne-2dof"]
+    omega = np.geomspace(5.0, 60.0, 20)
+    response = chain.frequency_response(omega)[0]
+    measured = FrequencyResponse(
+        cart=1, omega=omega, magnitude=np.abs(response), magnitude_std=0.01 * np.abs(response),
+        phase=np.angle(response), phase_std=np.full(omega.size, 0.01), source="dwells",
+    )  # fmt: skip
+    values = {**chain.parameters(), "omega_a": chain.parameters()["omega_a"] / 2}
+    with drawing():
+        figure = reported_bode_figure(
+            measured, chain=chain, reported=transfer_functions(values), units=("cm", "V")
+        )
+        svg = to_svg(figure, name="response-1", alt=f"Response of cart 1 of {name}.")
+    return (("response-1.svg", svg),)

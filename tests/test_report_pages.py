@@ -24,12 +24,16 @@ from pipeline.report.solution import render_solution
 from pipeline.resources import EXAMPLES
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
+from tests.grades import write_class
 from tests.test_gap_report import make_gap, two_cart_analysis
 from tests.ucsd import write_one_cart_submission, write_two_cart_submission
 
 CHROMIUM = shutil.which("chromium")
 FLAGS = "--headless --no-sandbox --disable-gpu --no-first-run --disable-background-networking"
-CASES = ("one", "two", "three", "real-one", "real-two", "gap", "solution", "effects")
+CASES = (
+    "one", "two", "three", "real-one", "real-two", "gap", "solution", "effects",
+    "class", "feedback",
+)  # fmt: skip
 LARGEST = 3_000_000  # bytes of a page
 WIDE, PHONE = (1280, 900), (390, 844)
 
@@ -45,6 +49,9 @@ def folder(tmp_path_factory):
             if case == "gap":
                 gap = make_gap(keys=("coulomb_friction", "input_delay", "cubic_spring"))
                 render_gap(gap, two_cart_analysis(), out)
+            elif case in ("class", "feedback"):
+                out = write_class(out)
+                out = out / "feedback" / "team-02" if case == "feedback" else out
             elif case == "effects":
                 render_effects(CATALOGUE, out)
             elif case == "solution":
@@ -141,7 +148,7 @@ def test_no_word_of_the_pdf_is_cut_or_covered(made):
     """All words lie on their page, and none on another."""
     pdf = next(made.glob("*.pdf"), None)
     if pdf is None:
-        pytest.skip("the catalogue of effects is a page alone")
+        pytest.skip("a page alone, without a PDF")
     boxes = subprocess.run(
         ["pdftotext", "-bbox", pdf, "-"],
         capture_output=True,
@@ -262,6 +269,34 @@ def test_no_text_is_cut_or_covered(made, show):
             drawn = [Box(*text) for text in texts]
             assert [text for text in drawn if not text.lies_in(Box._make([*edge, ""]))] == []
             assert covered(drawn) == []
+
+
+def test_a_class_is_searched_and_sorted(folder, request, show):
+    """Words narrow the table, headings sort it by number or name, up and down; names are links."""
+    page = show(page_of(folder("class", request)))
+    table = page.locator("table.finder")
+    rows = table.locator("tbody tr:visible")
+
+    def column(n: int) -> list[str]:
+        return [text.strip() for text in rows.locator(f"td:nth-child({n})").all_inner_texts()]
+
+    assert rows.count() == 16
+    page.get_by_label("Search").fill("UNAL s12")
+    assert column(1) == ["Ünal 学生 & co"]
+    assert page.locator(".find output").inner_text() == "1 of 16"
+    page.get_by_label("Search").fill("hz_for_rad_s")
+    assert rows.count() == 5
+    page.get_by_label("Search").fill("")
+    page.get_by_role("button", name="Points").last.click()
+    points = [float(text) for text in column(3)]
+    assert points == sorted(points)
+    page.get_by_role("button", name="Points").last.click()
+    assert [float(text) for text in column(3)] == points[::-1]
+    heading = table.locator("th", has_text="Points")
+    assert heading.get_attribute("aria-sort") == "descending"
+
+    rows.get_by_role("link", name="Ünal").click()
+    assert page.locator("h1").inner_text() == "Ünal 学生 & co"
 
 
 def numbers(text: str) -> list[float]:
