@@ -193,6 +193,7 @@ def _follows(u: Array, reference: Array) -> bool:
 
 
 def is_stepped(u: Array) -> bool:
+    """Is the input flat between a few edges?"""
     edges = np.flatnonzero(np.abs(np.diff(u)) > _EDGE * np.ptp(u)) + 1
     if edges.size > _MOST_EDGES:
         return False
