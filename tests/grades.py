@@ -95,6 +95,7 @@ def make_outcome(grade: Grade, *, key: str = "", **changes: Any) -> Outcome:
 
 def write_class(folder: Path) -> Path:
     """Write the pages of a class of all sorts into a folder, figures and hostile names included."""
+    folder.mkdir(exist_ok=True)
     rubric = two_cart_rubric()
     names = [f"team-{n:02d}" for n in range(1, 13)]
     names += ["Ünal 学生 & co", "a-name-without-end-" * 5, "=cmd'C'!A0"]

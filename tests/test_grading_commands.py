@@ -1,0 +1,103 @@
+"""The commands for what comes after grading, as they are typed."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from pipeline.cli import main
+from tests.grades import write_class
+from tests.test_survey import write_paper
+
+
+@pytest.fixture
+def run(monkeypatch, capsys):
+    """Type a command; return its exit status, stdout and stderr."""
+
+    def typed(*words: str | Path) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["cartlab", *map(str, words)])
+        with pytest.raises(SystemExit) as end:
+            main()
+        told = capsys.readouterr()
+        return int(end.value.code or 0), told.out, told.err
+
+    return typed
+
+
+@pytest.fixture(scope="module")
+def grades(tmp_path_factory) -> Path:
+    """A graded class that no test changes."""
+    return write_class(tmp_path_factory.mktemp("grades"))
+
+
+def points_of(folder: Path, team: str) -> float:
+    text = (folder / "feedback" / team / "grade.json").read_text(encoding="utf-8")
+    return json.loads(text)["points"]
+
+
+def test_an_override_reaches_the_pages_at_once(run, tmp_path):
+    """And is taken back by `auto`; history tells both."""
+    grades = write_class(tmp_path)
+    before = points_of(grades, "team-03")
+
+    status, out, err = run(
+        "override", grades, "s2", "pieces", "1", "--why", "all there", "--by", "Ada"
+    )
+
+    assert (status, out) == (0, "")
+    assert err == f"team-03: {before + 0.1:g} of 20 points\n"
+    assert points_of(grades, "team-03") == pytest.approx(before + 0.1)
+    assert "all there" in (grades / "feedback/team-03/feedback.html").read_text(encoding="utf-8")
+    run("override", grades, "team-03", "pieces", "auto", "--why", "no", "--by", "Ada")
+    assert points_of(grades, "team-03") == before
+    status, out, _ = run("history", grades, "team-03")
+    assert (status, len(out.splitlines())) == (0, 5)
+    assert "override  pieces: 1 by hand, by Ada: all there" in out
+    _, out, _ = run("history", grades, "team-03", "--json")
+    assert [event["what"] for event in json.loads(out)["events"]] == [
+        "graded", "listed", "override", "override",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("lms", ["canvas", "moodle", "gradescope"])
+def test_an_export_lies_beside_the_grades(run, grades, tmp_path, lms):
+    """Or where it is told to; what a person must know is said."""
+    status, out, err = run("export", grades, "--lms", lms)
+    assert (status, out) == (0, "")
+    assert f"wrote {grades / lms}.csv" in err
+    assert "could not be graded, left blank: broken" in err
+    run("export", grades, "--lms", lms, "--out", tmp_path / "elsewhere", "--title", "Lab")
+    assert (tmp_path / "elsewhere" / f"{lms}.csv").is_file()
+
+
+def test_a_survey_is_told_on_stdout(run, tmp_path):
+    """As Markdown or JSON; columns that are left out on stderr."""
+    file = write_paper(tmp_path / "answers.csv")
+    status, out, err = run("survey", file)
+    assert status == 0
+    assert out.startswith("| Question ")
+    assert err == "left out, no question of either table: Timestamp\n"
+    assert json.loads(run("survey", file, "--json")[1])["students"] == 13
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("history", "nowhere", "team-1"), "nowhere: holds no gradebook.sqlite"),
+        (("history", "{grades}", "team-99"), "team-99: no such submission; there is team-09"),
+        (("override", "{grades}", "team-01", "pieces", "lots", "--why", "x", "--by", "y"), "lots:"),
+        (("export", "{grades}", "--lms", "blackboard"), "blackboard"),
+        (("export", "{grades}", "--lms", "canvas", "--roster", "none.csv"), "none.csv"),
+        (("survey", "none.csv"), "none.csv"),
+        (("export", "mysql://u:secret@h/d", "--lms", "canvas"), "no driver"),
+    ],
+)
+def test_what_cannot_be_done_is_one_line(run, grades, tmp_path, monkeypatch, words, message):
+    """Exit status 2, a clear message, no traceback, no password."""
+    monkeypatch.chdir(tmp_path)
+    status, out, err = run(*(word.replace("{grades}", str(grades)) for word in words))
+    assert (status, out) == (2, "")
+    assert message in err
+    assert err.count("\n") == 1
+    assert "secret" not in err

@@ -1,0 +1,192 @@
+"""Exports as the platforms themselves read them: their importers' rules, written anew."""
+
+import csv
+import io
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from pipeline.errors import ConfigError
+from pipeline.grading.batch import Batch
+from pipeline.grading.export import export
+from pipeline.grading.gradebook import Gradebook
+from tests.grades import failed_grade, hertz_flag, make_grade, make_outcome, two_cart_rubric
+
+RUBRIC = two_cart_rubric()
+
+
+def write(tmp_path: Path, *outcomes, platform, roster: str = "", overrides=(), **options):
+    """Export a class; return the rows of its table and what was said."""
+    with Gradebook(tmp_path / "g.sqlite", assignment="lab", create=True) as book:
+        for outcome in outcomes:
+            book.put(outcome)
+        book.finish(Batch(keys=tuple(o.key for o in outcomes), shared={}), rubric=RUBRIC)
+        for team, criterion, points in overrides:
+            book.override(team, criterion, points, why="x", by="y")
+        if roster:
+            (tmp_path / "roster.csv").write_text(roster, encoding="utf-8-sig")
+            options["roster"] = tmp_path / "roster.csv"
+        done = export(book, platform, tmp_path / "out", **options)
+    text = done.files[0].read_bytes().decode()
+    return list(csv.reader(io.StringIO(text, newline=""))), done.remarks
+
+
+def canvas_import(rows: list[list[str]]) -> dict[str, dict[str, str]]:
+    """Read grades as `gradebook_importer.rb` does; return them by assignment and student."""
+    head = rows[0]
+    assert len(head) > 3
+    assert "Student" in head[0]
+    assert "ID" in head[1]
+    columns = 3
+    assert re.search(r"SIS\s+User\s+ID", head[2])
+    assert re.search(r"SIS\s+Login\s+ID", head[3])
+    columns += 2 + ("Integration ID" in head[4])
+    columns += "Root Account" in head[columns - 1]
+    assert "Section" in head[columns - 1]  # the last that is about the student
+    grades: dict[str, dict[str, str]] = {title: {} for title in head[columns:]}
+    for row in rows[1:]:
+        if "Points Possible" in row[0]:
+            assert [float(cell) for cell in row[columns:]] == [20.0] * len(grades)
+            continue
+        who = row[1] or row[2] or row[3] or row[0]
+        for title, cell in zip(grades, row[columns:], strict=True):
+            grades[title][who] = cell
+    return grades
+
+
+def moodle_import(rows: list[list[str]]) -> dict[str, tuple[str, str]]:
+    """Read a worksheet as `importgradeslib.php` does; return grade and feedback by participant."""
+    head = rows[0]
+    at = {name: head.index(name) for name in ("Identifier", "Grade", "Feedback comments")}
+    assert "Last modified (grade)" in head
+    return {
+        row[at["Identifier"]].removeprefix("Participant "): (
+            row[at["Grade"]],
+            row[at["Feedback comments"]],
+        )
+        for row in rows[1:]
+    }
+
+
+HALF = make_outcome(make_grade("team-1", share=0.5, flags=(hertz_flag(),)), owner="doejane (1024)")
+FULL = make_outcome(make_grade("team-2", authors=("=ann", "bo")), owner="poeann (1025)")
+BROKEN = make_outcome(failed_grade("team-3", "<b>broken</b>"), owner="roeric (1026)")
+
+
+def test_canvas_takes_the_grades(tmp_path):
+    """A row for every author; who could not be graded is blank, and said."""
+    rows, remarks = write(tmp_path, HALF, FULL, BROKEN, platform="canvas", title="Lab 3 (77)")
+
+    assert canvas_import(rows) == {
+        "Lab 3 (77)": {"1024": "10", "'=ann": "20", "bo": "20", "1026": ""}
+    }
+    assert remarks == ("could not be graded, left blank: team-3",)
+
+
+def test_a_broken_submission_graded_by_hand_is_exported(tmp_path):
+    """Then somebody did grade it, even with no points."""
+    rows, remarks = write(
+        tmp_path, BROKEN, platform="canvas", overrides=[("team-3", "pieces", 0.0)]
+    )
+    assert canvas_import(rows) == {RUBRIC.title: {"1026": "0"}}
+    assert remarks == ()
+
+
+def test_canvas_own_export_is_filled_in(tmp_path):
+    """By id, login or name; its assignment's column is found by its title; others are left out."""
+    roster = (
+        "Student,ID,SIS User ID,SIS Login ID,Section,Lab 3 (77),Final Score\n"
+        "    Points Possible,,,,,20,(read only)\n"
+        '"Doe, Jane",1024,u1,jane@x.edu,A,3,90\n'
+        '"Lee, Bo",7,u2,bo@x.edu,A,,80\n'
+        '"Poe, Ann",8,=ann,ap@x.edu,B,,70\n'
+        '"Zed, Al",9,u9,al@x.edu,B,5,60\n'
+    )
+    rows, remarks = write(
+        tmp_path, HALF, FULL, BROKEN, platform="canvas", title="Lab 3", roster=roster
+    )
+    assert canvas_import(rows) == {"Lab 3 (77)": {"1024": "10", "7": "20", "8": "20", "9": "5"}}
+    assert remarks[-1] == "not in roster.csv, so not exported: roeric"
+
+
+def test_moodle_takes_a_worksheet_where_participants_are_known(tmp_path):
+    """With feedback as harmless HTML, within the maximum grade."""
+    rows, _ = write(tmp_path, HALF, BROKEN, platform="moodle")
+
+    found = moodle_import(rows)
+    assert {number: grade for number, (grade, _) in found.items()} == {"1024": "10", "1026": ""}
+    assert "this looks like Hz where rad/s is asked." in found["1024"][1]
+    assert found["1026"][1] == "Could not be graded: &lt;b&gt;broken&lt;/b&gt;"
+    assert all(row[rows[0].index("Maximum Grade")] == "20" for row in rows[1:])
+
+
+def test_moodle_own_worksheet_is_filled_in(tmp_path):
+    """By participant, id number or email; every other cell stays as it was."""
+    roster = (
+        "Identifier,Full name,ID number,Email address,Status,Grade,Maximum Grade,"
+        "Grade can be changed,Last modified (submission),Last modified (grade),Feedback comments\n"
+        'Participant 1024,Jane Doe,,j@x.edu,Submitted,,20.00,Yes,"Friday, 3 May",-,\n'
+        "Participant 5,Bo Lee,,bo@x.edu,Submitted,,20.00,Yes,-,-,\n"
+        "Participant 6,Al Zed,,al@x.edu,No submission,,20.00,Yes,-,-,kept\n"
+    )
+    rows, remarks = write(tmp_path, HALF, FULL, platform="moodle", roster=roster)
+    found = moodle_import(rows)
+    assert {k: g for k, (g, _) in found.items()} == {"1024": "10", "5": "20", "6": ""}
+    assert found["6"][1] == "kept"
+    assert rows[1][8] == "Friday, 3 May"
+    assert remarks == ("not in roster.csv, so not exported: =ann",)
+
+
+def test_moodle_takes_a_table_of_grades_otherwise(tmp_path):
+    """Where nobody's participant number is known: by id number."""
+    rows, _ = write(tmp_path, FULL, platform="moodle", title="Lab 3")
+    assert rows == [
+        ["ID number", "Lab 3 (Real)", "Lab 3 (Feedback)"],
+        ["'=ann", "20", ""],
+        ["bo", "20", ""],
+    ]
+
+
+def test_gradescope_gets_a_result_for_each_submission(tmp_path):
+    """With the keys and the values that its specification of autograders allows, and no others."""
+    late = make_outcome(make_grade("team-4", share=0.5, days_late=1.25, deducted=1.0, points=9.0))
+    rows, _ = write(tmp_path, HALF, FULL, BROKEN, late, platform="gradescope")
+
+    head = rows[0]
+    assert head[5:11] == [
+        "Total Score", "Max Points", "Status", "Submission ID", "Submission Time",
+        "Lateness (H:M:S)",
+    ]  # fmt: skip
+    assert [row[5] for row in rows[1:]] == ["10", "20", "20", "", "9"]
+    assert [row[10] for row in rows[1:]][-1] == "30:00:00"
+    results = {
+        path.parent.name: json.loads(path.read_text(encoding="utf-8"))
+        for path in (tmp_path / "out" / "gradescope").glob("*/results.json")
+    }
+    assert sorted(results) == ["team-1", "team-2", "team-3", "team-4"]
+    top = {"score", "output", "output_format", "test_output_format", "test_name_format",
+           "stdout_visibility", "tests", "extra_data"}  # fmt: skip
+    inner = {"score", "max_score", "status", "name", "number", "output", "tags", "visibility"}
+    for result in results.values():
+        assert set(result) == top
+        assert all(set(test) == inner for test in result["tests"])
+        assert {test["status"] for test in result["tests"]} <= {"passed", "failed"}
+    assert results["team-4"]["score"] == 9.0
+    assert sum(test["max_score"] for test in results["team-1"]["tests"]) == 20.0
+    assert results["team-1"]["extra_data"] == {"flags": ["hz_for_rad_s"]}
+
+
+def test_who_is_in_two_submissions_is_named(tmp_path):
+    """The higher points count, and a person is told."""
+    other = make_outcome(make_grade("team-9", share=0.25, authors=("s-team-1",)))
+    rows, remarks = write(tmp_path, HALF, other, platform="canvas")
+    assert canvas_import(rows) == {RUBRIC.title: {"1024": "10"}}
+    assert remarks == ("s-team-1 is in team-1 and team-9: the higher points are exported",)
+
+
+def test_a_table_that_is_no_roster_is_refused(tmp_path):
+    """Nothing in it says who a row is about."""
+    with pytest.raises(ConfigError, match=r"roster\.csv: no column says who a row is about"):
+        write(tmp_path, HALF, platform="canvas", roster="a,b\n1,2\n")

@@ -1,0 +1,334 @@
+"""What a grading writes: files that are a function of the gradebook, harmless and complete."""
+
+import csv
+import io
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from urllib.parse import unquote
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.errors import ConfigError
+from pipeline.grading.anonymous import KEY_FILE, pseudonyms
+from pipeline.grading.batch import Batch
+from pipeline.grading.class_page import Line, class_page
+from pipeline.grading.feedback import feedback_page
+from pipeline.grading.feedback_words import PLACES, TITLES
+from pipeline.grading.grade import CODES, Flag
+from pipeline.grading.gradebook import Gradebook
+from pipeline.grading.outputs import grades_csv, write_outputs
+from pipeline.grading.override import read_points
+from pipeline.grading.table import csv_text, neutral, read_table
+from tests.grades import (
+    failed_grade,
+    hertz_flag,
+    make_grade,
+    make_outcome,
+    shared_flag,
+    two_cart_rubric,
+    write_class,
+)
+
+RUBRIC = two_cart_rubric()
+
+
+@pytest.fixture(scope="module")
+def graded(tmp_path_factory) -> Path:
+    """A class with all sorts of submissions in it."""
+    return write_class(tmp_path_factory.mktemp("class"))
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO(path.read_bytes().decode(), newline="")))
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    """Return all files but the gradebook itself."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.name != "gradebook.sqlite"
+    }
+
+
+# ------------------------------------------------------------------------ grades.csv
+
+
+def test_every_submission_has_its_row(graded):
+    """A broken one too, with its reason; points by criterion, lateness, and points by hand."""
+    rows = {row["submission"].lstrip("'"): row for row in rows_of(graded / "grades.csv")}
+
+    assert len(rows) == 16
+    broken = rows["broken"]
+    assert (broken["status"], broken["points"], broken["pieces"]) == ("failed", "0", "")
+    assert broken["reason"] == "submission.toml line 3: <b>cart</b> is no key"
+    by_hand = rows["team-02"]  # 95 % of 20, 1 in place of 0.95 for one criterion, 1 day late
+    assert float(by_hand["points"]) == pytest.approx((19 - 0.95 + 1) * 0.9, abs=0.006)
+    assert (by_hand["laws"], by_hand["by_hand"], by_hand["remarks"]) == ("1", "laws", "shared_data")
+    assert rows["team-03"]["pieces"] == "0.9"
+    assert rows["team-05"]["authors"] == "s4 <script>alert(1)</script>"
+
+
+def test_no_cell_is_a_formula(graded):
+    """Text that a spreadsheet would run begins with an apostrophe; numbers stay numbers."""
+    cells = [cell for row in rows_of(graded / "grades.csv") for cell in row.values()]
+    assert "'=cmd'C'!A0" in cells
+    assert not [cell for cell in cells if cell.startswith(tuple("=@\t\r"))]
+
+
+@pytest.mark.parametrize("text", ["-1.5", "+3", "1e-3", "-.5", "7"])
+def test_numbers_are_left_alone(text):
+    """A minus sign before a number is no formula."""
+    assert neutral(text) == text
+
+
+@pytest.mark.parametrize(
+    "text", ["=1+1", "+cmd", "-2+3", "@SUM(A1)", "\t=1", "\r=1", "  =1", "\u00a0@x", "＝1", "-1-1"]
+)
+def test_formulas_are_neutralised(text):
+    """However they are dressed."""
+    assert neutral(text) == f"'{text}"
+
+
+@given(st.lists(st.lists(st.text(), min_size=2, max_size=2), max_size=4))
+def test_a_table_reads_back_as_it_was_written(rows):
+    """Commas, quotes, line breaks and any letter survive; nothing starts a formula."""
+    text = csv_text(("a", "b"), rows)
+    back = list(csv.reader(io.StringIO(text, newline="")))
+    assert back == [["a", "b"], *([neutral(cell) for cell in row] for row in rows)]
+    assert not [cell for row in back for cell in row if re.match(r"[=@\t\r]", cell)]
+
+
+def test_a_criterion_may_be_called_like_a_column():
+    """Its column is told apart."""
+    criteria = (RUBRIC.criteria[0].model_copy(update={"id": "points"}),)
+    rubric = RUBRIC.model_copy(update={"criteria": criteria})
+    head = grades_csv([], rubric=rubric).strip().split(",")
+    assert len(head) == len(set(head))
+    assert "criterion points" in head
+
+
+# ------------------------------------------------------------------------- the files
+
+
+def test_the_same_class_gives_the_same_bytes(graded, tmp_path):
+    """In another folder, and where everything is graded in another order in between."""
+    again = write_class(tmp_path)
+    assert tree(again) == tree(graded)
+
+
+def test_nothing_of_a_student_is_markup(graded):
+    """Names, reasons and messages are text on every page."""
+    for path in (graded / "class.html", graded / "feedback" / "team-02" / "feedback.html"):
+        html = path.read_text(encoding="utf-8")
+        assert "<b>cart" not in html
+        assert "<i>as told" not in html
+        assert "<script>alert" not in html
+    assert "&lt;b&gt;cart" in (graded / "class.html").read_text(encoding="utf-8")
+
+
+def test_every_link_of_the_class_leads_to_feedback(graded):
+    """Whatever the names."""
+    html = (graded / "class.html").read_text(encoding="utf-8")
+    links = set(re.findall(r'href="(feedback/[^"]*)"', html))
+    assert len(links) == 16
+    assert all((graded / unquote(link)).is_file() for link in links)
+
+
+def test_grade_json_says_what_was_given_by_hand(graded):
+    """The reason, but not who: that is in the gradebook."""
+    text = (graded / "feedback" / "team-02" / "grade.json").read_text(encoding="utf-8")
+    grade = json.loads(text)
+    assert grade["schema"] == "cartlab-grade/1"
+    assert grade["overrides"] == [
+        {"criterion": "laws", "points": 1.0, "why": "right, <i>as told</i>"}
+    ]
+    assert "Ada" not in text
+    assert grade["flags"][0]["code"] == "shared_data"
+
+
+def test_only_what_changed_is_written_again(tmp_path):
+    """An override writes one feedback; what is missing is made again; what is stale goes."""
+    with Gradebook(tmp_path, assignment="lab", create=True) as book:
+        outcomes = [make_outcome(make_grade(name, share=0.5)) for name in "abc"]
+        for outcome in outcomes:
+            book.put(outcome)
+        book.finish(Batch(keys=tuple(o.key for o in outcomes), shared={}), rubric=RUBRIC)
+        told: list[str] = []
+        write_outputs(book, tmp_path, progress=told.append)
+        first = tree(tmp_path)
+        write_outputs(book, tmp_path, progress=told.append)
+        assert (told, tree(tmp_path)) == ([f"feedback: {n}" for n in "abc"], first)
+
+        book.override("b", "laws", 1.0, why="x", by="y")
+        (tmp_path / "feedback" / "c" / "feedback.html").unlink()
+        (tmp_path / "feedback" / "a" / "notes.txt").write_text("mine", encoding="utf-8")
+        write_outputs(book, tmp_path, progress=told.append)
+        assert told[3:] == ["feedback: b", "feedback: c"]
+
+        book.finish(Batch(keys=(outcomes[1].key,), shared={}), rubric=RUBRIC)
+        write_outputs(book, tmp_path)
+        assert sorted(p.name for p in (tmp_path / "feedback").iterdir()) == [".made.json", "a", "b"]
+        assert [p.name for p in (tmp_path / "feedback" / "a").iterdir()] == ["notes.txt"]
+
+
+@pytest.mark.parametrize("name", ["../out", "a/b", "..", ""])
+def test_a_name_that_leads_elsewhere_is_refused(tmp_path, name):
+    """Should a gradebook hold one, nothing is written outside."""
+    with Gradebook(tmp_path / "g.sqlite", assignment="lab", create=True) as book:
+        book.put(make_outcome(make_grade(name), key="k"))
+        book.finish(Batch(keys=("k",), shared={}), rubric=RUBRIC)
+        (tmp_path / "out").mkdir()
+        with pytest.raises(ConfigError, match="no name for a folder"):
+            write_outputs(book, tmp_path / "out")
+    assert [p.name for p in (tmp_path / "out").rglob("*") if p.is_file()] == []
+
+
+# --------------------------------------------------------------------- without names
+
+
+def test_without_names_nothing_tells_who_it_was(tmp_path):
+    """Not the pages, not the table, not its order; the key does."""
+    outcomes = [
+        make_outcome(make_grade("zoe-lab", authors=("zoe",), share=0.5)),
+        make_outcome(make_grade("ann-lab", authors=("ann",))),
+        make_outcome(failed_grade("bob-lab", "bob-lab: no submission.toml")),
+    ]
+    shared = {"zoe-lab": shared_flag("ann-lab"), "ann-lab": shared_flag("zoe-lab")}
+    with Gradebook(tmp_path / "g.sqlite", assignment="lab", create=True) as book:
+        for outcome in outcomes:
+            book.put(outcome)
+        rubric = RUBRIC.model_copy(update={"anonymous": True})
+        book.finish(Batch(keys=tuple(o.key for o in outcomes), shared=shared), rubric=rubric)
+        out = tmp_path / "out"
+        out.mkdir()
+        write_outputs(book, out)
+        before = tree(out)
+        book.put(make_outcome(make_grade("ann-lab", authors=("ann",), share=0.2), key="later"))
+        keys = (outcomes[0].key, "later", outcomes[2].key)
+        book.finish(Batch(keys=keys, shared=shared), rubric=rubric)
+        write_outputs(book, out)
+
+    key = {row["anonymous"]: row for row in rows_of(out / KEY_FILE)}
+    assert {row["submission"] for row in key.values()} == {"zoe-lab", "ann-lab", "bob-lab"}
+    names = [row["submission"] for row in rows_of(out / "grades.csv")]
+    assert names == sorted(key)
+    for name, content in tree(out).items():
+        if name != KEY_FILE:
+            told = re.sub(rb'url\("data:[^"]*"\)', b"", content)  # a font may spell anything
+            assert not re.search(rb"zoe|\bann\b|bob", told), name
+            assert not re.search(r"zoe|ann-|bob", name)
+    (ann,) = [n for n, row in key.items() if row["authors"] == "ann"]
+    (zoe,) = [n for n, row in key.items() if row["authors"] == "zoe"]
+    flag = json.loads(before[f"feedback/{zoe}/grade.json"])["flags"][0]
+    assert flag["evidence"] == {"submissions": [ann]}  # handing in again changes no name
+    assert ann in flag["message"]
+
+
+def test_names_that_stand_in_are_all_different():
+    """Ten thousand of them, made from what was handed in alone."""
+    names = pseudonyms({f"team-{n}": f"key {n}" for n in range(10_000)})
+    assert len(set(names.values())) == 10_000
+    assert names["team-7"].startswith(pseudonyms({"renamed": "key 7"})["renamed"])
+
+
+# -------------------------------------------------------------------------- the pages
+
+
+def test_every_flag_has_a_name_and_a_place_to_look():
+    """In words, for all codes there are."""
+    assert list(TITLES) == list(PLACES) == list(CODES)
+
+
+def test_the_feedback_puts_their_numbers_beside_ours():
+    """Both, the difference, the message, the help, and what lateness took."""
+    grade = make_grade("team-1", share=0.5, days_late=1.5, deducted=2.0, flags=(hertz_flag(),))
+    html = feedback_page(grade, rubric=RUBRIC, overrides={}, figures=(), name="team-1")
+
+    text = re.sub(r"<[^>]+>", "", html)
+    assert "this looks like Hz where rad/s is asked." in text
+    assert "Where to look: the unit of every frequency" in text
+    assert "1.5 days, −2 points" in text
+    assert re.search(r"YoursFrom your recordingsDifference\s+.*rad/s\]3\.1219\.6−84\.1 %", text)
+
+
+def test_a_submission_that_could_not_be_graded_hears_why():
+    """The reason, and what to do."""
+    grade = failed_grade("team-1", "no submission.toml in it")
+    html = feedback_page(grade, rubric=RUBRIC, overrides={}, figures=(), name="team-1")
+    assert "No submission.toml in it." in html
+    assert "Mend it and hand it in again" in html
+
+
+_VALUES = (
+    st.none()
+    | st.booleans()
+    | st.floats()
+    | st.text(max_size=8)
+    | st.lists(st.integers(), max_size=2)
+)
+
+
+@settings(max_examples=40)
+@given(st.dictionaries(st.text(max_size=8), _VALUES, max_size=4))
+def test_any_numbers_can_be_shown(values):
+    """Infinite, missing, text or nested: a page comes of it, with its control characters gone."""
+    grade = make_grade("team-1", share=0.5)
+    found = dict(reversed(values.items()))
+    first = replace(grade.criteria[0], expected=values, found=found)
+    grade = make_grade("team-1", criteria=(first, *grade.criteria[1:]))
+    html = feedback_page(grade, rubric=RUBRIC, overrides={}, figures=(), name="team-1")
+    assert not re.search(r"[\x00-\x08\x0b\x0c\x0e-\x1f]", html)
+
+
+def test_the_class_page_counts_what_there_is():
+    """Mean and median of those graded, outcomes by criterion, mistakes by how many made them."""
+    grades = [make_grade("a"), make_grade("b", share=0.5, flags=(hertz_flag(),)),
+              make_grade("c", share=0.0, flags=(hertz_flag(), missing_flag()))]  # fmt: skip
+    lines = [Line.of(grade, by_hand=()) for grade in grades]
+    lines.append(Line.of(failed_grade("d", "broken"), by_hand=()))
+    html = re.sub(r"<[^>]+>", " ", class_page(lines, rubric=RUBRIC))
+    text = " ".join(html.split())
+
+    assert "Could not be graded 1" in text
+    assert "Mean 10.00 of 20" in text
+    assert "Median 10.00 of 20" in text
+    assert "static gains from the steps 1 50 % 1 1 1 0" in text
+    assert re.search(r"hz_for_rad_s \) 2 50 % b , c .* missing \) 1 25 % c ", text)
+
+
+def missing_flag() -> Flag:
+    return Flag(code="missing", parameters=("K_1",), message="K_1 is missing.", evidence={})
+
+
+@pytest.mark.parametrize("grades", [[], [failed_grade("a", "broken")]])
+def test_a_class_without_grades_has_a_page(grades):
+    """Nobody handed in, or nothing could be graded."""
+    html = class_page([Line.of(grade, by_hand=()) for grade in grades], rubric=RUBRIC)
+    assert "Submissions" in html
+
+
+@pytest.mark.parametrize(("text", "points"), [("2", 2.0), ("1,5", 1.5), ("AUTO", None)])
+def test_points_are_read_as_typed(text, points):
+    """With either decimal mark; auto means the automatic ones."""
+    assert read_points(text) == points
+
+
+def test_points_that_are_none_are_refused():
+    """With what they may be."""
+    with pytest.raises(ConfigError, match="two: points are a number, or auto"):
+        read_points("two")
+
+
+def test_a_table_of_a_platform_is_read_whatever_its_separators(tmp_path):
+    """Semicolons, tabs, a byte-order mark, blank lines; with the lines its rows end on."""
+    path = tmp_path / "t.csv"
+    path.write_text('\ufeffa;b\n\n"x\ny";"1;2"\n', encoding="utf-8")
+    assert read_table(path) == [(1, ["a", "b"]), (4, ["x\ny", "1;2"])]
+    path.write_bytes(b"a,b\n\xff\xfe,1\n")
+    with pytest.raises(ConfigError, match=r"t\.csv: is not UTF-8"):
+        read_table(path)

@@ -1,0 +1,110 @@
+"""The paper's Tables 4 and 5, from answers that give them."""
+
+import json
+import re
+
+import pytest
+
+from pipeline.errors import ConfigError
+from pipeline.grading.survey import LEVELS, SCALE, read_survey, survey_dict, survey_text
+
+# Table 4 of Throne (2005): whole percents of the twelve who answered each question.
+TABLE_4 = {
+    "uses of models": (75, 25, 0, 0, 0),
+    "limitations of models": (58, 33, 8, 0, 0),
+    "frequency response": (42, 58, 0, 0, 0),
+}
+COUNTS = {
+    "uses of models": (9, 3, 0, 0, 0),
+    "limitations of models": (7, 4, 1, 0, 0),
+    "frequency response": (5, 7, 0, 0, 0),
+}
+# Table 5: averages with two decimals; all are twelfths.
+TABLE_5 = {
+    "approaches to modeling": ("2.83", "2.75", "3.67", "3.67"),
+    "model and real system": ("3.00", "2.92", "3.67", "3.58"),
+    "prediction and response": ("2.75", "2.92", "3.75", "3.75"),
+}
+
+
+def answers(average: str) -> list[int]:
+    """Return twelve scores with this average."""
+    total = round(12 * float(average))
+    low, more = divmod(total, 12)
+    return [low + (i < more) for i in range(12)]
+
+
+def write_paper(path, *, heading="{level}: {concept}"):
+    """Write the answers of the paper's class: twelve of thirteen students said something."""
+    columns: dict[str, list[str]] = {"Timestamp": [f"2003-11-{d:02d}" for d in range(1, 14)]}
+    for question, counts in COUNTS.items():
+        given = [word for word, n in zip(SCALE, counts, strict=True) for _ in range(n)]
+        columns[question] = [*given, ""]
+    for concept, averages in TABLE_5.items():
+        for level, average in zip(LEVELS, averages, strict=True):
+            scores = [f"{score} = so much" for score in answers(average)]
+            columns[heading.format(level=level, concept=concept)] = ["", *scores]
+    lines = [columns, *zip(*columns.values(), strict=True)]
+    path.write_text("\n".join(",".join(line) for line in lines) + "\n", encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    "heading", ["{level}: {concept}", "{level} [{concept}]", "{level} - {concept}"]
+)
+def test_the_tables_of_the_paper_come_out(tmp_path, heading):
+    """Their percents and averages to the digit; a column of dates is left out."""
+    survey = read_survey(write_paper(tmp_path / "answers.csv", heading=heading))
+
+    assert {o.question: o.percents for o in survey.opinions} == TABLE_4
+    assert {c.concept: tuple(map(c.mean, LEVELS)) for c in survey.concepts} == TABLE_5
+    assert survey.left_out == ("Timestamp",)
+    assert survey.students == 13
+    plain = json.loads(json.dumps(survey_dict(survey)))
+    assert plain["concepts"][0]["means"]["Pre Course Knowledge"] == 2.83
+    assert plain["concepts"][0]["answers"]["Pre Course Knowledge"] == 12
+
+
+def test_the_tables_read_as_markdown(tmp_path):
+    """Headings as in the paper, columns in line."""
+    text = survey_text(read_survey(write_paper(tmp_path / "answers.csv")))
+    rows = [re.split(r"\s*\|\s*", line.strip("| ")) for line in text.splitlines() if "|" in line]
+    assert rows[0] == ["Question", *SCALE]
+    assert rows[3] == ["limitations of models", "58 %", "33 %", "8 %", "0 %", "0 %"]
+    assert rows[5] == ["Concept", *LEVELS]
+    assert rows[7] == ["approaches to modeling", "2.83", "2.75", "3.67", "3.67"]
+    assert "Table 4: " in text
+    assert "Table 5: " in text
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ("Q\nAgree\nAgree\nPerhaps\n", "line 4, 'Q': 'Perhaps' is not one of Strongly Agree"),
+        ("Pre knowledge: x\n3\n5\n", "line 3, 'Pre knowledge: x': '5' is no score from 1 to 4"),
+        ("Pre knowledge: x\n3.5\n", "'3.5' is no score from 1 to 4"),
+        ("Pre knowledge: x,pre-course Knowledge [x]\n3,4\n", "two columns are"),
+        ("name,age\nann,20\n", "no question in it"),
+        ("Q\n", "needs a heading and at least one row"),
+        ("", "needs a heading and at least one row"),
+    ],
+)
+def test_answers_off_the_scale_are_an_error(tmp_path, rows, message):
+    """With line, question and answer; never guessed, never dropped."""
+    path = tmp_path / "a.csv"
+    path.write_text(rows, encoding="utf-8")
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        read_survey(path)
+
+
+def test_answers_may_be_written_in_many_ways(tmp_path):
+    """Capitals, apostrophes of all sorts, words for scores."""
+    path = tmp_path / "a.csv"
+    path.write_text(
+        "Q;post_knowledge: x\nstrongly agree;Moderate\nI don’t know;4\nDon't know.;high, used it\n",
+        encoding="utf-8",
+    )
+    survey = read_survey(path)
+    assert survey.opinions[0].counts == (1, 0, 0, 0, 2)
+    assert survey.concepts[0].mean("Post Course Knowledge") == "3.67"
+    assert survey.concepts[0].mean("Pre Course Knowledge") == ""
