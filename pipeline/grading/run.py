@@ -10,10 +10,11 @@ from pipeline.grading.checks import judge
 from pipeline.grading.controller import diagnose_controller, reported_controller
 from pipeline.grading.diagnose import diagnose_tables
 from pipeline.grading.grade import CODES, Criterion, Flag, Grade, Outcome
+from pipeline.grading.lateness import late_deduction
 from pipeline.grading.pieces import missing_flag, missing_pieces
 from pipeline.grading.recordings import bad_runs, data_flag
 from pipeline.grading.reference import recompute, trusted_chain
-from pipeline.grading.rubric import Late, Rubric
+from pipeline.grading.rubric import Rubric
 from pipeline.grading.state_model import diagnose_state_space, state_models
 from pipeline.grading.tolerance import exact
 from pipeline.grading.work import Work
@@ -100,7 +101,7 @@ def grade_analysis(
     )
     criteria = _criteria(work)
     earned = sum((Fraction(str(c.points)) for c in criteria), Fraction(0))
-    deducted = _late(earned, rubric.late, days_late)
+    deducted = late_deduction(earned, late=rubric.late, days_late=days_late)
     return Grade(
         submission=name,
         authors=tuple(author.id for author in submission.authors),
@@ -245,13 +246,6 @@ def _points(share: Fraction | None, points: float) -> float:
     return float(
         Fraction(math.floor((share or 0) * exact(points) * _CENTS + Fraction(1, 2)), _CENTS)
     )
-
-
-def _late(earned: Fraction, late: Late, days_late: float) -> Fraction:
-    """Return what lateness takes off: so much for every day begun after the grace."""
-    days = max(0, math.ceil(days_late - late.grace_days))
-    share = min(exact(late.percent_per_day) * days, exact(late.most_percent)) / 100
-    return Fraction(math.floor(earned * share * _CENTS + Fraction(1, 2)), _CENTS)
 
 
 def _flags(work: Work) -> list[Flag]:
