@@ -26,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 DEVELOPMENT, REPORT = 10_000, 900_000
 SUITES = ("singles", "small", "tiny", "weak", "dirt", "pairs", "clean", "clean-dirt")
 SEVERITY = {"small": 0.3, "weak": 0.2, "tiny": 0.05}
-# What friction tests need: the effects that dirt (scatter of friction) bears on come first.
+# Two of these on one cart would be one friction law: never a pair.
 DRY = ("coulomb_friction", "stiction", "presliding_friction")
 
 
@@ -72,6 +72,7 @@ def run_case(job: tuple[str, int, int]) -> dict:
                     z.append((value.value - float(true)) / value.std if value.std else None)
     return {
         "suite": suite,
+        "base": base,
         "index": index,
         "n": n,
         "truth": truth,
@@ -119,7 +120,8 @@ def main() -> None:
     options = parser.parse_args()
     base = REPORT if options.report else DEVELOPMENT
     rows = [json.loads(line) for line in options.out.open()] if options.out.exists() else []
-    done = {row["index"] for row in rows if row["suite"] == options.suite}
+    rows = [row for row in rows if row["suite"] == options.suite and row["base"] == base]
+    done = {row["index"] for row in rows}
     wanted = range(options.start, options.start + options.count)
     jobs = [(options.suite, i, base) for i in wanted if i not in done]
     with ProcessPoolExecutor(options.jobs) as pool, options.out.open("a") as out:
@@ -137,7 +139,7 @@ def main() -> None:
                     f"x{row['baseline']:.1f} -> x{row['final']:.2f}",
                     flush=True,
                 )
-    summarise([row for row in rows if row["suite"] == options.suite])
+    summarise(rows)
 
 
 def summarise(rows: list[dict]) -> None:

@@ -60,7 +60,7 @@ def test_error(gap: Gap, record: Record, *, skipped: int, zero: float) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="The gap workflow on the Silverbox.")
     parser.add_argument("folder", type=Path)
     parser.add_argument("--samples", type=int, default=20_000, help="of each training piece")
     options = parser.parse_args()

@@ -166,11 +166,9 @@ def make_traces(before: Hypothesis, after: Hypothesis, bench: Bench) -> tuple[Tr
 
 def compare_by_record(before: Hypothesis, after: Hypothesis, bench: Bench) -> tuple[RecordGap, ...]:
     """Return the relative error of every cart in every run, before and after."""
-    runs = {run.id: run for run in (*bench.training, *bench.held_out)}
     out = []
-    for trace in make_traces(before, after, bench):
-        run = runs[trace.experiment]
-        j = run.rows.index(trace.cart - 1)
+    runs = [(run, j) for run, _, _ in _sides_of(before, bench) for j in range(len(run.rows))]
+    for trace, (run, j) in zip(make_traces(before, after, bench), runs, strict=True):
         size = max(float(run.swing[j]), 1e-12)
 
         def error(model: np.ndarray, trace: Trace = trace, size: float = size) -> float:
@@ -194,7 +192,8 @@ def repeatability(runs: Sequence[Run]) -> float | None:
     squares, sizes = 0.0, 0.0
     for i, a in enumerate(runs):
         for b in runs[:i]:
-            alike = a.free == b.free and a.t.size == b.t.size and np.any(a.command)
+            alike = a.free == b.free and a.rows == b.rows and a.t.size == b.t.size
+            alike = alike and bool(np.any(a.command)) and np.allclose(a.t, b.t)
             if not alike or not np.array_equal(a.command, b.command):
                 continue
             difference = a.y - b.y

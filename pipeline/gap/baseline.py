@@ -79,6 +79,7 @@ def first_chain(runs: Sequence[Run], *, springs: Sequence[bool]) -> Chain:
         A, b = np.vstack([A, np.zeros(columns)]), np.append(b, 0.0)
         A[-1, 0] = b[-1] = _FIRST_MASS * float(np.abs(A[:, 0]).max())
     scale = np.linalg.norm(A, axis=0)
+    scale[scale == 0.0] = 1.0  # a cart that no run shows keeps the smallest values
     p = np.linalg.lstsq(A / scale, b, rcond=None)[0] / scale
     m = np.maximum(p[:n], 0.02 * max(1e-12, np.abs(p[:n]).max()))
     k = np.zeros(n + 1)

@@ -91,11 +91,14 @@ def explain_gap(
             fit = fit_model(fit.structure, fit.theta, bench.training, mapper=pool.map)
             chosen, found = _investigate(fit, bench)
         path = _path(chosen, found, bench)
-        chosen, path, bench = _with_offset(chosen, path, bench)
+        chosen, path, judged_by = _with_offset(chosen, path, bench)
+        if judged_by is not bench:
+            # The others were judged with the encoders' zeros free.
+            bench, found = judged_by, list(path)
         final = covariance(chosen.fit, bench.training, mapper=pool.map)
     floor = pooled_floor(bench.held_out)
     if chosen.key and chosen.error > REFUSED_FLOOR * floor:
-        notes.append(f"{chosen.error / floor:.1f} times the noise is left: something small remains")
+        notes.append(f"{chosen.error / floor:.1f} times the noise is left: something remains")
     sample_time = max(run.record.sample_time for run in bench.training)
     verdict, close = reach_verdict(
         chosen, path[0], found, bench=bench, floor=floor, sample_time=sample_time

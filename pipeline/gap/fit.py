@@ -56,7 +56,6 @@ class Fit:
     run_points: Array
     spread: Array
     covariance: Array | None = field(default=None)
-    log_det: float = 0.0
 
     @property
     def chi(self) -> float:
@@ -244,9 +243,8 @@ def _anchor(runs: Sequence[Run], size: int) -> Array:
 
 
 def _learn_spread(fit: Fit, runs: Sequence[Run], linear: Sequence[Linear]) -> Fit:
-    """Learn how much the friction of each cart varies, and move the mean into the force."""
+    """Learn how much the friction of each cart varies."""
     spread = fit.spread.copy()
-    theta = fit.theta.copy()
     factors = np.array([own.scatter for own in fit.locals_])
     noise = max(1.0, fit.chi)
     for i, dry in enumerate(fit.structure.dry):
@@ -266,7 +264,7 @@ def _learn_spread(fit: Fit, runs: Sequence[Run], linear: Sequence[Linear]) -> Fi
             variance = min(noise / column**2 if column else np.inf, spread[i] ** 2)
             total += (factors[r, i] - 1.0) ** 2 + variance
         spread[i] = np.clip(np.sqrt(total / (len(there) + weight)), _SCATTER_FLOOR, _SCATTER_TOP)
-    return replace(fit, spread=spread, theta=theta)
+    return replace(fit, spread=spread)
 
 
 def project(
@@ -323,10 +321,9 @@ def covariance(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
     linear = list(mapper(share, zip(runs, fit.locals_, strict=True)))
     parts = [*(part.reduced for part in linear), _anchor(runs, fit.theta.size)]
     J = np.concatenate(parts)[:, :-1]
+    if not np.all(np.isfinite(J)):
+        return fit
     _, s, vt = np.linalg.svd(J, full_matrices=False)
     s = np.maximum(s, 1e-9 * s[0])
     cov = (vt.T / s**2) @ vt * max(1.0, fit.chi)
-    log_det = float(
-        sum(np.log(np.abs(np.diagonal(part.own[:, : part.own.shape[0]]))).sum() for part in linear)
-    )
-    return replace(fit, covariance=cov, log_det=log_det)
+    return replace(fit, covariance=cov)

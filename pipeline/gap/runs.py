@@ -8,7 +8,7 @@ from pipeline.plant.chain import Array
 from pipeline.plant.simulate import interpolate_band_limited
 from pipeline.results import Record
 
-_REST_SAMPLES = 5  # this many first samples that do not move: the run starts at rest
+_REST_TIME = 0.02  # s without motion: the run starts at rest
 _TAIL = 0.12  # share of a record that must lie still to tell the rest point
 _STILL = 2.6  # encoder steps, peak to peak, that count as lying still
 _FIT_RATE = 250.0  # Hz; faster records are averaged in blocks, model and measurement alike
@@ -70,8 +70,8 @@ class Run:
         return np.sqrt(np.mean((self.y - self.rest[list(self.rows)][:, None]) ** 2, axis=1))
 
 
-def make_run(record: Record, *, n: int) -> Run:
-    """Prepare one record of a bench with n carts.
+def make_run(record: Record, *, n: int, in_motion: bool = False) -> Run:
+    """Prepare one record of a bench with n carts; `in_motion`: it is cut from a longer one.
 
     A decay starts after the hand has let go; a slow or held beginning is cut.
     """
@@ -89,13 +89,13 @@ def make_run(record: Record, *, n: int) -> Run:
         free = 2 * np.pi * _dominant_frequency(t, y) * record.sample_time
         first = min(_release(y - rest[:, None], still, radians=free), t.size // 2)
         t, u, y = t[first:], u[first:], y[:, first:]
-    head = y[:, :_REST_SAMPLES]
-    # The input may already act between these samples: the first two are before its effect.
-    lies_still = np.ptp(head[:, :2], axis=1) <= still
-    at_rest = bool(np.all(lies_still)) and record.kind != "decay"
+    # The input may already act between the samples: the first two are before its effect.
+    quiet = max(2, int(np.argmax(u != u[0])) + 1)
+    look = max(2, min(quiet, round(_REST_TIME / record.sample_time)))
+    lies_still = bool(np.all(np.ptp(y[:, :look], axis=1) <= still))
+    at_rest = lies_still and record.kind != "decay" and not in_motion
     # What moves before the input does was not in equilibrium, only held.
-    before = y[:, : max(2, int(np.argmax(u != 0.0)) + 1)]
-    balanced = at_rest and bool(np.all(np.ptp(before, axis=1) <= still))
+    balanced = at_rest and bool(np.all(np.ptp(y[:, :quiet], axis=1) <= still))
     zero, zero_std = np.zeros(n), np.ones(n)
     start, slope = np.zeros(n), np.zeros(n)
     span = np.ptp(y, axis=1)
@@ -103,7 +103,7 @@ def make_run(record: Record, *, n: int) -> Run:
         if settled[j] and quiet_end:
             zero[row], zero_std[row] = tail[j].mean(), 0.02 * span[j]
         elif balanced and u[0] == 0.0:
-            zero[row], zero_std[row] = head[j, 0], 0.02 * span[j]
+            zero[row], zero_std[row] = y[j, 0], 0.02 * span[j]
         else:
             zero[row], zero_std[row] = y[j].mean(), 0.2 * span[j]
         zero_std[row] = max(zero_std[row], resolution[j], 1e-12)

@@ -23,7 +23,7 @@ def search(baseline: Hypothesis, bench: Bench, *, depth: int = _DEPTH) -> list[H
             if parent.at_floor or parent.fit.chi > _HOPELESS * best.fit.chi:
                 continue
             for child in grow(parent, bench):
-                if not child.sound:
+                if not (child.sound and np.isfinite(child.error)):
                     continue
                 if child.key not in seen or child.bic < seen[child.key].bic:
                     seen[child.key] = child
@@ -67,7 +67,7 @@ def choose(found: Sequence[Hypothesis], baseline: Hypothesis) -> Hypothesis:
 
 
 def prune(chosen: Hypothesis, bench: Bench) -> Hypothesis:
-    """Drop effects the others have made needless; reduce rich friction to Coulomb's."""
+    """Drop effects the others have made needless."""
     while len(chosen.key) > 1:
         trials = []
         for index in range(len(chosen.fit.structure.effects)):

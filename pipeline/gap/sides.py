@@ -13,6 +13,7 @@ from pipeline.results import Record
 _LAST_SHARE = 0.4  # of a single run is held out
 _MOST_DWELLS = 4  # sine dwells used; they say little beyond their frequency
 _LEAST_MOTION = 8.0  # encoder steps
+_FEWEST, _SHORTEST = 50, 0.5  # samples, s
 _WINDOW = 0.5  # s; a chain without springs drifts, so it is judged over windows
 
 
@@ -24,7 +25,17 @@ def prepare(records: Sequence[Record], *, springs: tuple[bool, ...], notes: list
     DataError : no record with a free cart that moves.
     """
     n = len(springs) - 1
-    usable = [r for r in records if r.kind != "bode" and r.t.size >= 50 and r.free]
+    timed = [r for r in records if r.kind != "bode"]
+    usable = [r for r in timed if _is_usable(r)]
+    if len(usable) < len(timed):
+        notes.append(
+            "left out, as too short, without motion, without an input, or with all carts held: "
+            + ", ".join(r.id for r in timed if r not in usable)
+        )
+    if not usable:
+        raise DataError(
+            "gap: needs a record of half a second or more in which a free cart moves, found none"
+        )
     open_loop = [r for r in usable if r.kind != "closed_loop"]
     if open_loop and len(open_loop) < len(usable):
         notes.append("runs under feedback are left out: open-loop runs tell more")
@@ -35,23 +46,26 @@ def prepare(records: Sequence[Record], *, springs: tuple[bool, ...], notes: list
         picked = {round(i) for i in np.linspace(0, len(dwells) - 1, _MOST_DWELLS)}
         left_out = {r.id for i, r in enumerate(dwells) if i not in picked}
         usable = [r for r in usable if r.id not in left_out]
-    if not usable:
-        raise DataError("gap: needs a time record with a cart free to move, found none")
-    moving = [r for r in usable if _moves(r)]
-    if len(moving) < len(usable):
-        notes.append(f"{len(usable) - len(moving)} runs without motion left out")
-    if not moving:
-        raise DataError("gap: needs a run in which a free cart moves, found none")
-    runs = [make_run(record, n=n) for record in moving]
+        notes.append(f"of {len(dwells)} sine dwells {_MOST_DWELLS} are used")
+    runs = [make_run(record, n=n) for record in usable]
     if not any(np.any(run.command) for run in runs):
         notes.append("no run has an input: forces are per unit of the first mass")
     kept = without_twins(runs)
     if len(kept) < len(runs):
-        notes.append(f"{len(runs) - len(kept)} duplicate files left out")
+        notes.append(f"duplicate files left out: {len(runs) - len(kept)}")
     if not any(springs):
         notes.append("no springs: judged over windows of half a second, not by the drift")
         kept = [cut_shots(run, length=_WINDOW) for run in kept]
     return kept
+
+
+def _is_usable(record: Record) -> bool:
+    """Does a free cart move, for a known reason, for long enough?"""
+    if not record.free or record.t.size < _FEWEST or record.t[-1] - record.t[0] < _SHORTEST:
+        return False
+    # Without its input only a release or a held cart 1 is understood.
+    known = record.u is not None or record.kind == "decay" or 1 not in record.free
+    return known and _moves(record)
 
 
 def _moves(record: Record) -> bool:
@@ -68,7 +82,7 @@ def take_sides(runs: list[Run], *, notes: list[str]) -> tuple[list[Run], list[Ru
     notes.append("one run of each kind: the last 40 % of the longest is held out")
     longest = max(range(len(runs)), key=lambda i: runs[i].t[-1] - runs[i].t[0])
     run = runs[longest]
-    cut = int((1.0 - _LAST_SHARE) * run.t.size)
+    cut = int((1.0 - _LAST_SHARE) * _last_motion(run))
     pieces = []
     for piece in (slice(0, cut), slice(cut, None)):
         record = replace(
@@ -80,8 +94,17 @@ def take_sides(runs: list[Run], *, notes: list[str]) -> tuple[list[Run], list[Ru
             y=np.array([run.record.y[j][-run.t.size :][piece] for j in range(len(run.record.y))]),
             reference=None,
         )
-        part = make_run(record, n=run.zero.size)
+        starts = piece.start == 0 and run.record.kind != "decay"
+        part = make_run(record, n=run.zero.size, in_motion=not starts)
         moving = replace(part, zero=run.zero, zero_std=run.zero_std, rest=run.rest)
         pieces.append(moving if len(run.shots) == 2 else cut_shots(moving, length=_WINDOW))
     others = [r for i, r in enumerate(runs) if i != longest]
     return [*others, pieces[0]], [pieces[1]]
+
+
+def _last_motion(run: Run) -> int:
+    """Return how many samples there are up to the last motion of a run."""
+    step = run.sigma * np.sqrt(12.0)
+    away = np.abs(run.y - run.y[:, -1:]) > _LEAST_MOTION * step[:, None]
+    last = int(np.flatnonzero(away.any(axis=0))[-1]) + 1 if away.any() else run.t.size
+    return max(last, run.t.size // 2)

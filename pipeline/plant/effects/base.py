@@ -207,11 +207,15 @@ def make_term(effect: Effect, *, place: int, values: Mapping[str, float], chain:
     unknown = [name for name in values if name not in effect.names]
     if unknown:
         raise ConfigError(f"{effect.key}: has {', '.join(effect.names)}, found {unknown[0]}")
+    mirrored = either_wall and chain.k[place - 1] == 0.0
+    place = 3 - place if mirrored else place
     scales = chain_scales(chain, place=effect.place, at=place)
     chosen: list[float] = []
     for parameter in effect.parameters:
         if parameter.name in values:
-            chosen.append(float(values[parameter.name]))
+            # The other spring is stretched where this one is slackened.
+            side = -1.0 if mirrored and parameter.side else 1.0
+            chosen.append(side * float(values[parameter.name]))
         elif parameter.reported:
             raise ConfigError(f"{effect.key}: needs {parameter.name}")
         else:
