@@ -16,6 +16,7 @@ from pipeline.grading.rubric import Rubric
 from pipeline.report.document import (
     Block,
     Cell,
+    Details,
     Document,
     Picture,
     Section,
@@ -36,6 +37,7 @@ from pipeline.report.tables import cell, make_table
 from pipeline.report.words import clean
 
 _NAMED = 8  # submissions named beside a mistake
+_MOST_FAILED = 8  # whose reasons the summary shows unasked
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,12 +130,14 @@ def _summary(lines: Sequence[Line], graded: Sequence[Line]) -> list[Block]:
         ]  # fmt: skip
     blocks: list[Block] = [Tiles(tuple(tiles))]
     if failed:
-        blocks += [
-            paragraph("These could not be graded, and have no points but those given by hand:"),
-            bullet_list(
-                spans(_link(line.name), f": {clean(line.reason)}", _hand(line)) for line in failed
-            ),
-        ]
+        said = "could not be graded; points can be given by hand"
+        reasons = bullet_list(
+            spans(_link(line.name), f": {clean(line.reason)}", _hand(line)) for line in failed
+        )
+        if len(failed) > _MOST_FAILED:
+            blocks.append(Details(spans(f"{len(failed)} {said}"), (reasons,)))
+        else:
+            blocks += [paragraph(f"These {said}:"), reasons]
     return blocks
 
 

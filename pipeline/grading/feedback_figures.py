@@ -2,8 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-
 from pipeline.plant.chain import Array, transfer_functions
 from pipeline.report.figures import drawing
 from pipeline.report.figures_grading import reported_bode_figure
@@ -13,6 +11,7 @@ from pipeline.results import Analysis
 from pipeline.submission import Reported
 
 _MOST_CARTS = 3  # whose table stands for transfer functions
+_LARGEST = 1e9  # of gains and frequencies, and its reciprocal the least: no figure shows more
 
 
 def draw_figures(analysis: Analysis, reported: Reported | None) -> tuple[tuple[str, str], ...]:
@@ -41,9 +40,12 @@ def draw_figures(analysis: Analysis, reported: Reported | None) -> tuple[tuple[s
 
 def _response(values: Mapping[str, float]) -> tuple[Array, Sequence[Array]] | None:
     """Return the gains and polynomials that a table stands for, None where it stands for none."""
+    sizes = [abs(v) for name, v in values.items() if name.startswith(("K", "omega"))]
+    if any(not 1 / _LARGEST < size < _LARGEST for size in sizes):
+        return None
+    if any(not abs(v) < _LARGEST for v in values.values()):
+        return None
     try:
-        gains, tails = transfer_functions(values)
+        return transfer_functions(values)
     except KeyError:
         return None
-    sound = gains.all() and all(tail[-1] > 0 and np.isfinite(tail).all() for tail in tails)
-    return (gains, tails) if sound else None

@@ -99,5 +99,7 @@ def reported_magnitude(
     gains, tails = reported
     s = 1j * omega
     numerator = tails[cart] if cart < len(tails) else np.ones(1)
-    relative = (np.polyval(numerator, s) / numerator[-1]) / (np.polyval(tails[0], s) / tails[0][-1])
-    return 20 * np.log10(np.abs(gains[cart - 1] * relative))
+    with np.errstate(divide="ignore", invalid="ignore"):  # without damping a null has no size
+        above, below = np.polyval(numerator, s), np.polyval(tails[0], s)
+        relative = (above / numerator[-1]) / (below / tails[0][-1])
+        return 20 * np.log10(np.abs(gains[cart - 1] * relative))
