@@ -231,3 +231,36 @@ def test_a_rigid_body_under_feedback(friction):
         assert gap.effects[0].parameters["force"].value == pytest.approx(friction, rel=0.03)
     else:
         assert gap.verdict == "none"
+
+
+def test_a_single_decay_is_cut_where_it_still_moves():
+    """The part held out of one decay is one in which the cart moves."""
+    case = make_case(seed=47, n=1, effects=["coulomb_friction"], rate=113.1)
+    (decay, *_) = (r for r in case.records if r.kind == "decay")
+
+    gap = explain_gap([decay], springs=case.springs)
+
+    assert 0.0 < gap.noise_floor < 0.5  # the motion stands out of the noise
+    assert all(r.noise_floor < 0.5 for r in gap.by_record)
+
+
+def test_carts_that_no_run_shows_do_no_harm():
+    """Decays of the second cart alone explain its own friction; the first keeps its start."""
+    case = make_case(seed=48, n=2, effects=[], rate=113.1)
+    decays = [r for r in case.records if r.kind == "decay" and r.free == (2,)]
+
+    gap = explain_gap(decays, springs=case.springs)
+
+    assert gap.verdict == "none"
+
+
+def test_a_run_without_its_input_is_left_out_and_said():
+    """A step whose input was not logged explains nothing."""
+    case = make_case(seed=49, n=1, rate=113.1)
+    first, *others = case.records
+    unknown = Record(**{**vars(first), "u": None})
+
+    gap = explain_gap([unknown, *others], springs=case.springs)
+
+    assert first.id not in (*gap.training, *gap.held_out)
+    assert any(first.id in note for note in gap.notes)

@@ -77,7 +77,8 @@ def first_chain(runs: Sequence[Run], *, springs: Sequence[bool]) -> Chain:
     if not np.any(b):
         # Free decays alone: forces are per unit of the first mass.
         A, b = np.vstack([A, np.zeros(columns)]), np.append(b, 0.0)
-        A[-1, 0] = b[-1] = _FIRST_MASS * float(np.abs(A[:, 0]).max())
+        first = int(np.argmax(np.abs(A[:, :n]).max(axis=0) > 0.0))  # the first cart that moves
+        A[-1, first] = b[-1] = _FIRST_MASS * float(np.abs(A[:, first]).max())
     scale = np.linalg.norm(A, axis=0)
     scale[scale == 0.0] = 1.0  # a cart that no run shows keeps the smallest values
     p = np.linalg.lstsq(A / scale, b, rcond=None)[0] / scale

@@ -234,11 +234,11 @@ def fit_model(
 
 
 def _anchor(runs: Sequence[Run], size: int) -> Array:
-    """Return a row that holds the first mass where no run has an input to give forces a scale."""
+    """Return a row that holds the first free mass where no input gives forces a scale."""
     if any(np.any(run.command) for run in runs):
         return np.zeros((0, size + 1))
     row = np.zeros((1, size + 1))
-    row[0, 0] = _ANCHOR
+    row[0, int(np.argmax(np.any([run.free for run in runs], axis=0)))] = _ANCHOR
     return row
 
 
