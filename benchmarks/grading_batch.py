@@ -128,7 +128,10 @@ def kills(base: Path, *, count: int) -> None:
         process.wait()
     whole = _graded(command, base / "whole")
     for number in range(min(10, count)):
-        lost += _graded(command, base / f"out-{number}") != whole
+        rows = _graded(command, base / f"out-{number}")
+        lost += rows != whole
+        for name in sorted(n for n in rows | whole if rows.get(n) != whole.get(n)):
+            print(f"out-{number}: {name} differs")
     print(f"{count} kills: {lost} of {min(10, count)} gradebooks differ from a run left alone")
 
 
