@@ -95,7 +95,7 @@ def _options(
 def demo(
     out: Annotated[Path, typer.Option(help="Where to write.")] = Path("cartlab-demo"),
 ) -> None:
-    """Run the whole job: the shipped three-cart example, then a bench that hides friction."""
+    """Run the whole job: a shipped example, a bench that hides friction, a class of three."""
     from pipeline.output import check_folder
     from pipeline.resources import EXAMPLES
 
@@ -104,6 +104,11 @@ def demo(
     if not (bench / "submission.toml").exists():
         simulate(out=bench, preset="throne-2dof", hide=["coulomb_friction"])
     gap(bench, out=out / "gap")
+    for number in (1, 2, 3):
+        team = out / "class" / f"team-{number}"
+        if not (team / "submission.toml").exists():
+            simulate(out=team, preset="throne-1dof", seed=number, reported=True)
+    grade([out / "class"], rubric=Path("throne-1dof"), out=out / "grades")
 
 
 @app.command()
