@@ -164,11 +164,12 @@ def make_traces(before: Hypothesis, after: Hypothesis, bench: Bench) -> tuple[Tr
     return tuple(out)
 
 
-def compare_by_record(before: Hypothesis, after: Hypothesis, bench: Bench) -> tuple[RecordGap, ...]:
-    """Return the relative error of every cart in every run, before and after."""
+def compare_by_record(traces: Sequence[Trace], bench: Bench) -> tuple[RecordGap, ...]:
+    """Return the relative error of every cart in every run, before and after, as traced."""
     out = []
-    runs = [(run, j) for run, _, _ in _sides_of(before, bench) for j in range(len(run.rows))]
-    for trace, (run, j) in zip(make_traces(before, after, bench), runs, strict=True):
+    order = (*bench.training, *bench.held_out)
+    rows = [(run, j) for run in order for j in range(len(run.rows))]
+    for trace, (run, j) in zip(traces, rows, strict=True):
         size = max(float(run.swing[j]), 1e-12)
 
         def error(model: np.ndarray, trace: Trace = trace, size: float = size) -> float:

@@ -104,6 +104,7 @@ def explain_gap(
         chosen, path[0], found, bench=bench, floor=floor, sample_time=sample_time
     )
     effects = list_effects(path, final, found, position_unit=position_unit, input_unit=input_unit)
+    traces = make_traces(path[0], chosen, bench)
     return Gap(
         verdict=verdict,
         effects=effects,
@@ -111,14 +112,14 @@ def explain_gap(
         final=chosen.error,
         noise_floor=floor,
         repeatability=bench.repeatability or None,
-        by_record=compare_by_record(path[0], chosen, bench),
+        by_record=compare_by_record(traces, bench),
         where=find_windows(path[0].fit, bench.training) if verdict != "none" else (),
         next_experiment=choose_experiment(verdict, chosen, close),
         linear=path[0].fit.structure.model(path[0].fit.theta),
         model=chosen.fit.structure.model(chosen.fit.theta),
         training=tuple(run.id for run in bench.training),
         held_out=tuple(run.id for run in bench.held_out),
-        traces=make_traces(path[0], chosen, bench),
+        traces=traces,
         chain_std=chain_std(final),
         spread={
             i + 1: float(chosen.fit.spread[i])
@@ -213,14 +214,13 @@ def _with_offset(
             fit_whole(h.fit.structure, h.fit.theta, pinned),
             pinned,
             added=h.added,
-            parent=h.parent,
         )
         for h in path
     )
     grown = structure.with_effect(candidate)
     theta = np.append(chosen.fit.theta, np.sign(offset.force))
     fit = fit_whole(grown, theta, loose)
-    final = judge(fit, loose, added=candidate, parent=without[-1])
+    final = judge(fit, loose, added=candidate)
     if final.error > 0.9 * without[-1].error:
         return chosen, path, bench
     return final, (*without, final), loose

@@ -33,12 +33,12 @@ def grow(parent: Hypothesis, bench: Bench) -> list[Hypothesis]:
     """Return the children of a hypothesis: one further effect each, fully refitted."""
     children = []
     for candidate, fit in _starts(parent, bench):
-        child = _full_refit(candidate, fit, parent, bench)
+        child = _full_refit(candidate, fit, bench)
         children.append(child)
         if candidate.effect.family == "dry friction":
             for effect in bench.catalogue:
                 if effect.grows_from == candidate.effect.key:
-                    children.append(_grown_friction(effect, child, parent, bench))
+                    children.append(_grown_friction(effect, child, bench))
     return children
 
 
@@ -144,11 +144,11 @@ def _short_refit(
     return suspect.candidate, best
 
 
-def _full_refit(candidate: Candidate, start: Fit, parent: Hypothesis, bench: Bench) -> Hypothesis:
+def _full_refit(candidate: Candidate, start: Fit, bench: Bench) -> Hypothesis:
     fit = fit_whole(start.structure, start.theta, bench)
     if candidate.effect.key in CONTACT:
         fit = polish(fit, bench.training, enough=AT_FLOOR, mapper=bench.mapper)
-    return judge(fit, bench, added=candidate, parent=parent)
+    return judge(fit, bench, added=candidate)
 
 
 def fit_whole(structure: Structure, theta: Array, bench: Bench) -> Fit:
@@ -184,9 +184,7 @@ def fit_whole(structure: Structure, theta: Array, bench: Bench) -> Fit:
     return fit
 
 
-def _grown_friction(
-    effect: Effect, simple: Hypothesis, parent: Hypothesis, bench: Bench
-) -> Hypothesis:
+def _grown_friction(effect: Effect, simple: Hypothesis, bench: Bench) -> Hypothesis:
     """Fit a richer friction law from the simpler one's fit."""
     structure = simple.fit.structure
     index = len(structure.effects) - 1
@@ -218,7 +216,7 @@ def _grown_friction(
         )
     best = min(fits, key=lambda fit: fit.cost)
     fit = fit_whole(best.structure, best.theta, bench)
-    return judge(fit, bench, added=best.structure.effects[-1], parent=parent)
+    return judge(fit, bench, added=best.structure.effects[-1])
 
 
 def _friction_start(effect: Effect, force: float, values: tuple[float, ...]) -> tuple[float, ...]:

@@ -27,7 +27,7 @@ class Hypothesis:
     """A model with its fit on training runs and what it leaves on held-out ones.
 
     `at_floor`: nothing is left but noise, on training and on held-out runs. `added` is the effect
-    added last; `parent` the hypothesis it was added to.
+    added last.
     """
 
     fit: Fit
@@ -36,7 +36,6 @@ class Hypothesis:
     bic: float
     at_floor: bool
     added: Candidate | None = None
-    parent: "Hypothesis | None" = None
 
     @property
     def key(self) -> frozenset[tuple[str, int]]:
@@ -75,9 +74,7 @@ class Bench:
     tell: Callable[[str], None]
 
 
-def judge(
-    fit: Fit, bench: Bench, *, added: Candidate | None = None, parent: Hypothesis | None = None
-) -> Hypothesis:
+def judge(fit: Fit, bench: Bench, *, added: Candidate | None = None) -> Hypothesis:
     """Return the hypothesis a fit stands for."""
     held = fit_locals(fit, bench.held_out, mapper=bench.mapper)
     errors, sizes = [], []
@@ -95,7 +92,6 @@ def judge(
         bic=float(bic),
         at_floor=fit.chi < AT_FLOOR and held.chi < AT_FLOOR,
         added=added,
-        parent=parent,
     )
 
 

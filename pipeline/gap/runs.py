@@ -83,11 +83,12 @@ def make_run(record: Record, *, n: int, in_motion: bool = False) -> Run:
     tail = y[:, -max(3, int(_TAIL * t.size)) :]
     settled = np.ptp(tail, axis=1) <= still
     quiet_end = bool(np.all(u[-tail.shape[1] :] == 0.0))
-    pace = min(1.0, _USUAL_FREQUENCY / _dominant_frequency(t, y))
+    frequency = _dominant_frequency(t, y)
+    pace = min(1.0, _USUAL_FREQUENCY / frequency)
     if record.kind == "decay":
         rest = np.where(settled, tail.mean(axis=1), np.median(y, axis=1))
-        free = 2 * np.pi * _dominant_frequency(t, y) * record.sample_time
-        first = min(_release(y - rest[:, None], still, radians=free), t.size // 2)
+        radians = 2 * np.pi * frequency * record.sample_time
+        first = min(_release(y - rest[:, None], still, radians=radians), t.size // 2)
         t, u, y = t[first:], u[first:], y[:, first:]
     # The input may already act between the samples: the first two are before its effect.
     quiet = max(2, int(np.argmax(u != u[0])) + 1)

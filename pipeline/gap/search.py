@@ -74,7 +74,7 @@ def prune(chosen: Hypothesis, bench: Bench) -> Hypothesis:
             structure = chosen.fit.structure.without(index)
             theta = np.delete(chosen.fit.theta, np.r_[chosen.fit.structure.span(index)])
             fit = fit_whole(structure, theta, bench)
-            trial = judge(fit, bench, added=structure.effects[-1], parent=chosen.parent)
+            trial = judge(fit, bench, added=structure.effects[-1])
             trials += [trial] if trial.sound else []
         if not trials:
             return chosen

@@ -63,11 +63,6 @@ class Structure:
         return 2 * self.n + len(self.rows)
 
     @property
-    def size(self) -> int:
-        """All parameters."""
-        return self.base_size + sum(len(c.effect.parameters) for c in self.effects)
-
-    @property
     def dry(self) -> tuple[bool, ...]:
         """(n,) on which carts dry friction acts."""
         places = {c.place for c in self.effects if c.effect.family == "dry friction"}
