@@ -121,14 +121,17 @@ def explain_gap(
         held_out=tuple(run.id for run in bench.held_out),
         traces=traces,
         chain_std=chain_std(final),
-        spread={
-            i + 1: float(chosen.fit.spread[i])
-            for i, dry in enumerate(chosen.fit.structure.dry)
-            if dry
-        },
+        spread=_learnt_spread(chosen.fit),
         suspects=list_suspects(found, effects) if verdict == "unexplained" else (),
         notes=tuple(notes),
     )
+
+
+def _learnt_spread(fit: Fit) -> dict[int, float]:
+    """Return the run-to-run spread of each cart's dry friction, where the runs asked for one."""
+    moved = np.any([own.scatter != 1.0 for own in fit.locals_], axis=0)
+    dry = fit.structure.dry
+    return {i + 1: float(fit.spread[i]) for i in range(len(dry)) if dry[i] and moved[i]}
 
 
 # ------------------------------------------------------------------------ the noise

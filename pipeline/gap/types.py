@@ -105,7 +105,7 @@ class Gap:
     linear, model : the linear chain that fits best, and the chain with the effects.
     chain_std : standard errors of the latter's "m_1", "c_1", "k_1", …
     training, held_out : ids of the runs.
-    spread : learnt run-to-run spread of the dry friction, per cart, where there is any.
+    spread : learnt run-to-run spread of the dry friction, per cart, where the runs show any.
     notes : what a reader must know.
     """
 
