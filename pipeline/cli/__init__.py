@@ -1,0 +1,8 @@
+"""The `cartlab` command: parse, call one function, write, exit code."""
+
+# isort: off
+# In this order `cartlab --help` lists the commands: as a lab needs them.
+from pipeline.cli.common import app, main
+from pipeline.cli import reports, models, grading, demo
+
+__all__ = ["app", "demo", "grading", "main", "models", "reports"]

@@ -1,0 +1,83 @@
+"""The application: its errors, exit codes, talk and the options that commands share.
+
+Data goes to `--out` or stdout, talk to stderr. Exit 0 done, 1 done but checks failed, 2 cannot run.
+Everything heavy is imported by the command that needs it, so that `--help` answers at once.
+"""
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from typer.exceptions import TyperException
+
+from pipeline import __version__
+from pipeline.errors import PipelineError
+
+app = typer.Typer(
+    name="cartlab",
+    help="Lab reports and identification for carts on springs: from raw bench data to the plant, "
+    "a controller and a report.",
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+Folder = Annotated[Path, typer.Argument(metavar="DIR", help="A submission folder.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
+
+
+def main() -> None:
+    """Run the command line; an error that a person can act on is one line and exit status 2."""
+    try:
+        sys.exit(app(sys.argv[1:] or ["--help"], standalone_mode=False))
+    except TyperException as error:  # a wrong option or argument
+        _fail(f"{error.format_message()} (cartlab --help explains)")
+    except PipelineError as error:
+        _fail(str(error))
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        _fail(f"{where}{error.strerror or error}: choose another place, for example with --out")
+
+
+def _fail(message: str) -> None:
+    say(f"cartlab: {message}")
+    sys.exit(2)
+
+
+def say(text: str) -> None:
+    """Print to stderr: talk, never data."""
+    typer.echo(text, err=True)
+
+
+@contextmanager
+def progress_line() -> Iterator[Callable[[str], None]]:
+    """Show what is being done while it is done; silent where stderr is no terminal."""
+    if not sys.stderr.isatty():
+        yield lambda text: None
+        return
+    from rich.console import Console
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    text_column = TextColumn("{task.description}", markup=False)  # a record may be called "[b]"
+    columns = SpinnerColumn(), text_column, TimeElapsedColumn()
+    with Progress(*columns, console=Console(stderr=True), transient=True) as shown:
+        task = shown.add_task("starting", total=None)
+        yield lambda text: shown.update(task, description=text)
+
+
+def _version(value: bool) -> None:
+    if value:
+        typer.echo(f"cartlab {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
+    ] = False,
+) -> None:
+    pass

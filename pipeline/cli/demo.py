@@ -1,0 +1,31 @@
+"""The whole job on what is shipped."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipeline.cli.common import app
+from pipeline.cli.grading import grade
+from pipeline.cli.models import simulate
+from pipeline.cli.reports import gap, run_report
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(help="Where to write.")] = Path("cartlab-demo"),
+) -> None:
+    """Run the whole job: a shipped example, a bench that hides friction, a class of three."""
+    from pipeline.output import check_folder
+    from pipeline.resources import EXAMPLES
+
+    run_report(EXAMPLES / "three-cart", out=check_folder(out) / "report", pdf=True)
+    bench = out / "bench"
+    if not (bench / "submission.toml").exists():
+        simulate(out=bench, preset="throne-2dof", hide=["coulomb_friction"])
+    gap(bench, out=out / "gap")
+    for number in (1, 2, 3):
+        team = out / "class" / f"team-{number}"
+        if not (team / "submission.toml").exists():
+            simulate(out=team, preset="throne-1dof", seed=number, reported=True)
+    grade([out / "class"], rubric=Path("throne-1dof"), out=out / "grades")

@@ -1,0 +1,216 @@
+"""Commands of a class: grade, override, history, export, survey, check-rubric."""
+
+import json
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipeline.cli.common import AsJson, app, say
+
+
+@app.command()
+def grade(
+    paths: Annotated[
+        list[Path],
+        typer.Argument(metavar="PATH…", help="Submission folders, trees of them, or zip files."),
+    ],
+    rubric: Annotated[Path, typer.Option(metavar="FILE", help="A rubric, or a shipped name.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Where the gradebook is or will be.")],
+    jobs: Annotated[int, typer.Option(min=1, help="Processes; default: one a core.")] = (
+        os.cpu_count() or 1
+    ),
+    cluster: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler, tcp://HOST:PORT.")
+    ] = None,
+    time_limit: Annotated[float, typer.Option(min=1, help="s for each submission.")] = 120.0,
+    memory_limit: Annotated[float, typer.Option(min=0.1, help="GB for each submission.")] = 1.0,
+    figures: Annotated[
+        bool, typer.Option("--figures/--no-figures", help="Draw those of the feedback.")
+    ] = True,
+    anonymous: Annotated[
+        bool, typer.Option("--anonymous", help="Leave names out; anonymous-key.csv reveals them.")
+    ] = False,
+    gradebook: Annotated[
+        str | None,
+        typer.Option(metavar="URL", help="A database; default: gradebook.sqlite in --out."),
+    ] = None,
+) -> None:
+    """Grade a class: gradebook, grades.csv, a page of the class, feedback for each student."""
+    from pipeline.grading.batch_run import grade_class
+    from pipeline.grading.runner import Limits
+
+    with _batch_progress() as progress:
+        done = grade_class(
+            paths,
+            rubric_file=rubric,
+            out=out,
+            jobs=jobs,
+            cluster=cluster,
+            limits=Limits(time=time_limit, memory=round(memory_limit * 1e9)),
+            figures=figures,
+            progress=progress,
+            anonymous=anonymous,
+            gradebook=gradebook,
+        )
+    for submission, reason in done.failed:
+        say(f"{submission}: {reason}")
+    shared = f", {done.sharing} with recordings that another has too" if done.sharing else ""
+    say(f"{done.total - len(done.failed)} of {done.total} graded{shared}; wrote {out}")
+    if done.failed:
+        raise typer.Exit(1)
+
+
+@contextmanager
+def _batch_progress() -> Iterator[Callable[[int, int, str], None]]:
+    """Show how many are done and how long the others will take; silent where nobody looks."""
+    if not sys.stderr.isatty():
+        yield lambda done, total, last: None
+        return
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        MofNCompleteColumn(),
+        BarColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        TextColumn("{task.description}", markup=False),  # a submission may be called "[b]"
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as shown:
+        task = shown.add_task("opening", total=None)
+        yield lambda done, total, last: shown.update(
+            task, completed=done, total=total, description=last
+        )
+
+
+Grades = Annotated[
+    str, typer.Argument(metavar="GRADES", help="The --out folder of `cartlab grade`, or a URL.")
+]
+Team = Annotated[str, typer.Argument(metavar="TEAM", help="A submission, or one of its authors.")]
+Lab = Annotated[
+    str | None,
+    typer.Option("--assignment", help="A rubric's name, where the gradebook has several."),
+]
+
+
+@app.command()
+def override(
+    grades: Grades,
+    team: Team,
+    criterion: Annotated[str, typer.Argument(metavar="CRITERION", help="Its id in the rubric.")],
+    points: Annotated[
+        str, typer.Argument(metavar="POINTS", help="A number, or auto: the automatic ones again.")
+    ],
+    why: Annotated[str, typer.Option(help="The reason, which the student reads.")],
+    by: Annotated[str, typer.Option(metavar="NAME", help="Who says so.")],
+    assignment: Lab = None,
+) -> None:
+    """Give a criterion points by hand, which every later grading keeps."""
+    from pipeline.grading.gradebook import Gradebook
+    from pipeline.grading.outputs import write_outputs
+    from pipeline.grading.override import read_points
+
+    with Gradebook(grades, assignment=assignment) as book:
+        book.override(team, criterion, read_points(points), why=why, by=by)
+        folder = Path(grades)
+        if folder.is_dir():
+            write_outputs(book, folder)
+        grade = book.entry(team).grade
+    say(f"{grade.submission}: {grade.points:g} of {grade.out_of:g} points")
+
+
+@app.command()
+def history(grades: Grades, team: Team, assignment: Lab = None, as_json: AsJson = False) -> None:
+    """Show every grade and change of a team, with who, when and why."""
+    from pipeline.grading.gradebook import Gradebook
+    from pipeline.grading.history import history_dict, history_text
+
+    with Gradebook(grades, assignment=assignment) as book:
+        submission, events = book.history(team)
+    if as_json:
+        typer.echo(json.dumps(history_dict(submission, events), indent=1, ensure_ascii=False))
+    else:
+        typer.echo(history_text(submission, events))
+
+
+class Platform(StrEnum):
+    """A learning platform."""
+
+    CANVAS = "canvas"
+    MOODLE = "moodle"
+    GRADESCOPE = "gradescope"
+
+
+@app.command("export")
+def export_grades(
+    grades: Grades,
+    lms: Annotated[Platform, typer.Option(help="The learning platform.")],
+    out: Annotated[Path | None, typer.Option(help="Where to write; default: GRADES.")] = None,
+    roster: Annotated[
+        Path | None, typer.Option(metavar="CSV", help="The platform's own table, to be filled in.")
+    ] = None,
+    title: Annotated[
+        str | None, typer.Option(help="Of the assignment there; default: the rubric's.")
+    ] = None,
+    assignment: Lab = None,
+) -> None:
+    """Write the class grades for import into a learning platform."""
+    from pipeline.grading.export import export
+    from pipeline.grading.gradebook import Gradebook
+    from pipeline.output import check_folder
+
+    folder = Path(grades)
+    with Gradebook(grades, assignment=assignment) as book:
+        to = check_folder(out or (folder if folder.is_dir() else Path()))
+        done = export(book, lms.value, to, title=title, roster=roster)
+    for remark in done.remarks:
+        say(remark)
+    first, *more = done.files
+    say(f"wrote {first}" + (f" and {len(more)} more" if more else ""))
+
+
+@app.command()
+def survey(
+    file: Annotated[Path, typer.Argument(metavar="CSV", help="Answers, a row a student.")],
+    as_json: AsJson = False,
+) -> None:
+    """Make the tables of opinions and of knowledge and confidence from a questionnaire."""
+    from pipeline.grading.survey import read_survey, survey_dict, survey_text
+
+    found = read_survey(file)
+    if found.left_out:
+        say(f"left out, no question of either table: {', '.join(found.left_out)}")
+    if as_json:
+        typer.echo(json.dumps(survey_dict(found), indent=1, ensure_ascii=False))
+    else:
+        typer.echo(survey_text(found))
+
+
+@app.command("check-rubric")
+def check_rubric(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A rubric, or a shipped name.")],
+    as_json: AsJson = False,
+) -> None:
+    """Validate a rubric and show what it asks of a submission."""
+    from pipeline.grading.describe import rubric_dict, rubric_text
+    from pipeline.grading.load import load_rubric
+
+    rubric = load_rubric(file)
+    if as_json:
+        typer.echo(json.dumps(rubric_dict(rubric), indent=1, ensure_ascii=False))
+    else:
+        typer.echo(rubric_text(rubric))

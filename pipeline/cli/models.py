@@ -1,0 +1,83 @@
+"""Commands of models: simulate, effects, schema."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipeline.cli.common import AsJson, app, progress_line, say
+
+
+@app.command()
+def simulate(
+    out: Annotated[Path, typer.Option(help="The submission folder to write.")],
+    preset: Annotated[
+        str | None, typer.Option(help="throne-1dof, throne-2dof or throne-3dof.")
+    ] = None,
+    model: Annotated[
+        Path | None, typer.Option(help="A gap.json whose chain and effects to simulate.")
+    ] = None,
+    hide: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="EFFECT[:key=value,…]", help="Hide an effect (see `cartlab effects`); repeat."
+        ),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed: same seed, same bytes.")] = 0,
+    reported: Annotated[
+        bool, typer.Option("--reported", help="Add what an honest student would report.")
+    ] = False,
+) -> None:
+    """Write a synthetic submission: decays, steps, sine dwells, a sweep, a closed-loop step."""
+    from pipeline.output import new_folder
+    from pipeline.synthesis.hidden import prepare_bench, write_bench
+
+    new_folder(out)
+    bench = prepare_bench(preset=preset, model=model, hide=hide or ())
+    for sentence in bench.told:
+        say(f"hidden: {sentence}")
+    with progress_line() as progress:
+        progress("simulating the experiments")
+        write_bench(out, bench, seed=seed, reported=reported)
+    say(f"wrote {out}: try `cartlab report {out}`")
+
+
+@app.command()
+def effects(
+    name: Annotated[
+        str | None, typer.Argument(metavar="[NAME]", help="One effect; default: all.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Write effects.html here, with pictures of each.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """List what a bench may do beyond the linear chain: law, fingerprint, what decides."""
+    from pipeline.plant.effects import CATALOGUE, find_effect
+    from pipeline.report.words_effects import catalogue_data, catalogue_text
+
+    chosen = [find_effect(name)] if name else CATALOGUE
+    if out:
+        from pipeline.output import check_folder
+        from pipeline.report.effects import render_effects
+
+        with progress_line() as progress:
+            render_effects(chosen, check_folder(out), progress=progress)
+        say(f"wrote {out / 'effects.html'}")
+    if as_json:
+        typer.echo(json.dumps(catalogue_data(chosen), indent=1, ensure_ascii=False))
+    elif not out:
+        typer.echo(catalogue_text(chosen))
+
+
+@app.command()
+def schema(
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="results, gap or solution.")
+    ] = "results",
+) -> None:
+    """Print the JSON Schema of results.json, gap.json or solution.json."""
+    from pipeline.schemas.export import schema_text
+
+    typer.echo(schema_text(name), nl=False)

@@ -1,0 +1,170 @@
+"""Commands from raw data to a report: new, inspect, report, solution, gap."""
+
+import json
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from pipeline.cli.common import AsJson, Folder, app, progress_line, say
+from pipeline.errors import PipelineError
+
+if TYPE_CHECKING:
+    from pipeline.report.changes import DraftChanges
+    from pipeline.results import Analysis
+
+
+@app.command()
+def new(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="The folder to make.")],
+    carts: Annotated[int, typer.Option(min=1, max=4, help="How many carts the bench has.")] = 1,
+) -> None:
+    """Write a commented submission folder to fill in."""
+    from pipeline.submission import new_submission
+
+    new_submission(folder, carts=carts)
+    say(f"wrote {folder}: put your data files into {folder / 'data'} and fill in submission.toml")
+
+
+@app.command()
+def inspect(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE…", help="Data files.")],
+    as_json: AsJson = False,
+) -> None:
+    """Show what a data file holds: format, columns, rate, duration, kind, problems."""
+    from pipeline.ingest.inspect import format_inspection, inspect_file
+
+    inspections, unreadable = [], []
+    for file in files:  # one broken file does not hide the others
+        try:
+            inspections.append(inspect_file(file))
+        except PipelineError as error:
+            unreadable.append(str(error))
+    if as_json:
+        typer.echo(json.dumps([i.to_dict() for i in inspections], indent=1, ensure_ascii=False))
+    elif inspections:
+        typer.echo("\n\n".join(format_inspection(i) for i in inspections))
+    for message in unreadable:
+        say(f"cartlab: {message}")
+    if unreadable:
+        raise typer.Exit(2)
+
+
+@app.command()
+def report(
+    folder: Folder,
+    out: Annotated[Path | None, typer.Option(help="Where to write; default: DIR/report.")] = None,
+    pdf: Annotated[bool, typer.Option("--pdf/--no-pdf", help="Write the PDF too.")] = True,
+    compare: Annotated[
+        Path | None,
+        typer.Option(metavar="RESULTS", help="An earlier results.json: say what changed."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Identify the carts, design the controller, check the hardware, write the report."""
+    analysis = run_report(folder, out=out, pdf=pdf, compare=compare)
+    if as_json:
+        from pipeline.results_json import results_text
+
+        typer.echo(results_text(analysis), nl=False)
+    failed = [check for check in analysis.checks if check.outcome == "fail"]
+    if failed:
+        raise typer.Exit(1)
+
+
+def run_report(
+    folder: Path, *, out: Path | None, pdf: bool, compare: Path | None = None
+) -> "Analysis":
+    """Write the report of a submission and say in a few lines what it found."""
+    from pipeline.output import check_folder, own_folder, write_file
+    from pipeline.report.changes import changes_line
+    from pipeline.report.known_gap import with_gap
+    from pipeline.report.questions import open_line
+    from pipeline.report.render import render_report
+    from pipeline.report.summary import terminal_summary
+    from pipeline.results_json import results_text
+    from pipeline.submission import load_submission
+    from pipeline.workflow import analyse
+
+    submission = load_submission(folder)
+    out = check_folder(out) if out else own_folder(submission.folder, "report")
+    compared = _comparison(compare)
+    with progress_line() as progress:
+        analysis, gap = with_gap(analyse(submission, progress=progress), submission.folder)
+        changes = compared(analysis)
+        out.mkdir(parents=True, exist_ok=True)
+        write_file(out / "results.json", results_text(analysis))
+        render_report(analysis, out, gap=gap, changes=changes, pdf=pdf, progress=progress)
+    say(terminal_summary(analysis))
+    for line in (changes and changes_line(changes), open_line(analysis)):
+        if line:
+            say(line)
+    say(f"wrote {out / 'report.html'}" + (f" and {out / 'report.pdf'}" if pdf else ""))
+    return analysis
+
+
+def _comparison(earlier: Path | None) -> "Callable[[Analysis], DraftChanges | None]":
+    """Return what compares an analysis with an earlier draft, which is read at once."""
+    if earlier is None:
+        return lambda analysis: None
+    from pipeline.report.compare import compare_drafts, read_results
+
+    return partial(compare_drafts, read_results(earlier))
+
+
+@app.command()
+def solution(
+    folder: Folder,
+    out: Annotated[Path | None, typer.Option(help="Where to write; default: DIR/solution.")] = None,
+    pdf: Annotated[bool, typer.Option("--pdf/--no-pdf", help="Write the PDF too.")] = True,
+    as_json: AsJson = False,
+) -> None:
+    """Write the instructor's reference: derivations, numbers put in, what to expect."""
+    from pipeline.output import check_folder, own_folder, write_file
+    from pipeline.report.known_gap import with_gap
+    from pipeline.report.solution import render_solution, solution_text
+    from pipeline.submission import load_submission
+    from pipeline.workflow import analyse
+
+    submission = load_submission(folder)
+    out = check_folder(out) if out else own_folder(submission.folder, "solution")
+    with progress_line() as progress:
+        analysis, gap = with_gap(analyse(submission, progress=progress), submission.folder)
+        out.mkdir(parents=True, exist_ok=True)
+        write_file(out / "solution.json", text := solution_text(analysis))
+        render_solution(analysis, out, gap=gap, pdf=pdf, progress=progress)
+    say(f"wrote {out / 'solution.html'}" + (f" and {out / 'solution.pdf'}" if pdf else ""))
+    if as_json:
+        typer.echo(text, nl=False)
+
+
+@app.command()
+def gap(
+    folder: Folder,
+    out: Annotated[Path | None, typer.Option(help="Where to write; default: DIR/gap.")] = None,
+    pdf: Annotated[bool, typer.Option("--pdf/--no-pdf", help="Write the PDF too.")] = True,
+    as_json: AsJson = False,
+) -> None:
+    """Find what the linear model leaves out, name it, and show the gap shrink on held-out runs."""
+    from pipeline.gap.stored import gap_text
+    from pipeline.output import check_folder, own_folder, write_file
+    from pipeline.report.gap import render_gap
+    from pipeline.report.words_gap import terminal_verdict
+    from pipeline.submission import load_submission
+    from pipeline.workflow import analyse
+
+    submission = load_submission(folder)
+    out = check_folder(out) if out else own_folder(submission.folder, "gap")
+    with progress_line() as progress:
+        analysis = analyse(submission, progress=progress)
+        from pipeline.gap.investigate import investigate  # loads the compiled simulator
+
+        found = investigate(analysis, progress=progress)
+        out.mkdir(parents=True, exist_ok=True)
+        write_file(out / "gap.json", text := gap_text(found, analysis))
+        render_gap(found, analysis, out, pdf=pdf, progress=progress)
+    say(f"{terminal_verdict(found)}\nwrote {out / 'gap.html'}")
+    if as_json:
+        typer.echo(text, nl=False)
