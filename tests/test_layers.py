@@ -17,7 +17,7 @@ LEVELS = (
     ("workflow", "synthesis", "results_json"),
     ("gap",),
     ("report",),
-    ("grading",),
+    ("grading", "bench"),
     ("cli", "notebook"),
     ("__main__",),
 )
@@ -27,7 +27,8 @@ HOMES = {
     "typst": ("report",),
     "markdown_it": ("report",),
     "typer": ("cli",),
-    "rich": ("cli",),
+    "rich": ("cli", "bench"),
+    "serial": ("bench",),
     "control": ("plant", "stages"),
     "sqlalchemy": ("grading",),
     "pandas": ("ingest", "report", "grading"),

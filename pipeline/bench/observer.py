@@ -1,0 +1,74 @@
+"""Who watches a session at the bench: the terminal, a web page, a test."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from pipeline.bench.plan import Plan, Recording
+from pipeline.bench.protocol import Reading
+
+
+@dataclass(frozen=True, kw_only=True)
+class Anomalies:
+    """What went wrong on the line, in how many places.
+
+    Attributes
+    ----------
+    lost : lines that never came, by their time stamps.
+    garbled : lines that say nothing, or a merger of several.
+    late : lines that came in a lump, long after they were due.
+    resets : the bench's clock began again in mid-run.
+    stuck : encoders that did not move although the motor did.
+    """
+
+    lost: int = 0
+    garbled: int = 0
+    late: int = 0
+    resets: int = 0
+    stuck: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """How one recording ended.
+
+    Attributes
+    ----------
+    lines : valid lines kept.
+    partial : why it ended early; "": it did not.
+    remarks : what a person should know, a sentence each.
+    """
+
+    recording: Recording
+    lines: int
+    anomalies: Anomalies = Anomalies()
+    partial: str = ""
+    remarks: tuple[str, ...] = field(default=())
+
+
+class Observer(Protocol):
+    """What acquisition tells while it goes on; every call returns at once but `confirm`."""
+
+    def planned(self, plan: Plan, done: frozenset[str]) -> None:
+        """Tell what will be recorded, and the ids of what already is."""
+        ...
+
+    def confirm(self, instruction: str) -> None:
+        """Have a person do something at the bench, and wait until it is done."""
+        ...
+
+    def settling(self, recording: Recording, seconds: float) -> None:
+        """Tell that the carts come to rest first."""
+        ...
+
+    def started(self, recording: Recording) -> None:
+        """Tell that the bench streams."""
+        ...
+
+    def readings(self, batch: Sequence[Reading], anomalies: Anomalies) -> None:
+        """Hand on the lines that came, in order; `anomalies` are those of this run so far."""
+        ...
+
+    def finished(self, outcome: Outcome) -> None:
+        """Tell how the run ended."""
+        ...

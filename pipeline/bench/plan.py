@@ -1,0 +1,98 @@
+"""The plan of a session at the bench: what to record, and within which limits.
+
+It stands in `plan.toml` in the submission folder. `cartlab plan` proposes it, a person may change
+it, `cartlab acquire` carries it out.
+"""
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Limits(_Model):
+    """What no run may pass.
+
+    Attributes
+    ----------
+    input : largest input, input units.
+    travel : furthest a cart may be from where it was zeroed, position units.
+    """
+
+    input: Positive
+    travel: Positive
+
+
+class PidLoop(_Model):
+    """The bench's own PID on one cart: duty counts of e in encoder counts."""
+
+    type: Literal["pid"] = "pid"
+    kp: Finite
+    ki: Finite = 0.0
+    kd: Finite = 0.0
+    cart: Literal[1, 2] = 1
+
+
+class StateLoop(_Model):
+    """State feedback, in the submission's units; () and None: what the design finds."""
+
+    type: Literal["state_feedback"] = "state_feedback"
+    gains: tuple[Finite, ...] = ()
+    prefilter: Finite | None = None
+    cart: int = 1
+
+
+class Recording(_Model):
+    """One experiment to record.
+
+    Attributes
+    ----------
+    id : the experiment's in submission.toml; its files are named after it.
+    carts : free to move; the others are held.
+    wave : of the input, or in closed loop of the reference.
+    amplitude : input units, in closed loop position units; 0: a decay that a hand starts.
+    frequency : Hz, of the wave; a chirp starts there.
+    frequency_end : Hz, where a chirp ends.
+    cycles : periods; the run takes cycles/frequency seconds.
+    release : the cart that is pulled out and let go by hand; None: no hand.
+    controller : closes the loop.
+    settle : s of rest beforehand.
+    """
+
+    id: str
+    kind: Literal["decay", "step", "sine", "sweep", "closed_loop"]
+    carts: tuple[int, ...]
+    wave: Literal["delta", "square", "sine", "triangle", "sawtooth", "chirp"]
+    amplitude: Finite
+    frequency: Positive
+    frequency_end: Positive | None = None
+    cycles: Annotated[int, Field(ge=1)] = 1
+    release: int | None = None
+    controller: Annotated[PidLoop | StateLoop, Field(discriminator="type")] | None = None
+    settle: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 3.0
+    note: str = ""
+
+    @property
+    def duration(self) -> float:
+        """How long the run takes, s."""
+        return self.cycles / self.frequency
+
+
+class Plan(_Model):
+    """Everything to record, in order.
+
+    Attributes
+    ----------
+    baud : of the serial line.
+    """
+
+    version: Literal[1] = 1
+    baud: Annotated[int, Field(ge=300)] = 115_200
+    limits: Limits
+    recordings: tuple[Recording, ...] = ()
