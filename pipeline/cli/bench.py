@@ -1,1 +1,0 @@
-"""Commands of the bench: plan, acquire, emulate."""
