@@ -15,13 +15,13 @@ from pipeline.plant.chain import (
     quadratic_factors,
     recover_from_parameters,
 )
+from pipeline.plant.dwells import dwell_frequencies
 from pipeline.plant.simulate import simulate_linear
 from pipeline.resources import EXAMPLES
 from pipeline.submission import load_submission
 from pipeline.synthesis import COUNT, SAMPLE_TIME, write_submission
 from pipeline.synthesis.bench import Bench, Hand, Run
 from pipeline.synthesis.examples import CATALOGUE, write_examples
-from pipeline.synthesis.runs import dwell_frequencies
 
 PRESET_NAMES = list(PRESETS)
 NOISE = 0.2 * COUNT

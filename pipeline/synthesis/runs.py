@@ -4,8 +4,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.errors import DataError
 from pipeline.plant.chain import Array, Chain, quadratic_factors
+from pipeline.plant.dwells import (
+    SETTLED,
+    SETTLED_DWELL,
+    dwell_frequencies,
+    reach,
+    settling_wait,
+    steady_time,
+)
 from pipeline.plant.loop import StateFeedback
 from pipeline.plant.simulate import simulate_linear
 from pipeline.synthesis.bench import Hand, Run
@@ -14,13 +21,8 @@ INPUT_DECIMALS = 5  # the input is set in steps of 10 µV, so the log holds what
 FIGURE_FREQUENCY = 4.0  # Hz: the dwell of the paper's Figures 12-14
 
 _LETTERS = "abcdefgh"
-_SETTLED = 7.0  # time constants: a transient of 1 cm is down to half a count
-_SETTLED_DWELL = 9.0  # … to a tenth: at a resonance it hides in the amplitude
-_SETTLED_BEFOREHAND = 11.0  # nothing is left of it where the recorder starts late
-_LONGEST_WAIT = 12.0  # s; no student waits longer, however little damping there is
+_SETTLED_BEFOREHAND = 11.0  # time constants; nothing is left where the recorder starts late
 _LONGEST_DECAY = 8.0  # s
-_CYCLES = 6.5  # of steady state in a dwell: room to see that six do not change any more
-_SHORTEST_DWELL = 1.4  # s of it, at high frequencies
 _WHOLE_EVERY = 10  # a session that saves space records one dwell in so many from rest
 _REST = 0.5  # s of rest before a step and before a closed loop's
 
@@ -89,7 +91,7 @@ def decays(chain: Chain, session: Session, rng: np.random.Generator) -> list[Run
 
 def steps(chain: Chain, session: Session) -> list[Run]:
     """Step the input on and off again: a small size, and a larger one to the other side."""
-    wait = _wait(chain, _SETTLED)
+    wait = settling_wait(chain, time_constants=SETTLED)
     t = session.clock(_REST + 2 * wait)
     on = (t >= _REST) & (t < _REST + wait)
     # Underdamped carts overshoot to nearly twice their final position.
@@ -111,15 +113,16 @@ def steps(chain: Chain, session: Session) -> list[Run]:
 def dwells(chain: Chain, session: Session) -> list[Run]:
     """Dwell on one frequency after another, each with the input that moves the carts well."""
     runs = []
-    for number, hertz in enumerate(dwell_frequencies(chain, n=session.n_dwells), start=1):
+    frequencies = dwell_frequencies(chain, n=session.n_dwells, among=[FIGURE_FREQUENCY])
+    for number, hertz in enumerate(frequencies, start=1):
         whole = session.transients or hertz == FIGURE_FREQUENCY or number % _WHOLE_EVERY == 0
-        wait = _wait(chain, _SETTLED_DWELL if whole else _SETTLED_BEFOREHAND)
-        t = session.clock(wait + max(_CYCLES / hertz, _SHORTEST_DWELL))
+        settled = SETTLED_DWELL if whole else _SETTLED_BEFOREHAND
+        wait = settling_wait(chain, time_constants=settled)
+        t = session.clock(wait + steady_time(hertz))
         shape = np.sin(2 * np.pi * hertz * t)
-        unit = np.abs(simulate_linear(chain, t, shape))
-        steady, furthest = float(np.max(unit[:, t >= wait])), float(np.max(unit))
+        unit = reach(chain, t, shape=shape, wait=wait)
         # Far above the resonances the carts swing out at first, then hardly move.
-        amplitude = _typed(session.travel * min(0.8 / steady, 1.5 / furthest), session)
+        amplitude = _typed(session.travel * min(0.8 / unit.steady, 1.5 / unit.furthest), session)
         runs.append(
             Run(
                 id=f"sine-{number:02d}",
@@ -133,28 +136,6 @@ def dwells(chain: Chain, session: Session) -> list[Run]:
             )
         )
     return runs
-
-
-def dwell_frequencies(chain: Chain, *, n: int) -> list[float]:
-    """Return about `n` frequencies in Hz, ascending: closer at resonances and nulls.
-
-    Half the number is spread evenly over the range, as a first look would; the rest brackets each
-    feature: on it and half a bandwidth to each side. 4 Hz is always among them.
-    """
-    features = [quadratic_factors(chain.poles)]
-    features += [quadratic_factors(chain.zeros(cart)) for cart in range(1, chain.n)]
-    resonances = features[0][0]
-    omega = np.concatenate([f[0] for f in features])
-    zeta = np.clip(np.concatenate([f[1] for f in features]), 0.03, 0.3)
-    sides = np.linspace(-1.0, 1.0, max(3, round(0.5 * n / omega.size)))
-    close = (omega[:, None] * (1 + zeta[:, None] * sides)).ravel()
-    spread = np.geomspace(0.7 * resonances[0], 1.5 * resonances[-1], max(n - close.size, n // 2))
-    hertz = [FIGURE_FREQUENCY]
-    for candidate in [*close, *spread]:
-        f = round(float(candidate) / (2 * np.pi), 2)  # as one types it
-        if all(abs(f - other) > 0.015 * other for other in hertz):
-            hertz.append(f)
-    return sorted(hertz)
 
 
 def sweep(chain: Chain, session: Session) -> Run:
@@ -202,14 +183,6 @@ def closed_loop(
 
 def _all(chain: Chain) -> tuple[int, ...]:
     return tuple(range(1, chain.n + 1))
-
-
-def _wait(chain: Chain, time_constants: float) -> float:
-    """Return how long a student waits for the transient, s."""
-    slowest = float(np.min(-chain.poles.real))
-    if slowest <= 1e-9 * np.abs(chain.poles).max():  # zero but for rounding
-        raise DataError("the carts never settle: a session needs damping and a spring to a wall")
-    return min(time_constants / slowest, _LONGEST_WAIT)
 
 
 def _typed(value: float, session: Session) -> float:

@@ -1,0 +1,72 @@
+"""Sine dwells on a chain: at which frequencies, how long the transient lasts, how far they go."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.errors import DataError
+from pipeline.plant.chain import Array, Chain, quadratic_factors
+from pipeline.plant.simulate import simulate_linear
+
+SETTLED = 7.0  # time constants: a transient of 1 cm is down to half a count
+SETTLED_DWELL = 9.0  # … to a tenth of one: at a resonance it hides in the amplitude
+
+_LONGEST_WAIT = 12.0  # s; no student waits longer, however little damping there is
+_CYCLES = 6.5  # of steady state in a dwell: room to see that six do not change any more
+_SHORTEST_DWELL = 1.4  # s of it, at high frequencies
+
+
+def dwell_frequencies(chain: Chain, *, n: int, among: Sequence[float] = ()) -> list[float]:
+    """Return about `n` frequencies in Hz, ascending: closer at resonances and nulls.
+
+    Half the number is spread evenly over the range, as a first look would; the rest brackets each
+    feature: on it and half a bandwidth to each side. Those of `among` are always there.
+    """
+    features = [quadratic_factors(chain.poles)]
+    features += [quadratic_factors(chain.zeros(cart)) for cart in range(1, chain.n)]
+    resonances = features[0][0]
+    omega = np.concatenate([f[0] for f in features])
+    zeta = np.clip(np.concatenate([f[1] for f in features]), 0.03, 0.3)
+    sides = np.linspace(-1.0, 1.0, max(3, round(0.5 * n / omega.size)))
+    close = (omega[:, None] * (1 + zeta[:, None] * sides)).ravel()
+    spread = np.geomspace(0.7 * resonances[0], 1.5 * resonances[-1], max(n - close.size, n // 2))
+    hertz = list(among)
+    for candidate in [*close, *spread]:
+        f = round(float(candidate) / (2 * np.pi), 2)  # as one types it
+        if all(abs(f - other) > 0.015 * other for other in hertz):
+            hertz.append(f)
+    return sorted(hertz)
+
+
+def settling_wait(chain: Chain, *, time_constants: float) -> float:
+    """Return how long a student waits for the transient, s."""
+    slowest = float(np.min(-chain.poles.real))
+    if slowest <= 1e-9 * np.abs(chain.poles).max():  # zero but for rounding
+        raise DataError("the carts never settle: a session needs damping and a spring to a wall")
+    return min(time_constants / slowest, _LONGEST_WAIT)
+
+
+def steady_time(hertz: float) -> float:
+    """Return how long a dwell goes on once the transient is over, s."""
+    return max(_CYCLES / hertz, _SHORTEST_DWELL)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reach:
+    """How far an input of size one moves any cart, in position units.
+
+    Attributes
+    ----------
+    steady : once the transient is over.
+    furthest : at any time.
+    """
+
+    steady: float
+    furthest: float
+
+
+def reach(chain: Chain, t: Array, *, shape: Array, wait: float) -> Reach:
+    """Move the carts from rest by an input of `shape` (n,); its transient lasts `wait` s."""
+    unit = np.abs(simulate_linear(chain, t, shape))
+    return Reach(steady=float(np.max(unit[:, t >= wait])), furthest=float(np.max(unit)))
