@@ -1,7 +1,8 @@
 """One run: its own unknowns, its readings under a model, and its share of a step.
 
-A run's own unknowns are the carts' start (and restart) states, the encoders' zeros, and a factor
-on the dry friction of each cart, which varies from run to run. They enter the residual almost
+A run's own unknowns are the carts' start (and restart) states, those of hidden masses where the
+carts already move, the encoders' zeros, and a factor on the dry friction of each cart, which varies
+from run to run. They enter the residual almost
 linearly, so a QR factorisation of each run leaves a small problem in the shared parameters.
 All derivatives are differences, simulated in one batch per run.
 
@@ -22,7 +23,10 @@ _LOCAL_STEP = 1e-3  # of the run's swing, for derivatives with respect to start 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Locals:
-    """What belongs to one run: start states (shots, n), zeros (n,), friction factors (n,)."""
+    """What belongs to one run: start states (shots, 2 n), zeros (n,), friction factors (n,).
+
+    The start states are those of the carts, then those of their hidden masses relative to them.
+    """
 
     x0: Array
     v0: Array
@@ -34,9 +38,10 @@ def fresh_locals(run: Run) -> Locals:
     """Return a run's unknowns where they are expected."""
     n = run.zero.size
     free = np.array(run.free)
+    hidden = np.zeros((len(run.shots) - 1, n))
     return Locals(
-        x0=np.where(free, run.shot_x - run.zero, 0.0),
-        v0=np.where(free, run.shot_v, 0.0),
+        x0=np.hstack([np.where(free, run.shot_x - run.zero, 0.0), hidden]),
+        v0=np.hstack([np.where(free, run.shot_v, 0.0), hidden]),
         zero=np.where(free, run.zero, 0.0),
         scatter=np.ones(n),
     )
@@ -78,7 +83,7 @@ class Linear:
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """Which local unknowns a run has: cart indices of each kind."""
+    """Which local unknowns a run has: cart indices of each kind, n more for a hidden mass."""
 
     x0: tuple[int, ...]
     v0: tuple[int, ...]
@@ -91,9 +96,10 @@ def _layout(structure: Structure, run: Run, *, scatter_free: bool) -> Layout:
     free = tuple(i for i, moves in enumerate(run.free) if moves)
     multiple = len(run.shots) > 2
     dry = structure.dry if scatter_free else (False,) * structure.n
+    moving = () if run.at_rest else tuple(structure.n + i for i in structure.hidden if i in free)
     return Layout(
-        x0=free,
-        v0=free if multiple or not run.at_rest else (),
+        x0=free + moving,
+        v0=free + moving if multiple or not run.at_rest else (),
         zero=run.rows if any(structure.springs) else (),
         scatter=tuple(i for i in free if dry[i]),
         first_v0=not run.at_rest,
@@ -154,6 +160,7 @@ def linearise(
     size = np.array([max(1e-9, s) for s in run.swing])
     by_cart = np.full(n, size.max())
     by_cart[list(run.rows)] = size
+    by_cart = np.tile(by_cart, 2)
     lanes_x, lanes_v, lanes_g = len(layout.x0), len(layout.v0), len(layout.scatter)
     b = 1 + P + lanes_x + lanes_v + lanes_g
     thetas = np.repeat(theta[None], b, axis=0)
@@ -164,7 +171,7 @@ def linearise(
     divisors = [*steps]
     lane = P + 1
     rate = np.sqrt(np.diag(structure.chain(theta).stiffness) / np.exp(theta[:n]))
-    rate = np.maximum(rate, 1.0)
+    rate = np.tile(np.maximum(rate, 1.0), 2)
     for i in layout.x0:
         divisors.append(_LOCAL_STEP * by_cart[i])
         x0[lane, :, i] += divisors[-1]

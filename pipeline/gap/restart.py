@@ -35,7 +35,7 @@ def restart_runs(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
         for shift, factor in _RESTARTS:
             move = np.where(free, shift * band, 0.0)
             start = Locals(
-                x0=own.x0 - move if run.at_rest else own.x0,
+                x0=own.x0 - np.append(move, np.zeros(move.size)) if run.at_rest else own.x0,
                 v0=own.v0,
                 zero=np.where(free, run.zero, 0.0) + move,
                 scatter=np.where(rest & free, factor, 1.0),

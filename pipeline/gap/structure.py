@@ -69,6 +69,11 @@ class Structure:
         places |= {c.place for c in self.effects if c.effect.key == "load_friction"}
         return tuple(i + 1 in places for i in range(self.n))
 
+    @property
+    def hidden(self) -> tuple[int, ...]:
+        """Indices of the carts that carry a hidden mass."""
+        return tuple(sorted(c.place - 1 for c in self.effects if c.effect.key == "extra_mode"))
+
     def span(self, index: int) -> slice:
         """Return where the parameters of an effect stand in the vector."""
         start = self.base_size + sum(len(c.effect.parameters) for c in self.effects[:index])

@@ -477,6 +477,11 @@ def _simulate(cart, spring, drive, x0, v0, scatter, free, t, knots, command, sta
                         s[V, j] += v0[shot, i] - s[V, i]
                 s[X, i], s[V, i] = x0[shot, i], v0[shot, i]
                 s[ACC, i] = 0.0
+        if shot == 0 and x0.shape[1] > n:
+            for j in range(n, N):
+                if j != motor:
+                    s[X, j] += x0[shot, n + parent[j]]
+                    s[V, j] += v0[shot, n + parent[j]]
         for e in range(switches.size):
             # The state is new: a contact may be open or closed from the start.
             if _guard(switches[e], active[e], cart, spring, drive, n, motor, s, 0.0) > 0.0:
@@ -551,7 +556,9 @@ def simulate_batch(cart, spring, drive, x0, v0, scatter, free, t, knots, command
     Parameters
     ----------
     cart, spring, drive : (b, n, 17), (b, n + 1, 5), (b, 9) tables, see `Cart`, `Spring`, `Drive`.
-    x0, v0 : (b, shots, n) positions and velocities of the carts at the start of each shot.
+    x0, v0 : (b, shots, n) positions and velocities of the carts at the start of each shot; or
+        (b, shots, 2 n), where those of their hidden masses relative to them follow, which the
+        first shot takes and the later ones carry over.
     scatter : (b, n) factor on all dry friction of a cart.
     free : (n,) which carts move.
     t : (samples,) times; knots (k,), command (k,): the input, held from knot to knot.
