@@ -5,7 +5,8 @@ first letter tells which follow. The stock bench knows `d`, `g` and `z`; one tha
 which others it knows.
 """
 
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, TypeAlias
@@ -18,14 +19,27 @@ WATCHDOG = 0.1  # s after the last heartbeat the motor is cut
 PULSE = 0.05  # s a delta wave is on
 NOMINAL_PERIOD = 1e-3  # s from line to line
 CHIRP_SPAN = 20.0  # a chirp ends at so many times the frequency it starts at, unless told
-_LONGEST_FIELD = 32  # characters; longer is noise without a semicolon
+EXTENSIONS = frozenset("cfhks")  # the commands, `?` aside, that the stock bench does not know
+
+# What firmware can hold in 32 bits, and no bench needs more.
+_LONGEST_FIELD = 32  # characters
+_LARGEST_NUMBER = 1e9
+_LARGEST_AMPLITUDE = 1_000_000
+_MOST_CYCLES = 1_000_000
+_FREQUENCIES = (1e-3, 1e3)  # Hz
+_LONGEST_COUNT = 10  # digits of a field of a line
+
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+_WHOLE = re.compile(r"[+-]?\d+", re.ASCII)
+_LINE = re.compile(rf"(?:-?\d{{1,{_LONGEST_COUNT}}}:){{4,5}}\d{{1,{_LONGEST_COUNT}}}", re.ASCII)
 
 
 class Wave(StrEnum):
-    """The shape of the target over one period 1/FREQ; it starts at zero.
+    """The shape of the target over one period 1/FREQ.
 
-    delta is a short pulse; square is zero for half a period, then the amplitude; triangle and
-    sawtooth swing to both sides; chirp sweeps once, logarithmically, over the whole run.
+    delta is a short pulse as the period begins; square is zero for half a period, then the
+    amplitude; sine, triangle and sawtooth start at zero and swing to both sides; chirp sweeps
+    once, logarithmically, over the whole run. `pipeline.bench.waves` has the formulas.
     """
 
     DELTA = "d"
@@ -132,7 +146,8 @@ def encode(command: Command) -> bytes:
         case Hands(held=held, released=released):
             fields = ["h", str(sum(1 << (cart - 1) for cart in held)), str(released)]
         case Signal():
-            fields = [command.value]
+            # The empty field ends whatever a lost byte left open; stock benches know no stop.
+            fields = ["", "s"] if command is Signal.STOP else [command.value]
     return "".join(f"{field};" for field in fields).encode("ascii")
 
 
@@ -143,12 +158,20 @@ def _number(value: float) -> str:
 class CommandReader:
     """Cuts what arrives at a bench into commands; what is none is counted and dropped.
 
-    A field that cannot stand where it stands ends the command before it and may begin another, so
-    a lost byte never swallows the stop that follows.
+    A field that cannot stand where it stands ends the command before it and may begin another. If
+    it ends in the letter of a stop or a reset it is that, whatever noise comes before; so is an
+    `s` that seemed to be the wave of a start that then breaks off. So a lost byte never swallows
+    the stop that follows.
+
+    Parameters
+    ----------
+    encoders : of the bench; state feedback has two gains for each.
+    extensions : the letters it knows beyond the stock bench's; none: no query either.
     """
 
-    def __init__(self, *, encoders: int) -> None:
-        self._kinds = _field_kinds(encoders)
+    def __init__(self, *, encoders: int, extensions: Collection[str] = EXTENSIONS) -> None:
+        self._kinds = _field_kinds(encoders, extensions)
+        self._halts = tuple({Signal.STOP.value, Signal.RESET.value} & self._kinds.keys())
         self._rest = ""
         self._letter = ""
         self._values: list[str | float] = []
@@ -156,31 +179,39 @@ class CommandReader:
 
     def feed(self, data: bytes) -> list[Command]:
         """Return the commands that are now complete, in order."""
-        *whole, self._rest = (self._rest + data.decode("ascii", "replace")).split(";")
-        if len(self._rest) > _LONGEST_FIELD:
-            self._rest = ""
-            self.rejected += 1
-        return [command for field in whole if (command := self._take(field.strip()))]
+        *whole, rest = (self._rest + data.decode("latin-1")).split(";")
+        self._rest = rest[-_LONGEST_FIELD - 1 :]  # what is longer stays too long
+        return [command for field in whole for command in self._take(field.strip(" \t\r\n"))]
 
-    def _take(self, field: str) -> Command | None:
+    def _take(self, field: str) -> list[Command]:
+        broken_off: list[Command] = []
         if self._letter:
             try:
                 self._values.append(self._kinds[self._letter][len(self._values)](field))
             except ValueError:
-                self.rejected += 1
-                self._letter = ""
+                broken_off = self._break_off()
         if not self._letter:
-            if field not in self._kinds:
-                self.rejected += 1
-                return None
-            self._letter, self._values = field, []
+            letter = field if field in self._kinds else field[-1:]
+            if letter != field and letter not in self._halts:
+                self.rejected += bool(field)
+                return broken_off
+            self._letter, self._values = letter, []
         if len(self._values) < len(self._kinds[self._letter]):
-            return None
+            return broken_off
         letter, self._letter = self._letter, ""
-        return _command(letter, self._values)
+        return [*broken_off, _command(letter, self._values)]
+
+    def _break_off(self) -> list[Command]:
+        self.rejected += 1
+        self._letter = ""
+        misread = Signal.STOP.value in self._halts and self._values == [Wave.SINE]
+        return [Signal.STOP] if misread else []
 
 
-def _one_of(letters: str) -> Callable[[str], str]:
+_Reader: TypeAlias = Callable[[str], str | float]
+
+
+def _one_of(letters: str) -> _Reader:
     def read(field: str) -> str:
         if len(field) != 1 or field not in letters:
             raise ValueError(field)
@@ -189,37 +220,43 @@ def _one_of(letters: str) -> Callable[[str], str]:
     return read
 
 
-def _finite(field: str) -> float:
-    value = float(field)
-    if not abs(value) < float("inf"):  # no NaN either
-        raise ValueError(field)
-    return value
+def _number_within(lowest: float, highest: float, form: re.Pattern[str] = _NUMBER) -> _Reader:
+    def read(field: str) -> float:
+        if len(field) > _LONGEST_FIELD or not form.fullmatch(field):
+            raise ValueError(field)
+        value = int(field) if form is _WHOLE else float(field)
+        if not lowest <= value <= highest:
+            raise ValueError(field)
+        return value
+
+    return read
 
 
-def _positive(field: str) -> float:
-    value = _finite(field)
-    if value <= 0:
-        raise ValueError(field)
-    return value
+def _whole_within(lowest: int, highest: int) -> _Reader:
+    return _number_within(lowest, highest, _WHOLE)
 
 
-def _count(field: str) -> int:
-    value = int(field)
-    if value < 1:
-        raise ValueError(field)
-    return value
-
-
-def _field_kinds(encoders: int) -> Mapping[str, tuple[Callable[[str], str | float], ...]]:
-    """Return what follows each letter; state feedback has two gains an encoder."""
-    return {
-        "d": (_one_of("".join(Wave)), _one_of("oc"), _one_of("ot"), _positive, int, _count),
-        "g": (_finite,) * 3,
-        "f": (_finite,) * (2 * encoders + 1),
-        "c": (_positive,),
-        "h": (int, int),
-        **dict.fromkeys(Signal, ()),
+def _field_kinds(encoders: int, extensions: Collection[str]) -> Mapping[str, tuple[_Reader, ...]]:
+    """Return what follows each letter."""
+    waves = "".join(wave for wave in Wave if wave != Wave.CHIRP or "c" in extensions)
+    frequency = _number_within(*_FREQUENCIES)
+    gain = _number_within(-_LARGEST_NUMBER, _LARGEST_NUMBER)
+    amplitude = _whole_within(-_LARGEST_AMPLITUDE, _LARGEST_AMPLITUDE)
+    cycles = _whole_within(1, _MOST_CYCLES)
+    stock = {
+        "d": (_one_of(waves), _one_of("oc"), _one_of("ot"), frequency, amplitude, cycles),
+        "g": (gain,) * 3,
+        "z": (),
     }
+    further: dict[str, tuple[_Reader, ...]] = {
+        "f": (gain,) * (2 * encoders + 1),
+        "c": (frequency,),
+        "h": (_whole_within(0, 2**encoders - 1), _whole_within(0, encoders)),
+        "s": (),
+        "k": (),
+    }
+    known = {letter: kinds for letter, kinds in further.items() if letter in extensions}
+    return {**stock, **known, **({"?": ()} if known else {})}
 
 
 def _command(letter: str, values: list[Any]) -> Command:
@@ -270,12 +307,10 @@ def format_reading(reading: Reading) -> bytes:
 
 def parse_reading(line: bytes) -> Reading | None:
     """Return what a line says, its end stripped or not; None: it is no line of the stream."""
-    try:
-        *counts, target, duty, ms = map(int, line.decode("ascii").split(":"))
-    except ValueError:  # of letters, of a missing field, of bytes that are no ASCII
+    text = line.decode("latin-1").rstrip("\r\n")
+    if not _LINE.fullmatch(text):
         return None
-    if len(counts) not in (2, 3) or ms < 0:
-        return None
+    *counts, target, duty, ms = map(int, text.split(":"))
     return Reading(counts=tuple(counts), target=target, duty=duty, ms=ms)
 
 
