@@ -169,9 +169,14 @@ def _one_off(student: Student, table: str) -> Submission:
     known = [n for n in student.reported().final if not n.startswith("zeta")]
     if table == "initial":
         known = [*student.numbers("K"), *student.numbers("omega")]
-    name = str(student.rng.choice(known))
-    factor = student.rng.uniform(1.15, 1.45) ** float(student.rng.choice([-1, 1]))
-    return scaled(student, [name], factor, [table])
+    while True:
+        name = str(student.rng.choice(known))
+        factor = student.rng.uniform(1.15, 1.45) ** float(student.rng.choice([-1, 1]))
+        numbers = {**getattr(student.reported(), table)}
+        numbers[name] = typed(factor * float(numbers[name]))
+        gains = [numbers[other] for other in student.numbers("K")]
+        if gains == sorted(gains, reverse=True):  # else it is an impossible one
+            return change(student, **{table: {name: float(numbers[name])}})
 
 
 def final_off(student: Student) -> Submission:

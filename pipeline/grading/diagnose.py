@@ -1,6 +1,7 @@
 """Name the mistake behind a wrong number, where one reproduces it and the others do not."""
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from typing import Literal
@@ -26,7 +27,8 @@ _OFF_DAMPING = 80.0
 _SUSPECT_DAMPING = 40.0  # enough to look for a known mistake, not for a remark of its own
 _OFF_EACH_OTHER = 25.0
 _SIGMAS = 3.0
-# Of two explanations the other is out where it is this much further off, as share of what it may.
+# Of two explanations the other is out where it is this much further off, as share of what it may;
+# or ten times less likely to meet the numbers by chance, as it says less about them.
 _MARGIN = 0.35
 
 # What comes of reading a decay or a step; in a final table only where it was taken over.
@@ -73,18 +75,29 @@ def diagnose_tables(reported: Reported, *, references: References, analysis: Ana
             if name in known and name not in taken
         }
         suspect = [n for n, e in errors.items() if e > min(limit(n, label), _SUSPECT_DAMPING)]
+        laws = broken_orders(table, initial=label == "initial")
+        # Friction may leave room for either of two gains, and not for their order.
+        unordered = {
+            name
+            for law in laws
+            if law.is_of_gains and not set(law.names).isdisjoint(suspect)
+            for name in law.names
+            if name in errors
+        }
         mistakes = known_mistakes(known, analysis)
         if label == "final":
             mistakes = [m for m in mistakes if _may_be_final(m, reported)]
             if len(suspect) >= min(2, analysis.carts):
                 mistakes += transient_fits(analysis, table, known)
-        found, rest = explain(table, off=suspect, mistakes=mistakes, label=label)
-        explained += found
+        off = [name for name in errors if name in suspect or name in unordered]
+        found, rest = explain(table, off=off, mistakes=mistakes, label=label)
+        explained += [one for one in found if not set(one.names).isdisjoint(suspect)]
         rest = [name for name in rest if errors[name] > limit(name, label)]
         broken = [
             law
-            for law in broken_orders(table, initial=label == "initial")
-            if set(law.names) & set(rest) or not known
+            for law in laws
+            if not known
+            or (set(law.names) & set(rest) and (law.is_plain or set(law.names) <= set(rest)))
         ]
         for law in broken:
             flags.append(law.flag(table, label))
@@ -159,14 +172,14 @@ def explain(
         covers = [cover for cover in covers if cover.distances]
         if not covers:
             break
-        best = min(covers, key=lambda c: (-len(c.distances), len(c.codes), c.distance))
+        best = min(covers, key=lambda c: (-len(c.distances), len(c.codes), c.cost(c.distances)))
         rivals = [
             cover
             for cover in covers
             if not best.codes <= cover.codes
             and len(cover.codes) <= len(best.codes)
             and best.distances.keys() <= cover.distances.keys()
-            and cover.distance < best.distance + _MARGIN
+            and cover.cost(best.distances) < best.cost(best.distances) + _MARGIN
         ]
         if rivals:
             left += best.distances
@@ -183,15 +196,23 @@ def explain(
 
 @dataclass(frozen=True, kw_only=True)
 class _Cover:
-    """What some codes explain: each number by the mistake that comes nearest to it."""
+    """What some codes explain: each number by the mistake that comes nearest to it.
+
+    Attributes
+    ----------
+    distances : how far each number is off what is predicted, as share of what it may be.
+    widths : the room that is left for each, relative: how much of all numbers would have been met.
+    """
 
     codes: frozenset[Code]
     fits: tuple[tuple[Mistake, list[str]], ...]
     distances: dict[str, float]
+    widths: dict[str, float]
 
-    @property
-    def distance(self) -> float:
-        return sum(self.distances.values()) / len(self.distances)
+    def cost(self, names: Collection[str]) -> float:
+        """Return how badly some of the numbers are explained; tenfold the room is the margin."""
+        distance = sum(self.distances[name] for name in names) / len(names)
+        return distance + _MARGIN * sum(math.log10(self.widths[name]) for name in names)
 
 
 def _cover(
@@ -200,18 +221,20 @@ def _cover(
     """Explain what these codes can, with mistakes that explain more numbers first."""
     fits: list[tuple[Mistake, list[str]]] = []
     distances: dict[str, float] = {}
+    widths: dict[str, float] = {}
     usable = [m for m in mistakes if codes.issuperset(m.codes)]
     while True:
         open_ = [name for name in remaining if name not in distances]
         tried = [(m, names) for m in usable if (names := _explains(m, table, open_))]
         if not tried:
-            return _Cover(codes=codes, fits=tuple(fits), distances=distances)
+            return _Cover(codes=codes, fits=tuple(fits), distances=distances, widths=widths)
         mistake, names = min(
             tried,
             key=lambda fit: (-len(fit[1]), len(fit[0].codes), _distance(fit[0], table, fit[1])),
         )
         fits.append((mistake, names))
         distances |= {name: _off_by(mistake, table, name) for name in names}
+        widths |= {name: _width(mistake, name) for name in names}
 
 
 def _explains(mistake: Mistake, table: Table, remaining: Sequence[str]) -> list[str]:
@@ -229,6 +252,12 @@ def _off_by(mistake: Mistake, table: Table, name: str) -> float:
     """Return how far a number is off what a mistake predicts, as share of what it may be."""
     error = percent_off(table[name], mistake.predicted[name], sigmas=_SIGMAS)
     return float(error) / (100 * mistake.tolerance)
+
+
+def _width(mistake: Mistake, name: str) -> float:
+    """Return how wide a range of numbers a mistake explains: the logarithm of high over low."""
+    predicted, share = mistake.predicted[name], 1 / len(mistake.predicted)
+    return (math.log(predicted.high / predicted.low) + 2 * mistake.tolerance) * mistake.tries**share
 
 
 def _distance(mistake: Mistake, table: Table, names: Sequence[str]) -> float:

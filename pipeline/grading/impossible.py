@@ -28,6 +28,19 @@ class BrokenOrder:
         """Both parameters."""
         return self.lesser, self.greater
 
+    @property
+    def is_of_gains(self) -> bool:
+        """Whether it is about how far carts are moved by a constant input."""
+        return self.lesser.startswith("K")
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether everybody sees it: of gains or resonances; nulls and single carts need thought.
+
+        There the recordings' own value of the one number that is off is the better help.
+        """
+        return self.is_of_gains or {self.lesser[-1], self.greater[-1]} <= set("abcdefgh")
+
     def flag(self, table: Mapping[str, Decimal], label: str) -> Flag:
         """Return the flag for it."""
         low, high = table[self.lesser], table[self.greater]

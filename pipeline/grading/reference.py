@@ -9,6 +9,7 @@ from pipeline.stages.compare import CHI_SQUARE_LIMIT
 
 # A fitted frequency or gain that far from the measured one: the fit has gone astray; factors.
 _ASTRAY, _ASTRAY_GAIN = 1.3, 1.6
+_SIGMAS = 3.0
 # A resonance or null read off the dwells, and where friction blurs even those: factors.
 _BY_EYE, _BY_EYE_ASTRAY = 1.1, 1.6
 
@@ -73,7 +74,7 @@ def trusted_chain(analysis: Analysis) -> Chain | None:
     """Return the fitted chain; None where dry friction or worse has led the fit astray.
 
     A fit that does not explain the data must at least find the frequencies and gains that were
-    measured without it.
+    measured without it, and must not leave them open.
     """
     if analysis.fit is None or is_explained(analysis):
         return analysis.chain
@@ -83,6 +84,8 @@ def trusted_chain(analysis: Analysis) -> Chain | None:
         before, after = row.initial.value, row.final.value
         limit = _ASTRAY if row.name.startswith("omega") else _ASTRAY_GAIN
         if min(before, after) <= 0 or max(before / after, after / before) > limit:
+            return None
+        if _SIGMAS * (row.final.std or 0.0) > (limit - 1) * after:
             return None
     return analysis.chain
 

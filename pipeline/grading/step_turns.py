@@ -1,0 +1,81 @@
+"""Where a cart turns after an edge of a step: what may be read for the level it settles at."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.grading.reference import Reference
+from pipeline.results import Analysis, Record, StepGain
+
+_TURNS = 3  # the peak, the trough after it, the second peak
+_DIGITS = 2  # to which two edges of one size agree
+
+Edge = tuple[int, float]  # which of the record, and how large
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StepTurns:
+    """The turning points of one cart, per unit of input.
+
+    Attributes
+    ----------
+    by_edge : for every kind of edge, of each repeat where the cart turns first, next, after that.
+    """
+
+    by_edge: dict[Edge, list[list[float]]]
+
+    def extreme(self, turn: int) -> Reference | None:
+        """Return the turning point over all edges; None where one of those before is not real."""
+        turns = [one for repeats in self.by_edge.values() for one in repeats]
+        for earlier in range(turn + 1):
+            values = [one[earlier] for one in turns if len(one) > earlier]
+            if not values or min(values) <= 0:
+                return None
+        return _spread([one[turn] for one in turns if len(one) > turn])
+
+    def peak(self, edge: Edge) -> Reference:
+        """Return the first turning point after one kind of edge."""
+        return _spread([repeat[0] for repeat in self.by_edge[edge]])
+
+
+def step_turns(name: str, analysis: Analysis) -> StepTurns:
+    """Return where the cart of a gain (`K` or `K_i`) turns in the steps."""
+    cart = 1 if name == "K" else int(name.removeprefix("K_"))
+    records = {record.id: record for record in analysis.records}
+    found: dict[Edge, list[list[float]]] = {}
+    for step in analysis.step_gains:
+        if step.cart == cart:
+            for edge, turns in _turns(step, records[step.experiment]):
+                if turns and turns[0] > 0:
+                    found.setdefault(edge, []).append(turns)
+    return StepTurns(by_edge=found)
+
+
+def _spread(values: Sequence[float]) -> Reference:
+    return Reference(
+        value=float(np.median(values)), low=min(values), high=max(values), std=0.0, source="step"
+    )
+
+
+def _turns(step: StepGain, record: Record) -> Iterator[tuple[Edge, list[float]]]:
+    """Yield every edge, and where the cart turns after it."""
+    y = record.position(step.cart)
+    for number, edge in enumerate(step.edges):
+        change = edge.u_after - edge.u_before
+        inside = (record.t >= edge.t) & (record.t <= edge.window_after[1])
+        moved = (y[inside] - edge.level_before) / change
+        level = (edge.level_after - edge.level_before) / change
+        turns, side = [], 1.0
+        while moved.size and len(turns) < _TURNS:
+            # Up to where it crosses its level again, its furthest point is where it turns.
+            beyond = side * (moved - level) > 0
+            first = int(np.argmax(beyond)) if beyond.any() else moved.size
+            back = np.flatnonzero(~beyond[first:])
+            last = first + int(back[0]) if back.size else moved.size
+            if first == last:
+                break
+            stretch = moved[first:last]
+            turns.append(float(stretch[np.argmax(side * stretch)]))
+            moved, side = moved[last:], -side
+        yield (number, float(f"{change:.{_DIGITS}g}")), turns
