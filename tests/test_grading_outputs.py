@@ -87,11 +87,30 @@ def test_numbers_are_left_alone(text):
 
 
 @pytest.mark.parametrize(
-    "text", ["=1+1", "+cmd", "-2+3", "@SUM(A1)", "\t=1", "\r=1", "  =1", "\u00a0@x", "＝1", "-1-1"]
+    "text",
+    [
+        "=1+1",
+        "+cmd",
+        "-2+3",
+        "@SUM(A1)",
+        "\t=1",
+        "\r=1",
+        "  =1",
+        "\u00a0@x",
+        "＝1",
+        "-1-1",
+        "\ufeff=1",
+        "\v=1",
+    ],
 )
 def test_formulas_are_neutralised(text):
     """However they are dressed."""
     assert neutral(text) == f"'{text}"
+
+
+def test_a_nul_hides_no_formula():
+    """What is taken out of a cell is taken out before the cell is looked at."""
+    assert neutral("\0=1+1") == "'=1+1"
 
 
 @given(st.lists(st.lists(st.text(), min_size=2, max_size=2), max_size=4))

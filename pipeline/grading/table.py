@@ -11,6 +11,7 @@ from pipeline.errors import ConfigError
 _MOST_BYTES = 20_000_000
 _NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")
 _FORMULA = tuple("=+-@\t\r\n＝＋－＠")  # what starts a formula, full-width forms too
+_UNSEEN = " \v\f\u00a0\u200b\u2060\ufeff"
 
 
 def csv_text(head: Sequence[str], rows: Iterable[Sequence[object]], *, bom: bool = False) -> str:
@@ -31,11 +32,11 @@ def neutral(value: object) -> str:
     """Return a cell; text that a spreadsheet would take for a formula begins with an apostrophe."""
     if isinstance(value, float):
         return f"{value:.10g}"
-    text = str(value)
-    # Blanks before it do not keep a spreadsheet from seeing a formula.
-    if text.lstrip(" \u00a0").startswith(_FORMULA) and not _NUMBER.fullmatch(text):
+    text = str(value).replace("\0", "")
+    # Blanks, and marks that show as nothing, do not keep a spreadsheet from seeing a formula.
+    if text.lstrip(_UNSEEN).startswith(_FORMULA) and not _NUMBER.fullmatch(text):
         return f"'{text}"
-    return text.replace("\0", "")
+    return text
 
 
 def read_table(path: Path) -> list[tuple[int, list[str]]]:
