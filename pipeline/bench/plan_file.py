@@ -80,7 +80,7 @@ def save_plan(plan: Plan, submission: Submission) -> Path:
             raise ValueError(f"{path}: the plan is not an extension of the file")
         if n == len(plan.recordings):
             return path
-        text = path.read_text(encoding="utf-8-sig").rstrip("\n") + "\n\n"
+        text = path.read_bytes().decode("utf-8-sig").rstrip("\r\n") + "\n\n"
         text += "\n".join(_recording_text(r) for r in plan.recordings[n:])
     else:
         text = plan_text(plan, submission.system)

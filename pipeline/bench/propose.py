@@ -56,15 +56,13 @@ _LOOP_EDGE = 2.0  # s at least
 
 
 def propose_plan(submission: Submission, *, bench: Description | None = None) -> Plan:
-    """Propose a plan from what the submission says of the bench, and from its data if any.
+    """Propose the first runs from what the submission says of the bench; no data are read.
+
+    What is recorded already is not proposed. `extend_plan` goes on from there.
 
     Parameters
     ----------
     bench : as it describes itself; None: one that knows every command.
-
-    Raises
-    ------
-    DataError : what is recorded does not identify the carts.
     """
     system, recorded = submission.system, submission.experiments
     limits = _limits(system, submission.design, bench)
@@ -77,18 +75,16 @@ def propose_plan(submission: Submission, *, bench: Description | None = None) ->
         proposed += _first_steps(system, limits)
     if not kinds & {"sweep", "sine", "bode"}:
         proposed.append(_sweep(system, limits, chirps=bench is None or "c" in bench.commands))
-    plan = Plan(
-        baud=bench.baud if bench else Plan.model_fields["baud"].default,
-        limits=limits,
-        recordings=_renamed(proposed, taken=[e.id for e in recorded]),
-    )
-    return extend_plan(plan, submission)
+    recordings = _renamed(proposed, taken=[e.id for e in recorded])
+    plan = Plan(limits=limits, recordings=recordings)
+    return plan.model_copy(update={"baud": bench.baud}) if bench else plan
 
 
-def extend_plan(plan: Plan, submission: Submission) -> Plan:
+def extend_plan(plan: Plan, submission: Submission, *, bench: Description | None = None) -> Plan:
     """Add what the data recorded so far allow: dwells after a sweep, the closed loop after dwells.
 
-    What stands in the plan stays as it is and where it is. What was added once is not again.
+    What stands in the plan stays as it is and where it is. What was added once is not again. A
+    bench that knows no state feedback gets no closed loop: its PID is for a person to choose.
 
     Raises
     ------
@@ -97,7 +93,7 @@ def extend_plan(plan: Plan, submission: Submission) -> Plan:
     stages: list[Callable[[Analysis], list[Recording]]] = []
     if _wants_dwells(plan, submission):
         stages.append(lambda analysis: _driven(_chain(analysis), plan.limits))
-    if _wants_loop(plan, submission):
+    if _wants_loop(plan, submission) and (bench is None or "f" in bench.commands):
         stages.append(lambda analysis: [_loop(analysis, submission, plan.limits)])
     if not stages:
         return plan
