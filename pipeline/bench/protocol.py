@@ -192,7 +192,7 @@ class CommandReader:
                 broken_off = self._break_off()
         if not self._letter:
             letter = field if field in self._kinds else field[-1:]
-            if letter != field and letter not in self._halts:
+            if letter not in (self._kinds if letter == field else self._halts):
                 self.rejected += bool(field)
                 return broken_off
             self._letter, self._values = letter, []
