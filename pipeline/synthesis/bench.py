@@ -201,7 +201,7 @@ def _release_with_effects(model: AugmentedChain, run: Run, hand: Hand) -> Array:
     """
     from pipeline.plant.augmented import SteppedBench
 
-    hand = _before_stop(hand, model)
+    hand = before_stop(hand, model)
     bench, t, cart = SteppedBench(model, free=run.free), run.t, hand.cart
     start = int(np.searchsorted(t, hand.release))
     x = np.zeros((model.chain.n, t.size))
@@ -225,7 +225,7 @@ def _release_with_effects(model: AugmentedChain, run: Run, hand: Hand) -> Array:
     return x
 
 
-def _before_stop(hand: Hand, model: AugmentedChain) -> Hand:
+def before_stop(hand: Hand, model: AugmentedChain) -> Hand:
     """Return a hand that holds its cart on the near side of the end stop, if there is one."""
     row = model.tables()[0][hand.cart - 1]
     stiff = row[Cart.STOP_STIFFNESS] > model.chain.stiffness[hand.cart - 1, hand.cart - 1]

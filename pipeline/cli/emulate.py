@@ -1,0 +1,81 @@
+"""The command `emulate`: a virtual bench on a serial line."""
+
+import json
+import signal
+import threading
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipeline.cli.common import app, say
+
+
+@app.command()
+def emulate(
+    preset: Annotated[
+        str | None, typer.Option(help="throne-1dof, throne-2dof or throne-3dof.")
+    ] = None,
+    model: Annotated[
+        Path | None, typer.Option(help="A gap.json whose chain and effects to move.")
+    ] = None,
+    hide: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="EFFECT[:key=value,…]", help="Hide an effect (see `cartlab effects`); repeat."
+        ),
+    ] = None,
+    port: Annotated[
+        str, typer.Option(help="socket://HOST:PORT (port 0: any that is free) or pty.")
+    ] = "socket://127.0.0.1:0",
+    speed: Annotated[
+        float, typer.Option(min=0.01, help="Times faster than real time, as far as it can.")
+    ] = 1.0,
+    period: Annotated[
+        float, typer.Option(min=0.5, max=20.0, help="True ms from line to line.")
+    ] = 1.0024,
+    stock: Annotated[
+        bool, typer.Option("--stock", help="Know only what the stock bench does: d, g and z.")
+    ] = False,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KIND=RATE", help="Spoil the line: drop=0.01, delay@5, stuck=1@5, …; repeat."
+        ),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of noise, hands and faults.")] = 0,
+    remote: Annotated[
+        bool, typer.Option("--remote", help="Listen to other computers too.")
+    ] = False,
+) -> None:
+    """Run a virtual bench that speaks the serial protocol; its address is said on stderr."""
+    from pipeline.bench.emulate import open_bench
+    from pipeline.synthesis.hidden import prepare_bench
+
+    bench = prepare_bench(preset=preset, model=model, hide=hide or ())
+    server = open_bench(
+        bench,
+        port=port,
+        remote=remote,
+        speed=speed,
+        period=1e-3 * period,
+        stock=stock,
+        faults=fault or (),
+        seed=seed,
+        tell=lambda event: say(json.dumps(event)),
+    )
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    for sentence in bench.told:
+        say(f"hidden: {sentence}")
+    said = server.description
+    say(
+        f"a duty count is {said.input_per_count:.4g} {said.input_unit}, "
+        f"an encoder count {said.position_per_count:.4g} {said.position_unit}"
+    )
+    say(f"ready: {server.address}")
+    try:
+        server.serve(until=stop.is_set)
+    finally:
+        server.close()

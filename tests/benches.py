@@ -1,0 +1,77 @@
+"""A virtual bench in a process of its own, for tests and for whoever tries a host."""
+
+import json
+import queue
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+PATIENCE = 60.0  # s: a fresh machine compiles the carts first
+
+
+@dataclass
+class Emulator:
+    """A running `cartlab emulate`.
+
+    Attributes
+    ----------
+    address : what pyserial's `serial_for_url` opens.
+    said : the lines on stderr so far, but for the events.
+    """
+
+    address: str
+    process: subprocess.Popen[str]
+    said: list[str]
+    _events: "queue.Queue[dict[str, Any]]" = field(default_factory=queue.Queue)
+
+    def event(self, name: str, *, timeout: float = 10.0) -> dict[str, Any]:
+        """Wait for the next event of that name; others before it are passed over.
+
+        Raises
+        ------
+        queue.Empty : none came in `timeout` s.
+        """
+        while True:
+            event = self._events.get(timeout=timeout)
+            if event["event"] == name:
+                return event
+
+
+@contextmanager
+def emulator(*options: str, preset: str = "throne-2dof") -> Iterator[Emulator]:
+    """Run `cartlab emulate` with these options for as long as the block lasts."""
+    command = [sys.executable, "-m", "pipeline", "emulate", *options]
+    if "--model" not in options:
+        command += ["--preset", preset]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, encoding="utf-8")
+    running = Emulator(address="", process=process, said=[])
+    ready = threading.Event()
+
+    def listen() -> None:
+        assert process.stderr is not None
+        for line in process.stderr:
+            if line.startswith("{"):
+                running._events.put(json.loads(line))
+            else:
+                running.said.append(line.rstrip())
+            if line.startswith("ready: "):
+                running.address = line.removeprefix("ready: ").strip()
+                ready.set()
+        ready.set()
+
+    listener = threading.Thread(target=listen, daemon=True)
+    listener.start()
+    try:
+        assert ready.wait(PATIENCE), "no bench became ready"
+        assert running.address, "\n".join(running.said)
+        yield running
+    finally:
+        process.terminate()
+        process.wait(PATIENCE)
+        listener.join(PATIENCE)
+        assert process.stderr is not None
+        process.stderr.close()
