@@ -6,6 +6,7 @@ import re
 import sqlite3
 import subprocess
 import sys
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from itertools import count
 from pathlib import Path
@@ -19,6 +20,7 @@ from pipeline.grading.batch import Batch
 from pipeline.grading.grade import CODES
 from pipeline.grading.gradebook import Gradebook
 from pipeline.grading.history import history_dict, history_text
+from pipeline.grading.override import with_overrides
 from pipeline.grading.schema import FILE, metadata
 from tests import postgres
 from tests.grades import (
@@ -230,6 +232,34 @@ def test_assignments_in_one_database_stay_apart(open_book):
     assert one.entry("team-1").grade.points == 1
     assert two.entry("team-1").grade.points == 0
     assert open_book(None, create=False).entry("team-1").grade.points == 0
+
+
+def test_one_hand_in_under_one_rubric_is_graded_in_each_assignment(open_book):
+    """A rubric copied to another name gives the same key; its gradings are another's still."""
+    one, two = open_book("lab 1"), open_book("lab 2")
+    for book in (one, two):
+        finish(book, make_outcome(make_grade("team-1"), key="same"))
+
+    two.override("team-1", "pieces", 0.0, why="seen", by="Ada")
+
+    assert one.entry("team-1").grade.points == 20
+    assert two.entry("team-1").grade.points == 19
+    assert [event.what for event in one.history("team-1")[1]] == ["graded", "listed"]
+
+
+def test_no_override_is_above_what_the_rubric_has_now(open_book):
+    """A rubric that gives a criterion fewer points later gives an override of it no more."""
+    book = open_book()
+    outcome = make_outcome(make_grade("team-1", share=0.0))
+    finish(book, outcome)
+    book.override("team-1", "state-model", 2.0, why="seen", by="Ada")
+    (model,) = [c for c in book.entry("team-1").grade.criteria if c.id == "state-model"]
+    given = {"state-model": book.entry("team-1").overrides["state-model"]}
+
+    less = replace(make_grade("team-1"), criteria=(replace(model, points=0.0, out_of=1.0),))
+
+    (line,) = with_overrides(less, given, rubric=RUBRIC).criteria
+    assert (line.points, line.outcome) == (1.0, "pass")
 
 
 @pytest.mark.parametrize(

@@ -62,6 +62,13 @@ def test_four_rubrics_are_shipped():
     assert names == {"throne-1dof", "throne-2dof", "throne-3dof", "ucsd-mae171a"}
 
 
+def test_points_add_up_exactly(tmp_path):
+    """Three criteria of 0.1, 0.2 and 0.3 are 0.6 points."""
+    text = GOOD.replace("points = 2", "points = 0.1").replace("points = 1.5", "points = 0.2")
+    text += '\n[[criteria]]\nid = "more"\npoints = 0.3\ncheck = "data"\n'
+    assert load_rubric(write(tmp_path, text)).out_of == 0.6
+
+
 def test_a_pattern_is_written_out(tmp_path):
     """`K_*` stands for every gain of the system."""
     plain = rubric_dict(load_rubric(write(tmp_path, GOOD)))
@@ -84,6 +91,7 @@ def test_a_pattern_is_written_out(tmp_path):
         ("[false, true, true]", "[true]", 5, r"expected 3 values \(wall-1, 1-2, 2-wall\), found 1"),
         ("version = 1", "version = 2", 1, r"version: expected 1, found 2"),
         ("points = 1.5", "points = 1.5\nfull_percent = 30", 23, r"full_percent .*more than none"),
+        ("points = 1.5", "points = 0.333", 22, r"points \(model\): 0.333: points go to the hund"),
     ],
 )
 def test_a_mistake_is_named_with_its_line(tmp_path, old, new, line, what):

@@ -87,7 +87,7 @@ class Gradebook:
         newest = (
             select(gradings, submissions.c.name)
             .join(submissions)
-            .where(gradings.c.key == key)
+            .where(gradings.c.key == key, submissions.c.assignment == (self._assignment or ""))
             .order_by(gradings.c.id.desc())
             .limit(1)
         )
@@ -168,7 +168,7 @@ class Gradebook:
         listed = []
         with self._database.writing() as connection:
             for position, key in enumerate(batch.keys):
-                row = newest_of(connection, key)
+                row = newest_of(connection, key, assignment=self._assignment or "")
                 shared = batch.shared.get(row.name)
                 grade = final_entry(connection, row, shared=shared, rubric=rubric).grade
                 listed.append(

@@ -95,14 +95,15 @@ _COLUMNS = (
 )
 
 
-def newest_of(connection: Connection, key: str) -> Row:
-    """Return the newest grading of a key.
+def newest_of(connection: Connection, key: str, *, assignment: str) -> Row:
+    """Return the newest grading of a key; two assignments may have rubrics of one text.
 
     Raises
     ------
     KeyError : there is none.
     """
-    newest = select(*_COLUMNS).join(submissions).where(gradings.c.key == key)
+    newest = select(*_COLUMNS).join(submissions)
+    newest = newest.where(gradings.c.key == key, submissions.c.assignment == assignment)
     row = connection.execute(newest.order_by(gradings.c.id.desc()).limit(1)).one_or_none()
     if row is None:
         raise KeyError(key)

@@ -153,6 +153,8 @@ def _contradictions(found: Rubric) -> Iterator[tuple[Location, str]]:
                 known = "" if parent in ids else nearest(parent, ids)
                 yield ("criteria", i, "requires"), f"{parent!r} {where}{known}"
         seen.add(criterion.id)
+        if criterion.points != round(criterion.points, 2):
+            yield ("criteria", i, "points"), f"{criterion.points:g}: points go to the hundredth"
         if isinstance(criterion, Parameters | InitialFinal):
             for pattern in criterion.parameters:
                 if not matching((pattern,), names):

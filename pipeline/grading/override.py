@@ -87,6 +87,7 @@ def _unjudged(id_: str, title: str, out_of: float) -> Criterion:
 
 
 def _by_hand(criterion: Criterion, points: float, *, why: str) -> Criterion:
+    points = min(points, criterion.out_of)  # the rubric may have asked for more at the time
     return replace(
         criterion,
         points=points,

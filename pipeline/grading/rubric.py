@@ -1,5 +1,6 @@
 """The rubric: what a lab asks, the criteria with their points and tolerances, the late policy."""
 
+from decimal import Decimal
 from fnmatch import fnmatchcase
 from typing import Annotated, Literal
 
@@ -200,7 +201,7 @@ class Rubric(_Model):
     @property
     def out_of(self) -> float:
         """All points there are."""
-        return sum(criterion.points for criterion in self.criteria)
+        return float(sum(Decimal(str(criterion.points)) for criterion in self.criteria))
 
 
 def matching(patterns: tuple[str, ...], names: list[str]) -> list[str]:
