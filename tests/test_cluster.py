@@ -106,6 +106,8 @@ def test_an_address_that_is_no_schedulers_is_refused():
         run_on("http://localhost:8786")
     with pytest.raises(ConfigError, match=r"tls://"):
         run_on("tcp://192.0.2.1:8786")
+    with pytest.raises(ConfigError, match=r"no certificates .*distributed\.comm\.tls"):
+        run_on("tls://192.0.2.1:8786")
 
 
 def test_nobody_there_is_said(monkeypatch):

@@ -10,8 +10,9 @@ from dataclasses import replace
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from urllib.parse import urlsplit
+from uuid import uuid4
 
-from distributed import Client, WorkerPlugin, as_completed, get_worker
+from distributed import Client, Security, WorkerPlugin, as_completed, get_worker
 from distributed.worker import Worker as DaskWorker
 
 from pipeline.errors import ConfigError
@@ -21,7 +22,6 @@ from pipeline.grading.runner import Executor, code_version
 from pipeline.grading.worker import Setup, Task, failed, outcome_line, read_outcome
 from pipeline.grading.worker_process import Worker
 
-_PLUGIN = "cartlab-graders"
 _CONNECT_LIMIT = 20  # s
 _AHEAD = 2  # tasks under way for every thread of the cluster: none waits, few are in memory
 _LOOPBACK = ("localhost", "127.0.0.1", "::1")
@@ -33,7 +33,7 @@ def run_on(address: str) -> Executor:
     Raises
     ------
     ConfigError : unencrypted to another machine (a scheduler runs what it is sent), or nobody
-        answers, or the cluster runs another version.
+        answers, or there are no certificates, or the cluster runs another version.
     """
     parts = urlsplit(address)
     if parts.scheme not in ("tcp", "tls") or not parts.hostname:
@@ -42,6 +42,10 @@ def run_on(address: str) -> Executor:
         raise ConfigError(
             f"{address}: a scheduler runs whatever it is sent, so on another machine it needs "
             "encryption: start it with TLS certificates and name it tls://…"
+        )
+    if parts.scheme == "tls" and Security().get_connection_args("client")["ssl_context"] is None:
+        raise ConfigError(
+            f"{address}: no certificates in Dask's configuration (distributed.comm.tls)"
         )
 
     def execute(tasks: Sequence[Task], setup: Setup, out_of: float) -> Iterator[Outcome]:
@@ -54,8 +58,13 @@ def run_on(address: str) -> Executor:
                 client.wait_for_workers(1, timeout=_CONNECT_LIMIT)
             except TimeoutError:
                 raise ConfigError(f"{address}: the scheduler has no workers") from None
-            client.register_plugin(Graders(setup, out_of=out_of), name=_PLUGIN)
-            yield from _through(client, tasks, out_of=out_of)
+            # Runs on one cluster at once have graders of their own, with their own rubric.
+            graders = f"cartlab-graders-{uuid4()}"
+            client.register_plugin(Graders(setup, out_of=out_of), name=graders)
+            try:
+                yield from _through(client, tasks, graders=graders, out_of=out_of)
+            finally:
+                client.unregister_worker_plugin(graders)
 
     return execute
 
@@ -98,9 +107,9 @@ class Graders(WorkerPlugin):
             self._idle.put(process)
 
 
-def _grade(task: Task, archive: bytes) -> bytes:
+def _grade(task: Task, archive: bytes, plugin: str) -> bytes:
     """Run on a Dask worker: return the outcome as a line of JSON."""
-    graders = get_worker().plugins[_PLUGIN]
+    graders = get_worker().plugins[plugin]
     assert isinstance(graders, Graders)
     if not graders.same_code:
         raise ConfigError("the cluster's workers run another version of cartlab")
@@ -113,7 +122,9 @@ def _threads(client: Client) -> int:
     return sum(worker["nthreads"] for worker in workers.values())
 
 
-def _through(client: Client, tasks: Sequence[Task], *, out_of: float) -> Iterator[Outcome]:
+def _through(
+    client: Client, tasks: Sequence[Task], *, graders: str, out_of: float
+) -> Iterator[Outcome]:
     """Yield the outcomes as they come; a worker that is lost has its tasks done by another."""
     waiting = list(reversed(tasks))
     under_way: dict[str, Task] = {}
@@ -123,7 +134,8 @@ def _through(client: Client, tasks: Sequence[Task], *, out_of: float) -> Iterato
         while waiting and len(under_way) < room:
             task = waiting.pop()
             archive = packed([Path(source) for source in task.sources])
-            future = client.submit(_grade, task, archive, key=f"cartlab-{task.key}", pure=False)
+            key = f"{graders}-{task.key}"
+            future = client.submit(_grade, task, archive, graders, key=key, pure=False)
             under_way[str(future.key)] = task
             answers.add(future)
         future = next(answers)
