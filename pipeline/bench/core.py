@@ -4,6 +4,7 @@ docs/protocol.md says in words and formulas what is written here.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 from pipeline.bench.protocol import (
@@ -88,22 +89,21 @@ class ReferenceCore:
             self._zero = tuple(counts)
         if self._heard is not None and now - self._heard >= 1e3 * WATCHDOG:
             self._run = None
-        if self._run is None:
+        run = self._run
+        if run is None:
             return 0
-        ms = stamp - self._since
-        if ms >= 1e3 * self._run.duration:
+        ms = stamp - run.since
+        if ms >= 1e3 * run.start.duration:
             self._run = None
             return 0
         y = tuple(count - zero for count, zero in zip(counts, self._zero, strict=True))
-        target = target_at(self._run, 1e-3 * ms, chirp_end=self._chirp_end)
-        duty = self._law.duty(target, y)
+        target = target_at(run.start, 1e-3 * ms, chirp_end=run.chirp_end)
+        duty = run.law.duty(target, y)
         self._sent += format_reading(Reading(counts=y, target=target, duty=duty, ms=ms))
         return duty
 
     def _reset(self) -> None:
-        self._run: Start | None = None
-        self._since = 0  # ms of the bench's clock when the run began
-        self._law: _Law = _OpenLoop()
+        self._run: _Run | None = None
         self._gains: PidGains | StateGains = PidGains(kp=0.0, ki=0.0, kd=0.0)
         self._chirp_end: float | None = None
         self._zero: tuple[int, ...] | None = None  # None: the next counts are zero
@@ -112,8 +112,9 @@ class ReferenceCore:
     def _obey(self, command: Command, *, stamp: int, now: int) -> None:
         match command:
             case Start():
-                self._run, self._since = command, stamp
-                self._law = self._loop(command)
+                self._run = _Run(
+                    start=command, since=stamp, chirp_end=self._chirp_end, law=self._loop(command)
+                )
             case PidGains() | StateGains():
                 self._gains = command
             case ChirpEnd(frequency=frequency):
@@ -141,6 +142,14 @@ class _Law(Protocol):
     def duty(self, target: int, y: Sequence[int]) -> int:
         """Return the duty that acts from now on; called at every tick of a run."""
         ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Run:
+    start: Start
+    since: int  # ms of the bench's clock when it began
+    chirp_end: float | None
+    law: _Law
 
 
 class _OpenLoop:

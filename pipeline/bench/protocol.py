@@ -191,11 +191,12 @@ class CommandReader:
             except ValueError:
                 broken_off = self._break_off()
         if not self._letter:
-            letter = field if field in self._kinds else field[-1:]
-            if letter not in (self._kinds if letter == field else self._halts):
+            if field not in self._kinds:
                 self.rejected += bool(field)
-                return broken_off
-            self._letter, self._values = letter, []
+                if not field.endswith(self._halts):
+                    return broken_off
+                field = field[-1]
+            self._letter, self._values = field, []
         if len(self._values) < len(self._kinds[self._letter]):
             return broken_off
         letter, self._letter = self._letter, ""
