@@ -148,7 +148,7 @@ def analyse(submission: Submission, *, progress: Progress = _silent) -> Analysis
 
     progress("state feedback")
     feedback = _design(submission, fit, log=log)
-    if feedback and _is_reversed(data.records):
+    if feedback and is_reversed(data.records):
         log.warn(
             [
                 "state feedback: the gains are for an input that pushes cart 1 towards positive x; "
@@ -372,7 +372,7 @@ def _design(submission: Submission, fit: ChainFit | None, *, log: _Log) -> Feedb
     )
 
 
-def _is_reversed(records: Sequence[Record]) -> bool:
+def is_reversed(records: Sequence[Record]) -> bool:
     """Whether a positive input, as the bench counts it, drives cart 1 towards negative x."""
     signs = [r.input_scale for r in records if r.u is not None and r.kind != "closed_loop"]
     return sum(1 if sign > 0 else -1 for sign in signs) < 0

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from pipeline.bench.plan import Limits, PidLoop, Plan, Recording, StateLoop
 from pipeline.bench.plan_file import load_plan, plan_path, plan_text, save_plan
 from pipeline.bench.propose import AIM, extend_plan, propose_plan
-from pipeline.bench.protocol import Description
+from pipeline.bench.protocol import FULL_SCALE, Description, Start, Wave
+from pipeline.bench.waves import target_at
 from pipeline.cli import main
 from pipeline.errors import ConfigError, DataError
 from pipeline.plant.chain import PRESETS, quadratic_factors
@@ -106,6 +107,25 @@ def test_limits_come_from_what_is_stated(system, design, expected):
     """The design, the scale of the input, the unit of the positions; else usual ones."""
     limits = propose_plan(bare(**system, design=design)).limits
     assert (limits.input, limits.travel) == expected
+
+
+@pytest.mark.parametrize("preset", sorted(PRESETS))
+def test_the_first_runs_move_the_carts_well_and_not_too_far(preset):
+    """On a bench whose full scale holds the carts some 12 cm out: over 0.2 cm, under the limit."""
+    chain, per_count = PRESETS[preset], 0.5 / FULL_SCALE
+    plan = propose_plan(bare(carts=chain.n, input=Input(per_count=per_count)))
+    for recording in (*of_kind(plan, "step"), *of_kind(plan, "sweep")):
+        start = Start(
+            wave=Wave[recording.wave.upper()],
+            frequency=recording.frequency,
+            amplitude=round(recording.amplitude / per_count),
+            cycles=recording.cycles,
+        )
+        t = np.arange(0.0, recording.duration, 2e-3)
+        targets = [target_at(start, at, chirp_end=recording.frequency_end) for at in t]
+        x = np.abs(simulate_linear(chain, t, per_count * np.array(targets, dtype=np.float64)))
+        assert 0.2 < x.max(axis=1).min(), recording.id
+        assert x.max() < plan.limits.travel, recording.id
 
 
 # --------------------------------------------------------- from what is recorded
@@ -382,7 +402,7 @@ def test_a_link_in_its_place_is_not_followed(tmp_path):
 # ------------------------------------------------------------------- the command
 
 
-def run(monkeypatch, *arguments) -> int:
+def run(monkeypatch, *arguments) -> str | int:
     monkeypatch.setattr(sys, "argv", ["cartlab", *map(str, arguments)])
     with pytest.raises(SystemExit) as end:
         main()

@@ -37,7 +37,7 @@ _USUAL_INPUT = 5.0  # input units, where nothing says what the motor takes
 # Shares of the input limit before anything is known. A bench's motor moves its carts some 5 to 15
 # cm at full scale, and a resonance several times that.
 _FIRST_STEP = 0.04
-_FIRST_SWEEP = 0.03
+_FIRST_SWEEP = 0.02
 _REPEATS = "ab"  # of a decay
 _DECAY_TIME = 10.0  # s
 _FIRST_EDGE = 5.0  # s from edge to edge of the first steps
