@@ -101,6 +101,7 @@ class _SocketLink:
     def __init__(self, listener: socket.socket, *, address: str) -> None:
         self.address, self._listener = address, listener
         self._client: socket.socket | None = None
+        self._ready = False  # something arrived, or a host is at the door
         self._unsent = bytearray()
 
     @property
@@ -114,16 +115,20 @@ class _SocketLink:
     def wait(self, seconds: float) -> None:
         reader = self._client or self._listener
         writers = [self._client] if self._client and self._unsent else []
-        select.select([reader], writers, [], seconds)
+        readable, writable, _ = select.select([reader], writers, [], seconds)
+        self._ready = bool(readable)
+        if writable:
+            self.send(b"")
 
     def receive(self) -> bytes:
+        if not self._ready:
+            return b""
+        self._ready = False
         if self._client is None:
             self._accept()
-        if self._client is None:
             return b""
-        self.send(b"")
         try:
-            data = self._client.recv(_CHUNK) if self._client else b""
+            data = self._client.recv(_CHUNK)
         except BlockingIOError:
             return b""
         except OSError:  # reset by the host
