@@ -67,7 +67,7 @@ def test_a_tree_gives_a_row_for_every_team(tmp_path):
     archive(tmp_path / "class" / "section-2" / "team-06.zip", {"submission.toml": TOML})
     found = hand_ins(tmp_path, tmp_path / "class")
     assert [h.id for h in found] == ["lab", "team-01", "team-02", "team-03", "team-05", "team-06"]
-    with pytest.raises(SubmissionError, match=r"no submission\.toml in it, only notes\.txt"):
+    with pytest.raises(SubmissionError, match=r"no submission\.toml in it, only 'notes\.txt'"):
         opened(tmp_path, found[3])
     assert opened(tmp_path, found[5]) == ["submission.toml"]
 
@@ -153,6 +153,46 @@ def test_one_students_zip_is_one_hand_in(tmp_path):
         opened(tmp_path, second)
 
 
+def test_one_bad_hand_in_of_a_download_costs_its_own_row(tmp_path):
+    """Paths that lead out, depth, a password, broken bytes: the others of the class are there."""
+    download = archive(
+        tmp_path / "class.zip",
+        {
+            **{f"team-{n}/submission.toml": TOML for n in range(3)},
+            "../up/x": "",
+            "evil-1/../../x": "",
+            "evil-2/" + "a/" * 1_500 + "x": "",
+            "evil-3/locked.csv": "1",
+            "evil-4/submission.toml": "0" * 500,
+        },
+    )
+    raw = bytearray(download.read_bytes())
+    for signature, name_at, flags_at in ((b"PK\x03\x04", 30, 6), (b"PK\x01\x02", 46, 8)):
+        at = raw.find(b"evil-3/", raw.find(signature)) if signature == b"PK\x03\x04" else 0
+        at = at or raw.find(b"evil-3/", raw.find(b"PK\x01\x02"))
+        raw[at - name_at + flags_at] |= 1  # encrypted
+    raw[raw.find(b"0" * 500) + 7] ^= 1  # its checksum is wrong now
+    download.write_bytes(raw)
+    found = {h.id: h.problem for h in hand_ins(tmp_path, download)}
+    assert {name: why for name, why in found.items() if not why} == {
+        f"team-{n}": "" for n in range(3)
+    }
+    assert {name: why.rpartition(" ")[2] for name, why in found.items() if why} == {
+        "up": "archive", "evil-1": "archive", "evil-2": "deep", "evil-3": "password",
+        "evil-4": "'evil-4/submission.toml')",
+    }  # fmt: skip
+
+
+def test_what_is_hidden_counts_only_with_a_submission(tmp_path):
+    """`.git` is nobody's; a team that calls itself `...` is there, and `~$x` is a folder's name."""
+    tree(
+        tmp_path / "c",
+        {name + "/submission.toml": TOML for name in ("...", ".lab", "~$x", "a")}
+        | {".git/config": "", "__MACOSX/submission.toml": TOML},
+    )
+    assert [h.id for h in hand_ins(tmp_path, tmp_path / "c")] == ["_", "a", "lab", "~$x"]
+
+
 def test_archives_in_archives_are_opened_to_a_depth(tmp_path):
     """A zip in a zip is opened; the tenth in the ninth is not."""
     content = zip_bytes(tmp_path, {"submission.toml": TOML})
@@ -178,7 +218,7 @@ def test_two_submissions_in_one_hand_in_are_a_question(tmp_path):
     """Which of two is meant is not guessed; one that lies higher is meant."""
     files = {"a/submission.toml": TOML, "b/submission.toml": TOML}
     folder = tree(tmp_path / "t", files)
-    with pytest.raises(SubmissionError, match=r"which one.*a/submission\.toml and b/"):
+    with pytest.raises(SubmissionError, match=r"which one.*'a/submission\.toml' and 'b/"):
         open_submission([folder], tmp_path / "opened")
     tree(folder, {"submission.toml": TOML})
     assert open_submission([folder], tmp_path / "again") == tmp_path / "again"

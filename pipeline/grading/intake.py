@@ -1,5 +1,6 @@
 """Find the hand-ins in what a TA has: folders, trees, zip files, a platform's download."""
 
+import os
 import re
 import unicodedata
 from collections import Counter, defaultdict
@@ -9,11 +10,12 @@ from pathlib import Path, PurePosixPath
 
 from pipeline.errors import ConfigError, SubmissionError
 from pipeline.grading.lms_names import Upload, current, gradescope_owners, parse_name
-from pipeline.grading.unpack import CLASS, is_debris, member_names, unpack
+from pipeline.grading.unpack import CLASS, DEEPEST, is_debris, member_names, unpack
+from pipeline.submission.complaints import quote
 from pipeline.submission.load import NAME
 
 _DAYS_OF_A_LATE_MARK = 1.0  # Canvas marks lateness without saying how much: a day begun
-_LONGEST_ID = 100  # a folder's name, on every system
+_LONGEST_ID, _MOST_BYTES = 100, 200  # letters and bytes: a folder's name, on every system
 _NOT_IN_NAMES = re.compile(r'[<>:"/\\|?*\x00-\x1f\x7f-\x9f]')
 _RESERVED = re.compile(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?")
 
@@ -80,7 +82,7 @@ def _at(path: Path, *, scratch: Path, skip: set[Path]) -> list[_Found]:
     if path.name == NAME:
         path = path.parent
     if path.is_dir():
-        return _in_folder(path, skip=skip, top=True)
+        return _in_folder(path, skip=skip)
     if not path.is_file():
         raise ConfigError(f"{path}: there is no such file or folder")
     if path.suffix.lower() != ".zip":
@@ -92,7 +94,7 @@ def _at(path: Path, *, scratch: Path, skip: set[Path]) -> list[_Found]:
         refused = unpack(path, folder, limits=CLASS)
     except SubmissionError as error:
         raise ConfigError(str(error)) from None
-    found = _in_folder(folder, skip=skip, top=True)
+    found = _in_folder(folder, skip=skip)
     hand_ins = {source.name for one in found for source in one.sources}
     lost = [_Found(name=name, parent=path.stem, sources=(), problem=why) for name, why in
             sorted(refused.items()) if name not in hand_ins]  # fmt: skip
@@ -121,15 +123,22 @@ def _holds_a_class(archive: Path) -> bool:
 # ------------------------------------------------------------------------ folders
 
 
-def _in_folder(folder: Path, *, skip: set[Path], top: bool) -> list[_Found]:
-    if _is_submission(folder):
+def _in_folder(folder: Path, *, skip: set[Path], top: bool = True, depth: int = 0) -> list[_Found]:
+    """Return the hand-ins in a folder; one that cannot be looked into is itself one."""
+    try:
+        return _looked_into(folder, skip=skip, top=top, depth=depth)
+    except OSError as error:
+        problem = f"cannot be read ({error.strerror or error})"
+        return [_Found(name=folder.name, parent=folder.parent.name, sources=(), problem=problem)]
+
+
+def _looked_into(folder: Path, *, skip: set[Path], top: bool, depth: int) -> list[_Found]:
+    if _is_submission(folder) or depth > DEEPEST:
         return [_Found(name=folder.name, parent=folder.parent.name, sources=(folder,))]
     entries = [
         entry
         for entry in sorted(folder.iterdir())
-        if not is_debris(PurePosixPath(entry.name))
-        and not entry.name.startswith(".")
-        and entry.resolve() not in skip
+        if entry not in skip and not _is_passed_over(entry)
     ]
     uploads = {entry: upload for entry in entries if (upload := parse_name(entry.name))}
     if uploads:
@@ -137,13 +146,13 @@ def _in_folder(folder: Path, *, skip: set[Path], top: bool) -> list[_Found]:
         return _from_platform(folder, uploads) + [_single(entry) for entry in rest]
     entries = [entry for entry in entries if _may_be_one(entry)]
     if len(entries) == 1 and entries[0].is_dir() and not entries[0].is_symlink():
-        deeper = _in_folder(entries[0], skip=skip, top=top)
+        deeper = _in_folder(entries[0], skip=skip, top=top, depth=depth + 1)
         return deeper or [_single(entries[0])]
     found, without = [], []
     for entry in entries:
         if entry.is_symlink() or not entry.is_dir():
             found.append(_single(entry))
-        elif here := _in_folder(entry, skip=skip, top=False):
+        elif here := _in_folder(entry, skip=skip, top=False, depth=depth + 1):
             found += here
         else:
             without.append(_single(entry))
@@ -154,6 +163,13 @@ def _in_folder(folder: Path, *, skip: set[Path], top: bool) -> list[_Found]:
 def _is_submission(folder: Path) -> bool:
     toml = folder / NAME
     return toml.is_symlink() or toml.exists()
+
+
+def _is_passed_over(entry: Path) -> bool:
+    """Whether an entry is none of the students': debris, or hidden without a submission in it."""
+    if not entry.is_dir() or entry.name == "__MACOSX":
+        return is_debris(PurePosixPath(entry.name)) or entry.name.startswith(".")
+    return entry.name.startswith(".") and not os.access(entry / NAME, os.F_OK)
 
 
 def _may_be_one(entry: Path) -> bool:
@@ -167,7 +183,7 @@ def _single(entry: Path) -> _Found:
             name=entry.stem,
             parent=entry.parent.name,
             sources=(),
-            problem=f"{entry.name} is a link; hand in the files themselves",
+            problem=f"{quote(entry.name)} is a link; hand in the files themselves",
         )
     if entry.is_dir():
         return _Found(name=entry.name, parent=entry.parent.name, sources=(entry,))
@@ -264,5 +280,6 @@ def _fit(name: str) -> str:
     """Return a name that is a folder's on every system, and nothing but text on a terminal."""
     text = unicodedata.normalize("NFC", name)
     text = _NOT_IN_NAMES.sub("_", text.encode("utf-8", "replace").decode())
-    text = "".join(c if c.isprintable() else "_" for c in text)[:_LONGEST_ID].strip(" .")
+    text = "".join(c if c.isprintable() else "_" for c in text)[:_LONGEST_ID]
+    text = text.encode()[:_MOST_BYTES].decode(errors="ignore").strip(" .")
     return f"_{text}" if not text or _RESERVED.fullmatch(text) else text

@@ -17,6 +17,7 @@ from pathlib import Path, PurePosixPath
 from pipeline.errors import SubmissionError
 from pipeline.grading.lms_names import parse_name
 from pipeline.grading.unpack import HAND_IN, Limits, is_debris, unpack
+from pipeline.submission.complaints import quote
 from pipeline.submission.load import MAX_DATA_BYTES, NAME
 
 _DEEPEST = 12  # folders below the hand-in's
@@ -26,12 +27,18 @@ _FIXED_TIME = (1980, 1, 1, 0, 0, 0)  # in archives of ours: same files, same byt
 
 
 def digest(sources: Sequence[Path]) -> str:
-    """Return the SHA-256 of everything in a hand-in that could be graded."""
+    """Return the SHA-256 of everything in a hand-in that could be graded.
+
+    What cannot be read stands in it as such: the hand-in's row will say so.
+    """
     total = hashlib.sha256()
-    for name, path in _files(sources):
-        with path.open("rb") as file:
-            own = hashlib.file_digest(file, "sha256")
-        total.update(f"{len(name)} {name} {own.hexdigest()}\n".encode("utf-8", "surrogateescape"))
+    try:
+        for name, path in _files(sources):
+            with path.open("rb") as file:
+                own = hashlib.file_digest(file, "sha256").hexdigest()
+            total.update(f"{len(name)} {name} {own}\n".encode("utf-8", "surrogateescape"))
+    except OSError as error:
+        total.update(f"cannot be read: {error.errno}\n".encode())
     return total.hexdigest()
 
 
@@ -63,24 +70,26 @@ def open_submission(sources: Sequence[Path], into: Path) -> Path:
     Raises
     ------
     SubmissionError : there is none, or more than one to choose from, or an archive is bad.
+    OSError : a file cannot be read.
     """
     into.mkdir(parents=True, exist_ok=True)
     for name, path in _files(sources):
         target = into / name
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(path, target)
-    left, tried = HAND_IN, set()
+    left = HAND_IN
     for _ in range(_ARCHIVES_IN_ARCHIVES):
-        archives = [path for path in _archives(into) if path not in tried]
-        if _submissions(into) or not archives:
+        if _submissions(into):
             break
-        for path in archives:
-            folder = path.with_name(f"{path.stem} (unpacked)")
+        for path in _archives(into):
+            folder = path.with_suffix("")
+            if folder.exists():
+                folder = path.with_name(f"{path.stem} (unpacked)")
             refused = unpack(path, folder, limits=left)
             if refused:
-                raise SubmissionError(f"{path.name}: {next(iter(refused.values()))}")
+                raise SubmissionError(f"{quote(path.name)}: {next(iter(refused.values()))}")
+            path.unlink()
             left = _less(left, folder)
-        tried.update(archives)
     if tomls := _submissions(into):
         return _the_one(tomls, into)
     raise SubmissionError(_nothing_in(into))
@@ -143,7 +152,7 @@ def _archives(folder: Path) -> list[Path]:
 
 def _the_one(tomls: Sequence[Path], into: Path) -> Path:
     if len(tomls) > 1:
-        names = " and ".join(str(path.relative_to(into).as_posix()) for path in tomls[:2])
+        names = " and ".join(quote(path.relative_to(into).as_posix()) for path in tomls[:2])
         more = f" and {len(tomls) - 2} more" if len(tomls) > 2 else ""
         raise SubmissionError(f"which one is to be graded? There are {names}{more}")
     return tomls[0].parent
@@ -153,8 +162,8 @@ def _nothing_in(into: Path) -> str:
     files = [path for path in sorted(into.rglob("*")) if path.is_file()]
     if not files:
         return f"no {NAME} in it: it is empty"
-    named = ", ".join(path.name for path in files[:3])
+    named = ", ".join(quote(path.name) for path in files[:3])
     more = f" and {len(files) - 3} more" if len(files) > 3 else ""
     strange = [p.name for p in files if p.suffix.lower() in (".rar", ".7z", ".gz", ".tar", ".tgz")]
-    hint = f"; {strange[0]} cannot be opened, pack a zip file" if strange else ""
+    hint = f"; {quote(strange[0])} cannot be opened, pack a zip file" if strange else ""
     return f"no {NAME} in it, only {named}{more}{hint}"

@@ -1,10 +1,12 @@
 """Unpack what strangers packed: never outside the folder, never more than fits."""
 
+import lzma
 import stat
 import struct
 import unicodedata
 import zipfile
 import zlib
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import IO
@@ -16,6 +18,7 @@ _CHUNK = 1 << 16
 _RATIO_FROM = 1_000_000  # bytes; a smaller file may be as empty as it likes
 _END, _END_SIGNATURE = struct.Struct("<4s4H2LH"), b"PK\x05\x06"
 _LONGEST_COMMENT = 65_535
+DEEPEST = 40  # folders in folders; a submission needs three
 _UTF8_NAME, _ENCRYPTED = 0x800, 0x1
 
 _DEBRIS_FOLDERS = ("__MACOSX",)
@@ -24,16 +27,24 @@ _DEBRIS_FILES = (".ds_store", "thumbs.db", "desktop.ini")
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """What an archive may be; `ratio` of a file's size to its packed size."""
+    """What an archive may be.
+
+    Attributes
+    ----------
+    ratio : of a file's size to its packed size.
+    directory : bytes of the table of contents.
+    whole : one bad member refuses the archive; else only the entry at its top that it is in.
+    """
 
     members: int = 2_000
     total: int = 300_000_000  # bytes
     ratio: float = 200.0
-    directory: int = 2_000_000  # bytes of the archive's table of contents
+    directory: int = 2_000_000
+    whole: bool = True
 
 
 HAND_IN = Limits()
-CLASS = Limits(members=200_000, total=50_000_000_000, ratio=1e4, directory=100_000_000)
+CLASS = Limits(members=200_000, total=50_000_000_000, ratio=1e4, directory=100_000_000, whole=False)
 
 
 @dataclass(kw_only=True)
@@ -49,7 +60,7 @@ class _Budget:
 
 
 def is_debris(path: PurePosixPath) -> bool:
-    """Tell what macOS and Windows leave behind from what was handed in."""
+    """Tell the files that macOS and Windows leave behind from what was handed in."""
     name = path.name.lower()
     return (
         any(part in _DEBRIS_FOLDERS for part in path.parts)
@@ -61,8 +72,7 @@ def is_debris(path: PurePosixPath) -> bool:
 def unpack(archive: Path, into: Path, *, limits: Limits) -> dict[str, str]:
     """Unpack a zip archive into a new folder; return what was refused: top entry and reason.
 
-    Only regular files are written. One bad member of a class's archive costs the hand-in it
-    belongs to (its top entry), not the others.
+    Only regular files are written.
 
     Raises
     ------
@@ -74,38 +84,66 @@ def unpack(archive: Path, into: Path, *, limits: Limits) -> dict[str, str]:
         _refuse_long_contents(archive, limits=limits)
         with zipfile.ZipFile(archive) as opened:
             return _extract(opened, into, budget=_Budget(limits=limits))
-    except _Refused as error:
-        raise SubmissionError(f"{shown}: {error}") from None
-    except NotImplementedError:
-        raise SubmissionError(f"{shown}: packed in a way that is not supported") from None
-    except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, struct.error) as error:
-        raise SubmissionError(f"{shown}: not a whole zip archive ({_line(error)})") from None
-    except OSError as error:
-        raise SubmissionError(f"{shown}: cannot be unpacked ({error.strerror})") from None
-    except RuntimeError as error:  # an archive with a password, or a decoder's complaint
-        raise SubmissionError(f"{shown}: cannot be unpacked ({_line(error)})") from None
+    except _TROUBLE as error:
+        raise SubmissionError(f"{shown}: {_why(error)}") from None
 
 
 def member_names(archive: Path, *, limits: Limits = HAND_IN) -> list[PurePosixPath]:
-    """Return the files in an archive that are no debris; none where it is none or too large."""
+    """Return the files that may be unpacked and are no debris; none where it is no archive."""
+    if not archive.is_file():  # a pipe would be waited for
+        return []
     try:
         _refuse_long_contents(archive, limits=limits)
         with zipfile.ZipFile(archive) as opened:
-            paths = [_path(info) for info in opened.infolist() if not info.is_dir()]
-    except (_Refused, zipfile.BadZipFile, OSError, ValueError, struct.error, NotImplementedError):
+            infos = [info for info in opened.infolist() if not info.is_dir()]
+    except _TROUBLE:
         return []
+    paths = []
+    for info in infos:
+        with suppress(_Refused):
+            paths.append(_path(info))
     return [path for path in paths if not is_debris(path)]
 
 
 class _Refused(Exception):
-    """A member that must not be unpacked, or an archive beyond the limits."""
+    """A member that must not be unpacked."""
+
+
+class _TooLarge(_Refused):
+    """An archive beyond the limits."""
+
+
+# All that reading an archive of any bytes raises.
+_TROUBLE = (
+    _Refused,
+    zipfile.BadZipFile,
+    zlib.error,
+    lzma.LZMAError,
+    struct.error,
+    EOFError,
+    OSError,
+    ValueError,
+    RuntimeError,
+)
+
+
+def _why(error: Exception) -> str:
+    """Return what is wrong with an archive, in one line."""
+    if isinstance(error, _Refused):
+        return str(error)
+    if isinstance(error, NotImplementedError):
+        return "packed in a way that is not supported"
+    if isinstance(error, OSError | RuntimeError):  # the disk's complaint, or a decoder's
+        said = getattr(error, "strerror", None) or _line(error)
+        return f"cannot be unpacked ({said})"
+    return f"not a whole zip archive ({_line(error)})"
 
 
 def _refuse_long_contents(archive: Path, *, limits: Limits) -> None:
     """Refuse an archive whose table of contents alone would fill the memory."""
     size = archive.stat().st_size
     if size > limits.total:
-        raise _Refused(f"{size:,} bytes, the limit is {limits.total:,}")
+        raise _TooLarge(f"{size:,} bytes, the limit is {limits.total:,}")
     with archive.open("rb") as file:
         file.seek(max(0, size - _END.size - _LONGEST_COMMENT))
         tail = file.read()
@@ -115,7 +153,7 @@ def _refuse_long_contents(archive: Path, *, limits: Limits) -> None:
     _, _, _, _, _, directory, _, _ = _END.unpack_from(tail, at)
     # A 64-bit archive says 2^32 - 1 here; no class needs one.
     if directory > limits.directory:
-        raise _Refused(f"a table of contents of {directory:,} bytes")
+        raise _TooLarge(f"a table of contents of {directory:,} bytes")
 
 
 def _extract(opened: zipfile.ZipFile, into: Path, *, budget: _Budget) -> dict[str, str]:
@@ -124,7 +162,7 @@ def _extract(opened: zipfile.ZipFile, into: Path, *, budget: _Budget) -> dict[st
     for info in opened.infolist():
         budget.members -= 1
         if budget.members < 0:
-            raise _Refused(f"more than {budget.limits.members:,} files")
+            raise _TooLarge(f"more than {budget.limits.members:,} files")
         try:
             path = _path(info)
         except _Refused as error:
@@ -133,16 +171,23 @@ def _extract(opened: zipfile.ZipFile, into: Path, *, budget: _Budget) -> dict[st
         if not info.is_dir() and not is_debris(path):
             members[path] = info  # of two with one name, the later
     for path, info in members.items():
-        if info.flag_bits & _ENCRYPTED:
-            raise _Refused("is encrypted; pack it without a password")
         target = into / path
         try:
+            if info.flag_bits & _ENCRYPTED:
+                raise _Refused("is encrypted; pack it without a password")
             target.parent.mkdir(parents=True, exist_ok=True)
             with opened.open(info) as packed, target.open("xb") as file:
                 _copy(packed, file, info, budget=budget, shown=str(path))
+        except _TooLarge:
+            raise
         except OSError as error:  # a file where a folder should be, a name that is too long
-            reason = f"{quote(str(path))} cannot be written ({error.strerror})"
+            reason = f"{quote(str(path))} cannot be written ({error.strerror or _line(error)})"
             refused.setdefault(path.parts[0], reason)
+        except _TROUBLE as error:
+            if budget.limits.whole:
+                raise
+            target.unlink(missing_ok=True)  # half of it may be there
+            refused.setdefault(path.parts[0], _why(error))
     return refused
 
 
@@ -160,7 +205,7 @@ def _copy(
         size += len(chunk)
         budget.total -= len(chunk)
         if budget.total < 0:
-            raise _Refused(f"unpacks to more than {budget.limits.total:,} bytes")
+            raise _TooLarge(f"unpacks to more than {budget.limits.total:,} bytes")
         if size > max(_RATIO_FROM, budget.limits.ratio * info.compress_size):
             raise _Refused(
                 f"{quote(shown)} unpacks to more than {budget.limits.ratio:g} times its size"
@@ -181,6 +226,8 @@ def _path(info: zipfile.ZipInfo) -> PurePosixPath:
         raise _Refused(f"{quote(name)} leaves the archive")
     if not path.parts or "\0" in name:
         raise _Refused("a file without a name")
+    if len(path.parts) > DEEPEST:
+        raise _Refused(f"{quote(name)} lies more than {DEEPEST} folders deep")
     return path
 
 

@@ -118,7 +118,7 @@ def failed(
     detail: str = "",
 ) -> Outcome:
     """Return the outcome of a hand-in that could not be graded."""
-    reason = " ".join(reason.split())
+    reason = "".join(c if c.isprintable() else "�" for c in " ".join(reason.split()))
     grade = Grade(
         submission=task.id,
         authors=tuple(authors),

@@ -28,7 +28,7 @@ MAX_DATA_BYTES = 100_000_000  # over half an hour at 1 kHz
 _MAX_KEY_DEPTH = 30  # tomllib's time grows with the square of a dotted key's depth
 _LARGEST = Decimal("1e100")  # beyond any physical number in any unit, yet safe to square
 _DOTTED_KEY = re.compile(r"[\w\"'-]+(?:[ \t]*\.[ \t]*[\w\"'-]+)*")
-_COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
+_COMMENT = re.compile(r"<!--.*?(?:-->|\Z)", re.DOTALL)  # one left open runs to the end
 _SYSTEM_COLUMNS = ("time", "input", "reference", "frequency")
 
 
@@ -128,8 +128,8 @@ def _validate(document: dict, *, where: str) -> Submission:
         return Submission.model_validate(plain, strict=True)
     except ValidationError as error:
         # A misspelt required key is both unknown and missing: the first says more.
-        errors = sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
-        _raise_first([explain(e, plain) for e in errors], where)
+        first, *others = sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
+        _raise_first([explain(first, plain)], where, more=len(others))
         raise  # never: there is at least one error
 
 
@@ -156,11 +156,11 @@ def _plain(value: object, at: tuple[int | str, ...]) -> object:
     return float(value) if isinstance(value, Decimal) else value
 
 
-def _raise_first(problems: list[str], where: str) -> None:
-    """Raise the first problem, with a count of the others."""
+def _raise_first(problems: list[str], where: str, *, more: int = 0) -> None:
+    """Raise the first problem, with a count of the others and of those that were not worded."""
     if problems:
-        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-        raise SubmissionError(f"{where}: {problems[0]}{more}")
+        others = len(problems) - 1 + more
+        raise SubmissionError(f"{where}: {problems[0]}{f' (and {others} more)' if others else ''}")
 
 
 def _notes(folder: Path) -> str | None:
