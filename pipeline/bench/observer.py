@@ -27,6 +27,17 @@ class Anomalies:
     resets: int = 0
     stuck: int = 0
 
+    def __str__(self) -> str:
+        """Say what there is, "12 lines lost, 3 late"; "none" where there is nothing."""
+        words = {
+            "lines lost": self.lost,
+            "garbled": self.garbled,
+            "late": self.late,
+            "resets": self.resets,
+            "encoders stuck": self.stuck,
+        }
+        return ", ".join(f"{count} {word}" for word, count in words.items() if count) or "none"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
@@ -72,3 +83,49 @@ class Observer(Protocol):
     def finished(self, outcome: Outcome) -> None:
         """Tell how the run ended."""
         ...
+
+    def remark(self, sentence: str) -> None:
+        """Tell what concerns no single run."""
+        ...
+
+
+class Observers:
+    """Several observers as one; the first of them has the person confirm."""
+
+    def __init__(self, observers: Sequence[Observer]) -> None:
+        self._observers = tuple(observers)
+
+    def planned(self, plan: Plan, done: frozenset[str]) -> None:
+        """Tell what will be recorded, and the ids of what already is."""
+        for observer in self._observers:
+            observer.planned(plan, done)
+
+    def confirm(self, instruction: str) -> None:
+        """Have a person do something at the bench, and wait until it is done."""
+        for observer in self._observers[:1]:
+            observer.confirm(instruction)
+
+    def settling(self, recording: Recording, seconds: float) -> None:
+        """Tell that the carts come to rest first."""
+        for observer in self._observers:
+            observer.settling(recording, seconds)
+
+    def started(self, recording: Recording) -> None:
+        """Tell that the bench streams."""
+        for observer in self._observers:
+            observer.started(recording)
+
+    def readings(self, batch: Sequence[Reading], anomalies: Anomalies) -> None:
+        """Hand on the lines that came."""
+        for observer in self._observers:
+            observer.readings(batch, anomalies)
+
+    def finished(self, outcome: Outcome) -> None:
+        """Tell how the run ended."""
+        for observer in self._observers:
+            observer.finished(outcome)
+
+    def remark(self, sentence: str) -> None:
+        """Tell what concerns no single run."""
+        for observer in self._observers:
+            observer.remark(sentence)

@@ -1,0 +1,289 @@
+"""Carry out the plan of a submission on a bench, from where it was left."""
+
+from collections.abc import Collection, Generator, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from pipeline.bench.experiments import add_experiment, prepare_submission, scale_remarks
+from pipeline.bench.gains import Scales, bench_gains, bench_scales, controller_table
+from pipeline.bench.observer import Observer, Observers, Outcome
+from pipeline.bench.orders import Order, make_order
+from pipeline.bench.plan import Plan, Recording
+from pipeline.bench.plan_file import load_plan, plan_path, save_plan
+from pipeline.bench.propose import extend_plan, propose_plan
+from pipeline.bench.protocol import PidGains, StateGains
+from pipeline.bench.raw import FOLDER as RAW
+from pipeline.bench.raw import read_raw
+from pipeline.bench.record import save_record
+from pipeline.bench.serial_line import SerialLine, open_line
+from pipeline.bench.session import Session, stopping_on_signals
+from pipeline.errors import ConfigError, DataError, HardwareError
+from pipeline.output import own_folder
+from pipeline.submission import Submission, load_submission
+from pipeline.submission.load import NAME
+from pipeline.synthesis.files import Value
+from pipeline.workflow import analyse
+
+_TRIES = 3  # of one recording; a fault that strikes three times is not chance
+_USUAL_BAUD = 115_200
+
+
+def acquire(
+    folder: Path, *, port: str, observers: Sequence[Observer], only: Collection[str] = ()
+) -> tuple[Outcome, ...]:
+    """Record what the plan asks for and is not there yet; return how each run ended.
+
+    Every run that is complete stands in submission.toml at once, so a session that is broken off
+    goes on where it was. What is partial is kept beside the data and recorded again.
+
+    Parameters
+    ----------
+    port : of the bench, as pyserial names it.
+    observers : who watches; the first has a person confirm what hands must do.
+    only : the ids to record, the others left; () for the whole plan, which then grows by what
+        the data recorded allow.
+
+    Raises
+    ------
+    HardwareError : no bench, or none that can do what the plan asks.
+    ConfigError : the plan or the submission does not fit the bench.
+    """
+    with stopping_on_signals():
+        work = _Acquisition(folder, port=port, observer=Observers(observers), only=only)
+        return tuple(work.outcomes())
+
+
+class _Acquisition:
+    def __init__(
+        self, folder: Path, *, port: str, observer: Observer, only: Collection[str]
+    ) -> None:
+        self._folder = folder
+        self._port = port
+        self._observer = observer
+        self._only = frozenset(only)
+        self._failed: dict[str, int] = {}  # tries of each recording that has not come off yet
+
+    def outcomes(self) -> Iterator[Outcome]:
+        """Record until nothing is left; a line that was lost is opened again."""
+        while True:
+            with open_line(self._port, baud=self._baud()) as line:
+                lost = yield from self._on_line(line)
+            if not lost:
+                return
+
+    def _baud(self) -> int:
+        if not (self._folder / NAME).exists():
+            return _USUAL_BAUD
+        submission = load_submission(self._folder)
+        return load_plan(submission).baud if plan_path(submission).exists() else _USUAL_BAUD
+
+    def _on_line(self, line: SerialLine) -> Generator[Outcome, None, bool]:
+        """Record over one line; return whether it was lost."""
+        bench = line.bench
+        submission = prepare_submission(self._folder, bench, stock=not bench.commands)
+        if not line.knows("k"):
+            self._observer.remark(
+                f"the bench {bench.name!r} has no watchdog: if this program or the cable dies in "
+                "a run, the motor runs on; keep a hand on its switch"
+            )
+        for sentence in scale_remarks(submission, bench):
+            self._observer.remark(sentence)
+        plan = self._plan(submission, line)
+        session = Session(
+            line, carts=submission.system.carts, limits=plan.limits, observer=self._observer
+        )
+        self._observer.planned(plan, _done(submission))
+        while True:
+            recording = self._next(plan, submission)
+            if recording is None:
+                longer = plan if self._only else self._extended(plan, submission, line)
+                if longer is plan:
+                    return False
+                plan = longer
+                self._observer.planned(plan, _done(submission))
+                continue
+            outcome, submission = self._record(recording, plan, submission, session, line)
+            self._observer.finished(outcome)
+            yield outcome
+            if outcome.partial:
+                self._failed[recording.id] = self._failed.get(recording.id, 0) + 1
+                if self._failed[recording.id] < _TRIES:
+                    self._observer.confirm(f"{recording.id}: {outcome.partial}. Record it again")
+                if _is_lost(line):
+                    return True
+
+    def _plan(self, submission: Submission, line: SerialLine) -> Plan:
+        if plan_path(submission).exists():
+            plan = load_plan(submission)
+        else:
+            plan = propose_plan(submission, bench=line.bench)
+            path = save_plan(plan, submission)
+            self._observer.remark(
+                f"wrote {path}: limits {plan.limits.input:g} {submission.system.input.unit} and "
+                f"{plan.limits.travel:g} {submission.system.position.unit}"
+            )
+        known = {recording.id for recording in plan.recordings}
+        if unknown := sorted(self._only - known):
+            raise ConfigError(f"--only {unknown[0]}: plan.toml has {', '.join(sorted(known))}")
+        return plan
+
+    def _next(self, plan: Plan, submission: Submission) -> Recording | None:
+        done = _done(submission)
+        for recording in plan.recordings:
+            wanted = not self._only or recording.id in self._only
+            given_up = self._failed.get(recording.id, 0) >= _TRIES
+            if wanted and recording.id not in done and not given_up:
+                return recording
+        return None
+
+    def _extended(self, plan: Plan, submission: Submission, line: SerialLine) -> Plan:
+        try:
+            longer = extend_plan(plan, submission, bench=line.bench)
+        except DataError as error:
+            self._observer.remark(f"the plan is not extended: {error}")
+            return plan
+        if longer.recordings == plan.recordings:
+            return plan
+        save_plan(longer, submission)
+        return longer
+
+    def _record(
+        self,
+        recording: Recording,
+        plan: Plan,
+        submission: Submission,
+        session: Session,
+        line: SerialLine,
+    ) -> tuple[Outcome, Submission]:
+        """Record one experiment and note it; return how it went and the submission as it is now."""
+        try:
+            order, table = _order(recording, plan, submission, line)
+        except DataError as error:  # a loop that would do harm: nothing is sent
+            self._failed[recording.id] = _TRIES
+            return Outcome(recording=recording, lines=0, partial=str(error)), submission
+        path = _raw_path(self._folder, recording)
+        try:
+            restless = session.prepare(recording)
+            outcome = session.record(order, path)
+        except HardwareError as error:
+            return Outcome(recording=recording, lines=0, partial=str(error)), submission
+        except KeyboardInterrupt:
+            self._keep_partial(path, submission, "stopped by hand")
+            raise
+        remarks = [restless] if restless else []
+        if str(outcome.anomalies) != "none":
+            remarks.append(str(outcome.anomalies))
+        if outcome.partial:
+            self._keep_partial(path, submission, outcome.partial)
+        else:
+            file = save_record(path, folder=self._folder, carts=submission.system.carts)
+            entry = _experiment(recording, file=file, controller=table, remarks=remarks)
+            submission = add_experiment(load_submission(self._folder), entry)
+        return _with_remarks(outcome, remarks), submission
+
+    def _keep_partial(self, path: Path, submission: Submission, why: str) -> None:
+        """Save what came of a run that ended early, where no report takes it for a whole one."""
+        if not path.exists():
+            return
+        try:
+            file = save_record(
+                path, folder=self._folder, carts=submission.system.carts, partial=True
+            )
+        except DataError:  # nothing came
+            return
+        self._observer.remark(f"{file} is partial ({why}); it is not in {NAME}")
+
+
+def recover(folder: Path, *, carts: int) -> list[str]:
+    """Save the partial records of raw files that no data file was made of; return their names."""
+    saved = []
+    for path in sorted((folder / RAW).glob("*.raw")):
+        try:
+            recording = read_raw(path).header.recording
+            known = [folder / "data" / f"{recording.id}{end}" for end in (".txt", ".partial.txt")]
+            if not any(file.exists() for file in known):
+                saved.append(save_record(path, folder=folder, carts=carts, partial=True))
+        except DataError:  # cut within its first lines
+            continue
+    return saved
+
+
+def _done(submission: Submission) -> frozenset[str]:
+    return frozenset(experiment.id for experiment in submission.experiments)
+
+
+def _is_lost(line: SerialLine) -> bool:
+    try:
+        line.stop()
+        line.drain()
+    except HardwareError:
+        return True
+    return False
+
+
+def _raw_path(folder: Path, recording: Recording) -> Path:
+    """Return a name not yet taken: each try of a recording has a raw file of its own."""
+    parent = own_folder(folder, RAW)
+    number = 1
+    while (path := parent / f"{recording.id}-{number}.raw").exists():
+        number += 1
+    return path
+
+
+def _order(
+    recording: Recording, plan: Plan, submission: Submission, line: SerialLine
+) -> tuple[Order, dict[str, Value] | None]:
+    """Return the order and, of a closed loop, the controller as submission.toml tells of it."""
+    system, bench = submission.system, line.bench
+    scales = Scales(
+        input=system.input.per_count or bench.input_per_count,
+        position=system.position.per_count or bench.position_per_count,
+    )
+    gains: PidGains | StateGains | None = None
+    table: dict[str, Value] | None = None
+    if recording.controller is not None:
+        analysis = analyse(submission)
+        scales = bench_scales(submission, bench=bench, analysis=analysis)
+        gains = bench_gains(
+            recording,
+            submission=submission,
+            analysis=analysis,
+            bench=bench,
+            limits=plan.limits,
+        )
+        cart = recording.controller.cart
+        table = dict(controller_table(gains, cart=cart, scales=scales, carts=system.carts))
+    order = make_order(
+        recording, limits=plan.limits, scales=scales, system=system, bench=bench, gains=gains
+    )
+    return order, table
+
+
+def _experiment(
+    recording: Recording,
+    *,
+    file: str,
+    controller: dict[str, Value] | None,
+    remarks: Sequence[str],
+) -> dict[str, Value]:
+    """Return the keys of the `[[experiments]]` table of a recording."""
+    entry: dict[str, Value] = {
+        "id": recording.id,
+        "kind": recording.kind,
+        "carts": list(recording.carts),
+        "file": file,
+    }
+    if recording.kind == "sine":
+        entry["frequency"] = recording.frequency
+    if recording.controller is not None and controller is not None:
+        entry["controlled_cart"] = recording.controller.cart
+        entry["controller"] = controller
+    note = "; ".join([recording.note, *remarks] if recording.note else remarks)
+    if note:
+        entry["note"] = note
+    return entry
+
+
+def _with_remarks(outcome: Outcome, remarks: Sequence[str]) -> Outcome:
+
+    return replace(outcome, remarks=(*outcome.remarks, *remarks))

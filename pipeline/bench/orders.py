@@ -1,0 +1,114 @@
+"""What a recording asks of the bench: commands and limits in the bench's own counts."""
+
+from dataclasses import dataclass
+
+from pipeline.bench.gains import Scales
+from pipeline.bench.plan import Limits, Recording
+from pipeline.bench.protocol import (
+    ChirpEnd,
+    Command,
+    Description,
+    PidGains,
+    Reading,
+    Start,
+    StateGains,
+    Wave,
+)
+from pipeline.errors import ConfigError, HardwareError
+from pipeline.submission import System
+
+
+@dataclass(frozen=True, kw_only=True)
+class Order:
+    """A recording in the bench's counts.
+
+    Attributes
+    ----------
+    commands : to send, the start last.
+    scales : of the counts; `input_unit`, `position_unit` are theirs.
+    most_duty, most_counts : what no line may pass, duty and encoder counts.
+    """
+
+    recording: Recording
+    commands: tuple[Command, ...]
+    scales: Scales
+    input_unit: str
+    position_unit: str
+    most_duty: float
+    most_counts: float
+
+    def passed(self, reading: Reading, *, carts: int) -> str:
+        """Return what a line passes the limits by, or ""."""
+        if abs(reading.duty) > self.most_duty:
+            found, most = (abs(self.scales.input) * n for n in (reading.duty, self.most_duty))
+            return f"the input was {found:.4g} {self.input_unit}, the limit is {most:.4g}"
+        for cart, count in enumerate(reading.counts[:carts], start=1):
+            if abs(count) > self.most_counts:
+                found, most = (self.scales.position * n for n in (count, self.most_counts))
+                return (
+                    f"cart {cart} was {found:.4g} {self.position_unit} from its zero, "
+                    f"the limit is {most:.4g}"
+                )
+        return ""
+
+
+def make_order(
+    recording: Recording,
+    *,
+    limits: Limits,
+    scales: Scales,
+    system: System,
+    bench: Description,
+    gains: PidGains | StateGains | None = None,
+) -> Order:
+    """Turn a recording into commands, its amplitude into counts; `gains` close its loop.
+
+    Raises
+    ------
+    ConfigError : the amplitude passes the limits, or is less than half a count.
+    HardwareError : the bench does not know the wave or the controller.
+    """
+    closed = recording.controller is not None
+    limit, unit, per_count = (
+        (limits.travel, system.position.unit, scales.position)
+        if closed
+        else (limits.input, system.input.unit, abs(scales.input))
+    )
+    where = f"plan.toml: {recording.id}: amplitude {recording.amplitude:g} {unit}"
+    if abs(recording.amplitude) > limit:
+        raise ConfigError(f"{where} passes the limit of {limit:g} {unit}")
+    amplitude = round(recording.amplitude / per_count)
+    if recording.amplitude and not amplitude:
+        raise ConfigError(f"{where} is less than half a count of the bench ({per_count:g} {unit})")
+    commands: list[Command] = []
+    if gains is not None:
+        if isinstance(gains, StateGains):
+            _check_known("f", "state feedback", recording, bench)
+        commands.append(gains)
+    if recording.wave == "chirp":
+        _check_known("c", "chirp", recording, bench)
+        if recording.frequency_end is not None:
+            commands.append(ChirpEnd(frequency=recording.frequency_end))
+    commands.append(
+        Start(
+            wave=Wave[recording.wave.upper()],
+            encoder=min(recording.controller.cart, 2) if recording.controller else None,
+            frequency=recording.frequency,
+            amplitude=amplitude,
+            cycles=recording.cycles,
+        )
+    )
+    return Order(
+        recording=recording,
+        commands=tuple(commands),
+        scales=scales,
+        input_unit=system.input.unit,
+        position_unit=system.position.unit,
+        most_duty=limits.input / abs(scales.input) + 0.5,  # amplitudes are rounded
+        most_counts=limits.travel / scales.position,
+    )
+
+
+def _check_known(letter: str, name: str, recording: Recording, bench: Description) -> None:
+    if letter not in bench.commands:
+        raise HardwareError(f"{recording.id}: the bench {bench.name!r} knows no {name}")

@@ -1,0 +1,287 @@
+"""Runs on the bench, one at a time: rest, start, watch every line, stop; whatever happens, stop.
+
+A run is watched by one loop that looks at the port every few milliseconds, writes what came to the
+raw file, keeps the bench's watchdog awake and checks the limits. There is no thread: if this loop
+hangs, the heartbeat ends and the bench cuts its motor itself.
+"""
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+from types import FrameType
+
+from pipeline.bench.observer import Anomalies, Observer, Outcome
+from pipeline.bench.orders import Order
+from pipeline.bench.plan import Limits, Recording
+from pipeline.bench.protocol import (
+    HEARTBEAT_EVERY,
+    Command,
+    Hands,
+    Reading,
+    Signal,
+    Start,
+    Wave,
+    encode,
+)
+from pipeline.bench.raw import RawHeader, RawWriter
+from pipeline.bench.serial_line import SerialLine
+from pipeline.bench.stream import Stream
+from pipeline.errors import HardwareError
+
+_LOOK = 0.004  # s between looks at the port
+_FORWARD = 0.05  # s between batches handed to the observers
+_COUNT = 1.0  # s between counts of what is lost
+_FIRST_LINE = 1.0  # s a bench may take to begin
+_SILENCE = 0.5  # s without a byte in mid-run: the bench is gone
+_NEARLY = 100.0  # ms before the end at which silence is the end, its last lines lost
+_AFTER_END = 0.02  # s the last lines may still be under way
+_REST_TRIES = 4
+_REST_WINDOW = 500.0  # ms at the end of a rest over which it is judged
+_STILL = 4  # counts a cart at rest may flicker
+
+
+class Stopped(KeyboardInterrupt):
+    """The program was told to end by a signal."""
+
+
+@contextmanager
+def stopping_on_signals() -> Iterator[None]:
+    """Turn SIGTERM into an exception, so that a run under way is stopped and saved."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        raise Stopped(f"signal {number}")
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+class Session:
+    """A bench and what is known of it: who holds which carts, how long its period is.
+
+    Parameters
+    ----------
+    carts : on the bench; encoders beyond them are not looked at.
+    """
+
+    def __init__(self, line: SerialLine, *, carts: int, limits: Limits, observer: Observer) -> None:
+        self._line = line
+        self._carts = carts
+        self._limits = limits
+        self._observer = observer
+        self._period = 1e3 * line.bench.period
+        self._free: tuple[int, ...] | None = None  # as a person was last told
+        self._beat = float("-inf")
+
+    def prepare(self, recording: Recording) -> str:
+        """Have the carts held or freed and at rest; return what is to be said of it, or ""."""
+        held = tuple(cart for cart in range(1, self._carts + 1) if cart not in recording.carts)
+        if self._line.knows("h"):
+            self._line.send(Hands(held=held))
+        elif recording.carts != self._free:
+            self._observer.confirm(_hold(recording.carts, held))
+            self._free = recording.carts
+        restless = self._rest(recording)
+        if self._line.knows("h"):
+            self._line.send(Hands(held=held, released=recording.release or 0))
+        elif recording.release:
+            self._observer.confirm(
+                f"Pull cart {recording.release} out and hold it still; let it go once the "
+                "recording has begun"
+            )
+        return restless
+
+    def record(self, order: Order, path: Path) -> Outcome:
+        """Carry out one run and write its raw file.
+
+        Whatever ends it early (a limit, the line, Ctrl-C, a signal), the bench is told to stop and
+        what came is in the file; an interrupt goes on to the caller.
+        """
+        header = RawHeader(
+            recording=order.recording,
+            limits=self._limits,
+            commands=tuple(encode(command).decode() for command in order.commands),
+            bench=self._line.bench,
+            begun=datetime.now().astimezone().isoformat(timespec="seconds"),
+        )
+        stream = self._stream(order.recording.carts)
+        watch = _Watch(order, carts=self._carts, stream=stream, observer=self._observer)
+        partial = "stopped"
+        with RawWriter(path, header) as raw:
+            try:
+                self._line.receive()  # nothing of an earlier run belongs here
+                self._start(order.commands)
+                self._observer.started(order.recording)
+                partial = self._listen(
+                    stream,
+                    seconds=order.recording.duration,
+                    arrived=raw.write,
+                    check=watch.check,
+                )
+            except HardwareError as error:
+                partial = str(error)
+            finally:
+                self._stop(always=bool(partial))
+        watch.forward(stream.finish())
+        outcome = Outcome(
+            recording=order.recording,
+            lines=stream.lines,
+            anomalies=stream.anomalies,
+            partial=partial,
+        )
+        self._period = stream.period
+        return outcome
+
+    def _stream(self, free: Sequence[int]) -> Stream:
+        watched = tuple(cart for cart in free if cart <= self._carts)
+        return Stream(encoders=self._line.bench.encoders, period=self._period, free=watched)
+
+    def _rest(self, recording: Recording) -> str:
+        """Wait, in a run that does nothing, until the carts have come to rest."""
+        if recording.settle <= 0:
+            return ""
+        moving: dict[int, int] = {}
+        for _ in range(_REST_TRIES):
+            self._observer.settling(recording, recording.settle)
+            last = _Tail(since=1e3 * recording.settle - _REST_WINDOW)
+            self._start([Start(wave=Wave.DELTA, frequency=1 / recording.settle, amplitude=0)])
+            trouble = self._listen(self._stream(()), seconds=recording.settle, check=last.keep)
+            if trouble:
+                raise HardwareError(f"{recording.id}: while the carts came to rest, {trouble}")
+            moving = {
+                cart: swing
+                for cart, swing in enumerate(last.swings[: self._carts], start=1)
+                if swing > _STILL
+            }
+            if not moving:
+                return ""
+        swings = ", ".join(f"cart {cart} by {swing} counts" for cart, swing in moving.items())
+        return f"not at rest when the run began: {swings} within half a second"
+
+    def _start(self, commands: Sequence[Command]) -> None:
+        self._heartbeat()
+        self._line.send(*commands)
+
+    def _heartbeat(self) -> None:
+        now = time.monotonic()
+        if self._line.knows("k") and now - self._beat > HEARTBEAT_EVERY - _LOOK:
+            self._line.send(Signal.HEARTBEAT)
+            self._beat = now
+
+    def _stop(self, *, always: bool) -> None:
+        """Stop the bench; a stock one, which that zeroes, only if the run did not end by itself."""
+        if not always and not self._line.knows("s"):
+            return
+        try:
+            self._line.stop()
+        except HardwareError as error:
+            self._observer.remark(f"the stop could not be sent: {error}")
+
+    def _listen(
+        self,
+        stream: Stream,
+        *,
+        seconds: float,
+        check: Callable[[Sequence[Reading]], str],
+        arrived: Callable[[bytes], None] = lambda data: None,
+    ) -> str:
+        """Read lines until the run is over; return why it ended early, or ""."""
+        since = last = time.monotonic()
+        end = 1e3 * seconds
+        while True:
+            self._heartbeat()
+            now = time.monotonic()
+            if data := self._line.receive():
+                arrived(data)
+                last = now
+                if trouble := check(stream.feed(data, since=since)):
+                    return trouble
+                if stream.restarted:
+                    return "the bench began again in mid-run: its supply or its reset line"
+            quiet = now - last
+            if stream.latest >= end - 2 * self._period and quiet > _AFTER_END:
+                return ""
+            if stream.latest >= end - _NEARLY and quiet > 2 * _AFTER_END + _SILENCE / 2:
+                return ""
+            if quiet > (_SILENCE if stream.latest >= 0 else _FIRST_LINE):
+                return (
+                    f"the bench fell silent after {1e-3 * stream.latest:.3f} s"
+                    if stream.latest >= 0
+                    else "the bench did not begin to stream"
+                )
+            since = now
+            time.sleep(_LOOK)
+
+
+class _Watch:
+    """Checks each line against the limits, and hands them on in batches."""
+
+    def __init__(self, order: Order, *, carts: int, stream: Stream, observer: Observer) -> None:
+        self._order = order
+        self._carts = carts
+        self._stream = stream
+        self._observer = observer
+        self._batch: list[Reading] = []
+        self._forwarded = self._counted = time.monotonic()
+        self._anomalies = Anomalies()
+
+    def check(self, batch: Sequence[Reading]) -> str:
+        """Return why the run must stop, or ""."""
+        for reading in batch:
+            if passed := self._order.passed(reading, carts=self._carts):
+                self.forward(batch)
+                return f"stopped: {passed}"
+        self._batch += batch
+        now = time.monotonic()
+        if now - self._counted > _COUNT:
+            self._anomalies, self._counted = self._stream.anomalies, now
+        if now - self._forwarded > _FORWARD:
+            self._forwarded = now
+            self.forward(())
+        return ""
+
+    def forward(self, batch: Sequence[Reading]) -> None:
+        """Hand on what waits, and this."""
+        waiting, self._batch = [*self._batch, *batch], []
+        if waiting:
+            self._observer.readings(waiting, self._anomalies)
+
+
+class _Tail:
+    """The last lines of a rest."""
+
+    def __init__(self, *, since: float) -> None:
+        self._since = since
+        self._readings: list[Reading] = []
+
+    def keep(self, batch: Sequence[Reading]) -> str:
+        """Keep what is late enough; nothing is wrong with it."""
+        self._readings += [reading for reading in batch if reading.ms >= self._since]
+        return ""
+
+    @property
+    def swings(self) -> list[int]:
+        """How far each encoder went, counts."""
+        columns = zip(*(reading.counts for reading in self._readings), strict=True)
+        return [max(column) - min(column) for column in columns]
+
+
+def _hold(free: Sequence[int], held: Sequence[int]) -> str:
+    text = f"Let {_carts(free)} move freely"
+    return f"Hold {_carts(held)} fast and let {_carts(free)} move freely" if held else text
+
+
+def _carts(carts: Sequence[int]) -> str:
+    if len(carts) == 1:
+        return f"cart {carts[0]}"
+    *most, last = map(str, carts)
+    return f"carts {', '.join(most)} and {last}"

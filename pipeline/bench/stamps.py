@@ -1,0 +1,111 @@
+"""How many lines a run of time stamps lacks, and the true period behind them.
+
+Stamps are whole milliseconds. Near 1 kHz a clock of 1.0024 ms skips a stamp every 417 ms although
+no line is lost, so a difference of two tells nothing by itself. But the clock's own skips are
+evenly spaced, like the teeth of a comb, and losses are not.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Stamps = NDArray[np.int64]
+
+_STRIP = 1.25  # ms: stamps of one even clock lie within 1 ms of a line; a loss makes it 1.5 or more
+_SLOW = 1.5  # ms: from this period on each difference tells by itself
+_FIRST_TEETH, _SECOND_TEETH = 60, 120  # missing stamps tried as the comb's first two teeth
+_CLOSEST_TEETH = 20  # ms: a clock of 1.05 ms; one further off is no bench's that aims at 1 kHz
+_MOST_ABSENT = 0.2  # of the stamps; more is a slower clock
+_BY_CHANCE = 0.01  # how likely losses may look like a comb
+_SLACK = 1  # ms a tooth may be off: stamps are rounded
+_RECENT = 16  # teeth the spacing is told from, for a clock that drifts
+
+
+@dataclass(frozen=True, kw_only=True)
+class StampFit:
+    """The clock of a run.
+
+    Attributes
+    ----------
+    period : ms from line to line.
+    missing : lines that the clock ticked and that are not there.
+    """
+
+    period: float
+    missing: int
+
+
+def fit_stamps(stamps: Stamps, *, period: float) -> StampFit:
+    """Return the clock behind stamps (n,) in ms, never falling; `period` (ms) is what is expected.
+
+    The expectation counts only where the stamps do not tell: a short run with losses, a clock
+    within some 1e-5 of 1 ms, or one that ticks twice within a millisecond.
+    """
+    n = stamps.size
+    if n < 2:
+        return StampFit(period=period, missing=0)
+    if (slope := _even(stamps)) is not None:
+        return StampFit(period=slope, missing=0)
+    steps = np.diff(stamps)
+    usual = float(np.median(steps))
+    if usual >= _SLOW:
+        own = float(steps[steps < usual + _SLOW].mean())  # rounding makes two usual steps
+        return StampFit(period=own, missing=int((np.round(steps / own) - 1).clip(min=0).sum()))
+    span = int(stamps[-1] - stamps[0])
+    seen = np.zeros(span + 1, dtype=np.bool_)
+    seen[stamps - stamps[0]] = True
+    absent = np.flatnonzero(~seen).tolist()
+    if len(absent) > _MOST_ABSENT * span and period < 1 / (1 - _MOST_ABSENT):
+        return StampFit(period=span / (n - 1), missing=0)  # not the bench that is expected
+    if not 1.0 <= period < 1.0 + 1.0 / _CLOSEST_TEETH:
+        return StampFit(period=period, missing=max(0, round(span / period) + 1 - n))
+    teeth = _comb(absent)
+    chance = (1 + 2 * _SLACK) * len(absent) / span  # that a tooth is there though it is none
+    if _FIRST_TEETH * _SECOND_TEETH * chance ** (len(teeth) - 2) < _BY_CHANCE:
+        spacing = (teeth[-1] - teeth[0]) / (len(teeth) - 1)
+        return StampFit(period=spacing / (spacing - 1), missing=len(absent) - len(teeth))
+    own_skips = round(span * (1 - 1 / period))
+    return StampFit(period=period, missing=max(0, len(absent) - own_skips))
+
+
+def _even(stamps: Stamps) -> float | None:
+    """Return the period of stamps that one even clock explains without a loss, else None."""
+    i = np.arange(stamps.size) - (stamps.size - 1) / 2
+    slope = float(i @ stamps / (i @ i))
+    return slope if slope > 0 and np.ptp(stamps - slope * i) < _STRIP else None
+
+
+def _comb(absent: Sequence[int]) -> list[int]:
+    """Return the absent stamps (ascending) that are the clock's own skips: the longest comb.
+
+    Every tooth of it must be there, from the first absent stamps to the last.
+    """
+    there = frozenset(absent)
+    best: list[int] = []
+    for i, first in enumerate(absent[:_FIRST_TEETH]):
+        for second in absent[i + 1 : i + 1 + _SECOND_TEETH]:
+            # Closer teeth are the rarer find: a comb may miss none, so the most teeth win.
+            teeth = _follow(first, second, there=there, last=absent[-1])
+            best = max(best, teeth, key=len)
+    return best
+
+
+def _follow(first: int, second: int, *, there: frozenset[int], last: int) -> list[int]:
+    """Return the teeth from the first two on; [] where one is missing before the end."""
+    if second - first < _CLOSEST_TEETH:
+        return []
+    teeth = [first, second]
+    while True:
+        back = teeth[-_RECENT:]
+        # Two teeth tell their spacing to a millisecond, many to a fraction of it.
+        expected = back[-1] + (back[-1] - back[0]) / (len(back) - 1)
+        slack = _SLACK + 1.0 / (len(back) - 1)
+        low, high = int(np.ceil(expected - slack)), int(np.floor(expected + slack))
+        if high > last:
+            return teeth
+        near = [stamp for stamp in range(low, high + 1) if stamp in there]
+        if not near:
+            return []
+        teeth.append(min(near, key=lambda stamp: abs(stamp - expected)))

@@ -1,0 +1,248 @@
+"""Lines out of lumps of bytes, and everything that went wrong on the way.
+
+A line is judged when the next one is there: a bench's clock never goes back and no cart jumps out
+and back within two lines, so a line that stands out between its neighbours was garbled though it
+can still be read. That costs one line of delay and no line that was right.
+"""
+
+from array import array
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from pipeline.bench.observer import Anomalies
+from pipeline.bench.protocol import FULL_SCALE, Reading, parse_reading
+from pipeline.bench.stamps import fit_stamps
+
+_LONGEST_LINE = 512  # bytes; more without an end is noise
+_SPIKE = 32  # counts a true reading may stand out between its neighbours: a hit on an end stop
+_LATE = 0.02  # s behind the earliest lines: they waited somewhere for one another
+_FORGET = 1e-3  # s/s the two clocks may drift apart
+_WINDOW = 1000  # ms over which an encoder is watched
+_MOVED, _NEIGHBOUR_MOVED = 20, 200  # counts
+_DRIVEN = 8  # duty counts; less moves no cart
+
+
+class Stream:
+    """The lines of one run.
+
+    Parameters
+    ----------
+    encoders : fields of a line that are counts.
+    period : ms from line to line, as expected.
+    free : the carts that can move; their encoders are watched.
+    """
+
+    def __init__(self, *, encoders: int, period: float = 1.0, free: Sequence[int] = ()) -> None:
+        self._encoders = encoders
+        self._expected = period
+        self._tail = b""
+        self._before: Reading | None = None  # the last line handed on
+        self._held: Reading | None = None  # waits for its successor
+        self._stamps = array("q")
+        self._garbled = 0
+        self._garbled_lines = 0  # a merger of two is one garbled place and two lines
+        self._late = 0
+        self._resets = 0
+        self._lead = float("inf")  # s, the least of arrival minus stamp
+        self._watch = _EncoderWatch(cart for cart in free if cart <= encoders)
+
+    @property
+    def lines(self) -> int:
+        """How many valid lines were handed on."""
+        return len(self._stamps)
+
+    @property
+    def latest(self) -> int:
+        """The stamp of the newest line, judged or not, ms; -1 of none."""
+        newest = self._held or self._before
+        return -1 if newest is None else newest.ms
+
+    @property
+    def restarted(self) -> bool:
+        """Whether the bench's clock began again: no line after that belongs to this run."""
+        return self._resets > 0
+
+    @property
+    def period(self) -> float:
+        """The clock that explains the stamps, ms from line to line."""
+        return fit_stamps(np.array(self._stamps), period=self._expected).period
+
+    @property
+    def anomalies(self) -> Anomalies:
+        """All that went wrong so far; a line without its successor is not yet judged."""
+        missing = fit_stamps(np.array(self._stamps), period=self._expected).missing
+        return Anomalies(
+            lost=max(0, missing - self._garbled_lines),
+            garbled=self._garbled,
+            late=self._late,
+            resets=self._resets,
+            stuck=self._watch.stuck,
+        )
+
+    def feed(self, data: bytes, *, since: float) -> list[Reading]:
+        """Return the lines that are now known to be valid.
+
+        `since` (s, of any clock that runs on) is when the port was last found empty: the data came
+        after it, so a host that was busy elsewhere does not make lines late.
+        """
+        *lines, self._tail = (self._tail + data).split(b"\n")
+        if len(self._tail) > _LONGEST_LINE:
+            lines.append(self._tail)
+            self._tail = b""
+        valid: list[Reading] = []
+        for line in lines:
+            reading = self._read(line)
+            if reading is not None:
+                valid += self._judge(reading)
+                self._time(reading, since)
+        self._watch.see(valid)
+        return valid
+
+    def finish(self) -> list[Reading]:
+        """Return the line that still waited for its successor; the run is over."""
+        last, self._held = self._held, None
+        if last is None or (self._before is not None and last.ms < self._before.ms):
+            return []
+        self._keep(last)
+        self._watch.see([last])
+        return [last]
+
+    def _read(self, line: bytes) -> Reading | None:
+        if not line.strip():
+            return None
+        reading = parse_reading(line)
+        if (
+            reading is None
+            or len(reading.counts) != self._encoders
+            or abs(reading.duty) > FULL_SCALE
+        ):
+            whole = round(line.count(b":") / (self._encoders + 2))
+            self._reject(lines=max(1, whole))
+            return None
+        return reading
+
+    def _reject(self, *, lines: int = 1) -> None:
+        self._garbled += 1
+        self._garbled_lines += lines
+
+    def _judge(self, after: Reading) -> list[Reading]:
+        """Return the line held back if its neighbours bear it out, and hold this one."""
+        if self.restarted:
+            return []
+        before, held, self._held = self._before, self._held, after
+        if held is None:
+            return []
+        if before is None:
+            if after.ms < held.ms:  # left over from an earlier run, or garbled
+                self._reject()
+                return []
+        elif held.ms < before.ms and after.ms < before.ms and after.ms >= held.ms:
+            self._resets += 1
+            self._held = None
+            return []
+        elif _stands_out(before, held, after):
+            self._reject()
+            return []
+        self._keep(held)
+        return [held]
+
+    def _keep(self, reading: Reading) -> None:
+        self._before = reading
+        self._stamps.append(reading.ms)
+
+    def _time(self, reading: Reading, since: float) -> None:
+        lag = since - 1e-3 * reading.ms
+        self._late += lag > self._lead + _LATE
+        self._lead = min(self._lead + _FORGET * 1e-3 * self._expected, lag)
+
+
+def _stands_out(before: Reading, held: Reading, after: Reading) -> bool:
+    """Tell a line that its two neighbours, which agree with one another, speak against."""
+    if before.ms <= after.ms and not before.ms <= held.ms <= after.ms:
+        return True
+    if held.ms < before.ms:
+        return True
+    room = _SPIKE * max(1, after.ms - before.ms)
+    signals = [*zip(before.counts, held.counts, after.counts, strict=True)]
+    signals.append((before.target, held.target, after.target))
+    if before.duty == before.target and after.duty == after.target:  # open loop: no kicks
+        signals.append((before.duty, held.duty, after.duty))
+    return any(abs(2 * b - a - c) > 2 * (room + 2 * abs(c - a)) for a, b, c in signals)
+
+
+class _EncoderWatch:
+    """Notices encoders that stand still although the motor does not."""
+
+    def __init__(self, carts: Iterable[int]) -> None:
+        self._encoders = [cart - 1 for cart in carts]
+        self._ranges: dict[int, _Range] = {encoder: _Range() for encoder in self._encoders}
+        self._duty = _Range()
+        self._start = 0
+        self._earlier: tuple[dict[int, int], int] | None = None
+        self._overall: dict[int, _Range] = {encoder: _Range() for encoder in self._encoders}
+        self._driven = _Range()
+        self._frozen: set[int] = set()
+
+    @property
+    def stuck(self) -> int:
+        """How many encoders froze while driven on, or never moved though their carts had to."""
+        moved = {encoder: seen.width for encoder, seen in self._overall.items()}
+        pushed = self._driven.width >= _DRIVEN
+        never = {
+            encoder
+            for encoder, width in moved.items()
+            if width == 0
+            and pushed
+            and (encoder == 0 or max(moved.values()) >= _NEIGHBOUR_MOVED)
+            and self._earlier is not None  # a run of less than a window tells nothing
+        }
+        return len(self._frozen | never)
+
+    def see(self, readings: Sequence[Reading]) -> None:
+        """Take note of valid lines, in order."""
+        if not readings:
+            return
+        for encoder in self._encoders:
+            counts = [reading.counts[encoder] for reading in readings]
+            self._ranges[encoder].widen(counts)
+            self._overall[encoder].widen(counts)
+        duties = [reading.duty for reading in readings]
+        self._duty.widen(duties)
+        self._driven.widen(duties)
+        if readings[-1].ms - self._start >= _WINDOW:
+            self._close(readings[-1].ms)
+
+    def _close(self, ms: int) -> None:
+        widths = {encoder: seen.width for encoder, seen in self._ranges.items()}
+        duty = self._duty.width
+        if self._earlier is not None:
+            earlier, earlier_duty = self._earlier
+            if duty >= max(_DRIVEN, earlier_duty / 2):
+                self._frozen |= {
+                    encoder
+                    for encoder, width in widths.items()
+                    if width == 0 and earlier[encoder] >= _MOVED
+                }
+        self._earlier, self._start = (widths, duty), ms
+        self._ranges = {encoder: _Range() for encoder in self._encoders}
+        self._duty = _Range()
+
+
+class _Range:
+    """The least and the greatest of whole numbers."""
+
+    def __init__(self) -> None:
+        self._low: int | None = None
+        self._high = 0
+
+    @property
+    def width(self) -> int:
+        """The distance from the least to the greatest; 0 of none."""
+        return 0 if self._low is None else self._high - self._low
+
+    def widen(self, values: Sequence[int]) -> None:
+        """Take in some more."""
+        low, high = min(values), max(values)
+        self._high = high if self._low is None else max(self._high, high)
+        self._low = low if self._low is None else min(self._low, low)
