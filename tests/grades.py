@@ -74,7 +74,10 @@ def shared_flag(other: str) -> Flag:
         code="shared_data",
         parameters=("step-1",),
         message=f"The recording of step-1 stands in {other} too.",
-        evidence={"submissions": [other]},
+        evidence={
+            "submissions": [other],
+            "recordings": [{"experiment": "step-1", "submission": other}],
+        },
     )
 
 

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import ConfigError
-from pipeline.grading.anonymous import KEY_FILE, pseudonyms
+from pipeline.grading.anonymous import KEY_FILE, anonymise, pseudonyms
 from pipeline.grading.batch import Batch
 from pipeline.grading.class_page import Line, class_page
 from pipeline.grading.feedback import feedback_page
@@ -244,8 +244,30 @@ def test_without_names_nothing_tells_who_it_was(tmp_path):
     (ann,) = [n for n, row in key.items() if row["authors"] == "ann"]
     (zoe,) = [n for n, row in key.items() if row["authors"] == "zoe"]
     flag = json.loads(before[f"feedback/{zoe}/grade.json"])["flags"][0]
-    assert flag["evidence"] == {"submissions": [ann]}  # handing in again changes no name
+    assert flag["evidence"]["submissions"] == [ann]  # handing in again changes no name
     assert ann in flag["message"]
+
+
+def test_a_name_that_is_a_number_or_a_word_garbles_nothing():
+    """Teams are called 3, or step: numbers and experiments in their feedback stay."""
+    grade = make_grade("3", share=0.5, flags=(hertz_flag(), shared_flag("step")))
+    hidden = anonymise(grade, {"3": "anon-a", "step": "anon-b"})
+    assert [c.message for c in hidden.criteria] == [c.message for c in grade.criteria]
+    assert hidden.flags[0] == grade.flags[0]
+    assert hidden.flags[1].message.startswith("step-1 also stands in anon-b: ")
+    assert hidden.flags[1].evidence["recordings"][0]["submission"] == "anon-b"
+
+
+@pytest.mark.parametrize(
+    ("reason", "shown"),
+    [
+        ("3/submission.toml line 3: no key", "anon-a/submission.toml line 3: no key"),
+        ("doejane_1024_77_lab.zip: not a whole zip", "the archive: not a whole zip"),
+    ],
+)
+def test_a_reason_names_nobody(reason, shown):
+    """Neither the folder before a file nor an archive with the student's name stays."""
+    assert anonymise(failed_grade("3", reason), {"3": "anon-a"}).reason == shown
 
 
 def test_names_that_stand_in_are_all_different():

@@ -6,15 +6,16 @@ from base64 import b32encode
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
-from pipeline.grading.grade import Grade
+from pipeline.grading.grade import Flag, Grade
+from pipeline.grading.shared import shared_message
 from pipeline.grading.table import csv_text
 
 KEY_FILE = "anonymous-key.csv"
 _PREFIX = "anon-"
 _SHORTEST = 6  # letters: a thousand submissions rarely need one more
 _STRANGER = "another submission"
+_ARCHIVE = re.compile(r"^.*?\.zip\W?: ", re.IGNORECASE)  # at the beginning of a reason
 
 
 def pseudonyms(first_keys: Mapping[str, str]) -> dict[str, str]:
@@ -36,36 +37,37 @@ def pseudonyms(first_keys: Mapping[str, str]) -> dict[str, str]:
 
 
 def anonymise(grade: Grade, names: Mapping[str, str]) -> Grade:
-    """Return the grade without authors, and with the names of submissions replaced everywhere.
+    """Return the grade without authors, and without the names of submissions.
 
-    What students call their runs and files stays.
+    Those stand in the flag for shared data, and before the files of a submission in the reason why
+    it could not be graded; platforms put the student's name into that of an archive. What students
+    call their runs and files stays.
     """
-    mentioned = {grade.submission: names[grade.submission]}
-    for flag in grade.flags:
-        if flag.code == "shared_data":
-            for other in flag.evidence.get("submissions", ()):
-                mentioned[other] = names.get(other, _STRANGER)
-    longest_first = sorted(mentioned, key=len, reverse=True)
-    pattern = re.compile(rf"(?<!\w)(?:{'|'.join(map(re.escape, longest_first))})(?!\w)")
-
-    def hidden(value: Any) -> Any:
-        if isinstance(value, str):
-            return pattern.sub(lambda match: mentioned[match[0]], value)
-        if isinstance(value, Mapping):
-            return {key: hidden(item) for key, item in value.items()}
-        return [hidden(item) for item in value] if isinstance(value, list | tuple) else value
-
+    own = names[grade.submission]
+    name = re.escape(grade.submission)
+    path = re.compile(rf"^{name}(?=:)|(?<![^\s'\"(]){name}(?=[/\\])")
     return replace(
         grade,
-        submission=names[grade.submission],
+        submission=own,
         authors=(),
-        reason=hidden(grade.reason),
-        notes=tuple(hidden(grade.notes)),
-        criteria=tuple(replace(c, message=hidden(c.message)) for c in grade.criteria),
+        reason=path.sub(own, _ARCHIVE.sub("the archive: ", grade.reason)),
         flags=tuple(
-            replace(flag, message=hidden(flag.message), evidence=hidden(flag.evidence))
-            for flag in grade.flags
+            _hidden(flag, names) if flag.code == "shared_data" else flag for flag in grade.flags
         ),
+    )
+
+
+def _hidden(flag: Flag, names: Mapping[str, str]) -> Flag:
+    """Return a flag for shared data that calls submissions by other names."""
+    others = list(dict.fromkeys(names.get(o, _STRANGER) for o in flag.evidence["submissions"]))
+    recordings = [
+        {**recording, "submission": names.get(recording["submission"], _STRANGER)}
+        for recording in flag.evidence["recordings"]
+    ]
+    return replace(
+        flag,
+        message=shared_message(flag.parameters, others),
+        evidence={"submissions": others, "recordings": recordings},
     )
 
 

@@ -116,15 +116,10 @@ def shared_flag(records: Sequence[SharedRecord]) -> Flag:
     """Return the flag of one submission: which recordings, and where else they stand."""
     experiments = tuple(dict.fromkeys(record.experiment for record in records))
     others = list(dict.fromkeys(record.other for record in records))
-    named = ", ".join(experiments[:4]) + (
-        f" and {len(experiments) - 4} more" if len(experiments) > 4 else ""
-    )
-    stand = "stands" if len(experiments) == 1 else "stand"
     return Flag(
         code="shared_data",
         parameters=experiments,
-        message=f"{named} also {stand} in {', '.join(others)}: the noise of the recordings is the "
-        "same. That does not say whose they are; if they were shared for a reason, say so.",
+        message=shared_message(experiments, others),
         evidence={
             "submissions": others,
             "recordings": [
@@ -137,6 +132,17 @@ def shared_flag(records: Sequence[SharedRecord]) -> Flag:
                 for record in records
             ],
         },
+    )
+
+
+def shared_message(experiments: Sequence[str], others: Iterable[str]) -> str:
+    """Return the sentence for recordings that stand in other submissions."""
+    more = f" and {len(experiments) - 4} more" if len(experiments) > 4 else ""
+    stand = "stands" if len(experiments) == 1 else "stand"
+    return (
+        f"{', '.join(experiments[:4])}{more} also {stand} in {', '.join(others)}: the noise of the "
+        "recordings is the same. That does not say whose they are; if they were shared for a "
+        "reason, say so."
     )
 
 
