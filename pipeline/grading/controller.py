@@ -20,6 +20,7 @@ from pipeline.submission import Design, StateFeedback, Submission
 _OVERSHOOT = 20.0  # percentage points above the goal
 _SETTLING = 2.0  # times the goal
 _CLAIM_OVERSHOOT, _CLAIM_SETTLING = 12.0, 1.6  # percentage points, times
+_OTHER_GAINS = 2.5  # times: claims so far off are of other gains, whatever the prefilter
 _PREFILTER, _PREFILTER_BLURRED = 0.10, 0.20  # relative
 _SAME_GAINS = 0.02  # relative to the largest of its kind: typed again with fewer digits
 
@@ -80,6 +81,13 @@ class Controller:
         settles = numbers.settling_time
         ratio = None if settles is None else settles / float(self.settling)
         return ratio is not None and 1 / _CLAIM_SETTLING <= ratio <= _CLAIM_SETTLING
+
+    def is_of_other_gains(self, numbers: LoopNumbers) -> bool:
+        """Whether a loop settles so much sooner or later than reported that it is not meant."""
+        if self.settling is None or self.settling <= 0 or numbers.settling_time is None:
+            return False
+        ratio = numbers.settling_time / float(self.settling)
+        return max(ratio, 1 / ratio) > _OTHER_GAINS
 
     def prefilter_fits(self, numbers: LoopNumbers) -> bool:
         """Whether the reported prefilter is one over the static gain of this loop."""
@@ -155,6 +163,7 @@ def diagnose_controller(controller: Controller) -> list[Flag]:
     # The gains that ran tell which of the reported numbers does not belong to the others.
     other_ran = ran is not None and not _same(ran, controller.gains)
     wrong = not meets or (slip and not (fits and claimed)) or (not claimed and not fits)
+    wrong = wrong or all(controller.is_of_other_gains(one) for one in numbers)
     if other_ran and ran is not None:
         of_ran = controller.numbers(ran)
         better = any(
@@ -247,6 +256,8 @@ def _gains_flag(
     why = slip or (
         "they are not the gains that ran on the bench"
         if other_ran
+        else f"you report {controller.settling} s"
+        if controller.meets(numbers)
         else f"the goal was {goal.overshoot_percent:g} % and {goal.settling_time:g} s"
     )
     assert controller.gains is not None

@@ -1,13 +1,12 @@
 """Name the mistake behind a wrong number, where one reproduces it and the others do not."""
 
-import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
-from typing import Literal
 
+from pipeline.grading.explain import SIGMAS, Explained, Explanation, Label, Table, explain
 from pipeline.grading.grade import CODES, Code, Flag
-from pipeline.grading.impossible import broken_orders, not_positive
+from pipeline.grading.impossible import BrokenOrder, broken_orders, not_positive
 from pipeline.grading.mistakes import Mistake, known_mistakes
 from pipeline.grading.no_fit import copied_final
 from pipeline.grading.reference import Reference, References
@@ -26,26 +25,11 @@ _OFF_BY_EYE = 30.0  # resonances and nulls before any fit
 _OFF_DAMPING = 80.0
 _SUSPECT_DAMPING = 40.0  # enough to look for a known mistake, not for a remark of its own
 _OFF_EACH_OTHER = 25.0
-_SIGMAS = 3.0
-# Of two explanations the other is out where it is this much further off, as share of what it may;
-# or ten times less likely to meet the numbers by chance, as it says less about them.
-_MARGIN = 0.35
+_CONFIRMED = Decimal("0.05")  # relative: the other table says the same
+_OTHER: dict[Label, Label] = {"initial": "final", "final": "initial"}
 
 # What comes of reading a decay or a step; in a final table only where it was taken over.
-_FROM_TIME_RECORDS = {"peak_count", "log10_for_ln", "peak_for_steady_state"}
-_TAKEN_OVER = Decimal("0.05")
-
-Table = Mapping[str, Decimal]
-Label = Literal["initial", "final"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Explained:
-    """Numbers of one table that a mistake explains."""
-
-    mistake: Mistake
-    table: Label
-    names: tuple[str, ...]
+_FROM_TIME_RECORDS = {"peak_count", "log10_for_ln", "peak_for_steady_state", "transient_used"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,51 +44,36 @@ def diagnose_tables(reported: Reported, *, references: References, analysis: Ana
     """Return the flags of the two tables of parameters."""
     tables: dict[Label, Table] = {"initial": reported.initial, "final": reported.final}
     copied = copied_final(reported, references=references)
-    flags: list[Flag] = []
-    explained: list[Explained] = []
+    judged: dict[Label, _Judged] = {
+        label: _judge(label, reported, references=references, analysis=analysis, copied=copied)
+        for label in tables
+    }
+    # What one table alone leaves open the mistakes of the other may decide.
+    found: dict[Label, Explanation] = {
+        label: one.explain(believed=frozenset(judged[_OTHER[label]].explain().codes))
+        for label, one in judged.items()
+    }
+    flags = [flag for one in judged.values() for flag in one.flags]
     left: dict[Label, list[str]] = {}
-    for label, table in tables.items():
-        known: dict[str, Reference] = getattr(references, label)
-        impossible = not_positive(table)
-        if impossible:
-            flags.append(_impossible_flag(table, impossible, known, label))
-        taken = {*impossible, *(copied if label == "final" else ())}
-        errors = {
-            name: float(percent_off(typed, known[name], sigmas=_SIGMAS))
-            for name, typed in table.items()
-            if name in known and name not in taken
-        }
-        suspect = [n for n, e in errors.items() if e > min(limit(n, label), _SUSPECT_DAMPING)]
-        laws = broken_orders(table, initial=label == "initial")
-        # Friction may leave room for either of two gains, and not for their order.
-        unordered = {
-            name
-            for law in laws
-            if law.is_of_gains and not set(law.names).isdisjoint(suspect)
-            for name in law.names
-            if name in errors
-        }
-        mistakes = known_mistakes(known, analysis)
-        if label == "final":
-            mistakes = [m for m in mistakes if _may_be_final(m, reported)]
-            if len(suspect) >= min(2, analysis.carts):
-                mistakes += transient_fits(analysis, table, known)
-        off = [name for name in errors if name in suspect or name in unordered]
-        found, rest = explain(table, off=off, mistakes=mistakes, label=label)
-        explained += [one for one in found if not set(one.names).isdisjoint(suspect)]
-        rest = [name for name in rest if errors[name] > limit(name, label)]
+    for label, one in judged.items():
+        rest = [n for n in found[label].left if one.errors[n] > limit(n, label)]
         broken = [
             law
-            for law in laws
-            if not known
+            for law in one.laws
+            if not one.errors
             or (set(law.names) & set(rest) and (law.is_plain or set(law.names) <= set(rest)))
         ]
-        for law in broken:
-            flags.append(law.flag(table, label))
-            rest = [name for name in rest if name not in law.names]
-        left[label] = rest
+        flags += [law.flag(tables[label], label) for law in broken]
+        impossible = {name for law in broken for name in law.names}
+        left[label] = [name for name in rest if name not in impossible]
     if copied:
         flags.append(_copied_flag(reported, copied, references))
+    explained = [
+        e
+        for label, one in found.items()
+        for e in one.explained
+        if not judged[label].suspect.isdisjoint(e.names)
+    ]
     flags += _specific_flags(explained, tables, references)
     flags += [
         _off_flag(tables[label], names, getattr(references, label), label)
@@ -112,10 +81,98 @@ def diagnose_tables(reported: Reported, *, references: References, analysis: Ana
         if names
     ]
     named = {name for flag in flags for name in flag.parameters}
-    flags += _disagreements(reported, references, named=named)
+    if apart := [one for one in _disagreements(reported, references) if one[1] not in named]:
+        flags.append(_disagreement_flag(reported, apart))
     corrected = _corrected(reported.final, explained, references.final)
     corrected |= {name: references.final[name].value for name in left["final"]}
     return Diagnosis(flags=tuple(flags), corrected=corrected)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Judged:
+    """A table against its references.
+
+    Attributes
+    ----------
+    errors : of every number that has a reference and is not flagged already, percent.
+    suspect : enough off, or in enough doubt, to look for a known mistake.
+    unordered : gains that may be right one by one, and are not in their order.
+    flags : what is wrong whatever the recordings say.
+    """
+
+    label: Label
+    table: Table
+    errors: dict[str, float]
+    suspect: frozenset[str]
+    unordered: frozenset[str]
+    mistakes: list[Mistake]
+    laws: list[BrokenOrder]
+    flags: list[Flag]
+
+    def explain(self, *, believed: frozenset[Code] = frozenset()) -> Explanation:
+        """Return the mistakes that explain what is off."""
+        off = [n for n in self.errors if n in self.suspect or n in self.unordered]
+        return explain(
+            self.table, off=off, mistakes=self.mistakes, label=self.label, believed=believed
+        )
+
+
+def _judge(
+    label: Label,
+    reported: Reported,
+    *,
+    references: References,
+    analysis: Analysis,
+    copied: Sequence[str],
+) -> _Judged:
+    """Hold one table against the recordings."""
+    table: Table = getattr(reported, label)
+    known: dict[str, Reference] = getattr(references, label)
+    impossible = not_positive(table)
+    taken = {*impossible, *(copied if label == "final" else ())}
+    errors = {
+        name: float(percent_off(typed, known[name], sigmas=SIGMAS))
+        for name, typed in table.items()
+        if name in known and name not in taken
+    }
+    suspect = [n for n, e in errors.items() if e > min(limit(n, label), _SUSPECT_DAMPING)]
+    if label == "initial":  # friction may leave room for what the student's own fit does not
+        suspect += [n for _, n in _disagreements(reported, references) if n in errors]
+    mistakes = known_mistakes({n: r for n, r in known.items() if n in table}, analysis)
+    if label == "final":
+        mistakes = [m for m in mistakes if _may_be_final(m, reported)]
+        if len(suspect) >= min(2, analysis.carts):
+            mistakes += transient_fits(analysis, table, known)
+    laws = broken_orders(table, initial=label == "initial")
+    return _Judged(
+        label=label,
+        table=table,
+        errors=errors,
+        suspect=frozenset(suspect),
+        unordered=_unordered(laws, label, reported, suspect=suspect) & errors.keys(),
+        mistakes=mistakes,
+        laws=laws,
+        flags=[_impossible_flag(table, impossible, known, label)] if impossible else [],
+    )
+
+
+def _unordered(
+    laws: Sequence[BrokenOrder], label: Label, reported: Reported, *, suspect: Sequence[str]
+) -> frozenset[str]:
+    """Return the gains that are not in their order and not as in the other table."""
+    other: Table = getattr(reported, _OTHER[label])
+    table: Table = getattr(reported, label)
+    gains = [law for law in laws if law.is_of_gains and not set(law.names).isdisjoint(suspect)]
+    return frozenset(
+        name
+        for law in gains
+        if not any(n in other and _near(table[n], other[n]) for n in law.names)
+        for name in law.names
+    )
+
+
+def _near(a: Decimal, b: Decimal) -> bool:
+    return abs(a - b) <= _CONFIRMED * abs(b)
 
 
 def _may_be_final(mistake: Mistake, reported: Reported) -> bool:
@@ -123,10 +180,7 @@ def _may_be_final(mistake: Mistake, reported: Reported) -> bool:
     if not _FROM_TIME_RECORDS & set(mistake.codes):
         return True
     both = [n for n in mistake.predicted if n in reported.final and n in reported.initial]
-    return all(
-        abs(reported.final[n] - reported.initial[n]) <= _TAKEN_OVER * abs(reported.initial[n])
-        for n in both
-    )
+    return all(reported.final[n] == reported.initial[n] for n in both)
 
 
 def _corrected(
@@ -149,119 +203,6 @@ def limit(name: str, table: str) -> float:
         return _OFF_FINAL
     by_eye = name.startswith("omega") and name[-1] in "abcdefghxy"
     return _OFF_BY_EYE if by_eye else _OFF_INITIAL
-
-
-# ------------------------------------------------------------------- explaining
-
-
-def explain(
-    table: Table, *, off: Sequence[str], mistakes: Sequence[Mistake], label: Label
-) -> tuple[list[Explained], list[str]]:
-    """Find the fewest mistakes that reproduce the numbers that are off; return also the rest.
-
-    The codes that explain most numbers come first, then one before two at once. Where another
-    code explains the same numbers about as well, none is named.
-    """
-    remaining, left, codes = list(off), [], frozenset[Code]()
-    found: list[Explained] = []
-    while remaining:
-        covers = [
-            _cover(codes | more, table, remaining, mistakes)
-            for more in dict.fromkeys(frozenset(m.codes) for m in mistakes)
-        ]
-        covers = [cover for cover in covers if cover.distances]
-        if not covers:
-            break
-        best = min(covers, key=lambda c: (-len(c.distances), len(c.codes), c.cost(c.distances)))
-        rivals = [
-            cover
-            for cover in covers
-            if not best.codes <= cover.codes
-            and len(cover.codes) <= len(best.codes)
-            and best.distances.keys() <= cover.distances.keys()
-            and cover.cost(best.distances) < best.cost(best.distances) + _MARGIN
-        ]
-        if rivals:
-            left += best.distances
-        else:
-            codes = best.codes
-            for mistake, names in best.fits:
-                own = remaining if mistake.table_wide else names
-                found.append(Explained(mistake=mistake, table=label, names=tuple(own)))
-        wide = any(m.table_wide for m, _ in best.fits) and not rivals
-        remaining = [n for n in remaining if n not in best.distances and not wide]
-    explained = {name for one in found for name in one.names}
-    return found, [name for name in off if name not in explained]
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Cover:
-    """What some codes explain: each number by the mistake that comes nearest to it.
-
-    Attributes
-    ----------
-    distances : how far each number is off what is predicted, as share of what it may be.
-    widths : the room that is left for each, relative: how much of all numbers would have been met.
-    """
-
-    codes: frozenset[Code]
-    fits: tuple[tuple[Mistake, list[str]], ...]
-    distances: dict[str, float]
-    widths: dict[str, float]
-
-    def cost(self, names: Collection[str]) -> float:
-        """Return how badly some of the numbers are explained; tenfold the room is the margin."""
-        distance = sum(self.distances[name] for name in names) / len(names)
-        return distance + _MARGIN * sum(math.log10(self.widths[name]) for name in names)
-
-
-def _cover(
-    codes: frozenset[Code], table: Table, remaining: Sequence[str], mistakes: Sequence[Mistake]
-) -> _Cover:
-    """Explain what these codes can, with mistakes that explain more numbers first."""
-    fits: list[tuple[Mistake, list[str]]] = []
-    distances: dict[str, float] = {}
-    widths: dict[str, float] = {}
-    usable = [m for m in mistakes if codes.issuperset(m.codes)]
-    while True:
-        open_ = [name for name in remaining if name not in distances]
-        tried = [(m, names) for m in usable if (names := _explains(m, table, open_))]
-        if not tried:
-            return _Cover(codes=codes, fits=tuple(fits), distances=distances, widths=widths)
-        mistake, names = min(
-            tried,
-            key=lambda fit: (-len(fit[1]), len(fit[0].codes), _distance(fit[0], table, fit[1])),
-        )
-        fits.append((mistake, names))
-        distances |= {name: _off_by(mistake, table, name) for name in names}
-        widths |= {name: _width(mistake, name) for name in names}
-
-
-def _explains(mistake: Mistake, table: Table, remaining: Sequence[str]) -> list[str]:
-    """Return which of the remaining numbers a mistake reproduces, if it may be believed."""
-    asked = [name for name in mistake.predicted if name in table]
-    met = [name for name in asked if _off_by(mistake, table, name) <= 1]
-    if len(met) < mistake.least or (mistake.whole and len(met) < len(asked)):
-        return []
-    wrong = [name for name in remaining if name in met]
-    # Of two carts swapped both numbers are wrong, not only near the other's.
-    return [] if "carts_swapped" in mistake.codes and len(wrong) < mistake.least else wrong
-
-
-def _off_by(mistake: Mistake, table: Table, name: str) -> float:
-    """Return how far a number is off what a mistake predicts, as share of what it may be."""
-    error = percent_off(table[name], mistake.predicted[name], sigmas=_SIGMAS)
-    return float(error) / (100 * mistake.tolerance)
-
-
-def _width(mistake: Mistake, name: str) -> float:
-    """Return how wide a range of numbers a mistake explains: the logarithm of high over low."""
-    predicted, share = mistake.predicted[name], 1 / len(mistake.predicted)
-    return (math.log(predicted.high / predicted.low) + 2 * mistake.tolerance) * mistake.tries**share
-
-
-def _distance(mistake: Mistake, table: Table, names: Sequence[str]) -> float:
-    return sum(_off_by(mistake, table, name) for name in names) / len(names)
 
 
 # ------------------------------------------------------------------------ flags
@@ -314,7 +255,7 @@ def _off_flag(
     table: Table, names: Sequence[str], known: Mapping[str, Reference], label: str
 ) -> Flag:
     def error(name: str) -> float:
-        return float(percent_off(table[name], known[name], sigmas=_SIGMAS)) / limit(name, label)
+        return float(percent_off(table[name], known[name], sigmas=SIGMAS)) / limit(name, label)
 
     worst = max(names, key=error)
     reference, typed = known[worst], table[worst]
@@ -363,13 +304,13 @@ def _copied_flag(reported: Reported, copied: Sequence[str], references: Referenc
     )
 
 
-def _disagreements(reported: Reported, references: References, *, named: set[str]) -> list[Flag]:
-    """Return a flag where the tables contradict each other and the data do not say which errs."""
+def _disagreements(reported: Reported, references: References) -> list[tuple[float, str]]:
+    """Return (how much, name) of what the tables contradict each other in, the worst first."""
     apart: list[tuple[float, str]] = []
     for name, final in reported.final.items():
         initial = reported.initial.get(name)
         guess = is_damping(name) and name not in references.initial
-        if initial is None or name in named or guess or final <= 0 or initial <= 0:
+        if initial is None or guess or final <= 0 or initial <= 0:
             continue
         bounds = [float(final)]
         if name in references.initial and name in references.final:
@@ -386,20 +327,21 @@ def _disagreements(reported: Reported, references: References, *, named: set[str
         by_eye = limit(name, "initial") == _OFF_BY_EYE
         if error > (worth + _OFF_BY_EYE if by_eye else worth):
             apart.append((error / worth, name))
-    if not apart:
-        return []
-    _, worst = max(apart)
-    return [
-        Flag(
-            code="initial_final_disagree",
-            parameters=tuple(name for _, name in apart),
-            message=f"{worst}: your first estimate is {reported.initial[worst]}, the final one "
-            f"{reported.final[worst]}: one of the two is worth another look.",
-            evidence={
-                "parameter": worst,
-                "initial": float(reported.initial[worst]),
-                "final": float(reported.final[worst]),
-                "ratio": float(reported.final[worst] / reported.initial[worst]),
-            },
-        )
-    ]
+    return sorted(apart, reverse=True)
+
+
+def _disagreement_flag(reported: Reported, apart: Sequence[tuple[float, str]]) -> Flag:
+    _, worst = apart[0]
+    initial, final = reported.initial[worst], reported.final[worst]
+    return Flag(
+        code="initial_final_disagree",
+        parameters=tuple(name for _, name in apart),
+        message=f"{worst}: your first estimate is {initial}, the final one {final}: one of the two "
+        "is worth another look.",
+        evidence={
+            "parameter": worst,
+            "initial": float(initial),
+            "final": float(final),
+            "ratio": float(final / initial),
+        },
+    )

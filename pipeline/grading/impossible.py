@@ -1,11 +1,11 @@
 """What no real chain of carts can do, whatever the data: signs and orders of reported numbers."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from decimal import Decimal
-from itertools import pairwise
 
 from pipeline.grading.grade import Flag
+from pipeline.grading.orders import orders
 from pipeline.grading.tolerance import half_digit
 
 # How far an order may be broken: fitted numbers are good to some percent, and first estimates of
@@ -60,32 +60,6 @@ class BrokenOrder:
 def not_positive(table: Mapping[str, Decimal]) -> list[str]:
     """Return the parameters that are zero or negative; all of a real chain are above."""
     return [name for name, typed in table.items() if typed <= 0]
-
-
-def orders(names: Sequence[str]) -> list[tuple[str, str, str]]:
-    """Return (lesser, greater, why) of every order that the named parameters obey."""
-    gains = [name for name in names if name.startswith("K_")]
-    modes = [n for n in names if n.startswith("omega_") and n[-1] in "abcdefgh"]
-    alone = [n for n in names if n.startswith("omega_") and n[-1].isdigit()]
-    found = [
-        (far, near, "a cart further from the motor is moved less by a constant input")
-        for near, far in pairwise(gains)
-    ]
-    found += [(a, b, "the resonances are listed in rising order") for a, b in pairwise(modes)]
-    if modes:
-        why = "a cart alone swings faster than all together at the first resonance, and slower "
-        why += "than at the last"
-        found += [(modes[0], name, why) for name in alone]
-        found += [(name, modes[-1], why) for name in alone]
-    if {"omega_x", "omega_y"} <= set(names) and len(modes) == 3:
-        why = "each null of cart 1 lies between two resonances"
-        a, b, c = modes
-        found += [(a, "omega_x", why), ("omega_x", b, why), (b, "omega_y", why)]
-        found += [("omega_y", c, why)]
-        why = "carts 2 and 3 alone lie between the nulls of cart 1"
-        for name in ("omega_2", "omega_3"):
-            found += [("omega_x", name, why), (name, "omega_y", why)] * (name in names)
-    return found
 
 
 def broken_orders(table: Mapping[str, Decimal], *, initial: bool) -> list[BrokenOrder]:

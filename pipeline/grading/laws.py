@@ -11,7 +11,7 @@ from decimal import Decimal
 
 import numpy as np
 
-from pipeline.grading.impossible import orders
+from pipeline.grading.orders import orders
 from pipeline.grading.rubric import is_damping
 from pipeline.grading.tolerance import half_digit
 from pipeline.plant.chain import Array, parameter_names

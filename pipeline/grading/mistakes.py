@@ -24,6 +24,7 @@ _MANY_PERIODS = range(5, 11)
 _GAIN_OR_FREQUENCY = 0.03  # an honest reading after one slip: relative
 _BLURRED = 0.05  # … of a gain where the carts stick
 _COUNTED = 0.02
+_COUNTED_ALONE = 0.012  # … where no damping tells the same story
 _DAMPING = 0.2
 _SHARP = 1.05  # high over low of a reference that friction does not blur
 _CLEARLY_OFF = 0.06  # of a gain: another extremum of the step as near as this says nothing
@@ -75,6 +76,8 @@ def known_mistakes(references: Mapping[str, Reference], analysis: Analysis) -> l
     ]
     single = [*hertz, *scales, *log10, *_miscounts(own_omegas, own_zetas)]
     swaps = [*_swaps(gains), *_swaps(own_omegas), *_swaps(own_zetas)]
+    if {_damping(name) for name in own_omegas} == own_zetas.keys():
+        swaps += _swaps(own_omegas, {n: _with_slack(r) for n, r in own_zetas.items()})
     pairs = [*_swapped(hertz, own_omegas), *_swapped(scales, gains), *_swapped(log10, own_zetas)]
     pairs += list(_in_counts(scales))
     for miscount in single:
@@ -124,7 +127,7 @@ def _miscounts(
     """One period too many or too few: ω is off by their ratio, and a decrement by its inverse."""
     found = []
     for name, omega in omegas.items():
-        zeta = "zeta" if name == "omega_n" else name.replace("omega", "zeta")
+        zeta = _damping(name)
         for k in (*_FEW_PERIODS, *_MANY_PERIODS):
             for counted, there in ((k + 1, k), (k, k + 1)):
                 help_ = (
@@ -136,7 +139,8 @@ def _miscounts(
                     both[zeta] = _miscounted_damping(zetas[zeta], there / counted)
                     found.append(_miscount(both, help_, whole=True, least=2))
                 if k in _FEW_PERIODS:
-                    found.append(_miscount({name: both[name]}, help_))
+                    alone = _miscount({name: both[name]}, help_)
+                    found.append(replace(alone, tolerance=_COUNTED_ALONE))
     for zeta, reference in zetas.items():
         if reference.high > reference.low * _SHARP:
             continue
@@ -152,6 +156,11 @@ def _miscounts(
                 )
             )
     return found
+
+
+def _with_slack(zeta: Reference) -> Reference:
+    """Return a damping with what it may be off in its bounds, to stand beside sharper numbers."""
+    return replace(zeta, low=zeta.low / (1 + _DAMPING), high=zeta.high * (1 + _DAMPING))
 
 
 def _miscounted_damping(zeta: Reference, factor: float) -> Reference:
@@ -324,19 +333,30 @@ def _permutations(names: Sequence[str]) -> Iterator[dict[str, str]]:
             yield dict(zip(names, order, strict=True))
 
 
-def _swaps(references: Mapping[str, Reference]) -> Iterator[Mistake]:
+def _swaps(
+    references: Mapping[str, Reference], dampings: Mapping[str, Reference] | None = None
+) -> Iterator[Mistake]:
+    """Yield every order of the carts but the right one; frequencies may take dampings along."""
     for source in _permutations(list(references)):
         moved = {name: other for name, other in source.items() if name != other}
-        tolerance = _DAMPING if is_damping(next(iter(moved))) else _GAIN_OR_FREQUENCY
+        predicted = {name: references[other] for name, other in moved.items()}
+        if dampings is not None:
+            predicted |= {
+                _damping(name): dampings[_damping(other)] for name, other in moved.items()
+            }
         yield Mistake(
             codes=("carts_swapped",),
-            predicted={name: references[other] for name, other in moved.items()},
-            tolerance=tolerance,
+            predicted=predicted,
+            tolerance=_DAMPING if is_damping(next(iter(moved))) else _GAIN_OR_FREQUENCY,
             help="{reported} is what your recordings give for another cart, not {recomputed}: "
             "cart 1 is the one at the motor",
             whole=True,
             least=2,
         )
+
+
+def _damping(omega: str) -> str:
+    return omega.replace("omega", "zeta").removesuffix("_n")
 
 
 def _swapped(mistakes: Sequence[Mistake], references: Mapping[str, Reference]) -> Iterator[Mistake]:

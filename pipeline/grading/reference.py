@@ -1,15 +1,20 @@
 """What the student's own recordings say each parameter is, and what an honest reading may give."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
+import numpy as np
+
+from pipeline.grading.orders import orders
 from pipeline.grading.rubric import is_damping
 from pipeline.plant.chain import Chain
-from pipeline.results import Analysis, Estimate, ParameterRow
+from pipeline.results import Analysis, Estimate, ParameterRow, StepEdge
 from pipeline.stages.compare import CHI_SQUARE_LIMIT
 
 # A fitted frequency or gain that far from the measured one: the fit has gone astray; factors.
 _ASTRAY, _ASTRAY_GAIN = 1.3, 1.6
 _SIGMAS = 3.0
+_STILL = 3.0  # encoder steps
 # A resonance or null read off the dwells, and where friction blurs even those: factors.
 _BY_EYE, _BY_EYE_ASTRAY = 1.1, 1.6
 
@@ -30,6 +35,12 @@ class Reference:
     high: float
     std: float
     source: str
+
+    def including(self, value: float) -> "Reference":
+        """Return the reference with a positive value between its bounds."""
+        if value <= 0:
+            return self
+        return replace(self, low=min(self.low, value), high=max(self.high, value))
 
     def times(self, factor: float) -> "Reference":
         """Return the reference multiplied by a positive factor."""
@@ -65,9 +76,22 @@ def recompute(analysis: Analysis) -> References:
         measured = _initial(row, fitted, analysis, trusted=trusted)
         if measured is not None:
             initial[row.name] = measured
-        if fitted is not None or (measured is not None and row.final is not None):
-            final[row.name] = fitted or initial[row.name]
+        if fitted is not None:
+            final[row.name] = fitted
+        elif measured is not None and row.final is not None:
+            # Where our fit goes astray, the students' may.
+            final[row.name] = measured.including(row.final.value)
+    for table in (initial, final) if not trusted else ():
+        for name in _out_of_order(table):
+            del table[name]
     return References(initial=initial, final=final)
+
+
+def _out_of_order(table: Mapping[str, Reference]) -> list[str]:
+    """Return the resonances and nulls read off dwells where one is not what it was taken for."""
+    by_eye = {n: r for n, r in table.items() if r.source == "frequency_response"}
+    wrong = [law for law in orders(list(by_eye)) if by_eye[law[0]].value > by_eye[law[1]].value]
+    return list(by_eye) if wrong else []
 
 
 def trusted_chain(analysis: Analysis) -> Chain | None:
@@ -153,12 +177,33 @@ def _readings(name: str, analysis: Analysis) -> list[float]:
     cart = int(suffix or 1)
     readings: list[float] = []
     if symbol == "K":
+        held = _held(cart, analysis)
         for step in analysis.step_gains:
             if step.cart == cart:
                 readings += [step.gain, *(step.interval or ())]
+                readings += [_shortest(edge, held=held) for edge in step.edges if held]
     if symbol == "zeta":
         for decay in analysis.log_decrements:
             if decay.cart == cart:
                 without = decay.friction.zeta if decay.friction and decay.friction.present else None
                 readings += [decay.zeta, *([without] if without and without > 0 else [])]
     return readings
+
+
+def _held(cart: int, analysis: Analysis) -> float:
+    """Return the largest step of the input that friction kept a free cart from following."""
+    held = [
+        float(np.abs(r.u).max())
+        for r in analysis.records
+        if r.kind == "step"
+        and r.u is not None
+        and cart in r.free
+        and cart in r.carts
+        and np.ptp(r.position(cart)) <= _STILL * r.encoder_step(cart)
+    ]
+    return max(held, default=0.0)
+
+
+def _shortest(edge: StepEdge, *, held: float) -> float:
+    """Return the gain where so much of the input's worth of friction held the cart far out."""
+    return abs((edge.level_after - edge.level_before) / (abs(edge.u_after - edge.u_before) + held))

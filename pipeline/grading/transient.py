@@ -16,7 +16,7 @@ from pipeline.stages.bode_fit import fit_bode
 _TOLERANCE = 0.04  # the fit of a student weighs the points its own way
 _DAMPING = 0.2
 _MET = 0.65  # of the numbers: a wrong response has no exact fit, so not every one is met
-_NEW = 0.05  # a fit that moves no number by as much tells nothing
+_NEW = 0.05  # of a number: moved by less it tells nothing
 
 Reading = Callable[[Record, Array], float]
 
@@ -31,17 +31,17 @@ def transient_fits(
     found = []
     for reading in _readings():
         predicted = _refit(analysis, runs, reading)
-        moved = [
-            name
+        moved = {
+            name: r
             for name, r in predicted.items()
             if name in known and known[name].low > 0 and abs(r.value / known[name].value - 1) > _NEW
-        ]
-        asked = [name for name in predicted if name in table]
-        if moved and asked:
+        }
+        asked = [name for name in moved if name in table]
+        if asked:
             found.append(
                 Mistake(
                     codes=("transient_used",),
-                    predicted=predicted,
+                    predicted=moved,
                     tolerance=_TOLERANCE,
                     help="{reported} is what a fit to amplitudes of the first swings gives; after "
                     "the transient the same recordings give {recomputed}",
