@@ -125,6 +125,16 @@ def test_a_crash_costs_one_row_and_the_worker_is_replaced(task, setup):
     worker.close()
 
 
+def test_what_this_machine_fails_at_is_tried_again(task, setup, tmp_path):
+    """Where the scratch is full or gone the row says so, and does not stand for good."""
+    (tmp_path / "scratch").touch()  # no folder can be made in it
+    worker = Worker(replace(setup, scratch=str(tmp_path / "scratch")), out_of=RUBRIC.out_of)
+    outcome = worker.run(task)
+    worker.close()
+    assert (outcome.status, outcome.settled) == ("failed", False)
+    assert outcome.reason.startswith("cannot be read (")
+
+
 def test_a_hang_is_stopped(task, setup):
     """Past the time limit the worker is ended and the reason says so."""
     worker = Worker(replace(setup, time_limit=0.01), out_of=RUBRIC.out_of)

@@ -27,6 +27,7 @@ from pipeline.submission import Submission, load_submission
 from pipeline.submission.complaints import quote
 
 _GRACE = 30.0  # s; a worker without a parent to stop it ends by itself so long after the limit
+OUT_OF_MEMORY = "needs more memory than allowed"
 _DETAIL = 20_000  # characters of a traceback
 
 
@@ -65,10 +66,10 @@ def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = Fal
     authors: tuple[str, ...] = ()
     reason = detail = ""
     settled = True
-    with tempfile.TemporaryDirectory(
-        dir=scratch, prefix="open-", ignore_cleanup_errors=True
-    ) as folder:
-        try:
+    try:
+        with tempfile.TemporaryDirectory(
+            dir=scratch, prefix="open-", ignore_cleanup_errors=True
+        ) as folder:
             sources = [Path(source) for source in task.sources]
             submission = load_submission(open_submission(sources, Path(folder) / task.id))
             authors = tuple(author.id for author in submission.authors)
@@ -88,15 +89,15 @@ def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = Fal
                 figures=_figures(submission, graded) if figures else (),
                 owner=task.owner,
             )
-        except PipelineError as error:
-            reason = str(error)
-        except OSError as error:
-            reason = f"cannot be read ({error.strerror or error})"
-        except MemoryError:
-            reason, settled = "needs more memory than allowed", False
-        except Exception as error:
-            reason = f"the grader failed: {type(error).__name__}: {quote(str(error))}"
-            detail = traceback.format_exc()[-_DETAIL:]
+    except PipelineError as error:
+        reason = str(error)
+    except OSError as error:  # a full disk, a folder gone: perhaps not the hand-in's fault
+        reason, settled = f"cannot be read ({error.strerror or error})", False
+    except MemoryError:
+        reason, settled = OUT_OF_MEMORY, False
+    except Exception as error:
+        reason = f"the grader failed: {type(error).__name__}: {quote(str(error))}"
+        detail = traceback.format_exc()[-_DETAIL:]
     return failed(
         task, reason, authors=authors, out_of=rubric.out_of, settled=settled, detail=detail
     )
@@ -194,7 +195,7 @@ def main() -> None:
         answers.write(outcome_line(outcome))
         answers.flush()
         if not outcome.settled:
-            return  # it ran out of memory: a fresh process is surer
+            return  # after a fault a fresh process is surer
 
 
 def _limit_memory(more: int) -> None:

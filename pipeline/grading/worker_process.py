@@ -14,7 +14,7 @@ import psutil
 
 from pipeline.errors import ConfigError
 from pipeline.grading.batch import Outcome
-from pipeline.grading.worker import Setup, Task, failed, read_outcome, task_line
+from pipeline.grading.worker import OUT_OF_MEMORY, Setup, Task, failed, read_outcome, task_line
 
 _GLANCE = 0.05  # s between looks at the clock and the memory
 _START_LIMIT = 120.0  # s; a cold start on a busy machine takes ten
@@ -73,7 +73,7 @@ class Worker:
             outcome = read_outcome(line)
             if not outcome.settled or self._done >= _TASKS_EACH:
                 self.close()
-            if outcome.settled:
+            if outcome.reason != OUT_OF_MEMORY:
                 return outcome
             return failed(
                 task, self._too_large(), authors=outcome.authors, out_of=self._out_of, settled=False
