@@ -94,6 +94,23 @@ def test_a_broken_submission_graded_by_hand_is_exported(tmp_path):
     assert remarks == ()
 
 
+@pytest.mark.parametrize("platform", ["canvas", "moodle", "gradescope"])
+def test_a_number_of_another_platform_is_nobodys(tmp_path, platform):
+    """The same number means another student there: nobody gets somebody else's grade."""
+    others = {"canvas", "moodle", "gradescope"} - {platform}
+    entries = [
+        make_outcome(make_grade(f"team-{of}"), owner=f"Jane Doe ({of} 1024)") for of in others
+    ]
+    rows, _ = write(tmp_path, *entries, platform=platform)
+    assert not any("1024" in cell for row in rows for cell in row)
+    (tmp_path / "own").mkdir()
+    rows, _ = write(
+        tmp_path / "own", make_outcome(make_grade("t"), owner=f"Jane ({platform} 1024)"),
+        platform=platform,
+    )  # fmt: skip
+    assert any("1024" in cell for row in rows for cell in row)
+
+
 def test_canvas_own_export_is_filled_in(tmp_path):
     """By id, login or name; its assignment's column is found by its title; others are left out."""
     roster = (

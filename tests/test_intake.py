@@ -96,15 +96,22 @@ def test_a_canvas_download(tmp_path):
             "loose_1027_77004_submission.toml": TOML,
             "loose_1027_77005_step.csv": "1,2",
             "empty_1028_text.html": "<p>sorry</p>",
+            "LATE_anon_x7Yb2_77006_lab3.zip": inner,  # graded without names
         },
     )
     found = {h.id: h for h in hand_ins(tmp_path, download)}
-    assert sorted(found) == ["empty", "loose", "poeann-lab3", "roeric-lab3", "team-07"]
+    assert sorted(found) == [
+        "anon_x7Yb2-lab3", "empty", "loose", "poeann-lab3", "roeric-lab3", "team-07",
+    ]  # fmt: skip
+    assert (found["anon_x7Yb2-lab3"].days_late, found["anon_x7Yb2-lab3"].owner) == (
+        1.0,
+        "anon_x7Yb2",
+    )
     assert opened(tmp_path, found["team-07"]) == ["submission.toml"]  # of the later attempt
     assert opened(tmp_path, found["loose"]) == ["step.csv", "submission.toml"]
     assert found["roeric-lab3"].days_late == 1.0
     assert found["poeann-lab3"].days_late == 0.0
-    assert found["roeric-lab3"].owner == "roeric (1025)"
+    assert found["roeric-lab3"].owner == "roeric (canvas 1025)"
     with pytest.raises(SubmissionError, match="no submission"):
         opened(tmp_path, found["empty"])
 
@@ -118,10 +125,14 @@ def test_a_moodle_download(tmp_path):
             "Jane Doe_1024_assignsubmission_file_/work.zip": inner,
             "Zoë Ünal_1025_assignsubmission_file_/submission.toml": TOML,
             "Ann Poe_1026_assignsubmission_file_submission.toml": TOML,
+            "Default group_assignsubmission_file_/submission.toml": TOML,
+            "Jane Doe_1024_assignsubmission_onlinetext_/onlinetext.html": "<p>see the file</p>",
         },
     )
     found = {h.id: h for h in hand_ins(tmp_path, download)}
-    assert sorted(found) == ["Ann Poe", "Jane Doe", "Zoë Ünal"]
+    assert sorted(found) == ["Ann Poe", "Default group", "Jane Doe", "Zoë Ünal"]
+    assert found["Jane Doe"].owner == "Jane Doe (moodle 1024)"
+    assert found["Default group"].owner == "Default group"
     assert all(opened(tmp_path, h) for h in found.values())
 
 
@@ -129,7 +140,8 @@ def test_a_gradescope_download(tmp_path):
     """Names come from the metadata; a folder it does not know keeps its own."""
     metadata = (
         "submission_77:\n  :submitters:\n  - :name: Jane Doe\n    :sid: A1\n"
-        "  - :name: Ric Roe\n  :created_at: 2026-11-20 10:00:00 -08:00\n"
+        "  - :name: Ric Roe\n  :created_at: 2026-11-20 10:00:00.123456000 -08:00\n"
+        "  :history:\n  - :created_at: 2026-11-19 10:00:00.5 Z\n"
     )
     download = archive(
         tmp_path / "export.zip",
@@ -139,7 +151,16 @@ def test_a_gradescope_download(tmp_path):
             "assignment_9_export/submission_78/submission.toml": TOML,
         },
     )
-    assert [h.id for h in hand_ins(tmp_path, download)] == ["Jane Doe, Ric Roe", "submission_78"]
+    known, unknown = hand_ins(tmp_path, download)
+    assert (known.id, unknown.id) == ("Jane Doe, Ric Roe", "submission_78")
+    assert known.owner == "Jane Doe, Ric Roe (gradescope 77)"
+    assert (known.handed_in, unknown.handed_in) == ("2026-11-20T10:00:00-08:00", "")
+
+
+def test_unpacked_canvas_archives_are_not_taken_for_one_student(tmp_path):
+    """Folders called like Canvas' files, by chance or unpacked, are a row each."""
+    tree(tmp_path / "c", {f"team_1_{n}_lab/submission.toml": TOML for n in range(3)})
+    assert len(hand_ins(tmp_path, tmp_path / "c")) == 3
 
 
 def test_one_students_zip_is_one_hand_in(tmp_path):

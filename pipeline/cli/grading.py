@@ -40,6 +40,9 @@ def grade(
         str | None,
         typer.Option(metavar="URL", help="A database; default: gradebook.sqlite in --out."),
     ] = None,
+    lateness: Annotated[
+        Path | None, typer.Option(metavar="CSV", help="Who was late; see docs/batch.md.")
+    ] = None,
 ) -> None:
     """Grade a class: gradebook, grades.csv, a page of the class, feedback for each student."""
     from pipeline.grading.batch_run import grade_class
@@ -57,7 +60,10 @@ def grade(
             progress=progress,
             anonymous=anonymous,
             gradebook=gradebook,
+            lateness=lateness,
         )
+    for remark in done.remarks:
+        say(remark)
     for submission, reason in done.failed:
         say(f"{submission}: {reason}")
     shared = f", {done.sharing} with recordings that another has too" if done.sharing else ""

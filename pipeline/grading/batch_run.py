@@ -8,6 +8,7 @@ from pathlib import Path
 from pipeline.errors import ConfigError, PipelineError
 from pipeline.grading.gradebook import Gradebook
 from pipeline.grading.intake import find_hand_ins
+from pipeline.grading.late_table import LateTable, settle_lateness
 from pipeline.grading.load import load_rubric
 from pipeline.grading.outputs import write_outputs
 from pipeline.grading.rubric import Rubric
@@ -24,11 +25,15 @@ _MEMORY = ".compared.json"  # may be removed at any time
 
 @dataclass(frozen=True, kw_only=True)
 class Summary:
-    """How many there were, which could not be graded (id, reason), how many share recordings."""
+    """How many there were, which could not be graded (id, reason), how many share recordings.
+
+    `remarks` are what the person at the command line should know besides.
+    """
 
     total: int
     failed: tuple[tuple[str, str], ...]
     sharing: int
+    remarks: tuple[str, ...] = ()
 
 
 def grade_class(
@@ -43,6 +48,7 @@ def grade_class(
     progress: Progress,
     anonymous: bool = False,
     gradebook: str | None = None,
+    lateness: Path | None = None,
 ) -> Summary:
     """Grade everything in `paths` into the folder `out`.
 
@@ -50,18 +56,21 @@ def grade_class(
     ----------
     anonymous : leave names out of what is written, as a rubric may ask for itself.
     gradebook : a database URL; default: `gradebook.sqlite` in `out`.
+    lateness : a table that says who was late.
 
     Raises
     ------
-    ConfigError : the rubric, a path, the folder or the cluster cannot be used.
+    ConfigError : the rubric, the table, a path, the folder or the cluster cannot be used.
     """
     rubric = load_rubric(rubric_file)
+    late_table = LateTable.read(lateness) if lateness else None
     check_folder(out).mkdir(parents=True, exist_ok=True)
     scratch = own_folder(out, _SCRATCH)
     shutil.rmtree(scratch, ignore_errors=True)  # of a run that was stopped
     scratch.mkdir(exist_ok=True)
     try:
-        hand_ins = find_hand_ins(paths, scratch=scratch, skip=[out])
+        found = find_hand_ins(paths, scratch=scratch, skip=[out])
+        hand_ins, remarks = settle_lateness(found, late=rubric.late, table=late_table)
         # The rubric's file says which assignment it is: its title may be mended on the way.
         with Gradebook(gradebook or out, assignment=rubric_file.stem, create=True) as book:
             batch = grade_batch(
@@ -82,7 +91,12 @@ def grade_class(
             write_outputs(book, out, progress=lambda what: progress(total, total, what))
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
-    return Summary(total=len(hand_ins), failed=batch.failed, sharing=len(batch.shared))
+    return Summary(
+        total=len(hand_ins),
+        failed=batch.failed,
+        sharing=len(batch.shared),
+        remarks=tuple(remarks),
+    )
 
 
 def _executor(*, jobs: int, cluster: str | None) -> Executor:

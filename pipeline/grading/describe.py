@@ -145,4 +145,5 @@ def _late(rubric: Rubric) -> str:
     if not late.percent_per_day:
         return "nothing is taken off"
     grace = f" after {late.grace_days:g} days of grace" if late.grace_days else ""
-    return f"{late.percent_per_day:g} % a day{grace}, at most {late.most_percent:g} %"
+    due = f" from {late.due:%Y-%m-%d %H:%M %z}" if late.due else ""
+    return f"{late.percent_per_day:g} % a day{due}{grace}, at most {late.most_percent:g} %"

@@ -16,7 +16,6 @@ import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from pipeline.grading.export_roster import POINTS_POSSIBLE, Roster
 from pipeline.grading.export_students import Student, students_of
@@ -24,11 +23,11 @@ from pipeline.grading.feedback_words import OUTCOMES, points_text
 from pipeline.grading.grade import Grade
 from pipeline.grading.gradebook import Gradebook
 from pipeline.grading.gradebook_rows import Entry
+from pipeline.grading.lms_names import Platform
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.table import csv_text
 from pipeline.output import own_folder, write_file
 
-Platform = Literal["canvas", "moodle", "gradescope"]
 _HOURS = 24.0
 
 
@@ -62,7 +61,7 @@ def export(
     rubric = book.rubric
     title = title or rubric.title or "cartlab"
     entries = list(book.entries())
-    students, remarks = students_of(entries)
+    students, remarks = students_of(entries, platform=platform)
     if roster:
         text, strangers = _filled(Roster.read(roster), platform, students, rubric, title=title)
         remarks += strangers
@@ -159,7 +158,8 @@ def _said(grade: Grade) -> list[str]:
 def _gradescope(students: Sequence[Student], rubric: Rubric) -> str:
     head = [
         "First Name", "Last Name", "SID", "Email", "Sections", "Total Score", "Max Points",
-        "Status", "Submission ID", "Submission Time", "Lateness (H:M:S)",
+        "Status", "Submission ID", "Submission Time", "Lateness (H:M:S)", "View Count",
+        "Submission Count",
     ]  # fmt: skip
     head += [
         f"{i}: {c.title or c.id} ({c.points} pts)" for i, c in enumerate(rubric.criteria, start=1)
@@ -178,9 +178,11 @@ def _gradescope(students: Sequence[Student], rubric: Rubric) -> str:
                 s.points,
                 points_text(rubric.out_of),
                 "Graded" if s.points else "Ungraded",
-                "",
+                s.number,
                 "",
                 _clock(s.grade.days_late),
+                "",
+                "",
                 *(points_text(given[c.id]) if c.id in given else "" for c in rubric.criteria),
             ]
         )

@@ -11,7 +11,7 @@ from pipeline.grading.table import csv_text, read_table
 
 POINTS_POSSIBLE = "Points Possible"  # Canvas' row on top, about the assignments
 # Columns that say who a row is about.
-_NUMBERS = ("ID", "Identifier")
+_NUMBERS = ("ID", "Identifier", "Submission ID")
 _IDS = ("SIS User ID", "SIS Login ID", "ID number", "SID", "Username", "Email", "Email address")
 _NAMES = ("Student", "Full name", "Name")
 _PARTICIPANT = re.compile(r"\D+ (\d+)")  # of Moodle, in any language

@@ -1,14 +1,12 @@
 """The students of a class list, each with a grade."""
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from pipeline.grading.feedback_words import points_text
 from pipeline.grading.grade import Grade
 from pipeline.grading.gradebook_rows import Entry
-
-_OWNER = re.compile(r"(?P<name>.*?)(?: \((?P<number>\d+)\))?", re.DOTALL)
+from pipeline.grading.lms_names import Platform, read_owner
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,7 +16,8 @@ class Student:
     Attributes
     ----------
     id : as the submission names the author, or "".
-    name, number : as the learning platform calls who handed it in, or "".
+    name, number : as the learning platform calls who handed it in, or "". The number is the
+        platform's that the grades are for.
     """
 
     id: str
@@ -39,20 +38,19 @@ class Student:
         return self.id or self.name or self.grade.submission
 
 
-def students_of(entries: Sequence[Entry]) -> tuple[list[Student], list[str]]:
+def students_of(entries: Sequence[Entry], *, platform: Platform) -> tuple[list[Student], list[str]]:
     """Return every student once, and what to say about it."""
     found: dict[str, Student] = {}
     twice: dict[str, list[str]] = {}
     for entry in entries:
-        owner = _OWNER.fullmatch(entry.owner)
-        assert owner is not None
+        name, of, number = read_owner(entry.owner)
         authors = entry.grade.authors
         alone = len(authors) < 2  # of several, which one handed it in is not said
         for id_ in authors or ("",):
             student = Student(
                 id=id_,
-                name=owner["name"] if alone else "",
-                number=(owner["number"] or "") if alone else "",
+                name=name if alone else "",
+                number=number if alone and of in ("", platform) else "",
                 grade=entry.grade,
                 by_hand=bool(entry.overrides),
             )

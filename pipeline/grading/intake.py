@@ -9,7 +9,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 from pipeline.errors import ConfigError, SubmissionError
-from pipeline.grading.lms_names import Upload, current, gradescope_owners, parse_name
+from pipeline.grading.lms_names import (
+    Upload,
+    current,
+    gradescope_metadata,
+    owner_text,
+    parse_name,
+)
 from pipeline.grading.unpack import CLASS, DEEPEST, is_debris, member_names, unpack
 from pipeline.submission.complaints import quote
 from pipeline.submission.load import NAME
@@ -29,13 +35,15 @@ class HandIn:
     id : unique in the batch, fit for a folder's name.
     sources : one folder, or files of which archives are to be unpacked.
     owner : who handed it in, as the learning platform calls them, with the number that it knows
-        them by: "Jane Doe (1024)"; or "".
+        them by: "Jane Doe (moodle 1024)"; or "".
+    handed_in : when, in ISO 8601, where the platform says so; or "".
     problem : why it cannot be opened, where that is plain already.
     """
 
     id: str
     sources: tuple[Path, ...]
     owner: str = ""
+    handed_in: str = ""
     days_late: float = 0.0
     problem: str = ""
 
@@ -48,6 +56,7 @@ class _Found:
     parent: str
     sources: tuple[Path, ...]
     owner: str = ""
+    handed_in: str = ""
     days_late: float = 0.0
     problem: str = ""
 
@@ -208,21 +217,26 @@ def _folder_inside(archive: Path) -> str:
 
 def _from_platform(folder: Path, uploads: dict[Path, Upload]) -> list[_Found]:
     """Return a hand-in for every student, whatever number of files they uploaded."""
-    owners = gradescope_owners(folder)
-    by_student: dict[tuple[str, str], dict[Path, Upload]] = defaultdict(dict)
+    metadata = gradescope_metadata(folder)
+    by_student: dict[tuple[str, str, str], dict[Path, Upload]] = defaultdict(dict)
     for path, upload in uploads.items():
-        by_student[upload.owner, upload.user][path] = upload
+        # Canvas makes no folders: one named so is an archive that somebody has unpacked.
+        own = path.name if upload.platform == "canvas" and path.is_dir() else ""
+        by_student[upload.owner, upload.user, own][path] = upload
     found = []
-    for (owner, user), files in sorted(by_student.items()):
+    for (owner, user, _), files in sorted(by_student.items()):
         sources = tuple(current(files))
         inside = _name_inside(sources)
-        shown = owners.get(owner, owner)
+        platform = next(iter(files.values())).platform
+        sent = metadata.get(owner)
+        shown = sent.names if sent and sent.names else owner
         found.append(
             _Found(
                 name=inside or shown,
                 parent=shown if inside else folder.name,
                 sources=sources,
-                owner=shown if owner in owners else f"{shown} ({user})",
+                owner=owner_text(shown, platform, user),
+                handed_in=sent.at if sent else "",
                 days_late=_DAYS_OF_A_LATE_MARK if any(u.late for u in files.values()) else 0.0,
                 problem="it is a link" if any(path.is_symlink() for path in sources) else "",
             )
@@ -269,6 +283,7 @@ def _with_ids(found: Sequence[_Found]) -> list[HandIn]:
                 id=unique,
                 sources=one.sources,
                 owner=one.owner,
+                handed_in=one.handed_in,
                 days_late=one.days_late,
                 problem=one.problem,
             )

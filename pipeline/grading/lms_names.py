@@ -1,7 +1,9 @@
 """Who handed in a file, and whether late, by the names learning platforms give their downloads.
 
-Canvas: `doejane_LATE_1024_77001_lab3.zip`, a resubmitted file `lab3-1.zip`. Moodle: a folder, or
-the beginning of a file's name, `Jane Doe_1024_assignsubmission_file_`. Gradescope:
+Canvas (`lib/content_zipper.rb`): `doejane_LATE_1024_77001_lab3.zip`, graded without names
+`LATE_anon_x7Yb2_77001_lab3.zip`, a resubmitted file `lab3-1.zip`. Moodle
+(`mod/assign/classes/downloader.php`): a folder, or the beginning of a file's name,
+`Jane Doe_1024_assignsubmission_file_`, of a group its name and number. Gradescope:
 `submission_77001` beside `submission_metadata.yml`.
 """
 
@@ -9,20 +11,28 @@ import re
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Literal
 
 Platform = Literal["canvas", "moodle", "gradescope"]
 
-_CANVAS = re.compile(
-    r"(?P<owner>.+?)(?P<late>_LATE)?_(?P<user>\d+|(?<=anon_)\w{5})_(?P<upload>\d+)_(?P<file>.+)"
+_CANVAS = re.compile(r"(?P<owner>.+?)(?P<late>_LATE)?_(?P<user>\d+)_(?P<upload>\d+)_(?P<file>.+)")
+_CANVAS_NAMELESS = re.compile(
+    r"(?P<late>LATE_)?(?P<owner>anon_(?P<user>\w{5}))_(?P<upload>\d+)_(?P<file>.+)"
 )
-_CANVAS_TEXT = re.compile(r"(?P<owner>.+?)(?P<late>_LATE)?_(?P<user>\d+)_(?P<file>\w+\.html?)")
+_CANVAS_TEXT = re.compile(
+    r"(?P<owner>.+?)(?P<late>_LATE)?_(?P<user>\d+)_(?P<file>(?:text|link)\.html)"
+)
 _MOODLE = re.compile(
-    r"(?P<owner>.+?)_(?P<user>\d+)_assignsubmission_(?:file|onlinetext)(?:_(?P<file>.*))?"
+    r"(?P<owner>.+?)(?:_(?P<user>\d+))?_assignsubmission_(?:file|onlinetext)(?:_(?P<file>.*))?"
 )
 _GRADESCOPE = re.compile(r"(?P<owner>submission_\d+)(?P<file>\.\w+)?")
 _ATTEMPT = re.compile(r"(?P<stem>.+)-(?P<attempt>\d{1,3})(?P<suffix>(?:\.\w+)?)")
+_OWNER = re.compile(
+    r"(?P<name>.*?)(?: \((?:(?P<platform>canvas|moodle|gradescope) )?(?P<number>\d+)\))?", re.DOTALL
+)
+_TIME = re.compile(r"(\d{4}-\d\d-\d\d)[ T](\d\d:\d\d:\d\d)(?:\.\d*)? ?(Z|UTC|[+-]\d\d:?\d\d)")
 _METADATA = re.compile(r"(?:submission_)?metadata\.ya?ml")
 _MOST_METADATA = 10_000_000  # bytes
 
@@ -46,13 +56,17 @@ def parse_name(name: str) -> Upload | None:
     """Return what the name of a downloaded file or folder says; None where no platform made it."""
     if found := _MOODLE.fullmatch(name):
         return Upload(
-            platform="moodle", owner=found["owner"], user=found["user"], file=found["file"] or ""
+            platform="moodle",
+            owner=found["owner"],
+            user=found["user"] or "",
+            file=found["file"] or "",
         )
     if found := _GRADESCOPE.fullmatch(name):
         user = found["owner"].removeprefix("submission_")
         file = name if found["file"] else ""
         return Upload(platform="gradescope", owner=found["owner"], user=user, file=file)
-    if found := _CANVAS.fullmatch(name) or _CANVAS_TEXT.fullmatch(name):
+    canvas = (_CANVAS_NAMELESS, _CANVAS, _CANVAS_TEXT)
+    if found := next((found for form in canvas if (found := form.fullmatch(name))), None):
         return Upload(
             platform="canvas",
             owner=found["owner"],
@@ -78,15 +92,38 @@ def current(uploads: Mapping[Path, Upload]) -> list[Path]:
         if again and first in names:
             attempts[first].append((int(again["attempt"]), upload.number, path))
         else:
-            attempts[upload.file].append((0, upload.number, path))
+            attempts[upload.file or path.name].append((0, upload.number, path))
     return sorted(max(files)[-1] for files in attempts.values())
 
 
-def gradescope_owners(folder: Path) -> dict[str, str]:
-    """Return the students' names by `submission_…`, from the metadata file if there is one."""
+def owner_text(name: str, platform: Platform, user: str) -> str:
+    """Return who handed in, as kept in the gradebook: "Jane Doe (moodle 1024)".
+
+    Whose number it is matters: another platform's student may have the same.
+    """
+    return f"{name} ({platform} {user})" if user.isdigit() else name
+
+
+def read_owner(owner: str) -> tuple[str, str, str]:
+    """Return name, platform and number of what `owner_text` made, "" where they are not said."""
+    found = _OWNER.fullmatch(owner)
+    assert found is not None
+    return found["name"], found["platform"] or "", found["number"] or ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sent:
+    """What Gradescope's metadata say of a submission: names, and when, in ISO 8601, or ""."""
+
+    names: str
+    at: str
+
+
+def gradescope_metadata(folder: Path) -> dict[str, Sent]:
+    """Return what is known by `submission_…`, from the metadata file if there is one."""
     import yaml  # only a Gradescope download needs it
 
-    owners: dict[str, str] = {}
+    sent: dict[str, Sent] = {}
     for path in sorted(folder.iterdir()):
         if not _METADATA.fullmatch(path.name) or path.is_symlink() or not path.is_file():
             continue
@@ -97,12 +134,26 @@ def gradescope_owners(folder: Path) -> dict[str, str]:
         except (yaml.YAMLError, UnicodeError, RecursionError, ValueError):
             continue
         for key, entry in document.items() if isinstance(document, dict) else ():
-            submitters = entry.get(":submitters") if isinstance(entry, dict) else None
+            if not isinstance(entry, dict):
+                continue
+            submitters = entry.get(":submitters")
             names = [
                 str(person[":name"])
                 for person in (submitters if isinstance(submitters, list) else ())
                 if isinstance(person, dict) and person.get(":name")
             ]
-            if names:
-                owners[str(key)] = ", ".join(names)
-    return owners
+            sent[str(key)] = Sent(names=", ".join(names), at=_time(str(entry.get(":created_at"))))
+    return sent
+
+
+def _time(text: str) -> str:
+    """Return a time as Ruby writes it in ISO 8601; "" where it is none."""
+    found = _TIME.fullmatch(text)
+    if found is None:
+        return ""
+    day, clock, zone = found.groups()
+    try:
+        at = datetime.fromisoformat(f"{day}T{clock}{'+00:00' if zone in ('Z', 'UTC') else zone}")
+    except ValueError:
+        return ""
+    return at.isoformat()

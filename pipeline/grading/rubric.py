@@ -4,7 +4,7 @@ from decimal import Decimal
 from fnmatch import fnmatchcase
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
 
 from pipeline.plant.chain import parameter_names
 from pipeline.results import Kind
@@ -39,8 +39,12 @@ class Required(_Model):
 
 
 class Late(_Model):
-    """Points lost to lateness: `percent_per_day` of those earned, after the days of grace."""
+    """Points lost to lateness: `percent_per_day` of those earned, after the days of grace.
 
+    `due` is the deadline, where the platform says when something was handed in.
+    """
+
+    due: AwareDatetime | None = None
     percent_per_day: Percent = 0.0
     grace_days: Annotated[float, Field(ge=0, le=365, allow_inf_nan=False)] = 0.0
     most_percent: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 100.0

@@ -1,0 +1,137 @@
+"""Who was late: by the deadline, by a platform's table, by a table of one's own."""
+
+from datetime import datetime
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.errors import ConfigError
+from pipeline.grading.intake import HandIn
+from pipeline.grading.late_table import LateTable, settle_lateness
+from pipeline.grading.load import load_rubric
+from pipeline.grading.rubric import Late
+
+DUE = datetime.fromisoformat("2026-11-20T23:59:00-08:00")
+
+
+def hand_in(name: str, **fields) -> HandIn:
+    return HandIn(id=name, sources=(), **fields)
+
+
+def settle(tmp_path, *hand_ins: HandIn, text: str | None = None, due: datetime | None = None):
+    """Return the days by id, and the remarks."""
+    table = None
+    if text is not None:
+        path = tmp_path / "late.csv"
+        path.write_text(text, encoding="utf-8")
+        table = LateTable.read(path)
+    settled, remarks = settle_lateness(hand_ins, late=Late(due=due), table=table)
+    return {one.id: one.days_late for one in settled}, remarks
+
+
+def test_the_deadline_counts_where_it_is_said_when_something_was_handed_in(tmp_path):
+    """In whatever zone; early is not late; where nothing is said, the platform's mark holds."""
+    days, _ = settle(
+        tmp_path,
+        hand_in("late", handed_in="2026-11-21T19:59:00+00:00"),
+        hand_in("early", handed_in="2026-11-20T23:58:59-08:00"),
+        hand_in("marked", days_late=1.0),
+        due=DUE,
+    )
+    assert days == {"late": 0.5, "early": 0.0, "marked": 1.0}
+
+
+def test_a_table_of_ones_own_goes_first(tmp_path):
+    """An extension is a zero in it; a name that nobody has is said."""
+    days, remarks = settle(
+        tmp_path,
+        hand_in("Team-01", days_late=1.0),
+        hand_in("team-02", handed_in="2026-11-23T00:00:00+00:00"),
+        hand_in("team-03", days_late=1.0),
+        text="submission;days_late\nteam-01;0\nteam-02;1,5\nteam-99;2\n",
+        due=DUE,
+    )
+    assert days == {"Team-01": 0.0, "team-02": 1.5, "team-03": 1.0}
+    assert remarks == ["late.csv: no such submission: team-99"]
+
+
+def test_gradescopes_grades_say_it(tmp_path):
+    """By the number of the submission, to the second; of other platforms' numbers nothing."""
+    days, _ = settle(
+        tmp_path,
+        hand_in("a", owner="Jane Doe (gradescope 77)"),
+        hand_in("b", owner="Ric Roe (moodle 77)"),
+        hand_in("c", owner="Al Zed (gradescope 78)", days_late=3.0),
+        text="First Name,SID,Submission ID,Lateness (H:M:S),View Count\n"
+        "Jane,s1,77,30:00:00,2\nBo,s2,,,\nAl,s3,78,00:00:00,1\n",
+    )
+    assert days == {"a": 1.25, "b": 0.0, "c": 0.0}
+
+
+def test_moodles_worksheet_says_it(tmp_path):
+    """In its status, in words; whoever extended a deadline is not late."""
+    rows = {
+        1: "Submitted for grading - 1 day 3 hours late - Released -  - ",
+        2: "Submitted for grading - 3 mins 31 secs late",
+        3: "Submitted for grading - Released -  - ",
+        4: "No submission",
+    }
+    days, _ = settle(
+        tmp_path,
+        *(hand_in(f"t{n}", owner=f"Name {n} (moodle {n})") for n in rows),
+        text="Identifier,Full name,Status,Grade\n"
+        + "".join(f"Participant {n},x,{status},\n" for n, status in rows.items()),
+    )
+    assert days == pytest.approx({"t1": 1.125, "t2": 211 / 86_400, "t3": 0.0, "t4": 0.0})
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a,b\n1,2\n", "late.csv: says nobody's lateness: expected columns"),
+        ("submission,days_late\nx,soon\n", "late.csv line 2: days_late: cannot read 'soon'"),
+        ("submission,days_late\nx,-1\n", "late.csv line 2"),
+        ("submission,days_late\nx,nan\n", "late.csv line 2"),
+        ("Submission ID,Lateness (H:M:S)\n1,2 days\n", "line 2: Lateness"),
+        ("Identifier,Status\nTeilnehmer 1,Abgegeben - 1 Tag verspätet\n", "line 2: Status"),
+    ],
+)
+def test_what_cannot_be_understood_is_said(tmp_path, text, message):
+    """With its line: nobody is on time because a table was not understood."""
+    with pytest.raises(ConfigError) as error:
+        settle(tmp_path, hand_in("x"), text=text)
+    assert message in str(error.value)
+
+
+def test_a_deadline_needs_its_zone(tmp_path):
+    """A clock without one is an error with its line; with one, the rubric has it."""
+    path = tmp_path / "lab.toml"
+    shipped = load_rubric_text()
+    path.write_text(
+        shipped.replace("[late]", "[late]\ndue = 2026-11-20T23:59:00"), encoding="utf-8"
+    )
+    with pytest.raises(ConfigError, match=r"lab\.toml line \d+: late\.due: "):
+        load_rubric(path)
+    path.write_text(
+        shipped.replace("[late]", "[late]\ndue = 2026-11-20T23:59:00-08:00"), encoding="utf-8"
+    )
+    assert load_rubric(path).late.due == DUE
+
+
+def load_rubric_text() -> str:
+    from pipeline.resources import RUBRICS
+
+    return (RUBRICS / "throne-1dof.toml").read_text(encoding="utf-8")
+
+
+@given(st.text(max_size=30), st.text(max_size=30))
+def test_any_table_is_read_or_refused(tmp_path_factory, who, said):
+    """Whatever stands in the cells."""
+    folder = tmp_path_factory.mktemp("late")
+    for head in ("submission,days_late", "Submission ID,Lateness (H:M:S)", "Identifier,Status"):
+        try:
+            days, _ = settle(folder, hand_in("x"), text=f"{head}\n{who},{said}\n")
+        except ConfigError:
+            continue
+        assert days["x"] >= 0
