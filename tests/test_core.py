@@ -22,7 +22,7 @@ from pipeline.plant.loop import Pid, StateFeedback, simulate_loop
 
 PERIOD = 1e-3
 # Two carts in counts and duty counts: some 10 counts a duty count, 2 and 5 Hz.
-CHAIN = Chain(m=[2e-4, 1.5e-4], c=[2e-4, 1e-4], k=[0.0, 0.1, 0.06])
+CHAIN = Chain(m=np.array([2e-4, 1.5e-4]), c=np.array([2e-4, 1e-4]), k=np.array([0.0, 0.1, 0.06]))
 
 
 def make_core(**changes) -> ReferenceCore:

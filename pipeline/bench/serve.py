@@ -68,6 +68,7 @@ class Server:
         self._heard: float | None = None  # s of wall time, of the last heartbeat
         self._injected_before: Counter[str] = Counter()  # by the end of the last run
         self._connected = False
+        self._pulled = False  # a fault wants the cable pulled
 
     def serve(self, *, until: Callable[[], bool]) -> None:
         """Keep the bench going until told otherwise."""
@@ -83,9 +84,12 @@ class Server:
             while owed >= self._period and self._link.unsent < _MOST_UNSENT:
                 out += self._tick()
                 owed -= self._period
-                if time.monotonic() - now > _SLICE:
+                if self._pulled or time.monotonic() - now > _SLICE:
                     break
             self._link.send(bytes(out))
+            if self._pulled:
+                self._link.hang_up()
+                self._pulled = False
 
     @property
     def address(self) -> str:
@@ -137,8 +141,7 @@ class Server:
         for line in readings if self._connected else ():
             struck, kind = self._faults.strike(line, clock=self._clock)
             out += struck
-            if kind == "disconnect":
-                self._link.hang_up()
+            self._pulled |= kind == "disconnect"
         self._lines += len(readings)
         if not readings:
             self._end_run(self._ending)
