@@ -5,7 +5,8 @@
     python -m benchmarks.grading_batch shared [--teams 200]
 
 `speed`: submissions a second and core, two cores against one, memory over a long run, a run with
-nothing changed. `kills`: kill -9 at random moments, then compare with a run left alone.
+nothing changed. `kills`: kill -9 at random moments, then compare with a run left alone; all of it
+on a copy of the code, as a grade belongs to the code that made it.
 `shared`: honest teams on one bench (a third of them with hidden friction) and disguised copies.
 """
 
@@ -37,6 +38,7 @@ from pipeline.submission import load_submission
 from pipeline.synthesis import COUNT, write_submission
 from pipeline.synthesis.hidden import prepare_bench, write_bench
 
+ROOT = Path(__file__).parents[1]
 PRESET = "throne-2dof"
 # Noise added to a copy, in encoder steps, and what else is done to it.
 DISGUISES = {
@@ -117,26 +119,30 @@ def speed(base: Path, *, teams: int, copies: int) -> None:
 def kills(base: Path, *, count: int) -> None:
     write_class(base / "class", 6)
     times, lost = random.Random(1), 0
+    frozen = base / "frozen"
+    for name in ("pipeline", "templates", "rubrics", "submissions"):
+        shutil.copytree(ROOT / name, frozen / name, ignore=shutil.ignore_patterns("__pycache__"))
     command = [sys.executable, "-m", "pipeline", "grade", str(base / "class"), "--rubric", PRESET]
     for number in range(count):
         out = base / f"out-{number % 10}"
         process = subprocess.Popen(
-            [*command, "--jobs", "2", "--out", str(out)], stderr=subprocess.DEVNULL
+            [*command, "--jobs", "2", "--out", str(out)], stderr=subprocess.DEVNULL, cwd=frozen
         )
         time.sleep(times.uniform(0.2, 8.0))
         process.kill()
         process.wait()
-    whole = _graded(command, base / "whole")
+    whole = _graded(command, base / "whole", frozen)
     for number in range(min(10, count)):
-        rows = _graded(command, base / f"out-{number}")
+        rows = _graded(command, base / f"out-{number}", frozen)
         lost += rows != whole
         for name in sorted(n for n in rows | whole if rows.get(n) != whole.get(n)):
             print(f"out-{number}: {name} differs")
     print(f"{count} kills: {lost} of {min(10, count)} gradebooks differ from a run left alone")
 
 
-def _graded(command: list[str], out: Path) -> dict[str, bytes]:
-    subprocess.run([*command, "--jobs", "2", "--out", str(out)], check=True, capture_output=True)
+def _graded(command: list[str], out: Path, code: Path) -> dict[str, bytes]:
+    command = [*command, "--jobs", "2", "--out", str(out)]
+    subprocess.run(command, check=True, capture_output=True, cwd=code)
     files = {
         p.relative_to(out).as_posix(): p.read_bytes()
         for p in sorted(out.rglob("*"))
