@@ -40,7 +40,7 @@ from pipeline.stages.hardware_check import check_hardware
 from pipeline.stages.initial import estimate_initially
 from pipeline.stages.log_decrement import fit_log_decrement
 from pipeline.stages.repeats import find_outlier_repeats
-from pipeline.stages.sine import fit_sine
+from pipeline.stages.sine import Dwell
 from pipeline.stages.state_feedback import design_feedback
 from pipeline.stages.step_gain import fit_step_gain
 from pipeline.stages.time_fit import fit_records
@@ -275,9 +275,10 @@ def _step_gains(driven: Sequence[Record], *, system: System, log: _Log) -> list[
 def _sine_points(records: Sequence[Record], *, log: _Log) -> list[SinePoint]:
     points = []
     for run in records:
+        dwell = Dwell(run)
         for cart in run.carts if run.kind == "sine" else ():
             stage = f"sine steady state, {run.id}, cart {cart}"
-            point = log.attempt(stage, fit_sine, run, cart=cart)
+            point = log.attempt(stage, dwell.fit, cart=cart)
             if point and (fault := dwell_fault(point)):
                 log.skip(stage, fault)
             elif point:

@@ -1,14 +1,16 @@
 """Data files of text: ECP exports, bench logs and CSV of any delimiter and decimal mark."""
 
 import re
-from array import array
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
+from operator import methodcaller
 
 import numpy as np
 
 from pipeline.errors import SubmissionError
 from pipeline.ingest.table import Form, Table, refuse_unusable
+from pipeline.plant.chain import Array
 
 _MAX_COLUMNS = 64
 _SNIFFED_ROWS = 40
@@ -29,7 +31,7 @@ def read_text(raw: bytes, *, source: str) -> Table:
     SubmissionError : not text, not a table, or a row that does not fit; names the line.
     """
     text = _decode(raw, source=source).replace("\r\n", "\n").replace("\r", "\n")
-    opening = _OPENING.search(text)
+    opening = _OPENING.search(text) if "[" in text else None
     return _ecp(text, opening, source) if opening else _delimited(text, source)
 
 
@@ -61,36 +63,45 @@ class _Rows:
 
 
 def _parse(
-    rows: Iterable[tuple[int, list[str]]],
+    rows: Sequence[str],
+    lines: Sequence[int],
     *,
+    split: Callable[[str], Sequence[str]],
     names: Sequence[str],
     source: str,
-    decimal_comma: bool = False,
 ) -> _Rows:
-    """Parse fields into numbers; a bad last row is a file cut short, any other an error."""
-    width = len(names)
-    numbers, lines = array("d"), array("q")
-    failure: str | None = None
-    for line, fields in rows:
-        if failure is not None:  # the bad row was not the last
-            raise SubmissionError(f"{source} {failure}")
-        if decimal_comma:
-            fields = [field.replace(",", ".") for field in fields]
-        try:
-            if len(fields) != width:
-                raise ValueError
-            numbers.extend([float(field) for field in fields])
-        except ValueError:
-            failure = f"line {line}: {_what_is_wrong(fields, names)}"
-            continue
-        lines.append(line)
-    if not lines:
-        raise SubmissionError(
-            f"{source} {failure}" if failure else f"{source}: holds no rows of numbers"
-        )
-    values = np.frombuffer(numbers, dtype=np.float64).reshape(-1, width)
+    """Parse rows into numbers; a bad last row is a file cut short, any other an error.
+
+    Parameters
+    ----------
+    lines : of the file, in which the rows stand.
+    split : what returns the fields of a row.
+    """
+    values, cut = _numbers(map(split, rows), width=len(names)), None
+    if values is None:
+        bad = next(i for i, row in enumerate(rows) if not _fits(split(row), width=len(names)))
+        cut = f"line {lines[bad]}: {_what_is_wrong(split(rows[bad]), names)}"
+        values = _numbers(map(split, rows[:bad]), width=len(names))
+        if bad < len(rows) - 1 or values is None or not values.size:
+            raise SubmissionError(f"{source} {cut}")
+    if not values.size:
+        raise SubmissionError(f"{source}: holds no rows of numbers")
+    lines = lines[: len(values)]
     refuse_unusable(values.T, names=names, place=lambda row: f"{source} line {lines[row]}")
-    return _Rows(values=values, lines=np.array(lines), cut=failure)
+    return _Rows(values=values, lines=np.array(lines), cut=cut)
+
+
+def _numbers(rows: Iterable[Sequence[str]], *, width: int) -> Array | None:
+    """Return rows of numbers (n, width), None where one is none; none is looked at by itself."""
+    fields = chain.from_iterable(row if len(row) == width else ("",) for row in rows)
+    try:
+        return np.fromiter(map(float, fields), np.float64).reshape(-1, width)
+    except ValueError:
+        return None
+
+
+def _fits(row: Sequence[str], *, width: int) -> bool:
+    return len(row) == width and all(map(_is_number, row))
 
 
 def _what_is_wrong(fields: Sequence[str], names: Sequence[str]) -> str:
@@ -164,17 +175,20 @@ def _ecp(text: str, opening: re.Match[str], source: str) -> Table:
     first_line = text.count("\n", 0, opening.end()) + 1
     end = text.find("]", opening.end())
     body = text[opening.end() : end if end >= 0 else len(text)]
-    rows: list[tuple[int, list[str]]] = []
-    for line, content in enumerate(body.split("\n"), start=first_line):
-        pieces = content.partition("%")[0].split(";")
-        rows += [(line, piece.replace(",", " ").split()) for piece in pieces if piece.strip()]
+    rows: list[str] = []
+    lines: list[int] = []
+    for line, content in enumerate(body.replace(",", " ").split("\n"), start=first_line):
+        found = [piece for piece in content.partition("%")[0].split(";") if piece.strip()]
+        rows += found
+        lines += [line] * len(found)
     if not rows:
         raise SubmissionError(f"{source} line {first_line}: no rows after the opening bracket")
-    width = len(rows[0][1])
+    typed = rows[0].split()
+    width = len(typed)
     heading, heading_line = _ecp_heading(text[: opening.start()])
     if heading and len(heading) != width:
         raise SubmissionError(
-            f"{source} line {rows[0][0]}: expected {len(heading)} columns "
+            f"{source} line {lines[0]}: expected {len(heading)} columns "
             f"as in the heading, found {width}"
         )
     names = _checked_names(
@@ -183,7 +197,7 @@ def _ecp(text: str, opening: re.Match[str], source: str) -> Table:
     notes = []
     cut = None
     if end < 0:
-        cut = f"line {rows[-1][0]}: the closing bracket is missing"
+        cut = f"line {lines[-1]}: the closing bracket is missing"
     elif (rest := text[end + 1 :].strip("; \t\n")) != "":
         line = text.count("\n", 0, end) + 1
         if "[" in rest:
@@ -193,11 +207,11 @@ def _ecp(text: str, opening: re.Match[str], source: str) -> Table:
             )
         notes.append(f"text after line {line} is not data and was not read")
     return _table(
-        _parse(rows, names=names, source=source),
+        _parse(rows, lines, split=str.split, names=names, source=source),
         source=source,
         form="ecp",
         names=names,
-        typed=rows[0][1],
+        typed=typed,
         cut=cut,
         notes=notes,
     )
@@ -233,6 +247,15 @@ class _Layout:
         fields = line.strip(" " if self.delimiter == "\t" else None).split(self.delimiter)
         return fields[:-1] if self.trailing and not fields[-1].strip() else fields
 
+    @property
+    def split(self) -> Callable[[str], list[str]]:
+        """What returns the fields of a row of numbers, with a decimal point."""
+        if self.decimal_comma:
+            return lambda row: [field.replace(",", ".") for field in self.fields(row)]
+        if self.delimiter is None or self.trailing:
+            return self.fields
+        return methodcaller("split", self.delimiter)  # white space around a number does no harm
+
 
 def _delimited(text: str, source: str) -> Table:
     """Read a heading and rows; the delimiter and the decimal mark are found."""
@@ -258,10 +281,11 @@ def _delimited(text: str, source: str) -> Table:
         heading or [str(i) for i in range(1, len(typed) + 1)], source=source, line=lines[start][0]
     )
     rows = _parse(
-        ((number, layout.fields(line)) for number, line in lines[first:]),
+        [line for _, line in lines[first:]],
+        [number for number, _ in lines[first:]],
+        split=layout.split,
         names=names,
         source=source,
-        decimal_comma=layout.decimal_comma,
     )
     return _table(
         rows,
@@ -319,9 +343,7 @@ def _sniff(sample: Sequence[str]) -> _Layout | None:
                 line.rstrip().endswith(delimiter) for line in sample[1:] or sample
             )
             layout = _Layout(delimiter, decimal_comma, has_heading=False, trailing=trailing)
-            split = [layout.fields(line) for line in sample]
-            if decimal_comma:
-                split = [[field.replace(",", ".") for field in fields] for fields in split]
+            split = list(map(layout.split, sample))
             has_heading = not all(map(_is_number, split[0]))
             width = len(split[0])
             numeric = [len(row) for row in split[has_heading:] if all(map(_is_number, row))]
@@ -330,4 +352,6 @@ def _sniff(sample: Sequence[str]) -> _Layout | None:
             score = numeric.count(width) * (2 if width > 1 else 1) + 0.01 * len(numeric)
             if score > best_score:
                 best, best_score = replace(layout, has_heading=has_heading), score
+            if width > 1 and numeric.count(width) == len(split) - has_heading > 0:
+                return best  # every line has the delimiter in it, which is in no number
     return best

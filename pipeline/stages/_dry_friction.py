@@ -10,11 +10,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares
+from numpy.typing import NDArray
 
 from pipeline.plant.chain import Array
 from pipeline.results import FrictionTest
 from pipeline.stages._ringing import Ringing
+from pipeline.stages._separable import fit_separable
 from pipeline.stages._signals import colour
 
 THRESHOLD = 10.8  # F(1, many) above this once in a thousand decays without friction
@@ -38,8 +39,8 @@ def fit_friction(
 ) -> FrictionFit | None:
     """Fit a decay with viscous damping and dry friction; compare with viscous damping alone.
 
-    Variable projection over (turning point, decay rate, frequency); rest point, drift, first
-    amplitude and friction band are linear. The F-statistic allows for a coloured residual.
+    Searched are turning point, decay rate and frequency; rest point, drift, first amplitude and
+    friction band are linear. The F-statistic allows for a coloured residual.
 
     Parameters
     ----------
@@ -58,37 +59,33 @@ def fit_friction(
         return None
     direction = -1.0 if falling else 1.0
 
-    def columns(p: Array, at: Array) -> Array:
-        return _columns(at, turning=p[0], decay=p[1], omega_d=p[2], direction=direction)
-
-    def project(p: Array) -> tuple[Array, Array]:
-        X = columns(p, t)
-        linear = np.linalg.lstsq(X, y, rcond=None)[0]
-        return linear.astype(np.float64), X @ linear - y
+    def swings(p: Array) -> _Swings:
+        return _Swings.at(t, p, direction=direction)
 
     fits = [
-        least_squares(
-            lambda p: project(p)[1],
-            [turning, -pole.real * share, pole.imag],
-            method="lm",
-            max_nfev=_MAX_EVALUATIONS,
-            x_scale=[1 / pole.imag, abs(pole), abs(pole)],
+        fit_separable(
+            y,
+            swings,
+            start=np.array([turning, -pole.real * share, pole.imag]),
+            max_evaluations=_MAX_EVALUATIONS,
+            scale=np.array([1 / pole.imag, abs(pole), abs(pole)]),
         )
         for share in (_LESS_DAMPING if viscous.rms > _ONE_START * floor else _LESS_DAMPING[:1])
     ]
-    best = min(fits, key=lambda fit: fit.cost)
-    if not best.success or best.x[2] <= 0:
+    best = min(fits, key=lambda fit: float(fit.residual @ fit.residual))
+    if not best.converged or best.p[2] <= 0:
         return None
-    linear, residual = project(best.x)
+    linear, residual = best.linear, best.residual
     dof = t.size - _UNKNOWNS
-    angle = best.x[2] * (t[-1] - t[0]) / (t.size - 1)
+    angle = best.p[2] * (t[-1] - t[0]) / (t.size - 1)
     variance = max(float(residual @ residual) / dof, floor**2) * colour(residual, angle=angle)
     gained = viscous.rms**2 * t.size - float(residual @ residual)
-    full = np.column_stack([_per_nonlinear(best.x, t, linear, columns), columns(best.x, t)])
+    fitted = swings(best.p)
+    full = np.column_stack([fitted.derivatives(linear), fitted.columns])
     size = np.maximum(np.linalg.norm(full, axis=0), np.finfo(float).tiny)
     inverse = np.linalg.pinv(np.linalg.qr(full / size, mode="r")) / size[:, None]
     covariance = variance * (inverse @ inverse.T)
-    decay, omega_d = float(best.x[1]), float(best.x[2])
+    decay, omega_d = float(best.p[1]), float(best.p[2])
     omega_n = float(np.hypot(decay, omega_d))
     per_pole = np.array([omega_d**2, -decay * omega_d]) / omega_n**3  # of zeta = decay / omega_n
     drop, statistic = float(linear[3]), max(gained / variance, 0.0)
@@ -101,38 +98,100 @@ def fit_friction(
         zeta=decay / omega_n,
         zeta_std=float(np.sqrt(per_pole @ covariance[1:3, 1:3] @ per_pole)),
     )
-    return FrictionFit(test=test, model=lambda at: columns(best.x, at) @ linear)
+    return FrictionFit(
+        test=test,
+        model=lambda at: _Swings.at(at, best.p, direction=direction).columns @ linear,
+    )
 
 
-def _columns(t: Array, *, turning: float, decay: float, omega_d: float, direction: float) -> Array:
-    """Return what rest point, drift, amplitude at `turning` and friction band d multiply, (n, 4).
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Swings:
+    """A decay, cut into half cycles at its turning points; those before the first one count, too.
 
-    `direction` is the sign of the velocity in the half cycle after `turning`.
+    In each, y = rest + drift + (amplitude kept + friction pushed) swing - friction side, where
+    the friction band d is on the side the cart moves to.
+
+    Attributes
+    ----------
+    p : turning point s, decay rate and damped frequency rad/s.
+    since : (n,) s since the turning point; tau (n,) s since the half cycle began.
+    swing : (n,) from 1 at the half cycle's beginning towards -1 at its end; sine (n,) beside it.
+    cycle : (n,) which of the half cycles a sample is in.
+    number : (n_cycles,) what they are numbered, 0 after the turning point.
+    kept, pushed, side : (n_cycles,) see above.
     """
-    half = np.pi / omega_d
-    k = np.floor((t - turning) / half)  # half cycles; negative before the turning point
-    tau = t - turning - k * half
-    swing = np.exp(np.clip(-decay * tau, -_MOST_LOSS, _MOST_LOSS)) * (
-        np.cos(omega_d * tau) + decay / omega_d * np.sin(omega_d * tau)
-    )
-    loss = np.clip(decay * half, -_MOST_LOSS, _MOST_LOSS)  # rho = exp(-loss)
-    rho, lost = np.exp(-loss), np.clip(-loss * k, -_MOST_LOSS, _MOST_LOSS)
-    # (1 - rho^k) / (1 - rho), which is k without viscous damping
-    geometric = np.expm1(lost) / np.expm1(-loss) if loss else k
-    sign = np.where(k % 2 == 0, 1.0, -1.0)
-    amplitude = sign * np.exp(lost) * swing
-    friction = direction * sign * ((1 + (1 + rho) * geometric) * swing - 1)
-    return np.column_stack([np.ones_like(t), t - turning, amplitude, friction])
 
+    p: Array
+    since: Array
+    tau: Array
+    swing: Array
+    sine: Array
+    cycle: NDArray[np.int64]
+    number: Array
+    kept: Array
+    pushed: Array
+    side: Array
 
-def _per_nonlinear(
-    p: Array, t: Array, linear: Array, columns: Callable[[Array, Array], Array]
-) -> Array:
-    """Return the model's derivatives by the three nonlinear unknowns (n, 3), numerically."""
-    steps = 1e-6 * np.array([1 / p[2], p[2], p[2]])
-    return np.column_stack(
-        [
-            (columns(p + step, t) - columns(p - step, t)) @ linear / (2 * step.sum())
-            for step in np.diag(steps)
-        ]
-    )
+    @classmethod
+    def at(cls, t: Array, p: Array, *, direction: float) -> "_Swings":
+        """Cut the samples `t`; the cart moves to `direction` (1, -1) after the turning point."""
+        turning, decay, omega_d = p
+        since, half = t - turning, np.pi / omega_d
+        k = np.floor(since / half)
+        tau = since - k * half
+        number = np.arange(k.min(), k.max() + 1)
+        loss = np.clip(decay * half, -_MOST_LOSS, _MOST_LOSS)  # rho = exp(-loss)
+        lost = np.clip(-loss * number, -_MOST_LOSS, _MOST_LOSS)
+        # (1 - rho^k) / (1 - rho), which is k without viscous damping
+        geometric = np.expm1(lost) / np.expm1(-loss) if loss else number
+        sign = np.where(number % 2 == 0, 1.0, -1.0)
+        left = np.exp(np.clip(-decay * tau, -_MOST_LOSS, _MOST_LOSS))
+        sine = left * np.sin(omega_d * tau)
+        return cls(
+            p=p,
+            since=since,
+            tau=tau,
+            swing=left * np.cos(omega_d * tau) + decay / omega_d * sine,
+            sine=sine,
+            cycle=(k - number[0]).astype(np.int64),
+            number=number,
+            kept=sign * np.exp(lost),
+            pushed=direction * sign * (1 + (1 + np.exp(-loss)) * geometric),
+            side=direction * sign,
+        )
+
+    @property
+    def columns(self) -> Array:
+        """What rest point, drift, amplitude and friction band multiply, (n, 4)."""
+        kept, pushed, side = (part[self.cycle] for part in (self.kept, self.pushed, self.side))
+        one = np.ones_like(self.tau)
+        return np.array([one, self.since, kept * self.swing, pushed * self.swing - side]).T
+
+    def derivatives(self, linear: Array) -> Array:
+        """Return those of y by the turning point, the decay rate and the frequency, (n, 3)."""
+        _, drift, amplitude, band = linear
+        _, decay, omega_d = self.p
+        tau, swing, sine, ratio = self.tau, self.swing, self.sine, decay / omega_d
+        per_tau = -(decay**2 + omega_d**2) / omega_d * sine
+        per_decay = sine / omega_d - tau * swing
+        per_omega_d = ratio * (tau * swing - sine / omega_d) - (1 + ratio**2) * tau * sine
+        # The sizes of the half cycles by their logarithmic loss, decay pi / omega_d.
+        rho, number = np.exp(-np.clip(np.pi * ratio, -_MOST_LOSS, _MOST_LOSS)), self.number
+        geometric = (self.pushed / self.side - 1) / (1 + rho)
+        per_loss = (
+            (number * np.abs(self.kept) - rho * geometric) / (1 - rho)
+            if rho != 1
+            else -number * (number - 1) / 2
+        )
+        pushed_per_loss = self.side * ((1 + rho) * per_loss - rho * geometric)
+        size = (amplitude * self.kept + band * self.pushed)[self.cycle]
+        size_per_loss = (band * pushed_per_loss - amplitude * number * self.kept)[self.cycle]
+        longer = np.pi / omega_d**2 * number[self.cycle]  # tau by omega_d
+        return np.array(
+            [
+                -drift - size * per_tau,
+                size * per_decay + np.pi / omega_d * size_per_loss * swing,
+                size * (per_omega_d + longer * per_tau)
+                - np.pi * ratio / omega_d * size_per_loss * swing,
+            ]
+        ).T

@@ -151,7 +151,7 @@ def fit_decay(t: Array, y: Array, *, stretch: Stretch, run: list[int], floor: fl
         stop = int(np.searchsorted(t[: stretch.stop], t[run[-1]] + 2 * interval))
     pole = complex(-np.log(_ratio(y, run)) / interval, np.pi / interval)
 
-    def fit_from(first: int, *, last: bool = False) -> FreeDecay:
+    def fit_from(first: int, *, near: complex = pole, last: bool = False) -> FreeDecay:
         return _fit(
             t,
             y,
@@ -159,7 +159,7 @@ def fit_decay(t: Array, y: Array, *, stretch: Stretch, run: list[int], floor: fl
             first=first,
             stop=stop,
             run=run,
-            pole=pole,
+            pole=near,
             floor=floor,
             last=last,
         )
@@ -177,12 +177,12 @@ def fit_decay(t: Array, y: Array, *, stretch: Stretch, run: list[int], floor: fl
         first = _carried_back(t, y, decay, latest=latest, share=share, floor=floor)
         if first == decay.first:
             break
-        decay = fit_from(first)
+        decay = fit_from(first, near=complex(decay.fit.poles[0]))
     first = decay.first
     if first > stretch.first:
         margin = t[first] + _RELEASE_MARGIN * 2 * interval
         first = min(int(np.searchsorted(t, margin)), latest)
-    return fit_from(first, last=True)
+    return fit_from(first, near=complex(decay.fit.poles[0]), last=True)
 
 
 def _carried_back(

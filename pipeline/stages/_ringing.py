@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from pipeline.plant.chain import Array, ComplexArray
+from pipeline.stages._separable import fit_separable
 from pipeline.stages._signals import colour
 
 _PENCIL_SAMPLES = 300  # the matrix pencil only starts the fit; more samples would only cost time
@@ -45,8 +45,8 @@ class Ringing:
 def fit_ringing(t: Array, y: Array, *, poles: ComplexArray, drift: bool) -> Ringing:
     """Fit damped sinusoids, a level and (with `drift`) a straight drift, from these poles on.
 
-    Variable projection: the level, slope and amplitudes are linear, so that only decay rates and
-    frequencies are searched (Golub & Pereyra, SIAM J. Numer. Anal. 10, 1973, in Kaufman's form).
+    The level, slope and amplitudes are linear, so that only decay rates and frequencies are
+    searched.
 
     Parameters
     ----------
@@ -54,47 +54,22 @@ def fit_ringing(t: Array, y: Array, *, poles: ComplexArray, drift: bool) -> Ring
     poles : (n_modes,) start, upper half plane, rad/s.
     """
     n_modes, scale = poles.size, float(np.mean(np.abs(poles)))
-    tau = t - t[0]
-    level_columns = [np.ones_like(t), tau] if drift else [np.ones_like(t)]
-
-    def basis(p: Array) -> tuple[Array, Array, Array]:
-        """Return the linear columns (n, n_lin), the cosines and the sines (n_modes, n)."""
-        growth = np.minimum(-p[:n_modes, None] * scale * tau, _MOST_GROWTH)
-        wave = np.exp(growth + 1j * p[n_modes:, None] * scale * tau)
-        return np.array([*level_columns, *wave.real, *wave.imag]).T, wave.real, wave.imag
-
-    def solve(p: Array) -> tuple[Array, Array, Array, Array]:
-        X, cosine, sine = basis(p)
-        Q, R = np.linalg.qr(X)
-        linear = np.linalg.lstsq(R, Q.T @ y, rcond=None)[0].astype(np.float64)
-        k = len(level_columns)
-        a, b = linear[k : k + n_modes, None], linear[k + n_modes :, None]
-        per_decay = -tau * scale * (a * cosine + b * sine)
-        per_frequency = tau * scale * (b * cosine - a * sine)
-        return Q, X @ linear - y, np.concatenate([per_decay, per_frequency]).T, linear
-
-    def residual(p: Array) -> Array:
-        return solve(p)[1]
-
-    def jacobian(p: Array) -> Array:
-        Q, _, J, _ = solve(p)
-        return J - Q @ (Q.T @ J)
-
-    start = np.concatenate([np.maximum(-poles.real / scale, _ALWAYS_DECAYS), poles.imag / scale])
-    fit = least_squares(
-        residual,
-        start,
-        jac=jacobian,  # pyright: ignore[reportArgumentType] - scipy's default is a string
-        method="lm",
-        max_nfev=_MAX_EVALUATIONS,
+    tau = scale * (t - t[0])
+    level = np.array([np.ones_like(t), t - t[0]] if drift else [np.ones_like(t)])
+    k = len(level)
+    fit = fit_separable(
+        y,
+        lambda p: _Waves.at(tau, p, level=level),
+        start=np.append(np.maximum(-poles.real / scale, _ALWAYS_DECAYS), poles.imag / scale),
+        max_evaluations=_MAX_EVALUATIONS,
     )
-    _, left, J, linear = solve(fit.x)
-    k = len(level_columns)
-    full = np.column_stack([np.array(level_columns).T, J / scale, basis(fit.x)[0][:, k:]])
+    linear, left, waves = fit.linear, fit.residual, _Waves.at(tau, fit.p, level=level)
+    X = waves.columns
+    full = np.column_stack([X[:, :k], waves.derivatives(linear) / scale, X[:, k:]])
     kept = [0, 1] if drift else [0]
     kept += list(range(k, k + 2 * n_modes))
     inverse = np.linalg.pinv(np.linalg.qr(full, mode="r"))[kept]
-    angle = float(np.median(fit.x[n_modes:])) * scale * (tau[-1] / (t.size - 1))
+    angle = float(np.median(fit.p[n_modes:])) * float(tau[-1] / (t.size - 1))
     variance = float(left @ left) / max(t.size - full.shape[1], 1) * colour(left, angle=angle)
     covariance = variance * (inverse @ inverse.T)
     if not drift:
@@ -103,12 +78,37 @@ def fit_ringing(t: Array, y: Array, *, poles: ComplexArray, drift: bool) -> Ring
         t0=float(t[0]),
         level=float(linear[0]),
         slope=float(linear[1]) if drift else 0.0,
-        poles=scale * (-fit.x[:n_modes] + 1j * fit.x[n_modes:]),
+        poles=scale * (-fit.p[:n_modes] + 1j * fit.p[n_modes:]),
         amplitudes=linear[k : k + n_modes] - 1j * linear[k + n_modes :],
         covariance=covariance,
         rms=float(np.sqrt(np.mean(left**2))),
-        converged=bool(fit.success),
+        converged=fit.converged,
     )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Waves:
+    """Damped waves (n_modes, n) at dimensionless times `tau`, beside a level (and drift)."""
+
+    tau: Array
+    level: Array
+    waves: ComplexArray
+
+    @classmethod
+    def at(cls, tau: Array, p: Array, *, level: Array) -> "_Waves":
+        """Return those with decay rates and frequencies p (2 n_modes,)."""
+        decay, frequency = p.reshape(2, -1, 1)
+        growth = np.minimum(-decay * tau, _MOST_GROWTH)
+        return cls(tau=tau, level=level, waves=np.exp(growth + 1j * frequency * tau))
+
+    @property
+    def columns(self) -> Array:
+        return np.concatenate([self.level, self.waves.real, self.waves.imag]).T
+
+    def derivatives(self, linear: Array) -> Array:
+        cosine, sine = linear[len(self.level) :].reshape(2, -1, 1)
+        turned = -self.tau * (cosine - 1j * sine) * self.waves
+        return np.concatenate([turned.real, turned.imag]).T
 
 
 def find_poles(t: Array, y: Array, *, n_modes: int) -> ComplexArray:

@@ -1,5 +1,7 @@
 """What several time-domain stages ask of a measured signal: its noise, extrema and plateaus."""
 
+from functools import cache
+
 import numpy as np
 
 from pipeline.plant.chain import Array
@@ -18,17 +20,20 @@ def local_noise(t: Array, y: Array) -> float:
     """
     if t.size < 7:
         return 0.0
-    centre = np.arange(3, t.size - 3)
-    nodes = t[centre[:, None] + np.array(_NEIGHBOURS)] - t[centre, None]  # (n - 6, 6)
-    weights = np.ones_like(nodes)  # Lagrange's, at zero
-    for j in range(len(_NEIGHBOURS)):
-        for m in range(len(_NEIGHBOURS)):
-            if m != j:
-                weights[:, j] *= nodes[:, m] / (nodes[:, m] - nodes[:, j])
-    predicted = np.sum(weights * y[centre[:, None] + np.array(_NEIGHBOURS)], axis=1)
-    scaled = (y[centre] - predicted) / np.sqrt(1 + np.sum(weights**2, axis=1))
+    nodes = _neighbours(t) - t[3:-3]  # (6, n - 6)
+    weights = np.empty_like(nodes)  # Lagrange's, at zero
+    for j, node in enumerate(nodes):
+        others = nodes[np.arange(len(nodes)) != j]
+        weights[j] = np.prod(others / (others - node), axis=0)
+    predicted = np.einsum("jn,jn->n", weights, _neighbours(y))
+    scaled = (y[3:-3] - predicted) / np.sqrt(1 + np.einsum("jn,jn->n", weights, weights))
     moving = scaled[scaled != 0]  # a cart at rest on one count says nothing about the noise
     return float(_MEDIAN_TO_SIGMA * np.median(np.abs(moving))) if moving.size else 0.0
+
+
+def _neighbours(x: Array) -> Array:
+    """Return the six neighbours (6, n - 6) of every sample that has them."""
+    return np.array([x[3 + j : x.size - 3 + j] for j in _NEIGHBOURS])
 
 
 def grain(t: Array, y: Array, *, step: float) -> float:
@@ -66,11 +71,16 @@ def colour(residual: Array, *, angle: float) -> float:
     power = float(residual @ residual)
     if power == 0 or lags < 2:
         return 1.0
-    k = np.arange(1, lags)
-    correlation = np.array([residual[:-lag] @ residual[lag:] for lag in k]) / power
-    x = k / lags
-    parzen = np.where(x <= 0.5, 1 - 6 * x**2 * (1 - x), 2 * (1 - x) ** 3)
-    return max(1.0, float(1 + 2 * np.sum(parzen * correlation * np.cos(angle * k))))
+    correlation = np.array([residual[:-lag] @ residual[lag:] for lag in range(1, lags)]) / power
+    wave = np.cos(angle * np.arange(1, lags))
+    return max(1.0, float(1 + 2 * np.sum(_parzen(lags) * correlation * wave)))
+
+
+@cache
+def _parzen(lags: int) -> Array:
+    """Return Parzen's window at the lags from 1 on."""
+    x = np.arange(1, lags) / lags
+    return np.where(x <= 0.5, 1 - 6 * x**2 * (1 - x), 2 * (1 - x) ** 3)
 
 
 def extrema(y: Array, *, prominence: float) -> list[int]:

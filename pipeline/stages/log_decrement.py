@@ -17,8 +17,6 @@ _NO_DECAY = 0.08  # of the motion: a fit that leaves more is of something else
 _MAX_FIGURE_POINTS = 3000
 _GROWS = 1.05  # damping ratio at large amplitudes over the mean, where it is worth a word
 _FIGURE_POINTS = 60  # per period
-_MAX_GROWS = 1.05  # damping ratio at large amplitudes over the mean, where it is worth a word
-_FIGURE_POINTS = 3000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -170,7 +168,7 @@ def _vertex(t: Array, y: Array, index: int, *, half_width: float) -> tuple[float
     first, stop = np.searchsorted(t, t[index] + half_width * np.array([-1, 1]))
     first, stop = min(int(first), max(index - 1, 0)), max(int(stop), min(index + 2, t.size))
     tau = (t[first:stop] - t[index]) / half_width
-    if tau.size < 3:
+    if tau.size < 3 or np.ptp(y[first:stop]) == 0:  # a cart that has come to rest
         return float(t[index]), float(y[index])
     a, b, c = np.linalg.lstsq(np.vander(tau, 3), y[first:stop], rcond=None)[0]
     vertex = -b / (2 * a) if a else 0.0

@@ -1,7 +1,7 @@
 """Sine dwell: amplitude and phase of the steady state, and where it begins."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -33,21 +33,62 @@ _PHASE_CONVERGED = 1e-9  # rad at the ends of the record
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class _Part:
+    """Some samples and the columns fitted to them, solved once for all signals.
+
+    Attributes
+    ----------
+    columns : (n, p) what `_columns` returns; inverse (p, n), its pseudo-inverse.
+    angle : of the sine, rad per sample.
+    """
+
+    columns: Array
+    inverse: Array
+    angle: float
+
+    @classmethod
+    def of(cls, columns: Array, *, angle: float) -> "_Part":
+        inverse = np.linalg.pinv(columns).astype(np.float64)
+        return cls(columns=columns, inverse=inverse, angle=angle)
+
+    def fit(self, y: Array) -> "_Sine":
+        coefficients = self.inverse @ y
+        residual = y - self.columns @ coefficients
+        return _Sine(part=self, coefficients=coefficients, residual=residual)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class _Sine:
-    """a sin(omega t) + b cos(omega t) + offset + slope (t - middle), and what it leaves."""
+    """A sine, an offset and a straight drift (the coefficients), and what they leave."""
 
-    z: complex  # a + jb: amplitude and phase against sin(omega t)
-    std: float  # of |z|; the phase's is std / |z|
-    omega: float
-    omega_std: float
-    middle: float
-    offset: float
-    slope: float
-    rms: float  # of the residual
+    part: _Part
+    coefficients: Array
+    residual: Array
 
-    def __call__(self, t: Array) -> Array:
-        line = self.offset + self.slope * (t - self.middle)
-        return line + (self.z * np.exp(1j * self.omega * t)).imag
+    @property
+    def z(self) -> complex:
+        """Amplitude and phase against sin(omega t): a + jb of a sin(omega t) + b cos(omega t)."""
+        return complex(self.coefficients[0], self.coefficients[1])
+
+    @property
+    def rms(self) -> float:
+        """Root-mean-square of the residual."""
+        return float(np.sqrt(self.residual @ self.residual / self.residual.size))
+
+    @cached_property
+    def std(self) -> float:
+        """Standard error of |z|; that of the phase is std / |z|."""
+        return float(np.hypot(self.error(0), self.error(1)) / np.sqrt(2))
+
+    def error(self, which: int) -> float:
+        """Return the standard error of a coefficient, for a residual that need not be white."""
+        return self._sigma * float(np.linalg.norm(self.part.inverse[which]))
+
+    @cached_property
+    def _sigma(self) -> float:
+        left = max(self.residual.size - self.coefficients.size, 1)
+        variance = float(self.residual @ self.residual) / left
+        return float(np.sqrt(variance * colour(self.residual, angle=self.part.angle)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +106,7 @@ def fit_sine(record: Record, *, cart: int) -> SinePoint:
     The steady part is found: the last windows tell whether there is one, and it reaches back as
     far as its own sine explains the record. The input is fitted over the same part; where it is
     held from sample to sample, its amplitude is that of the held staircase. Valid for one
-    frequency, from one cycle on.
+    frequency, from one cycle on. Several carts of one dwell share much work: see `Dwell`.
 
     Reference: IEEE Std 1057-2017, section 4.6 (three- and four-parameter sine fits).
 
@@ -78,95 +119,180 @@ def fit_sine(record: Record, *, cart: int) -> SinePoint:
     ------
     DataError : no input column, an input that does not oscillate, or less than a full cycle.
     """
-    u, driven = _driven(record)
-    t, y, step = record.t[driven], record.position(cart)[driven], record.encoder_step(cart)
-    if np.ptp(y) == 0:
-        raise DataError(f"{record.id}: a sine fit needs motion, cart {cart} does not move")
-    omega, frequency_note = _frequency(record, t, u)
-    cycles = omega * (t[-1] - t[0]) / (2 * np.pi)
-    if cycles < 1:
-        raise DataError(
-            f"{record.id}: a sine fit needs a full cycle of driven motion, found {cycles:.2f}"
-        )
-    floor = grain(t, y, step=step) / np.sqrt(12)
-    steady = _steady_part(t, y, omega=omega, floor=floor)
-    t, u, y = t[steady.start :], u[steady.start :], y[steady.start :]
+    return Dwell(record).fit(cart=cart)
 
-    position = _fit(t, y, omega=omega)
-    drive = _fit(t, u, omega=omega)
-    if drive.rms >= _NO_SINE * abs(drive.z):
-        raise DataError(
-            f"{record.id}: a sine dwell needs an input of one frequency, found an amplitude of "
-            f"{abs(drive.z):.3g} at {omega / (2 * np.pi):.4g} Hz and {drive.rms:.3g} (rms) besides"
+
+class Dwell:
+    """The driven part of a dwell: its frequency, and the columns that every fit to it shares."""
+
+    def __init__(self, record: Record) -> None:
+        self._record = record
+        self._parts: dict[tuple[int, int], _Part] = {}
+
+    def fit(self, *, cart: int) -> SinePoint:
+        """Fit the steady state of one cart; see `fit_sine`."""
+        record, driven = self._record, self._driven
+        y, step = record.position(cart)[driven], record.encoder_step(cart)
+        if np.ptp(y) == 0:
+            raise DataError(f"{record.id}: a sine fit needs motion, cart {cart} does not move")
+        omega, frequency_note = self._frequency
+        cycles = omega * (self._t[-1] - self._t[0]) / (2 * np.pi)
+        if cycles < 1:
+            raise DataError(
+                f"{record.id}: a sine fit needs a full cycle of driven motion, found {cycles:.2f}"
+            )
+        floor = grain(self._t, y, step=step) / np.sqrt(12)
+        steady = self._steady_part(y, floor=floor)
+        t = self._t[steady.start :]
+        position, drive = self._fit(y, steady.start), self._fit(self._u, steady.start)
+        if drive.rms >= _NO_SINE * abs(drive.z):
+            raise DataError(
+                f"{record.id}: a sine dwell needs an input of one frequency, found an amplitude of "
+                f"{abs(drive.z):.3g} at {omega / (2 * np.pi):.4g} Hz and {drive.rms:.3g} (rms) "
+                "besides"
+            )
+        amplitude, input_amplitude = abs(position.z), abs(drive.z)
+        held = _held(t, omega=omega) if record.hold == "zero_order" else 1.0
+        rounding = _rounding_std(position, step=step)  # leaves the phase alone
+        angle_std = _angle_std(position.z, float(np.hypot(position.std, steady.left)))
+        notes = [
+            frequency_note,
+            "" if steady.settled else "no steady state is seen before the record ends",
+            _note_small(amplitude, step=step),
+            _note_off_sine(position, floor=floor),
+        ]
+        return SinePoint(
+            experiment=record.id,
+            cart=cart,
+            omega=omega,
+            amplitude=float(amplitude),
+            amplitude_std=float(np.linalg.norm([position.std, rounding, steady.left])),
+            phase=float(np.angle(position.z / (drive.z * held))),
+            phase_std=float(np.hypot(angle_std, _angle_std(drive.z, drive.std))),
+            input_amplitude=float(input_amplitude * abs(held)),
+            input_amplitude_std=drive.std,
+            steady_from=float(t[0]),
+            settled=steady.settled,
+            n_points=t.size,
+            note="; ".join(note for note in notes if note),
         )
-    amplitude, input_amplitude = abs(position.z), abs(drive.z)
-    held = _held(t, omega=omega) if record.hold == "zero_order" else 1.0
-    rounding = _rounding_std(position, step=step)  # leaves the phase alone
-    angle_std = _angle_std(position.z, float(np.hypot(position.std, steady.left)))
-    notes = [
-        frequency_note,
-        "" if steady.settled else "no steady state is seen before the record ends",
-        _note_small(amplitude, step=step),
-        _note_off_sine(position, floor=floor),
-    ]
-    return SinePoint(
-        experiment=record.id,
-        cart=cart,
-        omega=omega,
-        amplitude=float(amplitude),
-        amplitude_std=float(np.linalg.norm([position.std, rounding, steady.left])),
-        phase=float(np.angle(position.z / (drive.z * held))),
-        phase_std=float(np.hypot(angle_std, _angle_std(drive.z, drive.std))),
-        input_amplitude=float(input_amplitude * abs(held)),
-        input_amplitude_std=drive.std,
-        steady_from=float(t[0]),
-        settled=steady.settled,
-        n_points=t.size,
-        note="; ".join(note for note in notes if note),
-    )
+
+    # ------------------------------------------------------------ what all carts share
+
+    @cached_property
+    def _driven(self) -> slice:
+        return _driven(self._record)
+
+    @cached_property
+    def _t(self) -> Array:
+        return self._record.t[self._driven]
+
+    @cached_property
+    def _u(self) -> Array:
+        assert self._record.u is not None  # or nothing is driven
+        return self._record.u[self._driven]
+
+    @cached_property
+    def _frequency(self) -> tuple[float, str]:
+        return _frequency(self._t, self._u, stated=self._record.omega)
+
+    @cached_property
+    def _columns(self) -> Array:
+        return _columns(self._t, omega=self._frequency[0])
+
+    def _fit(self, y: Array, start: int, stop: int | None = None) -> _Sine:
+        """Fit a sine to samples [start, stop) of y (n,), all carts' the same way."""
+        span = start, self._t.size if stop is None else stop
+        if span not in self._parts:
+            t = self._t[slice(*span)]
+            angle = self._frequency[0] * (t[-1] - t[0]) / (t.size - 1)
+            self._parts[span] = _Part.of(self._columns[slice(*span)], angle=float(angle))
+        return self._parts[span].fit(y[slice(*span)])
+
+    # ------------------------------------------------------------------ the steady part
+
+    def _steady_part(self, y: Array, *, floor: float) -> _Steady:
+        """Find where the steady part starts, and whether there is one.
+
+        Settled: the complex amplitudes of the last windows agree. Their sine is then carried back
+        over the record as far as it leaves no more than its own residual.
+        """
+        windows = _windows(self._t, omega=self._frequency[0])
+        last = windows[-_LAST_WINDOWS:]
+        fits = [self._fit(y, *window) for window in last]
+        z = np.array([fit.z for fit in fits])
+        latest, _ = last[-1]
+        spread = float(np.max(np.abs(z - z.mean())))
+        agree = spread <= max(_SPREAD * abs(z.mean()), floor)
+        if len(last) < 2 or not (agree or spread <= 3 * max(fit.std for fit in fits)):
+            return _Steady(start=latest, settled=False, left=spread)
+        start = self._carry_back(y, latest, floor=floor, stretches=len(windows))
+        if start > 0:
+            start = min(start + (y.size - start) // _MARGIN, latest)
+        start, left = self._drop_drifting(y, start, latest=latest, floor=floor)
+        return _Steady(start=start, settled=True, left=left)
+
+    def _carry_back(self, y: Array, start: int, *, floor: float, stretches: int) -> int:
+        """Return how far back the sine from `start` on explains the record."""
+        for _ in range(_PASSES):
+            steady = self._fit(y, start)
+            square = np.cumsum((y - self._columns @ steady.coefficients) ** 2)
+            hop = max((y.size - start) // stretches, _MIN_SAMPLES)
+            edges = np.arange(start, -1, -hop)
+            mean = -np.diff(square[edges]) / hop  # of the stretches before `start`, going back
+            limit = max(steady.rms, floor) ** 2 * (1 + _BACK_SIGMAS * np.sqrt(2 / hop))
+            worse = np.flatnonzero(mean > limit)
+            reached = int(edges[worse[0]]) if worse.size else 0
+            if reached == start:
+                break
+            start = reached
+        return start
+
+    def _drop_drifting(
+        self, y: Array, start: int, *, latest: int, floor: float
+    ) -> tuple[int, float]:
+        """Return a start, not after `latest`, from which the two halves agree; and what is left.
+
+        At a resonance the transient has the dwell's own frequency and hides in its amplitude. Half
+        of the difference between the halves, where it is more than noise, is still in the mean.
+        """
+        while True:
+            middle = (start + y.size) // 2
+            if y.size - middle < _MIN_SAMPLES:
+                return start, 0.0
+            early = self._fit(y, start, middle)
+            late = self._fit(y, middle)
+            difference = abs(early.z - late.z)
+            noise = max(np.hypot(early.std, late.std), floor / np.sqrt(y.size - start))
+            if start == latest or difference <= _DRIFT_SIGMAS * noise:
+                return start, float(np.sqrt(max(difference**2 - 4 * noise**2, 0.0))) / 2
+            start = min(start + (y.size - start) // _DROP, latest)
 
 
 # ------------------------------------------------------------------- the fits
 
 
-def _fit(t: Array, y: Array, *, omega: float, free_frequency: bool = False) -> _Sine:
-    """Least-squares sine with offset and slope; iterate on the frequency if it is free.
+def _columns(t: Array, *, omega: float) -> Array:
+    """Return sin(omega t), cos(omega t), 1 and time, from -1 to 1: (n, 4)."""
+    half = (t[-1] - t[0]) / 2
+    tau = (t - (t[0] + half)) / half
+    return np.array([np.sin(omega * t), np.cos(omega * t), np.ones_like(t), tau]).T
 
-    The standard errors allow for a residual that is not white (see `colour`).
-    """
-    middle, half = (t[0] + t[-1]) / 2, (t[-1] - t[0]) / 2
-    tau = (t - middle) / half
-    columns, coefficients = _solve(t, y, omega=omega, tau=tau)
-    for _ in range(_ITERATIONS if free_frequency else 0):
-        per_omega = tau * (coefficients[0] * columns[1] - coefficients[1] * columns[0])
-        columns, coefficients = _solve(t, y, omega=omega, tau=tau, extra=[per_omega])
-        change = coefficients[4] / half
-        omega += change
-        if abs(change) * half < _PHASE_CONVERGED:
+
+def _refined(t: Array, y: Array, *, omega: float) -> tuple[float, float]:
+    """Return the frequency of the sine near `omega`, and its standard error, rad/s."""
+    half, angle = (t[-1] - t[0]) / 2, omega * (t[-1] - t[0]) / (t.size - 1)
+    X = _columns(t, omega=omega)
+    fit = _Part.of(X, angle=angle).fit(y)
+    for _ in range(_ITERATIONS):
+        # by how much a change of omega, in rad at the ends of the record, changes the sine
+        turned = X[:, 3] * (fit.coefficients[0] * X[:, 1] - fit.coefficients[1] * X[:, 0])
+        X = np.column_stack([_columns(t, omega=omega), turned])
+        fit = _Part.of(X, angle=angle).fit(y)
+        omega += fit.coefficients[4] / half
+        if abs(fit.coefficients[4]) < _PHASE_CONVERGED:
             break
-    X = np.array(columns).T
-    residual = y - X @ coefficients
-    inverse = np.linalg.pinv(np.linalg.qr(X, mode="r"))
-    spread = float(residual @ residual) / max(t.size - X.shape[1], 1)
-    variance = spread * colour(residual, angle=omega * 2 * half / (t.size - 1))
-    covariance = variance * (inverse @ inverse.T)
-    return _Sine(
-        z=complex(coefficients[0], coefficients[1]),
-        std=float(np.sqrt((covariance[0, 0] + covariance[1, 1]) / 2)),
-        omega=float(omega),
-        omega_std=float(np.sqrt(covariance[4, 4])) / half if free_frequency else 0.0,
-        middle=float(middle),
-        offset=float(coefficients[2]),
-        slope=float(coefficients[3] / half),
-        rms=float(np.sqrt(np.mean(residual**2))),
-    )
-
-
-def _solve(
-    t: Array, y: Array, *, omega: float, tau: Array, extra: Sequence[Array] = ()
-) -> tuple[list[Array], Array]:
-    columns = [np.sin(omega * t), np.cos(omega * t), np.ones_like(t), tau, *extra]
-    return columns, np.linalg.lstsq(np.array(columns).T, y, rcond=None)[0].astype(np.float64)
+    return float(omega), fit.error(4) / float(half)
 
 
 def _angle_std(z: complex, std: float) -> float:
@@ -197,8 +323,8 @@ def _held(t: Array, *, omega: float) -> complex:
 # -------------------------------------------------------- what the record holds
 
 
-def _driven(record: Record) -> tuple[Array, slice]:
-    """Return the input where it oscillates, and which samples these are."""
+def _driven(record: Record) -> slice:
+    """Return the samples in which the input oscillates."""
     u = record.u
     if u is None:
         raise DataError(
@@ -217,34 +343,32 @@ def _driven(record: Record) -> tuple[Array, slice]:
             f"{record.id}: a sine fit needs {_MIN_SAMPLES} samples of driven motion, found "
             f"{last + 1 - first}"
         )
-    return u[driven], driven
+    return driven
 
 
-def _frequency(record: Record, t: Array, u: Array) -> tuple[float, str]:
+def _frequency(t: Array, u: Array, *, stated: float | None) -> tuple[float, str]:
     """Return the frequency, rad/s: as stated, unless the input clearly says otherwise."""
-    stated = record.omega
     grid = np.linspace(t[0], t[-1], t.size)
     even = np.interp(grid, t, u - np.mean(u))
     n = 4 * t.size  # padded: the peak is found to a quarter of a line
     spectrum = np.abs(np.fft.rfft(even * np.hanning(t.size), n))
     line = 2 * np.pi / (n * (grid[1] - grid[0]))
     peak = line * (1 + int(np.argmax(spectrum[1:])))
-    fitted = _fit(t, u, omega=peak, free_frequency=True)
-    if abs(fitted.omega - peak) > _PEAK_LINES * line:  # no sine, which the caller will see
-        fitted = replace(fitted, omega=peak)
+    fitted, std = _refined(t, u, omega=peak)
+    if abs(fitted - peak) > _PEAK_LINES * line:  # no sine, which the caller will see
+        fitted = peak
     if stated is None:
-        return fitted.omega, ""
-    off = abs(fitted.omega - stated)
-    if off <= max(_FREQUENCY_SIGMAS * fitted.omega_std, _FREQUENCY_RELATIVE * stated):
+        return fitted, ""
+    if abs(fitted - stated) <= max(_FREQUENCY_SIGMAS * std, _FREQUENCY_RELATIVE * stated):
         return stated, ""
-    return fitted.omega, (
-        f"the input oscillates at {fitted.omega / (2 * np.pi):.4g} Hz, not at the "
+    return fitted, (
+        f"the input oscillates at {fitted / (2 * np.pi):.4g} Hz, not at the "
         f"{stated / (2 * np.pi):.4g} Hz stated; the former is used"
     )
 
 
-def _windows(t: Array, *, omega: float) -> list[slice]:
-    """Return sliding windows over the record, the last one ending with it, in order."""
+def _windows(t: Array, *, omega: float) -> list[tuple[int, int]]:
+    """Return sliding windows [start, stop) over the record, the last one ending with it."""
     period = 2 * np.pi / omega
     duration = t[-1] - t[0]
     length = max(_WINDOW_CYCLES * period, _WINDOW_TIME)
@@ -253,74 +377,12 @@ def _windows(t: Array, *, omega: float) -> list[slice]:
         length, hop = period, max(period / 2, (duration - period) / _LAST_WINDOWS)
     ends = t[-1] - hop * np.arange(int((duration - length) / hop + 1e-9) + 1)
     first, stop = np.searchsorted(t, ends - length), np.searchsorted(t, ends, side="right")
-    whole = [slice(0, t.size)]
+    whole = [(0, t.size)]
     return [
-        slice(int(a), int(b))
+        (int(a), int(b))
         for a, b in zip(first[::-1], stop[::-1], strict=True)
         if b - a >= _MIN_SAMPLES
     ] or whole
-
-
-def _steady_part(t: Array, y: Array, *, omega: float, floor: float) -> _Steady:
-    """Find where the steady part starts, and whether there is one.
-
-    Settled: the complex amplitudes of the last windows agree. Their sine is then carried back
-    over the record as far as it leaves no more than its own residual.
-    """
-    windows = _windows(t, omega=omega)
-    last = windows[-_LAST_WINDOWS:]
-    fits = [_fit(t[w], y[w], omega=omega) for w in last]
-    z = np.array([fit.z for fit in fits])
-    tolerance = max(_SPREAD * abs(z.mean()), 3 * max(fit.std for fit in fits), floor)
-    latest = last[-1].start
-    spread = float(np.max(np.abs(z - z.mean())))
-    if len(last) < 2 or spread > tolerance:
-        return _Steady(start=latest, settled=False, left=spread)
-    start = _carry_back(t, y, latest, omega=omega, floor=floor, stretches=len(windows))
-    if start > 0:
-        start = min(start + (t.size - start) // _MARGIN, latest)
-    start, left = _drop_drifting(t, y, start, latest=latest, omega=omega, floor=floor)
-    return _Steady(start=start, settled=True, left=left)
-
-
-def _carry_back(
-    t: Array, y: Array, start: int, *, omega: float, floor: float, stretches: int
-) -> int:
-    """Return how far back the sine from `start` on explains the record."""
-    for _ in range(_PASSES):
-        steady = _fit(t[start:], y[start:], omega=omega)
-        square = np.cumsum((y - steady(t)) ** 2)
-        hop = max((t.size - start) // stretches, _MIN_SAMPLES)
-        edges = np.arange(start, -1, -hop)
-        mean = -np.diff(square[edges]) / hop  # of the stretches before `start`, going back
-        limit = max(steady.rms, floor) ** 2 * (1 + _BACK_SIGMAS * np.sqrt(2 / hop))
-        worse = np.flatnonzero(mean > limit)
-        reached = int(edges[worse[0]]) if worse.size else 0
-        if reached == start:
-            break
-        start = reached
-    return start
-
-
-def _drop_drifting(
-    t: Array, y: Array, start: int, *, latest: int, omega: float, floor: float
-) -> tuple[int, float]:
-    """Return a start, not after `latest`, from which the two halves agree; and what is left.
-
-    At a resonance the transient has the dwell's own frequency and hides in its amplitude. Half
-    of the difference between the halves, where it is more than noise, is still in the mean.
-    """
-    while True:
-        middle = (start + t.size) // 2
-        if t.size - middle < _MIN_SAMPLES:
-            return start, 0.0
-        early = _fit(t[start:middle], y[start:middle], omega=omega)
-        late = _fit(t[middle:], y[middle:], omega=omega)
-        difference = abs(early.z - late.z)
-        noise = max(np.hypot(early.std, late.std), floor / np.sqrt(t.size - start))
-        if start == latest or difference <= _DRIFT_SIGMAS * noise:
-            return start, float(np.sqrt(max(difference**2 - 4 * noise**2, 0.0))) / 2
-        start = min(start + (t.size - start) // _DROP, latest)
 
 
 # ------------------------------------------------------------------------ notes
