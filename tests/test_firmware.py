@@ -1,6 +1,7 @@
 """The firmware's C core does what the reference controller in Python does, byte for byte."""
 
 import ctypes
+import shutil
 import subprocess
 
 import pytest
@@ -159,6 +160,48 @@ def test_the_motor_is_cut_100_ms_after_the_last_heartbeat(library):
     assert core.tick((0, 0), stamp=600_000, now=9900) == -900
 
 
+STOPPING = [
+    b"s;",
+    b";s;",
+    b"d;q;o;s;",
+    b"d;s;k;",
+    b"d;s;;",
+    b"g;1;s;",
+    b"noises;",
+    b"9" * 50 + b"s;",
+    b"z;",
+]
+NOT_STOPPING = [b"d;s;", b"s", b"k;", b"noise;", b"d;s;o;o;1;5;0;", b"ss k;", b"\x00s\x00;", b"?;"]
+
+
+@pytest.mark.parametrize(
+    ("data", "stops"),
+    [(data, True) for data in STOPPING] + [(data, False) for data in NOT_STOPPING],
+)
+def test_no_lost_byte_swallows_a_stop(library, data, stops):
+    """A stop behind anything stops; what is no stop lets the run go on; the reference agrees."""
+    duties = []
+    for core in _both(library):
+        core.receive(encode(Start(wave=Wave.SQUARE, frequency=1e-3, amplitude=70)))
+        core.tick((0, 0), stamp=0, now=0)
+        core.receive(data)
+        duties.append(core.tick((0, 0), stamp=600_000, now=600_000))
+    assert duties == [0 if stops else 70] * 2
+
+
+def test_a_reset_forgets_gains_and_chirp_end(library):
+    """After a reset a chirp ends where it does unasked, and a closed loop has gains of zero."""
+    firmware, reference = _both(library)
+    told = encode(PidGains(kp=1.0, ki=0.0, kd=0.0)) + encode(ChirpEnd(frequency=2.0))
+    chirp = Start(wave=Wave.CHIRP, encoder=1, frequency=1.0, amplitude=1000)
+    for core in (firmware, reference):
+        core.receive(told + b"z;" + encode(chirp))
+    for stamp in range(1000):
+        assert firmware.tick((0, 0), stamp=stamp, now=0) == 0
+        reference.tick((0, 0), stamp=stamp, now=0)
+        assert firmware.take() == reference.take()
+
+
 def test_the_clock_may_go_round(library):
     """A run and the watchdog go on where 32 bits of milliseconds begin again."""
     core, _ = _both(library)
@@ -206,6 +249,39 @@ def test_noise_breaks_nothing(tmp_path):
     for seed in range(1, 5):
         done = subprocess.run([program, str(seed), "250000"], capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
+
+
+# What the sketch asks of a board with 32 bits and Teensy's additions to Arduino, without a body.
+ARDUINO = """
+#include <stdint.h>
+#include <stdlib.h>
+enum { OUTPUT, INPUT_PULLUP, CHANGE };
+static inline int min(int a, int b) { return a < b ? a : b; }
+void pinMode(uint8_t, uint8_t), digitalWrite(uint8_t, uint8_t), analogWrite(uint8_t, int);
+void analogWriteResolution(uint32_t), analogWriteFrequency(uint8_t, float);
+uint8_t digitalRead(uint8_t);
+int digitalPinToInterrupt(uint8_t);
+void attachInterrupt(uint8_t, void (*)(), int), noInterrupts(), interrupts();
+uint32_t micros();
+struct Line { void begin(long); int available(), read(), availableForWrite(), write(uint8_t); };
+extern Line Serial;
+"""
+
+
+@pytest.mark.parametrize("options", [[], ["-DTEENSYDUINO"], ["-DMOTOR_DAC=40"]])
+def test_the_sketch_compiles_for_other_boards(tmp_path, options):
+    """The parts of the sketch that no simulated board runs fit together, without a warning."""
+    compiler = shutil.which("c++")
+    if compiler is None:
+        pytest.skip("no C++ compiler is here")
+    (tmp_path / "Arduino.h").write_text(ARDUINO, encoding="utf-8")
+    command = [
+        compiler, "-std=c++11", "-fsyntax-only", "-Wall", "-Wextra", "-Werror", *options,
+        "-I", tmp_path, "-I", FIRMWARE / "core", "-include", "Arduino.h",
+        "-x", "c++", FIRMWARE / "cartlab_bench" / "cartlab_bench.ino",
+    ]  # fmt: skip
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 # ------------------------------------------------------------------- the parts

@@ -55,6 +55,9 @@ static void motor_begin()
     pinMode(MOTOR_PWM, OUTPUT);
     pinMode(MOTOR_DIRECTION, OUTPUT);
     analogWriteResolution(12);
+#if defined(TEENSYDUINO)
+    analogWriteFrequency(MOTOR_PWM, 10000); /* Hz; unasked it may be as low as 488 */
+#endif
     motor_drive(0);
 }
 
