@@ -17,7 +17,7 @@ REACH = 12.0  # times the travel that full duty moves the carts, about: 1 cm is 
 FEWEST_ENCODERS = 2  # a line has two counts even where there is one cart
 
 _NOISE = 0.2  # counts that shake a free cart's encoder: it flickers between two counts
-_PULL = 1.5  # times the travel a hand pulls a cart out
+_PULL = (1.2, 1.8)  # times the travel, at random to either side, a hand pulls a cart out
 _PULL_TIME = 1.5  # s it takes
 _RELEASE = (0.3, 0.6)  # s after the start of a run, at random, it lets go
 _FADE = (0.01, 0.03)  # s its force takes to fall
@@ -40,21 +40,19 @@ class VirtualCarts:
     def __init__(self, bench: HiddenBench, *, seed: int, period: float = TRUE_PERIOD) -> None:
         self._bench, self._period = bench, period
         self._model = AugmentedChain(chain=bench.chain, terms=bench.effects)
-        self._rng = np.random.default_rng(seed)
+        self._noise_rng, self._hand_rng = np.random.default_rng(seed).spawn(2)
         n = bench.chain.n
         self.encoders = max(FEWEST_ENCODERS, n)
         self.input_per_count = input_per_count(bench)
         # Where between two counts an encoder gets its power is chance.
-        self._phase = self._rng.uniform(-0.5, 0.5, size=n)
-        self._noise = iter(np.empty((0, n)))
-        self._started = False
-        self._hold(Hands())
+        self._phase = self._noise_rng.uniform(-0.5, 0.5, size=n)
+        self.take_in_hand(Hands())
 
     def counts(self) -> tuple[int, ...]:
         """Return what the encoders count since they had power."""
         noise = next(self._noise, None)
         if noise is None:
-            block = self._rng.standard_normal((_NOISE_BLOCK, self._shaken.size))
+            block = self._noise_rng.standard_normal((_NOISE_BLOCK, self._shaken.size))
             self._noise = iter(_NOISE * block * self._shaken)
             noise = next(self._noise)
         exact = self._plant.readings / self._bench.count + self._phase + noise
@@ -79,13 +77,7 @@ class VirtualCarts:
 
     def take_in_hand(self, hands: Hands) -> None:
         """Bring all carts to rest; hold some, and pull one out to let it go in the next run."""
-        self._hold(hands)
-
-    def start(self) -> None:
-        """Tell the hands that a run starts."""
-        self._started = True
-
-    def _hold(self, hands: Hands) -> None:
+        self._started = False
         n = self._bench.chain.n
         free = [cart for cart in range(1, n + 1) if cart not in hands.held]
         self._shaken = np.isin(np.arange(1, n + 1), free).astype(float)
@@ -93,30 +85,33 @@ class VirtualCarts:
         self._plant = SteppedBench(self._model, free=free)
         self._hand = self._lead(hands.released) if hands.released in free else None
 
+    def start(self) -> None:
+        """Tell the hands that a run starts."""
+        self._started = True
+
     def _lead(self, cart: int) -> Generator[None]:
         """Pull a cart out, hold it until a run has begun, let go; one tick a step."""
-        self._started = False
-        tremor = self._rng.uniform(0.0, 2 * np.pi, size=3)
+        rng = self._hand_rng
+        tremor = rng.uniform(0.0, 2 * np.pi, size=3)
         hand = before_stop(
             Hand(
                 cart=cart,
-                position=_PULL * self._bench.travel,
-                release=float(self._rng.uniform(*_RELEASE)),
-                fade=float(self._rng.uniform(*_FADE)),
+                position=rng.choice([-1.0, 1.0]) * rng.uniform(*_PULL) * self._bench.travel,
+                release=float(rng.uniform(*_RELEASE)),
+                fade=float(rng.uniform(*_FADE)),
                 tremor=(float(tremor[0]), float(tremor[1]), float(tremor[2])),
             ),
             self._model,
         )
-        # The hand's own clock stands while it pulls and starts with the run, trembling on.
-        held = hand.hold(np.zeros(1))[0]
-        for share in np.linspace(0.0, math.pi, math.ceil(_PULL_TIME / self._period)):
-            yield self._carry(cart, held * (1.0 - math.cos(share)) / 2.0)
-        waited, left = 0.0, math.inf
+        out, _ = hand.hold(np.zeros(1))
+        for angle in np.linspace(0.0, math.pi, math.ceil(_PULL_TIME / self._period)):
+            yield self._carry(cart, out * (1.0 - math.cos(angle)) / 2.0)
+        held, left = np.zeros(1), hand.release
         while left > 0.0:
-            waited += self._period
-            left = min(left, hand.release) - self._period if self._started else left
-            yield self._carry(cart, hand.hold(np.array([waited]))[0])
-        force = self._plant.let_go(cart, velocity=float(hand.hold(np.array([waited]))[1][0]))
+            held += self._period
+            left -= self._period * self._started
+            yield self._carry(cart, hand.hold(held)[0])
+        force = self._plant.let_go(cart, velocity=float(hand.hold(held)[1][0]))
         ticks = math.ceil(hand.fade / self._period)
         for tick in range(ticks):
             # The force of a tick is the mean of a fall in a straight line.
