@@ -29,6 +29,8 @@ HOMES = {
     "typer": ("cli",),
     "rich": ("cli", "bench"),
     "serial": ("bench",),
+    "starlette": ("bench",),
+    "uvicorn": ("bench",),
     "control": ("plant", "stages"),
     "sqlalchemy": ("grading",),
     "pandas": ("ingest", "report", "grading"),

@@ -213,13 +213,14 @@ def test_a_long_set_point_is_cut_to_the_travel():
 
 
 def test_new_recordings_take_names_of_their_own():
-    """A sweep beside a recorded "sweep" is "sweep-2"; ids never clash with the submission's."""
-    submission = recorded("two-cart", "decay", "step", "sweep")
+    """Steps go on counting where the submission's end; ids never clash."""
+    submission = recorded("two-cart", *FIRST)
     taken = {e.id for e in submission.experiments}
     plan = extend_plan(propose_plan(submission), submission)
     ids = [r.id for r in plan.recordings]
     assert not taken & set(ids)
     assert len(set(ids)) == len(ids)
+    assert ids[:3] == ["step-5", "step-6", "sine-01"]
 
 
 def test_data_that_identify_nothing_say_so():

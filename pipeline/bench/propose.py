@@ -130,15 +130,17 @@ def _wants_loop(plan: Plan, submission: Submission) -> bool:
 
 
 def _renamed(proposed: Sequence[Recording], *, taken: Sequence[str]) -> tuple[Recording, ...]:
-    """Return the recordings, each with an id of its own: "sweep-2" where there is a "sweep"."""
+    """Return the recordings, each with an id of its own: "step-3" where there is a "step-2"."""
     used, renamed = set(taken), []
     for recording in proposed:
-        candidate, number = recording.id, 1
-        while candidate in used:
-            number += 1
-            candidate = f"{recording.id}-{number}"
-        used.add(candidate)
-        renamed.append(recording.model_copy(update={"id": candidate}))
+        name = recording.id
+        while name in used:
+            stem, dash, number = name.rpartition("-")
+            counted = dash and number.isdecimal()
+            width = len(number)
+            name = f"{stem}-{int(number) + 1:0{width}d}" if counted else f"{name}-2"
+        used.add(name)
+        renamed.append(recording.model_copy(update={"id": name}))
     return tuple(renamed)
 
 

@@ -1,0 +1,242 @@
+// Shows a session while it goes on: news come as server-sent events, plots are drawn on canvases.
+(() => {
+  'use strict';
+  const WINDOW = 10; // s shown
+  const COUNTERS = ['lines', 'lost', 'garbled', 'late', 'resets', 'stuck'];
+  const COLOURS = ['--f-model', '--f-second', '--f-third', '--f-mark'];
+  const DASH = [6, 4];
+  const $ = (id) => document.getElementById(id);
+  const make = (tag, text = '', name = '') => {
+    const element = document.createElement(tag);
+    element.textContent = text;
+    element.className = name;
+    return element;
+  };
+  const time = (seconds) => {
+    const s = Math.max(0, Math.round(seconds));
+    return s < 60 ? `${s} s` : `${Math.floor(s / 60)} min ${s % 60} s`;
+  };
+  const short = (value) => (value === undefined ? '–' : value.toPrecision(3).replace('-', '−'));
+
+  let state = { phase: 'waiting', plan: [], remarks: [], units: {}, carts: 0, seconds: 0, seconds_left: 0 };
+  let since = performance.now(); // when the phase began
+  let run = 0;
+  let points = []; // [t, input, target, x1, …] of this run
+  let rate = [];
+
+  // ------------------------------------------------------------------ words and lists
+
+  const STATUS = {
+    waiting: () => (state.instruction ? 'Waiting for you.' : 'Waiting for the bench.'),
+    settling: () => `The carts come to rest before ${state.now}.`,
+    recording: () => `Recording ${state.now}.`,
+    over: () => 'The session is over.',
+  };
+  const tell = (text, lost = false) => {
+    if ($('status').textContent !== text) $('status').textContent = text;
+    $('status').classList.toggle('lost', lost);
+  };
+  const showState = (fresh) => {
+    if (fresh.phase !== state.phase || fresh.now !== state.now) since = performance.now();
+    const asked = fresh.instruction?.number !== state.instruction?.number;
+    const relisted = JSON.stringify(fresh.plan) !== JSON.stringify(state.plan);
+    const rekeyed = fresh.carts !== state.carts || fresh.closed !== state.closed;
+    state = fresh;
+    document.title = `${state.now ?? 'At the bench'} – cartlab`;
+    $('title').textContent = state.title || 'cartlab';
+    tell(STATUS[state.phase]());
+    for (const [id, unit] of [['positions', state.units.position], ['inputs', state.units.input]])
+      $(id).closest('figure').querySelector('.unit').textContent = unit ? `in ${unit}` : '';
+    if (asked) {
+      $('ask').hidden = !state.instruction;
+      $('instruction').textContent = state.instruction?.text ?? '';
+      $('confirm').disabled = false;
+      if (state.instruction) $('confirm').focus({ preventScroll: true });
+    }
+    if (relisted) listPlan();
+    if (rekeyed) listKeys();
+    $('told').hidden = state.remarks.length === 0;
+    $('remarks').replaceChildren(...state.remarks.map((text) => make('li', text)));
+  };
+  const listPlan = () => {
+    $('plan').replaceChildren(...state.plan.map((entry) => {
+      const item = make('li', '', entry.state);
+      item.append(make('span', entry.state, 'state'), make('b', entry.id), make('span', entry.what, 'what'));
+      if (entry.why) item.append(make('span', entry.why, 'why'));
+      return item;
+    }));
+    const now = $('plan').querySelector('.now');
+    if (now) $('plan').scrollTop = now.offsetTop - $('plan').clientHeight / 3;
+  };
+  const showCounters = (counters) => {
+    const parts = COUNTERS.map((name) => {
+      const part = make('div', '', name !== 'lines' && counters[name] ? 'bad' : '');
+      part.append(make('dt', name), make('dd', String(counters[name])));
+      return part;
+    });
+    const per = make('div');
+    const [first, last] = [rate[0], rate.at(-1)];
+    const known = rate.length > 1 && last[0] > first[0] + 500; // ms: less is chance
+    per.append(make('dt', 'lines/s'), make('dd', known ? String(Math.round(1e3 * (last[1] - first[1]) / (last[0] - first[0]))) : '–'));
+    document.querySelector('.counters').replaceChildren(per, ...parts);
+  };
+  const showProgress = () => {
+    const spent = (performance.now() - since) / 1e3;
+    let done = 0; // s of this recording
+    if (state.phase === 'settling') done = Math.min(spent, state.settle);
+    if (state.phase === 'recording') done = state.settle + (points.at(-1)?.[0] ?? 0);
+    const left = Math.max(0, state.seconds_left - done);
+    $('whole').max = $('part').max = 1;
+    $('whole').value = state.seconds ? 1 - left / state.seconds : 0;
+    $('left').textContent = state.seconds ? `${time(left)} left` : '';
+    const total = state.settle + state.duration;
+    $('part').value = state.now ? Math.min(1, done / total) : 0;
+    $('elapsed').textContent = state.now ? `${time(total - done)} left` : '';
+  };
+
+  // ------------------------------------------------------------------ plots
+
+  // What a plot draws: column of a point, name, colour, whether it is dashed.
+  const series = (id) => {
+    const target = { column: 2, name: 'target', colour: '--f-axis', dashed: true };
+    if (id === 'inputs') {
+      const input = { column: 1, name: 'input', colour: COLOURS[0] };
+      return state.closed ? [input] : [target, input];
+    }
+    const carts = Array.from({ length: state.carts }, (_, i) => ({ column: 3 + i, name: `cart ${i + 1}`, colour: COLOURS[i] }));
+    return state.closed ? [target, ...carts] : carts;
+  };
+  const SVG = 'http://www.w3.org/2000/svg';
+  const listKeys = () => {
+    for (const id of ['positions', 'inputs']) {
+      $(id).closest('figure').querySelector('.keys').replaceChildren(...series(id).map(({ name, colour, dashed }) => {
+        const item = make('li');
+        const svg = document.createElementNS(SVG, 'svg');
+        const line = document.createElementNS(SVG, 'line');
+        for (const [key, value] of Object.entries({ x1: 0, x2: '100%', y1: '50%', y2: '50%', stroke: `var(${colour})` }))
+          line.setAttribute(key, value);
+        if (dashed) line.setAttribute('stroke-dasharray', DASH.join(' '));
+        svg.setAttribute('aria-hidden', 'true');
+        svg.append(line);
+        item.append(svg, make('span', name), ' ', make('span', '–', 'value'));
+        return item;
+      }));
+    }
+  };
+  const ticks = (low, high, most) => {
+    const rough = (high - low) / most;
+    const power = 10 ** Math.floor(Math.log10(rough));
+    const step = [1, 2, 5, 10].map((n) => n * power).find((n) => n >= rough);
+    const found = [];
+    for (let i = Math.ceil(low / step); i * step <= high; i += 1) found.push(i * step);
+    return [found, Math.max(0, -Math.floor(Math.log10(step) + 1e-9))];
+  };
+  const draw = (id) => {
+    const canvas = $(id);
+    const { clientWidth: width, clientHeight: height } = canvas;
+    const scale = window.devicePixelRatio || 1;
+    if (canvas.width !== Math.round(width * scale) || canvas.height !== Math.round(height * scale)) {
+      canvas.width = Math.round(width * scale);
+      canvas.height = Math.round(height * scale);
+    }
+    const style = getComputedStyle(canvas);
+    const colour = (name) => style.getPropertyValue(name);
+    const pen = canvas.getContext('2d');
+    pen.setTransform(scale, 0, 0, scale, 0, 0);
+    pen.clearRect(0, 0, width, height);
+    pen.font = `13px ${style.fontFamily}`;
+    const box = { left: 58, right: width - 12, top: 8, bottom: height - 34 };
+    const lines = series(id);
+
+    const end = Math.max(WINDOW, points.at(-1)?.[0] ?? 0);
+    const shown = points.filter((p) => p[0] >= end - WINDOW);
+    const values = shown.flatMap((p) => lines.map((l) => p[l.column]));
+    let [low, high] = [Math.min(0, ...values), Math.max(0, ...values)];
+    if (high - low < 1e-9) [low, high] = [-1, 1];
+    const margin = 0.06 * (high - low);
+    [low, high] = [low - margin, high + margin];
+    const x = (t) => box.left + ((t - end + WINDOW) / WINDOW) * (box.right - box.left);
+    const y = (v) => box.bottom - ((v - low) / (high - low)) * (box.bottom - box.top);
+
+    pen.lineWidth = 1;
+    pen.strokeStyle = colour('--f-grid');
+    pen.fillStyle = colour('--f-axis');
+    const rule = (x1, y1, x2, y2) => { pen.beginPath(); pen.moveTo(x1, y1); pen.lineTo(x2, y2); pen.stroke(); };
+    const [levels, digits] = ticks(low, high, height / 45);
+    pen.textAlign = 'right';
+    pen.textBaseline = 'middle';
+    for (const level of levels) {
+      rule(box.left, y(level), box.right, y(level));
+      pen.fillText((Math.abs(level) < 1e-12 ? 0 : level).toFixed(digits).replace('-', '−'), box.left - 8, y(level));
+    }
+    pen.textAlign = 'center';
+    pen.textBaseline = 'top';
+    for (const t of ticks(end - WINDOW, end, width < 500 ? 5 : 10)[0]) {
+      rule(x(t), box.top, x(t), box.bottom);
+      if (x(t) < box.right - 30) pen.fillText(String(Math.round(t)), x(t), box.bottom + 6);
+    }
+    pen.textAlign = 'right';
+    pen.fillText('t in s', box.right, box.bottom + 6);
+
+    pen.save();
+    pen.beginPath();
+    pen.rect(box.left, box.top, box.right - box.left, box.bottom - box.top);
+    pen.clip();
+    pen.lineJoin = 'round';
+    for (const line of lines) {
+      pen.strokeStyle = colour(line.colour);
+      pen.lineWidth = line.dashed ? 1.5 : 2;
+      pen.setLineDash(line.dashed ? DASH : []);
+      pen.beginPath();
+      shown.forEach((p, i) => (i ? pen.lineTo(x(p[0]), y(p[line.column])) : pen.moveTo(x(p[0]), y(p[line.column]))));
+      pen.stroke();
+    }
+    pen.restore();
+    const last = points.at(-1);
+    const keys = canvas.closest('figure').querySelectorAll('.keys .value');
+    lines.forEach((line, i) => { if (keys[i]) keys[i].textContent = short(last?.[line.column]); });
+  };
+  let drawn = 0;
+  const frame = () => {
+    drawn = 0;
+    draw('positions');
+    draw('inputs');
+    showProgress();
+  };
+  const redraw = () => { drawn ||= requestAnimationFrame(frame); };
+
+  // ------------------------------------------------------------------ news
+
+  const news = new EventSource('events');
+  news.addEventListener('state', (event) => {
+    showState(JSON.parse(event.data));
+    if (state.phase === 'over') news.close();
+    redraw();
+  });
+  news.addEventListener('points', (event) => {
+    const fresh = JSON.parse(event.data);
+    if (fresh.run !== run) [run, points, rate] = [fresh.run, [], []];
+    points.push(...fresh.points);
+    while (points.length && points[0][0] < points.at(-1)[0] - WINDOW) points.shift();
+    rate.push([performance.now(), fresh.counters.lines]);
+    while (rate.length > 2 && rate[0][0] < rate.at(-1)[0] - 2000) rate.shift();
+    showCounters(fresh.counters);
+    redraw();
+  });
+  news.addEventListener('error', () => tell('The connection is lost; trying again …', true));
+  news.addEventListener('open', () => tell(STATUS[state.phase]()));
+  $('confirm').addEventListener('click', async () => {
+    $('confirm').disabled = true;
+    const body = JSON.stringify({ number: state.instruction?.number });
+    try {
+      await fetch('confirm', { method: 'POST', headers: { 'Content-Type': 'application/json' }, body });
+    } catch {
+      $('confirm').disabled = false;
+    }
+  });
+  new ResizeObserver(redraw).observe($('positions'));
+  matchMedia('(prefers-color-scheme: dark)').addEventListener('change', redraw);
+  setInterval(showProgress, 250);
+  showCounters(Object.fromEntries(COUNTERS.map((name) => [name, 0])));
+  listKeys();
+})();
