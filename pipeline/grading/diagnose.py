@@ -136,8 +136,11 @@ def _judge(
         if name in known and name not in taken
     }
     suspect = [n for n, e in errors.items() if e > min(limit(n, label), _SUSPECT_DAMPING)]
-    if label == "initial":  # friction may leave room for what the student's own fit does not
-        suspect += [n for _, n in _disagreements(reported, references) if n in errors]
+    if (
+        label == "initial"
+    ):  # friction may leave room for what the student's own, right, fit does not
+        apart = [n for _, n in _disagreements(reported, references) if n.startswith("K")]
+        suspect += [n for n in apart if n in errors and _agrees(reported.final[n], references, n)]
     mistakes = known_mistakes({n: r for n, r in known.items() if n in table}, analysis)
     if label == "final":
         mistakes = [m for m in mistakes if _may_be_final(m, reported)]
@@ -169,6 +172,12 @@ def _unordered(
         if not any(n in other and _near(table[n], other[n]) for n in law.names)
         for name in law.names
     )
+
+
+def _agrees(final: Decimal, references: References, name: str) -> bool:
+    """Whether a final number is what the recordings say."""
+    known = references.final.get(name)
+    return known is not None and percent_off(final, known, sigmas=SIGMAS) == 0
 
 
 def _near(a: Decimal, b: Decimal) -> bool:

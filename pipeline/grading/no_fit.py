@@ -1,13 +1,20 @@
 """Final estimates copied from the initial ones: too many coincidences for a fit."""
 
-from pipeline.grading.reference import References
+from decimal import Decimal
+from math import exp
+
+from pipeline.grading.reference import Reference, References
 from pipeline.grading.rubric import is_damping
-from pipeline.grading.tolerance import half_digit
+from pipeline.grading.tolerance import half_digit, percent_off
 from pipeline.submission import Reported
 
-# How far an initial and a final estimate of one number usually lie apart, relative.
-_APART = 0.01
-_APART_DAMPING = 0.15
+# How far an initial and a final estimate of one number usually lie apart, relative: where the
+# recordings leave no doubt, and where they do.
+_APART, _APART_BLURRED = 0.003, 0.01
+_APART_DAMPING, _APART_DAMPING_BLURRED = 0.03, 0.15
+_SHARP, _SHARP_DAMPING = 1.01, 1.05  # high over low of a reference without doubt
+_SURPRISE = 3.0  # at most so much (e-folds) does the wrong number tell, as some fit badly
+_NORMAL, _SIGMAS = 3.5, 3.0  # one over the density of a normal difference at zero
 _CHANCE = 1e-3  # of a table that a fit gave agreeing so by coincidence
 _FITTED_BY_EYE = "abcdefghxy"  # symbols of resonances and nulls: only a fit gives those
 _SHARE = 0.75  # of the numbers in both tables
@@ -28,14 +35,27 @@ def copied_final(reported: Reported, *, references: References) -> list[str]:
         return []
     chance = 1.0
     for name in same:
-        apart = _APART_DAMPING if is_damping(name) else _APART
-        reference = references.final.get(name)
-        typed = reported.final[name]
-        if name in fitted and reference and reference.low > 0 and not is_damping(name):
-            apart = max(apart, abs(float(typed) / reference.value - 1))
-        step = 2 * float(half_digit(typed)) / abs(float(typed)) if typed else 1.0
-        chance *= min(1.0, step / (apart * 3.5))  # the density of a normal difference at zero
+        chance *= _coincidence(reported.final[name], references.final.get(name), name)
     return same if chance < _CHANCE else []
+
+
+def _coincidence(typed: Decimal, reference: Reference | None, name: str) -> float:
+    """Return how likely a fit gives a number again, digit for digit.
+
+    Where the first estimate was right already that is no wonder, and the less of one the fewer
+    digits are typed.
+    """
+    if not typed:
+        return 1.0
+    damping = is_damping(name)
+    step = 2 * float(half_digit(typed)) / abs(float(typed))
+    apart = _APART_DAMPING_BLURRED if damping else _APART_BLURRED
+    if reference is None or reference.low <= 0:
+        return min(1.0, step / (apart * _NORMAL))
+    if reference.high <= reference.low * (_SHARP_DAMPING if damping else _SHARP):
+        apart = _APART_DAMPING if damping else _APART
+    off = float(percent_off(typed, reference, sigmas=_SIGMAS)) / 100
+    return min(1.0, step / (apart * _NORMAL)) * exp(-min(0.5 * (off / apart) ** 2, _SURPRISE))
 
 
 def _same(reported: Reported, name: str) -> bool:
