@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import serial
 
-from pipeline.bench.faults import read_fault
+from pipeline.bench.faults import Faults, read_fault
 from pipeline.bench.links import open_link
 from pipeline.bench.protocol import (
     STOCK_STOP,
@@ -122,7 +122,7 @@ def test_a_cart_that_hands_let_go_rings_at_its_own_frequency(fast_bench):
     chain = PRESETS["throne-2dof"]
     with host(fast_bench) as line:
         line.write(encode(Hands(held=(1,), released=2)))
-        time.sleep(0.3)  # 3 s for the hand, which needs 1.5
+        time.sleep(1.0)  # the hand needs 1.5 s of the bench's clock
         readings = stream(line, Start(wave=Wave.DELTA, frequency=0.2, amplitude=0))
         line.write(encode(Hands()))
     counts = np.array([reading.counts for reading in readings], dtype=float).T
@@ -207,6 +207,19 @@ def test_faults_come_when_they_are_told_to():
         with host(bench) as line:
             again = stream(line, Start(wave=Wave.SINE, frequency=1.0, amplitude=200, cycles=1))
         assert len({reading.counts[1] for reading in again}) == 1
+
+
+def test_what_is_held_up_still_comes():
+    """A lost line end comes once the run is over; a late lump keeps its order, and comes."""
+    faults = Faults([read_fault("merge@0.003"), read_fault("delay@0.004")], seed=0, period=1e-3)
+    sent = [faults.strike(b"1:2:3:4:%d\n" % ms, clock=1e-3 * ms)[0] for ms in range(3)]
+    assert sent == [b"1:2:3:4:0\n", b"1:2:3:4:1\n", b"1:2:3:4:2"]
+    assert faults.idle(clock=0.004) == b"\n"
+    sent = [faults.strike(b"1:2:3:4:%d\n" % ms, clock=0.005 + 1e-3 * ms)[0] for ms in range(3)]
+    assert sent == [b"", b"", b""]
+    assert faults.idle(clock=0.054) == b""
+    assert faults.idle(clock=0.056) == b"1:2:3:4:0\n1:2:3:4:1\n1:2:3:4:2\n"
+    assert faults.injected == {"merge": 1, "delay": 1, "late": 3}
 
 
 @pytest.mark.parametrize("way", ["falls silent", "goes away", "is killed"])

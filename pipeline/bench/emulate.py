@@ -41,7 +41,7 @@ def open_bench(
     ConfigError : the port or a fault will not do.
     DataError : no spring ties the carts to a wall, or what is hidden makes them run away.
     """
-    struck = Faults([read_fault(text) for text in faults], seed=seed)
+    struck = Faults([read_fault(text) for text in faults], seed=seed, period=period)
     if port == "pty" and any(text.startswith("disconnect") for text in faults):
         raise ConfigError("--fault disconnect: a pty cannot be pulled out; take --port socket://…")
     carts = VirtualCarts(bench, seed=seed, period=period)

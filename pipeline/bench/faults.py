@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.bench.protocol import NOMINAL_PERIOD
 from pipeline.errors import ConfigError
 from pipeline.submission.complaints import nearest
 
@@ -80,18 +79,22 @@ def read_fault(text: str) -> Fault:
 class Faults:
     """Strikes the lines that go by, each at most once.
 
+    Parameters
+    ----------
+    period : s from line to line.
+
     Attributes
     ----------
     injected : how often each kind struck; `late` are the lines that a delay held back.
     """
 
-    def __init__(self, faults: Sequence[Fault] = (), *, seed: int) -> None:
+    def __init__(self, faults: Sequence[Fault] = (), *, seed: int, period: float) -> None:
         self._random = [fault for fault in faults if fault.rate > 0]
         timed = [(fault.at, fault) for fault in faults if fault.at is not None]
         self._timed = sorted(timed, key=lambda entry: entry[0])
         self._rng = np.random.default_rng(seed)
         self.injected: Counter[str] = Counter()
-        self._lines = 0
+        self._period, self._streamed = period, 0.0  # s
         self._stuck: dict[int, bytes | None] = {}  # what the encoder shows; None: from now on
         self._ms = -1  # of the last line
         self._clock_began = 0  # ms of the run, at the last reset
@@ -120,9 +123,14 @@ class Faults:
             line = b""
         if clock < self._until:
             self.injected["late"] += bool(line)
-        return self.hold(line, clock=clock), kind
+        return self._hold(line, clock=clock), kind
 
-    def hold(self, data: bytes, *, clock: float) -> bytes:
+    def idle(self, *, clock: float) -> bytes:
+        """Return what is still due where the bench sends no line: a late lump, a lost line end."""
+        end, self._open = b"\n" * self._open, False
+        return self._hold(end, clock=clock)
+
+    def _hold(self, data: bytes, *, clock: float) -> bytes:
         """Return what goes out now: this and what was held back, or nothing yet."""
         self._held += data
         if not self._held or clock < self._until:
@@ -131,15 +139,10 @@ class Faults:
         self._held.clear()
         return out
 
-    def end_run(self, *, clock: float) -> bytes:
-        """Return what is still missing of the last line."""
-        end, self._open = b"\n" * self._open, False
-        return self.hold(end, clock=clock)
-
     def _choose(self) -> str:
         """Return the kind that strikes the next line; "": none."""
-        self._lines += 1
-        while self._timed and self._timed[0][0] <= self._lines * NOMINAL_PERIOD:
+        self._streamed += self._period
+        while self._timed and self._timed[0][0] <= self._streamed:
             _, fault = self._timed.pop(0)
             self.injected[fault.kind] += 1
             if not fault.encoder:
@@ -149,12 +152,12 @@ class Faults:
             return ""
         draw = self._rng.random()
         for fault in self._random:
-            draw -= fault.rate
-            if draw < 0 and not (fault.kind == "delay" and self._held):
+            if draw < fault.rate:
+                if fault.kind == "delay" and self._held:  # late already
+                    return ""
                 self.injected[fault.kind] += 1
                 return fault.kind
-            if draw < 0:
-                break
+            draw -= fault.rate
         return ""
 
     def _rewritten(self, line: bytes, *, reset: bool) -> bytes:

@@ -74,8 +74,9 @@ class Server:
         """Keep the bench going until told otherwise."""
         owed, last = 0.0, time.monotonic()
         while not until():
-            asleep = not self._connected and self._clock - self._still_since > _REST
-            self._link.wait(_ASLEEP if asleep else 0.0 if owed >= self._period else _LUMP)
+            asleep = self._is_asleep()
+            late = owed >= self._period and self._link.unsent < _MOST_UNSENT
+            self._link.wait(_ASLEEP if asleep else 0.0 if late else _LUMP)
             self._listen()
             now = time.monotonic()
             owed = 0.0 if asleep else min(owed + (now - last) * self._speed, _MOST_OWED)
@@ -103,6 +104,11 @@ class Server:
     @property
     def _clock(self) -> float:
         return self._ticks * self._period
+
+    def _is_asleep(self) -> bool:
+        """Whether nothing moves and nobody would see it."""
+        resting = self._clock - self._still_since > _REST
+        return resting and not self._connected and not self._lines
 
     def _listen(self) -> None:
         data = self._link.receive()
@@ -145,7 +151,7 @@ class Server:
         self._lines += len(readings)
         if not readings:
             self._end_run(self._ending)
-            out += self._faults.hold(b"", clock=self._clock)
+            out += self._faults.idle(clock=self._clock)
         self._carts.move(duty)
         self._ticks += 1
         if duty:
