@@ -82,8 +82,12 @@ class _Log:
         self.warnings += [text for text in texts if text and text not in self.warnings]
 
 
-def analyse(submission: Submission, *, progress: Progress = _silent) -> Analysis:
+def analyse(
+    submission: Submission, *, design: bool = True, progress: Progress = _silent
+) -> Analysis:
     """Run every stage that the submission's data support; the rest is skipped with its reason.
+
+    Without `design` no controller is designed: see `reference_design`.
 
     Raises
     ------
@@ -146,8 +150,10 @@ def analyse(submission: Submission, *, progress: Progress = _silent) -> Analysis
     if fit:
         checks += check_chain(fit, springs=springs)
 
-    progress("state feedback")
-    feedback = _design(submission, fit, log=log)
+    feedback = None
+    if design:
+        progress("state feedback")
+        feedback = _design(submission, fit, log=log)
     if feedback and is_reversed(data.records):
         log.warn(
             [
@@ -343,25 +349,19 @@ def _fit(
     return log.attempt("final estimates", fit_records, driven, n=n, springs=springs)
 
 
-def _design(submission: Submission, fit: ChainFit | None, *, log: _Log) -> FeedbackDesign | None:
+def reference_design(submission: Submission, fit: ChainFit | None) -> FeedbackDesign:
+    """Return the state feedback for the submission's task on the carts as they were identified.
+
+    Raises
+    ------
+    DataError : they are not identified well enough to design for.
+    """
     if fit is None:
-        log.skip("state feedback", "the carts are not identified")
-        return None
+        raise DataError("the carts are not identified")
     if not fit.converged:
-        log.skip("state feedback", f"the fit of the carts did not converge: {fit.message}")
-        return None
-    task = submission.design
-    if task is None:
-        task = Design(cart=submission.system.carts)
-        log.warn(
-            [
-                "no [design] in submission.toml: the controller is designed for cart "
-                f"{task.cart}, {task.overshoot_percent:g} % overshoot, {task.settling_time:g} s"
-            ]
-        )
-    return log.attempt(
-        "state feedback",
-        design_feedback,
+        raise DataError(f"the fit of the carts did not converge: {fit.message}")
+    task = submission.design or Design(cart=submission.system.carts)
+    return design_feedback(
         fit.chain,
         cart=task.cart,
         reference=task.reference,
@@ -371,6 +371,18 @@ def _design(submission: Submission, fit: ChainFit | None, *, log: _Log) -> Feedb
         sample_time=task.sample_time,
         method=task.method,
     )
+
+
+def _design(submission: Submission, fit: ChainFit | None, *, log: _Log) -> FeedbackDesign | None:
+    if submission.design is None and fit is not None and fit.converged:
+        task = Design(cart=submission.system.carts)
+        log.warn(
+            [
+                "no [design] in submission.toml: the controller is designed for cart "
+                f"{task.cart}, {task.overshoot_percent:g} % overshoot, {task.settling_time:g} s"
+            ]
+        )
+    return log.attempt("state feedback", reference_design, submission, fit)
 
 
 def is_reversed(records: Sequence[Record]) -> bool:

@@ -2,11 +2,12 @@
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import Decimal
 
 import numpy as np
 
+from pipeline.errors import DataError
 from pipeline.grading.grade import Flag
 from pipeline.grading.loop_numbers import LoopNumbers, loop_numbers
 from pipeline.grading.reference import is_explained
@@ -15,6 +16,7 @@ from pipeline.grading.tolerance import half_digit
 from pipeline.plant.chain import Array, Chain
 from pipeline.results import Analysis
 from pipeline.submission import Design, StateFeedback, Submission
+from pipeline.workflow import reference_design
 
 # Where a controller is wrong rather than a matter of taste or of the model's error.
 _OVERSHOOT = 20.0  # percentage points above the goal
@@ -34,7 +36,7 @@ class Controller:
     gains : (2n,) as reported; None if they were not.
     ran : (2n,) gains stated for a closed-loop run, if any.
     models : the reference chain and the student's own.
-    goal : what must be met; what the reference reaches where that is less.
+    goal : what must be met; what a reference design reaches where neither it nor these gains do.
     blurred : the reference's gains are as uncertain as friction makes them.
     """
 
@@ -60,6 +62,16 @@ class Controller:
             for chain in self.models
         ]
         return [numbers for numbers in found if numbers is not None]
+
+    def reaches_goal(self, gains: Array) -> bool:
+        """Whether gains do what is asked for on one of the models."""
+        return any(
+            numbers.stable
+            and numbers.overshoot <= self.goal.overshoot_percent
+            and numbers.settling_time is not None
+            and numbers.settling_time <= self.goal.settling_time
+            for numbers in self.numbers(gains)
+        )
 
     def meets(self, numbers: LoopNumbers) -> bool:
         """Whether a loop comes near enough to the goal not to be called wrong."""
@@ -118,29 +130,39 @@ def reported_controller(
     models = [model for model in (chain, *own) if model is not None]
     if feedback is None or not models:
         return None
-    goal = submission.design or Design(cart=n)
-    design = analysis.feedback
-    if design is not None and not design.reachable and design.settling_time is not None:
-        goal = goal.model_copy(
-            update={
-                "overshoot_percent": max(goal.overshoot_percent, design.overshoot_percent),
-                "settling_time": max(goal.settling_time, design.settling_time),
-            }
-        )
     ran = [
         e.controller.gains
         for e in submission.experiments
         if isinstance(e.controller, StateFeedback) and e.controller.gains
     ]
-    return Controller(
+    controller = Controller(
         gains=np.array([float(g) for g in feedback.gains]) if feedback.gains else None,
         prefilter=feedback.prefilter,
         overshoot=feedback.overshoot_percent,
         settling=feedback.settling_time,
         ran=np.array(ran[0]) if ran else None,
         models=tuple(models),
-        goal=goal,
+        goal=submission.design or Design(cart=n),
         blurred=not is_explained(analysis),
+    )
+    if controller.gains is None or controller.reaches_goal(controller.gains):
+        return controller
+    return replace(controller, goal=_reachable(controller.goal, submission, analysis))
+
+
+def _reachable(goal: Design, submission: Submission, analysis: Analysis) -> Design:
+    """Return the goal or, where the reference design comes short of it, what that reaches."""
+    try:
+        design = reference_design(submission, analysis.fit)
+    except DataError:
+        return goal
+    if design.reachable or design.settling_time is None:
+        return goal
+    return goal.model_copy(
+        update={
+            "overshoot_percent": max(goal.overshoot_percent, design.overshoot_percent),
+            "settling_time": max(goal.settling_time, design.settling_time),
+        }
     )
 
 
@@ -161,7 +183,7 @@ def diagnose_controller(controller: Controller) -> list[Flag]:
     slip, intended = _slip(controller)
     ran = controller.ran
     # The gains that ran tell which of the reported numbers does not belong to the others.
-    other_ran = ran is not None and not _same(ran, controller.gains)
+    other_ran = ran is not None and not same_gains(ran, controller.gains)
     wrong = not meets or (slip and not (fits and claimed)) or (not claimed and not fits)
     wrong = wrong or all(controller.is_of_other_gains(one) for one in numbers)
     if other_ran and ran is not None:
@@ -180,7 +202,7 @@ def diagnose_controller(controller: Controller) -> list[Flag]:
     return flags
 
 
-def _same(a: Array, b: Array) -> bool:
+def same_gains(a: Array, b: Array) -> bool:
     """Whether two sets of gains are one, typed with different numbers of digits."""
     if a.shape != b.shape:
         return False
@@ -196,7 +218,7 @@ def _slip(controller: Controller) -> tuple[str, Array | None]:
     assert gains is not None
     for text, meant in _undone(gains):
         if controller.ran is not None:
-            if _same(meant, controller.ran):
+            if same_gains(meant, controller.ran):
                 return text, meant
             continue
         better = [
@@ -238,7 +260,7 @@ def _undone(gains: Array) -> Iterator[tuple[str, Array]]:
         flipped[i] = -flipped[i]
         found.append((f"the sign of gain {i + 1} is reversed", flipped))
     for text, meant in found:
-        if not _same(meant, gains):
+        if not same_gains(meant, gains):
             yield text, meant
 
 

@@ -94,13 +94,15 @@ def _stuck(y: Array, *, sticky: bool) -> list[tuple[int, int]]:
     Static friction stops a cart from a crawl; it does not stop one at speed, nor is it elsewhere
     when it moves on.
     """
+    spans = stuck_spans(y)
+    if not spans or not sticky:
+        return spans
     moves = np.abs(np.diff(y))
     fastest = float(np.quantile(moves, _FASTEST))
     return [
         (first, last)
-        for first, last in stuck_spans(y)
-        if not sticky
-        or moves[first - 1] >= _AT_SPEED * fastest
+        for first, last in spans
+        if moves[first - 1] >= _AT_SPEED * fastest
         or (last < moves.size and moves[last] >= _AWAY * fastest)
     ]
 

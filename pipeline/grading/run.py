@@ -21,7 +21,7 @@ from pipeline.grading.work import Work
 from pipeline.ingest.columns import conversion
 from pipeline.ingest.read import read_data
 from pipeline.results import Analysis
-from pipeline.submission import Reported, Submission, System
+from pipeline.submission import Experiment, InputOverride, Reported, Submission, System
 from pipeline.workflow import analyse
 
 _CENTS = 100  # points are given to the hundredth
@@ -50,7 +50,8 @@ def grade_submission(
     """
     count = submission.system.carts
     if count != rubric.system.carts:
-        reason = f"the submission is for {count} carts, the rubric for {rubric.system.carts}"
+        carts = f"{count} cart{'s' if count > 1 else ''}"
+        reason = f"the submission is for {carts}, the rubric for {rubric.system.carts}"
         return _failed(submission, rubric, name=name, reason=reason, days_late=days_late)
     submission, notes = under_rubric(submission, rubric)
     try:
@@ -147,8 +148,32 @@ def under_rubric(submission: Submission, rubric: Rubric) -> tuple[Submission, tu
             update={"unit": unit, "per_count": per_count or own.position.per_count}
         ),
     )
-    update = {"system": system, "design": rubric.design or submission.design}
+    experiments = tuple(_under_calibration(e, set_) for e in submission.experiments)
+    if experiments != submission.experiments:
+        notes.append(
+            "the input's sign and scale are the rubric's, also where a record states its own"
+        )
+    update = {
+        "system": system,
+        "design": rubric.design or submission.design,
+        "experiments": experiments,
+    }
     return submission.model_copy(update=update), tuple(notes)
+
+
+def _under_calibration(experiment: Experiment, system: System) -> Experiment:
+    """Return the experiment without an input calibration of its own that the rubric states.
+
+    Under feedback a bench may log another signal as its input, so there the record's own stands.
+    """
+    own = experiment.input
+    if own is None or experiment.kind == "closed_loop":
+        return experiment
+    left = InputOverride(
+        sign=None if system.input.sign else own.sign,
+        per_count=None if system.input.per_count else own.per_count,
+    )
+    return experiment.model_copy(update={"input": left})
 
 
 # --------------------------------------------------------------------- the analysis
@@ -165,7 +190,7 @@ def _analyse(
     """
     say = progress or (lambda text: None)
     try:
-        return analyse(submission, progress=say), {}
+        return analyse(submission, design=False, progress=say), {}
     except SubmissionError as error:
         unreadable = {}
         for experiment in submission.experiments:
@@ -176,9 +201,8 @@ def _analyse(
         left = tuple(e for e in submission.experiments if e.id not in unreadable)
         if not left or not unreadable:
             raise error
-        return analyse(
-            submission.model_copy(update={"experiments": left}), progress=say
-        ), unreadable
+        submission = submission.model_copy(update={"experiments": left})
+        return analyse(submission, design=False, progress=say), unreadable
 
 
 def _failed(

@@ -21,17 +21,20 @@ def stuck_spans(x: Array) -> list[tuple[int, int]]:
     slows down first.
     """
     moves = np.abs(np.diff(x))
+    still = [
+        (first, last)
+        for first, last in _runs(moves == 0.0)
+        if last - first + 1 >= _STUCK_SAMPLES and first > 0
+    ]
     moving = moves[moves > 0]
-    if moving.size < 3:
+    if not still or moving.size < 3:
         return []
     abrupt = _ABRUPT * (encoder_step(x) or float(np.median(moving)))
-    spans = []
-    for first, last in _runs(moves == 0.0):
-        from_speed = first > 0 and moves[first - 1] >= abrupt
-        with_jump = last == x.size - 1 or moves[last] >= abrupt
-        if last - first + 1 >= _STUCK_SAMPLES and from_speed and with_jump:
-            spans.append((first, last))
-    return spans
+    return [
+        (first, last)
+        for first, last in still
+        if moves[first - 1] >= abrupt and (last == x.size - 1 or moves[last] >= abrupt)
+    ]
 
 
 def _runs(still: np.ndarray) -> Iterator[tuple[int, int]]:
