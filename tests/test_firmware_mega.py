@@ -1,9 +1,16 @@
 """The firmware's sketch on a simulated Arduino Mega: pins, interrupts, timers, serial line."""
 
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
 from pipeline.bench.core import ReferenceCore
+from pipeline.bench.links import Link, open_link
 from pipeline.bench.protocol import (
     Description,
     PidGains,
@@ -16,6 +23,10 @@ from pipeline.bench.protocol import (
     parse_description,
     parse_reading,
 )
+from pipeline.bench.virtual_carts import VirtualCarts
+from pipeline.submission import load_submission
+from pipeline.synthesis.hidden import prepare_bench
+from pipeline.workflow import analyse
 from tests.firmware_mega import Mega, build_sketch, memory, missing
 
 pytestmark = pytest.mark.skipif(bool(missing()), reason=f"{missing()} is not here")
@@ -167,3 +178,68 @@ def test_a_stop_stops_the_motor_at_the_next_tick(mega):
     mega.send(b";s;")
     mega.run(3 * 87e-6 + PERIOD + 0.0005)
     assert mega.duty == 0
+
+
+SUBMISSION = """
+version = 1
+[system]
+carts = 1
+position = { unit = "cm", per_count = 0.00227 }
+input = { unit = "V" }
+"""
+PLAN = """
+version = 1
+[limits]
+input = 0.5
+travel = 2.5
+[[recordings]]
+id = "step"
+kind = "step"
+carts = [1]
+wave = "square"
+amplitude = 0.03
+frequency = 0.1
+settle = 0.1
+"""
+STEP = 1e-3  # s from edge to edge of what the carts and the board know of each other
+
+
+def _serve(mega: Mega, carts: VirtualCarts, link: Link, until: Callable[[], bool]) -> None:
+    """Let board and carts move each other at the pace of the clock, or as fast as it goes."""
+    at, ahead = carts.counts(), mega.clock - time.monotonic()
+    volts = 5 / 4096 / carts.input_per_count  # the sketch's duty counts in the carts' own
+    while not until():
+        time.sleep(max(0.0, mega.clock - time.monotonic() - ahead))
+        mega.send(link.receive())
+        begun, counts = mega.clock, carts.counts()
+        for encoder, (new, old) in enumerate(zip(counts, at, strict=True)):
+            mega.turn(encoder, new - old)
+        at = counts
+        mega.run(max(0.0, begun + STEP - mega.clock))
+        carts.move(round(mega.duty * volts))
+        link.send(mega.take())
+
+
+@pytest.mark.slow
+def test_acquire_records_with_the_board(mega, tmp_path):
+    """The host, a pty, the board's UART, its PWM, carts, its encoder pins: the gain is the cart's."""
+    (tmp_path / "submission.toml").write_text(SUBMISSION, encoding="utf-8")
+    (tmp_path / "plan.toml").write_text(PLAN, encoding="utf-8")
+    bench = prepare_bench(preset="throne-1dof")
+    link, done = open_link("pty"), threading.Event()
+    carts = VirtualCarts(bench, seed=1, period=STEP)
+    power = threading.Thread(target=_serve, args=(mega, carts, link, done.is_set))
+    power.start()
+    try:
+        command = [sys.executable, "-m", "pipeline", "acquire", tmp_path, "--yes"]
+        options = ["--port", link.address, "--only", "step"]
+        host = subprocess.run([*command, *options], capture_output=True, text=True, timeout=300)
+    finally:
+        done.set()
+        power.join()
+        link.close()
+    assert host.returncode == 0, host.stderr
+    [gain] = analyse(load_submission(tmp_path)).step_gains
+    # A level of 390 encoder counts, a noise of a fifth of one: a tenth of a per cent; the last
+    # swing of 1 % of it that is left after 5 s is in the mean once.
+    assert gain.gain == pytest.approx(bench.chain.static_gains()[0], rel=0.01)
