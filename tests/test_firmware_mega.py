@@ -222,7 +222,7 @@ def _serve(mega: Mega, carts: VirtualCarts, link: Link, until: Callable[[], bool
 
 @pytest.mark.slow
 def test_acquire_records_with_the_board(mega, tmp_path):
-    """The host, a pty, the board's UART, its PWM, carts, its encoder pins: the gain is the cart's."""
+    """Host, pty, UART, PWM, carts, encoder pins, and back: the gain is the cart's."""
     (tmp_path / "submission.toml").write_text(SUBMISSION, encoding="utf-8")
     (tmp_path / "plan.toml").write_text(PLAN, encoding="utf-8")
     bench = prepare_bench(preset="throne-1dof")
