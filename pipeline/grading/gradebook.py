@@ -15,6 +15,7 @@ from sqlalchemy import Connection, Row, func, insert, select
 
 from pipeline.errors import ConfigError
 from pipeline.grading.batch import Batch, Outcome, Prints, read_grade
+from pipeline.grading.changes import points_changes, rubric_changes
 from pipeline.grading.gradebook_rows import (
     Entry,
     add_row,
@@ -158,19 +159,22 @@ class Gradebook:
                     submission=name, authors=tuple(json.loads(authors)), fingerprints=fingerprints
                 )
 
-    def finish(self, batch: Batch, *, rubric: Rubric) -> None:
+    def finish(self, batch: Batch, *, rubric: Rubric) -> list[str]:
         """Make a batch that ran to its end the class list; one that changes nothing adds nothing.
+
+        Returns what is another than in the class list before, a phrase each: the rubric first.
 
         Raises
         ------
         KeyError : an outcome of the batch was never put in.
         """
-        listed = []
+        listed, points = [], {}
         with self._database.writing() as connection:
             for position, key in enumerate(batch.keys):
                 row = newest_of(connection, key, assignment=self._assignment or "")
                 shared = batch.shared.get(row.name)
                 grade = final_entry(connection, row, shared=shared, rubric=rubric).grade
+                points[row.name] = grade.points
                 listed.append(
                     {
                         "position": position,
@@ -182,12 +186,17 @@ class Gradebook:
                     }
                 )
             text = rubric.model_dump_json()
-            if self._unchanged(connection, listed, text):
-                return
+            last = self._newest(connection)
+            if last is not None and last.rubric == text and _lines_of(connection, last) == listed:
+                return []
             new = {"assignment": self._assignment or "", "at": self._at(), "rubric": text}
             number = add_row(connection, batches, new)
             if listed:
                 connection.execute(insert(entries), [{"batch_id": number, **e} for e in listed])
+            if last is None:
+                return []
+            told = [f"rubric: {change}" for change in rubric_changes(last.rubric, text)]
+            return told + points_changes(_points_of(connection, last), points)
 
     # ---------------------------------------------------------------- what counts now
 
@@ -320,16 +329,26 @@ class Gradebook:
         line = class_list().where(entries.c.batch_id == last.id, entries.c.position == found[0])
         return last, connection.execute(line).one()
 
-    def _unchanged(self, connection: Connection, listed: list[dict], rubric: str) -> bool:
-        newest = select(batches).where(batches.c.assignment == (self._assignment or ""))
-        last = connection.execute(newest.order_by(batches.c.id.desc()).limit(1)).one_or_none()
-        if last is None or last.rubric != rubric:
-            return False
-        names = [name for name in entries.c.keys() if name != "batch_id"]
-        columns = [entries.c[name] for name in names]
-        mine = select(*columns).where(entries.c.batch_id == last.id).order_by(entries.c.position)
-        before = [tuple(row) for row in connection.execute(mine)]
-        return before == [tuple(line[name] for name in names) for line in listed]
+    def _newest(self, connection: Connection) -> Row | None:
+        """Return the batch of this assignment before the one that ends now."""
+        mine = select(batches).where(batches.c.assignment == (self._assignment or ""))
+        return connection.execute(mine.order_by(batches.c.id.desc()).limit(1)).one_or_none()
+
+
+def _lines_of(connection: Connection, batch: Row) -> list[dict]:
+    """Return a class list as it was put in."""
+    columns = [column for column in entries.c if column.name != "batch_id"]
+    mine = select(*columns).where(entries.c.batch_id == batch.id).order_by(entries.c.position)
+    return [dict(row._mapping) for row in connection.execute(mine)]
+
+
+def _points_of(connection: Connection, batch: Row) -> dict[str, float]:
+    """Return the points of a class list by submission."""
+    both = select(submissions.c.name, entries.c.points).join(
+        submissions, entries.c.submission_id == submissions.c.id
+    )
+    mine = both.where(entries.c.batch_id == batch.id).order_by(entries.c.position)
+    return {row.name: row.points for row in connection.execute(mine)}
 
 
 def _pages(numbers: list[int]) -> Iterator[list[int]]:

@@ -5,8 +5,10 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from pydantic import ValidationError
 from sqlalchemy import Connection, Row, Select, Table, insert, select
 
+from pipeline.errors import ConfigError
 from pipeline.grading.batch import read_grade
 from pipeline.grading.grade import Flag, Grade
 from pipeline.grading.override import Override, with_overrides
@@ -160,8 +162,18 @@ def read_flag(text: str) -> Flag | None:
 
 
 def read_rubric(batch: Row) -> Rubric:
-    """Return the rubric of a batch."""
-    return Rubric.model_validate_json(batch.rubric)
+    """Return the rubric of a batch.
+
+    Raises
+    ------
+    ConfigError : another version of cartlab put it there.
+    """
+    try:
+        return Rubric.model_validate_json(batch.rubric)
+    except ValidationError:
+        raise ConfigError(
+            "the gradebook's rubric is of another version of cartlab: run cartlab grade again"
+        ) from None
 
 
 def storable(text: str) -> str:

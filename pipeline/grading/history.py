@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from sqlalchemy import Connection, select
 
+from pipeline.grading.changes import rubric_changes
 from pipeline.grading.schema import batches, entries, flags, gradings, overrides
 
 
@@ -70,14 +71,16 @@ def _overridden(connection: Connection, submission: int) -> Iterator[Event]:
 
 def _listed(connection: Connection, submission: int) -> Iterator[Event]:
     """Yield the class lists in which something was new."""
-    columns = batches.c.at, entries.c.points, entries.c.out_of, entries.c.shared
+    columns = batches.c.at, batches.c.rubric, entries.c.points, entries.c.out_of, entries.c.shared
     mine = select(*columns).join(batches).where(entries.c.submission_id == submission)
-    before = None
-    for at, points, out_of, shared in connection.execute(mine.order_by(batches.c.id)):
-        if (points, out_of, shared) != before:
-            text = "shared_data" if shared else ""
-            yield Event(at=at, what="listed", points=points, out_of=out_of, text=text)
-        before = (points, out_of, shared)
+    before, judged_by = None, ""
+    for at, rubric, points, out_of, shared in connection.execute(mine.order_by(batches.c.id)):
+        said = ["shared_data"] if shared else []
+        if judged_by and rubric != judged_by:
+            said += [f"rubric: {change}" for change in rubric_changes(judged_by, rubric)]
+        if ((points, out_of, shared), rubric) != (before, judged_by):
+            yield Event(at=at, what="listed", points=points, out_of=out_of, text="; ".join(said))
+        before, judged_by = (points, out_of, shared), rubric
 
 
 def history_dict(submission: str, events: Sequence[Event]) -> dict[str, Any]:

@@ -46,10 +46,12 @@ def read_table(path: Path) -> list[tuple[int, list[str]]]:
     ------
     ConfigError : it is no such table.
     """
-    if path.stat().st_size > _MOST_BYTES:
-        raise ConfigError(f"{path.name}: is larger than {_MOST_BYTES // 1_000_000} MB")
     try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise ConfigError(f"{path.name}: is larger than {_MOST_BYTES // 1_000_000} MB")
         text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
     except UnicodeDecodeError:
         raise ConfigError(f"{path.name}: is not UTF-8 text; export it anew as CSV") from None
     delimiter = max(",;\t", key=text.partition("\n")[0].count)
