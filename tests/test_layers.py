@@ -29,6 +29,7 @@ HOMES = {
     "typer": ("cli",),
     "rich": ("cli", "bench"),
     "serial": ("bench",),
+    "tomlkit": ("bench",),
     "starlette": ("bench",),
     "uvicorn": ("bench",),
     "control": ("plant", "stages"),

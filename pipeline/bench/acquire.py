@@ -14,7 +14,7 @@ from pipeline.bench.propose import extend_plan, propose_plan
 from pipeline.bench.protocol import PidGains, StateGains
 from pipeline.bench.raw import FOLDER as RAW
 from pipeline.bench.raw import read_raw
-from pipeline.bench.record import save_record
+from pipeline.bench.record import data_file, save_record
 from pipeline.bench.serial_line import SerialLine, open_line
 from pipeline.bench.session import Session, stopping_on_signals
 from pipeline.errors import ConfigError, DataError, HardwareError
@@ -65,11 +65,10 @@ class _Acquisition:
 
     def outcomes(self) -> Iterator[Outcome]:
         """Record until nothing is left; a line that was lost is opened again."""
-        while True:
+        lost = True
+        while lost:
             with open_line(self._port, baud=self._baud()) as line:
                 lost = yield from self._on_line(line)
-            if not lost:
-                return
 
     def _baud(self) -> int:
         if not (self._folder / NAME).exists():
@@ -88,6 +87,8 @@ class _Acquisition:
             )
         for sentence in scale_remarks(submission, bench):
             self._observer.remark(sentence)
+        for file in _recovered(self._folder, carts=submission.system.carts):
+            self._observer.remark(f"{file} is what a session left that was cut off")
         plan = self._plan(submission, line)
         session = Session(
             line, carts=submission.system.carts, limits=plan.limits, observer=self._observer
@@ -106,11 +107,18 @@ class _Acquisition:
             self._observer.finished(outcome)
             yield outcome
             if outcome.partial:
-                self._failed[recording.id] = self._failed.get(recording.id, 0) + 1
-                if self._failed[recording.id] < _TRIES:
-                    self._observer.confirm(f"{recording.id}: {outcome.partial}. Record it again")
+                self._offer_again(outcome)
                 if _is_lost(line):
                     return True
+
+    def _offer_again(self, outcome: Outcome) -> None:
+        name = outcome.recording.id
+        self._failed[name] = self._failed.get(name, 0) + 1
+        if self._failed[name] < _TRIES:
+            try:
+                self._observer.confirm(f"Record {name} again")
+            except ConfigError:  # nobody there to decide: the rest of the plan goes on
+                self._failed[name] = _TRIES
 
     def _plan(self, submission: Submission, line: SerialLine) -> Plan:
         if plan_path(submission).exists():
@@ -171,15 +179,16 @@ class _Acquisition:
             self._keep_partial(path, submission, "stopped by hand")
             raise
         remarks = [restless] if restless else []
-        if str(outcome.anomalies) != "none":
-            remarks.append(str(outcome.anomalies))
+        # Late lines have their stamps: no reader of the data need know.
+        if (spoilt := str(replace(outcome.anomalies, late=0))) != "none":
+            remarks.append(spoilt)
         if outcome.partial:
             self._keep_partial(path, submission, outcome.partial)
         else:
             file = save_record(path, folder=self._folder, carts=submission.system.carts)
             entry = _experiment(recording, file=file, controller=table, remarks=remarks)
             submission = add_experiment(load_submission(self._folder), entry)
-        return _with_remarks(outcome, remarks), submission
+        return replace(outcome, remarks=tuple(remarks)), submission
 
     def _keep_partial(self, path: Path, submission: Submission, why: str) -> None:
         """Save what came of a run that ended early, where no report takes it for a whole one."""
@@ -194,14 +203,14 @@ class _Acquisition:
         self._observer.remark(f"{file} is partial ({why}); it is not in {NAME}")
 
 
-def recover(folder: Path, *, carts: int) -> list[str]:
-    """Save the partial records of raw files that no data file was made of; return their names."""
+def _recovered(folder: Path, *, carts: int) -> list[str]:
+    """Save partial records of raw files that no data file was made of; return their names."""
     saved = []
     for path in sorted((folder / RAW).glob("*.raw")):
         try:
             recording = read_raw(path).header.recording
-            known = [folder / "data" / f"{recording.id}{end}" for end in (".txt", ".partial.txt")]
-            if not any(file.exists() for file in known):
+            made = [folder / data_file(recording, partial=partial) for partial in (False, True)]
+            if not any(file.exists() for file in made):
                 saved.append(save_record(path, folder=folder, carts=carts, partial=True))
         except DataError:  # cut within its first lines
             continue
@@ -282,8 +291,3 @@ def _experiment(
     if note:
         entry["note"] = note
     return entry
-
-
-def _with_remarks(outcome: Outcome, remarks: Sequence[str]) -> Outcome:
-
-    return replace(outcome, remarks=(*outcome.remarks, *remarks))

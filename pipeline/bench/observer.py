@@ -65,7 +65,12 @@ class Observer(Protocol):
         ...
 
     def confirm(self, instruction: str) -> None:
-        """Have a person do something at the bench, and wait until it is done."""
+        """Have a person do something at the bench, and wait until it is done.
+
+        Raises
+        ------
+        ConfigError : there is nobody who could.
+        """
         ...
 
     def settling(self, recording: Recording, seconds: float) -> None:

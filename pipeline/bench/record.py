@@ -26,7 +26,7 @@ def readings_of(run: RawRun) -> tuple[Reading, ...]:
         period=1e3 * run.header.bench.period,
         free=run.header.recording.carts,
     )
-    lines = [reading for data, at in run.lumps() for reading in stream.feed(data, since=at)]
+    lines = [reading for data, at in run.lumps() for reading in stream.feed(data, since=at, now=at)]
     return (*lines, *stream.finish())
 
 

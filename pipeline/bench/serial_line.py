@@ -22,7 +22,7 @@ from pipeline.bench.protocol import (
 from pipeline.errors import DataError, HardwareError
 
 _TRIES, _BETWEEN = 5, 0.4  # s; a bench just plugged in is not there at once
-_LUMP = 65_536  # bytes read at most at a time
+LUMP = 8192  # bytes read at most at a time: what is read within one heartbeat, many times over
 _WRITE_TIMEOUT = 0.5  # s
 _QUERIES, _ANSWER = 4, 0.6  # s; some boards boot for two seconds when the port is opened
 _LOOK = 0.005  # s between looks at the port
@@ -56,7 +56,10 @@ class SerialLine:
 
     def close(self) -> None:
         """Give the port back."""
+        socket = getattr(self._port, "_socket", None)
         self._port.close()
+        if socket is not None:  # which pyserial forgets where the other end has hung up
+            socket.close()
 
     def knows(self, letter: str) -> bool:
         """Tell whether the bench knows one of the commands beyond the stock ones."""
@@ -83,7 +86,7 @@ class SerialLine:
         HardwareError : the line is gone.
         """
         try:
-            return self._port.read(_LUMP)
+            return self._port.read(LUMP)
         except (serial.SerialException, OSError, TypeError) as error:
             # pyserial's POSIX port, closed under a read, raises a TypeError.
             raise self._gone(error) from None

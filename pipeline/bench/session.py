@@ -17,6 +17,7 @@ from types import FrameType
 from pipeline.bench.observer import Anomalies, Observer, Outcome
 from pipeline.bench.orders import Order
 from pipeline.bench.plan import Limits, Recording
+from pipeline.bench.plan_words import hold_words
 from pipeline.bench.protocol import (
     HEARTBEAT_EVERY,
     Command,
@@ -28,7 +29,7 @@ from pipeline.bench.protocol import (
     encode,
 )
 from pipeline.bench.raw import RawHeader, RawWriter
-from pipeline.bench.serial_line import SerialLine
+from pipeline.bench.serial_line import LUMP, SerialLine
 from pipeline.bench.stream import Stream
 from pipeline.errors import HardwareError
 
@@ -42,6 +43,7 @@ _AFTER_END = 0.02  # s the last lines may still be under way
 _REST_TRIES = 4
 _REST_WINDOW = 500.0  # ms at the end of a rest over which it is judged
 _STILL = 4  # counts a cart at rest may flicker
+_PULL_OUT = 1.7  # s a virtual hand takes to pull a cart out
 
 
 class Stopped(KeyboardInterrupt):
@@ -88,11 +90,14 @@ class Session:
         if self._line.knows("h"):
             self._line.send(Hands(held=held))
         elif recording.carts != self._free:
-            self._observer.confirm(_hold(recording.carts, held))
+            words = hold_words(recording.carts, n=self._carts)
+            self._observer.confirm(words[0].upper() + words[1:])
             self._free = recording.carts
         restless = self._rest(recording)
         if self._line.knows("h"):
-            self._line.send(Hands(held=held, released=recording.release or 0))
+            if recording.release:
+                self._line.send(Hands(held=held, released=recording.release))
+                time.sleep(_PULL_OUT)
         elif recording.release:
             self._observer.confirm(
                 f"Pull cart {recording.release} out and hold it still; let it go once the "
@@ -203,7 +208,7 @@ class Session:
             if data := self._line.receive():
                 arrived(data)
                 last = now
-                if trouble := check(stream.feed(data, since=since)):
+                if trouble := check(stream.feed(data, since=since, now=now)):
                     return trouble
                 if stream.restarted:
                     return "the bench began again in mid-run: its supply or its reset line"
@@ -218,8 +223,9 @@ class Session:
                     if stream.latest >= 0
                     else "the bench did not begin to stream"
                 )
-            since = now
-            time.sleep(_LOOK)
+            if len(data) < LUMP:  # nothing waits
+                since = now
+                time.sleep(_LOOK)
 
 
 class _Watch:
@@ -273,15 +279,3 @@ class _Tail:
         """How far each encoder went, counts."""
         columns = zip(*(reading.counts for reading in self._readings), strict=True)
         return [max(column) - min(column) for column in columns]
-
-
-def _hold(free: Sequence[int], held: Sequence[int]) -> str:
-    text = f"Let {_carts(free)} move freely"
-    return f"Hold {_carts(held)} fast and let {_carts(free)} move freely" if held else text
-
-
-def _carts(carts: Sequence[int]) -> str:
-    if len(carts) == 1:
-        return f"cart {carts[0]}"
-    *most, last = map(str, carts)
-    return f"carts {', '.join(most)} and {last}"

@@ -48,12 +48,12 @@ def fit_stamps(stamps: Stamps, *, period: float) -> StampFit:
         return StampFit(period=period, missing=0)
     if (slope := _even(stamps)) is not None:
         return StampFit(period=slope, missing=0)
-    steps = np.diff(stamps)
+    steps, span = np.diff(stamps), int(stamps[-1] - stamps[0])
     usual = float(np.median(steps))
     if usual >= _SLOW:
         own = float(steps[steps < usual + _SLOW].mean())  # rounding makes two usual steps
-        return StampFit(period=own, missing=int((np.round(steps / own) - 1).clip(min=0).sum()))
-    span = int(stamps[-1] - stamps[0])
+        missing = int((np.round(steps / own) - 1).clip(min=0).sum())
+        return StampFit(period=span / (n - 1 + missing), missing=missing)
     seen = np.zeros(span + 1, dtype=np.bool_)
     seen[stamps - stamps[0]] = True
     absent = np.flatnonzero(~seen).tolist()

@@ -17,7 +17,7 @@ from pipeline.bench.stamps import fit_stamps
 _LONGEST_LINE = 512  # bytes; more without an end is noise
 _SPIKE = 32  # counts a true reading may stand out between its neighbours: a hit on an end stop
 _LATE = 0.02  # s behind the earliest lines: they waited somewhere for one another
-_FORGET = 1e-3  # s/s the two clocks may drift apart
+_FORGET = 1.0  # s after which the two clocks are set by one another anew
 _WINDOW = 1000  # ms over which an encoder is watched
 _MOVED, _NEIGHBOUR_MOVED = 20, 200  # counts
 _DRIVEN = 8  # duty counts; less moves no cart
@@ -44,7 +44,8 @@ class Stream:
         self._garbled_lines = 0  # a merger of two is one garbled place and two lines
         self._late = 0
         self._resets = 0
-        self._lead = float("inf")  # s, the least of arrival minus stamp
+        # The least of arrival minus stamp, s: of the second before, and of this one.
+        self._lead, self._new_lead, self._lead_from = float("inf"), float("inf"), float("-inf")
         self._watch = _EncoderWatch(cart for cart in free if cart <= encoders)
 
     @property
@@ -80,11 +81,11 @@ class Stream:
             stuck=self._watch.stuck,
         )
 
-    def feed(self, data: bytes, *, since: float) -> list[Reading]:
+    def feed(self, data: bytes, *, since: float, now: float) -> list[Reading]:
         """Return the lines that are now known to be valid.
 
-        `since` (s, of any clock that runs on) is when the port was last found empty: the data came
-        after it, so a host that was busy elsewhere does not make lines late.
+        The data came between `since`, when the port was last found empty, and `now` (s, of any
+        clock that runs on): a host that was busy elsewhere does not make lines late.
         """
         *lines, self._tail = (self._tail + data).split(b"\n")
         if len(self._tail) > _LONGEST_LINE:
@@ -95,7 +96,7 @@ class Stream:
             reading = self._read(line)
             if reading is not None:
                 valid += self._judge(reading)
-                self._time(reading, since)
+                self._time(reading, since=since, now=now)
         self._watch.see(valid)
         return valid
 
@@ -151,10 +152,12 @@ class Stream:
         self._before = reading
         self._stamps.append(reading.ms)
 
-    def _time(self, reading: Reading, since: float) -> None:
-        lag = since - 1e-3 * reading.ms
-        self._late += lag > self._lead + _LATE
-        self._lead = min(self._lead + _FORGET * 1e-3 * self._expected, lag)
+    def _time(self, reading: Reading, *, since: float, now: float) -> None:
+        due = 1e-3 * reading.ms
+        if now - self._lead_from > _FORGET:
+            self._lead, self._new_lead, self._lead_from = self._new_lead, now - due, now
+        self._new_lead = min(self._new_lead, now - due)
+        self._late += since - due > min(self._lead, self._new_lead) + _LATE
 
 
 def _stands_out(before: Reading, held: Reading, after: Reading) -> bool:

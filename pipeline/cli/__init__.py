@@ -3,6 +3,6 @@
 # isort: off
 # In this order `cartlab --help` lists the commands: as a lab needs them.
 from pipeline.cli.common import app, main
-from pipeline.cli import reports, models, plan, emulate, grading, demo
+from pipeline.cli import reports, models, plan, acquire, emulate, grading, demo
 
-__all__ = ["app", "demo", "emulate", "grading", "main", "models", "plan", "reports"]
+__all__ = ["acquire", "app", "demo", "emulate", "grading", "main", "models", "plan", "reports"]

@@ -1,0 +1,79 @@
+"""The command `acquire`: from a bench, or from files as they appear, to a submission."""
+
+from collections.abc import Collection
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from pipeline.cli.common import Folder, app
+from pipeline.errors import ConfigError
+
+if TYPE_CHECKING:
+    from pipeline.bench.terminal import Terminal
+
+
+@app.command()
+def acquire(
+    folder: Folder,
+    port: Annotated[
+        str | None,
+        typer.Option(help="The bench: COM3, /dev/ttyACM0, socket://HOST:PORT, …"),
+    ] = None,
+    source: Annotated[
+        Path | None,
+        typer.Option(
+            "--import", metavar="FOLDER", help="Take files of other programs as they appear there."
+        ),
+    ] = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ID", help="Record this one of the plan only; repeat."),
+    ] = None,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Take what hands are asked to do as done.")
+    ] = False,
+    once: Annotated[
+        bool, typer.Option("--once", help="With --import: take what is there now, and end.")
+    ] = False,
+) -> None:
+    """Carry out the plan on a bench, or take files as they appear, into a submission."""
+    from pipeline.bench.terminal import Terminal
+
+    if (port is None) == (source is None):
+        raise ConfigError("say where the data come from: either --port or --import")
+    with Terminal(yes=yes) as terminal:
+        if source is not None:
+            _import(folder, source, terminal, once=once)
+        elif port is not None:
+            _record(folder, port, terminal, only=only or ())
+
+
+def _record(folder: Path, port: str, terminal: "Terminal", *, only: Collection[str]) -> None:
+    from pipeline.bench.acquire import acquire as carry_out
+
+    try:
+        outcomes = carry_out(folder, port=port, observers=[terminal], only=only)
+    except KeyboardInterrupt:
+        terminal.remark("stopped; the same command goes on where this ended")
+        raise typer.Exit(1) from None
+    whole = {outcome.recording.id for outcome in outcomes if not outcome.partial}
+    failed = {outcome.recording.id for outcome in outcomes} - whole
+    terminal.remark(f"{len(whole)} recorded into {folder}: try `cartlab report {folder}`")
+    if failed:
+        terminal.remark(f"not recorded: {', '.join(sorted(failed))}; the same command tries again")
+        raise typer.Exit(1)
+
+
+def _import(folder: Path, source: Path, terminal: "Terminal", *, once: bool) -> None:
+    from pipeline.bench.importing import Importer
+
+    taken = 0
+    try:
+        for imported in Importer(folder, source, observer=terminal).watch(once=once):
+            taken += 1
+            as_what = f"{imported.file}: {imported.experiment}, a {imported.kind}"
+            terminal.remark("; ".join([as_what, *imported.remarks]))
+    except KeyboardInterrupt:
+        pass  # the way to end it
+    terminal.remark(f"{taken} files taken into {folder}: check its submission.toml")

@@ -1,0 +1,208 @@
+"""Lines out of lumps: what is kept, what is counted."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.bench.protocol import Reading, format_reading
+from pipeline.bench.stamps import fit_stamps
+from pipeline.bench.stream import Stream
+
+
+def clock(n: int, *, period: float, phase: float = 0.3) -> np.ndarray:
+    """Return the stamps (n,) of an odd clock, whole ms."""
+    return np.floor(period * np.arange(n) + phase).astype(np.int64)
+
+
+def lines(n: int, *, period: float = 1.0024, duty: int = 300) -> list[Reading]:
+    """Return the lines of a dwell: two carts swing, the motor drives."""
+    stamps = clock(n, period=period)
+    wave = np.sin(2 * np.pi * 3.0 * 1e-3 * stamps)
+    return [
+        Reading(
+            counts=(round(400 * s), round(-250 * s)),
+            target=round(duty * s),
+            duty=round(duty * s),
+            ms=int(ms),
+        )
+        for s, ms in zip(wave, stamps, strict=True)
+    ]
+
+
+def read(raw: bytes, *, lump: int = 97, **options) -> tuple[list[Reading], Stream]:
+    """Feed bytes in lumps, each as it would come at 115200 baud."""
+    stream = Stream(encoders=2, free=(1, 2), **options)
+    got = []
+    for start in range(0, len(raw), lump):
+        got += stream.feed(raw[start : start + lump], since=start / 20_000, now=start / 20_000)
+    return got + stream.finish(), stream
+
+
+def join(readings) -> bytes:
+    """Return the stream of these lines."""
+    return b"".join(map(format_reading, readings))
+
+
+@given(lump=st.integers(1, 400))
+def test_lumps_of_any_size_give_the_same_lines(lump):
+    """However the bytes are cut into lumps, every line comes out once, in order."""
+    sent = lines(60)
+    got, stream = read(join(sent), lump=lump)
+    assert got == sent
+    assert stream.anomalies == type(stream.anomalies)()
+
+
+@given(raw=st.binary(max_size=400), lump=st.integers(1, 50))
+def test_noise_is_never_an_error(raw, lump):
+    """Any bytes whatever are read without an exception, and what comes out has rising stamps."""
+    got, stream = read(raw, lump=lump)
+    stamps = [reading.ms for reading in got]
+    assert stamps == sorted(stamps)
+    assert str(stream.anomalies)
+
+
+@pytest.mark.parametrize("period", [1.0, 1.0024, 1.0007, 2.08])
+def test_a_clock_without_losses_is_told_exactly(period):
+    """A whole run lacks no line however odd its clock, and the period comes back."""
+    fit = fit_stamps(clock(5000, period=period), period=1.0)
+    assert fit.missing == 0
+    # A slope through n stamps rounded to 1 ms is good to far better than 1 ms over the run.
+    assert fit.period == pytest.approx(period, abs=1.0 / 5000)
+
+
+@pytest.mark.parametrize("share", [0.002, 0.01, 0.04])
+@pytest.mark.parametrize("period", [1.0, 1.0024, 2.08])
+def test_lost_lines_are_told_from_the_skips_of_an_odd_clock(period, share):
+    """Of 20 000 lines some are lost at random; as many are missing, though the clock skips too."""
+    rng = np.random.default_rng(7)
+    stamps = clock(20_000, period=period)
+    kept = rng.random(stamps.size) > share
+    kept[[0, -1]] = True
+    fit = fit_stamps(stamps[kept], period=1.0)
+    # A loss that falls on a skip of the clock, or beside one, may count as the other.
+    assert abs(fit.missing - np.count_nonzero(~kept)) <= 2
+    assert fit.period == pytest.approx(period, abs=2e-4)
+
+
+def test_a_short_run_counts_by_the_expected_period():
+    """Where 300 stamps cannot tell 1.0024 ms from 1 ms, the period of earlier runs decides."""
+    stamps = np.delete(clock(300, period=1.0024, phase=0.0), [50, 51, 200])
+    # In 300 lines the clock skips 0.7 times on average: one is taken for its own.
+    assert fit_stamps(stamps, period=1.0024).missing == 2
+    assert fit_stamps(stamps, period=1.0).missing == 3
+
+
+def test_every_fault_is_counted_and_every_valid_line_kept():
+    """Drops, noise and mergers at once: no line that came whole is lost, each fault counts."""
+    rng = np.random.default_rng(3)
+    sent = lines(20_000)
+    kind = rng.choice(["whole", "drop", "garble", "merge"], size=20_000, p=[0.97] + 3 * [0.01])
+    kind[[0, 1, -2, -1]] = "whole"
+    kind[1:][kind[:-1] == "merge"] = "whole"  # the line behind a merger is hurt enough
+    raw, whole = bytearray(), []
+    for reading, what, before in zip(sent, kind, ["", *kind[:-1]], strict=True):
+        line = format_reading(reading)
+        if what == "garble":
+            line = line[:3] + b"#" + line[4:]
+        if what != "drop":
+            raw += line[:-1] if what == "merge" else line
+        if what == "whole" and before != "merge":
+            whole.append(reading)
+    got, stream = read(bytes(raw), lump=300)
+    assert got == whole
+    anomalies = stream.anomalies
+    assert anomalies.garbled == np.count_nonzero((kind == "garble") | (kind == "merge"))
+    assert abs(anomalies.lost - np.count_nonzero(kind == "drop")) <= 2
+    assert stream.period == pytest.approx(1.0024, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("field", "wrong"),
+    [("ms", b"9"), ("ms", b""), ("counts", b"77")],
+    ids=["stamp ahead", "stamp behind", "count"],
+)
+def test_a_line_that_can_be_read_but_cannot_be_is_garbled(field, wrong):
+    """A digit too many or too few still parses; between its neighbours it stands out."""
+    sent = lines(200)
+    texts = [format_reading(reading) for reading in sent]
+    struck = texts[120]
+    if field == "ms":
+        texts[120] = struck[:-1] + wrong + b"\n" if wrong else struck[:-2] + b"\n"
+    else:
+        texts[120] = wrong + struck
+    got, stream = read(b"".join(texts))
+    assert got == sent[:120] + sent[121:]
+    assert stream.anomalies.garbled == 1
+    assert stream.anomalies.lost == 0
+
+
+def test_a_hard_hit_on_a_stop_is_no_fault():
+    """A cart that bounces off an end stop within one line turns at once; its lines stay."""
+    out = [*range(0, 600, 12), *range(600, 0, -12)]
+    sent = [Reading(counts=(x, 0), target=0, duty=0, ms=i) for i, x in enumerate(out)]
+    got, stream = read(join(sent))
+    assert got == sent
+    assert stream.anomalies.garbled == 0
+
+
+def test_a_bench_that_begins_again_ends_the_run():
+    """Stamps that start over are counted as a reset, and no line after it belongs to the run."""
+    sent = lines(500)
+    got, stream = read(join(sent) + join(lines(300)))
+    assert got == sent
+    assert stream.restarted
+    assert stream.anomalies.resets == 1
+
+
+def test_what_an_earlier_run_left_in_the_line_is_not_of_this_one():
+    """A last line of the run before, and a half one, do not count as this run's first."""
+    sent = lines(100)
+    got, _ = read(b"5:0:0\n" + format_reading(lines(9000)[-1]) + join(sent))
+    assert got == sent
+
+
+def test_late_lines_are_counted_and_kept():
+    """Lines held back for 60 ms and sent in a lump are late as long as 20 ms of it are left."""
+    sent = lines(1000, period=1.0)
+    stream = Stream(encoders=2)
+    got = []
+    for reading in sent:
+        arrival = max(reading.ms, 560) if 500 <= reading.ms < 560 else reading.ms
+        got += stream.feed(format_reading(reading), since=1e-3 * arrival, now=1e-3 * arrival)
+    assert got + stream.finish() == sent
+    assert stream.anomalies.late in (
+        40,
+        41,
+    )  # stamps 500 … 539; the next is 20 ms late, but for rounding
+
+
+def test_a_host_that_was_busy_makes_no_line_late():
+    """Lines that waited because nobody looked are not late: the port was last seen empty before."""
+    sent = lines(1000, period=1.0)
+    stream = Stream(encoders=2)
+    for start in range(0, 1000, 100):  # a look every 100 ms
+        stream.feed(join(sent[start : start + 100]), since=1e-3 * start, now=1e-3 * (start + 100))
+    assert stream.anomalies.late == 0
+
+
+@pytest.mark.parametrize("since", [0, 2500])
+def test_an_encoder_that_stands_still_is_noticed(since):
+    """Encoder 2 stands still from a time on, or from the start, while the motor drives on."""
+    sent = [
+        Reading(counts=(r.counts[0], r.counts[1] if r.ms < since else 77), target=r.target,
+                duty=r.duty, ms=r.ms)
+        for r in lines(6000)
+    ]  # fmt: skip
+    _, stream = read(join(sent))
+    assert stream.anomalies.stuck == 1
+
+
+def test_a_cart_that_rests_after_a_step_is_not_stuck():
+    """Under a constant input a cart comes to rest: that is no fault of its encoder."""
+    sent = [
+        Reading(counts=(min(i, 300), 0), target=200, duty=200, ms=i) for i in range(4000)
+    ]  # fmt: skip
+    stream = Stream(encoders=2, free=(1,))
+    stream.feed(join(sent), since=0.0, now=4.0)
+    assert stream.anomalies.stuck == 0
