@@ -3,14 +3,18 @@
 import json
 import shutil
 from dataclasses import replace
+from decimal import Decimal
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pipeline.grading.grade import CODES, Flag, Grade, grade_text
+from pipeline.grading.impossible import not_positive
 from pipeline.grading.load import load_rubric
-from pipeline.grading.run import grade_submission
-from pipeline.submission import load_submission
+from pipeline.grading.run import grade_submission, under_rubric
+from pipeline.grading.state_model import compare_entries
+from pipeline.submission import Input, InputOverride, StateSpace, load_submission
 from pipeline.synthesis import write_submission
 from tests.grading_students import student
 
@@ -51,6 +55,39 @@ def test_results_that_a_submission_brings_along_are_not_believed(folder, tmp_pat
     assert grade_text(grade(planted)) == grade_text(grade(folder))
 
 
+def test_a_record_s_own_calibration_does_not_win_over_the_rubric_s(folder):
+    """Only under feedback, where benches log other signals, a record's own scale stands."""
+    submission, rubric = load_submission(folder), load_rubric(Path("throne-1dof"))
+    system = rubric.system.model_copy(update={"input": Input(sign=1, per_count=1e-4)})
+    own = InputOverride(sign=-1, per_count=0.5)
+    claiming = submission.model_copy(
+        update={
+            "experiments": tuple(
+                e.model_copy(update={"input": own}) for e in submission.experiments
+            )
+        }
+    )
+
+    read, notes = under_rubric(claiming, rubric.model_copy(update={"system": system}))
+
+    for experiment in read.experiments:
+        left = own if experiment.kind == "closed_loop" else InputOverride()
+        assert experiment.input == left
+    assert any("sign and scale are the rubric's" in note for note in notes)
+
+
+def test_rounding_is_no_error():
+    """A damping typed as 0.0, and what MATLAB leaves in an A of noughts and ones, are right."""
+    typed = {"zeta_b": Decimal("0.0"), "zeta_a": Decimal("-0.1"), "K_1": Decimal(0)}
+    assert not_positive(typed) == ["zeta_a"]
+    model = np.array([[0.0, 1.0, 0.0], [-174.0, -2.6, 5000.0]])
+    noisy = [["1.2e-17", "1.0000000001"], ["-174", "-2.6"]]
+    space = StateSpace(
+        A=tuple(tuple(map(Decimal, row)) for row in noisy), B=(Decimal("-3e-14"), Decimal(5000))
+    )
+    assert not any(entry.error for entry in compare_entries(space, models=[model], n=1))
+
+
 def test_the_rubric_s_system_wins(folder, tmp_path):
     """A submission that says no spring is there, and another sign, is read as the rubric says."""
     other = tmp_path / "team-07"
@@ -70,7 +107,7 @@ def test_a_submission_for_another_bench_fails_with_its_reason(folder):
     rubric = load_rubric(Path("throne-2dof"))
     failed = grade_submission(load_submission(folder), rubric=rubric, name="team-07").grade
     assert (failed.status, failed.points, failed.out_of) == ("failed", 0.0, 20)
-    assert "is for 1 carts, the rubric for 2" in failed.reason
+    assert "is for 1 cart, the rubric for 2" in failed.reason
 
 
 def test_a_cut_file_costs_its_own_run_only(folder, tmp_path):

@@ -11,7 +11,8 @@ from pipeline.grading.checks_loop import (
     judge_hardware,
     judge_prefilter,
 )
-from pipeline.grading.laws import judge_laws
+from pipeline.grading.impossible import not_positive
+from pipeline.grading.laws import MOST_WIDENING, judge_laws
 from pipeline.grading.pieces import asked_pieces, missing_pieces
 from pipeline.grading.reference import Reference
 from pipeline.grading.rubric import is_damping, matching
@@ -88,7 +89,8 @@ def _parameters(criterion: asked.Parameters, work: Work) -> Verdict:
     table: Mapping[str, Decimal] = getattr(work.reported, criterion.check)
     known: Mapping[str, Reference] = getattr(work.references, criterion.check)
     names = matching(criterion.parameters, work.rubric.names)
-    judged = [n for n in names if n in known or (n in table and table[n] <= 0)]
+    impossible = not_positive(table)
+    judged = [n for n in names if n in known or n in impossible]
     guessed = [n for n in names if n not in known and n not in judged]
     if not judged:
         reasons = [s.reason for s in work.analysis.skipped]
@@ -167,10 +169,10 @@ def _laws(criterion: asked.Laws, work: Work) -> Verdict:
     )
     if laws is None:
         return Verdict(share=None, message="Not checked: the final table is not complete.")
-    shares = [ALL if law.within_rounding else Fraction(law.within_tolerance, 2) for law in laws]
-    broken = [law for law in laws if not law.within_rounding]
+    broken = [law for law in laws if law.widening > 0]
+    worst = max((law.widening for law in laws), default=Fraction(0))
     return Verdict(
-        share=mean_share(shares),
+        share=ALL - worst / MOST_WIDENING,
         message="; ".join(f"{law.name} fails ({law.meaning})" for law in broken[:_NAMED]) + "."
         if broken
         else f"All {len(laws)} laws hold within the rounding.",

@@ -5,9 +5,9 @@ from fractions import Fraction
 import numpy as np
 
 from pipeline.grading import rubric as asked
-from pipeline.grading.controller import Controller
+from pipeline.grading.controller import Controller, same_gains
 from pipeline.grading.reference import Reference
-from pipeline.grading.tolerance import credit, exact, percent_off
+from pipeline.grading.tolerance import credit, exact, half_digit, percent_off
 from pipeline.grading.work import NONE, Verdict, Work, mean_share
 from pipeline.plant.chain import Array
 
@@ -84,6 +84,7 @@ def judge_claims(criterion: asked.Claims, work: Work) -> Verdict:
         shares = [NONE, NONE]
         if controller.overshoot is not None and np.isfinite(numbers.overshoot):
             off = abs(Fraction(controller.overshoot) - Fraction(numbers.overshoot))
+            off = max(off - half_digit(controller.overshoot), Fraction(0))
             shares[0] = credit(off, full=criterion.overshoot_full, none=criterion.overshoot_none)
         if controller.settling is not None and numbers.settling_time is not None:
             point = numbers.settling_time
@@ -159,7 +160,15 @@ def judge_hardware(criterion: asked.Hardware, work: Work) -> Verdict:
     error = exact(errors[run])
     return Verdict(
         share=credit(error, full=criterion.full_percent, none=criterion.none_percent),
-        message=f"{run}: model and measurement differ by {errors[run]:.3g} % of the motion.",
+        message=f"{run}: model and measurement differ by {errors[run]:.3g} % of the motion."
+        + (" The gains that ran are not those reported." if _others_ran(work) else ""),
         expected={"nrmse_percent": criterion.full_percent},
         found={"nrmse_percent": errors[run]},
     )
+
+
+def _others_ran(work: Work) -> bool:
+    controller = work.controller
+    if controller is None or controller.ran is None or controller.gains is None:
+        return False
+    return not same_gains(controller.ran, controller.gains)

@@ -3,6 +3,8 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from decimal import Decimal
+from fractions import Fraction
+from fractions import Fraction
 
 from pipeline.grading.grade import Flag
 from pipeline.grading.orders import orders
@@ -58,8 +60,8 @@ class BrokenOrder:
 
 
 def not_positive(table: Mapping[str, Decimal]) -> list[str]:
-    """Return the parameters that are zero or negative; all of a real chain are above."""
-    return [name for name, typed in table.items() if typed <= 0]
+    """Return the parameters that are zero or negative beyond their rounding."""
+    return [name for name, typed in table.items() if Fraction(typed) + half_digit(typed) <= 0]
 
 
 def broken_orders(table: Mapping[str, Decimal], *, initial: bool) -> list[BrokenOrder]:

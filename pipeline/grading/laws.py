@@ -8,6 +8,7 @@ it, or on its right side. Everything is evaluated at all corners at once.
 from collections.abc import Mapping
 from dataclasses import dataclass
 from decimal import Decimal
+from fractions import Fraction
 
 import numpy as np
 
@@ -16,17 +17,23 @@ from pipeline.grading.rubric import is_damping
 from pipeline.grading.tolerance import half_digit
 from pipeline.plant.chain import Array, parameter_names
 
+MOST_WIDENING = 4  # tolerances; a law that then still fails is simply broken
+_PER_TOLERANCE = 2  # steps in which the box is widened by one
 _RECOMPUTED = {2: ("_1",), 3: ("_1", "_2")}  # carts whose own numbers follow from the others
 
 
 @dataclass(frozen=True, kw_only=True)
 class Law:
-    """One law: does it hold within the rounding, or at least within the tolerances?"""
+    """One law, and how far the box of the rounding must be widened until it holds.
+
+    Attributes
+    ----------
+    widening : 0: it holds within the rounding; 1: within the tolerances; 2: within twice those.
+    """
 
     name: str
     meaning: str
-    within_rounding: bool
-    within_tolerance: bool
+    widening: Fraction
 
 
 def judge_laws(
@@ -40,17 +47,24 @@ def judge_laws(
     percent = {
         name: (damping_percent if is_damping(name) else frequency_percent) / 100 for name in names
     }
-    wide = {n_: max(rounding[n_], percent[n_] * abs(float(final[n_]))) for n_ in names}
-    narrow_results = _evaluate(final, rounding, n=n)
-    wide_results = _evaluate(final, wide, n=n)
+
+    def box(step: int) -> dict[str, float]:
+        share = step / _PER_TOLERANCE
+        return {x: max(rounding[x], share * percent[x] * abs(float(final[x]))) for x in names}
+
+    results, last = _evaluate(final, box(0), n=n), MOST_WIDENING * _PER_TOLERANCE
+    needed = {name: 0 if holds else last for name, (_, holds) in results.items()}
+    failing = {name for name, step in needed.items() if step}
+    for step in range(1, last) if failing else ():
+        wider = _evaluate(final, box(step), n=n)
+        met = {name for name in failing if wider[name][1]}
+        needed |= dict.fromkeys(met, step)
+        failing -= met
+        if not failing:
+            break
     return [
-        Law(
-            name=name,
-            meaning=meaning,
-            within_rounding=holds,
-            within_tolerance=wide_results[name][1],
-        )
-        for name, (meaning, holds) in narrow_results.items()
+        Law(name=name, meaning=meaning, widening=Fraction(needed[name], _PER_TOLERANCE))
+        for name, (meaning, _) in results.items()
     ]
 
 

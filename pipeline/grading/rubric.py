@@ -107,8 +107,9 @@ class InitialFinal(_Graded):
 class Laws(_Criterion):
     """Redundancies and inequalities that the final table of a real chain obeys.
 
-    A law holds where it does for some table within half the last digits typed, or within these
-    percentages; then it earns half.
+    A law holds where it does for some table within half the last digits typed. Else the worst law
+    counts: a quarter of the points is lost where it only holds within these percentages, half
+    within twice them, all from four times on.
     """
 
     check: Literal["laws"]
@@ -154,7 +155,10 @@ class Prefilter(_Criterion):
 
 
 class Hardware(_Criterion):
-    """A closed-loop run of the reported gains; how far the model is from it (NRMSE, percent)."""
+    """A closed-loop run whose controller is stated; how far the model is from it (NRMSE, percent).
+
+    Where gains other than the reported ones ran, that is said.
+    """
 
     check: Literal["hardware"]
     full_percent: Percent = 30.0

@@ -19,6 +19,8 @@ Kind = Literal["exact", "stiffness", "damping"]
 # From here on an entry is wrong rather than imprecise: percent. Couplings are differences of
 # large numbers, dampings are what friction adds to.
 _WRONG = {"exact": 0.0, "stiffness": 20.0, "damping": 100.0}
+# A 0 or 1 of A is met within what a computer adds to it: 1.2e-17 is zero.
+_EXACT = 1e-6
 _EXPLAINED = {"exact": 0.0, "stiffness": 12.0, "damping": 60.0}  # what a named slip must meet
 
 
@@ -111,9 +113,9 @@ def _matrix(space: StateSpace, n: int) -> dict[tuple[int, int], Decimal]:
 
 def _entry_error(typed: Decimal, right: float, kind: Kind) -> Fraction:
     if kind == "exact":
-        return Fraction(0) if float(typed) == right else Fraction(10**6)
+        return Fraction(0) if abs(float(typed) - right) <= _EXACT else Fraction(10**6)
     if right == 0:
-        return Fraction(0) if typed == 0 else Fraction(10**6)
+        return Fraction(0) if abs(typed) <= _EXACT else Fraction(10**6)
     size = abs(right)
     reference = Reference(value=size, low=size, high=size, std=0.0, source="")
     return percent_off(typed if right > 0 else -typed, reference, sigmas=0.0)
