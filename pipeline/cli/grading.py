@@ -4,7 +4,7 @@ import json
 import os
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -127,14 +127,17 @@ def override(
 ) -> None:
     """Give a criterion points by hand, which every later grading keeps."""
     from pipeline.grading.gradebook import Gradebook
+    from pipeline.grading.lock import alone_in
     from pipeline.grading.outputs import write_outputs
     from pipeline.grading.override import read_points
 
+    folder = Path(grades)
+    pages = folder.is_dir()
     with Gradebook(grades, assignment=assignment) as book:
-        book.override(team, criterion, read_points(points), why=why, by=by)
-        folder = Path(grades)
-        if folder.is_dir():
-            write_outputs(book, folder)
+        with alone_in(folder) if pages else nullcontext():
+            book.override(team, criterion, read_points(points), why=why, by=by)
+            if pages:
+                write_outputs(book, folder)
         grade = book.entry(team).grade
     say(f"{grade.submission}: {grade.points:g} of {grade.out_of:g} points")
 

@@ -1,6 +1,5 @@
 """The whole of `cartlab grade`: intake, grading, the gradebook, and what is written from it."""
 
-import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,16 +9,16 @@ from pipeline.grading.gradebook import Gradebook
 from pipeline.grading.intake import find_hand_ins
 from pipeline.grading.late_table import LateTable, settle_lateness
 from pipeline.grading.load import load_rubric
+from pipeline.grading.lock import alone_in, scratch_in
 from pipeline.grading.outputs import write_outputs
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.runner import Executor, Limits, Progress, grade_batch, run_here
 from pipeline.grading.shared_prints import fingerprint
 from pipeline.ingest.read import read_data
-from pipeline.output import check_folder, own_folder
+from pipeline.output import check_folder
 from pipeline.resources import EXAMPLES
 from pipeline.submission import load_submission
 
-_SCRATCH = ".scratch"
 _MEMORY = ".compared.json"  # may be removed at any time
 
 
@@ -60,15 +59,13 @@ def grade_class(
 
     Raises
     ------
-    ConfigError : the rubric, the table, a path, the folder or the cluster cannot be used.
+    ConfigError : the rubric, the table, a path, the folder or the cluster cannot be used, or
+        another run is writing there.
     """
     rubric = load_rubric(rubric_file)
     late_table = LateTable.read(lateness) if lateness else None
-    check_folder(out).mkdir(parents=True, exist_ok=True)
-    scratch = own_folder(out, _SCRATCH)
-    shutil.rmtree(scratch, ignore_errors=True)  # of a run that was stopped
-    scratch.mkdir(exist_ok=True)
-    try:
+    check_folder(out)
+    with alone_in(out), scratch_in(out) as scratch:
         found = find_hand_ins(paths, scratch=scratch, skip=[out])
         hand_ins, remarks = settle_lateness(found, late=rubric.late, table=late_table)
         # The rubric's file says which assignment it is: its title may be mended on the way.
@@ -89,8 +86,6 @@ def grade_class(
             book.finish(batch, rubric=rubric.model_copy(update={"anonymous": hidden}))
             total = len(hand_ins)
             write_outputs(book, out, progress=lambda what: progress(total, total, what))
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
     return Summary(
         total=len(hand_ins),
         failed=batch.failed,

@@ -1,0 +1,71 @@
+"""One run at a time writes into a folder."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from pipeline.errors import ConfigError
+from pipeline.grading.lock import alone_in, scratch_in
+
+_HOLDER = """
+import sys
+from pathlib import Path
+from pipeline.grading.lock import alone_in, scratch_in
+out = Path(sys.argv[1])
+with alone_in(out), scratch_in(out) as scratch:
+    (scratch / "copy").touch()
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.fixture
+def other(tmp_path):
+    """Another process that has the folder."""
+    command = [sys.executable, "-c", _HOLDER, str(tmp_path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"held" + os.linesep.encode()
+        yield process
+        process.kill()
+
+
+def test_a_second_run_is_refused_and_harms_nothing(other, tmp_path):
+    """It is told the process that writes there, whose scratch stays."""
+    refused = pytest.raises(ConfigError, match=rf"another cartlab \(process {other.pid}\) writes")
+    with refused, alone_in(tmp_path):
+        pass
+    command = [sys.executable, "-m", "pipeline", "grade", str(tmp_path / "none")]
+    typed = [*command, "--rubric", "throne-1dof", "--out", str(tmp_path)]
+    done = subprocess.run(typed, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert f"(process {other.pid})" in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert (tmp_path / f".scratch-{other.pid}" / "copy").is_file()
+
+
+def test_a_dead_run_is_no_obstacle(other, tmp_path):
+    """Its lock is gone with it; the next run removes its scratch, and its own at the end."""
+    other.kill()
+    other.wait()
+    assert (tmp_path / f".scratch-{other.pid}").is_dir()
+    with alone_in(tmp_path), scratch_in(tmp_path) as scratch:
+        assert [path.name for path in tmp_path.glob(".scratch*")] == [scratch.name]
+    assert [path.name for path in tmp_path.iterdir()] == [".lock"]
+
+
+def test_a_lock_that_is_none_is_said(tmp_path):
+    """A file of that name that is no lock is no reason to go on."""
+    (tmp_path / ".lock").write_bytes(b"something else" * 100)
+    with pytest.raises(ConfigError, match="not a database"), alone_in(tmp_path):
+        pass
+
+
+def test_a_folder_nothing_came_of_goes_again(tmp_path):
+    """What was made for a run that ended at once is removed; a folder that was there stays."""
+    for out in (tmp_path / "new" / "out", tmp_path):
+        with pytest.raises(ZeroDivisionError), alone_in(out), scratch_in(out):
+            raise ZeroDivisionError
+    assert list((tmp_path / "new").iterdir()) == []
