@@ -7,7 +7,13 @@ import pytest
 from numpy.testing import assert_allclose
 
 from pipeline.bench.core import ReferenceCore
-from pipeline.bench.gains import Scales, bench_gains, bench_scales, controller_table
+from pipeline.bench.gains import (
+    Scales,
+    bench_gains,
+    bench_scales,
+    controller_table,
+    propose_pid,
+)
 from pipeline.bench.plan import Limits, PidLoop, Recording, StateLoop
 from pipeline.bench.protocol import Description, Start, StateGains, Wave, encode
 from pipeline.errors import DataError
@@ -244,6 +250,38 @@ def test_a_pid_is_refused_where_it_swings_up(identified, kd, stable):
         x = simulate_loop(analysis.chain, law, t=t, reference=1.0, delay=0, input_limit=1e9).x
     early, late = np.ptp(x[0, : t.size // 4]), np.ptp(x[0, -t.size // 4 :])
     assert (late < early) if stable else (late > 1000)
+
+
+@pytest.mark.parametrize("example", ["one-cart", "two-cart", "three-cart"])
+def test_a_proposed_pid_brings_cart_1_to_the_level(example):
+    """On the carts it was made for: within 2 % of 1 cm after 5 s, no further than 1.1 cm."""
+    submission = load_submission(EXAMPLES / example)
+    kept = tuple(e for e in submission.experiments if e.kind in ("step", "sweep"))
+    submission = submission.model_copy(update={"experiments": kept})
+    analysis = analyse(submission)
+    bench = replace(BENCH, encoders=max(2, analysis.carts), carts=analysis.carts)
+    recording = closing(None, carts=analysis.carts)
+    pid = propose_pid(
+        recording, submission=submission, analysis=analysis, bench=bench, limits=LIMITS
+    )
+    law = Pid(kp=pid.kp, ki=pid.ki, kd=pid.kd, scale=DUTY / COUNT)
+    assert analysis.chain is not None
+    t = np.arange(0, 5, BENCH.period)
+    run = simulate_loop(
+        analysis.chain, law, t=t, reference=1.0, delay=0, encoder_step=COUNT, input_limit=0.5
+    )
+    assert abs(run.x[0, -1] - 1.0) < 0.02
+    assert run.x[0].max() < 1.1
+    weak = Limits(input=0.001, travel=2.5)
+    with pytest.raises(DataError, match=r"no PID is proposed: .*input"):
+        propose_pid(recording, submission=submission, analysis=analysis, bench=bench, limits=weak)
+
+
+def test_a_scale_that_nobody_states_is_asked_for(identified):
+    """Centimetres of the submission and counts of the bench do not go together by themselves."""
+    submission, analysis = identified
+    with pytest.raises(DataError, match=r"state system\.position\.per_count in cm"):
+        bench_scales(submission, bench=replace(BENCH, position_unit="count"), analysis=analysis)
 
 
 def test_without_a_model_no_loop_is_closed(identified):

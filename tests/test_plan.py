@@ -76,12 +76,18 @@ def test_a_cart_without_springs_is_not_let_go_and_untied_carts_are_not_pushed_as
 
 
 def test_a_stock_bench_gets_no_command_it_does_not_know():
-    """The sweep is a square wave then, and no state feedback follows the dwells."""
+    """The sweep is a square wave then, and after the dwells it runs its own PID on cart 1."""
     (sweep,) = of_kind(propose_plan(bare(), bench=STOCK), "sweep")
     assert (sweep.wave, sweep.frequency_end) == ("square", None)
     whole = recorded("two-cart", *FIRST, "sine")
-    plan = propose_plan(whole, bench=STOCK)
-    assert extend_plan(plan, whole, bench=STOCK) == plan
+    with pytest.raises(DataError, match=r"state system\.position\.per_count in cm"):
+        extend_plan(propose_plan(whole, bench=STOCK), whole, bench=STOCK)
+    position = whole.system.position.model_copy(update={"per_count": 0.00227})
+    system = whole.system.model_copy(update={"position": position})
+    whole = whole.model_copy(update={"system": system})
+    (loop,) = extend_plan(propose_plan(whole, bench=STOCK), whole, bench=STOCK).recordings
+    assert isinstance(loop.controller, PidLoop)
+    assert loop.controller.cart == 1
 
 
 def test_what_is_recorded_is_not_proposed():

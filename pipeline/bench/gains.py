@@ -7,7 +7,8 @@ simulated as the bench will run it before any gain is sent.
 """
 
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from itertools import product
+from typing import Any, Self, TypeAlias
 
 import numpy as np
 
@@ -25,6 +26,9 @@ from pipeline.workflow import is_reversed
 Table: TypeAlias = dict[str, Any]
 
 _LONGEST_STEP = 10.0  # s a simulated step is followed for
+_PID_SHARES = (1.0, 0.5, 0.25, 0.1)  # of the carts' own stiffness that a proposed kp adds
+_PID_ZETA = 0.5  # of all carts as one mass, by a proposed kd
+_PID_INTEGRAL = 0.25  # of the slowest pole, by which a proposed ki comes to the level
 _UNSEEN_COUNTS = 2.0  # of overshoot: no encoder tells them from its own flicker
 
 
@@ -43,8 +47,22 @@ class Scales:
 
 
 def bench_scales(submission: Submission, *, bench: Description, analysis: Analysis) -> Scales:
-    """Return the scales the submission states, or else the bench; the sign as the data have it."""
+    """Return the scales the submission states, or else the bench; the sign as the data have it.
+
+    Raises
+    ------
+    DataError : a scale that neither states in the submission's unit.
+    """
     stated = submission.system
+    for key, scale, unit in (
+        ("input", stated.input, bench.input_unit),
+        ("position", stated.position, bench.position_unit),
+    ):
+        if scale.per_count is None and scale.unit != unit:
+            raise DataError(
+                f"a loop needs to know what a count is: state system.{key}.per_count in "
+                f"{scale.unit}, the bench has it in {unit}"
+            )
     if any(record.u is not None for record in analysis.records):
         sign = -1 if is_reversed(analysis.records) else 1
     else:
@@ -70,15 +88,9 @@ def bench_gains(
     DataError : the carts are not identified; or on the bench the loop would be unstable, would
         pass a limit, or would miss the goal of its design.
     """
-    name, fit = recording.id, analysis.fit
-    if fit is None or not fit.converged:
-        raise DataError(f"{name}: a loop is closed on identified carts only, these are not")
-    trial = _Trial(
-        recording=recording,
-        chain=fit.chain,
-        period=bench.period,
-        scales=bench_scales(submission, bench=bench, analysis=analysis),
-        limits=limits,
+    name = recording.id
+    trial = _Trial.of(
+        recording, submission=submission, analysis=analysis, bench=bench, limits=limits
     )
     loop, per_count = recording.controller, trial.scales.position / trial.scales.input
     if isinstance(loop, PidLoop):
@@ -89,10 +101,49 @@ def bench_gains(
     law = _law(name, loop, analysis.feedback)
     goal = None if loop.gains else submission.design or Design(cart=loop.cart)
     trial.refuse_state(law, cart=loop.cart, goal=goal, design=analysis.feedback)
-    spare = [0.0] * (2 * (bench.encoders - fit.chain.n))  # encoders that no cart is tied to
+    spare = [0.0] * (2 * (bench.encoders - trial.chain.n))  # encoders that no cart is tied to
     return StateGains(
         gains=(*(per_count * law.gains).tolist(), *spare), prefilter=per_count * law.prefilter
     )
+
+
+def propose_pid(
+    recording: Recording,
+    *,
+    submission: Submission,
+    analysis: Analysis,
+    bench: Description,
+    limits: Limits,
+) -> PidLoop:
+    """Return gains on cart 1 for a bench that knows no other law: stiffer, damped, to the level.
+
+    A PID on a further cart soon swings up, on the one that the motor drives hardly ever.
+
+    Raises
+    ------
+    DataError : the carts are not identified, or no gains keep within the limits.
+    """
+    trial = _Trial.of(
+        recording, submission=submission, analysis=analysis, bench=bench, limits=limits
+    )
+    chain, counts = trial.chain, trial.scales.position / trial.scales.input
+    stiffness, slowest = 1 / chain.static_gains()[0], float(np.min(np.abs(chain.poles)))
+    refused = ""
+    for damped, share in product((True, False), _PID_SHARES):
+        kp = share * stiffness
+        damping = 2 * _PID_ZETA * float(np.sqrt((stiffness + kp) * chain.m.sum()))
+        loop = PidLoop(
+            kp=_typed(counts * kp),
+            ki=_typed(counts * kp * slowest * _PID_INTEGRAL),
+            kd=_typed(counts * damping) if damped else 0.0,
+        )
+        try:
+            trial.refuse_pid(loop)
+        except DataError as error:
+            refused = str(error)
+        else:
+            return loop
+    raise DataError(f"no PID is proposed: {refused}")
 
 
 def controller_table(
@@ -115,6 +166,10 @@ def controller_table(
 
 def _six_digits(value: float) -> float:
     return float(f"{value:.6g}")
+
+
+def _typed(value: float) -> float:
+    return float(f"{value:.2g}")
 
 
 def _law(name: str, loop: StateLoop, design: FeedbackDesign | None) -> StateFeedback:
@@ -140,6 +195,27 @@ class _Trial:
     period: float
     scales: Scales
     limits: Limits
+
+    @classmethod
+    def of(
+        cls,
+        recording: Recording,
+        *,
+        submission: Submission,
+        analysis: Analysis,
+        bench: Description,
+        limits: Limits,
+    ) -> Self:
+        fit = analysis.fit
+        if fit is None or not fit.converged:
+            raise DataError(f"{recording.id}: a loop is closed on identified carts only")
+        return cls(
+            recording=recording,
+            chain=fit.chain,
+            period=bench.period,
+            scales=bench_scales(submission, bench=bench, analysis=analysis),
+            limits=limits,
+        )
 
     def refuse_state(
         self,

@@ -10,6 +10,7 @@ from math import ceil, floor, log10
 
 import numpy as np
 
+from pipeline.bench.gains import propose_pid
 from pipeline.bench.plan import Limits, Plan, Recording, StateLoop
 from pipeline.bench.protocol import CHIRP_SPAN, FULL_SCALE, Description
 from pipeline.errors import DataError
@@ -84,17 +85,17 @@ def extend_plan(plan: Plan, submission: Submission, *, bench: Description | None
     """Add what the data recorded so far allow: dwells after a sweep, the closed loop after dwells.
 
     What stands in the plan stays as it is and where it is. What was added once is not again. A
-    bench that knows no state feedback gets no closed loop: its PID is for a person to choose.
+    bench that knows no state feedback gets a PID on cart 1.
 
     Raises
     ------
-    DataError : the data recorded do not identify the carts.
+    DataError : the data recorded do not identify the carts, or no loop can be closed on them.
     """
     stages: list[Callable[[Analysis], list[Recording]]] = []
     if _wants_dwells(plan, submission):
         stages.append(lambda analysis: _driven(_chain(analysis), plan.limits))
-    if _wants_loop(plan, submission) and (bench is None or "f" in bench.commands):
-        stages.append(lambda analysis: [_loop(analysis, submission, plan.limits)])
+    if _wants_loop(plan, submission):
+        stages.append(lambda analysis: [_loop(analysis, submission, plan.limits, bench)])
     if not stages:
         return plan
     analysis = analyse(submission)
@@ -277,12 +278,14 @@ def _driven(chain: Chain, limits: Limits) -> list[Recording]:
     return recordings
 
 
-def _loop(analysis: Analysis, submission: Submission, limits: Limits) -> Recording:
-    """Step the set point of the designed loop on and off.
+def _loop(
+    analysis: Analysis, submission: Submission, limits: Limits, bench: Description | None
+) -> Recording:
+    """Step the set point of the designed loop on and off, or that of a PID on a stock bench.
 
     Raises
     ------
-    DataError : there is no design, with the reason.
+    DataError : there is no design or no PID, with the reason.
     """
     feedback = analysis.feedback
     if feedback is None:
@@ -292,7 +295,7 @@ def _loop(analysis: Analysis, submission: Submission, limits: Limits) -> Recordi
     furthest = float(np.max(np.abs(feedback.y)) / abs(feedback.reference))
     size = min(abs(task.reference), FURTHEST * limits.travel / furthest)
     edge = max(_LOOP_SETTLING * task.settling_time, _LOOP_EDGE)
-    return Recording(
+    recording = Recording(
         id="control",
         kind="closed_loop",
         carts=tuple(range(1, submission.system.carts + 1)),
@@ -303,6 +306,12 @@ def _loop(analysis: Analysis, submission: Submission, limits: Limits) -> Recordi
         controller=StateLoop(cart=feedback.cart),
         settle=_rounded(settling_wait(_chain(analysis), time_constants=SETTLED)),
     )
+    if bench is None or "f" in bench.commands:
+        return recording
+    pid = propose_pid(
+        recording, submission=submission, analysis=analysis, bench=bench, limits=limits
+    )
+    return recording.model_copy(update={"controller": pid})
 
 
 def _rounded(value: float) -> float:
