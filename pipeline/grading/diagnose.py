@@ -81,7 +81,8 @@ def diagnose_tables(reported: Reported, *, references: References, analysis: Ana
         if names
     ]
     named = {name for flag in flags for name in flag.parameters}
-    if apart := [one for one in _disagreements(reported, references) if one[1] not in named]:
+    apart = _disagreements(reported, references, blurred=True)
+    if apart := [one for one in apart if one[1] not in named]:
         flags.append(_disagreement_flag(reported, apart))
     corrected = _corrected(reported.final, explained, references.final)
     corrected |= {name: references.final[name].value for name in left["final"]}
@@ -139,7 +140,8 @@ def _judge(
     if (
         label == "initial"
     ):  # friction may leave room for what the student's own, right, fit does not
-        apart = [n for _, n in _disagreements(reported, references) if n.startswith("K")]
+        apart = _disagreements(reported, references, blurred=False)
+        apart = [name for _, name in apart if name.startswith("K")]
         suspect += [n for n in apart if n in errors and _agrees(reported.final[n], references, n)]
     mistakes = known_mistakes({n: r for n, r in known.items() if n in table}, analysis)
     if label == "final":
@@ -313,8 +315,13 @@ def _copied_flag(reported: Reported, copied: Sequence[str], references: Referenc
     )
 
 
-def _disagreements(reported: Reported, references: References) -> list[tuple[float, str]]:
-    """Return (how much, name) of what the tables contradict each other in, the worst first."""
+def _disagreements(
+    reported: Reported, references: References, *, blurred: bool
+) -> list[tuple[float, str]]:
+    """Return (how much, name) of what the tables contradict each other in, the worst first.
+
+    With `blurred`, two numbers may be as far apart as the readings of the recordings are.
+    """
     apart: list[tuple[float, str]] = []
     for name, final in reported.final.items():
         initial = reported.initial.get(name)
@@ -328,6 +335,9 @@ def _disagreements(reported: Reported, references: References) -> list[tuple[flo
             # The data's own two estimates may differ as much.
             ratio = references.initial[name].value / references.final[name].value
             bounds.append(float(final) * ratio)
+            if blurred:
+                spread = references.initial[name].high / references.initial[name].low
+                bounds += [bounds[0] / spread, bounds[0] * spread]
         allowed = Reference(
             value=float(final), low=min(bounds), high=max(bounds), std=0.0, source="final"
         )

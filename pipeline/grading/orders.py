@@ -5,7 +5,11 @@ from itertools import pairwise
 
 
 def orders(names: Sequence[str]) -> list[tuple[str, str, str]]:
-    """Return (lesser, greater, why) of every order that the named parameters obey."""
+    """Return (lesser, greater, why) of every order that the named parameters obey.
+
+    The names may come in any order.
+    """
+    names = sorted(names)
     gains = [name for name in names if name.startswith("K_")]
     modes = [n for n in names if n.startswith("omega_") and n[-1] in "abcdefgh"]
     alone = [n for n in names if n.startswith("omega_") and n[-1].isdigit()]
