@@ -3,7 +3,10 @@
 import ctypes
 import shutil
 import subprocess
-from collections.abc import Sequence
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from pipeline.bench.protocol import Description, format_description
@@ -77,3 +80,34 @@ class FirmwareCore:
     def take(self) -> bytes:
         """Return what is to be sent since the last call."""
         return bytes(iter(lambda: self._library.bench_take(self._bench), -1))
+
+
+@contextmanager
+def kept_going(serve: Callable[[Callable[[], bool]], None]) -> Iterator[None]:
+    """Have `serve` work beside the block, until the block ends and what it was handed says so."""
+    done = threading.Event()
+    beside = threading.Thread(target=serve, args=(done.is_set,))
+    beside.start()
+    try:
+        yield
+    finally:
+        done.set()
+        beside.join()
+
+
+def acquire(folder: Path, *, port: str, only: Sequence[str]) -> None:
+    """Run `cartlab acquire` in a process of its own; hands are taken to do what they are asked."""
+    chosen = [word for name in only for word in ("--only", name)]
+    command = [
+        sys.executable,
+        "-m",
+        "pipeline",
+        "acquire",
+        folder,
+        "--port",
+        port,
+        "--yes",
+        *chosen,
+    ]
+    host = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=300)
+    assert host.returncode == 0, host.stderr

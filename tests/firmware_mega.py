@@ -35,16 +35,19 @@ def _run(*command: str | Path) -> str:
     return done.stdout
 
 
-def build_sketch(folder: Path) -> Path:
+def build_sketch(folder: Path, *, encoders: int = 2) -> Path:
     """Build the sketch as arduino-cli does, warnings in our own files being errors."""
+    sketch = Path(shutil.copytree(FIRMWARE / "cartlab_bench", folder / "cartlab_bench"))
+    board = (sketch / "board.h").read_text(encoding="utf-8")
+    board = board.replace("#define ENCODERS 2 ", f"#define ENCODERS {encoders} ")
+    (sketch / "board.h").write_text(board, encoding="utf-8")
     arduino = (f"-I{_ARDUINO / 'cores/arduino'}", f"-I{_ARDUINO / 'variants/mega'}")
     for source in SOURCES:
         _run("avr-gcc", *STRICT, *_COMMON, "-c", source, "-o", folder / f"{source.stem}.o")
-    sketch = FIRMWARE / "cartlab_bench" / "cartlab_bench.ino"
     _run(
         "avr-g++", "-x", "c++", *_CPP, *_COMMON, "-Wall", "-Wextra", "-Werror",
         *arduino, f"-I{FIRMWARE / 'core'}", "-include", "Arduino.h",
-        "-c", sketch, "-o", folder / "sketch.o",
+        "-c", sketch / "cartlab_bench.ino", "-o", folder / "sketch.o",
     )  # fmt: skip
     core = sorted((_ARDUINO / "cores/arduino").glob("*.[cS]*"))
     for source in core:

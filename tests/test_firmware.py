@@ -4,7 +4,7 @@ import ctypes
 import shutil
 import subprocess
 import sys
-import threading
+from contextlib import closing
 from functools import partial
 
 import pytest
@@ -29,7 +29,16 @@ from pipeline.bench.protocol import (
 from pipeline.submission import load_submission
 from pipeline.synthesis.hidden import prepare_bench
 from pipeline.workflow import analyse
-from tests.firmware_host import COMPILER, FIRMWARE, SOURCES, FirmwareCore, build_library, compile_c
+from tests.firmware_host import (
+    COMPILER,
+    FIRMWARE,
+    SOURCES,
+    FirmwareCore,
+    acquire,
+    build_library,
+    compile_c,
+    kept_going,
+)
 
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="no C compiler is here")
 
@@ -190,18 +199,8 @@ def test_acquire_records_with_the_firmware(library, tmp_path):
     (tmp_path / "plan.toml").write_text(PLAN, encoding="utf-8")
     bench = prepare_bench(preset="throne-1dof")
     server = open_bench(bench, port="pty", core=partial(FirmwareCore, library))
-    done = threading.Event()
-    power = threading.Thread(target=server.serve, kwargs={"until": done.is_set})
-    power.start()
-    try:
-        command = [sys.executable, "-m", "pipeline", "acquire", tmp_path]
-        options = ["--port", server.address, "--yes", "--only", "step", "--only", "control"]
-        host = subprocess.run([*command, *options], capture_output=True, text=True, timeout=120)
-    finally:
-        done.set()
-        power.join()
-        server.close()
-    assert host.returncode == 0, host.stderr
+    with closing(server), kept_going(lambda until: server.serve(until=until)):
+        acquire(tmp_path, port=server.address, only=["step", "control"])
     analysis = analyse(load_submission(tmp_path))
     loop = next(check for check in analysis.hardware if check.loop == "closed")
     # Noise and rounding are 0.2 % of the motion and the model is known to about 1 %; gains in wrong
@@ -234,17 +233,13 @@ def test_the_motor_is_cut_100_ms_after_the_last_heartbeat(library):
 
 
 STOPPING = [
-    b"s;",
-    b";s;",
-    b"d;q;o;s;",
-    b"d;s;k;",
-    b"d;s;;",
-    b"g;1;s;",
-    b"noises;",
-    b"9" * 50 + b"s;",
-    b"z;",
-]
-NOT_STOPPING = [b"d;s;", b"s", b"k;", b"noise;", b"d;s;o;o;1;5;0;", b"ss k;", b"\x00s\x00;", b"?;"]
+    b"s;", b";s;", b"z;", b"\r\n s\t;", b"d;q;o;s;", b"d;s;k;", b"d;s;;", b"g;1;s;",
+    b"noises;", b"noisez;", b"9" * 50 + b"s;",
+]  # fmt: skip
+NOT_STOPPING = [
+    b"s", b"d;s;", b"k;", b"?;", b"noise;", b"ss k;", b"\x00s\x00;", b"d;s;o;o;1;5;0;",
+    b"d;q;o;o;1;" + b"0" * 40 + b"5;1;",
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(

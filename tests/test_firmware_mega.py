@@ -1,10 +1,9 @@
 """The firmware's sketch on a simulated Arduino Mega: pins, interrupts, timers, serial line."""
 
-import subprocess
-import sys
-import threading
 import time
 from collections.abc import Callable
+from contextlib import closing
+from functools import partial
 
 import numpy as np
 import pytest
@@ -27,6 +26,7 @@ from pipeline.bench.virtual_carts import VirtualCarts
 from pipeline.submission import load_submission
 from pipeline.synthesis.hidden import prepare_bench
 from pipeline.workflow import analyse
+from tests.firmware_host import acquire, kept_going
 from tests.firmware_mega import Mega, build_sketch, memory, missing
 
 pytestmark = pytest.mark.skipif(bool(missing()), reason=f"{missing()} is not here")
@@ -54,7 +54,8 @@ def mega(board):
 
 
 def _readings(mega: Mega) -> list[Reading]:
-    readings = [parse_reading(line) for line in mega.take().splitlines()]
+    *lines, _ = mega.take().split(b"\n")  # the last one may still be on its way
+    readings = [parse_reading(line) for line in lines]
     assert None not in readings
     return [reading for reading in readings if reading]
 
@@ -93,6 +94,19 @@ def test_every_edge_at_the_pins_counts(mega):
         mega.turn(1, int(turn[1]))
     mega.run(2 * PERIOD)
     assert _readings(mega)[-1].counts == tuple(turns.sum(axis=0))
+
+
+def test_a_third_encoder_is_a_change_of_one_line(tmp_path):
+    """Built for three encoders, the sketch counts at pins 20 and 21 as well, and says so."""
+    mega = Mega(build_sketch(tmp_path, encoders=3), tmp_path)
+    mega.run(0.05)
+    assert _describe(mega).encoders == 3
+    mega.send(b"z;" + encode(Start(wave=Wave.SINE, frequency=1.0, amplitude=1000)))
+    mega.run(0.05)
+    for encoder, counts in enumerate((30, -20, 10)):
+        mega.turn(encoder, counts)
+    mega.run(2 * PERIOD)
+    assert _readings(mega)[-1].counts == (30, -20, 10)
 
 
 def test_a_run_lasts_and_ticks_as_told(mega):
@@ -226,19 +240,9 @@ def test_acquire_records_with_the_board(mega, tmp_path):
     (tmp_path / "submission.toml").write_text(SUBMISSION, encoding="utf-8")
     (tmp_path / "plan.toml").write_text(PLAN, encoding="utf-8")
     bench = prepare_bench(preset="throne-1dof")
-    link, done = open_link("pty"), threading.Event()
     carts = VirtualCarts(bench, seed=1, period=STEP)
-    power = threading.Thread(target=_serve, args=(mega, carts, link, done.is_set))
-    power.start()
-    try:
-        command = [sys.executable, "-m", "pipeline", "acquire", tmp_path, "--yes"]
-        options = ["--port", link.address, "--only", "step"]
-        host = subprocess.run([*command, *options], capture_output=True, text=True, timeout=300)
-    finally:
-        done.set()
-        power.join()
-        link.close()
-    assert host.returncode == 0, host.stderr
+    with closing(open_link("pty")) as link, kept_going(partial(_serve, mega, carts, link)):
+        acquire(tmp_path, port=link.address, only=["step"])
     [gain] = analyse(load_submission(tmp_path)).step_gains
     # A level of 390 encoder counts, a noise of a fifth of one: a tenth of a per cent; the last
     # swing of 1 % of it that is left after 5 s is in the mean once.

@@ -13,7 +13,7 @@
 #if defined(__AVR_ATmega2560__)
 
 /* Arduino Mega 2560. Its six interrupt pins take three encoders. 115200 baud carry 250 lines a
- * second however long they are; at 500000 baud the period may be 0.001. */
+ * second however long they are; at 500000 baud the period may be 0.0025. */
 #define BAUD 115200
 #define PERIOD 0.004 /* s */
 static const uint8_t ENCODER_PINS[][2] = {{2, 3}, {18, 19}, {20, 21}}; /* channels A, B */

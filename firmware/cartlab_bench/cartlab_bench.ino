@@ -23,9 +23,9 @@ static Bench bench;
 
 /* ------------------------------------------------------------------ time */
 
-static uint32_t due_us;    /* of micros(), when the next tick is due; goes round every 72 minutes */
-static uint32_t clock_ms;  /* of the last tick, whole milliseconds ... */
-static uint32_t clock_us;  /* ... and the rest */
+static uint32_t due_us;   /* of micros(), when the next tick is due; goes round every 72 minutes */
+static uint32_t clock_ms; /* of the last tick, whole milliseconds ... */
+static uint32_t clock_us; /* ... and the rest */
 
 /* True once a period. What the processor was too busy for is left out, and the clock shows it. */
 static bool tick_is_due()

@@ -4,11 +4,8 @@
 
 #if defined(MOTOR_DAC)
 
-/* A voltage around the middle of the converter's 12 bits; its top is a count short of full scale. */
-static void motor_drive(int16_t duty)
-{
-    analogWrite(MOTOR_DAC, min(2048 + duty / 2, 4095));
-}
+/* A voltage around the middle of the converter's 12 bits; its top is a step short of full scale. */
+static void motor_drive(int16_t duty) { analogWrite(MOTOR_DAC, min(2048 + duty / 2, 4095)); }
 
 static void motor_begin()
 {
@@ -37,7 +34,7 @@ static void motor_begin()
     pinMode(MOTOR_PWM, OUTPUT);
     pinMode(MOTOR_DIRECTION, OUTPUT);
     ICR4 = FULL_SCALE - 1;
-    TCCR4A = _BV(WGM41);                           /* fast PWM up to ICR4 ... */
+    TCCR4A = _BV(WGM41);                          /* fast PWM up to ICR4 ... */
     TCCR4B = _BV(WGM43) | _BV(WGM42) | _BV(CS40); /* ... at the processor's own pace */
     motor_drive(0);
 }

@@ -14,10 +14,8 @@ static uint8_t room(const Ring *ring) { return (uint8_t)(ring->taken - ring->wri
  * half a line from a whole one. */
 static void send(Bench *bench, const char *text, size_t length)
 {
-    if (length > room(&bench->output)) {
-        ++bench->lost;
+    if (length > room(&bench->output))
         return;
-    }
     while (length--)
         bench->output.bytes[bench->output.written++] = (uint8_t)*text++;
 }
@@ -28,7 +26,8 @@ int16_t bench_take(Bench *bench)
     return ring->taken == ring->written ? -1 : ring->bytes[ring->taken++];
 }
 
-static void send_line(Bench *bench, const int32_t *counts, int32_t target, int16_t duty, uint32_t ms)
+static void send_line(Bench *bench, const int32_t *counts, int32_t target, int16_t duty,
+                      uint32_t ms)
 {
     char line[LONGEST_LINE], *end = line;
     for (uint8_t i = 0; i < bench->settings.encoders; ++i) {
@@ -148,8 +147,8 @@ static int16_t follow(Bench *bench, int32_t target, const int32_t *counts)
     case PID_LOOP:
         return clipped(pid_effort(&law->pid, (double)target - counts[bench->followed], period));
     case STATE_LOOP:
-        bench->duty = clipped(
-            state_feedback_effort(&law->state_feedback, target, counts, encoders, period));
+        bench->duty =
+            clipped(state_feedback_effort(&law->state_feedback, target, counts, encoders, period));
         return computed_before;
     default:
         return clipped(target);

@@ -45,11 +45,10 @@ typedef struct {
     BenchSettings settings;
     CommandReader reader;
     Ring output;
-    uint16_t lost; /* answers that found no room on their way out */
 
     bool zeroed; /* false: the next counts are called zero */
     int32_t zero[MOST_ENCODERS];
-    Law gains; /* of the runs to come */
+    Law gains;        /* of the runs to come */
     double chirp_end; /* Hz; 0: not told */
 
     enum { STOPPED, STARTING, RUNNING } state;

@@ -16,13 +16,13 @@ typedef struct {
 } Field;
 
 static const Field FIELDS[] = {
-    {'W', "dqstwc", false, 0, 0}, /* wave */
-    {'L', "oc", false, 0, 0},     /* open or closed loop */
-    {'E', "ot", false, 0, 0},     /* encoder one or two */
-    {'f', NULL, false, 1e-3, 1e3},  /* frequency, Hz */
-    {'a', NULL, true, -1e6, 1e6},   /* amplitude, counts */
-    {'n', NULL, true, 1, 1e6},      /* cycles */
-    {'g', NULL, false, -1e9, 1e9},  /* gain */
+    {'W', "dqstwc", false, 0, 0},  /* wave */
+    {'L', "oc", false, 0, 0},      /* open or closed loop */
+    {'E', "ot", false, 0, 0},      /* encoder one or two */
+    {'f', NULL, false, 1e-3, 1e3}, /* frequency, Hz */
+    {'a', NULL, true, -1e6, 1e6},  /* amplitude, counts */
+    {'n', NULL, true, 1, 1e6},     /* cycles */
+    {'g', NULL, false, -1e9, 1e9}, /* gain */
 };
 
 /* The letters that begin a command, and the fields that follow. */

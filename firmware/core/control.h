@@ -21,8 +21,8 @@ double pid_effort(Pid *pid, double error, double period);
  *
  * Encoders give positions. An observer finds the velocities: it predicts each position one tick
  * ahead at constant velocity, and at the next tick puts half of what the prediction missed down to
- * the velocity. A half keeps three quarters of the encoder's rounding noise out, and forgets a wrong
- * start in a few ticks.
+ * the velocity. A half keeps three quarters of the encoder's rounding noise out, and forgets a
+ * wrong start in a few ticks.
  *
  * The effort acts from the next tick on, so that there is a whole period to compute it, and the
  * gains multiply the prediction: the state at the moment the effort begins to act. */

@@ -3,8 +3,10 @@
 #include <float.h>
 #include <stddef.h>
 
-#define MOST_DIGITS UINT64_C(100000000000000000) /* with one digit more it still fits in 64 bits */
-#define LARGEST_EXPONENT 1000                    /* beyond it everything is infinite or nothing */
+#define MOST_DIGITS                                                                                \
+    UINT64_C(100000000000000000) /* with one digit more it still fits in 64 bits                   \
+                                  */
+#define LARGEST_EXPONENT 1000    /* beyond it everything is infinite or nothing */
 
 static bool is_digit(char c) { return c >= '0' && c <= '9'; }
 
@@ -26,49 +28,65 @@ static double power_of_ten(uint16_t exponent)
     return power;
 }
 
+/* Step over digits with or without a point among them: the number is digits times ten to the
+ * exponent. False: there are none. */
+static bool take_digits(const char **text, bool whole, uint64_t *digits, int16_t *exponent)
+{
+    bool any = false, fraction = false;
+    for (;; ++*text) {
+        const char c = **text;
+        if (is_digit(c)) {
+            any = true;
+            if (*digits < MOST_DIGITS) {
+                *digits = 10 * *digits + (uint64_t)(c - '0');
+                *exponent -= fraction;
+            } else {
+                *exponent += !fraction; /* one more than fits: only its place counts */
+            }
+        } else if (c == '.' && !fraction && !whole) {
+            fraction = true;
+        } else {
+            return any;
+        }
+    }
+}
+
+/* Step over a power of ten such as e-3, if there is one. False: it breaks off. */
+static bool take_power(const char **text, int16_t *exponent)
+{
+    if (**text != 'e' && **text != 'E')
+        return true;
+    ++*text;
+    const bool negative = take_sign(text);
+    if (!is_digit(**text))
+        return false;
+    int16_t power = 0;
+    for (; is_digit(**text); ++*text)
+        if (power < LARGEST_EXPONENT)
+            power = (int16_t)(10 * power + (**text - '0'));
+    *exponent = (int16_t)(*exponent + (negative ? -power : power));
+    return true;
+}
+
 bool read_number(const char *text, bool whole, double *value)
 {
     const bool negative = take_sign(&text);
-    uint64_t digits = 0;  /* the number without its point ... */
-    int16_t exponent = 0; /* ... and the power of ten that puts the point back */
-    bool any = false, fraction = false;
-    for (;; ++text) {
-        if (*text == '.' && !fraction && !whole) {
-            fraction = true;
-        } else if (is_digit(*text)) {
-            any = true;
-            if (digits < MOST_DIGITS) {
-                digits = 10 * digits + (uint64_t)(*text - '0');
-                exponent -= fraction;
-            } else {
-                exponent += !fraction; /* one digit more than fits: only its place counts */
-            }
-        } else {
-            break;
-        }
-    }
-    if (!any)
+    uint64_t digits = 0;
+    int16_t exponent = 0;
+    if (!take_digits(&text, whole, &digits, &exponent))
         return false;
-    if ((*text == 'e' || *text == 'E') && !whole) {
-        ++text;
-        const bool down = take_sign(&text);
-        if (!is_digit(*text))
-            return false;
-        int16_t power = 0;
-        for (; is_digit(*text); ++text)
-            if (power < LARGEST_EXPONENT)
-                power = (int16_t)(10 * power + (*text - '0'));
-        exponent = (int16_t)(exponent + (down ? -power : power));
-    }
+    if (!whole && !take_power(&text, &exponent))
+        return false;
     if (*text)
         return false;
-    const double power = power_of_ten((uint16_t)(exponent < 0 ? -exponent : exponent));
-    double number = (double)digits;
-    if (digits) /* zero times an infinite power would be no number */
-        number = exponent < 0 ? number / power : number * power;
-    if (!(number <= DBL_MAX))
+    double size = (double)digits;
+    if (digits) { /* zero times an infinite power would be no number */
+        const double power = power_of_ten((uint16_t)(exponent < 0 ? -exponent : exponent));
+        size = exponent < 0 ? size / power : size * power;
+    }
+    if (size > DBL_MAX)
         return false;
-    *value = negative ? -number : number;
+    *value = negative ? -size : size;
     return true;
 }
 

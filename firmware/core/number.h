@@ -11,8 +11,8 @@
 /* Read a decimal number such as -12, +.5 or 3.2e-4, or where `whole` is set digits and a sign only.
  * False: the text is none, or its size is out of reach; `value` is then left alone.
  *
- * Up to fifteen digits and an exponent within 22 come out correctly rounded where double has 64 bits:
- * digits and power of ten are then exact. The host never sends more than nine. */
+ * Up to fifteen digits and an exponent within 22 come out correctly rounded where double has 64
+ * bits: digits and power of ten are then exact. The host never sends more than nine. */
 bool read_number(const char *text, bool whole, double *value);
 
 /* Write `value` in decimal digits and return how many characters that took. */

@@ -5,7 +5,7 @@
 #include <stdint.h>
 
 #define PULSE_TIME 0.05 /* s a delta is on */
-#define CHIRP_SPAN 20.0 /* a chirp ends at so many times the frequency it starts at, unless told */
+#define CHIRP_SPAN 20.0 /* unless told, a chirp ends at so many times the frequency it starts at */
 
 typedef struct {
     char shape; /* d delta, q square, s sine, t triangle, w sawtooth, c chirp */

@@ -29,8 +29,9 @@ static void receive_text(Bench *bench, const char *text)
 /* A field that may stand somewhere, or noise. */
 static void receive_field(Bench *bench)
 {
-    static const char *FIELDS[] = {"d", "g", "f", "c", "z", "s", "k", "?", "h", "q", "w", "t", "o",
-                                   "0", "1", "-1000000", "2.5", "1e9", "-3e-9", "1000", "0.001"};
+    static const char *FIELDS[] = {"d", "g",        "f",   "c",   "z",     "s",    "k",
+                                   "?", "h",        "q",   "w",   "t",     "o",    "0",
+                                   "1", "-1000000", "2.5", "1e9", "-3e-9", "1000", "0.001"};
     const uint32_t noise = draw(8) ? 0 : draw(50);
     for (uint32_t i = 0; i < noise; ++i)
         bench_receive(bench, (uint8_t)draw(256));
@@ -40,10 +41,13 @@ static void receive_field(Bench *bench)
 
 static void receive_start(Bench *bench)
 {
-    static const char *STARTS[] = {
-        "d;s;o;o;1e3;1000000;1000000;", "d;c;c;t;1e-3;-1000000;1;", "d;t;c;o;3;900;9;",
-        "f;1e9;-1e9;1e9;1e9;1e9;1e9;-1e9;d;q;c;o;2;5000;4;", "g;1e9;1e9;1e9;d;w;c;t;7;500;70;",
-        "c;1e3;d;c;o;o;.001;4000;1;", "z;k;"};
+    static const char *STARTS[] = {"d;s;o;o;1e3;1000000;1000000;",
+                                   "d;c;c;t;1e-3;-1000000;1;",
+                                   "d;t;c;o;3;900;9;",
+                                   "f;1e9;-1e9;1e9;1e9;1e9;1e9;-1e9;d;q;c;o;2;5000;4;",
+                                   "g;1e9;1e9;1e9;d;w;c;t;7;500;70;",
+                                   "c;1e3;d;c;o;o;.001;4000;1;",
+                                   "z;k;"};
     receive_text(bench, STARTS[draw(sizeof STARTS / sizeof *STARTS)]);
 }
 
