@@ -214,6 +214,16 @@ def test_what_is_hidden_counts_only_with_a_submission(tmp_path):
     assert [h.id for h in hand_ins(tmp_path, tmp_path / "c")] == ["_", "a", "lab", "~$x"]
 
 
+def test_results_of_a_grading_are_no_hand_ins(tmp_path):
+    """Whether written beside the hand-ins or among them; a team called feedback is one."""
+    made = ("class.html", "feedback/.made.json", "feedback/a/feedback.html", "gradescope/a/x")
+    tree(tmp_path / "c", dict.fromkeys(("a/submission.toml", *made), TOML))
+    tree(tmp_path / "c" / "grades", dict.fromkeys(made, ""))
+    assert [h.id for h in hand_ins(tmp_path, tmp_path / "c")] == ["a"]
+    tree(tmp_path / "d", dict.fromkeys(("a/submission.toml", "feedback/submission.toml"), TOML))
+    assert [h.id for h in hand_ins(tmp_path, tmp_path / "d")] == ["a", "feedback"]
+
+
 def test_archives_in_archives_are_opened_to_a_depth(tmp_path):
     """A zip in a zip is opened; the tenth in the ninth is not."""
     content = zip_bytes(tmp_path, {"submission.toml": TOML})

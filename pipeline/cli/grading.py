@@ -13,6 +13,9 @@ import typer
 
 from pipeline.cli.common import AsJson, app, say
 
+_MOST_TOLD = 20  # changes since the class list before
+_INTERRUPTED = 130  # exit status, as of any program that Ctrl-C ends
+
 
 @app.command()
 def grade(
@@ -48,24 +51,35 @@ def grade(
     from pipeline.grading.batch_run import grade_class
     from pipeline.grading.runner import Limits
 
-    with _batch_progress() as progress:
-        done = grade_class(
-            paths,
-            rubric_file=rubric,
-            out=out,
-            jobs=jobs,
-            cluster=cluster,
-            limits=Limits(time=time_limit, memory=round(memory_limit * 1e9)),
-            figures=figures,
-            progress=progress,
-            anonymous=anonymous,
-            gradebook=gradebook,
-            lateness=lateness,
-        )
+    try:
+        with _batch_progress() as progress:
+            done = grade_class(
+                paths,
+                rubric_file=rubric,
+                out=out,
+                jobs=jobs,
+                cluster=cluster,
+                limits=Limits(time=time_limit, memory=round(memory_limit * 1e9)),
+                figures=figures,
+                progress=progress,
+                anonymous=anonymous,
+                gradebook=gradebook,
+                lateness=lateness,
+            )
+    except KeyboardInterrupt:
+        say(f"stopped; what is graded is kept in {out}, and the same command goes on from there")
+        raise typer.Exit(_INTERRUPTED) from None
     for remark in done.remarks:
         say(remark)
+    if done.changes:
+        say("since the class list before:")
+        more = [f"and {len(done.changes) - _MOST_TOLD} more; cartlab history tells each"]
+        for change in [*done.changes[:_MOST_TOLD], *more * (len(done.changes) > _MOST_TOLD)]:
+            say(f"  {change}")
     for submission, reason in done.failed:
         say(f"{submission}: {reason}")
+    if len(done.failed) == done.total > 1:
+        say(f"not one could be graded: is {rubric} the rubric for these submissions?")
     shared = f", {done.sharing} with recordings that another has too" if done.sharing else ""
     say(f"{done.total - len(done.failed)} of {done.total} graded{shared}; wrote {out}")
     if done.failed:
@@ -140,6 +154,29 @@ def override(
                 write_outputs(book, folder)
         grade = book.entry(team).grade
     say(f"{grade.submission}: {grade.points:g} of {grade.out_of:g} points")
+
+
+@app.command()
+def remove(
+    grades: Grades,
+    teams: Annotated[
+        list[str], typer.Argument(metavar="TEAM…", help="Submissions, or one author of each.")
+    ],
+    assignment: Lab = None,
+) -> None:
+    """Take submissions off the class list; their history stays."""
+    from pipeline.grading.gradebook import Gradebook
+    from pipeline.grading.lock import alone_in
+    from pipeline.grading.outputs import write_outputs
+
+    folder = Path(grades)
+    pages = folder.is_dir()
+    with Gradebook(grades, assignment=assignment) as book:
+        with alone_in(folder) if pages else nullcontext():
+            gone = book.remove(teams)
+            if pages:
+                write_outputs(book, folder)
+    say(f"no longer in the class: {', '.join(gone)}")
 
 
 @app.command()

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import ConfigError, PipelineError
+from pipeline.grading.batch import Batch
 from pipeline.grading.gradebook import Gradebook
 from pipeline.grading.intake import find_hand_ins
 from pipeline.grading.late_table import LateTable, settle_lateness
@@ -16,8 +17,10 @@ from pipeline.grading.runner import Executor, Limits, Progress, grade_batch, run
 from pipeline.grading.shared_prints import fingerprint
 from pipeline.ingest.read import read_data
 from pipeline.output import check_folder
+from pipeline.report.numbers import listing
 from pipeline.resources import EXAMPLES
 from pipeline.submission import load_submission
+from pipeline.submission.load import NAME
 
 _MEMORY = ".compared.json"  # may be removed at any time
 
@@ -26,13 +29,15 @@ _MEMORY = ".compared.json"  # may be removed at any time
 class Summary:
     """How many there were, which could not be graded (id, reason), how many share recordings.
 
-    `remarks` are what the person at the command line should know besides.
+    `remarks` are what the person at the command line should know besides, `changes` what is
+    another than in the class list before.
     """
 
     total: int
     failed: tuple[tuple[str, str], ...]
     sharing: int
     remarks: tuple[str, ...] = ()
+    changes: tuple[str, ...] = ()
 
 
 def grade_class(
@@ -64,7 +69,7 @@ def grade_class(
     """
     rubric = load_rubric(rubric_file)
     late_table = LateTable.read(lateness) if lateness else None
-    check_folder(out)
+    _refuse_submission(check_folder(out))
     with alone_in(out), scratch_in(out) as scratch:
         found = find_hand_ins(paths, scratch=scratch, skip=[out])
         hand_ins, remarks = settle_lateness(found, late=rubric.late, table=late_table)
@@ -83,7 +88,8 @@ def grade_class(
                 progress=progress,
             )
             hidden = rubric.anonymous or anonymous
-            book.finish(batch, rubric=rubric.model_copy(update={"anonymous": hidden}))
+            changes = book.finish(batch, rubric=rubric.model_copy(update={"anonymous": hidden}))
+            remarks = [*remarks, *_told(batch, book)]
             total = len(hand_ins)
             write_outputs(book, out, progress=lambda what: progress(total, total, what))
     return Summary(
@@ -91,7 +97,46 @@ def grade_class(
         failed=batch.failed,
         sharing=len(batch.shared),
         remarks=tuple(remarks),
+        changes=tuple(changes),
     )
+
+
+def _refuse_submission(out: Path) -> None:
+    """Refuse to write into what is to be graded: it would be another submission afterwards."""
+    for folder in (out.resolve(), *out.resolve().parents):
+        if (folder / NAME).is_file():
+            raise ConfigError(f"{out}: is in a submission; name a folder outside of it with --out")
+
+
+_NAMED = 8  # submissions in a remark
+
+
+def _told(batch: Batch, book: Gradebook) -> Iterator[str]:
+    """Yield what this run did not grade anew, and where others stand in a team's place."""
+    for name, before, now in batch.taken_over:
+        yield (
+            f"{name} is now that of {listing(list(now))}, it was that of {listing(list(before))}: "
+            "where both count, give one of the folders another name"
+        )
+    if not batch.kept:
+        return
+    yield f"not in this run, kept as they were: {_names(batch.kept)} (cartlab remove takes one off)"
+    if others := sorted(set(book.by_other_rubrics()) & set(batch.kept)):
+        yield f"graded by the rubric as it was before, grade them again: {_names(others)}"
+
+
+def _names(names: Sequence[str]) -> str:
+    more = [f"{len(names) - _NAMED} more"] * (len(names) > _NAMED)
+    return listing([*names[:_NAMED], *more])
+
+
+def _names_so_far(place: Path | str, *, assignment: str) -> list[str]:
+    """Return the submissions of the class list so far; making no gradebook."""
+    try:
+        with Gradebook(place, assignment=assignment) as book:
+            return book.names()
+    except ConfigError:
+        return []
 
 
 def _executor(*, jobs: int, cluster: str | None) -> Executor:

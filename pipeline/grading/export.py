@@ -28,7 +28,6 @@ from pipeline.grading.rubric import Rubric
 from pipeline.grading.table import csv_text
 from pipeline.output import own_folder, write_file
 
-GRADESCOPE = "gradescope"  # folder of what its autograder would leave
 _HOURS = 24.0
 
 
@@ -76,7 +75,7 @@ def export(
     files = [out / f"{platform}.csv"]
     write_file(files[0], text)
     if platform == "gradescope":
-        files += _write_results(entries, own_folder(out, GRADESCOPE))
+        files += _write_results(entries, own_folder(out, "gradescope"))
     return Exported(files=tuple(files), remarks=tuple(remarks))
 
 

@@ -23,6 +23,8 @@ from pipeline.submission.load import NAME
 _DAYS_OF_A_LATE_MARK = 1.0  # Canvas marks lateness without saying how much: a day begun
 _LONGEST_ID, _MOST_BYTES = 100, 200  # letters and bytes: a folder's name, on every system
 _NOT_IN_NAMES = re.compile(r'[<>:"/\\|?*\x00-\x1f\x7f-\x9f]')
+_RESULTS = ("class.html", "feedback/.made.json")  # of a grading: its folder is no hand-in
+_PARTS_OF_RESULTS = ("feedback", "gradescope")
 _RESERVED = re.compile(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?")
 
 
@@ -95,7 +97,9 @@ def _at(path: Path, *, scratch: Path, skip: set[Path]) -> list[_Found]:
     if not path.is_file():
         raise ConfigError(f"{path}: there is no such file or folder")
     if path.suffix.lower() != ".zip":
-        raise ConfigError(f"{path}: neither a folder nor a zip file")
+        raise ConfigError(
+            f"{path}: neither a folder nor a zip file; name the folder with the {NAME}"
+        )
     if not _holds_a_class(path):
         return [_archive(path)]
     folder = scratch / path.stem
@@ -175,10 +179,15 @@ def _is_submission(folder: Path) -> bool:
 
 
 def _is_passed_over(entry: Path) -> bool:
-    """Whether an entry is none of the students': debris, or hidden without a submission in it."""
+    """Whether an entry is none of the students': debris, results, hidden without a submission."""
     if not entry.is_dir() or entry.name == "__MACOSX":
         return is_debris(PurePosixPath(entry.name)) or entry.name.startswith(".")
-    return entry.name.startswith(".") and not os.access(entry / NAME, os.F_OK)
+    if os.access(entry / NAME, os.F_OK):
+        return False
+    results = entry.parent if entry.name in _PARTS_OF_RESULTS else entry
+    return entry.name.startswith(".") or all(
+        os.access(results / name, os.F_OK) for name in _RESULTS
+    )
 
 
 def _may_be_one(entry: Path) -> bool:

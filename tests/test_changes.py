@@ -1,0 +1,107 @@
+"""What is said of a regrade: what is another in the rubric, and whose points."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from pipeline.grading.batch import Batch
+from pipeline.grading.changes import points_changes, rubric_changes
+from pipeline.grading.gradebook import Gradebook
+from pipeline.synthesis import write_submission
+from tests.grades import make_grade, make_outcome, two_cart_rubric
+
+RUBRIC = two_cart_rubric()
+
+
+def test_a_rubric_is_compared_by_its_criteria():
+    """New, gone, another number in one, another order; the rest of it by its keys."""
+    first, second, *rest = RUBRIC.criteria
+    dearer = first.model_copy(update={"points": first.points + 1})
+    late = RUBRIC.late.model_copy(update={"percent_per_day": 50.0})
+
+    def told(**update) -> list[str]:
+        changed = RUBRIC.model_copy(update=update)
+        return rubric_changes(RUBRIC.model_dump_json(), changed.model_dump_json())
+
+    assert told() == []
+    assert told(criteria=(dearer, second, *rest)) == [
+        f"{first.id}: points {first.points:g} → {first.points + 1:g}"
+    ]
+    assert told(criteria=(second, *rest)) == [f"criterion {first.id} is gone"]
+    assert told(criteria=(second, first, *rest)) == ["the criteria stand in another order"]
+    assert told(late=late, title="") == [
+        f"title {RUBRIC.title[:39]}{'…' if len(RUBRIC.title) > 40 else ''} → nothing",
+        "late.percent_per_day 10 → 50",
+    ]
+
+
+def test_a_rubric_of_another_version_is_said_to_be_one():
+    """Nothing is guessed about what cannot be read."""
+    assert rubric_changes('{"version": 0}', RUBRIC.model_dump_json()) == [
+        "the rubric before is of another version of cartlab"
+    ]
+
+
+def test_points_are_compared_by_name():
+    """Who has others, who is new, who is gone."""
+    assert points_changes({"a": 1.0, "b": 2.0, "c": 3.0}, {"a": 1.5, "b": 2.0, "d": 0.0}) == [
+        "a: 1 → 1.5", "d is new", "c is gone",
+    ]  # fmt: skip
+
+
+def test_the_gradebook_tells_and_history_keeps_it(tmp_path):
+    """The first class list is no change; a second run of the same says nothing."""
+    outcome = make_outcome(make_grade("a", share=0.5))
+    batch = Batch(keys=(outcome.key,), shared={})
+    late = RUBRIC.model_copy(update={"anonymous": True})
+    with Gradebook(tmp_path, assignment="lab", create=True) as book:
+        book.put(outcome)
+        assert book.finish(batch, rubric=RUBRIC) == []
+        assert book.finish(batch, rubric=RUBRIC) == []
+        book.override("a", "laws", 2.0, why="w", by="b")
+        assert book.finish(batch, rubric=late) == [
+            "rubric: anonymous False → True", f"a: 10 → {book.entry('a').grade.points:g}",
+        ]  # fmt: skip
+        _, events = book.history("a")
+    assert events[-1].text == "rubric: anonymous False → True"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Ctrl-C is a signal on POSIX")
+def test_ctrl_c_says_how_to_go_on(tmp_path):
+    """One line, the status of an interrupt, no worker left; the same command goes on."""
+    for number in range(4):
+        write_submission(tmp_path / "c" / f"t{number}", chain="throne-1dof", seed=number,
+                         authors=(f"s{number}",), compact=True)  # fmt: skip
+    command = [sys.executable, "-m", "pipeline", "grade", str(tmp_path / "c"), "--rubric",
+               "throne-1dof", "--out", str(tmp_path / "out"), "--jobs", "1"]  # fmt: skip
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True,
+                               cwd=Path(__file__).parents[1])  # fmt: skip
+    while not any(tmp_path.glob("out/gradebook.sqlite")) or not _graded(tmp_path / "out"):
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGINT)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 130, said
+    assert said == (
+        f"stopped; what is graded is kept in {tmp_path / 'out'}, and the same command goes on "
+        "from there\n"
+    )
+    before = _graded(tmp_path / "out")
+    again = subprocess.run(command, capture_output=True, text=True, check=True,
+                           cwd=Path(__file__).parents[1])  # fmt: skip
+    assert "4 of 4 graded" in again.stderr
+    assert 1 <= before < _graded(tmp_path / "out") == 4
+
+
+def _graded(out: Path) -> int:
+    import sqlite3
+
+    try:
+        with sqlite3.connect(f"file:{out / 'gradebook.sqlite'}?mode=ro", uri=True) as book:
+            return book.execute("SELECT count(*) FROM gradings").fetchone()[0]
+    except sqlite3.Error:
+        return 0
