@@ -100,7 +100,7 @@ TICKS = st.tuples(
     encoders=st.sampled_from([2, 3]),
     session=st.lists(st.tuples(BYTES, st.lists(TICKS, max_size=12)), max_size=8),
 )
-@settings(max_examples=300)
+@settings(max_examples=200)
 def test_any_session_is_that_of_the_reference(library, encoders, session):
     """Whatever arrives, in whatever condition, duties and lines are those of the reference."""
     firmware, reference = _both(library, encoders)
@@ -238,7 +238,8 @@ STOPPING = [
 ]  # fmt: skip
 NOT_STOPPING = [
     b"s", b"d;s;", b"k;", b"?;", b"noise;", b"ss k;", b"\x00s\x00;", b"d;s;o;o;1;5;0;",
-    b"d;q;o;o;1;" + b"0" * 40 + b"5;1;",
+    b"d;q;o;o;1;" + b"0" * 40 + b"5;1;", b"d;q;o;o;9e-4;5;1;", b"d;q;o;o;1001;5;1;",
+    b"d;q;o;o;1;1000001;1;", b"d;q;o;o;1;5.0;1;", b"d;q;o;o;1;5;1000001;",
 ]  # fmt: skip
 
 
@@ -305,7 +306,7 @@ def test_the_answer_to_a_query_is_a_description(library):
 
 
 def test_noise_breaks_nothing(tmp_path):
-    """A million ticks of noise, extreme gains and jumping clocks touch no foreign memory."""
+    """Half a million ticks of noise, extreme gains and jumping clocks touch no foreign memory."""
     sanitize = ("-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
     probe = tmp_path / "probe.c"
     probe.write_text("int main(void) { return 0; }\n", encoding="utf-8")
@@ -314,7 +315,7 @@ def test_noise_breaks_nothing(tmp_path):
     except AssertionError:
         pytest.skip("the C compiler has no sanitizers")
     program = compile_c(tmp_path / "fuzz", *sanitize, FIRMWARE / "host" / "fuzz.c", *SOURCES, "-lm")
-    for seed in range(1, 5):
+    for seed in (1, 2):
         done = subprocess.run([program, str(seed), "250000"], capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
 
