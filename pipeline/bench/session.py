@@ -14,7 +14,7 @@ from datetime import datetime
 from pathlib import Path
 from types import FrameType
 
-from pipeline.bench.observer import Anomalies, Observer, Outcome
+from pipeline.bench.observer import Observer, Outcome
 from pipeline.bench.orders import Order
 from pipeline.bench.plan import Limits, Recording
 from pipeline.bench.plan_words import hold_words
@@ -33,15 +33,15 @@ from pipeline.bench.serial_line import LUMP, SerialLine
 from pipeline.bench.stream import Stream
 from pipeline.errors import HardwareError
 
-_LOOK = 0.004  # s between looks at the port
+_LOOK = 0.003  # s between looks at the port
 _FORWARD = 0.05  # s between batches handed to the observers
-_COUNT = 1.0  # s between counts of what is lost
 _FIRST_LINE = 1.0  # s a bench may take to begin
 _SILENCE = 0.5  # s without a byte in mid-run: the bench is gone
 _NEARLY = 100.0  # ms before the end at which silence is the end, its last lines lost
 _AFTER_END = 0.02  # s the last lines may still be under way
 _REST_TRIES = 4
 _REST_WINDOW = 500.0  # ms at the end of a rest over which it is judged
+_ENOUGH = 1000  # lines that tell a clock's period
 _STILL = 4  # counts a cart at rest may flicker
 _PULL_OUT = 1.7  # s a virtual hand takes to pull a cart out
 
@@ -137,14 +137,15 @@ class Session:
             finally:
                 self._stop(always=bool(partial))
         watch.forward(stream.finish())
-        outcome = Outcome(
+        fit = stream.fit()
+        if stream.lines > _ENOUGH:
+            self._period = fit.period
+        return Outcome(
             recording=order.recording,
             lines=stream.lines,
-            anomalies=stream.anomalies,
+            anomalies=stream.anomalies(fit),
             partial=partial,
         )
-        self._period = stream.period
-        return outcome
 
     def _stream(self, free: Sequence[int]) -> Stream:
         watched = tuple(cart for cart in free if cart <= self._carts)
@@ -237,8 +238,7 @@ class _Watch:
         self._stream = stream
         self._observer = observer
         self._batch: list[Reading] = []
-        self._forwarded = self._counted = time.monotonic()
-        self._anomalies = Anomalies()
+        self._forwarded = time.monotonic()
 
     def check(self, batch: Sequence[Reading]) -> str:
         """Return why the run must stop, or ""."""
@@ -248,8 +248,6 @@ class _Watch:
                 return f"stopped: {passed}"
         self._batch += batch
         now = time.monotonic()
-        if now - self._counted > _COUNT:
-            self._anomalies, self._counted = self._stream.anomalies, now
         if now - self._forwarded > _FORWARD:
             self._forwarded = now
             self.forward(())
@@ -259,7 +257,7 @@ class _Watch:
         """Hand on what waits, and this."""
         waiting, self._batch = [*self._batch, *batch], []
         if waiting:
-            self._observer.readings(waiting, self._anomalies)
+            self._observer.readings(waiting, self._stream.anomalies())
 
 
 class _Tail:

@@ -12,13 +12,14 @@ import numpy as np
 
 from pipeline.bench.observer import Anomalies
 from pipeline.bench.protocol import FULL_SCALE, Reading, parse_reading
-from pipeline.bench.stamps import fit_stamps
+from pipeline.bench.stamps import StampFit, fit_stamps
 
 _LONGEST_LINE = 512  # bytes; more without an end is noise
 _SPIKE = 32  # counts a true reading may stand out between its neighbours: a hit on an end stop
 _LATE = 0.02  # s behind the earliest lines: they waited somewhere for one another
 _FORGET = 1.0  # s after which the two clocks are set by one another anew
-_WINDOW = 1000  # ms over which an encoder is watched
+_ODD = 0.005  # of the expected period: how far off a clock may well be
+_WINDOW = 1000  # ms over which an encoder is watched and losses are counted
 _MOVED, _NEIGHBOUR_MOVED = 20, 200  # counts
 _DRIVEN = 8  # duty counts; less moves no cart
 
@@ -40,6 +41,7 @@ class Stream:
         self._before: Reading | None = None  # the last line handed on
         self._held: Reading | None = None  # waits for its successor
         self._stamps = array("q")
+        self._missing = _MissingSoFar(period)
         self._garbled = 0
         self._garbled_lines = 0  # a merger of two is one garbled place and two lines
         self._late = 0
@@ -64,15 +66,13 @@ class Stream:
         """Whether the bench's clock began again: no line after that belongs to this run."""
         return self._resets > 0
 
-    @property
-    def period(self) -> float:
-        """The clock that explains the stamps, ms from line to line."""
-        return fit_stamps(np.array(self._stamps), period=self._expected).period
+    def fit(self) -> StampFit:
+        """Return the clock that explains the stamps; takes too long for a run under way."""
+        return fit_stamps(np.array(self._stamps), period=self._expected)
 
-    @property
-    def anomalies(self) -> Anomalies:
-        """All that went wrong so far; a line without its successor is not yet judged."""
-        missing = fit_stamps(np.array(self._stamps), period=self._expected).missing
+    def anomalies(self, fit: StampFit | None = None) -> Anomalies:
+        """Return all that went wrong so far; lost lines are estimated until there is a `fit`."""
+        missing = self._missing.lines if fit is None else fit.missing
         return Anomalies(
             lost=max(0, missing - self._garbled_lines),
             garbled=self._garbled,
@@ -151,6 +151,7 @@ class Stream:
     def _keep(self, reading: Reading) -> None:
         self._before = reading
         self._stamps.append(reading.ms)
+        self._missing.tick(reading.ms)
 
     def _time(self, reading: Reading, *, since: float, now: float) -> None:
         due = 1e-3 * reading.ms
@@ -172,6 +173,31 @@ def _stands_out(before: Reading, held: Reading, after: Reading) -> bool:
     if before.duty == before.target and after.duty == after.target:  # open loop: no kicks
         signals.append((before.duty, held.duty, after.duty))
     return any(abs(2 * b - a - c) > 2 * (room + 2 * abs(c - a)) for a, b, c in signals)
+
+
+class _MissingSoFar:
+    """Lines missing, second by second, as far as the expected period tells.
+
+    The least ms a line of any second is nearer to the true period, if few lines are lost.
+    """
+
+    def __init__(self, period: float) -> None:
+        self._expected = self._period = period
+        self._start, self._count = 0, -1
+        self.lines = 0
+
+    def tick(self, ms: int) -> None:
+        """Take note of a stamp."""
+        self._count += 1
+        span = ms - self._start
+        if span < _WINDOW or not self._count:
+            return
+        own = span / self._count
+        if self._period == self._expected or own < self._period:
+            near = abs(own / self._expected - 1) < _ODD
+            self._period = own if near else self._period
+        self.lines += max(0, round(span / self._period) - self._count)
+        self._start, self._count = ms, 0
 
 
 class _EncoderWatch:
