@@ -3,6 +3,9 @@
 import http.client
 import json
 import logging
+import re
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -19,6 +22,8 @@ from pipeline.bench.plan import Limits, Plan, Recording, StateLoop
 from pipeline.bench.protocol import Reading
 from pipeline.bench.web import LivePage
 from pipeline.errors import ConfigError, HardwareError
+from tests.acquisitions import sine, write_work
+from tests.benches import emulator
 from tests.test_report_pages import CHROMIUM, FLAGS, PHONE, WIDE
 
 DUTY, COUNT = 1e-4, 0.002  # V, cm
@@ -472,4 +477,35 @@ def test_the_end_is_told(folder, browser):
         expect(window.locator("#status")).to_have_text("Recording sine-01.")
     expect(window.locator("#status")).to_have_text("The session is over.")
     assert BLUE in window.evaluate(INK, "positions")
+    context.close()
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_a_session_is_watched_and_confirmed_in_the_browser(tmp_path, browser):
+    """`acquire --web` on a stock bench: a button lets it start; no file holds the secret."""
+    work = write_work(tmp_path / "work", [sine("dwell", seconds=1, settle=0.3)])
+    toml = work / "submission.toml"
+    scaled = toml.read_text(encoding="utf-8").replace('"cm"', '"cm", per_count = 0.00227')
+    toml.write_text(scaled, encoding="utf-8")
+    command = [sys.executable, "-m", "pipeline", "acquire", str(work), "--web"]
+    context = browser.new_context()
+    with emulator("--stock", "--speed", "5") as bench:
+        command += ["--port", bench.address, "--only", "dwell"]
+        with subprocess.Popen(command, stderr=subprocess.PIPE, encoding="utf-8") as host:
+            assert host.stderr is not None
+            url = re.search(r"http://\S+", host.stderr.readline())
+            assert url is not None
+            window = context.new_page()
+            window.goto(url[0])
+            expect(window.get_by_role("alert")).to_have_text("All carts free")
+            window.get_by_role("button", name="Done").click()
+            expect(window.locator("#status")).to_have_text("The session is over.", timeout=20_000)
+            expect(window.locator("#plan .done b")).to_have_text("dwell")
+            host.stderr.read()
+    assert host.returncode == 0
+    secret = urlsplit(url[0]).path.strip("/").encode()
+    files = [path.read_bytes() for path in work.rglob("*") if path.is_file()]
+    assert len(files) >= 4
+    assert not any(secret in file for file in files)
     context.close()

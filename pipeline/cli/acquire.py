@@ -1,6 +1,7 @@
 """The command `acquire`: from a bench, or from files as they appear, to a submission."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,6 +11,7 @@ from pipeline.cli.common import Folder, app
 from pipeline.errors import ConfigError
 
 if TYPE_CHECKING:
+    from pipeline.bench.observer import Observer
     from pipeline.bench.terminal import Terminal
 
 
@@ -33,6 +35,9 @@ def acquire(
     yes: Annotated[
         bool, typer.Option("--yes", help="Take what hands are asked to do as done.")
     ] = False,
+    web: Annotated[
+        bool, typer.Option("--web", help="With --port: show the session in a browser as well.")
+    ] = False,
     once: Annotated[
         bool, typer.Option("--once", help="With --import: take what is there now, and end.")
     ] = False,
@@ -42,18 +47,43 @@ def acquire(
 
     if (port is None) == (source is None):
         raise ConfigError("say where the data come from: either --port or --import")
+    if web and port is None:
+        raise ConfigError("--web shows a bench: it goes with --port")
     with Terminal(yes=yes) as terminal:
         if source is not None:
             _import(folder, source, terminal, once=once)
         elif port is not None:
-            _record(folder, port, terminal, only=only or ())
+            with _watching(folder, terminal, web=web, yes=yes) as observers:
+                _record(folder, port, terminal, observers=observers, only=only or ())
 
 
-def _record(folder: Path, port: str, terminal: "Terminal", *, only: Collection[str]) -> None:
+@contextmanager
+def _watching(
+    folder: Path, terminal: "Terminal", *, web: bool, yes: bool
+) -> Iterator[list["Observer"]]:
+    """Yield who watches, the first of whom has the person confirm."""
+    if not web:
+        yield [terminal]
+        return
+    from pipeline.bench.web import LivePage
+
+    with LivePage(folder) as page:
+        terminal.remark(f"watch{'' if yes else ', and confirm,'} at {page.url}")
+        yield [terminal, page] if yes else [page, terminal]
+
+
+def _record(
+    folder: Path,
+    port: str,
+    terminal: "Terminal",
+    *,
+    observers: Sequence["Observer"],
+    only: Collection[str],
+) -> None:
     from pipeline.bench.acquire import acquire as carry_out
 
     try:
-        outcomes = carry_out(folder, port=port, observers=[terminal], only=only)
+        outcomes = carry_out(folder, port=port, observers=observers, only=only)
     except KeyboardInterrupt:
         terminal.remark("stopped; the same command goes on where this ended")
         raise typer.Exit(1) from None
