@@ -409,7 +409,8 @@ class Analysis:
     """All results of one submission, in pipeline order.
 
     `files` maps each data file to its SHA-256; `rows` are the table; `chain` is None where no
-    fit was possible (then `skipped` says why).
+    fit was possible (then `skipped` says why). `tables` are the students' own reduced tables, also
+    where dwells stand in their place.
     """
 
     title: str
@@ -424,6 +425,7 @@ class Analysis:
     step_gains: tuple[StepGain, ...]
     sine_points: tuple[SinePoint, ...]
     frequency_responses: tuple[FrequencyResponse, ...]
+    tables: tuple[FrequencyResponse, ...] = ()
     fit: ChainFit | None
     rows: tuple[ParameterRow, ...]
     checks: tuple[Check, ...]

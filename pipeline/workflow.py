@@ -177,6 +177,7 @@ def analyse(
         step_gains=tuple(gains),
         sine_points=tuple(sines),
         frequency_responses=tuple(responses),
+        tables=tuple(data.tables),
         fit=fit,
         rows=rows,
         checks=tuple(checks),

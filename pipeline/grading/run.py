@@ -13,6 +13,7 @@ from pipeline.grading.grade import CODES, Criterion, Flag, Grade, Outcome
 from pipeline.grading.lateness import late_deduction
 from pipeline.grading.pieces import missing_flag, missing_pieces
 from pipeline.grading.recordings import bad_runs, data_flag
+from pipeline.grading.reduced import diagnose_reduced
 from pipeline.grading.reference import recompute, trusted_chain
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.state_model import diagnose_state_space, state_models
@@ -280,6 +281,7 @@ def _flags(work: Work) -> list[Flag]:
         flags += diagnose_state_space(space, models=work.state_models, n=n)
     if work.controller is not None:
         flags += diagnose_controller(work.controller)
+    flags += diagnose_reduced(work.analysis)
     if missing := missing_pieces(work.submission, work.rubric):
         flags.append(missing_flag(missing))
     if work.bad:

@@ -29,7 +29,7 @@ def transient_fits(
     if analysis.fit is None or not runs or len(runs) < len(analysis.sine_points) / analysis.carts:
         return []
     found = []
-    for reading in _readings():
+    for reading in early_readings():
         predicted = _refit(analysis, runs, reading)
         moved = {
             name: r
@@ -52,7 +52,7 @@ def transient_fits(
     return found
 
 
-def _readings() -> Iterator[Reading]:
+def early_readings() -> Iterator[Reading]:
     """Yield ways to read an amplitude too early."""
     yield lambda record, y: float(np.max(np.abs(y - np.median(y))))
     for cycles in (1.0, 2.0, 3.0, 5.0):
