@@ -1,6 +1,7 @@
 """What the runner and the gradebook share: an outcome per submission, the store, the batch."""
 
 import json
+import unicodedata
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
@@ -44,11 +45,28 @@ class Outcome:
 
 @dataclass(frozen=True, kw_only=True)
 class Prints:
-    """The fingerprints of one stored outcome and whose recordings they are of."""
+    """The fingerprints of one stored outcome and whose recordings they are of.
+
+    `of_class` where it is of the assignment that is being graded.
+    """
 
     submission: str
     authors: tuple[str, ...]
     fingerprints: bytes
+    of_class: bool = False
+
+
+def person(author: str) -> str:
+    """Return an author's id without what people type one way today and another tomorrow."""
+    return " ".join(unicodedata.normalize("NFKC", author).split()).casefold()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Listed:
+    """A line of the class list so far, and the key of the outcome it stands for."""
+
+    key: str
+    prints: Prints
 
 
 class Store(Protocol):
@@ -63,7 +81,11 @@ class Store(Protocol):
         ...
 
     def prints(self) -> Iterator[Prints]:
-        """Yield the fingerprints of the newest outcome of every (submission, authors)."""
+        """Yield all fingerprints that differ, of every submission under its authors."""
+        ...
+
+    def listed(self) -> Iterator[Listed]:
+        """Yield the class list so far; nothing where no batch ran to its end yet."""
         ...
 
 
@@ -76,11 +98,15 @@ class Batch:
     keys : of the outcomes, in the order of the submissions' ids.
     shared : by submission, the flag for recordings that stand in another submission too.
     failed : (submission, reason) of those that could not be graded.
+    kept : submissions of the class list before that were not in this run.
+    taken_over : (submission, authors before, authors now) where those are other people.
     """
 
     keys: tuple[str, ...]
     shared: Mapping[str, Flag]
     failed: tuple[tuple[str, str], ...] = ()
+    kept: tuple[str, ...] = ()
+    taken_over: tuple[tuple[str, tuple[str, ...], tuple[str, ...]], ...] = ()
 
     def grades(self, store: Store) -> Iterator[tuple[Outcome, Grade]]:
         """Yield every outcome with its grade, shared data flagged; one at a time in memory."""

@@ -23,6 +23,7 @@ from pipeline.submission import load_submission
 from pipeline.submission.load import NAME
 
 _MEMORY = ".compared.json"  # may be removed at any time
+_NAMED = 8  # submissions in a remark
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +72,8 @@ def grade_class(
     late_table = LateTable.read(lateness) if lateness else None
     _refuse_submission(check_folder(out))
     with alone_in(out), scratch_in(out) as scratch:
-        found = find_hand_ins(paths, scratch=scratch, skip=[out])
+        known = _names_so_far(gradebook or out, assignment=rubric_file.stem)
+        found = find_hand_ins(paths, scratch=scratch, skip=[out], known=known)
         hand_ins, remarks = settle_lateness(found, late=rubric.late, table=late_table)
         # The rubric's file says which assignment it is: its title may be mended on the way.
         with Gradebook(gradebook or out, assignment=rubric_file.stem, create=True) as book:
@@ -106,9 +108,6 @@ def _refuse_submission(out: Path) -> None:
     for folder in (out.resolve(), *out.resolve().parents):
         if (folder / NAME).is_file():
             raise ConfigError(f"{out}: is in a submission; name a folder outside of it with --out")
-
-
-_NAMED = 8  # submissions in a remark
 
 
 def _told(batch: Batch, book: Gradebook) -> Iterator[str]:

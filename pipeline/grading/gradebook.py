@@ -4,8 +4,9 @@ Grading puts each submission in as it comes, in a transaction of its own; a batc
 end becomes the class list. Results carry no dates: those are here, and in `cartlab history`.
 """
 
+import hashlib
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from difflib import get_close_matches
@@ -143,21 +144,54 @@ class Gradebook:
             put_parts(connection, grading, grade, outcome.figures)
 
     def prints(self) -> Iterator[Prints]:
-        """Yield the fingerprints of the newest outcome of every (submission, authors)."""
-        newest = select(func.max(gradings.c.id)).group_by(
-            gradings.c.submission_id, gradings.c.authors
-        )
+        """Yield all fingerprints that differ, of every submission under its authors.
+
+        Those of a first version count too: what was replaced may have been passed on before.
+        """
         with self._database.reading() as connection:
-            numbers = sorted(connection.scalars(newest))
-        of_page = select(submissions.c.name, gradings.c.authors, gradings.c.fingerprints)
+            numbers = sorted(connection.scalars(select(gradings.c.id)))
+        columns = submissions.c.assignment, gradings.c.authors, gradings.c.fingerprints
+        of_page = select(submissions.c.name, *columns).where(gradings.c.fingerprints != b"")
+        seen = set()
         for page in _pages(numbers):
             with self._database.reading() as connection:
                 wanted = of_page.join(submissions).where(gradings.c.id.in_(page))
                 rows = connection.execute(wanted.order_by(gradings.c.id)).all()
-            for name, authors, fingerprints in rows:
-                yield Prints(
-                    submission=name, authors=tuple(json.loads(authors)), fingerprints=fingerprints
+            for name, assignment, authors, fingerprints in rows:
+                own = assignment, name, authors, hashlib.sha256(fingerprints).digest()
+                if own not in seen:
+                    seen.add(own)
+                    yield Prints(
+                        submission=name,
+                        authors=tuple(json.loads(authors)),
+                        fingerprints=fingerprints,
+                        of_class=assignment == (self._assignment or ""),
+                    )
+
+    def listed(self) -> Iterator[Listed]:
+        """Yield the class list so far; nothing where no batch ran to its end yet."""
+        with self._database.reading() as connection:
+            last = self._newest(connection)
+            numbers = [] if last is None else [e["grading_id"] for e in _lines_of(connection, last)]
+        columns = gradings.c.key, gradings.c.authors, gradings.c.fingerprints
+        of_page = select(submissions.c.name, *columns).join(submissions)
+        for page in _pages(numbers):
+            with self._database.reading() as connection:
+                rows = connection.execute(of_page.where(gradings.c.id.in_(page))).all()
+            for name, key, authors, fingerprints in rows:
+                prints = Prints(
+                    submission=name,
+                    authors=tuple(json.loads(authors)),
+                    fingerprints=fingerprints,
+                    of_class=True,
                 )
+                yield Listed(key=key, prints=prints)
+
+    def names(self) -> list[str]:
+        """Return the submissions of the class list so far."""
+        with self._database.reading() as connection:
+            last = self._newest(connection)
+            return [] if last is None else list(_points_of(connection, last))
 
     def finish(self, batch: Batch, *, rubric: Rubric) -> list[str]:
         """Make a batch that ran to its end the class list; one that changes nothing adds nothing.
@@ -255,8 +289,29 @@ class Gradebook:
         ConfigError : there is no such submission, or several.
         """
         with self._database.reading() as connection:
-            _, row = self._find(connection, team)
+            row = self._find_ever(connection, team)
             return row.name, read_events(connection, row.submission_id)
+
+    def remove(self, teams: Sequence[str]) -> list[str]:
+        """Take submissions off the class list and return their names.
+
+        What happened to them stays in their history; graded again, they are back.
+
+        Raises
+        ------
+        ConfigError : one is not on it, or there are several.
+        """
+        with self._database.writing() as connection:
+            found = [self._find(connection, team) for team in teams]
+            gone = {row.submission_id: row.name for _, row in found}
+            last = self._last(connection)
+            left = [e for e in _lines_of(connection, last) if e["submission_id"] not in gone]
+            new = {"assignment": last.assignment, "at": self._at(), "rubric": last.rubric}
+            number = add_row(connection, batches, new)
+            lines = [{**e, "batch_id": number, "position": i} for i, e in enumerate(left)]
+            if lines:
+                connection.execute(insert(entries), lines)
+        return list(gone.values())
 
     def override(
         self, team: str, criterion: str, points: float | None, *, why: str, by: str
@@ -322,33 +377,34 @@ class Gradebook:
         of_batch = class_list(detail=False).where(entries.c.batch_id == last.id)
         rows = connection.execute(of_batch).all()
         exact = [r.position for r in rows if r.name == team]
-        found = exact or [r.position for r in rows if team in json.loads(r.authors)]
+        found = exact or [r.position for r in rows if _is_of(r.authors, team)]
         if len(found) != 1:
             hint = f"no such submission; {_nearest(team, [row.name for row in rows])}"
             raise ConfigError(f"{team}: {'is in several submissions: name one' if found else hint}")
         line = class_list().where(entries.c.batch_id == last.id, entries.c.position == found[0])
         return last, connection.execute(line).one()
 
+    def _find_ever(self, connection: Connection, team: str) -> Row:
+        """Return a team on the class list, or one that was graded and is not on it."""
+        try:
+            return self._find(connection, team)[1]
+        except ConfigError:
+            columns = gradings.c.submission_id, submissions.c.name, gradings.c.authors
+            ever = select(*columns).join(submissions).order_by(gradings.c.id)
+            if self._assignment is not None:
+                ever = ever.where(submissions.c.assignment == self._assignment)
+            rows = connection.execute(ever).all()
+            found = {r.submission_id: r for r in rows if r.name == team} or {
+                r.submission_id: r for r in rows if _is_of(r.authors, team)
+            }
+            if len(found) != 1:
+                raise
+            return found.popitem()[1]
+
     def _newest(self, connection: Connection) -> Row | None:
         """Return the batch of this assignment before the one that ends now."""
         mine = select(batches).where(batches.c.assignment == (self._assignment or ""))
         return connection.execute(mine.order_by(batches.c.id.desc()).limit(1)).one_or_none()
-
-
-def _lines_of(connection: Connection, batch: Row) -> list[dict]:
-    """Return a class list as it was put in."""
-    columns = [column for column in entries.c if column.name != "batch_id"]
-    mine = select(*columns).where(entries.c.batch_id == batch.id).order_by(entries.c.position)
-    return [dict(row._mapping) for row in connection.execute(mine)]
-
-
-def _points_of(connection: Connection, batch: Row) -> dict[str, float]:
-    """Return the points of a class list by submission."""
-    both = select(submissions.c.name, entries.c.points).join(
-        submissions, entries.c.submission_id == submissions.c.id
-    )
-    mine = both.where(entries.c.batch_id == batch.id).order_by(entries.c.position)
-    return {row.name: row.points for row in connection.execute(mine)}
 
 
 def _pages(numbers: list[int]) -> Iterator[list[int]]:

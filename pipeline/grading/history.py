@@ -5,10 +5,10 @@ from dataclasses import asdict, dataclass
 from datetime import datetime
 from typing import Any, Literal
 
-from sqlalchemy import Connection, select
+from sqlalchemy import Connection, and_, select
 
 from pipeline.grading.changes import rubric_changes
-from pipeline.grading.schema import batches, entries, flags, gradings, overrides
+from pipeline.grading.schema import batches, entries, flags, gradings, overrides, submissions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,14 +19,15 @@ class Event:
     ----------
     at : ISO 8601, UTC.
     what : `graded`: by the rubric alone; `listed`: in a class list, with shared data and
-        overrides; `override`: by hand, `points` None where it was taken back.
+        overrides; `removed`: off the class list; `override`: by hand, `points` None where it was
+        taken back.
     points, out_of : of the submission, or of the one criterion that an override is about.
     text : flags, or why.
     by : who, of an override.
     """
 
     at: str
-    what: Literal["graded", "listed", "override"]
+    what: Literal["graded", "listed", "removed", "override"]
     points: float | None
     out_of: float | None = None
     criterion: str = ""
@@ -70,11 +71,19 @@ def _overridden(connection: Connection, submission: int) -> Iterator[Event]:
 
 
 def _listed(connection: Connection, submission: int) -> Iterator[Event]:
-    """Yield the class lists in which something was new."""
+    """Yield the class lists in which something was new, and those it is no longer in."""
+    own = and_(entries.c.batch_id == batches.c.id, entries.c.submission_id == submission)
     columns = batches.c.at, batches.c.rubric, entries.c.points, entries.c.out_of, entries.c.shared
-    mine = select(*columns).join(batches).where(entries.c.submission_id == submission)
+    of_class = select(submissions.c.assignment).where(submissions.c.id == submission)
+    lists = select(*columns).select_from(batches.outerjoin(entries, own))
+    lists = lists.where(batches.c.assignment == of_class.scalar_subquery())
     before, judged_by = None, ""
-    for at, rubric, points, out_of, shared in connection.execute(mine.order_by(batches.c.id)):
+    for at, rubric, points, out_of, shared in connection.execute(lists.order_by(batches.c.id)):
+        if points is None:
+            if before is not None:
+                yield Event(at=at, what="removed", points=None, text="off the class list")
+            before = None
+            continue
         said = ["shared_data"] if shared else []
         if judged_by and rubric != judged_by:
             said += [f"rubric: {change}" for change in rubric_changes(judged_by, rubric)]
@@ -107,5 +116,7 @@ def _words(event: Event) -> str:
     if event.what == "override":
         points = "automatic points again" if event.points is None else f"{event.points:g} by hand"
         return f"override  {event.criterion}: {points}, by {event.by}: {event.text}"
+    if event.what == "removed":
+        return f"removed   {event.text}"
     note = f"  ({event.text})" if event.text else ""
     return f"{event.what:8}  {event.points:g} of {event.out_of:g}{note}"

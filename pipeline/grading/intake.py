@@ -64,7 +64,11 @@ class _Found:
 
 
 def find_hand_ins(
-    paths: Iterable[Path], *, scratch: Path, skip: Iterable[Path] = ()
+    paths: Iterable[Path],
+    *,
+    scratch: Path,
+    skip: Iterable[Path] = (),
+    known: Iterable[str] = (),
 ) -> tuple[HandIn, ...]:
     """Return the hand-ins in folders, trees and archives, in the order of their ids.
 
@@ -72,6 +76,7 @@ def find_hand_ins(
     ----------
     scratch : where archives of a whole class are unpacked.
     skip : folders that are no hand-ins, such as the one results go to.
+    known : ids of the class so far: one of several "team-1", by itself, keeps the id it had.
 
     Raises
     ------
@@ -86,7 +91,7 @@ def find_hand_ins(
                 f"{path}: nothing to grade in it: no folder or zip file with a {NAME}"
             )
         found += here
-    return tuple(sorted(_with_ids(found), key=lambda hand_in: hand_in.id))
+    return tuple(sorted(_with_ids(found, known=known), key=lambda hand_in: hand_in.id))
 
 
 def _at(path: Path, *, scratch: Path, skip: set[Path]) -> list[_Found]:
@@ -271,13 +276,14 @@ def _name_inside(sources: Sequence[Path]) -> str:
 # ---------------------------------------------------------------------------- ids
 
 
-def _with_ids(found: Sequence[_Found]) -> list[HandIn]:
+def _with_ids(found: Sequence[_Found], *, known: Iterable[str] = ()) -> list[HandIn]:
     """Give every hand-in its folder's name; where two are the same, the parent's before it."""
     names = [_fit(one.name) for one in found]
-    often = Counter(name.casefold() for name in names)
+    longer = [_fit(f"{one.parent}-{one.name}") for one in found]
+    often, before = Counter(name.casefold() for name in names), set(known)
     names = [
-        _fit(f"{one.parent}-{one.name}") if often[name.casefold()] > 1 else name
-        for one, name in zip(found, names, strict=True)
+        long if often[name.casefold()] > 1 or (long in before and name not in before) else name
+        for name, long in zip(names, longer, strict=True)
     ]
     taken: set[str] = set()
     hand_ins = []

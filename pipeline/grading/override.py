@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 
 from pipeline.errors import ConfigError
+from pipeline.grading.batch import person
 from pipeline.grading.grade import Criterion, Grade
 from pipeline.grading.lateness import late_deduction
 from pipeline.grading.rubric import Rubric
@@ -34,7 +35,9 @@ class Override:
 
         A submission that cannot be read names no authors: then its name decides.
         """
-        return not authors or not self.authors or not set(authors).isdisjoint(self.authors)
+        if not authors or not self.authors:
+            return True
+        return not set(map(person, authors)).isdisjoint(map(person, self.authors))
 
 
 def read_points(text: str) -> float | None:

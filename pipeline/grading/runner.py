@@ -4,7 +4,7 @@ import hashlib
 import json
 import queue
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from pipeline.grading.grade import SCHEMA, Flag
 from pipeline.grading.intake import HandIn
 from pipeline.grading.intake_files import digest
 from pipeline.grading.rubric import Rubric
-from pipeline.grading.shared import find_shared, same_team, shared_flag
+from pipeline.grading.shared import find_shared, same_recordings, same_team, shared_flag
 from pipeline.grading.worker import Setup, Task, failed
 from pipeline.grading.worker_process import Worker
 from pipeline.output import write_file
@@ -54,6 +54,9 @@ def grade_batch(
     progress: Progress = _silent,
 ) -> Batch:
     """Grade what the store does not know yet; every outcome is in the store as soon as it is had.
+
+    The class is all that the store lists: what is not among `hand_ins` stays as it was, and is
+    compared with them as before.
 
     Stopped at any moment and started again, it ends as if it had not been.
 
@@ -95,11 +98,15 @@ def grade_batch(
             rows[outcome.submission] = _Row.of(outcome)
             progress(len(rows), total, outcome.submission)
     progress(total, total, "comparing the recordings")
+    kept, taken_over = _so_far(rows, store)
+    rows |= kept
     in_order = [rows[name] for name in sorted(rows)]
     return Batch(
         keys=tuple(row.key for row in in_order),
         shared=_shared(in_order, store, basis=(code, text), memory=memory, examples=examples),
         failed=tuple((row.prints.submission, row.reason) for row in in_order if row.reason),
+        kept=tuple(kept),
+        taken_over=taken_over,
     )
 
 
@@ -122,6 +129,23 @@ class _Row:
             ),
             reason=outcome.reason if outcome.status == "failed" else "",
         )
+
+
+_TakenOver = tuple[tuple[str, tuple[str, ...], tuple[str, ...]], ...]
+
+
+def _so_far(rows: Mapping[str, _Row], store: Store) -> tuple[dict[str, _Row], _TakenOver]:
+    """Return those of the class list so far that are not in this run, and who is another there."""
+    now = {name.casefold(): row.prints for name, row in rows.items()}
+    kept, others = {}, []
+    for line in store.listed():
+        name, before = line.prints.submission, line.prints.authors
+        found = now.get(name.casefold())
+        if found is None:
+            kept[name] = _Row(key=line.key, prints=line.prints, reason="")
+        elif before and found.authors and not same_team(line.prints, found):
+            others.append((name, before, found.authors))
+    return kept, tuple(others)
 
 
 def run_here(*, jobs: int) -> Executor:
@@ -209,9 +233,7 @@ def _shared(
     earlier = [
         prints
         for prints in store.prints()
-        if prints.fingerprints
-        # What a team handed in before, or this very batch graded otherwise, is not news.
-        and not (prints.submission in names and same_team(prints, names[prints.submission]))
+        if prints.fingerprints and not _is_before(prints, names.get(prints.submission))
     ]
     compared = _digest(basis, batch, earlier)
     if memory is not None and (flags := _remembered(memory, compared)) is not None:
@@ -224,6 +246,17 @@ def _shared(
         plain = {name: asdict(flag) for name, flag in flags.items()}
         write_file(memory, json.dumps({"compared": compared, "flags": plain}))
     return flags
+
+
+def _is_before(earlier: Prints, now: Prints | None) -> bool:
+    """Tell what a team handed in before, or this very batch graded otherwise: that is no news.
+
+    Where only the ids of its authors were mended, the recordings tell.
+    """
+    if now is None:
+        return False
+    mended = earlier.of_class and same_recordings(earlier, now)
+    return mended or same_team(earlier, now)
 
 
 def _digest(head: Sequence[str], *groups: Sequence[Prints]) -> str:

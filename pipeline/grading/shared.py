@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.grading.batch import Prints
+from pipeline.grading.batch import Prints, person
 from pipeline.grading.grade import Flag
 from pipeline.grading.shared_prints import PASSED, Print, unpack
 
@@ -149,8 +149,14 @@ def shared_message(experiments: Sequence[str], others: Iterable[str]) -> str:
 def same_team(a: Prints, b: Prints) -> bool:
     """Tell whether two submissions have an author in common; without authors, the same name."""
     if a.authors and b.authors:
-        return bool(set(a.authors) & set(b.authors))
+        return not set(map(person, a.authors)).isdisjoint(map(person, b.authors))
     return a.submission == b.submission
+
+
+def same_recordings(a: Prints, b: Prints) -> bool:
+    """Tell whether one of two submissions has all recordings of the other, untouched."""
+    of_a, of_b = ({one.residual.tobytes() for one in unpack(p.fingerprints)} for p in (a, b))
+    return of_a <= of_b or of_b <= of_a
 
 
 def _decisive(found: Sequence[_Match]) -> list[_Match]:
