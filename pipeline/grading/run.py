@@ -16,6 +16,7 @@ from pipeline.grading.recordings import bad_runs, data_flag
 from pipeline.grading.reduced import diagnose_reduced
 from pipeline.grading.reference import recompute, trusted_chain
 from pipeline.grading.rubric import Rubric
+from pipeline.grading.signs import turned_round
 from pipeline.grading.state_model import diagnose_state_space, state_models
 from pipeline.grading.tolerance import exact
 from pipeline.grading.work import Work
@@ -86,7 +87,8 @@ def grade_analysis(
     submission : under the rubric's system, see `under_rubric`.
     unreadable : experiments that the analysis had to do without, each with the reason.
     """
-    reported, n = submission.reported or Reported(), rubric.system.carts
+    reported, signed = turned_round(submission.reported or Reported(), analysis.records)
+    submission, n = submission.model_copy(update={"reported": reported}), rubric.system.carts
     references, chain = recompute(analysis), trusted_chain(analysis)
     diagnosis = diagnose_tables(reported, references=references, analysis=analysis)
     tables = [{name: float(typed) for name, typed in reported.final.items()}]
@@ -116,6 +118,7 @@ def grade_analysis(
         flags=tuple(
             sorted([*diagnosis.flags, *_flags(work)], key=lambda flag: CODES.index(flag.code))
         ),
+        notes=signed,
     )
 
 

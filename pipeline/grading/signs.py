@@ -1,0 +1,50 @@
+"""A bench on which a positive input drives the carts to negative x: numbers signed as logged."""
+
+from collections.abc import Mapping, Sequence
+from decimal import Decimal
+
+from pipeline.results import Record
+from pipeline.submission import Feedback, Reported, StateSpace
+from pipeline.workflow import is_reversed
+
+_NOTE = (
+    "a positive input drives these carts towards negative x: what is reported with that sign is "
+    "taken as with the input turned round"
+)
+
+
+def turned_round(reported: Reported, records: Sequence[Record]) -> tuple[Reported, tuple[str, ...]]:
+    """Return what is reported as with the input turned round, where the bench is, and a note.
+
+    Gains, B and the controller change sign with the input; who signs all of a kind as the log has
+    it is right, as is who gives sizes.
+    """
+    if not is_reversed(records):
+        return reported, ()
+    turned = reported.model_copy(
+        update={
+            "initial": _gains(reported.initial),
+            "final": _gains(reported.final),
+            "state_space": _space(reported.state_space),
+            "feedback": _feedback(reported.feedback),
+        }
+    )
+    return turned, () if turned == reported else (_NOTE,)
+
+
+def _gains(table: Mapping[str, Decimal]) -> dict[str, Decimal]:
+    gains = {name: -value for name, value in table.items() if name.startswith("K")}
+    return {**table, **gains} if gains and min(gains.values()) > 0 else dict(table)
+
+
+def _space(space: StateSpace | None) -> StateSpace | None:
+    if space is None or not any(space.B) or max(space.B) > 0:
+        return space
+    return space.model_copy(update={"B": tuple(-b if b else b for b in space.B)})
+
+
+def _feedback(feedback: Feedback | None) -> Feedback | None:
+    if feedback is None or feedback.prefilter is None or feedback.prefilter >= 0:
+        return feedback
+    gains = tuple(-gain for gain in feedback.gains)
+    return feedback.model_copy(update={"gains": gains, "prefilter": -feedback.prefilter})
