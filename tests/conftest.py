@@ -1,5 +1,6 @@
 """Fixtures shared by the tests."""
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,22 @@ settings.load_profile("cartlab")
 
 # Real measurements may be used in place but not passed on, so they lie outside the project.
 REAL_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+CHROMIUM = shutil.which("chromium")
+FLAGS = "--headless --no-sandbox --disable-gpu --no-first-run --disable-background-networking"
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """A real browser; where there is none, what needs it skips."""
+    if CHROMIUM is None:
+        pytest.skip("no chromium on the path: apt-get install chromium")
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS.split())
+        yield browser
+        browser.close()
 
 
 @pytest.fixture(scope="session")

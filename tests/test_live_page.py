@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import expect, sync_playwright
+from playwright.sync_api import expect
 
 from pipeline.bench.live_state import LiveState
 from pipeline.bench.observer import Anomalies, Outcome
@@ -24,7 +24,7 @@ from pipeline.bench.web import LivePage
 from pipeline.errors import ConfigError, HardwareError
 from tests.acquisitions import sine, write_work
 from tests.benches import emulator
-from tests.test_report_pages import CHROMIUM, FLAGS, PHONE, WIDE
+from tests.test_report_pages import PHONE, WIDE
 
 DUTY, COUNT = 1e-4, 0.002  # V, cm
 SUBMISSION = f"""
@@ -323,17 +323,6 @@ def test_pages_hear_the_end_and_the_server_is_gone(folder):
 
 
 # --------------------------------------------------------------------------- in the browser
-
-
-@pytest.fixture(scope="module")
-def browser():
-    """A real browser; where there is none, what needs it skips."""
-    if CHROMIUM is None:
-        pytest.skip("no chromium on the path: apt-get install chromium")
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS.split())
-        yield browser
-        browser.close()
 
 
 @pytest.fixture

@@ -13,7 +13,6 @@ from unicodedata import normalize
 import html5lib
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import sync_playwright
 from pypdf import PdfReader
 
 from pipeline.plant.effects import CATALOGUE
@@ -28,8 +27,6 @@ from tests.grades import write_class
 from tests.test_gap_report import make_gap, two_cart_analysis
 from tests.ucsd import write_one_cart_submission, write_two_cart_submission
 
-CHROMIUM = shutil.which("chromium")
-FLAGS = "--headless --no-sandbox --disable-gpu --no-first-run --disable-background-networking"
 CASES = (
     "one", "two", "three", "real-one", "real-two", "gap", "solution", "effects",
     "class", "feedback",
@@ -88,17 +85,6 @@ def three(request, folder) -> Path:
 def page_of(made: Path) -> Path:
     (page,) = made.glob("*.html")
     return page
-
-
-@pytest.fixture(scope="module")
-def browser():
-    """A real browser; where there is none, what needs it skips."""
-    if CHROMIUM is None:
-        pytest.skip("no chromium on the path: apt-get install chromium")
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS.split())
-        yield browser
-        browser.close()
 
 
 @pytest.fixture
