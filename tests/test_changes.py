@@ -63,7 +63,7 @@ def test_the_gradebook_tells_and_history_keeps_it(tmp_path):
         book.put(outcome)
         assert book.finish(batch, rubric=RUBRIC) == []
         assert book.finish(batch, rubric=RUBRIC) == []
-        book.override("a", "laws", 2.0, why="w", by="b")
+        book.override("a", "laws", 1.0, why="w", by="b")
         assert book.finish(batch, rubric=late) == [
             "rubric: anonymous False → True", f"a: 10 → {book.entry('a').grade.points:g}",
         ]  # fmt: skip

@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
@@ -51,24 +52,20 @@ def grade(
     from pipeline.grading.batch_run import grade_class
     from pipeline.grading.runner import Limits
 
-    try:
-        with _batch_progress() as progress:
-            done = grade_class(
-                paths,
-                rubric_file=rubric,
-                out=out,
-                jobs=jobs,
-                cluster=cluster,
-                limits=Limits(time=time_limit, memory=round(memory_limit * 1e9)),
-                figures=figures,
-                progress=progress,
-                anonymous=anonymous,
-                gradebook=gradebook,
-                lateness=lateness,
-            )
-    except KeyboardInterrupt:
-        say(f"stopped; what is graded is kept in {out}, and the same command goes on from there")
-        raise typer.Exit(_INTERRUPTED) from None
+    with _stopping(out), _batch_progress() as progress:
+        done = grade_class(
+            paths,
+            rubric_file=rubric,
+            out=out,
+            jobs=jobs,
+            cluster=cluster,
+            limits=Limits(time=time_limit, memory=round(memory_limit * 1e9)),
+            figures=figures,
+            progress=progress,
+            anonymous=anonymous,
+            gradebook=gradebook,
+            lateness=lateness,
+        )
     for remark in done.remarks:
         say(remark)
     if done.changes:
@@ -84,6 +81,28 @@ def grade(
     say(f"{done.total - len(done.failed)} of {done.total} graded{shared}; wrote {out}")
     if done.failed:
         raise typer.Exit(1)
+
+
+@contextmanager
+def _stopping(out: Path) -> Iterator[None]:
+    """Say how to go on where Ctrl-C ends a run, whatever it was doing just then."""
+    pressed = False
+
+    def stop(*_: object) -> None:
+        nonlocal pressed
+        pressed = True
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, stop)
+    try:
+        yield
+    except BaseException:  # a library that is interrupted may end in an error of its own
+        if not pressed:
+            raise
+        say(f"stopped; what is graded is kept in {out}, and the same command goes on from there")
+        raise typer.Exit(_INTERRUPTED) from None
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager
