@@ -101,12 +101,15 @@ class Controller:
         ratio = numbers.settling_time / float(self.settling)
         return max(ratio, 1 / ratio) > _OTHER_GAINS
 
-    def prefilter_fits(self, numbers: LoopNumbers) -> bool:
-        """Whether the reported prefilter is one over the static gain of this loop."""
+    def prefilter_fits(self, numbers: LoopNumbers, *, sharp: bool = False) -> bool:
+        """Whether the reported prefilter is one over the static gain of this loop.
+
+        A student's own numbers leave less room than recordings that friction blurs: `sharp`.
+        """
         if self.prefilter is None:
             return True
         off = abs(float(self.prefilter) - numbers.prefilter) - float(half_digit(self.prefilter))
-        allowed = _PREFILTER_BLURRED if self.blurred else _PREFILTER
+        allowed = _PREFILTER_BLURRED if self.blurred and not sharp else _PREFILTER
         return off <= allowed * abs(numbers.prefilter)
 
 
@@ -184,7 +187,8 @@ def diagnose_controller(controller: Controller) -> list[Flag]:
     ran = controller.ran
     # The gains that ran tell which of the reported numbers does not belong to the others.
     other_ran = ran is not None and not same_gains(ran, controller.gains)
-    wrong = not meets or (slip and not (fits and claimed)) or (not claimed and not fits)
+    sharply = any(controller.prefilter_fits(one, sharp=True) for one in numbers)
+    wrong = not meets or (slip and not (fits and claimed)) or (not claimed and not sharply)
     wrong = wrong or all(controller.is_of_other_gains(one) for one in numbers)
     if other_ran and ran is not None:
         of_ran = controller.numbers(ran)

@@ -128,19 +128,18 @@ def _miscounts(
     found = []
     for name, omega in omegas.items():
         zeta = _damping(name)
-        for k in (*_FEW_PERIODS, *_MANY_PERIODS):
-            for counted, there in ((k + 1, k), (k, k + 1)):
-                help_ = (
-                    f"{{reported}} is {{recomputed}}·{counted}/{there}: {counted} periods counted "
-                    f"where there are {there}? From one peak to the n-th there are n − 1 periods"
-                )
-                both = {name: omega.times(counted / there)}
-                if zeta in zetas:
-                    both[zeta] = _miscounted_damping(zetas[zeta], there / counted)
-                    found.append(_miscount(both, help_, whole=True, least=2))
-                if k in _FEW_PERIODS:
-                    alone = _miscount({name: both[name]}, help_)
-                    found.append(replace(alone, tolerance=_COUNTED_ALONE))
+        for counted, there in _counts():
+            help_ = _miscount_help(counted, there)
+            both = {name: omega.times(counted / there)}
+            if zeta in zetas:
+                both[zeta] = _miscounted_damping(zetas[zeta], there / counted)
+                found.append(_miscount(both, help_, whole=True, least=2))
+            if min(counted, there) in _FEW_PERIODS:
+                alone = _miscount({name: both[name]}, help_)
+                found.append(replace(alone, tolerance=_COUNTED_ALONE))
+    for counted, there in _counts() if len(omegas) > 1 else ():
+        every = _times(omegas, counted / there)
+        found.append(_miscount(every, _miscount_help(counted, there), whole=True, least=2))
     for zeta, reference in zetas.items():
         if reference.high > reference.low * _SHARP:
             continue
@@ -156,6 +155,20 @@ def _miscounts(
                 )
             )
     return found
+
+
+def _counts() -> Iterator[tuple[int, int]]:
+    """Yield (periods counted, periods there)."""
+    for k in (*_FEW_PERIODS, *_MANY_PERIODS):
+        yield k + 1, k
+        yield k, k + 1
+
+
+def _miscount_help(counted: int, there: int) -> str:
+    return (
+        f"{{reported}} is {{recomputed}}·{counted}/{there}: {counted} periods counted "
+        f"where there are {there}? From one peak to the n-th there are n − 1 periods"
+    )
 
 
 def _with_slack(zeta: Reference) -> Reference:
