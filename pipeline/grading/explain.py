@@ -8,12 +8,14 @@ from typing import Literal
 
 from pipeline.grading.grade import Code
 from pipeline.grading.mistakes import Mistake
+from pipeline.grading.rubric import is_damping
 from pipeline.grading.tolerance import percent_off
 
 SIGMAS = 3.0  # standard errors of the recordings' own number that are no mistake
 # Of two explanations the other is out where it is this much further off, as share of what it may;
 # or ten times less likely to meet the numbers by chance, as it says less about them.
 _MARGIN = 0.35
+_DAMPING = 0.2  # relative: nobody reads a damping so well that meeting one closer says more
 
 Table = Mapping[str, Decimal]
 Label = Literal["initial", "final"]
@@ -157,7 +159,8 @@ def _off_by(mistake: Mistake, table: Table, name: str) -> float:
 def _width(mistake: Mistake, name: str) -> float:
     """Return how wide a range of numbers a mistake explains: the logarithm of high over low."""
     predicted, share = mistake.predicted[name], 1 / len(mistake.predicted)
-    return (math.log(predicted.high / predicted.low) + 2 * mistake.tolerance) * mistake.tries**share
+    room = 2 * (max(mistake.tolerance, _DAMPING) if is_damping(name) else mistake.tolerance)
+    return (math.log(predicted.high / predicted.low) + room) * mistake.tries**share
 
 
 def _distance(mistake: Mistake, table: Table, names: Sequence[str]) -> float:

@@ -26,6 +26,7 @@ _BLURRED = 0.05  # … of a gain where the carts stick
 _COUNTED = 0.02
 _COUNTED_ALONE = 0.012  # … where no damping tells the same story
 _DAMPING = 0.2
+_BLURRED_DAMPING = 1.3  # high over low: such a damping tells no story
 _SHARP = 1.05  # high over low of a reference that friction does not blur
 _CLEARLY_OFF = 0.06  # of a gain: another extremum of the step as near as this says nothing
 
@@ -133,7 +134,9 @@ def _miscounts(
             both = {name: omega.times(counted / there)}
             if zeta in zetas:
                 both[zeta] = _miscounted_damping(zetas[zeta], there / counted)
-                found.append(_miscount(both, help_, whole=True, least=2))
+                joint = _miscount(both, help_, whole=True, least=2)
+                blurred = zetas[zeta].high > zetas[zeta].low * _BLURRED_DAMPING
+                found.append(replace(joint, tolerance=_COUNTED_ALONE) if blurred else joint)
             if min(counted, there) in _FEW_PERIODS:
                 alone = _miscount({name: both[name]}, help_)
                 found.append(replace(alone, tolerance=_COUNTED_ALONE))
