@@ -20,6 +20,7 @@ from pipeline.output import check_folder
 from pipeline.report.numbers import listing
 from pipeline.resources import EXAMPLES
 from pipeline.submission import load_submission
+from pipeline.submission.complaints import quote
 from pipeline.submission.load import NAME
 
 _MEMORY = ".compared.json"  # may be removed at any time
@@ -114,7 +115,7 @@ def _told(batch: Batch, book: Gradebook) -> Iterator[str]:
     """Yield what this run did not grade anew, and where others stand in a team's place."""
     for name, before, now in batch.taken_over:
         yield (
-            f"{name} is now that of {listing(list(now))}, it was that of {listing(list(before))}: "
+            f"{name} is now that of {_people(now)}, it was that of {_people(before)}: "
             "where both count, give one of the folders another name"
         )
     if not batch.kept:
@@ -122,6 +123,10 @@ def _told(batch: Batch, book: Gradebook) -> Iterator[str]:
     yield f"not in this run, kept as they were: {_names(batch.kept)} (cartlab remove takes one off)"
     if others := sorted(set(book.by_other_rubrics()) & set(batch.kept)):
         yield f"graded by the rubric as it was before, grade them again: {_names(others)}"
+
+
+def _people(authors: Sequence[str]) -> str:
+    return listing([quote(author) for author in authors])
 
 
 def _names(names: Sequence[str]) -> str:

@@ -4,7 +4,6 @@ Grading puts each submission in as it comes, in a transaction of its own; a batc
 end becomes the class list. Results carry no dates: those are here, and in `cartlab history`.
 """
 
-import hashlib
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
@@ -12,11 +11,19 @@ from datetime import UTC, datetime
 from difflib import get_close_matches
 from pathlib import Path
 
-from sqlalchemy import Connection, Row, func, insert, select
+from sqlalchemy import Connection, Row, select
 
 from pipeline.errors import ConfigError
-from pipeline.grading.batch import Batch, Outcome, Prints, read_grade
+from pipeline.grading.batch import Batch, Listed, Outcome, Prints, read_grade
 from pipeline.grading.changes import points_changes, rubric_changes
+from pipeline.grading.gradebook_lists import (
+    add_list,
+    by_other_rubrics,
+    is_of,
+    lines_of,
+    points_of,
+)
+from pipeline.grading.gradebook_prints import pages, read_listed, read_prints
 from pipeline.grading.gradebook_rows import (
     Entry,
     add_row,
@@ -40,8 +47,6 @@ from pipeline.grading.schema import (
     overrides,
     submissions,
 )
-
-_PAGE = 100  # rows read at a time: memory stays flat, and a writer need not wait long
 
 
 class Gradebook:
@@ -144,54 +149,24 @@ class Gradebook:
             put_parts(connection, grading, grade, outcome.figures)
 
     def prints(self) -> Iterator[Prints]:
-        """Yield all fingerprints that differ, of every submission under its authors.
+        """Return all fingerprints that differ, of every submission under its authors.
 
         Those of a first version count too: what was replaced may have been passed on before.
         """
-        with self._database.reading() as connection:
-            numbers = sorted(connection.scalars(select(gradings.c.id)))
-        columns = submissions.c.assignment, gradings.c.authors, gradings.c.fingerprints
-        of_page = select(submissions.c.name, *columns).where(gradings.c.fingerprints != b"")
-        seen = set()
-        for page in _pages(numbers):
-            with self._database.reading() as connection:
-                wanted = of_page.join(submissions).where(gradings.c.id.in_(page))
-                rows = connection.execute(wanted.order_by(gradings.c.id)).all()
-            for name, assignment, authors, fingerprints in rows:
-                own = assignment, name, authors, hashlib.sha256(fingerprints).digest()
-                if own not in seen:
-                    seen.add(own)
-                    yield Prints(
-                        submission=name,
-                        authors=tuple(json.loads(authors)),
-                        fingerprints=fingerprints,
-                        of_class=assignment == (self._assignment or ""),
-                    )
+        return read_prints(self._database, assignment=self._assignment or "")
 
     def listed(self) -> Iterator[Listed]:
-        """Yield the class list so far; nothing where no batch ran to its end yet."""
+        """Return the class list so far; nothing where no batch ran to its end yet."""
         with self._database.reading() as connection:
             last = self._newest(connection)
-            numbers = [] if last is None else [e["grading_id"] for e in _lines_of(connection, last)]
-        columns = gradings.c.key, gradings.c.authors, gradings.c.fingerprints
-        of_page = select(submissions.c.name, *columns).join(submissions)
-        for page in _pages(numbers):
-            with self._database.reading() as connection:
-                rows = connection.execute(of_page.where(gradings.c.id.in_(page))).all()
-            for name, key, authors, fingerprints in rows:
-                prints = Prints(
-                    submission=name,
-                    authors=tuple(json.loads(authors)),
-                    fingerprints=fingerprints,
-                    of_class=True,
-                )
-                yield Listed(key=key, prints=prints)
+            lines = [] if last is None else lines_of(connection, last)
+        return read_listed(self._database, [line["grading_id"] for line in lines])
 
     def names(self) -> list[str]:
         """Return the submissions of the class list so far."""
         with self._database.reading() as connection:
             last = self._newest(connection)
-            return [] if last is None else list(_points_of(connection, last))
+            return [] if last is None else list(points_of(connection, last))
 
     def finish(self, batch: Batch, *, rubric: Rubric) -> list[str]:
         """Make a batch that ran to its end the class list; one that changes nothing adds nothing.
@@ -221,16 +196,15 @@ class Gradebook:
                 )
             text = rubric.model_dump_json()
             last = self._newest(connection)
-            if last is not None and last.rubric == text and _lines_of(connection, last) == listed:
+            if last is not None and last.rubric == text and lines_of(connection, last) == listed:
                 return []
-            new = {"assignment": self._assignment or "", "at": self._at(), "rubric": text}
-            number = add_row(connection, batches, new)
-            if listed:
-                connection.execute(insert(entries), [{"batch_id": number, **e} for e in listed])
+            add_list(
+                connection, listed, assignment=self._assignment or "", at=self._at(), rubric=text
+            )
             if last is None:
                 return []
             told = [f"rubric: {change}" for change in rubric_changes(last.rubric, text)]
-            return told + points_changes(_points_of(connection, last), points)
+            return told + points_changes(points_of(connection, last), points)
 
     # ---------------------------------------------------------------- what counts now
 
@@ -252,7 +226,7 @@ class Gradebook:
             of_batch = select(entries.c.position).where(entries.c.batch_id == last.id)
             positions = sorted(connection.scalars(of_batch))
         rubric = read_rubric(last)
-        for page in _pages(positions):
+        for page in pages(positions):
             with self._database.reading() as connection:
                 rows = connection.execute(
                     class_list().where(entries.c.batch_id == last.id, entries.c.position.in_(page))
@@ -275,6 +249,11 @@ class Gradebook:
             return final_entry(
                 connection, row, shared=read_flag(row.shared), rubric=read_rubric(last)
             )
+
+    def by_other_rubrics(self) -> list[str]:
+        """Return the submissions of the class list that its rubric did not grade."""
+        with self._database.reading() as connection:
+            return by_other_rubrics(connection, self._last(connection))
 
     def figures(self, entry: Entry) -> tuple[tuple[str, str], ...]:
         """Return the figures of a submission's feedback: file names and SVG."""
@@ -305,12 +284,14 @@ class Gradebook:
             found = [self._find(connection, team) for team in teams]
             gone = {row.submission_id: row.name for _, row in found}
             last = self._last(connection)
-            left = [e for e in _lines_of(connection, last) if e["submission_id"] not in gone]
-            new = {"assignment": last.assignment, "at": self._at(), "rubric": last.rubric}
-            number = add_row(connection, batches, new)
-            lines = [{**e, "batch_id": number, "position": i} for i, e in enumerate(left)]
-            if lines:
-                connection.execute(insert(entries), lines)
+            left = [e for e in lines_of(connection, last) if e["submission_id"] not in gone]
+            add_list(
+                connection,
+                [{**line, "position": i} for i, line in enumerate(left)],
+                assignment=last.assignment,
+                at=self._at(),
+                rubric=last.rubric,
+            )
         return list(gone.values())
 
     def override(
@@ -377,7 +358,7 @@ class Gradebook:
         of_batch = class_list(detail=False).where(entries.c.batch_id == last.id)
         rows = connection.execute(of_batch).all()
         exact = [r.position for r in rows if r.name == team]
-        found = exact or [r.position for r in rows if _is_of(r.authors, team)]
+        found = exact or [r.position for r in rows if is_of(r.authors, team)]
         if len(found) != 1:
             hint = f"no such submission; {_nearest(team, [row.name for row in rows])}"
             raise ConfigError(f"{team}: {'is in several submissions: name one' if found else hint}")
@@ -395,7 +376,7 @@ class Gradebook:
                 ever = ever.where(submissions.c.assignment == self._assignment)
             rows = connection.execute(ever).all()
             found = {r.submission_id: r for r in rows if r.name == team} or {
-                r.submission_id: r for r in rows if _is_of(r.authors, team)
+                r.submission_id: r for r in rows if is_of(r.authors, team)
             }
             if len(found) != 1:
                 raise
@@ -405,10 +386,6 @@ class Gradebook:
         """Return the batch of this assignment before the one that ends now."""
         mine = select(batches).where(batches.c.assignment == (self._assignment or ""))
         return connection.execute(mine.order_by(batches.c.id.desc()).limit(1)).one_or_none()
-
-
-def _pages(numbers: list[int]) -> Iterator[list[int]]:
-    return (numbers[i : i + _PAGE] for i in range(0, len(numbers), _PAGE))
 
 
 def _nearest(word: str, words: list[str]) -> str:

@@ -1,0 +1,63 @@
+"""The fingerprints in a gradebook, read some at a time."""
+
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+
+from sqlalchemy import select
+
+from pipeline.grading.batch import Listed, Prints
+from pipeline.grading.schema import Database, gradings, submissions
+
+_PAGE = 100  # rows read at a time: memory stays flat, and a writer need not wait long
+
+_PRINTS = (
+    select(
+        submissions.c.assignment,
+        submissions.c.name,
+        gradings.c.key,
+        gradings.c.authors,
+        gradings.c.fingerprints,
+    )
+    .join(submissions)
+    .order_by(gradings.c.id)
+)
+
+
+def read_prints(database: Database, *, assignment: str) -> Iterator[Prints]:
+    """Yield all fingerprints that differ, of every submission under its authors."""
+    with database.reading() as connection:
+        numbers = sorted(connection.scalars(select(gradings.c.id)))
+    seen = set()
+    for page in pages(numbers):
+        with database.reading() as connection:
+            wanted = _PRINTS.where(gradings.c.id.in_(page), gradings.c.fingerprints != b"")
+            rows = connection.execute(wanted).all()
+        for row in rows:
+            own = row.assignment, row.name, row.authors, hashlib.sha256(row.fingerprints).digest()
+            if own not in seen:
+                seen.add(own)
+                yield _prints(row, of_class=row.assignment == assignment)
+
+
+def read_listed(database: Database, numbers: Sequence[int]) -> Iterator[Listed]:
+    """Yield the gradings of these numbers as lines of a class list."""
+    for page in pages(numbers):
+        with database.reading() as connection:
+            rows = connection.execute(_PRINTS.where(gradings.c.id.in_(page))).all()
+        for row in rows:
+            yield Listed(key=row.key, prints=_prints(row, of_class=True))
+
+
+def pages(numbers: Sequence[int]) -> Iterator[Sequence[int]]:
+    """Return numbers of rows as many at a time as are read at once."""
+    return (numbers[i : i + _PAGE] for i in range(0, len(numbers), _PAGE))
+
+
+def _prints(row, *, of_class: bool) -> Prints:
+    return Prints(
+        submission=row.name,
+        authors=tuple(json.loads(row.authors)),
+        fingerprints=row.fingerprints,
+        of_class=of_class,
+    )
