@@ -133,6 +133,19 @@ def test_whole_runs_are_those_of_the_reference(library, wave):
     assert lines == 10_000
 
 
+@pytest.mark.parametrize("end", [0.5, 2.0, 30.0])
+def test_chirps_end_where_they_are_told(library, end):
+    """Below where they start, there (which is a sine), and above."""
+    firmware, reference = _both(library)
+    start = Start(wave=Wave.CHIRP, frequency=2.0, amplitude=1500, cycles=8)
+    for core in (firmware, reference):
+        core.receive(encode(ChirpEnd(frequency=end)) + encode(start))
+    for stamp in range(4000):
+        assert firmware.tick((0, 0), stamp=stamp, now=0) == reference.tick(
+            (0, 0), stamp=stamp, now=0
+        )
+
+
 @pytest.mark.parametrize(
     "gains",
     [PidGains(kp=2.0, ki=3.0, kd=0.05), StateGains(gains=(3.0, 0.2, -1.0, 0.1), prefilter=2.0)],
@@ -235,9 +248,10 @@ def test_the_motor_is_cut_100_ms_after_the_last_heartbeat(library):
 STOPPING = [
     b"s;", b";s;", b"z;", b"\r\n s\t;", b"d;q;o;s;", b"d;s;k;", b"d;s;;", b"g;1;s;",
     b"noises;", b"noisez;", b"9" * 50 + b"s;",
+    b"\r\nd; q;o\r;\no;\t1 ;5;1;",  # a start, whose first half is zero
 ]  # fmt: skip
 NOT_STOPPING = [
-    b"s", b"d;s;", b"k;", b"?;", b"noise;", b"ss k;", b"\x00s\x00;", b"d;s;o;o;1;5;0;",
+    b"s", b"d;s;", b"k;", b"?;", b"noise;", b"ss k;", b"s\x00;", b"d;s;o;o;1;5;0;",
     b"d;q;o;o;1;" + b"0" * 40 + b"5;1;", b"d;q;o;o;9e-4;5;1;", b"d;q;o;o;1001;5;1;",
     b"d;q;o;o;1;1000001;1;", b"d;q;o;o;1;5.0;1;", b"d;q;o;o;1;5;1000001;",
 ]  # fmt: skip
@@ -366,6 +380,16 @@ def test_numbers_are_read_as_python_reads_them(library, size, sign, form):
     text, read = sign + format(size, form), ctypes.c_double()
     assert library.read_number(text.encode(), False, ctypes.byref(read))
     assert read.value == float(text)
+
+
+@pytest.mark.parametrize(
+    "text", ["12345678901234567890123", "0.1234567890123456789012", "98765432109876543210.5e-3"]
+)
+def test_more_digits_than_fit_keep_their_place(library, text):
+    """Beyond 18 digits only the size counts: the rest is less than double can tell."""
+    read = ctypes.c_double()
+    assert library.read_number(text.encode(), False, ctypes.byref(read))
+    assert read.value == pytest.approx(float(text), rel=1e-15)
 
 
 @pytest.mark.parametrize(
