@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 
+NEEDED = "CARTLAB_TESTS_NEED_POSTGRESQL"  # set where a missing server is a failure, not a skip
+
 
 def missing() -> str:
     """Return why no server can be started here, or ""."""
