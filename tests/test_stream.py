@@ -165,6 +165,18 @@ def test_what_an_earlier_run_left_in_the_line_is_not_of_this_one():
     assert got == sent
 
 
+@pytest.mark.parametrize("closed", [True, False])
+def test_a_kick_of_the_duty_is_a_line_in_a_closed_loop_only(closed):
+    """A controller at rest kicks for one line as an encoder flickers; in open loop none does."""
+    sent = lines(100, period=1.0)
+    sent[50] = Reading(counts=sent[50].counts, target=0, duty=120, ms=sent[50].ms)
+    sent[49:52:2] = [
+        Reading(counts=r.counts, target=0, duty=0, ms=r.ms) for r in (sent[49], sent[51])
+    ]
+    got, _ = read(join(sent), closed=closed)
+    assert (sent[50] in got) == closed
+
+
 def test_late_lines_are_counted_and_kept():
     """Lines held back for 60 ms and sent in a lump are late as long as 20 ms of it are left."""
     sent = lines(1000, period=1.0)

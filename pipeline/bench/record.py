@@ -25,6 +25,7 @@ def readings_of(run: RawRun) -> tuple[Reading, ...]:
         encoders=run.header.bench.encoders,
         period=1e3 * run.header.bench.period,
         free=run.header.recording.carts,
+        closed=run.header.recording.controller is not None,
     )
     lines = [reading for data, at in run.lumps() for reading in stream.feed(data, since=at, now=at)]
     return (*lines, *stream.finish())

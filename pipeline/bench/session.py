@@ -118,7 +118,8 @@ class Session:
             bench=self._line.bench,
             begun=datetime.now().astimezone().isoformat(timespec="seconds"),
         )
-        stream = self._stream(order.recording.carts)
+        recording = order.recording
+        stream = self._stream(recording.carts, closed=recording.controller is not None)
         watch = _Watch(order, carts=self._carts, stream=stream, observer=self._observer)
         partial = "stopped"
         with RawWriter(path, header) as raw:
@@ -147,9 +148,10 @@ class Session:
             partial=partial,
         )
 
-    def _stream(self, free: Sequence[int]) -> Stream:
+    def _stream(self, free: Sequence[int], *, closed: bool = False) -> Stream:
         watched = tuple(cart for cart in free if cart <= self._carts)
-        return Stream(encoders=self._line.bench.encoders, period=self._period, free=watched)
+        encoders = self._line.bench.encoders
+        return Stream(encoders=encoders, period=self._period, free=watched, closed=closed)
 
     def _rest(self, recording: Recording) -> str:
         """Wait, in a run that does nothing, until the carts have come to rest."""

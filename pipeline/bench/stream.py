@@ -32,10 +32,19 @@ class Stream:
     encoders : fields of a line that are counts.
     period : ms from line to line, as expected.
     free : the carts that can move; their encoders are watched.
+    closed : the loop is closed: its duty may kick for a single line when an encoder flickers.
     """
 
-    def __init__(self, *, encoders: int, period: float = 1.0, free: Sequence[int] = ()) -> None:
+    def __init__(
+        self,
+        *,
+        encoders: int,
+        period: float = 1.0,
+        free: Sequence[int] = (),
+        closed: bool = False,
+    ) -> None:
         self._encoders = encoders
+        self._closed = closed
         self._expected = period
         self._tail = b""
         self._before: Reading | None = None  # the last line handed on
@@ -142,7 +151,7 @@ class Stream:
             self._resets += 1
             self._held = None
             return []
-        elif _stands_out(before, held, after):
+        elif _stands_out(before, held, after, closed=self._closed):
             self._reject()
             return []
         self._keep(held)
@@ -161,7 +170,7 @@ class Stream:
         self._late += since - due > min(self._lead, self._new_lead) + _LATE
 
 
-def _stands_out(before: Reading, held: Reading, after: Reading) -> bool:
+def _stands_out(before: Reading, held: Reading, after: Reading, *, closed: bool) -> bool:
     """Tell a line that its two neighbours, which agree with one another, speak against."""
     if before.ms <= after.ms and not before.ms <= held.ms <= after.ms:
         return True
@@ -170,7 +179,7 @@ def _stands_out(before: Reading, held: Reading, after: Reading) -> bool:
     room = _SPIKE * max(1, after.ms - before.ms)
     signals = [*zip(before.counts, held.counts, after.counts, strict=True)]
     signals.append((before.target, held.target, after.target))
-    if before.duty == before.target and after.duty == after.target:  # open loop: no kicks
+    if not closed:
         signals.append((before.duty, held.duty, after.duty))
     return any(abs(2 * b - a - c) > 2 * (room + 2 * abs(c - a)) for a, b, c in signals)
 
