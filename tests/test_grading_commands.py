@@ -1,5 +1,6 @@
 """The commands for what comes after grading, as they are typed."""
 
+import csv
 import json
 import sys
 from pathlib import Path
@@ -69,6 +70,36 @@ def test_an_export_lies_beside_the_grades(run, grades, tmp_path, lms):
     assert "could not be graded, left blank: broken" in err
     run("export", grades, "--lms", lms, "--out", tmp_path / "elsewhere", "--title", "Lab")
     assert (tmp_path / "elsewhere" / f"{lms}.csv").is_file()
+
+
+def test_a_class_that_nobody_could_be_graded_of(run, tmp_path):
+    """The rubric may be another lab's, and is asked about; lateness is known all the same."""
+    for name in ("team-1", "team-2"):
+        (tmp_path / "c" / name).mkdir(parents=True)
+        (tmp_path / "c" / name / "submission.toml").write_text(
+            "version = 1\n[system]\ncarts = 1\n", encoding="utf-8"
+        )
+    late = tmp_path / "late.csv"
+    late.write_text("submission,days_late\nteam-1,2.5\nteam-9,1\n", encoding="utf-8")
+    out = tmp_path / "out"
+    status, _, err = run(
+        "grade", tmp_path / "c", "--rubric", "throne-2dof", "--out", out, "--lateness", late,
+        "--jobs", 1,
+    )  # fmt: skip
+    assert status == 1
+    assert err.splitlines() == [
+        "late.csv: no such submission: team-9",
+        "team-1: the submission is for 1 cart, the rubric for 2",
+        "team-2: the submission is for 1 cart, the rubric for 2",
+        "not one could be graded: is throne-2dof the rubric for these submissions?",
+        f"0 of 2 graded; wrote {out}",
+    ]
+    with (out / "grades.csv").open(newline="", encoding="utf-8") as file:
+        assert [row["days_late"] for row in csv.DictReader(file)] == ["2.5", "0"]
+    inside = tmp_path / "c" / "team-1" / "grades"
+    status, _, err = run("grade", tmp_path / "c", "--rubric", "throne-2dof", "--out", inside)
+    assert (status, inside.exists()) == (2, False)
+    assert "is in a submission; name a folder outside of it" in err
 
 
 def test_a_survey_is_told_on_stdout(run, tmp_path):

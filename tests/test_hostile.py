@@ -50,7 +50,10 @@ sys.addaudithook(_tell)
 """
 
 
-@pytest.fixture(scope="module", params=[1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.fixture(
+    scope="module",
+    params=[1, pytest.param(2, marks=[pytest.mark.slow, pytest.mark.sample])],
+)
 def graded(request, tmp_path_factory):
     """A hostile class and what the command line made of it: folder, names, audit lines."""
     base = tmp_path_factory.mktemp("hostile")
