@@ -56,20 +56,6 @@ def feedback_page(
     figures : file names and SVG.
     name : what the submission is called on the page.
     """
-    return render_html(
-        feedback_document(grade, rubric=rubric, overrides=overrides, figures=figures, name=name)
-    )
-
-
-def feedback_document(
-    grade: Grade,
-    *,
-    rubric: Rubric,
-    overrides: Mapping[str, Override],
-    figures: Sequence[tuple[str, str]],
-    name: str,
-) -> Document:
-    """Return the feedback as a document."""
     numbers = count(1)
     sections = [Section("summary", "Summary", tuple(_summary(grade, overrides)))]
     if grade.flags:
@@ -80,13 +66,14 @@ def feedback_document(
     if figures:
         blocks = tuple(_picture(i, *figure) for i, figure in enumerate(figures, start=1))
         sections.append(Section("figures", "Your recordings", blocks))
-    return Document(
+    document = Document(
         title=clean(name),
         subtitle=clean(f"Feedback · {rubric.title}" if rubric.title else "Feedback"),
         authors=tuple(clean(author) for author in grade.authors),
         sections=tuple(sections),
         footer=f"cartlab {__version__}",
     )
+    return render_html(document)
 
 
 # -------------------------------------------------------------------------- summary
