@@ -38,8 +38,6 @@ def stream(folder: Path, *, minutes: float) -> None:
         acquire(folder, port=bench.address, observers=[notes], only=["long"])
         taken = time.monotonic() - began
         sent = bench.event("run")
-        while sent["lines"] < notes.outcomes[-1].lines / 2:  # the trial runs before it
-            sent = bench.event("run")
         cpu = [
             sum(after[:2]) - sum(first[:2])
             for after, first in (
@@ -62,9 +60,8 @@ def faults(folder: Path, *, seconds: float) -> None:
     with emulator(*options) as bench:
         notes = Notes()
         acquire(folder, port=bench.address, observers=[notes], only=["faulty"])
-        sent = bench.event("run")
-        while sent["lines"] < 0.9e3 * seconds:
-            sent = bench.event("run")
+        while (sent := bench.event("run"))["ended"] != "done":
+            pass
     struck, outcome = sent["injected"], notes.outcomes[-1]
     whole = sent["lines"] - struck["drop"] - struck["garble"] - 2 * struck["merge"]
     points = analyse(load_submission(folder)).sine_points
@@ -84,9 +81,8 @@ def stops(folder: Path, *, n: int) -> None:
             limits = Limits(input=0.5, travel=0.05 + 0.1 * trial / n)
             write_work(work, [sine("far", seconds=5.0, frequency=1.6)], limits=limits)
             acquire(work, port=bench.address, observers=[_Once()], only=["far"])
-            sent = bench.event("run")
-            while sent["ended"] != "stopped":
-                sent = bench.event("run")
+            while (sent := bench.event("run"))["ended"] != "stopped":
+                pass
             run = read_raw(work / "raw" / "far-1.raw")
             most = limits.travel / run.header.bench.position_per_count
             lines = readings_of(run)

@@ -1,5 +1,6 @@
 """A plan carried out on a virtual bench over a real line."""
 
+import json
 import os
 import queue
 import re
@@ -66,8 +67,8 @@ def last_run(bench) -> dict:
 
 @pytest.fixture(scope="module")
 def fast_bench():
-    """Return a virtual bench twenty times as fast as a real one."""
-    with emulator("--speed", "20") as bench:
+    """Return a virtual bench twenty times as fast as a real one, with fewer lines a second."""
+    with emulator("--speed", "20", "--period", "5.003") as bench:
         yield bench
 
 
@@ -158,7 +159,7 @@ def test_a_plan_becomes_a_submission(tmp_path, fast):
 
 def test_a_folder_without_a_submission_gets_one(tmp_path):
     """What the bench says of itself begins a submission; a plan is proposed and written."""
-    with emulator("--speed", "20", preset="throne-1dof") as bench:
+    with emulator("--speed", "20", "--period", "5.003", preset="throne-1dof") as bench:
         outcomes = acquire(
             tmp_path / "new", port=bench.address, observers=[Notes()], only=["step-1"]
         )
@@ -188,7 +189,7 @@ def test_a_stock_bench_is_driven_by_people(tmp_path):
     scaled = text.replace('unit = "cm"', 'unit = "cm", per_count = 0.00227')
     (work / "submission.toml").write_text(scaled, encoding="utf-8")
     notes = Notes()
-    with emulator("--stock", "--speed", "5") as bench:
+    with emulator("--stock", "--speed", "5", "--period", "5.003") as bench:
         *_, outcome = acquire(work, port=bench.address, observers=[notes], only=["dwell"])
     assert outcome.partial == ""
     assert notes.confirmed[0] == "All carts free"
@@ -205,6 +206,32 @@ def test_a_pty_is_a_port_like_any_other(tmp_path):
         *_, outcome = acquire(work, port=bench.address, observers=[Notes()], only=["dwell"])
     assert outcome.partial == ""
     assert outcome.lines == pytest.approx(1000 / 1.0024, abs=2)
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_the_whole_loop_names_what_the_bench_hides(tmp_path):
+    """Emulate with dry friction, acquire what is proposed, report, gap: the friction has a name."""
+    work = tmp_path / "work"
+    hidden = "coulomb_friction:cart=1,force=0.0025"
+    with emulator("--hide", hidden, "--speed", "20", "--period", "8.84") as bench:
+        outcomes = acquire(
+            work,
+            port=bench.address,
+            observers=[Notes()],
+            only=["decay-1a", "decay-2a", "step-1", "step-2", "sweep"],
+        )
+    assert {o.recording.id for o in outcomes if not o.partial} >= {"decay-1a", "step-1", "sweep"}
+    runner = CliRunner()
+    assert runner.invoke(app, ["report", str(work), "--no-pdf"]).exit_code in (0, 1)
+    assert runner.invoke(app, ["gap", str(work), "--no-pdf"]).exit_code == 0
+    gap = json.loads((work / "gap" / "gap.json").read_text(encoding="utf-8"))
+    assert gap["verdict"] == "named"
+    (effect,) = gap["effects"]
+    assert (effect["effect"], effect["where"]) == ("coulomb_friction", {"cart": 1})
+    force = effect["parameters"]["force"]
+    assert abs(force["value"] - 0.0025) < 4 * force["std"]
+    assert gap["gap"]["final"] < 1.5 * gap["gap"]["noise_floor"]
 
 
 # ----------------------------------------------------------------- what goes wrong
@@ -342,7 +369,7 @@ def test_a_killed_host_leaves_a_readable_file_and_a_motor_that_is_off(tmp_path, 
 def test_a_stuck_encoder_is_said(tmp_path):
     """An encoder that stands still while the motor drives is counted and noted."""
     work = write_work(tmp_path, [sine("dwell", seconds=6)])
-    with emulator("--fault", "stuck=2@1", "--speed", "10") as bench:
+    with emulator("--fault", "stuck=2@0.2", "--speed", "10", "--period", "5.003") as bench:
         *_, outcome = acquire(work, port=bench.address, observers=[Notes()], only=["dwell"])
     assert outcome.anomalies.stuck == 1
     assert "1 encoders stuck" in load_submission(work).experiments[0].note
