@@ -96,10 +96,10 @@ def make_outcome(grade: Grade, *, key: str = "", **changes: Any) -> Outcome:
     return Outcome(**{**fields, **changes})
 
 
-def write_class(folder: Path) -> Path:
+def write_class(folder: Path, *, anonymous: bool = False) -> Path:
     """Write the pages of a class of all sorts into a folder, figures and hostile names included."""
     folder.mkdir(exist_ok=True)
-    rubric = two_cart_rubric()
+    rubric = two_cart_rubric().model_copy(update={"anonymous": anonymous})
     names = [f"team-{n:02d}" for n in range(1, 13)]
     names += ["Ünal 学生 & co", "a-name-without-end-" * 5, "=cmd'C'!A0"]
     outcomes = []

@@ -61,6 +61,24 @@ def test_an_override_reaches_the_pages_at_once(run, tmp_path):
     ]  # fmt: skip
 
 
+def test_a_team_is_corrected_by_the_name_that_stands_in_for_it(run, tmp_path):
+    """Who grades without names need not look one up, and is not told one."""
+    grades = write_class(tmp_path, anonymous=True)
+    with (grades / "anonymous-key.csv").open(newline="", encoding="utf-8") as file:
+        names = {row["submission"]: row["anonymous"] for row in csv.DictReader(file)}
+    anon, broken = names["team-03"], names["broken"]
+    status, _, err = run("override", grades, anon, "pieces", "1", "--why", "all", "--by", "Ada")
+    assert (status, err.startswith(f"{anon}: ")) == (0, True)
+    assert points_of(grades, anon) == pytest.approx(float(err.split()[1]))
+    _, out, _ = run("history", grades, anon)
+    assert out.startswith(f"{anon}\n")
+    assert "team-03" not in out
+    assert "pieces: 1 by hand, by Ada: all" in out
+    _, out, _ = run("history", grades, broken)
+    assert "could not be graded" in out
+    assert run("history", grades, "anon-nobody")[0] == 2
+
+
 @pytest.mark.parametrize("lms", ["canvas", "moodle", "gradescope"])
 def test_an_export_lies_beside_the_grades(run, grades, tmp_path, lms):
     """Or where it is told to; what a person must know is said."""

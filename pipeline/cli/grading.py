@@ -8,11 +8,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from pipeline.cli.common import AsJson, app, say
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 _MOST_TOLD = 20  # changes since the class list before
 _INTERRUPTED = 130  # exit status, as of any program that Ctrl-C ends
@@ -130,16 +133,27 @@ def _batch_progress() -> Iterator[Callable[[int, int, str], None]]:
         TextColumn("{task.description}", markup=False),  # a submission may be called "[b]"
     )
     with Progress(*columns, console=Console(stderr=True), transient=True) as shown:
-        task = shown.add_task("opening", total=None)
-        yield lambda done, total, last: shown.update(
-            task, completed=done, total=total, description=last
-        )
+        yield counting(shown)
+
+
+def counting(shown: "Progress") -> Callable[[int, int, str], None]:
+    """Return what tells a progress bar; what was known before says nothing of the speed."""
+    task = shown.add_task("opening", total=None)
+
+    def show(done: int, total: int, last: str) -> None:
+        if shown.tasks[task].total is None:
+            shown.reset(task, completed=done, total=total)
+        shown.update(task, completed=done, total=total, description=last)
+
+    return show
 
 
 Grades = Annotated[
     str, typer.Argument(metavar="GRADES", help="The --out folder of `cartlab grade`, or a URL.")
 ]
-Team = Annotated[str, typer.Argument(metavar="TEAM", help="A submission, or one of its authors.")]
+Team = Annotated[
+    str, typer.Argument(metavar="TEAM", help="A submission, one of its authors, or anon-….")
+]
 Lab = Annotated[
     str | None,
     typer.Option("--assignment", help="A rubric's name, where the gradebook has several."),
@@ -159,6 +173,7 @@ def override(
     assignment: Lab = None,
 ) -> None:
     """Give a criterion points by hand, which every later grading keeps."""
+    from pipeline.grading.blind import meant
     from pipeline.grading.gradebook import Gradebook
     from pipeline.grading.lock import alone_in
     from pipeline.grading.outputs import write_outputs
@@ -168,11 +183,13 @@ def override(
     pages = folder.is_dir()
     with Gradebook(grades, assignment=assignment) as book:
         with alone_in(folder) if pages else nullcontext():
-            book.override(team, criterion, read_points(points), why=why, by=by)
+            name = meant(book, team)
+            book.override(name, criterion, read_points(points), why=why, by=by)
             if pages:
                 write_outputs(book, folder)
-        grade = book.entry(team).grade
-    say(f"{grade.submission}: {grade.points:g} of {grade.out_of:g} points")
+        grade = book.entry(name).grade
+    shown = grade.submission if name == team else team
+    say(f"{shown}: {grade.points:g} of {grade.out_of:g} points")
 
 
 @app.command()
@@ -201,11 +218,12 @@ def remove(
 @app.command()
 def history(grades: Grades, team: Team, assignment: Lab = None, as_json: AsJson = False) -> None:
     """Show every grade and change of a team, with who, when and why."""
+    from pipeline.grading.blind import history_of
     from pipeline.grading.gradebook import Gradebook
     from pipeline.grading.history import history_dict, history_text
 
     with Gradebook(grades, assignment=assignment) as book:
-        submission, events = book.history(team)
+        submission, events = history_of(book, team)
     if as_json:
         typer.echo(json.dumps(history_dict(submission, events), indent=1, ensure_ascii=False))
     else:

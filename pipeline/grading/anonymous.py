@@ -36,6 +36,11 @@ def pseudonyms(first_keys: Mapping[str, str]) -> dict[str, str]:
     return {name: f"{_PREFIX}{code[:length]}" for name, code in hashes.items()}
 
 
+def is_pseudonym(name: str) -> bool:
+    """Whether a name looks like one that stands in for another."""
+    return name.startswith(_PREFIX)
+
+
 def anonymise(grade: Grade, names: Mapping[str, str]) -> Grade:
     """Return the grade without authors, and without the names of submissions.
 
