@@ -27,6 +27,7 @@ _COUNTED = 0.02
 _COUNTED_ALONE = 0.012  # … where no damping tells the same story
 _DAMPING = 0.2
 _BLURRED_DAMPING = 1.3  # high over low: such a damping tells no story
+_VAGUE = 3.0  # high over low: what any mistake would meet tells of none
 _SHARP = 1.05  # high over low of a reference that friction does not blur
 _CLEARLY_OFF = 0.06  # of a gain: another extremum of the step as near as this says nothing
 
@@ -58,7 +59,7 @@ class Mistake:
 
 def known_mistakes(references: Mapping[str, Reference], analysis: Analysis) -> list[Mistake]:
     """Return every mistake that can be tried on a table, single ones before combined ones."""
-    references = {n: r for n, r in references.items() if r.low > 0}
+    references = {n: r for n, r in references.items() if 0 < r.high <= _VAGUE * r.low}
     gains = {n: r for n, r in references.items() if n.startswith("K")}
     omegas = {n: r for n, r in references.items() if n.startswith("omega")}
     own_omegas = {n: r for n, r in omegas.items() if n[-1] in _OWN}

@@ -13,6 +13,7 @@ from pipeline.stages.compare import CHI_SQUARE_LIMIT
 
 # A fitted frequency or gain that far from the measured one: the fit has gone astray; factors.
 _ASTRAY, _ASTRAY_GAIN = 1.3, 1.6
+_STUCK = 1.15  # factor: a gain where carts stick so that no linear fit is near
 _SIGMAS = 3.0
 _STILL = 3.0  # encoder steps
 # A resonance or null read off the dwells, and where friction blurs even those: factors.
@@ -41,6 +42,10 @@ class Reference:
         if value <= 0:
             return self
         return replace(self, low=min(self.low, value), high=max(self.high, value))
+
+    def widened(self, factor: float) -> "Reference":
+        """Return the reference with bounds that much further out."""
+        return replace(self, low=self.low / factor, high=self.high * factor)
 
     def times(self, factor: float) -> "Reference":
         """Return the reference multiplied by a positive factor."""
@@ -81,6 +86,10 @@ def recompute(analysis: Analysis) -> References:
         elif measured is not None and row.final is not None:
             # Where our fit goes astray, the students' may.
             final[row.name] = measured.including(row.final.value)
+        if not trusted and row.name.startswith("K"):
+            for table in (initial, final):
+                if row.name in table:
+                    table[row.name] = table[row.name].widened(_STUCK)
     for table in (initial, final) if not trusted else ():
         for name in _out_of_order(table):
             del table[name]
@@ -134,6 +143,7 @@ def _final(estimate: Estimate, row: ParameterRow, analysis: Analysis) -> Referen
     bounds = [estimate.value, estimate.value * (share if estimate.value > 0 else 1.0)]
     if not is_explained(analysis):
         bounds += _readings(row.name, analysis)
+        bounds += _least_damping(row.name, analysis)
         if row.initial is not None and row.initial.source != "assumed":
             bounds.append(row.initial.value)
     return Reference(
@@ -188,6 +198,23 @@ def _readings(name: str, analysis: Analysis) -> list[float]:
                 without = decay.friction.zeta if decay.friction and decay.friction.present else None
                 readings += [decay.zeta, *([without] if without and without > 0 else [])]
     return readings
+
+
+def _least_damping(name: str, analysis: Analysis) -> list[float]:
+    """Return the least that the damping of a mode or null may be by what each cart has alone.
+
+    Its rate 2 zeta omega is a mean of the carts' c/m, weighted by the shape of the mode, so it is
+    not below the least of them; friction only adds to what a fit of linear carts finds.
+    """
+    frequency = {row.name: row.final for row in analysis.rows}.get(name.replace("zeta", "omega"))
+    rates = [
+        d.omega_n * min(d.zeta, d.friction.zeta if d.friction and d.friction.present else d.zeta)
+        for d in analysis.log_decrements
+    ]
+    positive = [rate for rate in rates if rate > 0]
+    if not name.startswith("zeta_") or name[-1].isdigit() or not frequency or not positive:
+        return []
+    return [min(positive) / frequency.value]
 
 
 def _held(cart: int, analysis: Analysis) -> float:

@@ -44,8 +44,10 @@ class Print:
     Attributes
     ----------
     group : what was done: only recordings of the same kind of run are compared.
-    residual : (n_free, n) whole numbers -5 … 5; 0 also where the motion has a kink.
-    step : (n_free,) what 1 stands for, in the record's position unit.
+    residual : (n_rows, n) whole numbers -5 … 5; 0 also where the motion has a kink. A row for each
+        free cart; under feedback one more for the input, which is made of the carts' noise.
+    step : (n_rows,) what 1 stands for, in the record's position unit, or input unit.
+    fed_back : whether the last row is the input's.
     anchors : (n_anchors,) samples that are found again in a copy, the surest first, and so tell
         how it is shifted: where the motion passes the middle between two extrema (they stand
         much noise), in turn with where the noise is loudest (they stand any cut).
@@ -59,6 +61,7 @@ class Print:
     step: Array
     anchors: np.ndarray
     swing: Array
+    fed_back: bool
 
 
 def fingerprint(records: Sequence[Record]) -> bytes:
@@ -74,6 +77,7 @@ def fingerprint(records: Sequence[Record]) -> bytes:
             "step": one.step.tolist(),
             "anchors": one.anchors.tolist(),
             "swing": one.swing.tolist(),
+            "fed_back": one.fed_back,
         }
         for one in prints
     ]
@@ -99,6 +103,7 @@ def unpack(packed: bytes) -> tuple[Print, ...]:
                 step=np.array(entry["step"]),
                 anchors=np.array(entry["anchors"], dtype=np.int64),
                 swing=np.array(entry["swing"]),
+                fed_back=entry["fed_back"],
             )
         )
     return tuple(prints)
@@ -109,28 +114,34 @@ def _print(record: Record) -> Print | None:
     carts = [cart for cart in record.free if cart in record.carts]
     if not carts or record.t.size < _FEWEST_SAMPLES + 2 * MARGIN:
         return None
-    y = np.array([record.position(cart) for cart in carts])[:, : _MOST_SAMPLES + 2 * MARGIN]
+    rows = [record.position(cart) for cart in carts]
+    if record.kind == "closed_loop" and record.u is not None:
+        rows.append(record.u)
+    y = np.array(rows)[:, : _MOST_SAMPLES + 2 * MARGIN]
     noise = np.array([np.convolve(row, _high_pass(), "valid") for row in y])
     sigma = np.array(
         [_sigma(one, travel=float(np.ptp(row))) for one, row in zip(noise, y, strict=True)]
     )
-    if not np.all(sigma > 0):
+    if not np.all(sigma[: len(carts)] > 0):
         return None
+    fed_back = sigma.size > len(carts) and bool(sigma[-1] > 0)
+    noise, sigma = (noise, sigma) if fed_back else (noise[: len(carts)], sigma[: len(carts)])
     sigmas = noise / sigma[:, None]
     telling = np.abs(sigmas) < _KINK
     anchors, swing = _in_turn(
         _motion_anchors(y[0, MARGIN:-MARGIN] - noise[0]),
-        _noise_anchors(np.abs(sigmas).sum(axis=0)),
+        _noise_anchors(np.abs(sigmas[-1:] if fed_back else sigmas).sum(axis=0)),
     )
     levels = np.clip(np.round(_STEPS_PER_SIGMA * sigmas), -_LEVELS, _LEVELS)
     frequency = "" if record.omega is None else f"{record.omega / (2 * np.pi):.3g} Hz"
     return Print(
         experiment=record.id,
-        group=f"{record.kind} {','.join(map(str, carts))} {frequency}",
+        group=f"{record.kind} {','.join(map(str, carts))} {'u' if fed_back else ''}{frequency}",
         residual=np.where(telling, levels, 0).astype(np.int8),
         step=sigma / _STEPS_PER_SIGMA,
         anchors=anchors,
         swing=swing,
+        fed_back=fed_back,
     )
 
 
