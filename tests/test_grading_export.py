@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ import pytest
 from pipeline.errors import ConfigError
 from pipeline.grading.batch import Batch
 from pipeline.grading.export import export
+from pipeline.grading.export_students import students_of
 from pipeline.grading.gradebook import Gradebook
 from tests.grades import failed_grade, hertz_flag, make_grade, make_outcome, two_cart_rubric
 
@@ -31,6 +33,21 @@ def write(tmp_path: Path, *outcomes, platform, roster: str = "", overrides=(), *
         done = export(book, platform, tmp_path / "out", **options)
     text = done.files[0].read_bytes().decode()
     return list(csv.reader(io.StringIO(text, newline=""))), done.remarks
+
+
+def test_a_grade_is_better_than_none(tmp_path):
+    """Who stands in a hand-in that could not be graded and in one without points has those."""
+    unread = failed_grade("a", "too slow")
+    unread = replace(unread, authors=("bob",))
+    nothing = make_grade("b", share=0.0, authors=("bob",))
+    outcomes = make_outcome(unread), make_outcome(nothing)
+    with Gradebook(tmp_path, assignment="lab", create=True) as book:
+        for outcome in outcomes:
+            book.put(outcome)
+        book.finish(Batch(keys=tuple(o.key for o in outcomes), shared={}), rubric=RUBRIC)
+        for order in (1, -1):
+            (bob,), _ = students_of(list(book.entries())[::order], platform="canvas")
+            assert (bob.grade.submission, bob.points) == ("b", "0")
 
 
 def canvas_import(rows: list[list[str]]) -> dict[str, dict[str, str]]:

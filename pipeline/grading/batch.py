@@ -72,8 +72,8 @@ class Listed:
 class Store(Protocol):
     """Where outcomes are kept: the gradebook."""
 
-    def known(self, key: str) -> Outcome | None:
-        """Return the stored outcome of this key, None where there is none."""
+    def known(self, key: str, *, figures: bool = True) -> Outcome | None:
+        """Return the stored outcome of this key, None where there is none; or without figures."""
         ...
 
     def put(self, outcome: Outcome) -> None:

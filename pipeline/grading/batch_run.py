@@ -8,6 +8,7 @@ from pipeline.errors import ConfigError, PipelineError
 from pipeline.grading.batch import Batch
 from pipeline.grading.gradebook import Gradebook
 from pipeline.grading.intake import find_hand_ins
+from pipeline.grading.intake_files import digest
 from pipeline.grading.late_table import LateTable, settle_lateness
 from pipeline.grading.load import load_rubric
 from pipeline.grading.lock import alone_in, scratch_in
@@ -87,6 +88,7 @@ def grade_class(
                 limits=limits,
                 figures=figures,
                 examples=lambda: list(_handed_out(rubric, folder=rubric_file.parent)),
+                examples_digest=_examples_digest(rubric, folder=rubric_file.parent),
                 memory=out / _MEMORY,
                 progress=progress,
             )
@@ -151,6 +153,12 @@ def _executor(*, jobs: int, cluster: str | None) -> Executor:
     except ModuleNotFoundError as error:
         raise ConfigError(f"--cluster needs {error.name}: pip install 'cartlab[cluster]'") from None
     return run_on(cluster)
+
+
+def _examples_digest(rubric: Rubric, *, folder: Path) -> str:
+    """Return a hash of all that `_handed_out` reads."""
+    own = (folder / example for example in rubric.examples)
+    return " ".join(digest([path]) for path in (*own, EXAMPLES))
 
 
 def _handed_out(rubric: Rubric, *, folder: Path) -> Iterator[bytes]:

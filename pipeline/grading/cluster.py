@@ -112,7 +112,7 @@ def _grade(task: Task, archive: bytes, plugin: str) -> bytes:
     graders = get_worker().plugins[plugin]
     assert isinstance(graders, Graders)
     if not graders.same_code:
-        raise ConfigError("the cluster's workers run another version of cartlab")
+        raise ConfigError("the cluster's workers run another version of cartlab, numpy or scipy")
     return outcome_line(graders.grade(task, archive))
 
 

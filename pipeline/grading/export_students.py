@@ -33,6 +33,11 @@ class Student:
         return "" if ungraded else points_text(self.grade.points)
 
     @property
+    def rank(self) -> tuple[bool, float]:
+        """What is larger for the better of two grades: any is better than none."""
+        return bool(self.points), self.grade.points
+
+    @property
     def called(self) -> str:
         """What to call the student in a message."""
         return self.id or self.name or self.grade.submission
@@ -57,7 +62,7 @@ def students_of(entries: Sequence[Entry], *, platform: Platform) -> tuple[list[S
             key = id_ or f"\0{entry.submission}"  # nobody's id
             if key in found:
                 twice.setdefault(id_, [found[key].grade.submission]).append(entry.submission)
-                if found[key].grade.points >= student.grade.points:
+                if found[key].rank >= student.rank:
                     continue
             found[key] = student
     remarks = [

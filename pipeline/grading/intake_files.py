@@ -26,6 +26,10 @@ _CHUNK = 1 << 20
 _FIXED_TIME = (1980, 1, 1, 0, 0, 0)  # in archives of ours: same files, same bytes
 
 
+class Changed(Exception):
+    """The files of a hand-in are not those that its key is of."""
+
+
 def digest(sources: Sequence[Path]) -> str:
     """Return the SHA-256 of everything in a hand-in that could be graded.
 
@@ -34,12 +38,16 @@ def digest(sources: Sequence[Path]) -> str:
     total = hashlib.sha256()
     try:
         for name, path in _files(sources):
-            with path.open("rb") as file:
-                own = hashlib.file_digest(file, "sha256").hexdigest()
-            total.update(f"{len(name)} {name} {own}\n".encode("utf-8", "surrogateescape"))
+            total.update(_line(name, path))
     except OSError as error:
         total.update(f"cannot be read: {error.errno}\n".encode())
     return total.hexdigest()
+
+
+def _line(name: str, path: Path) -> bytes:
+    with path.open("rb") as file:
+        own = hashlib.file_digest(file, "sha256").hexdigest()
+    return f"{len(name)} {name} {own}\n".encode()
 
 
 def packed(sources: Sequence[Path]) -> bytes:
@@ -47,12 +55,8 @@ def packed(sources: Sequence[Path]) -> bytes:
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         for name, path in _files(sources):
-            archive.writestr(
-                zipfile.ZipInfo(name.encode("utf-8", "replace").decode(), _FIXED_TIME),
-                path.read_bytes(),
-                zipfile.ZIP_DEFLATED,
-                1,
-            )
+            info = zipfile.ZipInfo(name, _FIXED_TIME)
+            archive.writestr(info, path.read_bytes(), zipfile.ZIP_DEFLATED, 1)
     return buffer.getvalue()
 
 
@@ -62,21 +66,30 @@ def unpacked(archive: bytes, into: Path) -> None:
         opened.extractall(into)
 
 
-def open_submission(sources: Sequence[Path], into: Path) -> Path:
+def open_submission(sources: Sequence[Path], into: Path, *, digest: str = "") -> Path:
     """Copy or unpack a hand-in into a folder and return the folder of the submission in it.
 
     Archives are looked into where there is no `submission.toml` beside them.
+
+    Parameters
+    ----------
+    digest : what the copy's must be; "" where anything is right.
 
     Raises
     ------
     SubmissionError : there is none, or more than one to choose from, or an archive is bad.
     OSError : a file cannot be read.
+    Changed : the copy has another digest.
     """
     into.mkdir(parents=True, exist_ok=True)
+    total = hashlib.sha256()
     for name, path in _files(sources):
         target = into / name
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(path, target)
+        total.update(_line(name, target))
+    if digest and total.hexdigest() != digest:
+        raise Changed
     left = HAND_IN
     for _ in range(_ARCHIVES_IN_ARCHIVES):
         if _submissions(into):
@@ -96,9 +109,10 @@ def open_submission(sources: Sequence[Path], into: Path) -> Path:
 
 
 def _files(sources: Sequence[Path]) -> Iterator[tuple[str, Path]]:
-    """Yield (name below the hand-in, path) of the files to grade, sorted by name.
+    """Yield (name below the hand-in, path) of the files to grade, sorted by name, each once.
 
     Of too many or too large files the smallest are taken: data files are small, films are not.
+    Bytes that are no text in a name are replaced, here as on another machine.
     """
     found: list[tuple[int, str, Path]] = []
     for source in sources:
@@ -108,13 +122,13 @@ def _files(sources: Sequence[Path]) -> Iterator[tuple[str, Path]]:
             upload = parse_name(source.name)
             name = upload.file if upload and upload.file else source.name
             found.append((info.st_size, PurePosixPath(name.replace("\\", "/")).name, source))
-    chosen, left = [], HAND_IN.total
+    chosen, left = {}, HAND_IN.total
     for size, name, path in sorted(found, key=lambda one: one[:2])[: HAND_IN.members]:
         left -= size
         if left < 0:
             break
-        chosen.append((name, path))
-    yield from sorted(chosen)
+        chosen[name.encode("utf-8", "replace").decode()] = path
+    yield from sorted(chosen.items())
 
 
 def _walk(folder: Path, below: PurePosixPath) -> Iterator[tuple[int, str, Path]]:

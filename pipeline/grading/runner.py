@@ -6,6 +6,7 @@ import queue
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from importlib.metadata import version
 from pathlib import Path
 
 from pydantic import TypeAdapter
@@ -23,6 +24,7 @@ from pipeline.output import write_file
 
 TIME_LIMIT = 120.0  # s for each hand-in
 MEMORY_LIMIT = 1_000_000_000  # bytes
+_COMPUTE_WITH = ("numpy", "scipy")
 
 Progress = Callable[[int, int, str], None]
 Executor = Callable[[Sequence[Task], Setup, float], Iterator[Outcome]]
@@ -50,6 +52,7 @@ def grade_batch(
     limits: Limits | None = None,
     figures: bool = False,
     examples: Callable[[], Iterable[bytes]] = tuple,
+    examples_digest: str = "",
     memory: Path | None = None,
     progress: Progress = _silent,
 ) -> Batch:
@@ -65,7 +68,7 @@ def grade_batch(
     execute : what runs the tasks: `run_here(jobs=…)` or `cluster.run_on(address)`.
     figures : draw those of the feedback, too.
     examples : packed fingerprints of recordings that were handed out with the task; asked for
-        only where recordings are shared.
+        only where recordings are shared. `examples_digest` changes whenever they do.
     memory : a file that remembers which recordings were compared last, and with what result.
     progress : called with how many are done, of how many, and what was done last.
     """
@@ -75,7 +78,7 @@ def grade_batch(
     new = []
     for hand_in in hand_ins:
         task = _task(hand_in, basis=(code, text, figures))
-        outcome = store.known(task.key)
+        outcome = store.known(task.key, figures=False)
         if outcome is None and hand_in.problem:
             outcome = failed(task, hand_in.problem, out_of=rubric.out_of)
             store.put(outcome)
@@ -103,7 +106,13 @@ def grade_batch(
     in_order = [rows[name] for name in sorted(rows)]
     return Batch(
         keys=tuple(row.key for row in in_order),
-        shared=_shared(in_order, store, basis=(code, text), memory=memory, examples=examples),
+        shared=_shared(
+            in_order,
+            store,
+            basis=(code, text, examples_digest),
+            memory=memory,
+            examples=examples,
+        ),
         failed=tuple((row.prints.submission, row.reason) for row in in_order if row.reason),
         kept=tuple(kept),
         taken_over=taken_over,
@@ -198,9 +207,10 @@ def _work(
 
 
 def code_version() -> str:
-    """Return what changes whenever a grade may: a hash of all of the package's code."""
+    """Return what changes whenever a grade may: a hash of the code and what it computes with."""
     root = Path(pipeline.__file__).parent
-    total = hashlib.sha256(pipeline.__version__.encode())
+    versions = [pipeline.__version__, *(f"{name} {version(name)}" for name in _COMPUTE_WITH)]
+    total = hashlib.sha256(" ".join(versions).encode())
     for path in sorted(root.rglob("*.py")):
         total.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
     return total.hexdigest()
@@ -208,12 +218,14 @@ def code_version() -> str:
 
 def _task(hand_in: HandIn, *, basis: tuple[str, str, bool]) -> Task:
     """Return the task of a hand-in; its key covers all that the outcome depends on."""
-    plain = asdict(hand_in) | {"sources": digest(hand_in.sources)}
+    files = digest(hand_in.sources)
+    plain = asdict(hand_in) | {"sources": files}
     everything = json.dumps([SCHEMA, *basis, plain], sort_keys=True)
     return Task(
         id=hand_in.id,
         key=hashlib.sha256(everything.encode("utf-8", "surrogateescape")).hexdigest(),
         sources=tuple(str(source) for source in hand_in.sources),
+        digest=files,
         owner=hand_in.owner,
         days_late=hand_in.days_late,
     )

@@ -19,7 +19,7 @@ from typing import Any
 from pipeline.errors import PipelineError
 from pipeline.grading.batch import Outcome
 from pipeline.grading.grade import Grade, grade_text
-from pipeline.grading.intake_files import open_submission
+from pipeline.grading.intake_files import Changed, open_submission
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.run import Graded, grade_submission
 from pipeline.grading.shared_prints import fingerprint
@@ -52,11 +52,15 @@ class Setup:
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """One hand-in to grade; see `intake.HandIn` and, for the key, `batch.Outcome`."""
+    """One hand-in to grade; see `intake.HandIn` and, for the key, `batch.Outcome`.
+
+    `digest` is of the files that the key is of, "" where nobody asks whether those are graded.
+    """
 
     id: str
     key: str
     sources: tuple[str, ...]
+    digest: str = ""
     owner: str = ""
     days_late: float = 0.0
 
@@ -71,7 +75,8 @@ def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = Fal
             dir=scratch, prefix="open-", ignore_cleanup_errors=True
         ) as folder:
             sources = [Path(source) for source in task.sources]
-            submission = load_submission(open_submission(sources, Path(folder) / task.id))
+            opened = open_submission(sources, Path(folder) / task.id, digest=task.digest)
+            submission = load_submission(opened)
             authors = tuple(author.id for author in submission.authors)
             graded = grade_submission(
                 submission, rubric=rubric, name=task.id, days_late=task.days_late
@@ -89,15 +94,17 @@ def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = Fal
                 figures=_figures(submission, graded) if figures else (),
                 owner=task.owner,
             )
+    except Changed:  # by whoever synchronises the folder, say
+        reason, settled = "its files changed while the class was graded: grade it again", False
     except PipelineError as error:
         reason = str(error)
     except OSError as error:  # a full disk, a folder gone: perhaps not the hand-in's fault
         reason, settled = f"cannot be read ({error.strerror or error})", False
     except MemoryError:
         reason, settled = OUT_OF_MEMORY, False
-    except Exception as error:
+    except Exception as error:  # of ours, or of a library: a mended one is to have its try
         reason = f"the grader failed: {type(error).__name__}: {quote(str(error))}"
-        detail = traceback.format_exc()[-_DETAIL:]
+        detail, settled = traceback.format_exc()[-_DETAIL:], False
     return failed(
         task, reason, authors=authors, out_of=rubric.out_of, settled=settled, detail=detail
     )

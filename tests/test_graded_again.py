@@ -1,0 +1,103 @@
+"""What makes a hand-in be graded, or compared, again: all that its outcome depends on."""
+
+import shutil
+import sys
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+from pipeline.grading.gradebook import Gradebook
+from pipeline.grading.intake import find_hand_ins
+from pipeline.grading.intake_files import digest, packed, unpacked
+from pipeline.grading.load import load_rubric
+from pipeline.grading.runner import code_version, grade_batch, run_here
+from pipeline.grading.shared_prints import fingerprint
+from pipeline.grading.worker import Task, grade_task
+from pipeline.ingest.read import read_data
+from pipeline.submission import load_submission
+from pipeline.synthesis import write_submission
+
+RUBRIC = load_rubric(Path("throne-1dof"))
+
+
+@pytest.fixture(scope="module")
+def school(tmp_path_factory):
+    """Two teams, one of which has the other's step."""
+    folder = tmp_path_factory.mktemp("class")
+    for number in (0, 2):
+        write_submission(
+            folder / f"team-{number}",
+            chain="throne-1dof",
+            seed=number,
+            authors=(f"s{number}",),
+            compact=True,
+            reported=True,
+        )
+    step = (folder / "team-0" / "data" / "step-1.csv").read_bytes()
+    (folder / "team-2" / "data" / "step-2.csv").write_bytes(step)
+    return folder
+
+
+@pytest.fixture
+def task(school):
+    return Task(id="team-0", key="k", sources=(str(school / "team-0"),))
+
+
+def test_an_error_of_the_grader_is_tried_again(task, tmp_path):
+    """A mended grader, or library, is to have its try; the traceback is kept for who mends it."""
+    broken = RUBRIC.model_copy(update={"system": None})  # as no rubric can be
+    outcome = grade_task(task, rubric=broken, scratch=tmp_path)
+    assert (outcome.status, outcome.settled) == ("failed", False)
+    assert outcome.reason.startswith("the grader failed: AttributeError")
+    assert "Traceback" in outcome.detail
+
+
+def test_what_changed_meanwhile_is_not_graded_under_the_old_key(task, tmp_path, school):
+    """A file that is written between the hash and the copy ends in another try, not in a grade."""
+    own = shutil.copytree(school / "team-0", tmp_path / "team-0")
+    if sys.platform == "linux":  # elsewhere no file is called so
+        (own / "n\udcff").write_text("no name in any encoding", encoding="utf-8")
+    known = replace(task, sources=(str(own),), digest=digest([own]))
+    assert grade_task(known, rubric=RUBRIC, scratch=tmp_path).status == "graded"
+    unpacked(packed([own]), tmp_path / "travelled")  # as on a cluster
+    there = replace(known, sources=(str(tmp_path / "travelled"),))
+    assert grade_task(there, rubric=RUBRIC, scratch=tmp_path).status == "graded"
+    (own / "notes.md").write_text("one more word", encoding="utf-8")
+    outcome = grade_task(known, rubric=RUBRIC, scratch=tmp_path)
+    assert (outcome.status, outcome.settled) == ("failed", False)
+    assert outcome.reason == "its files changed while the class was graded: grade it again"
+
+
+def test_the_version_covers_what_it_computes_with(monkeypatch):
+    """Another numpy or scipy is another version, and so grades anew."""
+    before = code_version()
+    assert code_version() == before
+    for name in ("numpy", "scipy"):
+        with monkeypatch.context() as other:
+            other.setattr(
+                "pipeline.grading.runner.version",
+                lambda asked, name=name: "0" if asked == name else version(asked),
+            )
+            assert code_version() != before
+
+
+def test_mended_examples_are_compared_anew(school, tmp_path):
+    """What was handed out may be used by all; taken back, it is flagged though nothing else is."""
+    step = read_data(load_submission(school / "team-0")).records
+    shared = {}
+    for number, given in enumerate(((), (fingerprint(step),), ())):
+        with Gradebook(tmp_path, create=True) as book:
+            batch = grade_batch(
+                find_hand_ins([school], scratch=tmp_path),
+                rubric=RUBRIC,
+                store=book,
+                scratch=tmp_path,
+                execute=run_here(jobs=1),
+                examples=lambda given=given: given,
+                examples_digest=f"{len(given)}",
+                memory=tmp_path / "memory",
+            )
+        shared[number] = set(batch.shared)
+    assert shared == {0: {"team-0", "team-2"}, 1: set(), 2: {"team-0", "team-2"}}
