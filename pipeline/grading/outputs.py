@@ -22,7 +22,8 @@ from pipeline.resources import TEMPLATES
 from pipeline.results_json import plain_json
 
 FEEDBACK = "feedback"
-_PAGE, _JSON = "feedback.html", "grade.json"
+_PAGE, _JSON, _CLASS = "feedback.html", "grade.json", "class.html"
+_WHOLE = ""  # among what each submission's pages were made of, that of the class; none is called so
 # What each page was made of: a page of the same is not made again.
 _MADE = ".made.json"
 _BEFORE = ("submission", "authors", "status", "points", "out_of", "days_late", "deducted")
@@ -48,8 +49,7 @@ def write_outputs(
     for entry in book.entries():
         grade = anonymise(entry.grade, names) if names is not None else entry.grade
         lines.append(Line.of(grade, by_hand=sorted(entry.overrides)))
-        text = _grade_text(grade, entry)
-        now_of[grade.submission] = _digest(look, entry.key, text)
+        now_of[grade.submission] = _digest(look, entry.key, repr((grade, _by_hand(entry))))
         own = own_folder(folder, _checked(grade.submission))
         there = (own / _PAGE).is_file() and (own / _JSON).is_file()
         if there and made_of.get(grade.submission) == now_of[grade.submission]:
@@ -65,12 +65,14 @@ def write_outputs(
             name=grade.submission,
         )
         write_file(own / _PAGE, page)
-        write_file(own / _JSON, text)
+        write_file(own / _JSON, _grade_text(grade, entry))
     if names is not None:
         lines.sort(key=lambda line: line.name)  # the order of the names would tell
     _remove_stale(folder, keep=set(now_of))
     write_file(out / "grades.csv", grades_csv(lines, rubric=rubric))
-    write_file(out / "class.html", class_page(lines, rubric=rubric))
+    now_of[_WHOLE] = _digest(look, repr(lines), *now_of.values())
+    if made_of.get(_WHOLE) != now_of[_WHOLE] or not (out / _CLASS).is_file():
+        write_file(out / _CLASS, class_page(lines, rubric=rubric))
     write_file(
         folder / _MADE, json.dumps(now_of, indent=0, ensure_ascii=False, sort_keys=True) + "\n"
     )
@@ -116,12 +118,15 @@ def _names(book: Gradebook, out: Path) -> dict[str, str]:
 
 def _grade_text(grade: Grade, entry: Entry) -> str:
     """Return `grade.json` with the points given by hand."""
-    by_hand = [
+    plain = plain_json({**grade_dict(grade), "overrides": _by_hand(entry)})
+    return json.dumps(plain, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def _by_hand(entry: Entry) -> list[dict[str, str | float | None]]:
+    return [
         {"criterion": o.criterion, "points": o.points, "why": o.why}
         for _, o in sorted(entry.overrides.items())
     ]
-    plain = plain_json({**grade_dict(grade), "overrides": by_hand})
-    return json.dumps(plain, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def _look(rubric: Rubric) -> str:
