@@ -1,6 +1,7 @@
 """The commands for what comes after grading, as they are typed."""
 
 import csv
+import io
 import json
 import sys
 from pathlib import Path
@@ -77,6 +78,20 @@ def test_a_team_is_corrected_by_the_name_that_stands_in_for_it(run, tmp_path):
     _, out, _ = run("history", grades, broken)
     assert "could not be graded" in out
     assert run("history", grades, "anon-nobody")[0] == 2
+
+
+def test_a_console_of_few_letters_is_no_error(grades, monkeypatch):
+    """What it has no letter for is shown by its number; the JSON stays valid."""
+    raw = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(raw, encoding="cp1252"))
+    monkeypatch.setattr(
+        sys, "argv", ["cartlab", "history", str(grades), "Ünal 学生 & co", "--json"]
+    )
+    with pytest.raises(SystemExit) as end:
+        main()
+    sys.stdout.flush()
+    assert not end.value.code
+    assert json.loads(raw.getvalue().decode("cp1252"))["submission"] == "Ünal 学生 & co"
 
 
 @pytest.mark.parametrize("lms", ["canvas", "moodle", "gradescope"])

@@ -282,4 +282,7 @@ def _check_version(connection: Connection, *, name: str) -> None:
     if found is None:
         connection.execute(insert(settings).values(name="schema", value=_VERSION))
     elif found != _VERSION:
-        raise ConfigError(f"{name}: is a gradebook of version {found}, this cartlab has {_VERSION}")
+        raise ConfigError(
+            f"{name}: is a gradebook of version {found}, this cartlab has {_VERSION}: "
+            "grade into another folder, or use the cartlab that made it"
+        )
