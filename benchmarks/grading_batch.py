@@ -1,12 +1,13 @@
 """How fast a batch is, what it stands, and how well shared recordings are found.
 
-    python -m benchmarks.grading_batch speed [--teams 40] [--copies 1000]
+    python -m benchmarks.grading_batch speed [--preset throne-2dof] [--teams 40] [--copies 1000]
     python -m benchmarks.grading_batch kills [--kills 300]
     python -m benchmarks.grading_batch shared [--teams 200]
 
-`speed`: submissions a second and core, two cores against one, memory over a long run, a run with
-nothing changed. `kills`: kill -9 at random moments, then compare with a run left alone; all of it
-on a copy of the code, as a grade belongs to the code that made it.
+`speed`: submissions a second of one core's time, two jobs against one, a run with nothing changed,
+memory over a long run; on a busy machine believe the times of the processor.
+`kills`: kill -9 at random moments, then compare with a run left alone; all of it on a copy of the
+code, as a grade belongs to the code that made it.
 `shared`: honest teams on one bench (a third of them with hidden friction) and disguised copies.
 """
 
@@ -18,18 +19,17 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import psutil
 
 from pipeline.grading.batch import Prints
+from pipeline.grading.batch_run import grade_class
 from pipeline.grading.grade import grade_text
 from pipeline.grading.gradebook import Gradebook
-from pipeline.grading.intake import find_hand_ins
-from pipeline.grading.load import load_rubric
-from pipeline.grading.runner import grade_batch, run_here
+from pipeline.grading.runner import Limits
 from pipeline.grading.shared import find_shared
 from pipeline.grading.shared_prints import fingerprint
 from pipeline.ingest.read import read_data
@@ -53,11 +53,11 @@ DISGUISES = {
 }
 
 
-def write_class(folder: Path, teams: int) -> None:
+def write_class(folder: Path, teams: int, *, preset: str = PRESET) -> None:
     for seed in range(teams):
         write_submission(
             folder / f"team-{seed:03d}",
-            chain=PRESET,
+            chain=preset,
             seed=seed,
             authors=(f"s{seed}",),
             compact=True,
@@ -65,10 +65,27 @@ def write_class(folder: Path, teams: int) -> None:
         )
 
 
-def grade(folder: Path, out: Path, *, jobs: int, watch: list[float] | None = None) -> float:
-    """Grade a class without figures; return the seconds. `watch` collects MB in use."""
-    scratch = out / "scratch"
-    scratch.mkdir(parents=True, exist_ok=True)
+@dataclass(frozen=True, kw_only=True)
+class Cost:
+    """Seconds on the clock, and of the processor: this process and its workers."""
+
+    clock: float
+    parent: float
+    workers: float
+
+    @property
+    def cpu(self) -> float:
+        """Seconds of the processor, all processes together."""
+        return self.parent + self.workers
+
+    def __str__(self) -> str:
+        return f"{self.clock:.1f} s, {self.cpu:.1f} s of the processor, {self.parent:.2f} here"
+
+
+def grade(
+    folder: Path, out: Path, *, preset: str, jobs: int, watch: list[float] | None = None
+) -> Cost:
+    """Grade a class without figures, all files written; `watch` collects MB in use."""
     process = psutil.Process()
 
     def progress(done: int, total: int, last: str) -> None:
@@ -76,31 +93,36 @@ def grade(folder: Path, out: Path, *, jobs: int, watch: list[float] | None = Non
             family = (process, *process.children())
             watch.append(sum(p.memory_info().rss for p in family) / 1e6)
 
-    start = time.perf_counter()
-    with Gradebook(out, create=True) as book:
-        rubric = load_rubric(Path(PRESET))
-        batch = grade_batch(
-            find_hand_ins([folder], scratch=scratch),
-            rubric=rubric,
-            store=book,
-            scratch=scratch,
-            execute=run_here(jobs=jobs),
-            memory=out / "compared.json",
-            progress=progress,
-        )
-        book.finish(batch, rubric=rubric)
-    return time.perf_counter() - start
-
-
-def speed(base: Path, *, teams: int, copies: int) -> None:
-    write_class(base / "class", teams)
-    one = grade(base / "class", base / "one", jobs=1)
-    two = grade(base / "class", base / "two", jobs=2)
-    again = grade(base / "class", base / "two", jobs=2)
-    print(
-        f"{teams} submissions: {teams / one:.2f} a second on one core, {one / two:.2f} times on two"
+    start, before = time.perf_counter(), process.cpu_times()
+    grade_class(
+        [folder],
+        rubric_file=Path(preset),
+        out=out,
+        jobs=jobs,
+        cluster=None,
+        limits=Limits(),
+        figures=False,
+        progress=progress,
     )
-    print(f"nothing changed: {again:.2f} s, {two / again:.0f} times faster")
+    after = process.cpu_times()
+    return Cost(
+        clock=time.perf_counter() - start,
+        parent=after.user + after.system - before.user - before.system,
+        workers=after.children_user
+        + after.children_system
+        - before.children_user
+        - before.children_system,
+    )
+
+
+def speed(base: Path, *, preset: str, teams: int, copies: int) -> None:
+    write_class(base / "class", teams, preset=preset)
+    one = grade(base / "class", base / "one", preset=preset, jobs=1)
+    two = grade(base / "class", base / "two", preset=preset, jobs=2)
+    again = grade(base / "class", base / "two", preset=preset, jobs=2)
+    print(f"{teams} submissions, {preset}, one job: {one}: {teams / one.cpu:.2f} a second and core")
+    print(f"two jobs: {two}: {one.clock / two.clock:.2f} times as fast")
+    print(f"nothing changed: {again}: {one.cpu / again.cpu:.0f} times less of the processor")
     if copies:
         for number in range(copies):
             source = base / "class" / f"team-{number % teams:03d}"
@@ -108,12 +130,9 @@ def speed(base: Path, *, teams: int, copies: int) -> None:
             shutil.copytree(source, target)
             (target / "notes.md").write_text(f"number {number}", encoding="utf-8")
         watch: list[float] = []
-        seconds = grade(base / "many", base / "out-many", jobs=2, watch=watch)
-        marks = [watch[round(share * (len(watch) - 2))] for share in (0.1, 0.25, 0.5, 0.75, 1.0)]
-        print(
-            f"{copies} in one run: {seconds:.0f} s, MB at 10, 25, 50, 75, 100 %:",
-            *map(round, marks),
-        )
+        cost = grade(base / "many", base / "out-many", preset=preset, jobs=2, watch=watch)
+        marks = [watch[round(share * (copies - 1))] for share in (0.1, 0.25, 0.5, 0.75, 1.0)]
+        print(f"{copies} in one run: {cost}; MB at 10, 25, 50, 75, 100 %:", *map(round, marks))
 
 
 def kills(base: Path, *, count: int) -> None:
@@ -217,6 +236,7 @@ def shared(base: Path, *, teams: int) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("what", choices=("speed", "kills", "shared"))
+    parser.add_argument("--preset", default=PRESET)
     parser.add_argument("--teams", type=int, default=40)
     parser.add_argument("--copies", type=int, default=0)
     parser.add_argument("--kills", type=int, default=300)
@@ -224,7 +244,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         base = Path(folder)
         if options.what == "speed":
-            speed(base, teams=options.teams, copies=options.copies)
+            speed(base, preset=options.preset, teams=options.teams, copies=options.copies)
         elif options.what == "kills":
             kills(base, count=options.kills)
         else:
