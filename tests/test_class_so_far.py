@@ -134,7 +134,8 @@ def test_who_is_removed_is_off_every_list_but_history(tmp_path):
         book.finish(everybody, rubric=RUBRIC)
         assert book.names() == ["a", "b", "c"]
         book.remove(["a", "b", "c"])
-        assert write_outputs(book, tmp_path) == []
+        write_outputs(book, tmp_path)
+        assert rows(tmp_path) == {}
 
 
 def test_a_failed_second_try_hides_no_recordings(tmp_path):

@@ -10,6 +10,7 @@ from urllib.parse import quote
 import numpy as np
 
 from pipeline import __version__
+from pipeline.grading.doubles import Double
 from pipeline.grading.feedback_words import TITLES, points_text
 from pipeline.grading.grade import CODES, Code, Grade, Outcome
 from pipeline.grading.rubric import Rubric
@@ -81,18 +82,22 @@ class Line:
         )
 
 
-def class_page(lines: Sequence[Line], *, rubric: Rubric) -> str:
+def class_page(
+    lines: Sequence[Line], *, rubric: Rubric, doubles: Sequence[Double] = ()
+) -> str:
     """Return `class.html`; same class, same bytes."""
-    return render_html(class_document(lines, rubric=rubric))
+    return render_html(class_document(lines, rubric=rubric, doubles=doubles))
 
 
-def class_document(lines: Sequence[Line], *, rubric: Rubric) -> Document:
+def class_document(
+    lines: Sequence[Line], *, rubric: Rubric, doubles: Sequence[Double] = ()
+) -> Document:
     """Return the class as a document."""
     graded = [line for line in lines if line.status == "graded"]
     tables, pictures = count(1), count(1)
     with drawing():
         parts = [
-            ("summary", "Summary", _summary(lines, graded)),
+            ("summary", "Summary", _summary(lines, graded, doubles)),
             ("points", "Points", _points(graded, rubric, pictures)),
             ("criteria", "Criteria", _criteria(graded, rubric, tables, pictures)),
             ("mistakes", "Most common mistakes", _mistakes(lines, tables)),
@@ -109,7 +114,9 @@ def class_document(lines: Sequence[Line], *, rubric: Rubric) -> Document:
     )
 
 
-def _summary(lines: Sequence[Line], graded: Sequence[Line]) -> list[Block]:
+def _summary(
+    lines: Sequence[Line], graded: Sequence[Line], doubles: Sequence[Double]
+) -> list[Block]:
     failed = [line for line in lines if line.status == "failed"]
     tiles = [
         Tile(spans("Submissions"), spans(str(len(lines))), url="#class" if lines else ""),
@@ -138,6 +145,9 @@ def _summary(lines: Sequence[Line], graded: Sequence[Line]) -> list[Block]:
             blocks.append(Details(spans(f"{len(failed)} {said}"), (reasons,)))
         else:
             blocks += [paragraph(f"These {said}:"), reasons]
+    if doubles:
+        said = "Nobody is accused for what submissions with an author in common share. To look at:"
+        blocks += [paragraph(said), bullet_list(spans(f"{double}.") for double in doubles)]
     return blocks
 
 

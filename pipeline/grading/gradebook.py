@@ -162,6 +162,10 @@ class Gradebook:
             lines = [] if last is None else lines_of(connection, last)
         return read_listed(self._database, [line["grading_id"] for line in lines])
 
+    def prints_of(self, numbers: Sequence[int]) -> list[Prints]:
+        """Return the fingerprints of gradings, see `Entry.grading`."""
+        return [line.prints for line in read_listed(self._database, numbers)]
+
     def names(self) -> list[str]:
         """Return the submissions of the class list so far."""
         with self._database.reading() as connection:

@@ -5,12 +5,14 @@ The files are a function of the gradebook alone: written again at any time, they
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from pipeline.errors import ConfigError
 from pipeline.grading.anonymous import KEY_FILE, anonymise, key_text, pseudonyms
 from pipeline.grading.class_page import Line, class_page
+from pipeline.grading.doubles import Double, find_doubles, with_recordings
 from pipeline.grading.feedback import feedback_page
 from pipeline.grading.grade import Grade, grade_dict
 from pipeline.grading.gradebook import Gradebook
@@ -32,8 +34,8 @@ _AFTER = ("remarks", "by_hand", "reason")
 
 def write_outputs(
     book: Gradebook, out: Path, *, progress: Callable[[str], None] = lambda text: None
-) -> list[Line]:
-    """Write the class list of a gradebook into a folder; return its lines.
+) -> list[Double]:
+    """Write the class list of a gradebook into a folder; return who stands on it several times.
 
     A rubric that is `anonymous` leaves out all names, and `anonymous-key.csv` says whose is what.
     Feedback that an earlier batch left is removed; what is not ours stays.
@@ -46,9 +48,12 @@ def write_outputs(
     look = _look(rubric)
     lines: list[Line] = []
     now_of: dict[str, str] = {}
+    gradings: dict[str, int] = {}
+    authors: dict[str, tuple[str, ...]] = {}
     for entry in book.entries():
         grade = anonymise(entry.grade, names) if names is not None else entry.grade
         lines.append(Line.of(grade, by_hand=sorted(entry.overrides)))
+        gradings[entry.submission], authors[entry.submission] = entry.grading, entry.grade.authors
         now_of[grade.submission] = _digest(look, entry.key, repr((grade, _by_hand(entry))))
         own = own_folder(folder, _checked(grade.submission))
         there = (own / _PAGE).is_file() and (own / _JSON).is_file()
@@ -70,13 +75,36 @@ def write_outputs(
         lines.sort(key=lambda line: line.name)  # the order of the names would tell
     _remove_stale(folder, keep=set(now_of))
     write_file(out / "grades.csv", grades_csv(lines, rubric=rubric))
-    now_of[_WHOLE] = _digest(look, repr(lines), *now_of.values())
+    doubles = _doubles(book, authors, gradings=gradings, names=names)
+    now_of[_WHOLE] = _digest(look, repr((lines, doubles)), *now_of.values())
     if made_of.get(_WHOLE) != now_of[_WHOLE] or not (out / _CLASS).is_file():
-        write_file(out / _CLASS, class_page(lines, rubric=rubric))
+        write_file(out / _CLASS, class_page(lines, rubric=rubric, doubles=doubles))
     write_file(
         folder / _MADE, json.dumps(now_of, indent=0, ensure_ascii=False, sort_keys=True) + "\n"
     )
-    return lines
+    return doubles
+
+
+def _doubles(
+    book: Gradebook,
+    authors: Mapping[str, Sequence[str]],
+    *,
+    gradings: Mapping[str, int],
+    names: Mapping[str, str] | None,
+) -> list[Double]:
+    """Return who stands in several submissions, nameless where `names` stand in for those."""
+    found = find_doubles(authors)
+    concerned = dict.fromkeys(name for double in found for name in double.submissions)
+    found = with_recordings(found, book.prints_of([gradings[name] for name in concerned]))
+    if names is None:
+        return found
+    return sorted(
+        (
+            replace(double, author="", submissions=tuple(sorted(names[s] for s in double.submissions)))
+            for double in found
+        ),
+        key=lambda double: double.submissions,
+    )
 
 
 def grades_csv(lines: Sequence[Line], *, rubric: Rubric) -> str:
