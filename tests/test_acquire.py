@@ -10,26 +10,30 @@ import sys
 import time
 from contextlib import suppress
 from dataclasses import replace
+from io import StringIO
 
 import numpy as np
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 from pipeline.bench.acquire import acquire
 from pipeline.bench.experiments import prepare_submission
 from pipeline.bench.gains import Scales
+from pipeline.bench.observer import Anomalies, Outcome
 from pipeline.bench.orders import make_order
-from pipeline.bench.plan import Limits, Recording, StateLoop
+from pipeline.bench.plan import Limits, Plan, Recording, StateLoop
 from pipeline.bench.plan_file import load_plan
-from pipeline.bench.protocol import Description
+from pipeline.bench.protocol import Description, Reading
 from pipeline.bench.raw import read_raw
 from pipeline.bench.record import readings_of
 from pipeline.bench.serial_line import open_line
 from pipeline.bench.session import Session
+from pipeline.bench.terminal import Terminal, sparkline
 from pipeline.cli import app
 from pipeline.errors import ConfigError, HardwareError
 from pipeline.ingest.read import read_data
-from pipeline.submission import System, load_submission
+from pipeline.submission import StateFeedback, System, load_submission
 from tests.acquisitions import LIMITS, Notes, host, sine, write_work
 from tests.benches import emulator
 
@@ -152,7 +156,7 @@ def test_a_plan_becomes_a_submission(tmp_path, fast):
     # An amplitude goes over the line in whole counts of 0.00227 cm.
     assert reference.max() == pytest.approx(0.3, abs=0.5 * 0.00227)
     controller = next(e.controller for e in submission.experiments if e.id == "control")
-    assert controller is not None
+    assert isinstance(controller, StateFeedback)
     # Commands carry nine digits, the table six.
     assert controller.gains == pytest.approx((0.01, 0.002, 0.0, 0.0), rel=1e-5)
 
@@ -486,3 +490,64 @@ def test_an_id_that_the_plan_does_not_have_is_said(tmp_path, real):
     work = write_work(tmp_path, [sine("a", seconds=1)])
     with pytest.raises(ConfigError, match=r"--only nine: plan.toml has a$"):
         acquire(work, port=real.address, observers=[Notes()], only=["nine"])
+
+
+# ----------------------------------------------------------------- the terminal
+
+
+def shown(*, terminal: bool, **options) -> tuple[Terminal, StringIO]:
+    """Return a terminal view and what it prints."""
+    out = StringIO()
+    return Terminal(console=Console(file=out, force_terminal=terminal, width=100), **options), out
+
+
+def test_the_view_tells_plan_rate_faults_and_positions():
+    """While a run goes on: what is done and left, what is lost, where the carts are."""
+    view, out = shown(terminal=True)
+    plan = Plan(limits=LIMITS, recordings=(sine("a", seconds=30), sine("b", seconds=45)))
+    with view:
+        view.planned(plan, frozenset("a"))
+        view.started(plan.recordings[1])
+        for ms in range(0, 2000, 50):
+            view.readings(
+                [Reading(counts=(ms, -ms), target=0, duty=0, ms=ms + i) for i in range(50)],
+                Anomalies(lost=7, stuck=1),
+            )
+    text = out.getvalue()
+    assert "1 of 2 recorded, 43 s left" in text
+    assert "b (sine): 2.0 of 45.0 s" in text
+    assert "7 lines lost, 1 encoders stuck" in text
+    assert sparkline(range(0, 2000, 50)) in text
+
+
+def test_without_a_terminal_only_trouble_is_told():
+    """In a log file a run that went well leaves nothing, one that did not leaves its reason."""
+    view, out = shown(terminal=False)
+    well = Outcome(recording=sine("a", seconds=1), lines=998)
+    with view:
+        view.planned(Plan(limits=LIMITS, recordings=(well.recording,)), frozenset())
+        view.started(well.recording)
+        view.readings([Reading(counts=(1, 2), target=0, duty=0, ms=5)], Anomalies())
+        view.finished(well)
+        assert out.getvalue() == ""
+        view.finished(replace(well, partial="stopped: cart 1 [b] was too far"))
+    assert out.getvalue() == "a: stopped: cart 1 [b] was too far\n"
+
+
+def test_nobody_at_the_keyboard_confirms_nothing(monkeypatch):
+    """Without a keyboard an instruction ends the session; `--yes` takes it as done, and says so."""
+    monkeypatch.setattr("sys.stdin", StringIO())
+    view, _ = shown(terminal=False)
+    with pytest.raises(ConfigError, match=r"Hold cart 2: nobody is at the keyboard \(--yes"):
+        view.confirm("Hold cart 2")
+    view, out = shown(terminal=False, yes=True)
+    view.confirm("Hold cart 2")
+    assert out.getvalue() == "Hold cart 2: taken as done\n"
+
+
+@pytest.mark.parametrize(
+    ("values", "bars"), [([5, 5], "▁▁"), ([0, 7], "▁█"), (range(8), "▁▂▃▄▅▆▇█")]
+)
+def test_a_sparkline_goes_from_the_least_to_the_greatest(values, bars):
+    """One bar a value, the least lowest, the greatest highest; equal values lie low."""
+    assert sparkline(values) == bars

@@ -11,7 +11,6 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from pipeline.bench.plan import Limits, Recording
@@ -22,6 +21,7 @@ FOLDER = "raw"
 _VERSION = "cartlab-raw/1"
 _TIME = struct.Struct("<Qd")  # end of the lump in the stream, s since the run began
 _LONGEST_HEADER = 100_000  # bytes
+_LINE = ("target", "duty", "milliseconds")  # what follows the encoders
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,9 +57,6 @@ class RawHeader:
         return json.dumps(content, ensure_ascii=False)
 
 
-_LINE = ("target", "duty", "milliseconds")
-
-
 class RawWriter:
     """Writes what arrives, at once; what is written survives the program.
 
@@ -80,12 +77,7 @@ class RawWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._bytes.close()
         self._times.close()
 
