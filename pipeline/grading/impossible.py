@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
-from fractions import Fraction
 
 from pipeline.grading.grade import Flag
 from pipeline.grading.orders import orders
