@@ -1,13 +1,16 @@
 """Named mistakes: each gets its code and no other; an honest student gets none."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from decimal import Decimal
 
 import numpy as np
 import pytest
 
 from pipeline.grading.grade import Flag
+from pipeline.submission import Reported
 from tests.grading_students import Student, student, typed
+from tests.textbook_student import by_eye, final_table, initial_table
 
 TURN = 2 * np.pi
 FRICTION = ("coulomb_friction",)
@@ -54,6 +57,55 @@ def test_numbers_typed_with_two_digits_are_honest_too(carts):
         for table in ("initial", "final")
     }
     assert codes(one.reporting(initial=coarse["initial"], final=coarse["final"])) == []
+
+
+@pytest.mark.parametrize("carts", [1, 2, 3])
+@pytest.mark.parametrize("hide", [(), FRICTION])
+def test_a_student_with_a_textbook_is_honest(carts, hide):
+    """Means, peaks, half the swing and a fit in dB, last cart first: no flag."""
+    one = student(carts, hide=hide)
+    records = one.analysis.records
+    initial = by_eye(records, carts) if carts > 1 else {}
+    initial |= initial_table(records, carts)
+    tables = {"initial": initial, "final": final_table(records, carts, initial)}
+    reported = Reported(**{x: {n: typed(v) for n, v in t.items()} for x, t in tables.items()})
+    submission = one.submission.model_copy(update={"reported": reported})
+    assert set(codes(replace(one, submission=submission))) <= {"missing"}
+
+
+@pytest.mark.parametrize("digits", [2, 3])
+def test_a_right_first_estimate_may_be_found_again(digits):
+    """Of one cart on a quiet bench both estimates of a careful student are the same."""
+    one = student(1)
+    right = {row.name: row.final.value for row in one.analysis.rows if row.final}
+    table = {name: Decimal(f"{value:.{digits - 1}e}") for name, value in right.items()}
+    assert codes(one.reporting(initial=table, final=table)) == []
+
+
+@pytest.mark.parametrize("carts", [2, 3])
+def test_the_order_in_which_numbers_are_listed_does_not_matter(carts):
+    """Who writes the last cart first has the same table."""
+    one = student(carts)
+    reported = one.reported.model_copy(
+        update={
+            "initial": dict(reversed(one.reported.initial.items())),
+            "final": dict(reversed(one.reported.final.items())),
+        }
+    )
+    submission = one.submission.model_copy(update={"reported": reported})
+    assert codes(replace(one, submission=submission)) == []
+    swapped = replace(one, submission=submission).reporting(
+        final={"K_2": 1.25 * one.value("final", "K_1")}
+    )
+    assert only_flag(swapped).code == "physically_impossible"
+
+
+def test_a_student_who_reports_first_estimates_only_misses_the_rest():
+    """What is not there is missing; nothing else is held against them."""
+    one = student(2)
+    reported = Reported(initial=one.reported.initial)
+    submission = one.submission.model_copy(update={"reported": reported})
+    assert codes(replace(one, submission=submission)) == ["missing"]
 
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
@@ -116,6 +168,18 @@ def test_the_peak_of_the_step(carts):
     assert flag.parameters == tuple(own("K", carts))
 
 
+@pytest.mark.parametrize("hide", [(), FRICTION])
+def test_the_peak_of_one_edge_of_both_carts(hide):
+    """Where friction blurs the gains, the peaks of one edge are still those of one edge."""
+    one = student(2, hide=hide)
+    record = next(r for r in one.analysis.records if r.kind == "step")
+    assert record.u is not None
+    on = np.flatnonzero(record.u)
+    peaks = ((record.y[:, on] - record.y[:, :1]) / record.u[on]).max(axis=1)
+    flag = only_flag(one.reporting(initial={"K_1": peaks[0], "K_2": peaks[1]}))
+    assert flag.code == "peak_for_steady_state"
+
+
 @pytest.mark.parametrize("carts", [2, 3])
 @pytest.mark.parametrize("table", ["initial", "final"])
 def test_carts_swapped(carts, table):
@@ -160,6 +224,13 @@ def test_a_number_that_no_mistake_explains_is_only_off(carts):
     assert (flag.code, flag.parameters) == ("final_off", (omega,))
     flag = only_flag(scaled(one, "initial", [gain], 0.81))
     assert (flag.code, flag.parameters) == ("initial_off", (gain,))
+
+
+def test_a_frequency_out_of_order_is_told_by_the_recordings():
+    """One wrong number that also breaks the order of the nulls: what it should be helps more."""
+    one = student(3)
+    flag = only_flag(scaled(one, "final", ["omega_2"], 1.4))
+    assert (flag.code, flag.parameters) == ("final_off", ("omega_2",))
 
 
 def test_what_no_carts_can_do():
@@ -241,6 +312,20 @@ def test_wrong_gains_and_wrong_prefilters_are_told_apart(carts):
     flag = only_flag(one.reporting(feedback=inverse))
     assert flag.code == "wrong_prefilter"
     assert "take its reciprocal" in flag.message
+
+
+def test_claims_of_other_gains_are_not_these_gains():
+    """Two and a half times the gains settle later than was reported of them."""
+    one = student(1)
+    feedback = one.reported.feedback
+    assert feedback is not None
+    gains = feedback.model_copy(
+        update={"gains": tuple(typed(2.5 * float(g)) for g in feedback.gains)}
+    )
+    runs = [e.model_copy(update={"controller": None}) for e in one.submission.experiments]
+    submission = one.submission.model_copy(update={"experiments": tuple(runs)})
+    flag = only_flag(replace(one, submission=submission).reporting(feedback=gains))
+    assert flag.code == "wrong_gains"
 
 
 def test_what_is_missing_is_named():

@@ -77,6 +77,27 @@ def test_one_copied_recording_is_found_however_disguised(teams, kind, disguise):
     assert mine.experiment == copied.id
 
 
+def test_under_feedback_the_input_gives_a_copy_away(teams):
+    """The controller has made the input of the carts' noise: further noise in the carts is no veil.
+
+    The start, where the reference steps, is cut off as well.
+    """
+    rng = np.random.default_rng(9)
+    record = of_kind(teams[0], "closed_loop")
+    n = record.t.size // 8
+    cut = replace(
+        record,
+        t=record.t[n:],
+        u=record.u[n:],
+        y=record.y[:, n:],
+        reference=record.reference[n:],
+    )
+    found = find_shared(
+        [prints("a", teams[0]), prints("b", [*teams[1], disguised(cut, rng, noise=1.0, scale=2.0)])]
+    )
+    assert {r.experiment for r in found["a"]} == {record.id}
+
+
 def test_a_whole_copy_is_found_under_much_noise(teams):
     """Noise of six times the encoder's own hides single recordings, not all of them."""
     rng = np.random.default_rng(8)

@@ -255,10 +255,8 @@ def _agreement(a: Print, b: Print, *, shift: int, scale: float | None) -> float:
     first, last = max(0, -shift), min(a.residual.shape[1], b.residual.shape[1] - shift)
     if last - first < _LEAST_OVERLAP:
         return 0.0
-    # In units of b's noise, so that every cart has its say; the input may be scaled otherwise.
+    # In units of b's noise, so that every cart has its say.
     factor = np.ones(b.step.size) if scale is None else scale * a.step / b.step
-    if a.fed_back and b.fed_back:
-        factor[-1] = np.sign(factor[0])
     in_a = a.residual[:, first:last] * factor[:, None]
     in_b = b.residual[:, first + shift : last + shift].astype(np.float64)
     in_b, in_a = in_b * (in_a != 0), in_a * (in_b != 0)

@@ -7,7 +7,7 @@ where a record is cut, shifted in time, rescaled, renamed or buried in further n
 
 import json
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
@@ -45,9 +45,8 @@ class Print:
     ----------
     group : what was done: only recordings of the same kind of run are compared.
     residual : (n_rows, n) whole numbers -5 … 5; 0 also where the motion has a kink. A row for each
-        free cart; under feedback one more for the input, which is made of the carts' noise.
+        free cart, or one for the input.
     step : (n_rows,) what 1 stands for, in the record's position unit, or input unit.
-    fed_back : whether the last row is the input's.
     anchors : (n_anchors,) samples that are found again in a copy, the surest first, and so tell
         how it is shifted: where the motion passes the middle between two extrema (they stand
         much noise), in turn with where the noise is loudest (they stand any cut).
@@ -61,12 +60,11 @@ class Print:
     step: Array
     anchors: np.ndarray
     swing: Array
-    fed_back: bool
 
 
 def fingerprint(records: Sequence[Record]) -> bytes:
     """Return the fingerprints of a submission's recordings, packed; b"" where there are none."""
-    prints = [found for record in records if (found := _print(record)) is not None]
+    prints = [found for record in records for found in _prints(record)]
     if not prints:
         return b""
     heads = [
@@ -77,7 +75,6 @@ def fingerprint(records: Sequence[Record]) -> bytes:
             "step": one.step.tolist(),
             "anchors": one.anchors.tolist(),
             "swing": one.swing.tolist(),
-            "fed_back": one.fed_back,
         }
         for one in prints
     ]
@@ -103,45 +100,50 @@ def unpack(packed: bytes) -> tuple[Print, ...]:
                 step=np.array(entry["step"]),
                 anchors=np.array(entry["anchors"], dtype=np.int64),
                 swing=np.array(entry["swing"]),
-                fed_back=entry["fed_back"],
             )
         )
     return tuple(prints)
 
 
-def _print(record: Record) -> Print | None:
-    """Return the fingerprint of a recording, None where nothing moves or it is too short."""
+def _prints(record: Record) -> Iterator[Print]:
+    """Yield the fingerprints of a recording: of its motion, and of an input made of its noise.
+
+    None where nothing moves or it is too short. Under feedback the controller puts the noise of
+    the measured positions into the input, where noise added to the positions does not reach it.
+    """
     carts = [cart for cart in record.free if cart in record.carts]
     if not carts or record.t.size < _FEWEST_SAMPLES + 2 * MARGIN:
-        return None
-    rows = [record.position(cart) for cart in carts]
+        return
+    frequency = "" if record.omega is None else f"{record.omega / (2 * np.pi):.3g} Hz"
+    group = f"{record.kind} {','.join(map(str, carts))} {frequency}"
+    yield from _print(record, [record.position(cart) for cart in carts], group=group)
     if record.kind == "closed_loop" and record.u is not None:
-        rows.append(record.u)
-    y = np.array(rows)[:, : _MOST_SAMPLES + 2 * MARGIN]
+        yield from _print(record, [record.u], group=f"{group}input")
+
+
+def _print(record: Record, signals: Sequence[Array], *, group: str) -> Iterator[Print]:
+    """Yield the fingerprint of some signals of a recording; none where one has no noise."""
+    y = np.array(signals)[:, : _MOST_SAMPLES + 2 * MARGIN]
     noise = np.array([np.convolve(row, _high_pass(), "valid") for row in y])
     sigma = np.array(
         [_sigma(one, travel=float(np.ptp(row))) for one, row in zip(noise, y, strict=True)]
     )
-    if not np.all(sigma[: len(carts)] > 0):
-        return None
-    fed_back = sigma.size > len(carts) and bool(sigma[-1] > 0)
-    noise, sigma = (noise, sigma) if fed_back else (noise[: len(carts)], sigma[: len(carts)])
+    if not np.all(sigma > 0):
+        return
     sigmas = noise / sigma[:, None]
     telling = np.abs(sigmas) < _KINK
     anchors, swing = _in_turn(
         _motion_anchors(y[0, MARGIN:-MARGIN] - noise[0]),
-        _noise_anchors(np.abs(sigmas[-1:] if fed_back else sigmas).sum(axis=0)),
+        _noise_anchors(np.abs(sigmas).sum(axis=0)),
     )
     levels = np.clip(np.round(_STEPS_PER_SIGMA * sigmas), -_LEVELS, _LEVELS)
-    frequency = "" if record.omega is None else f"{record.omega / (2 * np.pi):.3g} Hz"
-    return Print(
+    yield Print(
         experiment=record.id,
-        group=f"{record.kind} {','.join(map(str, carts))} {'u' if fed_back else ''}{frequency}",
+        group=group,
         residual=np.where(telling, levels, 0).astype(np.int8),
         step=sigma / _STEPS_PER_SIGMA,
         anchors=anchors,
         swing=swing,
-        fed_back=fed_back,
     )
 
 
