@@ -111,6 +111,14 @@ def test_a_broken_submission_graded_by_hand_is_exported(tmp_path):
     assert remarks == ()
 
 
+def test_a_submission_that_names_nobody_is_said(tmp_path):
+    """A row without a student is no use to a platform; a person has to find out whose it is."""
+    nobody = make_outcome(failed_grade("team-8", "broken"))
+    rows, remarks = write(tmp_path, FULL, nobody, platform="canvas")
+    assert len(rows) == 4
+    assert remarks == ("nobody is named in it, so not exported: team-8",)
+
+
 @pytest.mark.parametrize("platform", ["canvas", "moodle", "gradescope"])
 def test_a_number_of_another_platform_is_nobodys(tmp_path, platform):
     """The same number means another student there: nobody gets somebody else's grade."""

@@ -201,6 +201,7 @@ def remove(
     assignment: Lab = None,
 ) -> None:
     """Take submissions off the class list; their history stays."""
+    from pipeline.grading.blind import meant
     from pipeline.grading.gradebook import Gradebook
     from pipeline.grading.lock import alone_in
     from pipeline.grading.outputs import write_outputs
@@ -209,7 +210,8 @@ def remove(
     pages = folder.is_dir()
     with Gradebook(grades, assignment=assignment) as book:
         with alone_in(folder) if pages else nullcontext():
-            gone = book.remove(teams)
+            names = {meant(book, team): team for team in teams}
+            gone = [names.get(name, name) for name in book.remove(list(names))]
             if pages:
                 write_outputs(book, folder)
     say(f"no longer in the class: {', '.join(gone)}")

@@ -69,6 +69,10 @@ def students_of(entries: Sequence[Entry], *, platform: Platform) -> tuple[list[S
         f"{id_} is in {' and '.join(names)}: the higher points are exported"
         for id_, names in twice.items()
     ]
+    nameless = [key for key, s in found.items() if not (s.id or s.name or s.number)]
+    if nameless:
+        teams = ", ".join(found.pop(key).grade.submission for key in nameless)
+        remarks.append(f"nobody is named in it, so not exported: {teams}")
     blank = dict.fromkeys(s.grade.submission for s in found.values() if not s.points)
     if blank:
         remarks.append(f"could not be graded, left blank: {', '.join(blank)}")
