@@ -38,13 +38,17 @@ _LOOK = 0.003  # s between looks at the port
 _FORWARD = 0.05  # s between batches handed to the observers
 _FIRST_LINE = 1.0  # s a bench may take to begin
 _SILENCE = 0.5  # s without a byte in mid-run: the bench is gone
-_NEARLY = 100.0  # ms before the end at which silence is the end, its last lines lost
+_UNREADABLE = 0.25  # s of bytes that are no lines: the motor may be on, and nobody sees the carts
+_NEARLY = 100.0  # ms before the end at which silence is the end; after it lines are too many
 _AFTER_END = 0.02  # s the last lines may still be under way
 _REST_TRIES = 4
 _REST_WINDOW = 500.0  # ms at the end of a rest over which it is judged
 _ENOUGH = 1000  # lines that tell a clock's period
 _STILL = 4  # counts a cart at rest may flicker
 _PULL_OUT = 1.7  # s a virtual hand takes to pull a cart out
+
+# Told to end; the terminal was closed; Ctrl-Break on Windows. No system has all three.
+_ENDING = ("SIGTERM", "SIGHUP", "SIGBREAK")
 
 
 class Stopped(KeyboardInterrupt):
@@ -53,7 +57,7 @@ class Stopped(KeyboardInterrupt):
 
 @contextmanager
 def stopping_on_signals() -> Iterator[None]:
-    """Turn SIGTERM into an exception, so that a run under way is stopped and saved."""
+    """Turn signals that end a program into an exception: a run is stopped and saved first."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -61,11 +65,14 @@ def stopping_on_signals() -> Iterator[None]:
     def stop(number: int, frame: FrameType | None) -> None:
         raise Stopped(f"signal {number}")
 
-    before = signal.signal(signal.SIGTERM, stop)
+    numbers = [getattr(signal, name) for name in _ENDING if hasattr(signal, name)]
+    # One that is ignored stays so: nohup means a closed terminal to end nothing.
+    before = {n: signal.signal(n, stop) for n in numbers if signal.getsignal(n) == signal.SIG_DFL}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @contextmanager
@@ -203,9 +210,14 @@ class Session:
         if not always and not self._line.knows("s"):
             return
         try:
-            self._line.stop()
+            try:
+                self._line.stop()
+            except KeyboardInterrupt:  # pressed twice: the stop still comes first
+                self._line.stop()
+                raise
         except HardwareError as error:
-            self._observer.remark(f"the stop could not be sent: {error}")
+            guard = "" if self._line.knows("k") else "; the motor may be on: switch it off"
+            self._observer.remark(f"the stop could not be sent: {error}{guard}")
 
     def _listen(
         self,
@@ -228,16 +240,27 @@ class Session:
         check: Callable[[Sequence[Reading]], str],
     ) -> str:
         since = last = time.monotonic()
+        first: int | None = None  # ms of the first line
+        unread: float | None = None  # since when what comes is no line
         while True:
             self._heartbeat()
             now = time.monotonic()
             if data := self._line.receive():
                 arrived(data)
                 last = now
-                if trouble := check(stream.feed(data, since=since, now=now)):
+                lines = stream.feed(data, since=since, now=now)
+                if trouble := check(lines):
                     return trouble
                 if stream.restarted:
                     return "the bench began again in mid-run: its supply or its reset line"
+                if lines:
+                    first, unread = lines[0].ms if first is None else first, None
+                    if lines[-1].ms - first > end + _NEARLY:
+                        return "stopped: the bench went on past the end of the run"
+                else:
+                    unread = now if unread is None else unread
+                    if now - unread > _UNREADABLE:
+                        return "stopped: what the bench sends cannot be read, so nothing is watched"
             quiet = now - last
             if stream.latest >= end - 2 * self._period and quiet > _AFTER_END:
                 return ""
