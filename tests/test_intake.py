@@ -157,6 +157,16 @@ def test_a_gradescope_download(tmp_path):
     assert (known.handed_in, unknown.handed_in) == ("2026-11-20T10:00:00-08:00", "")
 
 
+def test_metadata_that_explode_are_only_text(tmp_path):
+    """Lists of lists of lists by name are no names: nothing is written out a billion times."""
+    laughs = "".join(f"  - &l{i} [{', '.join([f'*l{i - 1}'] * 9)}]\n" for i in range(1, 30))
+    metadata = f"x:\n  - &l0 [ha]\n{laughs}submission_77:\n  :submitters:\n  - :name: *l29\n"
+    tree(tmp_path / "c", {"submission_metadata.yml": metadata + "  :created_at: *l29\n",
+                          "submission_77/submission.toml": TOML})  # fmt: skip
+    (found,) = hand_ins(tmp_path, tmp_path / "c")
+    assert (found.id, found.handed_in) == ("submission_77", "")
+
+
 def test_unpacked_canvas_archives_are_not_taken_for_one_student(tmp_path):
     """Folders called like Canvas' files, by chance or unpacked, are a row each."""
     tree(tmp_path / "c", {f"team_1_{n}_lab/submission.toml": TOML for n in range(3)})

@@ -138,11 +138,14 @@ def gradescope_metadata(folder: Path) -> dict[str, Sent]:
                 continue
             submitters = entry.get(":submitters")
             names = [
-                str(person[":name"])
+                name
                 for person in (submitters if isinstance(submitters, list) else ())
-                if isinstance(person, dict) and person.get(":name")
+                if isinstance(person, dict) and isinstance(name := person.get(":name"), str)
             ]
-            sent[str(key)] = Sent(names=", ".join(names), at=_time(str(entry.get(":created_at"))))
+            at = entry.get(":created_at")
+            sent[str(key)] = Sent(
+                names=", ".join(filter(None, names)), at=_time(at) if isinstance(at, str) else ""
+            )
     return sent
 
 
