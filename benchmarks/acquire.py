@@ -20,6 +20,7 @@ from pipeline.bench.acquire import acquire
 from pipeline.bench.plan import Limits
 from pipeline.bench.raw import read_raw
 from pipeline.bench.record import readings_of
+from pipeline.plant.chain import PRESETS
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
 from tests.acquisitions import Notes, host, sine, write_work
@@ -65,7 +66,10 @@ def faults(folder: Path, *, seconds: float) -> None:
     struck, outcome = sent["injected"], notes.outcomes[-1]
     whole = sent["lines"] - struck["drop"] - struck["garble"] - 2 * struck["merge"]
     points = analyse(load_submission(folder)).sine_points
-    gains = ", ".join(f"{p.gain:.5g} ± {p.gain_std:.2g} cm/V" for p in points)
+    true = np.abs(PRESETS["throne-2dof"].frequency_response(np.array([points[0].omega])))[:, 0]
+    gains = ", ".join(
+        f"{p.gain:.5g} ± {p.gain_std:.2g} cm/V (true {true[p.cart - 1]:.5g})" for p in points
+    )
     print(
         f"faults: sent {sent['lines']}, struck {struck}; valid {whole}, kept {outcome.lines}; "
         f"counted {outcome.anomalies}; analysed: {gains}"

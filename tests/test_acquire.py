@@ -33,7 +33,9 @@ from pipeline.bench.terminal import Terminal, sparkline
 from pipeline.cli import app
 from pipeline.errors import ConfigError, HardwareError
 from pipeline.ingest.read import read_data
+from pipeline.plant.chain import PRESETS
 from pipeline.submission import StateFeedback, System, load_submission
+from pipeline.workflow import analyse
 from tests.acquisitions import LIMITS, Notes, host, sine, write_work
 from tests.benches import emulator
 
@@ -255,8 +257,14 @@ def test_faults_of_every_kind_are_counted_and_the_rest_is_kept(tmp_path):
     assert outcome.anomalies.garbled == struck["garble"] + struck["merge"]
     # At the very ends of a run a loss leaves no gap in the stamps.
     assert abs(outcome.anomalies.lost - struck["drop"]) <= 2
-    note = load_submission(work).experiments[0].note
-    assert f"{outcome.anomalies.garbled} garbled" in note
+    submission = load_submission(work)
+    assert f"{outcome.anomalies.garbled} garbled" in submission.experiments[0].note
+    # And the record is as good as a whole one: the gains of the preset at this frequency.
+    points = analyse(submission).sine_points
+    true = np.abs(PRESETS["throne-2dof"].frequency_response(np.array([points[0].omega])))[:, 0]
+    for point in points:
+        # The input is sent in counts of 0.12 mV, of 10 mV; stamps are good to half a ms of 500.
+        assert point.gain == pytest.approx(true[point.cart - 1], rel=3e-3)
 
 
 @pytest.mark.parametrize(
