@@ -96,9 +96,7 @@ def grade_class(
             changes = book.finish(batch, rubric=rubric.model_copy(update={"anonymous": hidden}))
             remarks = [*remarks, *_told(batch, book)]
             total = len(hand_ins)
-            doubles = write_outputs(
-                book, out, progress=lambda what: progress(total, total, what)
-            )
+            doubles = write_outputs(book, out, progress=lambda what: progress(total, total, what))
             remarks += [f"{double}: see class.html" for double in doubles]
     return Summary(
         total=len(hand_ins),

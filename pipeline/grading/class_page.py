@@ -82,9 +82,7 @@ class Line:
         )
 
 
-def class_page(
-    lines: Sequence[Line], *, rubric: Rubric, doubles: Sequence[Double] = ()
-) -> str:
+def class_page(lines: Sequence[Line], *, rubric: Rubric, doubles: Sequence[Double] = ()) -> str:
     """Return `class.html`; same class, same bytes."""
     return render_html(class_document(lines, rubric=rubric, doubles=doubles))
 

@@ -100,7 +100,9 @@ def _doubles(
         return found
     return sorted(
         (
-            replace(double, author="", submissions=tuple(sorted(names[s] for s in double.submissions)))
+            replace(
+                double, author="", submissions=tuple(sorted(names[s] for s in double.submissions))
+            )
             for double in found
         ),
         key=lambda double: double.submissions,

@@ -267,8 +267,7 @@ def _is_before(earlier: Prints, now: Prints | None) -> bool:
     """
     if now is None:
         return False
-    mended = earlier.of_class and same_recordings(earlier, now)
-    return mended or same_team(earlier, now)
+    return same_team(earlier, now) or (earlier.of_class and same_recordings(earlier, now))
 
 
 def _digest(head: Sequence[str], *groups: Sequence[Prints]) -> str:
