@@ -19,6 +19,8 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -29,7 +31,9 @@ from pipeline.grading.batch import Prints
 from pipeline.grading.batch_run import grade_class
 from pipeline.grading.grade import grade_text
 from pipeline.grading.gradebook import Gradebook
-from pipeline.grading.runner import Limits
+from pipeline.grading.intake import find_hand_ins
+from pipeline.grading.load import load_rubric
+from pipeline.grading.runner import Limits, grade_batch, run_here
 from pipeline.grading.shared import find_shared
 from pipeline.grading.shared_prints import fingerprint
 from pipeline.ingest.read import read_data
@@ -82,37 +86,65 @@ class Cost:
         return f"{self.clock:.1f} s, {self.cpu:.1f} s of the processor, {self.parent:.2f} here"
 
 
-def grade(
-    folder: Path, out: Path, *, preset: str, jobs: int, watch: list[float] | None = None
-) -> Cost:
-    """Grade a class without figures, all files written; `watch` collects MB in use."""
+@contextmanager
+def measured(costs: list[Cost]) -> Iterator[None]:
+    """Add what a stretch of work costs."""
     process = psutil.Process()
+    start, before = time.perf_counter(), process.cpu_times()
+    yield
+    after = process.cpu_times()
+    children = (after.children_user + after.children_system) - (
+        before.children_user + before.children_system
+    )
+    costs.append(
+        Cost(
+            clock=time.perf_counter() - start,
+            parent=after.user + after.system - before.user - before.system,
+            workers=children,
+        )
+    )
+
+
+def grade(folder: Path, out: Path, *, preset: str, jobs: int) -> Cost:
+    """Grade a class without figures, all files written."""
+    costs: list[Cost] = []
+    with measured(costs):
+        grade_class(
+            [folder],
+            rubric_file=Path(preset),
+            out=out,
+            jobs=jobs,
+            cluster=None,
+            limits=Limits(),
+            figures=False,
+            progress=lambda *_: None,
+        )
+    return costs[0]
+
+
+def memory(folder: Path, out: Path, *, preset: str) -> tuple[Cost, list[float]]:
+    """Grade a class with two jobs; return the MB that all processes held after each hand-in.
+
+    Only the grading: of copies all recordings are shared, and naming them would take the time.
+    """
+    process, costs, used = psutil.Process(), [], []
 
     def progress(done: int, total: int, last: str) -> None:
-        if watch is not None:
-            family = (process, *process.children())
-            watch.append(sum(p.memory_info().rss for p in family) / 1e6)
+        family = (process, *process.children())
+        used.append(sum(p.memory_info().rss for p in family) / 1e6)
 
-    start, before = time.perf_counter(), process.cpu_times()
-    grade_class(
-        [folder],
-        rubric_file=Path(preset),
-        out=out,
-        jobs=jobs,
-        cluster=None,
-        limits=Limits(),
-        figures=False,
-        progress=progress,
-    )
-    after = process.cpu_times()
-    return Cost(
-        clock=time.perf_counter() - start,
-        parent=after.user + after.system - before.user - before.system,
-        workers=after.children_user
-        + after.children_system
-        - before.children_user
-        - before.children_system,
-    )
+    scratch = out / "scratch"
+    scratch.mkdir(parents=True)
+    with Gradebook(out, create=True) as book, measured(costs):
+        grade_batch(
+            find_hand_ins([folder], scratch=scratch),
+            rubric=load_rubric(Path(preset)),
+            store=book,
+            scratch=scratch,
+            execute=run_here(jobs=2),
+            progress=progress,
+        )
+    return costs[0], used
 
 
 def speed(base: Path, *, preset: str, teams: int, copies: int) -> None:
@@ -129,9 +161,8 @@ def speed(base: Path, *, preset: str, teams: int, copies: int) -> None:
             target = base / "many" / f"team-{number:04d}"
             shutil.copytree(source, target)
             (target / "notes.md").write_text(f"number {number}", encoding="utf-8")
-        watch: list[float] = []
-        cost = grade(base / "many", base / "out-many", preset=preset, jobs=2, watch=watch)
-        marks = [watch[round(share * (copies - 1))] for share in (0.1, 0.25, 0.5, 0.75, 1.0)]
+        cost, used = memory(base / "many", base / "out-many", preset=preset)
+        marks = [used[round(share * (copies - 1))] for share in (0.1, 0.25, 0.5, 0.75, 1.0)]
         print(f"{copies} in one run: {cost}; MB at 10, 25, 50, 75, 100 %:", *map(round, marks))
 
 
