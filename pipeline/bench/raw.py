@@ -69,7 +69,9 @@ class RawWriter:
         path.parent.mkdir(parents=True, exist_ok=True)
         # Unbuffered: each write is in the hands of the system when it returns.
         self._bytes = path.open("xb", buffering=0)
-        self._times = path.with_suffix(".times").open("wb", buffering=0)
+        times = path.with_suffix(".times")
+        times.unlink(missing_ok=True)  # of a raw file that is gone; a link is not followed
+        self._times = times.open("xb", buffering=0)
         self._bytes.write(header.to_json().encode() + b"\n")
         self._length = 0
         self._began = time.monotonic()
