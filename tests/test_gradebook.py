@@ -6,6 +6,7 @@ import re
 import sqlite3
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from itertools import count
@@ -108,6 +109,25 @@ def test_what_is_put_in_comes_back(open_book):
 
     assert open_book().known(outcome.key) == outcome
     assert open_book().known("another key") is None
+
+
+def test_runs_that_begin_at_once_make_one_gradebook(place):
+    """On a database without tables, each finds or makes all of them."""
+    with ThreadPoolExecutor(8) as runs:
+        books = list(runs.map(lambda n: Gradebook(place, assignment=f"{n}", create=True), range(8)))
+    for book in books:
+        book.put(make_outcome(make_grade("team-1")))
+        assert book.known("key of team-1")
+        book.close()
+
+
+def test_a_folder_may_be_called_like_a_database(tmp_path):
+    """What is there decides, not what it is called."""
+    (tmp_path / "lab.db").mkdir()
+    Gradebook(tmp_path / "lab.db", create=True).close()
+    assert (tmp_path / "lab.db" / FILE).is_file()
+    Gradebook(tmp_path / "other.db", create=True).close()
+    assert (tmp_path / "other.db").is_file()
 
 
 def test_the_newest_of_a_key_counts(open_book):

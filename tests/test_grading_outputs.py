@@ -16,12 +16,13 @@ from pipeline.errors import ConfigError
 from pipeline.grading.anonymous import KEY_FILE, anonymise, pseudonyms
 from pipeline.grading.batch import Batch
 from pipeline.grading.class_page import Line, class_page
+from pipeline.grading.export import results_text
 from pipeline.grading.feedback import feedback_page
 from pipeline.grading.feedback_words import PLACES, TITLES
 from pipeline.grading.grade import CODES, Flag
 from pipeline.grading.gradebook import Gradebook
 from pipeline.grading.outputs import grades_csv, write_outputs
-from pipeline.grading.override import read_points
+from pipeline.grading.override import Override, read_points, with_overrides
 from pipeline.grading.table import csv_text, neutral, read_table
 from tests.grades import (
     failed_grade,
@@ -344,6 +345,22 @@ def test_the_class_page_counts_what_there_is():
 
 def missing_flag() -> Flag:
     return Flag(code="missing", parameters=("K_1",), message="K_1 is missing.", evidence={})
+
+
+def test_points_by_hand_are_not_asked_for_again():
+    """Who was graded by hand reads so, on the page and in Gradescope, and hands in nothing anew."""
+    grade = failed_grade("team-7", "no submission.toml in it")
+    given = Override(criterion=RUBRIC.criteria[0].id, points=1.0, why="x", by="y", at="")
+    given = {given.criterion: given}
+    by_hand = with_overrides(grade, given, rubric=RUBRIC)
+    page = feedback_page(by_hand, rubric=RUBRIC, overrides=given, figures=(), name="team-7")
+    text = re.sub(r"<[^>]+>", "", page)
+    assert "could not be graded automatically" in text
+    assert "Its points were given by hand." in text
+    assert "Set by hand" in text
+    assert "hand it in again" not in text
+    told = json.loads(results_text(by_hand, by_hand=True))["output"]
+    assert told.startswith("Could not be graded automatically, points were given by hand: ")
 
 
 @pytest.mark.parametrize("grades", [[], [failed_grade("a", "broken")]])

@@ -173,6 +173,41 @@ def test_unpacked_canvas_archives_are_not_taken_for_one_student(tmp_path):
     assert len(hand_ins(tmp_path, tmp_path / "c")) == 3
 
 
+def test_a_folder_keeps_its_name_whatever_platform_it_looks_like(tmp_path):
+    """Teams named like Canvas' files are so many rows, each by its own name."""
+    names = ("throne_2026_03_alpha", "throne_2026_03_beta", "sec_01_02_x", "ME405_03_07_team")
+    tree(tmp_path / "c", {f"{name}/submission.toml": TOML for name in names})
+    found = hand_ins(tmp_path, tmp_path / "c")
+    assert [hand_in.id for hand_in in found] == sorted(names)
+
+
+@pytest.mark.parametrize("wrapped", ["", "class/", "term/class/"])
+def test_what_is_refused_costs_the_hand_in_it_is_in(tmp_path, wrapped):
+    """However deep the class lies: no row more, and one for a hand-in of which nothing is left."""
+    members = {f"{wrapped}team-{n}/submission.toml": TOML for n in range(3)}
+    class_ = archive(tmp_path / "all.zip", members)
+    with zipfile.ZipFile(class_, "a") as opened_:
+        for name in ("team-1/data/link.csv", "team-7/submission.toml"):
+            info = zipfile.ZipInfo(wrapped + name)
+            info.create_system, info.external_attr = 3, 0o120777 << 16
+            opened_.writestr(info, "/etc/passwd")
+    found = {hand_in.id: hand_in.problem for hand_in in hand_ins(tmp_path, class_)}
+    assert list(found) == ["team-0", "team-1", "team-2", "team-7"]
+    assert [bool(why) for why in found.values()] == [False, True, False, True]
+    assert all(why.endswith("is a link") for why in found.values() if why)
+
+
+def test_metadata_of_a_students_own_are_not_read(tmp_path):
+    """Names come from the top of a download, where no student writes."""
+    own = "submission_1:\n  :submitters:\n  - :name: Nobody\n"
+    tree(tmp_path / "c", {"a/submission_1/submission.toml": TOML,
+                          "a/submission_metadata.yml": own,
+                          "b/submission.toml": TOML})  # fmt: skip
+    assert [hand_in.owner for hand_in in hand_ins(tmp_path, tmp_path / "c")] == [
+        "", "submission_1 (gradescope 1)",
+    ]  # fmt: skip
+
+
 def test_one_students_zip_is_one_hand_in(tmp_path):
     """A zip file that is no class is itself the hand-in, and a broken one has its row."""
     good = archive(tmp_path / "team-07.zip", {"submission.toml": TOML})

@@ -54,6 +54,17 @@ def test_a_path_that_leaves_the_archive_is_refused(tmp_path, name):
     assert files_below(tmp_path) == ["a.zip", "in/out/good.txt"]
 
 
+@pytest.mark.parametrize("name", ["data/run:1.csv", "x.csv.", "a /x", "nul.csv", "COM1", "a?b"])
+def test_what_is_no_name_on_windows_is_refused_there(tmp_path, monkeypatch, name):
+    """There it would be another file, a stream or a device; elsewhere it is a name."""
+    packed = zipped(tmp_path / "a.zip", {name: "x", "good.txt": "good"})
+    assert not unpack(packed, tmp_path / "here", limits=SMALL)
+    monkeypatch.setattr("pipeline.grading.unpack.sys.platform", "win32")
+    (why,) = unpack(packed, tmp_path / "there", limits=SMALL).values()
+    assert why.endswith("is no name of a file on Windows")
+    assert files_below(tmp_path / "there") == ["good.txt"]
+
+
 @pytest.mark.parametrize(
     ("mode", "reason"), [(0o120777, "is a link"), (0o010644, "regular"), (0o020644, "regular")]
 )

@@ -200,15 +200,16 @@ def _write_results(entries: Iterable[Entry], folder: Path) -> list[Path]:
     for entry in entries:
         own = own_folder(folder, entry.submission)
         own.mkdir(parents=True, exist_ok=True)
-        write_file(own / "results.json", results_text(entry.grade))
+        write_file(own / "results.json", results_text(entry.grade, by_hand=bool(entry.overrides)))
         files.append(own / "results.json")
     return files
 
 
-def results_text(grade: Grade) -> str:
+def results_text(grade: Grade, *, by_hand: bool = False) -> str:
     """Return a grade as the `results.json` of a Gradescope autograder."""
+    how = " automatically, points were given by hand" if by_hand else ""
     failed = grade.status == "failed"
-    output = [f"Could not be graded: {grade.reason}"] if failed else []
+    output = [f"Could not be graded{how}: {grade.reason}"] if failed else []
     output += [flag.message for flag in grade.flags]
     if grade.deducted:
         output.append(f"Late: {points_text(grade.deducted)} points off.")

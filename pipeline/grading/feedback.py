@@ -81,13 +81,17 @@ def feedback_page(
 
 def _summary(grade: Grade, overrides: Mapping[str, Override]) -> list[Block]:
     points = f"{points_text(grade.points)} of {points_text(grade.out_of)}"
+    by_hand = Tile(spans("Set by hand"), spans(counted_criteria(len(overrides))))
     if grade.status == "failed":
+        tile = Tile(spans("Points"), spans(points), tone="" if overrides else "bad")
+        how, then = "", "Mend it and hand it in again, or talk to your instructor."
+        if overrides:
+            how, then = " automatically", "Its points were given by hand."
         return [
-            Tiles((Tile(spans("Points"), spans(points), tone="bad"),)),
+            Tiles((tile, by_hand) if overrides else (tile,)),
             paragraph(
-                Span("This submission could not be graded. ", "strong"),
-                f"{_sentence(grade.reason)} Mend it and hand it in again, or talk to your "
-                "instructor.",
+                Span(f"This submission could not be graded{how}. ", "strong"),
+                f"{_sentence(grade.reason)} {then}",
             ),
             *_notes(grade),
         ]
@@ -111,7 +115,7 @@ def _summary(grade: Grade, overrides: Mapping[str, Override]) -> list[Block]:
         late = f"{counted_days(grade.days_late)}, −{points_text(grade.deducted)} points"
         tiles.append(Tile(spans("Late"), spans(late), tone="bad" if grade.deducted else ""))
     if overrides:
-        tiles.append(Tile(spans("Set by hand"), spans(counted_criteria(len(overrides)))))
+        tiles.append(by_hand)
     return [Tiles(tuple(tiles)), *_lost(grade), *_notes(grade)]
 
 

@@ -4,7 +4,7 @@ import os
 import re
 import unicodedata
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
@@ -113,14 +113,29 @@ def _at(path: Path, *, scratch: Path, skip: set[Path]) -> list[_Found]:
     except SubmissionError as error:
         raise ConfigError(str(error)) from None
     found = _in_folder(folder, skip=skip)
-    hand_ins = {source.name for one in found for source in one.sources}
-    lost = [_Found(name=name, parent=path.stem, sources=(), problem=why) for name, why in
-            sorted(refused.items()) if name not in hand_ins]  # fmt: skip
-    return lost + [
-        replace(one, problem=refused[source.name])
-        if (source := one.sources[0]).name in refused
-        else one
+    return _with_refused(found, refused, folder=folder)
+
+
+def _with_refused(
+    found: Sequence[_Found], refused: Mapping[PurePosixPath, str], *, folder: Path
+) -> list[_Found]:
+    """Return the hand-ins of an archive with what was refused of them, and those refused whole."""
+    tops = [
+        [PurePosixPath(source.relative_to(folder).as_posix()) for source in one.sources]
         for one in found
+    ]
+    beside = min((len(top.parts) for of_one in tops for top in of_one), default=1)
+    problems: dict[int, str] = {}
+    lost: dict[str, str] = {}
+    for member, why in sorted(refused.items()):
+        whose = [i for i, of_one in enumerate(tops) if any(map(member.is_relative_to, of_one))]
+        for i in whose:
+            problems.setdefault(i, why)
+        if not whose:
+            lost.setdefault(member.parts[:beside][-1], why)
+    return [
+        *(_Found(name=x, parent=folder.name, sources=(), problem=why) for x, why in lost.items()),
+        *(replace(one, problem=problems.get(i, one.problem)) for i, one in enumerate(found)),
     ]
 
 
@@ -161,7 +176,7 @@ def _looked_into(folder: Path, *, skip: set[Path], top: bool, depth: int) -> lis
     uploads = {entry: upload for entry in entries if (upload := parse_name(entry.name))}
     if uploads:
         rest = [entry for entry in entries if entry not in uploads and _may_be_one(entry)]
-        return _from_platform(folder, uploads) + [_single(entry) for entry in rest]
+        return _from_platform(folder, uploads, top=top) + [_single(entry) for entry in rest]
     entries = [entry for entry in entries if _may_be_one(entry)]
     if len(entries) == 1 and entries[0].is_dir() and not entries[0].is_symlink():
         deeper = _in_folder(entries[0], skip=skip, top=top, depth=depth + 1)
@@ -229,25 +244,26 @@ def _folder_inside(archive: Path) -> str:
 # ---------------------------------------------------------------- learning platforms
 
 
-def _from_platform(folder: Path, uploads: dict[Path, Upload]) -> list[_Found]:
+def _from_platform(folder: Path, uploads: dict[Path, Upload], *, top: bool) -> list[_Found]:
     """Return a hand-in for every student, whatever number of files they uploaded."""
-    metadata = gradescope_metadata(folder)
+    # Further down, a student may have put metadata of their own.
+    metadata = gradescope_metadata(folder) if top else {}
     by_student: dict[tuple[str, str, str], dict[Path, Upload]] = defaultdict(dict)
     for path, upload in uploads.items():
         # Canvas makes no folders: one named so is an archive that somebody has unpacked.
         own = path.name if upload.platform == "canvas" and path.is_dir() else ""
         by_student[upload.owner, upload.user, own][path] = upload
     found = []
-    for (owner, user, _), files in sorted(by_student.items()):
+    for (owner, user, own), files in sorted(by_student.items()):
         sources = tuple(current(files))
-        inside = _name_inside(sources)
+        inside = own or _name_inside(sources)
         platform = next(iter(files.values())).platform
         sent = metadata.get(owner)
         shown = sent.names if sent and sent.names else owner
         found.append(
             _Found(
                 name=inside or shown,
-                parent=shown if inside else folder.name,
+                parent=shown if inside and not own else folder.name,
                 sources=sources,
                 owner=owner_text(shown, platform, user),
                 handed_in=sent.at if sent else "",

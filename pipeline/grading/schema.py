@@ -27,7 +27,9 @@ from sqlalchemy import (
     UniqueConstraint,
     create_engine,
     event,
+    func,
     insert,
+    inspect,
     make_url,
     select,
 )
@@ -38,6 +40,7 @@ from pipeline.errors import ConfigError
 FILE = "gradebook.sqlite"
 _SUFFIXES = (".sqlite", ".sqlite3", ".db")  # of files; anything else is a folder
 _VERSION = "1"
+_CREATING = 0x6361_7274  # a number for PostgreSQL's lock that nobody else has
 _PATIENCE = 60.0  # s, for a lock that another process holds; a commit takes milliseconds
 
 metadata = MetaData()
@@ -201,7 +204,7 @@ class Database:
         self._writer = self._engine.execution_options(writes=True)
         with self._translated(), (self._writer if create else self._engine).begin() as connection:
             if create:
-                metadata.create_all(connection)
+                _create(connection)
             elif not self._engine.dialect.has_table(connection, settings.name):
                 raise ConfigError(f"{self.name}: holds no gradebook")
             _check_version(connection, name=self.name)
@@ -239,9 +242,18 @@ class Database:
             raise ConfigError(f"{self.name}: {cause[0] if cause else error}") from error
 
 
+def _create(connection: Connection) -> None:
+    """Make the tables that are not there; two runs that begin at once make them one by one."""
+    if connection.dialect.name == "postgresql":  # SQLite's write lock is held already
+        connection.execute(select(func.pg_advisory_xact_lock(_CREATING)))
+    if not metadata.tables.keys() <= set(inspect(connection).get_table_names()):
+        metadata.create_all(connection)
+
+
 def _engine(place: str | Path, *, create: bool) -> Engine:
     if isinstance(place, Path) or "://" not in place:
-        file = Path(place) if Path(place).suffix in _SUFFIXES else Path(place) / FILE
+        is_file = Path(place).suffix in _SUFFIXES and not Path(place).is_dir()
+        file = Path(place) if is_file else Path(place) / FILE
         if not create and not file.is_file():
             raise ConfigError(f"{place}: holds no {FILE}; name the --out folder of cartlab grade")
         address = URL.create("sqlite", database=str(file))

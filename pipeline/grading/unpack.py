@@ -1,8 +1,10 @@
 """Unpack what strangers packed: never outside the folder, never more than fits."""
 
 import lzma
+import re
 import stat
 import struct
+import sys
 import unicodedata
 import zipfile
 import zlib
@@ -21,6 +23,9 @@ _LONGEST_COMMENT = 65_535
 DEEPEST = 40  # folders in folders; a submission needs three
 _UTF8_NAME, _ENCRYPTED = 0x800, 0x1
 
+# There a colon begins a stream, a last dot is dropped, and `nul.csv` is a device.
+_NOT_ON_WINDOWS = re.compile(r'(?i)[<>:"|?*\x00-\x1f]|[. ]$|^(con|prn|aux|nul|com\d|lpt\d)(\..*)?$')
+
 _DEBRIS_FOLDERS = ("__MACOSX",)
 _DEBRIS_FILES = (".ds_store", "thumbs.db", "desktop.ini")
 
@@ -33,7 +38,7 @@ class Limits:
     ----------
     ratio : of a file's size to its packed size.
     directory : bytes of the table of contents.
-    whole : one bad member refuses the archive; else only the entry at its top that it is in.
+    whole : one bad member refuses the archive; else only itself.
     """
 
     members: int = 2_000
@@ -69,8 +74,8 @@ def is_debris(path: PurePosixPath) -> bool:
     )
 
 
-def unpack(archive: Path, into: Path, *, limits: Limits) -> dict[str, str]:
-    """Unpack a zip archive into a new folder; return what was refused: top entry and reason.
+def unpack(archive: Path, into: Path, *, limits: Limits) -> dict[PurePosixPath, str]:
+    """Unpack a zip archive into a new folder; return what was refused: member and reason.
 
     Only regular files are written.
 
@@ -156,8 +161,8 @@ def _refuse_long_contents(archive: Path, *, limits: Limits) -> None:
         raise _TooLarge(f"a table of contents of {directory:,} bytes")
 
 
-def _extract(opened: zipfile.ZipFile, into: Path, *, budget: _Budget) -> dict[str, str]:
-    refused: dict[str, str] = {}
+def _extract(opened: zipfile.ZipFile, into: Path, *, budget: _Budget) -> dict[PurePosixPath, str]:
+    refused: dict[PurePosixPath, str] = {}
     members: dict[PurePosixPath, zipfile.ZipInfo] = {}
     for info in opened.infolist():
         budget.members -= 1
@@ -166,7 +171,7 @@ def _extract(opened: zipfile.ZipFile, into: Path, *, budget: _Budget) -> dict[st
         try:
             path = _path(info)
         except _Refused as error:
-            refused.setdefault(_top(info.filename), str(error))
+            refused.setdefault(_inside(info.filename), str(error))
             continue
         if not info.is_dir() and not is_debris(path):
             members[path] = info  # of two with one name, the later
@@ -182,12 +187,12 @@ def _extract(opened: zipfile.ZipFile, into: Path, *, budget: _Budget) -> dict[st
             raise
         except OSError as error:  # a file where a folder should be, a name that is too long
             reason = f"{quote(str(path))} cannot be written ({error.strerror or _line(error)})"
-            refused.setdefault(path.parts[0], reason)
+            refused.setdefault(path, reason)
         except _TROUBLE as error:
             if budget.limits.whole:
                 raise
             target.unlink(missing_ok=True)  # half of it may be there
-            refused.setdefault(path.parts[0], _why(error))
+            refused.setdefault(path, _why(error))
     return refused
 
 
@@ -226,6 +231,8 @@ def _path(info: zipfile.ZipInfo) -> PurePosixPath:
         raise _Refused(f"{quote(name)} leaves the archive")
     if not path.parts or "\0" in name:
         raise _Refused("a file without a name")
+    if sys.platform == "win32" and any(_NOT_ON_WINDOWS.search(part) for part in path.parts):
+        raise _Refused(f"{quote(name)} is no name of a file on Windows")
     if len(path.parts) > DEEPEST:
         raise _Refused(f"{quote(name)} lies more than {DEEPEST} folders deep")
     return path
@@ -242,9 +249,10 @@ def _decoded(info: zipfile.ZipInfo) -> str:
     return unicodedata.normalize("NFC", name)
 
 
-def _top(name: str) -> str:
+def _inside(name: str) -> PurePosixPath:
+    """Return where a refused member would lie, whatever way out of the archive it names."""
     parts = [part for part in name.replace("\\", "/").split("/") if part not in ("", ".", "..")]
-    return unicodedata.normalize("NFC", parts[0]) if parts else ""
+    return PurePosixPath(unicodedata.normalize("NFC", "/".join(parts) or "nameless"))
 
 
 def _line(error: Exception) -> str:
