@@ -8,6 +8,7 @@ import io
 import os
 import pickle
 import random
+import re
 import socket
 import stat
 import struct
@@ -26,6 +27,7 @@ _SCRIPT = "<script>alert(1)</script>"
 _IMAGE = '"><img src=http://evil.example/x onerror=alert(1)>'
 _TYPST = '#import "/etc/passwd": *; #read("/etc/passwd") $ x $ *b* <label> @ref \\'
 _FORMULA = '=HYPERLINK("http://evil.example","a")'
+_AUTHOR = r"(?<=\[\[authors\]\]\n)id = .*\n"
 _HEAD = "version = 1\n[system]\ncarts = 1\n"
 _STEP = '[[experiments]]\nid = "a"\nkind = "step"\nfile = "{}"\n'
 
@@ -195,6 +197,9 @@ def _spoilt(good: Files, rng: random.Random) -> dict[str, Files]:
     text("formula, tab", _marked(toml, "\t+1+cmd|' /C calc'!A0"))
     text("bidi", _marked(toml, "\u202egnp.\u2066x\u200b\u200d\ufeff"))
     text("control", _marked(toml, "\x1b[31m\x07\x00red\r\n\x85\u2028"))
+    for number, name in enumerate(("..", "CON", "", "x" * 300, "a/b", "-1+1")):
+        text(f"author {number}", re.sub(_AUTHOR, f'id = "{name}"\n', toml))
+        text(f"run {number}", toml.replace('id = "step-1"', f'id = "{name}"'))
     for number, file in enumerate(
         ("../../outside/secret.txt", "/etc/passwd", "..", "data", "", "C:\\x", "\\\\host\\x",
          "data/../../../outside/secret.txt", "file:///etc/passwd", "con", "data/" + "y" * 3_000)
@@ -238,11 +243,16 @@ def _marked(toml: str, text: str) -> str:
     quoted = '"' + "".join(
         c if c.isprintable() and c not in '"\\' else f"\\u{ord(c):04x}" for c in text
     ) + '"'  # fmt: skip
-    toml = toml.replace('title = "Simulated bench, throne-1dof, seed 1"', f"title = {quoted}")
-    toml = toml.replace('section = "01"', f"section = {quoted}")
-    toml = toml.replace('id = "s1"\n', f"id = {quoted}\nname = {quoted}\n")
-    toml = toml.replace('note = "recorded after the transient"', f"note = {quoted}")
-    return toml.replace('unit = "cm"', f"unit = {quoted}")
+    for pattern, new in (
+        (r"^title = .*$", f"title = {quoted}"),
+        (r"^section = .*$", f"section = {quoted}"),
+        (_AUTHOR, f"id = {quoted}\nname = {quoted}\n"),
+        (r"^note = .*$", f"note = {quoted}"),
+        (r'unit = "cm"', f"unit = {quoted}"),
+    ):
+        toml, times = re.subn(pattern, lambda _, new=new: new, toml, flags=re.MULTILINE)
+        assert times, pattern
+    return toml
 
 
 class _Evil:

@@ -58,17 +58,16 @@ def graded(request, tmp_path_factory):
     """A hostile class and what the command line made of it: folder, names, audit lines."""
     base = tmp_path_factory.mktemp("hostile")
     school = base / "school"
-    for number, name in enumerate(HONEST):
+    for number, place in enumerate((*(school / name for name in HONEST), base / "spoilt")):
         write_submission(
-            school / name, chain="throne-1dof", seed=number, authors=(f"s{number}",),
-            compact=True, reported=True,
+            place, chain="throne-1dof", seed=number, authors=(f"s{number}",), compact=True,
+            reported=True,
         )  # fmt: skip
     shutil.copytree(school, base / "alone")
     seed = request.param
     # The whole of it takes a minute; by default a part of what is graded to the end is enough.
-    names = write_hostile(
-        school, _small(school / HONEST[0]), seed=seed, every=6 if seed == 1 else 1
-    )
+    every = 8 if seed == 1 else 1
+    names = write_hostile(school, _small(base / "spoilt"), seed=seed, every=every)
     (base / "hook").mkdir()
     (base / "hook" / "sitecustomize.py").write_text(AUDIT, encoding="utf-8")
     before = _below(school), _below(base / "outside")
