@@ -1,6 +1,8 @@
 """The motor does not stay on, whatever the line, the terminal or a plan does."""
 
+import os
 import signal
+import subprocess
 import sys
 import time
 from dataclasses import replace
@@ -10,9 +12,11 @@ import pytest
 from pipeline.bench.acquire import acquire
 from pipeline.bench.gains import Scales
 from pipeline.bench.orders import make_order
+from pipeline.bench.protocol import Description, parse_description
+from pipeline.bench.raw import RawHeader, RawWriter
 from pipeline.bench.serial_line import open_line
 from pipeline.bench.session import Session
-from pipeline.errors import ConfigError
+from pipeline.errors import ConfigError, DataError
 from pipeline.submission import System
 from tests.acquisitions import LIMITS, Notes, host, sine, write_work
 from tests.benches import emulator
@@ -72,3 +76,118 @@ def test_a_closed_terminal_stops_the_motor(tmp_path):
         assert bench.event("run")["ended"] == "stopped"
     assert process.returncode == 1
     assert (work / "data" / "dwell.partial.txt").exists()
+
+
+DESCRIPTION = (
+    "?cartlab/1 name=b encoders=2 carts=2 period=0.001 baud=115200 commands=sk "
+    "input=0.001V position=0.002cm"
+)
+
+
+@pytest.mark.parametrize(
+    ("stated", "wrong"),
+    [
+        ("position=0.002cm", "position=0cm"),
+        ("position=0.002cm", "position=nancm"),
+        ("input=0.001V", "input=1e999V"),
+        ("period=0.001", "period=nan"),
+        ("encoders=2", "encoders=9"),
+        ("carts=2", "carts=0"),
+    ],
+)
+def test_a_description_that_no_limit_can_be_reckoned_with_is_refused(stated, wrong):
+    """Counts that are worth nothing, or infinitely much, would switch the limits off."""
+    assert parse_description(DESCRIPTION.encode()).carts == 2
+    with pytest.raises(DataError, match=f"describes itself as .*{wrong}.* is wrong"):
+        parse_description(DESCRIPTION.replace(stated, wrong).encode())
+
+
+def test_more_than_the_bench_can_give_is_refused():
+    """An amplitude past full scale would be cut off at the bench, and a sine be none."""
+    bench = Description(name="b", encoders=2, carts=2)
+    scales = Scales(input=1e-4, position=0.002)
+    ask = {"limits": LIMITS, "scales": scales, "system": TWO_CARTS, "bench": bench}
+    least = sine("dwell", seconds=1).model_copy(update={"amplitude": 0.4096})
+    assert make_order(least, **ask).commands
+    with pytest.raises(ConfigError, match=r"amplitude 0\.41 V is more than the bench can give"):
+        make_order(least.model_copy(update={"amplitude": 0.41}), **ask)
+
+
+# ----------------------------------------------------------------- files of others
+
+
+def _header(name: str) -> RawHeader:
+    return RawHeader(
+        recording=sine("dwell", seconds=1).model_copy(update={"id": name}),
+        limits=LIMITS,
+        commands=(),
+        bench=Description(name="b", encoders=2, carts=2),
+        begun="",
+    )
+
+
+def test_nothing_is_written_outside_or_over_the_data_of_others(tmp_path):
+    """Neither a raw file that names a place elsewhere nor a plan's id reaches another file."""
+    work = write_work(tmp_path / "a" / "work", [sine("dwell", seconds=1)])
+    (work / "data").mkdir()
+    mine = work / "data" / "dwell.txt"
+    mine.write_text("mine", encoding="utf-8")
+    with RawWriter(work / "raw" / "x-1.raw", _header("../../elsewhere")) as raw:
+        raw.write(b"".join(b"0:0:0:0:%d\n" % ms for ms in range(20)))
+    with (work / "submission.toml").open("a", encoding="utf-8") as file:
+        file.write("""\n[[experiments]]\nid = "first"\nkind = "step"\nfile = "data/dwell.txt"\n""")
+    with emulator("--speed", "20") as bench:
+        with pytest.raises(
+            ConfigError, match=r"dwell: data/dwell\.txt holds the experiment 'first'"
+        ):
+            acquire(work, port=bench.address, observers=[Notes()])
+    assert mine.read_text(encoding="utf-8") == "mine"
+    assert not list(tmp_path.rglob("elsewhere*"))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="links need a privilege on Windows")
+def test_a_raw_file_is_not_written_through_a_link(tmp_path):
+    """A link where the times of a run go is replaced; what it points at stays as it is."""
+    mine = tmp_path / "mine"
+    mine.write_text("mine", encoding="utf-8")
+    (tmp_path / "dwell-1.times").symlink_to(mine)
+    with RawWriter(tmp_path / "dwell-1.raw", _header("dwell")) as raw:
+        raw.write(b"0:0:0:0:0\n")
+    assert mine.read_text(encoding="utf-8") == "mine"
+    assert (tmp_path / "dwell-1.times").stat().st_size == 16
+
+
+# ----------------------------------------------------------------- at the keyboard
+
+ASK = (
+    "from pipeline.bench.terminal import Terminal\nTerminal().confirm('Hold cart 1')\nprint('held')"
+)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
+@pytest.mark.parametrize(("typed", "held"), [(b"\n", True), (b"\x04", False)])
+def test_only_what_is_typed_after_the_question_answers_it(typed, held):
+    """An Enter too many, typed before, starts no motor; Ctrl-D is a no in one line."""
+    controller, terminal = os.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-c", ASK],
+        stdin=terminal,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        encoding="utf-8",
+    )
+    try:
+        os.write(controller, b"\n\n")
+        assert process.stderr is not None
+        while (heard := process.stderr.read(1)) != ")":
+            assert heard, "nothing was asked"
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(timeout=1)
+        os.write(controller, typed)
+        said, complaint = process.communicate(timeout=20)
+    finally:
+        process.kill()
+        os.close(controller)
+        os.close(terminal)
+    assert ("held" in said) is held
+    assert ("Hold cart 1: the keyboard was closed" in complaint) is not held

@@ -133,6 +133,7 @@ class _Acquisition:
         known = {recording.id for recording in plan.recordings}
         if unknown := sorted(self._only - known):
             raise ConfigError(f"--only {unknown[0]}: plan.toml has {', '.join(sorted(known))}")
+        _check_files(plan, submission)
         return plan
 
     def _next(self, plan: Plan, submission: Submission) -> Recording | None:
@@ -153,6 +154,7 @@ class _Acquisition:
         if longer.recordings == plan.recordings:
             return plan
         save_plan(longer, submission)
+        _check_files(longer, submission)
         return longer
 
     def _record(
@@ -209,6 +211,8 @@ def _recovered(folder: Path, *, carts: int) -> list[str]:
     for path in sorted((folder / RAW).glob("*.raw")):
         try:
             recording = read_raw(path).header.recording
+            if path.stem.rpartition("-")[0] != recording.id:  # renamed, or meant to lead elsewhere
+                continue
             made = [folder / data_file(recording, partial=partial) for partial in (False, True)]
             if not any(file.exists() for file in made):
                 saved.append(save_record(path, folder=folder, carts=carts, partial=True))
@@ -219,6 +223,19 @@ def _recovered(folder: Path, *, carts: int) -> list[str]:
 
 def _done(submission: Submission) -> frozenset[str]:
     return frozenset(experiment.id for experiment in submission.experiments)
+
+
+def _check_files(plan: Plan, submission: Submission) -> None:
+    """Raise ConfigError where a recording would be written over the data of another experiment."""
+    taken = {(submission.folder / e.file).resolve(): e.id for e in submission.experiments}
+    for recording in plan.recordings:
+        name = data_file(recording)
+        other = taken.get((submission.folder / name).resolve(), recording.id)
+        if other != recording.id:
+            raise ConfigError(
+                f"plan.toml: {recording.id}: {name} holds the experiment {other!r}; choose "
+                "another id"
+            )
 
 
 def _is_lost(line: SerialLine) -> bool:

@@ -150,12 +150,12 @@ class Importer:
         if target.exists() or target.is_symlink():
             self._observer.remark(f"{path.name}: not taken, {target} is there already")
             return None
-        shutil.copyfile(path, target)
         try:
+            shutil.copyfile(path, target)
             entry = _entry(name, kind, target, inspection, planned, self._submission)
             self._submission = add_experiment(load_submission(self._folder), entry)
         except BaseException:
-            target.unlink()
+            target.unlink(missing_ok=True)
             raise
         if self._plan:
             self._observer.planned(self._plan, self._done)

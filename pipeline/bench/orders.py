@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pipeline.bench.gains import Scales
 from pipeline.bench.plan import Limits, Recording
 from pipeline.bench.protocol import (
+    FULL_SCALE,
     ChirpEnd,
     Command,
     Description,
@@ -65,7 +66,7 @@ def make_order(
 
     Raises
     ------
-    ConfigError : the amplitude passes the limits, or is less than half a count.
+    ConfigError : the amplitude passes the limits or full scale, or is less than half a count.
     HardwareError : the bench does not know the wave or the controller.
     """
     closed = recording.controller is not None
@@ -77,6 +78,9 @@ def make_order(
     where = f"plan.toml: {recording.id}: amplitude {recording.amplitude:g} {unit}"
     if abs(recording.amplitude) > limit:
         raise ConfigError(f"{where} passes the limit of {limit:g} {unit}")
+    full = FULL_SCALE * per_count
+    if not closed and abs(recording.amplitude) > full + 0.5 * per_count:
+        raise ConfigError(f"{where} is more than the bench can give: {full:g} {unit}")
     amplitude = round(recording.amplitude / per_count)
     if recording.amplitude and not amplitude:
         raise ConfigError(f"{where} is less than half a count of the bench ({per_count:g} {unit})")
@@ -105,7 +109,7 @@ def make_order(
         input_unit=system.input.unit,
         position_unit=system.position.unit,
         most_duty=limits.input / abs(scales.input) + 0.5,  # amplitudes are rounded
-        most_counts=limits.travel / scales.position,
+        most_counts=limits.travel / abs(scales.position),
     )
 
 

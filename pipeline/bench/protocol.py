@@ -5,6 +5,7 @@ first letter tells which follow. The stock bench knows `d`, `g` and `z`; one tha
 which others it knows.
 """
 
+import math
 import re
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
@@ -376,9 +377,9 @@ def parse_description(line: bytes) -> Description:
         position_per_count, position_unit = _scaled(entries["position"])
         return Description(
             name=entries["name"],
-            encoders=int(entries["encoders"]),
-            carts=int(entries["carts"]),
-            period=float(entries["period"]),
+            encoders={"2": 2, "3": 3}[entries["encoders"]],
+            carts={"1": 1, "2": 2, "3": 3}[entries["carts"]],
+            period=abs(_scaled(entries["period"])[0]),
             baud=int(entries["baud"]),
             commands=frozenset(entries["commands"]),
             input_unit=input_unit,
@@ -393,4 +394,6 @@ def parse_description(line: bytes) -> Description:
 def _scaled(text: str) -> tuple[float, str]:
     """Split "0.00227cm" into the number and the unit."""
     digits = len(text.rstrip("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ/%"))
-    return float(text[:digits]), text[digits:]
+    if not 0.0 < abs(number := float(text[:digits])) < math.inf:  # of no use to a limit
+        raise ValueError(repr(text))
+    return number, text[digits:]

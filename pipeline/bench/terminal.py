@@ -71,7 +71,10 @@ class Terminal:
         self._live.stop()
         self._console.print(Text(f"{instruction}, then press Enter (Ctrl-C ends)"), end=" ")
         try:
+            _forget_keys()
             input()
+        except EOFError:
+            raise ConfigError(f"{instruction}: the keyboard was closed") from None
         finally:
             if self._console.is_terminal:
                 self._live.start()
@@ -158,14 +161,29 @@ class _View:
         )
         lines = [Text(f"{run.id} ({run.kind}): {state}")]
         for number, trace in enumerate(self._traces, start=1):
-            lines.append(Text(f"  encoder {number} {trace[-1]:>7}  {sparkline(trace)}"))
+            shown = list(trace)  # at once: the lines come in another thread
+            if shown:
+                lines.append(Text(f"  encoder {number} {shown[-1]:>7}  {sparkline(shown)}"))
         return lines
 
     def _rate(self) -> float:
-        times = [at for at, _ in self._arrived]
-        if len(times) < 2 or times[-1] == times[0]:
+        arrived = list(self._arrived)  # at once: the lines come in another thread
+        if len(arrived) < 2 or arrived[-1][0] == arrived[0][0]:
             return 0.0
-        return sum(n for _, n in list(self._arrived)[1:]) / (times[-1] - times[0])
+        return sum(n for _, n in arrived[1:]) / (arrived[-1][0] - arrived[0][0])
+
+
+def _forget_keys() -> None:
+    """Drop what was typed before the question: it is no answer to it, and a motor may start."""
+    try:
+        import termios
+    except ImportError:  # Windows
+        import msvcrt
+
+        while msvcrt.kbhit():  # pyright: ignore[reportAttributeAccessIssue]
+            msvcrt.getwch()  # pyright: ignore[reportAttributeAccessIssue]
+    else:
+        termios.tcflush(sys.stdin, termios.TCIFLUSH)
 
 
 def sparkline(values: Sequence[int]) -> str:
