@@ -11,15 +11,19 @@ import queue
 import signal
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import psutil
 
 from pipeline.bench.acquire import acquire
+from pipeline.bench.observer import Anomalies
 from pipeline.bench.plan import Limits
+from pipeline.bench.protocol import Reading
 from pipeline.bench.raw import read_raw
 from pipeline.bench.record import readings_of
+from pipeline.errors import ConfigError
 from pipeline.plant.chain import PRESETS
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
@@ -29,12 +33,23 @@ from tests.benches import emulator
 FAULTS = ("drop", "garble", "merge", "delay")
 
 
+class _Once(Notes):
+    """Confirms no second try, keeps no lines."""
+
+    def confirm(self, instruction: str) -> None:
+        """Give up."""
+        raise ConfigError(instruction)
+
+    def readings(self, batch: Sequence[Reading], anomalies: Anomalies) -> None:
+        """Let them go."""
+
+
 def stream(folder: Path, *, minutes: float) -> None:
     """Stream at 1 kHz: lines lost, and what the host and the emulator take of a core."""
     write_work(folder, [sine("long", seconds=60 * minutes)])
     with emulator() as bench:
         process = psutil.Process(bench.process.pid)
-        notes, own = Notes(), psutil.Process()
+        notes, own = _Once(), psutil.Process()
         began, before, bench_before = time.monotonic(), own.cpu_times(), process.cpu_times()
         acquire(folder, port=bench.address, observers=[notes], only=["long"])
         taken = time.monotonic() - began
@@ -94,16 +109,6 @@ def stops(folder: Path, *, n: int) -> None:
             delays.append(1.0024 * sent["lines"] - first.ms)
     late = np.array(delays)
     print(f"stops: {n}, ms to the stop: median {np.median(late):.1f}, worst {late.max():.1f}")
-
-
-class _Once(Notes):
-    """Confirms no second try."""
-
-    def confirm(self, instruction: str) -> None:
-        """Give up."""
-        from pipeline.errors import ConfigError
-
-        raise ConfigError(instruction)
 
 
 def kills(folder: Path, *, n: int) -> None:
