@@ -17,6 +17,7 @@ from pipeline.grading.outputs import write_outputs
 from pipeline.grading.runner import Limits
 from pipeline.synthesis import write_submission
 from tests.grades import make_grade, make_outcome, two_cart_rubric
+from tests.test_schemas import assert_fits
 
 RUBRIC = two_cart_rubric()
 
@@ -71,6 +72,8 @@ def test_a_late_hand_in_by_itself_keeps_the_class(school, tmp_path):
     assert done.remarks == (
         "not in this run, kept as they were: B-team-1 and team-2 (cartlab remove takes one off)",
     )
+    for file in (parts / "feedback").glob("*/grade.json"):
+        assert_fits("grade", file.read_text(encoding="utf-8"))
     assert rows(parts) == rows(whole)
     assert list(rows(parts)) == ["A-team-1", "B-team-1", "team-2"]
     assert pages(parts) == pages(whole)

@@ -19,6 +19,7 @@ from pipeline.schemas.export import MODELS, schema_text
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
 from tests.analysis_factory import make_analysis
+from tests.grades import write_class
 from tests.test_gap_report import make_gap
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -69,6 +70,14 @@ def test_gaps_obey_the_schema(verdict):
     assert_fits("gap", gap_text(make_gap(verdict, keys), make_analysis(2)))
 
 
+def test_grades_obey_the_schema(tmp_path):
+    """Of a class of all sorts: graded, failed, flagged, shared, late, and points given by hand."""
+    files = sorted((write_class(tmp_path) / "feedback").glob("*/grade.json"))
+    assert len(files) == 16
+    for file in files:
+        assert_fits("grade", file.read_text(encoding="utf-8"))
+
+
 def test_a_broken_file_does_not_obey():
     """The schema refuses an unknown outcome, a text for a number and a missing key."""
     schema = json.loads(schema_text("results"))
@@ -88,5 +97,5 @@ def test_the_command_prints_it():
     command = [sys.executable, "-m", "pipeline", "schema"]
     done = subprocess.run([*command, "gap"], capture_output=True, encoding="utf-8", check=True)
     assert done.stdout == (DOCS / "gap.schema.json").read_text(encoding="utf-8")
-    with pytest.raises(ConfigError, match="there are results, gap, solution"):
+    with pytest.raises(ConfigError, match="there are results, gap, solution, grade"):
         schema_text("report")

@@ -74,10 +74,10 @@ def effects(
 @app.command()
 def schema(
     name: Annotated[
-        str, typer.Argument(metavar="NAME", help="results, gap or solution.")
+        str, typer.Argument(metavar="NAME", help="results, gap, solution or grade.")
     ] = "results",
 ) -> None:
-    """Print the JSON Schema of results.json, gap.json or solution.json."""
+    """Print the JSON Schema of results.json, gap.json, solution.json or grade.json."""
     from pipeline.schemas.export import schema_text
 
     typer.echo(schema_text(name), nl=False)

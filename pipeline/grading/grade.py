@@ -5,31 +5,10 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, get_args
 
 from pipeline.results_json import plain_json
+from pipeline.schemas.grade import Code, Outcome
 
 SCHEMA = "cartlab-grade/1"
 
-Outcome = Literal["pass", "partial", "fail", "skip"]
-Code = Literal[
-    "hz_for_rad_s",
-    "peak_count",
-    "peak_for_steady_state",
-    "peak_to_peak",
-    "transient_used",
-    "carts_swapped",
-    "counts_for_length",
-    "log10_for_ln",
-    "no_fit_done",
-    "final_off",
-    "initial_off",
-    "initial_final_disagree",
-    "physically_impossible",
-    "wrong_state_space",
-    "wrong_gains",
-    "wrong_prefilter",
-    "missing",
-    "shared_data",
-    "data_problem",
-]
 CODES: tuple[Code, ...] = get_args(Code)
 
 

@@ -5,14 +5,20 @@ import json
 from pipeline.errors import ConfigError
 from pipeline.schemas.base import Document, json_schema
 from pipeline.schemas.gap import Gap
+from pipeline.schemas.grade import Grade
 from pipeline.schemas.results import Results
 from pipeline.schemas.solution import Solution
 
-MODELS: dict[str, type[Document]] = {"results": Results, "gap": Gap, "solution": Solution}
+MODELS: dict[str, type[Document]] = {
+    "results": Results,
+    "gap": Gap,
+    "solution": Solution,
+    "grade": Grade,
+}
 
 
 def schema_text(name: str) -> str:
-    """Return the JSON Schema of `results.json`, `gap.json` or `solution.json`.
+    """Return the JSON Schema of `results.json`, `gap.json`, `solution.json` or `grade.json`.
 
     Raises
     ------

@@ -1,0 +1,82 @@
+"""`grade.json`, schema `cartlab-grade/1`."""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from pipeline.schemas.base import Document
+
+Outcome = Literal["pass", "partial", "fail", "skip"]
+Code = Literal[
+    "hz_for_rad_s",
+    "peak_count",
+    "peak_for_steady_state",
+    "peak_to_peak",
+    "transient_used",
+    "carts_swapped",
+    "counts_for_length",
+    "log10_for_ln",
+    "no_fit_done",
+    "final_off",
+    "initial_off",
+    "initial_final_disagree",
+    "physically_impossible",
+    "wrong_state_space",
+    "wrong_gains",
+    "wrong_prefilter",
+    "missing",
+    "shared_data",
+    "data_problem",
+]
+Values = dict[str, Any]  # numbers, texts, or lists of them
+
+
+class Criterion(Document):
+    """One line of the grade; `skip` where what it builds on failed, or nothing could be judged."""
+
+    id: str
+    title: str
+    outcome: Outcome
+    points: float
+    out_of: float
+    message: str
+    expected: Annotated[Values, Field(description="by parameter or entry")]
+    found: Annotated[Values, Field(description="by parameter or entry")]
+
+
+class Flag(Document):
+    """A named mistake, where, and the evidence for it."""
+
+    code: Code
+    parameters: Annotated[
+        tuple[str, ...],
+        Field(description="the numbers it explains, or what is missing, or the runs concerned"),
+    ]
+    message: str
+    evidence: Values
+
+
+class Override(Document):
+    """Points given by hand, already among those of the criterion."""
+
+    criterion: str
+    points: float
+    why: str
+
+
+class Grade(Document):
+    """The grade of one submission."""
+
+    schema_: Annotated[Literal["cartlab-grade/1"], Field(alias="schema")]
+    submission: str
+    authors: Annotated[tuple[str, ...], Field(description="none where names are left out")]
+    status: Literal["graded", "failed"]
+    points: float
+    out_of: float
+    days_late: float
+    deducted: Annotated[float, Field(description="for lateness, already out of `points`")]
+    reason: Annotated[str, Field(description="why it could not be graded, or empty")]
+    criteria: tuple[Criterion, ...]
+    flags: tuple[Flag, ...]
+    notes: tuple[str, ...]
+    overrides: tuple[Override, ...]
