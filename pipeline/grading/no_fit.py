@@ -15,7 +15,7 @@ _APART_DAMPING, _APART_DAMPING_BLURRED = 0.03, 0.15
 _SHARP, _SHARP_DAMPING = 1.01, 1.05  # high over low of a reference without doubt
 _SURPRISE = 3.0  # at most so much (e-folds) does the wrong number tell, as some fit badly
 _NORMAL, _SIGMAS = 3.5, 3.0  # one over the density of a normal difference at zero
-_CHANCE = 1e-3  # of a table that a fit gave agreeing so by coincidence
+_CHANCE = 3e-3  # of a table that a fit gave agreeing so by coincidence
 _FITTED_BY_EYE = "abcdefghxy"  # symbols of resonances and nulls: only a fit gives those
 _SHARE = 0.75  # of the numbers in both tables
 
@@ -42,8 +42,8 @@ def copied_final(reported: Reported, *, references: References) -> list[str]:
 def _coincidence(typed: Decimal, reference: Reference | None, name: str) -> float:
     """Return how likely a fit gives a number again, digit for digit.
 
-    Where the first estimate was right already that is no wonder, and the less of one the fewer
-    digits are typed.
+    Where the first estimate was right to its last digit already that is no wonder, and the less of
+    one the fewer digits are typed.
     """
     if not typed:
         return 1.0
@@ -52,9 +52,11 @@ def _coincidence(typed: Decimal, reference: Reference | None, name: str) -> floa
     apart = _APART_DAMPING_BLURRED if damping else _APART_BLURRED
     if reference is None or reference.low <= 0:
         return min(1.0, step / (apart * _NORMAL))
+    off = float(percent_off(typed, reference, sigmas=_SIGMAS)) / 100
     if reference.high <= reference.low * (_SHARP_DAMPING if damping else _SHARP):
         apart = _APART_DAMPING if damping else _APART
-    off = float(percent_off(typed, reference, sigmas=_SIGMAS)) / 100
+        if off == 0:
+            return 1.0
     return min(1.0, step / (apart * _NORMAL)) * exp(-min(0.5 * (off / apart) ** 2, _SURPRISE))
 
 

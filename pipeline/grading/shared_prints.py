@@ -26,6 +26,7 @@ MARGIN = _TAPS // 2  # samples lost at either end
 _LEVELS = 5  # a residual is kept as -5 … 5, in steps of two thirds of a standard deviation
 _STEPS_PER_SIGMA = 1.5
 _KINK = 4.5  # standard deviations: more is the motion's own kink (a step, a stop), not noise
+_JUMP = 30.0  # standard deviations: no cart kinks so, but the input where the reference steps
 _MAD_TO_SIGMA = 1.4826
 _NOTHING = 1e-7  # of the travel: rounding in the filter
 
@@ -131,7 +132,9 @@ def _print(record: Record, signals: Sequence[Array], *, group: str) -> Iterator[
     if not np.all(sigma > 0):
         return
     sigmas = noise / sigma[:, None]
-    telling = np.abs(sigmas) < _KINK
+    # Every run has the jump of an input, and what of it rings in the filter.
+    rings = [np.convolve(np.abs(row) > _JUMP, np.ones(_TAPS), "same") > 0 for row in sigmas]
+    telling = (np.abs(sigmas) < _KINK) & ~np.array(rings)
     anchors, swing = _in_turn(
         _motion_anchors(y[0, MARGIN:-MARGIN] - noise[0]),
         _noise_anchors(np.abs(sigmas).sum(axis=0)),

@@ -9,6 +9,7 @@ import numpy as np
 from pipeline.errors import DataError
 from pipeline.grading.mistakes import Mistake
 from pipeline.grading.reference import Reference
+from pipeline.grading.rubric import is_damping
 from pipeline.plant.chain import Array
 from pipeline.results import Analysis, FrequencyResponse, Record
 from pipeline.stages.bode_fit import fit_bode
@@ -16,7 +17,7 @@ from pipeline.stages.bode_fit import fit_bode
 _TOLERANCE = 0.06  # the fit of a student weighs the points its own way
 _DAMPING = 0.2
 _MET = 0.65  # of the numbers: a wrong response has no exact fit, so not every one is met
-_NEW = 0.05  # of a number: moved by less it tells nothing
+_NEW, _NEW_DAMPING = 0.12, 0.5  # of a number: moved by less, the right one would be met as well
 
 Reading = Callable[[Record, Array], float]
 
@@ -34,7 +35,7 @@ def transient_fits(
         moved = {
             name: r
             for name, r in predicted.items()
-            if name in known and known[name].low > 0 and abs(r.value / known[name].value - 1) > _NEW
+            if name in known and known[name].low > 0 and _is_new(name, r.value / known[name].value)
         }
         asked = [name for name in moved if name in table]
         if asked:
@@ -50,6 +51,10 @@ def transient_fits(
                 )
             )
     return found
+
+
+def _is_new(name: str, ratio: float) -> bool:
+    return abs(np.log(ratio)) > np.log1p(_NEW_DAMPING if is_damping(name) else _NEW)
 
 
 def early_readings() -> Iterator[Reading]:
@@ -102,7 +107,7 @@ def _refit(
     for name, estimate in fit.parameters.items():
         if estimate.value <= 0:
             continue
-        slack = _DAMPING if name.startswith("zeta") else 0.0
+        slack = _DAMPING if is_damping(name) else 0.0
         reference = Reference(
             value=estimate.value,
             low=estimate.value,
