@@ -12,6 +12,7 @@ import pytest
 from pipeline.bench.acquire import acquire
 from pipeline.bench.gains import Scales
 from pipeline.bench.orders import make_order
+from pipeline.bench.plan import Limits
 from pipeline.bench.protocol import Description, parse_description
 from pipeline.bench.raw import RawHeader, RawWriter
 from pipeline.bench.serial_line import open_line
@@ -38,9 +39,20 @@ def test_lines_that_cannot_be_read_end_a_run(tmp_path):
     with emulator("--fault", "garble=1") as bench:
         (outcome,) = acquire(work, port=bench.address, observers=[Alone()], only=["dwell"])
         sent = bench.event("run")
-    assert outcome.partial == "stopped: what the bench sends cannot be read, so nothing is watched"
+    assert outcome.partial == "stopped: what the bench sends cannot be read: nothing is watched"
     assert sent["ended"] == "stopped"
     assert sent["lines"] < 5000
+
+
+def test_a_run_that_passed_a_limit_is_not_tried_again(tmp_path):
+    """Whoever takes everything as done does not have the carts driven past the limit thrice."""
+    near = Limits(input=0.5, travel=0.1)  # cm: the dwell passes it within its first swing
+    work = write_work(tmp_path, [sine("dwell", seconds=4)], limits=near)
+    notes = Notes()
+    with emulator("--speed", "5") as bench:
+        outcomes = acquire(work, port=bench.address, observers=[notes], only=["dwell"])
+    assert [outcome.partial[:14] for outcome in outcomes] == ["stopped: cart "]
+    assert notes.confirmed == []
 
 
 def test_a_bench_that_goes_on_after_its_run_is_stopped(tmp_path):

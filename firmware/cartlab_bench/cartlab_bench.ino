@@ -61,7 +61,8 @@ void setup()
 
 void loop()
 {
-    while (Serial.available())
+    /* A few at a time: however fast bytes come, the watchdog in the tick has its turn. */
+    for (uint8_t left = 64; left && Serial.available(); --left)
         bench_receive(&bench, (uint8_t)Serial.read());
     if (tick_is_due())
         tick();

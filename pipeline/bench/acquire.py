@@ -16,7 +16,7 @@ from pipeline.bench.raw import FOLDER as RAW
 from pipeline.bench.raw import read_raw
 from pipeline.bench.record import data_file, save_record
 from pipeline.bench.serial_line import SerialLine, open_line
-from pipeline.bench.session import Session, stopping_on_signals
+from pipeline.bench.session import STOPPED, Session, stopping_on_signals
 from pipeline.errors import ConfigError, DataError, HardwareError
 from pipeline.output import own_folder
 from pipeline.submission import Submission, load_submission
@@ -113,6 +113,9 @@ class _Acquisition:
 
     def _offer_again(self, outcome: Outcome) -> None:
         name = outcome.recording.id
+        if outcome.partial.startswith(STOPPED):  # the same again would do the same harm
+            self._failed[name] = _TRIES
+            return
         self._failed[name] = self._failed.get(name, 0) + 1
         if self._failed[name] < _TRIES:
             try:

@@ -34,6 +34,8 @@ from pipeline.bench.serial_line import LUMP, SerialLine
 from pipeline.bench.stream import Stream
 from pipeline.errors import HardwareError
 
+STOPPED = "stopped: "  # begins why a run was ended that was not safe to go on with
+
 _LOOK = 0.003  # s between looks at the port
 _FORWARD = 0.05  # s between batches handed to the observers
 _FIRST_LINE = 1.0  # s a bench may take to begin
@@ -256,11 +258,11 @@ class Session:
                 if lines:
                     first, unread = lines[0].ms if first is None else first, None
                     if lines[-1].ms - first > end + _NEARLY:
-                        return "stopped: the bench went on past the end of the run"
+                        return f"{STOPPED}the bench went on past the end of the run"
                 else:
                     unread = now if unread is None else unread
                     if now - unread > _UNREADABLE:
-                        return "stopped: what the bench sends cannot be read, so nothing is watched"
+                        return f"{STOPPED}what the bench sends cannot be read: nothing is watched"
             quiet = now - last
             if stream.latest >= end - 2 * self._period and quiet > _AFTER_END:
                 return ""
@@ -293,7 +295,7 @@ class _Watch:
         for reading in batch:
             if passed := self._order.passed(reading, carts=self._carts):
                 self.forward(batch)
-                return f"stopped: {passed}"
+                return f"{STOPPED}{passed}"
         self._batch += batch
         now = time.monotonic()
         if now - self._forwarded > _FORWARD:

@@ -90,6 +90,11 @@ def _record(
     whole = {outcome.recording.id for outcome in outcomes if not outcome.partial}
     failed = {outcome.recording.id for outcome in outcomes} - whole
     terminal.remark(f"{len(whole)} recorded into {folder}: try `cartlab report {folder}`")
+    if not outcomes:
+        terminal.remark(
+            "what was asked for is there already; to record it anew, take its table out of "
+            "submission.toml"
+        )
     if failed:
         terminal.remark(f"not recorded: {', '.join(sorted(failed))}; the same command tries again")
         raise typer.Exit(1)
