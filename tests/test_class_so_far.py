@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -80,6 +81,20 @@ def test_a_late_hand_in_by_itself_keeps_the_class(school, tmp_path):
     assert sorted(path.name for path in (parts / "feedback").iterdir() if path.is_dir()) == [
         "A-team-1", "B-team-1", "team-2",
     ]  # fmt: skip
+
+
+def test_a_renamed_folder_is_told(school, tmp_path):
+    """Who is on the list under two names is said, as one of them is to be removed."""
+    out = tmp_path / "out"
+    grade(school / "B" / "team-1", out=out)
+    done = grade(shutil.copytree(school / "B" / "team-1", tmp_path / "team-one"), out=out)
+    kept, double = done.remarks
+    assert kept == "not in this run, kept as they were: team-1 (cartlab remove takes one off)"
+    assert re.fullmatch(
+        r"s1 is in team-1 and team-one, which have \d+ recordings in common: see class\.html",
+        double,
+    )
+    assert done.sharing == 0
 
 
 def test_a_mended_id_of_an_author_accuses_nobody(school, tmp_path):

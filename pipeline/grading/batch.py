@@ -2,7 +2,7 @@
 
 import json
 import unicodedata
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Literal, Protocol
@@ -63,10 +63,12 @@ def person(author: str) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Listed:
-    """A line of the class list so far, and the key of the outcome it stands for."""
+    """A line of the class list so far, and the outcome it stands for: its key and number."""
 
+    submission: str
+    authors: tuple[str, ...]
     key: str
-    prints: Prints
+    grading: int
 
 
 class Store(Protocol):
@@ -86,6 +88,10 @@ class Store(Protocol):
 
     def listed(self) -> Iterator[Listed]:
         """Yield the class list so far; nothing where no batch ran to its end yet."""
+        ...
+
+    def prints_of(self, numbers: Sequence[int]) -> list[Prints]:
+        """Return the fingerprints of such lines, by their numbers."""
         ...
 
 

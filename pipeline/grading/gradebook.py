@@ -23,7 +23,7 @@ from pipeline.grading.gradebook_lists import (
     lines_of,
     points_of,
 )
-from pipeline.grading.gradebook_prints import pages, read_listed, read_prints
+from pipeline.grading.gradebook_prints import pages, read_listed, read_prints, read_prints_of
 from pipeline.grading.gradebook_rows import (
     Entry,
     add_row,
@@ -164,7 +164,7 @@ class Gradebook:
 
     def prints_of(self, numbers: Sequence[int]) -> list[Prints]:
         """Return the fingerprints of gradings, see `Entry.grading`."""
-        return [line.prints for line in read_listed(self._database, numbers)]
+        return read_prints_of(self._database, numbers)
 
     def names(self) -> list[str]:
         """Return the submissions of the class list so far."""

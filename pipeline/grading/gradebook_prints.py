@@ -15,7 +15,6 @@ _PRINTS = (
     select(
         submissions.c.assignment,
         submissions.c.name,
-        gradings.c.key,
         gradings.c.authors,
         gradings.c.fingerprints,
     )
@@ -42,11 +41,24 @@ def read_prints(database: Database, *, assignment: str) -> Iterator[Prints]:
 
 def read_listed(database: Database, numbers: Sequence[int]) -> Iterator[Listed]:
     """Yield the gradings of these numbers as lines of a class list."""
+    columns = gradings.c.id, gradings.c.key, gradings.c.authors
+    lines = select(submissions.c.name, *columns).join(submissions).order_by(gradings.c.id)
+    for page in pages(numbers):
+        with database.reading() as connection:
+            rows = connection.execute(lines.where(gradings.c.id.in_(page))).all()
+        for row in rows:
+            authors = tuple(json.loads(row.authors))
+            yield Listed(submission=row.name, authors=authors, key=row.key, grading=row.id)
+
+
+def read_prints_of(database: Database, numbers: Sequence[int]) -> list[Prints]:
+    """Return the fingerprints of the gradings of these numbers."""
+    found = []
     for page in pages(numbers):
         with database.reading() as connection:
             rows = connection.execute(_PRINTS.where(gradings.c.id.in_(page))).all()
-        for row in rows:
-            yield Listed(key=row.key, prints=_prints(row, of_class=True))
+        found += [_prints(row, of_class=True) for row in rows]
+    return found
 
 
 def pages(numbers: Sequence[int]) -> Iterator[Sequence[int]]:

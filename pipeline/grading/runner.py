@@ -12,7 +12,7 @@ from pathlib import Path
 from pydantic import TypeAdapter
 
 import pipeline
-from pipeline.grading.batch import Batch, Outcome, Prints, Store
+from pipeline.grading.batch import Batch, Listed, Outcome, Prints, Store
 from pipeline.grading.grade import SCHEMA, Flag
 from pipeline.grading.intake import HandIn
 from pipeline.grading.intake_files import digest
@@ -146,14 +146,17 @@ _TakenOver = tuple[tuple[str, tuple[str, ...], tuple[str, ...]], ...]
 def _so_far(rows: Mapping[str, _Row], store: Store) -> tuple[dict[str, _Row], _TakenOver]:
     """Return those of the class list so far that are not in this run, and who is another there."""
     now = {name.casefold(): row.prints for name, row in rows.items()}
-    kept, others = {}, []
+    left: dict[str, Listed] = {}
+    others = []
     for line in store.listed():
-        name, before = line.prints.submission, line.prints.authors
-        found = now.get(name.casefold())
+        found = now.get(line.submission.casefold())
         if found is None:
-            kept[name] = _Row(key=line.key, prints=line.prints, reason="")
-        elif before and found.authors and not same_team(line.prints, found):
-            others.append((name, before, found.authors))
+            left[line.submission] = line
+        elif line.authors and found.authors and not same_team(line, found):
+            others.append((line.submission, line.authors, found.authors))
+    prints = store.prints_of([line.grading for line in left.values()])
+    kept = {one.submission: _Row(key=left[one.submission].key, prints=one, reason="")
+            for one in prints}  # fmt: skip
     return kept, tuple(others)
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.grading.batch import Prints, person
+from pipeline.grading.batch import Listed, Prints, person
 from pipeline.grading.grade import Flag
 from pipeline.grading.shared_prints import PASSED, Print, unpack
 
@@ -146,7 +146,7 @@ def shared_message(experiments: Sequence[str], others: Iterable[str]) -> str:
     )
 
 
-def same_team(a: Prints, b: Prints) -> bool:
+def same_team(a: Prints | Listed, b: Prints | Listed) -> bool:
     """Tell whether two submissions have an author in common; without authors, the same name."""
     if a.authors and b.authors:
         return not set(map(person, a.authors)).isdisjoint(map(person, b.authors))
