@@ -10,10 +10,17 @@ from dataclasses import replace
 import pytest
 
 from pipeline.bench.acquire import acquire
+from pipeline.bench.core import ReferenceCore
 from pipeline.bench.gains import Scales
 from pipeline.bench.orders import make_order
-from pipeline.bench.plan import Limits
-from pipeline.bench.protocol import Description, parse_description
+from pipeline.bench.plan import Limits, StateLoop
+from pipeline.bench.protocol import (
+    EXTENSIONS,
+    Description,
+    StateGains,
+    encode,
+    parse_description,
+)
 from pipeline.bench.raw import RawHeader, RawWriter
 from pipeline.bench.serial_line import open_line
 from pipeline.bench.session import Session
@@ -123,6 +130,26 @@ def test_more_than_the_bench_can_give_is_refused():
     assert make_order(least, **ask).commands
     with pytest.raises(ConfigError, match=r"amplitude 0\.41 V is more than the bench can give"):
         make_order(least.model_copy(update={"amplitude": 0.41}), **ask)
+
+
+def test_a_lost_byte_leaves_no_gains_of_an_earlier_run():
+    """Gains whose letter or a semicolon is lost are none: the motor rests, no old gains act."""
+    bench = Description(name="b", encoders=2, carts=2, commands=EXTENSIONS)
+    loop = sine("loop", seconds=1).model_copy(update={"controller": StateLoop()})
+    order = make_order(
+        loop,
+        limits=LIMITS,
+        scales=Scales(input=1e-4, position=0.002),
+        system=TWO_CARTS,
+        bench=bench,
+        gains=StateGains(gains=(0.5, 0.0, 0.0, 0.0), prefilter=0.5),
+    )
+    *before, gains, start = (encode(command) for command in order.commands)
+    for lost in (at for at, byte in enumerate(gains) if byte in b"f;"):
+        core = ReferenceCore(bench)
+        core.receive(encode(StateGains(gains=(5.0, 0.0, 0.0, 0.0), prefilter=5.0)))
+        core.receive(b"".join([*before, gains[:lost], gains[lost + 1 :], start]))
+        assert {core.tick((0, 0), stamp=ms, now=0) for ms in range(200)} == {0}
 
 
 # ----------------------------------------------------------------- files of others

@@ -88,7 +88,8 @@ def make_order(
     if gains is not None:
         if isinstance(gains, StateGains):
             _check_known("f", "state feedback", recording, bench)
-        commands.append(gains)
+        # A byte that is lost takes the gains with it: then none act, not those of an earlier run.
+        commands += [PidGains(kp=0.0, ki=0.0, kd=0.0), gains]
     if recording.wave == "chirp":
         _check_known("c", "chirp", recording, bench)
         if recording.frequency_end is not None:
