@@ -429,3 +429,17 @@ def test_the_real_second_cart_pulled_by_hand(real_records, repeat):
     assert 0.02 <= friction_of(got).zeta <= 0.035
     assert 24 <= friction_of(got).drop <= 34  # encoder counts
     assert 0.06 <= got.zeta <= 0.08
+
+
+def test_a_crest_of_equal_readings_turns_in_its_middle():
+    """Where an encoder is too coarse for a crest to curve, the turning point is still right."""
+    zeta = 0.05
+    run = released(zeta=zeta, count=0.03)
+    got = fit_log_decrement(run, cart=1)
+    # Half a radian to either side a parabola is fitted, where there is one.
+    crests = [run.y[0, np.abs(run.t - peak) <= 0.5 / OMEGA] for peak in got.peak_t]
+    flat = got.peak_t[[np.ptp(crest) == 0 for crest in crests]]
+    assert flat.size >= 3
+    half = np.pi / (OMEGA * np.sqrt(1 - zeta**2))
+    # The middle of a whole number of samples, the first and last of them up to one off.
+    assert_allclose((flat - RELEASE) / half, np.round((flat - RELEASE) / half), atol=1 / FS / half)

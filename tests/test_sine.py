@@ -1,6 +1,6 @@
 """Sinusoidal steady state: amplitude, phase, frequency, and where the steady part begins."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from pipeline.errors import DataError
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.simulate import simulate_linear
 from pipeline.results import Record
-from pipeline.stages.sine import fit_sine
+from pipeline.stages.sine import Dwell, fit_sine
 
 CHAIN = PRESETS["throne-1dof"]
 COUNT = 0.00227  # cm, the encoder of the ECP 210
@@ -97,6 +97,14 @@ def test_every_cart_of_a_chain_has_its_own_amplitude_and_phase():
         got = fit_sine(run, cart=cart)
         assert_allclose(got.gain, abs(truth[cart - 1]), rtol=2e-3)
         assert_allclose(np.exp(1j * got.phase), np.exp(1j * np.angle(truth[cart - 1])), atol=2e-3)
+
+
+def test_what_the_carts_of_a_dwell_share_changes_none_of_their_numbers():
+    """Fitted one after another, in any order, carts have the numbers they have alone."""
+    run, _ = dwell(sampled(6.0), chain=PRESETS["throne-3dof"], hertz=3.0)
+    together = Dwell(run)
+    for cart in (3, 1, 2):
+        assert asdict(together.fit(cart=cart)) == asdict(fit_sine(run, cart=cart))
 
 
 def test_the_transient_is_left_out():

@@ -10,7 +10,7 @@ from pipeline.plant.chain import PRESETS
 from pipeline.resources import EXAMPLES
 from pipeline.results_json import results_text
 from pipeline.submission import load_submission
-from pipeline.workflow import analyse
+from pipeline.workflow import analyse, reference_design
 
 PRESET_OF = {"one-cart": "throne-1dof", "two-cart": "throne-2dof", "three-cart": "throne-3dof"}
 
@@ -104,3 +104,12 @@ def test_decays_alone_end_in_reasons_not_in_a_crash(tmp_path):
     assert "null" in results_text(analysis)
     initial = {row.name: row.initial.value for row in analysis.rows if row.initial}
     assert math.isclose(initial["omega_2"], 32.926, rel_tol=1e-3)
+
+
+def test_the_design_can_be_left_out_and_had_later(analyses):
+    """Grading does without the design; asked for by itself it is the one of the whole line."""
+    submission, whole = load_submission(EXAMPLES / "one-cart"), analyses["one-cart"].feedback
+    without = analyse(submission, design=False)
+    assert without.feedback is None
+    assert not without.skipped
+    assert_allclose(reference_design(submission, without.fit).gains, whole.gains, rtol=1e-12)

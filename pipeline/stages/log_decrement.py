@@ -168,7 +168,7 @@ def _vertex(t: Array, y: Array, index: int, *, half_width: float) -> tuple[float
     first, stop = np.searchsorted(t, t[index] + half_width * np.array([-1, 1]))
     first, stop = min(int(first), max(index - 1, 0)), max(int(stop), min(index + 2, t.size))
     tau = (t[first:stop] - t[index]) / half_width
-    if tau.size < 3 or np.ptp(y[first:stop]) == 0:  # a cart that has come to rest
+    if tau.size < 3 or np.ptp(y[first:stop]) == 0:  # a crest of equal readings
         return float(t[index]), float(y[index])
     a, b, c = np.linalg.lstsq(np.vander(tau, 3), y[first:stop], rcond=None)[0]
     vertex = -b / (2 * a) if a else 0.0
