@@ -107,8 +107,8 @@ def test_a_mended_id_of_an_author_accuses_nobody(school, tmp_path):
         done = grade(own, out=out)
         assert done.sharing == 0
     assert done.remarks == (
-        "team-1 is now that of 's 17', it was that of ' S1 ': where both count, give one of the "
-        "folders another name",
+        "team-1 is now by others, 's 17' in place of ' S1 ': where both count, give one folder "
+        "another name",
     )
 
 

@@ -116,11 +116,10 @@ def _refuse_submission(out: Path) -> None:
 
 def _told(batch: Batch, book: Gradebook) -> Iterator[str]:
     """Yield what this run did not grade anew, and where others stand in a team's place."""
+    hidden = book.rubric.anonymous
     for name, before, now in batch.taken_over:
-        yield (
-            f"{name} is now that of {_people(now)}, it was that of {_people(before)}: "
-            "where both count, give one of the folders another name"
-        )
+        whose = "" if hidden else f", {_people(now)} in place of {_people(before)}"
+        yield f"{name} is now by others{whose}: where both count, give one folder another name"
     if not batch.kept:
         return
     yield f"not in this run, kept as they were: {_names(batch.kept)} (cartlab remove takes one off)"
