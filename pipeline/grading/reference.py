@@ -13,9 +13,10 @@ from pipeline.stages.compare import CHI_SQUARE_LIMIT
 
 # A fitted frequency or gain that far from the measured one: the fit has gone astray; factors.
 _ASTRAY, _ASTRAY_GAIN = 1.3, 1.6
-_STUCK = 1.15  # factor: a gain where carts stick so that no linear fit is near
+_STUCK = 1.2  # factor: a gain where carts stick so that no linear fit is near
 _SIGMAS = 3.0
 _STILL = 3.0  # encoder steps
+_FAR = 2.5  # … so far that nobody believes it
 # A resonance or null read off the dwells, and where friction blurs even those: factors.
 _BY_EYE, _BY_EYE_ASTRAY = 1.1, 1.6
 
@@ -38,9 +39,7 @@ class Reference:
     source: str
 
     def including(self, value: float) -> "Reference":
-        """Return the reference with a positive value between its bounds."""
-        if value <= 0:
-            return self
+        """Return the reference with a value between its bounds."""
         return replace(self, low=min(self.low, value), high=max(self.high, value))
 
     def widened(self, factor: float) -> "Reference":
@@ -83,9 +82,12 @@ def recompute(analysis: Analysis) -> References:
             initial[row.name] = measured
         if fitted is not None:
             final[row.name] = fitted
-        elif measured is not None and row.final is not None:
-            # Where our fit goes astray, the students' may.
-            final[row.name] = measured.including(row.final.value)
+        elif measured is not None:
+            final[row.name] = measured
+            # Where our fit of a gain goes astray, the students' may; they see it if it goes far.
+            astray = row.final.value if row.final and row.name.startswith("K") else measured.value
+            if measured.value / _FAR < astray < measured.value * _FAR:
+                final[row.name] = measured.including(astray)
         if not trusted and row.name.startswith("K"):
             for table in (initial, final):
                 if row.name in table:
