@@ -33,7 +33,7 @@ def write_submission(
     effects: Sequence[Term] = (),
     title: str | None = None,
     section: str = "01",
-    authors: Sequence[str] = ("s1001", "s1002"),
+    authors: Sequence[str] | None = None,
     springs: Sequence[bool] | None = None,
     position_unit: str = "cm",
     input_unit: str = "V",
@@ -52,6 +52,7 @@ def write_submission(
     ----------
     folder : made if need be; files of the same names are replaced.
     chain : the true plant, or a preset's name.
+    authors : ids; default: two that go with the seed, so that a class has no one twice.
     effects : what the bench does beyond the linear chain. Nothing written tells of it, and the
         students believe in a linear chain.
     springs : which springs the students say there are; default: those of the chain.
@@ -71,6 +72,7 @@ def write_submission(
     if isinstance(chain, str):
         title = title or f"Simulated bench, {chain}, seed {seed}"
         chain = preset_chain(chain)
+    authors = authors or (f"s{1001 + 2 * seed}", f"s{1002 + 2 * seed}")
     rng = np.random.default_rng(seed)
     session = runs.Session(
         sample_time=sample_time,
