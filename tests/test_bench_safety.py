@@ -1,6 +1,7 @@
 """The motor does not stay on, whatever the line, the terminal or a plan does."""
 
 import os
+import queue
 import signal
 import subprocess
 import sys
@@ -13,7 +14,7 @@ from pipeline.bench.acquire import acquire
 from pipeline.bench.core import ReferenceCore
 from pipeline.bench.gains import Scales
 from pipeline.bench.orders import make_order
-from pipeline.bench.plan import Limits, StateLoop
+from pipeline.bench.plan import Limits, Recording, StateLoop
 from pipeline.bench.protocol import (
     EXTENSIONS,
     Description,
@@ -25,7 +26,7 @@ from pipeline.bench.raw import RawHeader, RawWriter
 from pipeline.bench.serial_line import open_line
 from pipeline.bench.session import Session
 from pipeline.errors import ConfigError, DataError
-from pipeline.submission import System
+from pipeline.submission import System, load_submission
 from tests.acquisitions import LIMITS, Notes, host, sine, write_work
 from tests.benches import emulator
 
@@ -60,6 +61,58 @@ def test_a_run_that_passed_a_limit_is_not_tried_again(tmp_path):
         outcomes = acquire(work, port=bench.address, observers=[notes], only=["dwell"])
     assert [outcome.partial[:14] for outcome in outcomes] == ["stopped: cart "]
     assert notes.confirmed == []
+
+
+def test_a_plan_for_a_stronger_bench_moves_nothing(tmp_path):
+    """A tenth of "5 V" is all that a bench of 0.5 V has: such a plan is refused with both numbers."""
+    strong = Limits(input=5.0, travel=2.5)
+    work = write_work(tmp_path, [sine("dwell", seconds=1)], limits=strong)
+    with emulator("--speed", "20") as bench:
+        with pytest.raises(
+            ConfigError, match=r"input is 5 V, the bench gives at most 0\.5 V.*delete plan\.toml"
+        ):
+            acquire(work, port=bench.address, observers=[Notes()])
+        with pytest.raises(queue.Empty):
+            bench.event("run", timeout=0.5)
+    assert not (work / "raw").exists()
+
+
+def test_the_numbers_are_said_before_anything_moves(tmp_path):
+    """The limits stand beside what the bench gives and counts: 2.5 cm of 0.00227 cm are 1101."""
+    work = write_work(tmp_path, [sine("dwell", seconds=1)])
+    notes = Notes()
+    with emulator("--speed", "20") as bench:
+        acquire(work, port=bench.address, observers=[notes], only=["dwell"])
+    said = "limits: 0.5 V of 0.5 V that the bench gives, 2.5 cm (1101 counts) from where it is"
+    assert any(remark.startswith(said) for remark in notes.remarks)
+
+
+def test_what_a_bench_cannot_do_is_left_out_and_the_rest_recorded(tmp_path):
+    """A chirp on a stock bench and less than a count are skipped with reasons; the status is 1."""
+    chirp = Recording(
+        id="sweep",
+        kind="sweep",
+        carts=(1, 2),
+        wave="chirp",
+        amplitude=0.01,
+        frequency=1.0,
+        frequency_end=5.0,
+        settle=0.0,
+    )
+    faint = sine("faint", seconds=1).model_copy(update={"amplitude": 1e-5})
+    scales = 'input = { unit = "V", per_count = 0.0001220703125 }\n'
+    work = write_work(tmp_path, [chirp, faint, sine("dwell", seconds=1)], scales=scales)
+    text = (work / "submission.toml").read_text(encoding="utf-8")
+    text = text.replace('{ unit = "cm" }', '{ unit = "cm", per_count = 0.00227 }')
+    (work / "submission.toml").write_text(text, encoding="utf-8")
+    with emulator("--stock") as bench:
+        process = host(work, bench.address, "--yes")
+        _, said = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert "knows no chirp; take its table out of plan.toml or change it" in said
+    assert "less than half a count of the bench" in said
+    assert "not recorded: faint, sweep" in said
+    assert [e.id for e in load_submission(work).experiments] == ["dwell"]
 
 
 def test_a_bench_that_goes_on_after_its_run_is_stopped(tmp_path):

@@ -4,7 +4,12 @@ from collections.abc import Collection, Generator, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from pipeline.bench.experiments import add_experiment, prepare_submission, scale_remarks
+from pipeline.bench.experiments import (
+    add_experiment,
+    limit_words,
+    prepare_submission,
+    scale_remarks,
+)
 from pipeline.bench.gains import Scales, bench_gains, bench_scales, controller_table
 from pipeline.bench.observer import Observer, Observers, Outcome
 from pipeline.bench.orders import Order, make_order
@@ -17,7 +22,7 @@ from pipeline.bench.raw import read_raw
 from pipeline.bench.record import data_file, save_record
 from pipeline.bench.serial_line import SerialLine, open_line
 from pipeline.bench.session import STOPPED, Session, stopping_on_signals
-from pipeline.errors import ConfigError, DataError, HardwareError
+from pipeline.errors import ConfigError, DataError, HardwareError, PipelineError
 from pipeline.output import own_folder
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.load import NAME
@@ -45,8 +50,9 @@ def acquire(
 
     Raises
     ------
-    HardwareError : no bench, or none that can do what the plan asks.
-    ConfigError : the plan or the submission does not fit the bench.
+    HardwareError : there is no bench.
+    ConfigError : the plan as a whole or the submission does not fit the bench; of one recording
+        that does not, its outcome says why, and the others go on.
     """
     with stopping_on_signals():
         work = _Acquisition(folder, port=port, observer=Observers(observers), only=only)
@@ -115,6 +121,10 @@ class _Acquisition:
         name = outcome.recording.id
         if outcome.partial.startswith(STOPPED):  # the same again would do the same harm
             self._failed[name] = _TRIES
+            self._observer.remark(
+                f"{name} is not tried again now; if a limit was passed, divide its amplitude in "
+                "plan.toml by four"
+            )
             return
         self._failed[name] = self._failed.get(name, 0) + 1
         if self._failed[name] < _TRIES:
@@ -129,10 +139,8 @@ class _Acquisition:
         else:
             plan = propose_plan(submission, bench=line.bench)
             path = save_plan(plan, submission)
-            self._observer.remark(
-                f"wrote {path}: limits {plan.limits.input:g} {submission.system.input.unit} and "
-                f"{plan.limits.travel:g} {submission.system.position.unit}"
-            )
+            self._observer.remark(f"wrote {path}: check it")
+        self._observer.remark(limit_words(plan.limits, submission, line.bench))
         known = {recording.id for recording in plan.recordings}
         if unknown := sorted(self._only - known):
             raise ConfigError(f"--only {unknown[0]}: plan.toml has {', '.join(sorted(known))}")
@@ -171,7 +179,7 @@ class _Acquisition:
         """Record one experiment and note it; return how it went and the submission as it is now."""
         try:
             order, table = _order(recording, plan, submission, line)
-        except DataError as error:  # a loop that would do harm: nothing is sent
+        except PipelineError as error:  # this bench cannot, or must not, do it: nothing is sent
             self._failed[recording.id] = _TRIES
             return Outcome(recording=recording, lines=0, partial=str(error)), submission
         path = _raw_path(self._folder, recording)

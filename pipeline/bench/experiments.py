@@ -4,7 +4,8 @@ import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 
-from pipeline.bench.protocol import Description
+from pipeline.bench.plan import Limits
+from pipeline.bench.protocol import FULL_SCALE, Description
 from pipeline.errors import ConfigError, SubmissionError
 from pipeline.ingest.read import DUTY_COUNT
 from pipeline.output import new_folder, write_file
@@ -12,6 +13,7 @@ from pipeline.submission import Submission, load_submission
 from pipeline.submission.load import NAME
 from pipeline.synthesis.files import Value, toml_section
 
+_ROUNDED = 1.01  # an input limit typed with fewer digits may pass full scale by so much
 _SAME = 1e-3  # scales that differ by less are the same number typed with fewer digits
 
 
@@ -91,6 +93,29 @@ def scale_remarks(submission: Submission, bench: Description) -> list[str]:
         for name, (own, unit, stated) in pairs.items()
         if own.per_count and own.unit == unit and abs(own.per_count / stated - 1) > _SAME
     ]
+
+
+def limit_words(limits: Limits, submission: Submission, bench: Description) -> str:
+    """Return the limits of a plan beside what the bench counts and can give.
+
+    Raises
+    ------
+    ConfigError : more input is allowed than the bench can give: shares of it would be too large.
+    """
+    system = submission.system
+    unit, position = system.input.unit, system.position.unit
+    full = FULL_SCALE * abs(system.input.per_count or bench.input_per_count)
+    if limits.input > _ROUNDED * full:
+        raise ConfigError(
+            f"plan.toml: limits.input is {limits.input:g} {unit}, the bench gives at most "
+            f"{full:g} {unit}: the plan was made for another bench; delete plan.toml and a new "
+            "one is proposed, or lower limits.input and every amplitude"
+        )
+    counts = limits.travel / abs(system.position.per_count or bench.position_per_count)
+    return (
+        f"limits: {limits.input:g} {unit} of {full:g} {unit} that the bench gives, "
+        f"{limits.travel:g} {position} ({counts:.0f} counts) from where it is zeroed"
+    )
 
 
 def _is_count(unit: str) -> bool:

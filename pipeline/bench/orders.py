@@ -80,10 +80,12 @@ def make_order(
         raise ConfigError(f"{where} passes the limit of {limit:g} {unit}")
     full = FULL_SCALE * per_count
     if not closed and abs(recording.amplitude) > full + 0.5 * per_count:
-        raise ConfigError(f"{where} is more than the bench can give: {full:g} {unit}")
+        raise ConfigError(f"{where} is more than the bench can give: {full:g} {unit}; lower it")
     amplitude = round(recording.amplitude / per_count)
     if recording.amplitude and not amplitude:
-        raise ConfigError(f"{where} is less than half a count of the bench ({per_count:g} {unit})")
+        raise ConfigError(
+            f"{where} is less than half a count of the bench ({per_count:g} {unit}); raise it"
+        )
     commands: list[Command] = []
     if gains is not None:
         if isinstance(gains, StateGains):
@@ -116,4 +118,7 @@ def make_order(
 
 def _check_known(letter: str, name: str, recording: Recording, bench: Description) -> None:
     if letter not in bench.commands:
-        raise HardwareError(f"{recording.id}: the bench {bench.name!r} knows no {name}")
+        raise HardwareError(
+            f"{recording.id}: the bench {bench.name!r} knows no {name}; take its table "
+            "out of plan.toml or change it"
+        )
