@@ -140,6 +140,7 @@ def test_columns_without_a_clock_get_no_suggestion(tmp_path):
     scipy.io.savemat(tmp_path / "a.mat", {"data": np.column_stack([X, STEP, np.sin(9 * T)])})
     problems = inspect_file(tmp_path / "a.mat").problems
     assert "the columns have no names: say in submission.toml which is what" in problems
+    assert "sample_rate" not in problems
 
 
 @pytest.mark.skipif(os.name == "nt", reason="links need rights on Windows")

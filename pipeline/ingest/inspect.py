@@ -78,7 +78,8 @@ def inspect_file(path: Path) -> Inspection:
     except SubmissionError as error:
         columns, unused = {}, ()
         problems.append(str(error).removeprefix(f"{table.source}: "))
-    if not columns and all(name.isdigit() for name in table.names):
+    bare = not columns and all(name.isdigit() for name in table.names)
+    if bare:
         line = suggest_columns(table)
         problems.append(
             "the columns have no names: say in submission.toml which is what"
@@ -86,8 +87,9 @@ def inspect_file(path: Path) -> Inspection:
         )
     elif unused:
         problems.append(f"no role for {', '.join(unused)}: name them in `columns` to use them")
-    clock = _clock(table, columns, problems) if "frequency" not in columns else None
-    kind, frequency = _guess(table, columns, clock, problems)
+    further = [] if bare else problems  # without names everything else is missing too
+    clock = _clock(table, columns, further) if "frequency" not in columns else None
+    kind, frequency = _guess(table, columns, clock, further)
     roles = {column.index: role for role, column in columns.items()}
     return Inspection(
         file=str(path),
