@@ -27,6 +27,16 @@ app = typer.Typer(
 )
 
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="A submission folder.")]
+Preset = Annotated[str | None, typer.Option(help="throne-1dof, throne-2dof or throne-3dof.")]
+Model = Annotated[
+    Path | None, typer.Option(help="A gap.json whose chain and effects stand for a preset.")
+]
+Hide = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="EFFECT[:key=value,…]", help="Hide an effect (see `cartlab effects`); repeat."
+    ),
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
 
 

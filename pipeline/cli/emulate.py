@@ -3,28 +3,18 @@
 import json
 import signal
 import threading
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from pipeline.cli.common import app, say
+from pipeline.cli.common import Hide, Model, Preset, app, say
 
 
 @app.command()
 def emulate(
-    preset: Annotated[
-        str | None, typer.Option(help="throne-1dof, throne-2dof or throne-3dof.")
-    ] = None,
-    model: Annotated[
-        Path | None, typer.Option(help="A gap.json whose chain and effects to move.")
-    ] = None,
-    hide: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="EFFECT[:key=value,…]", help="Hide an effect (see `cartlab effects`); repeat."
-        ),
-    ] = None,
+    preset: Preset = None,
+    model: Model = None,
+    hide: Hide = None,
     port: Annotated[
         str, typer.Option(help="socket://HOST:PORT (port 0: any that is free) or pty.")
     ] = "socket://127.0.0.1:0",

@@ -6,24 +6,15 @@ from typing import Annotated
 
 import typer
 
-from pipeline.cli.common import AsJson, app, progress_line, say
+from pipeline.cli.common import AsJson, Hide, Model, Preset, app, progress_line, say
 
 
 @app.command()
 def simulate(
     out: Annotated[Path, typer.Option(help="The submission folder to write.")],
-    preset: Annotated[
-        str | None, typer.Option(help="throne-1dof, throne-2dof or throne-3dof.")
-    ] = None,
-    model: Annotated[
-        Path | None, typer.Option(help="A gap.json whose chain and effects to simulate.")
-    ] = None,
-    hide: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="EFFECT[:key=value,…]", help="Hide an effect (see `cartlab effects`); repeat."
-        ),
-    ] = None,
+    preset: Preset = None,
+    model: Model = None,
+    hide: Hide = None,
     seed: Annotated[int, typer.Option(min=0, help="Random seed: same seed, same bytes.")] = 0,
     reported: Annotated[
         bool, typer.Option("--reported", help="Add what an honest student would report.")
