@@ -6,6 +6,7 @@ from pathlib import Path
 
 from pipeline.bench.experiments import (
     add_experiment,
+    cart_remarks,
     limit_words,
     prepare_submission,
     scale_remarks,
@@ -91,7 +92,7 @@ class _Acquisition:
                 f"the bench {bench.name!r} has no watchdog: if this program or the cable dies in "
                 "a run, the motor runs on; keep a hand on its switch"
             )
-        for sentence in scale_remarks(submission, bench):
+        for sentence in (*cart_remarks(submission, bench), *scale_remarks(submission, bench)):
             self._observer.remark(sentence)
         for file in _recovered(self._folder, carts=submission.system.carts):
             self._observer.remark(f"{file} is what a session left that was cut off")

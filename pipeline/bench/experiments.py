@@ -52,7 +52,7 @@ def prepare_submission(folder: Path, bench: Description, *, stock: bool) -> Subm
 
     Raises
     ------
-    ConfigError : a scale that nobody states, or units that differ.
+    ConfigError : a scale that nobody states, units that differ, or fewer carts on the bench.
     """
     if not (folder / NAME).exists():
         if stock:
@@ -66,6 +66,11 @@ def prepare_submission(folder: Path, bench: Description, *, stock: bool) -> Subm
     if system.carts > bench.encoders:
         raise ConfigError(
             f"{folder}: has {system.carts} carts, the bench has {bench.encoders} encoders"
+        )
+    if not stock and system.carts > bench.carts:
+        raise ConfigError(
+            f"{folder}: has {system.carts} carts, the bench {bench.name!r} has {bench.carts}: is "
+            "this the right port, the right folder?"
         )
     missing: dict[str, float] = {}
     if system.position.per_count is None:
@@ -92,6 +97,18 @@ def scale_remarks(submission: Submission, bench: Description) -> list[str]:
         f"that of {NAME} is used"
         for name, (own, unit, stated) in pairs.items()
         if own.per_count and own.unit == unit and abs(own.per_count / stated - 1) > _SAME
+    ]
+
+
+def cart_remarks(submission: Submission, bench: Description) -> list[str]:
+    """Return what is to be said where the bench states more carts than the submission has."""
+    carts = submission.system.carts
+    if not bench.commands or bench.carts <= carts:
+        return []
+    return [
+        f"{NAME} has carts = {carts}, the bench {bench.name!r} has {bench.carts}: if this is not "
+        f"the wrong bench, hold the cart{'s' if bench.carts - carts > 1 else ''} after cart "
+        f"{carts} throughout"
     ]
 
 

@@ -34,6 +34,9 @@ from pipeline.bench.serial_line import LUMP, SerialLine
 from pipeline.bench.stream import Stream
 from pipeline.errors import HardwareError
 
+_NOTHING_MOVED = (
+    "no cart that is free moved: is it held, is its encoder plugged in, is the motor on?"
+)
 STOPPED = "stopped: "  # begins why a run was ended that was not safe to go on with
 
 _LOOK = 0.003  # s between looks at the port
@@ -160,6 +163,8 @@ class Session:
             finally:
                 self._stop(always=bool(partial))
         watch.forward(stream.finish())
+        if not partial and recording.controller is None and stream.widest <= _STILL:
+            partial = _NOTHING_MOVED
         fit = stream.fit()
         if stream.lines > _ENOUGH:
             self._period = fit.period

@@ -75,6 +75,11 @@ class Stream:
         """Whether the bench's clock began again: no line after that belongs to this run."""
         return self._resets > 0
 
+    @property
+    def widest(self) -> int:
+        """The counts that the free cart which moved most went from end to end."""
+        return self._watch.widest
+
     def fit(self) -> StampFit:
         """Return the clock that explains the stamps; takes too long for a run under way."""
         return fit_stamps(np.array(self._stamps), period=self._expected)
@@ -236,6 +241,11 @@ class _EncoderWatch:
             and self._earlier is not None  # a run of less than a window tells nothing
         }
         return len(self._frozen | never)
+
+    @property
+    def widest(self) -> int:
+        """The greatest range of any encoder watched, counts."""
+        return max((seen.width for seen in self._overall.values()), default=0)
 
     def see(self, readings: Sequence[Reading]) -> None:
         """Take note of valid lines, in order."""

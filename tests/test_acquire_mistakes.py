@@ -1,0 +1,40 @@
+"""What people get wrong at a bench is said, and harms nothing that was recorded."""
+
+import pytest
+
+from pipeline.bench.acquire import acquire
+from pipeline.bench.experiments import cart_remarks
+from pipeline.bench.protocol import EXTENSIONS, Description
+from pipeline.errors import ConfigError
+from pipeline.submission import load_submission
+from tests.acquisitions import Notes, sine, write_work
+from tests.benches import emulator
+
+
+def test_another_bench_than_the_submission_is_of_is_refused(tmp_path):
+    """A submission of two carts takes nothing from a bench that states one."""
+    work = write_work(tmp_path, [sine("dwell", seconds=1)])
+    with emulator("--speed", "20", preset="throne-1dof") as bench:
+        with pytest.raises(ConfigError, match=r"has 2 carts, the bench 'throne-1dof' has 1: is"):
+            acquire(work, port=bench.address, observers=[Notes()])
+    assert not (work / "raw").exists()
+
+
+def test_a_bench_of_more_carts_is_said(tmp_path):
+    """Whoever holds the third cart by hand may go on; the wrong cable is named."""
+    submission = load_submission(write_work(tmp_path, []))
+    bench = Description(name="three", encoders=3, carts=3, commands=EXTENSIONS)
+    (remark,) = cart_remarks(submission, bench)
+    assert "carts = 2, the bench 'three' has 3: if this is not the wrong bench" in remark
+    assert cart_remarks(submission, Description(name="stock", encoders=3, carts=3)) == []
+
+
+def test_a_run_in_which_nothing_moves_is_not_recorded(tmp_path):
+    """Two encoders that are not plugged in make no dwell; it is offered again, twice."""
+    work = write_work(tmp_path, [sine("dwell", seconds=2)])
+    notes = Notes()
+    dead = ("--fault", "stuck=1@0", "--fault", "stuck=2@0")
+    with emulator("--speed", "20", *dead) as bench:
+        outcomes = acquire(work, port=bench.address, observers=[notes], only=["dwell"])
+    assert [o.partial[:26] for o in outcomes] == ["no cart that is free moved"] * 3
+    assert load_submission(work).experiments == ()
