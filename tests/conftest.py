@@ -1,6 +1,7 @@
 """Fixtures shared by the tests."""
 
 import shutil
+import signal
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,10 @@ settings.load_profile("cartlab")
 REAL_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 CHROMIUM = shutil.which("chromium")
+# A shell starts what runs in the background deaf to Ctrl-C, and its children inherit that.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
 FLAGS = "--headless --no-sandbox --disable-gpu --no-first-run --disable-background-networking"
 
 
