@@ -3,9 +3,13 @@
 import os
 import queue
 import signal
+import socket
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 
 import pytest
@@ -13,22 +17,28 @@ import pytest
 from pipeline.bench.acquire import acquire
 from pipeline.bench.core import ReferenceCore
 from pipeline.bench.gains import Scales
+from pipeline.bench.observer import Anomalies
 from pipeline.bench.orders import make_order
 from pipeline.bench.plan import Limits, Recording, StateLoop
 from pipeline.bench.protocol import (
     EXTENSIONS,
+    Command,
     Description,
+    Reading,
+    Signal,
+    Start,
     StateGains,
+    Wave,
     encode,
     parse_description,
 )
 from pipeline.bench.raw import RawHeader, RawWriter
 from pipeline.bench.serial_line import open_line
 from pipeline.bench.session import Session
-from pipeline.errors import ConfigError, DataError
+from pipeline.errors import ConfigError, DataError, HardwareError
 from pipeline.submission import System, load_submission
 from tests.acquisitions import LIMITS, Notes, host, sine, write_work
-from tests.benches import emulator
+from tests.benches import Emulator, emulator
 
 TWO_CARTS = System(carts=2, springs=(True,) * 3)
 
@@ -64,7 +74,7 @@ def test_a_run_that_passed_a_limit_is_not_tried_again(tmp_path):
 
 
 def test_a_plan_for_a_stronger_bench_moves_nothing(tmp_path):
-    """A tenth of "5 V" is all that a bench of 0.5 V has: such a plan is refused with both numbers."""
+    """A bench of 0.5 V has a tenth of "5 V": such a plan is refused with both numbers."""
     strong = Limits(input=5.0, travel=2.5)
     work = write_work(tmp_path, [sine("dwell", seconds=1)], limits=strong)
     with emulator("--speed", "20") as bench:
@@ -131,6 +141,127 @@ def test_a_bench_that_goes_on_after_its_run_is_stopped(tmp_path):
         sent = bench.event("run")
     assert outcome.partial == "stopped: the bench went on past the end of the run"
     assert sent["ended"] == "stopped"
+
+
+@contextmanager
+def _session(bench: Emulator, *, carts: int = 2, observer: Notes | None = None):
+    """Yield a session on a new line, and what `make_order` needs there beside the recording."""
+    with open_line(bench.address, baud=115_200) as line:
+        session = Session(line, carts=carts, limits=LIMITS, observer=observer or Notes())
+        yield (
+            session,
+            line,
+            {
+                "limits": LIMITS,
+                "scales": Scales(input=line.bench.input_per_count, position=0.00227),
+                "system": System(carts=carts, springs=(True,) * (carts + 1)),
+                "bench": line.bench,
+            },
+        )
+
+
+@pytest.mark.parametrize("change", [{"frequency": 3.0}, {"amplitude": 92}, {"wave": Wave.TRIANGLE}])
+def test_a_changed_digit_of_a_start_is_noticed(tmp_path, monkeypatch, change):
+    """The targets in the lines are not those of the wave: the run ends, to be tried again."""
+    with emulator() as bench, _session(bench) as (session, line, ask):
+        order = make_order(sine("dwell", seconds=5), **ask)
+        send = line.send
+
+        def changed(*commands: Command) -> None:
+            send(*(replace(c, **change) if isinstance(c, Start) else c for c in commands))
+
+        monkeypatch.setattr(line, "send", changed)
+        outcome = session.record(order, tmp_path / "dwell-1.raw")
+        monkeypatch.undo()
+        sent = bench.event("run")
+        again = session.record(order, tmp_path / "dwell-2.raw")
+    assert outcome.partial.startswith("the bench follows another wave than it was sent")
+    assert sent["ended"] == "stopped"
+    assert sent["lines"] < 1000
+    assert again.partial == ""
+
+
+class Slow(Notes):
+    """Takes its time once a cart is far out."""
+
+    def readings(self, batch: Sequence[Reading], anomalies: Anomalies) -> None:
+        """Note the lines, and sleep longer than the bench waits for a heartbeat."""
+        super().readings(batch, anomalies)
+        if any(abs(count) > 22 for reading in batch for count in reading.counts):
+            time.sleep(0.4)
+
+
+def test_the_stop_goes_out_before_anybody_is_told(tmp_path):
+    """An observer that hangs at the very line past the limit does not keep the motor on."""
+    with emulator() as bench, _session(bench, observer=Slow()) as (session, _, ask):
+        near = Limits(input=0.5, travel=22 * 0.00227)
+        order = make_order(sine("dwell", seconds=4), **{**ask, "limits": near})
+        outcome = session.record(order, tmp_path / "dwell-1.raw")
+        sent = bench.event("run")
+    assert outcome.partial.startswith("stopped: cart ")
+    assert sent["ended"] == "stopped"
+
+
+def test_every_cart_of_the_bench_is_watched(tmp_path):
+    """Where a submission tells of one cart and the bench has two, the second may not run away."""
+    with emulator() as bench, _session(bench, carts=1) as (session, _, ask):
+        near = Limits(input=0.5, travel=0.25)
+        # At their second resonance, near 6 Hz, the second cart moves twice as far as the first.
+        dwell = sine("dwell", seconds=8, frequency=6.0)
+        order = make_order(
+            dwell.model_copy(update={"carts": (1,), "amplitude": 0.02}),
+            **{**ask, "limits": near},
+        )
+        outcome = session.record(order, tmp_path / "dwell-1.raw")
+    assert outcome.partial.startswith("stopped: cart 2 was ")
+
+
+def test_a_new_line_is_zeroed_once_the_carts_rest(tmp_path):
+    """A line opened while the carts swing has its zero in mid-swing; the next run's is at rest."""
+    recording = sine("dwell", seconds=1, settle=3.0)
+    notes = Notes()
+    with emulator("--seed", "3") as bench, _session(bench, observer=notes) as (session, line, ask):
+        line.send(Start(wave=Wave.SQUARE, frequency=0.5, amplitude=400))
+        time.sleep(1.2)  # it is on after one second
+        *_, away, _ = line.drain(longest=0.2).split(b"\n")
+        line.send(Signal.RESET)  # as whoever opens the line again does
+        line.drain()
+        assert session.prepare(recording) == ""
+        session.record(make_order(recording, **ask), tmp_path / "dwell-1.raw")
+    assert int(away.split(b":")[0]) > 100
+    assert max(map(abs, notes.readings_seen[0].counts)) <= 4  # which a cart at rest may flicker
+
+
+class Answers(threading.Thread):
+    """A port where each query is answered with the next of some lines."""
+
+    def __init__(self, *answers: bytes) -> None:
+        super().__init__(daemon=True)
+        self._answers = iter(answers)
+        self._door = socket.create_server(("127.0.0.1", 0))
+        self.address = f"socket://127.0.0.1:{self._door.getsockname()[1]}"
+
+    def run(self) -> None:
+        """Serve one host until it hangs up."""
+        peer, _ = self._door.accept()
+        with self._door, peer:
+            while heard := peer.recv(4096):
+                for _ in range(heard.count(b"?;")):
+                    peer.sendall(next(self._answers))
+
+
+def test_a_description_is_believed_when_it_came_twice():
+    """A digit that changed on the line would move every limit; what differs is asked again."""
+    true = DESCRIPTION.encode() + b"\n"
+    wrong = [true.replace(b"0.002cm", b"0.00%dcm" % digit) for digit in (1, 3, 6)]
+    port = Answers(wrong[0], true, true)
+    port.start()
+    with open_line(port.address, baud=115_200) as line:
+        assert line.bench.position_per_count == 0.002
+    port = Answers(*wrong, true)
+    port.start()
+    with pytest.raises(HardwareError, match=r"never describes itself twice alike.*check cable"):
+        open_line(port.address, baud=115_200)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows knows no SIGHUP")

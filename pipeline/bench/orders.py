@@ -15,6 +15,7 @@ from pipeline.bench.protocol import (
     StateGains,
     Wave,
 )
+from pipeline.bench.waves import target_at
 from pipeline.errors import ConfigError, HardwareError
 from pipeline.submission import System
 
@@ -37,6 +38,23 @@ class Order:
     position_unit: str
     most_duty: float
     most_counts: float
+
+    def strays(self, reading: Reading, *, period: float) -> bool:
+        """Tell whether the bench follows another target than it was told, as after a changed digit.
+
+        An edge may come a `period` (ms) early or late; a target may be rounded either way.
+        """
+        start = self.commands[-1]
+        assert isinstance(start, Start)
+        end = next((c.frequency for c in self.commands if isinstance(c, ChirpEnd)), None)
+
+        def target(ms: float) -> int:
+            return target_at(start, max(0.0, 1e-3 * ms), chirp_end=end)
+
+        if abs(reading.target - target(reading.ms)) <= 1:
+            return False
+        near = [target(reading.ms + shift) for shift in (-period, 0.0, period)]
+        return not min(near) - 1 <= reading.target <= max(near) + 1
 
     def passed(self, reading: Reading, *, carts: int) -> str:
         """Return what a line passes the limits by, or ""."""

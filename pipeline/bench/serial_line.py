@@ -113,17 +113,29 @@ class SerialLine:
         HardwareError : nothing there speaks this protocol.
         """
         self.send(*STOCK_STOP)
+        before: bytes | None = None
         for _ in range(_QUERIES):
             self.drain()
             self.send(Signal.QUERY)
-            if (answer := self._answer()) is not None:
-                try:
-                    self.bench = parse_description(answer)
-                except DataError as error:
-                    raise HardwareError(f"{self._name}: {error}") from None
-                self.send(Signal.RESET)
+            if (answer := self._answer()) is None:
+                continue
+            if answer == before:  # a changed digit of a scale would move every limit
+                self._believe(answer)
                 return
+            before = answer
+        if before is not None:
+            raise HardwareError(
+                f"{self._name}: the bench never describes itself twice alike, last as "
+                f"{before[:200]!r}; the line changes what it carries: check cable and baud rate"
+            )
         self._try_stock()
+
+    def _believe(self, description: bytes) -> None:
+        try:
+            self.bench = parse_description(description)
+        except DataError as error:
+            raise HardwareError(f"{self._name}: {error}") from None
+        self.send(Signal.RESET)
 
     def _answer(self) -> bytes | None:
         """Return the line that answers a query, or None."""

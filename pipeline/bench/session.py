@@ -50,6 +50,7 @@ _REST_TRIES = 4
 _REST_WINDOW = 500.0  # ms at the end of a rest over which it is judged
 _ENOUGH = 1000  # lines that tell a clock's period
 _STILL = 4  # counts a cart at rest may flicker
+_ASTRAY = 5  # lines in a row of another target; a garbled line is alone
 _PULL_OUT = 1.7  # s a virtual hand takes to pull a cart out
 
 # Told to end; the terminal was closed; Ctrl-Break on Windows. No system has all three.
@@ -97,7 +98,8 @@ class Session:
 
     Parameters
     ----------
-    carts : on the bench; encoders beyond them are not looked at.
+    carts : of the submission; a bench that describes itself may have more, whose travel is
+        watched as well.
     """
 
     def __init__(self, line: SerialLine, *, carts: int, limits: Limits, observer: Observer) -> None:
@@ -105,7 +107,9 @@ class Session:
         self._carts = carts
         self._limits = limits
         self._observer = observer
+        self._moving = max(carts, line.bench.carts) if line.bench.commands else carts
         self._period = 1e3 * line.bench.period
+        self._is_zeroed = False  # with the carts at rest, on this line
         self._free: tuple[int, ...] | None = None  # as a person was last told
         self._beat = float("-inf")
 
@@ -145,7 +149,13 @@ class Session:
         )
         recording = order.recording
         stream = self._stream(recording.carts, closed=recording.controller is not None)
-        watch = _Watch(order, carts=self._carts, stream=stream, observer=self._observer)
+        watch = _Watch(
+            order,
+            carts=self._moving,
+            period=self._period if self._line.bench.commands else None,
+            stream=stream,
+            observer=self._observer,
+        )
         partial = "stopped"
         with RawWriter(path, header) as raw:
             try:
@@ -198,9 +208,23 @@ class Session:
                 if swing > _STILL
             }
             if not moving:
+                self._zero_at_rest(recording)
                 return ""
         swings = ", ".join(f"cart {cart} by {swing} counts" for cart, swing in moving.items())
         return f"not at rest when the run began: {swings} within half a second"
+
+    def _zero_at_rest(self, recording: Recording) -> None:
+        """Zero the bench before the motor's first run on this line: it was opened at any time.
+
+        After a line that was lost the carts still swing; where they were then is no zero for the
+        travel limit. A hand's run waits with the zero: what is held by hand is never quite at rest.
+        """
+        if self._is_zeroed or not recording.amplitude:
+            return
+        self._line.send(Signal.RESET)
+        self._line.drain()
+        self._beat = float("-inf")  # a reset disarms the watchdog
+        self._is_zeroed = True
 
     def _start(self, commands: Sequence[Command]) -> None:
         self._heartbeat()
@@ -285,11 +309,26 @@ class Session:
 
 
 class _Watch:
-    """Checks each line against the limits, and hands them on in batches."""
+    """Checks each line against the limits and the wave, and hands them on in batches.
 
-    def __init__(self, order: Order, *, carts: int, stream: Stream, observer: Observer) -> None:
+    Parameters
+    ----------
+    period : ms from line to line; None of a stock bench, whose waves nobody knows to the ms.
+    """
+
+    def __init__(
+        self,
+        order: Order,
+        *,
+        carts: int,
+        period: float | None,
+        stream: Stream,
+        observer: Observer,
+    ) -> None:
         self._order = order
         self._carts = carts
+        self._period = period
+        self._astray = 0  # lines in a row
         self._stream = stream
         self._observer = observer
         self._batch: list[Reading] = []
@@ -297,11 +336,18 @@ class _Watch:
 
     def check(self, batch: Sequence[Reading]) -> str:
         """Return why the run must stop, or ""."""
+        self._batch += batch
         for reading in batch:
             if passed := self._order.passed(reading, carts=self._carts):
-                self.forward(batch)
-                return f"{STOPPED}{passed}"
-        self._batch += batch
+                return f"{STOPPED}{passed}"  # before anybody is told: the stop goes out first
+            if self._period is not None:
+                strays = self._order.strays(reading, period=self._period)
+                self._astray = self._astray + 1 if strays else 0
+                if self._astray == _ASTRAY:
+                    return (
+                        f"the bench follows another wave than it was sent, {reading.target} counts "
+                        f"at {1e-3 * reading.ms:.3f} s: the line changed a digit"
+                    )
         now = time.monotonic()
         if now - self._forwarded > _FORWARD:
             self._forwarded = now
