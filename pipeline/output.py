@@ -4,6 +4,8 @@ from pathlib import Path
 
 from pipeline.errors import ConfigError
 
+LOCK = ".lock"  # of `pipeline.lock`
+
 
 def check_folder(out: Path) -> Path:
     """Return the folder, there or not yet.
@@ -18,13 +20,13 @@ def check_folder(out: Path) -> Path:
 
 
 def new_folder(out: Path) -> Path:
-    """Return the folder, not yet there or empty.
+    """Return the folder, not yet there or empty but for a lock.
 
     Raises
     ------
     ConfigError : there is something in it, which a new submission would be mixed with.
     """
-    if check_folder(out).is_dir() and any(out.iterdir()):
+    if check_folder(out).is_dir() and any(path.name != LOCK for path in out.iterdir()):
         raise ConfigError(f"{out}: is not empty; name a new folder with --out")
     return out
 

@@ -1,5 +1,7 @@
 """What people get wrong at a bench is said, and harms nothing that was recorded."""
 
+import time
+
 import pytest
 
 from pipeline.bench.acquire import acquire
@@ -7,7 +9,7 @@ from pipeline.bench.experiments import cart_remarks
 from pipeline.bench.protocol import EXTENSIONS, Description
 from pipeline.errors import ConfigError
 from pipeline.submission import load_submission
-from tests.acquisitions import Notes, sine, write_work
+from tests.acquisitions import Notes, host, sine, write_work
 from tests.benches import emulator
 
 
@@ -38,3 +40,19 @@ def test_a_run_in_which_nothing_moves_is_not_recorded(tmp_path):
         outcomes = acquire(work, port=bench.address, observers=[notes], only=["dwell"])
     assert [o.partial[:26] for o in outcomes] == ["no cart that is free moved"] * 3
     assert load_submission(work).experiments == ()
+
+
+def test_a_second_session_in_a_folder_is_refused(tmp_path):
+    """It is told which process records there, and what that one records stays whole."""
+    work = write_work(tmp_path / "work", [sine("dwell", seconds=6)])
+    with emulator() as first, emulator("--speed", "20", "--seed", "1") as second:
+        process = host(work, first.address, "--only", "dwell", "--yes")
+        end = time.monotonic() + 30
+        while not (work / "raw" / "dwell-1.raw").exists():
+            assert time.monotonic() < end, "no run began"
+            time.sleep(0.02)
+        with pytest.raises(ConfigError, match=rf"another cartlab \(process {process.pid}\) writes"):
+            acquire(work, port=second.address, observers=[Notes()])
+        process.communicate(timeout=30)
+    assert process.returncode == 0
+    assert sorted(path.name for path in (work / "data").iterdir()) == ["dwell.txt"]

@@ -11,6 +11,7 @@ PIPELINE = Path(__file__).parents[1] / "pipeline"
 LEVELS = (
     ("__init__", "errors", "resources"),
     ("output", "schemas"),
+    ("lock",),
     ("plant",),
     ("results", "submission"),
     ("ingest", "stages"),

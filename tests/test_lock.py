@@ -7,12 +7,14 @@ import sys
 import pytest
 
 from pipeline.errors import ConfigError
-from pipeline.grading.lock import alone_in, scratch_in
+from pipeline.grading.scratch import scratch_in
+from pipeline.lock import alone_in
 
 _HOLDER = """
 import sys
 from pathlib import Path
-from pipeline.grading.lock import alone_in, scratch_in
+from pipeline.grading.scratch import scratch_in
+from pipeline.lock import alone_in
 out = Path(sys.argv[1])
 with alone_in(out), scratch_in(out) as scratch:
     (scratch / "copy").touch()

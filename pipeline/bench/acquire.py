@@ -24,6 +24,7 @@ from pipeline.bench.record import data_file, save_record
 from pipeline.bench.serial_line import SerialLine, open_line
 from pipeline.bench.session import STOPPED, Session, stopping_on_signals
 from pipeline.errors import ConfigError, DataError, HardwareError, PipelineError
+from pipeline.lock import alone_in
 from pipeline.output import own_folder
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.load import NAME
@@ -52,10 +53,10 @@ def acquire(
     Raises
     ------
     HardwareError : there is no bench.
-    ConfigError : the plan as a whole or the submission does not fit the bench; of one recording
-        that does not, its outcome says why, and the others go on.
+    ConfigError : another session writes there; or the plan as a whole or the submission does not
+        fit the bench; of one recording that does not, its outcome says why, and the others go on.
     """
-    with stopping_on_signals():
+    with stopping_on_signals(), alone_in(folder):
         work = _Acquisition(folder, port=port, observer=Observers(observers), only=only)
         return tuple(work.outcomes())
 

@@ -175,9 +175,9 @@ def override(
     """Give a criterion points by hand, which every later grading keeps."""
     from pipeline.grading.blind import meant
     from pipeline.grading.gradebook import Gradebook
-    from pipeline.grading.lock import alone_in
     from pipeline.grading.outputs import write_outputs
     from pipeline.grading.override import read_points
+    from pipeline.lock import alone_in
 
     folder = Path(grades)
     pages = folder.is_dir()
@@ -203,8 +203,8 @@ def remove(
     """Take submissions off the class list; their history stays."""
     from pipeline.grading.blind import meant
     from pipeline.grading.gradebook import Gradebook
-    from pipeline.grading.lock import alone_in
     from pipeline.grading.outputs import write_outputs
+    from pipeline.lock import alone_in
 
     folder = Path(grades)
     pages = folder.is_dir()

@@ -11,12 +11,13 @@ from pipeline.grading.intake import find_hand_ins
 from pipeline.grading.intake_files import digest
 from pipeline.grading.late_table import LateTable, settle_lateness
 from pipeline.grading.load import load_rubric
-from pipeline.grading.lock import alone_in, scratch_in
 from pipeline.grading.outputs import write_outputs
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.runner import Executor, Limits, Progress, grade_batch, run_here
+from pipeline.grading.scratch import scratch_in
 from pipeline.grading.shared_prints import fingerprint
 from pipeline.ingest.read import read_data
+from pipeline.lock import alone_in
 from pipeline.output import check_folder
 from pipeline.report.numbers import listing
 from pipeline.resources import EXAMPLES

@@ -1,0 +1,58 @@
+"""One cartlab at a time writes into a folder."""
+
+import os
+import sqlite3
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+from pipeline.errors import ConfigError
+from pipeline.output import LOCK
+
+# Where a database keeps its user's number, by SQLite's file format; the lock keeps its process
+# there, to be read by whoever the lock keeps out.
+_PROCESS = slice(60, 64)
+
+
+@contextmanager
+def alone_in(out: Path) -> Iterator[None]:
+    """Make a folder and keep other runs out of it; it goes again where nothing came of it.
+
+    The lock is SQLite's: it works on every system, and is gone with its process however that ends.
+
+    Raises
+    ------
+    ConfigError : another run is under way in it.
+    """
+    new, lock = not out.exists(), out / LOCK
+    out.mkdir(parents=True, exist_ok=True)
+    try:
+        with _locked(lock):
+            yield
+    finally:
+        if new and list(out.iterdir()) == [lock]:
+            lock.unlink()
+            out.rmdir()
+
+
+@contextmanager
+def _locked(lock: Path) -> Iterator[None]:
+    with ExitStack() as stack:
+        try:
+            connection = sqlite3.connect(lock, timeout=0, isolation_level=None)
+            stack.callback(connection.close)
+            connection.execute("PRAGMA journal_mode = MEMORY")  # no further file
+            connection.execute("PRAGMA locking_mode = EXCLUSIVE")  # a commit keeps the lock
+            connection.execute("BEGIN EXCLUSIVE")
+            connection.execute(f"PRAGMA user_version = {os.getpid()}")
+            connection.execute("COMMIT")
+        except sqlite3.Error as error:
+            if error.sqlite_errorcode != sqlite3.SQLITE_BUSY:
+                raise ConfigError(f"{lock}: {error}; is the folder yours to write?") from None
+            process = int.from_bytes(lock.read_bytes()[_PROCESS], "big")
+            who = f" (process {process})" if process else ""
+            raise ConfigError(
+                f"{lock.parent}: another cartlab{who} writes there; wait for it, or name another "
+                "folder"
+            ) from None
+        yield
