@@ -281,6 +281,24 @@ def test_a_closed_terminal_stops_the_motor(tmp_path):
     assert (work / "data" / "dwell.partial.txt").exists()
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows limits no file's size")
+def test_a_full_disk_stops_the_motor_and_says_what_to_do(tmp_path):
+    """A run that cannot be written down ends with a stop, the folder's name and no `--out`."""
+    work = write_work(tmp_path, [sine("dwell", seconds=30)])
+    command = 'ulimit -f 20; exec "$0" -m pipeline acquire "$1" --port "$2" --only dwell'
+    with emulator() as bench:
+        process = subprocess.run(
+            ["sh", "-c", command, sys.executable, str(work), bench.address],
+            stderr=subprocess.PIPE,
+            encoding="utf-8",
+            timeout=60,
+        )
+        assert bench.event("run")["ended"] == "stopped"
+    assert process.returncode == 2
+    assert f"`acquire` writes into {work}; make room there" in process.stderr
+    assert "--out" not in process.stderr
+
+
 DESCRIPTION = (
     "?cartlab/1 name=b encoders=2 carts=2 period=0.001 baud=115200 commands=sk "
     "input=0.001V position=0.002cm"

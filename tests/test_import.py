@@ -1,8 +1,10 @@
 """Files of other programs, taken into a submission as they appear in a folder."""
 
 import os
+import sys
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -175,6 +177,50 @@ def test_a_file_is_waited_for_until_it_is_complete(work, source):
     assert [imported.experiment for imported in watch] == ["step-1", "sine-01", "sine-02"]
     writer.join()
     assert len(read_data(load_submission(work)).records) == 3
+
+
+class Tidy(Notes):
+    """Deletes a file as soon as anything is said."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self._path = path
+
+    def remark(self, sentence: str) -> None:
+        """Note the sentence; the file vanishes."""
+        super().remark(sentence)
+        if "not taken" in sentence:
+            self._path.unlink(missing_ok=True)
+
+
+def test_a_file_that_vanishes_between_two_looks_ends_nothing(work, source):
+    """What its program takes away again before it is read is passed over, the rest is taken."""
+    put(source, "A.txt", "no table\n", at=1)
+    put(source, "B.txt", STEP, at=2)
+    put(source, "C.txt", STEP, at=3)
+    watch = Importer(work, source, observer=Tidy(source / "B.txt")).watch(once=True)
+    assert [imported.file for imported in watch] == ["C.txt"]
+
+
+@pytest.mark.skipif(
+    sys.platform == "win32" or os.geteuid() == 0, reason="root and Windows lock otherwise"
+)
+def test_a_locked_file_is_taken_once_it_can_be_read(work, source):
+    """A file that its program still keeps to itself is said once, and taken later."""
+    put(source, "A.txt", STEP, at=1)
+    (source / "A.txt").chmod(0)
+    waits = iter(range(9))
+
+    def wait(seconds: float) -> None:
+        if next(waits) == 3:
+            (source / "A.txt").chmod(0o600)
+
+    notes = Notes()
+    imported = next(Importer(work, source, observer=notes).watch(once=False, wait=wait))
+    assert imported.experiment == "step-1"
+    assert [r for r in notes.remarks if "cannot be read yet (Permission denied)" in r] == [
+        "A.txt: cannot be read yet (Permission denied)"
+    ]
 
 
 def test_the_command_takes_what_is_there(work, source):

@@ -356,6 +356,13 @@ def with_run(**changes) -> str:
         (with_run(amplitude=6), r"amplitude .*at most the limit of 5 V, found 6"),
         (with_run(amplitude=0), r"amplitude .*0 moves nothing"),
         (with_run(carts="[2]"), r"amplitude .*cart 1, which is held"),
+        (with_run(more="settle = 1e-4"), r"settle \(run\): expected 0, or 0.001 to 600 s, found 0"),
+        (with_run(more="settle = 1001"), r"settle \(run\): .* to 600 s, found 1001"),
+        (with_run(frequency=2000), r"frequency \(run\): expected 0.001 to 1000 Hz, found 2000"),
+        (
+            with_run(kind="sweep", wave="chirp", more="frequency_end = 5e-4"),
+            r"frequency_end \(run\): expected 0.001 to 1000 Hz, found 0.0005",
+        ),
         (with_run(more="cycles = 61"), r"cycles .*takes 610 s"),
         (with_run(more="release = 3"), r"release .*a cart that is free, found 3"),
         (with_run(wave="sine"), r"wave .*go together"),

@@ -68,6 +68,7 @@ class Importer:
         self._seen: dict[Path, tuple[int, int]] = {}  # size and time when last looked at
         self._looks: dict[Path, int] = {}
         self._over: set[Path] = set()  # taken, refused or there before
+        self._locked: set[Path] = set()  # of which that was said
         if self._plan:
             self._observer.planned(self._plan, self._done)
 
@@ -78,7 +79,7 @@ class Importer:
         self._ask()
         while True:
             for path in self._complete(at_once=once):
-                if (imported := self._take(path, final=once)) is not None:
+                if (imported := self._try(path, final=once)) is not None:
                     yield imported
                     self._ask()
             if once or (self._plan is not None and self._next is None):
@@ -105,15 +106,40 @@ class Importer:
         ready = []
         for path in self._source.iterdir():
             wanted = path.suffix.casefold() in _ENDINGS and not path.name.startswith((".", "~"))
-            if path in self._over or not wanted or not path.is_file():
+            if path in self._over or not wanted or not path.is_file() or not self._opens(path):
                 continue
-            info = path.stat()
+            try:
+                info = path.stat()
+            except OSError:  # gone meanwhile
+                continue
             state = info.st_size, info.st_mtime_ns
             self._looks[path] = self._looks.get(path, 0) + 1 if self._seen.get(path) == state else 0
             self._seen[path] = state
             if info.st_size and (at_once or self._looks[path] >= _COMPLETE):
                 ready.append(path)
-        return sorted(ready, key=lambda path: (path.stat().st_mtime_ns, path.name))
+        return sorted(ready, key=lambda path: (self._seen[path][1], path.name))
+
+    def _opens(self, path: Path) -> bool:
+        """Tell whether a file can be read; one that its program keeps to itself can be later."""
+        try:
+            path.open("rb").close()
+        except OSError as error:
+            if path not in self._locked:
+                self._locked.add(path)
+                self._observer.remark(f"{path.name}: cannot be read yet ({error.strerror})")
+            return False
+        return True
+
+    def _try(self, path: Path, *, final: bool) -> Imported | None:
+        """Take a file; one that vanishes or is locked meanwhile is looked at again."""
+        try:
+            return self._take(path, final=final)
+        except OSError:
+            if path.exists() and self._opens(path):
+                raise  # what failed is the folder of the submission
+            self._over.discard(path)
+            self._looks[path] = 0
+            return None
 
     def _take(self, path: Path, *, final: bool) -> Imported | None:
         """Copy a file into the submission and note it; None where it is refused or known.

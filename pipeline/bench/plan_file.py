@@ -9,6 +9,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from pipeline.bench.plan import Limits, PidLoop, Plan, Recording, StateLoop
+from pipeline.bench.protocol import FREQUENCIES
 from pipeline.errors import ConfigError
 from pipeline.output import write_file
 from pipeline.submission import Submission, System
@@ -182,6 +183,7 @@ def _recording_problems(
         yield "carts", f"expected some of the carts 1 to {n}, each once, found {list(carts)}"
     if recording.release is not None and recording.release not in carts:
         yield "release", f"expected a cart that is free, found {recording.release}"
+    yield from _time_problems(recording)
     if recording.duration > LONGEST_RUN:
         yield "cycles", f"the run takes {recording.duration:,.0f} s, at most {LONGEST_RUN:g} s do"
     yield from _amplitude_problems(recording, limits, system)
@@ -192,6 +194,19 @@ def _recording_problems(
     if wave == "chirp" and recording.frequency_end in (None, recording.frequency):
         yield "frequency_end", "a chirp needs another frequency to end at than it starts at"
     yield from _loop_problems(recording, n)
+
+
+def _time_problems(recording: Recording) -> Iterator[tuple[str, str]]:
+    """Yield what no bench takes: it drops the command, and streams nothing."""
+    low, high = FREQUENCIES
+    for key in ("frequency", "frequency_end"):
+        hertz = getattr(recording, key)
+        if hertz is not None and not low <= hertz <= high:
+            yield key, f"expected {low:g} to {high:g} Hz, found {hertz:g}"
+    # A rest is a run of one period.
+    if recording.settle and not 1 / high <= recording.settle <= LONGEST_RUN:
+        expected = f"0, or {1 / high:g} to {LONGEST_RUN:g} s"
+        yield "settle", f"expected {expected}, found {recording.settle:g}"
 
 
 def _amplitude_problems(

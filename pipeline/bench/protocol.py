@@ -20,6 +20,7 @@ WATCHDOG = 0.1  # s after the last heartbeat the motor is cut
 PULSE = 0.05  # s a delta wave is on
 NOMINAL_PERIOD = 1e-3  # s from line to line
 CHIRP_SPAN = 20.0  # a chirp ends at so many times the frequency it starts at, unless told
+FREQUENCIES = (1e-3, 1e3)  # Hz, of a wave; a command with any other is dropped
 EXTENSIONS = frozenset("cfhks")  # the commands, `?` aside, that the stock bench does not know
 
 # What firmware can hold in 32 bits, and no bench needs more.
@@ -27,7 +28,6 @@ _LONGEST_FIELD = 32  # characters
 _LARGEST_NUMBER = 1e9
 _LARGEST_AMPLITUDE = 1_000_000
 _MOST_CYCLES = 1_000_000
-_FREQUENCIES = (1e-3, 1e3)  # Hz
 _LONGEST_COUNT = 10  # digits of a field of a line
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
@@ -241,7 +241,7 @@ def _whole_within(lowest: int, highest: int) -> _Reader:
 def _field_kinds(encoders: int, extensions: Collection[str]) -> Mapping[str, tuple[_Reader, ...]]:
     """Return what follows each letter."""
     waves = "".join(wave for wave in Wave if wave != Wave.CHIRP or "c" in extensions)
-    frequency = _number_within(*_FREQUENCIES)
+    frequency = _number_within(*FREQUENCIES)
     gain = _number_within(-_LARGEST_NUMBER, _LARGEST_NUMBER)
     amplitude = _whole_within(-_LARGEST_AMPLITUDE, _LARGEST_AMPLITUDE)
     cycles = _whole_within(1, _MOST_CYCLES)

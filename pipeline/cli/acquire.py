@@ -49,12 +49,25 @@ def acquire(
         raise ConfigError("say where the data come from: either --port or --import")
     if web and port is None:
         raise ConfigError("--web shows a bench: it goes with --port")
-    with Terminal(yes=yes) as terminal:
+    with Terminal(yes=yes) as terminal, _saying_where(folder):
         if source is not None:
             _import(folder, source, terminal, once=once)
         elif port is not None:
             with _watching(folder, terminal, web=web, yes=yes) as observers:
                 _record(folder, port, terminal, observers=observers, only=only or ())
+
+
+@contextmanager
+def _saying_where(folder: Path) -> Iterator[None]:
+    """Say of a full disk or a folder that is not one's own what to do about it."""
+    try:
+        yield
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        raise ConfigError(
+            f"{where}{error.strerror or error}: `acquire` writes into {folder}; make room there, "
+            "or make it yours to write, then give the same command: what was recorded is kept"
+        ) from None
 
 
 @contextmanager
