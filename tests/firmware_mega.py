@@ -94,6 +94,10 @@ class Mega:
         """Turn an encoder, 20 µs an edge."""
         assert self._board.mega_turn(encoder, counts) == 0
 
+    def flicker(self, encoder: int, seconds: float, *, every: float) -> None:
+        """Have a channel of an encoder change so often, as a broken wire does."""
+        assert self._board.mega_flicker(encoder, round(1e6 * seconds), round(1e6 * every)) == 0
+
     @property
     def clock(self) -> float:
         """Seconds since the board had power."""

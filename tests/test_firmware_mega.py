@@ -184,6 +184,23 @@ def test_a_silent_host_stops_the_motor(mega):
     assert 0.095 < mega.clock - before < 0.115
 
 
+def test_a_storm_of_edges_does_not_keep_the_motor_on(program, tmp_path):
+    """A wire that flickers 250,000 times a second leaves no time for a tick: the board resets."""
+    mega = Mega(program, tmp_path)
+    mega.run(0.05)
+    mega.send(encode(Start(wave=Wave.SQUARE, frequency=10.0, amplitude=2000, cycles=9)))
+    mega.run(0.08)
+    assert mega.duty == 2000
+    mega.flicker(1, 0.2, every=4e-6)
+    assert mega.duty == 0
+    mega.flicker(1, 0.3, every=4e-6)
+    assert mega.duty == 0
+    mega.run(0.3)  # the wire is whole again: it answers, and rests
+    mega.take()
+    assert _describe(mega).encoders == 2
+    assert mega.duty == 0
+
+
 def test_a_stop_stops_the_motor_at_the_next_tick(mega):
     """Three bytes on the line and a tick after the stop is sent the motor is off."""
     mega.send(encode(Start(wave=Wave.SQUARE, frequency=10.0, amplitude=2000, cycles=9)))

@@ -4,6 +4,7 @@
 
 #include "board.h"
 #include "encoders.h"
+#include "guard.h"
 #include "motor.h"
 
 #define TEXT(x) #x
@@ -46,14 +47,16 @@ static void tick()
     int32_t counts[MOST_ENCODERS];
     encoders_read(counts);
     motor_drive(bench_tick(&bench, counts, clock_ms, clock_ms));
+    guard_feed();
 }
 
 /* ------------------------------------------------------------------ Arduino's two */
 
 void setup()
 {
+    guard_begin();
     motor_begin();
-    encoders_begin();
+    encoders_begin(); /* from here on interrupts may take all the time there is */
     bench_init(&bench, &SETTINGS);
     Serial.begin(BAUD);
     due_us = micros();

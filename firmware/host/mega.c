@@ -101,6 +101,18 @@ int mega_turn(int encoder, int32_t counts)
     return 0;
 }
 
+/* Have one channel of an encoder flicker, an edge every few microseconds, as a broken wire does. */
+int mega_flicker(int encoder, uint32_t us, uint32_t us_per_edge)
+{
+    for (uint32_t at = 0; at < us; at += us_per_edge) {
+        phase[encoder] ^= 1;
+        set_channels(encoder);
+        if (mega_run(us_per_edge) != 0)
+            return 1;
+    }
+    return 0;
+}
+
 /* Microseconds since it had power. */
 uint64_t mega_clock(void) { return avr->cycle / CYCLES_PER_US; }
 
