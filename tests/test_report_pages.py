@@ -257,6 +257,17 @@ def test_no_text_is_cut_or_covered(made, show):
             assert covered(drawn) == []
 
 
+@pytest.mark.parametrize("case", ["class", "feedback"])
+def test_a_phone_shows_the_numbers_of_a_table(case, folder, request, show):
+    """The column of names stays in sight and takes at most half of the view."""
+    page = show(page_of(folder(case, request)), size=PHONE)
+    widths = page.evaluate("""() => Array.from(document.querySelectorAll('details'),
+        (fold) => fold.open = true) && Array.from(
+        document.querySelectorAll('.numbered :is(th, td):first-child'),
+        (cell) => cell.getBoundingClientRect().width)""")
+    assert 0 < max(widths) <= PHONE[0] / 2
+
+
 def test_a_class_is_searched_and_sorted(folder, request, show):
     """Words narrow the table, headings sort it by number or name, up and down; names are links."""
     page = show(page_of(folder("class", request)))
