@@ -14,7 +14,14 @@ from pipeline.grading.batch import Batch
 from pipeline.grading.export import export
 from pipeline.grading.export_students import students_of
 from pipeline.grading.gradebook import Gradebook
-from tests.grades import failed_grade, hertz_flag, make_grade, make_outcome, two_cart_rubric
+from tests.grades import (
+    failed_grade,
+    hertz_flag,
+    make_grade,
+    make_outcome,
+    shared_flag,
+    two_cart_rubric,
+)
 
 RUBRIC = two_cart_rubric()
 
@@ -232,3 +239,14 @@ def test_a_table_that_is_no_roster_is_refused(tmp_path):
     """Nothing in it says who a row is about."""
     with pytest.raises(ConfigError, match=r"roster\.csv: no column says who a row is about"):
         write(tmp_path, HALF, platform="canvas", roster="a,b\n1,2\n")
+
+
+@pytest.mark.parametrize("platform", ["moodle", "gradescope"])
+def test_no_comment_names_the_other_team(tmp_path, platform):
+    """That a recording stands in another submission is said; in whose, the TA may say."""
+    shared = make_outcome(make_grade("a", flags=(shared_flag("b-team"),)), owner="Ann (1024)")
+    write(tmp_path, shared, platform=platform)
+    texts = [path.read_text("utf-8") for path in (tmp_path / "out").rglob("*.*")]
+    said = [text for text in texts if "step-1 also stands in another submission" in text]
+    assert said
+    assert not any("b-team" in text for text in texts)

@@ -298,6 +298,16 @@ def test_the_feedback_puts_their_numbers_beside_ours():
     assert re.search(r"YoursFrom your recordingsDifference\s+.*rad/s\]3\.1219\.6−84\.1 %", text)
 
 
+def test_feedback_on_shared_data_names_nobody_and_does_not_praise():
+    """All points or not, the page asks to talk; in whose submission it stands, it leaves open."""
+    grade = make_grade("team-1", flags=(shared_flag("b-team"),))
+    html = feedback_page(grade, rubric=RUBRIC, overrides={}, figures=(), name="team-1")
+
+    assert "also stands in another submission" in html
+    assert "All points were earned." in html
+    assert not re.search("b-team|Well done", html)
+
+
 def test_a_submission_that_could_not_be_graded_hears_why():
     """The reason, and what to do."""
     grade = failed_grade("team-1", "no submission.toml in it")

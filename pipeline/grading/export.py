@@ -25,6 +25,7 @@ from pipeline.grading.gradebook import Gradebook
 from pipeline.grading.gradebook_rows import Entry
 from pipeline.grading.lms_names import Platform
 from pipeline.grading.rubric import Rubric
+from pipeline.grading.shared import told
 from pipeline.grading.table import csv_text
 from pipeline.output import own_folder, write_file
 
@@ -149,7 +150,7 @@ def _said(grade: Grade) -> list[str]:
         if c.points < c.out_of
     ]
     late = [f"Late: {points_text(grade.deducted)} points off."] if grade.deducted else []
-    return [*lost, *(flag.message for flag in grade.flags), *late]
+    return [*lost, *map(told, grade.flags), *late]
 
 
 # ----------------------------------------------------------------------- Gradescope
@@ -210,7 +211,7 @@ def results_text(grade: Grade, *, by_hand: bool = False) -> str:
     how = " automatically, points were given by hand" if by_hand else ""
     failed = grade.status == "failed"
     output = [f"Could not be graded{how}: {grade.reason}"] if failed else []
-    output += [flag.message for flag in grade.flags]
+    output += map(told, grade.flags)
     if grade.deducted:
         output.append(f"Late: {points_text(grade.deducted)} points off.")
     document = {

@@ -12,6 +12,7 @@ from pipeline.grading.feedback_words import OUTCOMES, PLACES, TITLES, TONES, poi
 from pipeline.grading.grade import Criterion, Flag, Grade
 from pipeline.grading.override import Override
 from pipeline.grading.rubric import Rubric
+from pipeline.grading.shared import told
 from pipeline.report.document import (
     Block,
     Details,
@@ -133,7 +134,8 @@ def _lost(grade: Grade) -> list[Block]:
     """Return where points were lost, most first."""
     lost = [c for c in grade.criteria if c.points < c.out_of]
     if not lost:
-        return [paragraph("All points were earned. Well done.")]
+        praise = "" if grade.flags else " Well done."
+        return [paragraph(f"All points were earned.{praise}")]
     lost.sort(key=lambda c: c.points - c.out_of)
     return [
         paragraph("Points were lost here, most first:"),
@@ -169,7 +171,7 @@ def _remarks(flags: Sequence[Flag]) -> list[Block]:
     for flag in flags:
         blocks += [
             Heading(rich(_capital(TITLES[flag.code]))),
-            paragraph(rich(_sentence(flag.message))),
+            paragraph(rich(_sentence(told(flag)))),
             paragraph(Span("Where to look: ", "strong"), rich(PLACES[flag.code])),
         ]
     return blocks

@@ -146,6 +146,13 @@ def shared_message(experiments: Sequence[str], others: Iterable[str]) -> str:
     )
 
 
+def told(flag: Flag) -> str:
+    """Return what a student reads of a flag: whose the other submission is, the instructor says."""
+    if flag.code != "shared_data":
+        return flag.message
+    return shared_message(flag.parameters, ["another submission"])
+
+
 def same_team(a: Prints | Listed, b: Prints | Listed) -> bool:
     """Tell whether two submissions have an author in common; without authors, the same name."""
     if a.authors and b.authors:
