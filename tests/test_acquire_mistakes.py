@@ -1,12 +1,16 @@
 """What people get wrong at a bench is said, and harms nothing that was recorded."""
 
+import re
+import signal
 import time
+from collections.abc import Sequence
 
 import pytest
 
 from pipeline.bench.acquire import acquire
 from pipeline.bench.experiments import cart_remarks
-from pipeline.bench.protocol import EXTENSIONS, Description
+from pipeline.bench.observer import Anomalies
+from pipeline.bench.protocol import EXTENSIONS, Description, Reading
 from pipeline.errors import ConfigError
 from pipeline.submission import load_submission
 from tests.acquisitions import Notes, host, sine, write_work
@@ -56,3 +60,44 @@ def test_a_second_session_in_a_folder_is_refused(tmp_path):
         process.communicate(timeout=30)
     assert process.returncode == 0
     assert sorted(path.name for path in (work / "data").iterdir()) == ["dwell.txt"]
+
+
+class Late(Notes):
+    """Keeps the computer busy once, for longer than a watchdog waits."""
+
+    def readings(self, batch: Sequence[Reading], anomalies: Anomalies) -> None:
+        """Note the lines, and be slow after the first of them."""
+        if not self.readings_seen:
+            time.sleep(0.3)
+        super().readings(batch, anomalies)
+
+
+def test_a_busy_computer_is_named_where_the_watchdog_bites(tmp_path):
+    """A host that sends no heartbeat for 0.3 s says so, not only that the bench fell silent."""
+    work = write_work(tmp_path, [sine("dwell", seconds=5)])
+    notes = Late()
+    with emulator() as bench:
+        outcome, *_ = acquire(work, port=bench.address, observers=[notes], only=["dwell"])
+    assert "fell silent" in outcome.partial
+    assert re.search(r"too busy, it sent no heartbeat for [34]\d\d ms", outcome.partial)
+
+
+class LastMoment(Notes):
+    """Presses Ctrl-C when the last lines are there."""
+
+    def readings(self, batch: Sequence[Reading], anomalies: Anomalies) -> None:
+        """Note the lines."""
+        super().readings(batch, anomalies)
+        if batch[-1].ms >= 1990:
+            signal.raise_signal(signal.SIGINT)
+
+
+def test_an_interrupt_after_the_last_line_keeps_the_run(tmp_path):
+    """A run that was over when Ctrl-C came is recorded; the session ends all the same."""
+    work = write_work(tmp_path, [sine("first", seconds=2), sine("second", seconds=2)])
+    notes = LastMoment()
+    with emulator("--speed", "4") as bench, pytest.raises(KeyboardInterrupt):
+        acquire(work, port=bench.address, observers=[notes])
+    assert [experiment.id for experiment in load_submission(work).experiments] == ["first"]
+    assert [outcome.partial for outcome in notes.outcomes] == [""]
+    assert not (work / "data" / "first.partial.txt").exists()

@@ -1,6 +1,6 @@
 """Carry out the plan of a submission on a bench, from where it was left."""
 
-from collections.abc import Collection, Generator, Iterator, Sequence
+from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,7 +22,8 @@ from pipeline.bench.raw import FOLDER as RAW
 from pipeline.bench.raw import read_raw
 from pipeline.bench.record import data_file, save_record
 from pipeline.bench.serial_line import SerialLine, open_line
-from pipeline.bench.session import STOPPED, Session, stopping_on_signals
+from pipeline.bench.session import STOPPED, Session
+from pipeline.bench.signals import signals_held, stopping_on_signals
 from pipeline.errors import ConfigError, DataError, HardwareError, PipelineError
 from pipeline.lock import alone_in
 from pipeline.output import own_folder
@@ -112,7 +113,6 @@ class _Acquisition:
                 self._observer.planned(plan, _done(submission))
                 continue
             outcome, submission = self._record(recording, plan, submission, session, line)
-            self._observer.finished(outcome)
             yield outcome
             if outcome.partial:
                 self._offer_again(outcome)
@@ -183,27 +183,47 @@ class _Acquisition:
             order, table = _order(recording, plan, submission, line)
         except PipelineError as error:  # this bench cannot, or must not, do it: nothing is sent
             self._failed[recording.id] = _TRIES
-            return Outcome(recording=recording, lines=0, partial=str(error)), submission
+            return self._refused(recording, str(error)), submission
         path = _raw_path(self._folder, recording)
         try:
             restless = session.prepare(recording)
-            outcome = session.record(order, path)
+            with signals_held() as let_in:  # what is complete is noted before the program ends
+                outcome = self._run(session, order, path, submission, let_in)
+                remarks = [restless] if restless else []
+                # Late lines have their stamps: no reader of the data need know.
+                if (spoilt := str(replace(outcome.anomalies, late=0))) != "none":
+                    remarks.append(spoilt)
+                outcome = replace(outcome, remarks=tuple(remarks))
+                if outcome.partial:
+                    self._keep_partial(path, submission, outcome.partial)
+                else:
+                    file = save_record(path, folder=self._folder, carts=submission.system.carts)
+                    entry = _experiment(recording, file=file, controller=table, remarks=remarks)
+                    submission = add_experiment(load_submission(self._folder), entry)
+                self._observer.finished(outcome)
         except HardwareError as error:
-            return Outcome(recording=recording, lines=0, partial=str(error)), submission
+            return self._refused(recording, str(error)), submission
+        return outcome, submission
+
+    def _run(
+        self,
+        session: Session,
+        order: Order,
+        path: Path,
+        submission: Submission,
+        let_in: Callable[[], None],
+    ) -> Outcome:
+        try:
+            return session.record(order, path, let_in=let_in)
         except KeyboardInterrupt:
             self._keep_partial(path, submission, "stopped by hand")
             raise
-        remarks = [restless] if restless else []
-        # Late lines have their stamps: no reader of the data need know.
-        if (spoilt := str(replace(outcome.anomalies, late=0))) != "none":
-            remarks.append(spoilt)
-        if outcome.partial:
-            self._keep_partial(path, submission, outcome.partial)
-        else:
-            file = save_record(path, folder=self._folder, carts=submission.system.carts)
-            entry = _experiment(recording, file=file, controller=table, remarks=remarks)
-            submission = add_experiment(load_submission(self._folder), entry)
-        return replace(outcome, remarks=tuple(remarks)), submission
+
+    def _refused(self, recording: Recording, why: str) -> Outcome:
+        """Tell of a recording that did not begin."""
+        outcome = Outcome(recording=recording, lines=0, partial=why)
+        self._observer.finished(outcome)
+        return outcome
 
     def _keep_partial(self, path: Path, submission: Submission, why: str) -> None:
         """Save what came of a run that ended early, where no report takes it for a whole one."""

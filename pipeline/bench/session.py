@@ -6,14 +6,11 @@ hangs, the heartbeat ends and the bench cuts its motor itself.
 """
 
 import gc
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
-from types import FrameType
 
 from pipeline.bench.observer import Observer, Outcome
 from pipeline.bench.orders import Order
@@ -21,6 +18,7 @@ from pipeline.bench.plan import Limits, Recording
 from pipeline.bench.plan_words import hold_words
 from pipeline.bench.protocol import (
     HEARTBEAT_EVERY,
+    WATCHDOG,
     Command,
     Hands,
     Reading,
@@ -52,33 +50,6 @@ _ENOUGH = 1000  # lines that tell a clock's period
 _STILL = 4  # counts a cart at rest may flicker
 _ASTRAY = 5  # lines in a row of another target; a garbled line is alone
 _PULL_OUT = 1.7  # s a virtual hand takes to pull a cart out
-
-# Told to end; the terminal was closed; Ctrl-Break on Windows. No system has all three.
-_ENDING = ("SIGTERM", "SIGHUP", "SIGBREAK")
-
-
-class Stopped(KeyboardInterrupt):
-    """The program was told to end by a signal."""
-
-
-@contextmanager
-def stopping_on_signals() -> Iterator[None]:
-    """Turn signals that end a program into an exception: a run is stopped and saved first."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        raise Stopped(f"signal {number}")
-
-    numbers = [getattr(signal, name) for name in _ENDING if hasattr(signal, name)]
-    # One that is ignored stays so: nohup means a closed terminal to end nothing.
-    before = {n: signal.signal(n, stop) for n in numbers if signal.getsignal(n) == signal.SIG_DFL}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 @contextmanager
@@ -112,6 +83,7 @@ class Session:
         self._is_zeroed = False  # with the carts at rest, on this line
         self._free: tuple[int, ...] | None = None  # as a person was last told
         self._beat = float("-inf")
+        self._latest_beat = 0.0  # s, the longest without a heartbeat in this run
 
     def prepare(self, recording: Recording) -> str:
         """Have the carts held or freed and at rest; return what is to be said of it, or ""."""
@@ -134,11 +106,14 @@ class Session:
             )
         return restless
 
-    def record(self, order: Order, path: Path) -> Outcome:
+    def record(
+        self, order: Order, path: Path, *, let_in: Callable[[], None] = lambda: None
+    ) -> Outcome:
         """Carry out one run and write its raw file.
 
         Whatever ends it early (a limit, the line, Ctrl-C, a signal), the bench is told to stop and
-        what came is in the file; an interrupt goes on to the caller.
+        what came is in the file; an interrupt goes on to the caller. One that is held is asked for
+        with `let_in` while lines come: once the last one is there, the run is whole.
         """
         header = RawHeader(
             recording=order.recording,
@@ -156,6 +131,11 @@ class Session:
             stream=stream,
             observer=self._observer,
         )
+
+        def check(lines: Sequence[Reading]) -> str:
+            let_in()
+            return watch.check(lines)
+
         partial = "stopped"
         with RawWriter(path, header) as raw:
             try:
@@ -166,7 +146,7 @@ class Session:
                     stream,
                     seconds=order.recording.duration,
                     arrived=raw.write,
-                    check=watch.check,
+                    check=check,
                 )
             except HardwareError as error:
                 partial = str(error)
@@ -228,13 +208,24 @@ class Session:
 
     def _start(self, commands: Sequence[Command]) -> None:
         self._heartbeat()
+        self._latest_beat = 0.0
         self._line.send(*commands)
 
     def _heartbeat(self) -> None:
         now = time.monotonic()
         if self._line.knows("k") and now - self._beat > HEARTBEAT_EVERY - _LOOK:
             self._line.send(Signal.HEARTBEAT)
+            self._latest_beat = max(self._latest_beat, now - self._beat)
             self._beat = now
+
+    def _lateness(self) -> str:
+        """Return what to say of a bench whose watchdog had reason to cut the motor, or ""."""
+        if self._latest_beat < WATCHDOG:
+            return ""
+        return (
+            f": this computer was too busy, it sent no heartbeat for {1e3 * self._latest_beat:.0f} "
+            "ms, upon which the bench cuts its motor; close other programs"
+        )
 
     def _stop(self, *, always: bool) -> None:
         """Stop the bench; a stock one, which that zeroes, only if the run did not end by itself."""
@@ -299,7 +290,7 @@ class Session:
                 return ""
             if quiet > (_SILENCE if stream.latest >= 0 else _FIRST_LINE):
                 return (
-                    f"the bench fell silent after {1e-3 * stream.latest:.3f} s"
+                    f"the bench fell silent after {1e-3 * stream.latest:.3f} s{self._lateness()}"
                     if stream.latest >= 0
                     else "the bench did not begin to stream"
                 )

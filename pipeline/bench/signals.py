@@ -1,0 +1,61 @@
+"""Signals that end a program: turned into an exception, or held while something is finished."""
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+# Told to end; the terminal was closed; Ctrl-Break on Windows. No system has all three.
+_ENDING = ("SIGTERM", "SIGHUP", "SIGBREAK")
+
+
+class Stopped(KeyboardInterrupt):
+    """The program was told to end by a signal."""
+
+
+@contextmanager
+def stopping_on_signals() -> Iterator[None]:
+    """Turn signals that end a program into an exception: a run is stopped and saved first."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        raise Stopped(f"signal {number}")
+
+    numbers = [getattr(signal, name) for name in _ENDING if hasattr(signal, name)]
+    # One that is ignored stays so: nohup means a closed terminal to end nothing.
+    before = {n: signal.signal(n, stop) for n in numbers if signal.getsignal(n) == signal.SIG_DFL}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def signals_held() -> Iterator[Callable[[], None]]:
+    """Hold Ctrl-C and its like until the block is over; calling what it yields lets them in."""
+    waiting: list[int] = []
+
+    def let_in() -> None:
+        if waiting:
+            raise Stopped(f"signal {waiting[0]}")
+
+    if threading.current_thread() is not threading.main_thread():
+        yield let_in
+        return
+
+    def hold(number: int, frame: FrameType | None) -> None:
+        waiting.append(number)
+
+    numbers = [getattr(signal, name) for name in ("SIGINT", *_ENDING) if hasattr(signal, name)]
+    # What is ignored, or ends the program at once, stays as it is.
+    before = {n: signal.signal(n, hold) for n in numbers if callable(signal.getsignal(n))}
+    try:
+        yield let_in
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    let_in()
