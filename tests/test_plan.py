@@ -238,6 +238,11 @@ def test_data_that_identify_nothing_say_so():
         extend_plan(propose_plan(submission), submission)
 
 
+def test_counts_in_the_plural_are_counts():
+    """A travel limit in "counts" is that of an ECP 210, not two and a half counts."""
+    assert propose_plan(bare(position=Position(unit="counts"))).limits.travel == 1100.0
+
+
 # --------------------------------------------------------------------- the file
 
 finite = st.floats(-1e6, 1e6, allow_nan=False).map(lambda x: round(x, 6))

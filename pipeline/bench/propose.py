@@ -32,7 +32,7 @@ AIM = 0.4  # of the travel limit: how far the carts are meant to move
 FURTHEST = 0.8  # of the travel limit: a transient may take so much; the quick model may err
 
 # About 1 cm in units people use; an ECP 210 counts 440 to the centimetre.
-_ABOUT_1_CM = {"m": 0.01, "cm": 1.0, "mm": 10.0, "in": 0.4, "count": 440.0}
+_ABOUT_1_CM = {"m": 0.01, "cm": 1.0, "mm": 10.0, "in": 0.4, "count": 440.0, "counts": 440.0}
 _USUAL_INPUT = 5.0  # input units, where nothing says what the motor takes
 
 # Shares of the input limit before anything is known. A bench's motor moves its carts some 5 to 15
