@@ -384,7 +384,7 @@ def test_a_stuck_encoder_is_said(tmp_path):
     with emulator("--fault", "stuck=2@0.2", "--speed", "10", "--period", "5.003") as bench:
         *_, outcome = acquire(work, port=bench.address, observers=[Notes()], only=["dwell"])
     assert outcome.anomalies.stuck == 1
-    assert "1 encoders stuck" in load_submission(work).experiments[0].note
+    assert "1 encoder stuck" in load_submission(work).experiments[0].note
 
 
 # ----------------------------------------------------------------- ports and scales
@@ -524,7 +524,7 @@ def test_the_view_tells_plan_rate_faults_and_positions():
     text = out.getvalue()
     assert "1 of 2 recorded, 43 s left" in text
     assert "b (sine): 2.0 of 45.0 s" in text
-    assert "7 lines lost, 1 encoders stuck" in text
+    assert "7 lines lost, 1 encoder stuck" in text
     assert sparkline(range(0, 2000, 50)) in text
 
 

@@ -2,6 +2,7 @@
 
 import re
 import signal
+import socket
 import time
 from collections.abc import Sequence
 
@@ -9,9 +10,11 @@ import pytest
 
 from pipeline.bench.acquire import acquire
 from pipeline.bench.experiments import cart_remarks
+from pipeline.bench.links import open_link
 from pipeline.bench.observer import Anomalies
 from pipeline.bench.protocol import EXTENSIONS, Description, Reading
-from pipeline.errors import ConfigError
+from pipeline.bench.serial_line import open_line
+from pipeline.errors import ConfigError, HardwareError
 from pipeline.submission import load_submission
 from tests.acquisitions import Notes, host, sine, write_work
 from tests.benches import emulator
@@ -101,3 +104,23 @@ def test_an_interrupt_after_the_last_line_keeps_the_run(tmp_path):
     assert [experiment.id for experiment in load_submission(work).experiments] == ["first"]
     assert [outcome.partial for outcome in notes.outcomes] == [""]
     assert not (work / "data" / "first.partial.txt").exists()
+
+
+def test_a_network_port_typed_as_a_device_is_told_how_to_write_it():
+    """Neither a number nor HOST:PORT is a device; the form that works is named."""
+    for port in ("41001", "127.0.0.1:41001"):
+        with pytest.raises(HardwareError, match=r"is written socket://HOST:PORT"):
+            open_line(port, baud=115_200)
+
+
+def test_a_port_that_is_taken_says_what_to_choose():
+    """A second emulator on the port of the first is told that 0 takes any."""
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        with pytest.raises(ConfigError, match="choose another port, or 0 for any"):
+            open_link(f"socket://127.0.0.1:{taken.getsockname()[1]}")
+
+
+def test_one_is_not_many():
+    """One line, one encoder, two resets."""
+    assert str(Anomalies(lost=1, stuck=1, resets=2)) == "1 line lost, 2 resets, 1 encoder stuck"
+    assert str(Anomalies(lost=2, stuck=2, resets=1)) == "2 lines lost, 1 reset, 2 encoders stuck"

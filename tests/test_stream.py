@@ -120,6 +120,16 @@ def test_every_fault_is_counted_and_every_valid_line_kept():
     assert stream.fit().period == pytest.approx(1.0024, abs=1e-4)
 
 
+@pytest.mark.parametrize("period", [1.0, 1.0004, 1.0024, 1.017, 5.003])
+def test_no_line_is_said_to_be_lost_of_a_stream_that_is_whole(period):
+    """While a run goes on, the skips of an odd clock are not taken for losses."""
+    stream = Stream(encoders=2, period=round(period))
+    for i in range(10_000):
+        reading = Reading(counts=(0, 0), target=0, duty=0, ms=round(i * period))
+        stream.feed(format_reading(reading), since=0.0, now=1e-3 * reading.ms)
+        assert stream.anomalies().lost == 0
+
+
 @pytest.mark.parametrize(
     ("field", "wrong"),
     [("ms", b"9"), ("ms", b""), ("counts", b"77")],

@@ -1,6 +1,7 @@
 """The far ends of a serial line: a TCP port that `socket://` reaches, or a pseudo-terminal."""
 
 import contextlib
+import errno
 import os
 import select
 import socket
@@ -90,7 +91,8 @@ def open_link(port: str, *, remote: bool = False) -> Link:
         listener.bind(address)
     except OSError as error:
         listener.close()
-        raise ConfigError(f"{where}: {error.strerror}") from None
+        taken = "; choose another port, or 0 for any" if error.errno == errno.EADDRINUSE else ""
+        raise ConfigError(f"{where}: {error.strerror}{taken}") from None
     listener.listen()
     listener.setblocking(False)
     name = f"[{host}]" if ":" in host else host

@@ -29,14 +29,14 @@ class Anomalies:
 
     def __str__(self) -> str:
         """Say what there is, "12 lines lost, 3 late"; "none" where there is nothing."""
-        words = {
-            "lines lost": self.lost,
-            "garbled": self.garbled,
-            "late": self.late,
-            "resets": self.resets,
-            "encoders stuck": self.stuck,
-        }
-        return ", ".join(f"{count} {word}" for word, count in words.items() if count) or "none"
+        words = [
+            (self.lost, "line" if self.lost == 1 else "lines", "lost"),
+            (self.garbled, "garbled"),
+            (self.late, "late"),
+            (self.resets, "reset" if self.resets == 1 else "resets"),
+            (self.stuck, "encoder" if self.stuck == 1 else "encoders", "stuck"),
+        ]
+        return ", ".join(" ".join(map(str, entry)) for entry in words if entry[0]) or "none"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,5 +1,6 @@
 """The serial line to a bench: open it, shake hands, send, receive. Nobody else touches a port."""
 
+import re
 import time
 from collections.abc import Sequence
 from typing import Self
@@ -26,6 +27,7 @@ _WRITE_TIMEOUT = 0.5  # s
 _QUERIES, _ANSWER = 4, 0.6  # s; some boards boot for two seconds when the port is opened
 _LOOK = 0.005  # s between looks at the port
 _TRIAL = 0.1  # s of a run that does nothing, to see whether a stock bench is there at all
+_NETWORK = re.compile(r"[\w.-]+:\d+|\d+|\[.*\]:\d+")  # a host and a port, or a port, alone
 _QUIET = 0.05  # s without a byte: what was under way has arrived
 
 
@@ -160,7 +162,7 @@ class SerialLine:
             what = "nothing" if not heard else f"{heard[:40]!r}, which is no line of a bench"
             raise HardwareError(
                 f"{self._name}: answers {what}; is this the bench's port, is the bench switched "
-                "on, is the baud rate of plan.toml its own?"
+                "on, is the baud rate of plan.toml its own, is another program connected to it?"
             )
         usual = max(set(encoders), key=encoders.count)
         self.bench = Description(name="stock", encoders=usual, carts=usual)
@@ -186,6 +188,8 @@ def open_line(port: str, *, baud: int) -> SerialLine:
 
 
 def _opened(port: str, *, baud: int) -> "serial.SerialBase":
+    if _NETWORK.fullmatch(port):
+        raise HardwareError(f"{port}: a bench on the network is written socket://HOST:PORT")
     failure = ""
     for attempt in range(_TRIES):
         if attempt:

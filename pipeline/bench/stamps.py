@@ -46,7 +46,7 @@ def fit_stamps(stamps: Stamps, *, period: float) -> StampFit:
     n = stamps.size
     if n < 2:
         return StampFit(period=period, missing=0)
-    if (slope := _even(stamps)) is not None:
+    if (slope := even_period(stamps)) is not None:
         return StampFit(period=slope, missing=0)
     steps, span = np.diff(stamps), int(stamps[-1] - stamps[0])
     usual = float(np.median(steps))
@@ -70,7 +70,7 @@ def fit_stamps(stamps: Stamps, *, period: float) -> StampFit:
     return StampFit(period=period, missing=max(0, len(absent) - own_skips))
 
 
-def _even(stamps: Stamps) -> float | None:
+def even_period(stamps: Stamps) -> float | None:
     """Return the period of stamps that one even clock explains without a loss, else None."""
     i = np.arange(stamps.size) - (stamps.size - 1) / 2
     slope = float(i @ stamps / (i @ i))

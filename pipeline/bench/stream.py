@@ -12,7 +12,7 @@ import numpy as np
 
 from pipeline.bench.observer import Anomalies
 from pipeline.bench.protocol import FULL_SCALE, Reading, parse_reading
-from pipeline.bench.stamps import StampFit, fit_stamps
+from pipeline.bench.stamps import StampFit, even_period, fit_stamps
 
 _LONGEST_LINE = 512  # bytes; more without an end is noise
 _SPIKE = 32  # counts a true reading may stand out between its neighbours: a hit on an end stop
@@ -190,28 +190,35 @@ def _stands_out(before: Reading, held: Reading, after: Reading, *, closed: bool)
 
 
 class _MissingSoFar:
-    """Lines missing, second by second, as far as the expected period tells.
+    """Lines missing, second by second.
 
-    The least ms a line of any second is nearer to the true period, if few lines are lost.
+    A clock skips a stamp now and then by itself; a second whose stamps one even clock explains
+    lacks none, and tells the period for those that do lack some. Until there was one, the least ms
+    a line of any second is nearer to the true period, if few lines are lost.
     """
 
     def __init__(self, period: float) -> None:
         self._expected = self._period = period
-        self._start, self._count = 0, -1
+        self._seen_even = False
+        self._stamps: list[int] = []
         self.lines = 0
 
     def tick(self, ms: int) -> None:
         """Take note of a stamp."""
-        self._count += 1
-        span = ms - self._start
-        if span < _WINDOW or not self._count:
+        self._stamps.append(ms)
+        span, count = ms - self._stamps[0], len(self._stamps) - 1
+        if span < _WINDOW or not count:
             return
-        own = span / self._count
-        if self._period == self._expected or own < self._period:
+        if (even := even_period(np.array(self._stamps))) is not None:
+            self._period, self._seen_even = even, True
+        else:
+            own = span / count
             near = abs(own / self._expected - 1) < _ODD
-            self._period = own if near else self._period
-        self.lines += max(0, round(span / self._period) - self._count)
-        self._start, self._count = ms, 0
+            first = self._period == self._expected
+            if near and not self._seen_even and (first or own < self._period):
+                self._period = own
+            self.lines += max(0, round(span / self._period) - count)
+        self._stamps = [ms]
 
 
 class _EncoderWatch:
