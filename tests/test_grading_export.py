@@ -106,7 +106,8 @@ def test_canvas_takes_the_grades(tmp_path):
     assert canvas_import(rows) == {
         "Lab 3 (77)": {"1024": "10", "'=ann": "20", "bo": "20", "1026": ""}
     }
-    assert remarks == ("could not be graded, left blank: team-3",)
+    assert remarks[0] == "could not be graded, left blank: team-3"
+    assert remarks[1].endswith("by the number in the file's name: poeann (team-2)")
 
 
 def test_a_broken_submission_graded_by_hand_is_exported(tmp_path):
@@ -123,7 +124,7 @@ def test_a_submission_that_names_nobody_is_said(tmp_path):
     nobody = make_outcome(failed_grade("team-8", "broken"))
     rows, remarks = write(tmp_path, FULL, nobody, platform="canvas")
     assert len(rows) == 4
-    assert remarks == ("nobody is named in it, so not exported: team-8",)
+    assert remarks[0] == "nobody is named in it, so not exported: team-8"
 
 
 @pytest.mark.parametrize("platform", ["canvas", "moodle", "gradescope"])
@@ -235,10 +236,43 @@ def test_who_is_in_two_submissions_is_named(tmp_path):
     assert remarks == ("s-team-1 is in team-1 and team-9: the higher points are exported",)
 
 
-def test_a_table_that_is_no_roster_is_refused(tmp_path):
-    """Nothing in it says who a row is about."""
-    with pytest.raises(ConfigError, match=r"roster\.csv: no column says who a row is about"):
-        write(tmp_path, HALF, platform="canvas", roster="a,b\n1,2\n")
+def test_of_several_authors_the_one_who_handed_it_in_is_found(tmp_path):
+    """By the number in the file's name, where no author's id is Canvas'; who is lost is named."""
+    roster = 'Student,ID,SIS User ID,SIS Login ID,Section\n"Doe, Jane",1001,S1,doejane,A\n'
+    team = make_outcome(make_grade("t", authors=("u1a", "u1b")), owner="doejane (canvas 1001)")
+    other = make_outcome(make_grade("o", authors=("x", "y")), owner="roeric (canvas 9)")
+    rows, remarks = write(tmp_path, team, other, platform="canvas", roster=roster)
+    assert canvas_import(rows) == {RUBRIC.title: {"1001": "20"}}
+    assert remarks[:2] == (
+        "not in roster.csv, so not exported: u1a, u1b, x, y",
+        "nobody of these is in roster.csv: o",
+    )
+    assert remarks[2].endswith("one of the authors: doejane (t)")
+
+
+@pytest.mark.parametrize(
+    ("platform", "head", "wanted"),
+    [
+        ("canvas", "a,b", "ID and Student"),
+        ("moodle", "Student,ID,SIS User ID,SIS Login ID,Section", "Identifier, or ID number"),
+        ("gradescope", "Identifier,Full name,Email address", "SID, or Email"),
+        ("canvas", "First Name,Last Name,SID,Email", "ID and Student"),
+    ],
+)
+def test_a_table_that_is_no_roster_is_refused(tmp_path, platform, head, wanted):
+    """Another platform's as well: the columns that it should have are named."""
+    with pytest.raises(
+        ConfigError, match=rf"roster\.csv: is not {platform.capitalize()}.*{wanted}"
+    ):
+        write(tmp_path, HALF, platform=platform, roster=f"{head}\n1,2,3\n")
+
+
+def test_gradescope_must_have_a_score(tmp_path):
+    """Zero where nothing could be graded, and the person who uploads it is told."""
+    _, remarks = write(tmp_path, BROKEN, platform="gradescope")
+    (path,) = (tmp_path / "out" / "gradescope").glob("*/results.json")
+    assert json.loads(path.read_text("utf-8"))["score"] == 0
+    assert "but 0 in results.json" in remarks[0]
 
 
 @pytest.mark.parametrize("platform", ["moodle", "gradescope"])

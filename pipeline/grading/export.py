@@ -64,10 +64,18 @@ def export(
     entries = list(book.entries())
     students, remarks = students_of(entries, platform=platform)
     if roster:
-        text, strangers = _filled(Roster.read(roster), platform, students, rubric, title=title)
+        text, strangers = _filled(
+            Roster.read(roster, platform=platform), platform, students, rubric, title=title
+        )
         remarks += strangers
     elif platform == "canvas":
-        text = _canvas(students, rubric, title=title)
+        text = _canvas([s for s in students if not s.uploader], rubric, title=title)
+        sent = [f"{s.name} ({s.grade.submission})" for s in students if s.uploader]
+        if sent:
+            remarks.append(
+                "found by their authors' ids alone; with a roster also by the number in the "
+                f"file's name: {', '.join(sent)}"
+            )
     elif platform == "moodle":
         text = _moodle(students, rubric, title=title)
     else:

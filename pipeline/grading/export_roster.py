@@ -7,6 +7,7 @@ from pathlib import Path
 
 from pipeline.errors import ConfigError
 from pipeline.grading.export_students import Student
+from pipeline.grading.lms_names import Platform
 from pipeline.grading.table import csv_text, read_table
 
 POINTS_POSSIBLE = "Points Possible"  # Canvas' row on top, about the assignments
@@ -14,6 +15,17 @@ POINTS_POSSIBLE = "Points Possible"  # Canvas' row on top, about the assignments
 _NUMBERS = ("ID", "Identifier", "Submission ID")
 _IDS = ("SIS User ID", "SIS Login ID", "ID number", "SID", "Username", "Email", "Email address")
 _NAMES = ("Student", "Full name", "Name")
+# What a platform's own table has for certain, any of these; no other platform's has it.
+_OWN: Mapping[Platform, tuple[frozenset[str], ...]] = {
+    "canvas": (frozenset({"Student", "ID"}),),
+    "moodle": (
+        frozenset({"Identifier"}),
+        frozenset({"ID number"}),
+        frozenset({"Username"}),
+        frozenset({"Email address"}),
+    ),
+    "gradescope": (frozenset({"SID"}), frozenset({"Email"}), frozenset({"Submission ID"})),
+}
 _PARTICIPANT = re.compile(r"\D+ (\d+)")  # of Moodle, in any language
 _TITLE = re.compile(r"(.*?)(?: \(\d+\))?")  # of Canvas, with the assignment's id behind it
 
@@ -27,18 +39,20 @@ class Roster:
     rows: tuple[tuple[str, ...], ...]
 
     @classmethod
-    def read(cls, path: Path) -> "Roster":
-        """Read a roster: CSV with commas, semicolons or tabs.
+    def read(cls, path: Path, *, platform: Platform) -> "Roster":
+        """Read a platform's roster: CSV with commas, semicolons or tabs.
 
         Raises
         ------
-        ConfigError : it is no table, or has no column that says who a row is about.
+        ConfigError : it is no table, or has not the columns that say who a row is about there.
         """
         lines = [row for _, row in read_table(path)]
         head = tuple(name.strip() for name in lines[0]) if lines else ()
-        if not set(head) & {*_NUMBERS, *_IDS, *_NAMES}:
+        if not any(columns <= set(head) for columns in _OWN[platform]):
+            wanted = ", or ".join(" and ".join(sorted(columns)) for columns in _OWN[platform])
             raise ConfigError(
-                f"{path.name}: no column says who a row is about; export it from the platform"
+                f"{path.name}: is not {platform.capitalize()}'s table; "
+                f"that has the columns {wanted}"
             )
         rows = tuple(tuple((*row, *[""] * len(head))[: len(head)]) for row in lines[1:])
         return cls(file=path.name, head=head, rows=rows)
@@ -68,16 +82,36 @@ class Roster:
                 row |= {name: row.get(name) or possible for name in titles.values()}
         index = self._index()
         strangers = []
+        best: dict[int, Student] = {}
         for student in students:
             at = _row_of(student, index)
             if at is None:
-                strangers.append(student.called)
-                continue
+                if not student.uploader:  # one of the authors, who are named
+                    strangers.append(student.called)
+            elif at not in best or student.rank > best[at].rank:
+                best[at] = student
+        for at, student in best.items():
             for title, value in columns.items():
                 table[at][titles[title]] = value(student)
-        remarks = [f"not in {self.file}, so not exported: {', '.join(strangers)}"]
+        remarks = []
+        if strangers:
+            remarks.append(f"not in {self.file}, so not exported: {', '.join(strangers)}")
+        reached = {student.grade.submission for student in best.values()}
+        lost = dict.fromkeys(
+            s.grade.submission
+            for s in students
+            if len(s.grade.authors) > 1 and s.grade.submission not in reached
+        )
+        if lost:
+            remarks.append(f"nobody of these is in {self.file}: {', '.join(lost)}")
+        by_number = [f"{s.name} ({s.grade.submission})" for s in best.values() if s.uploader]
+        if by_number:
+            remarks.append(
+                "found by the number in the file's name, so the same person as one of the "
+                f"authors: {', '.join(by_number)}"
+            )
         text = csv_text(head, [[row.get(name, "") for name in head] for row in table])
-        return text, remarks if strangers else []
+        return text, remarks
 
     def _title(self, title: str) -> str:
         """Return a column's title as the table has it."""

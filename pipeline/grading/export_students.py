@@ -8,6 +8,9 @@ from pipeline.grading.grade import Grade
 from pipeline.grading.gradebook_rows import Entry
 from pipeline.grading.lms_names import Platform, read_owner
 
+# `results.json` needs a score: "optional, but required if not on each test case".
+_GRADESCOPE_BLANK = "left blank in gradescope.csv but 0 in results.json, which must have a score"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Student:
@@ -17,7 +20,8 @@ class Student:
     ----------
     id : as the submission names the author, or "".
     name, number : as the learning platform calls who handed it in, or "". The number is the
-        platform's that the grades are for.
+        platform's that the grades are for. Of several authors nobody says which that is: it is
+        then a student beside them, known as `uploader`.
     """
 
     id: str
@@ -25,6 +29,7 @@ class Student:
     number: str
     grade: Grade
     by_hand: bool
+    uploader: bool = False
 
     @property
     def points(self) -> str:
@@ -51,17 +56,37 @@ def students_of(entries: Sequence[Entry], *, platform: Platform) -> tuple[list[S
         name, of, number = read_owner(entry.owner)
         authors = entry.grade.authors
         alone = len(authors) < 2  # of several, which one handed it in is not said
-        for id_ in authors or ("",):
-            student = Student(
+        number = number if of in ("", platform) else ""
+        by_hand = bool(entry.overrides)
+        own = [
+            Student(
                 id=id_,
                 name=name if alone else "",
-                number=number if alone and of in ("", platform) else "",
+                number=number if alone else "",
                 grade=entry.grade,
-                by_hand=bool(entry.overrides),
+                by_hand=by_hand,
             )
-            key = id_ or f"\0{entry.submission}"  # nobody's id
+            for id_ in authors or ("",)
+        ]
+        # Moodle's and Gradescope's numbers of a team's hand-in are not a student's.
+        if not alone and number and platform == "canvas":
+            own.append(
+                Student(
+                    id="",
+                    name=name,
+                    number=number,
+                    grade=entry.grade,
+                    by_hand=by_hand,
+                    uploader=True,
+                )
+            )
+        for student in own:
+            # Nobody's id stands for a number, or for who is not named at all.
+            nameless = student.number if student.uploader else entry.submission
+            key = student.id or f"\0{nameless}"
             if key in found:
-                twice.setdefault(id_, [found[key].grade.submission]).append(entry.submission)
+                names = twice.setdefault(student.called, [found[key].grade.submission])
+                names.append(entry.submission)
                 if found[key].rank >= student.rank:
                     continue
             found[key] = student
@@ -75,5 +100,6 @@ def students_of(entries: Sequence[Entry], *, platform: Platform) -> tuple[list[S
         remarks.append(f"nobody is named in it, so not exported: {teams}")
     blank = dict.fromkeys(s.grade.submission for s in found.values() if not s.points)
     if blank:
-        remarks.append(f"could not be graded, left blank: {', '.join(blank)}")
+        where = _GRADESCOPE_BLANK if platform == "gradescope" else "left blank"
+        remarks.append(f"could not be graded, {where}: {', '.join(blank)}")
     return list(found.values()), remarks
