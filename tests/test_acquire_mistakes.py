@@ -7,13 +7,16 @@ import time
 from collections.abc import Sequence
 
 import pytest
+from typer.testing import CliRunner
 
 from pipeline.bench.acquire import acquire
-from pipeline.bench.experiments import cart_remarks
+from pipeline.bench.experiments import cart_remarks, prepare_submission
 from pipeline.bench.links import open_link
 from pipeline.bench.observer import Anomalies
+from pipeline.bench.plan import Limits
 from pipeline.bench.protocol import EXTENSIONS, Description, Reading
 from pipeline.bench.serial_line import open_line
+from pipeline.cli import app
 from pipeline.errors import ConfigError, HardwareError
 from pipeline.submission import load_submission
 from tests.acquisitions import Notes, host, sine, write_work
@@ -124,3 +127,38 @@ def test_one_is_not_many():
     """One line, one encoder, two resets."""
     assert str(Anomalies(lost=1, stuck=1, resets=2)) == "1 line lost, 2 resets, 1 encoder stuck"
     assert str(Anomalies(lost=2, stuck=2, resets=1)) == "2 lines lost, 1 reset, 2 encoders stuck"
+
+
+def test_a_new_submission_says_what_the_bench_does_not_know(tmp_path):
+    """Springs stand there to be checked; authors and goal need but their # taken away."""
+    bench = Description(name="two", encoders=2, carts=2, commands=EXTENSIONS, position_unit="cm")
+    folder = tmp_path / "new"
+    assert prepare_submission(folder, bench, stock=False).authors == ()
+    path = folder / "submission.toml"
+    text = path.read_text(encoding="utf-8")
+    assert "springs = [true, true, true]  # check: wall-1, 1-2, 2-wall; false where" in text
+    path.write_text(re.sub(r"(?m)^#(?! )", "", text), encoding="utf-8")
+    submission = load_submission(folder)
+    assert [author.id for author in submission.authors] == ["s1024"]
+    assert submission.design is not None
+
+
+def test_where_nothing_was_recorded_no_report_is_offered(tmp_path):
+    """A limit that is too small is said with what to do; `report` would have nothing to read."""
+    near = Limits(input=0.5, travel=0.05)
+    work = write_work(tmp_path, [sine("dwell", seconds=4)], limits=near)
+    with emulator("--speed", "5") as bench:
+        process = host(work, bench.address, "--only", "dwell", "--yes")
+        _, said = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert "divide its amplitude in plan.toml by four, or raise the limit in plan.toml" in said
+    assert "again: taken as done" not in said
+    assert "cartlab report" not in said
+
+
+def test_files_need_a_submission_to_go_to(tmp_path):
+    """A folder that is not there is told how to be made."""
+    where = str(tmp_path / "new")
+    done = CliRunner().invoke(app, ["acquire", where, "--import", str(tmp_path), "--once"])
+    assert isinstance(done.exception, ConfigError)
+    assert f"begin with `cartlab new {where} --carts N`" in str(done.exception)

@@ -88,7 +88,13 @@ class _Acquisition:
     def _on_line(self, line: SerialLine) -> Generator[Outcome, None, bool]:
         """Record over one line; return whether it was lost."""
         bench = line.bench
+        new = not (self._folder / NAME).exists()
         submission = prepare_submission(self._folder, bench, stock=not bench.commands)
+        if new:
+            self._observer.remark(
+                f"wrote {self._folder / NAME}: check its springs, which the bench does not know; "
+                "add the authors and the design goal"
+            )
         if not line.knows("k"):
             self._observer.remark(
                 f"the bench {bench.name!r} has no watchdog: if this program or the cable dies in "
@@ -123,9 +129,14 @@ class _Acquisition:
         name = outcome.recording.id
         if outcome.partial.startswith(STOPPED):  # the same again would do the same harm
             self._failed[name] = _TRIES
+            less = (
+                "divide its amplitude in plan.toml by four"
+                if outcome.recording.amplitude
+                else "pull the cart out less far"
+            )
             self._observer.remark(
-                f"{name} is not tried again now; if a limit was passed, divide its amplitude in "
-                "plan.toml by four"
+                f"{name} is not tried again now; if a limit was passed, {less}, or raise the limit "
+                "in plan.toml if the bench has the room"
             )
             return
         self._failed[name] = self._failed.get(name, 0) + 1

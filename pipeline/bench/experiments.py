@@ -10,9 +10,21 @@ from pipeline.errors import ConfigError, SubmissionError
 from pipeline.ingest.read import DUTY_COUNT
 from pipeline.output import new_folder, write_file
 from pipeline.submission import Submission, load_submission
-from pipeline.submission.load import NAME
+from pipeline.submission.load import NAME, spring_names
 from pipeline.synthesis.files import Value, toml_section
 
+_TO_ADD = """\
+# Who you are, one table for each of you:
+#[[authors]]
+#id = "s1024"
+
+# The controller you are asked for; `cartlab new` writes every key with a comment.
+#[design]
+#cart = 1                         # whose position is controlled
+#reference = 1.0                  # size of the step, in position units
+#overshoot_percent = 10.0
+#settling_time = 1.0              # s, to within 2 %
+"""
 _ROUNDED = 1.01  # an input limit typed with fewer digits may pass full scale by so much
 _SAME = 1e-3  # scales that differ by less are the same number typed with fewer digits
 
@@ -168,8 +180,12 @@ def _write_new(folder: Path, bench: Description) -> None:
         "position": {"unit": bench.position_unit, "per_count": bench.position_per_count},
     }
     new_folder(folder).mkdir(parents=True, exist_ok=True)
+    there = ", ".join(["true"] * (bench.carts + 1))
+    names = ", ".join(spring_names(bench.carts))
+    springs = f"springs = [{there}]  # check: {names}; false where there is none"
     sections = [
         toml_section("", {"version": 1, "title": f"Recorded on the bench {bench.name}"}),
-        toml_section("[system]", system),
+        toml_section("[system]", system).rstrip() + f"\n{springs}\n",
+        _TO_ADD,
     ]
     write_file(folder / NAME, "\n".join(sections))

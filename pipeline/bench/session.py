@@ -101,8 +101,8 @@ class Session:
                 time.sleep(_PULL_OUT)
         elif recording.release:
             self._observer.confirm(
-                f"Pull cart {recording.release} out and hold it still; let it go once the "
-                "recording has begun"
+                f"Pull cart {recording.release} out and hold it still, nearer than limits.travel "
+                f"({self._limits.travel:g}) to its zero; let it go once the recording has begun"
             )
         return restless
 

@@ -102,26 +102,34 @@ def _record(
         raise typer.Exit(1) from None
     whole = {outcome.recording.id for outcome in outcomes if not outcome.partial}
     failed = {outcome.recording.id for outcome in outcomes} - whole
-    terminal.remark(f"{len(whole)} recorded into {folder}: try `cartlab report {folder}`")
+    report = f": try `cartlab report {folder}`" if whole or not failed else ""
+    terminal.remark(f"{len(whole)} recorded into {folder}{report}")
     if not outcomes:
         terminal.remark(
             "what was asked for is there already; to record it anew, take its table out of "
             "submission.toml"
         )
     if failed:
-        terminal.remark(f"not recorded: {', '.join(sorted(failed))}; the same command tries again")
+        terminal.remark(
+            f"not recorded: {', '.join(sorted(failed))}; once what stood in the way is mended, the "
+            "same command tries again"
+        )
         raise typer.Exit(1)
 
 
 def _import(folder: Path, source: Path, terminal: "Terminal", *, once: bool) -> None:
     from pipeline.bench.importing import Importer
+    from pipeline.lock import alone_in
 
+    if not folder.exists():  # no file says how many carts there are
+        raise ConfigError(f"{folder}: no such folder; begin with `cartlab new {folder} --carts N`")
     taken = 0
     try:
-        for imported in Importer(folder, source, observer=terminal).watch(once=once):
-            taken += 1
-            as_what = f"{imported.file}: {imported.experiment}, a {imported.kind}"
-            terminal.remark("; ".join([as_what, *imported.remarks]))
+        with alone_in(folder):
+            for imported in Importer(folder, source, observer=terminal).watch(once=once):
+                taken += 1
+                as_what = f"{imported.file}: {imported.experiment}, a {imported.kind}"
+                terminal.remark("; ".join([as_what, *imported.remarks]))
     except KeyboardInterrupt:
         pass  # the way to end it
     terminal.remark(f"{taken} files taken into {folder}: check its submission.toml")
