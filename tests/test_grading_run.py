@@ -169,6 +169,19 @@ def test_points_never_rise_with_the_error(table, side):
     )
 
 
+def test_a_broken_law_is_told_in_words():
+    """What does not hold, and why it should; the laws' own ids are in the data only."""
+    honest = student(2)
+    final = honest.reported.final
+    swapped = honest.reporting(final={"K_1": final["K_2"], "K_2": final["K_1"]})
+    (laws,) = [c for c in swapped.grade().criteria if c.id == "laws"]
+    assert laws.message.startswith(
+        "This does not hold: K_2 ≤ K_1 (a cart further from the motor is moved less"
+    )
+    assert not any(law in laws.message for law in laws.expected["laws"])
+    assert "order.K_2.K_1" in laws.found["broken"]
+
+
 def test_lateness_takes_its_share_for_every_day_begun():
     """Ten percent a day, after an hour of grace, at most half."""
     one = student(1)

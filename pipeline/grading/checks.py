@@ -170,10 +170,11 @@ def _laws(criterion: asked.Laws, work: Work) -> Verdict:
     if laws is None:
         return Verdict(share=None, message="Not checked: the final table is not complete.")
     broken = [law for law in laws if law.widening > 0]
+    meanings = dict.fromkeys(law.meaning for law in broken)  # two may mean the same
     worst = max((law.widening for law in laws), default=Fraction(0))
     return Verdict(
         share=ALL - worst / MOST_WIDENING,
-        message="; ".join(f"{law.name} fails ({law.meaning})" for law in broken[:_NAMED]) + "."
+        message=f"This does not hold: {'; '.join(list(meanings)[:_NAMED])}."
         if broken
         else f"All {len(laws)} laws hold within the rounding.",
         expected={"laws": [law.name for law in laws]},

@@ -78,7 +78,7 @@ def _evaluate(
         results[f"positive.{name}"] = (f"{name} is positive", value[name] + half[name] > 0)
     for lesser, greater, reason in orders(parameter_names(n)):
         holds = value[lesser] - half[lesser] <= value[greater] + half[greater]
-        results[f"order.{lesser}.{greater}"] = (f"{lesser} ≤ {greater}: {reason}", holds)
+        results[f"order.{lesser}.{greater}"] = (f"{lesser} ≤ {greater} ({reason})", holds)
     if n not in _RECOMPUTED:
         return results
     corner = _corners(value, half, n=n)
@@ -88,7 +88,8 @@ def _evaluate(
             holds = bool(difference.min() <= 0 <= difference.max())
             results[f"redundancy.{name}"] = ("two routes to one number agree", holds)
         for name, number in least.items():
-            results[f"sign.{name}"] = (f"{name} is not negative", bool(number.max() >= 0))
+            what = "the coupling of two carts" if name.startswith("kappa") else name
+            results[f"sign.{name}"] = (f"{what} is not negative", bool(number.max() >= 0))
         for name, numbers in recomputed.items():
             real = numbers[np.isfinite(numbers)]  # none where a frequency squared is negative
             low, high = float(np.min(real, initial=np.inf)), float(np.max(real, initial=-np.inf))
