@@ -67,8 +67,10 @@ def test_a_student_with_a_textbook_is_honest(carts, hide):
     records = one.analysis.records
     initial = by_eye(records, carts) if carts > 1 else {}
     initial |= initial_table(records, carts)
-    tables = {"initial": initial, "final": final_table(records, carts, initial)}
-    reported = Reported(**{x: {n: typed(v) for n, v in t.items()} for x, t in tables.items()})
+    reported = Reported(
+        initial={n: typed(v) for n, v in initial.items()},
+        final={n: typed(v) for n, v in final_table(records, carts, initial).items()},
+    )
     submission = one.submission.model_copy(update={"reported": reported})
     assert set(codes(replace(one, submission=submission))) <= {"missing"}
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pipeline.grading.load import load_rubric
@@ -44,8 +45,8 @@ def bench(real_data, tmp_path_factory):
 
 def viscous_fit() -> Chain:
     """Return what a simulation matched to the two-cart steps gives, friction left out."""
-    m, k = (5.5e-6, 3.7e-6), (1.79e-3, 1.03e-3, 0.0)
-    return Chain(m=m, c=(2 * 0.15 * 22.6 * m[0], 2 * 0.074 * 16.6 * m[1]), k=k)
+    m, k = np.array([5.5e-6, 3.7e-6]), np.array([1.79e-3, 1.03e-3, 0.0])
+    return Chain(m=m, c=2 * np.array([0.15 * 22.6, 0.074 * 16.6]) * m, k=k)
 
 
 def first_estimates(bench: Bench) -> dict[str, Decimal]:

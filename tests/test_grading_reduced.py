@@ -22,6 +22,7 @@ def reduced(analysis: Analysis) -> tuple[FrequencyResponse, ...]:
         ratios = []
         for point in points:
             record = runs[point.experiment]
+            assert record.u is not None
             last = record.t >= record.t[-1] - 3 * TURN / point.omega
             ratios.append(np.ptp(record.position(cart)[last]) / np.ptp(record.u[last]))
         magnitude = np.array(ratios) * (1 + 0.01 * rng.standard_normal(len(ratios)))

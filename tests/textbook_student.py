@@ -109,7 +109,7 @@ def by_eye(records: Sequence[Record], n: int) -> dict[str, float]:
     return table
 
 
-def _factor(s: Array, omega: float, zeta: float) -> Array:
+def _factor(s: np.ndarray, omega: float, zeta: float) -> np.ndarray:
     return (s / omega) ** 2 + 2 * zeta * s / omega + 1
 
 
