@@ -72,6 +72,8 @@ def fast_bench() -> Iterator[Emulator]:
         yield bench
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pty_only
 def test_hosts_talk_to_a_pseudo_terminal_one_after_the_other():
     """In real time: a description, a run with the stamps of a period that is no whole ms.

@@ -205,6 +205,8 @@ controller = { type = "state_feedback", cart = 1 }
 """
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
 def test_acquire_records_with_the_firmware(library, tmp_path):
     """Behind a pty with simulated carts it records a step, then the loop designed from it."""

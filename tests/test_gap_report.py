@@ -414,6 +414,8 @@ def test_command_writes_everything_and_names_the_friction(bench):
     assert "Dry (Coulomb) friction on cart 1 explains" in bench.done.stderr
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_report_shows_the_verdict_and_the_better_simulation(bench):
     """Beside a gap analysis of its data, the report tells it and simulates with the effects."""
     analysis, gap = with_gap(analyse(load_submission(bench.folder)), bench.folder)
