@@ -1,10 +1,20 @@
-"""Writing results: whole files or none, and never through a link that a submission brought."""
+"""Writing results: whole files or none, never through a link that a submission brought.
 
+Tables are written so that a spreadsheet runs nothing that a student wrote.
+"""
+
+import re
+from collections.abc import Iterable, Sequence
+from numbers import Real
 from pathlib import Path
 
 from pipeline.errors import ConfigError
 
 LOCK = ".lock"  # of `pipeline.lock`
+_NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+# What starts a formula, wide and small forms too, at the start of a cell or behind a semicolon,
+# where a spreadsheet of a country with decimal commas begins another cell, quotes or not.
+_FORMULA = re.compile(r"(^|;)(?=[ \"']*[=+\-@＝＋－＠﹦﹢﹣﹫])")
 
 
 def check_folder(out: Path) -> Path:
@@ -59,3 +69,24 @@ def clear_files(folder: Path, pattern: str) -> None:
     for path in folder.glob(pattern):
         if path.is_file() or path.is_symlink():
             path.unlink()
+
+
+def csv_text(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Return a table as CSV: commas, line feeds, every text quoted; NaN and None are empty."""
+    return "".join(",".join(map(_cell, row)) + "\n" for row in (head, *rows))
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, Real):
+        return "" if value != value else f"{float(value):.10g}"
+    return '"{}"'.format(harmless("" if value is None else str(value)).replace('"', '""'))
+
+
+def harmless(text: str) -> str:
+    """Return text without control characters, an apostrophe before what starts a formula.
+
+    Blanks of all sorts and marks that show as nothing become plain blanks: none ends a row, and
+    none keeps a spreadsheet, but not us, from seeing a formula.
+    """
+    text = "".join(c if c.isprintable() else " " for c in text)
+    return text if _NUMBER.fullmatch(text) else _FORMULA.sub(r"\1'", text)

@@ -23,7 +23,7 @@ from pipeline.grading.grade import CODES, Flag
 from pipeline.grading.gradebook import Gradebook
 from pipeline.grading.outputs import grades_csv, write_outputs
 from pipeline.grading.override import Override, read_points, with_overrides
-from pipeline.grading.table import csv_text, neutral, read_table
+from pipeline.grading.table import read_table
 from tests.grades import (
     failed_grade,
     hertz_flag,
@@ -81,53 +81,11 @@ def test_no_cell_is_a_formula(graded):
     assert not [cell for cell in cells if cell.startswith(tuple("=@\t\r"))]
 
 
-@pytest.mark.parametrize("text", ["-1.5", "+3", "1e-3", "-.5", "7"])
-def test_numbers_are_left_alone(text):
-    """A minus sign before a number is no formula."""
-    assert neutral(text) == text
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "=1+1",
-        "+cmd",
-        "-2+3",
-        "@SUM(A1)",
-        "\t=1",
-        "\r=1",
-        "  =1",
-        "\u00a0@x",
-        "＝1",
-        "-1-1",
-        "\ufeff=1",
-        "\v=1",
-    ],
-)
-def test_formulas_are_neutralised(text):
-    """However they are dressed."""
-    assert neutral(text) == f"'{text}"
-
-
-def test_a_nul_hides_no_formula():
-    """What is taken out of a cell is taken out before the cell is looked at."""
-    assert neutral("\0=1+1") == "'=1+1"
-
-
-@given(st.lists(st.lists(st.text(), min_size=2, max_size=2), max_size=4))
-def test_a_table_reads_back_as_it_was_written(rows):
-    """Commas, quotes, line breaks and any letter survive; nothing starts a formula."""
-    text = csv_text(("a", "b"), rows)
-    back = list(csv.reader(io.StringIO(text, newline="")))
-    assert back == [["a", "b"], *([neutral(cell) for cell in row] for row in rows)]
-    assert not [cell for row in back for cell in row if re.match(r"[=@\t\r]", cell)]
-
-
 def test_a_criterion_may_be_called_like_a_column():
     """Its column is told apart."""
     criteria = (RUBRIC.criteria[0].model_copy(update={"id": "points"}),)
     rubric = RUBRIC.model_copy(update={"criteria": criteria})
-    head = grades_csv([], rubric=rubric).strip().split(",")
+    (head,) = csv.reader([grades_csv([], rubric=rubric).strip()])
     assert len(head) == len(set(head))
     assert "criterion points" in head
 

@@ -1,9 +1,25 @@
 """Results are written whole, in their place, and never through a link."""
 
+import csv
+import io
+import re
+import unicodedata
+
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from pipeline.errors import ConfigError
-from pipeline.output import check_folder, clear_files, new_folder, own_folder, write_file
+from pipeline.output import (
+    check_folder,
+    clear_files,
+    csv_text,
+    harmless,
+    new_folder,
+    own_folder,
+    write_file,
+)
 
 
 def test_a_file_is_replaced_whole(tmp_path):
@@ -60,3 +76,53 @@ def test_a_folder_with_something_in_it_is_not_new(tmp_path):
     (tmp_path / "submission.toml").write_text("")
     with pytest.raises(ConfigError, match="is not empty"):
         new_folder(tmp_path)
+
+
+# ------------------------------------------------------------------------------- CSV
+
+
+@pytest.mark.parametrize("text", ["-1.5", "+3", "1e-3", "-.5", "7", "ünal-lab", "K_1: 2; K_2: 3"])
+def test_numbers_and_words_are_left_alone(text):
+    """A minus sign before a number is no formula, nor is one in a word."""
+    assert harmless(text) == text
+
+
+_SIGNS = ["=1+1", "+cmd", "-2+3", "@SUM(A1)", "-1-1", "＝1", "﹦1", "-１"]
+_HIDING = [
+    "", " ", "\t", "\r", "\n", "\v", "\0", "\x85", "\u00a0", "\u00ad", "\u200b", "\u200e", "\u202e",
+    "\u2028", "\u3000", "\ufeff", "\ud800", "\U000e0020", "\r\n \u3000",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("sign", _SIGNS)
+@pytest.mark.parametrize("hidden", _HIDING)
+@pytest.mark.parametrize("before", ["", "x;", 'x;"', "x; '"])
+def test_formulas_are_neutralised(before, hidden, sign):
+    """Behind whatever shows as nothing, at the start of a cell or where a semicolon begins one."""
+    text = harmless(before + hidden + sign)
+    assert text.isprintable()
+    assert re.match(r"(x;)?'[ \"']*" + re.escape(sign), text)
+
+
+_MEANT = st.text(st.sampled_from("=+-@;,\"'\r\n\t \u3000\u00ad\u200eab1")) | st.text()
+
+
+@given(st.lists(st.lists(_MEANT, min_size=2, max_size=2), max_size=4))
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+def test_no_row_and_no_formula_comes_of_a_text(separator, rows):
+    """Whatever separates the cells of a spreadsheet: rows as many as written, no formula in one."""
+    text = csv_text(("a", "b"), rows)
+    assert not [c for c in text if unicodedata.category(c).startswith("C") and c != "\n"]
+    assert text.count("\n") == len(rows) + 1
+    back = list(csv.reader(io.StringIO(text, newline=""), delimiter=separator))
+    if separator == ",":
+        assert back == [["a", "b"], *([harmless(cell) for cell in row] for row in rows)]
+    cells = [cell for row in back for cell in row]
+    number = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?", re.IGNORECASE)
+    assert not [c for c in cells if c.lstrip()[:1] in [*"=+-@"] and not number.fullmatch(c)]
+
+
+def test_numbers_stay_bare_and_texts_are_quoted():
+    """A number is one to every program; none where there is none."""
+    rows = [("1024", 17.50, np.float64(1 / 3), np.int64(3), float("nan"), None, 'a "b"')]
+    assert csv_text("abcdefg", rows).splitlines()[1] == '"1024",17.5,0.3333333333,3,,"","a ""b"""'

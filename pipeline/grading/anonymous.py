@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from pipeline.grading.grade import Flag, Grade
 from pipeline.grading.shared import shared_message
-from pipeline.grading.table import csv_text
+from pipeline.output import csv_text
 
 KEY_FILE = "anonymous-key.csv"
 _PREFIX = "anon-"

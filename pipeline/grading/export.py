@@ -26,8 +26,7 @@ from pipeline.grading.gradebook_rows import Entry
 from pipeline.grading.lms_names import Platform
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.shared import told
-from pipeline.grading.table import csv_text
-from pipeline.output import own_folder, write_file
+from pipeline.output import csv_text, own_folder, write_file
 
 _HOURS = 24.0
 
@@ -145,7 +144,7 @@ def _moodle(students: Sequence[Student], rubric: Rubric, *, title: str) -> str:
 
 def _comment(student: Student) -> str:
     """Return the feedback in short, as the HTML that Moodle takes it for."""
-    return "<br>".join(html.escape(line) for line in _said(student.grade))
+    return "<br>".join(html.escape(line, quote=False) for line in _said(student.grade))
 
 
 def _said(grade: Grade) -> list[str]:

@@ -8,7 +8,8 @@ from pathlib import Path
 from pipeline.errors import ConfigError
 from pipeline.grading.export_students import Student
 from pipeline.grading.lms_names import Platform
-from pipeline.grading.table import csv_text, read_table
+from pipeline.grading.table import read_table
+from pipeline.output import csv_text
 
 POINTS_POSSIBLE = "Points Possible"  # Canvas' row on top, about the assignments
 # Columns that say who a row is about.

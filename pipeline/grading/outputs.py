@@ -18,8 +18,7 @@ from pipeline.grading.grade import Grade, grade_dict
 from pipeline.grading.gradebook import Gradebook
 from pipeline.grading.gradebook_rows import Entry
 from pipeline.grading.rubric import Rubric
-from pipeline.grading.table import csv_text
-from pipeline.output import own_folder, write_file
+from pipeline.output import csv_text, own_folder, write_file
 from pipeline.resources import TEMPLATES
 from pipeline.results_json import plain_json
 

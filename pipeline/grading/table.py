@@ -1,42 +1,12 @@
-"""Tables as CSV, written so that a spreadsheet runs nothing that a student wrote."""
+"""Tables that platforms and people bring as CSV."""
 
 import csv
 import io
-import re
-from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from pipeline.errors import ConfigError
 
 _MOST_BYTES = 20_000_000
-_NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")
-_FORMULA = tuple("=+-@\t\r\n＝＋－＠")  # what starts a formula, full-width forms too
-_UNSEEN = " \v\f\u00a0\u200b\u2060\ufeff"
-
-
-def csv_text(head: Sequence[str], rows: Iterable[Sequence[object]], *, bom: bool = False) -> str:
-    """Return a table as CSV: commas, line feeds, formulas neutralised.
-
-    Parameters
-    ----------
-    bom : start with the mark by which Excel knows UTF-8.
-    """
-    buffer = io.StringIO(newline="")
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow([neutral(text) for text in head])
-    writer.writerows([neutral(value) for value in row] for row in rows)
-    return ("\ufeff" if bom else "") + buffer.getvalue()
-
-
-def neutral(value: object) -> str:
-    """Return a cell; text that a spreadsheet would take for a formula begins with an apostrophe."""
-    if isinstance(value, float):
-        return f"{value:.10g}"
-    text = str(value).replace("\0", "")
-    # Blanks, and marks that show as nothing, do not keep a spreadsheet from seeing a formula.
-    if text.lstrip(_UNSEEN).startswith(_FORMULA) and not _NUMBER.fullmatch(text):
-        return f"'{text}"
-    return text
 
 
 def read_table(path: Path) -> list[tuple[int, list[str]]]:
