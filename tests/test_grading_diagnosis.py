@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from pipeline.grading.grade import Flag
-from pipeline.submission import Reported
+from pipeline.submission import Reported, StateSpace
 from tests.grading_students import Student, student, typed
 from tests.textbook_student import by_eye, final_table, initial_table
 
 TURN = 2 * np.pi
 FRICTION = ("coulomb_friction",)
+FROM_TABLES = {"initial", "final", "comparison", "laws", "state"}  # criteria begin so
 
 
 def codes(one: Student) -> list[str]:
@@ -168,6 +169,28 @@ def test_the_peak_of_the_step(carts):
     flag = only_flag(one.reporting(initial=dict(zip(own("K", carts), peaks.tolist(), strict=True))))
     assert flag.code == "peak_for_steady_state"
     assert flag.parameters == tuple(own("K", carts))
+
+
+@pytest.mark.parametrize("vague", ["0e2", "0.0"])
+@pytest.mark.parametrize("carts", [1, 2, 3])
+def test_digits_that_say_nothing_earn_nothing(carts, vague):
+    """A table of zeros, however they are typed, is impossible, and so are dampings of 0.0."""
+    one = student(carts)
+    zeros = dict.fromkeys(one.rubric.names, Decimal(vague))
+    space = StateSpace(
+        A=tuple((Decimal(vague),) * (2 * carts) for _ in range(2 * carts)),
+        B=(Decimal(vague),) * (2 * carts),
+    )
+    grade = one.reporting(initial=zeros, final=zeros, state_space=space).grade()
+    assert {flag.code for flag in grade.flags} >= {"physically_impossible"}
+    tables = [c for c in grade.criteria if c.id.split("-")[0] in FROM_TABLES]
+    assert tables
+    assert sum(c.points for c in tables) == 0
+    undamped = {name: zero for name, zero in zeros.items() if name.startswith("zeta")}
+    grade = one.reporting(final=undamped).grade()
+    (flag,) = [flag for flag in grade.flags if flag.code == "physically_impossible"]
+    assert set(flag.parameters) == set(undamped)
+    assert {c.points for c in grade.criteria if c.id in ("final-dampings", "laws")} == {0}
 
 
 @pytest.mark.parametrize("hide", [(), FRICTION])

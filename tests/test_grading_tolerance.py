@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.grading.reference import Reference
-from pipeline.grading.tolerance import credit, half_digit, percent_off
+from pipeline.grading.tolerance import credit, half_digit, percent_off, rounding
 
 percents = st.decimals("0", "500", places=2).map(float)
 
@@ -79,3 +79,16 @@ def test_a_wrong_sign_earns_nothing():
     """No tolerance is wide enough for a negative gain."""
     error = percent_off(Decimal("-24.3"), at(24.3), sigmas=3.0)
     assert credit(error, full=1000.0, none=1000.0) == 0
+
+
+@pytest.mark.parametrize("vague", ["0e2", "0", "0.0", "-0.0"])
+def test_a_zero_is_no_number_that_fits_everything(vague):
+    """What rounding may excuse is a share of the number: of zero it is nothing."""
+    assert rounding(Decimal(vague)) == 0
+    assert credit(percent_off(Decimal(vague), at(0.1), sigmas=0.0), full=50.0, none=200.0) == 0
+
+
+def test_one_digit_is_excused_as_little_as_two():
+    """3e1 may stand for 28.5 to 31.5, not for 25 to 35."""
+    assert rounding(Decimal("3e1")) == Fraction(3, 2)
+    assert percent_off(Decimal("3e1"), at(35.0), sigmas=0.0) == 100 * (Fraction(70, 63) - 1)

@@ -17,7 +17,7 @@ from pipeline.grading.pieces import asked_pieces, missing_pieces
 from pipeline.grading.reference import Reference
 from pipeline.grading.rubric import is_damping, matching
 from pipeline.grading.state_model import compare_entries
-from pipeline.grading.tolerance import credit, half_digit, percent_off
+from pipeline.grading.tolerance import NO_CREDIT, credit, percent_off, rounding
 from pipeline.grading.work import ALL, NONE, Verdict, Work, mean_share
 
 _NAMED = 4  # so many are named in a message
@@ -105,7 +105,7 @@ def _parameters(criterion: asked.Parameters, work: Work) -> Verdict:
         error = (
             percent_off(table[name], known[name], sigmas=criterion.sigmas)
             if name in known
-            else Fraction(10**6)
+            else NO_CREDIT
         )
         shares.append(_credit(error, name, criterion))
         if shares[-1] < 1:
@@ -154,8 +154,10 @@ def _initial_final(criterion: asked.InitialFinal, work: Work) -> Verdict:
 
 
 def between(initial: Decimal, final: Decimal) -> Fraction:
-    """Return how far two typed numbers are apart, in percent, half the last digit of each off."""
-    value, half = float(initial), float(half_digit(initial))
+    """Return how far two typed numbers are apart, in percent, the rounding of each off."""
+    if initial <= 0 or final <= 0:
+        return NO_CREDIT
+    value, half = float(initial), float(rounding(initial))
     reference = Reference(value=value, low=value, high=value, std=half, source="initial")
     return percent_off(final, reference, sigmas=1.0)
 

@@ -7,7 +7,7 @@ import numpy as np
 from pipeline.grading import rubric as asked
 from pipeline.grading.controller import Controller, same_gains
 from pipeline.grading.reference import Reference
-from pipeline.grading.tolerance import credit, exact, half_digit, percent_off
+from pipeline.grading.tolerance import credit, exact, percent_off, rounding
 from pipeline.grading.work import NONE, Verdict, Work, mean_share
 from pipeline.plant.chain import Array
 
@@ -84,7 +84,7 @@ def judge_claims(criterion: asked.Claims, work: Work) -> Verdict:
         shares = [NONE, NONE]
         if controller.overshoot is not None and np.isfinite(numbers.overshoot):
             off = abs(Fraction(controller.overshoot) - Fraction(numbers.overshoot))
-            off = max(off - half_digit(controller.overshoot), Fraction(0))
+            off = max(off - rounding(controller.overshoot), Fraction(0))
             shares[0] = credit(off, full=criterion.overshoot_full, none=criterion.overshoot_none)
         if controller.settling is not None and numbers.settling_time is not None:
             point = numbers.settling_time

@@ -12,7 +12,7 @@ from pipeline.grading.grade import Flag
 from pipeline.grading.loop_numbers import LoopNumbers, loop_numbers
 from pipeline.grading.reference import is_explained
 from pipeline.grading.state_model import own_chain
-from pipeline.grading.tolerance import half_digit
+from pipeline.grading.tolerance import rounding
 from pipeline.plant.chain import Array, Chain
 from pipeline.results import Analysis
 from pipeline.submission import Design, StateFeedback, Submission
@@ -108,7 +108,7 @@ class Controller:
         """
         if self.prefilter is None:
             return True
-        off = abs(float(self.prefilter) - numbers.prefilter) - float(half_digit(self.prefilter))
+        off = abs(float(self.prefilter) - numbers.prefilter) - float(rounding(self.prefilter))
         allowed = _PREFILTER_BLURRED if self.blurred and not sharp else _PREFILTER
         return off <= allowed * abs(numbers.prefilter)
 
@@ -308,7 +308,7 @@ def _prefilter_flag(controller: Controller, numbers: LoopNumbers) -> Flag:
     assert controller.gains is not None
     hint = "it is one over the static gain of the loop, from r to the cart that is controlled"
     for text, value in _prefilter_slips(controller, right):
-        if abs(float(typed) - value) <= 0.5 * _PREFILTER * abs(value) + float(half_digit(typed)):
+        if abs(float(typed) - value) <= 0.5 * _PREFILTER * abs(value) + float(rounding(typed)):
             hint = text
             break
     return Flag(

@@ -198,7 +198,7 @@ def _corrected(
     final: Table, explained: Sequence[Explained], known: Mapping[str, Reference]
 ) -> dict[str, float]:
     """Return the final table as it would be without the mistakes found in it."""
-    corrected = {name: float(typed) for name, typed in final.items()}
+    corrected = {name: float(typed) for name, typed in final.items() if typed}
     for one in explained:
         inside = [n for n in one.names if n in one.mistake.predicted]
         for name in inside if one.table == "final" else ():
@@ -291,11 +291,12 @@ def _impossible_flag(
     table: Table, names: Sequence[str], known: Mapping[str, Reference], label: str
 ) -> Flag:
     name = names[0]
+    hint = "is a sign wrong?" if table[name] else "type as many digits as show how large it is."
     return Flag(
         code="physically_impossible",
         parameters=tuple(names),
         message=f"{name} = {table[name]}: gains, frequencies and dampings of carts on springs are "
-        "positive; is a sign wrong?",
+        f"positive; {hint}",
         evidence=_evidence(name, table[name], known.get(name), label),
     )
 

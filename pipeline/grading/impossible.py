@@ -3,11 +3,10 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from decimal import Decimal
-from fractions import Fraction
 
 from pipeline.grading.grade import Flag
 from pipeline.grading.orders import orders
-from pipeline.grading.tolerance import half_digit
+from pipeline.grading.tolerance import rounding
 
 # How far an order may be broken: fitted numbers are good to some percent, and first estimates of
 # resonances and nulls are read off a plot.
@@ -59,8 +58,8 @@ class BrokenOrder:
 
 
 def not_positive(table: Mapping[str, Decimal]) -> list[str]:
-    """Return the parameters that are zero or negative beyond their rounding."""
-    return [name for name, typed in table.items() if Fraction(typed) + half_digit(typed) <= 0]
+    """Return the parameters that are zero or negative."""
+    return [name for name, typed in table.items() if typed <= 0]
 
 
 def broken_orders(table: Mapping[str, Decimal], *, initial: bool) -> list[BrokenOrder]:
@@ -74,8 +73,8 @@ def broken_orders(table: Mapping[str, Decimal], *, initial: bool) -> list[Broken
         low, high = table[lesser], table[greater]
         if low <= 0 or high <= 0:
             continue
-        least = low - Decimal(float(half_digit(low)))
-        most = high + Decimal(float(half_digit(high)))
+        least = low - Decimal(float(rounding(low)))
+        most = high + Decimal(float(rounding(high)))
         if float(least) > slack * float(most):
             broken.append(BrokenOrder(lesser=lesser, greater=greater, reason=reason))
     return broken

@@ -75,7 +75,7 @@ def _evaluate(
     results: dict[str, tuple[str, bool]] = {}
     value = {name: float(typed) for name, typed in final.items()}
     for name in parameter_names(n):
-        results[f"positive.{name}"] = (f"{name} is positive", value[name] + half[name] > 0)
+        results[f"positive.{name}"] = (f"{name} is positive", value[name] > 0)
     for lesser, greater, reason in orders(parameter_names(n)):
         holds = value[lesser] - half[lesser] <= value[greater] + half[greater]
         results[f"order.{lesser}.{greater}"] = (f"{lesser} ≤ {greater} ({reason})", holds)

@@ -91,7 +91,7 @@ def grade_analysis(
     submission, n = submission.model_copy(update={"reported": reported}), rubric.system.carts
     references, chain = recompute(analysis), trusted_chain(analysis)
     diagnosis = diagnose_tables(reported, references=references, analysis=analysis)
-    tables = [{name: float(typed) for name, typed in reported.final.items()}]
+    tables = [{name: float(typed) for name, typed in reported.final.items() if typed}]
     if diagnosis.corrected != tables[0]:
         tables.append(diagnosis.corrected)
     work = Work(

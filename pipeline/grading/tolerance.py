@@ -5,7 +5,10 @@ from fractions import Fraction
 
 from pipeline.grading.reference import Reference
 
-_NO_CREDIT = Fraction(10**6)  # percent; of a number with the wrong sign
+NO_CREDIT = Fraction(10**6)  # percent; of a number that is zero or has the wrong sign
+# The most that rounding may excuse, of the number: that of two digits, 10 for 10.5. One digit says
+# too little of what was measured, and "0e2" nothing at all.
+_MOST_ROUNDING = Fraction(1, 20)
 
 
 def half_digit(typed: Decimal) -> Fraction:
@@ -16,6 +19,11 @@ def half_digit(typed: Decimal) -> Fraction:
     return Fraction(10) ** exponent / 2
 
 
+def rounding(typed: Decimal) -> Fraction:
+    """Return how far rounding may have moved a number: half a digit, at most 5 % of it."""
+    return min(half_digit(typed), _MOST_ROUNDING * abs(Fraction(typed)))
+
+
 def exact(value: float) -> Fraction:
     """Return a number of a rubric as its author typed it: 0.1 is a tenth."""
     return Fraction(repr(value))
@@ -24,12 +32,12 @@ def exact(value: float) -> Fraction:
 def percent_off(typed: Decimal, reference: Reference, *, sigmas: float) -> Fraction:
     """Return how far a number is off its reference, in percent of the smaller of the two.
 
-    5 % is a factor of 1.05 either way. Half a unit of the last digit typed and `sigmas` standard
-    errors of the reference come off first; any value between the reference's bounds is right.
+    5 % is a factor of 1.05 either way. What `rounding` excuses and `sigmas` standard errors of the
+    reference come off first; any value between the reference's bounds is right.
     """
     slack = exact(sigmas) * Fraction(reference.std)
     low, high = Fraction(reference.low) - slack, Fraction(reference.high) + slack
-    half = half_digit(typed)
+    half = rounding(typed)
     least, most = Fraction(typed) - half, Fraction(typed) + half
     if most < low:
         above, below = low, most
@@ -37,7 +45,7 @@ def percent_off(typed: Decimal, reference: Reference, *, sigmas: float) -> Fract
         above, below = least, high
     else:
         return Fraction(0)
-    return min(100 * (above / below - 1), _NO_CREDIT) if below > 0 else _NO_CREDIT
+    return min(100 * (above / below - 1), NO_CREDIT) if below > 0 else NO_CREDIT
 
 
 def credit(error: Fraction, *, full: float, none: float) -> Fraction:
