@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
+from tests.waiting import PATIENCE
+
 # The same examples every time, and no verdict on how fast a busy machine is.
 settings.register_profile(
     "cartlab", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
@@ -29,10 +31,13 @@ def browser():
     """A real browser; where there is none, what needs it skips."""
     if CHROMIUM is None:
         pytest.skip("no chromium on the path: apt-get install chromium")
-    from playwright.sync_api import sync_playwright
+    from playwright.sync_api import expect, sync_playwright
 
+    expect.set_options(timeout=1e3 * PATIENCE)
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS.split())
+        browser = playwright.chromium.launch(
+            executable_path=CHROMIUM, args=FLAGS.split(), timeout=1e3 * PATIENCE
+        )
         yield browser
         browser.close()
 

@@ -3,7 +3,9 @@
 Served to this computer alone, and only to who has the address: it holds a secret that is made anew
 for every session. Requests that another page makes (by a name that leads here, or from an origin
 of its own) are refused. The server runs in a thread of its own and looks for news a few times a
-second, so however slow a browser reads, the acquisition never waits.
+second, so however slow a browser reads, the acquisition never waits. Anybody on this computer can
+connect: those who have not shown the secret share a few connections, so that the files and ports of
+the acquisition never lack a descriptor.
 """
 
 import asyncio
@@ -25,6 +27,7 @@ from starlette.responses import PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn import Config, Server
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from pipeline.bench.live_state import LiveState
 from pipeline.errors import HardwareError
@@ -34,7 +37,9 @@ _FRAME = 1 / 30  # s between looks for news
 _ALIVE = 5.0  # s between signs of life where there is none
 _MOST_PAGES = 8  # open at a time; each costs a little of the processor
 _LARGEST_ANSWER = 200  # bytes of what a button sends
-_START_UP = 5.0  # s
+_MOST_STRANGERS = 16  # connections without the secret; the newest drives out the oldest
+_TO_SHOW_IT = 5.0  # s a stranger may stay
+_BACKLOG = 32  # connections accepted at once, before any can be driven out
 _GOODBYE = 1.0  # s for open pages to hear that the session is over
 
 _FILES = {
@@ -85,9 +90,13 @@ class LivePage(LiveState):
             Route("/confirm", self._confirm, methods=["POST"]),
             Route("/{name}", self._file),
         ]
-        app = _Guard(Starlette(routes=routes), token=token, port=port)
+        strangers = _Strangers()
+        app = _Guard(Starlette(routes=routes), token=token, port=port, strangers=strangers)
         config = Config(
             app,
+            http=_protocol(strangers),
+            backlog=_BACKLOG,
+            proxy_headers=False,  # a peer is who it is, whatever it says of itself
             log_config=None,
             log_level="critical",  # nothing that holds the address is written anywhere
             access_log=False,
@@ -103,11 +112,11 @@ class LivePage(LiveState):
 
     def __enter__(self) -> Self:
         self._thread.start()
-        for _ in range(round(_START_UP / 0.01)):
-            if self._server.started:
-                return self
+        while not self._server.started:
+            if not self._thread.is_alive():
+                raise HardwareError("the page could not be served")
             time.sleep(0.01)
-        raise HardwareError("the page could not be served")
+        return self
 
     def __exit__(
         self,
@@ -177,11 +186,50 @@ def _event(kind: str, data: Mapping[str, object]) -> str:
     return f"event: {kind}\ndata: {text}\n\n"
 
 
+class _Strangers:
+    """The connections over which nobody has shown the secret yet: few, and not for long."""
+
+    def __init__(self) -> None:
+        # By address, the oldest first; each has a timer that ends its stay.
+        self._there: dict[object, tuple[asyncio.Transport, asyncio.TimerHandle]] = {}
+
+    def add(self, transport: asyncio.Transport) -> None:
+        """Take in a new one; the oldest goes where there are too many."""
+        peer = transport.get_extra_info("peername")
+        self.know(peer)  # an earlier one from the same address is closed already
+        timer = asyncio.get_running_loop().call_later(_TO_SHOW_IT, self._turn_out, peer)
+        self._there[peer] = transport, timer
+        if len(self._there) > _MOST_STRANGERS:
+            self._turn_out(next(iter(self._there)))
+
+    def know(self, peer: object) -> None:
+        """Let one stay: the secret was shown."""
+        if peer in self._there:
+            self._there.pop(peer)[1].cancel()
+
+    def _turn_out(self, peer: object) -> None:
+        transport, _ = self._there[peer]
+        self.know(peer)
+        transport.abort()
+
+
+def _protocol(strangers: _Strangers) -> type[asyncio.Protocol]:
+    """Return HTTP that tells of each connection as it is made."""
+
+    class Announced(H11Protocol):
+        def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+            super().connection_made(transport)
+            strangers.add(transport)
+
+    return Announced
+
+
 class _Guard:
     """Lets in who knows the secret, asks by this computer's own name and is no other page."""
 
-    def __init__(self, app: ASGIApp, *, token: str, port: int) -> None:
+    def __init__(self, app: ASGIApp, *, token: str, port: int, strangers: _Strangers) -> None:
         self._app, self._token = app, f"{token}/"  # links of the page go on from the slash
+        self._strangers = strangers
         self._hosts = {f"127.0.0.1:{port}", f"localhost:{port}"}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -195,6 +243,7 @@ class _Guard:
         if refusal := self._refusal(headers, method=scope["method"], token=token + slash):
             await PlainTextResponse(refusal, status_code=403)(scope, receive, guarded)
             return
+        self._strangers.know(scope["client"])
         await self._app({**scope, "path": f"/{inside}"}, receive, guarded)
 
     def _refusal(self, headers: Headers, *, method: str, token: str) -> str:
