@@ -300,7 +300,10 @@ class ChainFit:
 
 @dataclass(frozen=True, kw_only=True)
 class ParameterRow:
-    """A line of the paper's Tables 1-3. `consistent` is None where there is nothing to compare."""
+    """A line of the paper's Tables 1-3.
+
+    `consistent` is None where there is nothing to compare, or errors too wide to tell.
+    """
 
     name: str
     unit: str

@@ -23,6 +23,7 @@ from pipeline.results import (
 )
 from pipeline.stages.bode_fit import fit_bode
 from pipeline.stages.compare import (
+    NOT_IDENTIFIED,
     check_chain,
     check_decays,
     check_rows,
@@ -147,8 +148,7 @@ def analyse(
         *check_decays(decays, position_unit=system.position.unit),
         *check_steps(gains, gain_unit=f"{system.position.unit}/{system.input.unit}"),
     ]
-    if fit:
-        checks += check_chain(fit, springs=springs)
+    checks += check_chain(fit, springs=springs) if fit else [NOT_IDENTIFIED]
 
     feedback = None
     if design:
@@ -375,14 +375,9 @@ def reference_design(submission: Submission, fit: ChainFit | None) -> FeedbackDe
 
 
 def _design(submission: Submission, fit: ChainFit | None, *, log: _Log) -> FeedbackDesign | None:
-    if submission.design is None and fit is not None and fit.converged:
-        task = Design(cart=submission.system.carts)
-        log.warn(
-            [
-                "no [design] in submission.toml: the controller is designed for cart "
-                f"{task.cart}, {task.overshoot_percent:g} % overshoot, {task.settling_time:g} s"
-            ]
-        )
+    if submission.design is None:
+        log.skip("state feedback", "no goal is stated: add a [design] table to submission.toml")
+        return None
     return log.attempt("state feedback", reference_design, submission, fit)
 
 

@@ -146,6 +146,14 @@ def test_whole_ecp_values_without_a_scale_are_counts(tmp_path):
     assert_array_equal(record.position(1), X1)
 
 
+@pytest.mark.parametrize(("system", "said"), [("", True), ('position = { unit = "cm" }', False)])
+def test_fractions_of_a_count_are_noticed(system, said, tmp_path):
+    """Whoever forgets the unit is told so: an encoder has no fractions of a count."""
+    data = read(tmp_path, system, STEP, csv(time=T, input=U, x1=Y[0] / 440, x2=Y[1] / 440))
+    notes = " ".join(data.records[0].notes)
+    assert ("fractions" in notes) == said
+
+
 def bench_log(effort: np.ndarray) -> str:
     """Write the bench's own tab-separated log."""
     lines = ["Sample\tTime\tEncoder 1 Pos\tEncoder 2 Pos\tControl Effort"]

@@ -101,9 +101,18 @@ def test_decays_alone_end_in_reasons_not_in_a_crash(tmp_path):
     assert analysis.chain is None
     stages = {skip.stage for skip in analysis.skipped}
     assert {"final estimates", "state feedback", "hardware check"} <= stages
+    assert "fit.identified" in {check.id for check in analysis.checks if check.outcome == "fail"}
     assert "null" in results_text(analysis)
     initial = {row.name: row.initial.value for row in analysis.rows if row.initial}
     assert math.isclose(initial["omega_2"], 32.926, rel_tol=1e-3)
+
+
+def test_no_controller_is_designed_for_a_goal_that_nobody_stated():
+    """Without [design] there is no feedback, and the reason is given."""
+    submission = load_submission(EXAMPLES / "one-cart").model_copy(update={"design": None})
+    analysis = analyse(submission)
+    assert analysis.feedback is None
+    assert [skip.stage for skip in analysis.skipped] == ["state feedback"]
 
 
 def test_the_design_can_be_left_out_and_had_later(analyses):

@@ -273,6 +273,13 @@ def _position_scale(table: Table, column: Column, system: System, notes: list[st
             f"{table.source}: {column.name!r} holds encoder counts; state how many {unit} one "
             f"count is: position = {{ unit = {unit!r}, per_count = … }}"
         )
+    values = table.values[column.index]
+    if unit.rstrip("s") == "count" and column.unit is None and np.any(values != np.round(values)):
+        notes.append(
+            f"{column.name!r} holds fractions, yet no length unit is stated and so they count as "
+            'encoder counts: state position = { unit = "…" }'
+        )
+        return 1.0
     return _unit_scale(column, unit, notes)
 
 

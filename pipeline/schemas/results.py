@@ -33,7 +33,9 @@ class Parameter(Document):
     final_from: Annotated[str | None, Field(description="bode_fit or time_fit")]
     change_percent: Number
     change_sigmas: Annotated[Number, Field(description="in combined standard errors")]
-    consistent: Annotated[bool | None, Field(description="null: nothing to compare")]
+    consistent: Annotated[
+        bool | None, Field(description="null: nothing to compare, or too uncertain")
+    ]
     note: str
 
 

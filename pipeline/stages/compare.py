@@ -15,6 +15,7 @@ from pipeline.results import (
     Check,
     Estimate,
     LogDecrement,
+    Outcome,
     ParameterRow,
     Record,
     StepGain,
@@ -24,7 +25,8 @@ from pipeline.results import (
 # (one null, read off by eye, by 29 %), damping ratios by half and more.
 GAIN_AND_FREQUENCY_LIMIT = 15.0  # percent
 DAMPING_LIMIT = 50.0  # percent
-SIGMA_LIMIT = 3.0  # combined standard errors: below, a difference is chance
+SIGMA_LIMIT = 3.0  # combined standard errors: below, a difference may be chance
+_UNDECIDED = "the two estimates are too uncertain to agree or to disagree"
 REDUNDANCY_LIMIT = 1e-9  # two routes to one number through unrounded values
 CHI_SQUARE_LIMIT = 2.0  # by chance under 1.5 with 30 points and more; errors of 40 % give 2
 HELD_SHARE = 0.2  # of a held cart's swing: a free one that moves less is not the free one
@@ -51,8 +53,9 @@ def compare(
             percent = 100 * (after.value - before.value) / abs(before.value)
             if before.source != "assumed":
                 sigmas = _combined_sigmas(before, after)
-                limit = _limit(name)
-                consistent = abs(percent) <= limit or (sigmas is not None and sigmas <= SIGMA_LIMIT)
+                consistent = abs(percent) <= _limit(name)
+                if not consistent and sigmas is not None and sigmas <= SIGMA_LIMIT:
+                    consistent, note = None, _UNDECIDED
         rows.append(
             ParameterRow(
                 name=name,
@@ -83,19 +86,24 @@ def _combined_sigmas(before: Estimate, after: Estimate) -> float | None:
 
 
 def check_rows(rows: Sequence[ParameterRow]) -> list[Check]:
-    """Judge every parameter that was measured in two ways."""
+    """Judge every parameter that was measured in two ways; a wide error is no agreement."""
+    verdicts: dict[bool | None, tuple[Outcome, str]] = {
+        True: ("pass", "agree"),
+        False: ("fail", "disagree"),
+        None: ("skip", "are too uncertain to compare"),
+    }
     checks = []
     for row in rows:
-        if row.consistent is None or row.change_percent is None:
+        if row.change_percent is None or (row.consistent is None and row.change_sigmas is None):
             continue
         limit = _limit(row.name)
-        verdict = "agree" if row.consistent else "disagree"
+        outcome, verdict = verdicts[row.consistent]
         sigmas = "" if row.change_sigmas is None else f", {row.change_sigmas:.1f} standard errors"
-        advice = "" if row.consistent else _advice(row)
+        advice = _advice(row) if outcome == "fail" else ""
         checks.append(
             Check(
                 id=f"initial_final.{row.name}",
-                outcome="pass" if row.consistent else "fail",
+                outcome=outcome,
                 value=abs(row.change_percent),
                 limit=limit,
                 message=f"Initial and final {row.name} {verdict}: "
@@ -191,6 +199,15 @@ def check_setup(records: Sequence[Record]) -> list[Check]:
             )
         )
     return checks
+
+
+NOT_IDENTIFIED = Check(
+    id="fit.identified",
+    outcome="fail",
+    value=None,
+    limit=None,
+    message="No model was identified: the reasons are among what was skipped.",
+)
 
 
 def check_chain(fit: ChainFit, *, springs: Sequence[bool]) -> list[Check]:
