@@ -1,5 +1,6 @@
 """Shared recordings: found however disguised, and never where two teams only used one bench."""
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -140,6 +141,35 @@ def test_earlier_batches_count(teams):
     flag = shared_flag(found["a"])
     assert flag.parameters == tuple(r.id for r in teams[0][:4])
     assert "does not say whose" in flag.message
+
+
+def test_a_recording_under_many_names_is_compared_once(teams):
+    """Two hand-ins of a thousand names for one file cost no more than two recordings."""
+    record = of_kind(teams[0], "decay")
+    many = [replace(record, id=f"decay-{number}") for number in range(1_000)]
+    a, b = prints("a", many), prints("b", many)
+    assert len(unpack(a.fingerprints)) == 1_000
+    assert sum(one.residual.size for one in unpack(a.fingerprints)) <= 2_000_000
+    start = time.process_time()
+    found = find_shared([a, b])
+    assert time.process_time() - start < 10  # s; all of them held against all: an hour
+    assert [r.experiment for r in found["a"]] == ["decay-0"]
+
+
+@pytest.mark.parametrize("alike", ["cuts of one run", "one hum in all"])
+def test_the_cost_grows_with_the_recordings_not_their_square(teams, alike):
+    """Two hand-ins made to look alike everywhere take no longer than their number asks."""
+    rng = np.random.default_rng(5)
+    record = of_kind(teams[0], "decay")
+    if alike == "cuts of one run":
+        made = lambda: disguised(record, rng, noise=0.01, keep=0.8)  # noqa: E731
+    else:
+        hum = np.resize(3 * COUNT * rng.standard_normal(37), record.t.size)
+        made = lambda: disguised(replace(record, y=record.y + hum), rng, noise=1.0)  # noqa: E731
+    batch = [prints(name, [replace(made(), id=str(k)) for k in range(100)]) for name in "ab"]
+    start = time.process_time()
+    find_shared(batch)
+    assert time.process_time() - start < 15  # s
 
 
 @pytest.mark.parametrize("kind", ["step", "decay"])

@@ -36,6 +36,7 @@ _MOST_ANCHORS = 12  # in the motion
 _NOISE_ANCHORS, _APART = 6, 5  # samples
 _FEWEST_SAMPLES = 60
 _MOST_SAMPLES = 8192  # of one record; more does not make it surer
+_MOST_VALUES = 2_000_000  # of one submission: sixty such records of four carts
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -65,7 +66,9 @@ class Print:
 
 def fingerprint(records: Sequence[Record]) -> bytes:
     """Return the fingerprints of a submission's recordings, packed; b"" where there are none."""
-    prints = [found for record in records for found in _prints(record)]
+    rows = sum(len(record.carts) + 1 for record in records)
+    most = min(_MOST_SAMPLES, _MOST_VALUES // max(rows, 1))
+    prints = [found for record in records for found in _prints(record, most=most)]
     if not prints:
         return b""
     heads = [
@@ -106,7 +109,7 @@ def unpack(packed: bytes) -> tuple[Print, ...]:
     return tuple(prints)
 
 
-def _prints(record: Record) -> Iterator[Print]:
+def _prints(record: Record, *, most: int) -> Iterator[Print]:
     """Yield the fingerprints of a recording: of its motion, and of an input made of its noise.
 
     None where nothing moves or it is too short. Under feedback the controller puts the noise of
@@ -117,14 +120,15 @@ def _prints(record: Record) -> Iterator[Print]:
         return
     frequency = "" if record.omega is None else f"{record.omega / (2 * np.pi):.3g} Hz"
     group = f"{record.kind} {','.join(map(str, carts))} {frequency}"
-    yield from _print(record, [record.position(cart) for cart in carts], group=group)
+    positions = [record.position(cart) for cart in carts]
+    yield from _print(record, positions, group=group, most=most)
     if record.kind == "closed_loop" and record.u is not None:
-        yield from _print(record, [record.u], group=f"{group}input")
+        yield from _print(record, [record.u], group=f"{group}input", most=most)
 
 
-def _print(record: Record, signals: Sequence[Array], *, group: str) -> Iterator[Print]:
+def _print(record: Record, signals: Sequence[Array], *, group: str, most: int) -> Iterator[Print]:
     """Yield the fingerprint of some signals of a recording; none where one has no noise."""
-    y = np.array(signals)[:, : _MOST_SAMPLES + 2 * MARGIN]
+    y = np.array(signals)[:, : most + 2 * MARGIN]
     noise = np.array([np.convolve(row, _high_pass(), "valid") for row in y])
     sigma = np.array(
         [_sigma(one, travel=float(np.ptp(row))) for one, row in zip(noise, y, strict=True)]
