@@ -258,11 +258,16 @@ class FrequencyResponse:
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """A number with its standard error and where it comes from ("step", "log_decrement", …)."""
+    """A number with its standard error and where it comes from ("step", "log_decrement", …).
+
+    `at_bound`: a fit ended at the bound of what is possible (a damping of zero), so `value` is
+    that bound and no measurement, `std` is None, and nothing may be concluded from either.
+    """
 
     value: float
     std: float | None
     source: str
+    at_bound: bool = False
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -273,8 +278,12 @@ class ChainFit:
     ----------
     method : "bode_fit" (frequency response) or "time_fit" (time records).
     chain : the fitted plant.
-    names : physical parameters that were free ("m_1", "c_1", "k_2", …); covariance (n_p, n_p).
-    parameters : the named parameters of the chain with standard errors, in table order.
+    names : physical parameters that have a standard error ("m_1", "c_1", "k_2", …).
+    covariance : (n_p, n_p) of those.
+    at_bound : physical parameters that the fit's own data put at their bound, zero: held there, or
+        taken from the decays where those tell.
+    parameters : the named parameters of the chain with standard errors, in table order. One that
+        ended at its bound says so (`Estimate.at_bound`) and is in no table.
     staged : the named parameters the stage-by-stage fit (last cart first) found, for the report.
     chi_square_per_dof : near 1 where model and stated noise explain the data.
     standardised : per cart (n_w,) or per record (n,): residual over its standard error.
@@ -284,6 +293,7 @@ class ChainFit:
     chain: Chain
     names: tuple[str, ...]
     covariance: Array
+    at_bound: tuple[str, ...] = ()
     parameters: dict[str, Estimate]
     staged: dict[str, float] = field(default_factory=dict)
     chi_square_per_dof: float

@@ -23,6 +23,7 @@ from pipeline.results import (
 )
 from pipeline.stages.bode_fit import fit_bode
 from pipeline.stages.compare import (
+    AT_BOUND,
     NOT_IDENTIFIED,
     check_chain,
     check_decays,
@@ -135,6 +136,9 @@ def analyse(
     final = fit.parameters if fit else {}
     if fit and not final:
         log.skip("named parameters", _UNTIED)
+    for name, estimate in final.items():
+        if estimate.at_bound:
+            log.skip(f"final {name}", AT_BOUND)
     rows = compare(
         initial,
         final=final,
@@ -340,7 +344,15 @@ def _fit(
     has_points = any(response.source != "records" for response in responses)
     if has_points:
         values = {name: estimate.value for name, estimate in initial.items()}
-        fit = log.attempt("Bode fit", fit_bode, responses, n=n, springs=springs, initial=values)
+        fit = log.attempt(
+            "Bode fit",
+            fit_bode,
+            responses,
+            n=n,
+            springs=springs,
+            initial=values,
+            decays=_decay_dampings(initial, n=n),
+        )
         if fit:
             return fit
     if not driven:
@@ -348,6 +360,16 @@ def _fit(
         log.skip("final estimates", f"{found} step or sweep with all carts free to fit them to")
         return None
     return log.attempt("final estimates", fit_records, driven, n=n, springs=springs)
+
+
+def _decay_dampings(initial: dict[str, Estimate], *, n: int) -> dict[int, Estimate]:
+    """Return by cart the damping ratio it has alone, as far as decays tell."""
+    own = {cart: initial.get("zeta" if n == 1 else f"zeta_{cart}") for cart in range(1, n + 1)}
+    return {
+        cart: zeta
+        for cart, zeta in own.items()
+        if zeta and zeta.source == "log_decrement" and zeta.value > 0 and zeta.std
+    }
 
 
 def reference_design(submission: Submission, fit: ChainFit | None) -> FeedbackDesign:

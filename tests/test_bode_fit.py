@@ -12,7 +12,7 @@ from scipy.stats import binom
 from benchmarks.identification import PAPER_STARTS, converged_share, measure, quality
 from pipeline.errors import DataError
 from pipeline.plant.chain import PRESETS, Array, Chain
-from pipeline.results import FrequencyResponse
+from pipeline.results import Estimate, FrequencyResponse
 from pipeline.stages.bode_fit import fit_bode
 
 BENCH_BAND = 2 * np.pi * np.geomspace(0.3, 7.0, 30)
@@ -199,6 +199,70 @@ def test_a_far_spring_and_a_damper_that_are_not_there_are_held_at_zero():
     assert_allclose(got.chain.k, loose.k, atol=1e-5)
     assert_allclose(got.chain.c, loose.c, atol=1e-7)
     assert_allclose(got.parameters["K_1"].value, got.parameters["K_2"].value, rtol=1e-4)
+
+
+# Beside a peak so sharp that none of six points sees its damping.
+SHARP = Chain(m=np.array([2e-3]), c=np.array([0.0]), k=np.array([0.6, 0.0]))
+BESIDE = np.sqrt(300.0) * np.array([0.4, 0.6, 0.8, 1.25, 1.5, 2.0])
+
+
+def test_a_damping_at_its_bound_is_no_measurement():
+    """Held at zero, it says so and has no standard error; gain and frequency are known."""
+    got = fit_bode(exact(SHARP, BESIDE), n=1, springs=(True, True))
+
+    assert got.at_bound == ("c_1",)
+    zeta = got.parameters["zeta"]
+    assert (zeta.value, zeta.std, zeta.at_bound) == (0.0, None, True)
+    assert not got.parameters["K"].at_bound
+    assert_allclose(got.parameters["omega_n"].value, np.sqrt(300.0), rtol=1e-4)
+
+
+def test_what_rests_on_a_damping_at_its_bound_is_known_no_better_than_it():
+    """One of two dampings at zero: the modes keep an error that allows for it on both sides."""
+    chain = replace(PRESETS["throne-2dof"], c=np.array([6e-4, 0.0]))
+    got = fit_bode(exact(chain), n=2, springs=(False, True, True))
+
+    assert got.at_bound == ("c_2",)
+    assert got.parameters["zeta_2"].at_bound
+    row = got.names.index("c_2")
+    damping_std = float(np.sqrt(got.covariance[row, row]))
+    # Of the second mode's damping rate, c_2 has the share of its kinetic energy: over a third.
+    std = got.parameters["zeta_b"].std
+    assert std is not None
+    assert std > 0.3 * damping_std / (2 * chain.m[1] * got.parameters["omega_b"].value)
+
+
+def test_the_decay_tells_a_damping_that_the_response_leaves_open():
+    """Six points beside a sharp peak allow any small damping, so the decay's is the answer."""
+    decay = Estimate(value=0.017, std=0.0005, source="log_decrement")
+    got = fit_bode(exact(SHARP, BESIDE), n=1, springs=(True, True), decays={1: decay})
+
+    zeta = got.parameters["zeta"]
+    assert zeta.std is not None
+    assert_allclose([zeta.value, zeta.std], [0.017, 0.0005], rtol=0.02)
+    assert (zeta.source, zeta.at_bound, got.at_bound) == ("log_decrement", False, ("c_1",))
+    assert_allclose(got.chain.zeta_carts, 0.017, rtol=0.02)
+
+
+def test_a_decay_that_the_response_rules_out_is_not_used():
+    """Points on a peak of 1 in 1000 damping contradict 0.05: the two are not mixed."""
+    undamped = exact(SHARP, np.sqrt(300.0) * np.array([0.5, 0.9, 0.99, 0.998, 1.002, 1.01, 1.1]))
+    decay = Estimate(value=0.05, std=0.001, source="log_decrement")
+    got = fit_bode(undamped, n=1, springs=(True, True), decays={1: decay})
+
+    assert got.parameters["zeta"].at_bound
+    assert got.chain.c[0] == 0
+
+
+def test_a_decay_is_not_used_where_the_response_tells():
+    """Initial and final estimate then come from different data."""
+    responses = noisy("throne-1dof")
+    decay = Estimate(value=0.3, std=1e-4, source="log_decrement")
+    alone, given = (
+        fit_bode(responses, n=1, springs=(True, True), decays=decays)
+        for decays in (None, {1: decay})
+    )
+    assert given.parameters == alone.parameters
 
 
 def test_a_spring_known_to_be_missing_is_not_fitted():

@@ -183,6 +183,16 @@ def test_frequency_response_of_a_preset_by_python_control():
     assert_allclose(chain.frequency_response(omega), expected, rtol=1e-9)
 
 
+def test_the_response_at_an_undamped_pole_is_infinite():
+    """Exactly there and nowhere else, whatever the number of carts."""
+    one = Chain(m=np.array([1.0]), c=np.array([0.0]), k=np.array([4.0, 0.0]))
+    two = Chain(m=np.ones(2), c=np.zeros(2), k=np.array([1.0, 1.5, 1.0]))
+    for chain in (one, two):
+        got = chain.frequency_response(np.array([1.5, 2.0, 2.5]))
+        assert np.isfinite(got[:, [0, 2]]).all()
+        assert np.isinf(got[:, 1]).all()
+
+
 @given(chains())
 @settings(max_examples=30)
 def test_transfer_function_is_gain_and_tails(chain):

@@ -76,6 +76,33 @@ def test_a_wide_error_makes_no_agreement(std, outcome):
     assert check.outcome == outcome
 
 
+def test_a_final_value_at_its_bound_is_none():
+    """A damping that the fit holds at zero is no number for the table, and nothing is judged."""
+    final = Estimate(value=0.0, std=None, source="bode_fit", at_bound=True)
+    (row,) = compare(
+        {"zeta": _estimate(0.017, 1e-4, "log_decrement")},
+        final={"zeta": final},
+        names=["zeta"],
+        position_unit="cm",
+        input_unit="V",
+    )
+    assert (row.final, row.consistent, row.change_percent) == (None, None, None)
+    assert "bound" in row.note
+
+
+def test_an_estimate_is_not_compared_with_itself():
+    """Where the final damping rests on the decay too, there are not two ways to compare."""
+    (row,) = compare(
+        {"zeta": _estimate(0.017, 1e-4, "log_decrement")},
+        final={"zeta": _estimate(0.017, 1e-4, "log_decrement")},
+        names=["zeta"],
+        position_unit="cm",
+        input_unit="V",
+    )
+    assert row.final is not None
+    assert (row.consistent, row.change_percent) == (None, None)
+
+
 def test_an_assumed_value_is_never_judged():
     """The paper's ζ = 0.1 is a guess: the change is shown, no verdict is given."""
     row = _row(0.1, 0.03, name="zeta_b", source="assumed")

@@ -10,16 +10,18 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import psutil
 import pytest
 
+from pipeline.grading import feedback_figures
 from pipeline.grading.grade import grade_text
 from pipeline.grading.gradebook import Gradebook
 from pipeline.grading.intake import find_hand_ins
 from pipeline.grading.load import load_rubric
 from pipeline.grading.outputs import write_outputs
 from pipeline.grading.runner import Limits, grade_batch, run_here
-from pipeline.grading.worker import Setup, Task
+from pipeline.grading.worker import Setup, Task, grade_task
 from pipeline.grading.worker_process import Worker
 from pipeline.synthesis import write_submission
 
@@ -136,6 +138,23 @@ def test_a_crash_costs_one_row_and_the_worker_is_replaced(task, setup):
     assert "the grader crashed" in outcome.reason
     assert worker.run(task).status == "graded"
     worker.close()
+
+
+def test_a_grade_stands_where_its_figures_fail(school, tmp_path, monkeypatch):
+    """The row has its points and no figure; the next run tries again."""
+
+    def undrawable(*_):
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    monkeypatch.setattr(feedback_figures, "draw_figures", undrawable)
+    (hand_in, *_) = find_hand_ins([school], scratch=tmp_path)
+    sources = tuple(str(source) for source in hand_in.sources)
+    task = Task(id=hand_in.id, key="", sources=sources)
+    outcome = grade_task(task, rubric=RUBRIC, scratch=tmp_path, figures=True)
+
+    assert (outcome.status, outcome.figures, outcome.settled) == ("graded", (), False)
+    assert json.loads(outcome.grade)["points"] > 0
+    assert "Singular matrix" in outcome.detail
 
 
 def test_what_this_machine_fails_at_is_tried_again(task, setup, tmp_path):

@@ -222,6 +222,23 @@ def test_a_body_on_no_spring_has_mass_and_damping():
     assert "held at zero, their bound: k_1" in fit.message
 
 
+def test_a_damping_at_its_bound_is_no_measurement():
+    """An undamped cart's step: held at zero or not, the damping is never known to be zero."""
+    chain = Chain(m=np.array([2e-3]), c=np.array([0.0]), k=np.array([0.6, 0.0]))
+    fits = [
+        fit_records([step_record(chain, rng=np.random.default_rng(seed))], n=1, springs=(True,) * 2)
+        for seed in range(6)
+    ]
+    held = [fit for fit in fits if fit.at_bound]
+    assert held
+    for fit in held:
+        zeta = fit.parameters["zeta"]
+        assert (zeta.value, zeta.std, zeta.at_bound) == (0.0, None, True)
+        assert fit.at_bound == ("c_1",)
+        assert fit.names == ("m_1", "c_1", "k_1")  # with a standard error of its own
+        assert fit.covariance[1, 1] > 0
+
+
 def test_a_spring_that_is_not_there_is_held_at_zero():
     """The last spring, expected but missing, is found to be zero and said to be held there."""
     rng = np.random.default_rng(1)

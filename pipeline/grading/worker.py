@@ -82,6 +82,7 @@ def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = Fal
                 submission, rubric=rubric, name=task.id, days_late=task.days_late
             )
             records = graded.analysis.records if graded.analysis else ()
+            drawn, detail = _figures(submission, graded) if figures else ((), "")
             return Outcome(
                 submission=task.id,
                 authors=graded.grade.authors,
@@ -91,8 +92,10 @@ def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = Fal
                 days_late=task.days_late,
                 grade=grade_text(graded.grade),
                 fingerprints=fingerprint(records),
-                figures=_figures(submission, graded) if figures else (),
+                figures=drawn,
                 owner=task.owner,
+                settled=not detail,
+                detail=detail,
             )
     except Changed:  # by whoever synchronises the folder, say
         reason, settled = "its files changed while the class was graded: grade it again", False
@@ -104,16 +107,26 @@ def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = Fal
         reason, settled = OUT_OF_MEMORY, False
     except Exception as error:  # of ours, or of a library: a mended one is to have its try
         reason = f"the grader failed: {type(error).__name__}: {quote(str(error))}"
-        detail, settled = traceback.format_exc()[-_DETAIL:], False
+        detail, settled = _traceback(), False
     return failed(
         task, reason, authors=authors, out_of=rubric.out_of, settled=settled, detail=detail
     )
 
 
-def _figures(submission: Submission, graded: Graded) -> tuple[tuple[str, str], ...]:
+def _figures(submission: Submission, graded: Graded) -> tuple[tuple[tuple[str, str], ...], str]:
+    """Return the figures; or none and why: a grade stands whatever happens to its pictures."""
     from pipeline.grading.feedback_figures import draw_figures  # costs half a second at first
 
-    return draw_figures(graded.analysis, submission.reported) if graded.analysis else ()
+    if graded.analysis is None:
+        return (), ""
+    try:
+        return draw_figures(graded.analysis, submission.reported), ""
+    except Exception:
+        return (), _traceback()
+
+
+def _traceback() -> str:
+    return traceback.format_exc()[-_DETAIL:]
 
 
 def failed(

@@ -139,7 +139,10 @@ class Chain:
         return bool(np.all(from_left | from_right))
 
     def frequency_response(self, omega: Array) -> ComplexArray:
-        """Return X_i/U at `omega` (n_w,), rad/s; shape (n, n_w), position unit per input unit."""
+        """Return X_i/U at `omega` (n_w,), rad/s; shape (n, n_w), position unit per input unit.
+
+        At a pole without damping the response is infinite.
+        """
         s = 1j * np.asarray(omega, dtype=np.float64)
         eye = np.eye(self.n)
         Z = (
@@ -147,8 +150,12 @@ class Chain:
             + s[:, None, None] * (self.c * eye)
             + (s**2)[:, None, None] * (self.m * eye)
         )
+        at_pole = np.linalg.slogdet(Z).sign == 0
+        Z[at_pole] = eye
         force = np.broadcast_to(eye[:, :1], (s.size, self.n, 1))
-        return np.linalg.solve(Z, force)[:, :, 0].T.astype(np.complex128)
+        G = np.linalg.solve(Z, force)[:, :, 0].astype(np.complex128)
+        G[at_pole] = np.inf
+        return G.T
 
     # ------------------------------------------------------ the map to names
 

@@ -1,7 +1,7 @@
 """What the Bode fit compares: the measured points in one row, and the chain's response at them."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import DataError
 from pipeline.plant.chain import Array, ComplexArray
-from pipeline.results import FrequencyResponse
+from pipeline.results import Estimate, FrequencyResponse
 from pipeline.stages.chain_parameters import Parametrisation
 
 Scale = Literal["log", "magnitude", "polar"]
@@ -21,7 +21,10 @@ _PHASE_KNOWN = 0.5  # rad; a worse phase tells nothing
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Points:
-    """All measured points in one row (N,); `at` and `cart` index frequency and cart (from 0)."""
+    """All measured points in one row (N,); `at` and `cart` index frequency and cart (from 0).
+
+    `decays`: what decays say of a cart's own damping ratio, by cart (from 1), one more point each.
+    """
 
     omega: Array  # (n_w,) the distinct frequencies
     at: NDArray[np.intp]
@@ -31,6 +34,7 @@ class Points:
     unit: ComplexArray  # exp(-i phase), 1 where not known
     phase_std: Array  # infinite where not known
     from_table: bool
+    decays: Mapping[int, Estimate] = field(default_factory=dict)
 
     @classmethod
     def collect(cls, responses: Sequence[FrequencyResponse], *, n: int) -> "Points":
@@ -113,9 +117,40 @@ def response_at(
 
 
 def weighted_residuals(
-    data: Points, scale: Scale, G: ComplexArray, dG: ComplexArray
+    P: Parametrisation, data: Points, scale: Scale, physical: Array
 ) -> tuple[Array, Array]:
     """Return the weighted residuals (model minus measured) and their slopes by p."""
+    G, dG = response_at(P, data, physical)
+    r, J = _response_residuals(data, scale, G, dG)
+    if not data.decays:
+        return r, J
+    own, slopes = _decay_residuals(P, data.decays, physical)
+    return np.concatenate([r, own]), np.vstack([J, slopes])
+
+
+def _decay_residuals(
+    P: Parametrisation, decays: Mapping[int, Estimate], physical: Array
+) -> tuple[Array, Array]:
+    """Return ln ζ_i over the decay's, in standard errors, and its slopes; ζ² = c² / 4mk."""
+    chain = P.chain(physical)
+    residuals, slopes = [], []
+    for cart, measured in decays.items():
+        i, weight = cart - 1, measured.value / (measured.std or np.inf)
+        held = chain.k[i] + chain.k[i + 1]
+        by_name = {
+            f"c_{cart}": 1 / chain.c[i],
+            f"m_{cart}": -0.5 / chain.m[i],
+            f"k_{cart}": -0.5 / held,
+            f"k_{cart + 1}": -0.5 / held,
+        }
+        residuals.append(weight * np.log(chain.zeta_carts[i] / measured.value))
+        slopes.append([weight * by_name.get(name, 0.0) for name in P.names])
+    return np.array(residuals), np.array(slopes)
+
+
+def _response_residuals(
+    data: Points, scale: Scale, G: ComplexArray, dG: ComplexArray
+) -> tuple[Array, Array]:
     size = np.abs(G)
     radial = (np.conj(G)[:, None] * dG).real / size[:, None]  # d|G|/dp
     if scale == "log":

@@ -8,12 +8,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from pipeline.errors import DataError
 from pipeline.plant.chain import Array, Chain, recover_chain
-from pipeline.results import ChainFit, FrequencyResponse
+from pipeline.results import ChainFit, Estimate, FrequencyResponse
 from pipeline.stages._bode_points import Points, Scale, response_at, weighted_residuals
 from pipeline.stages.chain_parameters import (
     Parametrisation,
@@ -32,6 +31,7 @@ _NEAR, _PRECISION = 1e-3, 1e-8  # change of the cost to stop at: on the way ther
 _EVALUATIONS = 100  # a fit that gets there takes about ten
 _PHASE_AGREES = 3.0  # times as far off as the magnitudes are: a delay or a wrong sign is further
 _VANISHING = 1e-4  # of its usual size: a damping or far spring that the data put at zero
+_DECAY_AGREES = 9.0  # chi² that a decay may add: as far off by chance, three standard errors
 _RANK = 1e-8  # smallest singular value over the largest, columns in natural sizes
 _SHARES, _SHARE_PRECISION = (1e-6, 10.0), 0.01  # where a missing relative error may lie; ratio
 _WIDENINGS = 3  # fits in turn with the error they call for: it settles to a per cent
@@ -45,13 +45,15 @@ def fit_bode(
     n: int,
     springs: Sequence[bool],
     initial: Mapping[str, float] | None = None,
+    decays: Mapping[int, Estimate] | None = None,
 ) -> ChainFit:
     """Fit the chain of n carts to measured frequency responses; carts may be missing.
 
     Phases are used where they are given and agree with the magnitudes, else magnitudes alone;
     they are used unasked where the magnitudes are no more than the parameters.
-    A parameter that the data put at or below zero is held there and the others fitted again: the
-    standard errors then hold on both sides of the bound.
+    A parameter that the data put at or below zero is held there and the others fitted again. A few
+    dwells beside a sharp peak leave its damping open down to zero: where the cart's decay tells
+    and does not contradict, its damping ratio is then one point more to fit.
 
     Where the misfit is larger than the points' errors allow, the chain does not describe the bench
     to that precision: a relative error, the same for all points, is added until it does, and
@@ -62,6 +64,7 @@ def fit_bode(
     ----------
     springs : (n + 1,) which springs there are.
     initial : named parameters to start from, as far as known.
+    decays : by cart, the damping ratio it has alone; used only where the responses put it at zero.
 
     Returns
     -------
@@ -92,7 +95,8 @@ def fit_bode(
         else:
             remark = "magnitudes alone: the phases do not agree with them"
     best, share = _widen(best, data)
-    best = _hold_vanished(best, data.widened(share))
+    best, used = _hold_vanished(best, data.widened(share), decays or {})
+    data = replace(data, decays=used)
     return _result(best, data, share=share, staged=staged, tried=tried, remark=remark)
 
 
@@ -185,7 +189,7 @@ def _evaluator(
     def evaluate(theta: Array) -> tuple[Array, Array]:
         if not last or not np.array_equal(last[0][0], theta):
             physical = P.physical(P.unpack(theta))
-            r, J = weighted_residuals(data, scale, *response_at(P, data, physical))
+            r, J = weighted_residuals(P, data, scale, physical)
             J = J * P.slopes(theta)
             if not np.isfinite(np.sum(J**2)):  # without slopes no step could go on from here
                 r = np.full_like(r, np.nan)
@@ -266,12 +270,17 @@ def _missing_share(fitted: _Fitted, data: Points) -> float:
 
 def _chi_square(fitted: _Fitted, data: Points) -> float:
     P = fitted.parametrisation
-    response = response_at(P, data, P.physical(fitted.chain))
-    return float(np.sum(weighted_residuals(data, fitted.scale, *response)[0] ** 2))
+    r, _ = weighted_residuals(P, data, fitted.scale, P.physical(fitted.chain))
+    return float(np.sum(r**2))
 
 
-def _hold_vanished(fitted: _Fitted, data: Points) -> _Fitted:
-    """Fit again with every parameter at zero that the data put there or below."""
+def _hold_vanished(
+    fitted: _Fitted, data: Points, decays: Mapping[int, Estimate]
+) -> tuple[_Fitted, Mapping[int, Estimate]]:
+    """Fit again with every parameter at zero that the data put there or below.
+
+    But a damping that a decay tells is fitted to both. Return also the decays that were used.
+    """
     P, chain = fitted.parametrisation, fitted.chain
     physical = P.physical(chain)
     sizes = _natural_sizes(P, chain, data)
@@ -281,9 +290,19 @@ def _hold_vanished(fitted: _Fitted, data: Points) -> _Fitted:
         if value < (0.0 if name == "k_1" else _VANISHING * size)
     ]
     if not vanished:
-        return fitted
-    held = replace(P, zero=(*P.zero, *vanished))
-    return _solve(held, data, held.pack(fitted.chain), fitted.scale)
+        return fitted, {}
+    told = {cart: zeta for cart, zeta in decays.items() if f"c_{cart}" in vanished}
+    if told:
+        c, k = chain.c.copy(), chain.k[:-1] + chain.k[1:]
+        for cart, zeta in told.items():
+            c[cart - 1] = 2 * zeta.value * np.sqrt(chain.m[cart - 1] * k[cart - 1])
+        held = P.holding_at_zero(*(set(vanished) - {f"c_{cart}" for cart in told}))
+        start = held.pack(replace(chain, c=c))
+        both = _solve(held, replace(data, decays=told), start, fitted.scale)
+        if both.chi_square < fitted.chi_square + _DECAY_AGREES:
+            return both, told
+    held = P.holding_at_zero(*vanished)
+    return _solve(held, data, held.pack(chain), fitted.scale), {}
 
 
 def _natural_sizes(P: Parametrisation, chain: Chain, data: Points) -> Array:
@@ -315,16 +334,23 @@ def _result(
     remark: str,
 ) -> ChainFit:
     P, chain = fitted.parametrisation, fitted.chain
-    G, dG = response_at(P, data, P.physical(chain))
-    _, J = weighted_residuals(data.widened(share), fitted.scale, G, dG)
-    covariance = _covariance(
-        P, J, sizes=_natural_sizes(P, chain, data), carts=np.unique(data.cart) + 1
-    )
+    names, covariance = _covariance(P, chain, data.widened(share), fitted.scale)
     chi_square_per_dof = _chi_square(fitted, data) / fitted.dof
     if data.from_table:
         covariance *= chi_square_per_dof
+    G, _ = response_at(P, data, P.physical(chain))
     standardised = (data.magnitude - np.abs(G)) / data.std
     remarks = [remark, *(f"{name} is at its bound, zero" for name in P.zero)]
+    told = [f"c_{cart}" for cart in data.decays]
+    if told:
+        remarks.append(
+            f"the response puts {', '.join(told)} at zero, its bound, and has too few points to "
+            "tell: the decay's damping ratio is fitted with it"
+        )
+    parameters = named_estimates(chain, names=names, covariance=covariance, source="bode_fit")
+    for cart in data.decays:
+        name = "zeta" if chain.n == 1 else f"zeta_{cart}"
+        parameters[name] = replace(parameters[name], source=data.decays[cart].source)
     if share > 0:
         remarks.append(
             f"the points lie {100 * share:.2g} % off the model, beyond their errors: "
@@ -335,9 +361,10 @@ def _result(
     return ChainFit(
         method="bode_fit",
         chain=chain,
-        names=P.names,
+        names=names,
         covariance=covariance,
-        parameters=named_estimates(chain, names=P.names, covariance=covariance, source="bode_fit"),
+        at_bound=(*P.zero, *told),
+        parameters=parameters,
         staged=staged.parameters if staged else {},
         chi_square_per_dof=chi_square_per_dof,
         dof=fitted.dof,
@@ -351,14 +378,23 @@ def _result(
     )
 
 
-def _covariance(P: Parametrisation, J: Array, *, sizes: Array, carts: NDArray[np.intp]) -> Array:
-    """Return the covariance (n_p, n_p) of the physical parameters from the residuals' slopes."""
-    _, singular, V = np.linalg.svd(J * sizes, full_matrices=False)
-    if singular[-1] < _RANK * singular[0]:
-        listed = ", ".join(str(cart) for cart in carts)
-        raise DataError(
-            f"Bode fit: the response of cart {listed} does not determine "
-            f"all of {', '.join(P.names)}"
-        )
-    root = (V / singular[:, None]) * sizes
-    return root.T @ root
+def _covariance(
+    P: Parametrisation, chain: Chain, data: Points, scale: Scale
+) -> tuple[tuple[str, ...], Array]:
+    """Return the covariance (n_p, n_p) of the physical parameters, and their names.
+
+    A damping that is held at zero is one of them where the data tell its error: no cart is without
+    damping, and what rests on it is known no better. A far spring may well not be there.
+    """
+    springs = tuple(name for name in P.zero if name[0] == "k")
+    for Q in (replace(P, zero=springs), P):
+        sizes = _natural_sizes(Q, chain, data)
+        _, J = weighted_residuals(Q, data, scale, Q.physical(chain))
+        _, singular, V = np.linalg.svd(J * sizes, full_matrices=False)
+        if singular[-1] >= _RANK * singular[0]:
+            root = (V / singular[:, None]) * sizes
+            return Q.names, root.T @ root
+    listed = ", ".join(str(cart) for cart in np.unique(data.cart) + 1)
+    raise DataError(
+        f"Bode fit: the response of cart {listed} does not determine all of {', '.join(P.names)}"
+    )

@@ -18,6 +18,7 @@ from pipeline.results import Estimate
 
 START_ZETA = 0.05  # damping ratio of each cart alone to start from: what a cart on bearings has
 _DIFFERENCE = 1e-6  # relative step; a forward difference errs by as much, rounding by 1e-9
+_NO_DAMPING = 1e-10  # far below any bench's, above the rounding of a pole on the imaginary axis
 _FARTHEST = 100.0  # of a logarithm: a step that goes astray must not overflow
 # A start must be a chain: what a measured table implies below this share of the largest spring
 # (or mass) is raised to it.
@@ -147,8 +148,12 @@ def named_estimates(
 
     Parameters
     ----------
-    names : the free physical parameters ("m_1", …); all others are known exactly.
+    names : the physical parameters ("m_1", …) that have an error; all others are known exactly.
     covariance : (n_p, n_p) of those, in physical units.
+
+    Returns
+    -------
+    By name; a damping of zero is no measurement and is returned as `at_bound`.
 
     Raises
     ------
@@ -158,7 +163,9 @@ def named_estimates(
     J = _parameter_jacobian(chain, names)
     variance = np.einsum("ij,jk,ik->i", J, covariance, J)
     return {
-        name: Estimate(value=value, std=float(np.sqrt(v)) if v >= 0 else None, source=source)
+        name: Estimate(value=0.0, std=None, source=source, at_bound=True)
+        if name.startswith(("zeta", "damping")) and value <= _NO_DAMPING
+        else Estimate(value=value, std=float(np.sqrt(v)) if v >= 0 else None, source=source)
         for (name, value), v in zip(values.items(), variance, strict=True)
     }
 
@@ -170,12 +177,18 @@ def _parameter_jacobian(chain: Chain, names: Sequence[str]) -> Array:
     for name in names:
         values: Array = getattr(chain, name[0])
         i = int(name[2:]) - 1
-        step = _DIFFERENCE * (values[i] if values[i] > 0 else float(np.max(values)))
+        step = _DIFFERENCE * (values[i] or np.max(values) or critical_damping(chain))
         moved = {"m": chain.m.copy(), "c": chain.c.copy(), "k": chain.k.copy()}
         moved[name[0]][i] += step
         there = np.array(list(Chain(**moved).parameters().values()))
         columns.append((there - base) / step)
     return np.stack(columns, axis=1)
+
+
+def critical_damping(chain: Chain) -> float:
+    """Return of what order a damping would be that takes a mode's swing at once."""
+    m, k = float(np.max(chain.m)), float(np.max(chain.k))
+    return float(np.sqrt(m * k)) or m  # on no spring: in one second
 
 
 def physical_start(found: Chain, *, springs: Sequence[bool], zeta: float = START_ZETA) -> Chain:

@@ -30,6 +30,10 @@ _UNDECIDED = "the two estimates are too uncertain to agree or to disagree"
 REDUNDANCY_LIMIT = 1e-9  # two routes to one number through unrounded values
 CHI_SQUARE_LIMIT = 2.0  # by chance under 1.5 with 30 points and more; errors of 40 % give 2
 HELD_SHARE = 0.2  # of a held cart's swing: a free one that moves less is not the free one
+AT_BOUND = (
+    "the fit ends at its bound, zero: its data are too few to tell, so there is no final value"
+)
+_ONE_SOURCE = "the fit's own points do not tell it: the final value rests on the decay as well"
 HEAVY_DAMPING = 0.3  # above it the orderings, exact without damping, may bend
 
 
@@ -49,7 +53,12 @@ def compare(
         note = ""
         if before is not None and before.source == "assumed":
             note = "the initial value was assumed, not measured"
-        if before is not None and after is not None and before.value != 0:
+        if after is not None and after.at_bound:
+            note, after = AT_BOUND, None
+        one_source = before is not None and after is not None and before.source == after.source
+        if one_source:
+            note = _ONE_SOURCE
+        elif before is not None and after is not None and before.value != 0:
             percent = 100 * (after.value - before.value) / abs(before.value)
             if before.source != "assumed":
                 sigmas = _combined_sigmas(before, after)

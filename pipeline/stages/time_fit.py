@@ -17,7 +17,7 @@ import numpy as np
 from pipeline.errors import DataError
 from pipeline.plant.chain import Array, Chain
 from pipeline.results import ChainFit, Estimate, Record
-from pipeline.stages.chain_parameters import Parametrisation, named_estimates
+from pipeline.stages.chain_parameters import Parametrisation, critical_damping, named_estimates
 from pipeline.stages.residual_colour import long_run_variance, score_covariance
 from pipeline.stages.time_search import Attempt, condense, descend, look, search
 from pipeline.stages.time_window import Window, open_window
@@ -26,6 +26,7 @@ _NEGLIGIBLE = 0.05  # of its standard error: such a damping or wall spring is he
 _REST_SIGMAS = 5.0  # how far beyond chance a free start must improve the fit to be kept
 _STRUCTURE_VALUES = 20  # independent values of the chain's own error in a record
 _DETERMINED = 1e-9  # smallest singular value of the scaled Jacobian over its largest
+_NO_DAMPING = 1e-6  # of the critical one: as good as none, and its logarithm has slopes
 _TOLERANCE = 1e-9  # of the cost, relative; far below one standard error for any record
 
 
@@ -72,9 +73,7 @@ def fit_records(
         )
     elif not attempt.converged:
         remarks.insert(0, "the search did not settle")
-    return _result(
-        attempt, covariance, explained=explained, n_starts=found.n_starts, remarks=remarks
-    )
+    return _result(attempt, explained=explained, n_starts=found.n_starts, remarks=remarks)
 
 
 def _open(records: Sequence[Record]) -> tuple[list[Window], list[str]]:
@@ -179,12 +178,26 @@ def _negligible(attempt: Attempt, covariance: Array) -> tuple[str, ...]:
     return walls or tuple(name for name in gone if name[0] == "c" and is_held)
 
 
+def _released(attempt: Attempt) -> Attempt:
+    """Return the same with the dampings free that were held at zero.
+
+    No cart is without damping, and what rests on one is known no better than it. A spring may
+    well not be there.
+    """
+    held, chain = attempt.parametrisation, attempt.chain
+    springs = tuple(name for name in held.zero if name[0] == "k")
+    if springs == held.zero:
+        return attempt
+    free = replace(held, zero=springs)
+    c = np.where(chain.c > 0, chain.c, _NO_DAMPING * critical_damping(chain))
+    return look(attempt.windows, free, free.pack(replace(chain, c=c)))
+
+
 # ------------------------------------------------------------------- the outcome
 
 
 def _result(
     attempt: Attempt,
-    covariance: Array,
     *,
     explained: bool,
     n_starts: int,
@@ -192,10 +205,10 @@ def _result(
 ) -> ChainFit:
     """Collect the fit's outcome, its residuals counted in the stated errors."""
     parametrisation, chain = attempt.parametrisation, attempt.chain
+    released = _released(attempt)
+    names, covariance = released.parametrisation.names, _covariance(released)
     try:
-        parameters = named_estimates(
-            chain, names=parametrisation.names, covariance=covariance, source="time_fit"
-        )
+        parameters = named_estimates(chain, names=names, covariance=covariance, source="time_fit")
     except DataError:  # several carts and no wall: they have no gains to name
         parameters: dict[str, Estimate] = {}
     chi_square = 0.0
@@ -208,8 +221,9 @@ def _result(
     return ChainFit(
         method="time_fit",
         chain=chain,
-        names=parametrisation.names,
+        names=names,
         covariance=covariance,
+        at_bound=parametrisation.zero,
         parameters=parameters,
         chi_square_per_dof=chi_square / attempt.dof,
         dof=attempt.dof,
