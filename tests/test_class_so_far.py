@@ -4,6 +4,8 @@ import csv
 import json
 import re
 import shutil
+import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,6 +18,7 @@ from pipeline.grading.history import history_text
 from pipeline.grading.intake import find_hand_ins
 from pipeline.grading.outputs import write_outputs
 from pipeline.grading.runner import Limits
+from pipeline.grading.so_far import Row, class_so_far
 from pipeline.synthesis import write_submission
 from tests.grades import make_grade, make_outcome, two_cart_rubric
 from tests.test_schemas import assert_fits
@@ -54,6 +57,12 @@ def grade(*paths: Path, out: Path, rubric: Path = Path("throne-1dof")):
     )
 
 
+def give(out: Path, team: str, points: float) -> None:
+    with Gradebook(out) as book:
+        book.override(team, "pieces", points, why="x", by="y")
+        write_outputs(book, out)
+
+
 def rows(out: Path) -> dict[str, dict[str, str]]:
     with (out / "grades.csv").open(encoding="utf-8", newline="") as file:
         return {row["submission"]: row for row in csv.DictReader(file)}
@@ -83,18 +92,104 @@ def test_a_late_hand_in_by_itself_keeps_the_class(school, tmp_path):
     ]  # fmt: skip
 
 
-def test_a_renamed_folder_is_told(school, tmp_path):
-    """Who is on the list under two names is said, as one of them is to be removed."""
+def test_a_renamed_folder_is_the_same_submission(school, tmp_path):
+    """One row, under the name it has now, which is told; what its people were given goes on."""
     out = tmp_path / "out"
     grade(school / "B" / "team-1", out=out)
-    done = grade(shutil.copytree(school / "B" / "team-1", tmp_path / "team-one"), out=out)
-    kept, double = done.remarks
-    assert kept == "not in this run, kept as they were: team-1 (cartlab remove takes one off)"
-    assert re.fullmatch(
-        r"s1 is in team-1 and team-one, which have \d+ recordings in common: see class\.html",
-        double,
-    )
-    assert done.sharing == 0
+    give(out, "team-1", 0.25)
+    copy = shutil.copytree(school / "B" / "team-1", tmp_path / "team-one")
+    for name in ("team-one", "TEAM-one", "team-1"):
+        done = grade(copy.rename(tmp_path / name), out=out)
+        copy = tmp_path / name
+        assert done.remarks[0].endswith(f" is now {name}, as are the points it was given by hand")
+        assert len(done.remarks) == 1
+        assert not re.search("is (new|gone)", " ".join(done.changes))
+        assert {n: (r["by_hand"], r["pieces"]) for n, r in rows(out).items()} == {
+            name: ("pieces", "0.25")
+        }
+    with Gradebook(out) as book:
+        book.override("team-1", "pieces", None, why="x", by="y")
+    grade(copy.rename(tmp_path / "team-one"), out=out)
+    assert rows(out)["team-one"]["by_hand"] == ""
+
+
+@pytest.mark.parametrize("author", ["s0", "s1"])
+def test_a_folder_in_a_strangers_zip_takes_nothing_from_a_team(school, tmp_path, author):
+    """It makes the names longer; the rows of those who had them, and points by hand, go on.
+
+    So with the id of the team in it, too, and where a submission cannot be read.
+    """
+    out, folder = tmp_path / "out", tmp_path / "class"
+    shutil.copytree(school / "B" / "team-1", folder / "team-1")
+    (folder / "team-2").mkdir()
+    (folder / "team-2" / "submission.toml").write_text("carts = ?", encoding="utf-8")
+    grade(folder, out=out)
+    give(out, "team-1", 0.25)
+    give(out, "team-2", 0.75)
+    before = rows(out)
+    stranger = school / "A" / "team-1"
+    toml = (stranger / "submission.toml").read_text(encoding="utf-8")
+    with zipfile.ZipFile(folder / "stranger.zip", "w") as archive:
+        archive.writestr("team-1/submission.toml", toml.replace('"s0"', f'"{author}"'))
+        for file in (stranger / "data").iterdir():
+            archive.write(file, f"team-1/data/{file.name}")
+    with zipfile.ZipFile(folder / "other.zip", "w") as archive:
+        archive.writestr("team-2/submission.toml", "carts = !")
+    grade(folder, out=out)
+    now = rows(out)
+    assert list(now) == ["class-team-1", "class-team-2", "other-team-2", "stranger-team-1"]
+    for name, row in before.items():
+        same = {key: row[key] for key in row if key not in ("submission", "reason")}
+        assert now[f"class-{name}"] | same == now[f"class-{name}"]
+    assert {now[name]["by_hand"] for name in ("stranger-team-1", "other-team-2")} == {""}
+
+
+def test_who_exchanges_folders_keeps_what_was_given(tmp_path):
+    """Two teams, each in the folder of the other now, the recordings made anew."""
+    with Gradebook(tmp_path, assignment="lab", create=True) as book:
+        for run, names in enumerate(((("a", "ann"), ("b", "bo")), (("a", "bo"), ("b", "ann")))):
+            outcomes = [
+                make_outcome(make_grade(n, authors=(who,)), key=f"{run} {n}", fingerprints=b"")
+                for n, who in names
+            ]
+            found = class_so_far({o.submission: Row.of(o) for o in outcomes}, book)
+            assert (dict(found.kept), found.taken_over) == ({}, ())
+            assert found.moved == ({"a": "b", "b": "a"} if run else {})
+            for outcome in outcomes:
+                book.put(outcome)
+            keys = tuple(o.key for o in outcomes)
+            book.finish(Batch(keys=keys, shared={}, moved=found.moved), rubric=RUBRIC)
+            if not run:
+                book.override("ann", "pieces", 0.25, why="x", by="y")
+        assert {e.submission: list(e.overrides) for e in book.entries()} == {
+            "a": [],
+            "b": ["pieces"],
+        }
+
+
+def test_what_makes_two_the_same_submission(tmp_path):
+    """The platform's number before the files, those before the people; never other people's."""
+    old = make_outcome(make_grade("old", authors=("ann",)), key="k-files", owner="A (canvas 7)")
+    with Gradebook(tmp_path, assignment="lab", create=True) as book:
+        book.put(old)
+        book.finish(Batch(keys=(old.key,), shared={}), rubric=RUBRIC)
+
+        def goes_on_as(**others) -> str:
+            found = {}
+            for name, (who, key, owner) in others.items():
+                new = make_outcome(make_grade(name, authors=who), key=key, owner=owner)
+                found[name] = Row.of(replace(new, fingerprints=b""))
+            return class_so_far(found, book).moved.get("old", "")
+
+        number = (("ann l",), "1-x", "A (canvas 7)")
+        files = (("ann",), "2-files", "B (canvas 8)")
+        people = (("Ann ",), "3-y", "")
+        assert goes_on_as(people=people, files=files, number=number) == "number"
+        assert goes_on_as(people=people, files=files) == "files"
+        assert goes_on_as(people=people) == "people"
+        assert goes_on_as(another=(("ann", "bo"), "3-y", "")) == ""
+        assert goes_on_as(another=(("ann",), "3-y", "B (canvas 8)")) == ""
+        assert goes_on_as(another=((), "3-y", "")) == ""
 
 
 def test_a_mended_id_of_an_author_accuses_nobody(school, tmp_path):

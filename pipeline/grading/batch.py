@@ -19,7 +19,8 @@ class Outcome:
     Attributes
     ----------
     submission : its id, unique in the batch.
-    key : hash of all the outcome depends on: the files as handed in, rubric, code, name, lateness.
+    key : hash of all the outcome depends on: the files as handed in, rubric, code, name, lateness;
+        behind a hyphen that of the files alone.
     status : `failed` where it could not be graded, for the one-line `reason`.
     settled : False where a limit or a crash ended it: another run tries again.
     grade : `grade.json` without what other submissions add (shared data, overrides).
@@ -61,12 +62,18 @@ def person(author: str) -> str:
     return " ".join(unicodedata.normalize("NFKC", author).split()).casefold()
 
 
+def content(key: str) -> str:
+    """Return the part of an outcome's key that is of the files alone, "" where it has none."""
+    return key.partition("-")[2]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Listed:
     """A line of the class list so far, and the outcome it stands for: its key and number."""
 
     submission: str
     authors: tuple[str, ...]
+    owner: str
     key: str
     grading: int
 
@@ -104,14 +111,14 @@ class Batch:
     keys : of the outcomes, in the order of the submissions' ids.
     shared : by submission, the flag for recordings that stand in another submission too.
     failed : (submission, reason) of those that could not be graded.
-    kept : submissions of the class list before that were not in this run.
-    taken_over : (submission, authors before, authors now) where those are other people.
+    kept, moved, taken_over : what became of the class list before, see `so_far.SoFar`.
     """
 
     keys: tuple[str, ...]
     shared: Mapping[str, Flag]
     failed: tuple[tuple[str, str], ...] = ()
     kept: tuple[str, ...] = ()
+    moved: Mapping[str, str] = field(default_factory=dict)
     taken_over: tuple[tuple[str, tuple[str, ...], tuple[str, ...]], ...] = ()
 
     def grades(self, store: Store) -> Iterator[tuple[Outcome, Grade]]:

@@ -116,8 +116,10 @@ def _refuse_submission(out: Path) -> None:
 
 
 def _told(batch: Batch, book: Gradebook) -> Iterator[str]:
-    """Yield what this run did not grade anew, and where others stand in a team's place."""
+    """Yield who has another name now, what was not graded anew, and who stands in whose place."""
     hidden = book.rubric.anonymous
+    for before, now in batch.moved.items():
+        yield f"{before} is now {now}, as are the points it was given by hand"
     for name, before, now in batch.taken_over:
         whose = "" if hidden else f", {_people(now)} in place of {_people(before)}"
         yield f"{name} is now by others{whose}: where both count, give one folder another name"

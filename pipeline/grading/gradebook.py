@@ -27,8 +27,10 @@ from pipeline.grading.gradebook_prints import pages, read_listed, read_prints, r
 from pipeline.grading.gradebook_rows import (
     Entry,
     add_row,
+    carry_overrides,
     class_list,
     final_entry,
+    known_outcome,
     newest_of,
     put_parts,
     read_figures,
@@ -91,32 +93,10 @@ class Gradebook:
 
     def known(self, key: str, *, figures: bool = True) -> Outcome | None:
         """Return the newest outcome of this key, None where there is none; or without figures."""
-        newest = (
-            select(gradings, submissions.c.name)
-            .join(submissions)
-            .where(gradings.c.key == key, submissions.c.assignment == (self._assignment or ""))
-            .order_by(gradings.c.id.desc())
-            .limit(1)
-        )
         with self._database.reading() as connection:
-            row = connection.execute(newest).one_or_none()
-            if row is None:
-                return None
-            drawn = read_figures(connection, row.id) if figures else ()
-        return Outcome(
-            submission=row.name,
-            authors=tuple(json.loads(row.authors)),
-            key=row.key,
-            status=row.status,
-            reason=row.reason,
-            settled=row.settled,
-            days_late=row.days_late,
-            grade=row.grade,
-            fingerprints=row.fingerprints,
-            figures=drawn,
-            owner=row.owner,
-            detail=row.detail,
-        )
+            return known_outcome(
+                connection, key, assignment=self._assignment or "", figures=figures
+            )
 
     def put(self, outcome: Outcome) -> None:
         """Add an outcome: durable on return, and nothing of it there before.
@@ -183,6 +163,7 @@ class Gradebook:
         """
         listed, points = [], {}
         with self._database.writing() as connection:
+            carry_overrides(connection, batch.moved, assignment=self._assignment or "")
             for position, key in enumerate(batch.keys):
                 row = newest_of(connection, key, assignment=self._assignment or "")
                 shared = batch.shared.get(row.name)
@@ -208,7 +189,9 @@ class Gradebook:
             if last is None:
                 return []
             told = [f"rubric: {change}" for change in rubric_changes(last.rubric, text)]
-            return told + points_changes(points_of(connection, last), points)
+            before = points_of(connection, last)
+            before = {batch.moved.get(name, name): had for name, had in before.items()}
+            return told + points_changes(before, points)
 
     # ---------------------------------------------------------------- what counts now
 

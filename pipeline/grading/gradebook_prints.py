@@ -41,14 +41,16 @@ def read_prints(database: Database, *, assignment: str) -> Iterator[Prints]:
 
 def read_listed(database: Database, numbers: Sequence[int]) -> Iterator[Listed]:
     """Yield the gradings of these numbers as lines of a class list."""
-    columns = gradings.c.id, gradings.c.key, gradings.c.authors
+    columns = gradings.c.id, gradings.c.key, gradings.c.authors, gradings.c.owner
     lines = select(submissions.c.name, *columns).join(submissions).order_by(gradings.c.id)
     for page in pages(numbers):
         with database.reading() as connection:
             rows = connection.execute(lines.where(gradings.c.id.in_(page))).all()
         for row in rows:
             authors = tuple(json.loads(row.authors))
-            yield Listed(submission=row.name, authors=authors, key=row.key, grading=row.id)
+            yield Listed(
+                submission=row.name, authors=authors, owner=row.owner, key=row.key, grading=row.id
+            )
 
 
 def read_prints_of(database: Database, numbers: Sequence[int]) -> list[Prints]:

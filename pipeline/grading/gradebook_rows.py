@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from sqlalchemy import Connection, Row, Select, Table, insert, select
 
 from pipeline.errors import ConfigError
-from pipeline.grading.batch import read_grade
+from pipeline.grading.batch import Outcome, read_grade
 from pipeline.grading.grade import Flag, Grade
 from pipeline.grading.override import Override, with_overrides
 from pipeline.grading.rubric import Rubric
@@ -86,6 +86,31 @@ def read_figures(connection: Connection, grading: int) -> tuple[tuple[str, str],
     return tuple((name, zlib.decompress(svg).decode()) for name, svg in rows)
 
 
+def known_outcome(
+    connection: Connection, key: str, *, assignment: str, figures: bool
+) -> Outcome | None:
+    """Return the newest outcome of a key, None where there is none; or without its figures."""
+    newest = select(gradings, submissions.c.name).join(submissions)
+    newest = newest.where(gradings.c.key == key, submissions.c.assignment == assignment)
+    row = connection.execute(newest.order_by(gradings.c.id.desc()).limit(1)).one_or_none()
+    if row is None:
+        return None
+    return Outcome(
+        submission=row.name,
+        authors=tuple(json.loads(row.authors)),
+        key=row.key,
+        status=row.status,
+        reason=row.reason,
+        settled=row.settled,
+        days_late=row.days_late,
+        grade=row.grade,
+        fingerprints=row.fingerprints,
+        figures=read_figures(connection, row.id) if figures else (),
+        owner=row.owner,
+        detail=row.detail,
+    )
+
+
 _COLUMNS = (
     gradings.c.id,
     gradings.c.submission_id,
@@ -151,6 +176,27 @@ def final_entry(connection: Connection, row: Row, *, shared: Flag | None, rubric
         grading=row.id,
         first_key=connection.scalar(first.order_by(gradings.c.id).limit(1)) or "",
     )
+
+
+def carry_overrides(connection: Connection, moved: Mapping[str, str], *, assignment: str) -> None:
+    """Put in, for who goes on under another name, what was given by hand under the old one.
+
+    All that is not there yet, so that it stays right when the name changes back.
+    """
+    columns = [column for column in overrides.c if column.name not in ("id", "submission_id")]
+    named = select(submissions.c.name, submissions.c.id).where(
+        submissions.c.assignment == assignment,
+        submissions.c.name.in_([*moved, *moved.values()]),
+    )
+    numbers = {row.name: row.id for row in connection.execute(named)}
+    given = {}
+    for name, number in numbers.items():
+        mine = select(*columns).where(overrides.c.submission_id == number).order_by(overrides.c.id)
+        given[name] = [dict(row) for row in connection.execute(mine).mappings()]
+    for old, new in moved.items():
+        for values in given[old]:
+            if values not in given[new]:
+                add_row(connection, overrides, {**values, "submission_id": numbers[new]})
 
 
 def read_flag(text: str) -> Flag | None:

@@ -4,7 +4,7 @@ import hashlib
 import json
 import queue
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -12,12 +12,13 @@ from pathlib import Path
 from pydantic import TypeAdapter
 
 import pipeline
-from pipeline.grading.batch import Batch, Listed, Outcome, Prints, Store
+from pipeline.grading.batch import Batch, Outcome, Prints, Store
 from pipeline.grading.grade import SCHEMA, Flag
 from pipeline.grading.intake import HandIn
 from pipeline.grading.intake_files import digest
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.shared import find_shared, same_recordings, same_team, shared_flag
+from pipeline.grading.so_far import Row, class_so_far
 from pipeline.grading.worker import Setup, Task, failed
 from pipeline.grading.worker_process import Worker
 from pipeline.output import write_file
@@ -74,7 +75,7 @@ def grade_batch(
     """
     limits = limits or Limits()
     code, text = code_version(), rubric.model_dump_json()
-    rows: dict[str, _Row] = {}
+    rows: dict[str, Row] = {}
     new = []
     for hand_in in hand_ins:
         task = _task(hand_in, basis=(code, text, figures))
@@ -85,7 +86,7 @@ def grade_batch(
         if outcome is None or not outcome.settled:
             new.append(task)
         else:
-            rows[task.id] = _Row.of(outcome)
+            rows[task.id] = Row.of(outcome)
     total = len(hand_ins)
     progress(len(rows), total, "")
     if new:
@@ -98,11 +99,11 @@ def grade_batch(
         )
         for outcome in execute(new, setup, rubric.out_of):
             store.put(outcome)
-            rows[outcome.submission] = _Row.of(outcome)
+            rows[outcome.submission] = Row.of(outcome)
             progress(len(rows), total, outcome.submission)
     progress(total, total, "comparing the recordings")
-    kept, taken_over = _so_far(rows, store)
-    rows |= kept
+    before = class_so_far(rows, store)
+    rows |= before.kept
     in_order = [rows[name] for name in sorted(rows)]
     return Batch(
         keys=tuple(row.key for row in in_order),
@@ -114,50 +115,10 @@ def grade_batch(
             examples=examples,
         ),
         failed=tuple((row.prints.submission, row.reason) for row in in_order if row.reason),
-        kept=tuple(kept),
-        taken_over=taken_over,
+        kept=tuple(before.kept),
+        moved=before.moved,
+        taken_over=before.taken_over,
     )
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Row:
-    """What the batch itself needs of an outcome: all else stays in the store."""
-
-    key: str
-    prints: Prints
-    reason: str
-
-    @classmethod
-    def of(cls, outcome: Outcome) -> "_Row":
-        return cls(
-            key=outcome.key,
-            prints=Prints(
-                submission=outcome.submission,
-                authors=outcome.authors,
-                fingerprints=outcome.fingerprints,
-            ),
-            reason=outcome.reason if outcome.status == "failed" else "",
-        )
-
-
-_TakenOver = tuple[tuple[str, tuple[str, ...], tuple[str, ...]], ...]
-
-
-def _so_far(rows: Mapping[str, _Row], store: Store) -> tuple[dict[str, _Row], _TakenOver]:
-    """Return those of the class list so far that are not in this run, and who is another there."""
-    now = {name.casefold(): row.prints for name, row in rows.items()}
-    left: dict[str, Listed] = {}
-    others = []
-    for line in store.listed():
-        found = now.get(line.submission.casefold())
-        if found is None:
-            left[line.submission] = line
-        elif line.authors and found.authors and not same_team(line, found):
-            others.append((line.submission, line.authors, found.authors))
-    prints = store.prints_of([line.grading for line in left.values()])
-    kept = {one.submission: _Row(key=left[one.submission].key, prints=one, reason="")
-            for one in prints}  # fmt: skip
-    return kept, tuple(others)
 
 
 def run_here(*, jobs: int) -> Executor:
@@ -224,9 +185,10 @@ def _task(hand_in: HandIn, *, basis: tuple[str, str, bool]) -> Task:
     files = digest(hand_in.sources)
     plain = asdict(hand_in) | {"sources": files}
     everything = json.dumps([SCHEMA, *basis, plain], sort_keys=True)
+    whole = hashlib.sha256(everything.encode("utf-8", "surrogateescape")).hexdigest()
     return Task(
         id=hand_in.id,
-        key=hashlib.sha256(everything.encode("utf-8", "surrogateescape")).hexdigest(),
+        key=f"{whole}-{files}",
         sources=tuple(str(source) for source in hand_in.sources),
         digest=files,
         owner=hand_in.owner,
@@ -235,7 +197,7 @@ def _task(hand_in: HandIn, *, basis: tuple[str, str, bool]) -> Task:
 
 
 def _shared(
-    rows: Sequence[_Row],
+    rows: Sequence[Row],
     store: Store,
     *,
     basis: Sequence[str],

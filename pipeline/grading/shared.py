@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.fft import next_fast_len
 
-from pipeline.grading.batch import Listed, Prints, person
+from pipeline.grading.batch import Prints, person
 from pipeline.grading.grade import Flag
 from pipeline.grading.shared_prints import PASSED, Print, unpack
 
@@ -162,7 +162,7 @@ def told(flag: Flag) -> str:
     return shared_message(flag.parameters, ["another submission"])
 
 
-def same_team(a: Prints | Listed, b: Prints | Listed) -> bool:
+def same_team(a: Prints, b: Prints) -> bool:
     """Tell whether two submissions have an author in common; without authors, the same name."""
     if a.authors and b.authors:
         return not set(map(person, a.authors)).isdisjoint(map(person, b.authors))
