@@ -156,6 +156,37 @@ def test_what_is_no_record_is_refused_and_said(work, source, name, content, why)
     assert not (work / "data").exists()
 
 
+def test_an_export_for_matlab_is_a_record(work, source):
+    """`NAME.m` with its matrix in brackets is taken as any export is."""
+    heading, matrix = STEP.split("\n", 1)
+    put(source, "run.m", f"% {heading}\ndata = {matrix.rstrip()};\n", at=1)
+    taken, notes = take(work, source)
+    assert [i.experiment for i in taken] == ["step-1"], notes.remarks
+    (record,) = read_data(load_submission(work)).records
+    assert record.y[0].max() == pytest.approx(200 * 0.00227)
+
+
+def test_everything_else_in_the_folder_is_said_once(work, source):
+    """A script, a picture and a folder are named with why; what a program hides is its own."""
+    put(source, "plot.m", "x = load('run.txt');\nplot(x(:, 1))\n", at=1)
+    put(source, "photo.JPG", b"\xff\xd8", at=2)
+    put(source, "~run.txt", STEP, at=3)
+    (source / "monday").mkdir()
+    looks, notes = [], Notes()
+
+    def wait(seconds: float) -> None:
+        looks.append(seconds)
+        if len(looks) == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        list(Importer(work, source, observer=notes).watch(once=False, wait=wait))
+    said = sorted(remark for remark in notes.remarks if "not taken" in remark)
+    assert [remark.split(":")[0] for remark in said] == ["monday", "not taken", "photo.JPG"]
+    assert "plot.m" in said[1]
+    assert load_submission(work).experiments == ()
+
+
 def test_a_file_is_waited_for_until_it_is_complete(work, source):
     """A program that writes slowly is not caught half way; when the plan is done, watching ends."""
     half = len(STEP) // 2

@@ -164,7 +164,7 @@ def test_a_bench_that_begins_again_ends_the_run():
     sent = lines(500)
     got, stream = read(join(sent) + join(lines(300)))
     assert got == sent
-    assert stream.restarted
+    assert stream.broken == "the bench began again in mid-run: its supply or its reset line"
     assert stream.anomalies().resets == 1
 
 

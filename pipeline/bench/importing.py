@@ -25,7 +25,7 @@ from pipeline.synthesis.files import Value
 LOOK_EVERY = 0.5  # s
 _COMPLETE = 2  # looks in a row at which size and time of a file were the same
 _CUT_SHORT = 20  # … at which a file that ends in mid-line is taken to stay so
-_ENDINGS = frozenset({".txt", ".csv", ".mat", ".log", ".dat", ".tsv", ".asc"})
+_ENDINGS = (".txt", ".csv", ".mat", ".m", ".log", ".dat", ".tsv", ".asc")
 _SAME_FREQUENCY = 0.05  # of it: a dwell recorded for the one the plan asks for
 _NO_NAME = re.compile(r"[^\w.-]+", re.ASCII)
 
@@ -105,8 +105,8 @@ class Importer:
         """Return the files that do not change any more, oldest first."""
         ready = []
         for path in self._source.iterdir():
-            wanted = path.suffix.casefold() in _ENDINGS and not path.name.startswith((".", "~"))
-            if path in self._over or not wanted or not path.is_file() or not self._opens(path):
+            hidden = path.name.startswith((".", "~"))  # or of a program at work
+            if path in self._over or hidden or self._is_other(path) or not self._opens(path):
                 continue
             try:
                 info = path.stat()
@@ -118,6 +118,18 @@ class Importer:
             if info.st_size and (at_once or self._looks[path] >= _COMPLETE):
                 ready.append(path)
         return sorted(ready, key=lambda path: (self._seen[path][1], path.name))
+
+    def _is_other(self, path: Path) -> bool:
+        """Tell whether this can be no data file, and say so."""
+        if path.is_dir():
+            why = "a folder"
+        elif path.suffix.casefold() not in _ENDINGS:
+            why = f"a data file ends in {', '.join(_ENDINGS)}"
+        else:
+            return not path.is_file()
+        self._over.add(path)
+        self._observer.remark(f"{path.name}: not taken, {why}")
+        return True
 
     def _opens(self, path: Path) -> bool:
         """Tell whether a file can be read; one that its program keeps to itself can be later."""

@@ -56,6 +56,16 @@ class Order:
         near = [target(reading.ms + shift) for shift in (-period, 0.0, period)]
         return not min(near) - 1 <= reading.target <= max(near) + 1
 
+    def drives_off(self, reading: Reading, *, before: Reading) -> bool:
+        """Tell whether the motor gets another duty than the target, which in open loop is its duty.
+
+        An edge may act a line later.
+        """
+        if self.recording.controller is not None:
+            return False
+        near = [min(max(r.target, -FULL_SCALE), FULL_SCALE) for r in (before, reading)]
+        return not min(near) - 1 <= reading.duty <= max(near) + 1
+
     def passed(self, reading: Reading, *, carts: int) -> str:
         """Return what a line passes the limits by, or ""."""
         if abs(reading.duty) > self.most_duty:

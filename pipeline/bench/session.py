@@ -156,7 +156,7 @@ class Session:
         if not partial and recording.controller is None and stream.widest <= _STILL:
             partial = _NOTHING_MOVED
         fit = stream.fit()
-        if stream.lines > _ENOUGH:
+        if stream.lines > _ENOUGH and not partial:
             self._period = fit.period
         return Outcome(
             recording=order.recording,
@@ -167,8 +167,14 @@ class Session:
 
     def _stream(self, free: Sequence[int], *, closed: bool = False) -> Stream:
         watched = tuple(cart for cart in free if cart <= self._carts)
-        encoders = self._line.bench.encoders
-        return Stream(encoders=encoders, period=self._period, free=watched, closed=closed)
+        bench = self._line.bench
+        return Stream(
+            encoders=bench.encoders,
+            period=self._period,
+            stated=bool(bench.commands),
+            free=watched,
+            closed=closed,
+        )
 
     def _rest(self, recording: Recording) -> str:
         """Wait, in a run that does nothing, until the carts have come to rest."""
@@ -273,8 +279,8 @@ class Session:
                 lines = stream.feed(data, since=since, now=now)
                 if trouble := check(lines):
                     return trouble
-                if stream.restarted:
-                    return "the bench began again in mid-run: its supply or its reset line"
+                if stream.broken:
+                    return stream.broken
                 if lines:
                     first, unread = lines[0].ms if first is None else first, None
                     if lines[-1].ms - first > end + _NEARLY:
@@ -319,7 +325,8 @@ class _Watch:
         self._order = order
         self._carts = carts
         self._period = period
-        self._astray = 0  # lines in a row
+        self._astray = self._off = 0  # lines in a row
+        self._before: Reading | None = None
         self._stream = stream
         self._observer = observer
         self._batch: list[Reading] = []
@@ -339,6 +346,13 @@ class _Watch:
                         f"the bench follows another wave than it was sent, {reading.target} counts "
                         f"at {1e-3 * reading.ms:.3f} s: the line changed a digit"
                     )
+            off = self._order.drives_off(reading, before=self._before or reading)
+            self._off, self._before = self._off + 1 if off else 0, reading
+            if self._off == _ASTRAY:
+                return (
+                    f"{STOPPED}the bench drives its motor with {reading.duty} duty counts where it "
+                    f"was told {reading.target}, at {1e-3 * reading.ms:.3f} s"
+                )
         now = time.monotonic()
         if now - self._forwarded > _FORWARD:
             self._forwarded = now

@@ -37,33 +37,39 @@ class StampFit:
     missing: int
 
 
-def fit_stamps(stamps: Stamps, *, period: float) -> StampFit:
+def fit_stamps(stamps: Stamps, *, period: float, stated: bool = False) -> StampFit:
     """Return the clock behind stamps (n,) in ms, never falling; `period` (ms) is what is expected.
 
     The expectation counts only where the stamps do not tell: a short run with losses, a clock
-    within some 1e-5 of 1 ms, or one that ticks twice within a millisecond.
+    within some 1e-5 of 1 ms, or one that ticks twice within a millisecond. Where the bench itself
+    `stated` it, it counts as well where more lines are missing than a comb can be told from.
     """
     n = stamps.size
-    if n < 2:
+    if n < 2 or stamps[-1] == stamps[0]:
         return StampFit(period=period, missing=0)
     if (slope := even_period(stamps)) is not None:
         return StampFit(period=slope, missing=0)
     steps, span = np.diff(stamps), int(stamps[-1] - stamps[0])
+    missing = max(0, round(span / period) + 1 - n)
+    if stated and missing > _MOST_ABSENT * span / period:
+        return StampFit(period=period, missing=missing)
     usual = float(np.median(steps))
     if usual >= _SLOW:
         own = float(steps[steps < usual + _SLOW].mean())  # rounding makes two usual steps
-        missing = int((np.round(steps / own) - 1).clip(min=0).sum())
-        return StampFit(period=span / (n - 1 + missing), missing=missing)
+        lost = int((np.round(steps / own) - 1).clip(min=0).sum())
+        return StampFit(period=span / (n - 1 + lost), missing=lost)
+    if span + 1 - np.unique(stamps).size > _MOST_ABSENT * span:  # or the clock has leapt
+        if stated or period >= 1 / (1 - _MOST_ABSENT):
+            return StampFit(period=period, missing=missing)
+        return StampFit(period=span / (n - 1), missing=0)  # not the bench that is expected
+    if not 1.0 <= period < 1.0 + 1.0 / _CLOSEST_TEETH:
+        return StampFit(period=period, missing=missing)
     seen = np.zeros(span + 1, dtype=np.bool_)
     seen[stamps - stamps[0]] = True
     absent = np.flatnonzero(~seen).tolist()
-    if len(absent) > _MOST_ABSENT * span and period < 1 / (1 - _MOST_ABSENT):
-        return StampFit(period=span / (n - 1), missing=0)  # not the bench that is expected
-    if not 1.0 <= period < 1.0 + 1.0 / _CLOSEST_TEETH:
-        return StampFit(period=period, missing=max(0, round(span / period) + 1 - n))
     teeth = _comb(absent)
     chance = (1 + 2 * _SLACK) * len(absent) / span  # that a tooth is there though it is none
-    if _FIRST_TEETH * _SECOND_TEETH * chance ** (len(teeth) - 2) < _BY_CHANCE:
+    if teeth and _FIRST_TEETH * _SECOND_TEETH * chance ** (len(teeth) - 2) < _BY_CHANCE:
         spacing = (teeth[-1] - teeth[0]) / (len(teeth) - 1)
         return StampFit(period=spacing / (spacing - 1), missing=len(absent) - len(teeth))
     own_skips = round(span * (1 - 1 / period))

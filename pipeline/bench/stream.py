@@ -22,6 +22,9 @@ _ODD = 0.005  # of the expected period: how far off a clock may well be
 _WINDOW = 1000  # ms over which an encoder is watched and losses are counted
 _MOVED, _NEIGHBOUR_MOVED = 20, 200  # counts
 _DRIVEN = 8  # duty counts; less moves no cart
+_LEAP = 1000  # ms between two stamps: no line for so long, or a clock that jumped
+_CROWD = 500  # lines whose stamps are looked at together …
+_CROWDED = 0.25  # … and the least share of their time the clock may go on meanwhile
 
 
 class Stream:
@@ -30,9 +33,13 @@ class Stream:
     Parameters
     ----------
     encoders : fields of a line that are counts.
-    period : ms from line to line, as expected.
+    period : ms from line to line, as expected; `stated`: by the bench itself.
     free : the carts that can move; their encoders are watched.
     closed : the loop is closed: its duty may kick for a single line when an encoder flickers.
+
+    Attributes
+    ----------
+    broken : what the bench's clock did, after which no line belongs to this run; "": nothing.
     """
 
     def __init__(
@@ -40,10 +47,12 @@ class Stream:
         *,
         encoders: int,
         period: float = 1.0,
+        stated: bool = False,
         free: Sequence[int] = (),
         closed: bool = False,
     ) -> None:
         self._encoders = encoders
+        self._stated = stated
         self._closed = closed
         self._expected = period
         self._tail = b""
@@ -55,6 +64,7 @@ class Stream:
         self._garbled_lines = 0  # a merger of two is one garbled place and two lines
         self._late = 0
         self._resets = 0
+        self.broken = ""
         # The least of arrival minus stamp, s: of the second before, and of this one.
         self._lead, self._new_lead, self._lead_from = float("inf"), float("inf"), float("-inf")
         self._watch = _EncoderWatch(cart for cart in free if cart <= encoders)
@@ -71,18 +81,13 @@ class Stream:
         return -1 if newest is None else newest.ms
 
     @property
-    def restarted(self) -> bool:
-        """Whether the bench's clock began again: no line after that belongs to this run."""
-        return self._resets > 0
-
-    @property
     def widest(self) -> int:
         """The counts that the free cart which moved most went from end to end."""
         return self._watch.widest
 
     def fit(self) -> StampFit:
         """Return the clock that explains the stamps; takes too long for a run under way."""
-        return fit_stamps(np.array(self._stamps), period=self._expected)
+        return fit_stamps(np.array(self._stamps), period=self._expected, stated=self._stated)
 
     def anomalies(self, fit: StampFit | None = None) -> Anomalies:
         """Return all that went wrong so far; lost lines are estimated until there is a `fit`."""
@@ -143,24 +148,37 @@ class Stream:
 
     def _judge(self, after: Reading) -> list[Reading]:
         """Return the line held back if its neighbours bear it out, and hold this one."""
-        if self.restarted:
+        if self.broken:
             return []
         before, held, self._held = self._before, self._held, after
         if held is None:
             return []
-        if before is None:
-            if after.ms < held.ms:  # left over from an earlier run, or garbled
-                self._reject()
-                return []
-        elif held.ms < before.ms and after.ms < before.ms and after.ms >= held.ms:
-            self._resets += 1
-            self._held = None
-            return []
-        elif _stands_out(before, held, after, closed=self._closed):
+        last = 0 if before is None else before.ms
+        if before is None and after.ms < held.ms:  # left over from an earlier run, or garbled
             self._reject()
             return []
+        if held.ms < last and after.ms < last and after.ms >= held.ms:
+            self._resets += 1
+            return self._break("the bench began again in mid-run: its supply or its reset line")
+        if before is not None and _stands_out(before, held, after, closed=self._closed):
+            self._reject()
+            return []
+        if held.ms - last > _LEAP:
+            return self._break(
+                f"the bench's stamps leap from {1e-3 * last:.3f} to {1e-3 * held.ms:.3f} s: "
+                "its clock, or a second in which no line came"
+            )
         self._keep(held)
+        if self.lines > _CROWD:
+            went_on = held.ms - self._stamps[-1 - _CROWD]
+            if went_on < _CROWDED * _CROWD * self._expected:
+                self._break(f"the bench's clock stands still: {_CROWD} lines in {went_on} ms of it")
         return [held]
+
+    def _break(self, why: str) -> list[Reading]:
+        """End the run here."""
+        self.broken, self._held = why, None
+        return []
 
     def _keep(self, reading: Reading) -> None:
         self._before = reading
