@@ -2,6 +2,7 @@
 
 import os
 import sys
+import time
 import zipfile
 from pathlib import Path
 
@@ -260,13 +261,46 @@ def test_what_is_hidden_counts_only_with_a_submission(tmp_path):
 
 
 def test_results_of_a_grading_are_no_hand_ins(tmp_path):
-    """Whether written beside the hand-ins or among them; a team called feedback is one."""
+    """Whether written beside the hand-ins or among them, and told of; a team may be so called."""
     made = ("class.html", "feedback/.made.json", "feedback/a/feedback.html", "gradescope/a/x")
     tree(tmp_path / "c", dict.fromkeys(("a/submission.toml", *made), TOML))
     tree(tmp_path / "c" / "grades", dict.fromkeys(made, ""))
-    assert [h.id for h in hand_ins(tmp_path, tmp_path / "c")] == ["a"]
+    told = []
+    found = find_hand_ins([tmp_path / "c"], scratch=tmp_path / "scratch", say=told.append)
+    assert [h.id for h in found] == ["a"]
+    assert [text.split("'")[1] for text in told] == ["c/feedback", "c/grades", "c/gradescope"]
     tree(tmp_path / "d", dict.fromkeys(("a/submission.toml", "feedback/submission.toml"), TOML))
     assert [h.id for h in hand_ins(tmp_path, tmp_path / "d")] == ["a", "feedback"]
+
+
+@pytest.mark.parametrize("name", ["t.tar.gz", "t.tgz", "t.7z", "t.rar", "t.tar"])
+def test_an_archive_that_is_not_opened_is_a_row(tmp_path, name):
+    """Beside folders and zip files; in a team's own folder it is a backup of theirs."""
+    tree(tmp_path / "c", {"a/submission.toml": TOML, "b/lab/submission.toml": TOML, name: "packed"})
+    tree(tmp_path / "c" / "b", {name: "packed"})
+    found = {h.id: h for h in hand_ins(tmp_path, tmp_path / "c")}
+    assert sorted(found) == ["a", "lab", "t"]
+    with pytest.raises(SubmissionError, match=f"{name}' cannot be opened, pack a zip file"):
+        opened(tmp_path, found["t"])
+
+
+@pytest.mark.parametrize("beside", [(), ("figures/bode.png",), ("notes.md",)])
+def test_a_team_without_its_file_keeps_its_name(tmp_path, beside):
+    """The folder of the recordings names nobody: not in a class, not alone, not under a section."""
+    for where in ("c/team-7", "alone", "section/only/team-7"):
+        tree(tmp_path / where, dict.fromkeys(("data/step.csv", *beside), "1,2"))
+    tree(tmp_path / "c", {"a/submission.toml": TOML})
+    ids = {where: [h.id for h in hand_ins(tmp_path, tmp_path / where)]
+           for where in ("c", "alone", "section")}  # fmt: skip
+    assert ids == {"c": ["a", "team-7"], "alone": ["alone"], "section": ["team-7"]}
+
+
+def test_a_name_of_many_numbers_is_read_at_once():
+    """A member's name has up to 65,535 letters, and no form of name is tried from each of them."""
+    start = time.process_time()
+    for part in ("_1", "_LATE_1", "_assignsubmission_", "anon_", "-1.a"):
+        parse_name(part * (65_000 // len(part)) + "\n")
+    assert time.process_time() - start < 1  # s; from each letter: seven for one name
 
 
 def test_archives_in_archives_are_opened_to_a_depth(tmp_path):

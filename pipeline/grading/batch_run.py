@@ -76,7 +76,8 @@ def grade_class(
     _refuse_submission(check_folder(out))
     with alone_in(out), scratch_in(out) as scratch:
         known = _names_so_far(gradebook or out, assignment=rubric_file.stem)
-        found = find_hand_ins(paths, scratch=scratch, skip=[out], known=known)
+        passed: list[str] = []
+        found = find_hand_ins(paths, scratch=scratch, skip=[out], known=known, say=passed.append)
         hand_ins, remarks = settle_lateness(found, late=rubric.late, table=late_table)
         # The rubric's file says which assignment it is: its title may be mended on the way.
         with Gradebook(gradebook or out, assignment=rubric_file.stem, create=True) as book:
@@ -95,7 +96,7 @@ def grade_class(
             )
             hidden = rubric.anonymous or anonymous
             changes = book.finish(batch, rubric=rubric.model_copy(update={"anonymous": hidden}))
-            remarks = [*remarks, *_told(batch, book)]
+            remarks = [*passed, *remarks, *_told(batch, book)]
             total = len(hand_ins)
             doubles = write_outputs(book, out, progress=lambda what: progress(total, total, what))
             remarks += [f"{double}: see class.html" for double in doubles]

@@ -4,7 +4,7 @@ import os
 import re
 import unicodedata
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
@@ -16,7 +16,14 @@ from pipeline.grading.lms_names import (
     owner_text,
     parse_name,
 )
-from pipeline.grading.unpack import CLASS, DEEPEST, is_debris, member_names, unpack
+from pipeline.grading.unpack import (
+    CLASS,
+    DEEPEST,
+    STRANGE_ARCHIVES,
+    is_debris,
+    member_names,
+    unpack,
+)
 from pipeline.submission.complaints import quote
 from pipeline.submission.load import NAME
 
@@ -25,6 +32,7 @@ _LONGEST_ID, _MOST_BYTES = 100, 200  # letters and bytes: a folder's name, on ev
 _NOT_IN_NAMES = re.compile(r'[<>:"/\\|?*\x00-\x1f\x7f-\x9f]')
 _RESULTS = ("class.html", "feedback/.made.json")  # of a grading: its folder is no hand-in
 _PARTS_OF_RESULTS = ("feedback", "gradescope")
+_DATA = "data"  # where a submission has its recordings: the name of nobody's hand-in
 _RESERVED = re.compile(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?")
 
 
@@ -51,6 +59,18 @@ class HandIn:
 
 
 @dataclass(frozen=True, kw_only=True)
+class _Walk:
+    """What is no hand-in where folders are looked through, and whom to tell of what was none."""
+
+    skip: set[Path]
+    say: Callable[[str], None]
+
+
+def _silent(text: str) -> None:
+    pass
+
+
+@dataclass(frozen=True, kw_only=True)
 class _Found:
     """A hand-in before its id is settled: its name, and that of the folder around it."""
 
@@ -69,6 +89,7 @@ def find_hand_ins(
     scratch: Path,
     skip: Iterable[Path] = (),
     known: Iterable[str] = (),
+    say: Callable[[str], None] = _silent,
 ) -> tuple[HandIn, ...]:
     """Return the hand-ins in folders, trees and archives, in the order of their ids.
 
@@ -77,15 +98,16 @@ def find_hand_ins(
     scratch : where archives of a whole class are unpacked.
     skip : folders that are no hand-ins, such as the one results go to.
     known : ids of the class so far: one of several "team-1", by itself, keeps the id it had.
+    say : told of every folder that was passed over for the results of a grading.
 
     Raises
     ------
     ConfigError : a path is not there, or there is nothing in it.
     """
-    skipped = {path.resolve() for path in skip} | {scratch.resolve()}
+    walk = _Walk(skip={path.resolve() for path in skip} | {scratch.resolve()}, say=say)
     found: list[_Found] = []
     for number, path in enumerate(dict.fromkeys(path.resolve() for path in paths)):
-        here = _at(path, scratch=scratch / f"class-{number}", skip=skipped)
+        here = _at(path, scratch=scratch / f"class-{number}", walk=walk)
         if not here:
             raise ConfigError(
                 f"{path}: nothing to grade in it: no folder or zip file with a {NAME}"
@@ -94,11 +116,11 @@ def find_hand_ins(
     return tuple(sorted(_with_ids(found, known=known), key=lambda hand_in: hand_in.id))
 
 
-def _at(path: Path, *, scratch: Path, skip: set[Path]) -> list[_Found]:
+def _at(path: Path, *, scratch: Path, walk: _Walk) -> list[_Found]:
     if path.name == NAME:
         path = path.parent
     if path.is_dir():
-        return _in_folder(path, skip=skip)
+        return _in_folder(path, walk=walk)
     if not path.is_file():
         raise ConfigError(f"{path}: there is no such file or folder")
     if path.suffix.lower() != ".zip":
@@ -112,7 +134,7 @@ def _at(path: Path, *, scratch: Path, skip: set[Path]) -> list[_Found]:
         refused = unpack(path, folder, limits=CLASS)
     except SubmissionError as error:
         raise ConfigError(str(error)) from None
-    found = _in_folder(folder, skip=skip)
+    found = _in_folder(folder, walk=walk)
     return _with_refused(found, refused, folder=folder)
 
 
@@ -120,19 +142,18 @@ def _with_refused(
     found: Sequence[_Found], refused: Mapping[PurePosixPath, str], *, folder: Path
 ) -> list[_Found]:
     """Return the hand-ins of an archive with what was refused of them, and those refused whole."""
-    tops = [
-        [PurePosixPath(source.relative_to(folder).as_posix()) for source in one.sources]
-        for one in found
-    ]
-    beside = min((len(top.parts) for of_one in tops for top in of_one), default=1)
+    whose = {
+        source.relative_to(folder).parts: i for i, one in enumerate(found) for source in one.sources
+    }
+    depths = sorted({len(parts) for parts in whose}) or [1]
     problems: dict[int, str] = {}
     lost: dict[str, str] = {}
     for member, why in sorted(refused.items()):
-        whose = [i for i, of_one in enumerate(tops) if any(map(member.is_relative_to, of_one))]
-        for i in whose:
-            problems.setdefault(i, why)
-        if not whose:
-            lost.setdefault(member.parts[:beside][-1], why)
+        owner = next((i for d in depths if (i := whose.get(member.parts[:d])) is not None), None)
+        if owner is None:
+            lost.setdefault(member.parts[: depths[0]][-1], why)
+        else:
+            problems.setdefault(owner, why)
     return [
         *(_Found(name=x, parent=folder.name, sources=(), problem=why) for x, why in lost.items()),
         *(replace(one, problem=problems.get(i, one.problem)) for i, one in enumerate(found)),
@@ -156,22 +177,22 @@ def _holds_a_class(archive: Path) -> bool:
 # ------------------------------------------------------------------------ folders
 
 
-def _in_folder(folder: Path, *, skip: set[Path], top: bool = True, depth: int = 0) -> list[_Found]:
+def _in_folder(folder: Path, *, walk: _Walk, top: bool = True, depth: int = 0) -> list[_Found]:
     """Return the hand-ins in a folder; one that cannot be looked into is itself one."""
     try:
-        return _looked_into(folder, skip=skip, top=top, depth=depth)
+        return _looked_into(folder, walk=walk, top=top, depth=depth)
     except OSError as error:
         problem = f"cannot be read ({error.strerror or error})"
         return [_Found(name=folder.name, parent=folder.parent.name, sources=(), problem=problem)]
 
 
-def _looked_into(folder: Path, *, skip: set[Path], top: bool, depth: int) -> list[_Found]:
+def _looked_into(folder: Path, *, walk: _Walk, top: bool, depth: int) -> list[_Found]:
     if _is_submission(folder) or depth > DEEPEST:
         return [_Found(name=folder.name, parent=folder.parent.name, sources=(folder,))]
     entries = [
         entry
         for entry in sorted(folder.iterdir())
-        if entry not in skip and not _is_passed_over(entry)
+        if entry not in walk.skip and not _is_passed_over(entry, walk=walk)
     ]
     uploads = {entry: upload for entry in entries if (upload := parse_name(entry.name))}
     if uploads:
@@ -179,16 +200,22 @@ def _looked_into(folder: Path, *, skip: set[Path], top: bool, depth: int) -> lis
         return _from_platform(folder, uploads, top=top) + [_single(entry) for entry in rest]
     entries = [entry for entry in entries if _may_be_one(entry)]
     if len(entries) == 1 and entries[0].is_dir() and not entries[0].is_symlink():
-        deeper = _in_folder(entries[0], skip=skip, top=top, depth=depth + 1)
-        return deeper or [_single(entries[0])]
+        deeper = _in_folder(entries[0], walk=walk, top=top, depth=depth + 1)
+        if deeper or not top:
+            return deeper
+        return [_single(folder if entries[0].name.lower() == _DATA else entries[0])]
     found, without = [], []
     for entry in entries:
-        if entry.is_symlink() or not entry.is_dir():
+        if entry.suffix.lower() in STRANGE_ARCHIVES:
+            without.append(_single(entry))
+        elif entry.is_symlink() or not entry.is_dir():
             found.append(_single(entry))
-        elif here := _in_folder(entry, skip=skip, top=False, depth=depth + 1):
+        elif here := _in_folder(entry, walk=walk, top=False, depth=depth + 1):
             found += here
         else:
             without.append(_single(entry))
+    if not found and any(entry.name.lower() == _DATA for entry in entries):
+        return [_single(folder)]  # a submission that lacks its file
     # Beside one submission, a folder without any is a student's own pictures or drafts.
     return found + without if top or len(found) > 1 else found
 
@@ -198,20 +225,29 @@ def _is_submission(folder: Path) -> bool:
     return toml.is_symlink() or toml.exists()
 
 
-def _is_passed_over(entry: Path) -> bool:
+def _is_passed_over(entry: Path, *, walk: _Walk) -> bool:
     """Whether an entry is none of the students': debris, results, hidden without a submission."""
     if not entry.is_dir() or entry.name == "__MACOSX":
         return is_debris(PurePosixPath(entry.name)) or entry.name.startswith(".")
     if os.access(entry / NAME, os.F_OK):
         return False
+    if entry.name.startswith("."):
+        return True
     results = entry.parent if entry.name in _PARTS_OF_RESULTS else entry
-    return entry.name.startswith(".") or all(
-        os.access(results / name, os.F_OK) for name in _RESULTS
-    )
+    if not all(os.access(results / name, os.F_OK) for name in _RESULTS):
+        return False
+    if results not in walk.skip:  # a student's own folder may look so
+        walk.say(
+            f"{quote(f'{entry.parent.name}/{entry.name}')} is passed over: it looks like the "
+            f"results of a grading; if it is a hand-in, take {_RESULTS[0]} out of it"
+        )
+    return True
 
 
 def _may_be_one(entry: Path) -> bool:
-    return entry.is_dir() or entry.is_symlink() or entry.suffix.lower() == ".zip"
+    return (
+        entry.is_dir() or entry.is_symlink() or entry.suffix.lower() in (".zip", *STRANGE_ARCHIVES)
+    )
 
 
 def _single(entry: Path) -> _Found:
@@ -229,10 +265,8 @@ def _single(entry: Path) -> _Found:
 
 
 def _archive(path: Path) -> _Found:
-    name = _folder_inside(path)
-    return _Found(
-        name=name or path.stem, parent=path.stem if name else path.parent.name, sources=(path,)
-    )
+    name, own = _folder_inside(path), path.stem.removesuffix(".tar")
+    return _Found(name=name or own, parent=own if name else path.parent.name, sources=(path,))
 
 
 def _folder_inside(archive: Path) -> str:

@@ -16,7 +16,7 @@ from pathlib import Path, PurePosixPath
 
 from pipeline.errors import SubmissionError
 from pipeline.grading.lms_names import parse_name
-from pipeline.grading.unpack import HAND_IN, Limits, is_debris, unpack
+from pipeline.grading.unpack import HAND_IN, STRANGE_ARCHIVES, Limits, is_debris, unpack
 from pipeline.submission.complaints import quote
 from pipeline.submission.load import MAX_DATA_BYTES, NAME
 
@@ -178,6 +178,6 @@ def _nothing_in(into: Path) -> str:
         return f"no {NAME} in it: it is empty"
     named = ", ".join(quote(path.name) for path in files[:3])
     more = f" and {len(files) - 3} more" if len(files) > 3 else ""
-    strange = [p.name for p in files if p.suffix.lower() in (".rar", ".7z", ".gz", ".tar", ".tgz")]
+    strange = [path.name for path in files if path.suffix.lower() in STRANGE_ARCHIVES]
     hint = f"; {quote(strange[0])} cannot be opened, pack a zip file" if strange else ""
     return f"no {NAME} in it, only {named}{more}{hint}"

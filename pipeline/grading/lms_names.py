@@ -17,15 +17,20 @@ from typing import Literal
 
 Platform = Literal["canvas", "moodle", "gradescope"]
 
-_CANVAS = re.compile(r"(?P<owner>.+?)(?P<late>_LATE)?_(?P<user>\d+)_(?P<upload>\d+)_(?P<file>.+)")
+# Whatever follows is a file's name, a line's end in it too: so no name is gone through again from
+# each of its letters.
+_CANVAS = re.compile(
+    r"(?P<owner>.+?)(?P<late>_LATE)?_(?P<user>\d+)_(?P<upload>\d+)_(?P<file>.+)", re.DOTALL
+)
 _CANVAS_NAMELESS = re.compile(
-    r"(?P<late>LATE_)?(?P<owner>anon_(?P<user>\w{5}))_(?P<upload>\d+)_(?P<file>.+)"
+    r"(?P<late>LATE_)?(?P<owner>anon_(?P<user>\w{5}))_(?P<upload>\d+)_(?P<file>.+)", re.DOTALL
 )
 _CANVAS_TEXT = re.compile(
-    r"(?P<owner>.+?)(?P<late>_LATE)?_(?P<user>\d+)_(?P<file>(?:text|link)\.html)"
+    r"(?P<owner>.+?)(?P<late>_LATE)?_(?P<user>\d+)_(?P<file>(?:text|link)\.html)", re.DOTALL
 )
 _MOODLE = re.compile(
-    r"(?P<owner>.+?)(?:_(?P<user>\d+))?_assignsubmission_(?:file|onlinetext)(?:_(?P<file>.*))?"
+    r"(?P<owner>.+?)(?:_(?P<user>\d+))?_assignsubmission_(?:file|onlinetext)(?:_(?P<file>.*))?",
+    re.DOTALL,
 )
 _GRADESCOPE = re.compile(r"(?P<owner>submission_\d+)(?P<file>\.\w+)?")
 _ATTEMPT = re.compile(r"(?P<stem>.+)-(?P<attempt>\d{1,3})(?P<suffix>(?:\.\w+)?)")

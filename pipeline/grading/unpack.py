@@ -1,5 +1,6 @@
 """Unpack what strangers packed: never outside the folder, never more than fits."""
 
+import io
 import lzma
 import re
 import stat
@@ -8,7 +9,8 @@ import sys
 import unicodedata
 import zipfile
 import zlib
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import IO
@@ -18,8 +20,7 @@ from pipeline.submission.complaints import quote
 
 _CHUNK = 1 << 16
 _RATIO_FROM = 1_000_000  # bytes; a smaller file may be as empty as it likes
-_END, _END_SIGNATURE = struct.Struct("<4s4H2LH"), b"PK\x05\x06"
-_LONGEST_COMMENT = 65_535
+_END_OF_ZIP = 66_000  # bytes; there a comment may stand, which is read at once
 DEEPEST = 40  # folders in folders; a submission needs three
 _UTF8_NAME, _ENCRYPTED = 0x800, 0x1
 
@@ -28,6 +29,8 @@ _NOT_ON_WINDOWS = re.compile(r'(?i)[<>:"|?*\x00-\x1f]|[. ]$|^(con|prn|aux|nul|co
 
 _DEBRIS_FOLDERS = ("__MACOSX",)
 _DEBRIS_FILES = (".ds_store", "thumbs.db", "desktop.ini")
+# Archives that nothing here opens; a hand-in in one of them is told to be a zip file.
+STRANGE_ARCHIVES = (".7z", ".bz2", ".gz", ".rar", ".tar", ".tbz", ".tgz", ".xz", ".zst")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +40,7 @@ class Limits:
     Attributes
     ----------
     ratio : of a file's size to its packed size.
-    directory : bytes of the table of contents.
+    directory : bytes of the table of contents, which is read as a whole.
     whole : one bad member refuses the archive; else only itself.
     """
 
@@ -49,7 +52,7 @@ class Limits:
 
 
 HAND_IN = Limits()
-CLASS = Limits(members=200_000, total=50_000_000_000, ratio=1e4, directory=100_000_000, whole=False)
+CLASS = Limits(members=200_000, total=50_000_000_000, ratio=1e4, directory=24_000_000, whole=False)
 
 
 @dataclass(kw_only=True)
@@ -86,8 +89,7 @@ def unpack(archive: Path, into: Path, *, limits: Limits) -> dict[PurePosixPath, 
     shown = quote(archive.name)
     into.mkdir(parents=True)
     try:
-        _refuse_long_contents(archive, limits=limits)
-        with zipfile.ZipFile(archive) as opened:
+        with _opened(archive, limits=limits) as opened:
             return _extract(opened, into, budget=_Budget(limits=limits))
     except _TROUBLE as error:
         raise SubmissionError(f"{shown}: {_why(error)}") from None
@@ -98,8 +100,7 @@ def member_names(archive: Path, *, limits: Limits = HAND_IN) -> list[PurePosixPa
     if not archive.is_file():  # a pipe would be waited for
         return []
     try:
-        _refuse_long_contents(archive, limits=limits)
-        with zipfile.ZipFile(archive) as opened:
+        with _opened(archive, limits=limits) as opened:
             infos = [info for info in opened.infolist() if not info.is_dir()]
     except _TROUBLE:
         return []
@@ -144,21 +145,31 @@ def _why(error: Exception) -> str:
     return f"not a whole zip archive ({_line(error)})"
 
 
-def _refuse_long_contents(archive: Path, *, limits: Limits) -> None:
-    """Refuse an archive whose table of contents alone would fill the memory."""
+class _Bounded(io.BufferedReader):
+    """A file of which only so many bytes are read at once.
+
+    `zipfile` reads the table of contents as a whole, and it takes the length from whichever of
+    three records it follows.
+    """
+
+    def __init__(self, path: Path, *, most: int) -> None:
+        super().__init__(io.FileIO(path))
+        self._most = max(most, _END_OF_ZIP)
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        if size is not None and size > self._most:
+            raise _TooLarge(f"a table of contents of {size:,} bytes")
+        return super().read(size)  # without a size: the end of the file, for the comment in it
+
+
+@contextmanager
+def _opened(archive: Path, *, limits: Limits) -> Iterator[zipfile.ZipFile]:
+    """Open an archive that is not too large and whose contents fit the memory."""
     size = archive.stat().st_size
     if size > limits.total:
         raise _TooLarge(f"{size:,} bytes, the limit is {limits.total:,}")
-    with archive.open("rb") as file:
-        file.seek(max(0, size - _END.size - _LONGEST_COMMENT))
-        tail = file.read()
-    at = tail.rfind(_END_SIGNATURE)
-    if at < 0 or len(tail) - at < _END.size:
-        raise _Refused("not a whole zip archive (it has no end)")
-    _, _, _, _, _, directory, _, _ = _END.unpack_from(tail, at)
-    # A 64-bit archive says 2^32 - 1 here; no class needs one.
-    if directory > limits.directory:
-        raise _TooLarge(f"a table of contents of {directory:,} bytes")
+    with _Bounded(archive, most=limits.directory) as file, zipfile.ZipFile(file) as opened:
+        yield opened
 
 
 def _extract(opened: zipfile.ZipFile, into: Path, *, budget: _Budget) -> dict[PurePosixPath, str]:
