@@ -421,7 +421,8 @@ class Skipped:
 class Analysis:
     """All results of one submission, in pipeline order.
 
-    `files` maps each data file to its SHA-256; `rows` are the table; `chain` is None where no
+    `files` maps each data file to its SHA-256, `unreadable` each experiment that could not be read
+    to its reason; `rows` are the table; `chain` is None where no
     fit was possible (then `skipped` says why). `tables` are the students' own reduced tables, also
     where dwells stand in their place.
     """
@@ -447,6 +448,7 @@ class Analysis:
     skipped: tuple[Skipped, ...]
     warnings: tuple[str, ...]
     files: dict[str, str]
+    unreadable: dict[str, str] = field(default_factory=dict)
     discussion: str | None  # notes.md, without its comments
 
     @property

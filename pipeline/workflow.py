@@ -27,6 +27,7 @@ from pipeline.stages.compare import (
     NOT_IDENTIFIED,
     check_chain,
     check_decays,
+    check_files,
     check_rows,
     check_setup,
     check_steps,
@@ -93,7 +94,7 @@ def analyse(
 
     Raises
     ------
-    SubmissionError : a data file is broken or missing.
+    SubmissionError : none of the data files can be read.
     """
     system = submission.system
     n, springs = system.carts, system.springs
@@ -101,6 +102,8 @@ def analyse(
 
     progress("reading the data")
     data = read_data(submission)
+    for name, reason in data.unreadable.items():
+        log.skip(f"reading {name}", reason)
     log.warn(data.warnings)
     log.warn(_by_note((record.id, note) for record in data.records for note in record.notes))
     driven = _driven(data.records, n=n, unit=system.position.unit, log=log)
@@ -147,6 +150,7 @@ def analyse(
         input_unit=system.input.unit,
     )
     checks = [
+        *check_files(data.unreadable),
         *check_setup(data.records),
         *check_rows(rows),
         *check_decays(decays, position_unit=system.position.unit),
@@ -190,6 +194,7 @@ def analyse(
         skipped=tuple(log.skipped),
         warnings=tuple(log.warnings),
         files=data.files,
+        unreadable=data.unreadable,
         discussion=submission.discussion,
     )
 

@@ -189,7 +189,7 @@ BAD_TOML = {
     "too large": (GOOD + "# " + "x" * 1_000_000, r"1,000,\d+ bytes, the limit is 1,000,000"),
     "file missing": (
         GOOD.replace("step.csv", "stepp.csv"),
-        r"experiments\[1\]\.file \(step-a\): there is no file 'data/stepp\.csv'; "
+        r"step-a: there is no file 'data/stepp\.csv'; "
         r"did you mean 'step\.csv'\?",
     ),
     "file above": (GOOD.replace("data/step.csv", "../step.csv"), r"leaves the submission folder"),

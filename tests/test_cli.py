@@ -1,6 +1,8 @@
 """The command line as people meet it: real processes, exit codes, one clear line."""
 
+import html
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -110,6 +112,45 @@ def test_failed_checks_are_status_one(tmp_path):
     checks = {check["id"]: check["outcome"] for check in json.loads(done.stdout)["checks"]}
     assert checks["initial_final.K"] == "fail"
     assert done.returncode == 1
+
+
+def test_a_file_that_cannot_be_read_is_its_own_run_s_problem(tmp_path):
+    """One missing, one broken: told on stderr and in results.json with status 1, the rest is there.
+
+    Without a single file that can be read there is nothing to report.
+    """
+    folder = tmp_path / "team"
+    shutil.copytree(EXAMPLES / "one-cart", folder)
+    (folder / "data" / "decay-1a.csv").unlink()
+    step = folder / "data" / "step-1.csv"
+    lines = step.read_text(encoding="utf-8").splitlines()
+    step.write_text("\n".join([*lines[:40], "0.3,x,0.1", *lines[40:]]), encoding="utf-8")
+    done = cartlab("report", folder, "--no-pdf", "--json")
+    found = json.loads(done.stdout)
+
+    assert done.returncode == 1
+    reasons = {
+        "decay-1a": "there is no file 'data/decay-1a.csv'; did you mean 'decay-1b.csv'?",
+        "step-1": "data/step-1.csv line 41: 'input' is no number: 'x'",
+    }
+    failed = {check["id"] for check in found["checks"] if check["outcome"] == "fail"}
+    assert failed == {f"data.{name}" for name in reasons}
+    for name, reason in reasons.items():
+        assert f"cartlab: {name}: {reason}" in done.stderr
+        assert any(
+            skip["stage"] == f"reading {name}" and reason in skip["reason"]
+            for skip in found["skipped"]
+        )
+    page = html.unescape((folder / "report" / "report.html").read_text(encoding="utf-8"))
+    assert all(reason.partition(";")[0] in page for reason in reasons.values())
+    assert all(parameter["initial"] and parameter["final"] for parameter in found["parameters"])
+
+    for file in (folder / "data").iterdir():
+        file.unlink()
+    done = cartlab("report", folder, "--no-pdf")
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert re.search(r"there is no file 'data/decay-1a\.csv' \(and \d+ more\)$", line)
 
 
 def test_new_then_report_tells_what_to_do_next(tmp_path):

@@ -122,6 +122,23 @@ def test_a_cut_file_costs_its_own_run_only(folder, tmp_path):
     assert found.points > 19
 
 
+def test_a_missing_file_costs_what_was_to_be_in_it(folder, tmp_path):
+    """One of two decays: its run is flagged. The only control run: the piece is missing, too."""
+    whole, less = grade(folder), tmp_path / "team-07"
+    shutil.copytree(folder, less)
+    (less / "data" / "decay-1a.csv").unlink()
+    one = grade(less)
+    assert {(flag.code, flag.parameters) for flag in one.flags} == {("data_problem", ("decay-1a",))}
+    assert "there is no file 'data/decay-1a.csv'" in one.flags[0].message
+    (less / "data" / "control.csv").write_bytes(bytes(range(256)))
+    two = grade(less)
+    assert {(flag.code, flag.parameters) for flag in two.flags} == {
+        ("data_problem", ("decay-1a", "control")),
+        ("missing", ("closed_loop",)),
+    }
+    assert whole.points > one.points > two.points > 15
+
+
 def test_a_copied_file_and_another_experiment_s_are_seen(folder, tmp_path):
     """A decay in the place of a step: the copy and the missing step are one remark."""
     other = tmp_path / "team-07"

@@ -210,7 +210,9 @@ class Importer:
         size = path.stat().st_size
         copies = [self._folder / experiment.file for experiment in self._submission.experiments]
         return any(
-            copy.stat().st_size == size and copy.read_bytes() == path.read_bytes()
+            copy.is_file()
+            and copy.stat().st_size == size
+            and copy.read_bytes() == path.read_bytes()
             for copy in copies
         )
 

@@ -98,11 +98,17 @@ def run_report(
         write_file(out / "results.json", results_text(analysis))
         render_report(analysis, out, gap=gap, changes=changes, pdf=pdf, progress=progress)
     say(terminal_summary(analysis))
+    _say_unreadable(analysis)
     for line in (changes and changes_line(changes), open_line(analysis)):
         if line:
             say(line)
     say(f"wrote {out / 'report.html'}" + (f" and {out / 'report.pdf'}" if pdf else ""))
     return analysis
+
+
+def _say_unreadable(analysis: "Analysis") -> None:
+    for name, reason in analysis.unreadable.items():
+        say(f"cartlab: {name}: {reason}")
 
 
 def _comparison(earlier: Path | None) -> "Callable[[Analysis], DraftChanges | None]":
@@ -135,6 +141,7 @@ def solution(
         out.mkdir(parents=True, exist_ok=True)
         write_file(out / "solution.json", text := solution_text(analysis))
         render_solution(analysis, out, gap=gap, pdf=pdf, progress=progress)
+    _say_unreadable(analysis)
     say(f"wrote {out / 'solution.html'}" + (f" and {out / 'solution.pdf'}" if pdf else ""))
     if as_json:
         typer.echo(text, nl=False)
@@ -165,6 +172,7 @@ def gap(
         out.mkdir(parents=True, exist_ok=True)
         write_file(out / "gap.json", text := gap_text(found, analysis))
         render_gap(found, analysis, out, pdf=pdf, progress=progress)
+    _say_unreadable(analysis)
     say(f"{terminal_verdict(found)}\nwrote {out / 'gap.html'}")
     if as_json:
         typer.echo(text, nl=False)

@@ -169,9 +169,12 @@ def _handed_out(rubric: Rubric, *, folder: Path) -> Iterator[bytes]:
     """Yield the fingerprints of the rubric's examples and of those shipped for as many carts."""
     for example in rubric.examples:
         try:
-            yield fingerprint(read_data(load_submission(folder / example)).records)
+            data = read_data(load_submission(folder / example))
         except PipelineError as error:
             raise ConfigError(f"the rubric's example {example}: {error}") from None
+        for run, reason in data.unreadable.items():
+            raise ConfigError(f"the rubric's example {example}: {run}: {reason}")
+        yield fingerprint(data.records)
     for shipped in sorted(EXAMPLES.iterdir()):
         if (shipped / "submission.toml").is_file():
             submission = load_submission(shipped)

@@ -13,7 +13,7 @@ from pipeline.grading.checks_loop import (
 )
 from pipeline.grading.impossible import not_positive
 from pipeline.grading.laws import MOST_WIDENING, judge_laws
-from pipeline.grading.pieces import asked_pieces, missing_pieces
+from pipeline.grading.pieces import asked_pieces
 from pipeline.grading.reference import Reference
 from pipeline.grading.rubric import is_damping, matching
 from pipeline.grading.state_model import compare_entries
@@ -57,7 +57,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def _required(work: Work) -> Verdict:
-    pieces, missing = asked_pieces(work.rubric), missing_pieces(work.submission, work.rubric)
+    pieces, missing = asked_pieces(work.rubric), work.missing
     if not pieces:
         return Verdict(share=ALL, message="Nothing in particular was asked for.")
     return Verdict(

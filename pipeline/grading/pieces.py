@@ -1,5 +1,7 @@
 """What must be handed in and is not."""
 
+from collections.abc import Collection
+
 from pipeline.grading.grade import Flag
 from pipeline.grading.rubric import RequiredRuns, Rubric, matching
 from pipeline.submission import Experiment, Submission
@@ -13,8 +15,12 @@ def asked_pieces(rubric: Rubric) -> list[str]:
     return list(_pieces(None, rubric))
 
 
-def missing_pieces(submission: Submission, rubric: Rubric) -> list[str]:
-    """Return the names of the pieces that are not there."""
+def missing_pieces(
+    submission: Submission, rubric: Rubric, *, unreadable: Collection[str]
+) -> list[str]:
+    """Return the names of the pieces that are not there; an unreadable experiment is none."""
+    left = tuple(e for e in submission.experiments if e.id not in unreadable)
+    submission = submission.model_copy(update={"experiments": left})
     return [name for name, there in _pieces(submission, rubric).items() if not there]
 
 

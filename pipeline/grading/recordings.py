@@ -20,9 +20,9 @@ _AT_SPEED, _AWAY = 0.6, 1.5  # of the fastest
 _DRIVEN = 1e-3  # of the largest input of any run: a decay with more is driven
 
 
-def bad_runs(analysis: Analysis, *, unreadable: Mapping[str, str]) -> dict[str, str]:
+def bad_runs(analysis: Analysis) -> dict[str, str]:
     """Return the runs that do not hold what they should, each with what is wrong, in words."""
-    found = dict(unreadable)
+    found = dict(analysis.unreadable)
     usual = _usual_motion(analysis.records)
     setups = {
         check.id.removeprefix("setup."): check.message.split(": ", 1)[-1]

@@ -1,7 +1,7 @@
 """Grade one submission: its own recordings are analysed anew, nothing it brings is believed."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
@@ -11,7 +11,7 @@ from pipeline.grading.controller import diagnose_controller, reported_controller
 from pipeline.grading.diagnose import diagnose_tables
 from pipeline.grading.grade import CODES, Criterion, Flag, Grade, Outcome
 from pipeline.grading.lateness import late_deduction
-from pipeline.grading.pieces import missing_flag, missing_pieces
+from pipeline.grading.pieces import missing_flag
 from pipeline.grading.recordings import bad_runs, data_flag
 from pipeline.grading.reduced import diagnose_reduced
 from pipeline.grading.reference import recompute, trusted_chain
@@ -21,7 +21,6 @@ from pipeline.grading.state_model import diagnose_state_space, state_models
 from pipeline.grading.tolerance import exact
 from pipeline.grading.work import Work
 from pipeline.ingest.columns import conversion
-from pipeline.ingest.read import read_data
 from pipeline.results import Analysis
 from pipeline.submission import Experiment, InputOverride, Reported, Submission, System
 from pipeline.workflow import analyse
@@ -47,7 +46,7 @@ def grade_submission(
 ) -> Graded:
     """Analyse a submission's recordings under the rubric's system and grade what it reports.
 
-    Recordings that cannot be read are left out, and flagged. Where none can be, or the carts are
+    Recordings that cannot be read are flagged. Where none can be, or the carts are
     not as many as the rubric's, the grade is `failed` with its reason.
     """
     count = submission.system.carts
@@ -57,17 +56,10 @@ def grade_submission(
         return _failed(submission, rubric, name=name, reason=reason, days_late=days_late)
     submission, notes = under_rubric(submission, rubric)
     try:
-        analysis, unreadable = _analyse(submission, progress)
+        analysis = analyse(submission, design=False, progress=progress or (lambda text: None))
     except SubmissionError as error:
         return _failed(submission, rubric, name=name, reason=str(error), days_late=days_late)
-    grade = grade_analysis(
-        submission,
-        analysis,
-        rubric=rubric,
-        name=name,
-        days_late=days_late,
-        unreadable=unreadable,
-    )
+    grade = grade_analysis(submission, analysis, rubric=rubric, name=name, days_late=days_late)
     return Graded(grade=replace(grade, notes=(*notes, *grade.notes)), analysis=analysis)
 
 
@@ -78,14 +70,12 @@ def grade_analysis(
     rubric: Rubric,
     name: str,
     days_late: float = 0.0,
-    unreadable: Mapping[str, str] | None = None,
 ) -> Grade:
     """Grade a submission against the analysis of its own recordings: a pure function.
 
     Parameters
     ----------
     submission : under the rubric's system, see `under_rubric`.
-    unreadable : experiments that the analysis had to do without, each with the reason.
     """
     reported, signed = turned_round(submission.reported or Reported(), analysis.records)
     submission, n = submission.model_copy(update={"reported": reported}), rubric.system.carts
@@ -101,7 +91,7 @@ def grade_analysis(
         references=references,
         controller=reported_controller(submission, analysis, chain=chain, tables=tables),
         state_models=state_models(tables, chain=chain, n=n),
-        bad=bad_runs(analysis, unreadable=unreadable or {}),
+        bad=bad_runs(analysis),
     )
     criteria = _criteria(work)
     earned = sum((Fraction(str(c.points)) for c in criteria), Fraction(0))
@@ -180,35 +170,6 @@ def _under_calibration(experiment: Experiment, system: System) -> Experiment:
     return experiment.model_copy(update={"input": left})
 
 
-# --------------------------------------------------------------------- the analysis
-
-
-def _analyse(
-    submission: Submission, progress: Callable[[str], None] | None
-) -> tuple[Analysis, dict[str, str]]:
-    """Analyse what can be read; return also the experiments left out, with the reason.
-
-    Raises
-    ------
-    SubmissionError : nothing can be read.
-    """
-    say = progress or (lambda text: None)
-    try:
-        return analyse(submission, design=False, progress=say), {}
-    except SubmissionError as error:
-        unreadable = {}
-        for experiment in submission.experiments:
-            try:
-                read_data(submission.model_copy(update={"experiments": (experiment,)}))
-            except SubmissionError as own:
-                unreadable[experiment.id] = str(own).removeprefix(f"{experiment.id}: ")
-        left = tuple(e for e in submission.experiments if e.id not in unreadable)
-        if not left or not unreadable:
-            raise error
-        submission = submission.model_copy(update={"experiments": left})
-        return analyse(submission, design=False, progress=say), unreadable
-
-
 def _failed(
     submission: Submission, rubric: Rubric, *, name: str, reason: str, days_late: float
 ) -> Graded:
@@ -285,8 +246,8 @@ def _flags(work: Work) -> list[Flag]:
     if work.controller is not None:
         flags += diagnose_controller(work.controller)
     flags += diagnose_reduced(work.analysis)
-    if missing := missing_pieces(work.submission, work.rubric):
-        flags.append(missing_flag(missing))
+    if work.missing:
+        flags.append(missing_flag(work.missing))
     if work.bad:
         flags.append(data_flag(work.bad))
     return flags

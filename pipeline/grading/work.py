@@ -6,6 +6,7 @@ from fractions import Fraction
 from typing import Any
 
 from pipeline.grading.controller import Controller
+from pipeline.grading.pieces import missing_pieces
 from pipeline.grading.reference import References
 from pipeline.grading.rubric import Rubric
 from pipeline.plant.chain import Array
@@ -32,6 +33,11 @@ class Work:
     controller: Controller | None
     state_models: Sequence[Array]
     bad: Mapping[str, str]
+
+    @property
+    def missing(self) -> list[str]:
+        """What must be handed in and is not; a file that cannot be read is not."""
+        return missing_pieces(self.submission, self.rubric, unreadable=self.analysis.unreadable)
 
     @property
     def reported(self) -> Reported:

@@ -35,21 +35,26 @@ class Ingested:
     records : the time series, in the order of the submission.
     tables : frequency responses the students reduced, one a cart.
     files : SHA-256 of each data file, by path, sorted.
+    unreadable : by experiment, why its file is not among them: missing, broken, another's.
     warnings : what concerns more than one record.
     """
 
     records: tuple[Record, ...]
     tables: tuple[FrequencyResponse, ...]
     files: dict[str, str]
+    unreadable: dict[str, str]
     warnings: tuple[str, ...]
 
 
 def read_data(submission: Submission) -> Ingested:
     """Read every experiment's file into a record in position and input units.
 
+    A file that is missing or broken, or does not hold what its experiment says, is that
+    experiment's problem.
+
     Raises
     ------
-    SubmissionError : a file that is broken, or does not hold what the experiment says; one line.
+    SubmissionError : not one can be read; one line.
     """
     if not submission.experiments:
         raise SubmissionError(
@@ -60,8 +65,9 @@ def read_data(submission: Submission) -> Ingested:
     opened: list[_Opened] = []
     points: Points = {}
     warnings: list[str] = []
+    unreadable: dict[str, str] = {}
     for experiment in submission.experiments:
-        with _named(experiment):
+        with _noted(experiment, unreadable):
             if experiment.file not in tables:
                 tables[experiment.file] = read_table(submission.folder, experiment.file)
             table, _ = tables[experiment.file]
@@ -72,8 +78,10 @@ def read_data(submission: Submission) -> Ingested:
     records: list[Record] = []
     clocks = read_clocks([o.stamps for o in opened])  # one clock made them all
     for one, clock in zip(opened, clocks, strict=True):
-        with _named(one.experiment):
+        with _noted(one.experiment, unreadable):
             records.append(_read_record(one, clock, submission.system))
+    if len(unreadable) == len(submission.experiments):
+        raise SubmissionError(_none_readable(unreadable))
     warnings += _unused_scale(records, submission.system)
     records, found = with_signs(records, submission)
     responses, spread = frequency_responses(points)
@@ -81,17 +89,23 @@ def read_data(submission: Submission) -> Ingested:
         records=tuple(records),
         tables=responses,
         files={name: digest for name, (_, digest) in sorted(tables.items())},
+        unreadable=unreadable,
         warnings=(*warnings, *_copies(tables), *found, *((spread,) if responses else ())),
     )
 
 
 @contextmanager
-def _named(experiment: Experiment) -> Iterator[None]:
-    """Let errors begin with the experiment they are about."""
+def _noted(experiment: Experiment, unreadable: dict[str, str]) -> Iterator[None]:
+    """Keep an error as that of the experiment it is about."""
     try:
         yield
     except SubmissionError as error:
-        raise SubmissionError(f"{experiment.id}: {error}") from None
+        unreadable[experiment.id] = str(error)
+
+
+def _none_readable(unreadable: Mapping[str, str]) -> str:
+    (name, reason), *others = unreadable.items()
+    return f"{name}: {reason}{f' (and {len(others)} more)' if others else ''}"
 
 
 def _unused_scale(records: Sequence[Record], system: System) -> list[str]:

@@ -94,6 +94,20 @@ def _combined_sigmas(before: Estimate, after: Estimate) -> float | None:
 # ---------------------------------------------------------------------- checks
 
 
+def check_files(unreadable: Mapping[str, str]) -> list[Check]:
+    """Fail for each experiment whose file could not be read."""
+    return [
+        Check(
+            id=f"data.{name}",
+            outcome="fail",
+            value=None,
+            limit=None,
+            message=f"{name} could not be read, so all else is without it: {reason}",
+        )
+        for name, reason in unreadable.items()
+    ]
+
+
 def check_rows(rows: Sequence[ParameterRow]) -> list[Check]:
     """Judge every parameter that was measured in two ways; a wide error is no agreement."""
     verdicts: dict[bool | None, tuple[Outcome, str]] = {

@@ -4,6 +4,7 @@ import re
 import stat
 import tomllib
 from collections.abc import Iterator
+from contextlib import suppress
 from decimal import Decimal
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
@@ -214,7 +215,7 @@ def _experiment_problems(
 ) -> Iterator[tuple[Location, str]]:
     if not experiment.id.strip() or not experiment.id.isprintable() or len(experiment.id) > 100:
         yield ("id",), "expected 1 to 100 printable characters"
-    if (problem := outside(folder, experiment.file)) is not None:
+    if (problem := leaves(folder, experiment.file)) is not None:
         yield ("file",), problem
     for j, cart in enumerate(experiment.carts):
         yield from _in_range(("carts", j), cart, n)
@@ -275,19 +276,27 @@ def _posix(name: str) -> str:
     return str(PurePosixPath(name.replace("\\", "/")))
 
 
-def outside(folder: Path, name: str) -> str | None:
-    """Return why `name` is no readable regular file inside `folder`, or None where it is one."""
+def leaves(folder: Path, name: str) -> str | None:
+    """Return why `name` stands for no file inside `folder`, or None; it need not be there."""
     shown = quote(name)
     if not name.strip() or not name.isprintable():
         return f"expected a file name, found {shown}"
     windows, relative = PureWindowsPath(name), Path(_posix(name))
     if windows.drive or windows.root or relative.is_absolute() or ".." in windows.parts:
         return f"{shown} leaves the submission folder"
-    try:
-        root, target = folder.resolve(), (folder / relative).resolve()
-        if not target.is_relative_to(root):
+    with suppress(OSError, RuntimeError):  # `outside` tells what cannot be followed
+        if not (folder / relative).resolve().is_relative_to(folder.resolve()):
             return f"{shown} leaves the submission folder through a link"
-        info = target.stat()
+    return None
+
+
+def outside(folder: Path, name: str) -> str | None:
+    """Return why `name` is no readable regular file inside `folder`, or None where it is one."""
+    if (problem := leaves(folder, name)) is not None:
+        return problem
+    shown = quote(name)
+    try:
+        info = (folder / _posix(name)).resolve().stat()
     except FileNotFoundError:
         return f"there is no file {shown}{_near_file(folder, _posix(name))}"
     except (OSError, RuntimeError) as error:  # a loop of links is a RuntimeError before 3.13
