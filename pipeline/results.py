@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from pipeline.plant.chain import Array, Chain, ComplexArray, frozen_array
+from pipeline.plant.designed_loop import Margins
 
 Kind = Literal["decay", "step", "sine", "sweep", "closed_loop", "bode"]
 Hold = Literal["zero_order", "band_limited"]
@@ -353,6 +354,7 @@ class FeedbackDesign:
     overshoot_percent, settling_time (s, 2 %), peak_input : of the simulated step.
     t, y (n_carts, n), u : that step.
     reachable : False where the goal cannot be met; `message` says what is reachable.
+    margins : of the loop with its observer and delay, cut at the motor; None where not looked at.
     """
 
     cart: int
@@ -373,6 +375,7 @@ class FeedbackDesign:
     u: Array
     reachable: bool
     message: str
+    margins: Margins | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

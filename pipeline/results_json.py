@@ -164,6 +164,7 @@ def _feedback(design: FeedbackDesign) -> dict[str, Any]:
         "overshoot_percent": design.overshoot_percent,
         "settling_time": design.settling_time,
         "peak_input": design.peak_input,
+        "margins": design.margins and vars(design.margins),
         "reachable": design.reachable,
         "message": design.message,
     }

@@ -1,7 +1,7 @@
 """The straight line from a submission to its analysis: the only file that knows the order."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import ParamSpec, TypeVar
 
@@ -33,6 +33,7 @@ from pipeline.stages.compare import (
     check_steps,
     compare,
 )
+from pipeline.stages.design_check import design_margins, verify_design
 from pipeline.stages.frequency_response import (
     collect_dwells,
     dwell_fault,
@@ -162,6 +163,10 @@ def analyse(
     if design:
         progress("state feedback")
         feedback = _design(submission, fit, log=log)
+    if feedback and fit:
+        margins = log.attempt("margins", design_margins, fit.chain, feedback)
+        feedback = replace(feedback, margins=margins)
+        checks.append(verify_design(fit.chain, feedback))
     if feedback and is_reversed(data.records):
         log.warn(
             [

@@ -12,11 +12,15 @@ of Freedom Systems in an Introductory Controls Class", Proc. ASEE Annual Confere
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import DataError
+
+if TYPE_CHECKING:
+    import control  # half a second: imported where it is used
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -99,6 +103,22 @@ class Chain:
         C = np.zeros((f, 2 * f))
         C[:, 0::2] = np.eye(f)
         return A, B, C, np.zeros((f, 1))
+
+    def to_control(self, *, free: Sequence[int] | None = None) -> "control.StateSpace":
+        """Return the free carts as python-control's system, the others held.
+
+        States `x1, v1, x2, v2, …`, input `u`, outputs `x1, x2, …`, numbered as the carts are.
+        """
+        import control
+
+        carts = [row + 1 for row in self._rows(free)]
+        return control.StateSpace(
+            *self.state_space(free=free),
+            inputs=["u"],
+            outputs=[f"x{cart}" for cart in carts],
+            states=[f"{letter}{cart}" for cart in carts for letter in "xv"],
+            name="carts",
+        )
 
     def _rows(self, free: Sequence[int] | None) -> list[int]:
         carts = range(1, self.n + 1) if free is None else sorted(set(free))

@@ -218,11 +218,13 @@ def discretise(
     return phi[:size, :size], phi[:size, size]
 
 
-def loop_matrix(chain: Chain, controller: StateFeedback, *, sample_time: float) -> Array:
-    """Return the map of (x, prediction, acting input), (4n + 1)², from tick to tick.
+def broken_loop(
+    chain: Chain, controller: StateFeedback, *, sample_time: float
+) -> tuple[Array, Array, Array]:
+    """Return A (4n + 1)², B and C (4n + 1,) of the loop cut where the effort drives cart 1.
 
-    All carts free, one tick of delay, nothing clipped or rounded, no reference. The loop is
-    stable if and only if all eigenvalues lie inside the unit circle.
+    From a force on cart 1 to minus the effort, tick to tick; the state is (x, prediction, acting
+    effort). All carts free, one tick of delay, nothing clipped or rounded, no reference.
     """
     free = tuple(range(1, chain.n + 1))
     size = 2 * chain.n
@@ -232,8 +234,18 @@ def loop_matrix(chain: Chain, controller: StateFeedback, *, sample_time: float) 
     reading[0::2, 0::2] = np.eye(chain.n)
     reading[1::2, 0::2] = VELOCITY_CORRECTION / sample_time * np.eye(chain.n)
     predicted = np.hstack([model @ reading, model @ (np.eye(size) - reading), drive[:, None]])
-    moved = np.hstack([phi, np.zeros((size, size)), gamma[:, None]])
-    return np.vstack([moved, predicted, -controller.gains @ predicted])
+    moved = np.hstack([phi, np.zeros((size, size + 1))])
+    A = np.vstack([moved, predicted, -controller.gains @ predicted])
+    return A, np.append(gamma, np.zeros(size + 1)), np.append(np.zeros(2 * size), -1.0)
+
+
+def loop_matrix(chain: Chain, controller: StateFeedback, *, sample_time: float) -> Array:
+    """Return the map of (x, prediction, acting effort), (4n + 1)², from tick to tick.
+
+    The loop is stable if and only if all eigenvalues lie inside the unit circle.
+    """
+    A, B, C = broken_loop(chain, controller, sample_time=sample_time)
+    return A - np.outer(B, C)
 
 
 # ------------------------------------------------------------------- inside

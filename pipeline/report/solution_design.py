@@ -13,7 +13,7 @@ from pipeline.report.mathematics import Math, Term, matrix, parens, power, row, 
 from pipeline.report.model import formula, matlab_matrix, number_matrix
 from pipeline.report.numbers import percent, significant
 from pipeline.report.page import Page
-from pipeline.report.tables import cell, make_table
+from pipeline.report.tables import cell, make_table, margin_texts
 from pipeline.report.tex import from_tex
 from pipeline.results import FeedbackDesign
 
@@ -145,6 +145,7 @@ def design_blocks(page: Page) -> list[Block]:
             )
             + f" and needs {significant(design.peak_input, digits=3)} {page.drive} at most."
         ),
+        *_margins(design),
         paragraph("Gains are not unique. A student's own are right where"),
         bullet_list(
             spans(text)
@@ -156,6 +157,18 @@ def design_blocks(page: Page) -> list[Block]:
                 "the step, simulated with the reference chain, meets the goal of the task.",
             )
         ),
+    ]
+
+
+def _margins(design: FeedbackDesign) -> list[Block]:
+    found = [f"{name} {value} {at}".strip() for name, value, at in margin_texts(design.margins)]
+    if not found:
+        return []
+    return [
+        paragraph(
+            "Cut where the effort drives cart 1, with the controller's observer and the delay in "
+            f"it, the loop has these margins: {', '.join(found)}.".replace(" °", "°")
+        )
     ]
 
 

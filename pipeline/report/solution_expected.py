@@ -230,6 +230,7 @@ def solution_dict(analysis: Analysis) -> dict[str, Any]:
             "overshoot_percent": design.overshoot_percent,
             "settling_time": design.settling_time,
             "peak_input": design.peak_input,
+            "margins": design.margins and vars(design.margins),
         },
         "provenance": {"version": __version__, "files": dict(sorted(analysis.files.items()))},
     }

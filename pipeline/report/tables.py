@@ -24,6 +24,7 @@ from pipeline.results import (
     FeedbackDesign,
     HardwareCheck,
     LogDecrement,
+    Margins,
     ParameterRow,
     StepGain,
 )
@@ -255,6 +256,7 @@ def feedback_table(design: FeedbackDesign, *, number: int, units: tuple[str, str
         (spans("overshoot"), percent(design.overshoot_percent), ""),
         (spans("settling time, 2 %"), significant(design.settling_time, digits=3), "s"),
         (spans("largest input"), significant(design.peak_input, digits=3), drive),
+        *((spans(f"{name} margin"), value, at) for name, value, at in margin_texts(design.margins)),
     ]
     return make_table(
         number,
@@ -264,6 +266,23 @@ def feedback_table(design: FeedbackDesign, *, number: int, units: tuple[str, str
         [[cell(what), cell(value), cell(unit_text(unit))] for what, value, unit in rows],
         "ldl",
     )
+
+
+def margin_texts(margins: Margins | None) -> list[tuple[str, str, str]]:
+    """Return name, number and what belongs to it of each margin; none where they are unknown."""
+    if margins is None:
+        return []
+    gain, phase = margins.gain, margins.phase_deg
+    degrees = "" if phase is None else "° of lag " if phase > 0 else "° of lead "
+    return [
+        ("gain", significant(gain, digits=3), _at(margins.omega_gain)),
+        ("phase", significant(phase and abs(phase), digits=3), degrees + _at(margins.omega_phase)),
+        ("modulus", significant(margins.modulus, digits=3), ""),
+    ]
+
+
+def _at(omega: float | None) -> str:
+    return "no limit" if omega is None else f"at {significant(omega, digits=3)} rad/s"
 
 
 def pole_table(design: FeedbackDesign, *, number: int) -> Table:

@@ -49,6 +49,16 @@ class ChainWithUnits(Chain):
     units: ChainUnits
 
 
+class Margins(Document):
+    """How much the designed loop, cut at the motor, may change before it is unstable."""
+
+    gain: Annotated[Number, Field(description="a factor; null where none makes it unstable")]
+    phase_deg: Annotated[Number, Field(description="of lag; of lead where below zero")]
+    modulus: Annotated[Number, Field(description="least distance of the Nyquist curve from -1")]
+    omega_gain: Annotated[Number, Field(description="rad/s")]
+    omega_phase: Annotated[Number, Field(description="rad/s")]
+
+
 class Provenance(Document):
     """What made the file, and of what."""
 

@@ -4,7 +4,15 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from pipeline.schemas.base import ChainWithUnits, Document, Number, Numbers, Provenance, Units
+from pipeline.schemas.base import (
+    ChainWithUnits,
+    Document,
+    Margins,
+    Number,
+    Numbers,
+    Provenance,
+    Units,
+)
 
 
 class Submitted(Document):
@@ -142,6 +150,7 @@ class Feedback(Document):
     overshoot_percent: Number
     settling_time: Annotated[Number, Field(description="s, to within 2 %")]
     peak_input: Number
+    margins: Margins | None = None
     reachable: bool
     message: str
 

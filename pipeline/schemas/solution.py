@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from pipeline.schemas.base import Document, Number, Numbers, Provenance, Units
+from pipeline.schemas.base import Document, Margins, Number, Numbers, Provenance, Units
 
 
 class Bench(Document):
@@ -47,6 +47,7 @@ class ReferenceFeedback(Document):
     overshoot_percent: Number
     settling_time: Number
     peak_input: Number
+    margins: Margins | None = None
 
 
 class Solution(Document):
