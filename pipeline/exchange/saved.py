@@ -1,0 +1,121 @@
+"""An analysis saved for other programs: `tables/*.csv`, and `results.mat` for MATLAB.
+
+Same input, same bytes.
+"""
+
+import re
+from collections.abc import Mapping
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.io import savemat
+
+from pipeline.exchange.frames import record_series, tables
+from pipeline.output import clear_files, own_folder, write_file
+from pipeline.results import Analysis, Estimate
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_DIGITS = "%.10g"  # significant, as in results.json
+_HEADER = b"MATLAB 5.0 MAT-file".ljust(116)  # scipy's own holds the time of day
+_LONGEST_NAME = 63  # of a variable in MATLAB
+_RESPONSE = ("cart", "omega", "magnitude", "magnitude_std", "phase", "phase_std")
+
+
+def save_tables(analysis: Analysis, out: Path) -> None:
+    """Write one `tables/*.csv` a table of results, and `results.mat`, into the folder `out`."""
+    folder = own_folder(out, "tables")
+    folder.mkdir(parents=True, exist_ok=True)
+    clear_files(folder, "*.csv")
+    for name, frame in tables(analysis).items():
+        write_file(folder / f"{name}.csv", _csv(frame))
+    write_file(out / "results.mat", matlab_file(analysis))
+
+
+def _csv(frame: "pd.DataFrame") -> str:
+    """Return the table as text; a heading holds its column's unit in brackets."""
+    headings = {name: f"{name} [{unit}]" for name, unit in frame.attrs["units"].items()}
+    return frame.rename(columns=headings).to_csv(
+        index=False, float_format=_DIGITS, lineterminator="\n"
+    )
+
+
+def matlab_file(analysis: Analysis) -> bytes:
+    """Return a MAT-file (level 5) whose variables are named as in `results.json`.
+
+    `parameters.initial.K_1`, `parameters.initial_std.K_1`, the same for `final`; `A`, `B`, `C`,
+    `D`, and `m`, `c`, `k` of the chain; `gains`, `prefilter`, `sample_time`; one structure a cart
+    in `frequency_response`; `records.ID` with `time`, `u`, `x1`, …; `units`. A number that could
+    not be had is NaN; what was not found at all is not there.
+    """
+    chain, design = analysis.chain, analysis.feedback
+    variables: dict[str, Any] = {
+        "units": {"position": analysis.position_unit, "input": analysis.input_unit, "time": "s"},
+        "parameters": {
+            "initial": {row.name: _value(row.initial) for row in analysis.rows},
+            "initial_std": {row.name: _std(row.initial) for row in analysis.rows},
+            "final": {row.name: _value(row.final) for row in analysis.rows},
+            "final_std": {row.name: _std(row.final) for row in analysis.rows},
+        },
+        "frequency_response": _structures(
+            [
+                {key: _or_empty(getattr(response, key)) for key in _RESPONSE}
+                for response in analysis.frequency_responses
+            ],
+        ),
+        "records": _named(
+            {
+                record.id: {"id": record.id, "kind": record.kind, **record_series(record)}
+                for record in analysis.records
+            }
+        ),
+    }
+    if chain is not None:
+        variables |= dict(zip("ABCD", chain.state_space(), strict=True))
+        variables |= {"m": chain.m, "c": chain.c, "k": chain.k}
+    if design is not None:
+        variables |= {
+            "gains": design.gains[None, :],
+            "prefilter": design.prefilter,
+            "sample_time": design.sample_time,
+        }
+    stream = BytesIO()
+    savemat(stream, variables, oned_as="column", long_field_names=True)
+    return _HEADER + stream.getvalue()[len(_HEADER) :]
+
+
+def _value(estimate: Estimate | None) -> float:
+    return np.nan if estimate is None else estimate.value
+
+
+def _std(estimate: Estimate | None) -> float:
+    return np.nan if estimate is None or estimate.std is None else estimate.std
+
+
+def _or_empty(value: Any) -> Any:
+    return np.zeros((0, 0)) if value is None else value
+
+
+def _structures(rows: list[dict[str, Any]]) -> Any:
+    """Return an array of structures (1, n), as MATLAB has them."""
+    array = np.empty((1, len(rows)), dtype=[(key, object) for key in _RESPONSE])
+    for i, row in enumerate(rows):
+        array[0, i] = tuple(row.values())
+    return array
+
+
+def _named(records: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the records under names that MATLAB takes, one each: `step-1` as `step_1`."""
+    named: dict[str, Any] = {}
+    for id_, record in records.items():
+        plain = re.sub(r"\W", "_", id_, flags=re.ASCII)
+        plain = plain if plain[:1].isalpha() else f"r_{plain}"
+        name, count = plain[:_LONGEST_NAME], 1
+        while name in named:
+            count += 1
+            name = f"{plain[: _LONGEST_NAME - 4]}_{count}"
+        named[name] = record
+    return named
