@@ -1,17 +1,30 @@
-"""An analysis for a notebook: one call, and every part shows itself."""
+"""An analysis for a notebook: one call, and everything in the types of pandas and control."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from pipeline.errors import ConfigError
+from pipeline.errors import ConfigError, DataError
+from pipeline.exchange import frames
+from pipeline.plant.chain import Chain
+from pipeline.plant.designed_loop import closed_loop
+from pipeline.plant.loop import StateFeedback
 from pipeline.report.content import build_document
 from pipeline.report.document import Block, Document, Heading, spans
 from pipeline.report.html import render_fragment
 from pipeline.report.known_gap import with_gap
+from pipeline.report.questions import ask
 from pipeline.report.summary import terminal_summary
-from pipeline.results import Analysis
+from pipeline.results import Analysis, FeedbackDesign
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse as run
+
+if TYPE_CHECKING:
+    import control
+    import pandas as pd
+
+_AT_A_GLANCE = ("summary", "parameters")
 
 
 @dataclass(frozen=True)
@@ -29,10 +42,114 @@ class Shown:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
-class LabAnalysis(Analysis):
-    """All results of one submission; at the end of a cell it shows its summary and its table."""
+class Lab:
+    """All results of one submission; at the end of a cell it shows its summary and its table.
 
+    Attributes
+    ----------
+    results : the same in the program's own types (`pipeline.results`).
+    """
+
+    results: Analysis
     document: Document
+
+    # ----------------------------------------------------------------- systems
+
+    @property
+    def chain(self) -> Chain:
+        """The identified masses, dampings and springs.
+
+        Raises
+        ------
+        DataError : the carts could not be identified; `results.skipped` says why.
+        """
+        if self.results.chain is None:
+            raise DataError("the carts were not identified: results.skipped says why")
+        return self.results.chain
+
+    @property
+    def design(self) -> FeedbackDesign:
+        """The designed state feedback: gains, prefilter, margins, …
+
+        Raises
+        ------
+        DataError : none was designed; `results.skipped` says why.
+        """
+        if self.results.feedback is None:
+            raise DataError("no feedback was designed: results.skipped says why")
+        return self.results.feedback
+
+    @cached_property
+    def system(self) -> "control.StateSpace":
+        """The carts: states `x1, v1, …`, input `u`, outputs `x1, …`, continuous."""
+        return self.chain.to_control()
+
+    @cached_property
+    def transfer_functions(self) -> "dict[str, control.TransferFunction]":
+        """The same from `u` to each output, by the output's name."""
+        import control
+
+        return {
+            name: control.TransferFunction(
+                *self.chain.transfer_function(cart), inputs=["u"], outputs=[name], name=name
+            )
+            for cart, name in enumerate(self.system.output_labels, start=1)
+        }
+
+    @cached_property
+    def closed_loop(self) -> "control.StateSpace":
+        """The designed loop from the set point `r` to the positions, sampled: `dt` in s.
+
+        States `x1, v1, …` and the effort `u` that acts, computed a sample before.
+        """
+        design = self.design
+        controller = StateFeedback(gains=design.gains, prefilter=design.prefilter)
+        return closed_loop(self.chain, controller, sample_time=design.sample_time)
+
+    # ------------------------------------------------------------------ tables
+
+    @cached_property
+    def parameters(self) -> "pd.DataFrame":
+        """Initial and final estimates, by parameter."""
+        return frames.parameters(self.results)
+
+    @cached_property
+    def checks(self) -> "pd.DataFrame":
+        """The consistency checks, by id."""
+        return frames.checks(self.results)
+
+    @cached_property
+    def decays(self) -> "pd.DataFrame":
+        """Natural frequency and damping of each free decay, with its friction test."""
+        return frames.decays(self.results)
+
+    @cached_property
+    def steps(self) -> "pd.DataFrame":
+        """The static gain of each step and cart."""
+        return frames.steps(self.results)
+
+    @cached_property
+    def dwells(self) -> "pd.DataFrame":
+        """Amplitudes, ratio and phase of each sine dwell and cart."""
+        return frames.dwells(self.results)
+
+    @cached_property
+    def frequency_response(self) -> "pd.DataFrame":
+        """The measured points of the Bode plots, by cart and frequency."""
+        return frames.frequency_response(self.results)
+
+    @cached_property
+    def records(self) -> "dict[str, pd.DataFrame]":
+        """The records by experiment, each by `time`, with columns `u`, `x1`, …"""
+        records = self.results.records
+        return {r.id: frames.record_frame(r, analysis=self.results) for r in records}
+
+    # ------------------------------------------------------------------ report
+
+    @property
+    def questions(self) -> dict[str, str]:
+        """What this data raises, by the id under which `notes.md` answers it."""
+        return {question.id: question.text for question in ask(self.results)}
 
     @property
     def sections(self) -> tuple[str, ...]:
@@ -58,21 +175,16 @@ class LabAnalysis(Analysis):
         )
 
     def __repr__(self) -> str:
-        return terminal_summary(self)
+        return terminal_summary(self.results)
 
 
-_AT_A_GLANCE = ("summary", "parameters")
-
-
-def analyse(folder: Path | str) -> LabAnalysis:
+def analyse(folder: Path | str) -> Lab:
     """Run the whole pipeline on a submission folder.
 
     Raises
     ------
-    SubmissionError : `submission.toml` or a data file is wrong or missing.
+    SubmissionError : `submission.toml` is wrong or missing, or no data can be read.
     """
     submission = load_submission(Path(folder))
-    analysis, gap = with_gap(run(submission), submission.folder)
-    document = build_document(analysis, gap=gap, progress=None)
-    values = {field.name: getattr(analysis, field.name) for field in fields(analysis)}
-    return LabAnalysis(**values, document=document)
+    results, gap = with_gap(run(submission), submission.folder)
+    return Lab(results=results, document=build_document(results, gap=gap, progress=None))

@@ -17,7 +17,7 @@ LEVELS = (
     ("ingest", "stages"),
     ("workflow", "synthesis", "results_json"),
     ("gap",),
-    ("report",),
+    ("exchange", "report"),
     ("grading", "bench"),
     ("cli", "notebook"),
     ("__main__",),
@@ -33,9 +33,9 @@ HOMES = {
     "tomlkit": ("bench",),
     "starlette": ("bench",),
     "uvicorn": ("bench",),
-    "control": ("plant", "stages"),
+    "control": ("plant", "stages", "notebook"),
     "sqlalchemy": ("grading",),
-    "pandas": ("ingest", "report", "grading"),
+    "pandas": ("exchange", "grading", "notebook"),
 }
 MODULES = sorted(PIPELINE.rglob("*.py"))
 

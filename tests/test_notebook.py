@@ -4,15 +4,21 @@ import ast
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import matplotlib as mpl
+import numpy as np
 import pytest
+from matplotlib import pyplot
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.optimize import linear_sum_assignment
 
 import pipeline
-from pipeline.errors import ConfigError, SubmissionError
-from pipeline.notebook import LabAnalysis, analyse
+from pipeline.errors import ConfigError, DataError, SubmissionError
+from pipeline.notebook import Lab, analyse
 from pipeline.resources import EXAMPLES
-from pipeline.results_json import results_text
+from pipeline.results_json import results_dict, results_text
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse as run
 from tests.test_report import Page
@@ -21,25 +27,110 @@ NOTEBOOK = Path(__file__).parents[1] / "docs" / "example.ipynb"
 
 
 @pytest.fixture(scope="module")
-def lab() -> LabAnalysis:
+def lab() -> Lab:
     return analyse(EXAMPLES / "two-cart")
 
 
 def test_analyse_is_the_packages_own(lab):
     """`from pipeline import analyse` is this function, and gives the very results of a report."""
     assert pipeline.analyse is analyse
-    assert results_text(lab) == results_text(run(load_submission(EXAMPLES / "two-cart")))
+    assert results_text(lab.results) == results_text(run(load_submission(EXAMPLES / "two-cart")))
 
 
 def test_nothing_heavy_is_loaded_until_it_is_asked_for():
-    """Importing the package alone loads neither numpy nor matplotlib; another name is no name."""
-    code = "import sys, pipeline; print({'numpy', 'matplotlib'} & set(sys.modules))"
+    """Importing the package alone loads nothing heavy; another name is no name."""
+    code = (
+        "import sys, pipeline; "
+        "print({'numpy', 'matplotlib', 'pandas', 'control'} & set(sys.modules))"
+    )
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, encoding="utf-8", check=True
     )
     assert done.stdout.strip() == "set()"
     with pytest.raises(AttributeError, match="no attribute 'analyze'"):
         pipeline.analyze  # noqa: B018
+
+
+def test_the_system_is_the_identified_chain(lab):
+    """States, input and outputs are named, and A to D are those of results.json."""
+    system = lab.system
+    assert system.isctime()
+    assert system.state_labels == ["x1", "v1", "x2", "v2"]
+    assert (system.input_labels, system.output_labels) == (["u"], ["x1", "x2"])
+    for own, letter in zip(lab.chain.state_space(), "ABCD", strict=True):
+        assert_array_equal(getattr(system, letter), own)
+
+
+def test_one_cart_held_is_a_system_of_its_own(lab):
+    """With cart 1 held, what is left is cart 2 alone, which nothing drives."""
+    alone = lab.chain.to_control(free=(2,))
+    assert (alone.state_labels, alone.output_labels) == (["x2", "v2"], ["x2"])
+    assert_array_equal(alone.B, np.zeros((2, 1)))
+
+
+def test_transfer_functions_are_those_of_the_system(lab):
+    """By output, with the frequency response of the state model."""
+    omega = np.geomspace(1.0, 100.0, 20)
+    assert list(lab.transfer_functions) == ["x1", "x2"]
+    for row, (name, found) in enumerate(lab.transfer_functions.items()):
+        assert found.output_labels == [name]
+        # Near a resonance of zeta 0.03 the polynomial of degree four loses two digits.
+        assert_allclose(found(1j * omega), lab.chain.frequency_response(omega)[row], rtol=1e-11)
+
+
+def test_the_closed_loop_is_the_designed_one(lab):
+    """It is sampled as the design is, and its poles are the design's and the delay's."""
+    loop, design = lab.closed_loop, lab.design
+    assert loop.dt == design.sample_time
+    assert loop.input_labels == ["r"]
+    expected = np.append(np.exp(design.poles * loop.dt), 0.0)
+    away = np.abs(loop.poles()[:, None] - expected)
+    # The pole at zero is as well conditioned as the others, all of them apart.
+    assert away[linear_sum_assignment(away)].max() < 1e-9
+
+
+def test_tables_have_the_names_of_the_results(lab):
+    """One row a parameter, check, decay, step and dwell; units in the attributes."""
+    results = results_dict(lab.results)
+    for frame, rows in (
+        (lab.parameters, results["parameters"]),
+        (lab.checks, results["checks"]),
+    ):
+        assert list(frame.columns) == list(rows[0])
+        assert len(frame) == len(rows)
+    assert lab.parameters.loc["omega_a", "final"] == results["parameters"][2]["final"]
+    assert (lab.checks["outcome"] == "pass").all()
+    assert list(lab.decays["experiment"]) == ["decay-1a", "decay-1b", "decay-2a", "decay-2b"]
+    assert not lab.decays["friction_present"].any()
+    assert len(lab.steps) == len(results["step_gains"])
+    assert lab.steps.attrs["units"]["gain"] == "cm/V"
+    assert len(lab.dwells) == len(lab.results.sine_points)
+    assert lab.dwells.attrs["units"]["omega"] == "rad/s"
+    assert len(lab.frequency_response) == sum(
+        len(response["omega"]) for response in results["frequency_response"]
+    )
+
+
+def test_records_are_tables_by_time(lab):
+    """Each record has its measured times as index, and input and positions as columns."""
+    run = lab.records["control"]
+    (record,) = [record for record in lab.results.records if record.id == "control"]
+    assert list(run.columns) == ["u", "reference", "x1", "x2"]
+    assert run.index.name == "time"
+    assert_array_equal(run.index, record.t)
+    assert_array_equal(run["x2"], record.position(2))
+    assert run.attrs["units"] == {
+        "time": "s", "u": "V", "reference": "cm", "x1": "cm", "x2": "cm"
+    }  # fmt: skip
+
+
+def test_what_was_not_found_is_said(lab):
+    """Without a fit or a design there is no system or loop; the error says where to look."""
+    bare = replace(lab, results=replace(lab.results, fit=None, feedback=None))
+    with pytest.raises(DataError, match=r"not identified: results\.skipped"):
+        _ = bare.system
+    with pytest.raises(DataError, match="no feedback was designed"):
+        _ = bare.closed_loop
 
 
 def test_an_analysis_shows_its_summary_and_its_table(lab):
@@ -87,11 +178,12 @@ def test_the_style_sheet_stays_inside(lab):
 
 def test_the_example_notebook_runs(monkeypatch):
     """Every code cell runs, in order, and what ends a cell shows itself."""
+    mpl.use("agg")
     monkeypatch.chdir(EXAMPLES.parent)
     notebook = json.loads(NOTEBOOK.read_text(encoding="utf-8"))
     assert (notebook["nbformat"], notebook["nbformat_minor"]) == (4, 5)
     names: dict[str, object] = {}
-    shown = []
+    shown = {}
     for cell in notebook["cells"]:
         assert {"cell_type", "id", "metadata", "source"} <= set(cell)
         if cell["cell_type"] != "code":
@@ -100,13 +192,12 @@ def test_the_example_notebook_runs(monkeypatch):
         *body, last = ast.parse("".join(cell["source"])).body
         exec(compile(ast.Module(body, []), "cell", "exec"), names)
         assert isinstance(last, ast.Expr)
-        shown.append(eval(compile(ast.Expression(last.value), "cell", "eval"), names))
-    assert [hasattr(value, "_repr_html_") for value in shown] == [
-        True,
-        True,
-        False,
-        False,
-        False,
-        True,
-    ]
-    assert "omega_a falls from 10.138 to" in str(shown[3])
+        shown[cell["id"]] = eval(compile(ast.Expression(last.value), "cell", "eval"), names)
+    pyplot.close("all")
+    assert all(hasattr(shown[id_], "_repr_html_") for id_ in ("analyse", "bode", "steps"))
+    assert "omega_a falls from 10.138 to" in shown["heavier"]
+    steps = shown["steps"]
+    # The bench ran the designed loop; a controller of one's own settles too, and overshoots.
+    assert steps.loc["designed", "SettlingTime"] == steps.loc["measured", "SettlingTime"]
+    assert_allclose(steps["SteadyStateValue"], 1.0, rtol=5e-3)  # two encoder steps of 0.0023 cm
+    assert 5 < steps.loc["mine", "Overshoot"] < 10

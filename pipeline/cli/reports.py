@@ -61,10 +61,13 @@ def report(
         Path | None,
         typer.Option(metavar="RESULTS", help="An earlier results.json: say what changed."),
     ] = None,
+    tables: Annotated[
+        bool, typer.Option("--tables", help="Write tables/*.csv and, for MATLAB, results.mat too.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Identify the carts, design the controller, check the hardware, write the report."""
-    analysis = run_report(folder, out=out, pdf=pdf, compare=compare)
+    analysis = run_report(folder, out=out, pdf=pdf, compare=compare, tables=tables)
     if as_json:
         from pipeline.results_json import results_text
 
@@ -75,7 +78,12 @@ def report(
 
 
 def run_report(
-    folder: Path, *, out: Path | None, pdf: bool, compare: Path | None = None
+    folder: Path,
+    *,
+    out: Path | None,
+    pdf: bool,
+    compare: Path | None = None,
+    tables: bool = False,
 ) -> "Analysis":
     """Write the report of a submission and say in a few lines what it found."""
     from pipeline.output import check_folder, own_folder, write_file
@@ -96,6 +104,10 @@ def run_report(
         changes = compared(analysis)
         out.mkdir(parents=True, exist_ok=True)
         write_file(out / "results.json", results_text(analysis))
+        if tables:
+            from pipeline.exchange.saved import save_tables  # loads pandas
+
+            save_tables(analysis, out)
         render_report(analysis, out, gap=gap, changes=changes, pdf=pdf, progress=progress)
     say(terminal_summary(analysis))
     _say_unreadable(analysis)

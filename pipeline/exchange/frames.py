@@ -93,7 +93,7 @@ def record_frame(record: Record, *, analysis: Analysis) -> "pd.DataFrame":
 
 
 def record_series(record: Record) -> dict[str, Array]:
-    """Return `time`, `u`, `reference` (where there are any) and the positions `x1`, …, each (n,)."""
+    """Return `time`, `u` and `reference` where there are any, and positions `x1`, …: (n,) each."""
     series = {"time": record.t, "u": record.u, "reference": record.reference}
     positions = {f"x{cart}": record.position(cart) for cart in record.carts}
     return {name: values for name, values in series.items() if values is not None} | positions

@@ -13,13 +13,13 @@ import numpy as np
 from scipy.io import savemat
 
 from pipeline.exchange.frames import record_series, tables
-from pipeline.output import clear_files, own_folder, write_file
+from pipeline.output import clear_files, csv_text, own_folder, write_file
 from pipeline.results import Analysis, Estimate
+from pipeline.results_json import plain_json
 
 if TYPE_CHECKING:
     import pandas as pd
 
-_DIGITS = "%.10g"  # significant, as in results.json
 _HEADER = b"MATLAB 5.0 MAT-file".ljust(116)  # scipy's own holds the time of day
 _LONGEST_NAME = 63  # of a variable in MATLAB
 _RESPONSE = ("cart", "omega", "magnitude", "magnitude_std", "phase", "phase_std")
@@ -37,10 +37,9 @@ def save_tables(analysis: Analysis, out: Path) -> None:
 
 def _csv(frame: "pd.DataFrame") -> str:
     """Return the table as text; a heading holds its column's unit in brackets."""
-    headings = {name: f"{name} [{unit}]" for name, unit in frame.attrs["units"].items()}
-    return frame.rename(columns=headings).to_csv(
-        index=False, float_format=_DIGITS, lineterminator="\n"
-    )
+    units = frame.attrs["units"]
+    head = [f"{name} [{units[name]}]" if name in units else name for name in frame.columns]
+    return csv_text(head, plain_json(frame.to_numpy(dtype=object).tolist()))
 
 
 def matlab_file(analysis: Analysis) -> bytes:

@@ -97,7 +97,7 @@ class Chain:
         A = np.zeros((2 * f, 2 * f))
         A[0::2, 1::2] = np.eye(f)
         A[1::2, 0::2] = -inverse[:, None] * stiffness
-        A[1::2, 1::2] = -inverse[:, None] * damping
+        A[1::2, 1::2] = np.diag(-inverse * np.diag(damping))
         B = np.zeros((2 * f, 1))
         B[1::2, 0] = inverse * force
         C = np.zeros((f, 2 * f))
@@ -212,6 +212,12 @@ class Chain:
     def zeros(self, cart: int) -> ComplexArray:
         """Return the 2(n - cart) zeros of X_cart/U."""
         return np.roots(self.tails()[cart]).astype(np.complex128)
+
+    def transfer_function(self, cart: int) -> tuple[Array, Array]:
+        """Return numerator and denominator of X_cart/U, in falling powers; the latter is monic."""
+        tails = self.tails()
+        reach = np.prod(self.k[1:cart] / self.m[1:cart]) / self.m[0]
+        return reach * tails[cart], tails[0]
 
     def parameters(self) -> dict[str, float]:
         """Return the named parameters of this chain, in the order of the paper's Tables 1-3.

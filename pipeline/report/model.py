@@ -232,9 +232,7 @@ def _short(value: float) -> Term:
 
 
 def _polynomial_ratio(chain: Chain, cart: int) -> Math:
-    tails = chain.tails()
-    gain = np.prod(chain.k[1:cart]) / np.prod(chain.m[:cart])
-    above, below = gain * tails[cart], tails[0]
+    above, below = chain.transfer_function(cart)
     return row(_ratio(cart), "=", fraction(_polynomial(above), _polynomial(below)))
 
 

@@ -1,0 +1,110 @@
+"""What `report --tables` saves is what the analysis found, for pandas and for MATLAB."""
+
+import io
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.io
+from numpy.testing import assert_allclose, assert_array_equal
+
+from pipeline.exchange import frames
+from pipeline.exchange.saved import matlab_file, save_tables
+from pipeline.resources import EXAMPLES
+from pipeline.results import Analysis
+from pipeline.submission import load_submission
+from pipeline.workflow import analyse
+from tests.test_cli import cartlab
+
+TABLES = {"parameters", "checks", "decays", "steps", "dwells", "frequency_response"}
+
+
+@pytest.fixture(scope="module")
+def analysis() -> Analysis:
+    return analyse(load_submission(EXAMPLES / "two-cart"))
+
+
+def matlab(analysis: Analysis) -> dict:
+    return scipy.io.loadmat(
+        io.BytesIO(matlab_file(analysis)), simplify_cells=True, chars_as_strings=True
+    )
+
+
+def test_the_saved_tables_hold_the_analysis(analysis, tmp_path):
+    """Each table reads back to ten digits; headings have units; twice gives the same bytes."""
+    save_tables(analysis, tmp_path)
+    assert {path.stem for path in (tmp_path / "tables").iterdir()} == TABLES
+    dwells = pd.read_csv(tmp_path / "tables" / "dwells.csv", keep_default_na=True)
+    own = frames.dwells(analysis)
+    assert_allclose(dwells["omega [rad/s]"], own["omega"], rtol=1e-9)  # ten digits
+    assert_allclose(dwells["gain [cm/V]"], own["gain"], rtol=1e-9)
+    assert list(dwells["experiment"]) == list(own["experiment"])
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()}
+    save_tables(analysis, tmp_path)
+    assert before == {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()}
+
+
+def test_matlab_finds_the_names_of_the_report(analysis):
+    """State model, gains, parameters, frequency response and records are as in the analysis."""
+    found = matlab(analysis)
+    assert analysis.chain is not None
+    assert analysis.feedback is not None
+    for letter, own in zip("ABCD", analysis.chain.state_space(), strict=True):
+        assert_array_equal(np.reshape(found[letter], own.shape), own)
+    assert_array_equal(found["gains"], analysis.feedback.gains)
+    assert found["prefilter"] == analysis.feedback.prefilter
+    final = {row.name: row.final.value for row in analysis.rows if row.final}
+    assert found["parameters"]["final"] == final
+    second = found["frequency_response"][1]
+    assert second["cart"] == 2
+    assert_array_equal(second["magnitude"], analysis.frequency_responses[1].magnitude)
+    record = next(record for record in analysis.records if record.id == "step-1")
+    assert found["records"]["step_1"]["kind"] == "step"
+    assert_array_equal(found["records"]["step_1"]["x2"], record.position(2))
+    assert found["units"] == {"position": "cm", "input": "V", "time": "s"}
+
+
+def test_records_get_names_that_matlab_takes(analysis):
+    """Ids that MATLAB would read as the same name, or as none, stay apart and keep their id."""
+    record = analysis.records[0]
+    ids = ("step-1", "step 1", "1", "é" * 80, "é" * 81, "x" * 70, "x" * 71)
+    found = matlab(replace(analysis, records=tuple(replace(record, id=id_) for id_ in ids)))
+    names = found["records"]
+    assert [entry["id"] for entry in names.values()] == list(ids)
+    assert all(name.isidentifier() and name.isascii() and len(name) <= 63 for name in names)
+    assert all(name[0].isalpha() for name in names)
+
+
+def test_an_analysis_of_nothing_still_has_its_tables(analysis, tmp_path):
+    """Where nothing was found, tables have their headings and the MAT-file has no A."""
+    nothing = replace(
+        analysis, records=(), log_decrements=(), step_gains=(), sine_points=(), rows=(), checks=(),
+        frequency_responses=(), fit=None, feedback=None,
+    )  # fmt: skip
+    save_tables(nothing, tmp_path)
+    for name in TABLES:
+        frame = pd.read_csv(tmp_path / "tables" / f"{name}.csv")
+        assert frame.empty
+        assert len(frame.columns) > 4
+    assert "A" not in scipy.io.loadmat(tmp_path / "results.mat")
+
+
+def test_what_could_not_be_had_is_nan(analysis):
+    """A parameter with a final value only has NaN, not 0, for its initial one."""
+    first = replace(analysis.rows[0], initial=None)
+    found = matlab(replace(analysis, rows=(first, *analysis.rows[1:])))["parameters"]
+    assert np.isnan(found["initial"]["K_1"])
+    assert np.isnan(found["initial_std"]["K_1"])
+
+
+def test_report_saves_tables_when_asked(tmp_path):
+    """`--tables` writes beside results.json; without it there are none."""
+    out = tmp_path / "out"
+    folder = EXAMPLES / "one-cart"
+    assert cartlab("report", folder, "--out", out, "--no-pdf").returncode == 0
+    assert not (out / "tables").exists()
+    assert cartlab("report", folder, "--out", out, "--no-pdf", "--tables").returncode == 0
+    assert {path.stem for path in (out / "tables").iterdir()} == TABLES
+    assert Path(out / "results.mat").stat().st_size > 1000
