@@ -2,6 +2,8 @@
 
 import json
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from decimal import Decimal
 from pathlib import Path
@@ -42,6 +44,29 @@ def test_the_same_submission_gives_the_same_bytes(folder):
     assert {"id", "outcome", "points", "out_of", "message", "expected", "found"} <= set(
         document["criteria"][0]
     )
+
+
+def test_grading_loads_neither_pandas_nor_control(folder):
+    """They cost half a second a worker; a reference design and the figures need neither."""
+    code = f"""
+import sys
+from pathlib import Path
+from pipeline.grading import worker
+from pipeline.grading.feedback_figures import draw_figures
+from pipeline.grading.load import load_rubric
+from pipeline.grading.run import grade_submission
+from pipeline.submission import load_submission
+from pipeline.workflow import reference_design
+submission = load_submission(Path({str(folder)!r}))
+graded = grade_submission(submission, rubric=load_rubric(Path("throne-1dof")), name="team-07")
+draw_figures(graded.analysis, submission.reported)
+reference_design(submission, graded.analysis.fit)
+print({{"pandas", "control"}} & set(sys.modules))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, encoding="utf-8", check=True
+    )
+    assert done.stdout.strip() == "set()"
 
 
 def test_results_that_a_submission_brings_along_are_not_believed(folder, tmp_path):

@@ -15,7 +15,7 @@ from pipeline.plant.loop import StateFeedback, broken_loop, discretise
 if TYPE_CHECKING:
     import control  # half a second: imported where it is used
 
-_SPREAD = 300  # frequencies of the whole band, to which each mode adds its own
+_SPREAD = 200  # frequencies of the whole band, to which each mode adds its own
 _NEAR_A_MODE = np.tan(np.linspace(-1.5, 1.5, 61))  # in half widths: equal steps of its phase
 _SLOWEST = 1e-3  # of the Nyquist frequency, where the band begins
 
@@ -105,10 +105,10 @@ def _response(A: Array, B: Array, C: Array, *, z: ComplexArray) -> ComplexArray:
     return (C @ np.linalg.solve(shifted, B[:, None]))[:, 0]
 
 
-def _frequencies(z: Array, *, sample_time: float) -> Array:
+def _frequencies(z: ComplexArray, *, sample_time: float) -> Array:
     """Return frequencies up to Nyquist's, rad/s, close where a pole makes the response turn."""
     nyquist = np.pi / sample_time
-    s = np.log(z[np.abs(z) > 0].astype(np.complex128)) / sample_time
-    modes = np.abs(s.imag)[:, None] + np.abs(s.real)[:, None] * _NEAR_A_MODE
+    s = np.log(z[z.imag > 0]) / sample_time
+    modes = s.imag[:, None] + np.abs(s.real)[:, None] * _NEAR_A_MODE
     omega = np.append(np.geomspace(_SLOWEST * nyquist, nyquist, _SPREAD, endpoint=False), modes)
     return np.unique(omega[(omega >= _SLOWEST * nyquist) & (omega < nyquist)])
