@@ -79,7 +79,7 @@ def stability_margins(
     if np.abs(np.linalg.eigvals(A - np.outer(B, C))).max() >= 1:
         return None
     nyquist = np.pi / sample_time
-    omega = _frequencies(np.linalg.eigvals(A), sample_time=sample_time)
+    omega = _frequencies(np.linalg.eigvals(A).astype(np.complex128), sample_time=sample_time)
     # At both ends of the band the response is real, and where it is negative crosses -180° too;
     # carts that no spring ties to a wall have none at the lower end.
     ends = np.array([0.0, nyquist] if chain.is_tied else [nyquist])
