@@ -78,10 +78,9 @@ def test_the_good_one_is_read(tmp_path):
 
 
 BAD_TOML = {
-    "syntax": (HEAD + "title = two carts\n", r"team-01/submission\.toml line 5: not valid TOML"),
-    "unclosed text": (HEAD + 'title = "two\n', r"submission\.toml line 5: not valid TOML"),
-    "ends in the middle": (GOOD + "[[experiments", r"submission\.toml line 9: not valid TOML"),
-    "key twice": (HEAD + "[system]\ncarts = 1\n", r"line 5: not valid TOML"),
+    "syntax": (HEAD + "title = two carts\n", r"team-01/submission\.toml line 5: text .* in quotes"),
+    "ends in the middle": (GOOD + "[[experiments", r"line 9: .*; found \[\[experiments$"),
+    "no slip we know": (HEAD + "carts = &2\n", r"line 5: not valid TOML: Invalid value; found "),
     "empty": ("", r"version: is required"),
     "no system": ("version = 1\n", r"system: is required"),
     "no carts": ("version = 1\n[system]\n", r"system\.carts: is required"),
@@ -190,7 +189,19 @@ BAD_TOML = {
     "file missing": (
         GOOD.replace("step.csv", "stepp.csv"),
         r"step-a: there is no file 'data/stepp\.csv'; "
-        r"did you mean 'step\.csv'\?",
+        r"did you mean 'data/step\.csv'\?",
+    ),
+    "file without its folder": (
+        GOOD.replace("data/step.csv", "Step.csv"),
+        r"there is no file 'Step\.csv'; did you mean 'data/step\.csv'\?",
+    ),
+    "file with an escape": (
+        GOOD.replace("data/step.csv", "data\\next.csv"),
+        r"expected a file name, found .*backslash",
+    ),
+    "experiments in single brackets": (
+        GOOD.replace("[[experiments]]", "[experiments]"),
+        r"experiments: expected a list .*; begin each with \[\[experiments\]\]",
     ),
     "file above": (GOOD.replace("data/step.csv", "../step.csv"), r"leaves the submission folder"),
     "file above, Windows": (GOOD.replace("data/step.csv", "..\\\\step.csv"), r"leaves the sub"),
@@ -396,6 +407,45 @@ def test_a_named_pipe_does_not_hang_the_reader(name, tmp_path):
     one_line(folder, r"is not a regular file")
 
 
+SLIPS = {
+    "K = 1,13": "comma",
+    "K = -0,5 # cm/V": "comma",
+    "title = “Two carts”": "curly",
+    "kind = ‘step’": "curly",
+    "kind = decay": "quotes",
+    "file = data/step.csv": "quotes",
+    'file = "data\\step.csv"': "backslash",
+    'file = "C:\\Users\\me.csv"': "backslash",
+    "springs = [True, True]": "small letters",
+    "K = −1.5": "dash",
+    "kind\N{NO-BREAK SPACE}= 'step'": "space",
+    "K = 1.13 cm/V": "unit",
+    "zeta = 5%": "unit",
+    "K = 1.2*10^-3": "unit",
+    "K = .5": "point",
+    "K = 05": "no 0",
+    'kind: "step"': "=",
+    'kind "step"': "=",
+    "K =": "after the =",
+    "// ours": "#",
+    'title = "two': "not closed",
+    "[experiments]\n[experiments]": r"\[\[experiments\]\]",
+    "K = 1\nK = 2": "already",
+    "springs = [true,\n[x]": "not closed",
+    "input = { sign = 1": "one line",
+}
+
+
+@pytest.mark.parametrize("typed", SLIPS)
+def test_a_slip_of_the_keyboard_is_told_by_what_to_type(typed, tmp_path):
+    """What people type that TOML refuses: the line, the reason, and the line as it stands."""
+    write(tmp_path / "team-01", "version = 1\n" + typed + "\n")
+    with pytest.raises(SubmissionError, match=rf"toml line [234]: .*{SLIPS[typed]}") as caught:
+        load_submission(tmp_path / "team-01")
+    assert "not valid TOML" not in str(caught.value)
+    assert len(str(caught.value).splitlines()) == 1
+
+
 @pytest.mark.parametrize("path", ["nowhere", "team-01/data", "team-01/data/step.csv"])
 def test_a_path_that_is_no_submission_is_one_line(path, tmp_path):
     """A missing folder, one without submission.toml and a file of another kind are told apart."""
@@ -403,7 +453,7 @@ def test_a_path_that_is_no_submission_is_one_line(path, tmp_path):
     one_line_patterns = {
         "nowhere": r"no such folder",
         "team-01/data": r"there is no file 'submission\.toml'",
-        "team-01/data/step.csv": r"line 1: not valid TOML",
+        "team-01/data/step.csv": r"line 1: .*; found time,input,x1,x2",
     }
     with pytest.raises(SubmissionError, match=one_line_patterns[path]) as caught:
         load_submission(tmp_path / path)

@@ -128,5 +128,5 @@ def test_a_rubric_that_is_not_there_names_the_shipped_ones():
 
 def test_toml_that_is_none_says_where(tmp_path):
     """A syntax error keeps the line that the parser gives."""
-    with pytest.raises(ConfigError, match=r"not valid TOML: .*line 2"):
+    with pytest.raises(ConfigError, match=r"line 2: nothing stands after the =; found title ="):
         load_rubric(write(tmp_path, "version = 1\ntitle = \n"))

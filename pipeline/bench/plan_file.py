@@ -1,7 +1,6 @@
 """`plan.toml`: read it, write it, add to it; whatever is wrong is one line a person can act on."""
 
 import re
-import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from pipeline.errors import ConfigError
 from pipeline.output import write_file
 from pipeline.submission import Submission, System
 from pipeline.submission.complaints import Location, dotted, explain, quote
+from pipeline.submission.toml_file import parse_toml, read_text
 from pipeline.synthesis.files import toml_section
 
 NAME = "plan.toml"
@@ -62,7 +62,10 @@ def load_plan(submission: Submission) -> Plan:
     """
     path = plan_path(submission)
     where = f"{submission.folder.resolve().name}/{NAME}"
-    return _parse(_text(path, where=where), where=where, system=submission.system)
+    if path.is_symlink():
+        raise ConfigError(f"{where}: is a link; put the file itself there")
+    text = read_text(path, where=where, limit=_MAX_BYTES, error=ConfigError)
+    return _parse(text, where=where, system=submission.system)
 
 
 def save_plan(plan: Plan, submission: Submission) -> Path:
@@ -112,29 +115,8 @@ def _recording_text(recording: Recording) -> str:
 # ----------------------------------------------------------------------- reading
 
 
-def _text(path: Path, *, where: str) -> str:
-    try:
-        if path.is_symlink():
-            raise ConfigError(f"{where}: is a link; put the file itself there")
-        raw = path.read_bytes()
-    except OSError as error:
-        raise ConfigError(f"{where}: cannot be read ({error.strerror})") from None
-    if len(raw) > _MAX_BYTES:
-        raise ConfigError(f"{where}: {len(raw):,} bytes, the limit is {_MAX_BYTES:,}")
-    try:
-        return raw.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = raw[: error.start].count(b"\n") + 1
-        raise ConfigError(f"{where} line {line}: not UTF-8 text; save it as UTF-8") from None
-
-
 def _parse(text: str, *, where: str, system: System) -> Plan:
-    try:
-        document = _tuples(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{where}: not valid TOML: {' '.join(str(error).split())}") from None
-    except (RecursionError, ValueError):
-        raise ConfigError(f"{where}: not valid TOML: nested too deeply or too long") from None
+    document = _tuples(parse_toml(text, where=where, error=ConfigError))
     try:
         plan = Plan.model_validate(document, strict=True)
     except ValidationError as error:

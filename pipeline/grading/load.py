@@ -1,7 +1,6 @@
 """Read a rubric; every mistake in it is one line that names file, line, key and what is near."""
 
 import re
-import tomllib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from pipeline.grading.rubric import InitialFinal, Parameters, Rubric, matching
 from pipeline.resources import RUBRICS
 from pipeline.submission.complaints import Location, dotted, explain, nearest, without_tag
 from pipeline.submission.load import spring_names
+from pipeline.submission.toml_file import parse_toml, read_text
 
 _MAX_BYTES = 1_000_000
 _CHECKS: dict[str, type[BaseModel]] = {
@@ -55,13 +55,11 @@ def load_rubric(path: Path) -> Rubric:
     path = Path(path)
     if not path.exists() and path.suffix == "" and (RUBRICS / f"{path.name}.toml").is_file():
         path = RUBRICS / f"{path.name}.toml"
-    text = _text(path)
-    try:
-        document = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path.name}: not valid TOML: {error}") from None
-    except (RecursionError, ValueError):
-        raise ConfigError(f"{path.name}: not valid TOML: nested too deeply") from None
+    if not path.exists():
+        shipped = nearest(path.stem, sorted(p.stem for p in RUBRICS.glob("*.toml")))
+        raise ConfigError(f"{path}: there is no such rubric{shipped}")
+    text = read_text(path, where=path.name, limit=_MAX_BYTES, error=ConfigError)
+    document = parse_toml(text, where=path.name, error=ConfigError)
     problems = _validate(document)
     if isinstance(problems, Rubric):
         found, problems = problems, list(_contradictions(problems))
@@ -70,21 +68,6 @@ def load_rubric(path: Path) -> Rubric:
         problems = [(at, f"{dotted(at, document)}: {what}") for at, what in problems]
     lines = [(_line_of(text, at), what) for at, what in problems]
     raise ConfigError("\n".join(f"{path.name} line {line}: {what}" for line, what in sorted(lines)))
-
-
-def _text(path: Path) -> str:
-    try:
-        raw = path.read_bytes()
-    except OSError as error:
-        shipped = nearest(path.stem, sorted(p.stem for p in RUBRICS.glob("*.toml")))
-        raise ConfigError(f"{path}: cannot be read ({error.strerror}){shipped}") from None
-    if len(raw) > _MAX_BYTES:
-        raise ConfigError(f"{path.name}: {len(raw):,} bytes, the limit is {_MAX_BYTES:,}")
-    try:
-        return raw.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = raw[: error.start].count(b"\n") + 1
-        raise ConfigError(f"{path.name} line {line}: not UTF-8 text; save it as UTF-8") from None
 
 
 def _validate(document: dict) -> Rubric | list[tuple[Location, str]]:

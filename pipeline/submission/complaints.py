@@ -118,6 +118,8 @@ def explain(
     if kind not in _EXPECTED:
         return f"{where}: {error['msg']}, found {quote(found)}"
     text = f"{where}: expected {_EXPECTED[kind].format(**context)}, found {quote(found)}"
+    if kind == "tuple_type" and isinstance(found, dict):
+        text += f"; begin each with [[{where}]], in double brackets"
     if kind == "literal_error" and isinstance(found, str):
         close = get_close_matches(found, re.findall(r"'([^']*)'", context["expected"]), n=1)
         text += f"; did you mean {close[0]!r}?" if close else ""

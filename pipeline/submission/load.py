@@ -2,10 +2,10 @@
 
 import re
 import stat
-import tomllib
 from collections.abc import Iterator
 from contextlib import suppress
 from decimal import Decimal
+from itertools import islice
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from pydantic import ValidationError
@@ -21,14 +21,14 @@ from pipeline.submission.complaints import (
     quote,
 )
 from pipeline.submission.models import Experiment, StateFeedback, Submission
+from pipeline.submission.toml_file import BACKSLASH, parse_toml, read_text
 
 NAME = "submission.toml"
 MAX_TOML_BYTES = 1_000_000  # a full class section's worth of experiments needs a tenth of it
 MAX_NOTES_BYTES = 1_000_000
 MAX_DATA_BYTES = 100_000_000  # over half an hour at 1 kHz
-_MAX_KEY_DEPTH = 30  # tomllib's time grows with the square of a dotted key's depth
 _LARGEST = Decimal("1e100")  # beyond any physical number in any unit, yet safe to square
-_DOTTED_KEY = re.compile(r"[\w\"'-]+(?:[ \t]*\.[ \t]*[\w\"'-]+)*")
+_MOST_LOOKED_AT = 1_000  # files and folders, for the one that may be meant
 _COMMENT = re.compile(r"<!--.*?(?:-->|\Z)", re.DOTALL)  # one left open runs to the end
 _SYSTEM_COLUMNS = ("time", "input", "reference", "frequency")
 
@@ -51,8 +51,9 @@ def load_submission(path: Path) -> Submission:
         raise SubmissionError(f"{quote(str(path))}: no such folder")
     if (problem := outside(folder, toml.name)) is not None:
         raise SubmissionError(f"{where}: {problem}")
-    text = _text(toml, where=where, limit=MAX_TOML_BYTES)
-    document = _parse(text, where=where)
+    text = read_text(toml, where=where, limit=MAX_TOML_BYTES, error=SubmissionError)
+    # Decimals stay so: no typed digit is lost.
+    document = parse_toml(text, where=where, error=SubmissionError, parse_float=Decimal)
     submission = _validate(document, where=where)
     _raise_first(
         [f"{dotted(at, document)}: {what}" for at, what in _problems(submission, folder)], where
@@ -72,44 +73,7 @@ def load_submission(path: Path) -> Submission:
     )
 
 
-# ------------------------------------------------------------------ from bytes to a document
-
-
-def _text(path: Path, *, where: str, limit: int) -> str:
-    """Return the text of a small UTF-8 file; a byte-order mark is dropped."""
-    try:
-        size = path.stat().st_size
-        if size > limit:
-            raise SubmissionError(f"{where}: {size:,} bytes, the limit is {limit:,}")
-        raw = path.read_bytes()
-    except OSError as error:
-        raise SubmissionError(f"{where}: cannot be read ({error.strerror})") from None
-    try:
-        return raw.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = raw[: error.start].count(b"\n") + 1
-        raise SubmissionError(f"{where} line {line}: not UTF-8 text; save it as UTF-8") from None
-
-
-def _parse(text: str, *, where: str) -> dict:
-    """Parse TOML; decimals stay `Decimal`, so that no typed digit is lost."""
-    for key in _DOTTED_KEY.finditer(text):
-        if key.group().count(".") > _MAX_KEY_DEPTH:
-            line = text.count("\n", 0, key.start()) + 1
-            raise SubmissionError(f"{where} line {line}: keys nest too deeply")
-    try:
-        return tomllib.loads(text, parse_float=Decimal)
-    except tomllib.TOMLDecodeError as error:
-        message = " ".join(str(error).split())
-        if at := re.search(r" \(at line (\d+), column (\d+)\)$", message):
-            line, message = int(at[1]), message[: at.start()] + f" at column {at[2]}"
-        else:
-            line = text.count("\n") + 1
-        raise SubmissionError(f"{where} line {line}: not valid TOML: {message}") from None
-    except RecursionError:
-        raise SubmissionError(f"{where}: lists or tables nest too deeply") from None
-    except ValueError:  # an integer of thousands of digits
-        raise SubmissionError(f"{where}: a number has too many digits") from None
+# ------------------------------------------------------------- from a document to a model
 
 
 def _validate(document: dict, *, where: str) -> Submission:
@@ -171,7 +135,8 @@ def _notes(folder: Path) -> str | None:
         return None
     if (problem := outside(folder, "notes.md")) is not None:
         raise SubmissionError(f"{where}: {problem}")
-    text = _COMMENT.sub("", _text(path, where=where, limit=MAX_NOTES_BYTES))
+    typed = read_text(path, where=where, limit=MAX_NOTES_BYTES, error=SubmissionError)
+    text = _COMMENT.sub("", typed)
     return text if text.strip() else None
 
 
@@ -280,7 +245,8 @@ def leaves(folder: Path, name: str) -> str | None:
     """Return why `name` stands for no file inside `folder`, or None; it need not be there."""
     shown = quote(name)
     if not name.strip() or not name.isprintable():
-        return f"expected a file name, found {shown}"
+        hint = "" if name.isprintable() else f"; {BACKSLASH}"
+        return f"expected a file name, found {shown}{hint}"
     windows, relative = PureWindowsPath(name), Path(_posix(name))
     if windows.drive or windows.root or relative.is_absolute() or ".." in windows.parts:
         return f"{shown} leaves the submission folder"
@@ -311,11 +277,13 @@ def outside(folder: Path, name: str) -> str | None:
 
 
 def _near_file(folder: Path, name: str) -> str:
-    """Return "; did you mean …?" for a file of a similar name nearby."""
-    parent = (folder / name).parent
+    """Return "; did you mean …?" for a file of this name elsewhere, or of a similar one."""
     try:
-        siblings = sorted(p.name for p in parent.iterdir() if p.is_file())[:1000]
+        paths = sorted(p for p in islice(folder.rglob("*"), _MOST_LOOKED_AT) if p.is_file())
     except OSError:
         return ""
-    hint = nearest(Path(name).name, siblings)
+    files = [path.relative_to(folder).as_posix() for path in paths]
+    last = PurePosixPath(name).name.casefold()
+    same = [file for file in files if PurePosixPath(file).name.casefold() == last]
+    hint = f"; did you mean {same[0]!r}?" if same else nearest(name, files)
     return hint if "did you mean" in hint else ""

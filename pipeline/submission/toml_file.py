@@ -1,0 +1,127 @@
+"""Read files that people typed; what is wrong with TOML is told by what stands in the line."""
+
+import re
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import PipelineError
+from pipeline.submission.complaints import quote
+
+_MAX_KEY_DEPTH = 30  # tomllib's time grows with the square of a dotted key's depth
+_DOTTED_KEY = re.compile(r"[\w\"'-]+(?:[ \t]*\.[ \t]*[\w\"'-]+)*")
+_LONGEST_LINE, _SHOWN = 300, 60  # characters of a line that are looked at, and shown
+_AT = re.compile(r" \(at line (\d+), column (\d+)\)$")
+_NUMBER = r"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?"
+
+BACKSLASH = 'inside "…" a backslash begins a special character; write data/step.csv'
+_UNCLOSED = "a list [ … ] before this line is not closed, or lacks a comma"
+
+# What a line looks like that TOML refuses, and what to write; the first that fits is it.
+_SLIPS: tuple[tuple[str, str], ...] = (
+    (r"[“”„‟«»‘’‚]", 'these are curly quotes; type straight ones: "…"'),
+    (r"[\xa0\u2000-\u200f\u202f\u3000]", "a special space; delete it and type a plain one"),
+    (r"=.*[−–—]\s*\d", "this is a dash; type the minus of the keyboard: -"),
+    (r"=\s*[-+]?\d+,\d", "a decimal comma; write a point: 1.13"),
+    (r'"[^"]*\\', BACKSLASH),
+    (r"=\s*\[?.*\b(True|TRUE|False|FALSE)\b", "true and false are written in small letters"),
+    (r"^\s*(//|;|%)", "a comment begins with #"),
+    (r"^\s*(\[[A-Za-z][^\[\]]*\]|\[\[[^\[\]]+\]\])\s*(#.*)?$", _UNCLOSED),
+    (
+        r"^\s*\[+\s*[A-Za-z]",
+        "a table begins with [name], one of several with [[name]], in a line of its own",
+    ),
+    (r"^\s*[\w-]+\s*=\s*(#.*)?$", "nothing stands after the ="),
+    (r"^\s*[\w-]+(\s*:|\s+[^=\s])", "between a name and its value stands a =: K = 1.13"),
+    (r"=\s*[-+]?\.\d|=\s*[-+]?\d+\.(?!\d)", "a point has digits on both sides: 0.5"),
+    (r"=\s*[-+]?0\d", "a number begins with no 0 but that of 0.5"),
+    (rf"=\s*{_NUMBER}\s*[^\s\d#.,]", "a number stands alone, without a unit or a sum: K = 1.13"),
+    (r"=\s*[A-Za-z_./\\]", 'text stands in quotes: kind = "step"'),
+    (r"=\s*[\[{][^\"']*[\[{,\s][A-Za-z_]\w*\s*[,\]}]", 'text stands in quotes: "V"'),
+    (r"=\s*(\"[^\"]*|'[^']*)$", "the quote is not closed"),
+)
+# What tomllib says where no single line shows it.
+_SAID: tuple[tuple[str, str], ...] = (
+    (r"Cannot (declare|mutate|define).*", "there is such a table already; one of several, as an "
+     "experiment is, begins with [[experiments]], in double brackets"),
+    (r"Cannot overwrite a value|Duplicate.*", "this name has a value already, in the same table"),
+    (r"Unclosed array", _UNCLOSED),
+    (r"Unclosed inline table", "all of { … } stands in one line"),
+)  # fmt: skip
+
+
+def read_text(path: Path, *, where: str, limit: int, error: type[PipelineError]) -> str:
+    """Return the text of a small UTF-8 file; a byte-order mark is dropped.
+
+    Parameters
+    ----------
+    where : what to call the file.
+    limit : bytes.
+    error : whose mistake it is.
+
+    Raises
+    ------
+    PipelineError : of the kind `error`, where it is too large or no such text; one line.
+    """
+    try:
+        if (size := path.stat().st_size) > limit:
+            raise error(f"{where}: {size:,} bytes, the limit is {limit:,}")
+        raw = path.read_bytes()
+    except OSError as wrong:
+        raise error(f"{where}: cannot be read ({wrong.strerror})") from None
+    try:
+        return raw.decode("utf-8-sig")
+    except UnicodeDecodeError as wrong:
+        line = raw[: wrong.start].count(b"\n") + 1
+        raise error(f"{where} line {line}: not UTF-8 text; save it as UTF-8") from None
+
+
+def parse_toml(
+    text: str,
+    *,
+    where: str,
+    error: type[PipelineError],
+    parse_float: Callable[[str], Any] = float,
+) -> dict[str, Any]:
+    """Parse TOML that somebody typed.
+
+    Parameters
+    ----------
+    where : what to call the file; a line's number is added.
+    error : whose mistake it is.
+
+    Raises
+    ------
+    PipelineError : of the kind `error`; one line with the line's number and what to write.
+    """
+    for key in _DOTTED_KEY.finditer(text):
+        if key.group().count(".") > _MAX_KEY_DEPTH:
+            line = text.count("\n", 0, key.start()) + 1
+            raise error(f"{where} line {line}: keys nest too deeply")
+    try:
+        return tomllib.loads(text, parse_float=parse_float)
+    except tomllib.TOMLDecodeError as wrong:
+        message = " ".join(str(wrong).split())
+        at = _AT.search(message)
+        line = int(at[1]) if at else text.count("\n") + 1
+        typed = text.split("\n")[line - 1].strip()
+        shown = typed if typed.isprintable() and len(typed) <= _SHOWN else quote(typed)
+        words = _words(typed, _AT.sub("", message))
+        raise error(f"{where} line {line}: {words}; found {shown or 'the end'}") from None
+    except RecursionError:
+        raise error(f"{where}: lists or tables nest too deeply") from None
+    except ValueError:  # an integer of thousands of digits
+        raise error(f"{where}: a number has too many digits") from None
+
+
+def _words(line: str, message: str) -> str:
+    """Return what is wrong with a line, by what it looks like, else by what the parser says."""
+    for said, words in _SAID:
+        if re.fullmatch(said, message):
+            return words
+    looked_at = line[:_LONGEST_LINE]
+    for slip, words in _SLIPS:
+        if re.search(slip, looked_at):
+            return words
+    return f"not valid TOML: {message}"
