@@ -228,12 +228,61 @@ def test_gradescope_gets_a_result_for_each_submission(tmp_path):
     assert results["team-1"]["extra_data"] == {"flags": ["hz_for_rad_s"]}
 
 
-def test_who_is_in_two_submissions_is_named(tmp_path):
-    """The higher points count, and a person is told."""
-    other = make_outcome(make_grade("team-9", share=0.25, authors=("s-team-1",)))
+@pytest.mark.parametrize("platform", ["canvas", "moodle", "gradescope"])
+@pytest.mark.parametrize("author", ["s-team-1", " S-Team-1"])
+def test_who_is_in_two_submissions_has_no_points_until_somebody_decides(tmp_path, platform, author):
+    """Not the higher ones, in no table and no comment; a person is told where they stand."""
+    other = make_outcome(make_grade("team-9", share=0.25, authors=(author,)))
+    rows, remarks = write(tmp_path, HALF, other, platform=platform)
+    assert not [cell for row in rows for cell in row if re.search(r"^(10|5)$|omega_1", cell)]
+    assert remarks == (
+        "s-team-1 is in team-1 (10) and team-9 (5): left out, until cartlab remove takes the "
+        "wrong one off",
+    )
+
+
+def test_two_submissions_with_the_same_points_leave_nothing_to_decide(tmp_path):
+    """Partners who each hand in what both did."""
+    other = make_outcome(make_grade("team-9", share=0.5, authors=("s-team-1",)))
     rows, remarks = write(tmp_path, HALF, other, platform="canvas")
-    assert canvas_import(rows) == {RUBRIC.title: {"1024": "10"}}
-    assert remarks == ("s-team-1 is in team-1 and team-9: the higher points are exported",)
+    assert (canvas_import(rows), remarks) == ({RUBRIC.title: {"1024": "10"}}, ())
+
+
+def test_a_row_that_two_submissions_lead_to_stays_as_it_was(tmp_path):
+    """One by an author's id, one by the number of who handed it in: nobody chose either."""
+    roster = 'Student,ID,SIS User ID,SIS Login ID,Section,Lab 3\n"Doe, Jane",1001,S1,jane,A,3\n'
+    by_id = make_outcome(make_grade("team-1", share=0.5, authors=("s1",)))
+    by_number = make_outcome(make_grade("o", authors=("x", "y")), owner="doejane (canvas 1001)")
+    for order in (1, -1):
+        (tmp_path / f"{order}").mkdir()
+        rows, remarks = write(
+            tmp_path / f"{order}", *[by_id, by_number][::order],
+            platform="canvas", title="Lab 3", roster=roster,
+        )  # fmt: skip
+        assert canvas_import(rows) == {"Lab 3": {"1001": "3"}}
+        assert [r for r in remarks if "team-1 (10)" in r and "o (20)" in r and "left out" in r]
+
+
+@pytest.mark.parametrize("platform", ["canvas", "moodle", "gradescope"])
+def test_points_by_hand_of_a_submission_without_names_are_exported(tmp_path, platform):
+    """As who its folder is called, which is said; or as those it named before it broke."""
+    broken = make_outcome(failed_grade("team-8", "no TOML"))
+    rows, remarks = write(
+        tmp_path, broken, platform=platform, overrides=[("team-8", "pieces", 0.75)]
+    )
+    (row,) = [row for row in rows if "team-8" in row]
+    assert "0.75" in row
+    assert remarks == ("nobody is named in it, so exported as who its folder is called: team-8",)
+
+    outcomes = make_outcome(make_grade("team-8"), key="1"), replace(broken, key="2")
+    (tmp_path / "again").mkdir()
+    with Gradebook(tmp_path / "again", assignment="lab", create=True) as book:
+        for outcome in outcomes:
+            book.put(outcome)
+            book.finish(Batch(keys=(outcome.key,), shared={}), rubric=RUBRIC)
+        book.override("team-8", "pieces", 0.75, why="x", by="y")
+        (student,), remarks = students_of(list(book.entries()), platform="canvas")
+    assert (student.id, student.points, remarks) == ("s-team-8", "0.75", [])
 
 
 def test_of_several_authors_the_one_who_handed_it_in_is_found(tmp_path):
@@ -265,6 +314,15 @@ def test_a_table_that_is_no_roster_is_refused(tmp_path, platform, head, wanted):
         ConfigError, match=rf"roster\.csv: is not {platform.capitalize()}.*{wanted}"
     ):
         write(tmp_path, HALF, platform=platform, roster=f"{head}\n1,2,3\n")
+
+
+def test_a_roster_with_two_columns_of_one_name_is_refused(tmp_path):
+    """Nobody says which is to be filled in; columns without a name are no matter."""
+    with pytest.raises(ConfigError, match=r"roster\.csv: has two columns 'Lab'"):
+        write(tmp_path, HALF, platform="canvas", roster="Student,ID,Lab,Lab\na,1,,\n")
+    rows, _ = write(tmp_path, HALF, platform="gradescope", roster="SID,,Name,\ns-team-1,x,y,z\n")
+    assert rows == [["SID", "", "Name", "", "Total Score", "Max Points"],
+                    ["s-team-1", "x", "y", "z", "10", "20"]]  # fmt: skip
 
 
 def test_gradescope_must_have_a_score(tmp_path):

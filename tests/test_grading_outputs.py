@@ -354,7 +354,15 @@ def test_a_table_of_a_platform_is_read_whatever_its_separators(tmp_path):
     """Semicolons, tabs, a byte-order mark, blank lines; with the lines its rows end on."""
     path = tmp_path / "t.csv"
     path.write_text('\ufeffa;b\n\n"x\ny";"1;2"\n', encoding="utf-8")
-    assert read_table(path) == [(1, ["a", "b"]), (4, ["x\ny", "1;2"])]
+    table = read_table(path)
+    assert list(table.columns) == ["a", "b"]
+    assert list(table.itertuples(name=None)) == [(4, "x\ny", "1;2")]
+    path.write_text("a,b\n1\n1,2,3\n", encoding="utf-8")
+    assert list(read_table(path).itertuples(name=None)) == [(2, "1", ""), (3, "1", "2")]
     path.write_bytes(b"a,b\n\xff\xfe,1\n")
     with pytest.raises(ConfigError, match=r"t\.csv: is not UTF-8"):
         read_table(path)
+    for much in ("a\n" * 200_000, "," * 5_000):
+        path.write_text(f"a{much}\n", encoding="utf-8")
+        with pytest.raises(ConfigError, match=r"t\.csv: has more than 2000 columns or 100000 rows"):
+            read_table(path)

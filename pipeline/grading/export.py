@@ -97,9 +97,9 @@ def _filled(
         columns = {title: lambda student: student.points}
         return roster.filled(students, columns, keep=_CANVAS, possible=most)
     if platform == "moodle":
-        grade = "Grade" if "Identifier" in roster.head else f"{title} (Real)"
+        grade = "Grade" if "Identifier" in roster.table else f"{title} (Real)"
         columns = {grade: lambda student: student.points}
-        if "Feedback comments" in roster.head:
+        if "Feedback comments" in roster.table:
             columns["Feedback comments"] = _comment
         return roster.filled(students, columns)
     columns = {"Total Score": lambda student: student.points, "Max Points": lambda student: most}
@@ -144,6 +144,8 @@ def _moodle(students: Sequence[Student], rubric: Rubric, *, title: str) -> str:
 
 def _comment(student: Student) -> str:
     """Return the feedback in short, as the HTML that Moodle takes it for."""
+    if student.undecided:
+        return ""
     return "<br>".join(html.escape(line, quote=False) for line in _said(student.grade))
 
 
@@ -175,7 +177,7 @@ def _gradescope(students: Sequence[Student], rubric: Rubric) -> str:
     rows = []
     for s in students:
         first, _, last = s.name.partition(" ")
-        given = {c.id: c.points for c in s.grade.criteria}
+        given = {c.id: c.points for c in s.grade.criteria if not s.undecided}
         rows.append(
             [
                 first,

@@ -4,12 +4,16 @@ import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigError
-from pipeline.grading.export_students import Student
+from pipeline.grading.export_students import Student, one_of
 from pipeline.grading.lms_names import Platform
 from pipeline.grading.table import read_table
 from pipeline.output import csv_text
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 POINTS_POSSIBLE = "Points Possible"  # Canvas' row on top, about the assignments
 # Columns that say who a row is about.
@@ -27,17 +31,16 @@ _OWN: Mapping[Platform, tuple[frozenset[str], ...]] = {
     ),
     "gradescope": (frozenset({"SID"}), frozenset({"Email"}), frozenset({"Submission ID"})),
 }
-_PARTICIPANT = re.compile(r"\D+ (\d+)")  # of Moodle, in any language
+_PARTICIPANT = re.compile(r"^\D+ (\d+)$")  # of Moodle, in any language
 _TITLE = re.compile(r"(.*?)(?: \(\d+\))?")  # of Canvas, with the assignment's id behind it
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Roster:
-    """A platform's own table; cells that are not filled in stay as they are."""
+    """A platform's own table, all texts; cells that are not filled in stay as they are."""
 
     file: str
-    head: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
+    table: "pd.DataFrame"
 
     @classmethod
     def read(cls, path: Path, *, platform: Platform) -> "Roster":
@@ -45,18 +48,20 @@ class Roster:
 
         Raises
         ------
-        ConfigError : it is no table, or has not the columns that say who a row is about there.
+        ConfigError : it is no table, has not the columns that say who a row is about there, or has
+            two of one name.
         """
-        lines = [row for _, row in read_table(path)]
-        head = tuple(name.strip() for name in lines[0]) if lines else ()
-        if not any(columns <= set(head) for columns in _OWN[platform]):
+        table = read_table(path)
+        if not any(columns <= set(table.columns) for columns in _OWN[platform]):
             wanted = ", or ".join(" and ".join(sorted(columns)) for columns in _OWN[platform])
             raise ConfigError(
                 f"{path.name}: is not {platform.capitalize()}'s table; "
                 f"that has the columns {wanted}"
             )
-        rows = tuple(tuple((*row, *[""] * len(head))[: len(head)]) for row in lines[1:])
-        return cls(file=path.name, head=head, rows=rows)
+        twice = table.columns[table.columns.duplicated() & (table.columns != "")]
+        if len(twice):
+            raise ConfigError(f"{path.name}: has two columns {twice[0]!r}")
+        return cls(file=path.name, table=table)
 
     def filled(
         self,
@@ -75,29 +80,31 @@ class Roster:
         possible : the points possible, for Canvas' row of them.
         """
         titles = {title: self._title(title) for title in columns}
-        kept = [name for name in self.head if keep is None or name in keep]
-        head = [*kept, *(name for name in titles.values() if name not in kept)]
-        table = [dict(zip(self.head, row, strict=True)) for row in self.rows]
-        for row in table:
-            if POINTS_POSSIBLE in row.get("Student", ""):
-                row |= {name: row.get(name) or possible for name in titles.values()}
+        kept = [name in (keep or self.table.columns) for name in self.table.columns]
+        table = self.table.loc[:, kept].copy()
+        for name in titles.values():
+            if name not in table:
+                table[name] = self.table.get(name, "")
+            if "Student" in table:
+                of_all = table["Student"].str.contains(POINTS_POSSIBLE, regex=False)
+                table.loc[of_all & (table[name] == ""), name] = possible
         index = self._index()
-        strangers = []
-        best: dict[int, Student] = {}
-        for student in students:
-            at = _row_of(student, index)
-            if at is None:
-                if not student.uploader:  # one of the authors, who are named
-                    strangers.append(student.called)
-            elif at not in best or student.rank > best[at].rank:
-                best[at] = student
-        for at, student in best.items():
+        matched = [(_row_of(student, index), student) for student in students]
+        found: dict[Any, list[Student]] = {}
+        for at, student in matched:
+            if at is not None:
+                found.setdefault(at, []).append(student)
+        settled = {at: one_of(several) for at, several in found.items()}
+        for at, student in settled.items():
             for title, value in columns.items():
-                table[at][titles[title]] = value(student)
-        remarks = []
+                if not student.undecided:
+                    table.loc[at, titles[title]] = value(student)
+        # One of the authors, who are named, handed it in.
+        strangers = [s.called for at, s in matched if at is None and not s.uploader]
+        remarks = [s.undecided for s in settled.values() if s.undecided]
         if strangers:
             remarks.append(f"not in {self.file}, so not exported: {', '.join(strangers)}")
-        reached = {student.grade.submission for student in best.values()}
+        reached = {student.grade.submission for several in found.values() for student in several}
         lost = dict.fromkeys(
             s.grade.submission
             for s in students
@@ -105,43 +112,43 @@ class Roster:
         )
         if lost:
             remarks.append(f"nobody of these is in {self.file}: {', '.join(lost)}")
-        by_number = [f"{s.name} ({s.grade.submission})" for s in best.values() if s.uploader]
+        by_number = [f"{s.name} ({s.grade.submission})" for s in settled.values() if s.uploader]
         if by_number:
             remarks.append(
                 "found by the number in the file's name, so the same person as one of the "
                 f"authors: {', '.join(by_number)}"
             )
-        text = csv_text(head, [[row.get(name, "") for name in head] for row in table])
-        return text, remarks
+        return csv_text([*table.columns], table.itertuples(index=False)), remarks
 
     def _title(self, title: str) -> str:
         """Return a column's title as the table has it."""
-        for name in self.head:
+        for name in self.table.columns:
             found = _TITLE.fullmatch(name)
             if name == title or (found and found[1] == title):
                 return name
         return title
 
-    def _index(self) -> dict[tuple[str, str], int | None]:
-        """Return the row of everything that says who it is about; None where two rows share it."""
-        index: dict[tuple[str, str], int | None] = {}
-        for at, row in enumerate(self.rows):
-            words = set()
-            for name, value in zip(self.head, row, strict=True):
-                if name in _NUMBERS:
-                    found = _PARTICIPANT.fullmatch(value)
-                    words.add(("number", found[1] if found else value))
-                if name in _IDS or name == "ID":
-                    words |= {("id", value.casefold()), ("id", value.casefold().split("@")[0])}
-                if name in _NAMES:
-                    words.add(("name", _letters(value)))
-            for word in words:
-                if word[1]:
-                    index[word] = None if word in index else at
-        return index
+    def _index(self) -> dict[tuple[str, str], Any]:
+        """Return the row of everything that says who it is about; none that two rows share."""
+        import pandas as pd
+
+        words = []
+        for name, cells in self.table.items():
+            if name in _NUMBERS:
+                words.append(("number", cells.str.replace(_PARTICIPANT, r"\1", regex=True)))
+            if name in _IDS or name == "ID":
+                ids = cells.str.casefold()
+                words += [("id", ids), ("id", ids.str.partition("@")[0])]
+            if name in _NAMES:
+                words.append(("name", cells.map(_letters)))
+        found = pd.concat(
+            pd.DataFrame({"kind": kind, "word": cells, "row": cells.index}) for kind, cells in words
+        )
+        rows = found[found["word"] != ""].drop_duplicates().set_index(["kind", "word"])["row"]
+        return rows.loc[~rows.index.duplicated(keep=False)].to_dict()
 
 
-def _row_of(student: Student, index: Mapping[tuple[str, str], int | None]) -> int | None:
+def _row_of(student: Student, index: Mapping[tuple[str, str], Any]) -> Any:
     for word in (
         ("number", student.number),
         ("id", student.id.casefold()),

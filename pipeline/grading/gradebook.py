@@ -31,6 +31,7 @@ from pipeline.grading.gradebook_rows import (
     class_list,
     final_entry,
     known_outcome,
+    last_named,
     newest_of,
     put_parts,
     read_figures,
@@ -302,15 +303,16 @@ class Gradebook:
                 raise ConfigError(f"{criterion}: the rubric has no such criterion; {hint}")
             if points is not None and not 0 <= points <= out_of[criterion]:
                 raise ConfigError(f"{criterion}: has 0 to {out_of[criterion]:g} points")
+            authors = last_named(connection, row.submission_id)
             given = Override(
                 criterion=criterion,
                 points=points,
                 why=why,
                 by=by,
                 at=self._at(),
-                authors=tuple(json.loads(row.authors)),
+                authors=tuple(json.loads(authors)),
             )
-            values = {**asdict(given), "authors": row.authors, "submission_id": row.submission_id}
+            values = {**asdict(given), "authors": authors, "submission_id": row.submission_id}
             add_row(connection, overrides, values)
         return given
 

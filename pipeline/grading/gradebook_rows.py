@@ -178,6 +178,14 @@ def final_entry(connection: Connection, row: Row, *, shared: Flag | None, rubric
     )
 
 
+def last_named(connection: Connection, submission: int) -> str:
+    """Return the authors that a submission named last, as JSON: a broken one names nobody."""
+    named = select(gradings.c.authors).where(
+        gradings.c.submission_id == submission, gradings.c.authors != "[]"
+    )
+    return connection.scalar(named.order_by(gradings.c.id.desc()).limit(1)) or "[]"
+
+
 def carry_overrides(connection: Connection, moved: Mapping[str, str], *, assignment: str) -> None:
     """Put in, for who goes on under another name, what was given by hand under the old one.
 

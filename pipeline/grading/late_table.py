@@ -43,9 +43,8 @@ class LateTable:
         ------
         ConfigError : it is none of the three, or a line in it cannot be understood.
         """
-        lines = read_table(path)
-        head = [name.strip() for name in lines[0][1]] if lines else []
-        form = next((form for form in _FORMS if set(form[1]) <= set(head)), None)
+        table = read_table(path)
+        form = next((form for form in _FORMS if set(form[1]) <= set(table.columns)), None)
         if form is None:
             raise ConfigError(
                 f"{path.name}: says nobody's lateness: expected columns submission and days_late, "
@@ -53,9 +52,8 @@ class LateTable:
             )
         platform, (name, value) = form
         days: dict[tuple[str, str], float] = {}
-        for line, row in lines[1:]:
-            cells = dict(zip(head, row, strict=False))
-            who, said = cells.get(name, "").strip(), cells.get(value, "").strip()
+        for line, *cells in table.loc[:, [name, value]].itertuples():
+            who, said = (str(cell).strip() for cell in cells[:2])
             if platform == "moodle" and (found := _PARTICIPANT.fullmatch(who)):
                 who = found[1]
             late = _READERS[value](said)

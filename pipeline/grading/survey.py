@@ -6,15 +6,17 @@ are on the scale of Table 4; it is about a concept (Table 5) where its heading s
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from decimal import ROUND_HALF_UP, Decimal
-from fractions import Fraction
+from math import isnan, nan
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigError
 from pipeline.grading.table import read_table
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 SCALE = ("Strongly Agree", "Agree", "Disagree", "Strongly Disagree", "I Don't Know")
 LEVELS = ("Pre Course Knowledge", "Pre Course Confidence",
@@ -31,51 +33,31 @@ _CONCEPT = re.compile(
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Opinion:
-    """A row of Table 4: how many answered what, in the order of `SCALE`."""
-
-    question: str
-    counts: tuple[int, ...]
-
-    @property
-    def percents(self) -> tuple[int, ...]:
-        """Whole percents of those who answered, halves up, as the paper has them."""
-        total = sum(self.counts)
-        return tuple((200 * n + total) // (2 * total) for n in self.counts)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Concept:
-    """A row of Table 5: the answers (1 to 4) by the headings of `LEVELS`."""
-
-    concept: str
-    answers: Mapping[str, tuple[int, ...]]
-
-    def mean(self, level: str) -> str:
-        """Return the average score with two decimals, "" where nobody answered."""
-        given = self.answers.get(level, ())
-        if not given:
-            return ""
-        exact = Fraction(sum(given), len(given))
-        average = Decimal(exact.numerator) / Decimal(exact.denominator)
-        return str(average.quantize(Decimal("0.01"), ROUND_HALF_UP))
-
-
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Survey:
     """The answers of a questionnaire.
 
     Attributes
     ----------
     students : rows of the table.
+    opinions : Table 4, a row a question: how many answered what, columns `SCALE`.
+    means : Table 5, a row a concept: the average scores (1 to 4) to two decimals, halves up, NaN
+        where nobody answered; columns `LEVELS`.
+    answers : of how many they are.
     left_out : headings of columns that are no question of either table.
     """
 
     students: int
-    opinions: tuple[Opinion, ...]
-    concepts: tuple[Concept, ...]
+    opinions: "pd.DataFrame"
+    means: "pd.DataFrame"
+    answers: "pd.DataFrame"
     left_out: tuple[str, ...]
+
+    @property
+    def percents(self) -> "pd.DataFrame":
+        """Table 4 in whole percents of those who answered, halves up, as the paper has them."""
+        total = self.opinions.sum(axis="columns")
+        return (200 * self.opinions).add(total, axis="index").floordiv(2 * total, axis="index")
 
 
 def read_survey(path: Path) -> Survey:
@@ -85,27 +67,26 @@ def read_survey(path: Path) -> Survey:
     ------
     ConfigError : not a table, no question in it, or an answer that is not on the scale.
     """
-    rows = read_table(path)
-    if len(rows) < 2:
+    import pandas as pd
+
+    table = read_table(path)
+    if table.empty:
         raise ConfigError(f"{path.name}: needs a heading and at least one row of answers")
-    head, answers = [text.strip() for text in rows[0][1]], rows[1:]
-    opinions, left_out = [], []
-    concepts: dict[str, dict[str, tuple[int, ...]]] = {}
-    for column, title in enumerate(head):
-        given = [
-            (line, row[column].strip())
-            for line, row in answers
-            if column < len(row) and row[column].strip()
-        ]
+    left_out, opinions = [], []
+    concepts: dict[str, dict[str, pd.Series]] = {}
+    for title, cells in table.items():
+        title, cells = str(title), cells.str.strip()
+        where, given = (path.name, title), cells[cells != ""]
         if found := _CONCEPT.fullmatch(title):
             concept = " ".join((found["plain"] or found["boxed"]).split())
             level = f"{found['when']} Course {found['what']}".title()
-            scores = tuple(_score(text, path.name, line, title) for line, text in given)
             if level in concepts.setdefault(concept, {}):
                 raise ConfigError(f"{path.name}: two columns are {title!r}")
-            concepts[concept][level] = scores
-        elif given and sum(_agreement(text) is not None for _, text in given) * 2 > len(given):
-            opinions.append(_opinion(title, given, path.name))
+            concepts[concept][level] = _read(given, _score, "no score from 1 to 4", where)
+        elif 2 * given.map(_agreement).count() > len(given):
+            answers = _read(given, _agreement, f"not one of {', '.join(SCALE)}", where)
+            counts = answers.value_counts().reindex(range(len(SCALE)), fill_value=0)
+            opinions.append(counts.set_axis(SCALE).rename(title))
         elif title:
             left_out.append(title)
     if not opinions and not concepts:
@@ -113,12 +94,33 @@ def read_survey(path: Path) -> Survey:
             f"{path.name}: no question in it: answers from {SCALE[0]!r} to {SCALE[-1]!r}, or "
             "headings such as 'Pre knowledge: Bode plots' with scores from 1 to 4"
         )
+
+    def of_concepts(value: Callable[[pd.Series], float]) -> pd.DataFrame:
+        rows = {c: {level: value(s) for level, s in of.items()} for c, of in concepts.items()}
+        return pd.DataFrame.from_dict(rows, orient="index", columns=[*LEVELS])
+
     return Survey(
-        students=len(answers),
-        opinions=tuple(opinions),
-        concepts=tuple(Concept(concept=c, answers=levels) for c, levels in concepts.items()),
+        students=len(table),
+        opinions=pd.DataFrame(opinions, columns=[*SCALE]),
+        means=of_concepts(_average),
+        answers=of_concepts(len).fillna(0).astype(int),
         left_out=tuple(left_out),
     )
+
+
+def _read(
+    given: "pd.Series", read: Callable[[str], int | None], wanted: str, where: tuple[str, str]
+) -> "pd.Series":
+    """Return the answers as numbers; `where` is the file and the question, the index its lines."""
+    answers = given.map(read)
+    for line, text in given.loc[answers.isna()].items():
+        raise ConfigError(f"{where[0]} line {line}, {where[1]!r}: {text!r} is {wanted}")
+    return answers.astype(int)
+
+
+def _average(scores: "pd.Series") -> float:
+    # In whole numbers, as 2.125 is 2.13 whatever its binary digits are.
+    return int(200 * scores.sum() + len(scores)) // (2 * len(scores)) / 100 if len(scores) else nan
 
 
 def _agreement(text: str) -> int | None:
@@ -126,26 +128,11 @@ def _agreement(text: str) -> int | None:
     return _AGREEMENT.get(" ".join(plain.split()))
 
 
-def _opinion(question: str, given: Sequence[tuple[int, str]], file: str) -> Opinion:
-    counts = [0] * len(SCALE)
-    for line, text in given:
-        at = _agreement(text)
-        if at is None:
-            raise ConfigError(
-                f"{file} line {line}, {question!r}: {text!r} is not one of {', '.join(SCALE)}"
-            )
-        counts[at] += 1
-    return Opinion(question=question, counts=tuple(counts))
-
-
-def _score(text: str, file: str, line: int, question: str) -> int:
+def _score(text: str) -> int | None:
     """Return a score: "3", "3 = Moderate", "3.0" or "Moderate, …"."""
-    number = re.match(r"([1-4])(?:\.0+)?(?![\d.,])", text)
-    word = next((score for word, score in _WORDS.items() if text.casefold().startswith(word)), None)
-    score = int(number[1]) if number else word
-    if score is None:
-        raise ConfigError(f"{file} line {line}, {question!r}: {text!r} is no score from 1 to 4")
-    return score
+    if number := re.match(r"([1-4])(?:\.0+)?(?![\d.,])", text):
+        return int(number[1])
+    return next((score for word, score in _WORDS.items() if text.casefold().startswith(word)), None)
 
 
 # ---------------------------------------------------------------------------- output
@@ -157,20 +144,20 @@ def survey_dict(survey: Survey) -> dict[str, Any]:
         "schema": "cartlab-survey/1",
         "students": survey.students,
         "opinions": [
-            {
-                "question": o.question,
-                "counts": dict(zip(SCALE, o.counts, strict=True)),
-                "percents": dict(zip(SCALE, o.percents, strict=True)),
-            }
-            for o in survey.opinions
+            {"question": question, "counts": counts, "percents": percents}
+            for question, counts, percents in zip(
+                survey.opinions.index,
+                survey.opinions.to_dict("records"),
+                survey.percents.to_dict("records"),
+                strict=True,
+            )
         ],
         "concepts": [
-            {
-                "concept": c.concept,
-                "means": {level: float(m) if (m := c.mean(level)) else None for level in LEVELS},
-                "answers": {level: len(c.answers.get(level, ())) for level in LEVELS},
-            }
-            for c in survey.concepts
+            {"concept": concept, "means": means, "answers": survey.answers.loc[concept].to_dict()}
+            for concept, means in survey.means.astype(object)
+            .where(survey.means.notna(), None)
+            .to_dict("index")
+            .items()
         ],
         "left_out": list(survey.left_out),
     }
@@ -179,12 +166,13 @@ def survey_dict(survey: Survey) -> dict[str, Any]:
 def survey_text(survey: Survey) -> str:
     """Return both tables as Markdown, which reads as it is."""
     parts = []
-    if survey.opinions:
-        rows = [[o.question, *(f"{p} %" for p in o.percents)] for o in survey.opinions]
+    if len(survey.opinions):
+        rows = [[str(q), *(f"{p} %" for p in row)] for q, *row in survey.percents.itertuples()]
         parts.append(_markdown(["Question", *SCALE], rows))
         parts.append("Table 4: Results of student questionnaires at end of the course.")
-    if survey.concepts:
-        rows = [[c.concept, *(c.mean(level) or "–" for level in LEVELS)] for c in survey.concepts]
+    if len(survey.means):
+        shown = survey.means.map(lambda mean: "–" if isnan(mean) else f"{mean:.2f}")
+        rows = [[str(text) for text in row] for row in shown.itertuples()]
         parts.append(_markdown(["Concept", *LEVELS], rows))
         parts.append("Table 5: Pre and post course knowledge and confidence (average score).")
     return "\n\n".join(parts)

@@ -3,19 +3,29 @@
 import csv
 import io
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pipeline.errors import ConfigError
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 _MOST_BYTES = 20_000_000
+_MOST_ROWS, _MOST_COLUMNS = 100_000, 2_000  # no class and no questionnaire is larger
 
 
-def read_table(path: Path) -> list[tuple[int, list[str]]]:
-    """Return the rows of a CSV with the lines they end on: commas, semicolons or tabs.
+def read_table(path: Path) -> "pd.DataFrame":
+    """Return a CSV as texts under its heading, the lines that its rows end on as index.
+
+    Separators are commas, semicolons or tabs; rows without a text are left out, short ones filled
+    up, and cells beyond the heading cut off.
 
     Raises
     ------
-    ConfigError : it is no such table.
+    ConfigError : it is no such table, or too large.
     """
+    import pandas as pd
+
     try:
         if path.stat().st_size > _MOST_BYTES:
             raise ConfigError(f"{path.name}: is larger than {_MOST_BYTES // 1_000_000} MB")
@@ -25,9 +35,22 @@ def read_table(path: Path) -> list[tuple[int, list[str]]]:
     except UnicodeDecodeError:
         raise ConfigError(f"{path.name}: is not UTF-8 text; export it anew as CSV") from None
     delimiter = max(",;\t", key=text.partition("\n")[0].count)
+    # Not pandas' reader: it cannot tell the line of a row, which a message has to.
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter)
+    head: list[str] = []
+    rows: dict[int, list[str]] = {}
     try:
-        rows = [(reader.line_num, row) for row in reader]
+        for row in reader:
+            if not any(cell.strip() for cell in row):
+                continue
+            if not head:
+                head = [name.strip() for name in row]
+            else:
+                rows[reader.line_num] = [*row, *[""] * (len(head) - len(row))][: len(head)]
+            if len(head) > _MOST_COLUMNS or len(rows) > _MOST_ROWS:
+                raise ConfigError(
+                    f"{path.name}: has more than {_MOST_COLUMNS} columns or {_MOST_ROWS} rows"
+                )
     except csv.Error as error:
         raise ConfigError(f"{path.name} line {reader.line_num}: no table: {error}") from None
-    return [(line, row) for line, row in rows if any(cell.strip() for cell in row)]
+    return pd.DataFrame(list(rows.values()), index=list(rows), columns=head, dtype=object)
