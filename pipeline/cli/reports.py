@@ -177,7 +177,7 @@ def gap(
     submission = load_submission(folder)
     out = check_folder(out) if out else own_folder(submission.folder, "gap")
     with progress_line() as progress:
-        analysis = analyse(submission, progress=progress)
+        analysis = analyse(submission, design=False, progress=progress)
         from pipeline.gap.investigate import investigate  # loads the compiled simulator
 
         found = investigate(analysis, progress=progress)
