@@ -54,6 +54,23 @@ def test_an_error_of_the_grader_is_tried_again(task, tmp_path):
     assert "Traceback" in outcome.detail
 
 
+@pytest.mark.parametrize(
+    ("slip", "typed"),
+    [("carts = 1", "carts = ?"), ("carts = 1", "cart = 1"), ("data/step-1.csv", "data/none.csv"),
+     ("version = 1", "version = 1,0"), ('id = "s0"', "id = s0  # me"), ('"s0"', "“s0”")],
+)  # fmt: skip
+def test_what_cannot_be_read_is_still_somebodys(school, tmp_path, slip, typed):
+    """Points given by hand are to reach who handed it in."""
+    own = shutil.copytree(school / "team-0", tmp_path / "team-0")
+    file = own / "submission.toml"
+    text = file.read_text(encoding="utf-8")
+    assert slip in text
+    file.write_text(text.replace(slip, typed), encoding="utf-8")
+    task = Task(id="team-0", key="k", sources=(str(own),))
+    outcome = grade_task(task, rubric=RUBRIC, scratch=tmp_path)
+    assert outcome.authors == ("s0",)
+
+
 def test_what_changed_meanwhile_is_not_graded_under_the_old_key(task, tmp_path, school):
     """A file that is written between the hash and the copy ends in another try, not in a grade."""
     own = shutil.copytree(school / "team-0", tmp_path / "team-0")

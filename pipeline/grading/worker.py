@@ -25,6 +25,7 @@ from pipeline.grading.run import Graded, grade_submission
 from pipeline.grading.shared_prints import fingerprint
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.complaints import quote
+from pipeline.submission.named import named_authors
 
 _GRACE = 30.0  # s; a worker without a parent to stop it ends by itself so long after the limit
 OUT_OF_MEMORY = "needs more memory than allowed"
@@ -76,6 +77,7 @@ def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = Fal
         ) as folder:
             sources = [Path(source) for source in task.sources]
             opened = open_submission(sources, Path(folder) / task.id, digest=task.digest)
+            authors = named_authors(opened)
             submission = load_submission(opened)
             authors = tuple(author.id for author in submission.authors)
             graded = grade_submission(
