@@ -19,6 +19,7 @@ from pipeline.grading.intake import find_hand_ins
 from pipeline.grading.outputs import write_outputs
 from pipeline.grading.runner import Limits
 from pipeline.grading.so_far import Row, class_so_far
+from pipeline.resources import RUBRICS
 from pipeline.synthesis import write_submission
 from tests.grades import make_grade, make_outcome, two_cart_rubric
 from tests.test_schemas import assert_fits
@@ -142,6 +143,21 @@ def test_a_folder_in_a_strangers_zip_takes_nothing_from_a_team(school, tmp_path,
         same = {key: row[key] for key in row if key not in ("submission", "reason")}
         assert now[f"class-{name}"] | same == now[f"class-{name}"]
     assert {now[name]["by_hand"] for name in ("stranger-team-1", "other-team-2")} == {""}
+
+
+def test_a_rubric_of_another_name_replaces_no_class(school, tmp_path):
+    """Its files, and what was given by hand, would be gone without a word."""
+    out, rubric = tmp_path / "out", tmp_path / "lab.toml"
+    shutil.copy(RUBRICS / "throne-1dof.toml", rubric)
+    grade(school / "B" / "team-1", out=out, rubric=rubric)
+    give(out, "team-1", 0.25)
+    before = pages(out)
+    mended = rubric.rename(tmp_path / "lab-mended.toml")
+    with pytest.raises(ConfigError, match=r"holds the class of lab\.toml"):
+        grade(school / "B" / "team-1", out=out, rubric=mended)
+    assert pages(out) == before
+    grade(school / "B" / "team-1", out=out, rubric=mended.rename(rubric))
+    assert rows(out)["team-1"]["by_hand"] == "pieces"
 
 
 def test_who_exchanges_folders_keeps_what_was_given(tmp_path):

@@ -68,12 +68,14 @@ def grade_class(
 
     Raises
     ------
-    ConfigError : the rubric, the table, a path, the folder or the cluster cannot be used, or
-        another run is writing there.
+    ConfigError : the rubric, the table, a path, the folder or the cluster cannot be used, the
+        folder holds another class, or another run is writing there.
     """
     rubric = load_rubric(rubric_file)
     late_table = LateTable.read(lateness) if lateness else None
     _refuse_submission(check_folder(out))
+    if gradebook is None:
+        _refuse_another_class(out, assignment=rubric_file.stem)
     with alone_in(out), scratch_in(out) as scratch:
         known = _names_so_far(gradebook or out, assignment=rubric_file.stem)
         passed: list[str] = []
@@ -114,6 +116,20 @@ def _refuse_submission(out: Path) -> None:
     for folder in (out.resolve(), *out.resolve().parents):
         if (folder / NAME).is_file():
             raise ConfigError(f"{out}: is in a submission; name a folder outside of it with --out")
+
+
+def _refuse_another_class(out: Path, *, assignment: str) -> None:
+    """Refuse to write the class of another rubric's name over this one, points by hand and all."""
+    try:
+        with Gradebook(out) as book:
+            before = book.assignment
+    except ConfigError:
+        return  # no class there yet
+    if before != assignment:
+        raise ConfigError(
+            f"{out}: holds the class of {before}.toml, and a rubric of another name is another "
+            f"class: call the rubric {before}.toml to go on with it, or name another --out"
+        )
 
 
 def _told(batch: Batch, book: Gradebook) -> Iterator[str]:

@@ -197,6 +197,17 @@ class Gradebook:
     # ---------------------------------------------------------------- what counts now
 
     @property
+    def assignment(self) -> str:
+        """Whose class list it is.
+
+        Raises
+        ------
+        ConfigError : no batch ran to its end yet.
+        """
+        with self._database.reading() as connection:
+            return self._last(connection).assignment
+
+    @property
     def rubric(self) -> Rubric:
         """The rubric of the class list.
 
