@@ -76,7 +76,14 @@ def shared_flag(other: str) -> Flag:
         message=f"The recording of step-1 stands in {other} too.",
         evidence={
             "submissions": [other],
-            "recordings": [{"experiment": "step-1", "submission": other}],
+            "recordings": [
+                {
+                    "experiment": "step-1",
+                    "submission": other,
+                    "other_experiment": "step-1",
+                    "sigmas": 9.5,
+                }
+            ],
         },
     )
 

@@ -311,6 +311,46 @@ def test_the_class_page_counts_what_there_is():
     assert re.search(r"hz_for_rad_s \) 2 50 % b , c .* missing \) 1 25 % c ", text)
 
 
+def shares(*found: tuple[str, str, str]) -> Flag:
+    """Return the flag of (own recording, other submission, its recording)s."""
+    keys = ("experiment", "submission", "other_experiment")
+    recordings = [{**dict(zip(keys, one, strict=True)), "sigmas": 9.5} for one in found]
+    return replace(shared_flag("x"), evidence={"submissions": [], "recordings": recordings})
+
+
+def test_the_class_page_groups_who_shares_with_whom(tmp_path):
+    """Clusters, and in each what stands where; a submission of an earlier batch has no page."""
+    shared = {
+        "a": shares(("step-1", "b", "step-2"), ("sine-1", "b", "sine-1")),
+        "b": shares(("step-2", "a", "step-1"), ("sine-1", "a", "sine-1"), ("d", "c", "d")),
+        "c": shares(("d", "b", "d")),
+        "e": shares(("d", "old (an earlier batch)", "d")),
+    }
+    outcomes = [make_outcome(make_grade(name)) for name in "abcde"]
+    with Gradebook(tmp_path / "g.sqlite", assignment="lab", create=True) as book:
+        for outcome in outcomes:
+            book.put(outcome)
+        batch = Batch(keys=tuple(o.key for o in outcomes), shared=shared)
+        texts = {}
+        for anonymous in (False, True):
+            rubric = RUBRIC.model_copy(update={"anonymous": anonymous})
+            book.finish(batch, rubric=rubric)
+            write_outputs(book, tmp_path)
+            html = (tmp_path / "class.html").read_text(encoding="utf-8")
+            found = re.search(r'id="shared".*?(<tbody.*?)</table>', html, re.DOTALL)
+            assert found
+            rows = re.findall(r"<tr.*?</tr>", found[1], re.DOTALL)
+            texts[anonymous] = [" ".join(re.sub(r"<[^>]+>", " ", row).split()) for row in rows]
+    assert texts[False] == [
+        "1 a , b 2 sine-1, step-1 (step-2 in b)",
+        "1 b , c 1 d",
+        "2 e , old (an earlier batch) 1 d",
+    ]
+    assert len(texts[True]) == 3
+    assert not [text for text in texts[True] if re.search(r"\b[abce]\b|old", text)]
+    assert [text for text in texts[True] if re.search(r"anon-\w+ , another submission", text)]
+
+
 def missing_flag() -> Flag:
     return Flag(code="missing", parameters=("K_1",), message="K_1 is missing.", evidence={})
 

@@ -14,7 +14,7 @@ from pipeline.output import csv_text
 KEY_FILE = "anonymous-key.csv"
 _PREFIX = "anon-"
 _SHORTEST = 6  # letters: a thousand submissions rarely need one more
-_STRANGER = "another submission"
+STRANGER = "another submission"
 _ARCHIVE = re.compile(r"^.*?\.zip\W?: ", re.IGNORECASE)  # at the beginning of a reason
 
 
@@ -64,9 +64,9 @@ def anonymise(grade: Grade, names: Mapping[str, str]) -> Grade:
 
 def _hidden(flag: Flag, names: Mapping[str, str]) -> Flag:
     """Return a flag for shared data that calls submissions by other names."""
-    others = list(dict.fromkeys(names.get(o, _STRANGER) for o in flag.evidence["submissions"]))
+    others = list(dict.fromkeys(names.get(o, STRANGER) for o in flag.evidence["submissions"]))
     recordings = [
-        {**recording, "submission": names.get(recording["submission"], _STRANGER)}
+        {**recording, "submission": names.get(recording["submission"], STRANGER)}
         for recording in flag.evidence["recordings"]
     ]
     return replace(

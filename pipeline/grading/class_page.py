@@ -10,6 +10,7 @@ from urllib.parse import quote
 import numpy as np
 
 from pipeline import __version__
+from pipeline.grading.clusters import Cluster
 from pipeline.grading.doubles import Double
 from pipeline.grading.feedback_words import TITLES, points_text
 from pipeline.grading.grade import CODES, Code, Grade, Outcome
@@ -82,13 +83,23 @@ class Line:
         )
 
 
-def class_page(lines: Sequence[Line], *, rubric: Rubric, doubles: Sequence[Double] = ()) -> str:
+def class_page(
+    lines: Sequence[Line],
+    *,
+    rubric: Rubric,
+    doubles: Sequence[Double] = (),
+    clusters: Sequence[Cluster] = (),
+) -> str:
     """Return `class.html`; same class, same bytes."""
-    return render_html(class_document(lines, rubric=rubric, doubles=doubles))
+    return render_html(class_document(lines, rubric=rubric, doubles=doubles, clusters=clusters))
 
 
 def class_document(
-    lines: Sequence[Line], *, rubric: Rubric, doubles: Sequence[Double] = ()
+    lines: Sequence[Line],
+    *,
+    rubric: Rubric,
+    doubles: Sequence[Double] = (),
+    clusters: Sequence[Cluster] = (),
 ) -> Document:
     """Return the class as a document."""
     graded = [line for line in lines if line.status == "graded"]
@@ -99,6 +110,7 @@ def class_document(
             ("points", "Points", _points(graded, rubric, pictures)),
             ("criteria", "Criteria", _criteria(graded, rubric, tables, pictures)),
             ("mistakes", "Most common mistakes", _mistakes(lines, tables)),
+            ("shared", "Shared recordings", _shared(lines, clusters, tables)),
             ("class", "Everybody", _everybody(lines, tables)),
         ]
     return Document(
@@ -223,21 +235,55 @@ def _mistakes(lines: Sequence[Line], tables: count) -> list[Block]:
     order = sorted(having, key=lambda code: (-len(having[code]), CODES.index(code)))
     rows = []
     for code in order:
-        named = [_link(line.name) for line in having[code][:_NAMED]]
-        text: list[str | Span] = [part for span in named for part in (span, ", ")][:-1]
-        more = len(having[code]) - _NAMED
+        named = [_link(line.name) for line in having[code]]
         rows.append(
             [
                 cell(spans(f"{TITLES[code]} (", Span(code, "code"), ")")),
                 cell(str(len(having[code]))),
                 cell(f"{100 * len(having[code]) / len(lines):.0f} %"),
-                cell(spans(*text, f" and {more} more" if more > 0 else "")),
+                cell(spans(*_listed(named))),
             ]
         )
     head = ("Remark", "Submissions", "Share", "Whose")
     return [
         make_table(next(tables), "The remarks made, the most common first.", head, rows, "lrrl")
     ]
+
+
+def _shared(lines: Sequence[Line], clusters: Sequence[Cluster], tables: count) -> list[Block]:
+    """Return who shares recordings with whom, a cluster after the other."""
+    if not clusters:
+        return []
+    here = {line.name for line in lines}
+    rows = []
+    for number, cluster in enumerate(clusters, start=1):
+        for submissions, recordings in cluster.by_submissions().items():
+            links = [_link(name) if name in here else Span(clean(name)) for name in submissions]
+            more = len(recordings) - _NAMED
+            rows.append(
+                [
+                    cell(str(number)),
+                    cell(spans(*_listed(links))),
+                    cell(str(len(recordings))),
+                    cell(
+                        clean(", ".join(recordings[:_NAMED]))
+                        + (f" and {more} more" if more > 0 else "")
+                    ),
+                ]
+            )
+    head = ("Cluster", "Submissions", "Recordings", "Which")
+    caption = (
+        "Recordings that stand in several submissions. In a cluster everybody shares some with "
+        "another of it; whose they are the recordings do not say."
+    )
+    return [make_table(next(tables), caption, head, rows, "rlrl")]
+
+
+def _listed(links: Sequence[Span]) -> list[str | Span]:
+    """Return links with commas between them, those beyond the first few as a number."""
+    text: list[str | Span] = [part for link in links[:_NAMED] for part in (link, ", ")][:-1]
+    more = len(links) - _NAMED
+    return [*text, f" and {more} more"] if more > 0 else text
 
 
 def _everybody(lines: Sequence[Line], tables: count) -> list[Block]:

@@ -10,11 +10,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from pipeline.errors import ConfigError
-from pipeline.grading.anonymous import KEY_FILE, anonymise, key_text, pseudonyms
+from pipeline.grading.anonymous import KEY_FILE, STRANGER, anonymise, key_text, pseudonyms
 from pipeline.grading.class_page import Line, class_page
+from pipeline.grading.clusters import find_clusters, renamed
 from pipeline.grading.doubles import Double, find_doubles, with_recordings
 from pipeline.grading.feedback import feedback_page
-from pipeline.grading.grade import Grade, grade_dict
+from pipeline.grading.grade import Flag, Grade, grade_dict
 from pipeline.grading.gradebook import Gradebook
 from pipeline.grading.gradebook_rows import Entry
 from pipeline.grading.rubric import Rubric
@@ -49,7 +50,11 @@ def write_outputs(
     now_of: dict[str, str] = {}
     gradings: dict[str, int] = {}
     authors: dict[str, tuple[str, ...]] = {}
+    shared: dict[str, Flag] = {}
     for entry in book.entries():
+        shared |= dict(
+            (entry.submission, flag) for flag in entry.grade.flags if flag.code == "shared_data"
+        )
         grade = anonymise(entry.grade, names) if names is not None else entry.grade
         lines.append(Line.of(grade, by_hand=sorted(entry.overrides)))
         gradings[entry.submission], authors[entry.submission] = entry.grading, entry.grade.authors
@@ -75,9 +80,13 @@ def write_outputs(
     _remove_stale(folder, keep=set(now_of))
     write_file(out / "grades.csv", grades_csv(lines, rubric=rubric))
     doubles = _doubles(book, authors, gradings=gradings, names=names)
-    now_of[_WHOLE] = _digest(look, repr((lines, doubles)), *now_of.values())
+    clusters = find_clusters(shared)
+    if names is not None:
+        clusters = renamed(clusters, names, other=STRANGER)
+    now_of[_WHOLE] = _digest(look, repr((lines, doubles, clusters)), *now_of.values())
     if made_of.get(_WHOLE) != now_of[_WHOLE] or not (out / _CLASS).is_file():
-        write_file(out / _CLASS, class_page(lines, rubric=rubric, doubles=doubles))
+        page = class_page(lines, rubric=rubric, doubles=doubles, clusters=clusters)
+        write_file(out / _CLASS, page)
     write_file(
         folder / _MADE, json.dumps(now_of, indent=0, ensure_ascii=False, sort_keys=True) + "\n"
     )
