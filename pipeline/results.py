@@ -44,6 +44,7 @@ class Record:
     resolution : (len(carts),) the encoder step, in position units; 0 where none is seen.
     hold : how the input behaves between samples.
     source : path inside the submission; `notes` say what reading it had to mend.
+    turned : its input was found to count the other way than the bench's others, and was turned.
     position_scale, input_scale : what the file's own numbers were multiplied by to get y and u
         (the sign included); a controller's gains may be in the file's units.
     """
@@ -61,6 +62,7 @@ class Record:
     hold: Hold = "zero_order"
     source: str = ""
     notes: tuple[str, ...] = ()
+    turned: bool = False
     position_scale: float = 1.0
     input_scale: float = 1.0
 

@@ -7,9 +7,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from pipeline.ingest.problems import saturation, stuck_spans
-from pipeline.ingest.signals import encoder_step, input_sign, mirrors
-from pipeline.plant.chain import PRESETS
-from pipeline.plant.simulate import simulate_linear
+from pipeline.ingest.signals import encoder_step, mirrors
 
 RATE = 113.0
 T = np.arange(900, dtype=np.float64) / RATE
@@ -38,51 +36,6 @@ def test_a_signal_without_steps_has_no_encoder_step():
     rng = np.random.default_rng(1)
     assert encoder_step(rng.standard_normal(1000)) == 0.0
     assert encoder_step(np.full(1000, 3.0)) == 0.0
-
-
-def respond(name: str, u: np.ndarray, sign: int) -> np.ndarray:
-    """Return cart 1's position in encoder counts, with noise, for a logged input of that sign."""
-    rng = np.random.default_rng(7)
-    y = simulate_linear(PRESETS[name], T, sign * u)[0]
-    y = y / np.ptp(y) + 0.001 * rng.standard_normal(y.size)
-    return np.rint(440 * y)
-
-
-CASES = {
-    "step on": np.where(T > 0.3, 1.0, 0.0),
-    "step on and off": np.where((T > 0.3) & (T < 4.0), -1.0, 0.0),
-    "dwell below": np.sin(2 * np.pi * 1.0 * T),
-    "dwell near": np.sin(2 * np.pi * 2.0 * T),
-    "sweep": np.sin(2 * np.pi * (0.3 + 0.3 * T) * T),
-    "random": np.repeat(np.random.default_rng(5).standard_normal(90), 10),
-}
-
-
-@pytest.mark.parametrize("preset", ["throne-1dof", "throne-2dof", "throne-3dof"])
-@pytest.mark.parametrize("sign", [1, -1])
-@pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
-def test_the_sign_of_the_input_is_found(case, sign, preset):
-    """Whatever moves the cart from rest tells the direction in which the motor pushes."""
-    x = respond(preset, case, sign)
-    assert input_sign(case, x, closed_loop=False) == sign
-
-
-@pytest.mark.parametrize("frequency", np.geomspace(0.3, 20.0, 25))
-def test_the_sign_is_never_wrong_on_a_late_log(frequency):
-    """Far from resonance a log that is late by a sample leaves the sign open, never wrong."""
-    u = np.sin(2 * np.pi * frequency * T)
-    for preset in PRESETS:
-        for late in (0, 1):
-            x = np.roll(respond(preset, u, 1), late)
-            x[:late] = x[late]
-            assert input_sign(u, x, closed_loop=False) in (0, 1)
-
-
-def test_without_motion_or_input_there_is_no_sign():
-    """A decay or a locked cart tells nothing."""
-    decay = np.rint(440 * np.exp(-T) * np.cos(13 * T))
-    assert input_sign(np.zeros_like(T), decay, closed_loop=False) == 0
-    assert input_sign(np.sin(T), np.full_like(T, 3.0), closed_loop=False) == 0
 
 
 def test_a_mirrored_position_is_told_from_a_reference():

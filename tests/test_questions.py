@@ -257,6 +257,6 @@ def test_real_carts_raise_friction_and_damping(tmp_path, real_data):
     """The real two-cart data ask about dampings, dry friction and the bench, six at most."""
     folder = write_two_cart_submission(tmp_path / "real", real_data, steps=(2, 3, 4, 5))
     ids = [question.id for question in ask(analyse(load_submission(folder)))]
-    assert ids[:3] == ["zeta_2", "friction-1", "friction-2"]
+    assert ids[:4] == ["sign", "zeta_2", "friction-1", "friction-2"]
     assert "hardware" in ids
     assert len(ids) <= 6

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.ingest.signals import input_sign
+from pipeline.ingest.drive import find_signs
 from pipeline.results import Record
 from pipeline.submission import Submission
 
@@ -23,16 +23,7 @@ def with_signs(records: list[Record], submission: Submission) -> tuple[list[Reco
         if (sign := own or submission.system.input.sign) is not None:
             stated[experiment.id] = sign
     driven = [r for r in records if r.u is not None and np.ptp(r.u) > 0]
-    found = {
-        r.id: input_sign(
-            r.u,
-            r.position(1),
-            closed_loop=r.kind == "closed_loop",
-            tied=submission.system.tied or len(r.free) < submission.system.carts,
-        )
-        for r in driven
-        if r.u is not None and 1 in r.carts and 1 in r.free
-    }
+    found = find_signs(driven, stated=stated)
 
     def usual(record: Record) -> int:
         alike = [r for r in driven if (r.kind == "closed_loop") == (record.kind == "closed_loop")]
@@ -42,10 +33,17 @@ def with_signs(records: list[Record], submission: Submission) -> tuple[list[Reco
         return next((1 if vote > 0 else -1 for vote in votes if vote), 1)
 
     signs = {r.id: stated.get(r.id) or found.get(r.id) or usual(r) for r in records}
+    others = [r.id for r in driven if r.kind != "closed_loop"] or [r.id for r in driven]
+    bench = 1 if sum(signs[name] for name in others) >= 0 else -1
     signed = [
-        record
-        if record.u is None or signs[record.id] == 1
-        else replace(record, u=0.0 - record.u, input_scale=-record.input_scale)
+        replace(
+            record,
+            u=record.u if signs[record.id] == 1 else 0.0 - record.u,
+            input_scale=signs[record.id] * record.input_scale,
+            turned=record.id not in stated and found.get(record.id) == -bench,
+        )
+        if record.u is not None
+        else record
         for record in records
     ]
     return signed, _say_signs([r.id for r in driven], stated=stated, found=found, signs=signs)

@@ -28,6 +28,7 @@ from pipeline.results import Analysis, HardwareCheck, ParameterRow
 from pipeline.stages.compare import CHI_SQUARE_LIMIT, DAMPING_LIMIT
 
 _MOST = 6  # a report with more would be a questionnaire
+_LISTED = 4  # runs; of more the first
 _FAR = 0.10  # of the motion: a difference between bench and model worth a question
 _LEVEL = 0.03  # of the level
 _OVERSHOOT = 5.0  # percent of the step
@@ -47,11 +48,36 @@ class Asked:
 
 def ask(analysis: Analysis) -> tuple[Asked, ...]:
     """Return what this data raises, the most telling first; nothing where all is well."""
-    rules = (_damping, _friction, _gains_and_frequencies, _hardware, _misfit, _sticking, _assumed)
+    rules = (
+        _turned,
+        _damping,
+        _friction,
+        _gains_and_frequencies,
+        _hardware,
+        _misfit,
+        _sticking,
+        _assumed,
+    )
     return tuple(question for rule in rules for question in rule(analysis))[:_MOST]
 
 
 # ------------------------------------------------------------------------ the rules
+
+
+def _turned(analysis: Analysis) -> Iterator[Asked]:
+    turned = [record for record in analysis.records if record.turned]
+    if not turned:
+        return
+    names = [record.id for record in turned]
+    listed = listing(names) if len(names) <= _LISTED else f"{names[0]} and {len(names) - 1} more"
+    there = {"step": "steps", "sine": "frequency-response", "closed_loop": "hardware"}
+    yield Asked(
+        id="sign",
+        section=there.get(turned[0].kind, "discussion"),
+        text=f"The logged input of {listed} counts the other way than that of your other runs, and "
+        "was turned: no delay explains such a motion. What was different there: a plug, the "
+        "amplifier, or which signal is logged? State it in submission.toml, input = { sign = … }.",
+    )
 
 
 def _off(analysis: Analysis) -> list[ParameterRow]:

@@ -1,0 +1,167 @@
+"""Which way the motor pushes: the input held against the force that cart 1's motion asks for.
+
+    s u = m x_1'' + c x_1' + k x_1 + k' (x_1 - x_2),   m, c, k, k' ≥ 0,   s = ±1
+
+holds for every record of a bench with one m, c, k and k', so all records decide s together. No
+derivative is taken: both sides are weighed with a smooth bump that slides along the record, and
+the derivatives fall on the bump (modulating functions). An input that reaches the carts late, by a
+delay or a lag, turns the phases above the resonance so far that such a record alone seems to have
+the other sign; together with the others' inertia and stiffness it does not.
+
+Reference: H. A. Preisig & D. W. T. Rippin, Theory and application of the modulating function
+method, Computers & Chemical Engineering 17, 1993.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import nnls
+from scipy.signal import fftconvolve
+
+from pipeline.plant.chain import Array
+from pipeline.results import Record
+
+_BUMP = np.polynomial.Polynomial.fromroots([0.0] * 4 + [1.0] * 4)  # t⁴ (1 - t)⁴
+_NARROWEST = 8  # samples under a bump
+_BUMPS = 6  # side by side in a record, at least
+_OVERLAP = 6  # steps in which a bump slides on by its width
+_MOST_PLACES = 400  # of the bump in a record
+# Of the input's power: how much more the other sign must leave unexplained to be ruled out. Far
+# above what an encoder's steps do; a cart's damping is worth more at every frequency that moves it.
+_LEAST, _LEAST_SHARE = 1e-3, 0.1
+# Of the cosine between an input and the force that the bench's equation gives. A lag (at most 90°)
+# and any likely delay stay above zero; a log that counts the other way is near -1.
+_TELLS, _CONTRARY = 0.3, -0.7
+_ROUNDS = 5  # of turning contrary records and fitting again
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Weighed:
+    """Both sides of the equation under the sliding bump, over the norm of the input's.
+
+    Attributes
+    ----------
+    drive : (3, n) the input a sample early, as logged, and a sample late.
+    motion : (n, 4) what m, c, k and k' multiply.
+    complete : False where cart 2 is free and was not measured.
+    decisive : may be found to be contrary; a dwell may not that is not complete.
+    """
+
+    drive: Array
+    motion: Array
+    complete: bool
+    decisive: bool
+    closed: bool
+
+
+def find_signs(records: Sequence[Record], *, stated: Mapping[str, int]) -> dict[str, int]:
+    """Return by record the sign of its logged input; 0, or nothing, where the data do not tell.
+
+    One bench has one sign: a record has another only where its input is the opposite of the force
+    that the others' equation gives. What is logged under feedback may be another signal, so it
+    has no part in the equation where there are other records.
+
+    Parameters
+    ----------
+    stated : by record, the sign that it is said to have; the others count as 1.
+    """
+    weighed = {record.id: found for record in records if (found := _weigh(record)) is not None}
+    if not weighed:
+        return {}
+    said = {name: stated.get(name, 1) for name in weighed}
+    rule = {name for name, w in weighed.items() if w.complete} or set(weighed)
+    rule = {name for name in rule if not weighed[name].closed} or rule
+    # Where as many count one way as the other, what each says alone is the better start.
+    alone = {n for n, w in weighed.items() if w.decisive and _bench([w], [said[n]])[0] < 0}
+    for turned in (set[str](), alone):
+        found = _settle(weighed, said, turned, rule=rule)
+        if found:
+            return found
+    return {}
+
+
+def _settle(
+    weighed: Mapping[str, _Weighed], said: Mapping[str, int], turned: set[str], *, rule: set[str]
+) -> dict[str, int]:
+    """Turn what is contrary to the equation of `rule` until nothing is; see `find_signs`."""
+    for _ in range(_ROUNDS):
+        signs = {name: -said[name] if name in turned else said[name] for name in weighed}
+        sign, weights = _bench([weighed[name] for name in rule], [signs[name] for name in rule])
+        if sign == 0:
+            return {}
+        cosines = {name: sign * said[name] * _cosine(w, weights) for name, w in weighed.items()}
+        contrary = {n for n, w in weighed.items() if w.decisive and cosines[n] < _CONTRARY}
+        if contrary == turned:
+            return {
+                name: sign * signs[name] if name in turned or cosines[name] > _TELLS else 0
+                for name in weighed
+            }
+        turned = contrary
+    return {}
+
+
+def _bench(weighed: Sequence[_Weighed], signs: Sequence[int]) -> tuple[int, Array]:
+    """Return the sign, on top of `signs`, and m, c, k, k' of the equation that explains them all.
+
+    The sign is 0 where the other explains them nearly as well, or where a log that is early or
+    late by a sample would change it (a feedback law is never early).
+    """
+    motion = np.vstack([w.motion for w in weighed])
+    size = np.linalg.norm(motion, axis=0)
+    size[size == 0] = 1.0
+    shifts = (1, 2) if all(w.closed for w in weighed) else (0, 1, 2)
+    found, weights = set(), np.zeros(4)
+    for shift in shifts:
+        drive = np.concatenate([s * w.drive[shift] for s, w in zip(signs, weighed, strict=True)])
+        (ahead, left), (back, right) = (nnls(motion / size, sign * drive) for sign in (1, -1))
+        power = len(weighed)
+        share = np.array([left, right]) ** 2 / power
+        sure = abs(share[0] - share[1]) > _LEAST + _LEAST_SHARE * share.min()
+        found.add((1 if share[0] < share[1] else -1) if sure else 0)
+        if shift == 1:
+            weights = (ahead if share[0] < share[1] else back) / size
+    return (found.pop() if len(found) == 1 else 0), weights
+
+
+def _cosine(w: _Weighed, weights: Array) -> float:
+    """Return the cosine between the logged input and the force of the equation."""
+    force = w.motion @ weights
+    size = float(np.linalg.norm(force) * np.linalg.norm(w.drive[1]))
+    return float(w.drive[1] @ force) / size if size > 0 else 0.0
+
+
+def _weigh(record: Record) -> _Weighed | None:
+    """Return both sides of a record's equation; None where nothing drives or moves cart 1."""
+    if record.u is None or 1 not in record.carts or 1 not in record.free:
+        return None
+    t, u, x = record.t, record.u, record.position(1)
+    if t.size < _BUMPS * _NARROWEST or np.ptp(u) == 0.0 or np.ptp(x) == 0.0:
+        return None
+    known = 2 in record.carts and 2 in record.free
+    other = record.position(2) if known else np.full(t.size, x[0])
+    grid = np.linspace(t[0], t[-1], t.size)
+    u, x, other = (np.interp(grid, t, a - a.mean()) for a in (u, x, other))
+    dt = float(grid[1] - grid[0])
+    period = 2 * np.pi * np.std(x) / np.sqrt(np.mean(np.diff(x) ** 2))  # samples, of a sine
+    width = int(np.clip(period, _NARROWEST, t.size // _BUMPS))
+    at = (np.arange(width) + 0.5) / width
+    bumps = [_BUMP.deriv(order)(at) / (width * dt) ** order for order in (2, 1, 0)]
+    sides = [(x, bumps[0]), (x, -bumps[1]), (x, bumps[2]), (x - other, bumps[2]), (u, bumps[2])]
+    *motion, drive = (fftconvolve(a, bump[::-1], mode="valid") for a, bump in sides)
+    step = max(width // _OVERLAP, drive.size // _MOST_PLACES, 1)
+    places = np.arange(1, drive.size - 1, step)
+    centred = [a[places + shift] for a, shift in [(drive, -1), (drive, 0), (drive, 1)]]
+    centred += [a[places] for a in motion]
+    early, now, late, *terms = (a - a.mean() for a in centred)  # an encoder's zero drops out
+    size = np.linalg.norm(now)
+    if not (np.isfinite(size) and size > 0 and np.all(np.isfinite(terms))):
+        return None
+    complete = known or 2 not in record.free
+    return _Weighed(
+        drive=np.array([early, now, late]) / size,
+        motion=np.array(terms).T / size,
+        complete=complete,
+        decisive=complete or record.kind != "sine",
+        closed=record.kind == "closed_loop",
+    )

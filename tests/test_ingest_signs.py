@@ -1,0 +1,177 @@
+"""The sign of the input: one for a bench, decided by all its records together."""
+
+import re
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.ingest.drive import find_signs
+from pipeline.ingest.read import read_data
+from pipeline.plant.chain import PRESETS, Array
+from pipeline.plant.simulate import simulate_linear
+from pipeline.report.questions import ask
+from pipeline.results import Record
+from pipeline.submission import load_submission
+from pipeline.synthesis import write_submission
+from pipeline.synthesis.hidden import prepare_bench
+from pipeline.workflow import analyse
+
+T = 0.0088542 * np.arange(900, dtype=np.float64)
+LATE = ("input_delay:delay=0.014", "actuator_lag:time_constant=0.018")
+
+
+def one(u: Array, x: Array) -> list[Record]:
+    """Return cart 1's record of a bench whose other carts were not measured."""
+    return [
+        Record(
+            id="a",
+            kind="sweep",
+            t=T,
+            u=u,
+            y=x[None],
+            carts=(1,),
+            free=(1, 2, 3),
+            resolution=np.ones(1),
+        )
+    ]
+
+
+def respond(preset: str, u: Array, sign: int) -> Array:
+    """Return cart 1's position in encoder counts, with noise, for a logged input of that sign."""
+    rng = np.random.default_rng(7)
+    y = simulate_linear(PRESETS[preset], T, sign * u)[0]
+    y = y / np.ptp(y) + 0.001 * rng.standard_normal(y.size)
+    return np.rint(440 * y)
+
+
+CASES = {
+    "step on": np.where(T > 0.3, 1.0, 0.0),
+    "step on and off": np.where((T > 0.3) & (T < 4.0), -1.0, 0.0),
+    "dwell below": np.sin(2 * np.pi * 1.0 * T),
+    "dwell near": np.sin(2 * np.pi * 2.0 * T),
+    "sweep": np.sin(2 * np.pi * (0.3 + 0.3 * T) * T),
+    "random": np.repeat(np.random.default_rng(5).standard_normal(90), 10),
+}
+
+
+@pytest.mark.parametrize("preset", ["throne-1dof", "throne-2dof", "throne-3dof"])
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
+def test_the_sign_of_a_single_record_is_found(case, sign, preset):
+    """Whatever moves the cart from rest tells the direction in which the motor pushes."""
+    assert find_signs(one(case, respond(preset, case, sign)), stated={}) == {"a": sign}
+
+
+@pytest.mark.parametrize("frequency", np.geomspace(0.3, 20.0, 25))
+def test_the_sign_is_never_wrong_on_a_late_log(frequency):
+    """Far from resonance a log that is late by a sample leaves the sign open, never wrong."""
+    u = np.sin(2 * np.pi * frequency * T)
+    for preset in PRESETS:
+        for late in (0, 1):
+            x = np.roll(respond(preset, u, 1), late)
+            x[:late] = x[late]
+            assert find_signs(one(u, x), stated={}).get("a", 0) in (0, 1)
+
+
+def test_without_motion_or_input_there_is_no_sign():
+    """A decay, a locked cart or a few samples tell nothing."""
+    decay: Array = np.rint(440 * np.exp(-T) * np.cos(13 * T))
+    assert find_signs(one(np.zeros_like(T), decay), stated={}) == {}
+    assert find_signs(one(np.sin(T), np.full_like(T, 3.0)), stated={}) == {}
+    assert find_signs([], stated={}) == {}
+
+
+# ------------------------------------------------------------------- all records of a bench
+
+
+@pytest.fixture(scope="module", params=[(n, late) for n in (1, 2, 3) for late in LATE])
+def bench(request, tmp_path_factory) -> Path:
+    """The submission of a bench whose input reaches the carts late; it states no sign."""
+    carts, late = request.param
+    hidden = prepare_bench(preset=f"throne-{carts}dof", hide=(late,))
+    folder = tmp_path_factory.mktemp("late") / "bench"
+    write_submission(folder, chain=hidden.chain, effects=hidden.effects, seed=5, compact=True)
+    toml = folder / "submission.toml"
+    text = toml.read_text("utf-8")
+    toml.write_text(text.replace(", sign = 1", ""), "utf-8")
+    assert toml.read_text("utf-8") != text
+    return folder
+
+
+def driven(folder: Path) -> list[Record]:
+    return [
+        r for r in read_data(load_submission(folder)).records if r.u is not None and np.any(r.u)
+    ]
+
+
+def reversed_in(records: Sequence[Record], names: Collection[str]) -> list[Record]:
+    return [replace(r, u=-r.u) if r.u is not None and r.id in names else r for r in records]
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_late_input_does_not_turn_the_sign_of_dwells(bench, sign):
+    """Above the resonance each alone may seem to have the other sign; all together have one."""
+    records = driven(bench)
+    names = {record.id for record in records}
+    found = find_signs(reversed_in(records, names if sign < 0 else ()), stated={})
+    assert found == dict.fromkeys(names, sign)
+
+
+@pytest.mark.parametrize(("sign", "said"), [(1, False), (-1, True)])
+def test_a_stated_sign_is_not_doubted_because_the_input_is_late(bench, sign, said):
+    """Right, nothing is said; wrong, every record says so in one sentence."""
+    submission = load_submission(bench)
+    drive = submission.system.input.model_copy(update={"sign": sign})
+    system = submission.system.model_copy(update={"input": drive})
+    warnings = read_data(submission.model_copy(update={"system": system})).warnings
+    doubts = [text for text in warnings if "is stated as" in text]
+    assert bool(doubts) == said
+    assert not said or re.search(r"the data say \+1 in .* \(all that tell it\)", doubts[0])
+
+
+def test_a_record_that_counts_the_other_way_is_found(bench):
+    """Every single one, all dwells, or each second record.
+
+    But dwells so far up that a delay may do it tell nothing.
+    """
+    records = driven(bench)
+    names = [record.id for record in records]
+    sines = {record.id for record in records if record.kind == "sine"}
+    last = max((r for r in records if r.kind == "sine"), key=lambda r: r.omega or 0.0)
+    for contrary in ({name} for name in names):
+        found = find_signs(reversed_in(records, contrary), stated={})
+        wrong = {n for n in names if found[n] == (1 if n in contrary else -1)}
+        assert not wrong
+        open_ = {n for n in names if found[n] == 0}
+        frequencies = [r.omega for r in records if r.id in open_]
+        assert all(w is not None and w > 0.7 * (last.omega or 0.0) for w in frequencies)
+    for contrary in (sines, set(names[::2])):
+        found = find_signs(reversed_in(records, contrary), stated={})
+        majority = {n: found[n] * (-1 if n in contrary else 1) for n in names}
+        assert set(majority.values()) <= {0, 1}
+        assert sum(majority.values()) > 0.8 * len(names)
+
+
+def test_the_report_asks_why_a_record_was_turned(tmp_path):
+    """One step logged the other way round: it is turned, said, and asked about."""
+    folder = tmp_path / "bench"
+    write_submission(folder, chain="throne-1dof", seed=5, compact=True)
+    toml, step = folder / "submission.toml", folder / "data" / "step-1.csv"
+    toml.write_text(toml.read_text("utf-8").replace(", sign = 1", ""), "utf-8")
+    head, *rows = step.read_text("utf-8").splitlines()
+    column = head.split(",").index("input")
+    cells = [row.split(",") for row in rows]
+    turned = [",".join([*c[:column], f"{-float(c[column]):g}", *c[column + 1 :]]) for c in cells]
+    step.write_text("\n".join([head, *turned]) + "\n", "utf-8")
+
+    analysis = analyse(load_submission(folder))
+
+    assert [record.id for record in analysis.records if record.turned] == ["step-1"]
+    (question, *_) = ask(analysis)
+    assert (question.id, question.section) == ("sign", "steps")
+    assert "step-1" in question.text
+    assert "sign of the input found from the data: +1, but -1 in step-1" in analysis.warnings
+    assert all(row.consistent for row in analysis.rows)
