@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from urllib.parse import unquote
 
+import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -15,7 +16,8 @@ from hypothesis import strategies as st
 from pipeline.errors import ConfigError
 from pipeline.grading.anonymous import KEY_FILE, anonymise, pseudonyms
 from pipeline.grading.batch import Batch
-from pipeline.grading.class_page import Line, class_page
+from pipeline.grading.class_lines import Line
+from pipeline.grading.class_page import class_page
 from pipeline.grading.export import results_text
 from pipeline.grading.feedback import feedback_page
 from pipeline.grading.feedback_words import PLACES, TITLES
@@ -349,6 +351,36 @@ def test_the_class_page_groups_who_shares_with_whom(tmp_path):
     assert len(texts[True]) == 3
     assert not [text for text in texts[True] if re.search(r"\b[abce]\b|old", text)]
     assert [text for text in texts[True] if re.search(r"anon-\w+ , another submission", text)]
+
+
+def test_the_class_is_a_frame(tmp_path):
+    """A row a submission and criterion; what was never judged is there without points."""
+    outcomes = [make_outcome(make_grade("a", authors=("ann", "bo"), flags=(hertz_flag(),))),
+                make_outcome(make_grade("b", share=0.5, days_late=1.0, deducted=1.0, points=9.0)),
+                make_outcome(failed_grade("c", "broken"))]  # fmt: skip
+    with Gradebook(tmp_path, assignment="lab", create=True) as book:
+        for outcome in outcomes:
+            book.put(outcome)
+        book.finish(Batch(keys=tuple(o.key for o in outcomes), shared={}), rubric=RUBRIC)
+        book.override("c", "pieces", 0.75, why="x", by="y")
+        write_outputs(book, tmp_path)
+        frame = book.to_frame()
+    ids = [criterion.id for criterion in RUBRIC.criteria]
+    assert frame["submission"].to_list() == [name for name in "abc" for _ in ids]
+    assert frame["criterion"].to_list() == 3 * ids
+    wide = frame.pivot(index="submission", columns="criterion", values="points")
+    assert wide.sum(axis="columns").to_dict() == {"a": 20.0, "b": 10.0, "c": 0.75}
+    assert wide.count(axis="columns").to_dict() == {"a": len(ids), "b": len(ids), "c": 1}
+    totals = frame.pivot(index="submission", columns="criterion", values="total")["pieces"]
+    assert totals.to_list() == [20.0, 9.0, 0.75]
+    assert frame.loc[frame["by_hand"], ["submission", "criterion"]].to_numpy().tolist() == [
+        ["c", "pieces"]
+    ]
+    assert frame.loc[0, ["authors", "remarks", "outcome"]].to_list() == [
+        "ann bo", "hz_for_rad_s", "pass",
+    ]  # fmt: skip
+    table = pd.read_csv(tmp_path / "grades.csv").set_index("submission")
+    assert (table[ids].fillna(-1).to_numpy() == wide[ids].fillna(-1).to_numpy()).all()
 
 
 def missing_flag() -> Flag:

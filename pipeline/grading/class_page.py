@@ -1,19 +1,19 @@
 """The class at a glance: distribution, difficulty, the most common mistakes, everybody's grade."""
 
-from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import count
-from statistics import mean, median
+from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 import numpy as np
 
 from pipeline import __version__
+from pipeline.grading.class_lines import Line, class_frame
 from pipeline.grading.clusters import Cluster
 from pipeline.grading.doubles import Double
 from pipeline.grading.feedback_words import TITLES, points_text
-from pipeline.grading.grade import CODES, Code, Grade, Outcome
+from pipeline.grading.grade import CODES, Code
 from pipeline.grading.rubric import Rubric
 from pipeline.report.document import (
     Block,
@@ -38,49 +38,12 @@ from pipeline.report.svg import to_svg
 from pipeline.report.tables import cell, make_table
 from pipeline.report.words import clean
 
+if TYPE_CHECKING:
+    import pandas as pd
+
+_OUTCOMES = ("pass", "partial", "fail", "skip")
 _NAMED = 8  # submissions named beside a mistake
 _MOST_FAILED = 8  # whose reasons the summary shows unasked
-
-
-@dataclass(frozen=True, kw_only=True)
-class Line:
-    """What the pages and tables of a class need of one grade.
-
-    Attributes
-    ----------
-    name : of the submission as shown, and of its folder of feedback.
-    criteria : outcome and points by criterion.
-    by_hand : criteria with points given by hand.
-    """
-
-    name: str
-    authors: tuple[str, ...]
-    status: str
-    points: float
-    out_of: float
-    days_late: float
-    deducted: float
-    reason: str
-    criteria: dict[str, tuple[Outcome, float]]
-    codes: tuple[Code, ...]
-    by_hand: tuple[str, ...]
-
-    @classmethod
-    def of(cls, grade: Grade, *, by_hand: Sequence[str]) -> "Line":
-        """Return the line of a grade."""
-        return cls(
-            name=grade.submission,
-            authors=grade.authors,
-            status=grade.status,
-            points=grade.points,
-            out_of=grade.out_of,
-            days_late=grade.days_late,
-            deducted=grade.deducted,
-            reason=grade.reason,
-            criteria={c.id: (c.outcome, c.points) for c in grade.criteria},
-            codes=tuple(dict.fromkeys(flag.code for flag in grade.flags)),
-            by_hand=tuple(by_hand),
-        )
 
 
 def class_page(
@@ -102,12 +65,14 @@ def class_document(
     clusters: Sequence[Cluster] = (),
 ) -> Document:
     """Return the class as a document."""
-    graded = [line for line in lines if line.status == "graded"]
+    frame = class_frame(lines, rubric=rubric)
+    graded = frame.loc[frame["status"] == "graded"]
+    points = graded.drop_duplicates("submission").loc[:, "total"]
     tables, pictures = count(1), count(1)
     with drawing():
         parts = [
-            ("summary", "Summary", _summary(lines, graded, doubles)),
-            ("points", "Points", _points(graded, rubric, pictures)),
+            ("summary", "Summary", _summary(lines, points, rubric, doubles)),
+            ("points", "Points", _points(points, rubric, pictures)),
             ("criteria", "Criteria", _criteria(graded, rubric, tables, pictures)),
             ("mistakes", "Most common mistakes", _mistakes(lines, tables)),
             ("shared", "Shared recordings", _shared(lines, clusters, tables)),
@@ -125,7 +90,7 @@ def class_document(
 
 
 def _summary(
-    lines: Sequence[Line], graded: Sequence[Line], doubles: Sequence[Double]
+    lines: Sequence[Line], points: "pd.Series", rubric: Rubric, doubles: Sequence[Double]
 ) -> list[Block]:
     failed = [line for line in lines if line.status == "failed"]
     tiles = [
@@ -136,15 +101,14 @@ def _summary(
             tone="bad" if failed else "good",
         ),
     ]
-    if graded:
-        points = [line.points for line in graded]
-        out_of = points_text(graded[0].out_of)
+    if len(points):
+        out_of = points_text(rubric.out_of)
+        remarks = sum(line.status == "graded" and bool(line.codes) for line in lines)
         tiles += [
-            Tile(spans("Mean"), spans(f"{mean(points):.2f} of {out_of}"), url="#points"),
-            Tile(spans("Median"), spans(f"{median(points):.2f} of {out_of}"), url="#points"),
-            Tile(spans("With a remark"), spans(str(sum(bool(line.codes) for line in graded))),
-                 url="#mistakes"),
-        ]  # fmt: skip
+            Tile(spans("Mean"), spans(f"{points.mean():.2f} of {out_of}"), url="#points"),
+            Tile(spans("Median"), spans(f"{points.median():.2f} of {out_of}"), url="#points"),
+            Tile(spans("With a remark"), spans(str(remarks)), url="#mistakes"),
+        ]
     blocks: list[Block] = [Tiles(tuple(tiles))]
     if failed:
         said = "could not be graded; points can be given by hand"
@@ -165,41 +129,42 @@ def _hand(line: Line) -> str:
     return f" ({points_text(line.points)} points by hand)" if line.by_hand else ""
 
 
-def _points(graded: Sequence[Line], rubric: Rubric, pictures: count) -> list[Block]:
-    if not graded:
+def _points(points: "pd.Series", rubric: Rubric, pictures: count) -> list[Block]:
+    if points.empty:
         return []
-    points = [line.points for line in graded]
-    low, high = points_text(min(points)), points_text(max(points))
+    low, high = points_text(points.min()), points_text(points.max())
     alt = (
         f"Histogram of the points of {counted(len(points), 'submission')}, from {low} to {high} "
         f"of {points_text(rubric.out_of)}."
     )
     caption = f"How many submissions have how many points; they go from {low} to {high}."
-    figure = distribution_figure(points, out_of=rubric.out_of)
+    figure = distribution_figure(points.to_list(), out_of=rubric.out_of)
     return [_picture(pictures, "distribution", to_svg(figure, name="distribution", alt=alt),
                      caption=caption, alt=alt)]  # fmt: skip
 
 
 def _criteria(
-    graded: Sequence[Line], rubric: Rubric, tables: count, pictures: count
+    graded: "pd.DataFrame", rubric: Rubric, tables: count, pictures: count
 ) -> list[Block]:
     """Return how hard each criterion was."""
-    if not graded:
+    import pandas as pd
+
+    if graded.empty:
         return []
-    shares, rows = [], []
-    for asked in rubric.criteria:
-        had = [line.criteria[asked.id] for line in graded if asked.id in line.criteria]
-        outcomes = Counter(outcome for outcome, _ in had)
-        share = mean(points for _, points in had) / asked.points if had else 0.0
-        shares.append(share)
-        rows.append(
-            [
-                cell(clean(asked.title or asked.id)),
-                cell(points_text(asked.points)),
-                cell(f"{100 * share:.0f} %"),
-                *(cell(str(outcomes[o])) for o in ("pass", "partial", "fail", "skip")),
-            ]
-        )
+    ids = [asked.id for asked in rubric.criteria]
+    points = graded.pivot(index="submission", columns="criterion", values="points")[ids]
+    shares = (points.mean() / [asked.points for asked in rubric.criteria]).fillna(0.0).to_list()
+    outcomes = pd.crosstab(graded["criterion"], graded["outcome"])
+    outcomes = outcomes.reindex(index=ids, columns=[*_OUTCOMES], fill_value=0)
+    rows = [
+        [
+            cell(clean(asked.title or asked.id)),
+            cell(points_text(asked.points)),
+            cell(f"{100 * share:.0f} %"),
+            *(cell(str(n)) for n in outcomes.loc[asked.id]),
+        ]
+        for asked, share in zip(rubric.criteria, shares, strict=True)
+    ]
     hardest = rubric.criteria[int(np.argmin(shares))]
     alt = (
         f"Bars with the mean share of the points that each of {len(shares)} criteria earned; "
@@ -226,21 +191,22 @@ def _criteria(
 
 def _mistakes(lines: Sequence[Line], tables: count) -> list[Block]:
     """Return the flags, the most common first."""
-    having: dict[Code, list[Line]] = {}
-    for line in lines:
-        for code in line.codes:
-            having.setdefault(code, []).append(line)
-    if not having:
+    import pandas as pd
+
+    codes = pd.Series([line.codes for line in lines], [line.name for line in lines], dtype=object)
+    having = codes.explode().dropna()
+    if having.empty:
         return [paragraph("No submission has a remark.")] if lines else []
-    order = sorted(having, key=lambda code: (-len(having[code]), CODES.index(code)))
+    counts = having.value_counts().to_dict()
+    order: list[Code] = sorted(counts, key=lambda code: (-counts[code], CODES.index(code)))
     rows = []
     for code in order:
-        named = [_link(line.name) for line in having[code]]
+        named = [_link(name) for name in having.loc[having == code].index]
         rows.append(
             [
                 cell(spans(f"{TITLES[code]} (", Span(code, "code"), ")")),
-                cell(str(len(having[code]))),
-                cell(f"{100 * len(having[code]) / len(lines):.0f} %"),
+                cell(str(counts[code])),
+                cell(f"{100 * counts[code] / len(lines):.0f} %"),
                 cell(spans(*_listed(named))),
             ]
         )

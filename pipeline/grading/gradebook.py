@@ -8,19 +8,21 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
-from difflib import get_close_matches
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from sqlalchemy import Connection, Row, select
 
 from pipeline.errors import ConfigError
 from pipeline.grading.batch import Batch, Listed, Outcome, Prints, read_grade
 from pipeline.grading.changes import points_changes, rubric_changes
+from pipeline.grading.class_lines import Line, class_frame
 from pipeline.grading.gradebook_lists import (
     add_list,
     by_other_rubrics,
     is_of,
     lines_of,
+    nearest,
     points_of,
 )
 from pipeline.grading.gradebook_prints import pages, read_listed, read_prints, read_prints_of
@@ -50,6 +52,9 @@ from pipeline.grading.schema import (
     overrides,
     submissions,
 )
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 class Gradebook:
@@ -249,6 +254,11 @@ class Gradebook:
                 connection, row, shared=read_flag(row.shared), rubric=read_rubric(last)
             )
 
+    def to_frame(self) -> "pd.DataFrame":
+        """Return the class list, one row a submission and criterion; see `class_frame`."""
+        lines = (Line.of(entry.grade, by_hand=[*entry.overrides]) for entry in self.entries())
+        return class_frame(lines, rubric=self.rubric)
+
     def by_other_rubrics(self) -> list[str]:
         """Return the submissions of the class list that its rubric did not grade."""
         with self._database.reading() as connection:
@@ -310,7 +320,7 @@ class Gradebook:
             last, row = self._find(connection, team)
             out_of = {c.id: c.points for c in read_rubric(last).criteria}
             if criterion not in out_of:
-                hint = _nearest(criterion, list(out_of))
+                hint = nearest(criterion, list(out_of))
                 raise ConfigError(f"{criterion}: the rubric has no such criterion; {hint}")
             if points is not None and not 0 <= points <= out_of[criterion]:
                 raise ConfigError(f"{criterion}: has 0 to {out_of[criterion]:g} points")
@@ -360,7 +370,7 @@ class Gradebook:
         exact = [r.position for r in rows if r.name == team]
         found = exact or [r.position for r in rows if is_of(r.authors, team)]
         if len(found) != 1:
-            hint = f"no such submission; {_nearest(team, [row.name for row in rows])}"
+            hint = f"no such submission; {nearest(team, [row.name for row in rows])}"
             raise ConfigError(f"{team}: {'is in several submissions: name one' if found else hint}")
         line = class_list().where(entries.c.batch_id == last.id, entries.c.position == found[0])
         return last, connection.execute(line).one()
@@ -386,8 +396,3 @@ class Gradebook:
         """Return the batch of this assignment before the one that ends now."""
         mine = select(batches).where(batches.c.assignment == (self._assignment or ""))
         return connection.execute(mine.order_by(batches.c.id.desc()).limit(1)).one_or_none()
-
-
-def _nearest(word: str, words: list[str]) -> str:
-    near = get_close_matches(word, words, n=3, cutoff=0.4) or words[:8]
-    return f"there is {', '.join(near)}" if near else "there is none at all"

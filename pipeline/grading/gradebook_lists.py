@@ -1,6 +1,7 @@
 """The class lists of a gradebook: who is on one, and by which rubric they were graded."""
 
 import json
+from difflib import get_close_matches
 
 from pydantic import ValidationError
 from sqlalchemy import Connection, Row, func, insert, select
@@ -66,6 +67,12 @@ def by_other_rubrics(connection: Connection, batch: Row) -> list[str]:
 def is_of(authors: str, team: str) -> bool:
     """Tell whether somebody is among authors, a list in JSON."""
     return person(team) in map(person, json.loads(authors))
+
+
+def nearest(word: str, words: list[str]) -> str:
+    """Return what there is that was perhaps meant, in words."""
+    near = get_close_matches(word, words, n=3, cutoff=0.4) or words[:8]
+    return f"there is {', '.join(near)}" if near else "there is none at all"
 
 
 def _asked(rubric: Rubric) -> Rubric:

@@ -11,7 +11,8 @@ from pathlib import Path
 
 from pipeline.errors import ConfigError
 from pipeline.grading.anonymous import KEY_FILE, STRANGER, anonymise, key_text, pseudonyms
-from pipeline.grading.class_page import Line, class_page
+from pipeline.grading.class_lines import Line
+from pipeline.grading.class_page import class_page
 from pipeline.grading.clusters import find_clusters, renamed
 from pipeline.grading.doubles import Double, find_doubles, with_recordings
 from pipeline.grading.feedback import feedback_page
