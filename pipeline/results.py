@@ -283,8 +283,8 @@ class ChainFit:
     chain : the fitted plant.
     names : physical parameters that have a standard error ("m_1", "c_1", "k_2", …).
     covariance : (n_p, n_p) of those.
-    at_bound : physical parameters that the fit's own data put at their bound, zero: held there, or
-        taken from the decays where those tell.
+    at_bound : physical parameters that the fit's own data leave open down to their bound, zero:
+        held there, or taken from the decays where those tell.
     parameters : the named parameters of the chain with standard errors, in table order. One that
         ended at its bound says so (`Estimate.at_bound`) and is in no table.
     staged : the named parameters the stage-by-stage fit (last cart first) found, for the report.

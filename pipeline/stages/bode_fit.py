@@ -31,7 +31,7 @@ _NEAR, _PRECISION = 1e-3, 1e-8  # change of the cost to stop at: on the way ther
 _EVALUATIONS = 100  # a fit that gets there takes about ten
 _PHASE_AGREES = 3.0  # times as far off as the magnitudes are: a delay or a wrong sign is further
 _VANISHING = 1e-4  # of its usual size: a damping or far spring that the data put at zero
-_DECAY_AGREES = 9.0  # chi² that a decay may add: as far off by chance, three standard errors
+_DECAY_AGREES = 9.0  # chi² that each decay may add: by chance three standard errors off
 _RANK = 1e-8  # smallest singular value over the largest, columns in natural sizes
 _SHARES, _SHARE_PRECISION = (1e-6, 10.0), 0.01  # where a missing relative error may lie; ratio
 _WIDENINGS = 3  # fits in turn with the error they call for: it settles to a per cent
@@ -52,8 +52,8 @@ def fit_bode(
     Phases are used where they are given and agree with the magnitudes, else magnitudes alone;
     they are used unasked where the magnitudes are no more than the parameters.
     A parameter that the data put at or below zero is held there and the others fitted again. A few
-    dwells beside a sharp peak leave its damping open down to zero: where the cart's decay tells
-    and does not contradict, its damping ratio is then one point more to fit.
+    dwells beside a sharp peak leave its damping open down to zero: the damping ratios of decays
+    that do not contradict are then further points to fit.
 
     Where the misfit is larger than the points' errors allow, the chain does not describe the bench
     to that precision: a relative error, the same for all points, is added until it does, and
@@ -96,7 +96,7 @@ def fit_bode(
             remark = "magnitudes alone: the phases do not agree with them"
     best, share = _widen(best, data)
     best, used = _hold_vanished(best, data.widened(share), decays or {})
-    data = replace(data, decays=used)
+    data = replace(data, decays=used.decays)
     return _result(best, data, share=share, staged=staged, tried=tried, remark=remark)
 
 
@@ -276,33 +276,34 @@ def _chi_square(fitted: _Fitted, data: Points) -> float:
 
 def _hold_vanished(
     fitted: _Fitted, data: Points, decays: Mapping[int, Estimate]
-) -> tuple[_Fitted, Mapping[int, Estimate]]:
+) -> tuple[_Fitted, Points]:
     """Fit again with every parameter at zero that the data put there or below.
 
-    But a damping that a decay tells is fitted to both. Return also the decays that were used.
+    But where a damping is among them that a decay tells, all decays are fitted along: points that
+    leave one damping open know little of the others. Return also the points, with those decays.
     """
     P, chain = fitted.parametrisation, fitted.chain
-    physical = P.physical(chain)
     sizes = _natural_sizes(P, chain, data)
     vanished = [
         name
-        for name, value, size in zip(P.names, physical, sizes, strict=True)
+        for name, value, size in zip(P.names, P.physical(chain), sizes, strict=True)
         if value < (0.0 if name == "k_1" else _VANISHING * size)
     ]
     if not vanished:
-        return fitted, {}
-    told = {cart: zeta for cart, zeta in decays.items() if f"c_{cart}" in vanished}
-    if told:
+        return fitted, data
+    needed = {cart: zeta for cart, zeta in decays.items() if f"c_{cart}" in vanished}
+    for told in (decays, needed) if needed else ():
         c, k = chain.c.copy(), chain.k[:-1] + chain.k[1:]
         for cart, zeta in told.items():
             c[cart - 1] = 2 * zeta.value * np.sqrt(chain.m[cart - 1] * k[cart - 1])
-        held = P.holding_at_zero(*(set(vanished) - {f"c_{cart}" for cart in told}))
-        start = held.pack(replace(chain, c=c))
-        both = _solve(held, replace(data, decays=told), start, fitted.scale)
-        if both.chi_square < fitted.chi_square + _DECAY_AGREES:
-            return both, told
+        names = {f"c_{cart}" for cart in told}
+        held = P.holding_at_zero(*(name for name in vanished if name not in names))
+        along = replace(data, decays=told)
+        both = _solve(held, along, held.pack(replace(chain, c=c)), fitted.scale)
+        if both.chi_square < fitted.chi_square + _DECAY_AGREES * len(told):
+            return _hold_vanished(both, along, {})
     held = P.holding_at_zero(*vanished)
-    return _solve(held, data, held.pack(chain), fitted.scale), {}
+    return _hold_vanished(_solve(held, data, held.pack(chain), fitted.scale), data, {})
 
 
 def _natural_sizes(P: Parametrisation, chain: Chain, data: Points) -> Array:
@@ -344,8 +345,8 @@ def _result(
     told = [f"c_{cart}" for cart in data.decays]
     if told:
         remarks.append(
-            f"the response puts {', '.join(told)} at zero, its bound, and has too few points to "
-            "tell: the decay's damping ratio is fitted with it"
+            "the response has too few points to tell the damping and puts it at zero, its bound: "
+            f"the damping ratio of the decays is fitted along ({', '.join(told)})"
         )
     parameters = named_estimates(chain, names=names, covariance=covariance, source="bode_fit")
     for cart in data.decays:
