@@ -14,7 +14,7 @@ import pytest
 from pipeline.grading.grade import CODES, Flag, Grade, grade_text
 from pipeline.grading.load import load_rubric
 from pipeline.grading.run import grade_submission, under_rubric
-from pipeline.grading.state_model import compare_entries
+from pipeline.grading.state_model import StateModel, compare_entries
 from pipeline.submission import Input, InputOverride, StateSpace, load_submission
 from pipeline.synthesis import write_submission
 from tests.grading_students import student
@@ -103,11 +103,12 @@ def test_a_record_s_own_calibration_does_not_win_over_the_rubric_s(folder):
 def test_rounding_is_no_error():
     """What MATLAB leaves in an A of noughts and ones is right."""
     model = np.array([[0.0, 1.0, 0.0], [-174.0, -2.6, 5000.0]])
+    exactly = StateModel(right=model, slack=np.zeros_like(model))
     noisy = [["1.2e-17", "1.0000000001"], ["-174", "-2.6"]]
     space = StateSpace(
         A=tuple(tuple(map(Decimal, row)) for row in noisy), B=(Decimal("-3e-14"), Decimal(5000))
     )
-    assert not any(entry.error for entry in compare_entries(space, models=[model], n=1))
+    assert not any(entry.error for entry in compare_entries(space, models=[exactly], n=1))
 
 
 def test_the_rubric_s_system_wins(folder, tmp_path):

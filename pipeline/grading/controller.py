@@ -38,6 +38,7 @@ class Controller:
     models : the reference chain and the student's own.
     goal : what must be met; what a reference design reaches where neither it nor these gains do.
     blurred : the reference's gains are as uncertain as friction makes them.
+    own : the student's table is complete, so that what they designed for is known.
     """
 
     gains: Array | None
@@ -48,6 +49,7 @@ class Controller:
     models: tuple[Chain, ...]
     goal: Design
     blurred: bool
+    own: bool
 
     def numbers(self, gains: Array) -> list[LoopNumbers]:
         """Return what gains do on each of the models."""
@@ -147,6 +149,7 @@ def reported_controller(
         models=tuple(models),
         goal=submission.design or Design(cart=n),
         blurred=not is_explained(analysis),
+        own=any(model is not None for model in own),
     )
     if controller.gains is None or controller.reaches_goal(controller.gains):
         return controller
@@ -202,7 +205,10 @@ def diagnose_controller(controller: Controller) -> list[Flag]:
         known = [one for gains in sources for one in controller.numbers(gains)]
         fits = fits or not known or any(controller.prefilter_fits(one) for one in known)
     if not fits and controller.prefilter is not None:
-        flags.append(_prefilter_flag(controller, numbers[0]))
+        slip = _prefilter_slip(controller, numbers[0].prefilter)
+        # What is right on the student's own carts may be off on those of the reference.
+        if controller.own or slip:
+            flags.append(_prefilter_flag(controller, numbers[0], slip=slip))
     return flags
 
 
@@ -302,15 +308,22 @@ def _gains_flag(
     )
 
 
-def _prefilter_flag(controller: Controller, numbers: LoopNumbers) -> Flag:
-    typed, right = controller.prefilter, numbers.prefilter
+def _prefilter_slip(controller: Controller, right: float) -> str:
+    """Return the known slip that gives the reported prefilter, or ""."""
+    typed = controller.prefilter
     assert typed is not None
-    assert controller.gains is not None
-    hint = "it is one over the static gain of the loop, from r to the cart that is controlled"
     for text, value in _prefilter_slips(controller, right):
         if abs(float(typed) - value) <= 0.5 * _PREFILTER * abs(value) + float(rounding(typed)):
-            hint = text
-            break
+            return text
+    return ""
+
+
+def _prefilter_flag(controller: Controller, numbers: LoopNumbers, *, slip: str) -> Flag:
+    typed, right = controller.prefilter, numbers.prefilter
+    assert typed is not None
+    hint = (
+        slip or "it is one over the static gain of the loop, from r to the cart that is controlled"
+    )
     return Flag(
         code="wrong_prefilter",
         parameters=("prefilter",),

@@ -198,7 +198,7 @@ def _corrected(
     final: Table, explained: Sequence[Explained], known: Mapping[str, Reference]
 ) -> dict[str, float]:
     """Return the final table as it would be without the mistakes found in it."""
-    corrected = {name: float(typed) for name, typed in final.items() if typed}
+    corrected = {name: float(typed) for name, typed in final.items() if typed > 0}
     for one in explained:
         inside = [n for n in one.names if n in one.mistake.predicted]
         for name in inside if one.table == "final" else ():

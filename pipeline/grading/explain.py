@@ -15,6 +15,7 @@ SIGMAS = 3.0  # standard errors of the recordings' own number that are no mistak
 # Of two explanations the other is out where it is this much further off, as share of what it may;
 # or ten times less likely to meet the numbers by chance, as it says less about them.
 _MARGIN = 0.35
+_NEAR = 0.1  # relative: as far off is an honest first estimate, with a mistake in it or without
 _DAMPING = 0.2  # relative: nobody reads a damping so well that meeting one closer says more
 
 Table = Mapping[str, Decimal]
@@ -140,12 +141,18 @@ def _cover(
 
 
 def _explains(mistake: Mistake, table: Table, remaining: Sequence[str]) -> list[str]:
-    """Return which of the remaining numbers a mistake reproduces, if it may be believed."""
+    """Return which of the remaining numbers a mistake reproduces, if it may be believed.
+
+    Half of them must be met; the others may be as far off as honest numbers are.
+    """
     asked = [name for name in mistake.predicted if name in table]
     met = [name for name in asked if _off_by(mistake, table, name) <= 1]
-    if len(met) < mistake.least or (mistake.whole and len(met) < len(asked)):
+    near = [name for name in asked if name in met or _is_near(mistake, table, name)]
+    if len(met) < mistake.least or 2 * len(met) < len(near):
         return []
-    wrong = [name for name in remaining if name in met]
+    if mistake.whole and len(near) < len(asked):
+        return []
+    wrong = [name for name in remaining if name in near]
     # Of two carts swapped both numbers are wrong, not only near the other's.
     return [] if "carts_swapped" in mistake.codes and len(wrong) < mistake.least else wrong
 
@@ -154,6 +161,12 @@ def _off_by(mistake: Mistake, table: Table, name: str) -> float:
     """Return how far a number is off what a mistake predicts, as share of what it may be."""
     error = percent_off(table[name], mistake.predicted[name], sigmas=SIGMAS)
     return float(error) / (100 * mistake.tolerance)
+
+
+def _is_near(mistake: Mistake, table: Table, name: str) -> bool:
+    """Whether a number beside others that a mistake makes is off it as honest numbers are off."""
+    error = percent_off(table[name], mistake.predicted[name], sigmas=SIGMAS)
+    return not is_damping(name) and float(error) <= 100 * _NEAR
 
 
 def _width(mistake: Mistake, name: str) -> float:

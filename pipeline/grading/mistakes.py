@@ -20,11 +20,14 @@ _OWN = "0123456789n"  # what the symbol of a cart alone ends in
 # only count where damping, or another cart, tells the same story.
 _FEW_PERIODS = range(1, 5)
 _MANY_PERIODS = range(5, 11)
+_RATIOS = 2 * (len(_FEW_PERIODS) + len(_MANY_PERIODS))
 
 _GAIN_OR_FREQUENCY = 0.03  # an honest reading after one slip: relative
+_UNMISTAKABLE, _FAR = 0.1, 4.0  # … by a factor that is nothing else's, from so much on
 _BLURRED = 0.05  # … of a gain where the carts stick
 _COUNTED = 0.02
-_COUNTED_ALONE = 0.012  # … where no damping tells the same story
+_COUNTED_ALONE = 0.012  # … where the damping is too blurred to tell the same story
+_COUNTED_ONLY = 0.006  # … of one cart, where its damping does not: nothing but the ratio tells
 _DAMPING = 0.2
 _BLURRED_DAMPING = 1.3  # high over low: such a damping tells no story
 _VAGUE = 3.0  # high over low: what any mistake would meet tells of none
@@ -74,6 +77,7 @@ def known_mistakes(references: Mapping[str, Reference], analysis: Analysis) -> l
             tolerance=_DAMPING,
             help="{reported} is {recomputed}/2.303: the logarithmic decrement takes the natural "
             "logarithm, and this looks like log10",
+            whole=True,
         )
     ]
     single = [*hertz, *scales, *log10, *_miscounts(own_omegas, own_zetas)]
@@ -108,14 +112,14 @@ def _hertz(omegas: Mapping[str, Reference]) -> list[Mistake]:
         Mistake(
             codes=("hz_for_rad_s",),
             predicted=_times(omegas, 1 / _TURN),
-            tolerance=_GAIN_OR_FREQUENCY,
+            tolerance=_UNMISTAKABLE,
             help="{reported} is {recomputed}/2π: this looks like Hz where rad/s is asked, "
             "so multiply by 2π",
         ),
         Mistake(
             codes=("hz_for_rad_s",),
             predicted=_times(omegas, _TURN),
-            tolerance=_GAIN_OR_FREQUENCY,
+            tolerance=_UNMISTAKABLE,
             help="{reported} is 2π·{recomputed}: this was in rad/s already and looks converted "
             "from Hz once more",
         ),
@@ -138,9 +142,9 @@ def _miscounts(
                 joint = _miscount(both, help_, whole=True, least=2)
                 blurred = zetas[zeta].high > zetas[zeta].low * _BLURRED_DAMPING
                 found.append(replace(joint, tolerance=_COUNTED_ALONE) if blurred else joint)
-            if min(counted, there) in _FEW_PERIODS:
+            if len(omegas) == 1 and min(counted, there) in _FEW_PERIODS:
                 alone = _miscount({name: both[name]}, help_)
-                found.append(replace(alone, tolerance=_COUNTED_ALONE))
+                found.append(replace(alone, tolerance=_COUNTED_ONLY))
     for counted, there in _counts() if len(omegas) > 1 else ():
         every = _times(omegas, counted / there)
         found.append(_miscount(every, _miscount_help(counted, there), whole=True, least=2))
@@ -198,6 +202,7 @@ def _miscount(
         help=help_,
         whole=whole,
         least=least,
+        tries=_RATIOS,
     )
 
 
@@ -214,6 +219,7 @@ def _miscount_and(
             tolerance=_COUNTED,
             help=f"{miscount.help}; and it is in Hz where rad/s is asked",
             whole=True,
+            tries=_RATIOS,
         )
     if omega and zeta:
         yield Mistake(
@@ -223,6 +229,7 @@ def _miscount_and(
             help=f"{miscount.help}; and the decrement looks taken with log10",
             whole=True,
             least=2,
+            tries=_RATIOS,
         )
 
 
@@ -268,11 +275,12 @@ def _gain_mistakes(gains: Mapping[str, Reference], analysis: Analysis) -> list[M
         )
     counts = {name: _count(name, analysis) for name in gains}
     if all(counts.values()):
+        far = all(abs(math.log(count)) > math.log(_FAR) for count in counts.values())
         found.append(
             Mistake(
                 codes=("counts_for_length",),
                 predicted={n: r.times(1 / counts[n]) for n, r in gains.items()},
-                tolerance=_GAIN_OR_FREQUENCY,
+                tolerance=_UNMISTAKABLE if far else _GAIN_OR_FREQUENCY,
                 help="{reported} is {recomputed} in encoder counts: multiply by the length of a "
                 "count",
             )
@@ -281,27 +289,23 @@ def _gain_mistakes(gains: Mapping[str, Reference], analysis: Analysis) -> list[M
 
 
 def _peaks(turns: Mapping[str, StepTurns]) -> Iterator[Mistake]:
-    """Yield: of every cart the peak of one edge; any edges' peaks, of more carts unless alike."""
+    """Yield the peaks of one edge, or of any edges: of every cart, as one step moves them all."""
     peaks = {n: e for n, t in turns.items() if (e := t.extreme(0)) is not None}
     edges = set.intersection(*({*t.by_edge} for t in turns.values())) if turns else set()
     one_edge = [{n: t.peak(edge) for n, t in turns.items()} for edge in sorted(edges)]
     for predicted in one_edge:
-        yield _peak(predicted, least=1, whole=True, tries=len(one_edge))
-    yield _peak(peaks, least=min(2, len(turns)))
-    yield _peak(_sharp(peaks), least=1)
+        yield _peak(predicted, tries=len(one_edge))
+    yield _peak(peaks)
 
 
-def _peak(
-    predicted: dict[str, Reference], *, least: int, whole: bool = False, tries: int = 1
-) -> Mistake:
+def _peak(predicted: dict[str, Reference], *, tries: int = 1) -> Mistake:
     return Mistake(
         codes=("peak_for_steady_state",),
         predicted=predicted,
         tolerance=_GAIN_OR_FREQUENCY,
         help="{reported} is what the step peaks at: the static gain is the level it settles "
         "at, {recomputed}, per unit of input",
-        least=least,
-        whole=whole,
+        whole=True,
         tries=tries,
     )
 

@@ -13,6 +13,7 @@ from pipeline.submission import Reported
 _APART, _APART_BLURRED = 0.003, 0.01
 _APART_DAMPING, _APART_DAMPING_BLURRED = 0.03, 0.15
 _SHARP, _SHARP_DAMPING = 1.01, 1.05  # high over low of a reference without doubt
+_SLIP = 0.2  # relative: a number measured further off is wrong by a slip, maybe in both tables
 _SURPRISE = 3.0  # at most so much (e-folds) does the wrong number tell, as some fit badly
 _NORMAL, _SIGMAS = 3.5, 3.0  # one over the density of a normal difference at zero
 _CHANCE = 3e-3  # of a table that a fit gave agreeing so by coincidence
@@ -57,7 +58,9 @@ def _coincidence(typed: Decimal, reference: Reference | None, name: str) -> floa
         apart = _APART_DAMPING if damping else _APART
         if off == 0:
             return 1.0
-    return min(1.0, step / (apart * _NORMAL)) * exp(-min(0.5 * (off / apart) ** 2, _SURPRISE))
+    measured = not is_damping(name) and name[-1] not in _FITTED_BY_EYE
+    surprise = 0.0 if measured and off > _SLIP else min(0.5 * (off / apart) ** 2, _SURPRISE)
+    return min(1.0, step / (apart * _NORMAL)) * exp(-surprise)
 
 
 def _same(reported: Reported, name: str) -> bool:

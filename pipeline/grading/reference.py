@@ -1,6 +1,6 @@
 """What the student's own recordings say each parameter is, and what an honest reading may give."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,7 +8,7 @@ import numpy as np
 from pipeline.grading.orders import orders
 from pipeline.grading.rubric import is_damping
 from pipeline.plant.chain import Chain
-from pipeline.results import Analysis, Estimate, ParameterRow, StepEdge
+from pipeline.results import Analysis, ParameterRow, StepEdge
 from pipeline.stages.compare import CHI_SQUARE_LIMIT
 
 # A fitted frequency or gain that far from the measured one: the fit has gone astray; factors.
@@ -68,15 +68,14 @@ class References:
 def recompute(analysis: Analysis) -> References:
     """Return the references of both tables.
 
-    Where a cart sticks, dry friction adds to every damping ratio; a student who took it out is
-    right too, so the lower bound is without it. An initial estimate is right anywhere between the
-    recomputed initial and final ones; where the linear carts do not explain the data, so is a
-    final one, as then the fit itself may be off.
+    A number that was measured in several ways is right anywhere between them, in either table.
+    Dry friction adds to every damping ratio; a student who took it out is right too.
     """
-    trusted = trusted_chain(analysis) is not None
+    chain = trusted_chain(analysis)
+    trusted, tables = chain is not None, _by_decays(chain, analysis) if chain else []
     final, initial = {}, {}
     for row in analysis.rows:
-        fitted = _final(row.final, row, analysis) if row.final and trusted else None
+        fitted = _final(row, analysis, tables) if trusted else None
         measured = _initial(row, fitted, analysis, trusted=trusted)
         if measured is not None:
             initial[row.name] = measured
@@ -130,31 +129,54 @@ def is_explained(analysis: Analysis) -> bool:
     return analysis.fit is None or analysis.fit.chi_square_per_dof <= CHI_SQUARE_LIMIT
 
 
-def friction_share(analysis: Analysis) -> float:
-    """Return the least share of a decay's apparent damping that is viscous; 1 without friction."""
-    shares = [
-        d.friction.zeta / d.zeta
-        for d in analysis.log_decrements
-        if d.friction is not None and d.friction.present and d.zeta > 0
-    ]
-    return min([max(share, 0.0) for share in shares], default=1.0)
+def _final(
+    row: ParameterRow, analysis: Analysis, tables: Sequence[Mapping[str, float]]
+) -> Reference | None:
+    """Return the bounds of a final number: the fit, and all that was measured without it.
 
-
-def _final(estimate: Estimate, row: ParameterRow, analysis: Analysis) -> Reference:
-    share = friction_share(analysis) if is_damping(row.name) else 1.0
-    bounds = [estimate.value, estimate.value * (share if estimate.value > 0 else 1.0)]
-    if not is_explained(analysis):
-        bounds += _readings(row.name, analysis)
-        bounds += _least_damping(row.name, analysis)
-        if row.initial is not None and row.initial.source != "assumed":
-            bounds.append(row.initial.value)
+    A fit that holds a damping at zero, its bound, tells of no damping; one that does not explain
+    the data tells of no number that nothing else measures.
+    """
+    fitted = row.final
+    if is_damping(row.name):
+        measured = [table[row.name] for table in tables]
+    else:
+        measured = _readings(row.name, analysis)
+        if row.initial and (measured or not is_explained(analysis)):
+            spread = _BY_EYE if row.initial.source == "frequency_response" else 1.0
+            measured += [row.initial.value / spread, row.initial.value * spread]
+    told = fitted is not None and not (is_damping(row.name) and _undamped(analysis))
+    if not measured and not (told and is_explained(analysis)):
+        return None
+    bounds = [*measured, *([fitted.value] if fitted and told else [])]
     return Reference(
-        value=estimate.value,
+        value=fitted.value if fitted and told else sum(measured) / len(measured),
         low=min(bounds),
         high=max(bounds),
-        std=estimate.std or 0.0,
-        source=estimate.source,
+        std=(fitted.std or 0.0) if fitted and told else 0.0,
+        source=fitted.source if fitted and told else "log_decrement",
     )
+
+
+def _undamped(analysis: Analysis) -> bool:
+    """Whether the fit has put a damping at zero, which is its bound and no measurement."""
+    return analysis.chain is not None and not np.all(analysis.chain.c > 0)
+
+
+def _by_decays(chain: Chain, analysis: Analysis) -> list[dict[str, float]]:
+    """Return the numbers of the fitted carts with the least and the most damping of their decays.
+
+    What a cart's decays leave open is the fit's; none where that has put it at zero.
+    """
+    readings = [_readings(f"zeta_{cart}", analysis) for cart in range(1, chain.n + 1)]
+    if not any(readings) or not chain.is_tied:
+        return []
+    critical = 2 * chain.m * chain.omega_carts
+    found = []
+    for choose in (min, max):
+        zeta = [choose(r) if r else z for r, z in zip(readings, chain.zeta_carts, strict=True)]
+        found.append(replace(chain, c=np.array(zeta) * critical))
+    return [one.parameters() for one in found] if np.all(found[0].c > 0) else []
 
 
 def _initial(
@@ -182,11 +204,15 @@ def _initial(
 
 
 def _readings(name: str, analysis: Analysis) -> list[float]:
-    """Return the single readings of a gain or a cart's own damping: a student may quote any."""
+    """Return the single readings of a gain or of a cart alone: a student may quote any.
+
+    The damping of a decay is read with and without the dry friction that fits it best, also where
+    no test is sure of friction: with little damping a trace of it counts.
+    """
     symbol, _, suffix = name.partition("_")
-    if not (suffix.isdigit() or suffix == ""):
+    if not (suffix.isdigit() or suffix in ("", "n")):
         return []
-    cart = int(suffix or 1)
+    cart = int(suffix) if suffix.isdigit() else 1
     readings: list[float] = []
     if symbol == "K":
         held = _held(cart, analysis)
@@ -194,29 +220,13 @@ def _readings(name: str, analysis: Analysis) -> list[float]:
             if step.cart == cart:
                 readings += [step.gain, *(step.interval or ())]
                 readings += [_shortest(edge, held=held) for edge in step.edges if held]
-    if symbol == "zeta":
-        for decay in analysis.log_decrements:
-            if decay.cart == cart:
-                without = decay.friction.zeta if decay.friction and decay.friction.present else None
-                readings += [decay.zeta, *([without] if without and without > 0 else [])]
+    for decay in analysis.log_decrements:
+        if decay.cart == cart and symbol == "omega":
+            readings.append(decay.omega_n)
+        if decay.cart == cart and symbol == "zeta":
+            without = decay.friction.zeta if decay.friction else decay.zeta
+            readings += [zeta for zeta in (decay.zeta, without) if zeta > 0]
     return readings
-
-
-def _least_damping(name: str, analysis: Analysis) -> list[float]:
-    """Return the least that the damping of a mode or null may be by what each cart has alone.
-
-    Its rate 2 zeta omega is a mean of the carts' c/m, weighted by the shape of the mode, so it is
-    not below the least of them; friction only adds to what a fit of linear carts finds.
-    """
-    frequency = {row.name: row.final for row in analysis.rows}.get(name.replace("zeta", "omega"))
-    rates = [
-        d.omega_n * min(d.zeta, d.friction.zeta if d.friction and d.friction.present else d.zeta)
-        for d in analysis.log_decrements
-    ]
-    positive = [rate for rate in rates if rate > 0]
-    if not name.startswith("zeta_") or name[-1].isdigit() or not frequency or not positive:
-        return []
-    return [min(positive) / frequency.value]
 
 
 def _held(cart: int, analysis: Analysis) -> float:

@@ -18,7 +18,7 @@ from pipeline.grading.reference import recompute, trusted_chain
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.signs import turned_round
 from pipeline.grading.state_model import diagnose_state_space, state_models
-from pipeline.grading.tolerance import exact
+from pipeline.grading.tolerance import exact, rounding
 from pipeline.grading.work import Work
 from pipeline.ingest.columns import conversion
 from pipeline.results import Analysis
@@ -81,16 +81,21 @@ def grade_analysis(
     submission, n = submission.model_copy(update={"reported": reported}), rubric.system.carts
     references, chain = recompute(analysis), trusted_chain(analysis)
     diagnosis = diagnose_tables(reported, references=references, analysis=analysis)
-    tables = [{name: float(typed) for name, typed in reported.final.items() if typed}]
+    tables = [{name: float(typed) for name, typed in reported.final.items() if typed > 0}]
     if diagnosis.corrected != tables[0]:
         tables.append(diagnosis.corrected)
+    digits = {
+        name: float(rounding(typed) / abs(Fraction(typed)))
+        for name, typed in reported.final.items()
+        if typed > 0
+    }
     work = Work(
         submission=submission,
         analysis=analysis,
         rubric=rubric,
         references=references,
         controller=reported_controller(submission, analysis, chain=chain, tables=tables),
-        state_models=state_models(tables, chain=chain, n=n),
+        state_models=state_models(tables, rounding=digits, chain=chain, n=n),
         bad=bad_runs(analysis),
     )
     criteria = _criteria(work)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.grading.reference import Reference
+from pipeline.plant.chain import Array
 from pipeline.results import Analysis, Record, StepGain
 
 _TURNS = 3  # the peak, the trough after it, the second peak
@@ -21,9 +22,11 @@ class StepTurns:
     Attributes
     ----------
     by_edge : for every kind of edge, of each repeat where the cart turns first, next, after that.
+    furthest : … how far it ever goes: where two motions beat, that is not where it turns first.
     """
 
     by_edge: dict[Edge, list[list[float]]]
+    furthest: dict[Edge, list[float]]
 
     def extreme(self, turn: int) -> Reference | None:
         """Return the turning point over all edges; None where one of those before is not real."""
@@ -35,8 +38,8 @@ class StepTurns:
         return _spread([one[turn] for one in turns if len(one) > turn])
 
     def peak(self, edge: Edge) -> Reference:
-        """Return the first turning point after one kind of edge."""
-        return _spread([repeat[0] for repeat in self.by_edge[edge]])
+        """Return where the cart peaks after one kind of edge, at first or furthest."""
+        return _spread([*(repeat[0] for repeat in self.by_edge[edge]), *self.furthest[edge]])
 
 
 def step_turns(name: str, analysis: Analysis) -> StepTurns:
@@ -44,12 +47,14 @@ def step_turns(name: str, analysis: Analysis) -> StepTurns:
     cart = 1 if name == "K" else int(name.removeprefix("K_"))
     records = {record.id: record for record in analysis.records}
     found: dict[Edge, list[list[float]]] = {}
+    furthest: dict[Edge, list[float]] = {}
     for step in analysis.step_gains:
         if step.cart == cart:
-            for edge, turns in _turns(step, records[step.experiment]):
+            for edge, moved, turns in _turns(step, records[step.experiment]):
                 if turns and turns[0] > 0:
                     found.setdefault(edge, []).append(turns)
-    return StepTurns(by_edge=found)
+                    furthest.setdefault(edge, []).append(float(moved.max()))
+    return StepTurns(by_edge=found, furthest=furthest)
 
 
 def _spread(values: Sequence[float]) -> Reference:
@@ -58,24 +63,24 @@ def _spread(values: Sequence[float]) -> Reference:
     )
 
 
-def _turns(step: StepGain, record: Record) -> Iterator[tuple[Edge, list[float]]]:
-    """Yield every edge, and where the cart turns after it."""
+def _turns(step: StepGain, record: Record) -> Iterator[tuple[Edge, Array, list[float]]]:
+    """Yield every edge, how far the cart is moved after it per unit of input, where it turns."""
     y = record.position(step.cart)
     for number, edge in enumerate(step.edges):
         change = edge.u_after - edge.u_before
         inside = (record.t >= edge.t) & (record.t <= edge.window_after[1])
         moved = (y[inside] - edge.level_before) / change
         level = (edge.level_after - edge.level_before) / change
-        turns, side = [], 1.0
-        while moved.size and len(turns) < _TURNS:
+        turns, side, rest = [], 1.0, moved
+        while rest.size and len(turns) < _TURNS:
             # Up to where it crosses its level again, its furthest point is where it turns.
-            beyond = side * (moved - level) > 0
-            first = int(np.argmax(beyond)) if beyond.any() else moved.size
+            beyond = side * (rest - level) > 0
+            first = int(np.argmax(beyond)) if beyond.any() else rest.size
             back = np.flatnonzero(~beyond[first:])
-            last = first + int(back[0]) if back.size else moved.size
+            last = first + int(back[0]) if back.size else rest.size
             if first == last:
                 break
-            stretch = moved[first:last]
+            stretch = rest[first:last]
             turns.append(float(stretch[np.argmax(side * stretch)]))
-            moved, side = moved[last:], -side
-        yield (number, float(f"{change:.{_DIGITS}g}")), turns
+            rest, side = rest[last:], -side
+        yield (number, float(f"{change:.{_DIGITS}g}")), moved, turns

@@ -9,7 +9,7 @@ from pipeline.grading.controller import Controller
 from pipeline.grading.pieces import missing_pieces
 from pipeline.grading.reference import References
 from pipeline.grading.rubric import Rubric
-from pipeline.plant.chain import Array
+from pipeline.grading.state_model import StateModel
 from pipeline.results import Analysis
 from pipeline.submission import Reported, Submission
 
@@ -31,7 +31,7 @@ class Work:
     rubric: Rubric
     references: References
     controller: Controller | None
-    state_models: Sequence[Array]
+    state_models: Sequence[StateModel]
     bad: Mapping[str, str]
 
     @property
