@@ -114,7 +114,7 @@
       this.y = new Axis(y, log[1], top + height, -height);
       this.title = titles[2];
       [this.across, this.up] = titles.slice(0, 2).map((t) => {
-        const [, name, unit] = t.match(/^(.*?)(?: \[(.*)\])?$/);
+        const [, name, unit] = t.match(/^(.*?)(?: \[(.*)\])?$/s);
         return { name, unit: (unit ?? '').replace(/^dB re.*/, 'dB') };
       });
       this.link = [titles[0], x].join();

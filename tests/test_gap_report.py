@@ -352,6 +352,8 @@ def test_the_file_is_read_back_as_it_was(verdict):
         "{}",
         '{"schema": "cartlab-gap/2", "verdict": "named"}',
         '{"schema": "cartlab-gap/1", "verdict": "named", "gap": {}, "model": {}}',
+        "[" * 200_000,
+        '{"gap":' * 200_000,
     ],
 )
 def test_what_is_no_gap_file_is_refused_in_one_line(text):
@@ -446,8 +448,9 @@ def test_gap_analysis_of_other_data_is_only_a_warning(bench, tmp_path):
     assert gap is None
     assert warned.warnings[-1].startswith("gap/gap.json is of other data than this report")
     assert with_gap(analysis, tmp_path) == (analysis, None)
-    (tmp_path / "gap.json").write_text("{", encoding="utf-8")
-    assert "gap.json cannot be used" in with_gap(analysis, tmp_path)[0].warnings[-1]
+    for text in ("{", "[" * 200_000, " " * 20_000_000):
+        (tmp_path / "gap.json").write_text(text, encoding="utf-8")
+        assert "gap.json cannot be used" in with_gap(analysis, tmp_path)[0].warnings[-1]
 
 
 def test_hostile_words_in_a_gap_file_stay_words(bench):

@@ -140,6 +140,25 @@ def test_a_crash_costs_one_row_and_the_worker_is_replaced(task, setup):
     worker.close()
 
 
+def test_a_worker_killed_while_it_starts_is_started_again(task, setup):
+    """It costs nothing: the hand-in that it was started for is graded."""
+    worker, killed = Worker(setup, out_of=RUBRIC.out_of), []
+
+    def kill_the_first():
+        while not killed:
+            for child in psutil.Process().children():
+                if "pipeline.grading.worker" in child.cmdline():
+                    child.kill()
+                    killed.append(child)
+
+    killer = threading.Thread(target=kill_the_first)
+    killer.start()
+    outcome = worker.run(task)
+    killer.join()
+    worker.close()
+    assert outcome.status == "graded"
+
+
 def test_a_grade_stands_where_its_figures_fail(school, tmp_path, monkeypatch):
     """The row has its points and no figure; the next run tries again."""
 

@@ -5,17 +5,18 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
 from pipeline import __version__
-from pipeline.errors import ConfigError, PipelineError
-from pipeline.gap.document import SCHEMA, gap_json
+from pipeline.errors import ConfigError
+from pipeline.gap.document import gap_json
 from pipeline.gap.types import FoundEffect, Gap, GapWindow, NamedValue, RecordGap, Rival
 from pipeline.plant.chain import Chain
 from pipeline.plant.effects import AugmentedChain, Term, find_effect
 from pipeline.results import Analysis
 from pipeline.results_json import plain_json
-
-_VERDICTS = ("named", "none", "ambiguous", "unexplained")
+from pipeline.schemas.gap import Gap as GapDocument
+from pipeline.submission.complaints import quote
 
 
 def gap_text(gap: Gap, analysis: Analysis) -> str:
@@ -49,14 +50,14 @@ def read_gap(text: str) -> tuple[Gap, dict[str, str]]:
     ConfigError : the text is no `gap.json`, or its model is not of this catalogue.
     """
     try:
-        document = json.loads(text)
-        if document["schema"] != SCHEMA or document["verdict"] not in _VERDICTS:
-            raise ConfigError(f"needs the schema {SCHEMA}, found {document['schema']!r}")
+        document = GapDocument.model_validate_json(text).model_dump(by_alias=True)
         return _gap(document), dict(document["provenance"]["files"])
-    except PipelineError:
-        raise
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ConfigError(f"not what cartlab gap writes: {error!r}") from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"]))
+        raise ConfigError(f"not what cartlab gap writes: {where}: {first['msg']}") from None
+    except (ValueError, KeyError) as error:
+        raise ConfigError(f"not what cartlab gap writes: {quote(str(error))}") from None
 
 
 def _gap(document: Mapping[str, Any]) -> Gap:

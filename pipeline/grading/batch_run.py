@@ -83,6 +83,9 @@ def grade_class(
         hand_ins, remarks = settle_lateness(found, late=rubric.late, table=late_table)
         # The rubric's file says which assignment it is: its title may be mended on the way.
         with Gradebook(gradebook or out, assignment=rubric_file.stem, create=True) as book:
+            hidden = rubric.anonymous or anonymous
+            if hidden:  # it would tell who shares with whom
+                (out / _MEMORY).unlink(missing_ok=True)
             batch = grade_batch(
                 hand_ins,
                 rubric=rubric,
@@ -93,10 +96,9 @@ def grade_class(
                 figures=figures,
                 examples=lambda: list(_handed_out(rubric, folder=rubric_file.parent)),
                 examples_digest=_examples_digest(rubric, folder=rubric_file.parent),
-                memory=out / _MEMORY,
+                memory=None if hidden else out / _MEMORY,
                 progress=progress,
             )
-            hidden = rubric.anonymous or anonymous
             changes = book.finish(batch, rubric=rubric.model_copy(update={"anonymous": hidden}))
             remarks = [*passed, *remarks, *_told(batch, book)]
             total = len(hand_ins)

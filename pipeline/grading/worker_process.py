@@ -18,6 +18,7 @@ from pipeline.grading.worker import OUT_OF_MEMORY, Setup, Task, failed, read_out
 
 _GLANCE = 0.05  # s between looks at the clock and the memory
 _START_LIMIT = 120.0  # s; a cold start on a busy machine takes ten
+_STARTS = 3  # whoever frees memory may end a process that has just begun
 _STDERR_SHOWN = 4_000  # characters
 _TASKS_EACH = 500  # then a fresh process: what libraries keep does not pile up
 _ONE_THREAD = (
@@ -101,6 +102,15 @@ class Worker:
     def _ready(self) -> subprocess.Popen[bytes]:
         if self._process is not None and self._process.poll() is None:
             return self._process
+        for _ in range(_STARTS):
+            if process := self._started():
+                return process
+        said = self._said().strip().splitlines() or ["nothing was said"]
+        self.close()
+        raise ConfigError(f"the grading processes do not start: {said[-1]}")
+
+    def _started(self) -> subprocess.Popen[bytes] | None:
+        """Return a fresh process that is ready for tasks; None where it ended before."""
         self.close()
         self._stderr = tempfile.TemporaryFile()
         self._process = process = subprocess.Popen(
@@ -117,11 +127,7 @@ class Worker:
             first = self._answers.get(timeout=_START_LIMIT)
         except (OSError, queue.Empty):
             first = b""
-        if first != b"ready\n":
-            said = self._said().strip().splitlines() or ["nothing was said"]
-            self.close()
-            raise ConfigError(f"the grading processes do not start: {said[-1]}")
-        return process
+        return process if first == b"ready\n" else None
 
     def _said(self) -> str:
         """Return the end of what the process wrote to stderr."""

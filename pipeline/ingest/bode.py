@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline.errors import SubmissionError
 from pipeline.ingest.columns import Column, conversion
-from pipeline.ingest.table import Table
+from pipeline.ingest.table import Table, refuse_extreme
 from pipeline.plant.chain import Array
 from pipeline.results import FrequencyResponse
 
@@ -41,7 +41,7 @@ def read_points(table: Table, columns: Mapping[str, Column], *, carts: Sequence[
         raise SubmissionError(
             f"{table.source}: {frequency.name!r} is in {frequency.unit}, Hz was expected"
         )
-    omega = 2 * np.pi * factor * _positive(table, frequency)
+    omega = _measured(2 * np.pi * factor * _positive(table, frequency), table, frequency)
     return {
         column.cart: list(zip(omega.tolist(), _ratios(table, column).tolist(), strict=True))
         for column in measured
@@ -50,8 +50,16 @@ def read_points(table: Table, columns: Mapping[str, Column], *, carts: Sequence[
 
 def _ratios(table: Table, column: Column) -> Array:
     if column.unit is not None and column.unit.casefold() == "db":
-        return 10 ** (table.values[column.index] / 20)
-    return _positive(table, column)
+        with np.errstate(over="ignore"):
+            return _measured(10 ** (table.values[column.index] / 20), table, column)
+    return _measured(_positive(table, column), table, column)
+
+
+def _measured(values: Array, table: Table, column: Column) -> Array:
+    """Return positive values that a bench measures, each of them."""
+    for extreme in (values.min(), values.max()):
+        refuse_extreme(extreme, what=f"{table.source}: {column.name!r}")
+    return values
 
 
 def _positive(table: Table, column: Column) -> Array:

@@ -14,7 +14,7 @@ from pipeline.ingest.files import read_table
 from pipeline.ingest.problems import channel_problems
 from pipeline.ingest.signals import encoder_step, mirrors
 from pipeline.ingest.signs import with_signs
-from pipeline.ingest.table import Table
+from pipeline.ingest.table import Table, refuse_extreme
 from pipeline.ingest.times import FEWEST_SAMPLES, clock_notes, time_stamps
 from pipeline.plant.chain import Array
 from pipeline.results import FrequencyResponse, Record
@@ -213,6 +213,12 @@ def _read_record(opened: _Opened, clock: Clock, system: System) -> Record:
         for c, row, scale in zip(positions, y, scales, strict=True)
     ]
     u, input_scale = _input(table, columns, experiment, system, notes)
+    reference = _reference(table, columns, experiment, system, notes, keep)
+    measured = {f"the position of cart {c.cart}": row for c, row in zip(positions, y, strict=True)}
+    measured |= {"the input": u, "the reference": reference, "the time": clock.t - clock.t[0]}
+    for what, values in measured.items():
+        if values is not None:
+            refuse_extreme(values, what=f"{table.source}: {what}")
     names = {column.name: row[keep] for column, row in zip(positions, y, strict=True)}
     held = {c.name for c in positions if c.cart not in experiment.carts}
     moving = {name: row for name, row in names.items() if name not in held}
@@ -225,7 +231,7 @@ def _read_record(opened: _Opened, clock: Clock, system: System) -> Record:
         y=y[:, keep],
         carts=tuple(column.cart for column in positions),
         free=experiment.carts,
-        reference=_reference(table, columns, experiment, system, notes, keep),
+        reference=reference,
         omega=None if experiment.frequency is None else 2 * np.pi * experiment.frequency,
         resolution=np.array(resolution),
         hold=experiment.hold,

@@ -13,7 +13,10 @@ from pipeline.plant.chain import Array
 
 Form = Literal["ecp", "bench_log", "bench_mat", "matrix", "variables", "csv"]
 
-_LARGEST = 1e50  # squares and products of what is read must not overflow
+_LARGEST = 1e50  # of anything in a file, times and what is not used included
+# What a bench measures, in any unit: times, positions, inputs, ratios. Powers and products of some
+# of them, as the stages form them, neither overflow nor vanish.
+_SMALLEST_MEASURED, _LARGEST_MEASURED = 1e-12, 1e12
 
 FORM_TITLES: dict[Form, str] = {
     "ecp": 'ECP "Export Raw Data" text',
@@ -73,7 +76,7 @@ class Table:
                 return i
         close = get_close_matches(column, self.names, n=1)
         hint = f"did you mean {close[0]!r}?" if close else f"it has {self.headings()}"
-        raise SubmissionError(f"{self.source}: there is no column {column!r}; {hint}")
+        raise SubmissionError(f"{self.source}: there is no column {column[:60]!r}; {hint}")
 
     def headings(self) -> str:
         """Return the headings as one short line."""
@@ -93,6 +96,21 @@ def refuse_unusable(values: Array, *, names: Sequence[str], place: Callable[[int
         column, row = np.argwhere(~usable)[0]
         what = "too large" if np.isfinite(values[column, row]) else "not a finite number"
         raise SubmissionError(f"{place(int(row))}: {names[column]!r} is {what}")
+
+
+def refuse_extreme(values: Array, *, what: str) -> None:
+    """Refuse numbers, zeros aside, of which the largest is beyond what any bench measures.
+
+    Raises
+    ------
+    SubmissionError : says `what`, with its file.
+    """
+    largest = float(np.abs(values).max(initial=0.0))
+    if largest != 0 and not _SMALLEST_MEASURED <= largest <= _LARGEST_MEASURED:
+        raise SubmissionError(
+            f"{what} is {largest:.3g} at its largest; expected {_SMALLEST_MEASURED:g} to "
+            f"{_LARGEST_MEASURED:g}: check the file, its unit and `per_count`"
+        )
 
 
 def _loosely(name: str) -> str:

@@ -19,6 +19,7 @@ _HEADING_WORDS = re.compile(
     r"encoder\s*\d+\s+(?:pos|vel|acc)\w*|commanded\s+\w+|control\s+effort|[^\s,;]+", re.IGNORECASE
 )
 _OPENING = re.compile(r"^[^\S\n]*(?:[A-Za-z]\w*\s*=\s*)?\[", re.MULTILINE)
+_LONGEST_HEADING = 100  # characters
 _LONGEST_UNIT = 8  # characters: "counts", "rad/s"
 _QUOTES = " \"'"
 
@@ -157,6 +158,11 @@ def _checked_names(names: Sequence[str], *, source: str, line: int) -> list[str]
     """Return headings without quotes; an empty one becomes its number."""
     if len(names) > _MAX_COLUMNS:
         raise SubmissionError(f"{source} line {line}: more than {_MAX_COLUMNS} columns")
+    if (longest := max(map(len, names), default=0)) > _LONGEST_HEADING:
+        raise SubmissionError(
+            f"{source} line {line}: a heading of {longest:,} characters, at most "
+            f"{_LONGEST_HEADING} are read"
+        )
     clean = [name.strip(_QUOTES) or str(i) for i, name in enumerate(names, start=1)]
     clean = [name if name.isprintable() else repr(name)[1:-1] for name in clean]
     seen: set[str] = set()

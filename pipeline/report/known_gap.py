@@ -39,8 +39,10 @@ from pipeline.report.words_gap import (
 )
 from pipeline.results import Analysis, HardwareCheck, Record
 from pipeline.stages._measured_run import measured_run
+from pipeline.submission.toml_file import read_text
 
 _PLACES = ("gap/gap.json", "gap.json")  # in the submission's folder
+_MOST_BYTES = 10_000_000  # ten times that of three carts and a hundred runs
 _WORTH = 0.6  # of the error must go before a factor on the logged input is believed
 _AS_LOGGED = 1.5  # a factor within this is no other scale, but the model's error
 _MOST_RUNS = 4
@@ -63,8 +65,11 @@ def _find(folder: Path, analysis: Analysis) -> tuple[Gap | None, str]:
         if not path.is_file():
             continue
         try:
-            gap, files = read_gap(path.read_text(encoding="utf-8"))
-        except (ConfigError, UnicodeDecodeError) as error:
+            text = read_text(path, where=place, limit=_MOST_BYTES, error=ConfigError)
+            gap, files = read_gap(text)
+            if gap.linear.chain.n != analysis.carts:
+                raise ConfigError(f"it is of {gap.linear.chain.n} carts")
+        except ConfigError as error:
             return None, f"{place} cannot be used: {error}"
         if files != analysis.files:
             return None, f"{place} is of other data than this report: run cartlab gap again"

@@ -3,6 +3,7 @@
 Raw HTML is text, images leave their description, links keep only web and mail addresses.
 """
 
+import re
 from collections.abc import Iterable
 from urllib.parse import urlsplit
 
@@ -29,13 +30,14 @@ _TOP_HEADING = 3  # the report's own headings are above
 _DEEPEST_READ = 200  # levels; the parser leaves out what is nested further
 _DEEPEST_NESTING = 6  # lists and quotations further in are set flat: nobody reads them, and a page
 # has no room for them
+_ENDLESS = re.compile(r"\S{2000}")  # letters in a row: no address is longer, and no page as wide
 _SCHEMES = ("http", "https", "mailto")
 _ALIGN = {"text-align:center": "c", "text-align:right": "r"}
 
 
 def note_blocks(markdown: str) -> tuple[Block, ...]:
     """Return Markdown as blocks of inert text; nested beyond sense, it is shown as written."""
-    text = clean(markdown)
+    text = _ENDLESS.sub(r"\g<0> ", clean(markdown))
     parser = MarkdownIt("commonmark", {"html": False, "maxNesting": _DEEPEST_READ}).enable("table")
     try:
         return _blocks(SyntaxTreeNode(parser.parse(text)))

@@ -49,6 +49,7 @@ _EXPECTED = {
     "too_long": "at most {max_length} values",
     "too_short": "at least {min_length} values",
     "string_too_long": "at most {max_length} characters",
+    "string_pattern_mismatch": "one line of printable characters",
     "literal_error": "{expected}",
     "union_tag_invalid": "type = {expected_tags}",
     "union_tag_not_found": 'type = "state_feedback" or "pid"',

@@ -27,7 +27,9 @@ NAME = "submission.toml"
 MAX_TOML_BYTES = 1_000_000  # a full class section's worth of experiments needs a tenth of it
 MAX_NOTES_BYTES = 1_000_000
 MAX_DATA_BYTES = 100_000_000  # over half an hour at 1 kHz
-_LARGEST = Decimal("1e100")  # beyond any physical number in any unit, yet safe to square
+_LARGEST = Decimal("1e30")  # beyond any physical number in any unit, yet safe to multiply
+_MOST_DIGITS = 1_000
+_MOST_SHOWN = 30_000  # characters of the notes: fifteen pages
 _MOST_LOOKED_AT = 1_000  # files and folders, for the one that may be meant
 _COMMENT = re.compile(r"<!--.*?(?:-->|\Z)", re.DOTALL)  # one left open runs to the end
 _SYSTEM_COLUMNS = ("time", "input", "reference", "frequency")
@@ -116,6 +118,8 @@ def _plain(value: object, at: tuple[int | str, ...]) -> object:
         raise _Unusable(
             at, f"expected a number between {1 / _LARGEST:.0e} and {_LARGEST:.0e} in size"
         )
+    if len(Decimal(value).as_tuple().digits) > _MOST_DIGITS:
+        raise _Unusable(at, f"expected a number of at most {_MOST_DIGITS} digits")
     if at[0] == "reported":
         return Decimal(value)
     return float(value) if isinstance(value, Decimal) else value
@@ -137,6 +141,10 @@ def _notes(folder: Path) -> str | None:
         raise SubmissionError(f"{where}: {problem}")
     typed = read_text(path, where=where, limit=MAX_NOTES_BYTES, error=SubmissionError)
     text = _COMMENT.sub("", typed)
+    if len(text) > _MOST_SHOWN:
+        shown = text[: text.rfind("\n", 0, _MOST_SHOWN) + 1] or text[:_MOST_SHOWN]
+        length = f"{len(shown):,} of {len(text):,} characters"
+        text = f"{shown}\n\n(notes.md goes on: {length} are shown.)\n"
     return text if text.strip() else None
 
 
@@ -185,7 +193,7 @@ def _experiment_problems(
     for j, cart in enumerate(experiment.carts):
         yield from _in_range(("carts", j), cart, n)
     if len(set(experiment.carts)) < len(experiment.carts):
-        yield ("carts",), f"a cart is named twice: {list(experiment.carts)}"
+        yield ("carts",), f"a cart is named twice: {quote(experiment.carts)}"
     if experiment.window is not None and not experiment.window[0] < experiment.window[1]:
         start, end = experiment.window
         yield ("window",), f"expected [start, end] with start before end, found [{start}, {end}]"

@@ -8,6 +8,12 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+# A line on any page; pages and PDF readers fail at texts of a hundred thousand letters.
+Line = Annotated[str, Field(max_length=200)]
+# Units stand in the titles of figures, which scripts read.
+Unit = Annotated[str, Field(max_length=40, pattern=r"^[^\p{C}\p{Zl}\p{Zp}]*$")]
+MOST_AUTHORS = 50
+MOST_EXPERIMENTS = 300  # a class section's; every stage and every comparison goes through them
 Typed = Annotated[Decimal, Field(allow_inf_nan=False)]  # keeps the digits as typed: 0.10 has two
 
 
@@ -18,14 +24,14 @@ class _Model(BaseModel):
 class Author(_Model):
     """One student."""
 
-    id: str
-    name: str = ""
+    id: Line
+    name: Line = ""
 
 
 class Input(_Model):
     """The input's unit, sign and scale; `sign` None: found from the data."""
 
-    unit: str = "V"
+    unit: Unit = "V"
     sign: Literal[1, -1] | None = None
     per_count: Positive | None = None
 
@@ -40,7 +46,7 @@ class InputOverride(_Model):
 class Position(_Model):
     """The position's unit; `per_count` converts columns that hold encoder counts."""
 
-    unit: str = "count"
+    unit: Unit = "count"
     per_count: Positive | None = None
 
 
@@ -116,7 +122,7 @@ class Experiment(_Model):
     carts: tuple[int, ...] = ()  # the free carts; filled in with all of them on loading
     frequency: Positive | None = None  # Hz
     window: tuple[Finite, Finite] | None = None  # s
-    note: str = ""
+    note: Annotated[str, Field(max_length=2_000)] = ""
     input: InputOverride | None = None
     columns: dict[str, str | int] | None = None
     sample_rate: Positive | None = None  # Hz
@@ -165,12 +171,12 @@ class Submission(_Model):
     """A validated submission; `folder` is where it lies."""
 
     version: Literal[1]
-    title: str = ""
-    section: str = ""
-    authors: tuple[Author, ...] = ()
+    title: Line = ""
+    section: Line = ""
+    authors: Annotated[tuple[Author, ...], Field(max_length=MOST_AUTHORS)] = ()
     system: System
     design: Design | None = None
-    experiments: tuple[Experiment, ...] = ()
+    experiments: Annotated[tuple[Experiment, ...], Field(max_length=MOST_EXPERIMENTS)] = ()
     reported: Reported | None = None
     folder: Path = Field(default=Path(), exclude=True)
     discussion: str | None = Field(default=None, exclude=True)

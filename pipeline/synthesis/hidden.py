@@ -15,12 +15,14 @@ from pipeline.plant.effects import Effect, Parameter, Term, find_effect
 from pipeline.plant.effects.base import Scales, chain_scales
 from pipeline.plant.simulate import simulate_linear
 from pipeline.submission.complaints import nearest
+from pipeline.submission.toml_file import read_text
 from pipeline.synthesis import COUNT, SAMPLE_TIME, preset_chain, write_submission
 
 _LARGE_STEP = 0.9  # of the travel, as in a session's larger steps
 _RING = 6.0  # periods of the slowest motion: the first swings are the largest
 _PER_CM = {"cm": 1.0, "mm": 10.0, "m": 0.01, "in": 1 / 2.54, "count": 1 / COUNT}
 _INPUT_LIMIT = 5.0  # input units
+_MOST_BYTES = 10_000_000  # of a file with a model
 _INPUT_RESERVE = 4.0  # times the input that holds a cart at its travel
 
 
@@ -264,11 +266,9 @@ def _read_model(path: Path) -> HiddenBench:
     """Read the model of a `gap.json`: a chain, and the effects that act on it."""
     where = f"--model {path}"
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, ValueError) as error:
+        document = json.loads(read_text(path, where=where, limit=_MOST_BYTES, error=ConfigError))
+    except (RecursionError, ValueError) as error:
         raise ConfigError(f"{where}: no JSON: {error}") from None
-    except OSError as error:
-        raise ConfigError(f"{where}: {error.strerror}") from None
     document = _mapping(document, where=where)
     model = _mapping(document.get("model", document), where=f"{where}: model")
     chain = _chain(model.get("chain"), where=f"{where}: chain")
