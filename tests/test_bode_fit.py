@@ -244,6 +244,25 @@ def test_the_decay_tells_a_damping_that_the_response_leaves_open():
     assert_allclose(got.chain.zeta_carts, 0.017, rtol=0.02)
 
 
+def test_where_one_damping_is_open_all_decays_are_fitted_along():
+    """The response alone puts one of two dampings at zero: both decays tell."""
+    chain = PRESETS["throne-2dof"]
+    decays = {
+        cart: Estimate(value=float(zeta), std=0.02 * float(zeta), source="log_decrement")
+        for cart, zeta in enumerate(chain.zeta_carts, start=1)
+    }
+    low = exact(replace(chain, c=np.array([0.0, 1.0]) * chain.c))
+    vague = [replace(r, magnitude_std=0.3 * r.magnitude) for r in low]
+    alone = fit_bode(vague, n=2, springs=(False, True, True))
+    assert alone.at_bound == ("c_1",)
+
+    got = fit_bode(vague, n=2, springs=(False, True, True), decays=decays)
+    assert got.at_bound == ("c_1", "c_2")
+    # Two standard errors of the decays; a response 30 % uncertain adds nothing.
+    assert_allclose(got.chain.zeta_carts, chain.zeta_carts, rtol=0.04)
+    assert {got.parameters[f"zeta_{cart}"].source for cart in (1, 2)} == {"log_decrement"}
+
+
 def test_a_decay_that_the_response_rules_out_is_not_used():
     """Points on a peak of 1 in 1000 damping contradict 0.05: the two are not mixed."""
     undamped = exact(SHARP, np.sqrt(300.0) * np.array([0.5, 0.9, 0.99, 0.998, 1.002, 1.01, 1.1]))

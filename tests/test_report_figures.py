@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.text import Text
 
+from pipeline.plant.chain import Chain
 from pipeline.report.figures import (
     drawing,
     panels,
@@ -35,6 +36,7 @@ from pipeline.report.figures_time import (
 )
 from pipeline.report.svg import plain_svg, to_svg
 from pipeline.report.ticks import linear_ticks, log_ticks, tick_labels
+from pipeline.results import FrequencyResponse
 from tests.analysis_factory import make_analysis
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -89,6 +91,26 @@ def test_measured_phase_lies_on_the_branch_of_the_fit():
     # Noise of 0.01 rad and a grid of 300 points on the line: well within 15°.
     at = np.interp(response.omega, np.asarray(phase.lines[0].get_xdata(), dtype=float), line)
     assert np.max(np.abs(points - at)) < 15
+
+
+def test_a_peak_without_end_does_not_hide_the_measurement():
+    """The curve of carts without damping is cut above what was measured."""
+    chain = Chain(m=np.array([1.0]), c=np.zeros(1), k=np.array([4.0, 0.0]))
+    omega = np.array([0.5, 1.0, 3.0, 4.0])
+    magnitude = np.abs(chain.frequency_response(omega)[0])
+    response = FrequencyResponse(
+        cart=1,
+        omega=omega,
+        magnitude=magnitude,
+        magnitude_std=0.01 * magnitude,
+        phase=np.zeros(4),
+        phase_std=np.full(4, 0.01),
+        source="dwells",
+    )
+    with drawing():
+        figure = bode_figure(response, chain=chain, position_unit="cm", input_unit="V")
+        ElementTree.fromstring(to_svg(figure, name="x", alt=""))
+    assert figure.axes[0].get_ylim()[1] < 20 * np.log10(magnitude.max()) + 50
 
 
 def test_a_student_s_dollar_signs_are_no_formula():

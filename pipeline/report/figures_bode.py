@@ -21,6 +21,7 @@ from pipeline.results import FrequencyResponse
 
 _LINE_POINTS = 300
 _DB_PER_NEPER = 20 / np.log(10)
+_HIGHEST_PEAK = 100.0  # times the largest measured magnitude; without damping a peak has no end
 _WIDEST_BAR = 0.9  # of the magnitude: an error bar in decibels cannot reach down to zero
 
 
@@ -68,7 +69,8 @@ def plot_magnitude(
     if chain:
         omega = _dense(response.omega, chain)
         magnitude = np.abs(chain.frequency_response(omega)[response.cart - 1])
-        ax.plot(omega, _decibel(magnitude), color=MODEL, label="fit")
+        highest = float(response.magnitude.max()) * _HIGHEST_PEAK
+        ax.plot(omega, _decibel(np.minimum(magnitude, highest)), color=MODEL, label="fit")
         _mark_modes(ax, response.omega, chain)
     ax.set_ylabel(f"|X{subscript(response.cart)}/U| [dB re 1 {position_unit}/{input_unit}]")
 
