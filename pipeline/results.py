@@ -422,6 +422,19 @@ class Skipped:
     reason: str
 
 
+@dataclass(frozen=True, kw_only=True)
+class LeftOut:
+    """A recording that was not used, and why, in words that follow its name.
+
+    `is_wrong` : it does not hold what happened, and the reason says how; else it only stands off
+    its repeats.
+    """
+
+    experiment: str
+    reason: str
+    is_wrong: bool
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Analysis:
     """All results of one submission, in pipeline order.
@@ -455,6 +468,7 @@ class Analysis:
     files: dict[str, str]
     unreadable: dict[str, str] = field(default_factory=dict)
     discussion: str | None  # notes.md, without its comments
+    left_out: tuple[LeftOut, ...] = ()
 
     @property
     def chain(self) -> Chain | None:

@@ -1,9 +1,11 @@
 """The straight line from a submission to its analysis: the only file that knows the order."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence, Set
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import ParamSpec, TypeVar
+
+import numpy as np
 
 from pipeline.errors import DataError
 from pipeline.ingest.read import Ingested, read_data
@@ -15,6 +17,7 @@ from pipeline.results import (
     FeedbackDesign,
     FrequencyResponse,
     HardwareCheck,
+    LeftOut,
     LogDecrement,
     Record,
     SinePoint,
@@ -34,6 +37,7 @@ from pipeline.stages.compare import (
     compare,
 )
 from pipeline.stages.design_check import design_margins, verify_design
+from pipeline.stages.faults import check_left_out, find_faults, follows, standing_still
 from pipeline.stages.frequency_response import (
     collect_dwells,
     dwell_fault,
@@ -43,6 +47,7 @@ from pipeline.stages.frequency_response import (
 from pipeline.stages.hardware_check import check_hardware
 from pipeline.stages.initial import estimate_initially
 from pipeline.stages.log_decrement import fit_log_decrement
+from pipeline.stages.repeated_numbers import Repeats, compare_repeats
 from pipeline.stages.repeats import find_outlier_repeats
 from pipeline.stages.sine import Dwell
 from pipeline.stages.state_feedback import design_feedback
@@ -54,6 +59,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 Progress = Callable[[str], None]
 
+_ROUNDS = 3  # of leaving out what the carts found without it show to be wrong
 _LISTED = 4  # more runs than these are not named one by one
 _UNTIED = "no spring ties the carts to a wall: they rest anywhere and have no static gain"
 
@@ -85,6 +91,10 @@ class _Log:
     def warn(self, texts: Iterable[str]) -> None:
         self.warnings += [text for text in texts if text and text not in self.warnings]
 
+    def add(self, other: "_Log") -> None:
+        self.skipped += other.skipped
+        self.warn(other.warnings)
+
 
 def analyse(
     submission: Submission, *, design: bool = True, progress: Progress = _silent
@@ -107,36 +117,9 @@ def analyse(
         log.skip(f"reading {name}", reason)
     log.warn(data.warnings)
     log.warn(_by_note((record.id, note) for record in data.records for note in record.notes))
-    driven = _driven(data.records, n=n, unit=system.position.unit, log=log)
-
-    progress("free decays: logarithmic decrement")
-    decays = _log_decrements(data.records, springs=springs, log=log)
-    progress("steps: static gains")
-    gains = _step_gains(driven, system=system, log=log)
-    progress("sine dwells: steady state")
-    sines = _sine_points(data.records, log=log)
-    # What a check says of a decay or a step in full is not said twice.
-    log.warn(
-        _by_note(
-            [
-                *((f"{d.experiment}, cart {d.cart}", d.note) for d in decays if not _sticks(d)),
-                *((f"{g.experiment}, cart {g.cart}", g.note) for g in gains if not g.interval),
-                *((f"{p.experiment}, cart {p.cart}", p.note) for p in sines),
-            ]
-        )
-    )
-    progress("frequency response")
-    responses = _frequency_response(data, sines=sines, driven=driven, log=log)
-
-    found = _resonances(responses, system=system, log=log)
-    initial, left_out = estimate_initially(
-        carts=n, log_decrements=decays, step_gains=gains, from_response=found
-    )
-    log.warn(_by_note(left_out.items()))
-    driven = [record for record in driven if record.id not in left_out]
-
-    progress("fitting all carts at once")
-    fit = _fit(responses, driven=driven, initial=initial, n=n, springs=springs, log=log)
+    found, left_out = _identify_from_sound(data, system=system, progress=progress)
+    log.add(found.log)
+    fit = found.fit
     final = fit.parameters if fit else {}
     if fit and not final:
         log.skip("named parameters", _UNTIED)
@@ -144,7 +127,7 @@ def analyse(
         if estimate.at_bound:
             log.skip(f"final {name}", AT_BOUND)
     rows = compare(
-        initial,
+        found.initial,
         final=final,
         names=list(final) or parameter_names(n, rigid=system.rigid),
         position_unit=system.position.unit,
@@ -153,9 +136,11 @@ def analyse(
     checks = [
         *check_files(data.unreadable),
         *check_setup(data.records),
+        *check_left_out(left_out),
+        *found.repeats.checks,
         *check_rows(rows),
-        *check_decays(decays, position_unit=system.position.unit),
-        *check_steps(gains, gain_unit=f"{system.position.unit}/{system.input.unit}"),
+        *check_decays(found.decays, position_unit=system.position.unit),
+        *check_steps(found.gains, gain_unit=f"{system.position.unit}/{system.input.unit}"),
     ]
     checks += check_chain(fit, springs=springs) if fit else [NOT_IDENTIFIED]
 
@@ -186,10 +171,10 @@ def analyse(
         position_unit=system.position.unit,
         input_unit=system.input.unit,
         records=data.records,
-        log_decrements=tuple(decays),
-        step_gains=tuple(gains),
-        sine_points=tuple(sines),
-        frequency_responses=tuple(responses),
+        log_decrements=tuple(found.decays),
+        step_gains=tuple(found.gains),
+        sine_points=tuple(found.sines),
+        frequency_responses=tuple(found.responses),
         tables=tuple(data.tables),
         fit=fit,
         rows=rows,
@@ -201,6 +186,112 @@ def analyse(
         files=data.files,
         unreadable=data.unreadable,
         discussion=submission.discussion,
+        left_out=tuple(left_out),
+    )
+
+
+# ---------------------------------------------------------- from records to carts
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Identified:
+    """What the stages make of some records, up to the fit."""
+
+    decays: Sequence[LogDecrement]
+    gains: Sequence[StepGain]
+    sines: Sequence[SinePoint]
+    responses: Sequence[FrequencyResponse]
+    repeats: Repeats
+    initial: dict[str, Estimate]
+    fit: ChainFit | None
+    log: _Log
+
+
+def _identify_from_sound(
+    data: Ingested, *, system: System, progress: Progress
+) -> tuple[_Identified, list[LeftOut]]:
+    """Identify the carts without the records that they, or their repeats, show to be wrong.
+
+    Records in which a reading stands still bear no witness until the carts that the others show
+    say that it may.
+    """
+    driven = [r for r in data.records if r.kind in ("step", "sweep")]
+    odd = find_outlier_repeats(driven, unit=system.position.unit)
+    without, contradicted = odd.keys() | standing_still(data.records), []
+    found = _identify(data, without=without, system=system, progress=progress)
+    faults = find_faults(data.records, chain=found.fit.chain if found.fit else None)
+    for _ in range(_ROUNDS):
+        odd |= found.repeats.odd
+        if without == odd.keys() | faults.keys():
+            break
+        without = odd.keys() | faults.keys()
+        contradicted += [check for check in found.repeats.checks if check.outcome == "fail"]
+        found = _identify(data, without=without, system=system, progress=progress)
+        faults = find_faults(data.records, chain=found.fit.chain if found.fit else None)
+    checks = {check.id: check for check in (*found.repeats.checks, *contradicted)}
+    repeats = replace(found.repeats, checks=tuple(checks.values()))
+    left_out = {**odd, **faults}
+    return (
+        replace(found, repeats=repeats),
+        [left_out[record.id] for record in data.records if record.id in left_out],
+    )
+
+
+def _identify(
+    data: Ingested, *, without: Set[str], system: System, progress: Progress
+) -> _Identified:
+    """Take the records, but for those without, through the stages up to the fit."""
+    n, springs, log = system.carts, system.springs, _Log()
+    records = [record for record in data.records if record.id not in without]
+    driven = _driven(records, n=n, log=log)
+
+    progress("free decays: logarithmic decrement")
+    decays = _log_decrements(records, springs=springs, log=log)
+    progress("steps: static gains")
+    gains = _step_gains(driven, system=system, log=log)
+    progress("sine dwells: steady state")
+    sines = _sine_points(records, log=log)
+    # What a check says of a decay or a step in full is not said twice.
+    log.warn(
+        _by_note(
+            [
+                *((f"{d.experiment}, cart {d.cart}", d.note) for d in decays if not _sticks(d)),
+                *((f"{g.experiment}, cart {g.cart}", g.note) for g in gains if not g.interval),
+                *((f"{p.experiment}, cart {p.cart}", p.note) for p in sines),
+            ]
+        )
+    )
+    progress("frequency response")
+    responses = _frequency_response(data, sines=sines, driven=driven, log=log)
+    resonances = _resonances(responses, system=system, log=log)
+    measured = estimate_initially(carts=n, log_decrements=decays, step_gains=gains)
+
+    progress("fitting all carts at once")
+    fit = None
+    if _is_seen(n, records, responses):
+        fit = _fit(
+            responses,
+            dwells=[record for record in records if record.kind == "sine"],
+            driven=driven,
+            initial={**resonances, **measured},
+            n=n,
+            springs=springs,
+            log=log,
+        )
+    else:
+        log.skip("final estimates", f"cart {n} moves in no recording: is `carts = {n}` right?")
+    fitted = fit.parameters if fit and fit.converged else {}
+    repeats = compare_repeats(decays, gains, carts=n, fitted=fitted)
+    agreed = {name: one for name, one in measured.items() if name not in repeats.undecided}
+    return _Identified(
+        decays=decays,
+        gains=gains,
+        sines=sines,
+        responses=responses,
+        repeats=repeats,
+        initial={**resonances, **agreed},
+        fit=fit,
+        log=log,
     )
 
 
@@ -223,8 +314,8 @@ def _listed(ids: Sequence[str]) -> str:
     return f"{ids[0]}, {ids[1]} … {ids[-1]} ({len(ids)} runs)"
 
 
-def _driven(records: Sequence[Record], *, n: int, unit: str, log: _Log) -> list[Record]:
-    """Return the steps and sweeps of all carts together, without repeats that stand off.
+def _driven(records: Sequence[Record], *, n: int, log: _Log) -> list[Record]:
+    """Return the steps and sweeps of all carts together.
 
     Runs of single carts are left to the initial estimates, so that initial and final estimates
     come from different data and comparing them is a check.
@@ -238,14 +329,14 @@ def _driven(records: Sequence[Record], *, n: int, unit: str, log: _Log) -> list[
             if len(run.carts) < n
         )
     )
-    outliers = {outlier.experiment: outlier for outlier in find_outlier_repeats(runs)}
-    log.warn(
-        f"{name}: does not move as its repeats {', '.join(outlier.others)} do "
-        f"({outlier.distance:.3g} {unit} root mean square from them; they differ by "
-        f"{outlier.spread:.3g} {unit} among themselves): left out"
-        for name, outlier in outliers.items()
+    return runs
+
+
+def _is_seen(cart: int, records: Sequence[Record], responses: Sequence[FrequencyResponse]) -> bool:
+    """Whether a cart moves in any recording: a last one that does not may not be there."""
+    return cart in {response.cart for response in responses} or any(
+        cart in record.carts and np.ptp(record.position(cart)) > 0 for record in records
     )
-    return [record for record in runs if record.id not in outliers]
 
 
 def _log_decrements(
@@ -344,14 +435,16 @@ def _resonances(
 def _fit(
     responses: Sequence[FrequencyResponse],
     *,
+    dwells: Sequence[Record],
     driven: Sequence[Record],
     initial: dict[str, Estimate],
     n: int,
     springs: tuple[bool, ...],
     log: _Log,
 ) -> ChainFit | None:
-    """The Bode fit where dwells or a table allow it, else the joint fit on the time records."""
+    """The Bode fit where the dwells follow it or there is a table, else the joint fit in time."""
     has_points = any(response.source != "records" for response in responses)
+    fit = None
     if has_points:
         values = {name: estimate.value for name, estimate in initial.items()}
         fit = log.attempt(
@@ -363,13 +456,18 @@ def _fit(
             initial=values,
             decays=_decay_dampings(initial, n=n),
         )
-        if fit:
+        if fit and (not driven or follows(dwells, chain=fit.chain)):
             return fit
     if not driven:
         found = "the Bode fit gave none, and there is no" if has_points else "no dwells, table,"
         log.skip("final estimates", f"{found} step or sweep with all carts free to fit them to")
         return None
-    return log.attempt("final estimates", fit_records, driven, n=n, springs=springs)
+    other = log.attempt("final estimates", fit_records, driven, n=n, springs=springs)
+    if fit is None or (other and other.converged):
+        if fit:
+            log.warn(["the fit rests on the steps and sweeps: the dwells do not follow one chain"])
+        return other
+    return fit
 
 
 def _decay_dampings(initial: dict[str, Estimate], *, n: int) -> dict[int, Estimate]:

@@ -13,8 +13,6 @@ from pipeline.results import Analysis, Record
 
 _FREQUENCY = 0.08  # relative: a stated frequency further from that of the input is another run's
 _CUT = 0.5  # of the usual length of the repeats
-_SEEN_COUNTS = 20.0  # encoder steps that a cart must be expected to move before it is called stuck
-_SEEN_SHARE = 0.3  # … and of its motion in other runs: less may be friction that holds it
 _FASTEST = 0.98  # quantile of the steps from sample to sample: the odd jump does not count
 _AT_SPEED, _AWAY = 0.6, 1.5  # of the fastest
 _DRIVEN = 1e-3  # of the largest input of any run: a decay with more is driven
@@ -23,12 +21,14 @@ _DRIVEN = 1e-3  # of the largest input of any run: a decay with more is driven
 def bad_runs(analysis: Analysis) -> dict[str, str]:
     """Return the runs that do not hold what they should, each with what is wrong, in words."""
     found = dict(analysis.unreadable)
-    usual = _usual_motion(analysis.records)
+    found |= {one.experiment: one.reason for one in analysis.left_out if one.is_wrong}
+    sound = [record for record in analysis.records if record.id not in found]
     setups = {
         check.id.removeprefix("setup."): check.message.split(": ", 1)[-1]
         for check in analysis.checks
         if check.id.startswith("setup.") and check.outcome == "fail"
     }
+    sticky = not is_explained(analysis)
     largest = max(
         (float(np.abs(r.u).max()) for r in analysis.records if r.u is not None), default=0
     )
@@ -36,7 +36,7 @@ def bad_runs(analysis: Analysis) -> dict[str, str]:
         if record.id in setups:
             found[record.id] = setups[record.id]
             continue
-        for problem in _problems(record, analysis, usual=usual, largest=largest):
+        for problem in _problems(record, sound, sticky=sticky, largest=largest):
             found.setdefault(record.id, problem)
     for record, problem in _copies(analysis):
         found.setdefault(record, problem)
@@ -56,9 +56,9 @@ def data_flag(bad: Mapping[str, str]) -> Flag:
 
 
 def _problems(
-    record: Record, analysis: Analysis, *, usual: Mapping[int, float], largest: float
+    record: Record, sound: Sequence[Record], *, sticky: bool, largest: float
 ) -> Iterator[str]:
-    t, u, sticky = record.t, record.u, not is_explained(analysis)
+    t, u = record.t, record.u
     for cart in record.carts:
         if cart not in record.free:
             continue
@@ -68,8 +68,6 @@ def _problems(
                 f"the encoder of cart {cart} stands still at speed from {t[first]:.4g} s to "
                 f"{t[last]:.4g} s: it stuck"
             )
-        if np.ptp(y) == 0 and _should_move(record, cart, analysis, usual=usual):
-            yield f"cart {cart} is said to be free and its encoder never changes"
         # A cart that sticks rests where it turns, which looks like a clipped reading.
         limit = None if sticky or record.kind not in ("sine", "sweep") else saturation(y)
         if limit is not None:
@@ -78,7 +76,7 @@ def _problems(
         yield from _input_problems(record, u, largest=largest)
     siblings = [
         float(other.t[-1] - other.t[0])
-        for other in analysis.records
+        for other in sound
         if other.kind == record.kind and other.free == record.free and other is not record
     ]
     length = float(t[-1] - t[0])
@@ -130,33 +128,6 @@ def _input_problems(record: Record, u: Array, *, largest: float) -> Iterator[str
         late = u[u.size // 2 :]
         if float(np.ptp(late)) > _DRIVEN * largest and largest > 0:
             yield "the input is at work in what should be a free decay"
-
-
-def _usual_motion(records: Sequence[Record]) -> dict[int, float]:
-    """Return the largest motion of every cart in any run in which it is free."""
-    motion: dict[int, float] = {}
-    for record in records:
-        for cart in set(record.carts) & set(record.free):
-            motion[cart] = max(motion.get(cart, 0.0), float(np.ptp(record.position(cart))))
-    return motion
-
-
-def _should_move(
-    record: Record, cart: int, analysis: Analysis, *, usual: Mapping[int, float]
-) -> bool:
-    """Whether a cart that did not move should have: a cart that friction holds need not."""
-    if record.kind == "decay":
-        return True
-    if analysis.chain is None or record.u is None or usual.get(cart, 0.0) == 0:
-        return record.u is not None and bool(np.ptp(record.u) > 0)
-    omega = record.omega if record.kind == "sine" and record.omega else 0.0
-    try:
-        gain = abs(analysis.chain.frequency_response(np.array([omega]))[cart - 1, 0])
-    except np.linalg.LinAlgError:
-        return True
-    expected = float(gain * np.ptp(record.u))
-    steps = [r.encoder_step(cart) for r in analysis.records if cart in r.carts]
-    return expected > max(_SEEN_SHARE * usual[cart], _SEEN_COUNTS * max(steps, default=0.0))
 
 
 def _copies(analysis: Analysis) -> Iterator[tuple[str, str]]:

@@ -1,13 +1,12 @@
 """Repeats of one experiment, and which of them stands off the others."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 
 from pipeline.plant.chain import Array
-from pipeline.results import Record
+from pipeline.results import LeftOut, Record
 
 # Inputs count as the same where they differ by less than this share (root-mean-square): an edge
 # logged one sample early differs by 8 %, the next usual amplitude by 33 %.
@@ -23,31 +22,14 @@ _SPREADS = {3: 30.0, 4: 8.0}
 _SPREADS_OF_MANY = 5.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class OutlierRepeat:
-    """A repeat whose response stands off that of the others.
-
-    Attributes
-    ----------
-    experiment, others : ids; the input was the same.
-    distance : root-mean-square difference from the others (their median), position units.
-    spread : the same among the others.
-    """
-
-    experiment: str
-    others: tuple[str, ...]
-    distance: float
-    spread: float
-
-
-def find_outlier_repeats(records: Sequence[Record]) -> tuple[OutlierRepeat, ...]:
-    """Find the repeats that do not belong with the others.
+def find_outlier_repeats(records: Sequence[Record], *, unit: str) -> dict[str, LeftOut]:
+    """Find the repeats that do not belong with the others, by id.
 
     Repeats have the same kind, free and measured carts, and nearly the same input (the set point
     in closed loop). Decays are left alone: a hand never releases twice from the same place. Never
-    flags one of two, nor more than a minority.
+    flags one of two, nor more than a minority. `unit` is that of the positions.
     """
-    outliers: list[OutlierRepeat] = []
+    outliers: dict[str, LeftOut] = {}
     for group in _groups(records):
         differences, expected = _differences(group)
         left = list(range(len(group)))
@@ -57,13 +39,14 @@ def find_outlier_repeats(records: Sequence[Record]) -> tuple[OutlierRepeat, ...]
                 break
             index, distance, spread = found
             left.remove(index)
-            others = tuple(group[i].id for i in left)
-            outliers.append(
-                OutlierRepeat(
-                    experiment=group[index].id, others=others, distance=distance, spread=spread
-                )
+            name, others = group[index].id, ", ".join(group[i].id for i in left)
+            outliers[name] = LeftOut(
+                experiment=name,
+                reason=f"it does not move as its repeats {others} do ({distance:.3g} {unit} root "
+                f"mean square from them; they differ by {spread:.3g} {unit} among themselves)",
+                is_wrong=False,
             )
-    return tuple(outliers)
+    return outliers
 
 
 def _groups(records: Sequence[Record]) -> list[list[Record]]:

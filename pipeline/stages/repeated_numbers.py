@@ -1,0 +1,211 @@
+"""Numbers measured more than once: whether the runs agree, which stand off, and what they did.
+
+A frequency or a gain that two runs give 10 % apart, and beyond their errors, is no number with a
+wide error: one of the runs is wrong. The fit tells which, else the majority; else nothing does.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+
+import numpy as np
+
+from pipeline.results import Check, Estimate, LeftOut, LogDecrement, StepGain
+
+TOLERANCE = 10.0  # percent; the same run made twice, with dry friction of some percent
+_SIGMAS = 4.0
+_LIKE_THE_FIT = 0.15  # relative: as far as two ways to one number may lie apart
+_SAME = 0.05  # relative: what a mistake leaves of the difference between two runs
+_SAME_SIZE = 0.2  # relative: two steps that friction treats alike
+_TIME_UNITS = {1e-3: "milliseconds", 1e-6: "microseconds", 1e3: "thousands of seconds"}
+_SCALES = (10.0, 100.0, 1000.0, 2.54, 25.4)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Repeats:
+    """Repeated measurements held against one another.
+
+    Attributes
+    ----------
+    checks : one for each number that was measured more than once.
+    odd : the runs that stand off, by id, each with what is wrong.
+    undecided : the numbers whose runs contradict one another, nobody knows which is right.
+    """
+
+    checks: tuple[Check, ...] = ()
+    odd: dict[str, LeftOut] = field(default_factory=dict)
+    undecided: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Reading:
+    """One run's value, between where it lies, and the size of the step it was read from."""
+
+    run: str
+    value: float
+    low: float
+    high: float
+    size: float = 0.0
+
+    def contradicts(self, other: "_Reading") -> bool:
+        far = abs(self.value - other.value) > TOLERANCE / 100 * max(
+            abs(self.value), abs(other.value)
+        )
+        return far and max(self.low, other.low) > min(self.high, other.high)
+
+
+def compare_repeats(
+    decays: Sequence[LogDecrement],
+    steps: Sequence[StepGain],
+    *,
+    carts: int,
+    fitted: Mapping[str, Estimate],
+) -> Repeats:
+    """Hold the runs that give one frequency or one static gain against one another.
+
+    Parameters
+    ----------
+    fitted : the parameters of a fit that explains most records; else none.
+    """
+    readings = _readings(decays, steps, carts=carts)
+    chosen = {name: _right_ones(all_, fitted.get(name)) for name, all_ in readings.items()}
+    usual = {n: float(np.median([r.value for r in right])) for n, right in chosen.items() if right}
+    odd: dict[str, LeftOut] = {}
+    undecided = []
+    for name, all_ in readings.items():
+        for reading in all_:
+            if reading in chosen[name] or reading.run in odd:
+                continue
+            values = {
+                n: r.value for n, many in readings.items() for r in many if r.run == reading.run
+            }
+            said = _mistake(values, usual)
+            if usual.get(name) and (said or not _only_by_size(all_)):
+                off = f"{name} = {reading.value:.3g} where the others give {usual[name]:.3g}"
+                reason = f"{off}: {said}" if said else off
+                odd[reading.run] = LeftOut(
+                    experiment=reading.run, reason=reason, is_wrong=bool(said)
+                )
+        if not chosen[name] and not _only_by_size(all_):
+            undecided.append(name)
+    return Repeats(
+        checks=tuple(
+            _check(name, all_, odd=odd, undecided=name in undecided)
+            for name, all_ in readings.items()
+            if len(all_) > 1
+        ),
+        odd=odd,
+        undecided=tuple(undecided),
+    )
+
+
+def _readings(
+    decays: Sequence[LogDecrement], steps: Sequence[StepGain], *, carts: int
+) -> dict[str, list[_Reading]]:
+    found: dict[str, list[_Reading]] = {}
+    for decay in decays:
+        name = "omega_n" if carts == 1 else f"omega_{decay.cart}"
+        slack = _SIGMAS * decay.omega_n_std
+        found.setdefault(name, []).append(
+            _Reading(
+                run=decay.experiment,
+                value=decay.omega_n,
+                low=decay.omega_n - slack,
+                high=decay.omega_n + slack,
+            )
+        )
+    for step in steps:
+        name, slack = "K" if carts == 1 else f"K_{step.cart}", _SIGMAS * step.gain_std
+        low, high = step.interval or (step.gain, step.gain)  # where the cart sticks
+        found.setdefault(name, []).append(
+            _Reading(
+                run=step.experiment,
+                value=step.gain,
+                low=min(low, step.gain - slack),
+                high=max(high, step.gain + slack),
+                size=max(abs(edge.u_after - edge.u_before) for edge in step.edges),
+            )
+        )
+    return found
+
+
+def _only_by_size(readings: Sequence[_Reading]) -> bool:
+    """Whether steps of one size agree, those of another only among themselves: dry friction."""
+    return not any(
+        a.contradicts(b) and abs(a.size - b.size) <= _SAME_SIZE * max(a.size, b.size)
+        for a, b in combinations(readings, 2)
+    )
+
+
+def _right_ones(readings: Sequence[_Reading], fitted: Estimate | None) -> list[_Reading]:
+    """Return the readings that belong together: all, those like the fit, or most; none: open."""
+    if not any(a.contradicts(b) for a, b in combinations(readings, 2)):
+        return list(readings)
+    if fitted is not None:
+        near = _LIKE_THE_FIT * abs(fitted.value)
+        like = [r for r in readings if abs(r.value - fitted.value) <= near]
+        if like:
+            return like
+    groups = [[b for b in readings if not a.contradicts(b)] for a in readings]
+    largest = max(groups, key=len)
+    return largest if 2 * len(largest) > len(readings) else []
+
+
+def _mistake(values: Mapping[str, float], usual: Mapping[str, float]) -> str:
+    """Return the mistake that turns the usual numbers into a run's own, or ""."""
+    known = {name: value for name, value in values.items() if usual.get(name)}
+    ratios = {name: value / usual[name] for name, value in known.items()}
+    if all(name.startswith("omega") for name in known):
+        for factor, unit in _TIME_UNITS.items():
+            if all(_near(ratio, factor) for ratio in ratios.values()):
+                return f"its time looks to be in {unit}"
+        return ""
+    for a, b in combinations(known, 2):
+        if _near(values[a], usual[b]) and _near(values[b], usual[a]):
+            return f"x{a[2:]} and x{b[2:]} look exchanged"
+    for scale in _SCALES:
+        for factor in (scale, 1 / scale):
+            if all(_near(abs(ratio), factor) for ratio in ratios.values()):
+                return f"its positions look to be in another unit, {factor:.3g} times the others'"
+    turned = [name for name, ratio in ratios.items() if _near(ratio, -1.0)]
+    if turned and all(_near(abs(ratio), 1.0) for ratio in ratios.values()):
+        return f"the sign of {' and '.join(f'x{name[2:] or 1}' for name in turned)} looks turned"
+    return ""
+
+
+def _near(value: float, other: float) -> bool:
+    return abs(value - other) <= _SAME * abs(other)
+
+
+def _check(
+    name: str, readings: Sequence[_Reading], *, odd: Mapping[str, LeftOut], undecided: bool
+) -> Check:
+    values = [reading.value for reading in readings]
+    spread = 100 * (max(values) - min(values)) / max(map(abs, values))
+    off = [reading.run for reading in readings if reading.run in odd]
+    apart = f"from {min(values):.4g} to {max(values):.4g}"
+    count = f"{len(readings)} runs"
+    if undecided:
+        outcome, said = (
+            "fail",
+            (
+                f"contradict one another, {apart}, and nothing else tells which is right: "
+                "none of them is used"
+            ),
+        )
+    elif off:
+        reasons = "; ".join(f"{run}: {odd[run].reason}" for run in off)
+        outcome, said = "fail", f"contradict one another, {apart}. Left out is {reasons}"
+    elif any(a.contradicts(b) for a, b in combinations(readings, 2)):
+        outcome, said = "fail", f"lie {apart}, by the size of the step, as where a cart sticks"
+    elif spread > TOLERANCE:
+        outcome, said = "skip", f"lie {apart}, no further apart than their errors"
+    else:
+        outcome, said = "pass", f"agree within {spread:.2g} %"
+    return Check(
+        id=f"repeats.{name}",
+        outcome=outcome,
+        value=spread,
+        limit=TOLERANCE,
+        message=f"{name}: {count} {said}.",
+    )

@@ -1,0 +1,182 @@
+"""Recordings that do not hold what happened are named and left out; honest ones are not."""
+
+import csv
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.grading.load import load_rubric
+from pipeline.grading.run import grade_submission
+from pipeline.plant.chain import PRESETS, Array
+from pipeline.results import Analysis
+from pipeline.submission import load_submission
+from pipeline.synthesis import write_submission
+from pipeline.synthesis.hidden import prepare_bench
+from pipeline.workflow import analyse
+
+PRESET = "throne-2dof"
+TRUE = PRESETS[PRESET].parameters()
+
+Columns = dict[str, Array]
+Spoil = Callable[[Columns], Columns]
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory) -> Path:
+    """A whole session: two decays a cart, four steps, dwells, a sweep, a closed loop."""
+    folder = tmp_path_factory.mktemp("bench")
+    write_submission(folder, chain=PRESET, seed=3, compact=True, reported=True)
+    return folder
+
+
+def files(folder: Path, start: str) -> list[Path]:
+    return sorted((folder / "data").glob(f"{start}*.csv"))
+
+
+def spoil(path: Path, how: Spoil) -> None:
+    """Write a data file anew."""
+    with path.open(encoding="utf-8", newline="") as text:
+        heading, *rows = csv.reader(text)
+    values = how(dict(zip(heading, np.array(rows, dtype=np.float64).T, strict=True)))
+    lines = [
+        ",".join(heading),
+        *(",".join(map(repr, r.tolist())) for r in np.array([*values.values()]).T),
+    ]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def exchanged(columns: Columns) -> Columns:
+    return {**columns, "x1": columns["x2"], "x2": columns["x1"]}
+
+
+def in_milliseconds(columns: Columns) -> Columns:
+    return {**columns, "time": 1000 * columns["time"]}
+
+
+def dead(name: str) -> Spoil:
+    return lambda columns: {**columns, name: 0 * columns[name]}
+
+
+def cut(columns: Columns) -> Columns:
+    return {name: values[:60] for name, values in columns.items()}
+
+
+def frozen(name: str) -> Spoil:
+    """Freeze an encoder where the cart first turns after the input stepped on."""
+
+    def freeze(columns: Columns) -> Columns:
+        x = columns[name].copy()
+        on = np.flatnonzero(columns["input"])
+        turning = on[0] + np.argmax(np.abs(x[on] - x[0]))
+        x[turning:] = x[turning]
+        return {**columns, name: x}
+
+    return freeze
+
+
+# kind, which of its files, what happened to them, a word of the reason
+SPOILT = {
+    "a decay in milliseconds": ("decay-1", slice(1), in_milliseconds, "milliseconds"),
+    "two of four steps exchanged": ("step", slice(2, 4), exchanged, "exchanged"),
+    "cart 2 dead in every step": ("step", slice(None), dead("x2"), "encoder of cart 2"),
+    "cart 1 dead in a step": ("step", slice(1), dead("x1"), "encoder of cart 1"),
+    "all dwells exchanged": ("sine", slice(None), exchanged, "exchanged"),
+    "cart 1 frozen in a step": ("step", slice(1), frozen("x1"), "froze"),
+    "cart 2 frozen in a step": ("step", slice(1, 2), frozen("x2"), "froze"),
+}
+
+
+@pytest.mark.parametrize("case", SPOILT)
+def test_what_is_wrong_is_named_left_out_and_flagged(case, bench, tmp_path):
+    """The spoilt records and no others are out of all estimates; report and grade say why."""
+    kind, which, how, word = SPOILT[case]
+    folder = shutil.copytree(bench, tmp_path / "spoilt")
+    paths = files(folder, kind)[which]
+    for path in paths:
+        spoil(path, how)
+    graded = grade_submission(
+        load_submission(folder), rubric=load_rubric(Path(PRESET)), name="team"
+    )
+    analysis = graded.analysis
+    assert analysis is not None
+    assert {one.experiment for one in analysis.left_out} == {path.stem for path in paths}
+    assert all(one.is_wrong and word in one.reason for one in analysis.left_out)
+    assert f"record.{paths[0].stem}" in _failed(analysis)
+    (flag,) = graded.grade.flags
+    assert flag.code == "data_problem"
+    assert set(flag.parameters) == {path.stem for path in paths}
+    _numbers_are_right(analysis)
+
+
+def _failed(analysis: Analysis) -> set[str]:
+    return {check.id for check in analysis.checks if check.outcome == "fail"}
+
+
+def _numbers_are_right(analysis: Analysis) -> None:
+    """No spoilt record is in any estimate."""
+    for row in analysis.rows:
+        assert row.final is not None
+        assert row.final.value == pytest.approx(TRUE[row.name], rel=0.02)
+        if row.initial is not None and row.initial.source in ("step", "log_decrement"):
+            assert row.initial.value == pytest.approx(TRUE[row.name], rel=0.02)
+
+
+def test_dwells_that_were_cut_are_flagged(bench, tmp_path):
+    """Sixty rows are no steady state where they hold fewer than two cycles."""
+    folder = shutil.copytree(bench, tmp_path / "cut")
+    for path in files(folder, "sine"):
+        spoil(path, cut)
+    graded = grade_submission(
+        load_submission(folder), rubric=load_rubric(Path(PRESET)), name="team"
+    )
+    assert graded.analysis is not None
+    (flag,) = graded.grade.flags
+    frequency = {r.id: (r.omega or 0.0) / (2 * np.pi) for r in graded.analysis.records}
+    assert len(flag.parameters) >= 8
+    assert all(59 * 0.00884 * frequency[name] < 2 for name in flag.parameters)
+
+
+def test_records_of_two_carts_identify_no_third(bench, tmp_path):
+    """Without a recording of the last cart there is no model, and the report fails."""
+    folder = shutil.copytree(bench, tmp_path / "three")
+    path = folder / "submission.toml"
+    text = path.read_text(encoding="utf-8").partition('[[experiments]]\nid = "control"')[0]
+    text = text.replace("carts = 2", "carts = 3")
+    text = text.replace("springs = [false, true, true]", "springs = [false, true, true, true]")
+    path.write_text(text, encoding="utf-8")
+    analysis = analyse(load_submission(folder))
+    assert analysis.chain is None
+    assert analysis.feedback is None
+    assert "fit.identified" in _failed(analysis)
+    assert any("cart 3 moves in no recording" in skip.reason for skip in analysis.skipped)
+
+
+HONEST = {
+    "smooth": {"count": 0.002},
+    "coarse": {"count": 0.2},
+    "sticking": {"count": 0.002, "hide": 0.0008},
+    "sticking, coarse": {"count": 0.05, "hide": 0.0008},
+    "sticking at every small step": {"count": 0.01, "hide": 0.008},
+}
+
+
+@pytest.mark.parametrize("case", HONEST)
+def test_no_honest_record_is_accused(case, tmp_path, monkeypatch):
+    """Without encoder noise carts rest exactly, stick, or stay within one coarse step."""
+    monkeypatch.setattr("pipeline.synthesis._NOISE_COUNTS", 0.0)
+    force = HONEST[case].get("hide")
+    hidden = [f"coulomb_friction:cart={cart},force={force}" for cart in (1, 2)] if force else []
+    made = prepare_bench(preset=PRESET, hide=tuple(hidden))
+    write_submission(
+        tmp_path,
+        chain=made.chain,
+        effects=made.effects,
+        seed=5,
+        compact=True,
+        count=HONEST[case]["count"],
+    )
+    analysis = analyse(load_submission(tmp_path), design=False)
+    assert [one for one in analysis.left_out if one.is_wrong] == []
