@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -117,7 +118,7 @@ class Team(Student):
     rng: np.random.Generator
 
 
-def make_team(seed: int, *, folder: Path | None = None, **bench: float) -> Team:
+def make_team(seed: int, *, folder: Path | None = None, **bench: Any) -> Team:
     """Return one honest team: bench, recordings, analysis, report.
 
     Parameters

@@ -1,13 +1,25 @@
 """A class on benches all over what a lab may have: nobody honest is flagged, mistakes are named."""
 
+import tempfile
 from dataclasses import replace
 from decimal import Decimal
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from pipeline.grading.class_lines import Line, wrong_springs
+from pipeline.grading.class_page import class_page
+from pipeline.grading.grade import Grade
+from pipeline.grading.load import load_rubric
+from pipeline.grading.run import grade_submission
+from pipeline.plant.chain import Chain
 from tests.grading_class import Team, make_team
 from tests.grading_slips import OF_SEVERAL_CARTS, SLIPS
+
+TIED = Chain(
+    m=np.array([3.1e-4, 1.7e-4]), c=np.array([6.7e-4, 4.4e-4]), k=np.array([0.05, 0.127, 0.061])
+)
 
 
 def flags(team: Team) -> list[str]:
@@ -58,3 +70,28 @@ def test_a_mistake_gets_its_code(code):
             continue
         spoilt = SLIPS[code](replace(team, rng=np.random.default_rng([1, seed])))
         assert code in {flag.code for flag in spoilt.grade().flags}, (seed, team.bench)
+
+
+def tied(seed: int) -> tuple[Team, Grade]:
+    """Return a team of two carts tied to both walls, graded by a rubric without the near spring."""
+    with tempfile.TemporaryDirectory() as folder:
+        team = make_team(seed, folder=Path(folder), digits=3, chain=TIED)
+        rubric = load_rubric(Path("throne-2dof"))
+        submission = team.submission.model_copy(
+            update={"system": rubric.system.model_copy(update={"springs": (False, True, True)})}
+        )
+        required = team.rubric.required
+        rubric = rubric.model_copy(update={"required": required})
+        return team, grade_submission(submission, rubric=rubric, name="team-07").grade
+
+
+def test_springs_that_the_rubric_does_not_have_accuse_nobody():
+    """What the rubric's springs leave unexplained and others explain is judged with those."""
+    team, grade = tied(1)
+    assert grade.springs == ("wall-1",)
+    assert [flag.code for flag in grade.flags] == []
+    assert grade.points >= 0.95 * grade.out_of
+    assert "wall-1" in wrong_springs([grade.springs, ()])
+    lines = [Line.of(grade, by_hand=())]
+    assert "1 of 1 submissions" in class_page(lines, rubric=team.rubric)
+    assert wrong_springs([(), ()]) == ""

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from pipeline.errors import ConfigError, PipelineError
 from pipeline.grading.batch import Batch
+from pipeline.grading.class_lines import wrong_springs
 from pipeline.grading.gradebook import Gradebook
 from pipeline.grading.intake import find_hand_ins
 from pipeline.grading.intake_files import digest
@@ -135,7 +136,10 @@ def _refuse_another_class(out: Path, *, assignment: str) -> None:
 
 
 def _told(batch: Batch, book: Gradebook) -> Iterator[str]:
-    """Yield who has another name now, what was not graded anew, and who stands in whose place."""
+    """Yield whether the rubric's springs are the benches', and what became of the class before."""
+    graded = (grade for _, grade in batch.grades(book) if grade.status == "graded")
+    if asked := wrong_springs(grade.springs for grade in graded):
+        yield asked
     hidden = book.rubric.anonymous
     for before, now in batch.moved.items():
         yield f"{before} is now {now}, as are the points it was given by hand"

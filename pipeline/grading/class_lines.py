@@ -26,6 +26,7 @@ class Line:
     name : of the submission as shown, and of its folder of feedback.
     criteria : outcome and points by criterion.
     by_hand : criteria with points given by hand.
+    springs : that its recordings ask for and the rubric does not have.
     """
 
     name: str
@@ -39,6 +40,7 @@ class Line:
     criteria: dict[str, tuple[Outcome, float]]
     codes: tuple[Code, ...]
     by_hand: tuple[str, ...]
+    springs: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, grade: Grade, *, by_hand: Sequence[str]) -> "Line":
@@ -55,7 +57,26 @@ class Line:
             criteria={c.id: (c.outcome, c.points) for c in grade.criteria},
             codes=tuple(dict.fromkeys(flag.code for flag in grade.flags)),
             by_hand=tuple(by_hand),
+            springs=grade.springs,
         )
+
+
+def wrong_springs(graded: Iterable[tuple[str, ...]]) -> str:
+    """Return what to ask the instructor where recordings want springs that the rubric has not.
+
+    Parameters
+    ----------
+    graded : of every submission that was graded, the springs it asks for.
+    """
+    every = list(graded)
+    asking = [springs for springs in every if springs]
+    if not asking:
+        return ""
+    names = ", ".join(dict.fromkeys(name for springs in asking for name in springs))
+    return (
+        f"the recordings of {len(asking)} of {len(every)} submissions ask for springs that the "
+        f"rubric has not ({names}), and were judged with them: is its [system] that of the benches?"
+    )
 
 
 def class_frame(lines: Iterable[Line], *, rubric: Rubric) -> "pd.DataFrame":

@@ -9,7 +9,7 @@ from urllib.parse import quote
 import numpy as np
 
 from pipeline import __version__
-from pipeline.grading.class_lines import Line, class_frame
+from pipeline.grading.class_lines import Line, class_frame, wrong_springs
 from pipeline.grading.clusters import Cluster
 from pipeline.grading.doubles import Double
 from pipeline.grading.feedback_words import TITLES, points_text
@@ -110,6 +110,8 @@ def _summary(
             Tile(spans("With a remark"), spans(str(remarks)), url="#mistakes"),
         ]
     blocks: list[Block] = [Tiles(tuple(tiles))]
+    if asked := wrong_springs(line.springs for line in lines if line.status == "graded"):
+        blocks.append(paragraph(f"{asked[0].upper()}{asked[1:]}"))
     if failed:
         said = "could not be graded; points can be given by hand"
         reasons = bullet_list(

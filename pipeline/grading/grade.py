@@ -58,6 +58,7 @@ class Grade:
     ----------
     deducted : points taken off for lateness, already out of `points`.
     notes : what the reader must know about how it was graded.
+    springs : that the recordings ask for and the rubric does not have.
     """
 
     submission: str
@@ -71,6 +72,7 @@ class Grade:
     criteria: tuple[Criterion, ...] = ()
     flags: tuple[Flag, ...] = ()
     notes: tuple[str, ...] = ()
+    springs: tuple[str, ...] = ()
 
     def with_flags(self, *flags: Flag) -> "Grade":
         """Return the grade with further flags, in the order of the codes."""

@@ -17,6 +17,7 @@ from pipeline.grading.reduced import diagnose_reduced
 from pipeline.grading.reference import recompute, trusted_chain
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.signs import turned_round
+from pipeline.grading.springs import with_all_springs
 from pipeline.grading.state_model import diagnose_state_space, state_models
 from pipeline.grading.tolerance import exact, rounding
 from pipeline.grading.work import Work
@@ -55,12 +56,18 @@ def grade_submission(
         reason = f"the submission is for {carts}, the rubric for {rubric.system.carts}"
         return _failed(submission, rubric, name=name, reason=reason, days_late=days_late)
     submission, notes = under_rubric(submission, rubric)
+    say = progress or (lambda text: None)
     try:
-        analysis = analyse(submission, design=False, progress=progress or (lambda text: None))
+        analysis = analyse(submission, design=False, progress=say)
     except SubmissionError as error:
         return _failed(submission, rubric, name=name, reason=str(error), days_late=days_late)
+    analysis, springs = with_all_springs(submission, analysis, progress=say)
+    if springs:
+        asked = f"these recordings ask for springs that the rubric has not: {', '.join(springs)}"
+        notes = (*notes, f"{asked}; judged with them")
     grade = grade_analysis(submission, analysis, rubric=rubric, name=name, days_late=days_late)
-    return Graded(grade=replace(grade, notes=(*notes, *grade.notes)), analysis=analysis)
+    grade = replace(grade, springs=springs, notes=(*notes, *grade.notes))
+    return Graded(grade=grade, analysis=analysis)
 
 
 def grade_analysis(

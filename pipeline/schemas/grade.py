@@ -79,4 +79,8 @@ class Grade(Document):
     criteria: tuple[Criterion, ...]
     flags: tuple[Flag, ...]
     notes: tuple[str, ...]
+    springs: Annotated[
+        tuple[str, ...],
+        Field(description="that the recordings ask for and the rubric does not have"),
+    ]
     overrides: tuple[Override, ...]
