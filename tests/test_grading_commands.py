@@ -91,6 +91,18 @@ def test_a_team_is_corrected_by_the_name_that_stands_in_for_it(run, tmp_path):
     assert run("history", grades, "anon-nobody")[0] == 2
 
 
+def test_what_was_given_by_hand_is_not_taken_off_without_a_word(run, tmp_path):
+    """Who removes a submission reads whose points by hand go with it."""
+    grades = write_class(tmp_path)
+    status, _, err = run("remove", grades, "team-02", "s2")
+    assert status == 0
+    assert err.splitlines() == [
+        "no longer in the class: team-02, team-03",
+        "with points given by hand, which count no more: team-02",
+    ]
+    assert run("remove", grades, "team-02")[0] == 2
+
+
 def test_a_console_of_few_letters_is_no_error(grades, monkeypatch):
     """What it has no letter for is shown by its number; the JSON stays valid."""
     raw = io.BytesIO()

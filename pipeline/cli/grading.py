@@ -211,10 +211,13 @@ def remove(
     with Gradebook(grades, assignment=assignment) as book:
         with alone_in(folder) if pages else nullcontext():
             names = {meant(book, team): team for team in teams}
+            by_hand = [team for name, team in names.items() if book.entry(name).overrides]
             gone = [names.get(name, name) for name in book.remove(list(names))]
             if pages:
                 write_outputs(book, folder)
     say(f"no longer in the class: {', '.join(gone)}")
+    if by_hand:
+        say(f"with points given by hand, which count no more: {', '.join(by_hand)}")
 
 
 @app.command()

@@ -142,7 +142,7 @@ def _told(batch: Batch, book: Gradebook) -> Iterator[str]:
         yield asked
     hidden = book.rubric.anonymous
     for before, now in batch.moved.items():
-        yield f"{before} is now {now}, as are the points it was given by hand"
+        yield f"{before} is now called {now}; the points it was given by hand go on"
     for name, before, now in batch.taken_over:
         whose = "" if hidden else f", {_people(now)} in place of {_people(before)}"
         yield f"{name} is now by others{whose}: where both count, give one folder another name"

@@ -138,7 +138,7 @@ class Roster:
                 words.append(("number", cells.str.replace(_PARTICIPANT, r"\1", regex=True)))
             if name in _IDS or name == "ID":
                 ids = cells.str.casefold()
-                words += [("id", ids), ("id", ids.str.partition("@")[0])]
+                words += [("id", ids), ("id", ids.str.split("@").str[0])]
             if name in _NAMES:
                 words.append(("name", cells.map(_letters)))
         found = pd.concat(

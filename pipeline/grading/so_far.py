@@ -7,6 +7,7 @@ its files, its people and their recordings.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 from pipeline.grading.batch import Listed, Outcome, Prints, Store, content, person
 from pipeline.grading.lms_names import read_owner
@@ -36,12 +37,12 @@ class Row:
             reason=outcome.reason if outcome.status == "failed" else "",
         )
 
-    @property
+    @cached_property
     def people(self) -> set[str]:
         """The authors, however they typed their ids."""
         return set(map(person, self.prints.authors))
 
-    @property
+    @cached_property
     def number(self) -> tuple[str, str]:
         """Platform and number of who handed it in, "" where they are not said."""
         return read_owner(self.owner)[1:]

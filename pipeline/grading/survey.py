@@ -97,7 +97,7 @@ def read_survey(path: Path) -> Survey:
 
     def of_concepts(value: Callable[[pd.Series], float]) -> pd.DataFrame:
         rows = {c: {level: value(s) for level, s in of.items()} for c, of in concepts.items()}
-        return pd.DataFrame.from_dict(rows, orient="index", columns=[*LEVELS])
+        return pd.DataFrame.from_dict(rows, orient="index", columns=[*LEVELS], dtype=float)
 
     return Survey(
         students=len(table),
