@@ -55,6 +55,7 @@ class _Weighed:
     closed: bool
 
 
+@np.errstate(all="ignore")  # what overflows or vanishes is no finite number and tells nothing
 def find_signs(records: Sequence[Record], *, stated: Mapping[str, int]) -> dict[str, int]:
     """Return by record the sign of its logged input; 0, or nothing, where the data do not tell.
 
@@ -144,23 +145,26 @@ def _weigh(record: Record) -> _Weighed | None:
     u, x, other = (np.interp(grid, t, a - a.mean()) for a in (u, x, other))
     dt = float(grid[1] - grid[0])
     period = 2 * np.pi * np.std(x) / np.sqrt(np.mean(np.diff(x) ** 2))  # samples, of a sine
+    if not np.isfinite(period):
+        return None
     width = int(np.clip(period, _NARROWEST, t.size // _BUMPS))
     at = (np.arange(width) + 0.5) / width
     bumps = [_BUMP.deriv(order)(at) / (width * dt) ** order for order in (2, 1, 0)]
     sides = [(x, bumps[0]), (x, -bumps[1]), (x, bumps[2]), (x - other, bumps[2]), (u, bumps[2])]
-    *motion, drive = (fftconvolve(a, bump[::-1], mode="valid") for a, bump in sides)
-    step = max(width // _OVERLAP, drive.size // _MOST_PLACES, 1)
-    places = np.arange(1, drive.size - 1, step)
-    centred = [a[places + shift] for a, shift in [(drive, -1), (drive, 0), (drive, 1)]]
-    centred += [a[places] for a in motion]
+    *moved, driven = (fftconvolve(a, bump[::-1], mode="valid") for a, bump in sides)
+    step = max(width // _OVERLAP, driven.size // _MOST_PLACES, 1)
+    places = np.arange(1, driven.size - 1, step)
+    centred = [a[places + shift] for a, shift in [(driven, -1), (driven, 0), (driven, 1)]]
+    centred += [a[places] for a in moved]
     early, now, late, *terms = (a - a.mean() for a in centred)  # an encoder's zero drops out
-    size = np.linalg.norm(now)
-    if not (np.isfinite(size) and size > 0 and np.all(np.isfinite(terms))):
+    drive = np.array([early, now, late]) / np.linalg.norm(now)
+    motion = np.array(terms).T / np.linalg.norm(now)
+    if not (np.all(np.isfinite(drive)) and np.all(np.isfinite(motion))):
         return None
     complete = known or 2 not in record.free
     return _Weighed(
-        drive=np.array([early, now, late]) / size,
-        motion=np.array(terms).T / size,
+        drive=drive,
+        motion=motion,
         complete=complete,
         decisive=complete or record.kind != "sine",
         closed=record.kind == "closed_loop",
