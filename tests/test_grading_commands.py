@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 
 from pipeline.cli import main
-from tests.grades import write_class
+from pipeline.grading.batch import Batch
+from pipeline.grading.gradebook import Gradebook
+from tests.grades import make_grade, make_outcome, two_cart_rubric, write_class
 from tests.test_survey import write_paper
 
 
@@ -101,6 +103,18 @@ def test_what_was_given_by_hand_is_not_taken_off_without_a_word(run, tmp_path):
         "with points given by hand, which count no more: team-02",
     ]
     assert run("remove", grades, "team-02")[0] == 2
+
+
+def test_a_name_writes_nothing_over_what_is_said(run, tmp_path):
+    """Control characters of an author's id are blanks on the terminal."""
+    outcomes = [make_outcome(make_grade(name, share=1 / n, authors=("eve\r\x1b[2Kbob",)))
+                for n, name in ((1, "a"), (2, "b"))]  # fmt: skip
+    with Gradebook(tmp_path, assignment="lab", create=True) as book:
+        for outcome in outcomes:
+            book.put(outcome)
+        book.finish(Batch(keys=tuple(o.key for o in outcomes), shared={}), rubric=two_cart_rubric())
+    _, _, err = run("export", tmp_path, "--lms", "canvas")
+    assert err.startswith("eve  [2Kbob is in a (20) and b (10): left out")
 
 
 def test_a_console_of_few_letters_is_no_error(grades, monkeypatch):

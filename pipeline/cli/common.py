@@ -62,8 +62,8 @@ def _fail(message: str) -> None:
 
 
 def say(text: str) -> None:
-    """Print to stderr: talk, never data."""
-    typer.echo(text, err=True)
+    """Print to stderr: talk, never data; a name in it moves no cursor."""
+    typer.echo("".join(c if c.isprintable() or c == "\n" else " " for c in text), err=True)
 
 
 @contextmanager

@@ -54,17 +54,6 @@ def class_page(
     clusters: Sequence[Cluster] = (),
 ) -> str:
     """Return `class.html`; same class, same bytes."""
-    return render_html(class_document(lines, rubric=rubric, doubles=doubles, clusters=clusters))
-
-
-def class_document(
-    lines: Sequence[Line],
-    *,
-    rubric: Rubric,
-    doubles: Sequence[Double] = (),
-    clusters: Sequence[Cluster] = (),
-) -> Document:
-    """Return the class as a document."""
     frame = class_frame(lines, rubric=rubric)
     graded = frame.loc[frame["status"] == "graded"]
     points = graded.drop_duplicates("submission").loc[:, "total"]
@@ -78,7 +67,7 @@ def class_document(
             ("shared", "Shared recordings", _shared(lines, clusters, tables)),
             ("class", "Everybody", _everybody(lines, tables)),
         ]
-    return Document(
+    document = Document(
         title=clean(rubric.title) or "The class",
         subtitle="Class grades",
         authors=(),
@@ -87,6 +76,7 @@ def class_document(
         ),
         footer=f"cartlab {__version__}",
     )
+    return render_html(document)
 
 
 def _summary(
