@@ -130,7 +130,7 @@ def test_a_file_that_cannot_be_read_is_its_own_run_s_problem(tmp_path):
 
     assert done.returncode == 1
     reasons = {
-        "decay-1a": "there is no file 'data/decay-1a.csv'; did you mean 'decay-1b.csv'?",
+        "decay-1a": "there is no file 'data/decay-1a.csv'; did you mean 'data/decay-1b.csv'?",
         "step-1": "data/step-1.csv line 41: 'input' is no number: 'x'",
     }
     failed = {check["id"] for check in found["checks"] if check["outcome"] == "fail"}

@@ -38,7 +38,7 @@ class Parameter(Document):
     ]
     final: Number
     final_std: Number
-    final_from: Annotated[str | None, Field(description="bode_fit or time_fit")]
+    final_from: Annotated[str | None, Field(description="bode_fit, time_fit or log_decrement")]
     change_percent: Number
     change_sigmas: Annotated[Number, Field(description="in combined standard errors")]
     consistent: Annotated[
