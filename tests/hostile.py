@@ -20,6 +20,8 @@ from pathlib import Path
 import numpy as np
 import scipy.io
 
+from tests.poison import poisoned, zipped
+
 SECRET = "root:x:0:0:the-secret-outside"  # of a file beside the class: must be nowhere
 Files = Mapping[str, bytes]
 
@@ -32,10 +34,13 @@ _HEAD = "version = 1\n[system]\ncarts = 1\n"
 _STEP = '[[experiments]]\nid = "a"\nkind = "step"\nfile = "{}"\n'
 
 
-def write_hostile(school: Path, good: Files, *, seed: int, every: int = 1) -> list[str]:
+def write_hostile(
+    school: Path, good: Files, *, seed: int, every: int = 1, drawn: int = 0
+) -> list[str]:
     """Write the hostile hand-ins beside whatever is there; return the names of the entries.
 
-    Of the good submissions with one thing spoilt, which take the longest, one in `every`.
+    Of the good submissions with one thing spoilt, which take the longest, one in `every`; beside
+    these so many `drawn` at random, a third of them archives.
     """
     rng = random.Random(seed)
     outside = school.parent / "outside"
@@ -55,6 +60,12 @@ def write_hostile(school: Path, good: Files, *, seed: int, every: int = 1) -> li
         build(folder)
     for name, make in _entries(school, outside).items():
         make(school / name)
+    for number in range(drawn):
+        files = poisoned(good, rng)
+        if number % 3:
+            _write(school / f"drawn-{number:03d}", files)
+        else:
+            (school / f"drawn-{number:03d}.zip").write_bytes(zipped(files, rng))
     return sorted({path.name for path in school.iterdir()} - before)
 
 
@@ -243,12 +254,13 @@ def _marked(toml: str, text: str) -> str:
     quoted = '"' + "".join(
         c if c.isprintable() and c not in '"\\' else f"\\u{ord(c):04x}" for c in text
     ) + '"'  # fmt: skip
+    unit = "".join(c for c in text if c.isprintable())[:40].replace("\\", "").replace('"', "'")
     for pattern, new in (
         (r"^title = .*$", f"title = {quoted}"),
         (r"^section = .*$", f"section = {quoted}"),
         (_AUTHOR, f"id = {quoted}\nname = {quoted}\n"),
         (r"^note = .*$", f"note = {quoted}"),
-        (r'unit = "cm"', f"unit = {quoted}"),
+        (r'unit = "cm"', f'unit = "{unit}"'),
     ):
         toml, times = re.subn(pattern, lambda _, new=new: new, toml, flags=re.MULTILINE)
         assert times, pattern

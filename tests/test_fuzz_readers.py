@@ -140,6 +140,7 @@ def one_line_at_most():
     except PipelineError as error:
         message = str(error)
     assert len(message.splitlines()) <= 1
+    assert len(message) < 1_000
 
 
 def try_everything(submission: Submission, raw: bytes) -> None:

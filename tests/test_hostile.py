@@ -52,7 +52,11 @@ sys.addaudithook(_tell)
 
 @pytest.fixture(
     scope="module",
-    params=[1, pytest.param(2, marks=[pytest.mark.slow, pytest.mark.sample])],
+    params=[
+        (1, 4),
+        pytest.param((2, 20), marks=[pytest.mark.slow, pytest.mark.sample]),
+        pytest.param((3, 400), marks=pytest.mark.slow),
+    ],
 )
 def graded(request, tmp_path_factory):
     """A hostile class and what the command line made of it: folder, names, audit lines."""
@@ -64,14 +68,14 @@ def graded(request, tmp_path_factory):
             reported=True,
         )  # fmt: skip
     shutil.copytree(school, base / "alone")
-    seed = request.param
+    seed, drawn = request.param
     # The whole of it takes a minute; by default a part of what is graded to the end is enough.
     every = 8 if seed == 1 else 1
-    names = write_hostile(school, _small(base / "spoilt"), seed=seed, every=every)
+    names = write_hostile(school, _small(base / "spoilt"), seed=seed, every=every, drawn=drawn)
     (base / "hook").mkdir()
     (base / "hook" / "sitecustomize.py").write_text(AUDIT, encoding="utf-8")
     before = _below(school), _below(base / "outside")
-    done = _grade(base, "school", figures=seed != 1)
+    done = _grade(base, "school", figures=seed == 2)
     assert (_below(school), _below(base / "outside")) == before
     yield base, names, done
     for path in school.rglob("*"):
