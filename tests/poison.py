@@ -8,6 +8,7 @@ import json
 import re
 import zipfile
 from collections.abc import Callable, Mapping
+from copy import deepcopy
 from random import Random
 from typing import Any
 
@@ -107,8 +108,9 @@ def poisoned_json(document: Any, rng: Random) -> Any:
             if isinstance(here[key], dict | list) and here[key] and rng.random() < 0.9:
                 here = here[key]
                 continue
+            another = deepcopy(rng.choice(list(document.values())))
             here[key] = rng.choice([None, True, -1, 0, 3, 1e308, 1e-308, 10**400, [], {}, [[]], "1",
-                                    text(rng), rng.choice(list(document.values()))])  # fmt: skip
+                                    text(rng), another])  # fmt: skip
             break
     return document
 

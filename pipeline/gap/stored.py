@@ -56,7 +56,7 @@ def read_gap(text: str) -> tuple[Gap, dict[str, str]]:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
         raise ConfigError(f"not what cartlab gap writes: {where}: {first['msg']}") from None
-    except (ValueError, KeyError) as error:
+    except (ValueError, KeyError, TypeError) as error:  # null where a number is needed, say
         raise ConfigError(f"not what cartlab gap writes: {quote(str(error))}") from None
 
 

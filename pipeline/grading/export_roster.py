@@ -11,6 +11,7 @@ from pipeline.grading.export_students import Student, one_of
 from pipeline.grading.lms_names import Platform
 from pipeline.grading.table import read_table
 from pipeline.output import csv_text
+from pipeline.submission.complaints import quote
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -60,7 +61,7 @@ class Roster:
             )
         twice = table.columns[table.columns.duplicated() & (table.columns != "")]
         if len(twice):
-            raise ConfigError(f"{path.name}: has two columns {twice[0]!r}")
+            raise ConfigError(f"{path.name}: has two columns {quote(twice[0])}")
         return cls(file=path.name, table=table)
 
     def filled(

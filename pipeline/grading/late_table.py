@@ -15,6 +15,7 @@ from pipeline.grading.intake import HandIn
 from pipeline.grading.lms_names import read_owner
 from pipeline.grading.rubric import Late
 from pipeline.grading.table import read_table
+from pipeline.submission.complaints import quote
 
 _DAY = 86_400.0  # s
 _CLOCK = re.compile(r"(\d+):([0-5]\d):([0-5]\d)")
@@ -58,7 +59,7 @@ class LateTable:
                 who = found[1]
             late = _READERS[value](said)
             if late is None or not 0 <= late <= _LONGEST:
-                raise ConfigError(f"{path.name} line {line}: {value}: cannot read {said!r}")
+                raise ConfigError(f"{path.name} line {line}: {value}: cannot read {quote(said)}")
             if who:
                 days[platform, who if platform else who.casefold()] = late
         return cls(file=path.name, days=days)

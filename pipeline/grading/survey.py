@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigError
 from pipeline.grading.table import read_table
+from pipeline.submission.complaints import quote
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -81,7 +82,7 @@ def read_survey(path: Path) -> Survey:
             concept = " ".join((found["plain"] or found["boxed"]).split())
             level = f"{found['when']} Course {found['what']}".title()
             if level in concepts.setdefault(concept, {}):
-                raise ConfigError(f"{path.name}: two columns are {title!r}")
+                raise ConfigError(f"{path.name}: two columns are {quote(title)}")
             concepts[concept][level] = _read(given, _score, "no score from 1 to 4", where)
         elif 2 * given.map(_agreement).count() > len(given):
             answers = _read(given, _agreement, f"not one of {', '.join(SCALE)}", where)
@@ -114,7 +115,7 @@ def _read(
     """Return the answers as numbers; `where` is the file and the question, the index its lines."""
     answers = given.map(read)
     for line, text in given.loc[answers.isna()].items():
-        raise ConfigError(f"{where[0]} line {line}, {where[1]!r}: {text!r} is {wanted}")
+        raise ConfigError(f"{where[0]} line {line}, {quote(where[1])}: {quote(text)} is {wanted}")
     return answers.astype(int)
 
 
