@@ -45,7 +45,8 @@ class _Weighed:
     drive : (3, n) the input a sample early, as logged, and a sample late.
     motion : (n, 4) what m, c, k and k' multiply.
     complete : False where cart 2 is free and was not measured.
-    decisive : may be found to be contrary; a dwell may not that is not complete.
+    decisive : False for a dwell that is not complete: it may not be found to be contrary.
+    closed : recorded under feedback.
     """
 
     drive: Array
@@ -71,8 +72,8 @@ def find_signs(records: Sequence[Record], *, stated: Mapping[str, int]) -> dict[
     if not weighed:
         return {}
     said = {name: stated.get(name, 1) for name in weighed}
-    rule = {name for name, w in weighed.items() if w.complete} or set(weighed)
-    rule = {name for name in rule if not weighed[name].closed} or rule
+    rule = [name for name, w in weighed.items() if w.complete] or list(weighed)
+    rule = [name for name in rule if not weighed[name].closed] or rule
     # Where as many count one way as the other, what each says alone is the better start.
     alone = {n for n, w in weighed.items() if w.decisive and _bench([w], [said[n]])[0] < 0}
     for turned in (set[str](), alone):
@@ -83,7 +84,11 @@ def find_signs(records: Sequence[Record], *, stated: Mapping[str, int]) -> dict[
 
 
 def _settle(
-    weighed: Mapping[str, _Weighed], said: Mapping[str, int], turned: set[str], *, rule: set[str]
+    weighed: Mapping[str, _Weighed],
+    said: Mapping[str, int],
+    turned: set[str],
+    *,
+    rule: Sequence[str],
 ) -> dict[str, int]:
     """Turn what is contrary to the equation of `rule` until nothing is; see `find_signs`."""
     for _ in range(_ROUNDS):
@@ -115,14 +120,21 @@ def _bench(weighed: Sequence[_Weighed], signs: Sequence[int]) -> tuple[int, Arra
     found, weights = set(), np.zeros(4)
     for shift in shifts:
         drive = np.concatenate([s * w.drive[shift] for s, w in zip(signs, weighed, strict=True)])
-        (ahead, left), (back, right) = (nnls(motion / size, sign * drive) for sign in (1, -1))
-        power = len(weighed)
-        share = np.array([left, right]) ** 2 / power
+        (ahead, left), (back, right) = (_explain(motion / size, s * drive) for s in (1, -1))
+        share = np.array([left, right]) ** 2 / len(weighed)  # each record's input has the norm one
         sure = abs(share[0] - share[1]) > _LEAST + _LEAST_SHARE * share.min()
         found.add((1 if share[0] < share[1] else -1) if sure else 0)
         if shift == 1:
             weights = (ahead if share[0] < share[1] else back) / size
     return (found.pop() if len(found) == 1 else 0), weights
+
+
+def _explain(motion: Array, drive: Array) -> tuple[Array, float]:
+    """Return the weights (4,), none negative, and the norm of what they leave of the drive."""
+    try:
+        return nnls(motion, drive)
+    except RuntimeError:  # no end was found: nothing is explained
+        return np.zeros(motion.shape[1]), float(np.linalg.norm(drive))
 
 
 def _cosine(w: _Weighed, weights: Array) -> float:
