@@ -21,7 +21,7 @@ from pipeline.grading.runner import Limits
 from pipeline.grading.so_far import Row, class_so_far
 from pipeline.resources import RUBRICS
 from pipeline.synthesis import write_submission
-from tests.grades import make_grade, make_outcome, two_cart_rubric
+from tests.grades import failed_grade, make_grade, make_outcome, two_cart_rubric
 from tests.test_schemas import assert_fits
 
 RUBRIC = two_cart_rubric()
@@ -206,6 +206,18 @@ def test_what_makes_two_the_same_submission(tmp_path):
         assert goes_on_as(another=(("ann", "bo"), "3-y", "")) == ""
         assert goes_on_as(another=(("ann",), "3-y", "B (canvas 8)")) == ""
         assert goes_on_as(another=((), "3-y", "")) == ""
+
+
+def test_two_that_hand_in_nothing_are_not_the_same(tmp_path):
+    """Of files that name nobody the folder says whose they are; a longer name is no other one."""
+    old = make_outcome(failed_grade("team-3", "empty"), key="k-none", fingerprints=b"")
+    with Gradebook(tmp_path, assignment="lab", create=True) as book:
+        book.put(old)
+        book.finish(Batch(keys=(old.key,), shared={}), rubric=RUBRIC)
+        new = [Row.of(replace(old, submission=name)) for name in ("team-9", "class-team-3")]
+        rows = {row.prints.submission: row for row in new}
+        assert class_so_far(rows, book).moved == {"team-3": "class-team-3"}
+        assert class_so_far({"team-9": new[0]}, book).moved == {}
 
 
 def test_a_mended_id_of_an_author_accuses_nobody(school, tmp_path):

@@ -263,6 +263,18 @@ def test_a_row_that_two_submissions_lead_to_stays_as_it_was(tmp_path):
         assert [r for r in remarks if "team-1 (10)" in r and "o (20)" in r and "left out" in r]
 
 
+def test_the_number_of_who_handed_in_decides_nothing(tmp_path):
+    """An author of two submissions handed one of them in: which counts is still open, said once."""
+    roster = 'Student,ID,SIS User ID,SIS Login ID,Section,Lab 3\n"Doe, Jane",1001,s1,jane,A,3\n'
+    one = make_outcome(make_grade("a", share=0.5, authors=("s1", "x")), owner="doejane (1001)")
+    other = make_outcome(make_grade("b", share=0.25, authors=("s1",)))
+    rows, remarks = write(tmp_path, one, other, platform="canvas", title="Lab 3", roster=roster)
+    assert canvas_import(rows) == {"Lab 3": {"1001": "3"}}
+    assert [r for r in remarks if "left out" in r] == [
+        "s1 is in a (10) and b (5): left out, until cartlab remove takes the wrong one off"
+    ]
+
+
 @pytest.mark.parametrize("platform", ["canvas", "moodle", "gradescope"])
 def test_points_by_hand_of_a_submission_without_names_are_exported(tmp_path, platform):
     """As who its folder is called, which is said; or as those it named before it broke."""

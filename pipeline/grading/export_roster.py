@@ -102,7 +102,7 @@ class Roster:
                     table.loc[at, titles[title]] = value(student)
         # One of the authors, who are named, handed it in.
         strangers = [s.called for at, s in matched if at is None and not s.uploader]
-        remarks = [s.undecided for s in settled.values() if s.undecided]
+        remarks = [s.undecided for s in settled.values() if s.undecided and s not in students]
         if strangers:
             remarks.append(f"not in {self.file}, so not exported: {', '.join(strangers)}")
         reached = {student.grade.submission for several in found.values() for student in several}
@@ -113,7 +113,11 @@ class Roster:
         )
         if lost:
             remarks.append(f"nobody of these is in {self.file}: {', '.join(lost)}")
-        by_number = [f"{s.name} ({s.grade.submission})" for s in settled.values() if s.uploader]
+        by_number = [
+            f"{s.name} ({s.grade.submission})"
+            for s in settled.values()
+            if s.uploader and not s.undecided
+        ]
         if by_number:
             remarks.append(
                 "found by the number in the file's name, so the same person as one of the "

@@ -54,6 +54,8 @@ def one_of(several: Sequence[Student]) -> Student:
 
     Any points are better than none; of different points none are, until a person has decided.
     """
+    if undecided := [student for student in several if student.undecided]:
+        return undecided[0]
     graded = [student for student in several if student.points] or [*several]
     if len({student.points for student in graded}) == 1:
         return graded[0]
