@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 from pipeline.bench.observer import Anomalies, Outcome
@@ -11,6 +12,7 @@ from pipeline.bench.plan_file import save_plan
 from pipeline.bench.protocol import Reading
 from pipeline.submission import load_submission
 from pipeline.submission.load import NAME
+from tests.waiting import started, until
 
 LIMITS = Limits(input=0.5, travel=2.5)  # V, cm: what the virtual benches state as theirs
 
@@ -78,7 +80,17 @@ class Notes:
         self.remarks.append(sentence)
 
 
-def host(folder: Path, port: str, *options: str) -> subprocess.Popen[str]:
-    """Start `cartlab acquire` in a process of its own."""
-    command = [sys.executable, "-m", "pipeline", "acquire", str(folder), "--port", port, *options]
-    return subprocess.Popen(command, stderr=subprocess.PIPE, encoding="utf-8")
+def host(folder: Path, port: str, *options: str) -> AbstractContextManager[subprocess.Popen[str]]:
+    """Run `cartlab acquire` in a process of its own beside a block."""
+    command = [sys.executable, "-m", "pipeline", "acquire", folder, "--port", port, *options]
+    return started(command, stderr=subprocess.PIPE, encoding="utf-8")
+
+
+def until_bytes(raw: Path, process: subprocess.Popen[str], *, least: int = 5_000) -> None:
+    """Wait until a host has written so much of a run."""
+
+    def written() -> bool:
+        assert process.poll() is None, "the host ended before"
+        return raw.exists() and raw.stat().st_size >= least
+
+    until(written, "a run")

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
-PATIENCE = 60.0  # s: a fresh machine compiles the carts first
+from tests.waiting import PATIENCE, started
 
 
 @dataclass
@@ -21,14 +21,16 @@ class Emulator:
     ----------
     address : what pyserial's `serial_for_url` opens.
     said : the lines on stderr so far, but for the events.
+    runs : how many have ended so far.
     """
 
     address: str
     process: subprocess.Popen[str]
     said: list[str]
+    runs: int = 0
     _events: "queue.Queue[dict[str, Any]]" = field(default_factory=queue.Queue)
 
-    def event(self, name: str, *, timeout: float = 10.0) -> dict[str, Any]:
+    def event(self, name: str, *, timeout: float = PATIENCE) -> dict[str, Any]:
         """Wait for the next event of that name; others before it are passed over.
 
         Raises
@@ -47,31 +49,32 @@ def emulator(*options: str, preset: str = "throne-2dof") -> Iterator[Emulator]:
     command = [sys.executable, "-m", "pipeline", "emulate", *options]
     if "--model" not in options:
         command += ["--preset", preset]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, encoding="utf-8")
-    running = Emulator(address="", process=process, said=[])
-    ready = threading.Event()
+    with started(command, stderr=subprocess.PIPE, encoding="utf-8") as process:
+        running = Emulator(address="", process=process, said=[])
+        ready = threading.Event()
+        listener = threading.Thread(target=_listen, args=(running, ready), daemon=True)
+        listener.start()
+        try:
+            assert ready.wait(PATIENCE), "no bench became ready"
+            assert running.address, "\n".join(running.said)
+            yield running
+        finally:
+            process.terminate()
+            process.wait(PATIENCE)
+            listener.join()
 
-    def listen() -> None:
-        assert process.stderr is not None
-        for line in process.stderr:
-            if line.startswith("{"):
-                running._events.put(json.loads(line))
-            else:
-                running.said.append(line.rstrip())
-            if line.startswith("ready: "):
-                running.address = line.removeprefix("ready: ").strip()
-                ready.set()
-        ready.set()
 
-    listener = threading.Thread(target=listen, daemon=True)
-    listener.start()
-    try:
-        assert ready.wait(PATIENCE), "no bench became ready"
-        assert running.address, "\n".join(running.said)
-        yield running
-    finally:
-        process.terminate()
-        process.wait(PATIENCE)
-        listener.join(PATIENCE)
-        assert process.stderr is not None
-        process.stderr.close()
+def _listen(running: Emulator, ready: threading.Event) -> None:
+    """Take down what the bench says until it says no more."""
+    assert running.process.stderr is not None
+    for line in running.process.stderr:
+        if line.startswith("{"):
+            event = json.loads(line)
+            running.runs += event["event"] == "run"
+            running._events.put(event)
+        else:
+            running.said.append(line.rstrip())
+        if line.startswith("ready: "):
+            running.address = line.removeprefix("ready: ").strip()
+            ready.set()
+    ready.set()

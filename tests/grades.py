@@ -1,5 +1,7 @@
 """Grades and outcomes for tests of the gradebook and of what is written from it."""
 
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ from pipeline.grading.gradebook import Gradebook
 from pipeline.grading.load import load_rubric
 from pipeline.grading.outputs import write_outputs
 from pipeline.grading.rubric import Rubric
+from pipeline.grading.schema import FILE
 from pipeline.plant.chain import PRESETS, transfer_functions
 from pipeline.report.figures import drawing
 from pipeline.report.figures_grading import reported_bode_figure
@@ -146,3 +149,12 @@ def _figure(name: str) -> tuple[tuple[str, str], ...]:
         )
         svg = to_svg(figure, name="response-1", alt=f"Response of cart 1 of {name}.")
     return (("response-1.svg", svg),)
+
+
+def n_graded(out: Path) -> int:
+    """Return how many gradings the gradebook of a class holds; it may be in use, or not there."""
+    try:
+        with closing(sqlite3.connect(f"file:{out / FILE}?mode=ro", uri=True)) as book:
+            return book.execute("SELECT count(*) FROM gradings").fetchone()[0]
+    except sqlite3.Error:
+        return 0

@@ -19,7 +19,7 @@ from pipeline.bench.serial_line import open_line
 from pipeline.cli import app
 from pipeline.errors import ConfigError, HardwareError
 from pipeline.submission import load_submission
-from tests.acquisitions import Notes, host, sine, write_work
+from tests.acquisitions import Notes, host, sine, until_bytes, write_work
 from tests.benches import emulator
 
 
@@ -56,14 +56,12 @@ def test_a_second_session_in_a_folder_is_refused(tmp_path):
     """It is told which process records there, and what that one records stays whole."""
     work = write_work(tmp_path / "work", [sine("dwell", seconds=6)])
     with emulator() as first, emulator("--speed", "20", "--seed", "1") as second:
-        process = host(work, first.address, "--only", "dwell", "--yes")
-        end = time.monotonic() + 30
-        while not (work / "raw" / "dwell-1.raw").exists():
-            assert time.monotonic() < end, "no run began"
-            time.sleep(0.02)
-        with pytest.raises(ConfigError, match=rf"another cartlab \(process {process.pid}\) writes"):
-            acquire(work, port=second.address, observers=[Notes()])
-        process.communicate(timeout=30)
+        with host(work, first.address, "--only", "dwell", "--yes") as process:
+            until_bytes(work / "raw" / "dwell-1.raw", process)
+            refused = rf"another cartlab \(process {process.pid}\) writes"
+            with pytest.raises(ConfigError, match=refused):
+                acquire(work, port=second.address, observers=[Notes()])
+            process.communicate()
     assert process.returncode == 0
     assert sorted(path.name for path in (work / "data").iterdir()) == ["dwell.txt"]
 
@@ -85,7 +83,9 @@ def test_a_busy_computer_is_named_where_the_watchdog_bites(tmp_path):
     with emulator() as bench:
         outcome, *_ = acquire(work, port=bench.address, observers=[notes], only=["dwell"])
     assert "fell silent" in outcome.partial
-    assert re.search(r"too busy, it sent no heartbeat for [34]\d\d ms", outcome.partial)
+    late = re.search(r"too busy, it sent no heartbeat for (\d+) ms", outcome.partial)
+    assert late is not None
+    assert int(late[1]) >= 300
 
 
 class LastMoment(Notes):
@@ -148,8 +148,8 @@ def test_where_nothing_was_recorded_no_report_is_offered(tmp_path):
     near = Limits(input=0.5, travel=0.05)
     work = write_work(tmp_path, [sine("dwell", seconds=4)], limits=near)
     with emulator("--speed", "5") as bench:
-        process = host(work, bench.address, "--only", "dwell", "--yes")
-        _, said = process.communicate(timeout=60)
+        with host(work, bench.address, "--only", "dwell", "--yes") as process:
+            _, said = process.communicate()
     assert process.returncode == 1
     assert "divide its amplitude in plan.toml by four, or raise the limit in plan.toml" in said
     assert "again: taken as done" not in said

@@ -37,8 +37,9 @@ from pipeline.bench.serial_line import open_line
 from pipeline.bench.session import Session
 from pipeline.errors import ConfigError, DataError, HardwareError
 from pipeline.submission import System, load_submission
-from tests.acquisitions import LIMITS, Notes, host, sine, write_work
+from tests.acquisitions import LIMITS, Notes, host, sine, until_bytes, write_work
 from tests.benches import Emulator, emulator
+from tests.waiting import started, until
 
 TWO_CARTS = System(carts=2, springs=(True,) * 3)
 
@@ -116,8 +117,8 @@ def test_what_a_bench_cannot_do_is_left_out_and_the_rest_recorded(tmp_path):
     text = text.replace('{ unit = "cm" }', '{ unit = "cm", per_count = 0.00227 }')
     (work / "submission.toml").write_text(text, encoding="utf-8")
     with emulator("--stock") as bench:
-        process = host(work, bench.address, "--yes")
-        _, said = process.communicate(timeout=60)
+        with host(work, bench.address, "--yes") as process:
+            _, said = process.communicate()
     assert process.returncode == 1
     assert "knows no chirp; take its table out of plan.toml or change it" in said
     assert "less than half a count of the bench" in said
@@ -222,13 +223,18 @@ def test_a_new_line_is_zeroed_once_the_carts_rest(tmp_path):
     notes = Notes()
     with emulator("--seed", "3") as bench, _session(bench, observer=notes) as (session, line, ask):
         line.send(Start(wave=Wave.SQUARE, frequency=0.5, amplitude=400))
-        time.sleep(1.2)  # it is on after one second
-        *_, away, _ = line.drain(longest=0.2).split(b"\n")
+        heard = bytearray()
+
+        def away() -> bool:
+            heard.extend(line.receive())
+            *whole, _ = heard.split(b"\n")
+            return bool(whole) and int(whole[-1].split(b":")[0]) > 100
+
+        until(away, "a swing")  # it is on after one second
         line.send(Signal.RESET)  # as whoever opens the line again does
         line.drain()
         assert session.prepare(recording) == ""
         session.record(make_order(recording, **ask), tmp_path / "dwell-1.raw")
-    assert int(away.split(b":")[0]) > 100
     assert max(map(abs, notes.readings_seen[0].counts)) <= 4  # which a cart at rest may flicker
 
 
@@ -269,13 +275,10 @@ def test_a_closed_terminal_stops_the_motor(tmp_path):
     """SIGHUP ends a run with a stop, not a watchdog, and what came is saved."""
     work = write_work(tmp_path, [sine("dwell", seconds=30)])
     with emulator() as bench:
-        process = host(work, bench.address, "--only", "dwell")
-        raw, end = work / "raw" / "dwell-1.raw", time.monotonic() + 30
-        while not raw.exists() or raw.stat().st_size < 5_000:
-            assert time.monotonic() < end, "no run began"
-            time.sleep(0.02)
-        process.send_signal(signal.SIGHUP)
-        process.communicate(timeout=20)
+        with host(work, bench.address, "--only", "dwell") as process:
+            until_bytes(work / "raw" / "dwell-1.raw", process)
+            process.send_signal(signal.SIGHUP)
+            process.communicate()
         assert bench.event("run")["ended"] == "stopped"
     assert process.returncode == 1
     assert (work / "data" / "dwell.partial.txt").exists()
@@ -287,16 +290,13 @@ def test_a_full_disk_stops_the_motor_and_says_what_to_do(tmp_path):
     work = write_work(tmp_path, [sine("dwell", seconds=30)])
     command = 'ulimit -f 20; exec "$0" -m pipeline acquire "$1" --port "$2" --only dwell'
     with emulator() as bench:
-        process = subprocess.run(
-            ["sh", "-c", command, sys.executable, str(work), bench.address],
-            stderr=subprocess.PIPE,
-            encoding="utf-8",
-            timeout=60,
-        )
+        shell = ["sh", "-c", command, sys.executable, work, bench.address]
+        with started(shell, stderr=subprocess.PIPE, encoding="utf-8") as process:
+            _, said = process.communicate()
         assert bench.event("run")["ended"] == "stopped"
     assert process.returncode == 2
-    assert f"`acquire` writes into {work}; make room there" in process.stderr
-    assert "--out" not in process.stderr
+    assert f"`acquire` writes into {work}; make room there" in said
+    assert "--out" not in said
 
 
 DESCRIPTION = (
@@ -410,14 +410,8 @@ ASK = (
 def test_only_what_is_typed_after_the_question_answers_it(typed, held):
     """An Enter too many, typed before, starts no motor; Ctrl-D is a no in one line."""
     controller, terminal = os.openpty()
-    process = subprocess.Popen(
-        [sys.executable, "-c", ASK],
-        stdin=terminal,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        encoding="utf-8",
-    )
-    try:
+    pipes = {"stdin": terminal, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with started([sys.executable, "-c", ASK], **pipes, encoding="utf-8") as process:
         os.write(controller, b"\n\n")
         assert process.stderr is not None
         while (heard := process.stderr.read(1)) != ")":
@@ -425,10 +419,8 @@ def test_only_what_is_typed_after_the_question_answers_it(typed, held):
         with pytest.raises(subprocess.TimeoutExpired):
             process.wait(timeout=1)
         os.write(controller, typed)
-        said, complaint = process.communicate(timeout=20)
-    finally:
-        process.kill()
-        os.close(controller)
-        os.close(terminal)
+        said, complaint = process.communicate()
+    os.close(controller)
+    os.close(terminal)
     assert ("held" in said) is held
     assert ("Hold cart 1: the keyboard was closed" in complaint) is not held

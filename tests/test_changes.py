@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -13,7 +12,8 @@ from pipeline.grading.batch import Batch
 from pipeline.grading.changes import points_changes, rubric_changes
 from pipeline.grading.gradebook import Gradebook
 from pipeline.synthesis import write_submission
-from tests.grades import make_grade, make_outcome, two_cart_rubric
+from tests.grades import make_grade, make_outcome, n_graded, two_cart_rubric
+from tests.waiting import started, until
 
 RUBRIC = two_cart_rubric()
 
@@ -79,29 +79,18 @@ def test_ctrl_c_says_how_to_go_on(tmp_path):
                          authors=(f"s{number}",), compact=True)  # fmt: skip
     command = [sys.executable, "-m", "pipeline", "grade", str(tmp_path / "c"), "--rubric",
                "throne-1dof", "--out", str(tmp_path / "out"), "--jobs", "1"]  # fmt: skip
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True,
-                               cwd=Path(__file__).parents[1])  # fmt: skip
-    while not any(tmp_path.glob("out/gradebook.sqlite")) or not _graded(tmp_path / "out"):
-        time.sleep(0.05)
-    os.killpg(process.pid, signal.SIGINT)
-    _, said = process.communicate(timeout=60)
+    with started(command, stderr=subprocess.PIPE, text=True, start_new_session=True,
+                 cwd=Path(__file__).parents[1]) as process:  # fmt: skip
+        until(lambda: n_graded(tmp_path / "out") or process.poll() is not None)
+        os.killpg(process.pid, signal.SIGINT)
+        _, said = process.communicate()
     assert process.returncode == 130, said
     assert said == (
         f"stopped; what is graded is kept in {tmp_path / 'out'}, and the same command goes on "
         "from there\n"
     )
-    before = _graded(tmp_path / "out")
+    before = n_graded(tmp_path / "out")
     again = subprocess.run(command, capture_output=True, text=True, check=True,
                            cwd=Path(__file__).parents[1])  # fmt: skip
     assert "4 of 4 graded" in again.stderr
-    assert 1 <= before < _graded(tmp_path / "out") == 4
-
-
-def _graded(out: Path) -> int:
-    import sqlite3
-
-    try:
-        with sqlite3.connect(f"file:{out / 'gradebook.sqlite'}?mode=ro", uri=True) as book:
-            return book.execute("SELECT count(*) FROM gradings").fetchone()[0]
-    except sqlite3.Error:
-        return 0
+    assert 1 <= before < n_graded(tmp_path / "out") == 4

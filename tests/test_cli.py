@@ -10,6 +10,7 @@ import sys
 import pytest
 
 from pipeline.resources import EXAMPLES
+from tests.waiting import PATIENCE
 
 README = EXAMPLES.parent / "README.md"
 
@@ -22,7 +23,7 @@ def cartlab(*arguments, cwd=None):
         text=True,
         encoding="utf-8",
         cwd=cwd,
-        timeout=120,
+        timeout=PATIENCE,
         check=False,
     )
 

@@ -1,7 +1,7 @@
 """Damaged files: whatever the damage, a clear error or a record, never a crash, never a hang."""
 
+import time
 from contextlib import contextmanager
-from datetime import timedelta
 from io import BytesIO
 from pathlib import Path
 
@@ -23,7 +23,7 @@ X = np.round(300 * np.sin(20 * T))
 U = np.round(0.5 * np.sign(np.sin(9 * T)), 4)
 
 # A damaged file may take no longer than this even on a loaded machine; a good one takes 2 ms.
-PATIENCE = timedelta(seconds=10)
+MOST_TIME = 10.0  # s of the processor
 
 
 def _ecp() -> bytes:
@@ -135,12 +135,14 @@ def submission(tmp_path_factory) -> Submission:
 def one_line_at_most():
     """Let a complaint pass if it is one line; anything else that is raised is a failure."""
     message = ""
+    began = time.process_time()
     try:
         yield
     except PipelineError as error:
         message = str(error)
     assert len(message.splitlines()) <= 1
     assert len(message) < 1_000
+    assert time.process_time() - began < MOST_TIME
 
 
 def try_everything(submission: Submission, raw: bytes) -> None:
@@ -166,7 +168,6 @@ def test_the_undamaged_file_is_read(name, submission):
 @pytest.mark.parametrize("name", FILES)
 @settings(
     max_examples=60,
-    deadline=PATIENCE,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 @given(hits=st.lists(damage, min_size=1, max_size=4))
@@ -175,7 +176,7 @@ def test_a_damaged_file_is_an_error_or_a_record(name, hits, submission):
     try_everything(submission, damaged(FILES[name], hits))
 
 
-@settings(max_examples=150, deadline=PATIENCE)
+@settings(max_examples=150)
 @given(
     raw=st.one_of(
         st.binary(max_size=400),
@@ -191,7 +192,7 @@ def test_junk_is_an_error_or_a_record(raw, submission):
     try_everything(submission, raw)
 
 
-@settings(max_examples=150, deadline=PATIENCE)
+@settings(max_examples=150)
 @given(hits=st.lists(damage, min_size=1, max_size=4))
 def test_a_damaged_submission_file_is_an_error_or_a_submission(hits, tmp_path_factory):
     """`submission.toml` itself may be cut and garbled."""

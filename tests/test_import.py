@@ -2,8 +2,6 @@
 
 import os
 import sys
-import threading
-import time
 from pathlib import Path
 
 import numpy as np
@@ -190,23 +188,19 @@ def test_everything_else_in_the_folder_is_said_once(work, source):
 def test_a_file_is_waited_for_until_it_is_complete(work, source):
     """A program that writes slowly is not caught half way; when the plan is done, watching ends."""
     half = len(STEP) // 2
+    looks = iter(range(100))
 
-    def export() -> None:
-        with (source / "A.txt").open("w", encoding="utf-8") as file:
-            file.write(STEP[:half])
-            file.flush()
-            time.sleep(0.3)
-            file.write(STEP[half:])
-        (source / "B.txt").write_text(dwell(2.0), encoding="utf-8")
-        (source / "C.txt").write_text(dwell(2.0) + "\n", encoding="utf-8")
+    def export(seconds: float) -> None:
+        look = next(looks)
+        if look in (2, 8):  # looked at again and again meanwhile
+            with (source / "A.txt").open("a", encoding="utf-8") as file:
+                file.write(STEP[:half] if look == 2 else STEP[half:])
+        elif look == 9:
+            (source / "B.txt").write_text(dwell(2.0), encoding="utf-8")
+            (source / "C.txt").write_text(dwell(2.0) + "\n", encoding="utf-8")
 
-    writer = threading.Thread(target=export)
-    writer.start()
-    watch = Importer(work, source, observer=Notes()).watch(
-        once=False, wait=lambda seconds: time.sleep(0.05)
-    )
+    watch = Importer(work, source, observer=Notes()).watch(once=False, wait=export)
     assert [imported.experiment for imported in watch] == ["step-1", "sine-01", "sine-02"]
-    writer.join()
     assert len(read_data(load_submission(work)).records) == 3
 
 

@@ -2,22 +2,13 @@
 
 import json
 import re
-import subprocess
-import sys
 
 import pytest
 
 from pipeline.plant.effects import CATALOGUE, find_effect
 from pipeline.report.effects import build_gallery, render_effects
 from pipeline.report.words_effects import catalogue_data, catalogue_text
-
-
-def cartlab(*arguments):
-    """Run the command line in a process of its own."""
-    return subprocess.run(
-        [sys.executable, "-m", "pipeline", *map(str, arguments)],
-        capture_output=True, text=True, encoding="utf-8", timeout=120, check=False,
-    )  # fmt: skip
+from tests.test_cli import cartlab
 
 
 def test_the_list_has_every_effect_with_its_parameters():

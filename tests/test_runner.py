@@ -5,16 +5,15 @@ import random
 import shutil
 import subprocess
 import sys
-import threading
 import time
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import psutil
 import pytest
 
-from pipeline.grading import feedback_figures
+from pipeline.grading import feedback_figures, worker_process
 from pipeline.grading.grade import grade_text
 from pipeline.grading.gradebook import Gradebook
 from pipeline.grading.intake import find_hand_ins
@@ -24,6 +23,8 @@ from pipeline.grading.runner import Limits, grade_batch, run_here
 from pipeline.grading.worker import Setup, Task, grade_task
 from pipeline.grading.worker_process import Worker
 from pipeline.synthesis import write_submission
+from tests.grades import n_graded
+from tests.waiting import PATIENCE, started, until
 
 RUBRIC = load_rubric(Path("throne-1dof"))
 
@@ -59,7 +60,7 @@ def run(paths, out, *, jobs=1, limits=None, execute=None, progress=lambda *_: No
             store=book,
             scratch=scratch,
             execute=execute or run_here(jobs=jobs),
-            limits=limits,
+            limits=limits or Limits(time=PATIENCE),
             progress=progress,
         )
         return batch, {o.submission: (o, grade_text(g)) for o, g in batch.grades(book)}
@@ -118,26 +119,28 @@ def task(school):
 def setup(tmp_path):
     return Setup(
         rubric=RUBRIC.model_dump_json(),
-        time_limit=120.0,
+        time_limit=PATIENCE,
         memory_limit=1_000_000_000,
         scratch=str(tmp_path),
     )
 
 
-def test_a_crash_costs_one_row_and_the_worker_is_replaced(task, setup):
+def test_a_crash_costs_one_row_and_the_worker_is_replaced(task, setup, monkeypatch):
     """A worker that dies in the middle of a task is that task's reason; the next one is graded."""
-    worker = Worker(setup, out_of=RUBRIC.out_of)
-    assert worker.run(task).status == "graded"
-    (process,) = [c for c in psutil.Process().children() if "worker" in " ".join(c.cmdline())]
-    process.suspend()  # so that it dies with the task begun
-    killer = threading.Timer(1.0, process.kill)
-    killer.start()
-    outcome = worker.run(task)
-    killer.join()
-    assert (outcome.status, outcome.settled) == ("failed", False)
-    assert "the grader crashed" in outcome.reason
-    assert worker.run(task).status == "graded"
-    worker.close()
+
+    def send_and_kill(process, line):
+        send(process, line)
+        process.kill()
+
+    with closing(Worker(setup, out_of=RUBRIC.out_of)) as worker:
+        assert worker.run(task).status == "graded"
+        send = worker_process._send
+        monkeypatch.setattr(worker_process, "_send", send_and_kill)
+        outcome = worker.run(task)
+        monkeypatch.undo()
+        assert (outcome.status, outcome.settled) == ("failed", False)
+        assert "the grader crashed" in outcome.reason
+        assert worker.run(task).status == "graded"
 
 
 def test_a_worker_killed_while_it_starts_is_started_again(task, setup):
@@ -179,9 +182,9 @@ def test_a_grade_stands_where_its_figures_fail(school, tmp_path, monkeypatch):
 def test_what_this_machine_fails_at_is_tried_again(task, setup, tmp_path):
     """Where the scratch is full or gone the row says so, and does not stand for good."""
     (tmp_path / "scratch").touch()  # no folder can be made in it
-    worker = Worker(replace(setup, scratch=str(tmp_path / "scratch")), out_of=RUBRIC.out_of)
-    outcome = worker.run(task)
-    worker.close()
+    setup = replace(setup, scratch=str(tmp_path / "scratch"))
+    with closing(Worker(setup, out_of=RUBRIC.out_of)) as worker:
+        outcome = worker.run(task)
     assert (outcome.status, outcome.settled) == ("failed", False)
     assert outcome.reason.startswith("cannot be read (")
 
@@ -191,12 +194,13 @@ def test_memory_is_limited(school, setup, tmp_path):
     large = shutil.copytree(school / "team-0", tmp_path / "large")
     rows = "".join(f"{i / 1000:.3f},1,{i % 7}\n" for i in range(1_500_000))
     (large / "data" / "step-1.csv").write_text("time,input,x1\n" + rows, encoding="utf-8")
-    worker = Worker(replace(setup, memory_limit=100_000_000), out_of=RUBRIC.out_of)
-    outcome = worker.run(Task(id="large", key="k", sources=(str(large),)))
-    assert outcome.reason == "needed more than 0.1 GB of memory"
-    assert not outcome.settled
-    assert worker.run(Task(id="t", key="k", sources=(str(school / "team-0"),))).status == "graded"
-    worker.close()
+    small = replace(setup, memory_limit=100_000_000)
+    with closing(Worker(small, out_of=RUBRIC.out_of)) as worker:
+        outcome = worker.run(Task(id="large", key="k", sources=(str(large),)))
+        assert outcome.reason == "needed more than 0.1 GB of memory"
+        assert not outcome.settled
+        again = worker.run(Task(id="t", key="k", sources=(str(school / "team-0"),)))
+        assert again.status == "graded"
 
 
 def test_a_hang_is_stopped_and_tried_again(school, tmp_path):
@@ -207,16 +211,15 @@ def test_a_hang_is_stopped_and_tried_again(school, tmp_path):
     assert graded["team-0"][0].status == "graded"
 
 
-def killed_at(seconds, arguments):
-    """Run the command line and kill it, and what it started, after so many seconds."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "pipeline", *arguments],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    time.sleep(seconds)
-    process.kill()
-    return process.wait()
+def killed_within(rng, book, command):
+    """Run a command and kill it, and what it started, at some moment of its way.
+
+    That is by how much it has done: what takes a moment on one machine takes long on another.
+    """
+    enough = n_graded(book) + rng.randrange(3)
+    with started(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        until(lambda: process.poll() is not None or n_graded(book) >= enough)
+        time.sleep(rng.uniform(0.0, 0.5))
 
 
 @pytest.mark.parametrize(
@@ -225,13 +228,12 @@ def killed_at(seconds, arguments):
 def test_killed_at_any_moment_it_goes_on(school, graded, tmp_path, kills):
     """Killed again and again at random times, a run ends as one that was left alone."""
     killed = tmp_path / "killed"
-    command = ["grade", str(school), "--rubric", "throne-1dof", "--no-figures", "--out", killed]
-    times = random.Random(kills)
+    command = [sys.executable, "-m", "pipeline", "grade", school, "--rubric", "throne-1dof",
+               "--no-figures", "--out", killed]  # fmt: skip
+    rng = random.Random(kills)
     for _ in range(kills):
-        killed_at(times.uniform(0.2, 5.0), [*command, "--jobs", "2"])
-    done = subprocess.run(
-        [sys.executable, "-m", "pipeline", *command], capture_output=True, text=True, check=False
-    )
+        killed_within(rng, killed, [*command, "--jobs", "2"])
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 1, done.stderr  # team-3 could not be graded
     assert "team-3: team-3/submission.toml line 1" in done.stderr
     out, batch, rows, _ = graded

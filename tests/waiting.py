@@ -1,7 +1,12 @@
 """Waiting for what happens, however busy the machine: a deadline only ends a hang."""
 
+import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from typing import Any
+
+import psutil
 
 PATIENCE = 300.0  # s after which what is awaited is taken never to come
 
@@ -17,3 +22,28 @@ def until(happened: Callable[[], object], what: str = "it") -> None:
     while not happened():
         assert time.monotonic() < end, f"{what} never happened"
         time.sleep(0.01)
+
+
+@contextmanager
+def started(command: Sequence[object], **options: Any) -> Iterator[subprocess.Popen[Any]]:
+    """Run a program beside a block; after it that and all it started have ended."""
+    with subprocess.Popen(list(map(str, command)), **options) as process:
+        try:
+            yield process
+        finally:
+            kill(process)
+
+
+def kill(process: subprocess.Popen[Any]) -> None:
+    """Kill a program, then what it had started, and wait until all of them are gone."""
+    if process.poll() is not None:
+        return
+    tree: list[psutil.Process] = []
+    with suppress(psutil.NoSuchProcess):
+        tree = psutil.Process(process.pid).children(recursive=True)
+    process.kill()
+    process.wait()
+    for other in tree:
+        with suppress(psutil.NoSuchProcess):
+            other.kill()
+    psutil.wait_procs(tree, timeout=PATIENCE)
