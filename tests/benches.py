@@ -44,9 +44,16 @@ class Emulator:
 
 
 @contextmanager
-def emulator(*options: str, preset: str = "throne-2dof") -> Iterator[Emulator]:
-    """Run `cartlab emulate` with these options for as long as the block lasts."""
-    command = [sys.executable, "-m", "pipeline", "emulate", *options]
+def emulator(
+    *options: str, preset: str = "throne-2dof", watchdog: float = PATIENCE
+) -> Iterator[Emulator]:
+    """Run `cartlab emulate` with these options for as long as the block lasts.
+
+    Its watchdog waits longer (s) than a bench's, for a host on a machine that may be busy.
+    """
+    patient = f"from pipeline.bench import core; core.WATCHDOG = {watchdog}"
+    script = f"{patient}; from pipeline.cli import main; main()"
+    command = [sys.executable, "-c", script, "emulate", *options]
     if "--model" not in options:
         command += ["--preset", preset]
     with started(command, stderr=subprocess.PIPE, encoding="utf-8") as process:

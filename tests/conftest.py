@@ -1,13 +1,19 @@
 """Fixtures shared by the tests."""
 
+import os
 import shutil
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
 
+from tests.benches import Emulator, emulator
 from tests.waiting import PATIENCE
+
+if "PYTEST_XDIST_WORKER" in os.environ:  # which shares the machine with others
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 # The same examples every time, and no verdict on how fast a busy machine is.
 settings.register_profile(
@@ -19,11 +25,20 @@ settings.load_profile("cartlab")
 REAL_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 CHROMIUM = shutil.which("chromium")
+_FEW = 2  # files that are sooner done here than other processes are started
+
 # A shell starts what runs in the background deaf to Ctrl-C, and its children inherit that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 FLAGS = "--headless --no-sandbox --disable-gpu --no-first-run --disable-background-networking"
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int | None:
+    """Run a file or two in this process; for more xdist counts the processors."""
+    few = len(config.args) <= _FEW and all(".py" in argument for argument in config.args)
+    return 0 if few else os.cpu_count()
 
 
 @pytest.fixture(scope="module")
@@ -40,6 +55,36 @@ def browser():
         )
         yield browser
         browser.close()
+
+
+@pytest.fixture(scope="session")
+def fast() -> Iterator[Emulator]:
+    """A virtual bench twenty times as fast as a real one, with fewer lines a second."""
+    with emulator("--speed", "20", "--period", "5.003") as bench:
+        yield bench
+
+
+@pytest.fixture(scope="session")
+def real_bench() -> Iterator[Emulator]:
+    """A virtual bench as fast as a real one."""
+    with emulator() as bench:
+        yield bench
+
+
+@pytest.fixture
+def real(real_bench: Emulator) -> Emulator:
+    """The bench in real time, its carts at rest, with nothing to tell of earlier tests.
+
+    The last to be told of is a run of ten lines, which no test asks for.
+    """
+    from pipeline.bench.protocol import Hands, Start, Wave
+    from pipeline.bench.serial_line import open_line
+
+    with open_line(real_bench.address, baud=115_200) as line:
+        line.send(Hands(), Start(wave=Wave.DELTA, frequency=100.0, amplitude=0))
+        while real_bench.event("run")["lines"] > 10:
+            pass
+    return real_bench
 
 
 @pytest.fixture(scope="session")

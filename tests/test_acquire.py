@@ -22,7 +22,7 @@ from pipeline.bench.observer import Anomalies, Outcome
 from pipeline.bench.orders import make_order
 from pipeline.bench.plan import Limits, Plan, Recording, StateLoop
 from pipeline.bench.plan_file import load_plan
-from pipeline.bench.protocol import Description, Reading, Start, Wave
+from pipeline.bench.protocol import Description, Reading
 from pipeline.bench.raw import read_raw
 from pipeline.bench.record import readings_of
 from pipeline.bench.serial_line import open_line
@@ -67,33 +67,6 @@ def last_run(bench) -> dict:
     while (sent := bench.event("run"))["ended"] not in ("stopped", "watchdog"):
         pass
     return sent
-
-
-@pytest.fixture(scope="module")
-def fast():
-    """Return a virtual bench twenty times as fast as a real one, with fewer lines a second."""
-    with emulator("--speed", "20", "--period", "5.003") as bench:
-        yield bench
-
-
-@pytest.fixture(scope="module")
-def real_bench():
-    """Return a virtual bench as fast as a real one."""
-    with emulator() as bench:
-        yield bench
-
-
-@pytest.fixture
-def real(real_bench):
-    """Return the bench in real time with nothing to tell of earlier tests.
-
-    Their runs were cut or stopped; they are told of before one that ends by itself.
-    """
-    with open_line(real_bench.address, baud=115_200) as line:
-        line.send(Start(wave=Wave.DELTA, frequency=100.0, amplitude=0))
-        while real_bench.event("run")["ended"] != "done":
-            pass
-    return real_bench
 
 
 # ----------------------------------------------------------------- a whole session
@@ -346,16 +319,17 @@ def test_a_host_told_to_end_stops_the_motor_and_saves(tmp_path, number, real):
     assert load_submission(work).experiments == ()
 
 
-def test_a_killed_host_leaves_a_readable_file_and_a_motor_that_is_off(tmp_path, real, fast):
+def test_a_killed_host_leaves_a_readable_file_and_a_motor_that_is_off(tmp_path, fast):
     """After kill -9 the watchdog cuts the motor; the file lacks at most what was on its way."""
     work = write_work(tmp_path, [sine("dwell", seconds=10)])
-    with host(work, real.address, "--only", "dwell", "--yes") as process:
-        until_bytes(work / "raw" / "dwell-1.raw", process, least=20_000)
-        process.kill()
-    silent = real.event("motor off")["ms_after_heartbeat"]
-    sent = last_run(real)["lines"]
+    with emulator(watchdog=2.0) as bench:
+        with host(work, bench.address, "--only", "dwell", "--yes") as process:
+            until_bytes(work / "raw" / "dwell-1.raw", process, least=20_000)
+            process.kill()
+        silent = bench.event("motor off")["ms_after_heartbeat"]
+        sent = last_run(bench)["lines"]
     kept = readings_of(read_raw(work / "raw" / "dwell-1.raw"))
-    assert silent >= 99
+    assert silent >= 1999
     # The bench streamed on until its watchdog bit; up to its last heartbeat all is there but what
     # a busy machine had not yet handed over.
     assert kept[-1].ms > 1.0024 * sent - silent - 500

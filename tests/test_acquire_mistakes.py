@@ -14,7 +14,7 @@ from pipeline.bench.experiments import cart_remarks, prepare_submission
 from pipeline.bench.links import open_link
 from pipeline.bench.observer import Anomalies
 from pipeline.bench.plan import Limits
-from pipeline.bench.protocol import EXTENSIONS, Description, Reading
+from pipeline.bench.protocol import EXTENSIONS, WATCHDOG, Description, Reading
 from pipeline.bench.serial_line import open_line
 from pipeline.cli import app
 from pipeline.errors import ConfigError, HardwareError
@@ -52,16 +52,15 @@ def test_a_run_in_which_nothing_moves_is_not_recorded(tmp_path):
     assert load_submission(work).experiments == ()
 
 
-def test_a_second_session_in_a_folder_is_refused(tmp_path):
+def test_a_second_session_in_a_folder_is_refused(tmp_path, real, fast):
     """It is told which process records there, and what that one records stays whole."""
     work = write_work(tmp_path / "work", [sine("dwell", seconds=6)])
-    with emulator() as first, emulator("--speed", "20", "--seed", "1") as second:
-        with host(work, first.address, "--only", "dwell", "--yes") as process:
-            until_bytes(work / "raw" / "dwell-1.raw", process)
-            refused = rf"another cartlab \(process {process.pid}\) writes"
-            with pytest.raises(ConfigError, match=refused):
-                acquire(work, port=second.address, observers=[Notes()])
-            process.communicate()
+    with host(work, real.address, "--only", "dwell", "--yes") as process:
+        until_bytes(work / "raw" / "dwell-1.raw", process)
+        refused = rf"another cartlab \(process {process.pid}\) writes"
+        with pytest.raises(ConfigError, match=refused):
+            acquire(work, port=fast.address, observers=[Notes()])
+        process.communicate()
     assert process.returncode == 0
     assert sorted(path.name for path in (work / "data").iterdir()) == ["dwell.txt"]
 
@@ -77,15 +76,15 @@ class Late(Notes):
 
 
 def test_a_busy_computer_is_named_where_the_watchdog_bites(tmp_path):
-    """A host that sends no heartbeat for 0.3 s says so, not only that the bench fell silent."""
+    """A host that sends no heartbeat for too long says so, not only that the bench is silent."""
     work = write_work(tmp_path, [sine("dwell", seconds=5)])
     notes = Late()
-    with emulator() as bench:
+    with emulator(watchdog=WATCHDOG) as bench:
         outcome, *_ = acquire(work, port=bench.address, observers=[notes], only=["dwell"])
     assert "fell silent" in outcome.partial
     late = re.search(r"too busy, it sent no heartbeat for (\d+) ms", outcome.partial)
     assert late is not None
-    assert int(late[1]) >= 300
+    assert int(late[1]) >= 1e3 * WATCHDOG
 
 
 class LastMoment(Notes):
@@ -94,7 +93,7 @@ class LastMoment(Notes):
     def readings(self, batch: Sequence[Reading], anomalies: Anomalies) -> None:
         """Note the lines."""
         super().readings(batch, anomalies)
-        if batch[-1].ms >= 1990:
+        if batch[-1].ms >= 1999:
             signal.raise_signal(signal.SIGINT)
 
 
@@ -143,13 +142,12 @@ def test_a_new_submission_says_what_the_bench_does_not_know(tmp_path):
     assert submission.design is not None
 
 
-def test_where_nothing_was_recorded_no_report_is_offered(tmp_path):
+def test_where_nothing_was_recorded_no_report_is_offered(tmp_path, fast):
     """A limit that is too small is said with what to do; `report` would have nothing to read."""
     near = Limits(input=0.5, travel=0.05)
     work = write_work(tmp_path, [sine("dwell", seconds=4)], limits=near)
-    with emulator("--speed", "5") as bench:
-        with host(work, bench.address, "--only", "dwell", "--yes") as process:
-            _, said = process.communicate()
+    with host(work, fast.address, "--only", "dwell", "--yes") as process:
+        _, said = process.communicate()
     assert process.returncode == 1
     assert "divide its amplitude in plan.toml by four, or raise the limit in plan.toml" in said
     assert "again: taken as done" not in said

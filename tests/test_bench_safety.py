@@ -32,7 +32,8 @@ from pipeline.bench.protocol import (
     encode,
     parse_description,
 )
-from pipeline.bench.raw import RawHeader, RawWriter
+from pipeline.bench.raw import RawHeader, RawWriter, read_raw
+from pipeline.bench.record import readings_of
 from pipeline.bench.serial_line import open_line
 from pipeline.bench.session import Session
 from pipeline.errors import ConfigError, DataError, HardwareError
@@ -63,37 +64,34 @@ def test_lines_that_cannot_be_read_end_a_run(tmp_path):
     assert sent["lines"] < 5000
 
 
-def test_a_run_that_passed_a_limit_is_not_tried_again(tmp_path):
+def test_a_run_that_passed_a_limit_is_not_tried_again(tmp_path, fast):
     """Whoever takes everything as done does not have the carts driven past the limit thrice."""
     near = Limits(input=0.5, travel=0.1)  # cm: the dwell passes it within its first swing
     work = write_work(tmp_path, [sine("dwell", seconds=4)], limits=near)
     notes = Notes()
-    with emulator("--speed", "5") as bench:
-        outcomes = acquire(work, port=bench.address, observers=[notes], only=["dwell"])
+    outcomes = acquire(work, port=fast.address, observers=[notes], only=["dwell"])
     assert [outcome.partial[:14] for outcome in outcomes] == ["stopped: cart "]
     assert notes.confirmed == []
 
 
-def test_a_plan_for_a_stronger_bench_moves_nothing(tmp_path):
+def test_a_plan_for_a_stronger_bench_moves_nothing(tmp_path, real):
     """A bench of 0.5 V has a tenth of "5 V": such a plan is refused with both numbers."""
     strong = Limits(input=5.0, travel=2.5)
     work = write_work(tmp_path, [sine("dwell", seconds=1)], limits=strong)
-    with emulator("--speed", "20") as bench:
-        with pytest.raises(
-            ConfigError, match=r"input is 5 V, the bench gives at most 0\.5 V.*delete plan\.toml"
-        ):
-            acquire(work, port=bench.address, observers=[Notes()])
-        with pytest.raises(queue.Empty):
-            bench.event("run", timeout=0.5)
+    with pytest.raises(
+        ConfigError, match=r"input is 5 V, the bench gives at most 0\.5 V.*delete plan\.toml"
+    ):
+        acquire(work, port=real.address, observers=[Notes()])
+    with pytest.raises(queue.Empty):
+        real.event("run", timeout=0.5)
     assert not (work / "raw").exists()
 
 
-def test_the_numbers_are_said_before_anything_moves(tmp_path):
+def test_the_numbers_are_said_before_anything_moves(tmp_path, fast):
     """The limits stand beside what the bench gives and counts: 2.5 cm of 0.00227 cm are 1101."""
     work = write_work(tmp_path, [sine("dwell", seconds=1)])
     notes = Notes()
-    with emulator("--speed", "20") as bench:
-        acquire(work, port=bench.address, observers=[notes], only=["dwell"])
+    acquire(work, port=fast.address, observers=[notes], only=["dwell"])
     said = "limits: 0.5 V of 0.5 V that the bench gives, 2.5 cm (1101 counts) from where it is"
     assert any(remark.startswith(said) for remark in notes.remarks)
 
@@ -126,10 +124,10 @@ def test_what_a_bench_cannot_do_is_left_out_and_the_rest_recorded(tmp_path):
     assert [e.id for e in load_submission(work).experiments] == ["dwell"]
 
 
-def test_a_bench_that_goes_on_after_its_run_is_stopped(tmp_path):
+def test_a_bench_that_goes_on_after_its_run_is_stopped(tmp_path, real):
     """A bench that runs more cycles than it was told, as after a changed digit, is stopped."""
     recording = sine("dwell", seconds=1)
-    with emulator() as bench, open_line(bench.address, baud=115_200) as line:
+    with open_line(real.address, baud=115_200) as line:
         order = make_order(
             sine("dwell", seconds=20),
             limits=LIMITS,
@@ -139,7 +137,7 @@ def test_a_bench_that_goes_on_after_its_run_is_stopped(tmp_path):
         )
         session = Session(line, carts=2, limits=LIMITS, observer=Notes())
         outcome = session.record(replace(order, recording=recording), tmp_path / "dwell-1.raw")
-        sent = bench.event("run")
+        sent = real.event("run")
     assert outcome.partial == "stopped: the bench went on past the end of the run"
     assert sent["ended"] == "stopped"
 
@@ -162,9 +160,9 @@ def _session(bench: Emulator, *, carts: int = 2, observer: Notes | None = None):
 
 
 @pytest.mark.parametrize("change", [{"frequency": 3.0}, {"amplitude": 92}, {"wave": Wave.TRIANGLE}])
-def test_a_changed_digit_of_a_start_is_noticed(tmp_path, monkeypatch, change):
+def test_a_changed_digit_of_a_start_is_noticed(tmp_path, monkeypatch, change, real):
     """The targets in the lines are not those of the wave: the run ends, to be tried again."""
-    with emulator() as bench, _session(bench) as (session, line, ask):
+    with _session(real) as (session, line, ask):
         order = make_order(sine("dwell", seconds=5), **ask)
         send = line.send
 
@@ -174,7 +172,7 @@ def test_a_changed_digit_of_a_start_is_noticed(tmp_path, monkeypatch, change):
         monkeypatch.setattr(line, "send", changed)
         outcome = session.record(order, tmp_path / "dwell-1.raw")
         monkeypatch.undo()
-        sent = bench.event("run")
+        sent = real.event("run")
         again = session.record(order, tmp_path / "dwell-2.raw")
     assert outcome.partial.startswith("the bench follows another wave than it was sent")
     assert sent["ended"] == "stopped"
@@ -186,26 +184,32 @@ class Slow(Notes):
     """Takes its time once a cart is far out."""
 
     def readings(self, batch: Sequence[Reading], anomalies: Anomalies) -> None:
-        """Note the lines, and sleep longer than the bench waits for a heartbeat."""
+        """Note the lines, and hang for two seconds."""
         super().readings(batch, anomalies)
         if any(abs(count) > 22 for reading in batch for count in reading.counts):
-            time.sleep(0.4)
+            time.sleep(2.0)
 
 
-def test_the_stop_goes_out_before_anybody_is_told(tmp_path):
+def test_the_stop_goes_out_before_anybody_is_told(tmp_path, real):
     """An observer that hangs at the very line past the limit does not keep the motor on."""
-    with emulator() as bench, _session(bench, observer=Slow()) as (session, _, ask):
+    with _session(real, observer=Slow()) as (session, _, ask):
         near = Limits(input=0.5, travel=22 * 0.00227)
         order = make_order(sine("dwell", seconds=4), **{**ask, "limits": near})
         outcome = session.record(order, tmp_path / "dwell-1.raw")
-        sent = bench.event("run")
+        sent = real.event("run")
     assert outcome.partial.startswith("stopped: cart ")
     assert sent["ended"] == "stopped"
+    offending = next(
+        r.ms
+        for r in readings_of(read_raw(tmp_path / "dwell-1.raw"))
+        if max(map(abs, r.counts)) > 22
+    )
+    assert 1.0024 * sent["lines"] - offending < 1000
 
 
-def test_every_cart_of_the_bench_is_watched(tmp_path):
+def test_every_cart_of_the_bench_is_watched(tmp_path, real):
     """Where a submission tells of one cart and the bench has two, the second may not run away."""
-    with emulator() as bench, _session(bench, carts=1) as (session, _, ask):
+    with _session(real, carts=1) as (session, _, ask):
         near = Limits(input=0.5, travel=0.25)
         # At their second resonance, near 6 Hz, the second cart moves twice as far as the first.
         dwell = sine("dwell", seconds=8, frequency=6.0)
@@ -217,11 +221,11 @@ def test_every_cart_of_the_bench_is_watched(tmp_path):
     assert outcome.partial.startswith("stopped: cart 2 was ")
 
 
-def test_a_new_line_is_zeroed_once_the_carts_rest(tmp_path):
+def test_a_new_line_is_zeroed_once_the_carts_rest(tmp_path, real):
     """A line opened while the carts swing has its zero in mid-swing; the next run's is at rest."""
     recording = sine("dwell", seconds=1, settle=3.0)
     notes = Notes()
-    with emulator("--seed", "3") as bench, _session(bench, observer=notes) as (session, line, ask):
+    with _session(real, observer=notes) as (session, line, ask):
         line.send(Start(wave=Wave.SQUARE, frequency=0.5, amplitude=400))
         heard = bytearray()
 
@@ -271,29 +275,27 @@ def test_a_description_is_believed_when_it_came_twice():
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows knows no SIGHUP")
-def test_a_closed_terminal_stops_the_motor(tmp_path):
+def test_a_closed_terminal_stops_the_motor(tmp_path, real):
     """SIGHUP ends a run with a stop, not a watchdog, and what came is saved."""
     work = write_work(tmp_path, [sine("dwell", seconds=30)])
-    with emulator() as bench:
-        with host(work, bench.address, "--only", "dwell") as process:
-            until_bytes(work / "raw" / "dwell-1.raw", process)
-            process.send_signal(signal.SIGHUP)
-            process.communicate()
-        assert bench.event("run")["ended"] == "stopped"
+    with host(work, real.address, "--only", "dwell") as process:
+        until_bytes(work / "raw" / "dwell-1.raw", process)
+        process.send_signal(signal.SIGHUP)
+        process.communicate()
+    assert real.event("run")["ended"] == "stopped"
     assert process.returncode == 1
     assert (work / "data" / "dwell.partial.txt").exists()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows limits no file's size")
-def test_a_full_disk_stops_the_motor_and_says_what_to_do(tmp_path):
+def test_a_full_disk_stops_the_motor_and_says_what_to_do(tmp_path, real):
     """A run that cannot be written down ends with a stop, the folder's name and no `--out`."""
     work = write_work(tmp_path, [sine("dwell", seconds=30)])
     command = 'ulimit -f 20; exec "$0" -m pipeline acquire "$1" --port "$2" --only dwell'
-    with emulator() as bench:
-        shell = ["sh", "-c", command, sys.executable, work, bench.address]
-        with started(shell, stderr=subprocess.PIPE, encoding="utf-8") as process:
-            _, said = process.communicate()
-        assert bench.event("run")["ended"] == "stopped"
+    shell = ["sh", "-c", command, sys.executable, work, real.address]
+    with started(shell, stderr=subprocess.PIPE, encoding="utf-8") as process:
+        _, said = process.communicate()
+    assert real.event("run")["ended"] == "stopped"
     assert process.returncode == 2
     assert f"`acquire` writes into {work}; make room there" in said
     assert "--out" not in said
@@ -367,7 +369,7 @@ def _header(name: str) -> RawHeader:
     )
 
 
-def test_nothing_is_written_outside_or_over_the_data_of_others(tmp_path):
+def test_nothing_is_written_outside_or_over_the_data_of_others(tmp_path, fast):
     """Neither a raw file that names a place elsewhere nor a plan's id reaches another file."""
     work = write_work(tmp_path / "a" / "work", [sine("dwell", seconds=1)])
     (work / "data").mkdir()
@@ -377,11 +379,8 @@ def test_nothing_is_written_outside_or_over_the_data_of_others(tmp_path):
         raw.write(b"".join(b"0:0:0:0:%d\n" % ms for ms in range(20)))
     with (work / "submission.toml").open("a", encoding="utf-8") as file:
         file.write("""\n[[experiments]]\nid = "first"\nkind = "step"\nfile = "data/dwell.txt"\n""")
-    with emulator("--speed", "20") as bench:
-        with pytest.raises(
-            ConfigError, match=r"dwell: data/dwell\.txt holds the experiment 'first'"
-        ):
-            acquire(work, port=bench.address, observers=[Notes()])
+    with pytest.raises(ConfigError, match=r"dwell: data/dwell\.txt holds the experiment 'first'"):
+        acquire(work, port=fast.address, observers=[Notes()])
     assert mine.read_text(encoding="utf-8") == "mine"
     assert not list(tmp_path.rglob("elsewhere*"))
 

@@ -14,6 +14,7 @@ from pipeline.bench.faults import Faults, read_fault
 from pipeline.bench.links import open_link
 from pipeline.bench.protocol import (
     STOCK_STOP,
+    WATCHDOG,
     Hands,
     Reading,
     Signal,
@@ -70,7 +71,7 @@ def stream(bench: Emulator, line: serial.SerialBase, start: Start) -> list[Readi
 @pytest.fixture(scope="module")
 def fast_bench() -> Iterator[Emulator]:
     """Yield the two-cart preset, ten times as fast as time."""
-    with emulator("--speed", "10", "--seed", "3") as bench:
+    with emulator("--speed", "10", "--seed", "3", watchdog=WATCHDOG) as bench:
         yield bench
 
 

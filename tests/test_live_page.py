@@ -28,7 +28,7 @@ from pipeline.errors import ConfigError, HardwareError
 from tests.acquisitions import sine, write_work
 from tests.benches import emulator
 from tests.test_report_pages import PHONE, WIDE
-from tests.waiting import PATIENCE, until
+from tests.waiting import PATIENCE, started, until
 
 DUTY, COUNT = 1e-4, 0.002  # V, cm
 SUBMISSION = f"""
@@ -361,6 +361,7 @@ def show(browser, page):
         context = browser.new_context(
             viewport={"width": size[0], "height": size[1]}, reduced_motion="reduce", **options
         )
+        context.set_default_timeout(1e3 * PATIENCE)
         contexts.append(context)
         window = context.new_page()
         window.on("pageerror", lambda error: errors.append(str(error)))
@@ -483,6 +484,7 @@ def test_by_night_the_curves_change_colour(page, show):
 def test_the_end_is_told(folder, browser):
     """Once the session is over the page says so, keeps its curves, and asks no more."""
     context = browser.new_context()
+    context.set_default_timeout(1e3 * PATIENCE)
     window = context.new_page()
     with LivePage(folder) as page:
         page.planned(PLAN, frozenset())
@@ -504,9 +506,10 @@ def test_a_session_is_watched_and_confirmed_in_the_browser(tmp_path, browser):
     toml.write_text(scaled, encoding="utf-8")
     command = [sys.executable, "-m", "pipeline", "acquire", str(work), "--web"]
     context = browser.new_context()
+    context.set_default_timeout(1e3 * PATIENCE)
     with emulator("--stock", "--speed", "5") as bench:
         command += ["--port", bench.address, "--only", "dwell"]
-        with subprocess.Popen(command, stderr=subprocess.PIPE, encoding="utf-8") as host:
+        with started(command, stderr=subprocess.PIPE, encoding="utf-8") as host:
             assert host.stderr is not None
             url = re.search(r"http://\S+", host.stderr.readline())
             assert url is not None

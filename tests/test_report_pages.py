@@ -26,6 +26,7 @@ from pipeline.workflow import analyse
 from tests.grades import write_class
 from tests.test_gap_report import make_gap, two_cart_analysis
 from tests.ucsd import write_one_cart_submission, write_two_cart_submission
+from tests.waiting import PATIENCE
 
 CASES = (
     "one", "two", "three", "real-one", "real-two", "gap", "solution", "effects",
@@ -96,6 +97,7 @@ def show(browser):
         context = browser.new_context(
             viewport={"width": size[0], "height": size[1]}, reduced_motion="reduce", **options
         )
+        context.set_default_timeout(1e3 * PATIENCE)
         contexts.append(context)
         page = context.new_page()
         page.on("pageerror", lambda error: errors.append(str(error)))
