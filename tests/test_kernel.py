@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from pipeline.plant import kernel
 from pipeline.plant.chain import PRESETS, Array, Chain
 from pipeline.plant.effects import AugmentedChain, find_effect, make_term
 from pipeline.plant.kernel import simulate_batch
@@ -275,3 +276,29 @@ def test_a_hidden_mass_starts_where_it_is_told_to():
     start = np.array([cart[0], cart[1], cart[0] + offset[0], cart[1] + offset[1]])
     true = simulate_linear(pair, t, np.zeros(t.size), x0=start)[0]
     assert_allclose(got[0], true, atol=1e-6 * np.abs(true).max())
+
+
+def test_arrays_of_any_kind_meet_the_same_simulator():
+    """Views, whole numbers and what may not be written to cost no compilation of their own."""
+    tables = linear_tables(PRESETS["throne-2dof"])
+    cart, spring, drive = (np.asfortranarray(table[None]) for table in tables)
+    t = sample_times(50, 0.005)
+    command = np.zeros(50, dtype=int)
+    command.flags.writeable = False
+    whole = simulate(tables, t, np.zeros(50), x0=(1.0, 0.5))
+    fixed = simulate_batch(
+        cart,
+        spring,
+        drive,
+        np.broadcast_to(np.array([1.0, 0.5]), (1, 1, 2)),
+        np.broadcast_to(0.0, (1, 1, 2)),
+        np.broadcast_to(1.0, (1, 2)),
+        np.array([True, True]),
+        np.repeat(t, 2)[::2],
+        t,
+        command,
+        np.array([0, 50], dtype=np.int32),
+        1,
+    )
+    assert np.array_equal(fixed[0], whole)
+    assert len(kernel._simulate_batch.signatures) == 1

@@ -549,7 +549,6 @@ def _simulate(cart, spring, drive, x0, v0, scatter, free, t, knots, command, sta
     return True
 
 
-@_jit
 def simulate_batch(cart, spring, drive, x0, v0, scatter, free, t, knots, command, starts, refine):
     """Simulate many variants of one run.
 
@@ -569,6 +568,20 @@ def simulate_batch(cart, spring, drive, x0, v0, scatter, free, t, knots, command
     -------
     (b, n, samples) readings, encoder zero excluded; NaN where a variant diverged.
     """
+    # numba compiles anew, for 20 s, for every mix of arrays that may or may not be written to.
+    floats = (cart, spring, drive, x0, v0, scatter, t, knots, command)
+    cart, spring, drive, x0, v0, scatter, t, knots, command = (
+        np.require(array, np.float64, ["C", "W"]) for array in floats
+    )
+    free = np.require(free, np.bool_, ["C", "W"])
+    starts = np.require(starts, np.int64, ["C", "W"])
+    return _simulate_batch(
+        cart, spring, drive, x0, v0, scatter, free, t, knots, command, starts, float(refine)
+    )
+
+
+@_jit
+def _simulate_batch(cart, spring, drive, x0, v0, scatter, free, t, knots, command, starts, refine):
     y = np.empty((cart.shape[0], cart.shape[1], t.size))
     for b in range(cart.shape[0]):
         if not _simulate(
