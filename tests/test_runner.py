@@ -125,41 +125,37 @@ def setup(tmp_path):
     )
 
 
-def test_a_crash_costs_one_row_and_the_worker_is_replaced(task, setup, monkeypatch):
-    """A worker that dies in the middle of a task is that task's reason; the next one is graded."""
+@pytest.fixture
+def kill_next(monkeypatch):
+    """Return what has the next process that is sent a line killed as it gets it."""
+    send, doomed = worker_process._send, []
 
     def send_and_kill(process, line):
         send(process, line)
-        process.kill()
+        if doomed:
+            doomed.pop()
+            process.kill()
 
+    monkeypatch.setattr(worker_process, "_send", send_and_kill)
+    return lambda: doomed.append(True)
+
+
+def test_a_crash_costs_one_row_and_the_worker_is_replaced(task, setup, kill_next):
+    """A worker that dies in the middle of a task is that task's reason; the next one is graded."""
     with closing(Worker(setup, out_of=RUBRIC.out_of)) as worker:
         assert worker.run(task).status == "graded"
-        send = worker_process._send
-        monkeypatch.setattr(worker_process, "_send", send_and_kill)
+        kill_next()
         outcome = worker.run(task)
-        monkeypatch.undo()
         assert (outcome.status, outcome.settled) == ("failed", False)
         assert "the grader crashed" in outcome.reason
         assert worker.run(task).status == "graded"
 
 
-def test_a_worker_killed_while_it_starts_is_started_again(task, setup):
+def test_a_worker_killed_while_it_starts_is_started_again(task, setup, kill_next):
     """It costs nothing: the hand-in that it was started for is graded."""
-    worker, killed = Worker(setup, out_of=RUBRIC.out_of), []
-
-    def kill_the_first():
-        while not killed:
-            for child in psutil.Process().children():
-                if "pipeline.grading.worker" in child.cmdline():
-                    child.kill()
-                    killed.append(child)
-
-    killer = threading.Thread(target=kill_the_first)
-    killer.start()
-    outcome = worker.run(task)
-    killer.join()
-    worker.close()
-    assert outcome.status == "graded"
+    kill_next()
+    with closing(Worker(setup, out_of=RUBRIC.out_of)) as worker:
+        assert worker.run(task).status == "graded"
 
 
 def test_a_grade_stands_where_its_figures_fail(school, tmp_path, monkeypatch):
