@@ -261,7 +261,8 @@ def feedback_table(design: FeedbackDesign, *, number: int, units: tuple[str, str
     return make_table(
         number,
         f"State feedback for cart {design.cart}, its simulated step of "
-        f"{significant(design.reference)} {position}, and the margins of the loop cut at the motor.",
+        f"{significant(design.reference)} {position}, and the margins of the loop, "
+        "cut at the motor.",
         ("Quantity", "Value", "Unit"),
         [[cell(what), cell(value), cell(unit_text(unit))] for what, value, unit in rows],
         "ldl",
