@@ -16,8 +16,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.optimize import nnls
-from scipy.signal import fftconvolve
 
 from pipeline.plant.chain import Array
 from pipeline.results import Record
@@ -162,12 +162,12 @@ def _weigh(record: Record) -> _Weighed | None:
     width = int(np.clip(period, _NARROWEST, t.size // _BUMPS))
     at = (np.arange(width) + 0.5) / width
     bumps = [_BUMP.deriv(order)(at) / (width * dt) ** order for order in (2, 1, 0)]
-    sides = [(x, bumps[0]), (x, -bumps[1]), (x, bumps[2]), (x - other, bumps[2]), (u, bumps[2])]
-    *moved, driven = (fftconvolve(a, bump[::-1], mode="valid") for a, bump in sides)
-    step = max(width // _OVERLAP, driven.size // _MOST_PLACES, 1)
-    places = np.arange(1, driven.size - 1, step)
-    centred = [a[places + shift] for a, shift in [(driven, -1), (driven, 0), (driven, 1)]]
-    centred += [a[places] for a in moved]
+    sides = [(x, bumps[0]), (x, -bumps[1]), (x, bumps[2]), (x - other, bumps[2])]
+    last = x.size - width  # place of a bump
+    step = max(width // _OVERLAP, last // _MOST_PLACES, 1)
+    places = np.arange(1, last, step)
+    centred = [sliding_window_view(u, width)[places + shift] @ bumps[2] for shift in (-1, 0, 1)]
+    centred += [sliding_window_view(a, width)[places] @ bump for a, bump in sides]
     early, now, late, *terms = (a - a.mean() for a in centred)  # an encoder's zero drops out
     drive = np.array([early, now, late]) / np.linalg.norm(now)
     motion = np.array(terms).T / np.linalg.norm(now)
