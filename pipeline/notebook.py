@@ -9,7 +9,6 @@ from pipeline.errors import ConfigError, DataError
 from pipeline.exchange import frames
 from pipeline.plant.chain import Chain
 from pipeline.plant.designed_loop import closed_loop
-from pipeline.plant.loop import StateFeedback
 from pipeline.report.content import build_document
 from pipeline.report.document import Block, Document, Heading, spans
 from pipeline.report.html import render_fragment
@@ -61,10 +60,10 @@ class Lab:
 
         Raises
         ------
-        DataError : the carts could not be identified; `results.skipped` says why.
+        DataError : the carts could not be identified, with the reasons.
         """
         if self.results.chain is None:
-            raise DataError("the carts were not identified: results.skipped says why")
+            raise DataError(f"the carts were not identified: {self._reasons}")
         return self.results.chain
 
     @property
@@ -73,11 +72,15 @@ class Lab:
 
         Raises
         ------
-        DataError : none was designed; `results.skipped` says why.
+        DataError : none was designed, with the reasons.
         """
         if self.results.feedback is None:
-            raise DataError("no feedback was designed: results.skipped says why")
+            raise DataError(f"no feedback was designed: {self._reasons}")
         return self.results.feedback
+
+    @property
+    def _reasons(self) -> str:
+        return "; ".join(f"{skip.stage}: {skip.reason}" for skip in self.results.skipped)
 
     @cached_property
     def system(self) -> "control.StateSpace":
@@ -102,9 +105,8 @@ class Lab:
 
         States `x1, v1, …` and the effort `u` that acts, computed a sample before.
         """
-        design = self.design
-        controller = StateFeedback(gains=design.gains, prefilter=design.prefilter)
-        return closed_loop(self.chain, controller, sample_time=design.sample_time)
+        controller = self.design.controller(self.chain)
+        return closed_loop(self.chain, controller, sample_time=self.design.sample_time)
 
     # ------------------------------------------------------------------ tables
 

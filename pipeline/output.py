@@ -77,9 +77,11 @@ def csv_text(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 
 def _cell(value: object) -> str:
+    if value is None:
+        return ""
     if isinstance(value, Real):
         return "" if value != value else f"{float(value):.10g}"
-    return '"{}"'.format(harmless("" if value is None else str(value)).replace('"', '""'))
+    return '"{}"'.format(harmless(str(value)).replace('"', '""'))
 
 
 def harmless(text: str) -> str:

@@ -10,6 +10,7 @@ from typing import Literal
 
 from pipeline.plant.chain import Array, Chain, ComplexArray, frozen_array
 from pipeline.plant.designed_loop import Margins
+from pipeline.plant.loop import StateFeedback
 
 Kind = Literal["decay", "step", "sine", "sweep", "closed_loop", "bode"]
 Hold = Literal["zero_order", "band_limited"]
@@ -378,6 +379,10 @@ class FeedbackDesign:
     reachable: bool
     message: str
     margins: Margins | None = None
+
+    def controller(self, chain: Chain) -> StateFeedback:
+        """Return what runs: its observer knows the carts it was designed for."""
+        return StateFeedback(gains=self.gains, prefilter=self.prefilter, model=chain)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -61,7 +61,7 @@ submission = load_submission(Path({str(folder)!r}))
 graded = grade_submission(submission, rubric=load_rubric(Path("throne-1dof")), name="team-07")
 draw_figures(graded.analysis, submission.reported)
 reference_design(submission, graded.analysis.fit)
-print({{"pandas", "control"}} & set(sys.modules))
+print({{"pandas", "control", "scipy.signal"}} & set(sys.modules))
 """
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, encoding="utf-8", check=True

@@ -127,7 +127,7 @@ def test_records_are_tables_by_time(lab):
 def test_what_was_not_found_is_said(lab):
     """Without a fit or a design there is no system or loop; the error says where to look."""
     bare = replace(lab, results=replace(lab.results, fit=None, feedback=None))
-    with pytest.raises(DataError, match=r"not identified: results\.skipped"):
+    with pytest.raises(DataError, match="the carts were not identified"):
         _ = bare.system
     with pytest.raises(DataError, match="no feedback was designed"):
         _ = bare.closed_loop
@@ -195,6 +195,8 @@ def test_the_example_notebook_runs(monkeypatch):
         shown[cell["id"]] = eval(compile(ast.Expression(last.value), "cell", "eval"), names)
     pyplot.close("all")
     assert all(hasattr(shown[id_], "_repr_html_") for id_ in ("analyse", "bode", "steps"))
+    assert list(shown["parameters"].index)[:2] == ["K_1", "K_2"]
+    assert shown["checks"].empty
     assert "omega_a falls from 10.138 to" in shown["heavier"]
     steps = shown["steps"]
     # The bench ran the designed loop; a controller of one's own settles too, and overshoots.

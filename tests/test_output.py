@@ -125,4 +125,4 @@ def test_no_row_and_no_formula_comes_of_a_text(separator, rows):
 def test_numbers_stay_bare_and_texts_are_quoted():
     """A number is one to every program; none where there is none."""
     rows = [("1024", 17.50, np.float64(1 / 3), np.int64(3), float("nan"), None, 'a "b"')]
-    assert csv_text("abcdefg", rows).splitlines()[1] == '"1024",17.5,0.3333333333,3,,"","a ""b"""'
+    assert csv_text("abcdefg", rows).splitlines()[1] == '"1024",17.5,0.3333333333,3,,,"a ""b"""'

@@ -2,12 +2,15 @@
 
 import math
 import re
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.plant.designed_loop import Margins
 from pipeline.report.numbers import listing, percent, significant, with_error
+from pipeline.report.tables import margin_rows
 
 _SUPERSCRIPTS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻−", "0123456789--")
 
@@ -89,3 +92,19 @@ def test_percentages_carry_their_sign_where_they_are_changes():
 def test_listing_reads_as_english():
     """Commas, and an "and" before the last."""
     assert [listing(list("abc")[:n]) for n in range(4)] == ["", "a", "a and b", "a, b and c"]
+
+
+def test_margins_say_lag_lead_and_no_limit():
+    """A negative phase margin is a lead; where no gain or phase is the edge, there is no limit."""
+    lag = Margins(gain=4.0, phase_deg=60.0, modulus=0.7, omega_gain=0.0, omega_phase=20.0)
+    assert margin_rows(lag) == [
+        ("gain margin", "4.00", "", "at 0 rad/s"),
+        ("phase margin", "60.0", "°", "of lag at 20.0 rad/s"),
+        ("modulus margin", "0.700", "", ""),
+    ]
+    lead = replace(lag, phase_deg=-60.0, gain=None, omega_gain=None)
+    assert margin_rows(lead)[0][1:] == ("–", "", "no limit")
+    assert margin_rows(lead)[1][1:] == ("60.0", "°", "of lead at 20.0 rad/s")
+    none = replace(lag, phase_deg=None, omega_phase=None)
+    assert margin_rows(none)[1][1:] == ("–", "°", "no limit")
+    assert margin_rows(None) == []

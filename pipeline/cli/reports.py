@@ -86,7 +86,7 @@ def run_report(
     tables: bool = False,
 ) -> "Analysis":
     """Write the report of a submission and say in a few lines what it found."""
-    from pipeline.output import check_folder, own_folder, write_file
+    from pipeline.output import check_folder, clear_files, own_folder, write_file
     from pipeline.report.changes import changes_line
     from pipeline.report.known_gap import with_gap
     from pipeline.report.questions import open_line
@@ -104,6 +104,8 @@ def run_report(
         changes = compared(analysis)
         out.mkdir(parents=True, exist_ok=True)
         write_file(out / "results.json", results_text(analysis))
+        clear_files(out, "results.mat")  # of an earlier report
+        clear_files(own_folder(out, "tables"), "*.csv")
         if tables:
             from pipeline.exchange.saved import save_tables  # loads pandas
 

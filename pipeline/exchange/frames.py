@@ -6,6 +6,8 @@ A column's unit, where it has one, stands in `frame.attrs["units"]`.
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from pipeline.plant.chain import Array
 from pipeline.results import Analysis, Record
 from pipeline.results_json import results_dict
@@ -19,12 +21,13 @@ _DWELL = (
     "experiment", "cart", "omega", "gain", "gain_std", "phase", "phase_std", "amplitude",
     "amplitude_std", "input_amplitude", "input_amplitude_std", "steady_from", "settled", "note",
 )  # fmt: skip
-_RESPONSE = ("cart", "omega", "magnitude", "magnitude_std", "phase", "phase_std", "source")
+RESPONSE = ("cart", "omega", "magnitude", "magnitude_std", "phase", "phase_std", "source")
 
 
 def parameters(analysis: Analysis) -> "pd.DataFrame":
     """Return initial and final estimates, one row a parameter; the index is its name."""
     frame = _frame(results_dict(analysis)["parameters"], _keys(Parameter), analysis=analysis)
+    frame["consistent"] = frame["consistent"].astype("boolean")  # None where there is none
     return frame.set_axis(frame["name"].to_list(), axis="index")
 
 
@@ -63,14 +66,12 @@ def dwells(analysis: Analysis) -> "pd.DataFrame":
 
 def frequency_response(analysis: Analysis) -> "pd.DataFrame":
     """Return one row a cart and frequency: the points of the Bode plots."""
-    import pandas as pd
-
-    parts = [
-        pd.DataFrame({key: getattr(response, key) for key in _RESPONSE})
-        for response in analysis.frequency_responses
-    ]
-    rows = pd.concat(parts).to_dict("records") if parts else []
-    return _frame(rows, _RESPONSE, analysis=analysis)
+    rows = []
+    for response in analysis.frequency_responses:
+        values = {key: getattr(response, key) for key in RESPONSE}
+        for i in range(response.omega.size):
+            rows.append({k: v[i] if isinstance(v, np.ndarray) else v for k, v in values.items()})
+    return _frame(rows, RESPONSE, analysis=analysis)
 
 
 def tables(analysis: Analysis) -> "dict[str, pd.DataFrame]":

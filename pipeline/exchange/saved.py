@@ -4,7 +4,7 @@ Same input, same bytes.
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.io import savemat
 
-from pipeline.exchange.frames import record_series, tables
-from pipeline.output import clear_files, csv_text, own_folder, write_file
-from pipeline.results import Analysis, Estimate
+from pipeline.exchange.frames import RESPONSE, record_series, tables
+from pipeline.output import csv_text, own_folder, write_file
+from pipeline.results import Analysis, Estimate, FrequencyResponse
 from pipeline.results_json import plain_json
 
 if TYPE_CHECKING:
@@ -22,14 +22,16 @@ if TYPE_CHECKING:
 
 _HEADER = b"MATLAB 5.0 MAT-file".ljust(116)  # scipy's own holds the time of day
 _LONGEST_NAME = 63  # of a variable in MATLAB
-_RESPONSE = ("cart", "omega", "magnitude", "magnitude_std", "phase", "phase_std")
+_RESERVED = set(
+    "break case catch classdef continue else elseif end for function global if otherwise parfor "
+    "persistent return spmd switch try while".split()
+)
 
 
 def save_tables(analysis: Analysis, out: Path) -> None:
     """Write one `tables/*.csv` a table of results, and `results.mat`, into the folder `out`."""
     folder = own_folder(out, "tables")
     folder.mkdir(parents=True, exist_ok=True)
-    clear_files(folder, "*.csv")
     for name, frame in tables(analysis).items():
         write_file(folder / f"{name}.csv", _csv(frame))
     write_file(out / "results.mat", matlab_file(analysis))
@@ -39,16 +41,17 @@ def _csv(frame: "pd.DataFrame") -> str:
     """Return the table as text; a heading holds its column's unit in brackets."""
     units = frame.attrs["units"]
     head = [f"{name} [{units[name]}]" if name in units else name for name in frame.columns]
-    return csv_text(head, plain_json(frame.to_numpy(dtype=object).tolist()))
+    rows = frame.astype(object).where(frame.notna(), None)
+    return csv_text(head, plain_json(rows.to_numpy().tolist()))
 
 
 def matlab_file(analysis: Analysis) -> bytes:
     """Return a MAT-file (level 5) whose variables are named as in `results.json`.
 
     `parameters.initial.K_1`, `parameters.initial_std.K_1`, the same for `final`; `A`, `B`, `C`,
-    `D`, and `m`, `c`, `k` of the chain; `gains`, `prefilter`, `sample_time`; one structure a cart
-    in `frequency_response`; `records.ID` with `time`, `u`, `x1`, …; `units`. A number that could
-    not be had is NaN; what was not found at all is not there.
+    `D`, and `m`, `c`, `k` of the chain; `gains`, `prefilter`, `sample_time`, `margins`; one
+    structure a cart in `frequency_response`; `records.ID` with `time`, `u`, `x1`, …; `units`. A
+    number that could not be had is NaN; what was not found at all is not there.
     """
     chain, design = analysis.chain, analysis.feedback
     variables: dict[str, Any] = {
@@ -59,12 +62,7 @@ def matlab_file(analysis: Analysis) -> bytes:
             "final": {row.name: _value(row.final) for row in analysis.rows},
             "final_std": {row.name: _std(row.final) for row in analysis.rows},
         },
-        "frequency_response": _structures(
-            [
-                {key: _or_empty(getattr(response, key)) for key in _RESPONSE}
-                for response in analysis.frequency_responses
-            ],
-        ),
+        "frequency_response": _responses(analysis.frequency_responses),
         "records": _named(
             {
                 record.id: {"id": record.id, "kind": record.kind, **record_series(record)}
@@ -81,6 +79,9 @@ def matlab_file(analysis: Analysis) -> bytes:
             "prefilter": design.prefilter,
             "sample_time": design.sample_time,
         }
+        if design.margins is not None:
+            values = vars(design.margins).items()
+            variables["margins"] = {k: np.nan if v is None else v for k, v in values}
     stream = BytesIO()
     savemat(stream, variables, oned_as="column", long_field_names=True)
     return _HEADER + stream.getvalue()[len(_HEADER) :]
@@ -94,15 +95,13 @@ def _std(estimate: Estimate | None) -> float:
     return np.nan if estimate is None or estimate.std is None else estimate.std
 
 
-def _or_empty(value: Any) -> Any:
-    return np.zeros((0, 0)) if value is None else value
-
-
-def _structures(rows: list[dict[str, Any]]) -> Any:
-    """Return an array of structures (1, n), as MATLAB has them."""
-    array = np.empty((1, len(rows)), dtype=[(key, object) for key in _RESPONSE])
-    for i, row in enumerate(rows):
-        array[0, i] = tuple(row.values())
+def _responses(responses: Sequence[FrequencyResponse]) -> Any:
+    """Return an array of structures (1, n), as MATLAB has them; a phase not known is empty."""
+    keys = RESPONSE[:-1]
+    array = np.empty((1, len(responses)), dtype=[(key, object) for key in keys])
+    for i, response in enumerate(responses):
+        values = (getattr(response, key) for key in keys)
+        array[0, i] = tuple(np.zeros((0, 0)) if value is None else value for value in values)
     return array
 
 
@@ -111,7 +110,8 @@ def _named(records: Mapping[str, Any]) -> dict[str, Any]:
     named: dict[str, Any] = {}
     for id_, record in records.items():
         plain = re.sub(r"\W", "_", id_, flags=re.ASCII)
-        plain = plain if plain[:1].isalpha() else f"r_{plain}"
+        if not plain[:1].isalpha() or plain in _RESERVED:
+            plain = f"r_{plain}"
         name, count = plain[:_LONGEST_NAME], 1
         while name in named:
             count += 1

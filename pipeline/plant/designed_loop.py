@@ -9,15 +9,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.errors import DataError
 from pipeline.plant.chain import Array, Chain, ComplexArray
 from pipeline.plant.loop import StateFeedback, broken_loop, discretise
 
 if TYPE_CHECKING:
     import control  # half a second: imported where it is used
 
-_SPREAD = 200  # frequencies of the whole band, to which each mode adds its own
-_NEAR_A_MODE = np.tan(np.linspace(-1.5, 1.5, 61))  # in half widths: equal steps of its phase
-_SLOWEST = 1e-3  # of the Nyquist frequency, where the band begins
+_SLOWER = 1e-2  # times the slowest pole: there the band begins
+_NEAREST, _AROUND = 1e-6, 30  # of a mode's frequency, the least distance looked at, and how many
+_PER_DECADE = 60  # frequencies of the band, to which each mode adds its own
+_ON_AXIS = 1e-2  # rad, by which a crossing of the interpolated curve may miss the true one
+_UNDAMPED = 1e-9  # from the unit circle
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,8 +31,8 @@ class Margins:
     ----------
     gain : factor on the loop's gain that makes it unstable, the nearest to 1 (below 1: the least
         gain it needs); None where no factor does.
-    phase_deg : lag in degrees that makes it unstable, or lead where below zero; None where the
-        gain never is 1.
+    phase_deg : lag in degrees that makes it unstable, or lead where below zero, the nearest to 0;
+        None where none does: the loop's gain is 1 nowhere.
     modulus : the least distance of the Nyquist curve from -1, one over the peak of the sensitivity.
     omega_gain, omega_phase : rad/s, where `gain` and `phase_deg` are met.
 
@@ -72,43 +75,62 @@ def closed_loop(
 def stability_margins(
     chain: Chain, controller: StateFeedback, *, sample_time: float
 ) -> Margins | None:
-    """Return the margins of the loop cut at the motor, or None where it is not stable."""
+    """Return the margins of the loop cut at the motor, or None where it is not stable.
+
+    Raises
+    ------
+    DataError : a mode of the carts is undamped, as one is whose damping a fit held at zero.
+    """
     import control
 
     A, B, C = broken_loop(chain, controller, sample_time=sample_time)
-    if np.abs(np.linalg.eigvals(A - np.outer(B, C))).max() >= 1:
+    opened, closed = np.linalg.eigvals(A), np.linalg.eigvals(A - np.outer(B, C))
+    if np.abs(closed).max() >= 1:
         return None
-    nyquist = np.pi / sample_time
-    omega = _frequencies(np.linalg.eigvals(A).astype(np.complex128), sample_time=sample_time)
+    if np.any((np.abs(np.abs(opened) - 1) < _UNDAMPED) & (opened.imag != 0)):
+        raise DataError("margins need damped carts, found a mode without damping")
+    poles = np.append(opened, closed).astype(np.complex128)
+    omega = _frequencies(poles, sample_time=sample_time)
+
+    def response(omega: Array) -> ComplexArray:
+        shifted = np.exp(1j * sample_time * omega)[:, None, None] * np.eye(B.size) - A
+        return (C @ np.linalg.solve(shifted, B[:, None]))[:, 0].astype(np.complex128)
+
+    L = response(omega)
+    _, _, _, at_180, at_one, near_minus_one = control.stability_margins(
+        (np.abs(L), np.degrees(np.angle(L)), omega), returnall=True
+    )
     # At both ends of the band the response is real, and where it is negative crosses -180° too;
     # carts that no spring ties to a wall have none at the lower end.
-    ends = np.array([0.0, nyquist] if chain.is_tied else [nyquist])
-    L = _response(A, B, C, z=np.exp(1j * sample_time * np.append(omega, ends)))
-    inside, at_ends = L[: omega.size], L[omega.size :].real
-    gain, phase, distance, omega_gain, omega_phase, _ = control.stability_margins(
-        (np.abs(inside), np.degrees(np.angle(inside)), omega), returnall=True
-    )
-    gain = np.append(gain, -1 / at_ends[at_ends < 0])
-    omega_gain = np.append(omega_gain, ends[at_ends < 0])
-    nearest, least = np.argsort(np.abs(np.log(gain))), np.argsort(np.abs(phase))
+    at_180 = np.append(at_180, [0.0, np.pi / sample_time] if chain.is_tied else np.pi / sample_time)
+    # The curve between the frequencies looked at was interpolated: what counts is the true one.
+    real, size_one = response(at_180), response(at_one)
+    crosses = np.abs(np.angle(-real)) < _ON_AXIS
+    at_180, gain = at_180[crosses], 1 / np.abs(real[crosses])
+    reaches = np.abs(np.log(np.abs(size_one))) < _ON_AXIS
+    at_one, phase = at_one[reaches], np.degrees(np.angle(-size_one[reaches]))
+    gain_of, phase_of = np.argsort(np.abs(np.log(gain))), np.argsort(np.abs(phase))
+    distances = np.abs(1 + np.concatenate([L, real, response(near_minus_one)]))
     return Margins(
-        gain=float(gain[nearest[0]]) if gain.size else None,
-        phase_deg=float(phase[least[0]]) if phase.size else None,
-        modulus=float(min(distance.min(initial=np.inf), np.abs(1 + at_ends).min())),
-        omega_gain=float(omega_gain[nearest[0]]) if gain.size else None,
-        omega_phase=float(omega_phase[least[0]]) if phase.size else None,
+        gain=float(gain[gain_of[0]]) if gain.size else None,
+        phase_deg=float(phase[phase_of[0]]) if phase.size else None,
+        modulus=float(distances.min()),
+        omega_gain=float(at_180[gain_of[0]]) if gain.size else None,
+        omega_phase=float(at_one[phase_of[0]]) if phase.size else None,
     )
-
-
-def _response(A: Array, B: Array, C: Array, *, z: ComplexArray) -> ComplexArray:
-    shifted = z[:, None, None] * np.eye(B.size) - A
-    return (C @ np.linalg.solve(shifted, B[:, None]))[:, 0]
 
 
 def _frequencies(z: ComplexArray, *, sample_time: float) -> Array:
-    """Return frequencies up to Nyquist's, rad/s, close where a pole makes the response turn."""
+    """Return frequencies up to Nyquist's, rad/s, the closer together the nearer to a pole."""
     nyquist = np.pi / sample_time
-    s = np.log(z[z.imag > 0]) / sample_time
-    modes = s.imag[:, None] + np.abs(s.real)[:, None] * _NEAR_A_MODE
-    omega = np.append(np.geomspace(_SLOWEST * nyquist, nyquist, _SPREAD, endpoint=False), modes)
-    return np.unique(omega[(omega >= _SLOWEST * nyquist) & (omega < nyquist)])
+    s = np.log(z[np.abs(z) > np.exp(-np.pi)]) / sample_time  # the others turn nothing quickly
+    slowest = np.abs(s[np.abs(s) > _NEAREST * nyquist]).min(initial=nyquist)
+    lowest = min(_SLOWER * slowest, _SLOWER * nyquist)
+    count = int(_PER_DECADE * np.log10(nyquist / lowest))
+    band = np.geomspace(lowest, nyquist, count, endpoint=False)
+    modes = s[s.imag > 0]
+    width = np.maximum(-modes.real, _NEAREST * modes.imag)[:, None]
+    away = 0.1 * width * (nyquist / (0.1 * width)) ** np.linspace(0.0, 1.0, _AROUND)
+    near = np.concatenate([modes.imag[:, None] + away, modes.imag[:, None] - away])
+    omega = np.unique(np.append(band, near))
+    return omega[(omega >= lowest) & (omega < nyquist)]

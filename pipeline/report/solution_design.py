@@ -13,7 +13,7 @@ from pipeline.report.mathematics import Math, Term, matrix, parens, power, row, 
 from pipeline.report.model import formula, matlab_matrix, number_matrix
 from pipeline.report.numbers import percent, significant
 from pipeline.report.page import Page
-from pipeline.report.tables import cell, make_table, margin_texts
+from pipeline.report.tables import cell, make_table, margin_rows
 from pipeline.report.tex import from_tex
 from pipeline.results import FeedbackDesign
 
@@ -161,13 +161,14 @@ def design_blocks(page: Page) -> list[Block]:
 
 
 def _margins(design: FeedbackDesign) -> list[Block]:
-    found = [f"{name} {value} {at}".strip() for name, value, at in margin_texts(design.margins)]
+    rows = margin_rows(design.margins)
+    found = [f"{name} {value}{unit} {at}".strip() for name, value, unit, at in rows]
     if not found:
         return []
     return [
         paragraph(
             "Cut where the effort drives cart 1, with the controller's observer and the delay in "
-            f"it, the loop has these margins: {', '.join(found)}.".replace(" °", "°")
+            f"it, the loop has: {', '.join(found)}."
         )
     ]
 

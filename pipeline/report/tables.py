@@ -256,7 +256,10 @@ def feedback_table(design: FeedbackDesign, *, number: int, units: tuple[str, str
         (spans("overshoot"), percent(design.overshoot_percent), ""),
         (spans("settling time, 2 %"), significant(design.settling_time, digits=3), "s"),
         (spans("largest input"), significant(design.peak_input, digits=3), drive),
-        *((spans(f"{name} margin"), value, at) for name, value, at in margin_texts(design.margins)),
+        *(
+            (spans(name), value, f"{unit} {at}".strip())
+            for name, value, unit, at in margin_rows(design.margins)
+        ),
     ]
     return make_table(
         number,
@@ -269,16 +272,21 @@ def feedback_table(design: FeedbackDesign, *, number: int, units: tuple[str, str
     )
 
 
-def margin_texts(margins: Margins | None) -> list[tuple[str, str, str]]:
-    """Return name, number and what belongs to it of each margin; none where they are unknown."""
+def margin_rows(margins: Margins | None) -> list[tuple[str, str, str, str]]:
+    """Return name, number, unit and place of each margin; none where they are unknown."""
     if margins is None:
         return []
     gain, phase = margins.gain, margins.phase_deg
-    degrees = "" if phase is None else "° of lag " if phase > 0 else "° of lead "
+    turn = "of lead " if phase is not None and phase < 0 else "of lag "
     return [
-        ("gain", significant(gain, digits=3), _at(margins.omega_gain)),
-        ("phase", significant(phase and abs(phase), digits=3), degrees + _at(margins.omega_phase)),
-        ("modulus", significant(margins.modulus, digits=3), ""),
+        ("gain margin", significant(gain, digits=3), "", _at(margins.omega_gain)),
+        (
+            "phase margin",
+            significant(phase and abs(phase), digits=3),
+            "°",
+            ("" if phase is None else turn) + _at(margins.omega_phase),
+        ),
+        ("modulus margin", significant(margins.modulus, digits=3), "", ""),
     ]
 
 
