@@ -11,7 +11,8 @@ from pathlib import Path
 from pipeline.errors import ConfigError
 
 LOCK = ".lock"  # of `pipeline.lock`
-_NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+# What looks like the start of a formula and is none: a number, and the dash for nothing.
+_PLAIN = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?|-", re.ASCII)
 # What starts a formula, wide and small forms too, at the start of a cell or behind a semicolon,
 # where a spreadsheet of a country with decimal commas begins another cell, quotes or not.
 _FORMULA = re.compile(r"(^|;)(?=[ \"']*[=+\-@＝＋－＠﹦﹢﹣﹫])")
@@ -91,4 +92,4 @@ def harmless(text: str) -> str:
     none keeps a spreadsheet, but not us, from seeing a formula.
     """
     text = "".join(c if c.isprintable() else " " for c in text)
-    return text if _NUMBER.fullmatch(text) else _FORMULA.sub(r"\1'", text)
+    return text if _PLAIN.fullmatch(text) else _FORMULA.sub(r"\1'", text)

@@ -185,7 +185,7 @@ def test_moodle_own_worksheet_is_filled_in(tmp_path):
     found = moodle_import(rows)
     assert {k: g for k, (g, _) in found.items()} == {"1024": "10", "5": "20", "6": ""}
     assert found["6"][1] == "kept"
-    assert rows[1][8] == "Friday, 3 May"
+    assert rows[1][8:10] == ["Friday, 3 May", "-"]
     assert remarks == ("not in roster.csv, so not exported: =ann",)
 
 
