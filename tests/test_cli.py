@@ -154,6 +154,29 @@ def test_a_file_that_cannot_be_read_is_its_own_run_s_problem(tmp_path):
     assert re.search(r"there is no file 'data/decay-1a\.csv' \(and \d+ more\)$", line)
 
 
+def test_a_damping_at_its_bound_is_reported_as_unknown(tmp_path):
+    """Points beside a sharp peak: no final ζ, with its reason, and the pictures are drawn.
+
+    One of the points of the fit's curve lies on the pole.
+    """
+    hertz = [0.5, 1.0, 1.5, 2.5, 3.0, 4.0]  # resonance at 2 Hz, K = 20 cm/V
+    rows = [f"{f},{20 / abs(1 - (f / 2) ** 2):.6g}" for f in hertz]
+    (tmp_path / "bode.csv").write_text("\n".join(["frequency,x1", *rows]), encoding="utf-8")
+    (tmp_path / "submission.toml").write_text(
+        "version = 1\n[system]\ncarts = 1\n"
+        '[[experiments]]\nid = "bode"\nkind = "bode"\nfile = "bode.csv"\n',
+        encoding="utf-8",
+    )
+    done = cartlab("report", tmp_path, "--no-pdf", "--json")
+    found = json.loads(done.stdout)
+    assert done.returncode in (0, 1)
+    assert "Traceback" not in done.stderr
+    zeta = {parameter["name"]: parameter for parameter in found["parameters"]}["zeta"]
+    assert (zeta["final"], zeta["final_std"], zeta["consistent"]) == (None, None, None)
+    assert "bound" in {skip["stage"]: skip["reason"] for skip in found["skipped"]}["final zeta"]
+    assert found["chain"]["c"] == [0.0]
+
+
 def test_new_then_report_tells_what_to_do_next(tmp_path):
     """A fresh folder cannot be reported yet; the message says what is missing."""
     assert cartlab("new", tmp_path / "team", "--carts", "2").returncode == 0
