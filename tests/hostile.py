@@ -206,6 +206,7 @@ def _spoilt(good: Files, rng: random.Random) -> dict[str, Files]:
     text("typst", _marked(toml, _TYPST))
     text("formula", _marked(toml, _FORMULA))
     text("formula, tab", _marked(toml, "\t+1+cmd|' /C calc'!A0"))
+    text("formula, return", _marked(toml, "x\r=cmd|' /C calc'!A0;\u3000\u00ad\u200e=1+1"))
     text("bidi", _marked(toml, "\u202egnp.\u2066x\u200b\u200d\ufeff"))
     text("control", _marked(toml, "\x1b[31m\x07\x00red\r\n\x85\u2028"))
     for number, name in enumerate(("..", "CON", "", "x" * 300, "a/b", "-1+1")):
