@@ -14,7 +14,7 @@ from pipeline.plant.chain import Chain
 from pipeline.plant.effects import Effect, Parameter, Term, find_effect
 from pipeline.plant.effects.base import Scales, chain_scales
 from pipeline.plant.simulate import simulate_linear
-from pipeline.submission.complaints import nearest
+from pipeline.submission.complaints import nearest, quote
 from pipeline.submission.toml_file import read_text
 from pipeline.synthesis import COUNT, SAMPLE_TIME, preset_chain, write_submission
 
@@ -151,7 +151,7 @@ def _number(text: str, *, where: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise ConfigError(f"{where} needs a number, found {text!r}")
+        raise ConfigError(f"{where} needs a number, found {quote(text)}")
     return value
 
 
@@ -301,7 +301,7 @@ def _chain(entry: object, *, where: str) -> Chain:
     try:
         chain = Chain(m=fields["m"], c=fields["c"], k=fields["k"])
     except (KeyError, TypeError, ValueError) as error:
-        reason = f"needs {error}" if isinstance(error, KeyError) else error
+        reason = f"needs {error}" if isinstance(error, KeyError) else str(error)[:200]
         raise ConfigError(f"{where}: {reason}") from None
     numbers = np.concatenate([chain.m, chain.c, chain.k])
     if not (np.all(np.isfinite(numbers)) and np.all(chain.m > 0) and np.all(numbers >= 0)):
@@ -324,7 +324,7 @@ def _stored_effect(entry: object, bench: HiddenBench, *, where: str) -> Term:
         values[name] = _number(str(number), where=f"{where}.parameters.{name}")
     if unknown := [name for name in values if name not in effect.names]:
         known = nearest(unknown[0], effect.names)
-        raise ConfigError(f"{where}: {effect.key} has no {unknown[0]!r}{known}")
+        raise ConfigError(f"{where}: {effect.key} has no {quote(unknown[0])}{known}")
     if missing := [p.name for p in effect.parameters if p.reported and p.name not in values]:
         raise ConfigError(f"{where}: {effect.key} needs {missing[0]}")
     at = _mapping(fields.get("where", {}), where=f"{where}.where").get(effect.place, 0)

@@ -46,4 +46,4 @@ def find_effect(key: str) -> Effect:
     keys = [effect.key for effect in CATALOGUE]
     close = get_close_matches(key, keys, n=1, cutoff=0.5)
     known = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(keys)}"
-    raise ConfigError(f"no effect {key!r}; {known}")
+    raise ConfigError(f"no effect {key[:60]!r}; {known}")
