@@ -186,7 +186,7 @@ def _errors(gap: Gap) -> str:
         f"{share(gap.baseline)} of the motion to {share(gap.final)}; {_noise(gap)}"
     )
     least = max(gap.noise_floor, gap.repeatability or 0.0)
-    if gap.final > _ALL * least:
+    if 0 < _ALL * least < gap.final:
         times = significant(gap.final / least, digits=2)
         return f"{text}. So {times} times what noise makes is left: this is the main effect, " \
             "not all of it."  # fmt: skip

@@ -23,6 +23,7 @@ _RING = 6.0  # periods of the slowest motion: the first swings are the largest
 _PER_CM = {"cm": 1.0, "mm": 10.0, "m": 0.01, "in": 1 / 2.54, "count": 1 / COUNT}
 _INPUT_LIMIT = 5.0  # input units
 _MOST_BYTES = 10_000_000  # of a file with a model
+_SLOWEST, _FASTEST = 0.01, 1e4  # rad/s of a model's slowest motion: ten minutes, a sample
 _INPUT_RESERVE = 4.0  # times the input that holds a cart at its travel
 
 
@@ -300,12 +301,19 @@ def _chain(entry: object, *, where: str) -> Chain:
     fields = _mapping(entry, where=where)
     try:
         chain = Chain(m=fields["m"], c=fields["c"], k=fields["k"])
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         reason = f"needs {error}" if isinstance(error, KeyError) else str(error)[:200]
         raise ConfigError(f"{where}: {reason}") from None
     numbers = np.concatenate([chain.m, chain.c, chain.k])
     if not (np.all(np.isfinite(numbers)) and np.all(chain.m > 0) and np.all(numbers >= 0)):
         raise ConfigError(f"{where}: m must be positive, c and k at least zero")
+    with np.errstate(over="ignore"):  # what runs over is refused
+        slowest = float(np.abs(chain.poles).min())
+    if not _SLOWEST <= slowest <= _FASTEST:
+        raise ConfigError(
+            f"{where}: its slowest motion has {slowest:.3g} rad/s; "
+            f"{_SLOWEST:g} to {_FASTEST:g} can be run on a bench"
+        )
     return chain
 
 
