@@ -2,14 +2,14 @@
 
 from collections.abc import Callable, Iterable, Sequence, Set
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 from typing import ParamSpec, TypeVar
 
 import numpy as np
 
 from pipeline.errors import DataError
 from pipeline.ingest.read import Ingested, read_data
-from pipeline.plant.chain import parameter_names
+from pipeline.plant.chain import Chain, parameter_names
 from pipeline.results import (
     Analysis,
     ChainFit,
@@ -27,6 +27,7 @@ from pipeline.results import (
 from pipeline.stages.bode_fit import fit_bode
 from pipeline.stages.compare import (
     AT_BOUND,
+    CHI_SQUARE_LIMIT,
     NOT_IDENTIFIED,
     check_chain,
     check_decays,
@@ -219,15 +220,23 @@ def _identify_from_sound(
     odd = find_outlier_repeats(driven, unit=system.position.unit)
     without, contradicted = odd.keys() | standing_still(data.records), []
     found = _identify(data, without=without, system=system, progress=progress)
-    faults = find_faults(data.records, chain=found.fit.chain if found.fit else None)
+    chain = _witness(found, data.records, system=system)
+    faults = find_faults(data.records, chain=chain)
     for _ in range(_ROUNDS):
         odd |= found.repeats.odd
         if without == odd.keys() | faults.keys():
             break
         without = odd.keys() | faults.keys()
-        contradicted += [check for check in found.repeats.checks if check.outcome == "fail"]
+        contradicted += [
+            check
+            for check in found.repeats.checks
+            if check.outcome == "fail"
+            and check.id.removeprefix("repeats.") not in found.repeats.undecided
+        ]
         found = _identify(data, without=without, system=system, progress=progress)
-        faults = find_faults(data.records, chain=found.fit.chain if found.fit else None)
+        # Where nothing is left to identify the carts from, the verdict before stands.
+        chain = _witness(found, data.records, system=system) or chain
+        faults = find_faults(data.records, chain=chain)
     checks = {check.id: check for check in (*found.repeats.checks, *contradicted)}
     repeats = replace(found.repeats, checks=tuple(checks.values()))
     left_out = {**odd, **faults}
@@ -235,6 +244,26 @@ def _identify_from_sound(
         replace(found, repeats=repeats),
         [left_out[record.id] for record in data.records if record.id in left_out],
     )
+
+
+def _witness(found: _Identified, records: Sequence[Record], *, system: System) -> Chain | None:
+    """Return the chain that the records follow; or else would, with two columns exchanged."""
+    chain = found.fit.chain if found.fit else None
+    if chain and follows(records, chain=chain):
+        return chain
+    for i, j in combinations(sorted(response.cart for response in found.responses), 2):
+        turned = [replace(r, cart={i: j, j: i}.get(r.cart, r.cart)) for r in found.responses]
+        try:
+            fit = fit_bode(
+                sorted(turned, key=lambda response: response.cart),
+                n=system.carts,
+                springs=system.springs,
+            )
+        except DataError:
+            continue
+        if fit.chi_square_per_dof <= CHI_SQUARE_LIMIT:
+            return fit.chain
+    return chain
 
 
 def _identify(

@@ -139,6 +139,18 @@ def test_dwells_that_were_cut_are_flagged(bench, tmp_path):
     assert all(59 * 0.00884 * frequency[name] < 2 for name in flag.parameters)
 
 
+def test_columns_exchanged_in_every_recording_are_named(bench, tmp_path):
+    """No record follows any carts as it is, all of them do exchanged: nothing is identified."""
+    folder = shutil.copytree(bench, tmp_path / "exchanged")
+    driven = [*files(folder, "step"), *files(folder, "sine"), *files(folder, "sweep")]
+    for path in driven:
+        spoil(path, exchanged)
+    analysis = analyse(load_submission(folder))
+    assert {one.experiment for one in analysis.left_out} == {path.stem for path in driven}
+    assert all("exchanged" in one.reason for one in analysis.left_out)
+    assert "fit.identified" in _failed(analysis)
+
+
 def test_records_of_two_carts_identify_no_third(bench, tmp_path):
     """Without a recording of the last cart there is no model, and the report fails."""
     folder = shutil.copytree(bench, tmp_path / "three")

@@ -13,7 +13,9 @@ from pipeline.results import Analysis
 
 
 def investigate(analysis: Analysis, *, progress: Callable[[str], None]) -> Gap:
-    """Explain the gap of all time records of a submission, starting from the identified chain.
+    """Explain the gap of the time records of a submission, starting from the identified chain.
+
+    A record that does not hold what happened is no gap of the model.
 
     Raises
     ------
@@ -21,8 +23,9 @@ def investigate(analysis: Analysis, *, progress: Callable[[str], None]) -> Gap:
     """
     progress("preparing the simulator; once on each machine it is compiled, which takes a while")
     _compile()
+    wrong = {one.experiment for one in analysis.left_out if one.is_wrong}
     return explain_gap(
-        analysis.records,
+        [record for record in analysis.records if record.id not in wrong],
         springs=analysis.springs,
         chain=analysis.chain,
         position_unit=analysis.position_unit,

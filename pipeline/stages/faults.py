@@ -27,7 +27,7 @@ _SEEN_COUNTS, _SEEN_SHARE = 5.0, 0.3
 # Shares of a record's power (about its mean) that the identified carts leave unexplained.
 _FOLLOWED = 0.1
 _EXCHANGED, _BETTER = 0.05, 5.0  # as recorded at least this, exchanged so many times less
-_WITNESSES = 2  # records that follow the carts, before a record that does not is accused
+_WITNESSES = 2  # records that follow the carts, as they are or exchanged: one does by chance
 # Simulated carts with dry friction F under a force of amplitude A leave at least (F / 5A)² where
 # they move at all, which is doubled here; encoder and noise hide shares below the least.
 _FRICTION, _LEAST = 10.0, 1e-4
@@ -122,11 +122,11 @@ def _follow(records: Sequence[Record], chain: Chain | None) -> dict[str, _Follow
 
 
 def _held_against(record: Record, chain: Chain) -> _Followed | None:
+    springs = tuple(bool(k) for k in chain.k)
     try:
-        window = open_window(record)
-    except DataError:  # nothing moves
+        window, P = open_window(record), Parametrisation(n=chain.n, springs=springs)
+    except DataError:  # nothing moves, or the motor does not reach the last cart
         return None
-    P = Parametrisation(n=chain.n, springs=tuple(bool(k) for k in chain.k))
     modes = find_modes(chain, free=window.free, parametrisation=P, slopes=np.zeros(len(P.names)))
     residual = compare(window, modes).residual * window.sigma[:, None]
     power = np.var(window.y, axis=1)
@@ -267,7 +267,7 @@ def _exchanged(
 
     Where this is so of most of a kind, it is of those of the kind that tell it less clearly.
     """
-    if chain is None or sum(fit.share < _EXCHANGED for fit in fits.values()) < _WITNESSES:
+    if chain is None:
         return {}
     looks: dict[str, str] = {}
     kinds = {record.kind for record in records if record.id in fits}
@@ -277,6 +277,8 @@ def _exchanged(
         if 2 * len(sure) > len(alike):
             sure = {r.id: pair for r in alike if (pair := _pair(r, chain, better=1.0))}
         looks |= sure
+    if sum(fit.share < _EXCHANGED for fit in fits.values()) + len(looks) < _WITNESSES:
+        return {}
     return {
         name: f"{pair} look exchanged: read that way it follows the identified carts"
         for name, pair in looks.items()
