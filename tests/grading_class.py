@@ -5,7 +5,7 @@ the method does not reach that far on this bench, it is that of a more careful s
 """
 
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from pathlib import Path
@@ -17,6 +17,7 @@ from pipeline.errors import DataError
 from pipeline.grading.load import load_rubric
 from pipeline.grading.rubric import Rubric, is_damping
 from pipeline.grading.run import under_rubric
+from pipeline.grading.springs import with_all_springs
 from pipeline.grading.state_model import own_chain
 from pipeline.plant.chain import Array, Chain
 from pipeline.plant.effects import Term, find_effect
@@ -134,7 +135,36 @@ def make_team(seed: int, *, folder: Path | None = None, **bench: Any) -> Team:
     return _team(drawn, rng, seed=seed, folder=folder)
 
 
-def _team(bench: Bench, rng: np.random.Generator, *, seed: int, folder: Path) -> Team:
+def with_spoilt_data(seed: int) -> Team:
+    """Return the team of a seed with one file spoilt before anything is read of it."""
+    rng = np.random.default_rng([2005, seed])
+    bench = make_bench(rng, carts=1 + seed % 3)
+    with tempfile.TemporaryDirectory() as folder:
+        return _team(bench, rng, seed=seed, folder=Path(folder), spoil=spoil_data)
+
+
+def with_wrong_rubric(seed: int) -> Team | None:
+    """Return the team of a seed whose rubric lacks its near spring; None where it has none."""
+    rng = np.random.default_rng([2005, seed])
+    bench = make_bench(rng, carts=1 + seed % 3)
+    if bench.chain.n == 1 or not bench.springs[0]:
+        return None
+    rubric = rubric_of(bench)
+    system = rubric.system.model_copy(update={"springs": (False, *bench.springs[1:])})
+    rubric = rubric.model_copy(update={"system": system})
+    with tempfile.TemporaryDirectory() as folder:
+        return _team(bench, rng, seed=seed, folder=Path(folder), rubric=rubric)
+
+
+def _team(
+    bench: Bench,
+    rng: np.random.Generator,
+    *,
+    seed: int,
+    folder: Path,
+    rubric: Rubric | None = None,
+    spoil: Callable[[Submission, np.random.Generator], None] = lambda *_: None,
+) -> Team:
     write_submission(
         folder,
         chain=bench.chain,
@@ -145,17 +175,43 @@ def _team(bench: Bench, rng: np.random.Generator, *, seed: int, folder: Path) ->
         compact=seed % 2 == 0,
         reported=True,
     )
-    rubric = rubric_of(bench)
+    rubric = rubric or rubric_of(bench)
     submission = _fewer_dwells(load_submission(folder), bench.dwells)
+    spoil(submission, rng)
     submission, _ = under_rubric(submission, rubric)
     team = Team(
         submission=submission,
-        analysis=analyse(submission, design=False),
+        analysis=with_all_springs(submission, analyse(submission, design=False))[0],
         rubric=rubric,
         bench=bench,
         rng=rng,
     )
     return report(team)
+
+
+def spoil_data(submission: Submission, rng: np.random.Generator) -> None:
+    """Spoil one file: an encoder that sticks, a copy in its place, the end cut off."""
+    runs = [e for e in submission.experiments if e.kind in ("decay", "step", "sine")]
+    run = runs[int(rng.integers(len(runs)))]
+    path = submission.folder / run.file
+    lines = path.read_text(encoding="utf-8").splitlines()
+    kind = int(rng.integers(3))
+    if kind == 0:  # it sticks while it moves
+        column = lines[0].split(",").index(f"x{run.carts[0] if run.carts else 1}")
+        rows = [line.split(",") for line in lines[1:]]
+        x = np.array([float(row[column]) for row in rows])
+        start = int(np.argmax(np.abs(np.diff(x))))
+        for row in rows[start : start + 60]:
+            row[column] = rows[start][column]
+        lines = [lines[0], *(",".join(row) for row in rows)]
+    elif kind == 1:
+        others = [e for e in runs if e.id != run.id]
+        other = others[int(rng.integers(len(others)))]
+        lines = (submission.folder / other.file).read_text(encoding="utf-8").splitlines()
+    else:
+        lines = lines[: len(lines) // 2]
+        lines[-1] = lines[-1].split(",")[0]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
 
 
 def _fewer_dwells(submission: Submission, count: int) -> Submission:

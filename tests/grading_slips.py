@@ -12,7 +12,7 @@ from pipeline.errors import DataError
 from pipeline.plant.chain import Array
 from pipeline.results import FrequencyResponse
 from pipeline.stages.bode_fit import fit_bode
-from pipeline.submission import Feedback, Reported, Submission
+from pipeline.submission import Feedback, Reported
 from tests.grading_class import Team, written
 
 TURN = 2 * np.pi
@@ -176,7 +176,9 @@ def physically_impossible(team: Team) -> Team:
 
 
 def transient_used(team: Team) -> Team:
-    """Amplitudes read off the first cycles of every dwell, and a fit to them."""
+    """Amplitudes read off the first cycles of every dwell, and a fit to them, if there is one."""
+    if any(e.note for e in team.submission.experiments if e.kind == "sine"):
+        return team  # recorded after the transient: nobody can use it
     truth = team.bench.chain.parameters()
     for cycles in team.rng.permutation([2.0, 3.0]):
         try:
@@ -293,31 +295,6 @@ def missing(team: Team) -> Team:
         return reporting(team, team.reported.model_copy(update={"state_space": None}))
     runs = tuple(e for e in team.submission.experiments if e.kind != "closed_loop")
     return replace(team, submission=team.submission.model_copy(update={"experiments": runs}))
-
-
-def spoil_data(submission: Submission, rng: np.random.Generator) -> None:
-    """Spoil one file: an encoder that sticks, a copy in its place, the end cut off."""
-    runs = [e for e in submission.experiments if e.kind in ("decay", "step", "sine")]
-    run = runs[int(rng.integers(len(runs)))]
-    path = submission.folder / run.file
-    lines = path.read_text(encoding="utf-8").splitlines()
-    kind = int(rng.integers(3))
-    if kind == 0:  # it sticks while it moves
-        column = lines[0].split(",").index(f"x{run.carts[0] if run.carts else 1}")
-        rows = [line.split(",") for line in lines[1:]]
-        x = np.array([float(row[column]) for row in rows])
-        start = int(np.argmax(np.abs(np.diff(x))))
-        for row in rows[start : start + 60]:
-            row[column] = rows[start][column]
-        lines = [lines[0], *(",".join(row) for row in rows)]
-    elif kind == 1:
-        others = [e for e in runs if e.id != run.id]
-        other = others[int(rng.integers(len(others)))]
-        lines = (submission.folder / other.file).read_text(encoding="utf-8").splitlines()
-    else:
-        lines = lines[: len(lines) // 2]
-        lines[-1] = lines[-1].split(",")[0]
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
 
 
 SLIPS: dict[str, Callable[[Team], Team]] = {

@@ -124,6 +124,37 @@ def test_frequencies_in_hz(carts, table):
     assert "/2π" in flag.message
 
 
+def test_a_named_mistake_is_told_once_and_nothing_else_is_advised():
+    """Hz in both tables: one flag that says of which number it speaks, and no talk of peaks."""
+    one = student(2)
+    names = [n for n in one.reported.final if n.startswith("omega")]
+    hertz = scaled(scaled(one, "initial", names, 1 / TURN), "final", names, 1 / TURN).grade()
+    (flag,) = hertz.flags
+    assert "first estimate" in flag.message
+    assert flag.evidence["table"] == "initial"
+    lost = {c.id: c.message for c in hertz.criteria if c.outcome in ("partial", "fail")}
+    advice = {c.id: c.message for c in one.rubric.criteria if c.message}
+    assert advice["initial-decays"] not in lost["initial-decays"]
+
+
+@pytest.mark.parametrize("carts", [1, 2, 3])
+def test_numbers_beside_a_slip_are_as_far_off_as_honest_ones(carts):
+    """Gains in counts, one of them 7 % off as first estimates are: one number, one flag."""
+    one, names = student(carts), own("K", carts)
+    counted = {n: one.value("initial", n) / 0.00227 for n in names}
+    counted[names[-1]] *= 1.07
+    flag = only_flag(one.reporting(initial=counted))
+    assert (flag.code, set(flag.parameters)) == ("counts_for_length", set(names))
+
+
+@pytest.mark.parametrize("carts", [2, 3])
+def test_a_mistake_that_is_made_everywhere_shows_everywhere(carts):
+    """One damping that is 2.3 times too small beside right ones tells of no logarithm."""
+    one = student(carts)
+    flag = only_flag(scaled(one, "initial", ["zeta_1"], np.log10(np.e)))
+    assert (flag.code, flag.parameters) == ("initial_off", ("zeta_1",))
+
+
 @pytest.mark.parametrize("carts", [1, 2, 3])
 @pytest.mark.parametrize("k", [1, 2, 3])
 def test_one_period_counted_too_many(carts, k):

@@ -96,9 +96,10 @@ def _parameters(criterion: asked.Parameters, work: Work) -> Verdict:
         reasons = [s.reason for s in work.analysis.skipped]
         why = reasons[0] if reasons else "these are first guesses, and no recording decides them"
         return Verdict(share=None, message=f"Not checked: {why}.")
-    shares, off = [], []
+    shares, off, wrong = [], [], set()
     for name in judged:
         if name not in table:
+            wrong.add(name)
             shares.append(NONE)
             off.append(f"{name} is not reported")
             continue
@@ -109,13 +110,15 @@ def _parameters(criterion: asked.Parameters, work: Work) -> Verdict:
         )
         shares.append(_credit(error, name, criterion))
         if shares[-1] < 1:
-            there = f", your recordings give {known[name].value:.4g}" if name in known else ""
+            wrong.add(name)
+            there = f", your recordings give {known[name].said}" if name in known else ""
             off.append(f"{name}: you report {table[name]}{there}")
     left = f" Not judged: {_listed(guessed)}." if guessed and criterion.check == "final" else ""
     message = f"{'; '.join(off[:_NAMED])}." if off else "As your own recordings say."
     return Verdict(
         share=mean_share(shares),
         message=message + left,
+        explained=bool(wrong) and wrong <= work.named[criterion.check],
         expected={n: known[n].value for n in judged if n in known},
         found={n: float(table[n]) for n in judged if n in table},
     )

@@ -26,6 +26,7 @@ _OFF_DAMPING = 80.0
 _SUSPECT_DAMPING = 40.0  # enough to look for a known mistake, not for a remark of its own
 _OFF_EACH_OTHER = 25.0
 _CONFIRMED = Decimal("0.05")  # relative: the other table says the same
+_TOLD: dict[Label, str] = {"initial": "first estimate", "final": "final estimate"}
 _OTHER: dict[Label, Label] = {"initial": "final", "final": "initial"}
 
 # What comes of reading a decay or a step; in a final table only where it was taken over.
@@ -34,10 +35,16 @@ _FROM_TIME_RECORDS = {"peak_count", "log10_for_ln", "peak_for_steady_state", "tr
 
 @dataclass(frozen=True, kw_only=True)
 class Diagnosis:
-    """The flags of the tables, and the final table with what is off in it put right."""
+    """The flags of the tables, and the final table with what is off in it put right.
+
+    `named`: by table, the numbers that a known mistake explains. `possible`: what is left of the
+    final table once it is put right may be that of real carts.
+    """
 
     flags: tuple[Flag, ...]
     corrected: dict[str, float]
+    named: dict[Label, frozenset[str]]
+    possible: bool
 
 
 def diagnose_tables(reported: Reported, *, references: References, analysis: Analysis) -> Diagnosis:
@@ -82,11 +89,18 @@ def diagnose_tables(reported: Reported, *, references: References, analysis: Ana
     ]
     named = {name for flag in flags for name in flag.parameters}
     apart = _disagreements(reported, references, blurred=True)
-    if apart := [one for one in apart if one[1] not in named]:
+    # A mistake in one of the tables parts them; also where the recordings give no number.
+    kinds = {name[0] for one in explained for name in one.names}
+    if apart := [one for one in apart if one[1] not in named and one[1][0] not in kinds]:
         flags.append(_disagreement_flag(reported, apart))
     corrected = _corrected(reported.final, explained, references.final)
     corrected |= {name: references.final[name].value for name in left["final"]}
-    return Diagnosis(flags=tuple(flags), corrected=corrected)
+    named_in: dict[Label, frozenset[str]] = {
+        label: frozenset(n for e in explained if e.table == label for n in e.names)
+        for label in tables
+    }
+    possible = not broken_orders({n: Decimal(v) for n, v in corrected.items()}, initial=False)
+    return Diagnosis(flags=tuple(flags), corrected=corrected, named=named_in, possible=possible)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -251,7 +265,7 @@ def _specific_flags(
             Flag(
                 code=code,
                 parameters=tuple(names),
-                message=f"{name}: "
+                message=f"{name} ({_TOLD[first.table]}): "
                 + first.mistake.help.format(
                     reported=typed, recomputed=f"{reference.value:.4g}", name=name
                 )
@@ -282,7 +296,7 @@ def _off_flag(
     return Flag(
         code=code,
         parameters=tuple(names),
-        message=f"{worst}: your recordings give {reference.value:.4g}, you report {typed}: {look}.",
+        message=f"{worst}: your recordings give {reference.said}, you report {typed}: {look}.",
         evidence=_evidence(worst, typed, reference, label),
     )
 

@@ -62,18 +62,21 @@ class Mistake:
 
 def known_mistakes(references: Mapping[str, Reference], analysis: Analysis) -> list[Mistake]:
     """Return every mistake that can be tried on a table, single ones before combined ones."""
+    every_zeta = {
+        n: r
+        for n, r in references.items()
+        if r.low > 0 and (n == "zeta" or (is_damping(n) and n[-1] in _OWN))
+    }
     references = {n: r for n, r in references.items() if 0 < r.high <= _VAGUE * r.low}
     gains = {n: r for n, r in references.items() if n.startswith("K")}
     omegas = {n: r for n, r in references.items() if n.startswith("omega")}
     own_omegas = {n: r for n, r in omegas.items() if n[-1] in _OWN}
-    own_zetas = {
-        n: r for n, r in references.items() if n == "zeta" or (is_damping(n) and n[-1] in _OWN)
-    }
+    own_zetas = {n: r for n, r in every_zeta.items() if n in references}
     hertz, scales = _hertz(omegas), _gain_mistakes(gains, analysis)
     log10 = [
         Mistake(
             codes=("log10_for_ln",),
-            predicted=_times(own_zetas, _LOG10),
+            predicted=_times(every_zeta if own_zetas else {}, _LOG10),  # vague ones as well
             tolerance=_DAMPING,
             help="{reported} is {recomputed}/2.303: the logarithmic decrement takes the natural "
             "logarithm, and this looks like log10",
@@ -137,10 +140,10 @@ def _miscounts(
         for counted, there in _counts():
             help_ = _miscount_help(counted, there)
             both = {name: omega.times(counted / there)}
-            if zeta in zetas:
+            blurred = zeta in zetas and zetas[zeta].high > zetas[zeta].low * _BLURRED_DAMPING
+            if zeta in zetas and not (blurred and len(omegas) > 1):
                 both[zeta] = _miscounted_damping(zetas[zeta], there / counted)
                 joint = _miscount(both, help_, whole=True, least=2)
-                blurred = zetas[zeta].high > zetas[zeta].low * _BLURRED_DAMPING
                 found.append(replace(joint, tolerance=_COUNTED_ALONE) if blurred else joint)
             if len(omegas) == 1 and min(counted, there) in _FEW_PERIODS:
                 alone = _miscount({name: both[name]}, help_)

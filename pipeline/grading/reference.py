@@ -16,6 +16,7 @@ _ASTRAY, _ASTRAY_GAIN = 1.3, 1.6
 _STUCK = 1.2  # factor: a gain where carts stick so that no linear fit is near
 _SIGMAS = 3.0
 _STILL = 3.0  # encoder steps
+_SAME = 1.03  # factor: bounds that near each other are one number to a reader
 _FAR = 2.5  # … so far that nobody believes it
 # A resonance or null read off the dwells, and where friction blurs even those: factors.
 _BY_EYE, _BY_EYE_ASTRAY = 1.1, 1.6
@@ -37,6 +38,13 @@ class Reference:
     high: float
     std: float
     source: str
+
+    @property
+    def said(self) -> str:
+        """What the recordings give, in words: a number, or from where to where it may lie."""
+        if self.low > 0 and self.high <= _SAME * self.low:
+            return f"{self.value:.4g}"
+        return f"{self.low:.3g} to {self.high:.3g}"
 
     def including(self, value: float) -> "Reference":
         """Return the reference with a value between its bounds."""

@@ -91,6 +91,8 @@ def grade_analysis(
     tables = [{name: float(typed) for name, typed in reported.final.items() if typed > 0}]
     if diagnosis.corrected != tables[0]:
         tables.append(diagnosis.corrected)
+    if chain is None and not diagnosis.possible:
+        tables = []  # a model may well be right where its table was copied wrongly
     digits = {
         name: float(rounding(typed) / abs(Fraction(typed)))
         for name, typed in reported.final.items()
@@ -102,8 +104,11 @@ def grade_analysis(
         rubric=rubric,
         references=references,
         controller=reported_controller(submission, analysis, chain=chain, tables=tables),
-        state_models=state_models(tables, rounding=digits, chain=chain, n=n),
+        state_models=state_models(
+            tables, rounding=digits, known=references.final, chain=chain, n=n
+        ),
         bad=bad_runs(analysis),
+        named=diagnosis.named,
     )
     criteria = _criteria(work)
     earned = sum((Fraction(str(c.points)) for c in criteria), Fraction(0))
@@ -221,7 +226,8 @@ def _criteria(work: Work) -> tuple[Criterion, ...]:
             verdict = judge(asked, work)
             points = _points(verdict.share, asked.points)
             outcome = _outcome(verdict.share)
-            more = f" {asked.message}" if asked.message and outcome in ("partial", "fail") else ""
+            advised = outcome in ("partial", "fail") and not verdict.explained
+            more = f" {asked.message}" if asked.message and advised else ""
             found = Criterion(
                 id=asked.id,
                 title=asked.title,

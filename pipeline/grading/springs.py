@@ -14,7 +14,10 @@ _BETTER = 10.0
 
 
 def with_all_springs(
-    submission: Submission, analysis: Analysis, *, progress: Callable[[str], None]
+    submission: Submission,
+    analysis: Analysis,
+    *,
+    progress: Callable[[str], None] = lambda text: None,
 ) -> tuple[Analysis, tuple[str, ...]]:
     """Return the analysis with all springs, and those that are added, where these recordings ask.
 

@@ -97,6 +97,7 @@ def state_models(
     tables: Sequence[Mapping[str, float]],
     *,
     rounding: Mapping[str, float],
+    known: Mapping[str, Reference],
     chain: Chain | None,
     n: int,
 ) -> list[StateModel]:
@@ -109,6 +110,7 @@ def state_models(
     Parameters
     ----------
     rounding : by parameter, how far it may have moved a number of the table, relative.
+    known : the references of the final table: of dampings they tell more than the chain.
     """
     models = []
     reference = chain.parameters() if chain is not None and chain.is_tied and n <= _NAMED else None
@@ -121,12 +123,30 @@ def state_models(
             if right is None:
                 continue
             slack = _spread(make, values, right, rounding=rounding, n=n)
-            if values is reference and chain is not None:
-                # A damping that the fit has put at zero, its bound, is not known.
-                unknown = np.arange(1, 2 * n, 2)[chain.c <= 0]
-                right[unknown, unknown] = np.nan
+            if values is reference:
+                _put_dampings(right, slack, values, known=known)
             models.append(StateModel(right=right, slack=slack))
     return models
+
+
+def _put_dampings(
+    right: Array, slack: Array, values: Mapping[str, float], *, known: Mapping[str, Reference]
+) -> None:
+    """Put in each cart's own damping, anywhere between what was measured of it; NaN if nothing."""
+    n = right.shape[0] // 2
+    for i in range(n):
+        omega, zeta = _own_names(i, n)
+        at, told = 2 * i + 1, known.get(zeta)
+        if told is None:
+            right[at, at] = np.nan
+            continue
+        middle, half = (told.high + told.low) / 2, (told.high - told.low) / 2
+        right[at, at] = -2 * middle * values[omega]
+        slack[at, at] = 2 * (half + _SIGMAS * _HONEST_DAMPING * middle) * values[omega]
+
+
+def _own_names(i: int, n: int) -> tuple[str, str]:
+    return ("omega_n", "zeta") if n == 1 else (f"omega_{i + 1}", f"zeta_{i + 1}")
 
 
 def _implied(values: Mapping[str, float], n: int) -> Array | None:
@@ -144,7 +164,7 @@ def _direct(values: Mapping[str, float], n: int) -> Array:
     """Return the terms of each cart alone, from its own frequency and damping."""
     direct = np.full((2 * n, 2 * n + 1), np.nan)
     for i in range(n):
-        omega, zeta = ("omega_n", "zeta") if n == 1 else (f"omega_{i + 1}", f"zeta_{i + 1}")
+        omega, zeta = _own_names(i, n)
         if omega in values:
             direct[2 * i + 1, 2 * i] = -(values[omega] ** 2)
             if zeta in values:

@@ -6,6 +6,7 @@ from fractions import Fraction
 from typing import Any
 
 from pipeline.grading.controller import Controller
+from pipeline.grading.explain import Label
 from pipeline.grading.pieces import missing_pieces
 from pipeline.grading.reference import References
 from pipeline.grading.rubric import Rubric
@@ -24,6 +25,7 @@ class Work:
     ----------
     state_models : what [A B] may rightly be.
     bad : runs that do not hold what they should, each with what is wrong.
+    named : by table, the numbers that a known mistake explains.
     """
 
     submission: Submission
@@ -33,6 +35,7 @@ class Work:
     controller: Controller | None
     state_models: Sequence[StateModel]
     bad: Mapping[str, str]
+    named: Mapping[Label, frozenset[str]]
 
     @property
     def missing(self) -> list[str]:
@@ -47,12 +50,16 @@ class Work:
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """The share of the points; None where nothing could be judged, and `message` says why."""
+    """The share of the points; None where nothing could be judged, and `message` says why.
+
+    `explained`: a known mistake is behind all that is lost, and its flag says more than advice.
+    """
 
     share: Fraction | None
     message: str
     expected: dict[str, Any] = field(default_factory=dict)
     found: dict[str, Any] = field(default_factory=dict)
+    explained: bool = False
 
 
 def mean_share(shares: Sequence[Fraction]) -> Fraction:
