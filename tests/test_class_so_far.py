@@ -160,6 +160,28 @@ def test_a_rubric_of_another_name_replaces_no_class(school, tmp_path):
     assert rows(out)["team-1"]["by_hand"] == "pieces"
 
 
+def test_a_mended_id_and_another_folder_accuse_nobody(school, tmp_path):
+    """The platform's number says whose it is; so in the runs after that one, too."""
+    out, folder = tmp_path / "out", tmp_path / "class"
+    for inside, id_ in (("lab", "s 1"), ("lab-final", "s1")):
+        shutil.rmtree(folder, ignore_errors=True)
+        own = folder / "Jane Doe_1024_assignsubmission_file_" / inside
+        shutil.copytree(school / "B" / "team-1", own)
+        text = (own / "submission.toml").read_text(encoding="utf-8")
+        mended = text.replace('"s1"', f'"{id_}"')
+        (own / "submission.toml").write_text(mended, encoding="utf-8")
+        shutil.copytree(school / "A" / "team-1", folder / "Bo_7_assignsubmission_file_" / "other")
+        done = [grade(folder, out=out) for _ in range(2)]
+        assert [one.sharing for one in done] == [0, 0]
+        if inside == "lab":
+            give(out, "lab", 0.25)
+        else:  # by another id it is another's, and that is said
+            assert [r for r in done[0].remarks if "'s1' in place of 's 1'" in r]
+    assert {name: row["authors"] for name, row in rows(out).items()} == {
+        "lab-final": "s1", "other": "s0",
+    }  # fmt: skip
+
+
 def test_who_exchanges_folders_keeps_what_was_given(tmp_path):
     """Two teams, each in the folder of the other now, the recordings made anew."""
     with Gradebook(tmp_path, assignment="lab", create=True) as book:

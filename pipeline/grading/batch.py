@@ -48,12 +48,13 @@ class Outcome:
 class Prints:
     """The fingerprints of one stored outcome and whose recordings they are of.
 
-    `of_class` where it is of the assignment that is being graded.
+    `of_class` where it is of the assignment that is being graded, `owner` as of an outcome.
     """
 
     submission: str
     authors: tuple[str, ...]
     fingerprints: bytes
+    owner: str = ""
     of_class: bool = False
 
 

@@ -16,6 +16,7 @@ _PRINTS = (
         submissions.c.assignment,
         submissions.c.name,
         gradings.c.authors,
+        gradings.c.owner,
         gradings.c.fingerprints,
     )
     .join(submissions)
@@ -73,5 +74,6 @@ def _prints(row, *, of_class: bool) -> Prints:
         submission=row.name,
         authors=tuple(json.loads(row.authors)),
         fingerprints=row.fingerprints,
+        owner=row.owner,
         of_class=of_class,
     )

@@ -116,6 +116,12 @@ def read_owner(owner: str) -> tuple[str, str, str]:
     return found["name"], found["platform"] or "", found["number"] or ""
 
 
+def same_number(a: str, b: str) -> bool:
+    """Tell whether two such texts have the same number of the same platform."""
+    (_, *of_a), (_, *of_b) = read_owner(a), read_owner(b)
+    return of_a == of_b and bool(of_a[1])
+
+
 @dataclass(frozen=True, kw_only=True)
 class Sent:
     """What Gradescope's metadata say of a submission: names, and when, in ISO 8601, or ""."""

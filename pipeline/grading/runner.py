@@ -207,10 +207,13 @@ def _shared(
     """Return the flags for recordings that stand in two submissions of this or earlier batches."""
     batch = [row.prints for row in rows if row.prints.fingerprints]
     names = {prints.submission: prints for prints in batch}
+    here = {(prints.authors, prints.fingerprints) for prints in batch}  # under another name, too
     earlier = [
         prints
         for prints in store.prints()
-        if prints.fingerprints and not _is_before(prints, names.get(prints.submission))
+        if prints.fingerprints
+        and (prints.authors, prints.fingerprints) not in here
+        and not _is_before(prints, names.get(prints.submission))
     ]
     compared = _digest(basis, batch, earlier)
     if memory is not None and (flags := _remembered(memory, compared)) is not None:
@@ -242,7 +245,9 @@ def _digest(head: Sequence[str], *groups: Sequence[Prints]) -> str:
         total.update(b"group")
         for prints in group:
             own = hashlib.sha256(prints.fingerprints).hexdigest()
-            total.update(json.dumps([prints.submission, prints.authors, own]).encode())
+            total.update(
+                json.dumps([prints.submission, prints.authors, prints.owner, own]).encode()
+            )
     return total.hexdigest()
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from pipeline.grading.batch import Listed, Outcome, Prints, Store, content, person
-from pipeline.grading.lms_names import read_owner
+from pipeline.grading.lms_names import read_owner, same_number
 from pipeline.grading.shared import same_recordings
 
 
@@ -20,7 +20,6 @@ class Row:
 
     key: str
     prints: Prints
-    owner: str = ""
     reason: str = ""
 
     @classmethod
@@ -32,8 +31,8 @@ class Row:
                 submission=outcome.submission,
                 authors=outcome.authors,
                 fingerprints=outcome.fingerprints,
+                owner=outcome.owner,
             ),
-            owner=outcome.owner,
             reason=outcome.reason if outcome.status == "failed" else "",
         )
 
@@ -41,11 +40,6 @@ class Row:
     def people(self) -> set[str]:
         """The authors, however they typed their ids."""
         return set(map(person, self.prints.authors))
-
-    @cached_property
-    def number(self) -> tuple[str, str]:
-        """Platform and number of who handed it in, "" where they are not said."""
-        return read_owner(self.owner)[1:]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +50,8 @@ class SoFar:
     ----------
     kept : lines that the run says nothing of.
     moved : the new name of each submission that goes on under another.
-    taken_over : (submission, authors before, authors now) where those are other people.
+    taken_over : (submission, authors before, authors now) where those are others, who have not
+        what was given by hand.
     """
 
     kept: Mapping[str, Row]
@@ -69,7 +64,8 @@ def class_so_far(rows: Mapping[str, Row], store: Store) -> SoFar:
     now = {name.casefold(): name for name in rows}
     left: dict[str, Listed] = {}
     new, moved = dict(rows), {}
-    for line in store.listed():
+    lines = list(store.listed())
+    for line in lines:
         name = now.get(line.submission.casefold())
         if name is None or _others(_row(line), rows[name]):
             left[line.submission] = line
@@ -84,26 +80,31 @@ def class_so_far(rows: Mapping[str, Row], store: Store) -> SoFar:
         kept={n: r for n, r in before.items() if n not in moved and n.casefold() not in now},
         moved=moved,
         taken_over=tuple(
-            (name, row.prints.authors, rows[now[name.casefold()]].prints.authors)
-            for name, row in before.items()
-            if name not in moved and name.casefold() in now
+            (line.submission, line.authors, rows[name].prints.authors)
+            for line in lines
+            if (name := moved.get(line.submission) or now.get(line.submission.casefold()))
+            and _strangers(_row(line), rows[name])
         ),
     )
 
 
 def _row(line: Listed, fingerprints: bytes = b"") -> Row:
-    prints = Prints(submission=line.submission, authors=line.authors, fingerprints=fingerprints)
-    return Row(key=line.key, prints=prints, owner=line.owner)
+    prints = Prints(
+        submission=line.submission,
+        authors=line.authors,
+        fingerprints=fingerprints,
+        owner=line.owner,
+    )
+    return Row(key=line.key, prints=prints)
 
 
 def _others(before: Row, now: Row) -> bool:
-    """Tell whether a submission is other people's now; who is not named is nobody else."""
-    named = before.people and now.people
-    return bool(named) and before.people.isdisjoint(now.people) and not _same_number(before, now)
+    """Tell whether a submission is another team's now; who is not named is nobody else."""
+    return _strangers(before, now) and not same_number(before.prints.owner, now.prints.owner)
 
 
-def _same_number(before: Row, now: Row) -> bool:
-    return before.number == now.number and bool(now.number[1])
+def _strangers(before: Row, now: Row) -> bool:
+    return bool(before.people and now.people) and before.people.isdisjoint(now.people)
 
 
 def _matched(before: Mapping[str, Row], now: Mapping[str, Row]) -> dict[str, str]:
@@ -130,11 +131,11 @@ def _in_common(before: Row, now: Row) -> tuple[bool, ...]:
     # Of those who are not named many may hand in the same: nothing, or what cartlab new wrote.
     kin = both or any(a.endswith(b) for a, b in (names, names[::-1]))
     prints = before.prints.fingerprints and now.prints.fingerprints
-    other_number = before.number[0] == now.number[0] and before.number[1] != now.number[1]
+    (_, was, number), (_, is_, number_now) = (read_owner(r.prints.owner) for r in (before, now))
     return (
-        _same_number(before, now),
+        same_number(before.prints.owner, now.prints.owner),
         bool(kin) and content(before.key) == content(now.key) != "",
         bool(both and prints) and same_recordings(before.prints, now.prints),
         # Anybody can write other people's ids into a file, but not under their number.
-        bool(both) and before.people == now.people and not other_number,
+        bool(both) and before.people == now.people and (was != is_ or number == number_now),
     )
