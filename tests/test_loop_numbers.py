@@ -25,3 +25,11 @@ def test_a_fast_controller_is_seen_to_settle(sample_time):
     assert slow is not None
     assert numbers.settling_time == pytest.approx(slow.settling_time, abs=3e-3 + 3 * sample_time)
     assert numbers.prefilter == pytest.approx(OMEGA**2, rel=1e-6)
+
+
+@pytest.mark.parametrize("k", [1e58, 1e250])
+def test_a_loop_without_a_static_gain_has_no_numbers(k):
+    """Of a chain so stiff that the carts do not move, no prefilter brings them anywhere."""
+    stiff = Chain(m=np.array([1e-5]), c=np.array([0.0]), k=np.array([k, 0.0]))
+    numbers = loop_numbers(stiff, GAINS, cart=1, settling=1.0, sample_time=None)
+    assert numbers is None or np.isfinite(numbers.prefilter)

@@ -132,6 +132,15 @@ def test_what_was_handed_out_may_be_used_by_all(teams):
     }
 
 
+def test_what_was_handed_out_may_be_used_by_a_whole_class(teams):
+    """However many hold the same recording, each is held against what was handed out."""
+    rng = np.random.default_rng(11)
+    copies = [[disguised(r, rng, noise=0.1) for r in teams[0][:2]] for _ in range(40)]
+    batch = [prints(f"t{number:02d}", records) for number, records in enumerate(copies)]
+    assert len(find_shared(batch)) == 40
+    assert find_shared(batch, examples=[fingerprint(teams[0][:2])]) == {}
+
+
 def test_earlier_batches_count(teams):
     """A recording of last year is found, and said to be; last year's copies are no news."""
     old = [prints("x", teams[0]), prints("y", teams[0])]

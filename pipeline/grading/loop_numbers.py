@@ -49,6 +49,9 @@ def loop_numbers(
             static = np.linalg.solve(np.eye(size) - loop, gamma)
         except np.linalg.LinAlgError:
             return None
+        prefilter = float(1 / static[row])
+        if not np.isfinite(prefilter):
+            return None
         poles = np.asarray(np.log(z) / T, dtype=np.complex128)
         stable = bool(np.abs(z).max() < 1)
         samples = int(_HORIZON * settling / T) + 2
@@ -66,7 +69,7 @@ def loop_numbers(
         poles=poles,
         overshoot=overshoot,
         settling_time=None if np.isnan(settles) else settles,
-        prefilter=float(1 / static[row]),
+        prefilter=prefilter,
     )
 
 

@@ -25,7 +25,7 @@ _WORTH_A_LOOK = 3.2  # sigmas at first sight: one in a thousand by chance
 # The rest of the work grows with the number of recordings, not with its square. Chance offers so
 # many at first sight where 4,000 recordings are of one kind, and two honest teams with 20 runs of
 # that kind each a tenth of what is compared at most.
-_MOST_ALIKE = 16  # first anchors looked at for one anchor, the most alike
+_MOST_ALIKE = 16  # first anchors looked at for one anchor, the most alike; and what was handed out
 _MOST_COMPARED = 10  # times the recordings that two submissions have of one kind
 _LEAST_OVERLAP = 80  # samples that say something in both
 _LEAST_SLOPE = 0.5
@@ -88,7 +88,9 @@ def find_shared(
             groups[one.group].append(_Entry(owner=owner, print=one))
     matches: dict[tuple[int, int], list[_Match]] = defaultdict(list)
     for _, entries in sorted(groups.items()):
-        for a, b, sigmas in _matches(entries, first_batch=len(batch), owners=owners):
+        for a, b, sigmas in _matches(
+            entries, first_batch=len(batch), everyone=len(everyone), owners=owners
+        ):
             matches[a.owner, b.owner].append((sigmas, a.print.experiment, b.print.experiment))
     given = {
         (a, experiment)
@@ -197,7 +199,7 @@ def _decisive(found: Sequence[_Match]) -> list[_Match]:
 
 
 def _matches(
-    entries: Sequence[_Entry], *, first_batch: int, owners: Sequence[Prints]
+    entries: Sequence[_Entry], *, first_batch: int, everyone: int, owners: Sequence[Prints]
 ) -> Iterator[tuple[_Entry, _Entry, float]]:
     """Yield pairs of recordings of different teams that share their noise, with the sigmas."""
     best: dict[tuple[int, int], float] = {}
@@ -206,7 +208,7 @@ def _matches(
     partner: dict[tuple[int, int], int] = {}  # of a recording, in a submission: surely a copy
     compared: Counter[tuple[int, int]] = Counter()
     recordings = Counter(entry.owner for entry in entries)
-    for i, anchor_i, j, anchor_j in _candidates(entries):
+    for i, anchor_i, j, anchor_j in _candidates(entries, everyone=everyone):
         a, b = entries[i], entries[j]
         if a.owner > b.owner:
             i, anchor_i, j, anchor_j, a, b = j, anchor_j, i, anchor_i, b, a
@@ -233,12 +235,13 @@ def _matches(
         yield entries[i], entries[j], sigmas
 
 
-def _candidates(entries: Sequence[_Entry]) -> Iterator[tuple[int, int, int, int]]:
+def _candidates(entries: Sequence[_Entry], *, everyone: int) -> Iterator[tuple[int, int, int, int]]:
     """Yield (entry, its anchor, other entry, its anchor) whose surroundings look alike.
 
     All anchors are held against the first ones, in the motion and in the noise apart. No index
     does better than this one product: under its own noise six times over a copy looks hardly more
     alike than chance. The most alike come first, of those in the motion and of those in the noise.
+    What was handed out, by owners beyond `everyone`, is never crowded out by those who used it.
     """
     owners = np.array([entry.owner for entry in entries])
     for in_motion, n_first in ((True, _FIRST_IN_MOTION), (False, _FIRST_IN_NOISE)):
@@ -258,7 +261,9 @@ def _candidates(entries: Sequence[_Entry]) -> Iterator[tuple[int, int, int, int]
             alike[owners[[i for i, _ in block]][:, None] == of_columns] = 0.0
             for row in np.flatnonzero(np.any(alike >= _WORTH_A_LOOK, axis=1)).tolist():
                 near = np.flatnonzero(alike[row] >= _WORTH_A_LOOK)
-                near = near[np.argsort(-alike[row, near], kind="stable")[:_MOST_ALIKE]]
+                given = of_columns[near] >= everyone
+                most = np.argsort(-alike[row, near[~given]], kind="stable")[:_MOST_ALIKE]
+                near = np.concatenate([near[given], near[~given][most]])
                 found += [(float(alike[row, c]), start + row, c) for c in near.tolist()]
         for _, place, column in sorted(found, key=lambda one: (-one[0], one[1:])):
             yield *places[place], *first[column]
