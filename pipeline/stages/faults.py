@@ -5,7 +5,7 @@ of a small motion. So a channel is called dead only where the identified carts w
 far, and where runs that follow them leave friction too small to hold it.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -55,13 +55,27 @@ def find_faults(records: Sequence[Record], *, chain: Chain | None) -> dict[str, 
     """
     fits = _follow(records, chain)
     exchanged = _exchanged(records, chain=chain, fits=fits)
+    steps: dict[int, float] = {}  # a dead channel shows none
+    moving: set[int] = set()
+    for record in records:
+        for cart in _measured(record):
+            steps[cart] = max(steps.get(cart, 0.0), record.encoder_step(cart))
+            if _is_driven(record) and np.ptp(record.position(cart)) > 0:
+                moving.add(cart)
+    friction = {
+        cart: float(
+            np.median([f.friction.get(cart, np.inf) for f in fits.values() if cart in f.lost])
+        )
+        for cart in {cart for fit in fits.values() for cart in fit.lost}
+    }
+    usual_clock = float(np.median([record.sample_time for record in records])) if records else 0.0
     found: dict[str, LeftOut] = {}
     for record in records:
         for problem in (
-            *_wrong_clock(record, records),
+            *_wrong_clock(record, usual=usual_clock),
             *_short_dwell(record),
             *([exchanged[record.id]] if record.id in exchanged else ()),
-            *_dead_channels(record, records, chain=chain, fits=fits),
+            *_dead_channels(record, chain=chain, friction=friction, steps=steps, moving=moving),
         ):
             fault = LeftOut(experiment=record.id, reason=problem, is_wrong=True)
             found.setdefault(record.id, fault)
@@ -184,25 +198,30 @@ def _still(record: Record, cart: int) -> Iterator[slice]:
 
 def _dead_channels(
     record: Record,
-    records: Sequence[Record],
     *,
     chain: Chain | None,
-    fits: Mapping[str, _Followed],
+    friction: Mapping[int, float],
+    steps: Mapping[int, float],
+    moving: Set[int],
 ) -> Iterator[str]:
-    """Yield what is said of a free cart's reading that stays where the cart must have moved."""
+    """Yield what is said of a free cart's reading that stays where the cart must have moved.
+
+    By cart, `friction` is the most that the records allow, `steps` has the encoder step; `moving`
+    are the carts that any input ever moved.
+    """
     for cart in _measured(record):
         y = record.position(cart)
-        if np.ptp(y) == 0 and (record.kind == "decay" or _never_moves(cart, records)):
+        never = _is_driven(record) and cart not in moving
+        if np.ptp(y) == 0 and (record.kind == "decay" or never):
             yield f"cart {cart} is said to be free and its encoder never changes"
         if chain is None or record.u is None or not _is_driven(record):
             continue
-        allowed = [fit.friction[cart] for fit in fits.values() if cart in fit.friction]
         force = _force(record, chain, cart=cart)
         for still in _still(record, cart):
             # Friction that holds a cart pulls at most as far to one side as then to the other.
-            if not allowed or force is None or 2 * np.median(allowed) >= np.ptp(force[still]):
+            if force is None or 2 * friction.get(cart, np.inf) >= np.ptp(force[still]):
                 continue
-            if not _must_move(record, chain, still, cart=cart, step=_coarsest(records, cart)):
+            if not _must_move(record, chain, still, cart=cart, step=steps[cart]):
                 continue
             first, last = record.t[still.start], record.t[still.stop - 1]
             yield (
@@ -211,17 +230,6 @@ def _dead_channels(
                 else f"the encoder of cart {cart} stands still from {first:.4g} s to {last:.4g} s, "
                 "although the input moves the cart: it froze"
             )
-
-
-def _never_moves(cart: int, records: Sequence[Record]) -> bool:
-    """Whether a cart is still in every driven record in which it is free."""
-    readings = [r.position(cart) for r in records if _is_driven(r) and cart in _measured(r)]
-    return bool(readings) and all(np.ptp(y) == 0 for y in readings)
-
-
-def _coarsest(records: Sequence[Record], cart: int) -> float:
-    """Return the encoder step seen in any record: a dead channel shows none."""
-    return max((r.encoder_step(cart) for r in records if cart in r.carts), default=0.0)
 
 
 def _must_move(record: Record, chain: Chain, still: slice, *, cart: int, step: float) -> bool:
@@ -243,14 +251,10 @@ def _short_dwell(record: Record) -> Iterator[str]:
             yield f"fewer than {_CYCLES:.0f} cycles are no steady state: the file looks cut"
 
 
-def _wrong_clock(record: Record, records: Sequence[Record]) -> Iterator[str]:
-    """Yield the unit of a time column that makes this record's sampling that of the others."""
-    others = [r.sample_time for r in records if r.source != record.source]
-    if len(others) < 2:
-        return
-    usual = float(np.median(others))
+def _wrong_clock(record: Record, *, usual: float) -> Iterator[str]:
+    """Yield the unit of a time column that makes this record's sampling the usual one."""
     for factor, unit in _CLOCKS.items():
-        if abs(record.sample_time / (factor * usual) - 1) < _SAME_CLOCK:
+        if abs(record.sample_time - factor * usual) < _SAME_CLOCK * factor * usual:
             yield (
                 f"its samples are {record.sample_time:.3g} s apart, those of the others "
                 f"{usual:.3g} s: its time looks to be in {unit}"

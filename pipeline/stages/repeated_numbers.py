@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.results import Check, Estimate, LeftOut, LogDecrement, StepGain
 
@@ -47,12 +48,6 @@ class _Reading:
     high: float
     size: float = 0.0
 
-    def contradicts(self, other: "_Reading") -> bool:
-        far = abs(self.value - other.value) > TOLERANCE / 100 * max(
-            abs(self.value), abs(other.value)
-        )
-        return far and max(self.low, other.low) > min(self.high, other.high)
-
 
 def compare_repeats(
     decays: Sequence[LogDecrement],
@@ -68,26 +63,23 @@ def compare_repeats(
     fitted : the parameters of a fit that explains most records; else none.
     """
     readings = _readings(decays, steps, carts=carts)
-    chosen = {name: _right_ones(all_, fitted.get(name)) for name, all_ in readings.items()}
-    usual = {n: float(np.median([r.value for r in right])) for n, right in chosen.items() if right}
-    odd: dict[str, LeftOut] = {}
-    undecided = []
+    right = {name: _right_ones(all_, fitted.get(name)) for name, all_ in readings.items()}
+    usual = {n: float(np.median([r.value for r in ones])) for n, ones in right.items() if ones}
+    by_size = {name for name, all_ in readings.items() if _only_by_size(all_)}
+    of_run: dict[str, dict[str, float]] = {}
     for name, all_ in readings.items():
         for reading in all_:
-            if reading in chosen[name] or reading.run in odd:
-                continue
-            values = {
-                n: r.value for n, many in readings.items() for r in many if r.run == reading.run
-            }
-            said = _mistake(values, usual)
-            if usual.get(name) and (said or not _only_by_size(all_)):
-                off = f"{name} = {reading.value:.3g} where the others give {usual[name]:.3g}"
+            of_run.setdefault(reading.run, {})[name] = reading.value
+    odd: dict[str, LeftOut] = {}
+    for name, value in usual.items():
+        belong = {reading.run for reading in right[name]}
+        for run in [r.run for r in readings[name] if r.run not in belong and r.run not in odd]:
+            said = _mistake(of_run[run], usual)
+            if said or name not in by_size:
+                off = f"{name} = {of_run[run][name]:.3g} where the others give {value:.3g}"
                 reason = f"{off}: {said}" if said else off
-                odd[reading.run] = LeftOut(
-                    experiment=reading.run, reason=reason, is_wrong=bool(said)
-                )
-        if not chosen[name] and not _only_by_size(all_):
-            undecided.append(name)
+                odd[run] = LeftOut(experiment=run, reason=reason, is_wrong=bool(said))
+    undecided = tuple(name for name in readings if name not in usual and name not in by_size)
     return Repeats(
         checks=tuple(
             _check(name, all_, odd=odd, undecided=name in undecided)
@@ -95,7 +87,7 @@ def compare_repeats(
             if len(all_) > 1
         ),
         odd=odd,
-        undecided=tuple(undecided),
+        undecided=undecided,
     )
 
 
@@ -129,25 +121,33 @@ def _readings(
     return found
 
 
+def _contradictions(readings: Sequence[_Reading]) -> NDArray[np.bool_]:
+    """Return which readings (n, n) contradict one another."""
+    value, low, high = np.array([(r.value, r.low, r.high) for r in readings]).T
+    size = np.maximum(np.abs(value[:, None]), np.abs(value))
+    far = np.abs(value[:, None] - value) > TOLERANCE / 100 * size
+    return far & (np.maximum(low[:, None], low) > np.minimum(high[:, None], high))
+
+
 def _only_by_size(readings: Sequence[_Reading]) -> bool:
     """Whether steps of one size agree, those of another only among themselves: dry friction."""
-    return not any(
-        a.contradicts(b) and abs(a.size - b.size) <= _SAME_SIZE * max(a.size, b.size)
-        for a, b in combinations(readings, 2)
-    )
+    size = np.array([reading.size for reading in readings])
+    alike = np.abs(size[:, None] - size) <= _SAME_SIZE * np.maximum(size[:, None], size)
+    return not np.any(_contradictions(readings) & alike)
 
 
 def _right_ones(readings: Sequence[_Reading], fitted: Estimate | None) -> list[_Reading]:
     """Return the readings that belong together: all, those like the fit, or most; none: open."""
-    if not any(a.contradicts(b) for a, b in combinations(readings, 2)):
+    apart = _contradictions(readings)
+    if not np.any(apart):
         return list(readings)
-    if fitted is not None:
+    if fitted is not None and fitted.std is not None:
         near = _LIKE_THE_FIT * abs(fitted.value)
         like = [r for r in readings if abs(r.value - fitted.value) <= near]
-        if like:
+        if like and _SIGMAS * fitted.std <= near:
             return like
-    groups = [[b for b in readings if not a.contradicts(b)] for a in readings]
-    largest = max(groups, key=len)
+    most = ~apart[np.argmin(apart.sum(axis=1))]
+    largest = [reading for reading, belongs in zip(readings, most, strict=True) if belongs]
     return largest if 2 * len(largest) > len(readings) else []
 
 
@@ -196,7 +196,7 @@ def _check(
     elif off:
         reasons = "; ".join(f"{run}: {odd[run].reason}" for run in off)
         outcome, said = "fail", f"contradict one another, {apart}. Left out is {reasons}"
-    elif any(a.contradicts(b) for a, b in combinations(readings, 2)):
+    elif np.any(_contradictions(readings)):
         outcome, said = "fail", f"lie {apart}, by the size of the step, as where a cart sticks"
     elif spread > TOLERANCE:
         outcome, said = "skip", f"lie {apart}, no further apart than their errors"
