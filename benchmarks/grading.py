@@ -23,13 +23,18 @@ import numpy as np
 from scipy.stats import beta
 
 from tests.grading_class import Team, make_team, with_spoilt_data, with_wrong_rubric
-from tests.grading_slips import DOUBLE, OF_SEVERAL_CARTS, SLIPS
+from tests.grading_slips import DOUBLE, OF_SEVERAL_CARTS, ONE_NUMBER, SLIPS
 
 HONEST = "honest"
 WRONG_RUBRIC = "honest, rubric lacks a spring"  # every so many teams, as each is analysed anew
 DATA = "data_problem"
 ANEW_EVERY = 5
-KINDS = tuple((code,) for code in SLIPS) + DOUBLE
+ONE = "one number: "
+KINDS = (
+    *((code, (slip,)) for code, slip in SLIPS.items()),
+    *((ONE + code, (slip,)) for code, slip in ONE_NUMBER.items()),
+    *((" + ".join(codes), tuple(SLIPS[code] for code in codes)) for codes in DOUBLE),
+)
 
 
 def gradings(seed: int, *, slips: int) -> Iterator[tuple[str, Team, set[str]]]:
@@ -37,17 +42,18 @@ def gradings(seed: int, *, slips: int) -> Iterator[tuple[str, Team, set[str]]]:
     team = make_team(seed)
     yield f"{HONEST}, {team.bench.chain.n} carts", team, set()
     for turn in range(slips):
-        codes = KINDS[(seed * slips + turn) % len(KINDS)]
-        if team.bench.chain.n == 1 and OF_SEVERAL_CARTS & set(codes):
+        kind, made = KINDS[(seed * slips + turn) % len(KINDS)]
+        codes = kind.removeprefix(ONE).split(" + ")
+        if team.bench.chain.n == 1 and not OF_SEVERAL_CARTS.isdisjoint(codes):
             continue
         slipped = replace(team, rng=np.random.default_rng([9, seed, turn]))
-        for code in codes:
-            slipped = SLIPS[code](slipped)
+        for slip in made:
+            slipped = slip(slipped)
         if slipped.submission is team.submission:  # this team has no way to make it
             continue
         # Who hands in no recordings is told so as well.
         beside = {"missing"} if "initial_final_disagree" in codes else set()
-        yield " + ".join(codes), slipped, {*codes, *beside}
+        yield kind, slipped, {*codes, *beside}
     if seed % ANEW_EVERY == 0:
         yield DATA, with_spoilt_data(seed), {DATA}
     if seed % ANEW_EVERY == 1 and (other := with_wrong_rubric(seed)) is not None:

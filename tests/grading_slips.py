@@ -59,11 +59,15 @@ def some_tables(team: Team) -> list[str]:
 
 
 def hz(team: Team) -> Team:
-    """All frequencies, or the one that was forgotten, divided by 2π."""
+    """All frequencies divided by 2π."""
     names = [n for n in team.reported.final if n.startswith("omega")]
-    if team.rng.random() < 0.3:
-        names = [str(team.rng.choice(names))]
     return scaled(team, names, 1 / TURN, some_tables(team))
+
+
+def hz_of_one(team: Team) -> Team:
+    """One frequency, the one that was forgotten, divided by 2π."""
+    names = [n for n in team.reported.final if n.startswith("omega")]
+    return scaled(team, [str(team.rng.choice(names))], 1 / TURN, some_tables(team))
 
 
 def peak_count(team: Team) -> Team:
@@ -316,6 +320,7 @@ SLIPS: dict[str, Callable[[Team], Team]] = {
     "wrong_prefilter": wrong_prefilter,
     "missing": missing,
 }
+ONE_NUMBER = {"hz_for_rad_s": hz_of_one}
 DOUBLE = (
     ("hz_for_rad_s", "carts_swapped"),
     ("counts_for_length", "carts_swapped"),

@@ -186,7 +186,9 @@ def diagnose_controller(controller: Controller) -> list[Flag]:
     fits = any(controller.prefilter_fits(one) for one in numbers)
     meets = any(controller.meets(one) for one in numbers)
     claimed = any(controller.is_claimed(one) for one in numbers)
-    slip, intended = _slip(controller)
+    # Gains that reach the goal, and do what is claimed of them, are the ones meant.
+    told = controller.overshoot is not None or controller.settling is not None
+    slip, intended = ("", None) if meets and told and claimed else _slip(controller)
     ran = controller.ran
     # The gains that ran tell which of the reported numbers does not belong to the others.
     other_ran = ran is not None and not same_gains(ran, controller.gains)
