@@ -85,6 +85,9 @@ STAGES = {
     "initial",
     "state_feedback",
     "hardware_check",
+    "faults",
+    "repeats",
+    "repeated_numbers",
 }
 
 

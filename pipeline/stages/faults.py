@@ -114,7 +114,7 @@ class _Followed:
 
     Attributes
     ----------
-    lost : by cart, the share of its motion's power that is left unexplained.
+    lost : by cart, the share of its motion's power that neither chain nor noise explains.
     friction : by cart, the most dry friction that this allows, in input units.
     """
 
@@ -144,14 +144,14 @@ def _held_against(record: Record, chain: Chain) -> _Followed | None:
     modes = find_modes(chain, free=window.free, parametrisation=P, slopes=np.zeros(len(P.names)))
     residual = compare(window, modes).residual * window.sigma[:, None]
     power = np.var(window.y, axis=1)
-    lost = np.mean(residual**2, axis=1) / power
-    left = np.sqrt(np.maximum(lost - window.stated_sigma**2 / power, _LEAST))
+    left = np.mean(residual**2, axis=1) - window.stated_sigma**2  # beyond encoder and noise
+    lost = np.maximum(left, 0.0) / power
     return _Followed(
         lost=dict(zip(window.carts, lost.tolist(), strict=True)),
         friction={
-            cart: float(_FRICTION * share * np.ptp(force) / 2)
-            for cart, share, part in zip(window.carts, left, lost, strict=True)
-            if part <= _FOLLOWED and (force := _force(record, chain, cart=cart)) is not None
+            cart: float(_FRICTION * np.sqrt(max(share, _LEAST)) * np.ptp(force) / 2)
+            for cart, share in zip(window.carts, lost, strict=True)
+            if share <= _FOLLOWED and (force := _force(record, chain, cart=cart)) is not None
         },
     )
 
