@@ -36,9 +36,9 @@ FLAGS = "--headless --no-sandbox --disable-gpu --no-first-run --disable-backgrou
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int | None:
-    """Run a file or two in this process; for more xdist counts the processors."""
+    """Run a file or two in this process; one of several waits for a bench, not the processor."""
     few = len(config.args) <= _FEW and all(".py" in argument for argument in config.args)
-    return 0 if few else os.cpu_count()
+    return 0 if few else (os.cpu_count() or 1) + 1
 
 
 @pytest.fixture(scope="module")
