@@ -38,7 +38,14 @@ from pipeline.stages.compare import (
     compare,
 )
 from pipeline.stages.design_check import design_margins, verify_design
-from pipeline.stages.faults import check_left_out, find_faults, follows, standing_still
+from pipeline.stages.faults import (
+    Followed,
+    check_left_out,
+    find_faults,
+    follow,
+    follows,
+    standing_still,
+)
 from pipeline.stages.frequency_response import (
     collect_dwells,
     dwell_fault,
@@ -220,8 +227,8 @@ def _identify_from_sound(
     odd = find_outlier_repeats(driven, unit=system.position.unit)
     without, contradicted = odd.keys() | standing_still(data.records), []
     found = _identify(data, without=without, system=system, progress=progress)
-    chain = _witness(found, data.records, system=system)
-    faults = find_faults(data.records, chain=chain)
+    chain, fits = _witness(found, data.records, system=system)
+    faults = find_faults(data.records, chain=chain, fits=fits)
     for _ in range(_ROUNDS):
         odd |= found.repeats.odd
         if without == odd.keys() | faults.keys():
@@ -235,8 +242,9 @@ def _identify_from_sound(
         ]
         found = _identify(data, without=without, system=system, progress=progress)
         # Where nothing is left to identify the carts from, the verdict before stands.
-        chain = _witness(found, data.records, system=system) or chain
-        faults = find_faults(data.records, chain=chain)
+        if (verdict := _witness(found, data.records, system=system))[0]:
+            chain, fits = verdict
+        faults = find_faults(data.records, chain=chain, fits=fits)
     checks = {check.id: check for check in (*found.repeats.checks, *contradicted)}
     repeats = replace(found.repeats, checks=tuple(checks.values()))
     left_out = {**odd, **faults}
@@ -246,11 +254,14 @@ def _identify_from_sound(
     )
 
 
-def _witness(found: _Identified, records: Sequence[Record], *, system: System) -> Chain | None:
-    """Return the chain that the records follow; or else would, with two columns exchanged."""
+def _witness(
+    found: _Identified, records: Sequence[Record], *, system: System
+) -> tuple[Chain | None, dict[str, Followed]]:
+    """Return the chain that the records follow, and how; or would, with two columns exchanged."""
     chain = found.fit.chain if found.fit else None
-    if chain and follows(records, chain=chain):
-        return chain
+    fits = follow(records, chain)
+    if chain and follows(fits):
+        return chain, fits
     for i, j in combinations(sorted(response.cart for response in found.responses), 2):
         turned = [replace(r, cart={i: j, j: i}.get(r.cart, r.cart)) for r in found.responses]
         try:
@@ -262,8 +273,8 @@ def _witness(found: _Identified, records: Sequence[Record], *, system: System) -
         except DataError:
             continue
         if fit.chi_square_per_dof <= CHI_SQUARE_LIMIT:
-            return fit.chain
-    return chain
+            return fit.chain, follow(records, fit.chain)
+    return chain, fits
 
 
 def _identify(
@@ -485,7 +496,7 @@ def _fit(
             initial=values,
             decays=_decay_dampings(initial, n=n),
         )
-        if fit and (not driven or follows(dwells, chain=fit.chain)):
+        if fit and (not driven or follows(follow(dwells, fit.chain))):
             return fit
     if not driven:
         found = "the Bode fit gave none, and there is no" if has_points else "no dwells, table,"

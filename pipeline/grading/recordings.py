@@ -46,7 +46,9 @@ def bad_runs(analysis: Analysis) -> dict[str, str]:
 def data_flag(bad: Mapping[str, str]) -> Flag:
     """Return the flag for the runs that do not hold what they should."""
     first, problem = next(iter(bad.items()))
-    more = f" ({len(bad) - 1} more runs have a problem)" if len(bad) > 1 else ""
+    others = len(bad) - 1
+    have = "run has" if others == 1 else "runs have"
+    more = f" ({others} more {have} a problem)" if others else ""
     return Flag(
         code="data_problem",
         parameters=tuple(bad),

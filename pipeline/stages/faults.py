@@ -45,15 +45,17 @@ def standing_still(records: Sequence[Record]) -> set[str]:
     }
 
 
-def find_faults(records: Sequence[Record], *, chain: Chain | None) -> dict[str, LeftOut]:
+def find_faults(
+    records: Sequence[Record], *, chain: Chain | None, fits: Mapping[str, "Followed"]
+) -> dict[str, LeftOut]:
     """Return the records that do not hold what happened, by id, each with what is wrong.
 
     Parameters
     ----------
     chain : the carts as identified from the records that are not in doubt; None where they could
         not be: then only what no carts could do is found.
+    fits : how the records follow it, as `follow` has it.
     """
-    fits = _follow(records, chain)
     exchanged = _exchanged(records, chain=chain, fits=fits)
     steps: dict[int, float] = {}  # a dead channel shows none
     moving: set[int] = set()
@@ -99,9 +101,8 @@ def check_left_out(left_out: Sequence[LeftOut]) -> list[Check]:
     ]
 
 
-def follows(records: Sequence[Record], *, chain: Chain) -> bool:
-    """Tell whether at least half of the driven records follow a chain, if there are any."""
-    fits = _follow(records, chain)
+def follows(fits: Mapping[str, "Followed"]) -> bool:
+    """Tell whether at least half of the records that tell follow a chain, if there are any."""
     return 2 * sum(fit.share <= _FOLLOWED for fit in fits.values()) >= len(fits)
 
 
@@ -109,7 +110,7 @@ def follows(records: Sequence[Record], *, chain: Chain) -> bool:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Followed:
+class Followed:
     """How a record follows a chain.
 
     Attributes
@@ -123,10 +124,11 @@ class _Followed:
 
     @property
     def share(self) -> float:
+        """Their mean."""
         return float(np.mean(list(self.lost.values())))
 
 
-def _follow(records: Sequence[Record], chain: Chain | None) -> dict[str, _Followed]:
+def follow(records: Sequence[Record], chain: Chain | None) -> dict[str, Followed]:
     """Hold every driven record in which the measured carts move against the chain."""
     found = {}
     for record in records:
@@ -135,7 +137,7 @@ def _follow(records: Sequence[Record], chain: Chain | None) -> dict[str, _Follow
     return found
 
 
-def _held_against(record: Record, chain: Chain) -> _Followed | None:
+def _held_against(record: Record, chain: Chain) -> Followed | None:
     springs = tuple(bool(k) for k in chain.k)
     try:
         window, P = open_window(record), Parametrisation(n=chain.n, springs=springs)
@@ -146,7 +148,7 @@ def _held_against(record: Record, chain: Chain) -> _Followed | None:
     power = np.var(window.y, axis=1)
     left = np.mean(residual**2, axis=1) - window.stated_sigma**2  # beyond encoder and noise
     lost = np.maximum(left, 0.0) / power
-    return _Followed(
+    return Followed(
         lost=dict(zip(window.carts, lost.tolist(), strict=True)),
         friction={
             cart: float(_FRICTION * np.sqrt(max(share, _LEAST)) * np.ptp(force) / 2)
@@ -265,7 +267,7 @@ def _wrong_clock(record: Record, *, usual: float) -> Iterator[str]:
 
 
 def _exchanged(
-    records: Sequence[Record], *, chain: Chain | None, fits: Mapping[str, _Followed]
+    records: Sequence[Record], *, chain: Chain | None, fits: Mapping[str, Followed]
 ) -> dict[str, str]:
     """Return the records that follow the chain with two columns exchanged, and not as they are.
 
