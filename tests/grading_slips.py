@@ -115,8 +115,8 @@ def carts_swapped(team: Team) -> Team:
 
     groups = [g for g in groups if g == "zeta" or not alike(g)]
     groups = [g for g in groups if g != "zeta" or "omega" in groups]
-    if not groups:
-        return carts_swapped(team)
+    if not groups:  # nobody could see it
+        return team
     exchanged = {
         t: {f"{g}_{a}": team.value(t, f"{g}_{b}") for g in groups for a, b in ((i, j), (j, i))}
         for t in some_tables(team)
