@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.grading.orders import orders
 from pipeline.grading.rubric import is_damping
 from pipeline.plant.chain import Chain
 from pipeline.results import Analysis, ParameterRow, StepEdge
@@ -18,8 +17,8 @@ _SIGMAS = 3.0
 _STILL = 3.0  # encoder steps
 _SAME = 1.03  # factor: bounds that near each other are one number to a reader
 _FAR = 2.5  # … so far that nobody believes it
-# A resonance or null read off the dwells, and where friction blurs even those: factors.
-_BY_EYE, _BY_EYE_ASTRAY = 1.1, 1.6
+# A resonance or null read off the dwells: factor.
+_BY_EYE = 1.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +83,7 @@ def recompute(analysis: Analysis) -> References:
     final, initial = {}, {}
     for row in analysis.rows:
         fitted = _final(row, analysis, tables) if trusted else None
-        measured = _initial(row, fitted, analysis, trusted=trusted)
+        measured = _initial(row, fitted, analysis)
         if measured is not None:
             initial[row.name] = measured
         if fitted is not None:
@@ -99,17 +98,11 @@ def recompute(analysis: Analysis) -> References:
             for table in (initial, final):
                 if row.name in table:
                     table[row.name] = table[row.name].widened(_STUCK)
+    # Without a fit nothing says that the peaks seen in the dwells are those they are taken for.
     for table in (initial, final) if not trusted else ():
-        for name in _out_of_order(table):
+        for name in [n for n, r in table.items() if r.source == "frequency_response"]:
             del table[name]
     return References(initial=initial, final=final)
-
-
-def _out_of_order(table: Mapping[str, Reference]) -> list[str]:
-    """Return the resonances and nulls read off dwells where one is not what it was taken for."""
-    by_eye = {n: r for n, r in table.items() if r.source == "frequency_response"}
-    wrong = [law for law in orders(list(by_eye)) if by_eye[law[0]].value > by_eye[law[1]].value]
-    return list(by_eye) if wrong else []
 
 
 def trusted_chain(analysis: Analysis) -> Chain | None:
@@ -187,9 +180,7 @@ def _by_decays(chain: Chain, analysis: Analysis) -> list[dict[str, float]]:
     return [one.parameters() for one in found] if np.all(found[0].c > 0) else []
 
 
-def _initial(
-    row: ParameterRow, final: Reference | None, analysis: Analysis, *, trusted: bool
-) -> Reference | None:
+def _initial(row: ParameterRow, final: Reference | None, analysis: Analysis) -> Reference | None:
     measured = row.initial
     if measured is not None and measured.source == "assumed":
         return None
@@ -199,9 +190,7 @@ def _initial(
     bounds = [measured.value, *readings]
     if final is not None:
         bounds += [final.low, final.high]
-    spread = 1.0
-    if measured.source == "frequency_response":
-        spread = _BY_EYE if trusted else _BY_EYE_ASTRAY
+    spread = _BY_EYE if measured.source == "frequency_response" else 1.0
     return Reference(
         value=measured.value,
         low=min(bounds) / spread,
