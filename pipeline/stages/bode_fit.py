@@ -292,8 +292,9 @@ def _hold_vanished(
     if not vanished:
         return fitted, data
     needed = {cart: zeta for cart, zeta in decays.items() if f"c_{cart}" in vanished}
-    for told in (decays, needed) if needed else ():
-        c, k = chain.c.copy(), chain.k[:-1] + chain.k[1:]
+    k = chain.k[:-1] + chain.k[1:]  # below zero where k_1 is: a cart that no decay is of
+    for told in (decays, needed) if needed and np.all(k > 0) else ():
+        c = chain.c.copy()
         for cart, zeta in told.items():
             c[cart - 1] = 2 * zeta.value * np.sqrt(chain.m[cart - 1] * k[cart - 1])
         names = {f"c_{cart}" for cart in told}
