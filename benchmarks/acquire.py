@@ -6,9 +6,7 @@ Each part runs against `cartlab emulate` in a process of its own; 0 leaves a par
 """
 
 import argparse
-import os
 import queue
-import signal
 import tempfile
 import time
 from collections.abc import Sequence
@@ -117,15 +115,12 @@ def kills(folder: Path, *, n: int) -> None:
     with emulator() as bench:
         for trial in range(n):
             work = write_work(folder / str(trial), [sine("killed", seconds=60.0)])
-            process = host(work, bench.address, "--only", "killed", "--yes")
             raw = work / "raw" / "killed-1.raw"
-            while not raw.exists():
-                time.sleep(0.01)
-            time.sleep(float(rng.uniform(0.05, 1.5)))
-            os.kill(process.pid, signal.SIGKILL)
-            process.wait()
-            assert process.stderr is not None
-            process.stderr.close()
+            with host(work, bench.address, "--only", "killed", "--yes") as process:
+                while not raw.exists():
+                    time.sleep(0.01)
+                time.sleep(float(rng.uniform(0.05, 1.5)))
+                process.kill()
             silent = bench.event("motor off")["ms_after_heartbeat"]
             sent = bench.event("run")["lines"]
             run = read_raw(raw)
