@@ -4,6 +4,7 @@ import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal
+from fractions import Fraction
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from pipeline.grading.reference import is_explained
 from pipeline.grading.state_model import own_chain
 from pipeline.grading.tolerance import rounding
 from pipeline.plant.chain import Array, Chain
+from pipeline.plant.robustness import MASS_SPRING_ERROR, level_error_percent
 from pipeline.results import Analysis
 from pipeline.submission import Design, StateFeedback, Submission
 from pipeline.workflow import reference_design
@@ -24,6 +26,7 @@ _SETTLING = 2.0  # times the goal
 _CLAIM_OVERSHOOT, _CLAIM_SETTLING = 12.0, 1.6  # percentage points, times
 _OTHER_GAINS = 2.5  # times: claims so far off are of other gains, whatever the prefilter
 _PREFILTER, _PREFILTER_BLURRED = 0.10, 0.20  # relative
+_SIGMAS = 2.0  # of the fitted static gains, which a prefilter may be off by
 _SAME_GAINS = 0.02  # relative to the largest of its kind: typed again with fewer digits
 
 
@@ -38,6 +41,7 @@ class Controller:
     models : the reference chain and the student's own.
     goal : what must be met; what a reference design reaches where neither it nor these gains do.
     blurred : the reference's gains are as uncertain as friction makes them.
+    doubt : relative error of the prefilter that the models' own errors leave.
     own : the student's table is complete, so that what they designed for is known.
     """
 
@@ -50,6 +54,7 @@ class Controller:
     goal: Design
     blurred: bool
     own: bool
+    doubt: float = 0.0
 
     def numbers(self, gains: Array) -> list[LoopNumbers]:
         """Return what gains do on each of the models."""
@@ -112,7 +117,7 @@ class Controller:
             return True
         off = abs(float(self.prefilter) - numbers.prefilter) - float(rounding(self.prefilter))
         allowed = _PREFILTER_BLURRED if self.blurred and not sharp else _PREFILTER
-        return off <= allowed * abs(numbers.prefilter)
+        return off <= (allowed + self.doubt) * abs(numbers.prefilter)
 
 
 def reported_controller(
@@ -151,9 +156,32 @@ def reported_controller(
         blurred=not is_explained(analysis),
         own=any(model is not None for model in own),
     )
+    controller = replace(controller, doubt=_doubt(controller, submission, analysis))
     if controller.gains is None or controller.reaches_goal(controller.gains):
         return controller
     return replace(controller, goal=_reachable(controller.goal, submission, analysis))
+
+
+def _doubt(controller: Controller, submission: Submission, analysis: Analysis) -> float:
+    """Return the relative error that those of static gains, fitted or typed, leave in a prefilter.
+
+    Gains that cancel much of the plant's stiffness make more of them than there was.
+    """
+    chain, gains = controller.models[0], controller.gains
+    if gains is None or gains.size != 2 * chain.n:
+        return 0.0
+    share = level_error_percent(chain, gains, cart=controller.goal.cart) / 100 / MASS_SPRING_ERROR
+    fitted = [
+        _SIGMAS * row.final.std / abs(row.final.value)
+        for row in analysis.rows
+        if row.name.startswith("K") and row.final and row.final.std and row.final.value
+    ]
+    typed = [
+        float(rounding(value) / abs(Fraction(value)))
+        for name, value in (submission.reported.final if submission.reported else {}).items()
+        if name.startswith("K") and value
+    ]
+    return float(share) * max([*fitted, *typed], default=0.0)
 
 
 def _reachable(goal: Design, submission: Submission, analysis: Analysis) -> Design:
