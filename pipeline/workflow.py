@@ -9,6 +9,7 @@ import numpy as np
 
 from pipeline.errors import DataError
 from pipeline.ingest.read import Ingested, read_data
+from pipeline.ingest.signs import contradictions
 from pipeline.plant.chain import Chain, parameter_names
 from pipeline.results import (
     Analysis,
@@ -31,6 +32,7 @@ from pipeline.stages.compare import (
     NOT_IDENTIFIED,
     check_chain,
     check_decays,
+    check_dwells,
     check_files,
     check_rows,
     check_setup,
@@ -127,6 +129,7 @@ def analyse(
     log.warn(_by_note((record.id, note) for record in data.records for note in record.notes))
     found, left_out = _identify_from_sound(data, system=system, progress=progress)
     log.add(found.log)
+    log.warn(contradictions(data.signs, without={one.experiment for one in left_out}))
     fit = found.fit
     final = fit.parameters if fit else {}
     if fit and not final:
@@ -144,6 +147,7 @@ def analyse(
     checks = [
         *check_files(data.unreadable),
         *check_setup(data.records),
+        *check_dwells(data.records, found.sines),
         *check_left_out(left_out),
         *found.repeats.checks,
         *check_rows(rows),
@@ -224,13 +228,18 @@ def _identify_from_sound(
     say that it may.
     """
     driven = [r for r in data.records if r.kind in ("step", "sweep")]
-    odd = find_outlier_repeats(driven, unit=system.position.unit)
+    unit = system.position.unit
+    odd = find_outlier_repeats(driven, unit=unit)
+    numbers: dict[str, LeftOut] = {}  # that the numbers of repeats show to be odd
     without, contradicted = odd.keys() | standing_still(data.records), []
     found = _identify(data, without=without, system=system, progress=progress)
     chain, fits = _witness(found, data.records, system=system)
     faults = find_faults(data.records, chain=chain, fits=fits)
     for _ in range(_ROUNDS):
-        odd |= found.repeats.odd
+        numbers |= found.repeats.odd
+        # Most repeats may be the wrong ones: who is odd shows among the others.
+        sound = [record for record in driven if record.id not in faults]
+        odd = {**find_outlier_repeats(sound, unit=unit), **numbers}
         if without == odd.keys() | faults.keys():
             break
         without = odd.keys() | faults.keys()

@@ -139,6 +139,48 @@ def test_dwells_that_were_cut_are_flagged(bench, tmp_path):
     assert all(59 * 0.00884 * frequency[name] < 2 for name in flag.parameters)
 
 
+def test_the_sound_repeats_stay_where_most_are_exchanged(bench, tmp_path):
+    """Three of four exchanged steps are out, the one as it was is not, and no sign is advised."""
+    folder = shutil.copytree(bench, tmp_path / "most")
+    steps = files(folder, "step")
+    for path in steps[:3]:
+        spoil(path, exchanged)
+    analysis = analyse(load_submission(folder))
+    assert {one.experiment for one in analysis.left_out} == {path.stem for path in steps[:3]}
+    assert {gain.experiment for gain in analysis.step_gains} == {steps[3].stem}
+    assert not any("sign = " in warning for warning in analysis.warnings)
+
+
+def test_one_clock_in_milliseconds_throughout_fails_the_dwells(bench, tmp_path):
+    """All times a thousand times too long agree with one another, but not with what is stated."""
+    folder = shutil.copytree(bench, tmp_path / "slow")
+    for path in files(folder, ""):
+        spoil(path, in_milliseconds)
+    graded = grade_submission(
+        load_submission(folder), rubric=load_rubric(Path(PRESET)), name="team"
+    )
+    assert graded.grade.status == "graded"
+    assert graded.analysis is not None
+    (check,) = [c for c in graded.analysis.checks if c.id == "dwells.frequency"]
+    assert check.outcome == "fail"
+    assert check.value == pytest.approx(1000, rel=0.01)
+    assert "milliseconds" in check.message
+
+
+def test_one_recording_in_two_experiments_counts_once(bench, tmp_path):
+    """A repeat that names the file of another is left out, and flagged."""
+    folder = shutil.copytree(bench, tmp_path / "copied")
+    path = folder / "submission.toml"
+    text = path.read_text(encoding="utf-8").replace("data/step-2.csv", "data/step-1.csv")
+    path.write_text(text, encoding="utf-8")
+    graded = grade_submission(
+        load_submission(folder), rubric=load_rubric(Path(PRESET)), name="team"
+    )
+    assert graded.analysis is not None
+    assert {one.experiment for one in graded.analysis.left_out} == {"step-2"}
+    assert ["step-2"] in [list(f.parameters) for f in graded.grade.flags]
+
+
 def test_columns_exchanged_in_every_recording_are_named(bench, tmp_path):
     """No record follows any carts as it is, all of them do exchanged: nothing is identified."""
     folder = shutil.copytree(bench, tmp_path / "exchanged")

@@ -10,6 +10,7 @@ import pytest
 
 from pipeline.ingest.drive import find_signs
 from pipeline.ingest.read import read_data
+from pipeline.ingest.signs import contradictions
 from pipeline.plant.chain import PRESETS, Array
 from pipeline.plant.simulate import simulate_linear
 from pipeline.report.questions import ask
@@ -136,9 +137,10 @@ def test_a_stated_sign_is_not_doubted_because_the_input_is_late(bench, sign, sai
     submission = load_submission(bench)
     drive = submission.system.input.model_copy(update={"sign": sign})
     system = submission.system.model_copy(update={"input": drive})
-    warnings = read_data(submission.model_copy(update={"system": system})).warnings
-    doubts = [text for text in warnings if "is stated as" in text]
+    signs = read_data(submission.model_copy(update={"system": system})).signs
+    doubts = contradictions(signs, without=())
     assert bool(doubts) == said
+    assert not contradictions(signs, without=set(signs.found))
     assert not said or re.search(r"the data say \+1 in .* \(all that tell it\)", doubts[0])
 
 

@@ -47,7 +47,7 @@ def test_wrong_options_of_simulate_are_one_line(tmp_path):
     """A wrong effect and a missing model end with status 2, one line, and nothing written."""
     for arguments, expected in (
         (("--preset", "throne-1dof", "--hide", "friction:force=1"), "no effect 'friction'"),
-        (("--model", tmp_path / "no.json"), "no.json: No such file"),
+        (("--model", tmp_path / "no.json"), "no.json: cannot be read (No such file or directory)"),
         ((), "either --preset or --model"),
     ):
         done = cartlab("simulate", *arguments, "--out", tmp_path / "out")

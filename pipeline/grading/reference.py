@@ -7,8 +7,12 @@ import numpy as np
 
 from pipeline.grading.rubric import is_damping
 from pipeline.plant.chain import Chain
-from pipeline.results import Analysis, ParameterRow, StepEdge
-from pipeline.stages.compare import CHI_SQUARE_LIMIT
+from pipeline.results import Analysis, Estimate, ParameterRow, StepEdge
+from pipeline.stages.compare import (
+    CHI_SQUARE_LIMIT,
+    DAMPING_LIMIT,
+    GAIN_AND_FREQUENCY_LIMIT,
+)
 
 # A fitted frequency or gain that far from the measured one: the fit has gone astray; factors.
 _ASTRAY, _ASTRAY_GAIN = 1.3, 1.6
@@ -147,6 +151,8 @@ def _final(
             spread = _BY_EYE if row.initial.source == "frequency_response" else 1.0
             measured += [row.initial.value / spread, row.initial.value * spread]
     told = fitted is not None and not (is_damping(row.name) and _undamped(analysis))
+    if fitted and told and is_explained(analysis):
+        measured = [value for value in measured if _agrees(value, fitted, name=row.name)]
     if not measured and not (told and is_explained(analysis)):
         return None
     bounds = [*measured, *([fitted.value] if fitted and told else [])]
@@ -157,6 +163,17 @@ def _final(
         std=(fitted.std or 0.0) if fitted and told else 0.0,
         source=fitted.source if fitted and told else "log_decrement",
     )
+
+
+def _agrees(value: float, fitted: Estimate, *, name: str) -> bool:
+    """Whether a reading may be of the number that a fit explains the data with.
+
+    Else it is of a recording that holds something else, and no bound of what is right.
+    """
+    percent = DAMPING_LIMIT if is_damping(name) else GAIN_AND_FREQUENCY_LIMIT
+    slack = _SIGMAS * (fitted.std or 0.0)
+    least, most = fitted.value / (1 + percent / 100), fitted.value * (1 + percent / 100)
+    return least - slack <= value <= most + slack
 
 
 def _undamped(analysis: Analysis) -> bool:

@@ -86,6 +86,8 @@ def _refit(
             return {}
         points.sort(key=lambda point: point[0])
         magnitude = np.array([amplitude / p.input_amplitude for _, amplitude, p in points])
+        if not np.all(magnitude > 0):
+            return {}
         responses.append(
             FrequencyResponse(
                 cart=response.cart,

@@ -13,7 +13,7 @@ from pipeline.ingest.columns import Column, assign_columns, conversion, holds_co
 from pipeline.ingest.files import read_table
 from pipeline.ingest.problems import channel_problems
 from pipeline.ingest.signals import encoder_step, mirrors
-from pipeline.ingest.signs import with_signs
+from pipeline.ingest.signs import Contradicted, with_signs
 from pipeline.ingest.table import Table, refuse_extreme
 from pipeline.ingest.times import FEWEST_SAMPLES, clock_notes, time_stamps
 from pipeline.plant.chain import Array
@@ -36,6 +36,7 @@ class Ingested:
     tables : frequency responses the students reduced, one a cart.
     files : SHA-256 of each data file, by path, sorted.
     unreadable : by experiment, why its file is not among them: missing, broken, another's.
+    signs : of the inputs, as stated and as the data tell them.
     warnings : what concerns more than one record.
     """
 
@@ -43,6 +44,7 @@ class Ingested:
     tables: tuple[FrequencyResponse, ...]
     files: dict[str, str]
     unreadable: dict[str, str]
+    signs: Contradicted
     warnings: tuple[str, ...]
 
 
@@ -83,13 +85,14 @@ def read_data(submission: Submission) -> Ingested:
     if len(unreadable) == len(submission.experiments):
         raise SubmissionError(_none_readable(unreadable))
     warnings += _unused_scale(records, submission.system)
-    records, found = with_signs(records, submission)
+    records, found, signs = with_signs(records, submission)
     responses, spread = frequency_responses(points)
     return Ingested(
         records=tuple(records),
         tables=responses,
         files={name: digest for name, (_, digest) in sorted(tables.items())},
         unreadable=unreadable,
+        signs=signs,
         warnings=(*warnings, *_copies(tables), *found, *((spread,) if responses else ())),
     )
 

@@ -1,6 +1,7 @@
 """The sign of the input, record by record: stated, found from the data, or as in the others."""
 
-from dataclasses import replace
+from collections.abc import Container, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,8 +12,18 @@ from pipeline.submission import Submission
 _FEW_NAMES = 6  # more are not listed one by one
 
 
-def with_signs(records: list[Record], submission: Submission) -> tuple[list[Record], list[str]]:
-    """Return the records with signed inputs, and what is to be said about the signs.
+@dataclass(frozen=True, kw_only=True)
+class Contradicted:
+    """By record, the sign that is stated, and the one that its data tell: 0 where they do not."""
+
+    stated: Mapping[str, int]
+    found: Mapping[str, int]
+
+
+def with_signs(
+    records: list[Record], submission: Submission
+) -> tuple[list[Record], list[str], Contradicted]:
+    """Return the records with signed inputs, what is to be said of signs found, and those stated.
 
     Where a record does not tell, it takes the sign of most others of its sort (under feedback or
     not: a controller's log may count the other way), else of most others.
@@ -46,20 +57,19 @@ def with_signs(records: list[Record], submission: Submission) -> tuple[list[Reco
         else record
         for record in records
     ]
-    return signed, _say_signs([r.id for r in driven], stated=stated, found=found, signs=signs)
+    says = _say_signs([r.id for r in driven], stated=stated, found=found, signs=signs)
+    return signed, says, Contradicted(stated=stated, found=found)
 
 
 def _say_signs(
     driven: list[str], *, stated: dict[str, int], found: dict[str, int], signs: dict[str, int]
 ) -> list[str]:
-    """Return what was found, what was only taken, and where the data contradict the students."""
-    says = _contradictions(driven, stated=stated, found=found)
+    """Return what was found, and what was only taken."""
     searched = [name for name in driven if name not in stated]
     if not searched:
-        return says
+        return []
     if not any(found.get(name) for name in searched):
         return [
-            *says,
             "the data do not tell the sign of the input: it is taken as "
             f"{signs[searched[0]]:+d}; state it if it is not",
         ]
@@ -69,17 +79,22 @@ def _say_signs(
         text += f", but {-usual:+d} in {_some(others)}"
     if unsure := [name for name in searched if not found.get(name)]:
         text += f"; taken from the others where the data do not tell: {_some(unsure)}"
-    return [*says, text]
+    return [text]
 
 
-def _contradictions(
-    driven: list[str], *, stated: dict[str, int], found: dict[str, int]
-) -> list[str]:
-    """Return a sentence for each stated sign that records contradict, and what to do."""
+def contradictions(signs: Contradicted, *, without: Container[str]) -> list[str]:
+    """Return a sentence for each stated sign that records contradict, and what to do.
+
+    `without` are records that do not hold what happened, so that their sign says nothing.
+    """
     says = []
     for sign in (1, -1):
-        told = [name for name in driven if stated.get(name) == sign and found.get(name)]
-        contrary = [name for name in told if found[name] == -sign]
+        told = [
+            name
+            for name, found in signs.found.items()
+            if signs.stated.get(name) == sign and found and name not in without
+        ]
+        contrary = [name for name in told if signs.found[name] == -sign]
         if contrary:
             those = "all" if contrary == told else f"{len(contrary)} of the {len(told)}"
             those += " that tell it"

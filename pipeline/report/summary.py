@@ -37,6 +37,7 @@ _KINDS = {
 }
 _GOOD_FIT = 2.0  # chi-square per degree of freedom that stated noise still explains
 _MOST_TOLD = 3  # of one kind: a summary is short
+_OF_DATA = ("repeats.", "dwells.", "setup.")  # checks of recordings, not of what they say
 _CLOSE = 0.10  # a simulation within 10 % of the motion is a good linear model's
 
 
@@ -293,9 +294,24 @@ def _carts(carts: list[int]) -> str:
 def _next(analysis: Analysis) -> Items:
     advice: list[Spans] = []
     fit = analysis.fit
-    if fit is None:
+    wrong = [*analysis.unreadable, *(one.experiment for one in analysis.left_out)]
+    if wrong:
         advice.append(
-            spans("Record what the fit needs: sine dwells over the resonances, a step or a sweep.")
+            spans(
+                f"Mend or record again {clean(listing(wrong[:_MOST_TOLD]))}"
+                f"{' …' if len(wrong) > _MOST_TOLD else ''}: the checks say what is wrong."
+            )
+        )
+    elif any(c.outcome == "fail" and c.id.startswith(_OF_DATA) for c in analysis.checks):
+        advice.append(spans("Mend first what the failed checks say of the recordings."))
+    if fit is None:
+        reasons = [skip.reason for skip in analysis.skipped if skip.stage == "final estimates"]
+        advice.append(
+            spans(f"No carts were identified: {clean(reasons[-1])}")
+            if reasons
+            else spans(
+                "Record what the fit needs: sine dwells over the resonances, a step or a sweep."
+            )
         )
     off = [row.name for row in analysis.rows if row.consistent is False]
     if off:

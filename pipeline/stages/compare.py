@@ -18,6 +18,7 @@ from pipeline.results import (
     Outcome,
     ParameterRow,
     Record,
+    SinePoint,
     StepGain,
 )
 
@@ -34,6 +35,14 @@ AT_BOUND = (
     "the fit ends at its bound, zero: its data are too few to tell, so there is no final value"
 )
 _ONE_SOURCE = "the fit's own points do not tell it: the final value rests on the decay as well"
+_DWELL_LIMIT = 0.1  # relative: a dwell stated so far off is another one
+_DWELL_FACTORS = {
+    2 * np.pi: "the stated ones look to be in rad/s, and `frequency` is in Hz",
+    1 / (2 * np.pi): "the stated ones look to be divided by 2π",
+    1e3: "the time columns look to be in milliseconds; head them `time [ms]`",
+    1e6: "the time columns look to be in microseconds; head them `time [us]`",
+}
+_DWELLS_NAMED = 3
 HEAVY_DAMPING = 0.3  # above it the orderings, exact without damping, may bend
 
 
@@ -222,6 +231,36 @@ def check_setup(records: Sequence[Record]) -> list[Check]:
             )
         )
     return checks
+
+
+def check_dwells(records: Sequence[Record], points: Sequence[SinePoint]) -> list[Check]:
+    """Check that the dwells swing at the frequencies stated of them, as a class or one by one."""
+    stated = {record.id: record.omega for record in records if record.omega}
+    ratios = {
+        point.experiment: stated[point.experiment] / point.omega
+        for point in points
+        if point.experiment in stated
+    }
+    off = {name: r for name, r in ratios.items() if abs(np.log(r)) > _DWELL_LIMIT}
+    if not off:
+        return []
+    ratio = float(np.median(list(off.values())))
+    close = [
+        why for factor, why in _DWELL_FACTORS.items() if abs(ratio / factor - 1) < _DWELL_LIMIT
+    ]
+    alike = all(abs(r / ratio - 1) < _DWELL_LIMIT for r in off.values())
+    told = f", {ratio:.4g} times: {close[0]}" if close and alike else ""
+    named = ", ".join(list(off)[:_DWELLS_NAMED]) + (" …" if len(off) > _DWELLS_NAMED else "")
+    return [
+        Check(
+            id="dwells.frequency",
+            outcome="fail",
+            value=ratio,
+            limit=1.0,
+            message=f"{len(off)} of {len(ratios)} dwells ({named}) do not swing at the frequency "
+            f"stated{told}.",
+        )
+    ]
 
 
 NOT_IDENTIFIED = Check(

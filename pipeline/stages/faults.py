@@ -31,8 +31,8 @@ _WITNESSES = 2  # records that follow the carts, as they are or exchanged: one d
 # Simulated carts with dry friction F under a force of amplitude A leave at least (F / 5A)² where
 # they move at all, which is doubled here; encoder and noise hide shares below the least.
 _FRICTION, _LEAST = 10.0, 1e-4
-_CYCLES = 2.0  # a dwell with fewer holds no steady state, whatever its length
-_CLOCKS = {1e3: "milliseconds", 1e6: "microseconds", 1e-3: "thousands of seconds"}
+_CYCLES = 1.5  # a dwell with fewer holds no steady state, whatever its length
+_CLOCKS = {1e3: "milliseconds", 1e6: "microseconds"}
 _SAME_CLOCK = 0.02  # a bench samples at one rate, which a unit changes by exactly its factor
 
 
@@ -57,6 +57,7 @@ def find_faults(
     fits : how the records follow it, as `follow` has it.
     """
     exchanged = _exchanged(records, chain=chain, fits=fits)
+    copied = _copies(records)
     steps: dict[int, float] = {}  # a dead channel shows none
     moving: set[int] = set()
     for record in records:
@@ -70,12 +71,14 @@ def find_faults(
         )
         for cart in {cart for fit in fits.values() for cart in fit.lost}
     }
-    usual_clock = float(np.median([record.sample_time for record in records])) if records else 0.0
+    # However many are wrong: a bench is never sampled a thousand times as fast by mistake.
+    usual_clock = min((record.sample_time for record in records), default=0.0)
     found: dict[str, LeftOut] = {}
     for record in records:
         for problem in (
             *_wrong_clock(record, usual=usual_clock),
             *_short_dwell(record),
+            *([copied[record.id]] if record.id in copied else ()),
             *([exchanged[record.id]] if record.id in exchanged else ()),
             *_dead_channels(record, chain=chain, friction=friction, steps=steps, moving=moving),
         ):
@@ -246,11 +249,25 @@ def _must_move(record: Record, chain: Chain, still: slice, *, cart: int, step: f
     return far >= max(_SEEN_COUNTS * step, _SEEN_SHARE * float(np.ptp(y)))
 
 
+def _copies(records: Sequence[Record]) -> dict[str, str]:
+    """Return the records that hold the very samples of one of their kind before them."""
+    first: dict[tuple[object, ...], str] = {}
+    copies = {}
+    for record in records:
+        what = (record.kind, record.free, record.t.tobytes(), record.y.tobytes())
+        if first.setdefault(what, record.id) != record.id:
+            copies[record.id] = (
+                f"it holds the samples of {first[what]}: a repeat is a recording of its own"
+            )
+    return copies
+
+
 def _short_dwell(record: Record) -> Iterator[str]:
     if record.kind == "sine" and record.omega is not None:
-        cycles = record.omega * float(record.t[-1] - record.t[0]) / (2 * np.pi)
+        duration = float(record.t[-1] - record.t[0]) + record.sample_time
+        cycles = record.omega * duration / (2 * np.pi)
         if cycles < _CYCLES:
-            yield f"fewer than {_CYCLES:.0f} cycles are no steady state: the file looks cut"
+            yield f"fewer than {_CYCLES:g} cycles are no steady state: the file looks cut"
 
 
 def _wrong_clock(record: Record, *, usual: float) -> Iterator[str]:

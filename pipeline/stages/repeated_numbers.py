@@ -78,7 +78,8 @@ def compare_repeats(
             if said or name not in by_size:
                 off = f"{name} = {of_run[run][name]:.3g} where the others give {value:.3g}"
                 reason = f"{off}: {said}" if said else off
-                odd[run] = LeftOut(experiment=run, reason=reason, is_wrong=bool(said))
+                wrong = bool(said) and not _is_reversed(of_run[run], usual)
+                odd[run] = LeftOut(experiment=run, reason=reason, is_wrong=wrong)
     undecided = tuple(name for name in readings if name not in usual and name not in by_size)
     return Repeats(
         checks=tuple(
@@ -155,13 +156,16 @@ def _mistake(values: Mapping[str, float], usual: Mapping[str, float]) -> str:
     """Return the mistake that turns the usual numbers into a run's own, or ""."""
     known = {name: value for name, value in values.items() if usual.get(name)}
     ratios = {name: value / usual[name] for name, value in known.items()}
+    if not known:
+        return ""
     if all(name.startswith("omega") for name in known):
         for factor, unit in _TIME_UNITS.items():
             if all(_near(ratio, factor) for ratio in ratios.values()):
                 return f"its time looks to be in {unit}"
         return ""
     for a, b in combinations(known, 2):
-        if _near(values[a], usual[b]) and _near(values[b], usual[a]):
+        apart = not _near(usual[a], usual[b])
+        if apart and _near(values[a], usual[b]) and _near(values[b], usual[a]):
             return f"x{a[2:]} and x{b[2:]} look exchanged"
     for scale in _SCALES:
         for factor in (scale, 1 / scale):
@@ -173,6 +177,12 @@ def _mistake(values: Mapping[str, float], usual: Mapping[str, float]) -> str:
     return ""
 
 
+def _is_reversed(values: Mapping[str, float], usual: Mapping[str, float]) -> bool:
+    """Whether all carts went the other way: a log may count its input so by right."""
+    known = [name for name in values if usual.get(name)]
+    return bool(known) and all(_near(values[name], -usual[name]) for name in known)
+
+
 def _near(value: float, other: float) -> bool:
     return abs(value - other) <= _SAME * abs(other)
 
@@ -181,7 +191,8 @@ def _check(
     name: str, readings: Sequence[_Reading], *, odd: Mapping[str, LeftOut], undecided: bool
 ) -> Check:
     values = [reading.value for reading in readings]
-    spread = 100 * (max(values) - min(values)) / max(map(abs, values))
+    largest = max(map(abs, values))
+    spread = 100 * (max(values) - min(values)) / largest if largest > 0 else 0.0
     off = [reading.run for reading in readings if reading.run in odd]
     apart = f"from {min(values):.4g} to {max(values):.4g}"
     count = f"{len(readings)} runs"
