@@ -40,6 +40,7 @@ from pipeline.stages.compare import (
     compare,
 )
 from pipeline.stages.design_check import design_margins, verify_design
+from pipeline.stages.encoder_units import find_other_units
 from pipeline.stages.faults import (
     Followed,
     check_left_out,
@@ -230,7 +231,9 @@ def _identify_from_sound(
     driven = [r for r in data.records if r.kind in ("step", "sweep")]
     unit = system.position.unit
     odd = find_outlier_repeats(driven, unit=unit)
-    numbers: dict[str, LeftOut] = {}  # that the numbers of repeats show to be odd
+    # What the encoder's own step, later the numbers of repeats show to be odd.
+    numbers = find_other_units(data.records)
+    odd |= numbers
     without, contradicted = odd.keys() | standing_still(data.records), []
     found = _identify(data, without=without, system=system, progress=progress)
     chain, fits = _witness(found, data.records, system=system)
@@ -316,9 +319,9 @@ def _identify(
     measured = estimate_initially(carts=n, log_decrements=decays, step_gains=gains)
 
     progress("fitting all carts at once")
-    fit = None
+    fit, dwells_follow = None, False
     if _is_seen(n, records, responses):
-        fit = _fit(
+        fit, dwells_follow = _fit(
             responses,
             dwells=[record for record in records if record.kind == "sine"],
             driven=driven,
@@ -330,7 +333,9 @@ def _identify(
     else:
         log.skip("final estimates", f"cart {n} moves in no recording: is `carts = {n}` right?")
     fitted = fit.parameters if fit and fit.converged else {}
-    repeats = compare_repeats(decays, gains, carts=n, fitted=fitted)
+    repeats = compare_repeats(
+        decays, gains, carts=n, fitted=fitted, dwells=fitted if dwells_follow else {}
+    )
     agreed = {name: one for name, one in measured.items() if name not in repeats.undecided}
     return _Identified(
         decays=decays,
@@ -490,8 +495,11 @@ def _fit(
     n: int,
     springs: tuple[bool, ...],
     log: _Log,
-) -> ChainFit | None:
-    """The Bode fit where the dwells follow it or there is a table, else the joint fit in time."""
+) -> tuple[ChainFit | None, bool]:
+    """The Bode fit where the dwells follow it or there is a table, else the joint fit in time.
+
+    Return also whether there are dwells and they follow it.
+    """
     has_points = any(response.source != "records" for response in responses)
     fit = None
     if has_points:
@@ -505,18 +513,19 @@ def _fit(
             initial=values,
             decays=_decay_dampings(initial, n=n),
         )
-        if fit and (not driven or follows(follow(dwells, fit.chain))):
-            return fit
+        followed = fit is not None and follows(follow(dwells, fit.chain))
+        if fit and (followed or not driven):
+            return fit, followed and bool(dwells)
     if not driven:
         found = "the Bode fit gave none, and there is no" if has_points else "no dwells, table,"
         log.skip("final estimates", f"{found} step or sweep with all carts free to fit them to")
-        return None
+        return None, False
     other = log.attempt("final estimates", fit_records, driven, n=n, springs=springs)
     if fit is None or (other and other.converged):
         if fit:
             log.warn(["the fit rests on the steps and sweeps: the dwells do not follow one chain"])
-        return other
-    return fit
+        return other, False
+    return fit, False
 
 
 def _decay_dampings(initial: dict[str, Estimate], *, n: int) -> dict[int, Estimate]:

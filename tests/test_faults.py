@@ -60,6 +60,10 @@ def dead(name: str) -> Spoil:
     return lambda columns: {**columns, name: 0 * columns[name]}
 
 
+def times(factor: float, *names: str) -> Spoil:
+    return lambda columns: {**columns, **{name: factor * columns[name] for name in names}}
+
+
 def cut(columns: Columns) -> Columns:
     return {name: values[:60] for name, values in columns.items()}
 
@@ -86,6 +90,12 @@ SPOILT = {
     "all dwells exchanged": ("sine", slice(None), exchanged, "exchanged"),
     "cart 1 frozen in a step": ("step", slice(1), frozen("x1"), "froze"),
     "cart 2 frozen in a step": ("step", slice(1, 2), frozen("x2"), "froze"),
+    "all steps in millimetres": ("step", slice(None), times(10, "x1", "x2"), "another unit"),
+    "all dwells in millimetres": ("sine", slice(None), times(10, "x1", "x2"), "another unit"),
+    "a tenth of the input in every step": ("step", slice(None), times(0.1, "input"), "its input"),
+    "a third of the input in every step": ("step", slice(None), times(1 / 3, "input"), "K_1 = "),
+    "cart 1 turned in every step": ("step", slice(None), times(-1, "x1"), "sign of x1"),
+    "all decays at half speed": ("decay", slice(None), times(2, "time"), "clock"),
 }
 
 

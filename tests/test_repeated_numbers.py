@@ -40,7 +40,7 @@ def step(run: str, gain: float, *, cart: int = 1, std: float = 0.01, size: float
 
 def compared(decays=(), steps=(), *, carts: int = 2, **fitted: float) -> Repeats:
     estimates = {k: Estimate(value=v, std=0.01, source="bode_fit") for k, v in fitted.items()}
-    return compare_repeats(decays, steps, carts=carts, fitted=estimates)
+    return compare_repeats(decays, steps, carts=carts, fitted=estimates, dwells={})
 
 
 def test_repeats_that_agree_pass():

@@ -6,6 +6,7 @@ import numpy as np
 
 from pipeline.plant.chain import Array
 
+LENGTH_SCALES = (10.0, 100.0, 1000.0, 2.54, 25.4)  # between mm, cm, m and inches
 _NEIGHBOURS = (-3, -2, -1, 1, 2, 3)  # a quintic through these follows any motion we sample
 _MEDIAN_TO_SIGMA = 1.4826  # median absolute value to standard deviation, normal noise
 _FLAT_INPUT = 0.02  # of the input's range: smaller changes are noise of the logged input

@@ -2,6 +2,7 @@
 
 A frequency or a gain that two runs give 10 % apart, and beyond their errors, is no number with a
 wide error: one of the runs is wrong. The fit tells which, else the majority; else nothing does.
+Runs that agree with each other may share a mistake: dwells that one chain explains tell it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,14 +13,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.results import Check, Estimate, LeftOut, LogDecrement, StepGain
+from pipeline.stages._signals import LENGTH_SCALES
 
 TOLERANCE = 10.0  # percent; the same run made twice, with dry friction of some percent
 _SIGMAS = 4.0
 _LIKE_THE_FIT = 0.15  # relative: as far as two ways to one number may lie apart
+# Factors: what two ways to one number differ by where friction, play or a soft hold is at work.
+_BY_THE_BENCH = {"K": 1.6, "omega": 1.3}
 _SAME = 0.05  # relative: what a mistake leaves of the difference between two runs
 _SAME_SIZE = 0.2  # relative: two steps that friction treats alike
-_TIME_UNITS = {1e-3: "milliseconds", 1e-6: "microseconds", 1e3: "thousands of seconds"}
-_SCALES = (10.0, 100.0, 1000.0, 2.54, 25.4)
+_TIME_UNITS = {
+    1e-3: "its time looks to be in milliseconds",
+    1e-6: "its time looks to be in microseconds",
+    1e3: "its time looks to be in thousands of seconds",
+    0.5: "its clock looks to run twice too fast",
+    2.0: "its clock looks to run at half its speed",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,17 +64,22 @@ def compare_repeats(
     *,
     carts: int,
     fitted: Mapping[str, Estimate],
+    dwells: Mapping[str, Estimate],
 ) -> Repeats:
     """Hold the runs that give one frequency or one static gain against one another.
 
     Parameters
     ----------
     fitted : the parameters of a fit that explains most records; else none.
+    dwells : … of one that rests on dwells alone, and explains them; else none.
     """
     readings = _readings(decays, steps, carts=carts)
     right = {name: _right_ones(all_, fitted.get(name)) for name, all_ in readings.items()}
     usual = {n: float(np.median([r.value for r in ones])) for n, ones in right.items() if ones}
-    by_size = {name for name, all_ in readings.items() if _only_by_size(all_)}
+    for name, told in dwells.items():
+        if name in usual and all(_is_far(reading, told, name=name) for reading in right[name]):
+            usual[name], right[name] = told.value, []
+    by_size = {name for name, ones in right.items() if ones and _only_by_size(readings[name])}
     of_run: dict[str, dict[str, float]] = {}
     for name, all_ in readings.items():
         for reading in all_:
@@ -76,16 +90,17 @@ def compare_repeats(
         for run in [r.run for r in readings[name] if r.run not in belong and r.run not in odd]:
             said = _mistake(of_run[run], usual)
             if said or name not in by_size:
-                off = f"{name} = {of_run[run][name]:.3g} where the others give {value:.3g}"
+                others = "the others give" if right[name] else "the dwells ask for"
+                off = f"{name} = {of_run[run][name]:.3g} where {others} {value:.3g}"
                 reason = f"{off}: {said}" if said else off
-                wrong = bool(said) and not _is_reversed(of_run[run], usual)
+                wrong = bool(said or not right[name]) and not _is_reversed(of_run[run], usual)
                 odd[run] = LeftOut(experiment=run, reason=reason, is_wrong=wrong)
     undecided = tuple(name for name in readings if name not in usual and name not in by_size)
     return Repeats(
         checks=tuple(
             _check(name, all_, odd=odd, undecided=name in undecided)
             for name, all_ in readings.items()
-            if len(all_) > 1
+            if len(all_) > 1 and (right[name] or name not in usual)
         ),
         odd=odd,
         undecided=undecided,
@@ -152,6 +167,14 @@ def _right_ones(readings: Sequence[_Reading], fitted: Estimate | None) -> list[_
     return largest if 2 * len(largest) > len(readings) else []
 
 
+def _is_far(reading: _Reading, told: Estimate, *, name: str) -> bool:
+    """Whether a reading and its errors are of another number than one that is well known."""
+    if told.std is None or told.value <= 0 or _SIGMAS * told.std > _LIKE_THE_FIT * told.value:
+        return False
+    factor = _BY_THE_BENCH[name.partition("_")[0]]
+    return reading.high < told.value / factor or reading.low > told.value * factor
+
+
 def _mistake(values: Mapping[str, float], usual: Mapping[str, float]) -> str:
     """Return the mistake that turns the usual numbers into a run's own, or ""."""
     known = {name: value for name, value in values.items() if usual.get(name)}
@@ -159,18 +182,21 @@ def _mistake(values: Mapping[str, float], usual: Mapping[str, float]) -> str:
     if not known:
         return ""
     if all(name.startswith("omega") for name in known):
-        for factor, unit in _TIME_UNITS.items():
+        for factor, looks in _TIME_UNITS.items():
             if all(_near(ratio, factor) for ratio in ratios.values()):
-                return f"its time looks to be in {unit}"
+                return looks
         return ""
     for a, b in combinations(known, 2):
         apart = not _near(usual[a], usual[b])
         if apart and _near(values[a], usual[b]) and _near(values[b], usual[a]):
             return f"x{a[2:]} and x{b[2:]} look exchanged"
-    for scale in _SCALES:
+    for scale in LENGTH_SCALES:
         for factor in (scale, 1 / scale):
             if all(_near(abs(ratio), factor) for ratio in ratios.values()):
-                return f"its positions look to be in another unit, {factor:.3g} times the others'"
+                return (
+                    "its positions or its input look to be in another unit, "
+                    f"{factor:.3g} times the others'"
+                )
     turned = [name for name, ratio in ratios.items() if _near(ratio, -1.0)]
     if turned and all(_near(abs(ratio), 1.0) for ratio in ratios.values()):
         return f"the sign of {' and '.join(f'x{name[2:] or 1}' for name in turned)} looks turned"

@@ -1,0 +1,44 @@
+"""Recordings in another unit of length: one encoder has one step, whatever the experiment."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeline.results import LeftOut, Record
+from pipeline.stages._signals import LENGTH_SCALES
+
+_SAME = 0.02  # relative: as far as the step is seen alike in two recordings
+_WITNESSES = 2  # kinds of experiment that have the usual step; of two alone either may be wrong
+
+
+def find_other_units(records: Sequence[Record]) -> dict[str, LeftOut]:
+    """Find the records whose encoder step is that of the others in another unit, by id.
+
+    A class of a dozen dwells was exported in one go, and so may all be wrong: the usual step is
+    what most kinds of experiment have, not most records. A decay gives no length.
+    """
+    found: dict[str, LeftOut] = {}
+    for cart in sorted({cart for record in records for cart in record.carts}):
+        steps = {r.id: r.encoder_step(cart) for r in records if cart in r.carts}
+        by_kind = [
+            float(np.median(seen))
+            for kind in dict.fromkeys(record.kind for record in records)
+            if (seen := [s for r in records if r.kind == kind and (s := steps.get(r.id, 0.0))])
+        ]
+        usual = max(by_kind, key=lambda step: sum(_alike(step, s) for s in by_kind), default=0.0)
+        if sum(_alike(step, usual) for step in by_kind) < _WITNESSES:
+            continue
+        scales = [s for scale in LENGTH_SCALES for s in (scale, 1 / scale)]
+        for record in [r for r in records if r.id in steps and r.kind != "decay"]:
+            for scale in [s for s in scales if _alike(steps[record.id], s * usual)]:
+                reason = (
+                    f"one count of cart {cart} is {scale:.3g} times that in the others: "
+                    "its positions look to be in another unit"
+                )
+                one = LeftOut(experiment=record.id, reason=reason, is_wrong=True)
+                found.setdefault(record.id, one)
+    return found
+
+
+def _alike(step: float, other: float) -> bool:
+    return abs(step - other) <= _SAME * other
