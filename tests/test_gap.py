@@ -1,14 +1,17 @@
 """The gap workflow on a small fixed sample of benches with known, hidden physics."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from pipeline.errors import DataError
+from pipeline.gap.account import repeatability
 from pipeline.gap.document import gap_json
 from pipeline.gap.explain import explain_gap
 from pipeline.gap.investigate import investigate
+from pipeline.gap.runs import make_run
 from pipeline.gap.types import Gap
 from pipeline.plant.effects import CATALOGUE
 from pipeline.results import Record
@@ -108,6 +111,52 @@ def test_what_the_catalogue_lacks_is_not_misnamed():
     assert gap.verdict == "unexplained"
     assert gap.suspects
     assert all(s.nrmse_after > 0.5 * gap.baseline for s in gap.suspects)
+
+
+def test_a_part_is_called_a_part():
+    """Of two effects the catalogue has one: it is found, and nobody calls that all."""
+    case = make_case(seed=53, n=1, effects=["coulomb_friction", "saturation"], rate=113.1)
+    known = [e for e in CATALOGUE if e.key in ("coulomb_friction", "cubic_spring", "drive_damping")]
+
+    gap = explain(case, catalogue=known)
+
+    assert gap.verdict == "partial"
+    assert names(gap) == [("coulomb_friction", 1)]
+    assert gap.final > 2.0 * gap.noise_floor
+    assert all(found.nrmse_after < 0.9 * found.nrmse_before for found in gap.effects)
+    assert gap.left
+    assert gap.next_experiment
+
+
+def test_the_time_allowed_ends_the_search():
+    """Without any time the linear model is the best answer so far, and that is said."""
+    case = make_case(seed=45, n=1, effects=["dead_zone"], rate=113.1)
+
+    gap = explain(case, budget=0.0)
+
+    assert (gap.verdict, gap.complete, gap.effects) == ("unexplained", False, ())
+    assert gap.final == gap.baseline
+
+
+def test_repeats_are_compared_by_the_edge_of_their_input():
+    """Recordings of the same step differ by their noise, though their clocks began apart."""
+    case = make_case(seed=49, n=1, rate=113.1)
+    first = next(record for record in case.records if record.kind == "step")
+    assert first.u is not None
+    rest = np.zeros(20)
+    u = np.append(rest, first.u[:-20])
+    later = replace(
+        first,
+        id="later",
+        t=first.t + 1e-4,
+        u=u,
+        y=np.append(rest[None], first.y[:, :-20], axis=1),
+    )
+
+    runs = [make_run(record, n=1) for record in (first, later)]
+
+    assert repeatability(runs) == pytest.approx(0.0, abs=1e-3)
+    assert repeatability([runs[0], make_run(replace(later, u=0.5 * u), n=1)]) is None
 
 
 def test_two_effects_are_found_together():

@@ -130,6 +130,14 @@ def make_gap(verdict: Verdict = "named", keys=("coulomb_friction",)) -> Gap:
                 share=0.62,
             ),
         ),
+        left=()
+        if verdict in ("none", "named")
+        else (
+            GapWindow(
+                experiment="step-b", cart=2, start=2.0, end=2.6, what="velocity near zero",
+                share=0.31,
+            ),
+        ),
         next_experiment="" if verdict == "none" else "Steps of three sizes.",
         linear=linear,
         model=model,
@@ -212,12 +220,25 @@ def test_what_stays_unexplained_has_suspects_only(keys):
     assert "explains what" not in text
 
 
-def test_what_is_left_beyond_the_noise_is_admitted():
-    """A named effect that leaves three times the noise is the main one, not all of it."""
-    gap = replace(make_gap(), noise_floor=0.01, repeatability=None)
+def test_a_part_of_the_gap_says_what_is_left_and_where():
+    """Verdict partial: the effects, how much is left, in which run, cart and phase."""
+    gap = replace(make_gap("partial"), noise_floor=0.01)
+    text = page_of(gap).text
 
-    assert "4.1 times what noise makes is left" in terminal_verdict(gap)
-    assert "not all of it" not in terminal_verdict(make_gap())
+    assert "explains part of what the linear model leaves out" in text
+    assert "So 4.1 times as much is left" in text
+    assert "step-b, cart 2, from 2.00 to 2.60 s (velocity near zero)" in text
+    assert "Where the model with its effects fails most" in text
+    assert "is left, most of it" not in terminal_verdict(make_gap())
+
+
+def test_an_answer_so_far_is_said_to_be_one():
+    """What the time allowed has ended is told on top, and no page promises it again."""
+    text = page_of(replace(make_gap("unexplained", ()), complete=False)).text
+
+    assert "best answer so far" in text
+    assert "The same input gives the same report." not in text
+    assert "best answer so far" not in page_of(make_gap()).text
 
 
 @pytest.mark.parametrize("effect", CATALOGUE, ids=lambda effect: effect.key)
@@ -330,7 +351,7 @@ def test_a_cart_beside_one_that_was_not_measured_has_no_residual_force():
 # --------------------------------------------------------------------- the file
 
 
-@pytest.mark.parametrize("verdict", ["named", "none", "ambiguous", "unexplained"])
+@pytest.mark.parametrize("verdict", ["named", "partial", "none", "ambiguous", "unexplained"])
 def test_the_file_is_read_back_as_it_was(verdict):
     """What is read from `gap.json` writes the same file again, and tells the same verdict."""
     keys = () if verdict == "none" else ("end_stop", "input_delay")

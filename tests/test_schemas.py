@@ -63,7 +63,7 @@ def test_results_with_gaps_obey_the_schema(carts):
         assert_fits("solution", solution_text(poorer))
 
 
-@pytest.mark.parametrize("verdict", ["named", "none", "ambiguous", "unexplained"])
+@pytest.mark.parametrize("verdict", ["named", "partial", "none", "ambiguous", "unexplained"])
 def test_gaps_obey_the_schema(verdict):
     """Every verdict's file fits, effects, rivals and windows included."""
     keys = () if verdict == "none" else ("coulomb_friction", "cubic_spring")

@@ -165,6 +165,12 @@ def solution(
 def gap(
     folder: Folder,
     out: Annotated[Path | None, typer.Option(help="Where to write; default: DIR/gap.")] = None,
+    budget: Annotated[
+        float,
+        typer.Option(
+            metavar="SECONDS", min=0.0, help="Past it, the best answer so far, said as such."
+        ),
+    ] = 60.0,
     pdf: Annotated[bool, typer.Option("--pdf/--no-pdf", help="Write the PDF too.")] = True,
     as_json: AsJson = False,
 ) -> None:
@@ -182,7 +188,7 @@ def gap(
         analysis = analyse(submission, design=False, progress=progress)
         from pipeline.gap.investigate import investigate  # loads the compiled simulator
 
-        found = investigate(analysis, progress=progress)
+        found = investigate(analysis, budget=budget, progress=progress)
         out.mkdir(parents=True, exist_ok=True)
         write_file(out / "gap.json", text := gap_text(found, analysis))
         render_gap(found, analysis, out, pdf=pdf, progress=progress)

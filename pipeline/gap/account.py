@@ -1,6 +1,7 @@
 """The account of a search: effects with their errors, rivals, traces, errors by record."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -9,10 +10,13 @@ from pipeline.gap.hypothesis import AT_FLOOR, CONTACT, Bench, Hypothesis
 from pipeline.gap.linearise import Locals, simulate_run
 from pipeline.gap.runs import Run
 from pipeline.gap.types import FoundEffect, NamedValue, RecordGap, Rival, Trace
+from pipeline.plant.chain import Array
 from pipeline.plant.effects import find_effect
 from pipeline.plant.effects.base import Term
 
 _MOST_RIVALS = 4  # listed
+_SAME_LENGTH, _SAME_LEVEL = 0.9, 0.01  # share of the samples, and of the largest input: a repeat
+_EDGES = 0.02  # share of the samples that may differ, by one at each edge of the input
 
 
 def list_effects(
@@ -33,9 +37,12 @@ def list_effects(
     total = sum(weight.values())
     slopes = structure.physical_derivative(final.theta)
     std = np.sqrt(np.diag(final.covariance)) * slopes if final.covariance is not None else None
+    places = [candidate.key for candidate in structure.effects]
     out = []
-    for index, (candidate, term) in enumerate(zip(structure.effects, terms, strict=True)):
-        rest = chosen.key - {candidate.key}
+    for before, after in pairwise(path):
+        (added,) = after.key - before.key
+        index = places.index(added)
+        term, rest = terms[index], chosen.key - {added}
         rivals = sorted(
             ((key, h) for key, h in same_size.items() if rest < key and key != chosen.key),
             key=lambda pair: pair[1].bic,
@@ -55,9 +62,9 @@ def list_effects(
                 where=term.where,
                 parameters={k: v for k, v in values.items() if k in reported},
                 details={k: v for k, v in values.items() if k not in reported},
-                confidence=sum(w for key, w in weight.items() if candidate.key in key) / total,
-                nrmse_before=path[index].error,
-                nrmse_after=path[index + 1].error,
+                confidence=sum(w for key, w in weight.items() if added in key) / total,
+                nrmse_before=before.error,
+                nrmse_after=after.error,
                 rivals=tuple(
                     Rival(
                         effect=find_effect(next(iter(key - rest))[0]),
@@ -122,13 +129,6 @@ def chain_std(fit: Fit) -> dict[str, float]:
     return {name: float(v * r) for (name, v), r in zip(values.items(), relative, strict=True)}
 
 
-def pooled_floor(runs: Sequence[Run]) -> float:
-    """Return the noise relative to the motion, over all runs."""
-    noise = sum(float((run.sigma**2).sum()) * run.t.size for run in runs)
-    motion = sum(float((run.swing**2).sum()) * run.t.size for run in runs)
-    return float(np.sqrt(noise / motion))
-
-
 def _sides_of(hypothesis: Hypothesis, bench: Bench) -> list[tuple[Run, Locals, bool]]:
     """Return every run with its own unknowns, and whether it was held out."""
     training = zip(bench.training, hypothesis.fit.locals_, strict=True)
@@ -189,17 +189,39 @@ def compare_by_record(traces: Sequence[Trace], bench: Bench) -> tuple[RecordGap,
 
 
 def repeatability(runs: Sequence[Run]) -> float | None:
-    """Return the relative difference of runs with the same input, or None without such."""
+    """Return the relative difference of runs with the same input, or None without such.
+
+    Of two runs the second is read at the times of the first, their inputs' first edges together.
+    """
     squares, sizes = 0.0, 0.0
     for i, a in enumerate(runs):
         for b in runs[:i]:
-            alike = a.free == b.free and a.rows == b.rows and a.t.size == b.t.size
-            alike = alike and bool(np.any(a.command)) and np.allclose(a.t, b.t)
-            if not alike or not np.array_equal(a.command, b.command):
+            if a.free != b.free or a.rows != b.rows or not np.any(a.command):
                 continue
-            difference = a.y - b.y
+            t = a.t - _edge(a) + _edge(b)
+            inside = (t >= b.t[0]) & (t <= b.t[-1])
+            if not _same_input(a, b, a.t[inside], t[inside]):
+                continue
+            difference = [
+                x[inside] - np.interp(t[inside], b.t, y) for x, y in zip(a.y, b.y, strict=True)
+            ]
             # Encoders are zeroed for every run: a constant is no difference.
-            difference -= difference.mean(axis=1, keepdims=True)
-            squares += float((difference**2).sum()) / 2.0
-            sizes += float((a.swing**2).sum()) * a.t.size
+            squares += sum(float(((d - d.mean()) ** 2).sum()) for d in difference) / 2.0
+            sizes += float((a.swing**2).sum()) * np.count_nonzero(inside)
     return float(np.sqrt(squares / sizes)) if sizes else None
+
+
+def _edge(run: Run) -> float:
+    """Return when the input first changes, or the run's start."""
+    return float(run.knots[int(np.argmax(run.command != run.command[0]))])
+
+
+def _same_input(a: Run, b: Run, t_a: Array, t_b: Array) -> bool:
+    """Tell whether two inputs are one over most of the runs, but for samples at their edges."""
+    if t_a.size < _SAME_LENGTH * max(a.t.size, b.t.size):
+        return False
+    u, v = (
+        run.command[np.searchsorted(run.knots, t, side="right") - 1]
+        for run, t in ((a, t_a), (b, t_b))
+    )
+    return bool(np.mean(np.abs(u - v) > _SAME_LEVEL * np.abs(u).max()) < _EDGES)

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from pipeline.gap.types import FoundEffect, Gap, NamedValue, Rival
+from pipeline.gap.types import FoundEffect, Gap, GapWindow, NamedValue, Rival
 from pipeline.plant.chain import Chain
 
 SCHEMA = "cartlab-gap/1"
@@ -13,6 +13,7 @@ def gap_json(gap: Gap, *, position_unit: str = "cm", input_unit: str = "V") -> d
     return {
         "schema": SCHEMA,
         "verdict": gap.verdict,
+        "complete": gap.complete,
         "effects": [_effect(found) for found in gap.effects],
         "suspects": [_rival(rival) for rival in gap.suspects],
         "gap": {"baseline": gap.baseline, "final": gap.final, "noise_floor": gap.noise_floor},
@@ -28,17 +29,8 @@ def gap_json(gap: Gap, *, position_unit: str = "cm", input_unit: str = "V") -> d
             }
             for r in gap.by_record
         ],
-        "where": [
-            {
-                "experiment": w.experiment,
-                "cart": w.cart,
-                "from": w.start,
-                "to": w.end,
-                "what": w.what,
-                "share": w.share,
-            }
-            for w in gap.where
-        ],
+        "where": [_window(window) for window in gap.where],
+        "left": [_window(window) for window in gap.left],
         "next_experiment": gap.next_experiment,
         "training": list(gap.training),
         "held_out": list(gap.held_out),
@@ -70,6 +62,17 @@ def _effect(found: FoundEffect) -> dict[str, Any]:
         "nrmse_before": found.nrmse_before,
         "nrmse_after": found.nrmse_after,
         "rivals": [_rival(rival) for rival in found.rivals],
+    }
+
+
+def _window(window: GapWindow) -> dict[str, Any]:
+    return {
+        "experiment": window.experiment,
+        "cart": window.cart,
+        "from": window.start,
+        "to": window.end,
+        "what": window.what,
+        "share": window.share,
     }
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -13,25 +14,25 @@ from pipeline.gap.account import (
     list_effects,
     list_suspects,
     make_traces,
-    pooled_floor,
     repeatability,
 )
 from pipeline.gap.baseline import fit_baseline, measure_noise
+from pipeline.gap.deadline import Deadline, OutOfTime
 from pipeline.gap.fit import Fit, covariance, fit_model
 from pipeline.gap.grow import fit_whole
 from pipeline.gap.hypothesis import Bench, Hypothesis, judge
 from pipeline.gap.offset import find_offset
 from pipeline.gap.restart import dry_force
 from pipeline.gap.runs import Run
-from pipeline.gap.search import choose, prune, search
+from pipeline.gap.search import choose, prune, search, steps_to
 from pipeline.gap.sides import prepare, take_sides
 from pipeline.gap.structure import Candidate
-from pipeline.gap.types import Gap
-from pipeline.gap.verdict import AS_REPEATS, REFUSED_FLOOR, choose_experiment, reach_verdict
+from pipeline.gap.types import FoundEffect, Gap
+from pipeline.gap.verdict import AS_REPEATS, choose_experiment, reach_verdict
 from pipeline.gap.where import find_windows
 from pipeline.plant.chain import Chain
 from pipeline.plant.effects import CATALOGUE, find_effect
-from pipeline.plant.effects.base import Effect
+from pipeline.plant.effects.base import Effect, Term
 from pipeline.results import Record
 
 _NOISE_ROUNDS, _TOO_GOOD = 2, 0.7  # chi-square per point no fit to true noise falls to
@@ -46,6 +47,7 @@ def explain_gap(
     position_unit: str = "cm",
     input_unit: str = "V",
     workers: int = 2,
+    budget: float | None = None,
     tell: Callable[[str], None] = lambda text: None,
 ) -> Gap:
     """Find where the linear chain and the records disagree, name why, and show the gap shrink.
@@ -58,6 +60,8 @@ def explain_gap(
     chain : the stages' estimate, as one start of the fit.
     catalogue : the effects that may be named.
     workers : threads.
+    budget : s; past it the best answer so far. By default the search ends by itself, and the
+        answer does not depend on the machine.
     tell : takes a line of progress.
 
     Raises
@@ -69,6 +73,7 @@ def explain_gap(
     training, held_out = take_sides(runs, notes=notes)
     # Its matrices are small: BLAS with threads of its own only gets in the workers' way.
     with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(max_workers=workers) as pool:
+        deadline = Deadline(pool.map, seconds=budget)
         tell("fitting the linear chain")
         fit, training = fit_baseline(training, springs=springs, start=chain, mapper=pool.map)
         sigma = {row: s for run in training for row, s in zip(run.rows, run.sigma, strict=True)}
@@ -82,47 +87,58 @@ def explain_gap(
             mapper=pool.map,
             tell=tell,
         )
-        chosen, found = _investigate(fit, bench)
+        chosen, found = _investigate(fit, bench, deadline)
         for _ in range(_NOISE_ROUNDS):
-            if chosen.fit.chi > _TOO_GOOD:
+            if chosen.fit.chi > _TOO_GOOD or deadline.cut:
                 break
             # Less is left than was taken for noise: the misfit of the linear model was in it.
-            bench = _quieter(bench, chosen)
-            fit = fit_model(fit.structure, fit.theta, bench.training, mapper=pool.map)
-            chosen, found = _investigate(fit, bench)
-        path = _path(chosen, found, bench)
-        chosen, path, judged_by = _with_offset(chosen, path, bench)
-        if judged_by is not bench:
-            # The others were judged with the encoders' zeros free.
-            bench, found = judged_by, list(path)
+            quiet = _quieter(bench, chosen)
+            fit = fit_model(fit.structure, fit.theta, quiet.training, mapper=pool.map)
+            again = _investigate(fit, quiet, deadline)
+            if not deadline.cut:
+                bench, (chosen, found) = quiet, again
+        path = steps_to(chosen, found, bench)
+        with suppress(OutOfTime):
+            path, judged_by = _with_offset(path, replace(bench, mapper=deadline.map))
+            if judged_by is not None:
+                # The others were judged with the encoders' zeros free.
+                chosen, bench, found = path[-1], judged_by, list(path)
         final = covariance(chosen.fit, bench.training, mapper=pool.map)
-    floor = pooled_floor(bench.held_out)
-    if chosen.key and chosen.error > REFUSED_FLOOR * floor:
-        notes.append(f"{chosen.error / floor:.1f} times the noise is left: something remains")
     sample_time = max(run.record.sample_time for run in bench.training)
-    verdict, close = reach_verdict(
-        chosen, path[0], found, bench=bench, floor=floor, sample_time=sample_time
-    )
+    verdict, close = reach_verdict(path, found, bench=bench, sample_time=sample_time)
+    if verdict not in ("none", "unexplained") and not bench.explains(chosen):
+        times = chosen.error / bench.floor
+        notes.append(f"{times:.1f} times the noise is left: something remains")
+    if deadline.cut:
+        notes.append(
+            f"the search ended after the {budget:g} s allowed: this is the best answer so far, and "
+            "another run may come further (--budget SECONDS allows more)"
+        )
     effects = list_effects(path, final, found, position_unit=position_unit, input_unit=input_unit)
     traces = make_traces(path[0], chosen, bench)
+    model = chosen.fit.structure.model(chosen.fit.theta)
+    enough = verdict in ("none", "named")
+    left = () if enough else find_windows(chosen.fit, bench.training)
     return Gap(
         verdict=verdict,
         effects=effects,
         baseline=path[0].error,
         final=chosen.error,
-        noise_floor=floor,
+        noise_floor=bench.floor,
         repeatability=bench.repeatability or None,
         by_record=compare_by_record(traces, bench),
         where=find_windows(path[0].fit, bench.training) if verdict != "none" else (),
-        next_experiment=choose_experiment(verdict, chosen, close),
+        next_experiment=choose_experiment(verdict, chosen, close, left),
         linear=path[0].fit.structure.model(path[0].fit.theta),
-        model=chosen.fit.structure.model(chosen.fit.theta),
+        model=replace(model, terms=_in_order(model.terms, effects)),
         training=tuple(run.id for run in bench.training),
         held_out=tuple(run.id for run in bench.held_out),
         traces=traces,
         chain_std=chain_std(final),
         spread=_learnt_spread(chosen.fit),
         suspects=list_suspects(found, effects) if verdict == "unexplained" else (),
+        left=left,
+        complete=not deadline.cut,
         notes=tuple(notes),
     )
 
@@ -132,6 +148,12 @@ def _learnt_spread(fit: Fit) -> dict[int, float]:
     moved = np.any([own.scatter != 1.0 for own in fit.locals_], axis=0)
     dry = fit.structure.dry
     return {i + 1: float(fit.spread[i]) for i in range(len(dry)) if dry[i] and moved[i]}
+
+
+def _in_order(terms: Sequence[Term], effects: Sequence[FoundEffect]) -> tuple[Term, ...]:
+    """Return the terms in the order in which the effects were found."""
+    order = [(found.effect.key, found.where) for found in effects]
+    return tuple(sorted(terms, key=lambda term: order.index((term.effect.key, term.where))))
 
 
 # ------------------------------------------------------------------------ the noise
@@ -154,52 +176,36 @@ def _with_noise(run: Run, sigma: dict[int, float]) -> Run:
 # -------------------------------------------------------------------- the hypotheses
 
 
-def _investigate(fit: Fit, bench: Bench) -> tuple[Hypothesis, list[Hypothesis]]:
-    """Return the hypothesis chosen and all that were judged, the linear one first."""
+def _investigate(fit: Fit, bench: Bench, deadline: Deadline) -> tuple[Hypothesis, list[Hypothesis]]:
+    """Return the hypothesis chosen and all that were judged in time, the linear one first."""
     baseline = judge(fit, bench)
     if baseline.at_floor or baseline.error < AS_REPEATS * bench.repeatability:
         return baseline, [baseline]
     bench.tell(f"linear model: error {baseline.error:.1%} of the motion on held-out runs")
-    found = search(baseline, bench)
-    return prune(choose(found, baseline), bench), found
-
-
-def _path(chosen: Hypothesis, found: Sequence[Hypothesis], bench: Bench) -> tuple[Hypothesis, ...]:
-    """Return baseline, one effect, … chosen: the steps by which the effects were added."""
-    by_key = {h.key: h for h in found}
-    effects = chosen.fit.structure.effects
-    path = [by_key[frozenset()]]
-    for size in range(1, len(effects)):
-        key = frozenset(c.key for c in effects[:size])
-        if key in by_key:
-            path.append(by_key[key])
-            continue
-        structure = chosen.fit.structure
-        theta = chosen.fit.theta
-        for index in range(len(effects) - 1, size - 1, -1):
-            theta = np.delete(theta, np.r_[structure.span(index)])
-            structure = structure.without(index)
-        path.append(judge(fit_whole(structure, theta, bench), bench, added=effects[size - 1]))
-    return (*path, chosen) if effects else (path[0],)
+    timed = replace(bench, mapper=deadline.map)
+    found = search(baseline, timed)
+    return prune(choose(found, baseline, bench), timed), found
 
 
 def _with_offset(
-    chosen: Hypothesis, path: tuple[Hypothesis, ...], bench: Bench
-) -> tuple[Hypothesis, tuple[Hypothesis, ...], Bench]:
-    """Return everything with a constant force added, where the rest points ask for one.
+    path: tuple[Hypothesis, ...], bench: Bench
+) -> tuple[tuple[Hypothesis, ...], Bench | None]:
+    """Return the path with a constant force at its end, where the rest points ask for one.
 
-    With the force in the model the encoders' zeros are those of the file, within half a noise.
+    With the force in the model the encoders' zeros are those of the file, within half a noise:
+    then the bench by which all is judged is returned with it.
     """
+    chosen = path[-1]
     structure = chosen.fit.structure
     runs = [*bench.training, *bench.held_out]
     own = [*chosen.fit.locals_, *chosen.held.locals_]
     offset = find_offset(structure.chain(chosen.fit.theta), runs, own)
     if offset is None:
-        return chosen, path, bench
+        return path, None
     cart, _, _ = structure.model(chosen.fit.theta).tables()
     if abs(offset.force) < dry_force(cart)[offset.cart - 1]:
         # Friction holds a cart as far from its equilibrium: no proof of a constant force.
-        return chosen, path, bench
+        return path, None
     pinned, loose = (
         replace(
             bench,
@@ -225,8 +231,8 @@ def _with_offset(
     fit = fit_whole(grown, theta, loose)
     final = judge(fit, loose, added=candidate)
     if final.error > 0.9 * without[-1].error:
-        return chosen, path, bench
-    return final, (*without, final), loose
+        return path, None
+    return (*without, final), loose
 
 
 def _pin(run: Run, *, width: float) -> Run:

@@ -1,6 +1,6 @@
 """Grow a hypothesis: screen the catalogue, refit the suspects, fit the best to whole runs."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -29,17 +29,15 @@ _ZOOM_SHARE = 0.15  # of the first suspect's, below which one start must do
 _LEADING = 0.4  # of the first suspect's share, for what is dear to refit
 
 
-def grow(parent: Hypothesis, bench: Bench) -> list[Hypothesis]:
-    """Return the children of a hypothesis: one further effect each, fully refitted."""
-    children = []
+def grow(parent: Hypothesis, bench: Bench) -> Iterator[Hypothesis]:
+    """Yield the children of a hypothesis: one further effect each, fully refitted."""
     for candidate, fit in _starts(parent, bench):
         child = _full_refit(candidate, fit, bench)
-        children.append(child)
+        yield child
         if candidate.effect.family == "dry friction":
             for effect in bench.catalogue:
                 if effect.grows_from == candidate.effect.key:
-                    children.append(_grown_friction(effect, child, bench))
-    return children
+                    yield _grown_friction(effect, child, bench)
 
 
 def _starts(parent: Hypothesis, bench: Bench) -> list[tuple[Candidate, Fit]]:

@@ -16,7 +16,9 @@ AT_FLOOR = 1.15  # chi-square per point below this is noise
 THINNING = 10.0  # neighbouring residuals are not independent: N / 10 count
 BIC_DROP = 20.0  # by which the criterion must fall for one more effect
 CONTACT = ("end_stop", "backlash")
+_ENOUGH_NOISE, _ENOUGH_REPEATS = 2.0, 1.5  # times the floor, or what repeats differ by
 _HELD_OUT_GAIN = 0.95  # an effect must lower the held-out error by this factor …
+_PARTIAL_GAIN = 0.9  # … by this one where too much for a name is left …
 _CONTACT_GAIN = 0.5  # what a contact leaves is its contact law: no effect to mop it up
 _RUN_GAIN, _RUN_SHARE = 0.97, 0.6  # … and by 3 % in 60 % of the runs
 _BOUND_MARGIN = 0.01  # in logarithms, or in scales
@@ -73,6 +75,18 @@ class Bench:
     mapper: Mapper
     tell: Callable[[str], None]
 
+    @property
+    def floor(self) -> float:
+        """Relative error that the noise of the encoders alone makes on the held-out runs."""
+        noise = sum(float((run.sigma**2).sum()) * run.t.size for run in self.held_out)
+        motion = sum(float((run.swing**2).sum()) * run.t.size for run in self.held_out)
+        return float(np.sqrt(noise / motion))
+
+    def explains(self, hypothesis: Hypothesis) -> bool:
+        """Tell whether so little is left that the gap has its name."""
+        enough = max(_ENOUGH_NOISE * self.floor, _ENOUGH_REPEATS * self.repeatability)
+        return hypothesis.error <= enough
+
 
 def judge(fit: Fit, bench: Bench, *, added: Candidate | None = None) -> Hypothesis:
     """Return the hypothesis a fit stands for."""
@@ -95,8 +109,15 @@ def judge(fit: Fit, bench: Bench, *, added: Candidate | None = None) -> Hypothes
     )
 
 
-def worth_it(child: Hypothesis, parent: Hypothesis) -> bool:
+def lowers_error(child: Hypothesis, parent: Hypothesis, bench: Bench) -> bool:
+    """Is the held-out error lower, and by a tenth where too much for a name is left?"""
+    return child.error < (1.0 if bench.explains(child) else _PARTIAL_GAIN) * parent.error
+
+
+def worth_it(child: Hypothesis, parent: Hypothesis, bench: Bench) -> bool:
     """Does a further effect help on runs the model has not seen?"""
+    if not lowers_error(child, parent, bench):
+        return False
     contact = any(effect in CONTACT for effect, _ in parent.key)
     gain = _CONTACT_GAIN if contact else _HELD_OUT_GAIN
     if child.bic > parent.bic - BIC_DROP or child.held.chi > gain**2 * parent.held.chi:

@@ -12,10 +12,13 @@ from pipeline.plant.effects import AugmentedChain
 from pipeline.results import Analysis
 
 
-def investigate(analysis: Analysis, *, progress: Callable[[str], None]) -> Gap:
+def investigate(
+    analysis: Analysis, *, progress: Callable[[str], None], budget: float | None = None
+) -> Gap:
     """Explain the gap of the time records of a submission, starting from the identified chain.
 
-    A record that does not hold what happened is no gap of the model.
+    A record that does not hold what happened is no gap of the model. Past `budget` s, the
+    compilation apart, the best answer so far is returned.
 
     Raises
     ------
@@ -30,6 +33,7 @@ def investigate(analysis: Analysis, *, progress: Callable[[str], None]) -> Gap:
         chain=analysis.chain,
         position_unit=analysis.position_unit,
         input_unit=analysis.input_unit,
+        budget=budget,
         tell=progress,
     )
 

@@ -1,11 +1,14 @@
 """Search the catalogue: keep a few hypotheses, grow them, choose, prune."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 
 import numpy as np
 
+from pipeline.gap.deadline import OutOfTime
 from pipeline.gap.grow import fit_whole, grow
 from pipeline.gap.hypothesis import BIC_DROP, Bench, Hypothesis, judge, worth_it
+from pipeline.gap.structure import Candidate
 
 _BEAM = (3, 1, 1)  # hypotheses kept after one, two, three effects
 _HOPELESS = 30.0  # a hypothesis with this many times the best one's chi-square is not grown
@@ -13,8 +16,21 @@ _DEPTH = len(_BEAM)
 
 
 def search(baseline: Hypothesis, bench: Bench, *, depth: int = _DEPTH) -> list[Hypothesis]:
-    """Return every hypothesis judged, the baseline first."""
+    """Return every hypothesis judged, the baseline first; past the time, those so far."""
     seen: dict[frozenset[tuple[str, int]], Hypothesis] = {baseline.key: baseline}
+    with suppress(OutOfTime):
+        _grow_beam(baseline, bench, seen, depth=depth)
+    return list(seen.values())
+
+
+def _grow_beam(
+    baseline: Hypothesis,
+    bench: Bench,
+    seen: dict[frozenset[tuple[str, int]], Hypothesis],
+    *,
+    depth: int,
+) -> None:
+    """Fill `seen`, the best hypothesis of each set of effects."""
     beam = [baseline]
     for level in range(depth):
         children: list[Hypothesis] = []
@@ -37,7 +53,6 @@ def search(baseline: Hypothesis, bench: Bench, *, depth: int = _DEPTH) -> list[H
         bench.tell(f"{level + 1} effect{'s' * (level > 0)}: " + _names(beam[0]))
         if beam[0].at_floor:
             break
-    return list(seen.values())
 
 
 def _needlessly_rich(
@@ -55,31 +70,45 @@ def _names(hypothesis: Hypothesis) -> str:
     return " + ".join(c.label for c in hypothesis.fit.structure.effects)
 
 
-def choose(found: Sequence[Hypothesis], baseline: Hypothesis) -> Hypothesis:
+def choose(found: Sequence[Hypothesis], baseline: Hypothesis, bench: Bench) -> Hypothesis:
     """Return the best hypothesis whose every effect is worth it, the smaller where in doubt."""
     best = baseline
     for size in range(1, _DEPTH + 1):
         level = [h for h in found if len(h.key) == size]
-        level = [h for h in level if worth_it(h, best)]
+        level = [h for h in level if worth_it(h, best, bench)]
         if level:
             best = min(level, key=lambda h: h.bic)
     return best
 
 
 def prune(chosen: Hypothesis, bench: Bench) -> Hypothesis:
-    """Drop effects the others have made needless."""
-    while len(chosen.key) > 1:
-        trials = []
-        for index in range(len(chosen.fit.structure.effects)):
-            structure = chosen.fit.structure.without(index)
-            theta = np.delete(chosen.fit.theta, np.r_[chosen.fit.structure.span(index)])
-            fit = fit_whole(structure, theta, bench)
-            trial = judge(fit, bench, added=structure.effects[-1])
-            trials += [trial] if trial.sound else []
-        if not trials:
-            return chosen
-        smaller = min(trials, key=lambda h: h.bic)
-        if worth_it(chosen, smaller):
-            return chosen
-        chosen = smaller
+    """Drop effects the others have made needless, as far as the time allows."""
+    with suppress(OutOfTime):
+        while len(chosen.key) > 1:
+            trials = [_without(chosen, c, bench) for c in chosen.fit.structure.effects]
+            as_good = [h for h in trials if h.sound and not worth_it(chosen, h, bench)]
+            if not as_good:
+                break
+            chosen = min(as_good, key=lambda h: h.bic)
     return chosen
+
+
+def _without(hypothesis: Hypothesis, effect: Candidate, bench: Bench) -> Hypothesis:
+    structure = hypothesis.fit.structure
+    index = structure.effects.index(effect)
+    theta = np.delete(hypothesis.fit.theta, np.r_[structure.span(index)])
+    fit = fit_whole(structure.without(index), theta, bench)
+    return judge(fit, bench, added=fit.structure.effects[-1] if fit.structure.effects else None)
+
+
+def steps_to(
+    chosen: Hypothesis, found: Sequence[Hypothesis], bench: Bench
+) -> tuple[Hypothesis, ...]:
+    """Return the linear model, one effect, … chosen: what helps most by itself comes first."""
+    steps = [chosen]
+    while effects := steps[0].fit.structure.effects:
+        key = steps[0].key
+        smaller = [h for h in found if h.key < key and len(h.key) == len(key) - 1]
+        smaller = smaller or [_without(steps[0], effects[-1], bench)]
+        steps.insert(0, min(smaller, key=lambda h: h.error))
+    return tuple(steps)

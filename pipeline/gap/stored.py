@@ -70,17 +70,7 @@ def _gap(document: Mapping[str, Any]) -> Gap:
         noise_floor=float(errors["noise_floor"]),
         repeatability=_or_none(document["repeatability"]),
         by_record=tuple(RecordGap(**entry) for entry in document["by_record"]),
-        where=tuple(
-            GapWindow(
-                experiment=entry["experiment"],
-                cart=entry["cart"],
-                start=entry["from"],
-                end=entry["to"],
-                what=entry["what"],
-                share=entry["share"],
-            )
-            for entry in document["where"]
-        ),
+        where=tuple(_window(entry) for entry in document["where"]),
         next_experiment=str(document["next_experiment"]),
         linear=AugmentedChain(chain=_chain(document["linear"])),
         model=AugmentedChain(
@@ -92,6 +82,8 @@ def _gap(document: Mapping[str, Any]) -> Gap:
         chain_std=dict(document["chain_std"]),
         spread={int(cart): value for cart, value in document["friction_spread"].items()},
         suspects=tuple(_rival(entry) for entry in document["suspects"]),
+        left=tuple(_window(entry) for entry in document["left"]),
+        complete=document["complete"],
         notes=tuple(document["notes"]),
     )
 
@@ -106,6 +98,17 @@ def _effect(entry: Mapping[str, Any]) -> FoundEffect:
         nrmse_before=float(entry["nrmse_before"]),
         nrmse_after=float(entry["nrmse_after"]),
         rivals=tuple(_rival(rival) for rival in entry["rivals"]),
+    )
+
+
+def _window(entry: Mapping[str, Any]) -> GapWindow:
+    return GapWindow(
+        experiment=entry["experiment"],
+        cart=entry["cart"],
+        start=entry["from"],
+        end=entry["to"],
+        what=entry["what"],
+        share=entry["share"],
     )
 
 

@@ -6,7 +6,7 @@ from typing import Literal
 from pipeline.plant.chain import Array
 from pipeline.plant.effects.base import AugmentedChain, Effect
 
-Verdict = Literal["named", "none", "ambiguous", "unexplained"]
+Verdict = Literal["named", "partial", "none", "ambiguous", "unexplained"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +63,7 @@ class RecordGap:
 
 @dataclass(frozen=True, kw_only=True)
 class GapWindow:
-    """Where a run departs from the linear model most: the window, what happens, its share."""
+    """Where a run departs from a model most: the window, what happens, its share."""
 
     experiment: str
     cart: int
@@ -98,10 +98,13 @@ class Gap:
     Attributes
     ----------
     effects : in the order found. Under `ambiguous` the last one's rivals explain as much; under
-        `unexplained` they are suspects only.
+        `partial` each lowers the error by a tenth or more, and more is left; under `unexplained`
+        they are suspects only.
     baseline, final, noise_floor : relative errors pooled over the held-out runs.
     repeatability : the same between runs with the same input, or None without repeats.
     suspects : under `unexplained`, the single effects that help most, the best first.
+    where, left : where the linear model departs most; and the final one, unless it is enough.
+    complete : False where the time allowed ended the search: the best answer so far.
     linear, model : the linear chain that fits best, and the chain with the effects.
     chain_std : standard errors of the latter's "m_1", "c_1", "k_1", …
     training, held_out : ids of the runs.
@@ -126,4 +129,6 @@ class Gap:
     chain_std: dict[str, float] = field(default_factory=dict)
     spread: dict[int, float] = field(default_factory=dict)
     suspects: tuple[Rival, ...] = ()
+    left: tuple[GapWindow, ...] = ()
+    complete: bool = True
     notes: tuple[str, ...] = ()

@@ -1,41 +1,52 @@
-"""The verdict on a search: named, none, ambiguous, or unexplained, and what would settle it."""
+"""The verdict on a search: how much is explained, how surely, and what would settle it."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
-from pipeline.gap.hypothesis import THINNING, Bench, Hypothesis
+from pipeline.gap.hypothesis import THINNING, Bench, Hypothesis, lowers_error
 from pipeline.gap.linearise import simulate_run
-from pipeline.gap.types import Verdict
+from pipeline.gap.types import GapWindow, Verdict
 from pipeline.plant.effects import find_effect
 
 _CLOSE_ERROR, _CLOSE_GAIN, _CLOSE_BIC = 1.15, 0.10, 40.0
-_REFUSED_SHARE, REFUSED_FLOOR = 0.5, 1.5
+_MOSTLY = 0.5  # of the error: who leaves more has not explained most of it
+_NEAR_FLOOR = 1.5  # times the noise: beyond, what is left is not noise alone
 _NOTHING = 1.05  # times the noise: too little to speak of
+_REPEAT = "Repeat each run, so that what differs from run to run is known."
+# What shows more of what is left, by what the cart does there.
+_SHOWS = {
+    "velocity near zero": "Then small free decays, and a slow ramp of the input: what holds a cart "
+    "near its rest shows there.",
+    "fast motion": "Then free decays of one cart at a time from two release heights: what is in "
+    "the carts shows there, what is in the drive does not.",
+    "large displacement, positive side": "Then static steps of both signs and several sizes: a "
+    "spring or a stop that changes with the position bends the line of level against input.",
+    "after an edge of the input": "Then steps of several sizes at the highest sampling rate: what "
+    "is late, lost or soft in the drive shows at their edges.",
+    "input on": "Then steps of several sizes and both signs, and the same swing released by hand: "
+    "what only the driven cart does is in the drive.",
+}
+_SHOWS["large displacement, negative side"] = _SHOWS["large displacement, positive side"]
+_SHOWS["input off"] = _SHOWS["fast motion"]
 AS_REPEATS = 1.1  # an error below this many times what repeats differ by is theirs
-_DECISIVE_SHARE, _DECISIVE_RIVAL = 0.8, 1.2
 
 
 def reach_verdict(
-    chosen: Hypothesis,
-    baseline: Hypothesis,
-    found: Sequence[Hypothesis],
-    *,
-    bench: Bench,
-    floor: float,
-    sample_time: float,
+    steps: Sequence[Hypothesis], found: Sequence[Hypothesis], *, bench: Bench, sample_time: float
 ) -> tuple[Verdict, list[Hypothesis]]:
     """Return the verdict, and under `ambiguous` the rivals that explain as much.
 
-    `found` are all hypotheses judged; `floor` the relative error of noise alone.
+    `steps` lead from the linear model to the one chosen; `found` are all hypotheses judged.
     """
+    baseline, chosen = steps[0], steps[-1]
     if not chosen.key:
-        least = max(_NOTHING * floor, AS_REPEATS * bench.repeatability)
+        least = max(_NOTHING * bench.floor, AS_REPEATS * bench.repeatability)
         nothing = baseline.at_floor or baseline.error < least
         return ("none" if nothing else "unexplained"), []
-    refused = chosen.error > _REFUSED_SHARE * baseline.error
-    refused &= chosen.error > REFUSED_FLOOR * floor
-    if refused and not _decisive(chosen, baseline, found):
+    explained = bench.explains(chosen)
+    if not explained and not all(lowers_error(b, a, bench) for a, b in pairwise(steps)):
         return "unexplained", []
     gain = baseline.bic - chosen.bic
     close = [
@@ -47,7 +58,11 @@ def reach_verdict(
         and _evidence(chosen, rival, bench) < min(_CLOSE_GAIN * gain, _CLOSE_BIC)
         and not _same_thing(rival, chosen, sample_time=sample_time)
     ]
-    return ("ambiguous" if close else "named"), close
+    if close and not explained and chosen.error > _MOSTLY * baseline.error:
+        return "unexplained", []  # any of several stand-ins would help a little
+    if close:
+        return "ambiguous", close
+    return ("named" if explained else "partial"), []
 
 
 def _evidence(chosen: Hypothesis, rival: Hypothesis, bench: Bench) -> float:
@@ -57,7 +72,7 @@ def _evidence(chosen: Hypothesis, rival: Hypothesis, bench: Bench) -> float:
     independent than the criterion counts, and much of the difference may be chance.
     """
     difference = rival.bic - chosen.bic
-    if chosen.fit.chi < REFUSED_FLOOR**2:
+    if chosen.fit.chi < _NEAR_FLOOR**2:
         return difference
     counted = chosen.fit.n_points / THINNING
     return difference * min(1.0, _independent_points(chosen, bench) / counted)
@@ -81,19 +96,6 @@ def _independent_points(hypothesis: Hypothesis, bench: Bench) -> float:
     return total
 
 
-def _decisive(chosen: Hypothesis, baseline: Hypothesis, found: Sequence[Hypothesis]) -> bool:
-    """Is the name beyond doubt although much of the gap remains?
-
-    It must help clearly, and every rival of another kind must leave clearly more.
-    """
-    if chosen.error > _DECISIVE_SHARE * baseline.error or len(chosen.key) > 1:
-        return False
-    family = chosen.fit.structure.effects[0].effect.family
-    rivals = [h for h in found if len(h.key) == 1 and h.key != chosen.key]
-    others = [h for h in rivals if h.fit.structure.effects[0].effect.family != family or not family]
-    return all(h.error > _DECISIVE_RIVAL * chosen.error for h in others)
-
-
 def _same_thing(rival: Hypothesis, chosen: Hypothesis, *, sample_time: float) -> bool:
     """Is a rival a richer form of the same law, or one the data provably cannot tell from it?"""
     (mine,) = chosen.key - rival.key
@@ -111,18 +113,24 @@ def _same_thing(rival: Hypothesis, chosen: Hypothesis, *, sample_time: float) ->
     return False
 
 
-def choose_experiment(verdict: Verdict, chosen: Hypothesis, close: Sequence[Hypothesis]) -> str:
-    """Return what to record next: what tells the rivals apart, or settles the name."""
+def choose_experiment(
+    verdict: Verdict,
+    chosen: Hypothesis,
+    close: Sequence[Hypothesis],
+    left: Sequence[GapWindow],
+) -> str:
+    """Return what to record next: what tells the rivals apart, settles the name, or shows more.
+
+    `left` are the windows in which the chosen model still departs, the worst first.
+    """
     if verdict == "ambiguous":
         own = next(iter(chosen.key - close[0].key))
         other = next(iter(close[0].key - chosen.key))
         texts = {find_effect(key[0]).deciding_run for key in (own, other)}
         return " ".join(sorted(texts))
-    if verdict == "unexplained":
-        return (
-            "Repeat each run, then free decays of one cart at a time from two release heights: "
-            "what is in the carts shows there, what is in the drive does not."
-        )
     if verdict == "named":
         return chosen.fit.structure.effects[-1].effect.deciding_run
-    return ""
+    if verdict == "none":
+        return ""
+    phase = next((_SHOWS[w.what] for w in left if w.what in _SHOWS), "")
+    return f"{_REPEAT} {phase or _SHOWS['fast motion']}"

@@ -93,7 +93,7 @@ def build_gap_document(
         ("model", "The model with its effects", lambda: _model(page, gap)),
         ("method", "How this was found", lambda: _method(gap)),
         ("warnings", "Warnings", lambda: remarks(list(analysis.warnings))),
-        ("provenance", "Provenance", lambda: _provenance(page)),
+        ("provenance", "Provenance", lambda: _provenance(page, gap)),
     ]
     sections = []
     with drawing():
@@ -137,7 +137,8 @@ def _where(page: Page, gap: Gap) -> list[Block]:
         )
     ]
     if gap.where:
-        blocks.append(window_table(gap.where, number=page.table_number()))
+        number = page.table_number()
+        blocks.append(window_table(gap.where, model="the linear model", number=number))
     return blocks
 
 
@@ -239,10 +240,14 @@ def _evidence(
 
 
 def _runs(page: Page, gap: Gap, worst: Sequence[Trace]) -> list[Block]:
-    return [
+    blocks = [
         _before_after(page, gap, trace, number=i)
         for i, trace in enumerate(worst[:_MORE_TRACES], start=2)
     ]
+    if gap.left and gap.effects:
+        number = page.table_number()
+        blocks.append(window_table(gap.left, model="the model with its effects", number=number))
+    return blocks
 
 
 def _apart(gap: Gap) -> list[Block]:
@@ -346,10 +351,13 @@ def _method(gap: Gap) -> list[Block]:
     return blocks + remarks(list(gap.notes))
 
 
-def _provenance(page: Page) -> list[Block]:
+def _provenance(page: Page, gap: Gap) -> list[Block]:
     files = file_table(page.analysis, number=page.table_number())
     return [
-        paragraph(f"Made by cartlab {__version__}. The same input gives the same report."),
+        paragraph(
+            f"Made by cartlab {__version__}. The same input gives the same report"
+            + ("." if gap.complete else ", but for a search that the time allowed has ended.")
+        ),
         Details(spans(count(len(page.analysis.files), "data file")), (files,)),
     ]
 

@@ -82,7 +82,7 @@ def gap_in_short(gap: Gap | None) -> list[Block]:
     if gap is None:
         return []
     name = listing([effect_name(found.effect, found.where) for found in gap.effects])
-    names = f" ({name})" if name and gap.verdict == "named" else ""
+    names = f" ({name})" if name and gap.verdict in ("named", "partial") else ""
     return [
         paragraph(
             Span("The gap analysis. ", "strong"),

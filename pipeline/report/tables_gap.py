@@ -35,11 +35,11 @@ def error_table(gap: Gap, *, number: int) -> Table:
     )
 
 
-def window_table(windows: Sequence[GapWindow], *, number: int) -> Table:
-    """Return where the linear model fails most."""
+def window_table(windows: Sequence[GapWindow], *, model: str, number: int) -> Table:
+    """Return where a model fails most."""
     return make_table(
         number,
-        "Where the linear model fails most: the stretch of each run that holds most of its misfit "
+        f"Where {model} fails most: the stretch of each run that holds most of its misfit "
         "(squared), and what the cart does while the misfit grows.",
         ("Run", "Cart", "From [s]", "To [s]", "What happens", "Share"),
         [

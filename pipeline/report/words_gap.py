@@ -19,7 +19,6 @@ from pipeline.report.words import clean, plain_lines
 
 _AS_GOOD = 1.15  # times the error: a rival that the data do not tell from what was chosen
 _NEGLIGIBLE = 1e-3  # of a value: an error this small stands in the table alone
-_ALL = 1.5  # times the noise, or the difference of repeats: nothing to speak of is left
 
 
 def verdict_title(gap: Gap) -> str:
@@ -27,6 +26,7 @@ def verdict_title(gap: Gap) -> str:
     return {
         "none": "The linear model is enough",
         "named": "The gap has a name",
+        "partial": "Part of the gap has a name",
         "ambiguous": "Two explanations fit alike",
         "unexplained": "A gap that nothing in the catalogue explains",
     }[gap.verdict]
@@ -56,6 +56,24 @@ def error_board(gap: Gap) -> Tiles:
 
 def verdict_blocks(gap: Gap) -> list[Block]:
     """Say what explains the gap and how well; under `ambiguous`, both explanations."""
+    return [*_so_far(gap), *_verdict(gap)]
+
+
+def _so_far(gap: Gap) -> list[Block]:
+    if gap.complete:
+        return []
+    return [
+        paragraph(
+            Span("The best answer so far. ", "strong"),
+            "The time allowed ended the search before every explanation was tried: more time "
+            "(the option ",
+            Span("--budget", "code"),
+            ") may find a better one, and a faster computer may come further in the same time.",
+        )
+    ]
+
+
+def _verdict(gap: Gap) -> list[Block]:
     match gap.verdict:
         case "none":
             return [
@@ -65,7 +83,7 @@ def verdict_blocks(gap: Gap) -> list[Block]:
                     f"noise alone makes {share(gap.noise_floor)}. No effect is needed.",
                 )
             ]
-        case "named":
+        case "named" | "partial":
             return [_named(gap)]
         case "ambiguous":
             return _ambiguous(gap)
@@ -96,8 +114,9 @@ def _named(gap: Gap) -> Block:
     names = [effect_name(found.effect, found.where) for found in gap.effects]
     sizes = "; ".join(sizes_text(found.parameters) for found in gap.effects)
     verb = "explains" if len(names) == 1 else "together explain"
+    what = "part of what" if gap.verdict == "partial" else "what"
     return paragraph(
-        Span(f"{_capital(listing(names))} {verb} what the linear model leaves out: ", "strong"),
+        Span(f"{_capital(listing(names))} {verb} {what} the linear model leaves out: ", "strong"),
         f"{sizes}. {' '.join(found.effect.sentence for found in gap.effects)} ",
         _errors(gap),
     )
@@ -183,14 +202,18 @@ def _noise(gap: Gap) -> str:
 def _errors(gap: Gap) -> str:
     text = (
         "On runs the model had not seen the error falls from "
-        f"{share(gap.baseline)} of the motion to {share(gap.final)}; {_noise(gap)}"
+        f"{share(gap.baseline)} of the motion to {share(gap.final)}; {_noise(gap)}."
     )
+    if not gap.left:
+        return text
     least = max(gap.noise_floor, gap.repeatability or 0.0)
-    if 0 < _ALL * least < gap.final:
-        times = significant(gap.final / least, digits=2)
-        return f"{text}. So {times} times what noise makes is left: this is the main effect, " \
-            "not all of it."  # fmt: skip
-    return f"{text}."
+    worst = gap.left[0]
+    times = f"So {significant(gap.final / least, digits=2)} times as much" if least else "More"
+    return (
+        f"{text} {times} is left, most of it in {clean(worst.experiment)}, cart {worst.cart}, from "
+        f"{worst.start:.2f} to {worst.end:.2f} s ({clean(worst.what)}): this is the main part, not "
+        "all of it."
+    )
 
 
 def contenders(gap: Gap) -> tuple[FoundEffect, Rival | None]:

@@ -63,7 +63,7 @@ class RecordErrors(Document):
 
 
 class Window(Document):
-    """Where a run departs from the linear model most."""
+    """Where a run departs from a model most."""
 
     experiment: str
     cart: int
@@ -99,7 +99,14 @@ class Gap(Document):
     """What the linear model leaves out. A number that could not be had is null."""
 
     schema_: Annotated[Literal["cartlab-gap/1"], Field(alias="schema")]
-    verdict: Literal["named", "none", "ambiguous", "unexplained"]
+    verdict: Literal["named", "partial", "none", "ambiguous", "unexplained"]
+    complete: Annotated[
+        bool,
+        Field(
+            description="false: the time allowed ended the search, and this is the best answer so "
+            "far; another run may come further"
+        ),
+    ] = True
     effects: tuple[Effect, ...]
     suspects: Annotated[
         tuple[Rival, ...],
@@ -108,7 +115,11 @@ class Gap(Document):
     gap: Errors
     repeatability: Annotated[Number, Field(description="between runs of the same input")]
     by_record: tuple[RecordErrors, ...]
-    where: tuple[Window, ...]
+    where: Annotated[tuple[Window, ...], Field(description="where the linear model fails most")]
+    left: Annotated[
+        tuple[Window, ...],
+        Field(description="where the final model does, under `partial` and `unexplained`"),
+    ] = ()
     next_experiment: str
     training: tuple[str, ...]
     held_out: tuple[str, ...]

@@ -1,0 +1,40 @@
+"""The time a search may take: past it, the best answer so far."""
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
+
+from pipeline.gap.fit import Mapper
+
+
+class OutOfTime(Exception):
+    """The time allowed is over; whoever searches keeps what it has found."""
+
+
+class Deadline:
+    """Maps work over runs until the time is over; all that takes long goes through here.
+
+    `cut` tells whether anything was refused: whether the answer depends on the machine.
+    """
+
+    def __init__(self, mapper: Mapper, *, seconds: float | None) -> None:
+        """Start the clock; None waits for ever."""
+        self.cut = False
+        self._mapper = mapper
+        self._end = None if seconds is None else time.monotonic() + seconds
+
+    def map(self, work: Callable[[Any], Any], *items: Iterable[Any]) -> Iterator[Any]:
+        """Map as `map` does.
+
+        Raises
+        ------
+        OutOfTime : the time is over, before or between two items.
+        """
+
+        def in_time(*item: Any) -> Any:
+            if self._end is not None and time.monotonic() > self._end:
+                self.cut = True
+                raise OutOfTime
+            return work(*item)
+
+        return iter(self._mapper(in_time, *items))
