@@ -1,6 +1,6 @@
 """The straight line from a submission to its analysis: the only file that knows the order."""
 
-from collections.abc import Callable, Iterable, Sequence, Set
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from itertools import combinations, pairwise
 from typing import ParamSpec, TypeVar
@@ -60,7 +60,7 @@ from pipeline.stages.initial import estimate_initially
 from pipeline.stages.log_decrement import fit_log_decrement
 from pipeline.stages.repeated_numbers import Repeats, compare_repeats
 from pipeline.stages.repeats import find_outlier_repeats
-from pipeline.stages.sine import Dwell
+from pipeline.stages.sine import FEW_COUNTS, Dwell
 from pipeline.stages.state_feedback import design_feedback
 from pipeline.stages.step_gain import fit_step_gain
 from pipeline.stages.time_fit import fit_records
@@ -501,7 +501,7 @@ def _fit(
     Return also whether there are dwells and they follow it.
     """
     has_points = any(response.source != "records" for response in responses)
-    fit = None
+    fit, by_fit, doubted = None, {}, False
     if has_points:
         values = {name: estimate.value for name, estimate in initial.items()}
         fit = log.attempt(
@@ -513,19 +513,40 @@ def _fit(
             initial=values,
             decays=_decay_dampings(initial, n=n),
         )
-        followed = fit is not None and follows(follow(dwells, fit.chain))
-        if fit and (followed or not driven):
-            return fit, followed and bool(dwells)
+        by_fit = follow(dwells, fit.chain if fit else None)
+        doubted = fit is not None and fit.chi_square_per_dof > CHI_SQUARE_LIMIT
+        doubted = doubted and _are_coarse(dwells)
+        if fit and (not driven or (follows(by_fit) and not doubted)):
+            return fit, follows(by_fit) and bool(dwells)
     if not driven:
         found = "the Bode fit gave none, and there is no" if has_points else "no dwells, table,"
         log.skip("final estimates", f"{found} step or sweep with all carts free to fit them to")
         return None, False
     other = log.attempt("final estimates", fit_records, driven, n=n, springs=springs)
-    if fit is None or (other and other.converged):
-        if fit:
-            log.warn(["the fit rests on the steps and sweeps: the dwells do not follow one chain"])
+    if fit is None:
         return other, False
-    return fit, False
+    # One that dwells follow gives way only to one that the dwells follow more closely yet.
+    better = other is not None and (not follows(by_fit) or _is_closer(other, dwells, by_fit))
+    if other and other.converged and better:
+        log.warn(["the fit rests on the steps and sweeps: the dwells do not follow one chain"])
+        return other, False
+    return fit, follows(by_fit) and bool(dwells)
+
+
+def _is_closer(fit: ChainFit, dwells: Sequence[Record], other: Mapping[str, Followed]) -> bool:
+    """Whether a fit explains its own records, and the dwells follow it more closely."""
+    lost = [sum(f.share for f in fits.values()) for fits in (follow(dwells, fit.chain), other)]
+    return fit.chi_square_per_dof <= CHI_SQUARE_LIMIT and lost[0] < lost[1]
+
+
+def _are_coarse(dwells: Sequence[Record]) -> bool:
+    """Whether most motions are so few encoder steps that rounding hides the rest of a transient.
+
+    Beside a sharp resonance a dwell's amplitude is then off by several of its errors.
+    """
+    motions = [(r.position(cart), r.encoder_step(cart)) for r in dwells for cart in r.carts]
+    counts = [float(np.ptp(y)) / step for y, step in motions if step > 0]
+    return bool(counts) and float(np.median(counts)) < 2 * FEW_COUNTS
 
 
 def _decay_dampings(initial: dict[str, Estimate], *, n: int) -> dict[int, Estimate]:

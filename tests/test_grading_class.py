@@ -13,6 +13,7 @@ from pipeline.grading.class_page import class_page
 from pipeline.grading.grade import Grade
 from pipeline.grading.load import load_rubric
 from pipeline.grading.run import grade_submission
+from pipeline.grading.state_model import own_chain
 from pipeline.plant.chain import Chain
 from tests.grading_class import Team, make_team
 from tests.grading_slips import OF_SEVERAL_CARTS, SLIPS
@@ -41,6 +42,26 @@ def test_a_damping_that_the_fit_puts_at_zero_is_told_by_the_decay():
     wrong = team.reporting(final={"zeta": Decimal("0.031")}).grade()
     assert [flag.code for flag in wrong.flags] == ["final_off"]
     assert wrong.flags[0].evidence["recomputed"] == pytest.approx(0.00316, rel=0.1)
+
+
+@pytest.mark.parametrize("seed", [18, 34, 38])
+def test_coarse_encoders_cost_no_points(seed):
+    """Steps of a few counts, and dwells whose points miss the carts that their records follow."""
+    team = make_team(seed, count=0.2, travel=1.0, friction=0.0)
+    grade = team.grade()
+    assert [flag.code for flag in grade.flags] == []
+    assert grade.points >= 0.99 * grade.out_of
+
+
+def test_a_table_of_three_carts_without_a_gain_is_none_of_two():
+    """What is left of a table once a negative gain is out implies no carts."""
+    team = make_team(2)
+    table = {x: float(v) for x, v in team.reported.final.items()}
+    assert own_chain(table, n=3) is not None
+    del table["K_3"]
+    assert own_chain(table, n=3) is None
+    grade = team.reporting(final={"K_3": -team.reported.final["K_3"]}).grade()
+    assert "physically_impossible" in [flag.code for flag in grade.flags]
 
 
 @pytest.mark.parametrize("digits", [2, 3])

@@ -13,11 +13,13 @@ from pipeline.stages.compare import (
     DAMPING_LIMIT,
     GAIN_AND_FREQUENCY_LIMIT,
 )
+from pipeline.stages.faults import FOLLOWED, follow
 
 # A fitted frequency or gain that far from the measured one: the fit has gone astray; factors.
 _ASTRAY, _ASTRAY_GAIN = 1.3, 1.6
 _STUCK = 1.2  # factor: a gain where carts stick so that no linear fit is near
 _SIGMAS = 3.0
+_MOST = 0.9  # of the records follow carts that are identified, whatever single points say
 _STILL = 3.0  # encoder steps
 _SAME = 1.03  # factor: bounds that near each other are one number to a reader
 _FAR = 2.5  # … so far that nobody believes it
@@ -134,13 +136,24 @@ def is_explained(analysis: Analysis) -> bool:
     return analysis.fit is None or analysis.fit.chi_square_per_dof <= CHI_SQUARE_LIMIT
 
 
+def _is_followed(analysis: Analysis) -> bool:
+    """Whether nearly all driven records move as the fitted carts do.
+
+    A dwell beside a sharp resonance hides what is left of its transient below a coarse encoder's
+    rounding: the point is off by several of its errors, the record follows all the same.
+    """
+    bad = {one.experiment for one in analysis.left_out}
+    fits = follow([r for r in analysis.records if r.id not in bad], analysis.chain)
+    return bool(fits) and sum(f.share <= FOLLOWED for f in fits.values()) >= _MOST * len(fits)
+
+
 def _final(
     row: ParameterRow, analysis: Analysis, tables: Sequence[Mapping[str, float]]
 ) -> Reference | None:
     """Return the bounds of a final number: the fit, and all that was measured without it.
 
-    A fit that holds a damping at zero, its bound, tells of no damping; one that does not explain
-    the data tells of no number that nothing else measures.
+    A fit that holds a damping at zero, its bound, tells of no damping; one that neither explains
+    the points nor is followed by the records tells of no number that nothing else measures.
     """
     fitted = row.final
     if is_damping(row.name):
@@ -153,7 +166,7 @@ def _final(
     told = fitted is not None and not (is_damping(row.name) and _undamped(analysis))
     if fitted and told and is_explained(analysis):
         measured = [value for value in measured if _agrees(value, fitted, name=row.name)]
-    if not measured and not (told and is_explained(analysis)):
+    if not measured and not (told and (is_explained(analysis) or _is_followed(analysis))):
         return None
     bounds = [*measured, *([fitted.value] if fitted and told else [])]
     return Reference(

@@ -215,15 +215,19 @@ def _spread(
 
 
 def own_chain(values: Mapping[str, float], *, n: int) -> Chain | None:
-    """Return the chain that a student's final table implies; None where it is no table of one."""
+    """Return the chain of n carts that a student's final table implies; None where it has none.
+
+    Without one gain a table of three carts reads as one of two.
+    """
     try:
         with np.errstate(all="ignore"):
             chain = recover_from_parameters(values).chain() if n <= _NAMED else None
     except (KeyError, ZeroDivisionError, ValueError):
         return None
-    if chain is None or not np.all(np.isfinite([*chain.m, *chain.c, *chain.k])):
+    if chain is None or chain.n != n:
         return None
-    return chain if np.all(chain.m > 0) else None
+    finite = np.all(np.isfinite([*chain.m, *chain.c, *chain.k]))
+    return chain if finite and np.all(chain.m > 0) else None
 
 
 def _kinds(n: int) -> list[list[Kind]]:

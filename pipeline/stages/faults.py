@@ -25,7 +25,7 @@ _STILL_SHARE = 0.2  # … and for so long after it; of the record
 # its motion in the record, as a delay or play may hold it for a moment.
 _SEEN_COUNTS, _SEEN_SHARE = 5.0, 0.3
 # Shares of a record's power (about its mean) that the identified carts leave unexplained.
-_FOLLOWED = 0.1
+FOLLOWED = 0.1
 _EXCHANGED, _BETTER = 0.05, 5.0  # as recorded at least this, exchanged so many times less
 _WITNESSES = 2  # records that follow the carts, as they are or exchanged: one does by chance
 # Simulated carts with dry friction F under a force of amplitude A leave at least (F / 5A)² where
@@ -106,7 +106,7 @@ def check_left_out(left_out: Sequence[LeftOut]) -> list[Check]:
 
 def follows(fits: Mapping[str, "Followed"]) -> bool:
     """Tell whether at least half of the records that tell follow a chain, if there are any."""
-    return 2 * sum(fit.share <= _FOLLOWED for fit in fits.values()) >= len(fits)
+    return 2 * sum(fit.share <= FOLLOWED for fit in fits.values()) >= len(fits)
 
 
 # ------------------------------------------------------------------------ witnesses
@@ -156,7 +156,7 @@ def _held_against(record: Record, chain: Chain) -> Followed | None:
         friction={
             cart: float(_FRICTION * np.sqrt(max(share, _LEAST)) * np.ptp(force) / 2)
             for cart, share in zip(window.carts, lost, strict=True)
-            if share <= _FOLLOWED and (force := _force(record, chain, cart=cart)) is not None
+            if share <= FOLLOWED and (force := _force(record, chain, cart=cart)) is not None
         },
     )
 
@@ -313,7 +313,7 @@ def _pair(record: Record, chain: Chain, *, better: float) -> str:
     as_is = _held_against(record, chain)
     for i, j in combinations(_measured(record), 2):
         exchanged = _held_against(_with_exchanged(record, i, j), chain)
-        if as_is and exchanged and exchanged.share <= min(as_is.share / better, _FOLLOWED):
+        if as_is and exchanged and exchanged.share <= min(as_is.share / better, FOLLOWED):
             return f"x{i} and x{j}"
     return ""
 

@@ -23,7 +23,7 @@ _DROP = 6  # the share of it that goes at once where they do
 _PASSES = 3  # of carrying the sine back; each doubles or so what it stands on
 _DRIVEN = 0.5  # of the input's amplitude: the dwell runs from its first to its last such sample
 _FREQUENCY_SIGMAS, _FREQUENCY_RELATIVE = 5.0, 2e-4  # a stated frequency further off is not believed
-_FEW_COUNTS = 20  # an amplitude below this is known to a few percent only
+FEW_COUNTS = 20  # an amplitude below this is known to a few percent only
 _FLOOR_ROUNDING = 0.111  # of the encoder step, times sqrt(step / amplitude): see `_rounding_std`
 _PEAK_LINES = 4  # of the padded spectrum: a sine's frequency is no further from its peak
 _NO_SINE = 0.5  # of the input's amplitude: a residual above this is another signal
@@ -389,7 +389,7 @@ def _windows(t: Array, *, omega: float) -> list[tuple[int, int]]:
 
 
 def _note_small(amplitude: float, *, step: float) -> str:
-    if step == 0 or amplitude >= _FEW_COUNTS * step:
+    if step == 0 or amplitude >= FEW_COUNTS * step:
         return ""
     return f"the amplitude is {amplitude / step:.1f} encoder counts only"
 
