@@ -244,3 +244,11 @@ def test_no_honest_record_is_accused(case, tmp_path, monkeypatch):
     )
     analysis = analyse(load_submission(tmp_path), design=False)
     assert [one for one in analysis.left_out if one.is_wrong] == []
+
+
+def test_fewer_decimals_in_some_files_are_no_other_unit(bench, tmp_path):
+    folder = shutil.copytree(bench, tmp_path / "rounded")
+    for kind, decimals in {"decay": 1, "step": 1, "sine": 2}.items():
+        for path in files(folder, kind):
+            spoil(path, lambda c, d=decimals: {**c, **{x: c[x].round(d) for x in ("x1", "x2")}})
+    assert analyse(load_submission(folder), design=False).left_out == ()

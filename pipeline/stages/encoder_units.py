@@ -15,7 +15,8 @@ def find_other_units(records: Sequence[Record]) -> dict[str, LeftOut]:
     """Find the records whose encoder step is that of the others in another unit, by id.
 
     A class of a dozen dwells was exported in one go, and so may all be wrong: the usual step is
-    what most kinds of experiment have, not most records. A decay gives no length.
+    what most kinds of experiment have, not most records. A decay gives no length, and a step of
+    0.01 beside one of 0.001 is how many decimals were written.
     """
     found: dict[str, LeftOut] = {}
     for cart in sorted({cart for record in records for cart in record.carts}):
@@ -30,7 +31,10 @@ def find_other_units(records: Sequence[Record]) -> dict[str, LeftOut]:
             continue
         scales = [s for scale in LENGTH_SCALES for s in (scale, 1 / scale)]
         for record in [r for r in records if r.id in steps and r.kind != "decay"]:
-            for scale in [s for s in scales if _alike(steps[record.id], s * usual)]:
+            step = steps[record.id]
+            if _is_decimal(step) and _is_decimal(usual):
+                continue
+            for scale in [s for s in scales if _alike(step, s * usual)]:
                 reason = (
                     f"one count of cart {cart} is {scale:.3g} times that in the others: "
                     "its positions look to be in another unit"
@@ -42,3 +46,8 @@ def find_other_units(records: Sequence[Record]) -> dict[str, LeftOut]:
 
 def _alike(step: float, other: float) -> bool:
     return abs(step - other) <= _SAME * other
+
+
+def _is_decimal(step: float) -> bool:
+    """Whether a step is 1 of some decimal place, as numbers are written."""
+    return step > 0 and _alike(step, 10.0 ** round(np.log10(step)))
