@@ -79,8 +79,8 @@ def test_results_that_a_submission_brings_along_are_not_believed(folder, tmp_pat
     assert grade_text(grade(planted)) == grade_text(grade(folder))
 
 
-def test_a_record_s_own_calibration_does_not_win_over_the_rubric_s(folder):
-    """Only under feedback, where benches log other signals, a record's own scale stands."""
+def test_a_record_s_own_scale_does_not_win_over_the_rubric_s(folder):
+    """Only under feedback, where benches log other signals, it stands; a sign of its own does."""
     submission, rubric = load_submission(folder), load_rubric(Path("throne-1dof"))
     system = rubric.system.model_copy(update={"input": Input(sign=1, per_count=1e-4)})
     own = InputOverride(sign=-1, per_count=0.5)
@@ -95,9 +95,34 @@ def test_a_record_s_own_calibration_does_not_win_over_the_rubric_s(folder):
     read, notes = under_rubric(claiming, rubric.model_copy(update={"system": system}))
 
     for experiment in read.experiments:
-        left = own if experiment.kind == "closed_loop" else InputOverride()
+        left = own if experiment.kind == "closed_loop" else InputOverride(sign=-1)
         assert experiment.input == left
-    assert any("sign and scale are the rubric's" in note for note in notes)
+    assert any("scale is the rubric's" in note for note in notes)
+
+
+@pytest.mark.parametrize("turned", [True, False])
+def test_between_a_record_s_own_sign_and_the_rubric_s_the_data_decide(folder, tmp_path, turned):
+    """Steps said to be logged the other way are used as they are: turned, or not."""
+    other = tmp_path / "team-07"
+    shutil.copytree(folder, other)
+    for path in (other / "data").glob("step-*.csv") if turned else ():
+        heading, *rows = path.read_text("utf-8").splitlines()
+        column = heading.split(",").index("input")
+        cells = [row.split(",") for row in rows]
+        for row in cells:
+            row[column] = repr(-float(row[column]))
+        path.write_text("\n".join([heading, *map(",".join, cells)]) + "\n", "utf-8", newline="\n")
+    text = (other / "submission.toml").read_text("utf-8")
+    assert 'kind = "step"\n' in text
+    text = text.replace('kind = "step"\n', 'kind = "step"\ninput = { sign = -1 }\n')
+    (other / "submission.toml").write_text(text, "utf-8", newline="\n")
+    graded = grade_submission(
+        load_submission(other), rubric=load_rubric(Path("throne-1dof")), name="team-07"
+    )
+    assert graded.analysis is not None
+    assert graded.analysis.left_out == ()
+    assert graded.grade.flags == ()
+    assert graded.grade.points == grade(folder).points
 
 
 def test_rounding_is_no_error():

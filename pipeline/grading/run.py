@@ -161,9 +161,7 @@ def under_rubric(submission: Submission, rubric: Rubric) -> tuple[Submission, tu
     )
     experiments = tuple(_under_calibration(e, set_) for e in submission.experiments)
     if experiments != submission.experiments:
-        notes.append(
-            "the input's sign and scale are the rubric's, also where a record states its own"
-        )
+        notes.append("the input's scale is the rubric's, also where a record states its own")
     update = {
         "system": system,
         "design": rubric.design or submission.design,
@@ -173,18 +171,15 @@ def under_rubric(submission: Submission, rubric: Rubric) -> tuple[Submission, tu
 
 
 def _under_calibration(experiment: Experiment, system: System) -> Experiment:
-    """Return the experiment without an input calibration of its own that the rubric states.
+    """Return the experiment without an input scale of its own where the rubric states one.
 
     Under feedback a bench may log another signal as its input, so there the record's own stands.
+    Between its own sign and the rubric's the data decide, as everywhere.
     """
     own = experiment.input
-    if own is None or experiment.kind == "closed_loop":
+    if own is None or experiment.kind == "closed_loop" or not system.input.per_count:
         return experiment
-    left = InputOverride(
-        sign=None if system.input.sign else own.sign,
-        per_count=None if system.input.per_count else own.per_count,
-    )
-    return experiment.model_copy(update={"input": left})
+    return experiment.model_copy(update={"input": InputOverride(sign=own.sign)})
 
 
 def _failed(

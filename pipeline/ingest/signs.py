@@ -26,13 +26,17 @@ def with_signs(
     """Return the records with signed inputs, what is to be said of signs found, and those stated.
 
     Where a record does not tell, it takes the sign of most others of its sort (under feedback or
-    not: a controller's log may count the other way), else of most others.
+    not: a controller's log may count the other way), else of most others. A record whose own sign
+    is another than that of the system has the one that its data tell, else its own.
     """
     stated: dict[str, int] = {}
+    disputed: set[str] = set()
     for experiment in submission.experiments:
         own = experiment.input.sign if experiment.input is not None else None
         if (sign := own or submission.system.input.sign) is not None:
             stated[experiment.id] = sign
+        if own and submission.system.input.sign == -own and experiment.kind != "closed_loop":
+            disputed.add(experiment.id)
     driven = [r for r in records if r.u is not None and np.ptp(r.u) > 0]
     found = find_signs(driven, stated=stated)
 
@@ -43,7 +47,8 @@ def with_signs(
         ]
         return next((1 if vote > 0 else -1 for vote in votes if vote), 1)
 
-    signs = {r.id: stated.get(r.id) or found.get(r.id) or usual(r) for r in records}
+    told = {**found, **{n: s for n, s in stated.items() if n not in disputed or not found.get(n)}}
+    signs = {r.id: told.get(r.id) or usual(r) for r in records}
     others = [r.id for r in driven if r.kind != "closed_loop"] or [r.id for r in driven]
     bench = 1 if sum(signs[name] for name in others) >= 0 else -1
     signed = [
