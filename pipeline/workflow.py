@@ -27,7 +27,6 @@ from pipeline.results import (
 )
 from pipeline.stages.bode_fit import fit_bode
 from pipeline.stages.compare import (
-    AT_BOUND,
     CHI_SQUARE_LIMIT,
     NOT_IDENTIFIED,
     check_chain,
@@ -38,6 +37,7 @@ from pipeline.stages.compare import (
     check_setup,
     check_steps,
     compare,
+    why_open,
 )
 from pipeline.stages.design_check import design_margins, verify_design
 from pipeline.stages.encoder_units import find_other_units
@@ -136,8 +136,8 @@ def analyse(
     if fit and not final:
         log.skip("named parameters", _UNTIED)
     for name, estimate in final.items():
-        if estimate.at_bound:
-            log.skip(f"final {name}", AT_BOUND)
+        if reason := why_open(name, estimate):
+            log.skip(f"final {name}", reason)
     rows = compare(
         found.initial,
         final=final,

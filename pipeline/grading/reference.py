@@ -120,6 +120,8 @@ def trusted_chain(analysis: Analysis) -> Chain | None:
     if analysis.fit is None or is_explained(analysis):
         return analysis.chain
     for row in analysis.rows:
+        if row.name in analysis.fit.parameters and row.final is None and not is_damping(row.name):
+            return None  # the fit leaves it open
         if row.initial is None or row.final is None or is_damping(row.name):
             continue
         before, after = row.initial.value, row.final.value

@@ -34,6 +34,10 @@ HELD_SHARE = 0.2  # of a held cart's swing: a free one that moves less is not th
 AT_BOUND = (
     "the fit ends at its bound, zero: its data are too few to tell, so there is no final value"
 )
+NOT_DETERMINED = (
+    "not determined: the standard error is {percent:.0f} % of the value, more than the "
+    "{limit:.0f} % that initial and final may differ by"
+)
 _ONE_SOURCE = "the fit's own points do not tell it: the final value rests on the decay as well"
 _DWELL_LIMIT = 0.1  # relative: a dwell stated so far off is another one
 _DWELL_FACTORS = {
@@ -62,8 +66,8 @@ def compare(
         note = ""
         if before is not None and before.source == "assumed":
             note = "the initial value was assumed, not measured"
-        if after is not None and after.at_bound:
-            note, after = AT_BOUND, None
+        if after is not None and (reason := why_open(name, after)):
+            note, after = reason, None
         one_source = before is not None and after is not None and before.source == after.source
         if one_source:
             note = _ONE_SOURCE
@@ -87,6 +91,15 @@ def compare(
             )
         )
     return tuple(rows)
+
+
+def why_open(name: str, final: Estimate) -> str:
+    """Return why what a fit gives for a parameter is no number to go by, or ""."""
+    if final.at_bound:
+        return AT_BOUND
+    percent = 100 * (final.std or 0.0) / abs(final.value) if final.value else np.inf
+    limit = _limit(name)
+    return NOT_DETERMINED.format(percent=percent, limit=limit) if percent > limit else ""
 
 
 def _limit(name: str) -> float:
