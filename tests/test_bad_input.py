@@ -3,6 +3,7 @@
 import gzip
 import io
 import os
+import re
 import struct
 import sys
 import zlib
@@ -437,42 +438,59 @@ def test_a_named_pipe_does_not_hang_the_reader(name, tmp_path):
 
 
 SLIPS = {
-    "K = 1,13": "comma",
-    "K = -0,5 # cm/V": "comma",
-    "title = “Two carts”": "curly",
-    "kind = ‘step’": "curly",
-    "kind = decay": "quotes",
-    "file = data/step.csv": "quotes",
-    'file = "data\\step.csv"': "backslash",
-    'file = "C:\\Users\\me.csv"': "backslash",
-    "springs = [True, True]": "small letters",
-    "K = −1.5": "dash",
-    "kind\N{NO-BREAK SPACE}= 'step'": "space",
-    "K = 1.13 cm/V": "unit",
-    "zeta = 5%": "unit",
-    "K = 1.2*10^-3": "unit",
-    "K = .5": "point",
-    "K = 05": "no 0",
-    'kind: "step"': "=",
-    'kind "step"': "=",
-    "K =": "after the =",
-    "// ours": "#",
-    'title = "two': "not closed",
-    "[experiments]\n[experiments]": r"\[\[experiments\]\]",
-    "K = 1\nK = 2": "already",
-    "springs = [true,\n[x]": "not closed",
-    "input = { sign = 1": "one line",
+    "K = 1,13": ("comma", "K = 1.13"),
+    "K = -0,5 # cm/V": ("comma", "K = -0.5 # cm/V"),
+    "title = “Two carts”": ("curly", 'title = "Two carts"'),
+    "kind = ‘step’": ("curly", "kind = 'step'"),
+    "kind = decay": ("quotes", 'kind = "decay"'),
+    "file = data/step.csv # ours": ("quotes", 'file = "data/step.csv" # ours'),
+    "unit = { unit = V, sign = 1 }": ("quotes", 'unit = { unit = "V", sign = 1 }'),
+    'file = "data\\step.csv"': ("backslash", 'file = "data/step.csv"'),
+    'file = "C:\\Users\\me.csv"': ("backslash", 'file = "C:/Users/me.csv"'),
+    "springs = [True, False]": ("small letters", "springs = [true, false]"),
+    "K = −1.5": ("dash", "K = -1.5"),
+    "kind\N{NO-BREAK SPACE}= 'step'": ("space", "kind = 'step'"),
+    "K = 1.13 cm/V": ("unit", "K = 1.13"),
+    "zeta = 5%": ("unit", ""),  # which is 0.05
+    "K = 1.2*10^-3": ("unit", "K = 1.2e-3"),
+    "K = 1.2 * 3": ("unit", ""),
+    "K = .5": ("point", "K = 0.5"),
+    "K = 05": ("no 0", "K = 5"),
+    'kind: "step"': ("=", 'kind = "step"'),
+    'kind "step"': ("=", 'kind = "step"'),
+    "K =": ("after the =", ""),
+    "// ours": ("#", "# ours"),
+    'title = "two': ("not closed", 'title = "two"'),
+    "[experiments]\n[experiments]": (r"\[\[experiments\]\]", ""),
+    "K = 1\nK = 2": ("already", ""),
+    "springs = [true,\n[x]": ("not closed", ""),
+    "input = { sign = 1": ("one line", ""),
 }
 
 
 @pytest.mark.parametrize("typed", SLIPS)
 def test_a_slip_of_the_keyboard_is_told_by_what_to_type(typed, tmp_path):
-    """What people type that TOML refuses: the line, the reason, and the line as it stands."""
+    """What people type that TOML refuses: the line, the reason, their line mended, and as it is."""
     write(tmp_path / "team-01", "version = 1\n" + typed + "\n")
-    with pytest.raises(SubmissionError, match=rf"toml line [234]: .*{SLIPS[typed]}") as caught:
+    words, mended = SLIPS[typed]
+    with pytest.raises(SubmissionError, match=rf"toml line [234]: .*{words}") as caught:
         load_submission(tmp_path / "team-01")
-    assert "not valid TOML" not in str(caught.value)
-    assert len(str(caught.value).splitlines()) == 1
+    said = str(caught.value)
+    assert "not valid TOML" not in said
+    assert re.findall(r": write (.*?); found", said) == [mended] * bool(mended)
+    assert len(said.splitlines()) == 1
+
+
+def test_no_file_is_proposed_that_is_another_experiments(tmp_path):
+    """What is like the missing file, but already given its place, is not what was meant."""
+    second = STEP.replace("step-a", "step-b").replace("step.csv", "step2.csv")
+    folder = write(tmp_path / "team-01", GOOD + second)
+    assert read_data(load_submission(folder)).unreadable == {
+        "step-b": "there is no file 'data/step2.csv'"
+    }
+    (folder / "data" / "Step2.csv.csv").write_text("\n".join(good_rows()))
+    (said,) = read_data(load_submission(folder)).unreadable.values()
+    assert said.endswith("; did you mean 'data/Step2.csv.csv'?")
 
 
 @pytest.mark.parametrize("path", ["nowhere", "team-01/data", "team-01/data/step.csv"])

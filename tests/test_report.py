@@ -18,6 +18,7 @@ from pipeline.report.summary import terminal_summary
 from pipeline.results import (
     Analysis,
     Estimate,
+    LeftOut,
     ParameterRow,
     Skipped,
 )
@@ -395,6 +396,21 @@ def test_a_poor_result_is_called_so(tmp_path):
     assert "1 of 2 checks failed" in text
     assert "Record sine-04 again and longer" in text
     assert "Find what the linear model leaves out" in text
+
+
+def test_what_was_not_used_is_not_said_to_be():
+    """A record left out is no source of the model; a file that is not there is asked for."""
+    analysis = make_analysis(2)
+    dwells = [record.id for record in analysis.records if record.kind == "sine"]
+    left_out = LeftOut(experiment=dwells[0], reason="froze", is_wrong=True)
+    whole = terminal_summary(analysis)
+    text = terminal_summary(
+        replace(analysis, left_out=(left_out,), unreadable={"step-9": "there is no file"})
+    )
+    assert f"{len(dwells)} sine dwells" in whole
+    assert f"{len(dwells) - 1} sine dwells" in text
+    assert "the right name of it, for step-9" in text
+    assert f"Mend or record again {dwells[0]}:" in text
 
 
 def test_a_good_result_is_called_so():

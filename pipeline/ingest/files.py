@@ -1,6 +1,7 @@
 """Recognise a data file by what is in it and read its columns."""
 
 import hashlib
+from collections.abc import Collection
 from pathlib import Path
 
 from pipeline.errors import SubmissionError
@@ -21,16 +22,19 @@ _STRANGERS = (
 )
 
 
-def read_table(folder: Path, name: str, *, shown: str | None = None) -> tuple[Table, str]:
+def read_table(
+    folder: Path, name: str, *, shown: str | None = None, taken: Collection[str] = ()
+) -> tuple[Table, str]:
     """Return the columns of a data file and the SHA-256 of its bytes.
 
-    Messages call the file `shown`, by default its name.
+    Messages call the file `shown`, by default its name; where it is missing, the files `taken`
+    are not proposed.
 
     Raises
     ------
     SubmissionError : outside the folder, missing, of no known form or broken; names the line.
     """
-    if (problem := outside(folder, name)) is not None:
+    if (problem := outside(folder, name, taken=taken)) is not None:
         raise SubmissionError(problem if shown is None else f"{shown}: {problem}")
     source = shown or name
     try:

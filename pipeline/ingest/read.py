@@ -68,10 +68,13 @@ def read_data(submission: Submission) -> Ingested:
     points: Points = {}
     warnings: list[str] = []
     unreadable: dict[str, str] = {}
+    taken = {experiment.file for experiment in submission.experiments}
     for experiment in submission.experiments:
         with _noted(experiment, unreadable):
             if experiment.file not in tables:
-                tables[experiment.file] = read_table(submission.folder, experiment.file)
+                tables[experiment.file] = read_table(
+                    submission.folder, experiment.file, taken=taken
+                )
             table, _ = tables[experiment.file]
             if experiment.kind == "bode":
                 _read_bode(table, experiment, submission.system, points, warnings)

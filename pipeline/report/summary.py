@@ -75,7 +75,8 @@ def _findings(analysis: Analysis) -> list[tuple[bool, Spans]]:
 
 
 def _identified(analysis: Analysis) -> Block:
-    kinds = Counter(record.kind for record in analysis.records)
+    unused = {one.experiment for one in analysis.left_out}
+    kinds = Counter(record.kind for record in analysis.records if record.id not in unused)
     used = listing([count(kinds[kind], noun) for kind, noun in _KINDS.items() if kinds[kind]])
     carts = "single cart" if analysis.carts == 1 else f"chain of {analysis.carts} carts"
     source = f"from {used}" if used else "from the data given"
@@ -294,15 +295,17 @@ def _carts(carts: list[int]) -> str:
 def _next(analysis: Analysis) -> Items:
     advice: list[Spans] = []
     fit = analysis.fit
-    wrong = [*analysis.unreadable, *(one.experiment for one in analysis.left_out)]
-    if wrong:
-        advice.append(
-            spans(
-                f"Mend or record again {clean(listing(wrong[:_MOST_TOLD]))}"
-                f"{' …' if len(wrong) > _MOST_TOLD else ''}: the checks say what is wrong."
-            )
-        )
-    elif any(c.outcome == "fail" and c.id.startswith(_OF_DATA) for c in analysis.checks):
+    for what, which in (
+        ("Give a sound file, or the right name of it, for", list(analysis.unreadable)),
+        ("Mend or record again", [one.experiment for one in analysis.left_out]),
+    ):
+        if which:
+            more = " …" if len(which) > _MOST_TOLD else ""
+            named = clean(listing(which[:_MOST_TOLD]))
+            advice.append(spans(f"{what} {named}{more}: the checks say what is wrong."))
+    if not advice and any(
+        c.outcome == "fail" and c.id.startswith(_OF_DATA) for c in analysis.checks
+    ):
         advice.append(spans("Mend first what the failed checks say of the recordings."))
     if fit is None:
         reasons = [skip.reason for skip in analysis.skipped if skip.stage == "final estimates"]

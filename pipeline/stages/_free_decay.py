@@ -190,10 +190,8 @@ def _carried_back(
 ) -> int:
     """Return the first sample, not after `latest`, from which on the decay's model holds."""
     head = slice(decay.stretch.first, latest)
-    growth = np.exp(decay.fit.poles[0].real * (t[head] - decay.fit.t0))
-    tolerance = (
-        _BACK_SIGMAS * max(decay.rms(t, y), floor) + share * abs(decay.fit.amplitudes[0]) * growth
-    )
+    size = abs(decay.fit.amplitudes[0]) * decay.fit.growth(t[head])[0]
+    tolerance = _BACK_SIGMAS * max(decay.rms(t, y), floor) + share * size
     bad = np.flatnonzero(np.abs(y[head] - decay.model(t[head])) > tolerance)
     return head.start + (int(bad[-1]) + 1 if bad.size else 0)
 

@@ -11,7 +11,7 @@ from pipeline.stages._signals import colour
 _PENCIL_SAMPLES = 300  # the matrix pencil only starts the fit; more samples would only cost time
 _OSCILLATES = 1e-3  # imaginary part over size: below, a pole is real but for rounding
 _MAX_EVALUATIONS = 100
-_MOST_GROWTH = 50.0  # of an exponent on the way to the fit: beyond, numbers run over
+_MOST_GROWTH = 50.0  # of an exponent: beyond, numbers run over
 _ALWAYS_DECAYS = 1e-6  # of the frequency: the least damping of a start
 
 
@@ -38,8 +38,12 @@ class Ringing:
 
     def __call__(self, t: Array) -> Array:
         tau = t - self.t0
-        modes = self.amplitudes[:, None] * np.exp(self.poles[:, None] * tau)
-        return self.level + self.slope * tau + modes.real.sum(0)
+        waves = self.growth(t) * np.exp(1j * self.poles.imag[:, None] * tau)
+        return self.level + self.slope * tau + (self.amplitudes[:, None] * waves).real.sum(0)
+
+    def growth(self, t: Array) -> Array:
+        """Return the size of each mode against that at `t0`, (n_modes, n); at most e^50."""
+        return np.exp(np.minimum(self.poles.real[:, None] * (t - self.t0), _MOST_GROWTH))
 
 
 def fit_ringing(t: Array, y: Array, *, poles: ComplexArray, drift: bool) -> Ringing:

@@ -2,7 +2,7 @@
 
 import re
 import stat
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import suppress
 from decimal import Decimal
 from itertools import islice
@@ -264,15 +264,18 @@ def leaves(folder: Path, name: str) -> str | None:
     return None
 
 
-def outside(folder: Path, name: str) -> str | None:
-    """Return why `name` is no readable regular file inside `folder`, or None where it is one."""
+def outside(folder: Path, name: str, *, taken: Collection[str] = ()) -> str | None:
+    """Return why `name` is no readable regular file inside `folder`, or None where it is one.
+
+    The files `taken` are known to be others', so that they are not what was meant.
+    """
     if (problem := leaves(folder, name)) is not None:
         return problem
     shown = quote(name)
     try:
         info = (folder / _posix(name)).resolve().stat()
     except FileNotFoundError:
-        return f"there is no file {shown}{_near_file(folder, _posix(name))}"
+        return f"there is no file {shown}{_near_file(folder, _posix(name), taken)}"
     except (OSError, RuntimeError) as error:  # a loop of links is a RuntimeError before 3.13
         return f"{shown} cannot be read ({getattr(error, 'strerror', None) or 'a loop of links'})"
     if stat.S_ISDIR(info.st_mode):
@@ -284,13 +287,14 @@ def outside(folder: Path, name: str) -> str | None:
     return None
 
 
-def _near_file(folder: Path, name: str) -> str:
+def _near_file(folder: Path, name: str, taken: Collection[str]) -> str:
     """Return "; did you mean …?" for a file of this name elsewhere, or of a similar one."""
     try:
         paths = sorted(p for p in islice(folder.rglob("*"), _MOST_LOOKED_AT) if p.is_file())
     except OSError:
         return ""
     files = [path.relative_to(folder).as_posix() for path in paths]
+    files = [file for file in files if file not in taken]
     last = PurePosixPath(name).name.casefold()
     same = [file for file in files if PurePosixPath(file).name.casefold() == last]
     hint = f"; did you mean {same[0]!r}?" if same else nearest(name, files)

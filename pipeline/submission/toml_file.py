@@ -15,31 +15,76 @@ _LONGEST_LINE, _SHOWN = 300, 60  # characters of a line that are looked at, and 
 _AT = re.compile(r" \(at line (\d+), column (\d+)\)$")
 _NUMBER = r"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?"
 
-BACKSLASH = 'inside "…" a backslash begins a special character; write data/step.csv'
+BACKSLASH = 'inside "…" a backslash begins a special character; folders are parted by /'
 _UNCLOSED = "a list [ … ] before this line is not closed, or lacks a comma"
 
-# What a line looks like that TOML refuses, and what to write; the first that fits is it.
-_SLIPS: tuple[tuple[str, str], ...] = (
-    (r"[“”„‟«»‘’‚]", 'these are curly quotes; type straight ones: "…"'),
-    (r"[\xa0\u2000-\u200f\u202f\u3000]", "a special space; delete it and type a plain one"),
-    (r"=.*[−–—]\s*\d", "this is a dash; type the minus of the keyboard: -"),
-    (r"=\s*[-+]?\d+,\d", "a decimal comma; write a point: 1.13"),
-    (r'"[^"]*\\', BACKSLASH),
-    (r"=\s*\[?.*\b(True|TRUE|False|FALSE)\b", "true and false are written in small letters"),
-    (r"^\s*(//|;|%)", "a comment begins with #"),
-    (r"^\s*(\[[A-Za-z][^\[\]]*\]|\[\[[^\[\]]+\]\])\s*(#.*)?$", _UNCLOSED),
+# What a line looks like that TOML refuses, what is wrong with it, and what in it becomes what. The
+# first that fits is it; the line is shown mended where that makes it one that TOML takes.
+_SLIPS: tuple[tuple[str, str, tuple[tuple[str, str], ...]], ...] = (
+    (
+        r"[“”„‟«»‘’‚]",
+        "these are curly quotes; type straight ones",
+        ((r"[“”„‟«»]", '"'), (r"[‘’‚]", "'")),
+    ),
+    (
+        r"[\xa0\u2000-\u200f\u202f\u3000]",
+        "a special space; delete it and type a plain one",
+        ((r"[\xa0\u2000-\u200f\u202f\u3000]+", " "),),
+    ),
+    (
+        r"=.*[−–—]\s*\d",
+        "this is a dash; type the minus of the keyboard",
+        ((r"[−–—]\s*(?=\d)", "-"),),
+    ),
+    (r"=\s*[-+]?\d+,\d", "a decimal comma; write a point", ((r"(\d),(\d)", r"\1.\2"),)),
+    (r'"[^"]*\\', BACKSLASH, ((r"\\+", "/"),)),
+    (
+        r"=\s*\[?.*\b(True|TRUE|False|FALSE)\b",
+        "true and false are written in small letters",
+        ((r"\b(?:True|TRUE)\b", "true"), (r"\b(?:False|FALSE)\b", "false")),
+    ),
+    (r"^\s*(//|;|%)", "a comment begins with #", ((r"^\s*(?://|;|%)+", "#"),)),
+    (r"^\s*(\[[A-Za-z][^\[\]]*\]|\[\[[^\[\]]+\]\])\s*(#.*)?$", _UNCLOSED, ()),
     (
         r"^\s*\[+\s*[A-Za-z]",
         "a table begins with [name], one of several with [[name]], in a line of its own",
+        (),
     ),
-    (r"^\s*[\w-]+\s*=\s*(#.*)?$", "nothing stands after the ="),
-    (r"^\s*[\w-]+(\s*:|\s+[^=\s])", "between a name and its value stands a =: K = 1.13"),
-    (r"=\s*[-+]?\.\d|=\s*[-+]?\d+\.(?!\d)", "a point has digits on both sides: 0.5"),
-    (r"=\s*[-+]?0\d", "a number begins with no 0 but that of 0.5"),
-    (rf"=\s*{_NUMBER}\s*[^\s\d#.,]", "a number stands alone, without a unit or a sum: K = 1.13"),
-    (r"=\s*[A-Za-z_./\\]", 'text stands in quotes: kind = "step"'),
-    (r"=\s*[\[{][^\"']*[\[{,\s][A-Za-z_]\w*\s*[,\]}]", 'text stands in quotes: "V"'),
-    (r"=\s*(\"[^\"]*|'[^']*)$", "the quote is not closed"),
+    (r"^\s*[\w-]+\s*=\s*(#.*)?$", "nothing stands after the =", ()),
+    (
+        r"^\s*[\w-]+(\s*:|\s+[^=\s])",
+        "between a name and its value stands a =",
+        ((r"^(\s*[\w-]+)\s*:?\s*", r"\1 = "),),
+    ),
+    (
+        r"=\s*[-+]?\.\d|=\s*[-+]?\d+\.(?!\d)",
+        "a point has digits on both sides",
+        ((r"(?<!\d)\.(?=\d)", "0."), (r"(\d)\.(?!\d)", r"\1.0")),
+    ),
+    (
+        r"=\s*[-+]?0\d",
+        "a number begins with no 0 but that of 0.5",
+        ((r"(=\s*[-+]?)0+(?=\d)", r"\1"),),
+    ),
+    (
+        rf"=\s*{_NUMBER}\s*[^]\s\d#.,}}]",
+        "a number stands alone, without a unit or a sum",
+        (
+            (r"(\d)\s*[*·x×]\s*10\^?([-+]?\d)", r"\1e\2"),
+            (rf"(=\s*{_NUMBER})\s+[A-Za-zµ].*", r"\1"),
+        ),
+    ),
+    (
+        r"^[^=]*=\s*[A-Za-z_./\\]",
+        "text stands in quotes",
+        ((r"^([^=]*=)\s*([^#]*[^#\s])", r'\1 "\2"'),),
+    ),
+    (
+        r"=\s*[\[{][^\"']*[\[{,\s][A-Za-z_]\w*\s*[,\]}]",
+        "text stands in quotes",
+        ((r"([\[{,=]\s*)(?!true\b|false\b)([A-Za-z_]\w*)(?=\s*[,\]}])", r'\1"\2"'),),
+    ),
+    (r"=\s*(\"[^\"]*|'[^']*)$", "the quote is not closed", ((r"([\"'])([^\"']*)$", r"\1\2\1"),)),
 )
 # What tomllib says where no single line shows it.
 _SAID: tuple[tuple[str, str], ...] = (
@@ -121,7 +166,19 @@ def _words(line: str, message: str) -> str:
         if re.fullmatch(said, message):
             return words
     looked_at = line[:_LONGEST_LINE]
-    for slip, words in _SLIPS:
+    for slip, words, mends in _SLIPS:
         if re.search(slip, looked_at):
-            return words
+            return words + _mended(looked_at, mends)
     return f"not valid TOML: {message}"
+
+
+def _mended(line: str, mends: tuple[tuple[str, str], ...]) -> str:
+    """Return ": write …" with the line as it should be; "" where that is not known."""
+    new = line
+    for pattern, put in mends:
+        new = re.sub(pattern, put, new)
+    try:
+        tomllib.loads(new)
+    except (tomllib.TOMLDecodeError, RecursionError, ValueError):
+        return ""
+    return f": write {new}" if new != line and new.isprintable() and len(new) <= _SHOWN else ""
