@@ -21,7 +21,7 @@ from pipeline.grading.runner import Limits
 from pipeline.grading.so_far import Row, class_so_far
 from pipeline.resources import RUBRICS
 from pipeline.synthesis import write_submission
-from tests.grades import failed_grade, make_grade, make_outcome, two_cart_rubric
+from tests.grades import failed_grade, in_this_process, make_grade, make_outcome, two_cart_rubric
 from tests.test_schemas import assert_fits
 
 RUBRIC = two_cart_rubric()
@@ -43,6 +43,12 @@ def school(tmp_path_factory) -> Path:
     step = (folder / "A/team-1/data/step-1.csv").read_bytes()
     (folder / "B/team-2/data/step-2.csv").write_bytes(step)
     return folder
+
+
+@pytest.fixture(autouse=True)
+def _here(monkeypatch):
+    """Grade in this process: what a worker does apart is no matter here."""
+    monkeypatch.setattr("pipeline.grading.batch_run.run_here", lambda *, jobs: in_this_process)
 
 
 def grade(*paths: Path, out: Path, rubric: Path = Path("throne-1dof")):

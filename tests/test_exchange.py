@@ -16,7 +16,7 @@ from pipeline.resources import EXAMPLES
 from pipeline.results import Analysis
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
-from tests.test_cli import cartlab
+from tests.commandline import cartlab_here
 
 TABLES = {"parameters", "checks", "decays", "steps", "dwells", "frequency_response"}
 
@@ -134,10 +134,10 @@ def test_report_saves_tables_when_asked(tmp_path):
     """`--tables` writes beside results.json; a report without it leaves none."""
     out = tmp_path / "out"
     folder = EXAMPLES / "one-cart"
-    assert cartlab("report", folder, "--out", out, "--no-pdf").returncode == 0
+    assert cartlab_here("report", folder, "--out", out, "--no-pdf").returncode == 0
     assert not (out / "results.mat").exists()
-    assert cartlab("report", folder, "--out", out, "--no-pdf", "--tables").returncode == 0
+    assert cartlab_here("report", folder, "--out", out, "--no-pdf", "--tables").returncode == 0
     assert {path.stem for path in (out / "tables").iterdir()} == TABLES
     assert Path(out / "results.mat").stat().st_size > 1000
-    assert cartlab("report", folder, "--out", out, "--no-pdf").returncode == 0
+    assert cartlab_here("report", folder, "--out", out, "--no-pdf").returncode == 0
     assert not [*(out / "tables").iterdir(), *out.glob("*.mat")]  # nothing stale beside the new

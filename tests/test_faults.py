@@ -225,9 +225,16 @@ HONEST = {
     "sticking, coarse": {"count": 0.05, "hide": 0.0008},
     "sticking at every small step": {"count": 0.01, "hide": 0.008},
 }
+LONG = "sticking at every small step"
 
 
-@pytest.mark.parametrize("case", HONEST)
+@pytest.mark.parametrize(
+    "case",
+    [
+        *(case for case in HONEST if case != LONG),
+        pytest.param(LONG, marks=[pytest.mark.slow, pytest.mark.sample]),
+    ],
+)
 def test_no_honest_record_is_accused(case, tmp_path, monkeypatch):
     """Without encoder noise carts rest exactly, stick, or stay within one coarse step."""
     monkeypatch.setattr("pipeline.synthesis._NOISE_COUNTS", 0.0)

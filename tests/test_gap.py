@@ -35,7 +35,7 @@ def names(gap: Gap) -> list[tuple[str, int]]:
     ("effect", "n"),
     [
         ("coulomb_friction", 2),
-        ("presliding_friction", 1),
+        pytest.param("presliding_friction", 1, marks=[pytest.mark.slow, pytest.mark.sample]),
         ("cubic_spring", 2),
         ("slack_spring", 1),
         ("drive_damping", 1),

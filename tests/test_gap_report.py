@@ -39,7 +39,7 @@ from pipeline.report.words_gap import terminal_verdict
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
 from tests.analysis_factory import make_analysis
-from tests.test_cli import cartlab
+from tests.commandline import cartlab_here
 from tests.test_report import HOSTILE, Page
 from tests.truth.cases import make_case
 
@@ -409,7 +409,7 @@ def bench(tmp_path_factory):
         (folder / name).write_text(text, encoding="utf-8")
         toml += f'[[experiments]]\nid = "{record.id}"\nkind = "{kind}"\nfile = "{name}"\n'
     (folder / "submission.toml").write_text(toml, encoding="utf-8")
-    done = cartlab("gap", folder, "--json")
+    done = cartlab_here("gap", folder, "--json")
     (hidden,) = case.hidden
     return SimpleNamespace(folder=folder, done=done, force=hidden.parameters["force"])
 
@@ -490,7 +490,7 @@ def test_hostile_words_in_a_gap_file_stay_words(bench):
 
 def test_without_usable_runs_the_command_says_so_in_one_line(tmp_path):
     """A folder that is no submission ends in one line and status 2."""
-    done = cartlab("gap", tmp_path / "nowhere")
+    done = cartlab_here("gap", tmp_path / "nowhere")
 
     assert done.returncode == 2
     assert len(done.stderr.strip().splitlines()) == 1

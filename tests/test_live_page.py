@@ -283,20 +283,45 @@ def _held(page: LivePage) -> int:
 
 
 def test_strangers_leave_the_run_its_descriptors(page):
-    """Of 300 idle connections a few are held, half a request or not; who has the secret gets in."""
+    """Of 400 idle connections some are held, half a request or not; who has the secret gets in."""
     url = urlsplit(page.url)
     with ExitStack() as opened:
         stream = news(page, opened)
-        for number in range(300):
+        for number in range(400):
             stranger = socket.create_connection((url.hostname, url.port), timeout=PATIENCE)
             opened.enter_context(stranger)
             if number % 2:
                 stranger.sendall(b"GET / HTTP/1.1\r\nHost: ")
             if number % 30 == 0:  # fewer than are accepted at once
-                until(lambda: _held(page) <= 20)
-        until(lambda: _held(page) <= 20)
+                until(lambda: _held(page) <= 140)
+        until(lambda: _held(page) <= 140)
         assert ask(page)[0].status == 200
         assert stream.readline() == b"event: state\n"
+
+
+def test_nobody_is_faster_than_who_has_the_secret(page, monkeypatch):
+    """As many others as can be waiting, all accepted at once with it, drive no request out."""
+    url, held, go_on = urlsplit(page.url), threading.Event(), threading.Event()
+    snapshot = page.snapshot
+
+    def slow() -> object:
+        held.set()
+        assert go_on.wait(PATIENCE)
+        return snapshot()
+
+    monkeypatch.setattr(page, "snapshot", slow)
+    with ExitStack() as opened:
+        threading.Thread(target=news, args=(page, opened), daemon=True).start()
+        assert held.wait(PATIENCE)  # the server's loop stands still
+        rightful = socket.create_connection((url.hostname, url.port), timeout=PATIENCE)
+        opened.enter_context(rightful)
+        rightful.sendall(f"GET {url.path} HTTP/1.1\r\nHost: {url.netloc}\r\n\r\n".encode())
+        for _ in range(200):  # more than can wait
+            stranger = opened.enter_context(socket.socket())
+            stranger.setblocking(False)
+            stranger.connect_ex((url.hostname, url.port))
+        go_on.set()
+        assert rightful.recv(12) == b"HTTP/1.1 200"
 
 
 def test_a_stranger_is_turned_out_in_time_and_a_reader_is_not(folder, monkeypatch):

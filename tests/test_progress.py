@@ -9,12 +9,12 @@ from rich.progress import Progress
 
 from pipeline.cli.grading import counting
 from pipeline.resources import EXAMPLES
-from tests.test_cli import cartlab
+from tests.commandline import cartlab_here
 
 
 def test_a_pipe_sees_no_progress(tmp_path):
     """Where stderr is no terminal there is the summary alone, without control characters."""
-    done = cartlab("report", EXAMPLES / "one-cart", "--out", tmp_path, "--no-pdf")
+    done = cartlab_here("report", EXAMPLES / "one-cart", "--out", tmp_path, "--no-pdf")
 
     assert done.stdout == ""
     assert "\x1b" not in done.stderr

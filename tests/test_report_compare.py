@@ -1,8 +1,6 @@
 """Two drafts side by side: what moved, which checks turned, which files are others."""
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 
 import pytest
@@ -19,6 +17,7 @@ from pipeline.schemas.results import Results
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
 from tests.analysis_factory import make_analysis
+from tests.commandline import cartlab_here
 
 
 def draft_of(analysis: Analysis) -> Results:
@@ -142,11 +141,9 @@ def test_the_command_tells_the_change_in_one_line_of_stderr(tmp_path):
     earlier["parameters"][0]["final"] *= 0.9
     path = tmp_path / "earlier.json"
     path.write_text(json.dumps(earlier), encoding="utf-8")
-    arguments = ["report", str(EXAMPLES / "one-cart"), "--no-pdf", "--out", str(tmp_path / "out")]
-    done = subprocess.run(
-        [sys.executable, "-m", "pipeline", *arguments, "--compare", str(path)],
-        capture_output=True, encoding="utf-8", check=True,
-    )  # fmt: skip
+    arguments = ("--no-pdf", "--out", tmp_path / "out", "--compare", path)
+    done = cartlab_here("report", EXAMPLES / "one-cart", *arguments)
+    assert done.returncode == 0
     (line,) = [text for text in done.stderr.splitlines() if text.startswith("since the earlier")]
     assert "1 final estimate moved, K most (+11.1 %" in line
     assert 'id="changes"' in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")

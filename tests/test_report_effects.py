@@ -8,7 +8,7 @@ import pytest
 from pipeline.plant.effects import CATALOGUE, find_effect
 from pipeline.report.effects import build_gallery, render_effects
 from pipeline.report.words_effects import catalogue_data, catalogue_text
-from tests.test_cli import cartlab
+from tests.commandline import cartlab_here
 
 
 def test_the_list_has_every_effect_with_its_parameters():
@@ -25,7 +25,7 @@ def test_the_list_has_every_effect_with_its_parameters():
 
 def test_json_is_for_programs():
     """`cartlab effects --json` prints the catalogue as data, NAME picks one entry."""
-    done = cartlab("effects", "stiction", "--json")
+    done = cartlab_here("effects", "stiction", "--json")
 
     (entry,) = json.loads(done.stdout)
     assert entry == catalogue_data([find_effect("stiction")])[0]
@@ -37,7 +37,7 @@ def test_json_is_for_programs():
 
 def test_a_wrong_name_is_one_line_with_the_nearest():
     """A misspelt effect ends with status 2 and the name that was meant."""
-    done = cartlab("effects", "back_lash")
+    done = cartlab_here("effects", "back_lash")
 
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == "cartlab: no effect 'back_lash'; did you mean 'backlash'?\n"
@@ -50,7 +50,7 @@ def test_wrong_options_of_simulate_are_one_line(tmp_path):
         (("--model", tmp_path / "no.json"), "no.json: cannot be read (No such file or directory)"),
         ((), "either --preset or --model"),
     ):
-        done = cartlab("simulate", *arguments, "--out", tmp_path / "out")
+        done = cartlab_here("simulate", *arguments, "--out", tmp_path / "out")
 
         assert done.returncode == 2
         assert expected in done.stderr

@@ -4,8 +4,9 @@ Served to this computer alone, and only to who has the address: it holds a secre
 for every session. Requests that another page makes (by a name that leads here, or from an origin
 of its own) are refused. The server runs in a thread of its own and looks for news a few times a
 second, so however slow a browser reads, the acquisition never waits. Anybody on this computer can
-connect: those who have not shown the secret share a few connections, so that the files and ports of
-the acquisition never lack a descriptor.
+connect: those who have not shown the secret share so many connections, so that the files and ports
+of the acquisition never lack a descriptor. They are more than arrive between two looks at what was
+sent: however fast others connect, who sends the secret at once is known before being driven out.
 """
 
 import asyncio
@@ -37,9 +38,11 @@ _FRAME = 1 / 30  # s between looks for news
 _ALIVE = 5.0  # s between signs of life where there is none
 _MOST_PAGES = 8  # open at a time; each costs a little of the processor
 _LARGEST_ANSWER = 200  # bytes of what a button sends
-_MOST_STRANGERS = 16  # connections without the secret; the newest drives out the oldest
 _TO_SHOW_IT = 5.0  # s a stranger may stay
-_BACKLOG = 32  # connections accepted at once, before any can be driven out
+_BACKLOG = 32  # connections accepted in one turn of the loop, before any can be driven out
+# Connections without the secret; the newest drives out the oldest. A request that is there when its
+# connection is accepted is read two or three turns later.
+_MOST_STRANGERS = 4 * _BACKLOG
 _GOODBYE = 1.0  # s for open pages to hear that the session is over
 
 _FILES = {
@@ -91,10 +94,10 @@ class LivePage(LiveState):
             Route("/{name}", self._file),
         ]
         strangers = _Strangers()
-        app = _Guard(Starlette(routes=routes), token=token, port=port, strangers=strangers)
+        app = _Guard(Starlette(routes=routes), token=token, port=port)
         config = Config(
             app,
-            http=_protocol(strangers),
+            http=_protocol(strangers, token=token),
             backlog=_BACKLOG,
             proxy_headers=False,  # a peer is who it is, whatever it says of itself
             log_config=None,
@@ -213,13 +216,19 @@ class _Strangers:
         transport.abort()
 
 
-def _protocol(strangers: _Strangers) -> type[asyncio.Protocol]:
-    """Return HTTP that tells of each connection as it is made."""
+def _protocol(strangers: _Strangers, *, token: str) -> type[asyncio.Protocol]:
+    """Return HTTP that tells of each connection as it is made, and as it shows the secret."""
 
     class Announced(H11Protocol):
         def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
             super().connection_made(transport)
             strangers.add(transport)
+
+        def data_received(self, data: bytes) -> None:
+            shown = data[:_LARGEST_ANSWER].split(b"/", 2)[1:2]
+            if shown and secrets.compare_digest(shown[0], token.encode()):
+                strangers.know(self.client)
+            super().data_received(data)
 
     return Announced
 
@@ -227,9 +236,8 @@ def _protocol(strangers: _Strangers) -> type[asyncio.Protocol]:
 class _Guard:
     """Lets in who knows the secret, asks by this computer's own name and is no other page."""
 
-    def __init__(self, app: ASGIApp, *, token: str, port: int, strangers: _Strangers) -> None:
+    def __init__(self, app: ASGIApp, *, token: str, port: int) -> None:
         self._app, self._token = app, f"{token}/"  # links of the page go on from the slash
-        self._strangers = strangers
         self._hosts = {f"127.0.0.1:{port}", f"localhost:{port}"}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -241,9 +249,9 @@ class _Guard:
         token, slash, inside = scope["path"].removeprefix("/").partition("/")
         headers = Headers(scope=scope)
         if refusal := self._refusal(headers, method=scope["method"], token=token + slash):
-            await PlainTextResponse(refusal, status_code=403)(scope, receive, guarded)
+            answer = PlainTextResponse(refusal, status_code=403, headers={"Connection": "close"})
+            await answer(scope, receive, guarded)
             return
-        self._strangers.know(scope["client"])
         await self._app({**scope, "path": f"/{inside}"}, receive, guarded)
 
     def _refusal(self, headers: Headers, *, method: str, token: str) -> str:
