@@ -7,6 +7,8 @@ from io import StringIO
 from pathlib import Path
 from unittest.mock import patch
 
+import pytest
+
 from pipeline.cli import main
 from tests.waiting import PATIENCE
 
@@ -35,10 +37,9 @@ def cartlab_here(*arguments: object, cwd: Path | None = None) -> Done:
         chdir(cwd or Path.cwd()),
         redirect_stdout(out),
         redirect_stderr(err),
+        pytest.raises(SystemExit) as end,
     ):
-        try:
-            main()
-        except SystemExit as end:
-            status = end.code
-    assert status is None or isinstance(status, int)
-    return subprocess.CompletedProcess(words, status or 0, out.getvalue(), err.getvalue())
+        main()
+    status = end.value.code or 0
+    assert isinstance(status, int)
+    return Done(words, status, out.getvalue(), err.getvalue())

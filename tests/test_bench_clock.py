@@ -130,6 +130,22 @@ def test_lost_lines_are_told_however_many(tmp_path, share):
     assert f"{outcome.anomalies.lost} lines lost" in load_submission(work).experiments[0].note
 
 
+@pytest.mark.parametrize("lost", [(), (500, 1700, 1701)])
+def test_a_clock_slower_than_stated_loses_nothing(tmp_path, lost):
+    """A line every 1.3 ms where 1.0 was stated: it is said once, and only what is lost counts."""
+
+    def slow(lines: list[Reading]) -> Iterator[Reading]:
+        for k in range(round(len(lines) / 1.3)):
+            if k not in lost:
+                yield lines[int(1.3 * k)]
+
+    work, notes = write_work(tmp_path, [sine("dwell", seconds=RUN / 1e3)]), Notes()
+    (outcome,) = acquire(work, port=OddBench(slow).address, observers=[notes], only=["dwell"])
+    assert outcome.partial == ""
+    assert outcome.anomalies.lost == len(lost)
+    assert len([r for r in notes.remarks if "every 1 ms and sends one every 1.3 ms" in r]) == 1
+
+
 @pytest.mark.parametrize("factor", [25, -1])
 def test_a_motor_driven_with_another_duty_than_the_target_is_stopped(tmp_path, factor):
     """In open loop the duty is the target; one that is not is no run, and is not tried again."""

@@ -36,13 +36,13 @@ def names(gap: Gap) -> list[tuple[str, int]]:
     [
         ("coulomb_friction", 2),
         pytest.param("presliding_friction", 1, marks=[pytest.mark.slow, pytest.mark.sample]),
-        ("cubic_spring", 2),
+        pytest.param("cubic_spring", 2, marks=[pytest.mark.slow, pytest.mark.sample]),
         ("slack_spring", 1),
         ("drive_damping", 1),
         ("dead_zone", 1),
         ("input_delay", 1),
         ("extra_mode", 1),
-        ("end_stop", 1),
+        pytest.param("end_stop", 1, marks=[pytest.mark.slow, pytest.mark.sample]),
         ("force_offset", 2),
     ],
 )

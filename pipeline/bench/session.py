@@ -29,6 +29,7 @@ from pipeline.bench.protocol import (
 )
 from pipeline.bench.raw import RawHeader, RawWriter
 from pipeline.bench.serial_line import LUMP, SerialLine
+from pipeline.bench.stamps import OTHER
 from pipeline.bench.stream import Stream
 from pipeline.errors import HardwareError
 
@@ -157,6 +158,7 @@ class Session:
             partial = _NOTHING_MOVED
         fit = stream.fit()
         if stream.lines > _ENOUGH and not partial:
+            self._say_other_period(fit.period)
             self._period = fit.period
         return Outcome(
             recording=order.recording,
@@ -164,6 +166,18 @@ class Session:
             anomalies=stream.anomalies(fit),
             partial=partial,
         )
+
+    def _say_other_period(self, period: float) -> None:
+        """Say once that the bench does not keep to the period (ms) that it stated."""
+        stated = 1e3 * self._line.bench.period
+        if not self._line.bench.commands or abs(self._period / stated - 1) > OTHER:
+            return
+        if abs(period / stated - 1) > OTHER:
+            self._observer.remark(
+                f"the bench states a line every {stated:.3g} ms and sends one every {period:.3g} "
+                "ms: its times are right, but a controller that counts in its periods is not; "
+                "mend the period that it states"
+            )
 
     def _stream(self, free: Sequence[int], *, closed: bool = False) -> Stream:
         watched = tuple(cart for cart in free if cart <= self._carts)

@@ -20,6 +20,9 @@ _CLOSEST_TEETH = 20  # ms: a clock of 1.05 ms; one further off is no bench's tha
 _MOST_ABSENT = 0.2  # of the stamps; more is a slower clock
 _BY_CHANCE = 0.01  # how likely losses may look like a comb
 _SLACK = 1  # ms a tooth may be off: stamps are rounded
+_PIECE = 200  # lines, of which some lack none unless one in a hundred is lost
+_FEWEST_EVEN, _ALIKE = 0.25, 0.01  # of the pieces; of the period between them, as rounding has it
+OTHER = 0.02  # of a period: no clock is so far off the one that is stated
 _RECENT = 16  # teeth the spacing is told from, for a clock that drifts
 
 
@@ -49,6 +52,8 @@ def fit_stamps(stamps: Stamps, *, period: float, stated: bool = False) -> StampF
         return StampFit(period=period, missing=0)
     if (slope := even_period(stamps)) is not None:
         return StampFit(period=slope, missing=0)
+    if stated and (own := _other_period(stamps, period)) is not None:
+        return own
     steps, span = np.diff(stamps), int(stamps[-1] - stamps[0])
     missing = max(0, round(span / period) + 1 - n)
     if stated and missing > _MOST_ABSENT * span / period:
@@ -81,6 +86,27 @@ def even_period(stamps: Stamps) -> float | None:
     i = np.arange(stamps.size) - (stamps.size - 1) / 2
     slope = float(i @ stamps / (i @ i))
     return slope if slope > 0 and np.ptp(stamps - slope * i) < _STRIP else None
+
+
+def _other_period(stamps: Stamps, stated: float) -> StampFit | None:
+    """Return the clock of those pieces that are even, where it is another than the stated one.
+
+    Lines that a bench loses leave no long piece even, unless they are few.
+    """
+    pieces = [stamps[i : i + _PIECE + 1] for i in range(0, stamps.size - _PIECE, _PIECE)]
+    even = [period for piece in pieces if (period := even_period(piece)) is not None]
+    if len(even) < max(_FEWEST_EVEN * len(pieces), 1):
+        return None
+    own = float(np.median(even))
+    if abs(own / stated - 1) <= OTHER or max(even) - min(even) > _ALIKE * own:
+        return None
+    span = int(stamps[-1] - stamps[0])
+    missing = sum(
+        max(0, round(int(piece[-1] - piece[0]) / own) - _PIECE)
+        for piece in pieces
+        if even_period(piece) is None
+    )
+    return StampFit(period=span / (stamps.size - 1 + missing), missing=missing)
 
 
 def _comb(absent: Sequence[int]) -> list[int]:
