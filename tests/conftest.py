@@ -3,6 +3,7 @@
 import os
 import shutil
 import signal
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,6 +12,11 @@ from hypothesis import HealthCheck, settings
 
 from tests.benches import Emulator, emulator
 from tests.waiting import PATIENCE
+
+# Where Python is told to keep nothing that it compiled, as in containers, each of the hundred
+# programs that tests start would compile the package anew, and each worker all tests.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # which shares the machine with others
     os.environ.setdefault("OMP_NUM_THREADS", "1")

@@ -150,10 +150,10 @@ def try_seed(command: str, seed: int) -> None:
         run(command, folder)
 
 
-@pytest.mark.parametrize(("command", "seeds"), [("report", 2), ("import", 2)])
-def test_a_spoilt_submission_is_a_report_or_a_complaint(command, seeds):
-    """A few seeds."""
-    for seed in range(seeds):
+@pytest.mark.parametrize("command", ["report", "import"])
+def test_a_spoilt_submission_is_a_report_or_a_complaint(command):
+    """A few seeds, of one cart."""
+    for seed in (0, 3):
         try_seed(command, seed)
 
 

@@ -21,6 +21,7 @@ from pipeline.grading.gradebook import Gradebook
 from pipeline.grading.intake import find_hand_ins
 from pipeline.grading.intake_files import digest, open_submission
 from pipeline.synthesis import write_submission
+from tests.commandline import cartlab_here
 from tests.hostile import SECRET, write_hostile
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pipes, links and rights of POSIX")
@@ -212,11 +213,8 @@ def test_no_cell_is_a_formula_and_all_json_is_valid(graded):
     base, _, _ = graded
     out = base / "out-school"
     for lms in ("canvas", "moodle", "gradescope"):
-        subprocess.run(
-            [sys.executable, "-m", "pipeline", "export", str(out), "--lms", lms,
-             "--out", str(base / "lms")],
-            check=True, capture_output=True, cwd=Path(__file__).parents[1],
-        )  # fmt: skip
+        done = cartlab_here("export", out, "--lms", lms, "--out", base / "lms")
+        assert done.returncode == 0
     tables = [out / "grades.csv", *(base / "lms").glob("*.csv")]
     assert len(tables) == 4
     for table in tables:

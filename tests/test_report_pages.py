@@ -29,8 +29,9 @@ from tests.ucsd import write_one_cart_submission, write_two_cart_submission
 from tests.waiting import PATIENCE
 
 CASES = (
-    "one", "two", "three", "real-one", "real-two", "gap", "solution", "effects",
-    "class", "feedback",
+    "one", "two", "three", "gap", "solution", "effects", "class", "feedback",
+    *(pytest.param(case, marks=[pytest.mark.slow, pytest.mark.sample])
+      for case in ("real-one", "real-two")),
 )  # fmt: skip
 LARGEST = 3_000_000  # bytes of a page
 WIDE, PHONE = (1280, 900), (390, 844)
