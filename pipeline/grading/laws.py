@@ -14,7 +14,7 @@ import numpy as np
 
 from pipeline.grading.orders import orders
 from pipeline.grading.rubric import is_damping
-from pipeline.grading.tolerance import half_digit
+from pipeline.grading.tolerance import rounding
 from pipeline.plant.chain import Array, parameter_names
 
 MOST_WIDENING = 4  # tolerances; a law that then still fails is simply broken
@@ -43,14 +43,14 @@ def judge_laws(
     names = parameter_names(n)
     if any(name not in final for name in names):
         return None
-    rounding = {name: float(half_digit(final[name])) for name in names}
+    half = {name: float(rounding(final[name])) for name in names}
     percent = {
         name: (damping_percent if is_damping(name) else frequency_percent) / 100 for name in names
     }
 
     def box(step: int) -> dict[str, float]:
         share = step / _PER_TOLERANCE
-        return {x: max(rounding[x], share * percent[x] * abs(float(final[x]))) for x in names}
+        return {x: max(half[x], share * percent[x] * abs(float(final[x]))) for x in names}
 
     results, last = _evaluate(final, box(0), n=n), MOST_WIDENING * _PER_TOLERANCE
     needed = {name: 0 if holds else last for name, (_, holds) in results.items()}

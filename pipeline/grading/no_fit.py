@@ -1,11 +1,12 @@
 """Final estimates copied from the initial ones: too many coincidences for a fit."""
 
 from decimal import Decimal
+from fractions import Fraction
 from math import exp
 
 from pipeline.grading.reference import Reference, References
 from pipeline.grading.rubric import is_damping
-from pipeline.grading.tolerance import half_digit, percent_off
+from pipeline.grading.tolerance import percent_off, rounding
 from pipeline.submission import Reported
 
 # How far an initial and a final estimate of one number usually lie apart, relative: where the
@@ -49,7 +50,7 @@ def _coincidence(typed: Decimal, reference: Reference | None, name: str) -> floa
     if not typed:
         return 1.0
     damping = is_damping(name)
-    step = 2 * float(half_digit(typed)) / abs(float(typed))
+    step = 2 * float(rounding(typed) / abs(Fraction(typed)))
     apart = _APART_DAMPING_BLURRED if damping else _APART_BLURRED
     if reference is None or reference.low <= 0:
         return min(1.0, step / (apart * _NORMAL))
