@@ -88,6 +88,14 @@ SPOILT = {
     "cart 2 dead in every step": ("step", slice(None), dead("x2"), "encoder of cart 2"),
     "cart 1 dead in a step": ("step", slice(1), dead("x1"), "encoder of cart 1"),
     "all dwells exchanged": ("sine", slice(None), exchanged, "exchanged"),
+    "four dwells exchanged": ("sine", slice(1, 22, 6), exchanged, "exchanged"),
+    "every second dwell exchanged": ("sine", slice(None, None, 2), exchanged, "exchanged"),
+    "a step exchanged": ("step", slice(1), exchanged, "exchanged"),
+    "the sweep exchanged": ("sweep", slice(None), exchanged, "exchanged"),
+    "a dwell ten times too far": ("sine", slice(3, 4), times(10, "x1", "x2"), "another unit"),
+    "a step ten times too far": ("step", slice(1), times(10, "x1", "x2"), "another unit"),
+    "cart 1 turned in four dwells": ("sine", slice(1, 22, 6), times(-1, "x1"), "sign of x1"),
+    "cart 1 turned in the sweep": ("sweep", slice(None), times(-1, "x1"), "sign of x1"),
     "cart 1 frozen in a step": ("step", slice(1), frozen("x1"), "froze"),
     "cart 2 frozen in a step": ("step", slice(1, 2), frozen("x2"), "froze"),
     "all steps in millimetres": ("step", slice(None), times(10, "x1", "x2"), "another unit"),
@@ -99,11 +107,13 @@ SPOILT = {
 }
 
 
+@pytest.mark.parametrize("sign", ["", ", sign = 1"])
 @pytest.mark.parametrize("case", SPOILT)
-def test_what_is_wrong_is_named_left_out_and_flagged(case, bench, tmp_path):
+def test_what_is_wrong_is_named_left_out_and_flagged(case, sign, bench, tmp_path):
     """The spoilt records and no others are out of all estimates; report and grade say why."""
     kind, which, how, word = SPOILT[case]
     folder = shutil.copytree(bench, tmp_path / "spoilt")
+    _change(folder, ", sign = 1", sign)
     paths = files(folder, kind)[which]
     for path in paths:
         spoil(path, how)
@@ -119,6 +129,13 @@ def test_what_is_wrong_is_named_left_out_and_flagged(case, bench, tmp_path):
     assert flag.code == "data_problem"
     assert set(flag.parameters) == {path.stem for path in paths}
     _numbers_are_right(analysis)
+
+
+def _change(folder: Path, old: str, new: str) -> None:
+    path = folder / "submission.toml"
+    text = path.read_text(encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, new), encoding="utf-8")
 
 
 def _failed(analysis: Analysis) -> set[str]:
@@ -180,9 +197,7 @@ def test_one_clock_in_milliseconds_throughout_fails_the_dwells(bench, tmp_path):
 def test_one_recording_in_two_experiments_counts_once(bench, tmp_path):
     """A repeat that names the file of another is left out, and flagged."""
     folder = shutil.copytree(bench, tmp_path / "copied")
-    path = folder / "submission.toml"
-    text = path.read_text(encoding="utf-8").replace("data/step-2.csv", "data/step-1.csv")
-    path.write_text(text, encoding="utf-8")
+    _change(folder, "data/step-2.csv", "data/step-1.csv")
     graded = grade_submission(
         load_submission(folder), rubric=load_rubric(Path(PRESET)), name="team"
     )
@@ -201,6 +216,41 @@ def test_columns_exchanged_in_every_recording_are_named(bench, tmp_path):
     assert {one.experiment for one in analysis.left_out} == {path.stem for path in driven}
     assert all("exchanged" in one.reason for one in analysis.left_out)
     assert "fit.identified" in _failed(analysis)
+
+
+def test_dwells_and_steps_that_contradict_one_another_identify_nothing(bench, tmp_path):
+    """The input of all dwells or all steps is ten times off, nobody knows which: both are said."""
+    folder = shutil.copytree(bench, tmp_path / "undecided")
+    for path in files(folder, "sine"):
+        spoil(path, times(10, "input"))
+    path = folder / "submission.toml"
+    text = path.read_text(encoding="utf-8")
+    runs = text.split("[[experiments]]")
+    kept = [run for run in runs if 'kind = "sweep"' not in run]
+    assert len(kept) == len(runs) - 1
+    path.write_text("[[experiments]]".join(kept), encoding="utf-8")
+    analysis = analyse(load_submission(folder))
+    both = {path.stem for path in [*files(folder, "sine"), *files(folder, "step")]}
+    assert {one.experiment for one in analysis.left_out} == both
+    assert all("nothing tells which" in one.reason for one in analysis.left_out)
+    assert analysis.chain is None
+    initial = {row.name for row in analysis.rows if row.initial is not None}
+    assert initial == {"omega_1", "omega_2", "zeta_1", "zeta_2"}
+
+
+def test_a_record_that_follows_no_carts_is_left_out_without_an_accusation(bench, tmp_path):
+    """What moves in a dwell is not what its input moves."""
+    folder = shutil.copytree(bench, tmp_path / "stray")
+    path = files(folder, "sine")[4]
+
+    def another(columns: Columns) -> Columns:
+        x = np.round(2 * np.sin(17 * columns["time"] + 5 * columns["time"] ** 2), 3)
+        return {**columns, "x1": x, "x2": x}
+
+    spoil(path, another)
+    analysis = analyse(load_submission(folder), design=False)
+    assert [(one.experiment, one.is_wrong) for one in analysis.left_out] == [(path.stem, False)]
+    _numbers_are_right(analysis)
 
 
 def test_records_of_two_carts_identify_no_third(bench, tmp_path):

@@ -15,6 +15,7 @@ LEVELS = (
     ("plant",),
     ("results", "submission"),
     ("ingest", "stages"),
+    ("identify",),
     ("workflow", "synthesis", "results_json"),
     ("gap",),
     ("exchange", "report"),

@@ -13,7 +13,7 @@ from pipeline.stages.compare import (
     DAMPING_LIMIT,
     GAIN_AND_FREQUENCY_LIMIT,
 )
-from pipeline.stages.faults import FOLLOWED, follow
+from pipeline.stages.follow import follow
 
 # A fitted frequency or gain that far from the measured one: the fit has gone astray; factors.
 _ASTRAY, _ASTRAY_GAIN = 1.3, 1.6
@@ -145,8 +145,9 @@ def _is_followed(analysis: Analysis) -> bool:
     rounding: the point is off by several of its errors, the record follows all the same.
     """
     bad = {one.experiment for one in analysis.left_out}
-    fits = follow([r for r in analysis.records if r.id not in bad], analysis.chain)
-    return bool(fits) and sum(f.share <= FOLLOWED for f in fits.values()) >= _MOST * len(fits)
+    sound = [r for r in analysis.records if r.id not in bad]
+    fits = follow(sound, analysis.chain) if analysis.chain else {}
+    return bool(fits) and sum(fit.belongs for fit in fits.values()) >= _MOST * len(fits)
 
 
 def _final(

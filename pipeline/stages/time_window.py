@@ -194,7 +194,7 @@ def compare(window: Window, modes: Modes) -> Misfit:
         slopes = _real_part(np.concatenate(d_weights, axis=2), np.concatenate(signals))
     else:
         slopes = np.zeros((n_p, p, n))
-    slopes = (slopes / window.sigma[:, None]).reshape(n_p, -1)
+    slopes = (slopes / window.sigma[:, None]).reshape(n_p, p * n)
     slopes = slopes - (slopes @ basis) @ basis.T
     return Misfit(
         residual=(rest - basis @ along).reshape(p, n),

@@ -1,0 +1,60 @@
+"""What could not run, and what a reader must know."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import ParamSpec, TypeVar
+
+from pipeline.errors import DataError
+from pipeline.results import Skipped
+
+P = ParamSpec("P")
+T = TypeVar("T")
+Progress = Callable[[str], None]
+
+_LISTED = 4  # more runs than these are not named one by one
+
+
+@dataclass
+class Log:
+    """What could not run and what a reader must know, collected along the way."""
+
+    skipped: list[Skipped] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+    def attempt(
+        self, stage: str, run: Callable[P, T], *args: P.args, **options: P.kwargs
+    ) -> T | None:
+        """Run one stage; data that do not support it are a reason, not an end."""
+        try:
+            return run(*args, **options)
+        except DataError as error:
+            self.skip(stage, str(error))
+            return None
+
+    def skip(self, stage: str, reason: str) -> None:
+        """Note why a stage did not run."""
+        self.skipped.append(Skipped(stage=stage, reason=reason))
+
+    def warn(self, texts: Iterable[str]) -> None:
+        """Add what is not said yet."""
+        self.warnings += [text for text in texts if text and text not in self.warnings]
+
+    def add(self, other: "Log") -> None:
+        """Add what another log holds."""
+        self.skipped += other.skipped
+        self.warn(other.warnings)
+
+
+def by_note(notes: Iterable[tuple[str, str]]) -> list[str]:
+    """Return one sentence a note, headed by all the runs it is about."""
+    runs: dict[str, list[str]] = {}
+    for run, note in notes:
+        if note:
+            runs.setdefault(note, []).append(run)
+    return [f"{_listed(list(dict.fromkeys(ids)))}: {note}" for note, ids in runs.items()]
+
+
+def _listed(ids: Sequence[str]) -> str:
+    if len(ids) <= _LISTED:
+        return ", ".join(ids)
+    return f"{ids[0]}, {ids[1]} … {ids[-1]} ({len(ids)} runs)"

@@ -1,0 +1,87 @@
+"""Which records the carts are identified from: those that hold what happened."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from itertools import combinations
+
+from pipeline.errors import DataError
+from pipeline.identify.carts import Identified, identify
+from pipeline.identify.log import Progress
+from pipeline.ingest.read import Ingested
+from pipeline.plant.chain import Chain
+from pipeline.results import LeftOut
+from pipeline.stages.bode_fit import fit_bode
+from pipeline.stages.compare import CHI_SQUARE_LIMIT
+from pipeline.stages.encoder_units import find_other_units
+from pipeline.stages.faults import find_faults, standing_still
+from pipeline.stages.follow import Followed, follow, most_follow
+from pipeline.stages.repeats import find_outlier_repeats
+from pipeline.submission import System
+
+_ROUNDS = 4  # of leaving out what the carts found without it show to be wrong
+
+
+def identify_from_sound(
+    data: Ingested, *, system: System, progress: Progress
+) -> tuple[Identified, list[LeftOut]]:
+    """Identify the carts without the records that they, or their repeats, show to be wrong.
+
+    Records in which a reading stands still bear no witness until the carts that the others show
+    say that it may.
+    """
+    driven = [r for r in data.records if r.kind in ("step", "sweep")]
+    unit = system.position.unit
+    # Shown by the encoder's own step, later by numbers that are gone once they are out.
+    shown = find_other_units(data.records)
+    contradicted = []
+    chain: Chain | None = None
+    fits: Mapping[str, Followed] = {}
+    left_out = find_outlier_repeats(driven, unit=unit) | shown
+    without = left_out.keys() | standing_still(data.records)
+    found = identify(data, without=without, system=system, progress=progress)
+    for _ in range(_ROUNDS):
+        # Where nothing is left to identify the carts from, the verdict before stands.
+        chain, fits = _witness(found, data, system=system) or (chain, fits)
+        faults = find_faults(data.records, chain=chain, fits=fits)
+        shown |= {**found.repeats.odd, **found.fitted.conflict}
+        # Most repeats may be the wrong ones: who is odd shows among the others.
+        sound = [record for record in driven if record.id not in faults]
+        odd = find_outlier_repeats(sound, unit=unit)
+        left_out = {**odd, **shown, **faults}
+        if left_out.keys() == without:
+            break
+        without = left_out.keys()
+        contradicted += [
+            check
+            for check in found.repeats.checks
+            if check.outcome == "fail"
+            and check.id.removeprefix("repeats.") not in found.repeats.undecided
+        ]
+        found = identify(data, without=without, system=system, progress=progress)
+    checks = {check.id: check for check in (*found.repeats.checks, *contradicted)}
+    repeats = replace(found.repeats, checks=tuple(checks.values()))
+    return (
+        replace(found, repeats=repeats),
+        [left_out[record.id] for record in data.records if record.id in left_out],
+    )
+
+
+def _witness(
+    found: Identified, data: Ingested, *, system: System
+) -> tuple[Chain, Mapping[str, Followed]] | None:
+    """Return the chain that the records follow, and how; or would, with two columns exchanged."""
+    if found.fit and most_follow(found.fitted.fits):
+        return found.fit.chain, found.fitted.fits
+    for i, j in combinations(sorted(response.cart for response in found.responses), 2):
+        turned = [replace(r, cart={i: j, j: i}.get(r.cart, r.cart)) for r in found.responses]
+        try:
+            fit = fit_bode(
+                sorted(turned, key=lambda response: response.cart),
+                n=system.carts,
+                springs=system.springs,
+            )
+        except DataError:
+            continue
+        if fit.chi_square_per_dof <= CHI_SQUARE_LIMIT:
+            return fit.chain, follow(data.records, fit.chain)
+    return (found.fit.chain, found.fitted.fits) if found.fit else None

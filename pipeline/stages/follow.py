@@ -1,0 +1,225 @@
+"""How well records follow a chain, and how one would have to be read to follow it.
+
+Start and encoder zeros aside, what a chain leaves of a record is linear in its columns. So the
+weights with which they follow best tell at once which column is turned or in another unit.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from pipeline.errors import DataError
+from pipeline.plant.chain import Array, Chain
+from pipeline.results import Record
+from pipeline.stages._signals import LENGTH_SCALES
+from pipeline.stages.chain_parameters import Parametrisation
+from pipeline.stages.modal_response import Modes, find_modes
+from pipeline.stages.time_window import Window, compare, open_window
+
+# What a time column is in where it counts so many times as much as seconds would.
+TIME_UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e-3: "thousands of seconds"}
+_SAME_SCALE = 0.1  # relative
+_SEEN_STEPS = 5.0  # encoder steps of motion: rounding changes a smaller one by any factor
+# Shares of a record's power (about its mean) that the chain leaves unexplained.
+_FOLLOWED = 0.1
+_DOUBTFUL, _BETTER = 0.005, 10.0  # as recorded at least this, read otherwise so many times less
+_DETUNED = np.linspace(0.85, 1.15, 13)
+# Simulated carts with dry friction F under a force of amplitude A leave at least (F / 5A)² where
+# they move at all, which is doubled here; encoder and noise hide shares below the least.
+_FRICTION, _LEAST = 10.0, 1e-4
+
+
+@dataclass(frozen=True, kw_only=True)
+class Followed:
+    """How a record follows a chain.
+
+    Attributes
+    ----------
+    lost : by cart, the share of its motion's power that neither chain nor noise explains.
+    reach : by cart, how far it moves over how far the chain does, root-mean-square.
+    friction : by cart, the most dry friction that this allows, in input units.
+    """
+
+    lost: dict[int, float]
+    reach: dict[int, float]
+    friction: dict[int, float]
+
+    @property
+    def share(self) -> float:
+        """Their mean."""
+        return float(np.mean(list(self.lost.values())))
+
+    @property
+    def belongs(self) -> bool:
+        """Whether the record follows."""
+        return self.share <= _FOLLOWED
+
+
+@dataclass(frozen=True, kw_only=True)
+class Misread:
+    """What makes a record follow: `words` say it; a `legal` one need not be a mistake."""
+
+    words: str
+    legal: bool = False
+
+
+def is_driven(record: Record) -> bool:
+    """Whether a logged input, which no controller chose, moves the carts."""
+    driven = record.kind in ("step", "sine", "sweep") and 1 in record.free
+    return driven and record.u is not None and bool(np.ptp(record.u) > 0)
+
+
+def measured(record: Record) -> list[int]:
+    """Return the free carts that were measured."""
+    return [cart for cart in record.carts if cart in record.free]
+
+
+def follow(records: Sequence[Record], chain: Chain) -> dict[str, Followed]:
+    """Hold every driven record in which the measured carts move against the chain, by id."""
+    found = {record.id: _hold_against(record, chain) for record in records if is_driven(record)}
+    return {name: fit for name, fit in found.items() if fit}
+
+
+def most_follow(fits: Mapping[str, Followed]) -> bool:
+    """Tell whether at least half of some records follow, if there are any."""
+    return 2 * sum(fit.belongs for fit in fits.values()) >= len(fits)
+
+
+def near(record: Record, chain: Chain) -> list[Followed]:
+    """Return how a record follows carts like those of the chain, a little slower or faster.
+
+    A spring that stiffens, or an input that comes late, shifts resonances by some percent, and at
+    one of them that is all of the motion.
+    """
+    held = (_hold_against(replace(record, t=factor * record.t), chain) for factor in _DETUNED)
+    return [fit for fit in held if fit]
+
+
+def find_misread(
+    record: Record, chain: Chain, fit: Followed, *, better: float = _BETTER
+) -> Misread | None:
+    """Return how a record must be read to follow the chain, so many times better than as it is.
+
+    Parameters
+    ----------
+    fit : how it follows as it is.
+    """
+    found, least = None, min(fit.share / better, _FOLLOWED)
+    if better > 1 and fit.share < _DOUBTFUL:
+        return None
+    # As the bench counts its input: a record's own sign was found by what it holds.
+    record = replace(record, u=0.0 - record.u) if record.turned and record.u is not None else record
+    for misread, other in _readings(record, chain):
+        held = _hold_against(other, chain)
+        if held and held.share <= least:
+            found, least = misread, held.share
+    return found
+
+
+def _readings(record: Record, chain: Chain) -> Iterator[tuple[Misread, Record]]:
+    for i, j in combinations(measured(record), 2):
+        rows = list(range(len(record.carts)))
+        a, b = record.carts.index(i), record.carts.index(j)
+        rows[a], rows[b] = b, a
+        words = f"x{i} and x{j} look exchanged"
+        other = replace(record, y=record.y[rows], resolution=record.resolution[rows])
+        yield Misread(words=words), other
+    for factor, unit in TIME_UNITS.items():
+        yield Misread(words=f"its time looks to be in {unit}"), replace(record, t=record.t / factor)
+    try:
+        window = open_window(record)
+    except DataError:
+        return
+    if np.any(np.ptp(window.y, axis=1) < _SEEN_STEPS * np.sqrt(12) * window.stated_sigma):
+        return
+    if (said := _say(window.carts, _weights(window, _modes(window, chain)))) is not None:
+        misread, factors = said
+        by_cart = dict(zip(window.carts, factors, strict=True))
+        rows = np.array([by_cart.get(cart, 1.0) for cart in record.carts])
+        yield (
+            misread,
+            replace(record, y=rows[:, None] * record.y, resolution=abs(rows) * record.resolution),
+        )
+
+
+def _weights(window: Window, modes: Modes) -> Array:
+    """Return the factors (p,) with which the columns follow best."""
+    driven = compare(replace(window, y=0 * window.y), modes).residual.ravel()
+    alone = [
+        compare(replace(window, drive_u=None, y=window.y * row[:, None]), modes).residual.ravel()
+        for row in np.eye(len(window.carts))
+    ]
+    best, *_ = np.linalg.lstsq(-np.array(alone).T, driven, rcond=None)
+    return np.asarray(best, dtype=np.float64)
+
+
+def _say(carts: Sequence[int], weights: Array) -> tuple[Misread, Array] | None:
+    """Say what is wrong where columns need about these factors, and which; None if nothing known.
+
+    A unit is that of the whole file: one cart near its null moves by any factor too little.
+    """
+    sign, size = np.sign(weights), np.abs(weights)
+    for scale in (*LENGTH_SCALES, *(1 / scale for scale in LENGTH_SCALES)):
+        if np.all(np.abs(size * scale - 1) < _SAME_SCALE) and len(set(sign)) == 1:
+            words = (
+                "its positions or its input look to be in another unit: they move "
+                f"{scale:.3g} times as far as its input moves the carts"
+            )
+            return Misread(words=words), sign / scale
+    turned = [f"x{cart}" for cart, s in zip(carts, sign, strict=True) if s < 0]
+    if len(turned) == len(carts):
+        return Misread(words="its input looks to count the other way", legal=True), sign
+    if turned:
+        return Misread(words=f"the sign of {' and '.join(turned)} looks turned"), sign
+    return None
+
+
+# ------------------------------------------------------------------ one record held
+
+
+def _modes(window: Window, chain: Chain) -> Modes:
+    """Return the modes of the chain without their slopes, which nothing here needs."""
+    P = Parametrisation(n=chain.n, springs=tuple(bool(k) for k in chain.k))
+    modes = find_modes(chain, free=window.free, parametrisation=P, slopes=np.zeros(len(P.names)))
+    return replace(
+        modes,
+        d_poles=modes.d_poles[:0],
+        d_shapes=modes.d_shapes[:0],
+        d_entry=modes.d_entry[:0],
+        d_drive=modes.d_drive[:0],
+    )
+
+
+def _hold_against(record: Record, chain: Chain) -> Followed | None:
+    try:
+        window = open_window(record)
+        residual = compare(window, _modes(window, chain)).residual * window.sigma[:, None]
+    except DataError:  # nothing moves, or the motor does not reach the last cart
+        return None
+    power = np.var(window.y, axis=1)
+    left = np.mean(residual**2, axis=1) - window.stated_sigma**2  # beyond encoder and noise
+    lost = np.maximum(left, 0.0) / power
+    reach = np.sqrt(power) / np.maximum(np.std(window.y + residual, axis=1), window.stated_sigma)
+    return Followed(
+        lost=dict(zip(window.carts, lost.tolist(), strict=True)),
+        reach=dict(zip(window.carts, reach.tolist(), strict=True)),
+        friction={
+            cart: float(_FRICTION * np.sqrt(max(share, _LEAST)) * np.ptp(force) / 2)
+            for cart, share in zip(window.carts, lost, strict=True)
+            if share <= _FOLLOWED and (force := force_on(record, chain, cart=cart)) is not None
+        },
+    )
+
+
+def force_on(record: Record, chain: Chain, *, cart: int) -> Array | None:
+    """Return what pulls at a cart (n,) by input and neighbours; None where one is not known."""
+    assert record.u is not None
+    force = record.u if cart == 1 else np.zeros_like(record.u)
+    for neighbour, k in ((cart - 1, chain.k[cart - 1]), (cart + 1, chain.k[cart])):
+        if neighbour in record.carts:
+            force = force + k * record.position(neighbour)
+        elif neighbour in record.free:
+            return None
+    return force
