@@ -2,14 +2,25 @@
 
 import re
 from dataclasses import replace
+from io import BytesIO
 
 import numpy as np
 import pypdf
 import pytest
 
 from pipeline.report.content import build_document
-from pipeline.report.document import Paragraph, Question, flat, plain
+from pipeline.report.document import (
+    Document,
+    Paragraph,
+    Question,
+    Section,
+    flat,
+    paragraph,
+    plain,
+    spans,
+)
 from pipeline.report.notes import discussion_blocks
+from pipeline.report.pdf import render_pdf
 from pipeline.report.questions import ask, open_line, split_notes
 from pipeline.report.render import render_report
 from pipeline.resources import EXAMPLES
@@ -229,6 +240,22 @@ def test_page_and_print_mark_the_place_and_show_the_answer(tmp_path):
     assert "To be answered" not in pages["done"] + prints["done"]
     for page in pages.values():  # the discussion's list leads to every question
         assert page.count('href="#question-zeta_b"') == page.count('id="question-zeta_b"') == 1
+
+
+@pytest.mark.parametrize("answered", [False, True])
+def test_a_question_is_printed_with_what_answers_it(answered):
+    """Wherever on a page it comes to stand."""
+    answer = (paragraph("Our answer. " + "It sticks. " * 40),) if answered else ()
+    question = Question(id="q", text=spans("Why so? " * 30), answer=answer)
+    line = paragraph("A line.")
+    blocks = tuple(block for n in range(60) for block in (question, *[line] * (n % 7)))
+    section = Section(id="s", title="S", blocks=blocks)
+    document = Document(title="T", subtitle="", authors=(), sections=(section,), footer="")
+    pages = pypdf.PdfReader(BytesIO(render_pdf(document))).pages
+    texts = [page.extract_text() for page in pages]
+    asked, said = ("Question.", "Our answer." if answered else "To be answered")
+    assert sum(text.count(asked) for text in texts) == 60
+    assert [text.count(asked) for text in texts] == [text.count(said) for text in texts]
 
 
 def test_a_new_submission_says_how_to_answer_without_answering(tmp_path):
