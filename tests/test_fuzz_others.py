@@ -90,7 +90,9 @@ def spoilt(name: str, rng: Random) -> bytes:
 
 def use(name: str, path: Path) -> None:
     """Read a file, and write what would be written of it."""
-    student = Student(id="s1", name="Jane Doe", number="7", grade=make_grade("a"), by_hand=False)
+    student = Student(
+        id="s1", name="Jane Doe", number="7", grade=make_grade("a"), by_hand=frozenset()
+    )
     if name == "survey.csv":
         survey = read_survey(path)
         json.dumps(survey_dict(survey), allow_nan=False)

@@ -32,7 +32,9 @@ _TABLE = st.integers(1, 6).flatmap(
     )
 )
 STUDENTS = [
-    Student(id=id_, name=name, number=number, grade=make_grade(name, share=0.5), by_hand=False)
+    Student(
+        id=id_, name=name, number=number, grade=make_grade(name, share=0.5), by_hand=frozenset()
+    )
     for id_, name, number in (("s1", "a", ""), ("", "=cmd", "1024"), ("S1", "b", "7"))
 ]
 

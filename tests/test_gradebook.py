@@ -348,6 +348,24 @@ def test_the_history_says_who_did_what_when_and_why(open_book):
     assert json.loads(json.dumps(history_dict(name, events)))["events"][2]["by"] == "Ada"
 
 
+def test_the_history_tells_under_which_name_a_team_goes_on(open_book):
+    """A folder that is called otherwise in the next run: the old name says so, and the new one."""
+    book = open_book()
+    finish(
+        book, make_outcome(make_grade("team-1", authors=("ann",))), make_outcome(make_grade("b"))
+    )
+    finish(
+        book,
+        make_outcome(make_grade("group-1", authors=("ann",))),
+        make_outcome(make_grade("b")),
+        make_outcome(make_grade("c")),
+    )
+
+    assert [e.text for e in book.history("team-1")[1]][-1].endswith("goes on as group-1")
+    assert "was team-1 before" in [e.text for e in book.history("group-1")[1]]
+    assert [e.text for e in book.history("c")[1]] == ["", ""]
+
+
 def test_rows_are_only_added(open_book, place):
     """The database itself refuses to change or delete what is in any of its tables."""
     book = open_book()

@@ -189,6 +189,15 @@ def test_moodle_own_worksheet_is_filled_in(tmp_path):
     assert remarks == ("not in roster.csv, so not exported: =ann",)
 
 
+def test_moodle_is_told_why_points_were_given_by_hand(tmp_path):
+    """Also where they are all of them."""
+    first = RUBRIC.criteria[0]
+    given = [("team-b", first.id, first.points)]
+    outcome = make_outcome(make_grade("team-b", share=0.0, authors=("bo",)))
+    rows, _ = write(tmp_path, outcome, platform="moodle", overrides=given)
+    assert "by hand from 0 to" in rows[1][2]
+
+
 def test_moodle_takes_a_table_of_grades_otherwise(tmp_path):
     """Where nobody's participant number is known: by id number."""
     rows, _ = write(tmp_path, FULL, platform="moodle", title="Lab 3")

@@ -297,6 +297,13 @@ def test_any_numbers_can_be_shown(values):
     assert not re.search(r"[\x00-\x08\x0b\x0c\x0e-\x1f]", html)
 
 
+def test_only_all_points_are_100_percent():
+    """19.95 of 20 is 99 %."""
+    page = class_page([Line.of(make_grade("a", points=19.95), by_hand=())], rubric=RUBRIC)
+    cells = re.sub(r"<[^>]+>", " ", page.split("All submissions.")[-1]).split()
+    assert cells[cells.index("19.95") + 1] == "99"
+
+
 def test_the_class_page_counts_what_there_is():
     """Mean and median of those graded, outcomes by criterion, mistakes by how many made them."""
     grades = [make_grade("a"), make_grade("b", share=0.5, flags=(hertz_flag(),)),

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.grading.reference import Reference
-from pipeline.grading.tolerance import credit, half_digit, percent_off, rounding
+from pipeline.grading.tolerance import as_typed, credit, half_digit, percent_off, rounding
 
 percents = st.decimals("0", "500", places=2).map(float)
 
@@ -92,3 +92,9 @@ def test_one_digit_is_excused_as_little_as_two():
     """3e1 may stand for 28.5 to 31.5, not for 25 to 35."""
     assert rounding(Decimal("3e1")) == Fraction(3, 2)
     assert percent_off(Decimal("3e1"), at(35.0), sigmas=0.0) == 100 * (Fraction(70, 63) - 1)
+
+
+@pytest.mark.parametrize("typed", ["0e2", "25.60", "1e-7", "3e5"])
+def test_numbers_are_shown_as_typed(typed):
+    """Not as Python would write them."""
+    assert as_typed(Decimal(typed)) == typed

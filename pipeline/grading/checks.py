@@ -17,7 +17,7 @@ from pipeline.grading.pieces import asked_pieces
 from pipeline.grading.reference import Reference
 from pipeline.grading.rubric import is_damping, matching
 from pipeline.grading.state_model import compare_entries
-from pipeline.grading.tolerance import NO_CREDIT, credit, percent_off, rounding
+from pipeline.grading.tolerance import NO_CREDIT, as_typed, credit, percent_off, rounding
 from pipeline.grading.work import ALL, NONE, Verdict, Work, mean_share
 
 _NAMED = 4  # so many are named in a message
@@ -60,9 +60,13 @@ def _required(work: Work) -> Verdict:
     pieces, missing = asked_pieces(work.rubric), work.missing
     if not pieces:
         return Verdict(share=ALL, message="Nothing in particular was asked for.")
+    unread = _listed(list(work.analysis.unreadable))
+    here = "All that was asked for is here" + (
+        f", without {unread}, not readable" if unread else ""
+    )
     return Verdict(
         share=ALL - Fraction(len(missing), len(pieces)),
-        message=f"Missing: {_listed(missing)}." if missing else "All that was asked for is here.",
+        message=f"Missing: {_listed(missing)}." if missing else f"{here}.",
         expected={"pieces": pieces},
         found={"missing": missing},
     )
@@ -112,7 +116,7 @@ def _parameters(criterion: asked.Parameters, work: Work) -> Verdict:
         if shares[-1] < 1:
             wrong.add(name)
             there = f", your recordings give {known[name].said}" if name in known else ""
-            off.append(f"{name}: you report {table[name]}{there}")
+            off.append(f"{name}: you report {as_typed(table[name])}{there}")
     left = f" Not judged: {_listed(guessed)}." if guessed and criterion.check == "final" else ""
     message = f"{'; '.join(off[:_NAMED])}." if off else "As your own recordings say."
     return Verdict(
@@ -147,7 +151,7 @@ def _initial_final(criterion: asked.InitialFinal, work: Work) -> Verdict:
     for name in both:
         shares.append(_credit(between(initial[name], final[name]), name, criterion))
         if shares[-1] < 1:
-            apart.append(f"{name}: first {initial[name]}, then {final[name]}")
+            apart.append(f"{name}: first {as_typed(initial[name])}, then {as_typed(final[name])}")
     return Verdict(
         share=mean_share(shares),
         message=f"{'; '.join(apart[:_NAMED])}." if apart else "Both estimates agree.",
@@ -218,7 +222,9 @@ def _state_space(criterion: asked.StateModel, work: Work) -> Verdict:
     off = [e for e, share in zip(entries, shares, strict=True) if share < 1]
     return Verdict(
         share=mean_share(counted),
-        message="; ".join(f"{e.name} = {e.typed}, expected {e.right[0]:.4g}" for e in off[:_NAMED])
+        message="; ".join(
+            f"{e.name} = {as_typed(e.typed)}, expected {e.right[0]:.4g}" for e in off[:_NAMED]
+        )
         + "."
         if off
         else "A and B follow from the table.",

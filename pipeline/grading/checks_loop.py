@@ -7,7 +7,7 @@ import numpy as np
 from pipeline.grading import rubric as asked
 from pipeline.grading.controller import Controller, same_gains
 from pipeline.grading.reference import Reference
-from pipeline.grading.tolerance import credit, exact, percent_off, rounding
+from pipeline.grading.tolerance import as_typed, credit, exact, percent_off, rounding
 from pipeline.grading.work import NONE, Verdict, Work, mean_share
 from pipeline.plant.chain import Array
 
@@ -57,7 +57,7 @@ def judge_gains(criterion: asked.Gains, work: Work) -> Verdict:
     does = (
         "the loop is unstable"
         if not found["stable"]
-        else f"overshoot {overshoot:.3g} %, "
+        else f"overshoot {round(overshoot, 2):.3g} %, "
         + (f"settling in {settling:.3g} s" if settling is not None else "no settling in sight")
     )
     return Verdict(
@@ -136,7 +136,7 @@ def judge_prefilter(criterion: asked.Prefilter, work: Work) -> Verdict:
         share=best,
         message="One over the static gain of the loop, as it should be."
         if best == 1
-        else f"These gains need {right:.4g}, you report {typed}.",
+        else f"These gains need {right:.4g}, you report {as_typed(typed)}.",
         expected={"prefilter": right},
         found={"prefilter": float(typed)},
     )

@@ -1,5 +1,6 @@
 """The class at a glance: distribution, difficulty, the most common mistakes, everybody's grade."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import count
@@ -265,7 +266,7 @@ def _row(line: Line) -> list[Cell]:
         cell(_link(line.name)),
         cell(clean(listing(list(line.authors))) or NOTHING),
         cell(points_text(line.points)),
-        cell(f"{share:.0f}"),
+        cell(f"{math.floor(share)}"),  # 100 is for all points alone
         cell(f"{line.days_late:.3g}" if line.days_late else "0"),
         cell("not graded", "bad") if failed else cell(", ".join(line.codes)),
         cell(", ".join(line.by_hand)),

@@ -13,7 +13,7 @@ from pipeline.grading.grade import Flag
 from pipeline.grading.loop_numbers import LoopNumbers, loop_numbers
 from pipeline.grading.reference import is_explained
 from pipeline.grading.state_model import own_chain
-from pipeline.grading.tolerance import rounding
+from pipeline.grading.tolerance import as_typed, rounding
 from pipeline.plant.chain import Array, Chain
 from pipeline.plant.robustness import MASS_SPRING_ERROR, level_error_percent
 from pipeline.results import Analysis
@@ -310,7 +310,7 @@ def _gains_flag(
     goal = controller.goal
     settles = numbers.settling_time
     does = (
-        f"overshoot {numbers.overshoot:.3g} %, settling "
+        f"overshoot {round(numbers.overshoot, 2):.3g} %, settling "
         + (f"in {settles:.3g} s" if settles is not None else "not in sight")
         if numbers.stable
         else "the loop is unstable"
@@ -357,7 +357,7 @@ def _prefilter_flag(controller: Controller, numbers: LoopNumbers, *, slip: str) 
     return Flag(
         code="wrong_prefilter",
         parameters=("prefilter",),
-        message=f"prefilter: these gains need {right:.4g}, you report {typed}: {hint}.",
+        message=f"prefilter: these gains need {right:.4g}, you report {as_typed(typed)}: {hint}.",
         evidence={
             "parameter": "prefilter",
             "reported": float(typed),

@@ -11,7 +11,7 @@ from pipeline.grading.mistakes import Mistake, known_mistakes
 from pipeline.grading.no_fit import copied_final
 from pipeline.grading.reference import Reference, References
 from pipeline.grading.rubric import is_damping
-from pipeline.grading.tolerance import percent_off
+from pipeline.grading.tolerance import as_typed, percent_off
 from pipeline.grading.transient import transient_fits
 from pipeline.results import Analysis
 from pipeline.submission import Reported
@@ -267,7 +267,7 @@ def _specific_flags(
                 parameters=tuple(names),
                 message=f"{name} ({_TOLD[first.table]}): "
                 + first.mistake.help.format(
-                    reported=typed, recomputed=f"{reference.value:.4g}", name=name
+                    reported=as_typed(typed), recomputed=f"{reference.value:.4g}", name=name
                 )
                 + ".",
                 evidence=evidence,
@@ -296,21 +296,22 @@ def _off_flag(
     return Flag(
         code=code,
         parameters=tuple(names),
-        message=f"{worst}: your recordings give {reference.said}, you report {typed}: {look}.",
+        message=f"{worst}: your recordings give {reference.said}, you report "
+        f"{as_typed(typed)}: {look}.",
         evidence=_evidence(worst, typed, reference, label),
     )
 
 
 def _impossible_flag(
-    table: Table, names: Sequence[str], known: Mapping[str, Reference], label: str
+    table: Table, names: Sequence[str], known: Mapping[str, Reference], label: Label
 ) -> Flag:
     name = names[0]
     hint = "is a sign wrong?" if table[name] else "type as many digits as show how large it is."
     return Flag(
         code="physically_impossible",
         parameters=tuple(names),
-        message=f"{name} = {table[name]}: gains, frequencies and dampings of carts on springs are "
-        f"positive; {hint}",
+        message=f"{name} = {as_typed(table[name])} ({_TOLD[label]}): gains, frequencies and "
+        f"dampings of carts on springs are positive; {hint}",
         evidence=_evidence(name, table[name], known.get(name), label),
     )
 
@@ -370,8 +371,8 @@ def _disagreement_flag(reported: Reported, apart: Sequence[tuple[float, str]]) -
     return Flag(
         code="initial_final_disagree",
         parameters=tuple(name for _, name in apart),
-        message=f"{worst}: your first estimate is {initial}, the final one {final}: one of the two "
-        "is worth another look.",
+        message=f"{worst}: your first estimate is {as_typed(initial)}, the final one "
+        f"{as_typed(final)}: one of the two is worth another look.",
         evidence={
             "parameter": worst,
             "initial": float(initial),

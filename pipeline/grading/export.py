@@ -13,7 +13,7 @@ Each form is a table with a row for every student. Given the table that the plat
 
 import html
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -146,17 +146,18 @@ def _comment(student: Student) -> str:
     """Return the feedback in short, as the HTML that Moodle takes it for."""
     if student.undecided:
         return ""
-    return "<br>".join(html.escape(line, quote=False) for line in _said(student.grade))
+    said = _said(student.grade, by_hand=student.by_hand)
+    return "<br>".join(html.escape(line, quote=False) for line in said)
 
 
-def _said(grade: Grade) -> list[str]:
-    """Return what was lost and what to look at, a line each."""
+def _said(grade: Grade, *, by_hand: Collection[str]) -> list[str]:
+    """Return what was lost or given by hand, and what to look at, a line each."""
     if grade.status == "failed" and not grade.criteria:
         return [f"Could not be graded: {grade.reason}"]
     lost = [
         f"{c.title or c.id}: {points_text(c.points)} of {points_text(c.out_of)}. {c.message}"
         for c in grade.criteria
-        if c.points < c.out_of
+        if c.points < c.out_of or c.id in by_hand
     ]
     late = [f"Late: {points_text(grade.deducted)} points off."] if grade.deducted else []
     return [*lost, *map(told, grade.flags), *late]

@@ -23,6 +23,7 @@ class Student:
     name, number : as the learning platform calls who handed it in, or "". The number is the
         platform's that the grades are for. Of several authors nobody says which that is: it is
         then a student beside them, known as `uploader`.
+    by_hand : the criteria whose points were given by hand.
     undecided : where the student is in several submissions with different points: in which ones.
     """
 
@@ -30,7 +31,7 @@ class Student:
     name: str
     number: str
     grade: Grade
-    by_hand: bool
+    by_hand: frozenset[str]
     uploader: bool = False
     undecided: str = ""
 
@@ -105,7 +106,8 @@ def _students(entry: Entry, *, platform: Platform) -> list[Student]:
     number = number if of in ("", platform) else ""
     given = [author for o in entry.overrides.values() for author in o.authors]
     authors = entry.grade.authors or tuple(dict.fromkeys(given)) or ("",)
-    own = Student(id="", name=name, number=number, grade=entry.grade, by_hand=bool(entry.overrides))
+    by_hand = frozenset(entry.overrides)
+    own = Student(id="", name=name, number=number, grade=entry.grade, by_hand=by_hand)
     if len(authors) == 1:
         return [replace(own, id=authors[0])]
     named = [replace(own, id=author, name="", number="") for author in authors]

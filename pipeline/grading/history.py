@@ -73,23 +73,50 @@ def _overridden(connection: Connection, submission: int) -> Iterator[Event]:
 def _listed(connection: Connection, submission: int) -> Iterator[Event]:
     """Yield the class lists in which something was new, and those it is no longer in."""
     own = and_(entries.c.batch_id == batches.c.id, entries.c.submission_id == submission)
-    columns = batches.c.at, batches.c.rubric, entries.c.points, entries.c.out_of, entries.c.shared
+    of_batch = batches.c.id, batches.c.at, batches.c.rubric
+    columns = *of_batch, entries.c.points, entries.c.out_of, entries.c.shared
     of_class = select(submissions.c.assignment).where(submissions.c.id == submission)
     lists = select(*columns).select_from(batches.outerjoin(entries, own))
     lists = lists.where(batches.c.assignment == of_class.scalar_subquery())
-    before, judged_by = None, ""
-    for at, rubric, points, out_of, shared in connection.execute(lists.order_by(batches.c.id)):
+    before, judged_by, last = None, "", None
+    for batch, at, rubric, points, out_of, shared in connection.execute(
+        lists.order_by(batches.c.id)
+    ):
+        previous, last = last, batch
         if points is None:
             if before is not None:
-                yield Event(at=at, what="removed", points=None, text="off the class list")
+                now = _other_name(connection, submission, of=previous, among=batch)
+                text = "off the class list" + (f": goes on as {now}" if now else "")
+                yield Event(at=at, what="removed", points=None, text=text)
             before = None
             continue
         said = ["shared_data"] if shared else []
+        if before is None and (
+            then := _other_name(connection, submission, of=batch, among=previous)
+        ):
+            said.append(f"was {then} before")
         if judged_by and rubric != judged_by:
             said += [f"rubric: {change}" for change in rubric_changes(judged_by, rubric)]
         if ((points, out_of, shared), rubric) != (before, judged_by):
             yield Event(at=at, what="listed", points=points, out_of=out_of, text="; ".join(said))
         before, judged_by = (points, out_of, shared), rubric
+
+
+def _other_name(
+    connection: Connection, submission: int, *, of: int | None, among: int | None
+) -> str:
+    """Return what a submission of one class list is called in another where only its people are."""
+
+    def listed(batch: int | None) -> dict[int, tuple[str, str]]:
+        rows = select(submissions.c.id, submissions.c.name, gradings.c.authors)
+        rows = rows.select_from(entries.join(submissions).join(gradings))
+        rows = rows.where(entries.c.batch_id == batch)
+        return {row.id: (row.name, row.authors) for row in connection.execute(rows)}
+
+    here, there = listed(of), listed(among)
+    people = here[submission][1]
+    found = [name for i, (name, by) in there.items() if i not in here and by == people != "[]"]
+    return found[0] if len(found) == 1 else ""
 
 
 def history_dict(submission: str, events: Sequence[Event]) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from decimal import Decimal
 
 from pipeline.grading.grade import Flag
 from pipeline.grading.orders import orders
-from pipeline.grading.tolerance import rounding
+from pipeline.grading.tolerance import as_typed, rounding
 
 # How far an order may be broken: fitted numbers are good to some percent, and first estimates of
 # resonances and nulls are read off a plot.
@@ -47,8 +47,8 @@ class BrokenOrder:
         return Flag(
             code="physically_impossible",
             parameters=self.names,
-            message=f"{self.lesser} = {low} cannot be above {self.greater} = {high}: "
-            f"{self.reason}.",
+            message=f"{self.lesser} = {as_typed(low)} cannot be above {self.greater} = "
+            f"{as_typed(high)} ({label} estimates): {self.reason}.",
             evidence={
                 "table": label,
                 "reported": {self.lesser: float(low), self.greater: float(high)},

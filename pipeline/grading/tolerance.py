@@ -19,6 +19,11 @@ def half_digit(typed: Decimal) -> Fraction:
     return Fraction(10) ** exponent / 2
 
 
+def as_typed(typed: Decimal) -> str:
+    """Return a number as its author wrote it: `0e2` where Python would write `0E+2`."""
+    return str(typed).replace("E+", "e").replace("E", "e")
+
+
 def rounding(typed: Decimal) -> Fraction:
     """Return how far rounding may have moved a number: half a digit, at most 5 % of it."""
     return min(half_digit(typed), _MOST_ROUNDING * abs(Fraction(typed)))

@@ -246,9 +246,9 @@ def _hardware(analysis: Analysis) -> Iterator[Asked]:
             id="level",
             section="hardware",
             text=f"In {off_level.experiment} cart {off_level.cart} stops at {measured} {unit} "
-            f"where the model stops at {model} {unit}. State feedback has no integrator: which "
-            "force, or which error of the model, explains this, and how would you tell one from "
-            "the other?",
+            f"where the model stops at {model} {unit}. Which force, or which error of the model, "
+            "explains this, how would you tell one from the other, and what would an integrator in "
+            "the controller do about it?",
         )
     over = max(controlled, key=_overshoot_error, default=None)
     if over and _overshoot_error(over) > _OVERSHOOT:
