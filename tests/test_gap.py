@@ -159,6 +159,8 @@ def test_repeats_are_compared_by_the_edge_of_their_input():
     assert repeatability([runs[0], make_run(replace(later, u=0.5 * u), n=1)]) is None
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_two_effects_are_found_together():
     """Two hidden effects are both named."""
     case = make_case(seed=44, n=1, effects=["coulomb_friction", "saturation"], rate=113.1)
