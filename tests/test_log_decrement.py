@@ -11,6 +11,7 @@ from pipeline.ingest.read import read_data
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.simulate import simulate_linear
 from pipeline.results import Kind, Record
+from pipeline.stages._ringing import Ringing
 from pipeline.stages.log_decrement import fit_log_decrement
 from pipeline.submission import load_submission
 from tests.ucsd import write_two_cart_submission
@@ -443,3 +444,19 @@ def test_a_crest_of_equal_readings_turns_in_its_middle():
     half = np.pi / (OMEGA * np.sqrt(1 - zeta**2))
     # The middle of a whole number of samples, the first and last of them up to one off.
     assert_allclose((flat - RELEASE) / half, np.round((flat - RELEASE) / half), atol=1 / FS / half)
+
+
+def test_a_fit_of_spikes_is_finite_before_its_start():
+    """A fit to values of 1e12 is no decay; carried back over those before it, nothing overflows."""
+    fit = Ringing(
+        t0=1.25,
+        level=0.0,
+        slope=0.0,
+        poles=np.array([-1578 + 66_102j]),
+        amplitudes=np.array([1e14 + 0j]),
+        covariance=np.zeros((4, 4)),
+        rms=1.0,
+        converged=True,
+    )
+    assert np.isfinite(fit(np.linspace(0.0, 2.0, 50))).all()
+    assert fit.growth(np.array([1.25]))[0] == pytest.approx(1.0)
