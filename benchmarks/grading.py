@@ -47,9 +47,11 @@ def gradings(seed: int, *, slips: int) -> Iterator[tuple[str, Team, set[str]]]:
         if team.bench.chain.n == 1 and not OF_SEVERAL_CARTS.isdisjoint(codes):
             continue
         slipped = replace(team, rng=np.random.default_rng([9, seed, turn]))
+        unchanged = False  # this team has no way to make one of them
         for slip in made:
-            slipped = slip(slipped)
-        if slipped.submission is team.submission:  # this team has no way to make it
+            before, slipped = slipped, slip(slipped)
+            unchanged |= slipped.submission is before.submission
+        if unchanged:
             continue
         # Who hands in no recordings is told so as well.
         beside = {"missing"} if "initial_final_disagree" in codes else set()

@@ -27,7 +27,7 @@ def flags(team: Team) -> list[str]:
     return [f"{flag.code}: {flag.message}" for flag in team.grade().flags]
 
 
-@pytest.mark.parametrize("seed", [5, 30, 90])
+@pytest.mark.parametrize("seed", [5, 30, 90, 60023, 60066])
 def test_little_damping_accuses_nobody(seed):
     """Where dwells put a damping at zero, or dry friction has a share in it, nobody is wrong."""
     team = make_team(seed)

@@ -10,7 +10,6 @@ from pipeline.plant.chain import Chain
 from pipeline.results import Analysis, Estimate, ParameterRow, StepEdge
 from pipeline.stages.compare import (
     CHI_SQUARE_LIMIT,
-    DAMPING_LIMIT,
     GAIN_AND_FREQUENCY_LIMIT,
 )
 from pipeline.stages.follow import follow
@@ -167,8 +166,10 @@ def _final(
             spread = _BY_EYE if row.initial.source == "frequency_response" else 1.0
             measured += [row.initial.value / spread, row.initial.value * spread]
     told = fitted is not None and not (is_damping(row.name) and _undamped(analysis))
-    if fitted and told and is_explained(analysis):
-        measured = [value for value in measured if _agrees(value, fitted, name=row.name)]
+    # No unit, sign or clock is in a damping; but dry friction adds to it, more to dwells than to
+    # decays, and where those are few the fit explains them all the same.
+    if fitted and told and not is_damping(row.name) and is_explained(analysis):
+        measured = [value for value in measured if _agrees(value, fitted)]
     if not measured and not (told and (is_explained(analysis) or _is_followed(analysis))):
         return None
     bounds = [*measured, *([fitted.value] if fitted and told else [])]
@@ -181,14 +182,13 @@ def _final(
     )
 
 
-def _agrees(value: float, fitted: Estimate, *, name: str) -> bool:
+def _agrees(value: float, fitted: Estimate) -> bool:
     """Whether a reading may be of the number that a fit explains the data with.
 
     Else it is of a recording that holds something else, and no bound of what is right.
     """
-    percent = DAMPING_LIMIT if is_damping(name) else GAIN_AND_FREQUENCY_LIMIT
-    slack = _SIGMAS * (fitted.std or 0.0)
-    least, most = fitted.value / (1 + percent / 100), fitted.value * (1 + percent / 100)
+    slack, factor = _SIGMAS * (fitted.std or 0.0), 1 + GAIN_AND_FREQUENCY_LIMIT / 100
+    least, most = fitted.value / factor, fitted.value * factor
     return least - slack <= value <= most + slack
 
 
