@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from pipeline.identify.fit import Fitted, fit_carts
-from pipeline.identify.log import Log, Progress, by_note
+from pipeline.identify.log import Log, Progress, by_note, listed
 from pipeline.ingest.read import Ingested
 from pipeline.results import (
     ChainFit,
@@ -59,12 +59,13 @@ def identify(
     """Take the records, but for those without, through the stages up to the fit."""
     n, springs, log = system.carts, system.springs, Log()
     records = [record for record in data.records if record.id not in without]
+    out = [record for record in data.records if record.id in without]
     driven = _driven(records, n=n, log=log)
 
     progress("free decays: logarithmic decrement")
-    decays = _log_decrements(records, springs=springs, log=log)
+    decays = _log_decrements(records, out=out, springs=springs, log=log)
     progress("steps: static gains")
-    gains = _step_gains(driven, system=system, log=log)
+    gains = _step_gains(driven, out=out, system=system, log=log)
     progress("sine dwells: steady state")
     sines = _sine_points(records, log=log)
     # What a check says of a decay or a step in full is not said twice.
@@ -78,7 +79,7 @@ def identify(
         )
     )
     progress("frequency response")
-    responses = _frequency_response(data, sines=sines, driven=driven, log=log)
+    responses = _frequency_response(data, sines=sines, driven=driven, out=out, log=log)
     resonances = _resonances(responses, system=system, log=log)
     measured = estimate_initially(carts=n, log_decrements=decays, step_gains=gains)
 
@@ -88,7 +89,7 @@ def identify(
         fitted = fit_carts(
             responses,
             records=records,
-            beside=[record for record in data.records if record.id in without],
+            beside=out,
             driven=driven,
             initial={**resonances, **measured},
             n=n,
@@ -145,7 +146,7 @@ def _is_seen(cart: int, records: Sequence[Record], responses: Sequence[Frequency
 
 
 def _log_decrements(
-    records: Sequence[Record], *, springs: Sequence[bool], log: Log
+    records: Sequence[Record], *, out: Sequence[Record], springs: Sequence[bool], log: Log
 ) -> list[LogDecrement]:
     """Each cart alone: its decays, or the ring-down of its steps where there is no decay."""
     decays = []
@@ -158,7 +159,10 @@ def _log_decrements(
         if not runs:
             log.skip(
                 f"log decrement, cart {cart}",
-                f"no decay was recorded in which cart {cart} alone is free",
+                _none(
+                    f"decay in which cart {cart} alone is free",
+                    [r for r in out if r.free == (cart,) and r.kind in ("decay", "step")],
+                ),
             )
         for run in runs:
             decay = log.attempt(
@@ -173,13 +177,24 @@ def _sticks(decay: LogDecrement) -> bool:
     return decay.friction is not None and decay.friction.present
 
 
-def _step_gains(driven: Sequence[Record], *, system: System, log: Log) -> list[StepGain]:
+def _none(what: str, out: Sequence[Record]) -> str:
+    """Say that there is none of some records, or that all of them are left out."""
+    if not out:
+        return f"no {what} was recorded"
+    return f"every {what} is left out: {listed([r.id for r in out])} (the checks say why)"
+
+
+def _step_gains(
+    driven: Sequence[Record], *, out: Sequence[Record], system: System, log: Log
+) -> list[StepGain]:
     if not system.tied:
         log.skip("step gain", UNTIED)
         return []
     runs = [record for record in driven if record.kind == "step"]
     if not runs:
-        log.skip("step gain", "no step was recorded with all carts free")
+        n = system.carts
+        steps = [r for r in out if r.kind == "step" and len(r.free) == n]
+        log.skip("step gain", _none("step with all carts free", steps))
     gains = []
     for run in runs:
         for cart in run.carts:
@@ -208,6 +223,7 @@ def _frequency_response(
     *,
     sines: Sequence[SinePoint],
     driven: Sequence[Record],
+    out: Sequence[Record],
     log: Log,
 ) -> Sequence[FrequencyResponse]:
     """From dwells; else from the students' own table; else from steps and sweeps."""
@@ -215,8 +231,8 @@ def _frequency_response(
         return collect_dwells(sines)
     if data.tables:
         return data.tables
-    if not any(record.kind == "sine" for record in data.records):
-        log.skip("sine steady state", "no sine dwells were recorded")
+    if not any(record.kind == "sine" and record not in out for record in data.records):
+        log.skip("sine steady state", _none("sine dwell", [r for r in out if r.kind == "sine"]))
     if not driven:
         log.skip(
             "frequency response", "no usable dwell, no table, and no step or sweep to take it from"

@@ -51,10 +51,11 @@ def by_note(notes: Iterable[tuple[str, str]]) -> list[str]:
     for run, note in notes:
         if note:
             runs.setdefault(note, []).append(run)
-    return [f"{_listed(list(dict.fromkeys(ids)))}: {note}" for note, ids in runs.items()]
+    return [f"{listed(list(dict.fromkeys(ids)))}: {note}" for note, ids in runs.items()]
 
 
-def _listed(ids: Sequence[str]) -> str:
+def listed(ids: Sequence[str]) -> str:
+    """Return the names of runs, the middle of many left out."""
     if len(ids) <= _LISTED:
         return ", ".join(ids)
     return f"{ids[0]}, {ids[1]} … {ids[-1]} ({len(ids)} runs)"

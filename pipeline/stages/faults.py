@@ -12,8 +12,8 @@ import numpy as np
 from pipeline.plant.chain import Chain
 from pipeline.plant.simulate import simulate_linear
 from pipeline.results import Check, LeftOut, Record
+from pipeline.stages._signals import TIME_FACTORS
 from pipeline.stages.follow import (
-    TIME_UNITS,
     Followed,
     Misread,
     find_misread,
@@ -34,6 +34,7 @@ _STRAY = 0.5  # of the motion of every cart that stays unexplained in a record t
 _MOVES = 0.8  # … which moves at least that far, relative: friction makes no cart move further
 _SO_READ = ": read that way it follows the identified carts"
 _CYCLES = 1.5  # a dwell with fewer holds no steady state, whatever its length
+_UNIT = 100.0
 _SAME_CLOCK = 0.02  # a bench samples at one rate, which a unit changes by exactly its factor
 
 
@@ -196,11 +197,12 @@ def _short_dwell(record: Record) -> Iterator[str]:
 
 def _wrong_clock(record: Record, *, usual: float) -> Iterator[str]:
     """Yield the unit of a time column that makes this record's sampling the usual one."""
-    for factor, unit in TIME_UNITS.items():
-        if abs(record.sample_time - factor * usual) < _SAME_CLOCK * factor * usual:
+    for factor, words in TIME_FACTORS.items():
+        is_unit = factor >= _UNIT  # a bench may be sampled twice as fast by right
+        if is_unit and abs(record.sample_time - factor * usual) < _SAME_CLOCK * factor * usual:
             yield (
                 f"its samples are {record.sample_time:.3g} s apart, those of the others "
-                f"{usual:.3g} s: its time looks to be in {unit}"
+                f"{usual:.3g} s: {words}"
             )
 
 

@@ -13,13 +13,11 @@ import numpy as np
 from pipeline.errors import DataError
 from pipeline.plant.chain import Array, Chain
 from pipeline.results import Record
-from pipeline.stages._signals import LENGTH_SCALES
+from pipeline.stages._signals import LENGTH_SCALES, TIME_FACTORS
 from pipeline.stages.chain_parameters import Parametrisation
 from pipeline.stages.modal_response import Modes, find_modes
 from pipeline.stages.time_window import Window, compare, open_window
 
-# What a time column is in where it counts so many times as much as seconds would.
-TIME_UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e-3: "thousands of seconds"}
 _SAME_SCALE = 0.1  # relative
 _SEEN_STEPS = 5.0  # encoder steps of motion: rounding changes a smaller one by any factor
 # Shares of a record's power (about its mean) that the chain leaves unexplained.
@@ -126,8 +124,8 @@ def _readings(record: Record, chain: Chain) -> Iterator[tuple[Misread, Record]]:
         words = f"x{i} and x{j} look exchanged"
         other = replace(record, y=record.y[rows], resolution=record.resolution[rows])
         yield Misread(words=words), other
-    for factor, unit in TIME_UNITS.items():
-        yield Misread(words=f"its time looks to be in {unit}"), replace(record, t=record.t / factor)
+    for factor, words in TIME_FACTORS.items():
+        yield Misread(words=words), replace(record, t=record.t / factor)
     try:
         window = open_window(record)
     except DataError:

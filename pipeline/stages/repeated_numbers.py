@@ -7,28 +7,21 @@ Runs that agree with each other may share a mistake: dwells that one chain expla
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.results import Check, Estimate, LeftOut, LogDecrement, StepGain
-from pipeline.stages._signals import LENGTH_SCALES
+from pipeline.stages._signals import TIME_FACTORS
 
 TOLERANCE = 10.0  # percent; the same run made twice, with dry friction of some percent
+_DAMPING_TOLERANCE = 50.0  # … which, with a bearing's dirt, is about as much of the damping
 _SIGMAS = 4.0
 _LIKE_THE_FIT = 0.15  # relative: as far as two ways to one number may lie apart
 # Factors: what two ways to one number differ by where friction, play or a soft hold is at work.
 _BY_THE_BENCH = {"K": 1.6, "omega": 1.3}
 _SAME = 0.05  # relative: what a mistake leaves of the difference between two runs
 _SAME_SIZE = 0.2  # relative: two steps that friction treats alike
-_TIME_UNITS = {
-    1e-3: "its time looks to be in milliseconds",
-    1e-6: "its time looks to be in microseconds",
-    1e3: "its time looks to be in thousands of seconds",
-    0.5: "its clock looks to run twice too fast",
-    2.0: "its clock looks to run at half its speed",
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,13 +42,17 @@ class Repeats:
 
 @dataclass(frozen=True, kw_only=True)
 class _Reading:
-    """One run's value, between where it lies, and the size of the step it was read from."""
+    """One run's value, between where it lies, and the size of the step it was read from.
+
+    `tolerance` : percent that runs may differ by.
+    """
 
     run: str
     value: float
     low: float
     high: float
     size: float = 0.0
+    tolerance: float = TOLERANCE
 
 
 def compare_repeats(
@@ -66,7 +63,7 @@ def compare_repeats(
     fitted: Mapping[str, Estimate],
     dwells: Mapping[str, Estimate],
 ) -> Repeats:
-    """Hold the runs that give one frequency or one static gain against one another.
+    """Hold the runs that give one frequency, damping or static gain against one another.
 
     Parameters
     ----------
@@ -74,11 +71,13 @@ def compare_repeats(
     dwells : … of one that rests on dwells alone, and explains them; else none.
     """
     readings = _readings(decays, steps, carts=carts)
-    right = {name: _right_ones(all_, fitted.get(name)) for name, all_ in readings.items()}
+    # A fit's damping rests on the decays' own where its points do not tell it.
+    told = {name: one for name, one in fitted.items() if not name.startswith("zeta")}
+    right = {name: _right_ones(all_, told.get(name)) for name, all_ in readings.items()}
     usual = {n: float(np.median([r.value for r in ones])) for n, ones in right.items() if ones}
-    for name, told in dwells.items():
-        if name in usual and all(_is_far(reading, told, name=name) for reading in right[name]):
-            usual[name], right[name] = told.value, []
+    for name in [name for name in usual if name in dwells and not name.startswith("zeta")]:
+        if all(_is_far(reading, dwells[name], name=name) for reading in right[name]):
+            usual[name], right[name] = dwells[name].value, []
     by_size = {name for name, ones in right.items() if ones and _only_by_size(readings[name])}
     of_run: dict[str, dict[str, float]] = {}
     for name, all_ in readings.items():
@@ -88,7 +87,7 @@ def compare_repeats(
     for name, value in usual.items():
         belong = {reading.run for reading in right[name]}
         for run in [r.run for r in readings[name] if r.run not in belong and r.run not in odd]:
-            said = _mistake(of_run[run], usual)
+            said = _wrong_clock(of_run[run], usual)
             if said or name not in by_size:
                 others = "the others give" if right[name] else "the dwells ask for"
                 off = f"{name} = {of_run[run][name]:.3g} where {others} {value:.3g}"
@@ -98,7 +97,7 @@ def compare_repeats(
     undecided = tuple(name for name in readings if name not in usual and name not in by_size)
     return Repeats(
         checks=tuple(
-            _check(name, all_, odd=odd, undecided=name in undecided)
+            _check(name, all_, right=right[name], odd=odd, undecided=name in undecided)
             for name, all_ in readings.items()
             if len(all_) > 1 and (right[name] or name not in usual)
         ),
@@ -122,6 +121,19 @@ def _readings(
                 high=decay.omega_n + slack,
             )
         )
+        slack = _SIGMAS * decay.zeta_std
+        # Dry friction adds the more damping the less the cart swings.
+        sticks = decay.friction is not None and decay.friction.present
+        ratios = [decay.zeta, *(decay.zeta_at_amplitude[1].tolist() if sticks else ())]
+        found.setdefault("zeta" if carts == 1 else f"zeta_{decay.cart}", []).append(
+            _Reading(
+                run=decay.experiment,
+                value=decay.zeta,
+                low=min(ratios) - slack,
+                high=max(ratios) + slack,
+                tolerance=_DAMPING_TOLERANCE,
+            )
+        )
     for step in steps:
         name, slack = "K" if carts == 1 else f"K_{step.cart}", _SIGMAS * step.gain_std
         low, high = step.interval or (step.gain, step.gain)  # where the cart sticks
@@ -141,7 +153,7 @@ def _contradictions(readings: Sequence[_Reading]) -> NDArray[np.bool_]:
     """Return which readings (n, n) contradict one another."""
     value, low, high = np.array([(r.value, r.low, r.high) for r in readings]).T
     size = np.maximum(np.abs(value[:, None]), np.abs(value))
-    far = np.abs(value[:, None] - value) > TOLERANCE / 100 * size
+    far = np.abs(value[:, None] - value) > readings[0].tolerance / 100 * size
     return far & (np.maximum(low[:, None], low) > np.minimum(high[:, None], high))
 
 
@@ -161,7 +173,9 @@ def _right_ones(readings: Sequence[_Reading], fitted: Estimate | None) -> list[_
         near = _LIKE_THE_FIT * abs(fitted.value)
         like = [r for r in readings if abs(r.value - fitted.value) <= near]
         if like and _SIGMAS * fitted.std <= near:
-            return like
+            near_it = np.array([reading in like for reading in readings])
+            contrary = np.any(apart[:, near_it], axis=1) & ~near_it
+            return [r for r, is_odd in zip(readings, contrary, strict=True) if not is_odd]
     most = ~apart[np.argmin(apart.sum(axis=1))]
     largest = [reading for reading, belongs in zip(readings, most, strict=True) if belongs]
     return largest if 2 * len(largest) > len(readings) else []
@@ -175,37 +189,24 @@ def _is_far(reading: _Reading, told: Estimate, *, name: str) -> bool:
     return reading.high < told.value / factor or reading.low > told.value * factor
 
 
-def _mistake(values: Mapping[str, float], usual: Mapping[str, float]) -> str:
-    """Return the mistake that turns the usual numbers into a run's own, or ""."""
-    known = {name: value for name, value in values.items() if usual.get(name)}
-    ratios = {name: value / usual[name] for name, value in known.items()}
-    if not known:
-        return ""
-    if all(name.startswith("omega") for name in known):
-        for factor, looks in _TIME_UNITS.items():
-            if all(_near(ratio, factor) for ratio in ratios.values()):
-                return looks
-        return ""
-    for a, b in combinations(known, 2):
-        apart = not _near(usual[a], usual[b])
-        if apart and _near(values[a], usual[b]) and _near(values[b], usual[a]):
-            return f"x{a[2:]} and x{b[2:]} look exchanged"
-    for scale in LENGTH_SCALES:
-        for factor in (scale, 1 / scale):
-            if all(_near(abs(ratio), factor) for ratio in ratios.values()):
-                return (
-                    "its positions or its input look to be in another unit, "
-                    f"{factor:.3g} times the others'"
-                )
-    turned = [name for name, ratio in ratios.items() if _near(ratio, -1.0)]
-    if turned and all(_near(abs(ratio), 1.0) for ratio in ratios.values()):
-        return f"the sign of {' and '.join(f'x{name[2:] or 1}' for name in turned)} looks turned"
-    return ""
+def _wrong_clock(values: Mapping[str, float], usual: Mapping[str, float]) -> str:
+    """Return how a decay's clock makes its own frequencies of the usual ones, or ""."""
+    ratios = [
+        usual[name] / value
+        for name, value in values.items()
+        if name.startswith("omega") and usual.get(name)
+    ]
+    looks = (
+        words
+        for factor, words in TIME_FACTORS.items()
+        if ratios and all(_near(ratio, factor) for ratio in ratios)
+    )
+    return next(looks, "")
 
 
 def _is_reversed(values: Mapping[str, float], usual: Mapping[str, float]) -> bool:
     """Whether all carts went the other way: a log may count its input so by right."""
-    known = [name for name in values if usual.get(name)]
+    known = [name for name in values if name.startswith("K") and usual.get(name)]
     return bool(known) and all(_near(values[name], -usual[name]) for name in known)
 
 
@@ -214,12 +215,18 @@ def _near(value: float, other: float) -> bool:
 
 
 def _check(
-    name: str, readings: Sequence[_Reading], *, odd: Mapping[str, LeftOut], undecided: bool
+    name: str,
+    readings: Sequence[_Reading],
+    *,
+    right: Sequence[_Reading],
+    odd: Mapping[str, LeftOut],
+    undecided: bool,
 ) -> Check:
     values = [reading.value for reading in readings]
     largest = max(map(abs, values))
     spread = 100 * (max(values) - min(values)) / largest if largest > 0 else 0.0
-    off = [reading.run for reading in readings if reading.run in odd]
+    # A run that another number shows to be odd may agree in this one.
+    off = [reading for reading in readings if reading.run in odd and reading not in right]
     apart = f"from {min(values):.4g} to {max(values):.4g}"
     count = f"{len(readings)} runs"
     if undecided:
@@ -231,11 +238,11 @@ def _check(
             ),
         )
     elif off:
-        reasons = "; ".join(f"{run}: {odd[run].reason}" for run in off)
-        outcome, said = "fail", f"contradict one another, {apart}. Left out is {reasons}"
+        runs = ", ".join(f"{reading.run} ({reading.value:.4g})" for reading in off)
+        outcome, said = "fail", f"contradict one another, {apart}. Left out is {runs}"
     elif np.any(_contradictions(readings)):
         outcome, said = "fail", f"lie {apart}, by the size of the step, as where a cart sticks"
-    elif spread > TOLERANCE:
+    elif spread > readings[0].tolerance:
         outcome, said = "skip", f"lie {apart}, no further apart than their errors"
     else:
         outcome, said = "pass", f"agree within {spread:.2g} %"
@@ -243,6 +250,6 @@ def _check(
         id=f"repeats.{name}",
         outcome=outcome,
         value=spread,
-        limit=TOLERANCE,
+        limit=readings[0].tolerance,
         message=f"{name}: {count} {said}.",
     )
