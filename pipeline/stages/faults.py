@@ -33,6 +33,8 @@ _WITNESSES = 2  # records that follow the carts, as they are or read otherwise: 
 _STRAY = 0.5  # of the motion of every cart that stays unexplained in a record that does not belong
 _MOVES = 0.8  # … which moves at least that far, relative: friction makes no cart move further
 _SO_READ = ": read that way it follows the identified carts"
+_FROZEN_SAMPLES = 10
+_ELSEWHERE = 0.25  # of how far it was moved while it stood: what it misses the carts by else
 _CYCLES = 1.5  # a dwell with fewer holds no steady state, whatever its length
 _UNIT = 100.0
 _SAME_CLOCK = 0.02  # a bench samples at one rate, which a unit changes by exactly its factor
@@ -82,6 +84,7 @@ def find_faults(
             *_short_dwell(record),
             *([copied[record.id]] if record.id in copied else ()),
             *([f"{misread[record.id].words}{_SO_READ}"] if record.id in misread else ()),
+            *(_frozen(record, fits[record.id], steps=steps) if record.id in fits else ()),
             *_dead_channels(record, chain=chain, friction=friction, steps=steps, moving=moving),
         ):
             legal = record.id in misread and misread[record.id].legal
@@ -160,6 +163,28 @@ def _dead_channels(
                 else f"the encoder of cart {cart} stands still from {first:.4g} s to {last:.4g} s, "
                 "although the input moves the cart: it froze"
             )
+
+
+def _frozen(record: Record, fit: Followed, *, steps: Mapping[int, float]) -> Iterator[str]:
+    """Yield what is said of a reading that stays for a while in which the carts moved it far.
+
+    Before and after it follows them, so that friction, which acts all the time, is not the cause.
+    """
+    for cart, missed in fit.missed.items():
+        y = record.position(cart)
+        far = max(_SEEN_COUNTS * steps[cart], _SEEN_SHARE * float(np.ptp(y)))
+        edges = np.array([0, *(np.flatnonzero(np.diff(y)) + 1), y.size])
+        for i in np.flatnonzero(np.diff(edges) >= _FROZEN_SAMPLES):
+            part = slice(int(edges[i]), int(edges[i + 1]))
+            rest = np.delete(missed, part)
+            if np.ptp(missed[part]) < far or not rest.size:
+                continue
+            if float(np.sqrt(np.mean(rest**2))) < _ELSEWHERE * far:
+                first, last = record.t[part.start], record.t[part.stop - 1]
+                yield (
+                    f"the encoder of cart {cart} stands still from {first:.4g} s to {last:.4g} s, "
+                    "although the cart moves on: it froze"
+                )
 
 
 def _must_move(record: Record, chain: Chain, still: slice, *, cart: int, step: float) -> bool:

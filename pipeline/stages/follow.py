@@ -36,11 +36,13 @@ class Followed:
     Attributes
     ----------
     lost : by cart, the share of its motion's power that neither chain nor noise explains.
+    missed : by cart, (n,) where the chain is minus where the cart was read to be.
     reach : by cart, how far it moves over how far the chain does, root-mean-square.
     friction : by cart, the most dry friction that this allows, in input units.
     """
 
     lost: dict[int, float]
+    missed: dict[int, Array]
     reach: dict[int, float]
     friction: dict[int, float]
 
@@ -202,6 +204,7 @@ def _hold_against(record: Record, chain: Chain) -> Followed | None:
     reach = np.sqrt(power) / np.maximum(np.std(window.y + residual, axis=1), window.stated_sigma)
     return Followed(
         lost=dict(zip(window.carts, lost.tolist(), strict=True)),
+        missed=dict(zip(window.carts, residual, strict=True)),
         reach=dict(zip(window.carts, reach.tolist(), strict=True)),
         friction={
             cart: float(_FRICTION * np.sqrt(max(share, _LEAST)) * np.ptp(force) / 2)
