@@ -268,6 +268,24 @@ def test_records_of_two_carts_identify_no_third(bench, tmp_path):
     assert any("cart 3 moves in no recording" in skip.reason for skip in analysis.skipped)
 
 
+@pytest.mark.parametrize("kind", ["step-3", "sine-05"])
+def test_a_coarse_encoder_that_freezes_for_half_a_second_is_found(kind, tmp_path):
+    """At two counts a sample no reading shows it by itself: the cart moves on, and far."""
+    write_submission(tmp_path, chain=PRESET, seed=5, compact=True, count=0.03)
+    (path,) = files(tmp_path, kind)
+
+    def freeze(columns: Columns) -> Columns:
+        x = columns["x1"].copy()
+        first = int(np.argmax(np.abs(np.diff(x))))
+        x[first : first + 60] = x[first]
+        return {**columns, "x1": x}
+
+    spoil(path, freeze)
+    analysis = analyse(load_submission(tmp_path), design=False)
+    assert [(one.experiment, one.is_wrong) for one in analysis.left_out] == [(path.stem, True)]
+    assert "froze" in analysis.left_out[0].reason
+
+
 HONEST = {
     "smooth": {"count": 0.002},
     "coarse": {"count": 0.2},

@@ -69,6 +69,14 @@ def test_clipping_is_told_from_a_rounded_crest(digits):
     assert saturation(clipped) == 1.0
 
 
+def test_a_coarse_encoder_clips_no_crest_of_a_few_samples():
+    """Noise takes a count off the top of a sine of 23 samples a cycle: three of them are equal."""
+    t = 0.00884 * np.arange(159)
+    sines = [np.round(34 * np.sin(31.2274 * t + phase)) for phase in np.linspace(0, 6, 400)]
+    assert {saturation(np.minimum(sine, 33)) for sine in sines} == {None}
+    assert saturation(np.minimum(sines[0], 22)) == 22
+
+
 def test_steps_and_slow_approaches_are_not_clipped():
     """Inputs that are at their extreme by design or creep there are sound."""
     assert saturation(np.where(T > 1, 1.0, 0.0)) is None

@@ -61,7 +61,10 @@ def saturation(u: Array) -> float | None:
         for first, last in _runs((u[:-1] == limit) & (u[1:] == limit)):
             entry = abs(limit - u[first - 1]) if first > 0 else np.inf
             leave = abs(limit - u[last + 1]) if last + 1 < u.size else np.inf
-            if last - first + 1 >= _CLIPPED_SAMPLES and min(entry, leave) > 3 * gap:
+            m = last - first + 1
+            # m samples of a crest, a parabola, lie within one level where it falls by so many to
+            # the next; rounding adds one.
+            if m >= _CLIPPED_SAMPLES and min(entry, leave) > max(3, 4 * m / (m - 1) ** 2 + 1) * gap:
                 return abs(float(limit))
     return None
 

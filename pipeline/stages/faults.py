@@ -33,7 +33,7 @@ _WITNESSES = 2  # records that follow the carts, as they are or read otherwise: 
 _STRAY = 0.5  # of the motion of every cart that stays unexplained in a record that does not belong
 _MOVES = 0.8  # … which moves at least that far, relative: friction makes no cart move further
 _SO_READ = ": read that way it follows the identified carts"
-_FROZEN_SAMPLES = 10
+_FROZEN_SAMPLES, _FROZEN_SHARE = 10, 0.2  # the share of its motion that it moved meanwhile
 _ELSEWHERE = 0.25  # of how far it was moved while it stood: what it misses the carts by else
 _CYCLES = 1.5  # a dwell with fewer holds no steady state, whatever its length
 _UNIT = 100.0
@@ -172,14 +172,14 @@ def _frozen(record: Record, fit: Followed, *, steps: Mapping[int, float]) -> Ite
     """
     for cart, missed in fit.missed.items():
         y = record.position(cart)
-        far = max(_SEEN_COUNTS * steps[cart], _SEEN_SHARE * float(np.ptp(y)))
+        far = max(_SEEN_COUNTS * steps[cart], _FROZEN_SHARE * float(np.ptp(y)))
         edges = np.array([0, *(np.flatnonzero(np.diff(y)) + 1), y.size])
         for i in np.flatnonzero(np.diff(edges) >= _FROZEN_SAMPLES):
             part = slice(int(edges[i]), int(edges[i + 1]))
-            rest = np.delete(missed, part)
-            if np.ptp(missed[part]) < far or not rest.size:
+            rest, moved = np.delete(missed, part), float(np.ptp(missed[part]))
+            if moved < far or not rest.size:
                 continue
-            if float(np.sqrt(np.mean(rest**2))) < _ELSEWHERE * far:
+            if float(np.sqrt(np.mean(rest**2))) < _ELSEWHERE * moved:
                 first, last = record.t[part.start], record.t[part.stop - 1]
                 yield (
                     f"the encoder of cart {cart} stands still from {first:.4g} s to {last:.4g} s, "
