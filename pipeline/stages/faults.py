@@ -84,7 +84,11 @@ def find_faults(
             *_short_dwell(record),
             *([copied[record.id]] if record.id in copied else ()),
             *([f"{misread[record.id].words}{_SO_READ}"] if record.id in misread else ()),
-            *(_frozen(record, fits[record.id], steps=steps) if record.id in fits else ()),
+            *(
+                _frozen(record, fits[record.id], chain, friction=friction, steps=steps)
+                if chain and record.id in fits
+                else ()
+            ),
             *_dead_channels(record, chain=chain, friction=friction, steps=steps, moving=moving),
         ):
             legal = record.id in misread and misread[record.id].legal
@@ -165,10 +169,17 @@ def _dead_channels(
             )
 
 
-def _frozen(record: Record, fit: Followed, *, steps: Mapping[int, float]) -> Iterator[str]:
+def _frozen(
+    record: Record,
+    fit: Followed,
+    chain: Chain,
+    *,
+    friction: Mapping[int, float],
+    steps: Mapping[int, float],
+) -> Iterator[str]:
     """Yield what is said of a reading that stays for a while in which the carts moved it far.
 
-    Before and after it follows them, so that friction, which acts all the time, is not the cause.
+    Before and after it follows them, and what pulls at it meanwhile no friction can hold.
     """
     for cart, missed in fit.missed.items():
         y = record.position(cart)
@@ -177,7 +188,10 @@ def _frozen(record: Record, fit: Followed, *, steps: Mapping[int, float]) -> Ite
         for i in np.flatnonzero(np.diff(edges) >= _FROZEN_SAMPLES):
             part = slice(int(edges[i]), int(edges[i + 1]))
             rest, moved = np.delete(missed, part), float(np.ptp(missed[part]))
-            if moved < far or not rest.size:
+            force = force_on(record, chain, cart=cart)
+            if moved < far or not rest.size or force is None:
+                continue
+            if 2 * friction.get(cart, np.inf) >= np.ptp(force[part]):
                 continue
             if float(np.sqrt(np.mean(rest**2))) < _ELSEWHERE * moved:
                 first, last = record.t[part.start], record.t[part.stop - 1]
