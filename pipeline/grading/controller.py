@@ -4,7 +4,6 @@ import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal
-from fractions import Fraction
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from pipeline.grading.reference import is_explained
 from pipeline.grading.state_model import own_chain
 from pipeline.grading.tolerance import as_typed, rounding
 from pipeline.plant.chain import Array, Chain
-from pipeline.plant.robustness import MASS_SPRING_ERROR, level_error_percent
+from pipeline.plant.robustness import MASS_SPRING_ERROR, level_error_percent, static_levels
 from pipeline.results import Analysis
 from pipeline.submission import Design, StateFeedback, Submission
 from pipeline.workflow import reference_design
@@ -163,25 +162,35 @@ def reported_controller(
 
 
 def _doubt(controller: Controller, submission: Submission, analysis: Analysis) -> float:
-    """Return the relative error that those of static gains, fitted or typed, leave in a prefilter.
+    """Return the relative error that those of the models, fitted or typed, leave in a prefilter.
 
     Gains that cancel much of the plant's stiffness make more of them than there was.
     """
-    chain, gains = controller.models[0], controller.gains
+    chain, gains, cart = controller.models[0], controller.gains, controller.goal.cart
     if gains is None or gains.size != 2 * chain.n:
         return 0.0
-    share = level_error_percent(chain, gains, cart=controller.goal.cart) / 100 / MASS_SPRING_ERROR
+    share = float(level_error_percent(chain, gains, cart=cart)) / 100 / MASS_SPRING_ERROR
     fitted = [
         _SIGMAS * row.final.std / abs(row.final.value)
         for row in analysis.rows
         if row.name.startswith("K") and row.final and row.final.std and row.final.value
     ]
-    typed = [
-        float(rounding(value) / abs(Fraction(value)))
-        for name, value in (submission.reported.final if submission.reported else {}).items()
-        if name.startswith("K") and value
-    ]
-    return float(share) * max([*fitted, *typed], default=0.0)
+    typed = submission.reported.final if submission.reported else {}
+    return max(share * max(fitted, default=0.0), _by_rounding(typed, gains, cart=cart))
+
+
+def _by_rounding(typed: Mapping[str, Decimal], gains: Array, *, cart: int) -> float:
+    """Return how far the rounding of a typed table moves the prefilter on its own carts."""
+    values = {name: float(value) for name, value in typed.items()}
+
+    def level(table: Mapping[str, float]) -> float:
+        chain = own_chain(table, n=gains.size // 2)
+        return np.nan if chain is None else float(static_levels(chain, gains)[cart - 1])
+
+    half = {name: float(rounding(value)) for name, value in typed.items()}
+    moved = [level({**values, name: values[name] + half[name]}) for name in values]
+    relative = np.nan_to_num(np.array(moved) / level(values) - 1)
+    return _SIGMAS / np.sqrt(3) * float(np.linalg.norm(relative))
 
 
 def _reachable(goal: Design, submission: Submission, analysis: Analysis) -> Design:

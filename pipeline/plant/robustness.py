@@ -37,10 +37,20 @@ def level_error_percent(chain: Chain, gains: Array, *, cart: int) -> Array:
 
     In percent of the level, to first order, the errors of all springs against us.
     """
-    K = chain.stiffness + np.eye(chain.n)[:, :1] * gains[..., None, 0::2]
-    inverse = np.linalg.inv(K)
+    inverse = _compliance(chain, gains)
     x = inverse[..., :, 0]
     # Spring j adds k_j (e_j - e_{j-1})(e_j - e_{j-1})' to the stiffness; a wall has no e.
     ends = np.diff(np.eye(chain.n + 2)[1:-1], axis=1)  # (n, n + 1), one column each
     moved = chain.k * (x @ ends) * (inverse[..., cart - 1, :] @ ends)
     return 100 * MASS_SPRING_ERROR * np.abs(moved).sum(-1) / np.abs(x[..., cart - 1])
+
+
+def static_levels(chain: Chain, gains: Array) -> Array:
+    """Return the positions of all carts under the gains (…, 2n), per unit of input; (…, n)."""
+    return _compliance(chain, gains)[..., :, 0]
+
+
+def _compliance(chain: Chain, gains: Array) -> Array:
+    """Return the inverse of the stiffness that the feedback leaves, (…, n, n)."""
+    fed_back = np.eye(chain.n)[:, :1] * gains[..., None, 0::2]
+    return np.linalg.inv(chain.stiffness + fed_back)
