@@ -84,6 +84,7 @@ def frozen(name: str) -> Spoil:
 # kind, which of its files, what happened to them, a word of the reason
 SPOILT = {
     "a decay in milliseconds": ("decay-1", slice(1), in_milliseconds, "milliseconds"),
+    "a decay in thousands of seconds": ("decay-1", slice(1), times(1e-3, "time"), "thousands"),
     "two of four steps exchanged": ("step", slice(2, 4), exchanged, "exchanged"),
     "cart 2 dead in every step": ("step", slice(None), dead("x2"), "encoder of cart 2"),
     "cart 1 dead in a step": ("step", slice(1), dead("x1"), "encoder of cart 1"),

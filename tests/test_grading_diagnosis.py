@@ -392,3 +392,12 @@ def test_what_is_missing_is_named():
     one = student(2).without("final", "zeta_b")
     flag = only_flag(one)
     assert (flag.code, flag.parameters) == ("missing", ("final.zeta_b",))
+
+
+def test_gains_that_cancel_all_stiffness_are_judged():
+    """Where they leave no spring at all to the typed table no prefilter follows from it."""
+    one = student(1)
+    feedback = one.reported.feedback
+    assert feedback is not None
+    cancelling = feedback.model_copy(update={"gains": (Decimal("-0.25"), Decimal("0.01"))})
+    assert "wrong_gains" in codes(one.reporting(final={"K": 4}, feedback=cancelling))

@@ -297,11 +297,12 @@ def test_any_numbers_can_be_shown(values):
     assert not re.search(r"[\x00-\x08\x0b\x0c\x0e-\x1f]", html)
 
 
-def test_only_all_points_are_100_percent():
-    """19.95 of 20 is 99 %."""
-    page = class_page([Line.of(make_grade("a", points=19.95), by_hand=())], rubric=RUBRIC)
+@pytest.mark.parametrize(("points", "percent"), [(19.95, "99"), (4.6, "23")])
+def test_only_all_points_are_100_percent(points, percent):
+    """19.95 of 20 is 99 %, 4.6 of 20 is 23 %: decimals as typed, rounded down."""
+    page = class_page([Line.of(make_grade("a", points=points), by_hand=())], rubric=RUBRIC)
     cells = re.sub(r"<[^>]+>", " ", page.split("All submissions.")[-1]).split()
-    assert cells[cells.index("19.95") + 1] == "99"
+    assert cells[cells.index(str(points)) + 1] == percent
 
 
 def test_the_class_page_counts_what_there_is():

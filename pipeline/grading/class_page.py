@@ -16,6 +16,7 @@ from pipeline.grading.doubles import Double
 from pipeline.grading.feedback_words import TITLES, points_text
 from pipeline.grading.grade import CODES, Code
 from pipeline.grading.rubric import Rubric
+from pipeline.grading.tolerance import exact
 from pipeline.report.document import (
     Block,
     Cell,
@@ -261,7 +262,7 @@ def _everybody(lines: Sequence[Line], tables: count) -> list[Block]:
 
 def _row(line: Line) -> list[Cell]:
     failed = line.status == "failed"
-    share = 100 * line.points / line.out_of if line.out_of else 0.0
+    share = 100 * exact(line.points) / exact(line.out_of) if line.out_of else 0
     return [
         cell(_link(line.name)),
         cell(clean(listing(list(line.authors))) or NOTHING),

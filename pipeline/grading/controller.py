@@ -185,7 +185,10 @@ def _by_rounding(typed: Mapping[str, Decimal], gains: Array, *, cart: int) -> fl
 
     def level(table: Mapping[str, float]) -> float:
         chain = own_chain(table, n=gains.size // 2)
-        return np.nan if chain is None else float(static_levels(chain, gains)[cart - 1])
+        try:
+            return np.nan if chain is None else float(static_levels(chain, gains)[cart - 1])
+        except np.linalg.LinAlgError:  # the gains cancel all stiffness: nothing holds a level
+            return np.nan
 
     half = {name: float(rounding(value)) for name, value in typed.items()}
     moved = [level({**values, name: values[name] + half[name]}) for name in values]

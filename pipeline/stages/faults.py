@@ -37,6 +37,7 @@ _FROZEN_SAMPLES, _FROZEN_SHARE = 10, 0.2  # the share of its motion that it move
 _ELSEWHERE = 0.25  # of how far it was moved while it stood: what it misses the carts by else
 _CYCLES = 1.5  # a dwell with fewer holds no steady state, whatever its length
 _UNIT = 100.0
+_FASTEST = 1e-4  # s between samples: no bench reads its encoders more often
 _SAME_CLOCK = 0.02  # a bench samples at one rate, which a unit changes by exactly its factor
 
 
@@ -75,8 +76,9 @@ def find_faults(
         )
         for cart in {cart for fit in fits.values() for cart in fit.lost}
     }
-    # However many are wrong: a bench is never sampled a thousand times as fast by mistake.
-    usual_clock = min((record.sample_time for record in records), default=0.0)
+    # However many are wrong: no bench is read a thousand times as slowly in some recordings.
+    clocks = [record.sample_time for record in records]
+    usual_clock = min((dt for dt in clocks if dt >= _FASTEST), default=0.0)
     found: dict[str, LeftOut] = {}
     for record in records:
         for problem in (
@@ -237,7 +239,7 @@ def _short_dwell(record: Record) -> Iterator[str]:
 def _wrong_clock(record: Record, *, usual: float) -> Iterator[str]:
     """Yield the unit of a time column that makes this record's sampling the usual one."""
     for factor, words in TIME_FACTORS.items():
-        is_unit = factor >= _UNIT  # a bench may be sampled twice as fast by right
+        is_unit = max(factor, 1 / factor) >= _UNIT  # twice as fast may be by right
         if is_unit and abs(record.sample_time - factor * usual) < _SAME_CLOCK * factor * usual:
             yield (
                 f"its samples are {record.sample_time:.3g} s apart, those of the others "
