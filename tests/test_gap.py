@@ -128,6 +128,31 @@ def test_a_part_is_called_a_part():
     assert gap.next_experiment
 
 
+@pytest.mark.parametrize("irregular", [False, True])
+def test_blocks_of_fast_samples_are_readings_at_their_middle(irregular):
+    """Of 1 kHz every fourth millisecond is fitted, each reading on the curve it was taken from."""
+    t = np.arange(4001) / 1000.0
+    if irregular:
+        t = t + np.random.default_rng(0).uniform(-2e-4, 2e-4, t.size)
+    omega = 2 * np.pi * 4.0
+    record = Record(
+        id="fast", kind="sweep", t=t, u=np.cos(t), y=np.cos(omega * t)[None], carts=(1,),
+        free=(1,), resolution=np.array([1e-9]),
+    )  # fmt: skip
+
+    run = make_run(record, n=1)
+    thin = run.thin
+
+    assert run.block == 4
+    assert thin.shots == (0, thin.t.size) == (0, 1001)
+    assert thin.t[0] == run.t[0]
+    assert not thin.weight[0, 0]
+    # The fourth derivative of the motion leaves (omega h)⁴ / 1000, 1e-7 here, uneven times the
+    # third, (omega h)³ / 100; a mean alone 4e-4.
+    limit = 2e-5 if irregular else 1e-6
+    np.testing.assert_allclose(thin.y[0, 2:-1], np.cos(omega * thin.t[2:-1]), atol=limit)
+
+
 def test_the_time_allowed_ends_the_search():
     """Without any time the linear model is the best answer so far, and that is said."""
     case = make_case(seed=45, n=1, effects=["dead_zone"], rate=113.1)

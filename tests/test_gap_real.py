@@ -42,24 +42,29 @@ def explain_five(folder: Path, name: str, *, column: int, kind: str) -> Gap:
 
 
 def test_driven_cart_has_dry_friction(real_data):
-    """Five steps of a real cart: dry friction is named, unseen repeats come within 3.8 %."""
+    """Five steps of a real cart: dry friction is found, unseen repeats come within 2.7 %.
+
+    That is all of it only as near as repeats come to each other, which is nearer.
+    """
     folder = real_data / "ecp210-ucsd"
 
     gap = explain_five(folder, "DOF1_en1_input1", column=3, kind="step")
 
-    assert gap.verdict == "named"
+    assert gap.verdict == "partial"
     assert gap.effects[0].effect.key in DRY
-    assert gap.final < 0.038
+    assert gap.final < 0.027
+    assert gap.final > 1.5 * (gap.repeatability or 0.0)
 
 
 def test_released_cart_has_dry_friction(real_data):
-    """Five hand-released decays: dry friction is named first, unseen repeats within 4.1 %."""
+    """Five hand-released decays: dry friction is named first, unseen repeats within 3.6 %."""
     folder = real_data / "ecp210-ucsd"
 
     gap = explain_five(folder, "DOF1_en2_manual2", column=3, kind="decay")
 
     assert gap.effects[0].effect.key in DRY
-    assert gap.final < 0.041
+    assert gap.final < 0.036
+    assert all(found.nrmse_after < found.nrmse_before for found in gap.effects)
 
 
 def test_silverbox_has_a_hardening_spring(real_data):

@@ -35,6 +35,7 @@ from pipeline.plant.effects import CATALOGUE, find_effect
 from pipeline.plant.effects.base import Effect, Term
 from pipeline.results import Record
 
+_AS_FREE = 1.1  # times the error with free zeros: what a force that is there leaves with fixed ones
 _NOISE_ROUNDS, _TOO_GOOD = 2, 0.7  # chi-square per point no fit to true noise falls to
 
 
@@ -102,10 +103,11 @@ def explain_gap(
             path, judged_by = _with_offset(path, replace(bench, mapper=deadline.map))
             if judged_by is not None:
                 # The others were judged with the encoders' zeros free.
-                chosen, bench, found = path[-1], judged_by, list(path)
+                bench, found = judged_by, list(path)
+        sample_time = max(run.record.sample_time for run in bench.training)
+        verdict, path, close = reach_verdict(path, found, bench=bench, sample_time=sample_time)
+        chosen = path[-1]
         final = covariance(chosen.fit, bench.training, mapper=pool.map)
-    sample_time = max(run.record.sample_time for run in bench.training)
-    verdict, close = reach_verdict(path, found, bench=bench, sample_time=sample_time)
     if verdict not in ("none", "unexplained") and not bench.explains(chosen):
         times = chosen.error / bench.floor
         notes.append(f"{times:.1f} times the noise is left: something remains")
@@ -230,7 +232,7 @@ def _with_offset(
     theta = np.append(chosen.fit.theta, np.sign(offset.force))
     fit = fit_whole(grown, theta, loose)
     final = judge(fit, loose, added=candidate)
-    if final.error > 0.9 * without[-1].error:
+    if final.error > min(0.9 * without[-1].error, _AS_FREE * chosen.error):
         return path, None
     return (*without, final), loose
 

@@ -274,7 +274,7 @@ def project(
 
     Parameters
     ----------
-    extras : per run (k, rows, samples): what k further effects would add to the readings.
+    extras : per run (k, rows, samples of `thin`): what k further effects would add to its readings.
 
     Returns
     -------

@@ -21,6 +21,10 @@ _SHORT_LIST = 9  # suspects refitted on pieces
 _FULL_LIST = 5  # of which the best are refitted on whole runs …
 _FULL_SCREEN = 3  # … with the best of a screen on whole runs
 _OUT_OF_SIGHT = 8.0  # a suspect that leaves this many times the best one's misfit is out
+_BESIDE_THE_FLOOR = 1.5  # … where that one leaves no more than noise
+_IN_THE_RUNNING = 3.0  # times the best sibling's misfit: what may still win when refined
+_POLISHED = 0.1  # of the chi-square without it: a contact that is there explains more
+_NOISE_ALONE = 1.05  # chi-square that no richer law of friction lowers
 _HINT = 2.0  # what the criterion must fall by, by the screen's estimate, to be worth a refit
 _FRICTION_ROUNDS = 2  # of run-by-run friction, the worst runs started anew before each
 _NEARLY_RIGHT = 6.0  # chi-square of the better runs, below which the bad ones are worth a new start
@@ -30,14 +34,29 @@ _LEADING = 0.4  # of the first suspect's share, for what is dear to refit
 
 
 def grow(parent: Hypothesis, bench: Bench) -> Iterator[Hypothesis]:
-    """Yield the children of a hypothesis: one further effect each, fully refitted."""
-    for candidate, fit in _starts(parent, bench):
-        child = _full_refit(candidate, fit, bench)
-        yield child
-        if candidate.effect.family == "dry friction":
-            for effect in bench.catalogue:
-                if effect.grows_from == candidate.effect.key:
-                    yield _grown_friction(effect, child, bench)
+    """Yield the children of a hypothesis: one further effect each, fully refitted.
+
+    What is dear is done last, and only for those who can still win: contacts are polished, and
+    dry friction grows into its richer laws.
+    """
+    fits: list[tuple[Candidate, Fit]] = []
+    for candidate, start in _starts(parent, bench):
+        fits.append((candidate, fit_whole(start.structure, start.theta, bench)))
+        if candidate.effect.key not in CONTACT:
+            yield judge(fits[-1][1], bench, added=candidate)
+    lowest = min((fit.cost for _, fit in fits), default=np.inf)
+    contacts: dict[tuple[str, int], Fit] = {}
+    for candidate, fit in sorted(fits, key=lambda pair: pair[1].cost):
+        if candidate.effect.key in CONTACT and candidate.key not in contacts:
+            if fit.cost < _IN_THE_RUNNING * lowest and fit.chi < _POLISHED * parent.fit.chi:
+                fit = polish(fit, bench.training, enough=AT_FLOOR, mapper=bench.mapper)
+            contacts[candidate.key] = fit
+            yield judge(fit, bench, added=candidate)
+    for candidate, fit in fits:
+        running = _NOISE_ALONE * fit.n_points < fit.cost < _IN_THE_RUNNING * lowest
+        for effect in bench.catalogue if running else ():
+            if effect.grows_from == candidate.effect.key:
+                yield _grown_friction(effect, fit, bench)
 
 
 def _starts(parent: Hypothesis, bench: Bench) -> list[tuple[Candidate, Fit]]:
@@ -67,9 +86,11 @@ def _starts(parent: Hypothesis, bench: Bench) -> list[tuple[Candidate, Fit]]:
         _short_refit(loose, s, pieces, bench, top=suspects[0].share) for s in _short_list(suspects)
     ]
     short.sort(key=lambda pair: pair[1].cost)
-    within = _OUT_OF_SIGHT * short[0][1].cost if short else np.inf
+    closed = bool(short) and short[0][1].chi < AT_FLOOR
+    within = _BESIDE_THE_FLOOR if closed else _OUT_OF_SIGHT
+    within *= short[0][1].cost if short else np.inf
     chosen = [pair for pair in short[:_FULL_LIST] if pair[1].cost < within]
-    if short and short[0][1].chi < AT_FLOOR:
+    if closed:
         return chosen
     suspects = [s for s in look(parent.fit, bench.training) if _promises(s, parent.fit)]
     for suspect in suspects[:_FULL_SCREEN]:
@@ -142,13 +163,6 @@ def _short_refit(
     return suspect.candidate, best
 
 
-def _full_refit(candidate: Candidate, start: Fit, bench: Bench) -> Hypothesis:
-    fit = fit_whole(start.structure, start.theta, bench)
-    if candidate.effect.key in CONTACT:
-        fit = polish(fit, bench.training, enough=AT_FLOOR, mapper=bench.mapper)
-    return judge(fit, bench, added=candidate)
-
-
 def fit_whole(structure: Structure, theta: Array, bench: Bench) -> Fit:
     """Fit whole runs; friction first with one size for all runs, then run by run."""
     whole = bench.training
@@ -182,16 +196,14 @@ def fit_whole(structure: Structure, theta: Array, bench: Bench) -> Fit:
     return fit
 
 
-def _grown_friction(effect: Effect, simple: Hypothesis, bench: Bench) -> Hypothesis:
+def _grown_friction(effect: Effect, simple: Fit, bench: Bench) -> Hypothesis:
     """Fit a richer friction law from the simpler one's fit."""
-    structure = simple.fit.structure
+    structure = simple.structure
     index = len(structure.effects) - 1
     place = structure.effects[index].place
-    force = simple.fit.structure.model(simple.fit.theta).terms[index].values[0]
-    base = simple.fit.theta[: structure.span(index).start]
-    trials = candidates_at(
-        effect, place, runs=bench.training, chain=structure.chain(simple.fit.theta)
-    )
+    force = structure.model(simple.theta).terms[index].values[0]
+    base = simple.theta[: structure.span(index).start]
+    trials = candidates_at(effect, place, runs=bench.training, chain=structure.chain(simple.theta))
     without = structure.without(index)
     fits = []
     tried = set()
@@ -201,7 +213,7 @@ def _grown_friction(effect: Effect, simple: Hypothesis, bench: Bench) -> Hypothe
             continue
         tried.add(start)
         grown = without.with_effect(candidate)
-        theta = extend(replace(simple.fit, structure=without, theta=base), candidate, start)[1]
+        theta = extend(replace(simple, structure=without, theta=base), candidate, start)[1]
         fits.append(
             fit_model(
                 grown,

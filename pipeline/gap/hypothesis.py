@@ -19,6 +19,7 @@ CONTACT = ("end_stop", "backlash")
 _ENOUGH_NOISE, _ENOUGH_REPEATS = 2.0, 1.5  # times the floor, or what repeats differ by
 _HELD_OUT_GAIN = 0.95  # an effect must lower the held-out error by this factor …
 _PARTIAL_GAIN = 0.9  # … by this one where too much for a name is left …
+_PARTIAL_CONTACT = 0.55  # (a contact, with its many parameters, stands in for much)
 _CONTACT_GAIN = 0.5  # what a contact leaves is its contact law: no effect to mop it up
 _RUN_GAIN, _RUN_SHARE = 0.97, 0.6  # … and by 3 % in 60 % of the runs
 _BOUND_MARGIN = 0.01  # in logarithms, or in scales
@@ -110,8 +111,10 @@ def judge(fit: Fit, bench: Bench, *, added: Candidate | None = None) -> Hypothes
 
 
 def lowers_error(child: Hypothesis, parent: Hypothesis, bench: Bench) -> bool:
-    """Is the held-out error lower, and by a tenth where too much for a name is left?"""
-    return child.error < (1.0 if bench.explains(child) else _PARTIAL_GAIN) * parent.error
+    """Is the held-out error lower, and by enough where too much for a name is left?"""
+    added = child.key - parent.key
+    gain = _PARTIAL_CONTACT if any(key in CONTACT for key, _ in added) else _PARTIAL_GAIN
+    return child.error < (1.0 if bench.explains(child) else gain) * parent.error
 
 
 def worth_it(child: Hypothesis, parent: Hypothesis, bench: Bench) -> bool:

@@ -106,29 +106,23 @@ def _layout(structure: Structure, run: Run, *, scatter_free: bool) -> Layout:
     )
 
 
-def _blocks(residual: Array, run: Run) -> Array:
-    """Weigh (…, rows, samples) and average over blocks, so that white noise keeps its size.
+def _by_shot(residual: Array, run: Run) -> Array:
+    """Weigh (…, rows, samples) and cut it into shots, padded with zeros to one length.
 
-    Returns (…, shots, rows * blocks), the shots padded with zeros to one length.
+    Returns (…, shots, rows * longest).
     """
-    q = run.block
     residual = residual * run.weight
-    counts = np.diff(run.shots) // q
+    counts = np.diff(run.shots)
     longest = int(counts.max())
     out = np.zeros((*residual.shape[:-2], len(counts), residual.shape[-2], longest))
     for s, (first, count) in enumerate(zip(run.shots[:-1], counts, strict=True)):
-        piece = residual[..., first : first + count * q]
-        if q > 1:
-            piece = piece.reshape(*piece.shape[:-1], count, q).sum(-1) / np.sqrt(q)
-        out[..., s, :, :count] = piece
+        out[..., s, :, :count] = residual[..., first : first + count]
     return out.reshape(*out.shape[:-2], out.shape[-2] * longest)
 
 
 def residual_points(run: Run) -> float:
     """Return how many residuals a run adds to a fit, each by its weight."""
-    q = run.block
-    pieces = zip(run.shots[:-1], np.diff(run.shots) // q, strict=True)
-    return sum(float((run.weight[:, a : a + m * q] ** 2).sum()) / q for a, m in pieces)
+    return float((run.thin.weight**2).sum())
 
 
 def triangle(matrix: Array) -> Array:
@@ -151,8 +145,9 @@ def linearise(
     """Return a run's residual and its derivatives, with its own unknowns eliminated.
 
     `inflate` widens the noise to the misfit of a model that is still wrong, as far as priors are
-    concerned; `extras` (k, rows, samples) are further columns to project.
+    concerned; `extras` (k, rows, samples of `run.thin`) are further columns to project.
     """
+    run = run.thin
     layout = _layout(structure, run, scatter_free=scatter_free)
     n, P = structure.n, theta.size
     shots = len(run.shots) - 1
@@ -202,17 +197,17 @@ def linearise(
     )[:, list(run.rows)]
     sigma = run.sigma[:, None]
     model = y[0] + own.zero[list(run.rows)][:, None]
-    residual = _blocks((run.y - model) / sigma, run)  # (shots, points)
+    residual = _by_shot((run.y - model) / sigma, run)  # (shots, points)
     jac = (y[1:] - y[0]) / sigma / np.array(divisors)[:, None, None]
-    jac = _blocks(jac, run)  # (b - 1, shots, points)
+    jac = _by_shot(jac, run)  # (b - 1, shots, points)
     ones = np.zeros((len(layout.zero), len(run.rows), run.t.size))
     for z, i in enumerate(layout.zero):
         ones[z, run.rows.index(i)] = 1.0 / run.sigma[run.rows.index(i)]
-    zero_columns = _blocks(ones, run)
+    zero_columns = _by_shot(ones, run)
     theta_columns, local_columns = jac[:P], jac[P:]
     shot_columns = local_columns[: lanes_x + lanes_v]
     scatter_columns = local_columns[lanes_x + lanes_v :]
-    further = [] if extras is None else [_blocks(extras / sigma, run)]
+    further = [] if extras is None else [_by_shot(extras / sigma, run)]
     wide = np.concatenate(
         [shot_columns, scatter_columns, zero_columns, theta_columns, *further, residual[None]]
     )  # (columns, shots, points)
@@ -279,8 +274,9 @@ def run_cost(
     """Return chi-square of a run, and its prior terms."""
     if not structure.visible(theta):
         return np.inf, 0.0
+    run = run.thin
     model = simulate_run(structure, theta[None], run, own)[0]
-    residual = _blocks((run.y - model) / run.sigma[:, None], run)
+    residual = _by_shot((run.y - model) / run.sigma[:, None], run)
     chi = float((residual**2).sum())
     if not np.isfinite(chi):
         return np.inf, 0.0

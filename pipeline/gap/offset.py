@@ -31,6 +31,8 @@ def find_offset(chain: Chain, runs: Sequence[Run], locals_: Sequence[Locals]) ->
     """Return the constant force that the fitted zeros ask for, or None."""
     if not np.any(chain.k > 0):
         return None
+    if len({run.free for run in runs}) == 1 and not any(run.at_rest for run in runs):
+        return None  # neither other springs nor a start where it was zeroed: a zero like any other
     best: tuple[float, Offset] | None = None
     total, step = 0.0, 0.0
     for run, own in zip(runs, locals_, strict=True):

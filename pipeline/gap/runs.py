@@ -1,6 +1,8 @@
 """Records made ready for fitting: free motion only, rest and start found, noise estimated."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -11,7 +13,8 @@ from pipeline.results import Record
 _REST_TIME = 0.02  # s without motion: the run starts at rest
 _TAIL = 0.12  # share of a record that must lie still to tell the rest point
 _STILL = 2.6  # encoder steps, peak to peak, that count as lying still
-_FIT_RATE = 250.0  # Hz; faster records are averaged in blocks, model and measurement alike
+_FIT_RATE = 250.0  # Hz; faster records are averaged in blocks for the fits
+_FEWEST_BLOCKS = 3  # tell a curvature
 _USUAL_FREQUENCY = 8.0  # Hz; carts on a bench swing no faster
 _SMOOTHING = 0.03  # s, half width of a local cubic, at the usual pace
 _HELD_SAMPLES = 4  # fewer samples at the top are no hold …
@@ -36,7 +39,7 @@ class Run:
     zero, zero_std : (n,) where the encoder's zero is expected, and how far off it may be.
     sigma : (rows,) noise of one sample.
     weight : (rows, samples) square root of how much each sample counts, at most 1.
-    block : samples averaged to one residual.
+    block : samples averaged to one residual, in `thin`.
     pace : 1 for a bench of carts, less in proportion for what swings faster.
     shots : (shots + 1,) bounds of the pieces that start afresh; (0, samples) is the whole run.
     shot_x, shot_v : (shots, n) smoothed states at the start of each shot, zeros not taken off.
@@ -68,6 +71,11 @@ class Run:
     def swing(self) -> Array:
         """(rows,) root-mean-square of the reading about its rest."""
         return np.sqrt(np.mean((self.y - self.rest[list(self.rows)][:, None]) ** 2, axis=1))
+
+    @cached_property
+    def thin(self) -> "Run":
+        """The run as the fits see it: fast samples block by block, the pieces as they are."""
+        return _thin(self) if self.block > 1 else self
 
 
 def make_run(record: Record, *, n: int, in_motion: bool = False) -> Run:
@@ -144,6 +152,41 @@ def make_run(record: Record, *, n: int, in_motion: bool = False) -> Run:
         shots=(0, t.size),
         shot_x=start[None],
         shot_v=slope[None],
+    )
+
+
+def _thin(run: Run) -> Run:
+    """Return one reading for each block of samples, at the middle of its times.
+
+    The mean of a smooth motion exceeds its value in the middle by half the curvature times the
+    spread of the times: that is taken off, so the model need not be simulated sample by sample.
+    The first sample of each piece, where its state belongs, stays without weight.
+    """
+    q = run.block
+    t, y, weight, shots = [], [], [], [0]
+    for first, end in pairwise(run.shots):
+        last = first + (end - first) // q * q
+        times = run.t[first:last].reshape(-1, q)
+        middle = times.mean(axis=1)
+        mean = run.y[:, first:last].reshape(len(run.y), -1, q).mean(axis=2)
+        if middle.size >= _FEWEST_BLOCKS:
+            slope = np.diff(mean, axis=1) / np.diff(middle)
+            curvature = np.diff(slope, axis=1) / (0.5 * (middle[2:] - middle[:-2]))
+            mean = mean - 0.5 * times.var(axis=1) * np.pad(curvature, ((0, 0), (1, 1)), mode="edge")
+        share = (run.weight[:, first:last] ** 2).reshape(len(run.y), -1, q).mean(axis=2)
+        t += [run.t[first : first + 1], middle]
+        y += [run.y[:, first : first + 1], mean]
+        weight += [np.zeros((len(run.y), 1)), np.sqrt(share)]
+        shots.append(shots[-1] + 1 + middle.size)
+    side = (1.0 - q**-2) / 24.0  # of each neighbour's mean in a corrected one
+    return replace(
+        run,
+        t=np.concatenate(t),
+        y=np.concatenate(y, axis=1),
+        weight=np.concatenate(weight, axis=1),
+        sigma=run.sigma * np.sqrt(((1.0 + 2.0 * side) ** 2 + 2.0 * side**2) / q),
+        block=1,
+        shots=tuple(shots),
     )
 
 

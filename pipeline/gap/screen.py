@@ -115,14 +115,14 @@ def added_signals(
     *,
     mapper: Mapper,
 ) -> list[Array]:
-    """Return per run (k, rows, samples): the change of the readings under each trial.
+    """Return per run (k, rows, samples of `thin`): the change of the readings under each trial.
 
     A trial is a candidate with the values of its parameters; a diverged one changes nothing.
     """
     vectors = [(fit.structure.with_effect(candidate), values) for candidate, values in trials]
 
     def change(pair: tuple[Run, Locals]) -> Array:
-        run, own = pair
+        run, own = pair[0].thin, pair[1]
         base = simulate_run(fit.structure, fit.theta[None], run, own)[0]
         out = np.empty((len(trials), *base.shape))
         for at, (structure, values) in enumerate(vectors):

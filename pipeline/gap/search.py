@@ -7,12 +7,15 @@ import numpy as np
 
 from pipeline.gap.deadline import OutOfTime
 from pipeline.gap.grow import fit_whole, grow
-from pipeline.gap.hypothesis import BIC_DROP, Bench, Hypothesis, judge, worth_it
+from pipeline.gap.hypothesis import BIC_DROP, CONTACT, Bench, Hypothesis, judge, worth_it
 from pipeline.gap.structure import Candidate
 
-_BEAM = (3, 1, 1)  # hypotheses kept after one, two, three effects
-_HOPELESS = 30.0  # a hypothesis with this many times the best one's chi-square is not grown
-_DEPTH = len(_BEAM)
+_BEAM = (3, 2)  # hypotheses kept after one effect, two; then one
+_DEPTH = 6  # effects
+_HOPELESS = 5.0  # a hypothesis with this many times the best one's chi-square is not grown
+_STEP = 0.81  # of the chi-square: a tenth of the error, which a further effect must take
+_CONTACT_STEP = 0.3  # a contact that is there takes more, and without it others can be searched …
+_CONTACT_LAW = 10.0  # … chi-square that a contact of another law leaves: nothing to explain
 
 
 def search(baseline: Hypothesis, bench: Bench, *, depth: int = _DEPTH) -> list[Hypothesis]:
@@ -36,7 +39,7 @@ def _grow_beam(
         children: list[Hypothesis] = []
         best = min(beam, key=lambda h: h.bic)
         for parent in beam:
-            if parent.at_floor or parent.fit.chi > _HOPELESS * best.fit.chi:
+            if parent.fit.chi > _HOPELESS * best.fit.chi:
                 continue
             for child in grow(parent, bench):
                 if not (child.sound and np.isfinite(child.error)):
@@ -45,14 +48,31 @@ def _grow_beam(
                     seen[child.key] = child
                     if child.bic < parent.bic - BIC_DROP:
                         children.append(child)
+            if any(child.at_floor for child in children):
+                break
         if not children:
             break
         unique = {child.key: child for child in sorted(children, key=lambda h: -h.bic)}
         worthy = [child for child in unique.values() if not _needlessly_rich(child, unique)]
-        beam = sorted(worthy, key=lambda h: h.bic)[: _BEAM[level]]
-        bench.tell(f"{level + 1} effect{'s' * (level > 0)}: " + _names(beam[0]))
-        if beam[0].at_floor:
+        worthy.sort(key=lambda h: h.bic)
+        bench.tell(f"{level + 1} effect{'s' * (level > 0)}: " + _names(worthy[0]))
+        if worthy[0].at_floor:
             break
+        before = min(h.fit.chi for h in beam)
+        kept = [child for child in worthy if _leads_on(child, before)]
+        beam = kept[: _BEAM[level] if level < len(_BEAM) else 1]
+        if not beam:
+            break
+
+
+def _leads_on(child: Hypothesis, before: float) -> bool:
+    """May a further effect still make this one the best? `before` is the chi-square without."""
+    if child.added is not None and child.added.effect.key in CONTACT:
+        return _CONTACT_LAW < child.fit.chi < _CONTACT_STEP * before
+    if any(key in CONTACT for key, _ in child.key) and child.fit.chi < _CONTACT_LAW:
+        return False
+    # One of two effects may do little by itself.
+    return len(child.key) == 1 or child.fit.chi < _STEP * before
 
 
 def _needlessly_rich(

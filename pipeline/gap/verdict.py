@@ -34,20 +34,23 @@ AS_REPEATS = 1.1  # an error below this many times what repeats differ by is the
 
 
 def reach_verdict(
-    steps: Sequence[Hypothesis], found: Sequence[Hypothesis], *, bench: Bench, sample_time: float
-) -> tuple[Verdict, list[Hypothesis]]:
-    """Return the verdict, and under `ambiguous` the rivals that explain as much.
+    steps: tuple[Hypothesis, ...],
+    found: Sequence[Hypothesis],
+    *,
+    bench: Bench,
+    sample_time: float,
+) -> tuple[Verdict, tuple[Hypothesis, ...], list[Hypothesis]]:
+    """Return the verdict, the steps that stand, and under `ambiguous` the rivals.
 
-    `steps` lead from the linear model to the one chosen; `found` are all hypotheses judged.
+    `steps` lead from the linear model to the one chosen; `found` are all hypotheses judged. Where
+    much is left, a step that another could stand in for is taken back.
     """
     baseline, chosen = steps[0], steps[-1]
     if not chosen.key:
         least = max(_NOTHING * bench.floor, AS_REPEATS * bench.repeatability)
         nothing = baseline.at_floor or baseline.error < least
-        return ("none" if nothing else "unexplained"), []
+        return ("none" if nothing else "unexplained"), steps, []
     explained = bench.explains(chosen)
-    if not explained and not all(lowers_error(b, a, bench) for a, b in pairwise(steps)):
-        return "unexplained", []
     gain = baseline.bic - chosen.bic
     close = [
         rival
@@ -57,12 +60,15 @@ def reach_verdict(
         and rival.error < _CLOSE_ERROR * chosen.error
         and _evidence(chosen, rival, bench) < min(_CLOSE_GAIN * gain, _CLOSE_BIC)
         and not _same_thing(rival, chosen, sample_time=sample_time)
+        and (explained or not _same_kind(rival, chosen))
     ]
-    if close and not explained and chosen.error > _MOSTLY * baseline.error:
-        return "unexplained", []  # any of several stand-ins would help a little
+    helpful = all(lowers_error(after, before, bench) for before, after in pairwise(steps))
+    disputed = bool(close) and chosen.error > _MOSTLY * baseline.error
+    if not explained and (disputed or not helpful):
+        return reach_verdict(steps[:-1], found, bench=bench, sample_time=sample_time)
     if close:
-        return "ambiguous", close
-    return ("named" if explained else "partial"), []
+        return "ambiguous", steps, close
+    return ("named" if explained else "partial"), steps, []
 
 
 def _evidence(chosen: Hypothesis, rival: Hypothesis, bench: Bench) -> float:
@@ -94,6 +100,14 @@ def _independent_points(hypothesis: Hypothesis, bench: Bench) -> float:
             correlation = covariance / max(covariance[0], 1e-300)
             total += row.size / (1.0 + 2.0 * float((correlation[1:] ** 2).sum()))
     return total
+
+
+def _same_kind(rival: Hypothesis, chosen: Hypothesis) -> bool:
+    """Are the two laws of one family at one place, dry friction on one cart, say?"""
+    (mine,) = chosen.key - rival.key
+    (other,) = rival.key - chosen.key
+    families = {find_effect(key).family for key, _ in (mine, other)}
+    return mine[1] == other[1] and len(families) == 1 and "" not in families
 
 
 def _same_thing(rival: Hypothesis, chosen: Hypothesis, *, sample_time: float) -> bool:

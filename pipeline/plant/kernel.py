@@ -383,14 +383,16 @@ def _velocity(v, d2, d3, d4, d5, d6, h):
 
 
 @_jit
-def _integral(time, knots, u, total, at):
-    """Integrate the held input up to `time`; `at` is the interval found last."""
+def _integral(time, knots, u, total, twice, at):
+    """Integrate the held input up to `time`, once and twice; `at` is the interval found last."""
     last = knots.size - 1
     while at < last and knots[at + 1] <= time:
         at += 1
     while at > 0 and knots[at] > time:
         at -= 1
-    return total[at] + u[at] * (time - knots[at]), at
+    since = time - knots[at]
+    once = total[at] + u[at] * since
+    return once, twice[at] + 0.5 * (total[at] + once) * since, at
 
 
 @_jit
@@ -454,6 +456,7 @@ def _simulate(cart, spring, drive, x0, v0, scatter, free, t, knots, command, sta
 
     u = np.empty(command.size)
     total = np.zeros(command.size)
+    twice = np.zeros(command.size)
     for i in range(command.size):
         value = command[i]
         if drive[DEAD] != 0.0:
@@ -461,8 +464,11 @@ def _simulate(cart, spring, drive, x0, v0, scatter, free, t, knots, command, sta
             value = np.sign(value) * size_past if size_past > 0.0 else 0.0
         u[i] = min(max(value, -drive[LIMIT]), drive[LIMIT])
         if i > 0:
-            total[i] = total[i - 1] + u[i - 1] * (knots[i] - knots[i - 1])
+            held = knots[i] - knots[i - 1]
+            total[i] = total[i - 1] + u[i - 1] * held
+            twice[i] = twice[i - 1] + 0.5 * (total[i - 1] + total[i]) * held
     lagged = u[0]
+    driven = motor if motor >= 0 else 0
     at = 0
     on = 0
 
@@ -488,7 +494,7 @@ def _simulate(cart, spring, drive, x0, v0, scatter, free, t, knots, command, sta
                 active[e] = not active[e]
                 sign = 1.0 if active[e] else -1.0
                 _switch(switches[e], sign, cart, spring, drive, n, motor, s, K, C)
-        past, at = _integral(t[first] - drive[DELAY], knots, u, total, at)
+        past, past2, at = _integral(t[first] - drive[DELAY], knots, u, total, twice, at)
         if shot == 0 and presliding:
             for i in range(N):
                 s[MID_X, i], s[MID_V, i], s[FORCE, i] = s[X, i], s[V, i], s[FIX, i]
@@ -511,14 +517,18 @@ def _simulate(cart, spring, drive, x0, v0, scatter, free, t, knots, command, sta
             h = interval / count
             for sub in range(count):
                 now = t[sample] + sub * h
-                upto, at = _integral(now + h - drive[DELAY], knots, u, total, at)
+                upto, upto2, at = _integral(now + h - drive[DELAY], knots, u, total, twice, at)
                 mean = (upto - past) / h
-                past = upto
+                # What comes early in the step moves the body further than its mean would.
+                early = upto2 - past2 - 0.5 * h * (past + upto)
+                past, past2 = upto, upto2
                 if drive[LAG] > 0.0:
                     decay = np.exp(-h / drive[LAG])
                     target = mean
                     mean = target + (lagged - target) * drive[LAG] / h * (1.0 - decay)
+                    before = lagged
                     lagged = target + (lagged - target) * decay
+                    early = (before - lagged) * h * h / 12.0
                 drive_c = 0.0
                 if drive[DRIVE_C] != 0.0:
                     while on < knots.size - 1 and knots[on + 1] <= now + 0.5 * h:
@@ -544,6 +554,8 @@ def _simulate(cart, spring, drive, x0, v0, scatter, free, t, knots, command, sta
                     active,
                     contact_step,
                 )
+                if not dry or s[V, driven] != 0.0:
+                    s[X, driven] += early * s[INV, driven]
             if not abs(s[X, 0]) + abs(s[X, n - 1]) < _BLOWN_UP:
                 return False
     return True

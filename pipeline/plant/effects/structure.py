@@ -24,6 +24,7 @@ END_STOP = Effect(
             unit="input/position",
             scale=lambda s: s.stiffness,
             trials=(20.0,),
+            lower=4.0,  # what is softer is a spring that changes
             upper=3000.0,
             neutral=0.0,
         ),
