@@ -93,6 +93,8 @@ def outcome(truth: list, found: list, listed: set, verdict: str, baseline: float
     """Classify a case; `equivalent` are the provable ones of the catalogue."""
     if verdict == "unexplained":
         return "unexplained"
+    if verdict == "partial":
+        return "partial, right" if set(found) <= set(map(tuple, truth)) else "partial, wrong"
     if found == truth:
         return "ambiguous, right first" if verdict == "ambiguous" else "exact"
     if not found:
@@ -142,17 +144,32 @@ def main() -> None:
     summarise(rows)
 
 
+def _name(row: dict) -> str:
+    return " + ".join(effect for effect, _ in row["truth"]) or "nothing"
+
+
 def summarise(rows: list[dict]) -> None:
-    """Print outcomes by effect, the gap after, coverage of the standard errors and times."""
+    """Print outcomes and times by effect and carts, the gap after, coverage of the errors."""
     outcomes = Counter(row["outcome"] for row in rows)
     print(f"\n{len(rows)} cases: " + ", ".join(f"{k} {v}" for k, v in outcomes.most_common()))
     by_effect: dict[str, Counter] = {}
     for row in rows:
-        name = " + ".join(effect for effect, _ in row["truth"]) or "nothing"
-        by_effect.setdefault(name, Counter())[row["outcome"]] += 1
+        by_effect.setdefault(_name(row), Counter())[row["outcome"]] += 1
     if len(by_effect) < 25:
         for name, counts in sorted(by_effect.items()):
-            print(f"  {name:22s} " + ", ".join(f"{k} {v}" for k, v in counts.most_common()))
+            times = [
+                np.median(cpu)
+                for n in (1, 2, 3)
+                if (cpu := [r["cpu"] for r in rows if r["n"] == n and _name(r) == name])
+            ]
+            print(
+                f"  {name:22s} "
+                + ", ".join(f"{k} {v}" for k, v in counts.most_common())
+                + "; s: "
+                + ", ".join(f"{t:.1f}" for t in times)
+            )
+    near = [row["final"] <= 2.0 for row in rows]
+    print(f"at most twice the noise left: {sum(near)} of {len(near)}")
     final = np.array([row["final"] for row in rows if row["verdict"] in ("named", "ambiguous")])
     if final.size:
         print(
