@@ -60,6 +60,17 @@ def test_a_stuck_encoder_is_found():
     assert stuck_spans(np.rint(440 * np.exp(-3 * T) * np.cos(20 * T))) == []
 
 
+def test_a_coarse_encoder_that_stuck_comes_back_with_a_jump():
+    """Of few counts none shows speed; a cart that friction holds goes on where it stands."""
+    x = np.rint(12 * np.sin(3 * T))
+    assert stuck_spans(x) == []
+    held = np.concatenate([x[:240], np.full(60, x[240]), x[240:]])
+    assert stuck_spans(held) == []
+    frozen = x.copy()
+    frozen[241:301] = frozen[240]
+    assert [last for _, last in stuck_spans(frozen)] == [300]
+
+
 @pytest.mark.parametrize("digits", [2, 3, 4, 9])
 def test_clipping_is_told_from_a_rounded_crest(digits):
     """A sine rounded to a few digits dwells at its crest, but is not clipped."""

@@ -7,14 +7,12 @@ import numpy as np
 from pipeline.grading.grade import Flag
 from pipeline.grading.reference import is_explained
 from pipeline.ingest.inspect import is_stepped, line_frequency
-from pipeline.ingest.problems import saturation, stuck_spans
+from pipeline.ingest.problems import saturation
 from pipeline.plant.chain import Array
 from pipeline.results import Analysis, Record
 
 _FREQUENCY = 0.08  # relative: a stated frequency further from that of the input is another run's
 _CUT = 0.5  # of the usual length of the repeats
-_FASTEST = 0.98  # quantile of the steps from sample to sample: the odd jump does not count
-_AT_SPEED, _AWAY = 0.6, 1.5  # of the fastest
 _DRIVEN = 1e-3  # of the largest input of any run: a decay with more is driven
 
 
@@ -65,11 +63,6 @@ def _problems(
         if cart not in record.free:
             continue
         y = record.position(cart)
-        for first, last in _stuck(y, sticky=sticky)[:1]:
-            yield (
-                f"the encoder of cart {cart} stands still at speed from {t[first]:.4g} s to "
-                f"{t[last]:.4g} s: it stuck"
-            )
         # A cart that sticks rests where it turns, which looks like a clipped reading.
         limit = None if sticky or record.kind not in ("sine", "sweep") else saturation(y)
         if limit is not None:
@@ -86,25 +79,6 @@ def _problems(
         typical = float(np.median(siblings))
         if length < _CUT * typical:
             yield f"it lasts {length:.3g} s, its repeats {typical:.3g} s: the file looks cut"
-
-
-def _stuck(y: Array, *, sticky: bool) -> list[tuple[int, int]]:
-    """Return where an encoder stuck; of a cart that may stick itself, only what no cart can do.
-
-    Static friction stops a cart from a crawl; it does not stop one at speed, nor is it elsewhere
-    when it moves on.
-    """
-    spans = stuck_spans(y)
-    if not spans or not sticky:
-        return spans
-    moves = np.abs(np.diff(y))
-    fastest = float(np.quantile(moves, _FASTEST))
-    return [
-        (first, last)
-        for first, last in spans
-        if moves[first - 1] >= _AT_SPEED * fastest
-        or (last < moves.size and moves[last] >= _AWAY * fastest)
-    ]
 
 
 def _input_problems(record: Record, u: Array, *, largest: float) -> Iterator[str]:

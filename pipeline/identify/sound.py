@@ -7,6 +7,7 @@ from itertools import combinations
 from pipeline.errors import DataError
 from pipeline.identify.carts import Identified, identify
 from pipeline.identify.log import Progress
+from pipeline.identify.stuck import find_stuck
 from pipeline.ingest.read import Ingested
 from pipeline.plant.chain import Chain
 from pipeline.results import LeftOut
@@ -31,8 +32,8 @@ def identify_from_sound(
     """
     driven = [r for r in data.records if r.kind in ("step", "sweep")]
     unit = system.position.unit
-    # Shown by the encoder's own step, later by numbers that are gone once they are out.
-    shown = find_other_units(data.records)
+    # Shown by the encoder alone, later by numbers that are gone once they are out.
+    shown = find_other_units(data.records) | find_stuck(data.records)
     contradicted = []
     chain: Chain | None = None
     fits: Mapping[str, Followed] = {}

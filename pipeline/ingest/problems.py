@@ -8,6 +8,7 @@ from pipeline.ingest.signals import encoder_step
 from pipeline.plant.chain import Array
 
 _ABRUPT = 5.0  # encoder steps a sample; no cart stops from that speed between two samples
+_JUMP = 1.5  # times the fastest other move between two samples: no cart starts so from rest
 _STUCK_SAMPLES = 10
 _CLIPPED_SAMPLES = 3
 _CLIPPED_SHARE = 5  # times as often as the next level; the rounded crest of a sine: 1.4 times
@@ -18,7 +19,8 @@ def stuck_spans(x: Array) -> list[tuple[int, int]]:
     """Return (first, last) sample of every stretch in which a moving encoder stood still.
 
     The reading freezes at speed and, if it comes back, comes back with a jump; a cart that stops
-    slows down first.
+    slows down first. A coarse encoder shows no speed: there the jump alone tells, where it is far
+    beyond any other move.
     """
     moves = np.abs(np.diff(x))
     still = [
@@ -30,11 +32,15 @@ def stuck_spans(x: Array) -> list[tuple[int, int]]:
     if not still or moving.size < 3:
         return []
     abrupt = _ABRUPT * (encoder_step(x) or float(np.median(moving)))
-    return [
-        (first, last)
-        for first, last in still
-        if moves[first - 1] >= abrupt and (last == x.size - 1 or moves[last] >= abrupt)
-    ]
+    after = [last for _, last in still if last < moves.size]
+    jump = max(abrupt, _JUMP * float(np.delete(moves, after).max(initial=0.0)))
+
+    def is_stuck(first: int, last: int) -> bool:
+        on = moves[last : last + 2]  # it may move on between two samples
+        back = bool(on.max(initial=np.inf if last == moves.size else 0.0) >= abrupt)
+        return (moves[first - 1] >= abrupt and back) or bool(on[:1].max(initial=0.0) >= jump)
+
+    return [(first, last) for first, last in still if is_stuck(first, last)]
 
 
 def _runs(still: np.ndarray) -> Iterator[tuple[int, int]]:

@@ -14,6 +14,7 @@ from pipeline.plant.simulate import simulate_linear
 from pipeline.results import Check, LeftOut, Record
 from pipeline.stages._signals import TIME_FACTORS
 from pipeline.stages.follow import (
+    FOLLOWED,
     Followed,
     Misread,
     find_misread,
@@ -193,9 +194,12 @@ def _frozen(
             force = force_on(record, chain, cart=cart)
             if moved < far or not rest.size or force is None:
                 continue
-            if 2 * friction.get(cart, np.inf) >= np.ptp(force[part]):
+            # What pulls with the last sample moves the cart after it.
+            if 2 * friction.get(cart, np.inf) >= np.ptp(force[part][:-1]):
                 continue
-            if float(np.sqrt(np.mean(rest**2))) < _ELSEWHERE * moved:
+            elsewhere = float(np.mean(rest**2))
+            follows = elsewhere < FOLLOWED * float(np.var(np.delete(y, part)))
+            if follows and np.sqrt(elsewhere) < _ELSEWHERE * moved:
                 first, last = record.t[part.start], record.t[part.stop - 1]
                 yield (
                     f"the encoder of cart {cart} stands still from {first:.4g} s to {last:.4g} s, "

@@ -21,7 +21,7 @@ from pipeline.stages.time_window import Window, compare, open_window
 _SAME_SCALE = 0.1  # relative
 _SEEN_STEPS = 5.0  # encoder steps of motion: rounding changes a smaller one by any factor
 # Shares of a record's power (about its mean) that the chain leaves unexplained.
-_FOLLOWED = 0.1
+FOLLOWED = 0.1
 _DOUBTFUL, _BETTER = 0.005, 10.0  # as recorded at least this, read otherwise so many times less
 _DETUNED = np.linspace(0.85, 1.15, 13)
 # Simulated carts with dry friction F under a force of amplitude A leave at least (F / 5A)² where
@@ -54,7 +54,7 @@ class Followed:
     @property
     def belongs(self) -> bool:
         """Whether the record follows."""
-        return self.share <= _FOLLOWED
+        return self.share <= FOLLOWED
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,7 +106,7 @@ def find_misread(
     ----------
     fit : how it follows as it is.
     """
-    found, least = None, min(fit.share / better, _FOLLOWED)
+    found, least = None, min(fit.share / better, FOLLOWED)
     if better > 1 and fit.share < _DOUBTFUL:
         return None
     # As the bench counts its input: a record's own sign was found by what it holds.
@@ -209,7 +209,7 @@ def _hold_against(record: Record, chain: Chain) -> Followed | None:
         friction={
             cart: float(_FRICTION * np.sqrt(max(share, _LEAST)) * np.ptp(force) / 2)
             for cart, share in zip(window.carts, lost, strict=True)
-            if share <= _FOLLOWED and (force := force_on(record, chain, cart=cart)) is not None
+            if share <= FOLLOWED and (force := force_on(record, chain, cart=cart)) is not None
         },
     )
 
