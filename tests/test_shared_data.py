@@ -46,6 +46,35 @@ def disguised(record, rng, *, noise=0.0, scale=1.0, keep=1.0, later=0.0):
     )
 
 
+@pytest.fixture(scope="module")
+def quiet_teams(tmp_path_factory):
+    """What three teams would read on one bench, with encoders too fine to tell any noise."""
+    folder = tmp_path_factory.mktemp("quiet")
+    for seed in range(3):
+        write_submission(
+            folder / str(seed), chain="throne-2dof", seed=seed, compact=True, count=COUNT / 100
+        )
+    return [read_data(load_submission(folder / str(seed))).records for seed in range(3)]
+
+
+def rounded(records, *, count, seed):
+    """Return recordings by an encoder of that step, whose zero is anywhere and which has no noise.
+
+    Only what no controller drives: a controller would have read the coarse encoder, too.
+    """
+    rng = np.random.default_rng(seed)
+    zeros = [rng.uniform(-2, 2, size=(record.y.shape[0], 1)) for record in records]
+    return [
+        replace(
+            record,
+            y=count * np.round(record.y / count + zero),
+            resolution=np.full_like(record.resolution, count),
+        )
+        for record, zero in zip(records, zeros, strict=True)
+        if record.kind != "closed_loop"
+    ]
+
+
 def of_kind(records, kind):
     return next(record for record in records if record.kind == kind)
 
@@ -53,6 +82,39 @@ def of_kind(records, kind):
 def test_honest_teams_on_one_bench_share_nothing(teams):
     """The same carts under the same inputs move alike; their noise does not."""
     assert find_shared([prints(str(i), records) for i, records in enumerate(teams)]) == {}
+
+
+@pytest.mark.parametrize("per_cm", [5, 20, 37, 100, 500])
+def test_rounding_of_one_motion_is_nobodys(quiet_teams, per_cm):
+    """Without noise one motion is rounded alike where the zeros happen to agree: no evidence."""
+    honest = [
+        rounded(records, count=1 / per_cm, seed=seed) for seed, records in enumerate(quiet_teams)
+    ]
+    batch = [prints(str(seed), records) for seed, records in enumerate(honest)]
+    assert find_shared(batch) == {}
+    rng = np.random.default_rng(4)
+    if per_cm >= 100:  # a whole hand-in has too many zeros in common
+        copied = [disguised(r, rng, keep=0.8, later=2.0) for r in honest[0]]
+        assert set(find_shared([*batch, prints("copy", copied)])) == {"0", "copy"}
+
+
+@pytest.mark.parametrize("per_cm", [5, 20])
+def test_honest_teams_with_coarse_encoders_share_nothing(tmp_path, per_cm):
+    """Also where the carts move by one or two counts, and under feedback the input by as few."""
+    for seed in (1, 2, 7):
+        write_submission(
+            tmp_path / str(seed),
+            chain="throne-2dof",
+            seed=seed,
+            compact=True,
+            count=1 / per_cm,
+            travel=0.3,
+        )
+    batch = [
+        prints(str(seed), read_data(load_submission(tmp_path / str(seed))).records)
+        for seed in (1, 2, 7)
+    ]
+    assert find_shared(batch) == {}
 
 
 @pytest.mark.parametrize("kind", ["decay", "step", "sweep", "closed_loop"])

@@ -2,7 +2,9 @@
 
 A copy has the noise of its original, whatever noise was added on top: the regression of one
 residual on the other, brought to one scale, has slope one. Two honest runs share at most what the
-motion and the encoder's rounding leave in the residuals, a slope well below a half.
+motion and the encoder's rounding leave in the residuals: with noise a slope well below a half.
+Without noise, on a bench that repeats its motion to within a count, it is whatever their zeros
+make of it, and the recordings that agree only in part, or disagree, show that this is so.
 """
 
 from collections import Counter, defaultdict
@@ -29,6 +31,11 @@ _MOST_ALIKE = 16  # first anchors looked at for one anchor, the most alike; and 
 _MOST_COMPARED = 10  # times the recordings that two submissions have of one kind
 _LEAST_OVERLAP = 80  # samples that say something in both
 _LEAST_SLOPE = 0.5
+# Read from zeros δ counts apart, one motion without noise is rounded to a slope of 1 - 6 δ + 6 δ²:
+# one in five has 0.5 and more, one in two is in these bounds. With noise of 0.2 counts ± 0.09 is
+# left of it, and none.
+_LEAST_IN_PART, _MOST_IN_PART = 0.2, 0.4  # or below minus the least
+_MATCHES_TO_IN_PART = 10  # no chance, if that many agree wholly for each pair that does in part
 _NEARBY = 50  # shifts to either side that show how well chance does here
 _OWN_WIDTH = 2  # shifts next to the right one see the same match
 _COUNTS = 4.5  # sigmas of a recording that counts with others
@@ -185,11 +192,17 @@ def same_recordings(a: Prints, b: Prints) -> bool:
 
 
 def _decisive(found: Sequence[_Match]) -> list[_Match]:
-    """Return the matches of one pair of submissions, one for each recording, if they suffice."""
+    """Return the matches of one pair of submissions, one for each recording, if they suffice.
+
+    They do not where further recordings agree in part: the bench then repeats its motion to
+    within a count, with little noise, and that some are rounded alike is a matter of the zeros.
+    """
     chosen: list[_Match] = []
     for match in sorted(found, key=lambda m: (-m[0], m[1:])):
-        if all(match[1] != c[1] and match[2] != c[2] for c in chosen):
+        if match[0] > 0 and all(match[1] != c[1] and match[2] != c[2] for c in chosen):
             chosen.append(match)
+    if len(chosen) <= _MATCHES_TO_IN_PART * sum(sigmas < 0 for sigmas, _, _ in found):
+        return []
     together = float(np.sqrt(sum(sigmas**2 for sigmas, _, _ in chosen)))
     enough = chosen and (chosen[0][0] >= _ALONE or together >= _TOGETHER)
     return chosen if enough else []
@@ -201,7 +214,10 @@ def _decisive(found: Sequence[_Match]) -> list[_Match]:
 def _matches(
     entries: Sequence[_Entry], *, first_batch: int, everyone: int, owners: Sequence[Prints]
 ) -> Iterator[tuple[_Entry, _Entry, float]]:
-    """Yield pairs of recordings of different teams that share their noise, with the sigmas."""
+    """Yield pairs of recordings of different teams that share their noise, with the sigmas.
+
+    Those that share only a part of it, as one motion's rounding does, have negative ones.
+    """
     best: dict[tuple[int, int], float] = {}
     seen: set[tuple[int, int, int]] = set()
     apart: dict[tuple[int, int], bool] = {}
@@ -227,8 +243,8 @@ def _matches(
         in_a, in_b = a.print.swing[anchor_i], b.print.swing[anchor_j]
         scale = float(in_b / in_a) if in_a and in_b else None
         sigmas = _agreement(a.print, b.print, shift=shift, scale=scale)
-        if sigmas >= _COUNTS:
-            best[i, j] = max(sigmas, best.get((i, j), 0.0))
+        if abs(sigmas) >= _COUNTS:
+            best[i, j] = max(sigmas, best.get((i, j), sigmas))
         if sigmas >= _ALONE:
             partner[i, b.owner], partner[j, a.owner] = j, i
     for (i, j), sigmas in sorted(best.items()):
@@ -293,6 +309,9 @@ def _windows(entries: Sequence[_Entry], places: Sequence[tuple[int, int]]) -> np
 def _agreement(a: Print, b: Print, *, shift: int, scale: float | None) -> float:
     """Return by how many sigmas the noise of two recordings agrees; 0 where it is not one's own.
 
+    Where it agrees or disagrees in part, as the noise of no two runs and of no copy does, the
+    sigmas are negative.
+
     Sample i of `a` is sample i + shift of `b`, `scale` times as large. Where the motion does not
     tell the scale, that of the noise itself is taken: less further noise is then seen through.
     """
@@ -309,13 +328,14 @@ def _agreement(a: Print, b: Print, *, shift: int, scale: float | None) -> float:
     if common < _LEAST_OVERLAP:
         return 0.0
     product = float(np.sum(in_a * in_b))
-    product = abs(product) if scale is None else product
-    if product < _LEAST_SLOPE * min(power_a, power_b):
+    slope = (abs(product) if scale is None else product) / min(power_a, power_b)
+    in_part = slope <= -_LEAST_IN_PART or _LEAST_IN_PART <= slope <= _MOST_IN_PART
+    chance = float(np.sqrt(power_a * power_b / (PASSED * common)))
+    whole = slope >= _LEAST_SLOPE and not (a.is_coarse and b.is_coarse)
+    if not (whole or in_part) or abs(product) < _COUNTS * chance:
         return 0.0
-    chance = np.sqrt(power_a * power_b / (PASSED * common))
-    if product < _COUNTS * chance:
-        return 0.0
-    return product / max(chance, _chance_nearby(in_a, in_b))
+    sigmas = abs(product) / max(chance, _chance_nearby(in_a, in_b))
+    return -sigmas if in_part else sigmas
 
 
 def _chance_nearby(in_a: np.ndarray, in_b: np.ndarray) -> float:

@@ -35,6 +35,7 @@ _FEW_TURNS, _PARTS = 5, (0.5, 0.3, 0.7)  # of a swing, where there are few of th
 _MOST_ANCHORS = 12  # in the motion
 _NOISE_ANCHORS, _APART = 6, 5  # samples
 _FEWEST_SAMPLES = 60
+_FINE = 80.0  # residual steps that a cart swings: a dozen encoder steps, where those are the noise
 _MOST_SAMPLES = 8192  # of one record; more does not make it surer
 _MOST_VALUES = 2_000_000  # of one submission: sixty such records of four carts
 
@@ -62,6 +63,11 @@ class Print:
     step: Array
     anchors: np.ndarray
     swing: Array
+
+    @property
+    def is_coarse(self) -> bool:
+        """Whether the motion is so few encoder steps that it alone says when each is passed."""
+        return bool(np.max(np.abs(self.swing), initial=0.0) < _FINE * self.step[0])
 
 
 def fingerprint(records: Sequence[Record]) -> bytes:
