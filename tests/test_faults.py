@@ -3,6 +3,7 @@
 import csv
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from pipeline.grading.load import load_rubric
 from pipeline.grading.run import grade_submission
 from pipeline.plant.chain import PRESETS, Array
 from pipeline.results import Analysis
+from pipeline.stages.follow import find_misread, follow
 from pipeline.submission import load_submission
 from pipeline.synthesis import write_submission
 from pipeline.synthesis.hidden import prepare_bench
@@ -328,3 +330,12 @@ def test_fewer_decimals_in_some_files_are_no_other_unit(bench, tmp_path):
         for path in files(folder, kind):
             spoil(path, lambda c, d=decimals: {**c, **{x: c[x].round(d) for x in ("x1", "x2")}})
     assert analyse(load_submission(folder), design=False).left_out == ()
+
+
+def test_carts_that_stick_and_creep_are_in_no_other_unit_of_time(bench):
+    """In a microsecond the carts may do anything slow: no such reading makes a record follow."""
+    chain = PRESETS[PRESET]
+    dwell = next(r for r in analyse(load_submission(bench)).records if r.kind == "sine")
+    creep = 0.02 * dwell.t / dwell.t[-1]  # cm: nine encoder steps in all
+    stuck = replace(dwell, y=np.array([creep, 0.7 * creep]))
+    assert find_misread(stuck, chain, follow([stuck], chain)[stuck.id]) is None

@@ -12,7 +12,7 @@ import numpy as np
 from pipeline.plant.chain import Chain
 from pipeline.plant.simulate import simulate_linear
 from pipeline.results import Check, LeftOut, Record
-from pipeline.stages._signals import TIME_FACTORS
+from pipeline.stages._signals import FASTEST, TIME_FACTORS
 from pipeline.stages.follow import (
     FOLLOWED,
     Followed,
@@ -38,7 +38,6 @@ _FROZEN_SAMPLES, _FROZEN_SHARE = 10, 0.2  # the share of its motion that it move
 _ELSEWHERE = 0.25  # of how far it was moved while it stood: what it misses the carts by else
 _CYCLES = 1.5  # a dwell with fewer holds no steady state, whatever its length
 _UNIT = 100.0
-_FASTEST = 1e-4  # s between samples: no bench reads its encoders more often
 _SAME_CLOCK = 0.02  # a bench samples at one rate, which a unit changes by exactly its factor
 
 
@@ -79,7 +78,7 @@ def find_faults(
     }
     # However many are wrong: no bench is read a thousand times as slowly in some recordings.
     clocks = [record.sample_time for record in records]
-    usual_clock = min((dt for dt in clocks if dt >= _FASTEST), default=0.0)
+    usual_clock = min((dt for dt in clocks if dt >= FASTEST), default=0.0)
     found: dict[str, LeftOut] = {}
     for record in records:
         for problem in (

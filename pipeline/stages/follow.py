@@ -13,7 +13,7 @@ import numpy as np
 from pipeline.errors import DataError
 from pipeline.plant.chain import Array, Chain
 from pipeline.results import Record
-from pipeline.stages._signals import LENGTH_SCALES, TIME_FACTORS
+from pipeline.stages._signals import FASTEST, LENGTH_SCALES, TIME_FACTORS
 from pipeline.stages.chain_parameters import Parametrisation
 from pipeline.stages.modal_response import Modes, find_modes
 from pipeline.stages.time_window import Window, compare, open_window
@@ -127,7 +127,8 @@ def _readings(record: Record, chain: Chain) -> Iterator[tuple[Misread, Record]]:
         other = replace(record, y=record.y[rows], resolution=record.resolution[rows])
         yield Misread(words=words), other
     for factor, words in TIME_FACTORS.items():
-        yield Misread(words=words), replace(record, t=record.t / factor)
+        if record.sample_time >= factor * FASTEST:  # too short a time is any short curve
+            yield Misread(words=words), replace(record, t=record.t / factor)
     try:
         window = open_window(record)
     except DataError:
