@@ -340,6 +340,9 @@ class Check:
     message: str
 
 
+SIGN = "input.sign"  # of the check that fails where the data contradict the sign stated
+
+
 # --------------------------------------------------------------------- control
 
 

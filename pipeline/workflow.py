@@ -8,7 +8,7 @@ from pipeline.identify.carts import UNTIED
 from pipeline.identify.log import Log, Progress, by_note
 from pipeline.identify.sound import identify_from_sound
 from pipeline.ingest.read import read_data
-from pipeline.ingest.signs import contradictions
+from pipeline.ingest.signs import check_signs
 from pipeline.plant.chain import parameter_names
 from pipeline.results import Analysis, ChainFit, FeedbackDesign, HardwareCheck, Record
 from pipeline.stages.compare import (
@@ -57,9 +57,7 @@ def analyse(
     log.warn(by_note((record.id, note) for record in data.records for note in record.notes))
     found, left_out = identify_from_sound(data, system=system, progress=progress)
     log.add(found.log)
-    log.warn(
-        contradictions(data.signs, without={one.experiment for one in left_out if one.is_wrong})
-    )
+    signs = check_signs(data.signs, without={one.experiment for one in left_out if one.is_wrong})
     fit = found.fit
     final = fit.parameters if fit else {}
     if fit and not final:
@@ -75,10 +73,11 @@ def analyse(
         input_unit=system.input.unit,
     )
     checks = [
+        *signs,
         *check_files(data.unreadable),
         *check_setup(data.records),
         *check_dwells(data.records, found.sines),
-        *check_left_out(left_out),
+        *check_left_out(left_out, records=data.records),
         *found.repeats.checks,
         *check_rows(rows),
         *check_decays(found.decays, position_unit=system.position.unit),
@@ -94,7 +93,7 @@ def analyse(
         margins = log.attempt("margins", design_margins, fit.chain, feedback)
         feedback = replace(feedback, margins=margins)
         checks.append(verify_design(fit.chain, feedback))
-    if feedback and is_reversed(data.records):
+    if feedback and is_reversed(data.records) and not signs:
         log.warn(
             [
                 "state feedback: the gains are for an input that pushes cart 1 towards positive x; "

@@ -313,7 +313,7 @@ def test_a_host_told_to_end_stops_the_motor_and_saves(tmp_path, number, real):
         process.send_signal(number)
         _, said = process.communicate()
     assert last_run(real)["ended"] == "stopped"
-    assert process.returncode == 1
+    assert process.returncode == 130
     assert "stopped; the same command goes on where this ended" in said
     assert (work / "data" / "dwell.partial.txt").exists()
     assert load_submission(work).experiments == ()

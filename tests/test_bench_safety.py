@@ -288,7 +288,7 @@ def test_a_closed_terminal_stops_the_motor(tmp_path, real):
         process.send_signal(signal.SIGHUP)
         process.communicate()
     assert real.event("run")["ended"] == "stopped"
-    assert process.returncode == 1
+    assert process.returncode == 130
     assert (work / "data" / "dwell.partial.txt").exists()
 
 

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from pipeline.errors import SubmissionError
 from pipeline.ingest.read import DUTY_COUNT, Ingested, read_data
-from pipeline.ingest.signs import contradictions
+from pipeline.ingest.signs import check_signs
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.simulate import simulate_linear
 from pipeline.submission import load_submission
@@ -343,10 +343,10 @@ def test_a_stated_sign_is_used_and_a_doubtful_one_mentioned(tmp_path):
     content = csv(time=T, input=U, x1=X1)
     data = read(tmp_path, 'input = { unit = "V", sign = -1 }', STEP, content)
     assert_array_equal(data.records[0].u, -U)
-    assert contradictions(data.signs, without=()) == [
-        "the sign of the input is stated as -1, the data say +1 in a (all that tell it): "
-        "set sign = 1 there, or leave it out",
-    ]
+    (check,) = check_signs(data.signs, without=())
+    assert (check.id, check.outcome, check.value) == ("input.sign", "fail", 1.0)
+    assert "sign = -1 of the input contradicts" in check.message
+    assert "set sign = 1 there" in check.message
     own = STEP + "\ninput = { sign = 1, per_count = 2.0 }"
     data = read(tmp_path, 'input = { unit = "V", sign = -1 }', own, content)
     assert_array_equal(data.records[0].u, 2 * U)
@@ -354,17 +354,16 @@ def test_a_stated_sign_is_used_and_a_doubtful_one_mentioned(tmp_path):
 
 
 def test_a_wrong_sign_of_a_session_is_one_sentence(tmp_path):
-    """Every record that contradicts the stated sign is named in one warning, with the remedy."""
+    """Every record that contradicts the stated sign is named in one check, with the remedy."""
     toml = 'version = 1\n[system]\ncarts = 2\ninput = { unit = "V", sign = 1 }\n'
     for name, scale in {"one": -1, "two": -2, "right": 1}.items():
         toml += f'[[experiments]]\nid = "{name}"\nkind = "step"\nfile = "{name}.csv"\n'
         (tmp_path / f"{name}.csv").write_text(csv(time=T, input=scale * U, x1=abs(scale) * X1))
     (tmp_path / "submission.toml").write_text(toml)
     signs = read_data(load_submission(tmp_path)).signs
-    assert contradictions(signs, without=()) == [
-        "the sign of the input is stated as +1, the data say -1 in one, two "
-        "(2 of the 3 that tell it): set sign = -1 there, or leave it out",
-    ]
+    (check,) = check_signs(signs, without=())
+    assert check.value == 2.0
+    assert "one, two (2 of the 3 that tell it): set sign = -1 there" in check.message
 
 
 def test_signs_may_differ_between_experiments(tmp_path):

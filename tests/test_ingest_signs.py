@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.ingest.drive import find_signs
 from pipeline.ingest.read import read_data
-from pipeline.ingest.signs import contradictions
+from pipeline.ingest.signs import check_signs
 from pipeline.plant.chain import PRESETS, Array
 from pipeline.plant.simulate import simulate_linear
 from pipeline.report.questions import ask
@@ -138,10 +138,10 @@ def test_a_stated_sign_is_not_doubted_because_the_input_is_late(bench, sign, sai
     drive = submission.system.input.model_copy(update={"sign": sign})
     system = submission.system.model_copy(update={"input": drive})
     signs = read_data(submission.model_copy(update={"system": system})).signs
-    doubts = contradictions(signs, without=())
+    doubts = check_signs(signs, without=())
     assert bool(doubts) == said
-    assert not contradictions(signs, without=set(signs.found))
-    assert not said or re.search(r"the data say \+1 in .* \(all that tell it\)", doubts[0])
+    assert not check_signs(signs, without=set(signs.found))
+    assert not said or re.search(r"which say \+1 in .* \(all that tell it\)", doubts[0].message)
 
 
 def test_a_record_that_counts_the_other_way_is_found(bench):

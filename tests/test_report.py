@@ -16,7 +16,9 @@ from pipeline.report.pdf import missing_characters
 from pipeline.report.render import render_report
 from pipeline.report.summary import terminal_summary
 from pipeline.results import (
+    SIGN,
     Analysis,
+    Check,
     Estimate,
     LeftOut,
     ParameterRow,
@@ -419,8 +421,24 @@ def test_a_good_result_is_called_so():
     rows = tuple(replace(row, consistent=True) for row in analysis.rows)
     checks = tuple(check for check in analysis.checks if check.outcome == "pass")
     points = tuple(replace(point, settled=True) for point in analysis.sine_points)
-    text = terminal_summary(
-        replace(analysis, rows=rows, checks=checks, sine_points=points, skipped=())
-    )
+    good = replace(analysis, rows=rows, checks=checks, sine_points=points, skipped=(), warnings=())
+    text = terminal_summary(good)
     assert "all 3 parameters measured in two ways" in text
     assert "Nothing stands out" in text
+    assert good.feedback is not None
+    missed = replace(good.feedback, reachable=False, message="settling in 1 ms cannot be met")
+    for worse in (replace(good, warnings=("odd",)), replace(good, feedback=missed)):
+        assert "Nothing stands out" not in terminal_summary(worse)
+
+
+def test_a_wrong_sign_is_said_first_and_nothing_else_is_advised():
+    """A stated sign that the data contradict comes first; what may follow from it is not sought."""
+    analysis = make_analysis(1, repeats=1)
+    wrong = Check(id=SIGN, outcome="fail", value=3.0, limit=0.0, message="set sign = 1 there")
+    off = tuple(replace(row, consistent=False) for row in analysis.rows)
+    text = terminal_summary(replace(analysis, checks=(wrong, *analysis.checks), rows=off))
+    findings, _, advice = text.partition("What to do next.")
+    first = next(line for line in findings.splitlines() if line.startswith("- "))
+    assert first == "- Wrong sign: set sign = 1 there"
+    assert advice.count("- ") == 2
+    assert "set sign = 1 there" in advice

@@ -228,3 +228,22 @@ def test_a_new_submission_overwrites_nothing(tmp_path):
     with pytest.raises(ConfigError, match="expected 1 to 4, found 5"):
         new_submission(tmp_path / "new", carts=5)
     assert not (tmp_path / "new").exists()
+
+
+def test_a_wrong_number_of_carts_is_said_before_what_follows_from_it(tmp_path):
+    """Two lengths that agree on two carts: it is the three that is wrong, not both of them."""
+    text = """
+version = 1
+[system]
+carts = 3
+[[experiments]]
+id = "loop"
+kind = "closed_loop"
+file = "loop.csv"
+controller = { type = "state_feedback", gains = [1, 0, 1, 0] }
+[reported.feedback]
+gains = [1, 0, 1, 0]
+"""
+    (tmp_path / "submission.toml").write_text(text, encoding="utf-8")
+    with pytest.raises(SubmissionError, match=r"system\.carts: carts = 3, but .* are for 2"):
+        load_submission(tmp_path)

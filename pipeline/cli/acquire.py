@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pipeline.cli.common import Folder, app
+from pipeline.cli.common import INTERRUPTED, Folder, app
 from pipeline.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -99,7 +99,7 @@ def _record(
         outcomes = carry_out(folder, port=port, observers=observers, only=only)
     except KeyboardInterrupt:
         terminal.remark("stopped; the same command goes on where this ended")
-        raise typer.Exit(1) from None
+        raise typer.Exit(INTERRUPTED) from None
     whole = {outcome.recording.id for outcome in outcomes if not outcome.partial}
     failed = {outcome.recording.id for outcome in outcomes} - whole
     report = f": try `cartlab report {folder}`" if whole or not failed else ""

@@ -26,6 +26,8 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
+INTERRUPTED = 130  # exit status, as of any program that Ctrl-C ends
+
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="A submission folder.")]
 Preset = Annotated[str | None, typer.Option(help="throne-1dof, throne-2dof or throne-3dof.")]
 Model = Annotated[

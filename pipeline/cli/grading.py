@@ -12,13 +12,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pipeline.cli.common import AsJson, app, say
+from pipeline.cli.common import INTERRUPTED, AsJson, app, say
 
 if TYPE_CHECKING:
     from rich.progress import Progress
 
 _MOST_TOLD = 20  # changes since the class list before
-_INTERRUPTED = 130  # exit status, as of any program that Ctrl-C ends
 
 
 @app.command()
@@ -103,7 +102,7 @@ def _stopping(out: Path) -> Iterator[None]:
         if not pressed:
             raise
         say(f"stopped; what is graded is kept in {out}, and the same command goes on from there")
-        raise typer.Exit(_INTERRUPTED) from None
+        raise typer.Exit(INTERRUPTED) from None
     finally:
         signal.signal(signal.SIGINT, before)
 

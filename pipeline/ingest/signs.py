@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.ingest.drive import find_signs
-from pipeline.results import Record
+from pipeline.results import SIGN, Check, Record
 from pipeline.submission import Submission
 
 _FEW_NAMES = 6  # more are not listed one by one
@@ -87,12 +87,12 @@ def _say_signs(
     return [text]
 
 
-def contradictions(signs: Contradicted, *, without: Container[str]) -> list[str]:
-    """Return a sentence for each stated sign that records contradict, and what to do.
+def check_signs(signs: Contradicted, *, without: Container[str]) -> list[Check]:
+    """Return a failed check where records contradict the sign that is stated of them.
 
     `without` are records that do not hold what happened, so that their sign says nothing.
     """
-    says = []
+    says, wrong = [], 0
     for sign in (1, -1):
         told = [
             name
@@ -102,12 +102,16 @@ def contradictions(signs: Contradicted, *, without: Container[str]) -> list[str]
         contrary = [name for name in told if signs.found[name] == -sign]
         if contrary:
             those = "all" if contrary == told else f"{len(contrary)} of the {len(told)}"
-            those += " that tell it"
             says.append(
-                f"the sign of the input is stated as {sign:+d}, the data say {-sign:+d} in "
-                f"{_some(contrary)} ({those}): set sign = {-sign} there, or leave it out"
+                f"sign = {sign} of the input contradicts the data, which say {-sign:+d} in "
+                f"{_some(contrary)} ({those} that tell it): set sign = {-sign} there, or leave it "
+                "out."
             )
-    return says
+            wrong += len(contrary)
+    if not says:
+        return []
+    message = " ".join(says)
+    return [Check(id=SIGN, outcome="fail", value=float(wrong), limit=0.0, message=message)]
 
 
 def _some(names: list[str]) -> str:

@@ -25,14 +25,13 @@ from pipeline.report.numbers import (
     with_error,
 )
 from pipeline.report.words import clean, name_span, names_spans, plain_lines, rich, stage_name
-from pipeline.results import Analysis, Check, HardwareCheck
+from pipeline.results import SIGN, Analysis, Check, HardwareCheck
 
-_KINDS = {
+_KINDS = {  # what carts are identified from
     "decay": "decay",
     "step": "step",
     "sine": "sine dwell",
     "sweep": "sweep",
-    "closed_loop": "closed-loop run",
     "bode": "table of amplitude ratios",
 }
 _GOOD_FIT = 2.0  # chi-square per degree of freedom that stated noise still explains
@@ -70,7 +69,7 @@ def terminal_summary(analysis: Analysis) -> str:
 
 def _findings(analysis: Analysis) -> list[tuple[bool, Spans]]:
     """Return whether each thing found is well, with a sentence about it."""
-    found = (_agreement, _checks, _friction, _design, _hardware, _skipped)
+    found = (_sign, _agreement, _checks, _friction, _design, _hardware, _skipped)
     return [finding for of in found if (finding := of(analysis))]
 
 
@@ -82,7 +81,11 @@ def _identified(analysis: Analysis) -> Block:
     source = f"from {used}" if used else "from the data given"
     fit = analysis.fit
     if fit is None:
-        reasons = (Span(" The reasons stand "), Span("below", url="#skipped"), Span("."))
+        reasons = (
+            Span(" The reasons stand under "),
+            Span("What was skipped", url="#skipped"),
+            Span("."),
+        )
         return paragraph(
             Span("No model ", "strong"),
             f"of the {carts} could be identified {source}.",
@@ -180,6 +183,16 @@ def _tone(good: bool) -> Tone:
     return "good" if good else "bad"
 
 
+def _sign(analysis: Analysis) -> tuple[bool, Spans] | None:
+    """Everything that follows hangs on it, so it comes first."""
+    wrong = _wrong_sign(analysis)
+    return (False, spans(Span("Wrong sign: ", "strong"), rich(wrong))) if wrong else None
+
+
+def _wrong_sign(analysis: Analysis) -> str:
+    return next((clean(c.message) for c in analysis.checks if c.id == SIGN), "")
+
+
 def _agreement(analysis: Analysis) -> tuple[bool, Spans] | None:
     judged = [row for row in analysis.rows if row.consistent is not None]
     if not judged:
@@ -209,16 +222,20 @@ def _checks(analysis: Analysis) -> tuple[bool, Spans] | None:
     kinds: dict[str, Check] = {}
     for check in failed:
         kind = check.id.partition(".")[0]
-        if not kind.startswith(("initial_final", "decay")):
+        if check.id != SIGN and not kind.startswith(("initial_final", "decay")):
             kinds.setdefault(kind, check)
     told = list(kinds.values())[:_MOST_TOLD]
     return False, spans(
         Span("Inconsistent: ", "strong"),
-        f"{len(failed)} of {count(len(done), 'check')} failed. ",
-        rich(clean(" ".join(check.message for check in told))),
-        *([Span(" All are listed "), Span("below", url="#checks"), Span(".")]
-          if len(failed) > len(told) else []),
+        f"{len(failed)} of {count(len(done), 'check')} failed.",
+        rich(clean("".join(f" {_sentence(check.message)}" for check in told))),
+        *([Span(" The report lists all under "), Span("Consistency checks", url="#checks"),
+           Span(".")] if len(failed) > len(told) else []),
     )  # fmt: skip
+
+
+def _sentence(text: str) -> str:
+    return text if text.endswith((".", "?", "!")) else f"{text}."
 
 
 def _friction(analysis: Analysis) -> tuple[bool, Spans] | None:
@@ -278,8 +295,8 @@ def _skipped(analysis: Analysis) -> tuple[bool, Spans] | None:
     stages = listing(names[:_MOST_TOLD] + ([f"{more} more"] if more > 0 else []))
     return False, spans(
         Span("Skipped: ", "strong"),
-        f"{stages}; the reasons are ",
-        Span("below", url="#skipped"),
+        f"{stages}; the report has the reasons under ",
+        Span("What was skipped", url="#skipped"),
         ".",
     )
 
@@ -293,6 +310,8 @@ def _carts(carts: list[int]) -> str:
 
 
 def _next(analysis: Analysis) -> Items:
+    if wrong := _wrong_sign(analysis):  # what else is odd may come from it
+        return bullet_list([spans(rich(wrong)), spans("Then make the report again.")])
     advice: list[Spans] = []
     fit = analysis.fit
     for what, which in (
@@ -349,6 +368,13 @@ def _next(analysis: Analysis) -> Items:
         advice.append(spans("Run the designed feedback on the bench and add the record."))
     if analysis.skipped:
         advice.append(spans("Add the experiments that the skipped stages ask for."))
+    design = analysis.feedback
+    if design and not design.reachable:
+        advice.append(spans(f"Relax the goal of the design: {clean(design.message)}."))
+    if not advice and any(check.outcome == "fail" for check in analysis.checks):
+        advice.append(spans("Look into what the failed checks say."))
+    if not advice and analysis.warnings:
+        advice.append(spans("Look into the report's ", Span("Warnings", url="#warnings"), "."))
     if not advice:
         advice.append(spans("Nothing stands out. Discuss the remaining differences in the notes."))
     return bullet_list(advice)

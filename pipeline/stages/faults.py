@@ -38,6 +38,8 @@ _FROZEN_SAMPLES, _FROZEN_SHARE = 10, 0.2  # the share of its motion that it move
 _ELSEWHERE = 0.25  # of how far it was moved while it stood: what it misses the carts by else
 _CYCLES = 1.5  # a dwell with fewer holds no steady state, whatever its length
 _UNIT = 100.0
+_SPELT_OUT = 3  # records of one kind, if all of it; more are told by their number
+_PLURAL = {"sine": "dwells", "step": "steps", "decay": "decays", "sweep": "sweeps"}
 _SAME_CLOCK = 0.02  # a bench samples at one rate, which a unit changes by exactly its factor
 
 
@@ -101,8 +103,8 @@ def find_faults(
     return found
 
 
-def check_left_out(left_out: Sequence[LeftOut]) -> list[Check]:
-    """Return a failed check for each reason for which records are not used."""
+def check_left_out(left_out: Sequence[LeftOut], *, records: Sequence[Record]) -> list[Check]:
+    """Return a failed check for each reason for which some of the records are not used."""
     runs: dict[str, list[str]] = {}
     for one in left_out:
         runs.setdefault(one.reason, []).append(one.experiment)
@@ -112,10 +114,22 @@ def check_left_out(left_out: Sequence[LeftOut]) -> list[Check]:
             outcome="fail",
             value=float(len(names)),
             limit=0.0,
-            message=f"Left out {'is' if len(names) == 1 else 'are'} {', '.join(names)}: {reason}.",
+            message=f"Left out {'is' if len(names) == 1 else 'are'} {_named(names, records)}: "
+            f"{reason}.",
         )
         for reason, names in runs.items()
     ]
+
+
+def _named(names: Sequence[str], records: Sequence[Record]) -> str:
+    """Return names of records, those of a whole kind as such: "all 29 dwells, step-2"."""
+    said: list[str] = []
+    for kind in dict.fromkeys(record.kind for record in records):
+        alike = [record.id for record in records if record.kind == kind]
+        of_kind = [name for name in alike if name in names]
+        whole = len(of_kind) == len(alike) > _SPELT_OUT
+        said += [f"all {len(alike)} {_PLURAL.get(kind, kind)}"] if whole else of_kind
+    return ", ".join(said)
 
 
 # ------------------------------------------------------------------ single channels

@@ -20,7 +20,7 @@ from pipeline.submission.complaints import (
     nearest,
     quote,
 )
-from pipeline.submission.models import Experiment, StateFeedback, Submission
+from pipeline.submission.models import Experiment, Reported, StateFeedback, Submission
 from pipeline.submission.toml_file import BACKSLASH, parse_toml, read_text
 
 NAME = "submission.toml"
@@ -154,6 +154,7 @@ def _notes(folder: Path) -> str | None:
 def _problems(submission: Submission, folder: Path) -> Iterator[tuple[Location, str]]:
     """Yield (location, what is wrong) for what no single value shows."""
     n, springs = submission.system.carts, submission.system.springs
+    yield from _another_count(submission)
     if len(springs) != n + 1:
         yield (
             ("system", "springs"),
@@ -170,6 +171,25 @@ def _problems(submission: Submission, folder: Path) -> Iterator[tuple[Location, 
         for key, what in _experiment_problems(experiment, n, folder):
             yield ("experiments", i, *key), what
     yield from _reported_problems(submission)
+
+
+def _another_count(submission: Submission) -> Iterator[tuple[Location, str]]:
+    """Yield the number of carts that all else is for, where at least two things agree on it."""
+    reported = submission.reported or Reported()
+    controllers = {e.id: e.controller for e in submission.experiments}
+    lengths = {
+        f"the gains of {name}": len(law.gains)
+        for name, law in controllers.items()
+        if isinstance(law, StateFeedback)
+    }
+    lengths["the reported gains"] = len(reported.feedback.gains) if reported.feedback else 0
+    lengths["the reported A"] = len(reported.state_space.A) if reported.state_space else 0
+    given = {what: length for what, length in lengths.items() if length}
+    if len(given) < 2 or len(set(given.values())) > 1:
+        return
+    length, n = next(iter(given.values())), submission.system.carts
+    if length != 2 * n and length % 2 == 0:
+        yield ("system", "carts"), f"carts = {n}, but {' and '.join(given)} are for {length // 2}"
 
 
 def spring_names(carts: int) -> list[str]:
