@@ -186,7 +186,7 @@ def _tone(good: bool) -> Tone:
 def _sign(analysis: Analysis) -> tuple[bool, Spans] | None:
     """Everything that follows hangs on it, so it comes first."""
     wrong = _wrong_sign(analysis)
-    return (False, spans(Span("Wrong sign: ", "strong"), rich(wrong))) if wrong else None
+    return (False, spans(Span("Wrong sign: ", "strong"), wrong)) if wrong else None
 
 
 def _wrong_sign(analysis: Analysis) -> str:
@@ -311,7 +311,7 @@ def _carts(carts: list[int]) -> str:
 
 def _next(analysis: Analysis) -> Items:
     if wrong := _wrong_sign(analysis):  # what else is odd may come from it
-        return bullet_list([spans(rich(wrong)), spans("Then make the report again.")])
+        return bullet_list([spans(wrong), spans("Then make the report again.")])
     advice: list[Spans] = []
     fit = analysis.fit
     for what, which in (
