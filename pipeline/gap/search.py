@@ -37,10 +37,7 @@ def _grow_beam(
     beam = [baseline]
     for level in range(depth):
         children: list[Hypothesis] = []
-        best = min(beam, key=lambda h: h.bic)
         for parent in beam:
-            if parent.fit.chi > _HOPELESS * best.fit.chi:
-                continue
             for child in grow(parent, bench):
                 if not (child.sound and np.isfinite(child.error)):
                     continue
@@ -59,7 +56,8 @@ def _grow_beam(
         if worthy[0].at_floor:
             break
         before = min(h.fit.chi for h in beam)
-        kept = [child for child in worthy if _leads_on(child, before)]
+        within = _HOPELESS * worthy[0].fit.chi
+        kept = [h for h in worthy if h.fit.chi <= within and _leads_on(h, before)]
         beam = kept[: _BEAM[level] if level < len(_BEAM) else 1]
         if not beam:
             break
