@@ -8,6 +8,7 @@ from pipeline.identify.carts import UNTIED
 from pipeline.identify.log import Log, Progress, by_note
 from pipeline.identify.sound import identify_from_sound
 from pipeline.ingest.read import read_data
+from pipeline.ingest.scales import check_scales
 from pipeline.ingest.signs import check_signs
 from pipeline.plant.chain import parameter_names
 from pipeline.results import Analysis, ChainFit, FeedbackDesign, HardwareCheck, Record
@@ -57,7 +58,8 @@ def analyse(
     log.warn(by_note((record.id, note) for record in data.records for note in record.notes))
     found, left_out = identify_from_sound(data, system=system, progress=progress)
     log.add(found.log)
-    signs = check_signs(data.signs, without={one.experiment for one in left_out if one.is_wrong})
+    wrong = {one.experiment for one in left_out if one.is_wrong}
+    signs = check_signs(data.signs, without=wrong)
     fit = found.fit
     final = fit.parameters if fit else {}
     if fit and not final:
@@ -75,6 +77,7 @@ def analyse(
     checks = [
         *signs,
         *check_files(data.unreadable),
+        *check_scales([r for r in data.records if r.id not in wrong], system=system),
         *check_setup(data.records),
         *check_dwells(data.records, found.sines),
         *check_left_out(left_out, records=data.records),

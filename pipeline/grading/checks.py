@@ -14,7 +14,7 @@ from pipeline.grading.checks_loop import (
 from pipeline.grading.impossible import not_positive
 from pipeline.grading.laws import MOST_WIDENING, judge_laws
 from pipeline.grading.pieces import asked_pieces
-from pipeline.grading.reference import Reference
+from pipeline.grading.reference import OFF_SCALE, Reference, off_scale
 from pipeline.grading.rubric import is_damping, matching
 from pipeline.grading.state_model import compare_entries
 from pipeline.grading.tolerance import NO_CREDIT, as_typed, credit, percent_off, rounding
@@ -98,6 +98,8 @@ def _parameters(criterion: asked.Parameters, work: Work) -> Verdict:
     guessed = [n for n in names if n not in known and n not in judged]
     if not judged:
         reasons = [s.reason for s in work.analysis.skipped]
+        if off_scale(work.analysis):
+            reasons = [OFF_SCALE]
         why = reasons[0] if reasons else "these are first guesses, and no recording decides them"
         return Verdict(share=None, message=f"Not checked: {why}.")
     shares, off, wrong = [], [], set()

@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline.grading import rubric as asked
 from pipeline.grading.controller import Controller, same_gains
-from pipeline.grading.reference import Reference
+from pipeline.grading.reference import OFF_SCALE, Reference, off_scale
 from pipeline.grading.tolerance import as_typed, credit, exact, percent_off, rounding
 from pipeline.grading.work import NONE, Verdict, Work, mean_share
 from pipeline.plant.chain import Array
@@ -147,6 +147,8 @@ def judge_hardware(criterion: asked.Hardware, work: Work) -> Verdict:
     runs = {e.id for e in work.submission.experiments if e.kind == "closed_loop"}
     if not runs:
         return Verdict(share=NONE, message="No closed-loop run was handed in.")
+    if off_scale(work.analysis):
+        return Verdict(share=None, message=f"Not checked: {OFF_SCALE}.")
     closed: dict[str, list[float]] = {}
     for check in work.analysis.hardware:
         if check.experiment in runs and check.loop == "closed":

@@ -8,6 +8,7 @@ from pipeline.grading.grade import Flag
 from pipeline.grading.reference import is_explained
 from pipeline.ingest.inspect import is_stepped, line_frequency
 from pipeline.ingest.problems import saturation
+from pipeline.ingest.scales import SCALES
 from pipeline.plant.chain import Array
 from pipeline.results import Analysis, Record
 
@@ -22,9 +23,9 @@ def bad_runs(analysis: Analysis) -> dict[str, str]:
     found |= {one.experiment: one.reason for one in analysis.left_out if one.is_wrong}
     sound = [record for record in analysis.records if record.id not in found]
     setups = {
-        check.id.removeprefix("setup."): check.message.split(": ", 1)[-1]
+        check.id.partition(".")[2]: check.message.split(": ", 1)[-1]
         for check in analysis.checks
-        if check.id.startswith("setup.") and check.outcome == "fail"
+        if check.id.partition(".")[0] in ("setup", *SCALES) and check.outcome == "fail"
     }
     sticky = not is_explained(analysis)
     largest = max(

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.grading.rubric import is_damping
+from pipeline.ingest.scales import POSITION_SCALE, SCALES
 from pipeline.plant.chain import Chain
 from pipeline.results import Analysis, Estimate, ParameterRow, StepEdge
 from pipeline.stages.compare import (
@@ -24,6 +25,7 @@ _SAME = 1.03  # factor: bounds that near each other are one number to a reader
 _FAR = 2.5  # … so far that nobody believes it
 # A resonance or null read off the dwells: factor.
 _BY_EYE = 1.1
+OFF_SCALE = "the recordings are not in the units stated, see the data"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,6 +77,36 @@ class References:
 
     initial: dict[str, Reference]
     final: dict[str, Reference]
+
+
+def off_scale(analysis: Analysis) -> set[str]:
+    """Return which scales are not those stated: of the positions, of the input, of both."""
+    return {check.id.partition(".")[0] for check in analysis.checks} & {*SCALES}
+
+
+def in_scale(
+    references: References, chain: Chain | None, *, analysis: Analysis, per_count: float | None
+) -> tuple[References, Chain | None]:
+    """Return the references and carts in the units asked for, where the recordings are in others.
+
+    Counts are multiplied by the length of one, where it is stated; what is in a scale that nobody
+    stated is left out.
+    """
+    wrong = off_scale(analysis)
+    if not wrong:
+        return references, chain
+    factor = per_count if wrong == {POSITION_SCALE} else None
+
+    def scaled(table: Mapping[str, Reference]) -> dict[str, Reference]:
+        kept = {n: r for n, r in table.items() if factor or not n.startswith("K")}
+        return {n: r.times(factor or 1.0) if n.startswith("K") else r for n, r in kept.items()}
+
+    return (
+        References(initial=scaled(references.initial), final=scaled(references.final)),
+        replace(chain, m=chain.m / factor, c=chain.c / factor, k=chain.k / factor)
+        if chain and factor
+        else None,
+    )
 
 
 def recompute(analysis: Analysis) -> References:

@@ -14,7 +14,7 @@ from pipeline.grading.lateness import late_deduction
 from pipeline.grading.pieces import missing_flag
 from pipeline.grading.recordings import bad_runs, data_flag
 from pipeline.grading.reduced import diagnose_reduced
-from pipeline.grading.reference import recompute, trusted_chain
+from pipeline.grading.reference import in_scale, recompute, trusted_chain
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.signs import turned_round
 from pipeline.grading.springs import with_all_springs
@@ -86,7 +86,12 @@ def grade_analysis(
     """
     reported, signed = turned_round(submission.reported or Reported(), analysis.records)
     submission, n = submission.model_copy(update={"reported": reported}), rubric.system.carts
-    references, chain = recompute(analysis), trusted_chain(analysis)
+    references, chain = in_scale(
+        recompute(analysis),
+        trusted_chain(analysis),
+        analysis=analysis,
+        per_count=submission.system.position.per_count,
+    )
     diagnosis = diagnose_tables(reported, references=references, analysis=analysis)
     tables = [{name: float(typed) for name, typed in reported.final.items() if typed > 0}]
     if diagnosis.corrected != tables[0]:

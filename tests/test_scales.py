@@ -1,0 +1,76 @@
+"""Recordings in counts or millivolts that are said to be in centimetres or volts."""
+
+import csv
+from pathlib import Path
+
+import pytest
+
+from pipeline.grading.grade import Grade
+from pipeline.grading.load import load_rubric
+from pipeline.grading.run import grade_submission
+from pipeline.submission import load_submission
+from pipeline.synthesis import write_submission
+from pipeline.workflow import analyse
+
+COUNT = 0.00227  # cm
+
+
+def scaled(folder: Path, column: str, factor: float, *, whole: bool = False) -> Path:
+    """Write a submission and multiply a column of every recording."""
+    write_submission(folder, chain="throne-1dof", seed=3, compact=True, reported=True)
+    for path in (folder / "data").glob("*.csv"):
+        with path.open(encoding="utf-8", newline="") as file:
+            head, *rows = csv.reader(file)
+        at = head.index(column)
+        for row in rows:
+            value = factor * float(row[at])
+            row[at] = str(round(value)) if whole else f"{value:.10g}"
+        with path.open("w", encoding="utf-8", newline="") as file:
+            csv.writer(file).writerows([head, *rows])
+    return folder
+
+
+def grade(folder: Path, *, per_count: float | None = None) -> Grade:
+    submission, rubric = load_submission(folder), load_rubric(Path("throne-1dof"))
+    if per_count is not None:
+        position = submission.system.position.model_copy(update={"per_count": per_count})
+        system = submission.system.model_copy(update={"position": position})
+        submission = submission.model_copy(update={"system": system})
+    return grade_submission(submission, rubric=rubric, name="team").grade
+
+
+@pytest.fixture(scope="module")
+def in_counts(tmp_path_factory):
+    return scaled(tmp_path_factory.mktemp("counts"), "x1", 1 / COUNT, whole=True)
+
+
+def test_counts_said_to_be_centimetres_fail_a_check(in_counts):
+    """Every gain is hundreds of times too large, and all else agrees."""
+    failed = [c.id.split(".")[0] for c in analyse(load_submission(in_counts)).checks
+              if c.outcome == "fail"]  # fmt: skip
+    assert failed == ["position_scale"]
+
+
+def test_the_right_gain_is_not_accused_where_the_recordings_are_in_counts(in_counts):
+    """The recordings are flagged; the student's gain is not, nor the loop that ran."""
+    graded = grade(in_counts)
+    assert [flag.code for flag in graded.flags] == ["data_problem"]
+    outcomes = {c.id: c.outcome for c in graded.criteria if c.outcome != "pass"}
+    assert outcomes == {
+        "data": "partial", "initial-gains": "skip", "final-gains": "skip", "hardware": "skip"
+    }  # fmt: skip
+
+
+def test_a_stated_length_of_a_count_makes_the_gain_known(in_counts):
+    """The gain is held against the recordings times the count; a wrong one shows."""
+    outcomes = {c.id: c.outcome for c in grade(in_counts, per_count=COUNT).criteria}
+    assert outcomes["initial-gains"] == outcomes["final-gains"] == "pass"
+    off = {c.id: c.outcome for c in grade(in_counts, per_count=2 * COUNT).criteria}
+    assert off["initial-gains"] == off["final-gains"] == "fail"
+
+
+def test_millivolts_said_to_be_volts_fail_a_check(tmp_path):
+    """No amplifier at a bench gives hundreds of volts, and no gain is judged by them."""
+    graded = grade(scaled(tmp_path / "team", "input", 1e4))
+    assert [flag.code for flag in graded.flags] == ["data_problem"]
+    assert {c.id: c.outcome for c in graded.criteria}["final-gains"] == "skip"
