@@ -400,6 +400,7 @@ class HardwareCheck:
     input_scale : the factor on the logged input that explains the motion best (1 = as logged),
         its sign included; None where it was not looked for.
     t, measured, model : (n,).
+    contradicted : what was logged or stated of the run cannot be so; the note says how.
     """
 
     experiment: str
@@ -417,6 +418,7 @@ class HardwareCheck:
     measured: Array
     model: Array
     note: str = ""
+    contradicted: bool = False
 
 
 # -------------------------------------------------------------------- together

@@ -11,13 +11,14 @@ from pipeline.ingest.read import read_data
 from pipeline.ingest.scales import check_scales
 from pipeline.ingest.signs import check_signs
 from pipeline.plant.chain import parameter_names
-from pipeline.results import Analysis, ChainFit, FeedbackDesign, HardwareCheck, Record
+from pipeline.results import Analysis, ChainFit, FeedbackDesign, HardwareCheck, LeftOut, Record
 from pipeline.stages.compare import (
     NOT_IDENTIFIED,
     check_chain,
     check_decays,
     check_dwells,
     check_files,
+    check_loops,
     check_rows,
     check_setup,
     check_steps,
@@ -104,7 +105,8 @@ def analyse(
             ]
         )
     progress("hardware against model")
-    hardware = _hardware(submission, data.records, fit, log=log)
+    hardware = _hardware(submission, data.records, fit, left_out=left_out, log=log)
+    checks += check_loops(hardware)
 
     return Analysis(
         title=submission.title,
@@ -175,7 +177,12 @@ def is_reversed(records: Sequence[Record]) -> bool:
 
 
 def _hardware(
-    submission: Submission, records: Sequence[Record], fit: ChainFit | None, *, log: Log
+    submission: Submission,
+    records: Sequence[Record],
+    fit: ChainFit | None,
+    *,
+    left_out: Sequence[LeftOut],
+    log: Log,
 ) -> list[HardwareCheck]:
     runs = {record.id: record for record in records if record.kind == "closed_loop"}
     if not runs:
@@ -184,6 +191,9 @@ def _hardware(
     if fit is None:
         log.skip("hardware check", "the carts are not identified")
         return []
+    for one in left_out:
+        if runs.pop(one.experiment, None):
+            log.skip(f"hardware check, {one.experiment}", f"it is left out: {one.reason}")
     limit = submission.design.input_limit if submission.design else None
     checks: list[HardwareCheck] = []
     for experiment in submission.experiments:
@@ -200,5 +210,7 @@ def _hardware(
                 )
                 or ()
             )
-    log.warn(by_note((f"{check.experiment}, cart {check.cart}", check.note) for check in checks))
+    log.warn(
+        by_note((f"{c.experiment}, cart {c.cart}", c.note) for c in checks if not c.contradicted)
+    )
     return checks

@@ -16,6 +16,7 @@ from pipeline.plant.chain import PRESETS, Array, Chain
 from pipeline.plant.loop import Controller, Pid, StateFeedback, simulate_loop
 from pipeline.plant.simulate import simulate_linear
 from pipeline.results import FeedbackDesign, HardwareCheck, Kind, Record
+from pipeline.stages.compare import check_loops
 from pipeline.stages.hardware_check import check_hardware
 from pipeline.stages.state_feedback import design_feedback
 
@@ -202,6 +203,36 @@ def test_a_stated_scale_that_the_log_contradicts_is_said():
     # The middle one of many ratios of an input to one of rounded readings.
     assert re.match(r"the logged input is 0\.0097\d times what the stated", checks[0].note)
     assert checks[0].nrmse < 1.35 * noise_floor(y[0])
+
+
+@pytest.mark.parametrize("wrong", ["input", "reference", "gains", "controlled_cart", "counts"])
+def test_what_contradicts_the_run_fails_a_check(wrong):
+    """A tenfold column, exchanged gains or another cart: what is stated is not what ran."""
+    design = designed(TWO, 2)
+    law = StateFeedback(gains=design.gains, prefilter=design.prefilter, model=TWO)
+    y, u = bench(TWO, law)
+    gains = stated(design).gains
+    swapped = submission.StateFeedback(
+        type="state_feedback", gains=(gains[1], gains[0], *gains[2:]), prefilter=design.prefilter
+    )
+    run = record(
+        y / COUNT if wrong == "counts" else y,
+        u=10 * u if wrong == "input" else u,
+        reference=10 * STEPS if wrong == "reference" else STEPS,
+    )
+
+    checks = check_hardware(
+        run,
+        TWO,
+        controller=swapped if wrong == "gains" else stated(design),
+        controlled_cart=1 if wrong == "controlled_cart" else 2,
+    )
+
+    assert [(c.id, c.outcome) for c in check_loops(checks)] == [(f"hardware.{run.id}", "fail")]
+    true = check_hardware(
+        record(y, u=u, reference=STEPS), TWO, controller=stated(design), controlled_cart=2
+    )
+    assert check_loops(true) == []
 
 
 def test_noise_at_a_fast_sample_is_no_scale_of_the_log():

@@ -36,7 +36,12 @@ _KINDS = {  # what carts are identified from
 }
 _GOOD_FIT = 2.0  # chi-square per degree of freedom that stated noise still explains
 _MOST_TOLD = 3  # of one kind: a summary is short
-_OF_DATA = ("repeats.", "dwells.", "setup.")  # checks of recordings, not of what they say
+_OF_DATA = (
+    "repeats.",
+    "dwells.",
+    "setup.",
+    "hardware.",
+)  # checks of recordings, not of what they say
 _CLOSE = 0.10  # a simulation within 10 % of the motion is a good linear model's
 
 
@@ -356,7 +361,8 @@ def _next(analysis: Analysis) -> Items:
                 "with dry friction it grows as the amplitude falls."
             )
         )
-    poor = [check for check in analysis.hardware if check.nrmse > _CLOSE]
+    doubted = {check.experiment for check in analysis.hardware if check.contradicted}
+    poor = [c for c in analysis.hardware if c.nrmse > _CLOSE and c.experiment not in doubted]
     if poor or (fit is not None and fit.chi_square_per_dof > _GOOD_FIT):
         advice.append(
             spans(
@@ -366,7 +372,7 @@ def _next(analysis: Analysis) -> Items:
         )
     if analysis.feedback is not None and not any(r.kind == "closed_loop" for r in analysis.records):
         advice.append(spans("Run the designed feedback on the bench and add the record."))
-    if analysis.skipped:
+    if analysis.skipped and not analysis.left_out:
         advice.append(spans("Add the experiments that the skipped stages ask for."))
     design = analysis.feedback
     if design and not design.reachable:

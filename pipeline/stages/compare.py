@@ -14,6 +14,7 @@ from pipeline.results import (
     ChainFit,
     Check,
     Estimate,
+    HardwareCheck,
     LogDecrement,
     Outcome,
     ParameterRow,
@@ -273,6 +274,21 @@ def check_dwells(records: Sequence[Record], points: Sequence[SinePoint]) -> list
             message=f"{len(off)} of {len(ratios)} dwells ({named}) do not swing at the frequency "
             f"stated{told}.",
         )
+    ]
+
+
+def check_loops(hardware: Sequence[HardwareCheck]) -> list[Check]:
+    """Return a failed check for each run of which the log or the stated controller is wrong."""
+    wrong = [check for check in hardware if check.contradicted]
+    return [
+        Check(
+            id=f"hardware.{run}",
+            outcome="fail",
+            value=None,
+            limit=None,
+            message=f"{run}: {'; '.join(c.note for c in wrong if c.experiment == run and c.note)}.",
+        )
+        for run in dict.fromkeys(check.experiment for check in wrong)
     ]
 
 

@@ -26,6 +26,10 @@ _SETTLED_SHARE = 0.2  # of the time after a step, its end, whose mean is the ste
 _SMALL_CHANGE = 0.05  # of the cart's largest motion; a smaller step has no overshoot to speak of
 _EXPLAINED = 0.7  # a simulation further off than this explains less than half of the motion
 _SAME = 1e-3  # of the largest input: the same value
+# A plant right to the first under its very input, but off by the second, and so many times further,
+# in the loop: it is not the loop that ran. A stable loop makes a plant's error some times larger.
+_RIGHT, _WRONG, _TIMES_WORSE = 0.02, 0.1, 5.0
+_AT, _AWAY = 0.05, 0.2  # of the reference: a cart that settles there, and one that does not
 _BLOWN_UP = 10.0  # times the measured motion that a simulated loop is off by: it is unstable
 
 
@@ -74,8 +78,12 @@ def check_hardware(
         )
     checks = []
     if closed is not None:
-        scale = opened.scale if opened else None
-        checks += _compare(run, replace(closed, scale=scale), loop="closed")
+        closed = replace(closed, scale=opened.scale if opened else None)
+        if opened and (note := _not_as_stated(run, closed, opened)):
+            closed = replace(closed, note=note, contradicted=True)
+        elif note := _another_cart(run, controller, controlled_cart):
+            closed = replace(closed, note=note, contradicted=True)
+        checks += _compare(run, closed, loop="closed")
     if opened is not None:
         note = "; ".join(filter(None, (trouble, opened.note)))
         checks += _compare(run, replace(opened, note=note), loop="open")
@@ -88,6 +96,7 @@ class _Simulated:
 
     y: Array
     note: str
+    contradicted: bool = False
     factor: float = 1.0
     scale: float | None = None
 
@@ -104,9 +113,15 @@ def _open(run: MeasuredRun) -> _Simulated:
     note = (
         f"the logged input explains the motion only if taken {scale:.3g} times, so it is: "
         f"the difference over all carts falls from {100 * as_logged:.0f} % to {100 * scaled:.0f} % "
-        "(sign and scale of this log are not those of the system's input)"
+        "(the input or the positions of this run are not in the unit, or of the sign, stated)"
     )
-    return _Simulated(y=unforced + scale * forced, factor=scale, scale=scale, note=note)
+    return _Simulated(
+        y=unforced + scale * forced,
+        factor=scale,
+        scale=scale,
+        note=note,
+        contradicted=scaled <= _WRONG and not _plausible(abs(scale)),
+    )
 
 
 def _plausible(factor: float) -> bool:
@@ -159,19 +174,21 @@ def _close(
     drive = opened.factor if opened else 1.0
     limit = min(np.inf if limit is None else limit, _plateau(run.record.u))
     y, misfit = _run_loop(run, law, reference=reference, drive=drive, limit=limit)
-    to_beat, note = _WORTH_IT * misfit, ""
+    to_beat, note, times_stated = _WORTH_IT * misfit, "", 1.0
     for factor in _logged_per_stated(run, law, reference=reference, opened=opened):
         if misfit <= run.noise_floor:
             break
         times = _times(law, factor)
         scaled, less = _run_loop(run, times, reference=reference, drive=drive, limit=limit)
         if less < min(to_beat, misfit):
-            y, misfit = scaled, less
+            y, misfit, times_stated = scaled, less, factor
             note = f"is {factor:.3g} times" if factor != -1.0 else "has the opposite sign of"
             note = f"the logged input {note} what the stated controller asks for"
     if y is None:
         raise DataError("the stated controller makes it unstable")
-    return _Simulated(y=y, note=note)
+    # A bench may count its input the other way under feedback, by right.
+    wrong = abs(times_stated) != 1.0 and misfit <= _WRONG
+    return _Simulated(y=y, note=note, contradicted=wrong)
 
 
 def _run_loop(
@@ -258,6 +275,44 @@ def _median_ratio(logged: Array, stated: Array) -> float:
     return float(ratio[order[half]])
 
 
+def _not_as_stated(run: MeasuredRun, closed: _Simulated, opened: _Simulated) -> str:
+    """Say that the stated controller is not what ran, where the plant follows what it was given."""
+    loop, plant = run.misfit(closed.y), run.misfit(opened.y)
+    if opened.factor != 1.0 or not (plant <= _RIGHT and loop > max(_WRONG, _TIMES_WORSE * plant)):
+        return ""
+    return (
+        f"the carts follow the logged input to {100 * plant:.1f} %, but the loop with the stated "
+        f"controller is {100 * loop:.0f} % off: its gains, its prefilter or the reference are not "
+        "those that ran"
+    )
+
+
+def _another_cart(
+    run: MeasuredRun, controller: submission.Controller | None, cart: int | None
+) -> str:
+    """Say that another cart than the one said to be controlled comes to rest at the reference."""
+    reference = run.record.reference
+    if not isinstance(controller, submission.StateFeedback) or reference is None:
+        return ""
+    window = run.step_window(reference)
+    if cart is None or window is None or (target := float(reference[window.stop - 1])) == 0.0:
+        return ""
+    last = slice(
+        window.stop - max(1, round(_SETTLED_SHARE * (window.stop - window.start))), window.stop
+    )
+    off = {
+        run.free[row]: abs(float((run.y[row, last] - run.rest[row]).mean()) / target - 1)
+        for row in np.flatnonzero(run.seen).tolist()
+    }
+    there = [other for other, away in off.items() if away <= _AT]
+    if len(there) != 1 or off.get(cart, 0.0) < _AWAY:
+        return ""
+    return (
+        f"controlled_cart = {cart}, but cart {there[0]} comes to rest at the reference and cart "
+        f"{cart} {100 * off[cart]:.0f} % from it"
+    )
+
+
 def _plateau(u: Array | None) -> float:
     """Return the largest input if the log stays at it for more than a sample, else infinity."""
     if u is None:
@@ -307,6 +362,7 @@ def _compare(
                 measured=measured,
                 model=model,
                 note=note,
+                contradicted=simulated.contradicted,
             )
         )
         note = ""
