@@ -450,8 +450,9 @@ class Analysis:
     """All results of one submission, in pipeline order.
 
     `files` maps each data file to its SHA-256, `unreadable` each experiment that could not be read
-    to its reason; `rows` are the table; `chain` is None where no
-    fit was possible (then `skipped` says why). `tables` are the students' own reduced tables, also
+    to its reason, `unexplained` each driven recording in which the carts move to the share of its
+    motion's power that the fitted carts leave. `rows` are the table; `chain` is None where no fit
+    was possible (then `skipped` says why). `tables` are the students' own reduced tables, also
     where dwells stand in their place.
     """
 
@@ -477,6 +478,7 @@ class Analysis:
     warnings: tuple[str, ...]
     files: dict[str, str]
     unreadable: dict[str, str] = field(default_factory=dict)
+    unexplained: dict[str, float] = field(default_factory=dict)
     discussion: str | None  # notes.md, without its comments
     left_out: tuple[LeftOut, ...] = ()
 

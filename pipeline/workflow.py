@@ -131,6 +131,7 @@ def analyse(
         warnings=tuple(log.warnings),
         files=data.files,
         unreadable=data.unreadable,
+        unexplained={name: one.share for name, one in found.fitted.fits.items()},
         discussion=submission.discussion,
         left_out=tuple(left_out),
     )

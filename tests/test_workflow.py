@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose
 from pipeline.plant.chain import PRESETS
 from pipeline.resources import EXAMPLES
 from pipeline.results_json import results_text
+from pipeline.stages.follow import follow
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse, reference_design
 
@@ -47,6 +48,14 @@ def test_same_input_gives_same_bytes(analyses):
     """Analysing the same folder again gives the same results.json."""
     again = analyse(load_submission(EXAMPLES / "two-cart"))
     assert results_text(again) == results_text(analyses["two-cart"])
+
+
+def test_how_the_records_follow_is_handed_on(analyses):
+    """Who asks how well the records follow the carts need not follow them once more."""
+    for analysis in analyses.values():
+        fits = follow(analysis.records, analysis.chain)
+        assert fits
+        assert analysis.unexplained == {name: fit.share for name, fit in fits.items()}
 
 
 def _without(tmp_path, *, kinds, example="two-cart"):

@@ -13,7 +13,7 @@ from pipeline.stages.compare import (
     CHI_SQUARE_LIMIT,
     GAIN_AND_FREQUENCY_LIMIT,
 )
-from pipeline.stages.follow import follow
+from pipeline.stages.follow import FOLLOWED
 
 # A fitted frequency or gain that far from the measured one: the fit has gone astray; factors.
 _ASTRAY, _ASTRAY_GAIN = 1.3, 1.6
@@ -176,9 +176,8 @@ def _is_followed(analysis: Analysis) -> bool:
     rounding: the point is off by several of its errors, the record follows all the same.
     """
     bad = {one.experiment for one in analysis.left_out}
-    sound = [r for r in analysis.records if r.id not in bad]
-    fits = follow(sound, analysis.chain) if analysis.chain else {}
-    return bool(fits) and sum(fit.belongs for fit in fits.values()) >= _MOST * len(fits)
+    left = [share for name, share in analysis.unexplained.items() if name not in bad]
+    return bool(left) and sum(share <= FOLLOWED for share in left) >= _MOST * len(left)
 
 
 def _final(

@@ -3,6 +3,7 @@
 from collections.abc import Sequence, Set
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -54,10 +55,18 @@ class Identified:
 
 
 def identify(
-    data: Ingested, *, without: Set[str], system: System, progress: Progress
+    data: Ingested,
+    *,
+    without: Set[str],
+    system: System,
+    progress: Progress,
+    measured: dict[str, Any],
 ) -> Identified:
-    """Take the records, but for those without, through the stages up to the fit."""
-    n, springs, log = system.carts, system.springs, Log()
+    """Take the records, but for those without, through the stages up to the fit.
+
+    `measured` keeps what single records tell, for the next call with other records left out.
+    """
+    n, springs, log = system.carts, system.springs, Log(measured=measured)
     records = [record for record in data.records if record.id not in without]
     out = [record for record in data.records if record.id in without]
     driven = _driven(records, n=n, log=log)
@@ -165,7 +174,7 @@ def _log_decrements(
                 ),
             )
         for run in runs:
-            decay = log.attempt(
+            decay = log.attempt_once(
                 f"log decrement, {run.id}, cart {cart}", fit_log_decrement, run, cart=cart
             )
             if decay:
@@ -198,7 +207,9 @@ def _step_gains(
     gains = []
     for run in runs:
         for cart in run.carts:
-            gain = log.attempt(f"step gain, {run.id}, cart {cart}", fit_step_gain, run, cart=cart)
+            gain = log.attempt_once(
+                f"step gain, {run.id}, cart {cart}", fit_step_gain, run, cart=cart
+            )
             if gain:
                 gains.append(gain)
     return gains
@@ -210,7 +221,7 @@ def _sine_points(records: Sequence[Record], *, log: Log) -> list[SinePoint]:
         dwell = Dwell(run)
         for cart in run.carts if run.kind == "sine" else ():
             stage = f"sine steady state, {run.id}, cart {cart}"
-            point = log.attempt(stage, dwell.fit, cart=cart)
+            point = log.attempt_once(stage, dwell.fit, cart=cart)
             if point and (fault := dwell_fault(point)):
                 log.skip(stage, fault)
             elif point:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 from pipeline.errors import DataError
 from pipeline.results import Skipped
@@ -20,6 +20,7 @@ class Log:
 
     skipped: list[Skipped] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
+    measured: dict[str, Any] = field(default_factory=dict)  # by stage, for `attempt_once`
 
     def attempt(
         self, stage: str, run: Callable[P, T], *args: P.args, **options: P.kwargs
@@ -30,6 +31,21 @@ class Log:
         except DataError as error:
             self.skip(stage, str(error))
             return None
+
+    def attempt_once(
+        self, stage: str, run: Callable[P, T], *args: P.args, **options: P.kwargs
+    ) -> T | None:
+        """Run a stage of one record, which tells the same whatever others are left out."""
+        if stage not in self.measured:
+            try:
+                self.measured[stage] = run(*args, **options)
+            except DataError as error:
+                self.measured[stage] = error
+        found = self.measured[stage]
+        if isinstance(found, DataError):
+            self.skip(stage, str(found))
+            return None
+        return found
 
     def skip(self, stage: str, reason: str) -> None:
         """Note why a stage did not run."""

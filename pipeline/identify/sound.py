@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from itertools import combinations
 
 from pipeline.errors import DataError
@@ -39,7 +40,8 @@ def identify_from_sound(
     fits: Mapping[str, Followed] = {}
     left_out = find_outlier_repeats(driven, unit=unit) | shown
     without = left_out.keys() | standing_still(data.records)
-    found = identify(data, without=without, system=system, progress=progress)
+    again = partial(identify, data, system=system, progress=progress, measured={})
+    found = again(without=without)
     for _ in range(_ROUNDS):
         # Where nothing is left to identify the carts from, the verdict before stands.
         chain, fits = _witness(found, data, system=system) or (chain, fits)
@@ -58,7 +60,7 @@ def identify_from_sound(
             if check.outcome == "fail"
             and check.id.removeprefix("repeats.") not in found.repeats.undecided
         ]
-        found = identify(data, without=without, system=system, progress=progress)
+        found = again(without=without)
     checks = {check.id: check for check in (*found.repeats.checks, *contradicted)}
     repeats = replace(found.repeats, checks=tuple(checks.values()))
     return (

@@ -4,8 +4,9 @@ Start and encoder zeros aside, what a chain leaves of a record is linear in its 
 weights with which they follow best tell at once which column is turned or in another unit.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import combinations
 
 import numpy as np
@@ -27,6 +28,8 @@ _DETUNED = np.linspace(0.85, 1.15, 13)
 # Simulated carts with dry friction F under a force of amplitude A leave at least (F / 5A)² where
 # they move at all, which is doubled here; encoder and noise hide shares below the least.
 _FRICTION, _LEAST = 10.0, 1e-4
+
+_ModesOf = Callable[[tuple[int, ...]], Modes]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +81,8 @@ def measured(record: Record) -> list[int]:
 
 def follow(records: Sequence[Record], chain: Chain) -> dict[str, Followed]:
     """Hold every driven record in which the measured carts move against the chain, by id."""
-    found = {record.id: _hold_against(record, chain) for record in records if is_driven(record)}
+    modes = _modes(chain)
+    found = {r.id: _hold_against(r, chain, modes) for r in records if is_driven(r)}
     return {name: fit for name, fit in found.items() if fit}
 
 
@@ -93,8 +97,9 @@ def near(record: Record, chain: Chain) -> list[Followed]:
     A spring that stiffens, or an input that comes late, shifts resonances by some percent, and at
     one of them that is all of the motion.
     """
-    held = (_hold_against(replace(record, t=factor * record.t), chain) for factor in _DETUNED)
-    return [fit for fit in held if fit]
+    modes = _modes(chain)
+    detuned = [replace(record, t=factor * record.t) for factor in _DETUNED]
+    return [fit for other in detuned if (fit := _hold_against(other, chain, modes))]
 
 
 def find_misread(
@@ -111,14 +116,15 @@ def find_misread(
         return None
     # As the bench counts its input: a record's own sign was found by what it holds.
     record = replace(record, u=0.0 - record.u) if record.turned and record.u is not None else record
-    for misread, other in _readings(record, chain):
-        held = _hold_against(other, chain)
+    modes = _modes(chain)
+    for misread, other in _readings(record, modes):
+        held = _hold_against(other, chain, modes)
         if held and held.share <= least:
             found, least = misread, held.share
     return found
 
 
-def _readings(record: Record, chain: Chain) -> Iterator[tuple[Misread, Record]]:
+def _readings(record: Record, modes: _ModesOf) -> Iterator[tuple[Misread, Record]]:
     for i, j in combinations(measured(record), 2):
         rows = list(range(len(record.carts)))
         a, b = record.carts.index(i), record.carts.index(j)
@@ -135,7 +141,7 @@ def _readings(record: Record, chain: Chain) -> Iterator[tuple[Misread, Record]]:
         return
     if np.any(np.ptp(window.y, axis=1) < _SEEN_STEPS * np.sqrt(12) * window.stated_sigma):
         return
-    if (said := _say(window.carts, _weights(window, _modes(window, chain)))) is not None:
+    if (said := _say(window.carts, _weights(window, modes(window.free)))) is not None:
         misread, factors = said
         by_cart = dict(zip(window.carts, factors, strict=True))
         rows = np.array([by_cart.get(cart, 1.0) for cart in record.carts])
@@ -180,23 +186,28 @@ def _say(carts: Sequence[int], weights: Array) -> tuple[Misread, Array] | None:
 # ------------------------------------------------------------------ one record held
 
 
-def _modes(window: Window, chain: Chain) -> Modes:
-    """Return the modes of the chain without their slopes, which nothing here needs."""
+def _modes(chain: Chain) -> _ModesOf:
+    """Return what finds the chain's modes by its free carts, without slopes: none are needed."""
     P = Parametrisation(n=chain.n, springs=tuple(bool(k) for k in chain.k))
-    modes = find_modes(chain, free=window.free, parametrisation=P, slopes=np.zeros(len(P.names)))
-    return replace(
-        modes,
-        d_poles=modes.d_poles[:0],
-        d_shapes=modes.d_shapes[:0],
-        d_entry=modes.d_entry[:0],
-        d_drive=modes.d_drive[:0],
-    )
+
+    @cache
+    def find(free: tuple[int, ...]) -> Modes:
+        modes = find_modes(chain, free=free, parametrisation=P, slopes=np.zeros(len(P.names)))
+        return replace(
+            modes,
+            d_poles=modes.d_poles[:0],
+            d_shapes=modes.d_shapes[:0],
+            d_entry=modes.d_entry[:0],
+            d_drive=modes.d_drive[:0],
+        )
+
+    return find
 
 
-def _hold_against(record: Record, chain: Chain) -> Followed | None:
+def _hold_against(record: Record, chain: Chain, modes: _ModesOf) -> Followed | None:
     try:
         window = open_window(record)
-        residual = compare(window, _modes(window, chain)).residual * window.sigma[:, None]
+        residual = compare(window, modes(window.free)).residual * window.sigma[:, None]
     except DataError:  # nothing moves, or the motor does not reach the last cart
         return None
     power = np.var(window.y, axis=1)
