@@ -169,6 +169,33 @@ def test_dwells_that_were_cut_are_flagged(bench, tmp_path):
     assert all(60 * 0.00884 * frequency[name] < 1.5 for name in flag.parameters)
 
 
+@pytest.mark.parametrize(
+    ("kind", "stated", "word"),
+    [("step", "decay", "free decay"), ("sine", "step", "no step"), ("step", "cut", "cut")],
+)
+def test_a_recording_of_another_kind_or_a_cut_one_fails_report_and_grade(
+    kind, stated, word, bench, tmp_path
+):
+    """What is flagged where it is graded fails a check of the report, and is in no number."""
+    folder = shutil.copytree(bench, tmp_path / "kind")
+    path = files(folder, kind)[1]
+    if stated == "cut":
+        spoil(path, lambda columns: {k: v[: v.size // 3] for k, v in columns.items()})
+    else:
+        table = f'id = "{path.stem}"\nkind = '
+        _change(folder, f'{table}"{kind}"', f'{table}"{stated}"')
+    graded = grade_submission(
+        load_submission(folder), rubric=load_rubric(Path(PRESET)), name="team"
+    )
+    assert graded.analysis is not None
+    (one,) = graded.analysis.left_out
+    assert (one.experiment, one.is_wrong) == (path.stem, True)
+    assert word in one.reason
+    assert f"record.{path.stem}" in _failed(graded.analysis)
+    assert path.stem in {name for flag in graded.grade.flags for name in flag.parameters}
+    _numbers_are_right(graded.analysis)
+
+
 def test_the_sound_repeats_stay_where_most_are_exchanged(bench, tmp_path):
     """Three of four exchanged steps are out, the one as it was is not, and no sign is advised."""
     folder = shutil.copytree(bench, tmp_path / "most")

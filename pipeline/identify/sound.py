@@ -8,6 +8,7 @@ from itertools import combinations
 from pipeline.errors import DataError
 from pipeline.identify.carts import Identified, identify
 from pipeline.identify.log import Progress
+from pipeline.identify.other_kind import find_other_kinds
 from pipeline.identify.stuck import find_stuck
 from pipeline.ingest.read import Ingested
 from pipeline.plant.chain import Chain
@@ -33,8 +34,12 @@ def identify_from_sound(
     """
     driven = [r for r in data.records if r.kind in ("step", "sweep")]
     unit = system.position.unit
-    # Shown by the encoder alone, later by numbers that are gone once they are out.
-    shown = find_other_units(data.records) | find_stuck(data.records)
+    # Shown by input or encoder alone, later by numbers that are gone once they are out.
+    shown = {
+        **find_other_units(data.records),
+        **find_stuck(data.records),
+        **find_other_kinds(data.records, files=data.files),
+    }
     contradicted = []
     chain: Chain | None = None
     fits: Mapping[str, Followed] = {}
