@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.grading.batch import Batch
-from pipeline.grading.doubles import Double, find_doubles
+from pipeline.grading.batch import Batch, Prints
+from pipeline.grading.doubles import Double, find_doubles, with_recordings
 from pipeline.grading.gradebook import Gradebook
 from pipeline.grading.outputs import write_outputs
 from pipeline.grading.shared_prints import fingerprint
@@ -61,6 +61,18 @@ def test_without_names_nobody_is_named(recordings, tmp_path):
     assert re.fullmatch(
         r"One person is in anon-\w+ and anon-\w+, which have \d+ recordings in common", str(double)
     )
+
+
+def test_recordings_are_counted_not_pairs_of_submissions(recordings):
+    """Four submissions with one set of recordings have that many in common, not six times it."""
+    prints = [
+        Prints(submission=f"t{i}", authors=("s1",), fingerprints=recordings[0]) for i in range(4)
+    ]
+    counted = []
+    for some in (prints[:2], prints):
+        doubles = find_doubles({one.submission: one.authors for one in some})
+        counted += [double.recordings for double in with_recordings(doubles, some)]
+    assert counted[0] == counted[1] >= 3
 
 
 def test_one_submission_each_is_nothing_to_tell():

@@ -1,6 +1,7 @@
 """Recordings that do not hold what happened are named and left out; honest ones are not."""
 
 import csv
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from pipeline.grading.load import load_rubric
+from pipeline.grading.recordings import bad_runs
 from pipeline.grading.run import grade_submission
 from pipeline.plant.chain import PRESETS, Array
 from pipeline.results import Analysis
@@ -194,6 +196,33 @@ def test_a_recording_of_another_kind_or_a_cut_one_fails_report_and_grade(
     assert f"record.{path.stem}" in _failed(graded.analysis)
     assert path.stem in {name for flag in graded.grade.flags for name in flag.parameters}
     _numbers_are_right(graded.analysis)
+
+
+def test_grading_says_what_the_stated_frequencies_are_in(bench, tmp_path):
+    """Rad/s where hertz are asked for: no dwell is the file of another experiment."""
+    folder = shutil.copytree(bench, tmp_path / "spoilt")
+    path = folder / "submission.toml"
+    path.write_text(
+        re.sub(
+            r"frequency = ([\d.]+)",
+            lambda found: f"frequency = {2 * np.pi * float(found[1]):.3f}",
+            path.read_text(encoding="utf-8"),
+        ),
+        encoding="utf-8",
+    )
+    problems = bad_runs(analyse(load_submission(folder), design=False))
+    assert problems
+    assert all("rad/s" in why for why in problems.values())
+
+
+def test_a_held_cart_that_nobody_called_free_is_told_with_its_cure(bench, tmp_path):
+    """Where `carts` is left out all are free: the line that mends it is named."""
+    folder = shutil.copytree(bench, tmp_path / "spoilt")
+    path = folder / "submission.toml"
+    text = path.read_text(encoding="utf-8").replace("carts = [1]\n", "", 1)
+    path.write_text(text, encoding="utf-8")
+    (one,) = analyse(load_submission(folder), design=False).left_out
+    assert "write carts = [1]" in one.reason
 
 
 def test_the_sound_repeats_stay_where_most_are_exchanged(bench, tmp_path):

@@ -189,6 +189,14 @@ def test_moodle_own_worksheet_is_filled_in(tmp_path):
     assert remarks == ("not in roster.csv, so not exported: =ann",)
 
 
+def test_a_worksheet_with_another_maximum_is_refused(tmp_path):
+    """Moodle keeps its own maximum, so that every grade would be of the wrong one."""
+    roster = "Identifier,Full name,Grade,Maximum Grade\nParticipant 1024,Jane Doe,,{}\n"
+    write(tmp_path, HALF, platform="moodle", roster=roster.format('"20,00"'))
+    with pytest.raises(ConfigError, match=r"maximum grade 18\.00, the rubric 20 points"):
+        write(tmp_path, HALF, platform="moodle", roster=roster.format("18.00"))
+
+
 def test_moodle_is_told_why_points_were_given_by_hand(tmp_path):
     """Also where they are all of them."""
     first = RUBRIC.criteria[0]

@@ -11,12 +11,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.grading.checks import between
 from pipeline.grading.grade import CODES, Flag, Grade, grade_text
 from pipeline.grading.load import load_rubric
 from pipeline.grading.run import grade_submission, under_rubric
+from pipeline.grading.springs import with_all_springs
 from pipeline.grading.state_model import StateModel, compare_entries
 from pipeline.submission import Input, InputOverride, StateSpace, load_submission
 from pipeline.synthesis import write_submission
+from pipeline.synthesis.hidden import prepare_bench, write_bench
+from pipeline.workflow import analyse
 from tests.grading_students import student
 
 
@@ -148,6 +152,23 @@ def test_the_rubric_s_system_wins(folder, tmp_path):
     toml.write_text(changed, "utf-8", newline="\n")
     assert grade(other).points == grade(folder).points
     assert grade(other).flags == ()
+    assert grade(other).notes == ()  # one cart has one stiffness, whichever spring it stands for
+
+
+def test_a_delay_is_not_read_as_a_spring(tmp_path):
+    """A spring that the fit puts at none is not asked for, however well it then explains."""
+    bench = prepare_bench(preset="throne-2dof", model=None, hide=["input_delay"])
+    write_bench(tmp_path, bench, seed=304)
+    rubric = load_rubric(Path("throne-2dof"))
+    submission, _ = under_rubric(load_submission(tmp_path), rubric)
+    _, springs = with_all_springs(submission, analyse(submission, design=False))
+    assert springs == ()
+
+
+def test_two_first_and_final_numbers_of_one_sign_agree(folder):
+    """A sign that both tables have is no difference between them; two signs are one."""
+    assert between(Decimal("-24.4"), Decimal("-24.3")) == between(Decimal("24.4"), Decimal("24.3"))
+    assert between(Decimal("-24.4"), Decimal("24.3")) == between(Decimal("0"), Decimal("24.3"))
 
 
 def test_a_submission_for_another_bench_fails_with_its_reason(folder):

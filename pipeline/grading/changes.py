@@ -1,11 +1,12 @@
 """What is another since the class list before: the rubric, and whose points."""
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from typing import Any
 
 from pydantic import ValidationError
 
 from pipeline.grading.feedback_words import points_text
+from pipeline.grading.override import Override
 from pipeline.grading.rubric import Rubric
 
 
@@ -31,10 +32,29 @@ def rubric_changes(before: str, now: str) -> list[str]:
     return changes + _differing(old, new)
 
 
-def points_changes(before: Mapping[str, float], now: Mapping[str, float]) -> list[str]:
+def kept_by_hand(before: str, now: str, given: Mapping[str, Mapping[str, Override]]) -> list[str]:
+    """Return which points given by hand, by submission, stay as they are under other points."""
+    try:
+        rubrics = [Rubric.model_validate_json(text) for text in (before, now)]
+    except ValidationError:
+        return []
+    old, new = ({c.id: c.points for c in rubric.criteria} for rubric in rubrics)
+    return [
+        f"{name}: {id_} was given {points_text(one.points)} of {points_text(old[id_])} points by "
+        f"hand; it has {points_text(new[id_])} now"
+        for name, overrides in given.items()
+        for id_, one in overrides.items()
+        if one.points is not None and id_ in old and id_ in new and old[id_] != new[id_]
+    ]
+
+
+def points_changes(
+    before: Mapping[str, float], now: Mapping[str, float], *, by_hand: Container[str] = ()
+) -> list[str]:
     """Return whose points are another, and who is new or gone."""
     changes = [
         f"{name}: {points_text(before[name])} → {points_text(points)}"
+        + (" (with points given by hand)" if name in by_hand else "")
         for name, points in now.items()
         if name in before and points != before[name]
     ]

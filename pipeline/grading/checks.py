@@ -163,9 +163,13 @@ def _initial_final(criterion: asked.InitialFinal, work: Work) -> Verdict:
 
 
 def between(initial: Decimal, final: Decimal) -> Fraction:
-    """Return how far two typed numbers are apart, in percent, the rounding of each off."""
-    if initial <= 0 or final <= 0:
+    """Return how far two typed numbers are apart, in percent, the rounding of each off.
+
+    Two of one sign agree, whichever it is: that it is wrong is told elsewhere.
+    """
+    if initial * final <= 0:
         return NO_CREDIT
+    initial, final = abs(initial), abs(final)
     value, half = float(initial), float(rounding(initial))
     reference = Reference(value=value, low=value, high=value, std=half, source="initial")
     return percent_off(final, reference, sigmas=1.0)

@@ -22,7 +22,7 @@ class Double:
     Attributes
     ----------
     author : "" where names are left out.
-    recordings : how many stand in two of the submissions.
+    recordings : the most that one of the submissions has in common with the others.
     """
 
     author: str
@@ -59,12 +59,10 @@ def with_recordings(doubles: Iterable[Double], prints: Iterable[Prints]) -> list
     return [
         replace(
             double,
-            recordings=sum(
-                record.other in double.submissions
-                for submission in double.submissions
-                for record in shared.get(submission, ())
-            )
-            // 2,  # each is found from both sides
+            recordings=max(
+                len({r.experiment for r in shared.get(name, ()) if r.other in double.submissions})
+                for name in double.submissions
+            ),
         )
         for double in doubles
     ]

@@ -56,16 +56,16 @@ def export(
 
     Raises
     ------
-    ConfigError : the roster is no such table.
+    ConfigError : the roster is no such table, or its grades go up to another maximum.
     """
     rubric = book.rubric
     title = title or rubric.title or "cartlab"
     entries = list(book.entries())
     students, remarks = students_of(entries, platform=platform)
     if roster:
-        text, strangers = _filled(
-            Roster.read(roster, platform=platform), platform, students, rubric, title=title
-        )
+        own = Roster.read(roster, platform=platform)
+        own.check_maximum(rubric.out_of)
+        text, strangers = _filled(own, platform, students, rubric, title=title)
         remarks += strangers
     elif platform == "canvas":
         text = _canvas([s for s in students if not s.uploader], rubric, title=title)

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 POINTS_POSSIBLE = "Points Possible"  # Canvas' row on top, about the assignments
+_MAXIMUM = "Maximum Grade"  # Moodle's, of the assignment: its import refuses a grade above it
 # Columns that say who a row is about.
 _NUMBERS = ("ID", "Identifier", "Submission ID")
 _IDS = ("SIS User ID", "SIS Login ID", "ID number", "SID", "Username", "Email", "Email address")
@@ -63,6 +64,20 @@ class Roster:
         if len(twice):
             raise ConfigError(f"{path.name}: has two columns {quote(twice[0])}")
         return cls(file=path.name, table=table)
+
+    def check_maximum(self, out_of: float) -> None:
+        """Refuse a table whose grades go up to another maximum: the platform keeps its own.
+
+        Raises
+        ------
+        ConfigError : it says so in a column "Maximum Grade".
+        """
+        for text in self.table[_MAXIMUM].unique() if _MAXIMUM in self.table else ():
+            if (most := _number(text)) is not None and most != out_of:
+                raise ConfigError(
+                    f"{self.file}: has the maximum grade {text}, the rubric {out_of:g} points: set "
+                    "the assignment's maximum on the platform and download the table again"
+                )
 
     def filled(
         self,
@@ -163,6 +178,14 @@ def _row_of(student: Student, index: Mapping[tuple[str, str], Any]) -> Any:
         if at is not None:
             return at
     return None
+
+
+def _number(text: str) -> float | None:
+    """Return a number as the platform writes it, perhaps with a decimal comma; None for words."""
+    try:
+        return float(text.replace(",", "."))
+    except ValueError:
+        return None
 
 
 def _letters(name: str) -> str:

@@ -151,7 +151,10 @@ def _lost(grade: Grade) -> list[Block]:
 
 
 def _notes(grade: Grade) -> list[Block]:
-    return [bullet_list(rich(_sentence(note)) for note in grade.notes)] if grade.notes else []
+    if not grade.notes:
+        return []
+    notes = bullet_list(rich(_sentence(note)) for note in grade.notes)
+    return [paragraph("To know, without points lost for it:"), notes]
 
 
 def _sentence(text: str) -> str:

@@ -15,7 +15,7 @@ from sqlalchemy import Connection, Row, select
 
 from pipeline.errors import ConfigError
 from pipeline.grading.batch import Batch, Listed, Outcome, Prints, read_grade
-from pipeline.grading.changes import points_changes, rubric_changes
+from pipeline.grading.changes import kept_by_hand, points_changes, rubric_changes
 from pipeline.grading.class_lines import Line, class_frame
 from pipeline.grading.gradebook_lists import (
     add_list,
@@ -167,22 +167,23 @@ class Gradebook:
         ------
         KeyError : an outcome of the batch was never put in.
         """
-        listed, points = [], {}
+        listed, points, by_hand = [], {}, {}
         with self._database.writing() as connection:
             carry_overrides(connection, batch.moved, assignment=self._assignment or "")
             for position, key in enumerate(batch.keys):
                 row = newest_of(connection, key, assignment=self._assignment or "")
                 shared = batch.shared.get(row.name)
-                grade = final_entry(connection, row, shared=shared, rubric=rubric).grade
-                points[row.name] = grade.points
+                entry = final_entry(connection, row, shared=shared, rubric=rubric)
+                points[row.name] = entry.grade.points
+                by_hand |= {row.name: entry.overrides} if entry.overrides else {}
                 listed.append(
                     {
                         "position": position,
                         "submission_id": row.submission_id,
                         "grading_id": row.id,
                         "shared": json.dumps(asdict(shared)) if shared else "",
-                        "points": grade.points,
-                        "out_of": grade.out_of,
+                        "points": entry.grade.points,
+                        "out_of": entry.grade.out_of,
                     }
                 )
             text = rubric.model_dump_json()
@@ -197,7 +198,8 @@ class Gradebook:
             told = [f"rubric: {change}" for change in rubric_changes(last.rubric, text)]
             before = points_of(connection, last)
             before = {batch.moved.get(name, name): had for name, had in before.items()}
-            return told + points_changes(before, points)
+            told += kept_by_hand(last.rubric, text, by_hand)
+            return told + points_changes(before, points, by_hand=by_hand)
 
     # ---------------------------------------------------------------- what counts now
 

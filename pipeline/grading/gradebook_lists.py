@@ -11,6 +11,8 @@ from pipeline.grading.gradebook_rows import add_row, read_rubric
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.schema import batches, entries, gradings, submissions
 
+_NAMED = 8  # names of what there is, where none is near
+
 
 def lines_of(connection: Connection, batch: Row) -> list[dict]:
     """Return a class list as it was put in."""
@@ -71,8 +73,10 @@ def is_of(authors: str, team: str) -> bool:
 
 def nearest(word: str, words: list[str]) -> str:
     """Return what there is that was perhaps meant, in words."""
-    near = get_close_matches(word, words, n=3, cutoff=0.4) or words[:8]
-    return f"there is {', '.join(near)}" if near else "there is none at all"
+    near = get_close_matches(word, words, n=3, cutoff=0.4)
+    more = f" and {len(words) - _NAMED} more" if not near and len(words) > _NAMED else ""
+    near = near or words[:_NAMED]
+    return f"there is {', '.join(near)}{more}" if near else "there is none at all"
 
 
 def _asked(rubric: Rubric) -> Rubric:

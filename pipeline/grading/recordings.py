@@ -10,6 +10,7 @@ from pipeline.ingest.inspect import line_frequency
 from pipeline.ingest.problems import saturation
 from pipeline.ingest.scales import SCALES
 from pipeline.results import Analysis, Record
+from pipeline.stages.compare import why_other_frequency
 
 _FREQUENCY = 0.08  # relative: a stated frequency further from that of the input is another run's
 
@@ -65,7 +66,5 @@ def _problems(record: Record, *, sticky: bool) -> Iterator[str]:
         hertz, stated = line_frequency(record.t, u), record.omega / (2 * np.pi)
         resolution = 1.0 / float(record.t[-1] - record.t[0])
         if hertz is not None and abs(hertz - stated) > max(_FREQUENCY * stated, resolution):
-            yield (
-                f"the input has {hertz:.3g} Hz, {stated:.3g} Hz is stated: is it the file of "
-                "another experiment?"
-            )
+            why = why_other_frequency(stated / hertz) or "is it the file of another experiment?"
+            yield f"the input has {hertz:.3g} Hz, {stated:.3g} Hz is stated: {why}"

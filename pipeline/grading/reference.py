@@ -169,7 +169,7 @@ def is_explained(analysis: Analysis) -> bool:
     return analysis.fit is None or analysis.fit.chi_square_per_dof <= CHI_SQUARE_LIMIT
 
 
-def _is_followed(analysis: Analysis) -> bool:
+def is_followed(analysis: Analysis) -> bool:
     """Whether nearly all driven records move as the fitted carts do.
 
     A dwell beside a sharp resonance hides what is left of its transient below a coarse encoder's
@@ -201,7 +201,7 @@ def _final(
     # decays, and where those are few the fit explains them all the same.
     if fitted and told and not is_damping(row.name) and is_explained(analysis):
         measured = [value for value in measured if _agrees(value, fitted)]
-    if not measured and not (told and (is_explained(analysis) or _is_followed(analysis))):
+    if not measured and not (told and (is_explained(analysis) or is_followed(analysis))):
         return None
     bounds = [*measured, *([fitted.value] if fitted and told else [])]
     return Reference(

@@ -149,7 +149,7 @@ def under_rubric(submission: Submission, rubric: Rubric) -> tuple[Submission, tu
         unit = own.position.unit
         per_count = None if per_count is None else per_count * factor
         notes.append(f"lengths are in {unit}, as handed in; the rubric has {set_.position.unit}")
-    if own.springs != set_.springs:
+    if own.springs != set_.springs and set_.carts > 1:  # one cart has one stiffness
         notes.append("the springs are the rubric's, not those of the submission")
     system = System(
         carts=set_.carts,

@@ -259,11 +259,9 @@ def check_dwells(records: Sequence[Record], points: Sequence[SinePoint]) -> list
     if not off:
         return []
     ratio = float(np.median(list(off.values())))
-    close = [
-        why for factor, why in _DWELL_FACTORS.items() if abs(ratio / factor - 1) < _DWELL_LIMIT
-    ]
+    why = why_other_frequency(ratio)
     alike = all(abs(r / ratio - 1) < _DWELL_LIMIT for r in off.values())
-    told = f", {ratio:.4g} times: {close[0]}" if close and alike else ""
+    told = f", {ratio:.4g} times: {why}" if why and alike else ""
     named = ", ".join(list(off)[:_DWELLS_NAMED]) + (" …" if len(off) > _DWELLS_NAMED else "")
     return [
         Check(
@@ -290,6 +288,14 @@ def check_loops(hardware: Sequence[HardwareCheck]) -> list[Check]:
         )
         for run in dict.fromkeys(check.experiment for check in wrong)
     ]
+
+
+def why_other_frequency(ratio: float) -> str:
+    """Return what a dwell stated at so many times its frequency looks to be, or ""."""
+    close = (
+        why for factor, why in _DWELL_FACTORS.items() if abs(ratio / factor - 1) < _DWELL_LIMIT
+    )
+    return next(close, "")
 
 
 NOT_IDENTIFIED = Check(

@@ -166,7 +166,9 @@ def _dead_channels(
         y = record.position(cart)
         never = is_driven(record) and cart not in moving
         if np.ptp(y) == 0 and (record.kind == "decay" or never):
-            yield f"cart {cart} is said to be free and its encoder never changes"
+            others = [free for free in record.free if free != cart]
+            held = f"; if it was held, write carts = {others}" if others else ""
+            yield f"the encoder of cart {cart} never changes{held}"
         if chain is None or record.u is None or not is_driven(record):
             continue
         force = force_on(record, chain, cart=cart)
