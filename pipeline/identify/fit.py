@@ -87,13 +87,13 @@ def fit_carts(
     if other.fit is None or not other.fit.converged:
         return bode
     theirs = _kinds_that_follow(records, other)
-    if bode.by_dwells and contrary and len(mine) == len(theirs):
+    if bode.by_dwells and contrary and _votes(mine) == _votes(theirs):
         conflict = _conflict(records, bode, mine=mine, theirs=theirs)
         if conflict:
             log.skip("final estimates", next(iter(conflict.values())).reason)
             return Fitted(conflict=conflict)
-    if contrary and len(mine) != len(theirs):
-        better = len(mine) < len(theirs)
+    if contrary and _votes(mine) != _votes(theirs):
+        better = _votes(mine) < _votes(theirs)
     else:  # one that dwells follow gives way only to one that they follow more closely yet
         better = not bode.by_dwells or _is_closer(other, bode, dwells)
     if not better:
@@ -137,6 +137,11 @@ def _kinds_that_follow(records: Sequence[Record], fitted: Fitted) -> set[str]:
         for kind, ids in _by_kind(records, fitted).items()
         if most_follow({name: fitted.fits[name] for name in ids})
     }
+
+
+def _votes(kinds: Set[str]) -> int:
+    """Return how many ways of recording follow: steps and sweeps are logged in one way."""
+    return len({"step" if kind == "sweep" else kind for kind in kinds})
 
 
 def _contrary_kinds(records: Sequence[Record], fitted: Fitted) -> set[str]:

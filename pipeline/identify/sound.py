@@ -78,7 +78,7 @@ def _witness(
     found: Identified, data: Ingested, *, system: System
 ) -> tuple[Chain, Mapping[str, Followed]] | None:
     """Return the chain that the records follow, and how; or would, with two columns exchanged."""
-    if found.fit and most_follow(found.fitted.fits):
+    if found.fit and found.fit.converged and most_follow(found.fitted.fits):
         return found.fit.chain, found.fitted.fits
     for i, j in combinations(sorted(response.cart for response in found.responses), 2):
         turned = [replace(r, cart={i: j, j: i}.get(r.cart, r.cart)) for r in found.responses]
@@ -92,4 +92,6 @@ def _witness(
             continue
         if fit.chi_square_per_dof <= CHI_SQUARE_LIMIT:
             return fit.chain, follow(data.records, fit.chain)
-    return (found.fit.chain, found.fitted.fits) if found.fit else None
+    if found.fit is None or not found.fit.converged:
+        return None
+    return found.fit.chain, found.fitted.fits

@@ -209,8 +209,9 @@ def _frozen(
             force = force_on(record, chain, cart=cart)
             if moved < far or not rest.size or force is None:
                 continue
-            # What pulls with the last sample moves the cart after it.
-            if 2 * friction.get(cart, np.inf) >= np.ptp(force[part][:-1]):
+            # A cart at rest stays there for a moment after the input steps.
+            early = force[part][: (part.stop - part.start) // 2]
+            if 2 * friction.get(cart, np.inf) >= np.ptp(early):
                 continue
             elsewhere = float(np.mean(rest**2))
             follows = elsewhere < FOLLOWED * float(np.var(np.delete(y, part)))

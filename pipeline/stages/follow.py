@@ -24,6 +24,10 @@ _SEEN_STEPS = 5.0  # encoder steps of motion: rounding changes a smaller one by 
 # Shares of a record's power (about its mean) that the chain leaves unexplained.
 FOLLOWED = 0.1
 _DOUBTFUL, _BETTER = 0.005, 10.0  # as recorded at least this, read otherwise so many times less
+_UNMISTAKABLE = 10.0  # an amplifier at its limit makes less of the input by a factor of 2 or 3
+_TURNED = (
+    0.02  # at most this is left of a record that counts the other way; a long delay leaves more
+)
 _DETUNED = np.linspace(0.85, 1.15, 13)
 # Simulated carts with dry friction F under a force of amplitude A leave at least (F / 5A)² where
 # they move at all, which is doubled here; encoder and noise hide shares below the least.
@@ -119,7 +123,7 @@ def find_misread(
     modes = _modes(chain)
     for misread, other in _readings(record, modes):
         held = _hold_against(other, chain, modes)
-        if held and held.share <= least:
+        if held and held.share <= (min(least, _TURNED) if misread.legal else least):
             found, least = misread, held.share
     return found
 
@@ -168,7 +172,8 @@ def _say(carts: Sequence[int], weights: Array) -> tuple[Misread, Array] | None:
     A unit is that of the whole file: one cart near its null moves by any factor too little.
     """
     sign, size = np.sign(weights), np.abs(weights)
-    for scale in (*LENGTH_SCALES, *(1 / scale for scale in LENGTH_SCALES)):
+    scales = [scale for scale in LENGTH_SCALES if scale >= _UNMISTAKABLE]
+    for scale in (*scales, *(1 / scale for scale in scales)):
         if np.all(np.abs(size * scale - 1) < _SAME_SCALE) and len(set(sign)) == 1:
             words = (
                 "its positions or its input look to be in another unit: they move "
