@@ -273,7 +273,8 @@ def test_columns_exchanged_in_every_recording_are_named(bench, tmp_path):
         spoil(path, exchanged)
     analysis = analyse(load_submission(folder))
     assert {one.experiment for one in analysis.left_out} == {path.stem for path in driven}
-    assert all("exchanged" in one.reason for one in analysis.left_out)
+    assert {one.reason for one in analysis.left_out} == {analysis.left_out[0].reason}
+    assert 'columns = { x1 = "x2", x2 = "x1" }' in analysis.left_out[0].reason
     assert "fit.identified" in _failed(analysis)
 
 

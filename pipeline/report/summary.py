@@ -331,7 +331,7 @@ def _next(analysis: Analysis) -> Items:
         c.outcome == "fail" and c.id.startswith(_OF_DATA) for c in analysis.checks
     ):
         advice.append(spans("Mend first what the failed checks say of the recordings."))
-    if fit is None:
+    if fit is None and not analysis.left_out:
         reasons = [skip.reason for skip in analysis.skipped if skip.stage == "final estimates"]
         advice.append(
             spans(f"No carts were identified: {clean(reasons[-1])}")

@@ -240,7 +240,7 @@ def check_setup(records: Sequence[Record]) -> list[Check]:
                     f"the carts said to be free ({named}) are those that move."
                     if good
                     else f"cart {mover} moves and cart {named} does not, but cart {named} is said "
-                    "to be free: is `carts` right?"
+                    "to be free: is `carts` right, and is each cart in its column?"
                 ),
             )
         )

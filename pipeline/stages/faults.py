@@ -33,7 +33,6 @@ _SEEN_COUNTS, _SEEN_SHARE = 5.0, 0.3
 _WITNESSES = 2  # records that follow the carts, as they are or read otherwise: one does by chance
 _STRAY = 0.5  # of the motion of every cart that stays unexplained in a record that does not belong
 _MOVES = 0.8  # … which moves at least that far, relative: friction makes no cart move further
-_SO_READ = ": read that way it follows the identified carts"
 _FROZEN_SAMPLES, _FROZEN_SHARE = 10, 0.2  # the share of its motion that it moved meanwhile
 _ELSEWHERE = 0.25  # of how far it was moved while it stood: what it misses the carts by else
 _CYCLES = 1.5  # a dwell with fewer holds no steady state, whatever its length
@@ -64,6 +63,7 @@ def find_faults(
     fits : how the records follow it, as `follow` has it.
     """
     misread = _misread(records, chain=chain, fits=fits)
+    everywhere = len({m.words for m in misread.values()}) == 1 and misread.keys() == fits.keys()
     copied = _copies(records)
     steps: dict[int, float] = {}  # a dead channel shows none
     moving: set[int] = set()
@@ -87,7 +87,7 @@ def find_faults(
             *_wrong_clock(record, usual=usual_clock),
             *_short_dwell(record),
             *([copied[record.id]] if record.id in copied else ()),
-            *([f"{misread[record.id].words}{_SO_READ}"] if record.id in misread else ()),
+            *([_so_read(misread[record.id], everywhere)] if record.id in misread else ()),
             *(
                 _frozen(record, fits[record.id], chain, friction=friction, steps=steps)
                 if chain and record.id in fits
@@ -117,7 +117,7 @@ def check_left_out(left_out: Sequence[LeftOut], *, records: Sequence[Record]) ->
             message=f"Left out {'is' if len(names) == 1 else 'are'} {_named(names, records)}: "
             f"{reason}.",
         )
-        for reason, names in runs.items()
+        for reason, names in sorted(runs.items(), key=lambda item: -len(item[1]))
     ]
 
 
@@ -295,6 +295,15 @@ def _misread(
         found = {name: misread for name, misread in found.items() if name not in legal}
     agreeing = sum(fit.belongs for name, fit in fits.items() if name not in found) + len(found)
     return found if agreeing >= _WITNESSES else {}
+
+
+def _so_read(misread: Misread, everywhere: bool) -> str:
+    if everywhere:
+        return (
+            f"{misread.words}, in every recording of carts that the input moves: {misread.remedy}; "
+            "read that way they follow one model, as they are they follow none"
+        )
+    return f"{misread.words}: read that way it follows the identified carts"
 
 
 def _strays(

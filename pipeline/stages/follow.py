@@ -66,9 +66,13 @@ class Followed:
 
 @dataclass(frozen=True, kw_only=True)
 class Misread:
-    """What makes a record follow: `words` say it; a `legal` one need not be a mistake."""
+    """What makes a record follow: `words` say it; a `legal` one need not be a mistake.
+
+    `remedy` : what mends it where all records of a bench are so.
+    """
 
     words: str
+    remedy: str = "mend it in the files"
     legal: bool = False
 
 
@@ -135,7 +139,8 @@ def _readings(record: Record, modes: _ModesOf) -> Iterator[tuple[Misread, Record
         rows[a], rows[b] = b, a
         words = f"x{i} and x{j} look exchanged"
         other = replace(record, y=record.y[rows], resolution=record.resolution[rows])
-        yield Misread(words=words), other
+        remedy = f'state columns = {{ x{i} = "x{j}", x{j} = "x{i}" }} for each'
+        yield Misread(words=words, remedy=remedy), other
     for factor, words in TIME_FACTORS.items():
         if record.sample_time >= factor * FASTEST:  # too short a time is any short curve
             yield Misread(words=words), replace(record, t=record.t / factor)
