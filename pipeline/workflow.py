@@ -26,6 +26,7 @@ from pipeline.stages.compare import (
     why_open,
 )
 from pipeline.stages.design_check import design_margins, verify_design
+from pipeline.stages.encoder_units import find_other_units
 from pipeline.stages.faults import check_left_out
 from pipeline.stages.hardware_check import check_hardware
 from pipeline.stages.state_feedback import design_feedback
@@ -57,6 +58,9 @@ def analyse(
         log.skip(f"reading {name}", reason)
     log.warn(data.warnings)
     log.warn(by_note((record.id, note) for record in data.records for note in record.notes))
+    harmless = "a decay gives no length, so no number is off"
+    units = find_other_units(data.records, decays=True)
+    log.warn(by_note((name, f"{one.reason}; {harmless}") for name, one in units.items()))
     found, left_out = identify_from_sound(data, system=system, progress=progress)
     log.add(found.log)
     wrong = {one.experiment for one in left_out if one.is_wrong}

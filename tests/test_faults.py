@@ -198,6 +198,20 @@ def test_a_recording_of_another_kind_or_a_cut_one_fails_report_and_grade(
     _numbers_are_right(graded.analysis)
 
 
+@pytest.mark.parametrize("which", [slice(1), slice(None)])
+def test_decays_in_millimetres_are_told_and_used(which, bench, tmp_path):
+    """One or all: a warning names them, and no number is the worse for them."""
+    folder = shutil.copytree(bench, tmp_path / "spoilt")
+    paths = files(folder, "decay")[which]
+    for path in paths:
+        spoil(path, times(10, "x1", "x2"))
+    analysis = analyse(load_submission(folder), design=False)
+    assert not analysis.left_out
+    assert not _failed(analysis)
+    told = [text for text in analysis.warnings if "another unit" in text]
+    assert paths[0].stem in told[0]
+
+
 def test_grading_says_what_the_stated_frequencies_are_in(bench, tmp_path):
     """Rad/s where hertz are asked for: no dwell is the file of another experiment."""
     folder = shutil.copytree(bench, tmp_path / "spoilt")

@@ -11,12 +11,13 @@ _SAME = 0.02  # relative: as far as the step is seen alike in two recordings
 _WITNESSES = 2  # kinds of experiment that have the usual step; of two alone either may be wrong
 
 
-def find_other_units(records: Sequence[Record]) -> dict[str, LeftOut]:
+def find_other_units(records: Sequence[Record], *, decays: bool = False) -> dict[str, LeftOut]:
     """Find the records whose encoder step is that of the others in another unit, by id.
 
     A class of a dozen dwells was exported in one go, and so may all be wrong: the usual step is
-    what most kinds of experiment have, not most records. A decay gives no length, and a step of
-    0.01 beside one of 0.001 is how many decimals were written.
+    what most kinds of experiment have, not most records. A step of 0.01 beside one of 0.001 is
+    how many decimals were written. A decay gives no length, so that it is as good in any unit:
+    those are looked for alone, with `decays`.
     """
     found: dict[str, LeftOut] = {}
     for cart in sorted({cart for record in records for cart in record.carts}):
@@ -30,7 +31,7 @@ def find_other_units(records: Sequence[Record]) -> dict[str, LeftOut]:
         if sum(_alike(step, usual) for step in by_kind) < _WITNESSES:
             continue
         scales = [s for scale in LENGTH_SCALES for s in (scale, 1 / scale)]
-        for record in [r for r in records if r.id in steps and r.kind != "decay"]:
+        for record in [r for r in records if r.id in steps and (r.kind == "decay") is decays]:
             step = steps[record.id]
             if _is_decimal(step) and _is_decimal(usual):
                 continue
