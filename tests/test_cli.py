@@ -92,7 +92,7 @@ def test_failed_checks_are_status_one(tmp_path):
         file.write_text("\n".join([lines[0], *map(",".join, rows)]) + "\n", encoding="utf-8")
     done = cartlab_here("report", folder, "--no-pdf", "--json")
     checks = {check["id"]: check["outcome"] for check in json.loads(done.stdout)["checks"]}
-    assert checks["initial_final.K"] == "fail"
+    assert checks["record.step-1"] == "fail"
     assert done.returncode == 1
 
 

@@ -239,6 +239,18 @@ def test_a_held_cart_that_nobody_called_free_is_told_with_its_cure(bench, tmp_pa
     assert "write carts = [1]" in one.reason
 
 
+def test_a_loop_that_is_left_out_is_held_against_nothing(bench, tmp_path):
+    """A clock in milliseconds is no run to hold the model against, and the reason is there."""
+    folder = shutil.copytree(bench, tmp_path / "loop")
+    for path in files(folder, "control"):
+        spoil(path, in_milliseconds)
+    analysis = analyse(load_submission(folder))
+    assert [one.experiment for one in analysis.left_out] == ["control"]
+    assert analysis.hardware == ()
+    (skip,) = [s for s in analysis.skipped if s.stage == "hardware check, control"]
+    assert "milliseconds" in skip.reason
+
+
 def test_the_sound_repeats_stay_where_most_are_exchanged(bench, tmp_path):
     """Three of four exchanged steps are out, the one as it was is not, and no sign is advised."""
     folder = shutil.copytree(bench, tmp_path / "most")
