@@ -51,11 +51,14 @@ def _is_sine(t: Array, u: Array) -> bool:
 def _cut(record: Record, records: Sequence[Record]) -> Iterator[str]:
     if record.kind not in ("decay", "step"):
         return
-    lengths = [
-        float(other.t[-1] - other.t[0])
+    repeats = [
+        other
         for other in records
         if (other.kind, other.free) == (record.kind, record.free) and other is not record
     ]
-    length, usual = float(record.t[-1] - record.t[0]), float(np.median(lengths or [0.0]))
-    if length < _CUT * usual:
+    length = float(record.t[-1] - record.t[0])
+    usual = float(np.median([float(r.t[-1] - r.t[0]) for r in repeats] or [0.0]))
+    # A repeat whose clock is in another unit lasts long with no more samples.
+    samples = float(np.median([r.t.size for r in repeats] or [0]))
+    if length < _CUT * usual and record.t.size < _CUT * samples:
         yield f"it lasts {length:.3g} s, its repeats {usual:.3g} s: the file looks cut"
