@@ -53,4 +53,4 @@ def static_levels(chain: Chain, gains: Array) -> Array:
 def _compliance(chain: Chain, gains: Array) -> Array:
     """Return the inverse of the stiffness that the feedback leaves, (…, n, n)."""
     fed_back = np.eye(chain.n)[:, :1] * gains[..., None, 0::2]
-    return np.linalg.inv(chain.stiffness + fed_back)
+    return np.asarray(np.linalg.inv(chain.stiffness + fed_back), dtype=np.float64)
