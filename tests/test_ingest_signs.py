@@ -142,6 +142,8 @@ def test_a_stated_sign_is_not_doubted_because_the_input_is_late(bench, sign, sai
     assert bool(doubts) == said
     assert not check_signs(signs, without=set(signs.found))
     assert not said or re.search(r"which say \+1 in .* \(all that tell it\)", doubts[0].message)
+    few = {name: -sign if i < 2 else told for i, (name, told) in enumerate(signs.found.items())}
+    assert bool(check_signs(replace(signs, found=few), without=())) == said
 
 
 def test_a_record_that_counts_the_other_way_is_found(bench):

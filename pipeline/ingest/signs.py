@@ -90,7 +90,8 @@ def _say_signs(
 def check_signs(signs: Contradicted, *, without: Container[str]) -> list[Check]:
     """Return a failed check where records contradict the sign that is stated of them.
 
-    `without` are records that do not hold what happened, so that their sign says nothing.
+    `without` are records that do not hold what happened, so that their sign says nothing. A bench
+    has one sign: what a few dwells say against the others, a long delay makes them say.
     """
     says, wrong = [], 0
     for sign in (1, -1):
@@ -100,7 +101,7 @@ def check_signs(signs: Contradicted, *, without: Container[str]) -> list[Check]:
             if signs.stated.get(name) == sign and found and name not in without
         ]
         contrary = [name for name in told if signs.found[name] == -sign]
-        if contrary:
+        if contrary and 2 * len(contrary) >= len(told):
             those = "all" if contrary == told else f"{len(contrary)} of the {len(told)}"
             says.append(
                 f"sign = {sign} of the input contradicts the data, which say {-sign:+d} in "
