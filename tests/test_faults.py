@@ -422,3 +422,20 @@ def test_carts_that_stick_and_creep_are_in_no_other_unit_of_time(bench):
     creep = 0.02 * dwell.t / dwell.t[-1]  # cm: nine encoder steps in all
     stuck = replace(dwell, y=np.array([creep, 0.7 * creep]))
     assert find_misread(stuck, chain, follow([stuck], chain)[stuck.id]) is None
+
+
+def test_a_cart_that_moves_farther_than_the_one_that_pulls_it_accuses_no_gain(bench, tmp_path):
+    """One column in another unit in every file: no model, and no right number is called wrong."""
+    folder = shutil.copytree(bench, tmp_path / "millimetres")
+    for path in files(folder, ""):
+        head = path.read_text(encoding="utf-8").partition("\n")[0]
+        if "x2" in head.split(","):
+            spoil(path, times(10, "x2"))
+    graded = grade_submission(
+        load_submission(folder), rubric=load_rubric(Path(PRESET)), name="team"
+    )
+    assert graded.analysis is not None
+    steps = [one for one in graded.analysis.left_out if one.experiment.startswith("step")]
+    assert len(steps) == len(files(folder, "step"))
+    assert all("cart 2" in one.reason for one in steps)
+    assert [flag.code for flag in graded.grade.flags] == ["data_problem"]

@@ -16,7 +16,7 @@ from pipeline.results import LeftOut
 from pipeline.stages.bode_fit import fit_bode
 from pipeline.stages.compare import CHI_SQUARE_LIMIT
 from pipeline.stages.encoder_units import find_other_units
-from pipeline.stages.faults import find_faults, standing_still
+from pipeline.stages.faults import find_faults, find_impossible_gains, standing_still
 from pipeline.stages.follow import Followed, follow, most_follow
 from pipeline.stages.repeats import find_outlier_repeats
 from pipeline.submission import System
@@ -51,6 +51,7 @@ def identify_from_sound(
         # Where nothing is left to identify the carts from, the verdict before stands.
         chain, fits = _witness(found, data, system=system) or (chain, fits)
         faults = find_faults(data.records, chain=chain, fits=fits)
+        shown |= find_impossible_gains(found.gains)
         shown |= {**found.repeats.odd, **found.fitted.conflict}
         # Most repeats may be the wrong ones: who is odd shows among the others.
         sound = [record for record in driven if record.id not in faults]

@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.plant.chain import Chain
 from pipeline.plant.simulate import simulate_linear
-from pipeline.results import Check, LeftOut, Record
+from pipeline.results import Check, LeftOut, Record, StepGain
 from pipeline.stages._signals import FASTEST, TIME_FACTORS
 from pipeline.stages.follow import (
     FOLLOWED,
@@ -35,6 +35,7 @@ _STRAY = 0.5  # of the motion of every cart that stays unexplained in a record t
 _MOVES = 0.8  # … which moves at least that far, relative: friction makes no cart move further
 _FROZEN_SAMPLES, _FROZEN_SHARE = 10, 0.2  # the share of its motion that it moved meanwhile
 _ELSEWHERE = 0.25  # of how far it was moved while it stood: what it misses the carts by else
+_FARTHER, _GAIN_SIGMAS = 1.3, 4.0  # friction may hold carts a little out of the line
 _CYCLES = 1.5  # a dwell with fewer holds no steady state, whatever its length
 _UNIT = 100.0
 _SPELT_OUT = 3  # records of one kind, if all of it; more are told by their number
@@ -100,6 +101,28 @@ def find_faults(
             found.setdefault(record.id, fault)
     for name, reason in _strays(records, chain=chain, fits=fits):
         found.setdefault(name, LeftOut(experiment=name, reason=reason, is_wrong=False))
+    return found
+
+
+def find_impossible_gains(gains: Sequence[StepGain]) -> dict[str, LeftOut]:
+    """Return the steps in which a cart moves farther than the one that pulls it, by id.
+
+    The input acts on cart 1, springs do the rest: a static gain is at most that of the cart before.
+    """
+    found: dict[str, LeftOut] = {}
+    by_cart = {(gain.experiment, gain.cart): gain for gain in gains if gain.interval is None}
+    for (run, cart), gain in by_cart.items():
+        before = by_cart.get((run, cart - 1))
+        if before is None:
+            continue
+        least = abs(gain.gain) - _GAIN_SIGMAS * gain.gain_std
+        if least > _FARTHER * (abs(before.gain) + _GAIN_SIGMAS * before.gain_std):
+            reason = (
+                f"cart {cart} comes to rest {abs(gain.gain / before.gain):.3g} times as far out as "
+                f"cart {cart - 1}, which pulls it: no springs do that, so a column looks to be in "
+                "another unit or another cart's"
+            )
+            found[run] = LeftOut(experiment=run, reason=reason, is_wrong=True)
     return found
 
 
