@@ -18,7 +18,7 @@ _FREQUENCY = 0.08  # relative: a stated frequency further from that of the input
 def bad_runs(analysis: Analysis) -> dict[str, str]:
     """Return the runs that do not hold what they should, each with what is wrong, in words."""
     found = dict(analysis.unreadable)
-    found |= {one.experiment: one.reason for one in analysis.left_out}
+    found |= {one.experiment: one.reason for one in analysis.left_out if one.is_wrong}
     setups = {
         check.id.partition(".")[2]: check.message.split(": ", 1)[-1]
         for check in analysis.checks

@@ -8,7 +8,8 @@ from pipeline.ingest.inspect import is_stepped, line_frequency
 from pipeline.plant.chain import Array
 from pipeline.results import LeftOut, Record
 
-_CUT = 0.5  # of the usual length of the repeats
+_CUT, _SAME = 0.5, 0.02  # of the usual length, which a program gives to all
+_WITNESSES = 2  # that run for so long
 _DRIVEN = 1e-3  # of the largest input of any run: a decay with more is driven
 
 
@@ -49,16 +50,20 @@ def _is_sine(t: Array, u: Array) -> bool:
 
 
 def _cut(record: Record, records: Sequence[Record]) -> Iterator[str]:
+    """Yield that a file looks cut: others of its kind run for one and the same time, and longer.
+
+    Whoever stops by hand stops anywhere. A repeat whose clock is in another unit lasts long with
+    no more samples.
+    """
     if record.kind not in ("decay", "step"):
         return
-    repeats = [
-        other
-        for other in records
-        if (other.kind, other.free) == (record.kind, record.free) and other is not record
-    ]
+    others = [r for r in records if r.kind == record.kind and r is not record]
+    lengths = np.array([r.t[-1] - r.t[0] for r in others])
+    usual = float(np.median(lengths)) if others else 0.0
+    alike = np.abs(lengths - usual) <= _SAME * usual
+    samples = float(np.median([r.t.size for r in others] or [0]))
     length = float(record.t[-1] - record.t[0])
-    usual = float(np.median([float(r.t[-1] - r.t[0]) for r in repeats] or [0.0]))
-    # A repeat whose clock is in another unit lasts long with no more samples.
-    samples = float(np.median([r.t.size for r in repeats] or [0]))
+    if alike.sum() < max(_WITNESSES, len(others) / 2):
+        return
     if length < _CUT * usual and record.t.size < _CUT * samples:
-        yield f"it lasts {length:.3g} s, its repeats {usual:.3g} s: the file looks cut"
+        yield f"it lasts {length:.3g} s, the others {usual:.3g} s: the file looks cut"
