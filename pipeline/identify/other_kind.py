@@ -50,14 +50,18 @@ def _is_sine(t: Array, u: Array) -> bool:
 
 
 def _cut(record: Record, records: Sequence[Record]) -> Iterator[str]:
-    """Yield that a file looks cut: others of its kind run for one and the same time, and longer.
+    """Yield that a file looks cut: its repeats run for one and the same time, and longer.
 
     Whoever stops by hand stops anywhere. A repeat whose clock is in another unit lasts long with
     no more samples.
     """
     if record.kind not in ("decay", "step"):
         return
-    others = [r for r in records if r.kind == record.kind and r is not record]
+    others = [
+        other
+        for other in records
+        if (other.kind, other.free) == (record.kind, record.free) and other is not record
+    ]
     lengths = np.array([r.t[-1] - r.t[0] for r in others])
     usual = float(np.median(lengths)) if others else 0.0
     alike = np.abs(lengths - usual) <= _SAME * usual
@@ -66,4 +70,4 @@ def _cut(record: Record, records: Sequence[Record]) -> Iterator[str]:
     if alike.sum() < max(_WITNESSES, len(others) / 2):
         return
     if length < _CUT * usual and record.t.size < _CUT * samples:
-        yield f"it lasts {length:.3g} s, the others {usual:.3g} s: the file looks cut"
+        yield f"it lasts {length:.3g} s, its repeats {usual:.3g} s: the file looks cut"
