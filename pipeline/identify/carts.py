@@ -90,7 +90,7 @@ def identify(
     progress("frequency response")
     responses = _frequency_response(data, sines=sines, driven=driven, out=out, log=log)
     resonances = _resonances(responses, system=system, log=log)
-    measured = estimate_initially(carts=n, log_decrements=decays, step_gains=gains)
+    alone = estimate_initially(carts=n, log_decrements=decays, step_gains=gains)
 
     progress("fitting all carts at once")
     fitted = Fitted()
@@ -100,7 +100,7 @@ def identify(
             records=records,
             beside=out,
             driven=driven,
-            initial={**resonances, **measured},
+            initial={**resonances, **alone},
             n=n,
             springs=springs,
             log=log,
@@ -112,7 +112,7 @@ def identify(
     repeats = compare_repeats(
         decays, gains, carts=n, fitted=parameters, dwells=parameters if fitted.by_dwells else {}
     )
-    agreed = {name: one for name, one in measured.items() if name not in repeats.undecided}
+    agreed = {name: one for name, one in alone.items() if name not in repeats.undecided}
     return Identified(
         decays=decays,
         gains=gains,

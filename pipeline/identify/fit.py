@@ -178,13 +178,14 @@ def _conflict(
     assert fitted.fit is not None
     chain, ids = fitted.fit.chain, _by_kind(records, fitted)
     others = [r for r in records if r.id in fitted.fits and r.kind in theirs - mine]
-    found = [m.words for r in others if (m := find_misread(r, chain, fitted.fits[r.id]))]
+    found = [(r.id, m.words) for r in others if (m := find_misread(r, chain, fitted.fits[r.id]))]
     if 2 * len(found) <= len(others):
         return {}
+    example, words = found[0]
     of_mine, of_theirs = (" and ".join(sorted(kinds)) for kinds in (mine - theirs, theirs - mine))
     reason = (
         f"the {of_mine} and the {of_theirs} records contradict one another, and nothing tells "
-        f"which are right (of {others[0].id}, if the former are: {found[0]})"
+        f"which are right (of {example}, if the former are: {words})"
     )
     return {
         name: LeftOut(experiment=name, reason=reason, is_wrong=True)

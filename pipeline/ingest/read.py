@@ -13,7 +13,7 @@ from pipeline.ingest.columns import Column, assign_columns, conversion, holds_co
 from pipeline.ingest.files import read_table
 from pipeline.ingest.problems import channel_problems
 from pipeline.ingest.signals import encoder_step, mirrors
-from pipeline.ingest.signs import Contradicted, with_signs
+from pipeline.ingest.signs import Signs, with_signs
 from pipeline.ingest.table import Table, refuse_extreme
 from pipeline.ingest.times import FEWEST_SAMPLES, clock_notes, time_stamps
 from pipeline.plant.chain import Array
@@ -44,7 +44,7 @@ class Ingested:
     tables: tuple[FrequencyResponse, ...]
     files: dict[str, str]
     unreadable: dict[str, str]
-    signs: Contradicted
+    signs: Signs
     warnings: tuple[str, ...]
 
 

@@ -13,7 +13,7 @@ _FEW_NAMES = 6  # more are not listed one by one
 
 
 @dataclass(frozen=True, kw_only=True)
-class Contradicted:
+class Signs:
     """By record, the sign that is stated, and the one that its data tell: 0 where they do not."""
 
     stated: Mapping[str, int]
@@ -22,7 +22,7 @@ class Contradicted:
 
 def with_signs(
     records: list[Record], submission: Submission
-) -> tuple[list[Record], list[str], Contradicted]:
+) -> tuple[list[Record], list[str], Signs]:
     """Return the records with signed inputs, what is to be said of signs found, and those stated.
 
     Where a record does not tell, it takes the sign of most others of its sort (under feedback or
@@ -63,7 +63,7 @@ def with_signs(
         for record in records
     ]
     says = _say_signs([r.id for r in driven], stated=stated, found=found, signs=signs)
-    return signed, says, Contradicted(stated=stated, found=found)
+    return signed, says, Signs(stated=stated, found=found)
 
 
 def _say_signs(
@@ -87,7 +87,7 @@ def _say_signs(
     return [text]
 
 
-def check_signs(signs: Contradicted, *, without: Container[str]) -> list[Check]:
+def check_signs(signs: Signs, *, without: Container[str]) -> list[Check]:
     """Return a failed check where records contradict the sign that is stated of them.
 
     `without` are records that do not hold what happened, so that their sign says nothing. A bench
