@@ -19,10 +19,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.errors import DataError
+from pipeline.estimation.chain.parametrisation import Parametrisation, named_estimates
 from pipeline.plant.chain import PRESETS, Array, Chain
 from pipeline.results import ChainFit, FrequencyResponse
 from pipeline.stages.bode_fit import fit_bode
-from pipeline.stages.chain_parameters import Parametrisation, named_estimates
 
 RELATIVE_STD = 0.01
 ABSOLUTE_STD = 0.00115  # cm

@@ -3,10 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
+from pipeline.checks.design import design_margins, verify_design
 from pipeline.errors import DataError
 from pipeline.identify.carts import UNTIED
 from pipeline.identify.log import Log, Progress, by_note
 from pipeline.identify.sound import identify_from_sound
+from pipeline.identify.soundness.encoder_units import find_other_units
+from pipeline.identify.soundness.faults import check_left_out
 from pipeline.ingest.read import read_data
 from pipeline.ingest.scales import check_scales
 from pipeline.ingest.signs import check_signs
@@ -25,9 +28,6 @@ from pipeline.stages.compare import (
     compare,
     why_open,
 )
-from pipeline.stages.design_check import design_margins, verify_design
-from pipeline.stages.encoder_units import find_other_units
-from pipeline.stages.faults import check_left_out
 from pipeline.stages.hardware_check import check_hardware
 from pipeline.stages.state_feedback import design_feedback
 from pipeline.submission import Design, Submission

@@ -7,13 +7,13 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from pipeline.errors import DataError
-from pipeline.plant.chain import PRESETS, Chain
-from pipeline.stages.chain_parameters import (
+from pipeline.estimation.chain.parametrisation import (
     Parametrisation,
     even_chain,
     named_estimates,
     physical_start,
 )
+from pipeline.plant.chain import PRESETS, Chain
 
 
 @st.composite

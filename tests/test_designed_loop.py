@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from pipeline.checks.design import design_margins, verify_design
 from pipeline.errors import DataError
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.plant.designed_loop import closed_loop, stability_margins
 from pipeline.plant.loop import StateFeedback, broken_loop
 from pipeline.results import FeedbackDesign
-from pipeline.stages.design_check import design_margins, verify_design
 from pipeline.stages.state_feedback import Method, design_feedback
 
 RIGID = Chain(m=np.array([2e-4]), c=np.array([1e-4]), k=np.zeros(2))

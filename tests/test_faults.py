@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.estimation.chain.follow import find_misread, follow
 from pipeline.grading.load import load_rubric
 from pipeline.grading.recordings import bad_runs
 from pipeline.grading.run import grade_submission
 from pipeline.plant.chain import PRESETS, Array
 from pipeline.results import Analysis
-from pipeline.stages.follow import find_misread, follow
 from pipeline.submission import load_submission
 from pipeline.synthesis import write_submission
 from pipeline.synthesis.hidden import prepare_bench

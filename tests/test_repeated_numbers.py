@@ -2,8 +2,8 @@
 
 from dataclasses import replace
 
+from pipeline.identify.soundness.repeated_numbers import Repeats, compare_repeats
 from pipeline.results import Estimate, LogDecrement, StepEdge, StepGain
-from pipeline.stages.repeated_numbers import Repeats, compare_repeats
 from tests.analysis_factory import make_analysis
 
 SWING = make_analysis(1).log_decrements[0]

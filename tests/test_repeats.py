@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeline.identify.soundness.repeats import find_outlier_repeats
 from pipeline.ingest.read import read_data
 from pipeline.plant.chain import PRESETS, Chain
-from pipeline.stages.repeats import find_outlier_repeats
 from pipeline.submission import load_submission
 from tests.time_records import decay_record, step_record
 from tests.ucsd import write_two_cart_submission

@@ -7,16 +7,16 @@ import pytest
 from numpy.testing import assert_allclose
 
 from pipeline.errors import DataError
+from pipeline.estimation.chain.modal_response import find_modes
+from pipeline.estimation.chain.parametrisation import Parametrisation
+from pipeline.estimation.chain.time_search import search
+from pipeline.estimation.chain.time_window import compare, open_window, usable_segment
+from pipeline.estimation.residual_colour import long_run_variance, score_covariance
 from pipeline.ingest.read import read_data
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.plant.simulate import simulate_linear
 from pipeline.results import ChainFit, Record
-from pipeline.stages.chain_parameters import Parametrisation
-from pipeline.stages.modal_response import find_modes
-from pipeline.stages.residual_colour import long_run_variance, score_covariance
 from pipeline.stages.time_fit import fit_records
-from pipeline.stages.time_search import search
-from pipeline.stages.time_window import compare, open_window, usable_segment
 from pipeline.submission import load_submission
 from tests.time_records import decay_record, measure, random_chain, step_record
 from tests.ucsd import write_two_cart_submission

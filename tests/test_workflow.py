@@ -6,10 +6,10 @@ import shutil
 import pytest
 from numpy.testing import assert_allclose
 
+from pipeline.estimation.chain.follow import follow
 from pipeline.plant.chain import PRESETS
 from pipeline.resources import EXAMPLES
 from pipeline.results_json import results_text
-from pipeline.stages.follow import follow
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse, reference_design
 

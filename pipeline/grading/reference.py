@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pipeline.estimation.chain.follow import FOLLOWED
 from pipeline.grading.rubric import is_damping
 from pipeline.ingest.scales import POSITION_SCALE, SCALES
 from pipeline.plant.chain import Chain
@@ -13,7 +14,6 @@ from pipeline.stages.compare import (
     CHI_SQUARE_LIMIT,
     GAIN_AND_FREQUENCY_LIMIT,
 )
-from pipeline.stages.follow import FOLLOWED
 
 # A fitted frequency or gain that far from the measured one: the fit has gone astray; factors.
 _ASTRAY, _ASTRAY_GAIN = 1.3, 1.6

@@ -9,6 +9,7 @@ import numpy as np
 
 from pipeline.identify.fit import Fitted, fit_carts
 from pipeline.identify.log import Log, Progress, by_note, listed
+from pipeline.identify.soundness.repeated_numbers import Repeats, compare_repeats
 from pipeline.ingest.read import Ingested
 from pipeline.results import (
     ChainFit,
@@ -27,7 +28,6 @@ from pipeline.stages.frequency_response import (
 )
 from pipeline.stages.initial import estimate_initially
 from pipeline.stages.log_decrement import fit_log_decrement
-from pipeline.stages.repeated_numbers import Repeats, compare_repeats
 from pipeline.stages.sine import Dwell
 from pipeline.stages.step_gain import fit_step_gain
 from pipeline.submission import System

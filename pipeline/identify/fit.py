@@ -5,11 +5,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from pipeline.estimation.chain.follow import Followed, find_misread, follow, most_follow, near
 from pipeline.identify.log import Log
 from pipeline.results import ChainFit, Estimate, FrequencyResponse, LeftOut, Record
 from pipeline.stages.bode_fit import fit_bode
 from pipeline.stages.compare import CHI_SQUARE_LIMIT
-from pipeline.stages.follow import Followed, find_misread, follow, most_follow, near
 from pipeline.stages.sine import FEW_COUNTS
 from pipeline.stages.time_fit import fit_records
 

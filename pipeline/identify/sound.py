@@ -6,19 +6,19 @@ from functools import partial
 from itertools import combinations
 
 from pipeline.errors import DataError
+from pipeline.estimation.chain.follow import Followed, follow, most_follow
 from pipeline.identify.carts import Identified, identify
 from pipeline.identify.log import Progress
-from pipeline.identify.other_kind import find_other_kinds
-from pipeline.identify.stuck import find_stuck
+from pipeline.identify.soundness.encoder_units import find_other_units
+from pipeline.identify.soundness.faults import find_faults, find_impossible_gains, standing_still
+from pipeline.identify.soundness.other_kind import find_other_kinds
+from pipeline.identify.soundness.repeats import find_outlier_repeats
+from pipeline.identify.soundness.stuck import find_stuck
 from pipeline.ingest.read import Ingested
 from pipeline.plant.chain import Chain
 from pipeline.results import LeftOut
 from pipeline.stages.bode_fit import fit_bode
 from pipeline.stages.compare import CHI_SQUARE_LIMIT
-from pipeline.stages.encoder_units import find_other_units
-from pipeline.stages.faults import find_faults, find_impossible_gains, standing_still
-from pipeline.stages.follow import Followed, follow, most_follow
-from pipeline.stages.repeats import find_outlier_repeats
 from pipeline.submission import System
 
 _ROUNDS = 4  # of leaving out what the carts found without it show to be wrong

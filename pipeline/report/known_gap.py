@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pipeline.errors import ConfigError, DataError
+from pipeline.estimation.measured_run import measured_run
 from pipeline.gap.stored import read_gap
 from pipeline.gap.types import Gap
 from pipeline.plant.chain import Array
@@ -38,7 +39,6 @@ from pipeline.report.words_gap import (
     verdict_title,
 )
 from pipeline.results import Analysis, HardwareCheck, Record
-from pipeline.stages._measured_run import measured_run
 from pipeline.submission.toml_file import read_text
 
 _PLACES = ("gap/gap.json", "gap.json")  # in the submission's folder

@@ -11,16 +11,16 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from pipeline.errors import DataError
-from pipeline.plant.chain import Array, Chain, recover_chain
-from pipeline.results import ChainFit, Estimate, FrequencyResponse
-from pipeline.stages._bode_points import Points, Scale, response_at, weighted_residuals
-from pipeline.stages.chain_parameters import (
+from pipeline.estimation.chain.bode_points import Points, Scale, response_at, weighted_residuals
+from pipeline.estimation.chain.parametrisation import (
     Parametrisation,
     even_chain,
     named_estimates,
     physical_start,
 )
-from pipeline.stages.staged_fit import LogMagnitude, StagedFit, fit_stage_by_stage
+from pipeline.estimation.chain.staged_fit import LogMagnitude, StagedFit, fit_stage_by_stage
+from pipeline.plant.chain import Array, Chain, recover_chain
+from pipeline.results import ChainFit, Estimate, FrequencyResponse
 
 _STARTS = 8  # random ones, tried where the first does not explain the data
 _GOOD_CHI_SQUARE = 2.0  # per degree of freedom: the data are explained

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.errors import DataError
+from pipeline.estimation.record_transforms import transfer_ratio, visible_band
 from pipeline.plant.chain import Array, ComplexArray, parameter_names
 from pipeline.results import Estimate, FrequencyResponse, Record, SinePoint
-from pipeline.stages.record_transforms import transfer_ratio, visible_band
 
 # Two dwells are repeats where their frequencies differ by less than this: a fitted frequency is
 # good to some 1e-4, and no response changes by more than its error within it.

@@ -12,11 +12,11 @@ import numpy as np
 
 from pipeline import submission
 from pipeline.errors import DataError
+from pipeline.estimation.measured_run import MeasuredRun, measured_run
 from pipeline.plant import step_response
 from pipeline.plant.chain import Array, Chain
 from pipeline.plant.loop import Controller, Pid, StateFeedback, replay, simulate_loop
 from pipeline.results import HardwareCheck, Record
-from pipeline.stages._measured_run import MeasuredRun, measured_run
 
 _SERVO_PERIOD = 0.000884  # s; of the ECP controller, whose log keeps one sample in several
 _COARSE_LOG = 3.0  # servo periods between logged samples, from where on the two differ

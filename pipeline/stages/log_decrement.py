@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.errors import DataError
+from pipeline.estimation.decay.free_decay import FreeDecay, find_decay, fit_decay
+from pipeline.estimation.signals import grain
 from pipeline.plant.chain import Array
 from pipeline.results import LogDecrement, Record
-from pipeline.stages._free_decay import FreeDecay, find_decay, fit_decay
-from pipeline.stages._signals import grain
 
 _PEAKS_FOR_REGRESSION = 4  # two amplitudes
 _PEAK_HALF_WIDTH = 0.5  # rad: so near a turning point a cosine is nearly a parabola

@@ -6,9 +6,9 @@ from functools import cached_property
 import numpy as np
 
 from pipeline.errors import DataError
+from pipeline.estimation.signals import colour, grain, noise_beyond_rounding, rounding_left
 from pipeline.plant.chain import Array
 from pipeline.results import Record, SinePoint
-from pipeline.stages._signals import colour, grain, noise_beyond_rounding, rounding_left
 
 _MIN_SAMPLES = 12  # five unknowns, and something left to judge the fit by
 _WINDOW_CYCLES, _WINDOW_TIME = 3.0, 0.6  # a sliding window: the longer of the two; cycles, s

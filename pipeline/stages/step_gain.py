@@ -7,10 +7,8 @@ from itertools import pairwise
 import numpy as np
 
 from pipeline.errors import DataError
-from pipeline.plant.chain import Array
-from pipeline.results import Record, StepEdge, StepGain
-from pipeline.stages._ringing import find_poles, fit_ringing
-from pipeline.stages._signals import (
+from pipeline.estimation.decay.ringing import find_poles, fit_ringing
+from pipeline.estimation.signals import (
     colour,
     extrema,
     grain,
@@ -18,6 +16,8 @@ from pipeline.stages._signals import (
     plateaus,
     rounding_left,
 )
+from pipeline.plant.chain import Array
+from pipeline.results import Record, StepEdge, StepGain
 
 _MIN_SAMPLES = 12
 _CREEP = 0.005  # of the input's range: two halves of a constant stretch differ by no more

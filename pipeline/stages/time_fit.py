@@ -15,12 +15,16 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.errors import DataError
+from pipeline.estimation.chain.parametrisation import (
+    Parametrisation,
+    critical_damping,
+    named_estimates,
+)
+from pipeline.estimation.chain.time_search import Attempt, condense, descend, look, search
+from pipeline.estimation.chain.time_window import Window, open_window
+from pipeline.estimation.residual_colour import long_run_variance, score_covariance
 from pipeline.plant.chain import Array, Chain
 from pipeline.results import ChainFit, Estimate, Record
-from pipeline.stages.chain_parameters import Parametrisation, critical_damping, named_estimates
-from pipeline.stages.residual_colour import long_run_variance, score_covariance
-from pipeline.stages.time_search import Attempt, condense, descend, look, search
-from pipeline.stages.time_window import Window, open_window
 
 _NEGLIGIBLE = 0.05  # of its standard error: such a damping or wall spring is held at zero
 _REST_SIGMAS = 5.0  # how far beyond chance a free start must improve the fit to be kept

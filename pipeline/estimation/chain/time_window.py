@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.errors import DataError
+from pipeline.estimation.chain.modal_response import Modes, drive_modes
+from pipeline.estimation.signals import local_noise
 from pipeline.plant.chain import Array, ComplexArray
 from pipeline.plant.simulate import OVERSAMPLING, interpolate_band_limited
 from pipeline.results import Kind, Record
-from pipeline.stages._signals import local_noise
-from pipeline.stages.modal_response import Modes, drive_modes
 
 # A free decay is used from where its largest swing has fallen by half: whatever released the
 # cart has let go of it by then.

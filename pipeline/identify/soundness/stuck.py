@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pipeline.estimation.chain.follow import measured
 from pipeline.ingest.problems import stuck_spans
 from pipeline.results import LeftOut, Record
-from pipeline.stages.follow import measured
 
 _FASTEST = 0.98  # quantile of the moves from sample to sample: the odd jump does not count
 _AT_SPEED, _AWAY = 0.6, 1.5  # of the fastest

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import DataError
+from pipeline.estimation.chain.parametrisation import Parametrisation
 from pipeline.plant.chain import Array, ComplexArray
 from pipeline.results import Estimate, FrequencyResponse
-from pipeline.stages.chain_parameters import Parametrisation
 
 Scale = Literal["log", "magnitude", "polar"]
 
@@ -38,6 +38,7 @@ class Points:
 
     @classmethod
     def collect(cls, responses: Sequence[FrequencyResponse], *, n: int) -> "Points":
+        """Gather the responses of some of the n carts; numbers without an error get one."""
         if not responses:
             raise DataError("Bode fit: needs a frequency response, found none")
         for response in responses:
@@ -71,6 +72,7 @@ class Points:
 
     @property
     def size(self) -> int:
+        """How many points there are, N."""
         return self.magnitude.size
 
     @property
@@ -85,6 +87,7 @@ class Points:
 
     @property
     def level_weight(self) -> Array:
+        """One over the error of the level, (N,)."""
         return 1.0 / np.hypot(self.std / np.exp(self.level), _LOG_ERROR)
 
     def widened(self, share: float) -> "Points":
@@ -96,6 +99,7 @@ class Points:
         )
 
     def of_cart(self, cart: int) -> NDArray[np.bool_]:
+        """Tell which points are those of a cart (from 1), (N,)."""
         return self.cart == cart - 1
 
 

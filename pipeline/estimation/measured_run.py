@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import DataError
+from pipeline.estimation.signals import local_noise
 from pipeline.plant.chain import Array, Chain
 from pipeline.plant.simulate import simulate_linear
 from pipeline.results import Record
-from pipeline.stages._signals import local_noise
 
 _STILL = 0.02  # of its range that a signal may vary while nothing happens
 _MIN_QUIET = 5  # samples at rest that show a rest

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pipeline.estimation.signals import LENGTH_SCALES
 from pipeline.results import LeftOut, Record
-from pipeline.stages._signals import LENGTH_SCALES
 
 _SAME = 0.02  # relative: as far as the step is seen alike in two recordings
 _WITNESSES = 2  # kinds of experiment that have the usual step; of two alone either may be wrong

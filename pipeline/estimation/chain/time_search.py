@@ -8,11 +8,11 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from pipeline.errors import DataError
+from pipeline.estimation.chain.modal_response import find_modes
+from pipeline.estimation.chain.parametrisation import Parametrisation
+from pipeline.estimation.chain.time_start import WIDTHS, even_chains, regress_chain
+from pipeline.estimation.chain.time_window import Misfit, Window, compare
 from pipeline.plant.chain import Array, Chain
-from pipeline.stages.chain_parameters import Parametrisation
-from pipeline.stages.modal_response import find_modes
-from pipeline.stages.time_start import WIDTHS, even_chains, regress_chain
-from pipeline.stages.time_window import Misfit, Window, compare
 
 # A chain that leaves more than this share of the motion's power unexplained is not the one
 # (carts with dry friction leave some 2 %), unless the rest is noise.

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pipeline.estimation.chain.parametrisation import Parametrisation
 from pipeline.plant.chain import Array, Chain, ComplexArray
-from pipeline.stages.chain_parameters import Parametrisation
 
 # Below this |lambda dt| the slope of expm1(z)/z is taken from its series: rounding would leave
 # it 1e-16/|z|, the series errs by z²/8.

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.estimation.decay.ringing import Ringing
+from pipeline.estimation.decay.separable import fit_separable
+from pipeline.estimation.signals import colour
 from pipeline.plant.chain import Array
 from pipeline.results import FrictionTest
-from pipeline.stages._ringing import Ringing
-from pipeline.stages._separable import fit_separable
-from pipeline.stages._signals import colour
 
 THRESHOLD = 10.8  # F(1, many) above this once in a thousand decays without friction
 _UNKNOWNS = 7

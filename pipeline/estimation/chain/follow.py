@@ -12,12 +12,12 @@ from itertools import combinations
 import numpy as np
 
 from pipeline.errors import DataError
+from pipeline.estimation.chain.modal_response import Modes, find_modes
+from pipeline.estimation.chain.parametrisation import Parametrisation
+from pipeline.estimation.chain.time_window import Window, compare, open_window
+from pipeline.estimation.signals import FASTEST, LENGTH_SCALES, TIME_FACTORS
 from pipeline.plant.chain import Array, Chain
 from pipeline.results import Record
-from pipeline.stages._signals import FASTEST, LENGTH_SCALES, TIME_FACTORS
-from pipeline.stages.chain_parameters import Parametrisation
-from pipeline.stages.modal_response import Modes, find_modes
-from pipeline.stages.time_window import Window, compare, open_window
 
 _SAME_SCALE = 0.1  # relative
 _SEEN_STEPS = 5.0  # encoder steps of motion: rounding changes a smaller one by any factor

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.estimation.signals import TIME_FACTORS
 from pipeline.results import Check, Estimate, LeftOut, LogDecrement, StepGain
-from pipeline.stages._signals import TIME_FACTORS
 
 TOLERANCE = 10.0  # percent; the same run made twice, with dry friction of some percent
 _DAMPING_TOLERANCE = 50.0  # … which, with a bearing's dirt, is about as much of the damping

@@ -9,11 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence, Set
 
 import numpy as np
 
-from pipeline.plant.chain import Chain
-from pipeline.plant.simulate import simulate_linear
-from pipeline.results import Check, LeftOut, Record, StepGain
-from pipeline.stages._signals import FASTEST, TIME_FACTORS
-from pipeline.stages.follow import (
+from pipeline.estimation.chain.follow import (
     FOLLOWED,
     Followed,
     Misread,
@@ -24,6 +20,10 @@ from pipeline.stages.follow import (
     most_follow,
     near,
 )
+from pipeline.estimation.signals import FASTEST, TIME_FACTORS
+from pipeline.plant.chain import Chain
+from pipeline.plant.simulate import simulate_linear
+from pipeline.results import Check, LeftOut, Record, StepGain
 
 _ACROSS = 0.5  # of the input's range: a reading that stays while the input changes so far
 _STILL_SHARE = 0.2  # … and for so long after it; of the record

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.estimation.decay.separable import fit_separable
+from pipeline.estimation.signals import colour
 from pipeline.plant.chain import Array, ComplexArray
-from pipeline.stages._separable import fit_separable
-from pipeline.stages._signals import colour
 
 _PENCIL_SAMPLES = 300  # the matrix pencil only starts the fit; more samples would only cost time
 _OSCILLATES = 1e-3  # imaginary part over size: below, a pole is real but for rounding
@@ -37,6 +37,7 @@ class Ringing:
     converged: bool
 
     def __call__(self, t: Array) -> Array:
+        """Return y at times t (n,)."""
         tau = t - self.t0
         waves = self.growth(t) * np.exp(1j * self.poles.imag[:, None] * tau)
         return self.level + self.slope * tau + (self.amplitudes[:, None] * waves).real.sum(0)

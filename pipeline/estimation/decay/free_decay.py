@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.errors import DataError
+from pipeline.estimation.decay.dry_friction import FrictionFit, fit_friction
+from pipeline.estimation.decay.ringing import Ringing, fit_ringing
+from pipeline.estimation.signals import extrema, plateaus
 from pipeline.plant.chain import Array
 from pipeline.results import Record
-from pipeline.stages._dry_friction import FrictionFit, fit_friction
-from pipeline.stages._ringing import Ringing, fit_ringing
-from pipeline.stages._signals import extrema, plateaus
 
 # Swings are counted in grains: encoder steps, or as much noise as would round as coarsely.
 _PROMINENCE = 6.0

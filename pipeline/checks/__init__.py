@@ -1,0 +1,1 @@
+"""Consistency checks: what the data, the estimates, the carts and the loops must obey."""

@@ -1,0 +1,1 @@
+"""What the stages share: noise, peaks, level and transform estimators, least squares."""

@@ -1,0 +1,1 @@
+"""Damped sinusoids and dry friction in free motion: found and fitted."""

@@ -1,0 +1,1 @@
+"""Which recordings do not hold what happened, and what they did instead."""
