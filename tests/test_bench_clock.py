@@ -2,8 +2,9 @@
 
 import socket
 import threading
+import time
 import tracemalloc
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from pipeline.bench.protocol import (
     Reading,
     Signal,
     Start,
+    Wave,
     format_description,
     format_reading,
 )
@@ -38,6 +40,7 @@ BENCH = Description(
     position_per_count=0.002,
 )
 RUN = 4000  # ms
+NOTHING = Start(wave=Wave.DELTA, frequency=20.0, amplitude=0)
 
 
 class OddBench(threading.Thread):
@@ -46,11 +49,18 @@ class OddBench(threading.Thread):
     Parameters
     ----------
     lines : from those of a run as they should be to those that it sends.
+    late : more lines, which the first stop finds under way; they come when all are taken for gone.
     """
 
-    def __init__(self, lines: Callable[[list[Reading]], Iterator[Reading]]) -> None:
+    def __init__(
+        self,
+        lines: Callable[[list[Reading]], Iterator[Reading]],
+        *,
+        late: Sequence[Reading] = (),
+    ) -> None:
         super().__init__(daemon=True)
         self._lines = lines
+        self._late = late
         self._door = socket.create_server(("127.0.0.1", 0))
         self.address = f"socket://127.0.0.1:{self._door.getsockname()[1]}"
         self.start()
@@ -66,6 +76,10 @@ class OddBench(threading.Thread):
                         peer.sendall(format_description(BENCH))
                     elif isinstance(command, Start):
                         peer.sendall(b"".join(map(format_reading, self._lines(_whole(command)))))
+                    elif command is Signal.STOP and self._late:
+                        time.sleep(0.3)
+                        peer.sendall(b"".join(map(format_reading, self._late)))
+                        self._late = ()
 
 
 def _whole(start: Start) -> list[Reading]:
@@ -113,6 +127,21 @@ def test_a_clock_that_cannot_be_believed_ends_the_run(tmp_path, lines, said, kep
     assert len(rows) == kept
     assert len(readings_of(read_raw(work / "raw" / "dwell-1.raw"))) == kept
     assert most < 50e6  # bytes
+
+
+def test_lines_of_the_run_before_that_come_late_are_not_of_this_one(tmp_path):
+    """A computer may keep for any while what the bench sent before it heard the stop."""
+    first = iter([True])
+
+    def reset(lines: list[Reading]) -> Iterator[Reading]:
+        is_broken = len(lines) == RUN and next(first, False)
+        return (_with(r, ms=r.ms % 600) for r in lines[:700]) if is_broken else iter(lines)
+
+    bench = OddBench(reset, late=[_with(r, ms=r.ms + 50) for r in _whole(NOTHING)])
+    work = write_work(tmp_path, [sine("dwell", seconds=RUN / 1e3)])
+    broken, again = acquire(work, port=bench.address, observers=[Notes()], only=["dwell"])
+    assert broken.partial.startswith("the bench began again in mid-run")
+    assert (again.partial, again.lines, str(again.anomalies)) == ("", RUN, "none")
 
 
 @pytest.mark.parametrize("share", [0.1, 0.3, 0.6])

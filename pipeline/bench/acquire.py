@@ -285,7 +285,7 @@ def _check_files(plan: Plan, submission: Submission) -> None:
 def _is_lost(line: SerialLine) -> bool:
     try:
         line.stop()
-        line.drain()
+        line.clear()
     except HardwareError:
         return True
     return False

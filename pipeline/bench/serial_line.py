@@ -43,6 +43,7 @@ class SerialLine:
         self._port = port
         self._name = name
         self.bench = Description(name="stock", encoders=2, carts=2)
+        self._described = b""  # the line in which it describes itself; b"": a stock bench does not
 
     def __enter__(self) -> Self:
         return self
@@ -100,12 +101,33 @@ class SerialLine:
         """Return what still comes until the line is quiet, s."""
         heard, end = bytearray(), time.monotonic() + longest
         quiet_at = time.monotonic() + _QUIET
-        while time.monotonic() < min(end, quiet_at):
-            if data := self.receive():
+        while True:
+            data, now = self.receive(), time.monotonic()
+            if data:
                 heard += data
-                quiet_at = time.monotonic() + _QUIET
+                quiet_at = now + _QUIET
+            if now > min(end, quiet_at):  # seen after a look at the port: this computer may pause
+                return bytes(heard)
             time.sleep(_LOOK)
-        return bytes(heard)
+
+    def clear(self) -> None:
+        """Read away all that the bench has sent: what comes from now on answers what is sent next.
+
+        Silence tells nothing, for a busy computer keeps bytes for any while; but what comes behind
+        the answer to a query was sent after it. A stock bench answers nothing.
+
+        Raises
+        ------
+        HardwareError : the line or the bench is gone.
+        """
+        if not self._described:
+            self.drain()
+            return
+        for _ in range(_QUERIES):
+            self.send(Signal.QUERY)
+            if self._answer(self._described) is not None:
+                return
+        raise HardwareError(f"{self._name}: the bench answers no more; is it still switched on?")
 
     def shake_hands(self) -> None:
         """Stop and zero the bench, and find out what it is.
@@ -137,15 +159,16 @@ class SerialLine:
             self.bench = parse_description(description)
         except DataError as error:
             raise HardwareError(f"{self._name}: {error}") from None
+        self._described = description
         self.send(Signal.RESET)
 
-    def _answer(self) -> bytes | None:
-        """Return the line that answers a query, or None."""
+    def _answer(self, beginning: bytes = b"?") -> bytes | None:
+        """Return the line that answers a query, which begins so, or None."""
         heard, end = b"", time.monotonic() + _ANSWER
         while time.monotonic() < end:
             heard += self.receive()
             for line in heard.split(b"\n")[:-1]:
-                if line.startswith(b"?"):
+                if line.startswith(beginning):
                     return line
             time.sleep(_LOOK)
         return None

@@ -140,7 +140,6 @@ class Session:
         partial = "stopped"
         with RawWriter(path, header) as raw:
             try:
-                self._line.receive()  # nothing of an earlier run belongs here
                 self._start(order.commands)
                 self._observer.started(order.recording)
                 partial = self._listen(
@@ -227,6 +226,7 @@ class Session:
         self._is_zeroed = True
 
     def _start(self, commands: Sequence[Command]) -> None:
+        self._line.clear()  # nothing of an earlier run belongs to this one
         self._heartbeat()
         self._latest_beat = 0.0
         self._line.send(*commands)
