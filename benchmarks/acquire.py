@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from pipeline.bench.acquire import acquire
-from pipeline.bench.observer import Anomalies
-from pipeline.bench.plan import Limits
-from pipeline.bench.protocol import Reading
-from pipeline.bench.raw import read_raw
-from pipeline.bench.record import readings_of
+from pipeline.bench.host.acquire import acquire
+from pipeline.bench.host.raw import read_raw
+from pipeline.bench.host.record import readings_of
+from pipeline.bench.planning.plan import Limits
+from pipeline.bench.protocol.messages import Reading
+from pipeline.bench.watch.observer import Anomalies
 from pipeline.errors import ConfigError
 from pipeline.plant.chain import PRESETS
 from pipeline.submission import load_submission

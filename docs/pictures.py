@@ -4,9 +4,9 @@ import tempfile
 from pathlib import Path
 
 from pipeline.output import write_file
-from pipeline.report.content import build_document
-from pipeline.report.solution import build_solution
-from pipeline.report.svg import plain_svg
+from pipeline.report.draft.content import build_document
+from pipeline.report.figures.svg import plain_svg
+from pipeline.report.solution.write import build_solution
 from pipeline.submission import load_submission
 from pipeline.synthesis.hidden import prepare_bench, write_bench
 from pipeline.workflow import analyse

@@ -9,12 +9,12 @@ from pipeline.errors import ConfigError, DataError
 from pipeline.exchange import frames
 from pipeline.plant.chain import Chain
 from pipeline.plant.designed_loop import closed_loop
-from pipeline.report.content import build_document
 from pipeline.report.document import Block, Document, Heading, spans
-from pipeline.report.html import render_fragment
-from pipeline.report.known_gap import with_gap
-from pipeline.report.questions import ask
-from pipeline.report.summary import terminal_summary
+from pipeline.report.draft.content import build_document
+from pipeline.report.gap.section import with_gap
+from pipeline.report.render.html import render_fragment
+from pipeline.report.sections.questions import ask
+from pipeline.report.sections.summary import terminal_summary
 from pipeline.results import Analysis, FeedbackDesign
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse as run

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-from pipeline.bench.observer import Anomalies, Outcome
-from pipeline.bench.plan import Limits, Plan, Recording
-from pipeline.bench.plan_file import save_plan
-from pipeline.bench.protocol import Reading
+from pipeline.bench.planning.plan import Limits, Plan, Recording
+from pipeline.bench.planning.plan_file import save_plan
+from pipeline.bench.protocol.messages import Reading
+from pipeline.bench.watch.observer import Anomalies, Outcome
 from pipeline.submission import load_submission
 from pipeline.submission.load import NAME
 from tests.waiting import started, until

@@ -51,7 +51,7 @@ def emulator(
 
     Its watchdog waits longer (s) than a bench's, for a host on a machine that may be busy.
     """
-    patient = f"from pipeline.bench import core; core.WATCHDOG = {watchdog}"
+    patient = f"from pipeline.bench.emulator import core; core.WATCHDOG = {watchdog}"
     script = f"{patient}; from pipeline.cli import main; main()"
     command = [sys.executable, "-c", script, "emulate", *options]
     if "--model" not in options:

@@ -83,8 +83,8 @@ def real(real_bench: Emulator) -> Emulator:
 
     The last to be told of is a run of ten lines, which no test asks for.
     """
-    from pipeline.bench.protocol import Hands, Start, Wave
-    from pipeline.bench.serial_line import open_line
+    from pipeline.bench.host.serial_line import open_line
+    from pipeline.bench.protocol.messages import Hands, Start, Wave
 
     with open_line(real_bench.address, baud=115_200) as line:
         line.send(Hands(), Start(wave=Wave.DELTA, frequency=100.0, amplitude=0))

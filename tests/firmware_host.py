@@ -1,4 +1,4 @@
-"""The firmware's core, compiled for this computer: a controller as `pipeline.bench.core` has it."""
+"""The firmware's core, compiled here: a controller as `pipeline.bench.emulator.core` is one."""
 
 import ctypes
 import shutil
@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from pipeline.bench.protocol import Description, format_description
+from pipeline.bench.protocol.messages import Description, format_description
 
 FIRMWARE = Path(__file__).parents[1] / "firmware"
 SOURCES = sorted((FIRMWARE / "core").glob("*.c"))

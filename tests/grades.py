@@ -17,9 +17,9 @@ from pipeline.grading.rubric import Rubric
 from pipeline.grading.schema import FILE
 from pipeline.grading.worker import Setup, Task, grade_task
 from pipeline.plant.chain import PRESETS, transfer_functions
-from pipeline.report.figures import drawing
-from pipeline.report.figures_grading import reported_bode_figure
-from pipeline.report.svg import to_svg
+from pipeline.report.figures.grading import reported_bode_figure
+from pipeline.report.figures.style import drawing
+from pipeline.report.figures.svg import to_svg
 from pipeline.resources import RUBRICS
 from pipeline.results import FrequencyResponse
 

@@ -15,19 +15,19 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from pipeline.bench.acquire import acquire
-from pipeline.bench.experiments import prepare_submission
-from pipeline.bench.gains import Scales
-from pipeline.bench.observer import Anomalies, Outcome
-from pipeline.bench.orders import make_order
-from pipeline.bench.plan import Limits, Plan, Recording, StateLoop
-from pipeline.bench.plan_file import load_plan
-from pipeline.bench.protocol import Description, Reading
-from pipeline.bench.raw import read_raw
-from pipeline.bench.record import readings_of
-from pipeline.bench.serial_line import open_line
-from pipeline.bench.session import Session
-from pipeline.bench.terminal import Terminal, sparkline
+from pipeline.bench.host.acquire import acquire
+from pipeline.bench.host.experiments import prepare_submission
+from pipeline.bench.host.raw import read_raw
+from pipeline.bench.host.record import readings_of
+from pipeline.bench.host.serial_line import open_line
+from pipeline.bench.host.session import Session
+from pipeline.bench.planning.gains import Scales
+from pipeline.bench.planning.orders import make_order
+from pipeline.bench.planning.plan import Limits, Plan, Recording, StateLoop
+from pipeline.bench.planning.plan_file import load_plan
+from pipeline.bench.protocol.messages import Description, Reading
+from pipeline.bench.watch.observer import Anomalies, Outcome
+from pipeline.bench.watch.terminal import Terminal, sparkline
 from pipeline.cli import app
 from pipeline.errors import ConfigError, HardwareError
 from pipeline.ingest.read import read_data

@@ -9,13 +9,13 @@ from collections.abc import Sequence
 import pytest
 from typer.testing import CliRunner
 
-from pipeline.bench.acquire import acquire
-from pipeline.bench.experiments import cart_remarks, prepare_submission
-from pipeline.bench.links import open_link
-from pipeline.bench.observer import Anomalies
-from pipeline.bench.plan import Limits
-from pipeline.bench.protocol import EXTENSIONS, WATCHDOG, Description, Reading
-from pipeline.bench.serial_line import open_line
+from pipeline.bench.emulator.links import open_link
+from pipeline.bench.host.acquire import acquire
+from pipeline.bench.host.experiments import cart_remarks, prepare_submission
+from pipeline.bench.host.serial_line import open_line
+from pipeline.bench.planning.plan import Limits
+from pipeline.bench.protocol.messages import EXTENSIONS, WATCHDOG, Description, Reading
+from pipeline.bench.watch.observer import Anomalies
 from pipeline.cli import app
 from pipeline.errors import ConfigError, HardwareError
 from pipeline.submission import load_submission

@@ -11,8 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.bench.acquire import acquire
-from pipeline.bench.protocol import (
+from pipeline.bench.host.acquire import acquire
+from pipeline.bench.host.raw import read_raw
+from pipeline.bench.host.record import readings_of
+from pipeline.bench.protocol.messages import (
     EXTENSIONS,
     CommandReader,
     Description,
@@ -23,10 +25,8 @@ from pipeline.bench.protocol import (
     format_description,
     format_reading,
 )
-from pipeline.bench.raw import read_raw
-from pipeline.bench.record import readings_of
-from pipeline.bench.stamps import fit_stamps
-from pipeline.bench.waves import target_at
+from pipeline.bench.protocol.stamps import fit_stamps
+from pipeline.bench.protocol.waves import target_at
 from pipeline.submission import load_submission
 from tests.acquisitions import Notes, sine, write_work
 

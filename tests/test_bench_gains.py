@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pipeline.bench.core import ReferenceCore
-from pipeline.bench.gains import (
+from pipeline.bench.emulator.core import ReferenceCore
+from pipeline.bench.planning.gains import (
     Scales,
     bench_gains,
     bench_scales,
     controller_table,
     propose_pid,
 )
-from pipeline.bench.plan import Limits, PidLoop, Recording, StateLoop
-from pipeline.bench.protocol import Description, Start, StateGains, Wave, encode
+from pipeline.bench.planning.plan import Limits, PidLoop, Recording, StateLoop
+from pipeline.bench.protocol.messages import Description, Start, StateGains, Wave, encode
 from pipeline.errors import DataError
 from pipeline.plant.chain import Array, Chain
 from pipeline.plant.loop import Pid, StateFeedback, discretise, simulate_loop

@@ -14,13 +14,16 @@ from dataclasses import replace
 
 import pytest
 
-from pipeline.bench.acquire import acquire
-from pipeline.bench.core import ReferenceCore
-from pipeline.bench.gains import Scales
-from pipeline.bench.observer import Anomalies
-from pipeline.bench.orders import make_order
-from pipeline.bench.plan import Limits, Recording, StateLoop
-from pipeline.bench.protocol import (
+from pipeline.bench.emulator.core import ReferenceCore
+from pipeline.bench.host.acquire import acquire
+from pipeline.bench.host.raw import RawHeader, RawWriter, read_raw
+from pipeline.bench.host.record import readings_of
+from pipeline.bench.host.serial_line import open_line
+from pipeline.bench.host.session import Session
+from pipeline.bench.planning.gains import Scales
+from pipeline.bench.planning.orders import make_order
+from pipeline.bench.planning.plan import Limits, Recording, StateLoop
+from pipeline.bench.protocol.messages import (
     EXTENSIONS,
     Command,
     Description,
@@ -32,10 +35,7 @@ from pipeline.bench.protocol import (
     encode,
     parse_description,
 )
-from pipeline.bench.raw import RawHeader, RawWriter, read_raw
-from pipeline.bench.record import readings_of
-from pipeline.bench.serial_line import open_line
-from pipeline.bench.session import Session
+from pipeline.bench.watch.observer import Anomalies
 from pipeline.errors import ConfigError, DataError, HardwareError
 from pipeline.submission import System, load_submission
 from tests.acquisitions import LIMITS, Notes, host, sine, until_bytes, write_work
@@ -404,9 +404,9 @@ def test_a_raw_file_is_not_written_through_a_link(tmp_path):
 
 # ----------------------------------------------------------------- at the keyboard
 
-ASK = (
-    "from pipeline.bench.terminal import Terminal\nTerminal().confirm('Hold cart 1')\nprint('held')"
-)
+ASK = """from pipeline.bench.watch.terminal import Terminal
+Terminal().confirm('Hold cart 1')
+print('held')"""
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pipeline.bench.core import ReferenceCore
-from pipeline.bench.protocol import (
+from pipeline.bench.emulator.core import ReferenceCore
+from pipeline.bench.protocol.messages import (
     EXTENSIONS,
     FULL_SCALE,
     Description,
@@ -16,7 +16,7 @@ from pipeline.bench.protocol import (
     encode,
     parse_reading,
 )
-from pipeline.bench.waves import target_at
+from pipeline.bench.protocol.waves import target_at
 from pipeline.plant.chain import Chain
 from pipeline.plant.loop import Pid, StateFeedback, simulate_loop
 

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 import serial
 
-from pipeline.bench.faults import Faults, read_fault
-from pipeline.bench.links import open_link
-from pipeline.bench.protocol import (
+from pipeline.bench.emulator.carts import TRUE_PERIOD, VirtualCarts
+from pipeline.bench.emulator.faults import Faults, read_fault
+from pipeline.bench.emulator.links import open_link
+from pipeline.bench.protocol.messages import (
     STOCK_STOP,
     WATCHDOG,
     Hands,
@@ -24,7 +25,6 @@ from pipeline.bench.protocol import (
     parse_description,
     parse_reading,
 )
-from pipeline.bench.virtual_carts import TRUE_PERIOD, VirtualCarts
 from pipeline.errors import ConfigError
 from pipeline.plant.chain import PRESETS
 from pipeline.results import Record

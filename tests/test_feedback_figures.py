@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose
 
 from pipeline.grading.feedback_figures import draw_figures
 from pipeline.plant.chain import PRESETS, transfer_functions
-from pipeline.report.figures_grading import reported_magnitude
+from pipeline.report.figures.grading import reported_magnitude
 from tests.grading_students import student
 
 

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.bench.core import ReferenceCore
-from pipeline.bench.emulate import open_bench
-from pipeline.bench.protocol import (
+from pipeline.bench.emulator.bench import open_bench
+from pipeline.bench.emulator.core import ReferenceCore
+from pipeline.bench.protocol.messages import (
     FULL_SCALE,
     ChirpEnd,
     Description,

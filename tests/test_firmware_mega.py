@@ -8,9 +8,10 @@ from functools import partial
 import numpy as np
 import pytest
 
-from pipeline.bench.core import ReferenceCore
-from pipeline.bench.links import Link, open_link
-from pipeline.bench.protocol import (
+from pipeline.bench.emulator.carts import VirtualCarts
+from pipeline.bench.emulator.core import ReferenceCore
+from pipeline.bench.emulator.links import Link, open_link
+from pipeline.bench.protocol.messages import (
     Description,
     PidGains,
     Reading,
@@ -22,7 +23,6 @@ from pipeline.bench.protocol import (
     parse_description,
     parse_reading,
 )
-from pipeline.bench.virtual_carts import VirtualCarts
 from pipeline.submission import load_submission
 from pipeline.synthesis.hidden import prepare_bench
 from pipeline.workflow import analyse

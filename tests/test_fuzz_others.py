@@ -9,9 +9,9 @@ from random import Random
 
 import pytest
 
-from pipeline.bench.importing import Importer
-from pipeline.bench.plan_file import load_plan, plan_path, plan_text
-from pipeline.bench.propose import propose_plan
+from pipeline.bench.host.importing import Importer
+from pipeline.bench.planning.plan_file import load_plan, plan_path, plan_text
+from pipeline.bench.planning.propose import propose_plan
 from pipeline.errors import ConfigError
 from pipeline.gap.stored import gap_text, read_gap
 from pipeline.grading.export_roster import Roster
@@ -20,8 +20,8 @@ from pipeline.grading.late_table import LateTable
 from pipeline.grading.lms_names import Platform, gradescope_metadata
 from pipeline.grading.load import load_rubric
 from pipeline.grading.survey import read_survey, survey_dict, survey_text
-from pipeline.report.compare import compare_drafts, read_results
-from pipeline.report.words_gap import terminal_verdict
+from pipeline.report.draft.compare import compare_drafts, read_results
+from pipeline.report.gap.words import terminal_verdict
 from pipeline.resources import RUBRICS
 from pipeline.results_json import results_text
 from pipeline.submission import load_submission

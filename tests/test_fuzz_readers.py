@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import PipelineError
-from pipeline.ingest.files import parse_table
+from pipeline.ingest.formats.recognise import parse_table
 from pipeline.ingest.inspect import format_inspection, inspect_file
 from pipeline.ingest.read import read_data
 from pipeline.submission import Submission, load_submission

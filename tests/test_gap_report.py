@@ -27,15 +27,15 @@ from pipeline.plant.augmented import simulate_augmented
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.effects import CATALOGUE, AugmentedChain, Term, find_effect, make_term
 from pipeline.plant.effects.base import chain_scales
-from pipeline.report.content import build_document
 from pipeline.report.document import Formula
-from pipeline.report.gap import build_gap_document, render_gap
-from pipeline.report.html import render_html
-from pipeline.report.known_gap import with_gap
-from pipeline.report.mathematics import to_text
-from pipeline.report.model_gap import augmented_equations, law
-from pipeline.report.tex import from_tex
-from pipeline.report.words_gap import terminal_verdict
+from pipeline.report.draft.content import build_document
+from pipeline.report.equations.effects import augmented_equations, law
+from pipeline.report.gap.page import build_gap_document, render_gap
+from pipeline.report.gap.section import with_gap
+from pipeline.report.gap.words import terminal_verdict
+from pipeline.report.math.tex import from_tex
+from pipeline.report.math.tree import to_text
+from pipeline.report.render.html import render_html
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
 from tests.analysis_factory import make_analysis

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from pipeline.bench.importing import Importer
-from pipeline.bench.plan import Recording
+from pipeline.bench.host.importing import Importer
+from pipeline.bench.planning.plan import Recording
 from pipeline.cli import app
 from pipeline.errors import ConfigError
 from pipeline.ingest.read import read_data

@@ -9,8 +9,8 @@ import scipy.io
 from numpy.testing import assert_allclose, assert_array_equal
 
 from pipeline.errors import SubmissionError
-from pipeline.ingest.files import parse_table, read_table
-from pipeline.ingest.table import Table
+from pipeline.ingest.formats.recognise import parse_table, read_table
+from pipeline.ingest.formats.table import Table
 
 N = 50
 TIME = np.round(0.00884 * np.arange(N), 3)

@@ -13,7 +13,7 @@ from pipeline.ingest.read import read_data
 from pipeline.ingest.signs import check_signs
 from pipeline.plant.chain import PRESETS, Array
 from pipeline.plant.simulate import simulate_linear
-from pipeline.report.questions import ask
+from pipeline.report.sections.questions import ask
 from pipeline.results import Record
 from pipeline.submission import load_submission
 from pipeline.synthesis import write_submission

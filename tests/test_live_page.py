@@ -19,11 +19,11 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import expect
 
-from pipeline.bench.live_state import LiveState
-from pipeline.bench.observer import Anomalies, Outcome
-from pipeline.bench.plan import Limits, Plan, Recording, StateLoop
-from pipeline.bench.protocol import HEARTBEAT_EVERY, Reading
-from pipeline.bench.web import LivePage
+from pipeline.bench.planning.plan import Limits, Plan, Recording, StateLoop
+from pipeline.bench.protocol.messages import HEARTBEAT_EVERY, Reading
+from pipeline.bench.watch.live_state import LiveState
+from pipeline.bench.watch.observer import Anomalies, Outcome
+from pipeline.bench.watch.web import LivePage
 from pipeline.errors import ConfigError, HardwareError
 from tests.acquisitions import sine, write_work
 from tests.benches import emulator
@@ -326,7 +326,7 @@ def test_nobody_is_faster_than_who_has_the_secret(page, monkeypatch):
 
 def test_a_stranger_is_turned_out_in_time_and_a_reader_is_not(folder, monkeypatch):
     """An idle connection ends by itself; one that has shown the secret goes on."""
-    monkeypatch.setattr("pipeline.bench.web._TO_SHOW_IT", 0.2)
+    monkeypatch.setattr("pipeline.bench.watch.web._TO_SHOW_IT", 0.2)
     with LivePage(folder) as page, ExitStack() as opened:
         stream = news(page, opened)
         assert stream.readline() == b"event: state\n"

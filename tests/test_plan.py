@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.bench.plan import Limits, PidLoop, Plan, Recording, StateLoop
-from pipeline.bench.plan_file import load_plan, plan_path, plan_text, save_plan
-from pipeline.bench.propose import AIM, extend_plan, propose_plan
-from pipeline.bench.protocol import FULL_SCALE, Description, Start, Wave
-from pipeline.bench.waves import target_at
+from pipeline.bench.planning.plan import Limits, PidLoop, Plan, Recording, StateLoop
+from pipeline.bench.planning.plan_file import load_plan, plan_path, plan_text, save_plan
+from pipeline.bench.planning.propose import AIM, extend_plan, propose_plan
+from pipeline.bench.protocol.messages import FULL_SCALE, Description, Start, Wave
+from pipeline.bench.protocol.waves import target_at
 from pipeline.cli import main
 from pipeline.errors import ConfigError, DataError
 from pipeline.plant.chain import PRESETS, quadratic_factors

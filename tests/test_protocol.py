@@ -4,7 +4,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from pipeline.bench.protocol import (
+from pipeline.bench.protocol.messages import (
     STOCK_STOP,
     ChirpEnd,
     Command,

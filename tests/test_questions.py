@@ -8,7 +8,6 @@ import numpy as np
 import pypdf
 import pytest
 
-from pipeline.report.content import build_document
 from pipeline.report.document import (
     Document,
     Paragraph,
@@ -19,10 +18,11 @@ from pipeline.report.document import (
     plain,
     spans,
 )
-from pipeline.report.notes import discussion_blocks
-from pipeline.report.pdf import render_pdf
-from pipeline.report.questions import ask, open_line, split_notes
-from pipeline.report.render import render_report
+from pipeline.report.draft.content import build_document
+from pipeline.report.draft.write import render_report
+from pipeline.report.render.pdf import render_pdf
+from pipeline.report.sections.notes import discussion_blocks
+from pipeline.report.sections.questions import ask, open_line, split_notes
 from pipeline.resources import EXAMPLES
 from pipeline.results import Analysis, Estimate, StepGain
 from pipeline.submission import load_submission, new_submission

@@ -2,10 +2,10 @@
 
 import pytest
 
-from pipeline.bench.plan import Limits, Recording
-from pipeline.bench.protocol import Description, Reading, format_reading
-from pipeline.bench.raw import RawHeader, RawWriter, read_raw
-from pipeline.bench.record import log_text, readings_of, save_record
+from pipeline.bench.host.raw import RawHeader, RawWriter, read_raw
+from pipeline.bench.host.record import log_text, readings_of, save_record
+from pipeline.bench.planning.plan import Limits, Recording
+from pipeline.bench.protocol.messages import Description, Reading, format_reading
 from pipeline.errors import DataError
 from pipeline.ingest.read import read_data
 from pipeline.submission import load_submission

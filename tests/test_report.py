@@ -12,9 +12,9 @@ import pypdf
 import pytest
 
 from pipeline.plant.chain import Chain
-from pipeline.report.pdf import missing_characters
-from pipeline.report.render import render_report
-from pipeline.report.summary import terminal_summary
+from pipeline.report.draft.write import render_report
+from pipeline.report.render.pdf import missing_characters
+from pipeline.report.sections.summary import terminal_summary
 from pipeline.results import (
     SIGN,
     Analysis,

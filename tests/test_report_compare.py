@@ -6,10 +6,10 @@ from dataclasses import replace
 import pytest
 
 from pipeline.errors import ConfigError
-from pipeline.report.changes import changes_line
-from pipeline.report.compare import compare_drafts, read_results
-from pipeline.report.content import build_document
 from pipeline.report.document import Table, plain
+from pipeline.report.draft.changes import changes_line
+from pipeline.report.draft.compare import compare_drafts, read_results
+from pipeline.report.draft.content import build_document
 from pipeline.resources import EXAMPLES
 from pipeline.results import Analysis, Estimate
 from pipeline.results_json import results_text

@@ -6,8 +6,8 @@ import re
 import pytest
 
 from pipeline.plant.effects import CATALOGUE, find_effect
-from pipeline.report.effects import build_gallery, render_effects
-from pipeline.report.words_effects import catalogue_data, catalogue_text
+from pipeline.report.effects.page import build_gallery, render_effects
+from pipeline.report.effects.words import catalogue_data, catalogue_text
 from tests.commandline import cartlab_here
 
 

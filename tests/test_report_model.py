@@ -8,14 +8,14 @@ import pytest
 from numpy.testing import assert_allclose
 
 from pipeline.plant.chain import PRESETS, Chain
-from pipeline.report.mathematics import Math, Term, number, row, symbol, to_mathml, to_text
-from pipeline.report.model import (
+from pipeline.report.equations.model import (
     equations_of_motion,
     numeric_state_space,
     numeric_transfer_functions,
     symbolic_state_space,
     symbolic_transfer_functions,
 )
+from pipeline.report.math.tree import Math, Term, number, row, symbol, to_mathml, to_text
 
 FOUR = Chain(
     m=np.array([3e-4, 2.5e-4, 2e-4, 1.8e-4]),

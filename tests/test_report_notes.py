@@ -19,9 +19,9 @@ from pipeline.report.document import (
     Table,
     plain,
 )
-from pipeline.report.html import render_html
-from pipeline.report.notes import even_headings, note_blocks
-from pipeline.report.pdf import render_pdf
+from pipeline.report.render.html import render_html
+from pipeline.report.render.pdf import render_pdf
+from pipeline.report.sections.notes import even_headings, note_blocks
 
 
 def document_of(blocks: tuple[Block, ...]) -> Document:

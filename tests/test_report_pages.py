@@ -16,10 +16,10 @@ from axe_playwright_python.sync_playwright import Axe
 from pypdf import PdfReader
 
 from pipeline.plant.effects import CATALOGUE
-from pipeline.report.effects import render_effects
-from pipeline.report.gap import render_gap
-from pipeline.report.render import render_report
-from pipeline.report.solution import render_solution
+from pipeline.report.draft.write import render_report
+from pipeline.report.effects.page import render_effects
+from pipeline.report.gap.page import render_gap
+from pipeline.report.solution.write import render_solution
 from pipeline.resources import EXAMPLES
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse

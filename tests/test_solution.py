@@ -14,14 +14,14 @@ from numpy.testing import assert_allclose
 from sympy.parsing.sympy_parser import parse_expr
 
 from pipeline.plant.chain import PRESETS, Chain
-from pipeline.report import derivation
-from pipeline.report.derivation import work_state_model
-from pipeline.report.derivation_algebra import evaluate, shown, shown_with, value_term, work_out
 from pipeline.report.document import Formula
-from pipeline.report.mathematics import to_text
-from pipeline.report.solution import build_solution, solution_text
-from pipeline.report.solution_design import work_design
-from pipeline.report.solution_expected import expected_model, expected_parameters
+from pipeline.report.equations import derivation
+from pipeline.report.equations.algebra import evaluate, shown, shown_with, value_term, work_out
+from pipeline.report.equations.derivation import work_state_model
+from pipeline.report.math.tree import to_text
+from pipeline.report.solution.design import work_design
+from pipeline.report.solution.expected import expected_model, expected_parameters
+from pipeline.report.solution.write import build_solution, solution_text
 from pipeline.stages.state_feedback import design_feedback
 from tests.analysis_factory import make_analysis
 from tests.test_chain import chains

@@ -11,8 +11,8 @@ from pipeline.cli.common import INTERRUPTED, Folder, app
 from pipeline.errors import ConfigError
 
 if TYPE_CHECKING:
-    from pipeline.bench.observer import Observer
-    from pipeline.bench.terminal import Terminal
+    from pipeline.bench.watch.observer import Observer
+    from pipeline.bench.watch.terminal import Terminal
 
 
 @app.command()
@@ -43,7 +43,7 @@ def acquire(
     ] = False,
 ) -> None:
     """Carry out the plan on a bench, or take files as they appear, into a submission."""
-    from pipeline.bench.terminal import Terminal
+    from pipeline.bench.watch.terminal import Terminal
 
     if (port is None) == (source is None):
         raise ConfigError("say where the data come from: either --port or --import")
@@ -78,7 +78,7 @@ def _watching(
     if not web:
         yield [terminal]
         return
-    from pipeline.bench.web import LivePage
+    from pipeline.bench.watch.web import LivePage
 
     with LivePage(folder) as page:
         terminal.remark(f"watch{'' if yes else ', and confirm,'} at {page.url}")
@@ -93,7 +93,7 @@ def _record(
     observers: Sequence["Observer"],
     only: Collection[str],
 ) -> None:
-    from pipeline.bench.acquire import acquire as carry_out
+    from pipeline.bench.host.acquire import acquire as carry_out
 
     try:
         outcomes = carry_out(folder, port=port, observers=observers, only=only)
@@ -118,7 +118,7 @@ def _record(
 
 
 def _import(folder: Path, source: Path, terminal: "Terminal", *, once: bool) -> None:
-    from pipeline.bench.importing import Importer
+    from pipeline.bench.host.importing import Importer
     from pipeline.lock import alone_in
 
     if not folder.exists():  # no file says how many carts there are

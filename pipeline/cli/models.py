@@ -46,12 +46,12 @@ def effects(
 ) -> None:
     """List what a bench may do beyond the linear chain: law, fingerprint, what decides."""
     from pipeline.plant.effects import CATALOGUE, find_effect
-    from pipeline.report.words_effects import catalogue_data, catalogue_text
+    from pipeline.report.effects.words import catalogue_data, catalogue_text
 
     chosen = [find_effect(name)] if name else CATALOGUE
     if out:
         from pipeline.output import check_folder
-        from pipeline.report.effects import render_effects
+        from pipeline.report.effects.page import render_effects
 
         with progress_line() as progress:
             render_effects(chosen, check_folder(out), progress=progress)

@@ -18,10 +18,10 @@ def plan(
     as_json: AsJson = False,
 ) -> None:
     """Propose the experiments to record: write plan.toml, or add to it what the data allow."""
-    from pipeline.bench.plan_file import load_plan, plan_path, save_plan
-    from pipeline.bench.plan_words import plan_data, plan_table
-    from pipeline.bench.propose import extend_plan, propose_plan
-    from pipeline.bench.protocol import Description
+    from pipeline.bench.planning.plan_file import load_plan, plan_path, save_plan
+    from pipeline.bench.planning.plan_words import plan_data, plan_table
+    from pipeline.bench.planning.propose import extend_plan, propose_plan
+    from pipeline.bench.protocol.messages import Description
     from pipeline.submission import load_submission
 
     submission = load_submission(folder)

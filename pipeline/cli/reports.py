@@ -12,7 +12,7 @@ from pipeline.cli.common import AsJson, Folder, app, progress_line, say
 from pipeline.errors import PipelineError
 
 if TYPE_CHECKING:
-    from pipeline.report.changes import DraftChanges
+    from pipeline.report.draft.changes import DraftChanges
     from pipeline.results import Analysis
 
 
@@ -87,11 +87,11 @@ def run_report(
 ) -> "Analysis":
     """Write the report of a submission and say in a few lines what it found."""
     from pipeline.output import check_folder, clear_files, own_folder, write_file
-    from pipeline.report.changes import changes_line
-    from pipeline.report.known_gap import with_gap
-    from pipeline.report.questions import open_line
-    from pipeline.report.render import render_report
-    from pipeline.report.summary import terminal_summary
+    from pipeline.report.draft.changes import changes_line
+    from pipeline.report.draft.write import render_report
+    from pipeline.report.gap.section import with_gap
+    from pipeline.report.sections.questions import open_line
+    from pipeline.report.sections.summary import terminal_summary
     from pipeline.results_json import results_text
     from pipeline.submission import load_submission
     from pipeline.workflow import analyse
@@ -129,7 +129,7 @@ def _comparison(earlier: Path | None) -> "Callable[[Analysis], DraftChanges | No
     """Return what compares an analysis with an earlier draft, which is read at once."""
     if earlier is None:
         return lambda analysis: None
-    from pipeline.report.compare import compare_drafts, read_results
+    from pipeline.report.draft.compare import compare_drafts, read_results
 
     return partial(compare_drafts, read_results(earlier))
 
@@ -143,8 +143,8 @@ def solution(
 ) -> None:
     """Write the instructor's reference: derivations, numbers put in, what to expect."""
     from pipeline.output import check_folder, own_folder, write_file
-    from pipeline.report.known_gap import with_gap
-    from pipeline.report.solution import render_solution, solution_text
+    from pipeline.report.gap.section import with_gap
+    from pipeline.report.solution.write import render_solution, solution_text
     from pipeline.submission import load_submission
     from pipeline.workflow import analyse
 
@@ -177,8 +177,8 @@ def gap(
     """Find what the linear model leaves out, name it, and show the gap shrink on held-out runs."""
     from pipeline.gap.stored import gap_text
     from pipeline.output import check_folder, own_folder, write_file
-    from pipeline.report.gap import render_gap
-    from pipeline.report.words_gap import terminal_verdict
+    from pipeline.report.gap.page import render_gap
+    from pipeline.report.gap.words import terminal_verdict
     from pipeline.submission import load_submission
     from pipeline.workflow import analyse
 

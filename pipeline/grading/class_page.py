@@ -31,12 +31,12 @@ from pipeline.report.document import (
     paragraph,
     spans,
 )
-from pipeline.report.figures import WIDTH, drawing
-from pipeline.report.figures_grading import difficulty_figure, distribution_figure
-from pipeline.report.html import render_html
+from pipeline.report.figures.grading import difficulty_figure, distribution_figure
+from pipeline.report.figures.style import WIDTH, drawing
+from pipeline.report.figures.svg import to_svg
 from pipeline.report.numbers import NOTHING, listing
 from pipeline.report.numbers import count as counted
-from pipeline.report.svg import to_svg
+from pipeline.report.render.html import render_html
 from pipeline.report.tables import cell, make_table
 from pipeline.report.words import clean
 

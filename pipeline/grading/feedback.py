@@ -28,10 +28,10 @@ from pipeline.report.document import (
     paragraph,
     spans,
 )
-from pipeline.report.figures import WIDTH
-from pipeline.report.html import render_html
+from pipeline.report.figures.style import WIDTH
 from pipeline.report.numbers import NOTHING, percent, significant, typeset
 from pipeline.report.numbers import count as counted
+from pipeline.report.render.html import render_html
 from pipeline.report.tables import cell, make_table
 from pipeline.report.words import clean, name_span, rich
 

@@ -3,9 +3,9 @@
 from collections.abc import Mapping, Sequence
 
 from pipeline.plant.chain import Array, transfer_functions
-from pipeline.report.figures import drawing
-from pipeline.report.figures_grading import reported_bode_figure
-from pipeline.report.svg import to_svg
+from pipeline.report.figures.grading import reported_bode_figure
+from pipeline.report.figures.style import drawing
+from pipeline.report.figures.svg import to_svg
 from pipeline.report.words import clean
 from pipeline.results import Analysis
 from pipeline.submission import Reported

@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline.errors import SubmissionError
 from pipeline.ingest.columns import Column, conversion
-from pipeline.ingest.table import Table, refuse_extreme
+from pipeline.ingest.formats.table import Table, refuse_extreme
 from pipeline.plant.chain import Array
 from pipeline.results import FrequencyResponse
 

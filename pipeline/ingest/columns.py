@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from pipeline.errors import SubmissionError
-from pipeline.ingest.table import Table
+from pipeline.ingest.formats.table import Table
 
 _ROLES = (
     ("time", r"t|times?|time ?stamps?|t received|elapsed time"),

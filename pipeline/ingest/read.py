@@ -10,11 +10,11 @@ from pipeline.errors import SubmissionError
 from pipeline.ingest.bode import Points, frequency_responses, read_points
 from pipeline.ingest.clock import Clock, read_clocks
 from pipeline.ingest.columns import Column, assign_columns, conversion, holds_counts
-from pipeline.ingest.files import read_table
+from pipeline.ingest.formats.recognise import read_table
+from pipeline.ingest.formats.table import Table, refuse_extreme
 from pipeline.ingest.problems import channel_problems
 from pipeline.ingest.signals import encoder_step, mirrors
 from pipeline.ingest.signs import Signs, with_signs
-from pipeline.ingest.table import Table, refuse_extreme
 from pipeline.ingest.times import FEWEST_SAMPLES, clock_notes, time_stamps
 from pipeline.plant.chain import Array
 from pipeline.results import FrequencyResponse, Record

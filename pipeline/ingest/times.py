@@ -5,7 +5,7 @@ import numpy as np
 from pipeline.errors import SubmissionError
 from pipeline.ingest.clock import SLOW, Clock
 from pipeline.ingest.columns import Column, conversion
-from pipeline.ingest.table import Table
+from pipeline.ingest.formats.table import Table
 from pipeline.plant.chain import Array
 
 FEWEST_SAMPLES = 8

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any, Literal
 
-from pipeline.report.mathematics import Math, Term
+from pipeline.report.math.tree import Math, Term
 
 _LONG = 16  # letters of a value for which a tile is wide
 _WIDE_TILES, _MOST_TILES = 3, 5  # side by side

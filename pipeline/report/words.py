@@ -5,7 +5,7 @@ import unicodedata
 from collections.abc import Iterable
 
 from pipeline.report.document import Block, Items, Paragraph, Span, Spans, plain
-from pipeline.report.mathematics import GREEK, symbol
+from pipeline.report.math.tree import GREEK, symbol
 from pipeline.report.numbers import listing, typeset
 
 SOURCES = {

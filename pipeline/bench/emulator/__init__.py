@@ -1,0 +1,1 @@
+"""The virtual bench: carts and a controller behind a serial line."""

@@ -1,0 +1,199 @@
+"""What a bench's controller does between its line and its motor: a state machine, once a period.
+
+docs/protocol.md says in words and formulas what is written here.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from pipeline.bench.protocol.messages import (
+    FULL_SCALE,
+    WATCHDOG,
+    ChirpEnd,
+    Command,
+    CommandReader,
+    Description,
+    Hands,
+    PidGains,
+    Reading,
+    Signal,
+    Start,
+    StateGains,
+    format_description,
+    format_reading,
+)
+from pipeline.bench.protocol.waves import nearest_count, target_at
+from pipeline.plant.loop import VELOCITY_CORRECTION
+
+
+class Core(Protocol):
+    """A bench's controller without its hardware.
+
+    Whatever carries it calls `receive` when bytes arrive, `tick` once a period while the bench
+    has power, and `take` to send on what it has to say. The firmware and `ReferenceCore` are such.
+    """
+
+    def receive(self, data: bytes) -> None:
+        """Take bytes from the line; what they ask for happens at the next tick."""
+        ...
+
+    def tick(self, counts: Sequence[int], *, stamp: int, now: int) -> int:
+        """Return the duty that acts from now on, within ± FULL_SCALE.
+
+        Parameters
+        ----------
+        counts : of the encoders since they had power; a reset makes the next ones zero.
+        stamp : whole ms of the bench's clock, which lines, waves and run times go by.
+        now : whole ms of wall time, for the watchdog alone: an emulation may run faster.
+        """
+        ...
+
+    def take(self) -> bytes:
+        """Return what is to be sent since the last call: lines of readings, answers."""
+        ...
+
+
+class ReferenceCore:
+    """The controller in Python, plain rather than fast.
+
+    Parameters
+    ----------
+    description : what a query is answered with. Its period is the one the control laws count
+        with; without `commands` it is the stock bench, which answers nothing.
+    """
+
+    def __init__(self, description: Description) -> None:
+        self._description = description
+        self._reader = CommandReader(encoders=description.encoders, extensions=description.commands)
+        self._commands: list[Command] = []
+        self._sent = bytearray()
+        self._reset()
+
+    def receive(self, data: bytes) -> None:
+        """Take bytes from the line; what they ask for happens at the next tick."""
+        self._commands += self._reader.feed(data)
+
+    def take(self) -> bytes:
+        """Return what is to be sent since the last call."""
+        sent = bytes(self._sent)
+        self._sent.clear()
+        return sent
+
+    def tick(self, counts: Sequence[int], *, stamp: int, now: int) -> int:
+        """Return the duty that acts from now on."""
+        for command in self._commands:
+            self._obey(command, stamp=stamp, now=now)
+        self._commands.clear()
+        if self._zero is None:
+            self._zero = tuple(counts)
+        if self._heard is not None and now - self._heard >= 1e3 * WATCHDOG:
+            self._run = None
+        run = self._run
+        if run is None:
+            return 0
+        ms = stamp - run.since
+        if ms >= 1e3 * run.start.duration:
+            self._run = None
+            return 0
+        y = tuple(count - zero for count, zero in zip(counts, self._zero, strict=True))
+        target = target_at(run.start, 1e-3 * ms, chirp_end=run.chirp_end)
+        duty = run.law.duty(target, y)
+        self._sent += format_reading(Reading(counts=y, target=target, duty=duty, ms=ms))
+        return duty
+
+    def _reset(self) -> None:
+        self._run: _Run | None = None
+        self._gains: PidGains | StateGains = PidGains(kp=0.0, ki=0.0, kd=0.0)
+        self._chirp_end: float | None = None
+        self._zero: tuple[int, ...] | None = None  # None: the next counts are zero
+        self._heard: int | None = None  # ms of wall time of the last heartbeat; None: disarmed
+
+    def _obey(self, command: Command, *, stamp: int, now: int) -> None:
+        match command:
+            case Start():
+                self._run = _Run(
+                    start=command, since=stamp, chirp_end=self._chirp_end, law=self._loop(command)
+                )
+            case PidGains() | StateGains():
+                self._gains = command
+            case ChirpEnd(frequency=frequency):
+                self._chirp_end = frequency
+            case Signal.RESET:
+                self._reset()
+            case Signal.STOP:
+                self._run = None
+            case Signal.HEARTBEAT:
+                self._heard = now
+            case Signal.QUERY:
+                self._sent += format_description(self._description)
+            case Hands():
+                pass  # of the virtual bench around this controller
+
+    def _loop(self, start: Start) -> "_Law":
+        if start.encoder is None:
+            return _OpenLoop()
+        if isinstance(self._gains, PidGains):
+            return _Pid(self._gains, row=start.encoder - 1, period=self._description.period)
+        return _StateFeedback(self._gains, period=self._description.period)
+
+
+class _Law(Protocol):
+    def duty(self, target: int, y: Sequence[int]) -> int:
+        """Return the duty that acts from now on; called at every tick of a run."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Run:
+    start: Start
+    since: int  # ms of the bench's clock when it began
+    chirp_end: float | None
+    law: _Law
+
+
+class _OpenLoop:
+    def duty(self, target: int, y: Sequence[int]) -> int:
+        return _clipped(target)
+
+
+class _Pid:
+    """As `pipeline.plant.loop` has it, acting at once."""
+
+    def __init__(self, gains: PidGains, *, row: int, period: float) -> None:
+        self._gains, self._row, self._period = gains, row, period
+        self._integral = self._last = 0.0
+
+    def duty(self, target: int, y: Sequence[int]) -> int:
+        error = float(target - y[self._row])
+        self._integral += error * self._period
+        slope, self._last = (error - self._last) / self._period, error
+        gains = self._gains
+        return _clipped(gains.kp * error + gains.ki * self._integral + gains.kd * slope)
+
+
+class _StateFeedback:
+    """As `pipeline.plant.loop` has it without a model, acting one tick later."""
+
+    def __init__(self, gains: StateGains, *, period: float) -> None:
+        self._gains, self._period = gains, period
+        self._predicted: list[tuple[float, float]] = []  # position and velocity of each encoder
+        self._next = 0
+
+    def duty(self, target: int, y: Sequence[int]) -> int:
+        predicted = self._predicted or [(float(count), 0.0) for count in y]
+        acting, effort = self._next, self._gains.prefilter * target
+        correction = VELOCITY_CORRECTION / self._period
+        self._predicted = []
+        for i, (count, (position, velocity)) in enumerate(zip(y, predicted, strict=True)):
+            velocity += correction * (count - position)
+            position = count + self._period * velocity
+            self._predicted.append((position, velocity))
+            gains = self._gains.gains
+            effort -= gains[2 * i] * position + gains[2 * i + 1] * velocity
+        self._next = _clipped(effort)
+        return acting
+
+
+def _clipped(effort: float) -> int:
+    return nearest_count(min(max(effort, -FULL_SCALE), FULL_SCALE))

@@ -1,0 +1,1 @@
+"""Acquisition: the line, the session, and what is kept of it."""

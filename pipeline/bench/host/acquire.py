@@ -1,0 +1,354 @@
+"""Carry out the plan of a submission on a bench, from where it was left."""
+
+from collections.abc import Callable, Collection, Generator, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from pipeline.bench.host.experiments import (
+    add_experiment,
+    cart_remarks,
+    limit_words,
+    prepare_submission,
+    scale_remarks,
+)
+from pipeline.bench.host.raw import FOLDER as RAW
+from pipeline.bench.host.raw import read_raw
+from pipeline.bench.host.record import data_file, save_record
+from pipeline.bench.host.serial_line import SerialLine, open_line
+from pipeline.bench.host.session import STOPPED, Session
+from pipeline.bench.host.signals import signals_held, stopping_on_signals
+from pipeline.bench.planning.gains import Scales, bench_gains, bench_scales, controller_table
+from pipeline.bench.planning.orders import Order, make_order
+from pipeline.bench.planning.plan import Plan, Recording
+from pipeline.bench.planning.plan_file import load_plan, plan_path, save_plan
+from pipeline.bench.planning.propose import extend_plan, propose_plan
+from pipeline.bench.protocol.messages import PidGains, StateGains
+from pipeline.bench.watch.observer import Observer, Observers, Outcome
+from pipeline.errors import ConfigError, DataError, HardwareError, PipelineError
+from pipeline.lock import alone_in
+from pipeline.output import own_folder
+from pipeline.submission import Submission, load_submission
+from pipeline.submission.load import NAME
+from pipeline.synthesis.files import Value
+from pipeline.workflow import analyse
+
+_TRIES = 3  # of one recording; a fault that strikes three times is not chance
+_USUAL_BAUD = 115_200
+
+
+def acquire(
+    folder: Path, *, port: str, observers: Sequence[Observer], only: Collection[str] = ()
+) -> tuple[Outcome, ...]:
+    """Record what the plan asks for and is not there yet; return how each run ended.
+
+    Every run that is complete stands in submission.toml at once, so a session that is broken off
+    goes on where it was. What is partial is kept beside the data and recorded again.
+
+    Parameters
+    ----------
+    port : of the bench, as pyserial names it.
+    observers : who watches; the first has a person confirm what hands must do.
+    only : the ids to record, the others left; () for the whole plan, which then grows by what
+        the data recorded allow.
+
+    Raises
+    ------
+    HardwareError : there is no bench.
+    ConfigError : another session writes there; or the plan as a whole or the submission does not
+        fit the bench; of one recording that does not, its outcome says why, and the others go on.
+    """
+    with stopping_on_signals(), alone_in(folder):
+        work = _Acquisition(folder, port=port, observer=Observers(observers), only=only)
+        return tuple(work.outcomes())
+
+
+class _Acquisition:
+    def __init__(
+        self, folder: Path, *, port: str, observer: Observer, only: Collection[str]
+    ) -> None:
+        self._folder = folder
+        self._port = port
+        self._observer = observer
+        self._only = frozenset(only)
+        self._failed: dict[str, int] = {}  # tries of each recording that has not come off yet
+
+    def outcomes(self) -> Iterator[Outcome]:
+        """Record until nothing is left; a line that was lost is opened again."""
+        lost = True
+        while lost:
+            with open_line(self._port, baud=self._baud()) as line:
+                lost = yield from self._on_line(line)
+
+    def _baud(self) -> int:
+        if not (self._folder / NAME).exists():
+            return _USUAL_BAUD
+        submission = load_submission(self._folder)
+        return load_plan(submission).baud if plan_path(submission).exists() else _USUAL_BAUD
+
+    def _on_line(self, line: SerialLine) -> Generator[Outcome, None, bool]:
+        """Record over one line; return whether it was lost."""
+        bench = line.bench
+        new = not (self._folder / NAME).exists()
+        submission = prepare_submission(self._folder, bench, stock=not bench.commands)
+        if new:
+            self._observer.remark(
+                f"wrote {self._folder / NAME}: check its springs, which the bench does not know; "
+                "add the authors and the design goal"
+            )
+        if not line.knows("k"):
+            self._observer.remark(
+                f"the bench {bench.name!r} has no watchdog: if this program or the cable dies in "
+                "a run, the motor runs on; keep a hand on its switch"
+            )
+        for sentence in (*cart_remarks(submission, bench), *scale_remarks(submission, bench)):
+            self._observer.remark(sentence)
+        for file in _recovered(self._folder, carts=submission.system.carts):
+            self._observer.remark(f"{file} is what a session left that was cut off")
+        plan = self._plan(submission, line)
+        session = Session(
+            line, carts=submission.system.carts, limits=plan.limits, observer=self._observer
+        )
+        self._observer.planned(plan, _done(submission))
+        while True:
+            recording = self._next(plan, submission)
+            if recording is None:
+                longer = plan if self._only else self._extended(plan, submission, line)
+                if longer is plan:
+                    return False
+                plan = longer
+                self._observer.planned(plan, _done(submission))
+                continue
+            outcome, submission = self._record(recording, plan, submission, session, line)
+            yield outcome
+            if outcome.partial:
+                self._offer_again(outcome)
+                if _is_lost(line):
+                    return True
+
+    def _offer_again(self, outcome: Outcome) -> None:
+        name = outcome.recording.id
+        if outcome.partial.startswith(STOPPED):  # the same again would do the same harm
+            self._failed[name] = _TRIES
+            less = (
+                "divide its amplitude in plan.toml by four"
+                if outcome.recording.amplitude
+                else "pull the cart out less far"
+            )
+            self._observer.remark(
+                f"{name} is not tried again now; if a limit was passed, {less}, or raise the limit "
+                "in plan.toml if the bench has the room"
+            )
+            return
+        self._failed[name] = self._failed.get(name, 0) + 1
+        if self._failed[name] < _TRIES:
+            try:
+                self._observer.confirm(f"Record {name} again")
+            except ConfigError:  # nobody there to decide: the rest of the plan goes on
+                self._failed[name] = _TRIES
+
+    def _plan(self, submission: Submission, line: SerialLine) -> Plan:
+        if plan_path(submission).exists():
+            plan = load_plan(submission)
+        else:
+            plan = propose_plan(submission, bench=line.bench)
+            path = save_plan(plan, submission)
+            self._observer.remark(f"wrote {path}: check it")
+        self._observer.remark(limit_words(plan.limits, submission, line.bench))
+        known = {recording.id for recording in plan.recordings}
+        if unknown := sorted(self._only - known):
+            raise ConfigError(f"--only {unknown[0]}: plan.toml has {', '.join(sorted(known))}")
+        _check_files(plan, submission)
+        return plan
+
+    def _next(self, plan: Plan, submission: Submission) -> Recording | None:
+        done = _done(submission)
+        for recording in plan.recordings:
+            wanted = not self._only or recording.id in self._only
+            given_up = self._failed.get(recording.id, 0) >= _TRIES
+            if wanted and recording.id not in done and not given_up:
+                return recording
+        return None
+
+    def _extended(self, plan: Plan, submission: Submission, line: SerialLine) -> Plan:
+        try:
+            longer = extend_plan(plan, submission, bench=line.bench)
+        except DataError as error:
+            self._observer.remark(f"the plan is not extended: {error}")
+            return plan
+        if longer.recordings == plan.recordings:
+            return plan
+        save_plan(longer, submission)
+        _check_files(longer, submission)
+        return longer
+
+    def _record(
+        self,
+        recording: Recording,
+        plan: Plan,
+        submission: Submission,
+        session: Session,
+        line: SerialLine,
+    ) -> tuple[Outcome, Submission]:
+        """Record one experiment and note it; return how it went and the submission as it is now."""
+        try:
+            order, table = _order(recording, plan, submission, line)
+        except PipelineError as error:  # this bench cannot, or must not, do it: nothing is sent
+            self._failed[recording.id] = _TRIES
+            return self._refused(recording, str(error)), submission
+        path = _raw_path(self._folder, recording)
+        try:
+            restless = session.prepare(recording)
+            with signals_held() as let_in:  # what is complete is noted before the program ends
+                outcome = self._run(session, order, path, submission, let_in)
+                remarks = [restless] if restless else []
+                # Late lines have their stamps: no reader of the data need know.
+                if (spoilt := str(replace(outcome.anomalies, late=0))) != "none":
+                    remarks.append(spoilt)
+                outcome = replace(outcome, remarks=tuple(remarks))
+                if outcome.partial:
+                    self._keep_partial(path, submission, outcome.partial)
+                else:
+                    file = save_record(path, folder=self._folder, carts=submission.system.carts)
+                    entry = _experiment(recording, file=file, controller=table, remarks=remarks)
+                    submission = add_experiment(load_submission(self._folder), entry)
+                self._observer.finished(outcome)
+        except HardwareError as error:
+            return self._refused(recording, str(error)), submission
+        return outcome, submission
+
+    def _run(
+        self,
+        session: Session,
+        order: Order,
+        path: Path,
+        submission: Submission,
+        let_in: Callable[[], None],
+    ) -> Outcome:
+        try:
+            return session.record(order, path, let_in=let_in)
+        except KeyboardInterrupt:
+            self._keep_partial(path, submission, "stopped by hand")
+            raise
+
+    def _refused(self, recording: Recording, why: str) -> Outcome:
+        """Tell of a recording that did not begin."""
+        outcome = Outcome(recording=recording, lines=0, partial=why)
+        self._observer.finished(outcome)
+        return outcome
+
+    def _keep_partial(self, path: Path, submission: Submission, why: str) -> None:
+        """Save what came of a run that ended early, where no report takes it for a whole one."""
+        if not path.exists():
+            return
+        try:
+            file = save_record(
+                path, folder=self._folder, carts=submission.system.carts, partial=True
+            )
+        except DataError:  # nothing came
+            return
+        self._observer.remark(f"{file} is partial ({why}); it is not in {NAME}")
+
+
+def _recovered(folder: Path, *, carts: int) -> list[str]:
+    """Save partial records of raw files that no data file was made of; return their names."""
+    saved = []
+    for path in sorted((folder / RAW).glob("*.raw")):
+        try:
+            recording = read_raw(path).header.recording
+            if path.stem.rpartition("-")[0] != recording.id:  # renamed, or meant to lead elsewhere
+                continue
+            made = [folder / data_file(recording, partial=partial) for partial in (False, True)]
+            if not any(file.exists() for file in made):
+                saved.append(save_record(path, folder=folder, carts=carts, partial=True))
+        except DataError:  # cut within its first lines
+            continue
+    return saved
+
+
+def _done(submission: Submission) -> frozenset[str]:
+    return frozenset(experiment.id for experiment in submission.experiments)
+
+
+def _check_files(plan: Plan, submission: Submission) -> None:
+    """Raise ConfigError where a recording would be written over the data of another experiment."""
+    taken = {(submission.folder / e.file).resolve(): e.id for e in submission.experiments}
+    for recording in plan.recordings:
+        name = data_file(recording)
+        other = taken.get((submission.folder / name).resolve(), recording.id)
+        if other != recording.id:
+            raise ConfigError(
+                f"plan.toml: {recording.id}: {name} holds the experiment {other!r}; choose "
+                "another id"
+            )
+
+
+def _is_lost(line: SerialLine) -> bool:
+    try:
+        line.stop()
+        line.clear()
+    except HardwareError:
+        return True
+    return False
+
+
+def _raw_path(folder: Path, recording: Recording) -> Path:
+    """Return a name not yet taken: each try of a recording has a raw file of its own."""
+    parent = own_folder(folder, RAW)
+    number = 1
+    while (path := parent / f"{recording.id}-{number}.raw").exists():
+        number += 1
+    return path
+
+
+def _order(
+    recording: Recording, plan: Plan, submission: Submission, line: SerialLine
+) -> tuple[Order, dict[str, Value] | None]:
+    """Return the order and, of a closed loop, the controller as submission.toml tells of it."""
+    system, bench = submission.system, line.bench
+    scales = Scales(
+        input=system.input.per_count or bench.input_per_count,
+        position=system.position.per_count or bench.position_per_count,
+    )
+    gains: PidGains | StateGains | None = None
+    table: dict[str, Value] | None = None
+    if recording.controller is not None:
+        analysis = analyse(submission)
+        scales = bench_scales(submission, bench=bench, analysis=analysis)
+        gains = bench_gains(
+            recording,
+            submission=submission,
+            analysis=analysis,
+            bench=bench,
+            limits=plan.limits,
+        )
+        cart = recording.controller.cart
+        table = dict(controller_table(gains, cart=cart, scales=scales, carts=system.carts))
+    order = make_order(
+        recording, limits=plan.limits, scales=scales, system=system, bench=bench, gains=gains
+    )
+    return order, table
+
+
+def _experiment(
+    recording: Recording,
+    *,
+    file: str,
+    controller: dict[str, Value] | None,
+    remarks: Sequence[str],
+) -> dict[str, Value]:
+    """Return the keys of the `[[experiments]]` table of a recording."""
+    entry: dict[str, Value] = {
+        "id": recording.id,
+        "kind": recording.kind,
+        "carts": list(recording.carts),
+        "file": file,
+    }
+    if recording.kind == "sine":
+        entry["frequency"] = recording.frequency
+    if recording.controller is not None and controller is not None:
+        entry["controlled_cart"] = recording.controller.cart
+        entry["controller"] = controller
+    note = "; ".join([recording.note, *remarks] if recording.note else remarks)
+    if note:
+        entry["note"] = note
+    return entry

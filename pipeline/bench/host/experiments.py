@@ -1,0 +1,191 @@
+"""Additions to submission.toml: an experiment, a scale, a new file; what stands there is kept."""
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+
+from pipeline.bench.planning.plan import Limits
+from pipeline.bench.protocol.messages import FULL_SCALE, Description
+from pipeline.errors import ConfigError, SubmissionError
+from pipeline.ingest.read import DUTY_COUNT
+from pipeline.output import new_folder, write_file
+from pipeline.submission import Submission, load_submission
+from pipeline.submission.load import NAME, spring_names
+from pipeline.synthesis.files import Value, toml_section
+
+_TO_ADD = """\
+# Who you are, one table for each of you:
+#[[authors]]
+#id = "s1024"
+
+# The controller you are asked for; `cartlab new` writes every key with a comment.
+#[design]
+#cart = 1                         # whose position is controlled
+#reference = 1.0                  # size of the step, in position units
+#overshoot_percent = 10.0
+#settling_time = 1.0              # s, to within 2 %
+"""
+_ROUNDED = 1.01  # an input limit typed with fewer digits may pass full scale by so much
+_SAME = 1e-3  # scales that differ by less are the same number typed with fewer digits
+
+
+def add_experiment(submission: Submission, entry: Mapping[str, Value]) -> Submission:
+    """Append an `[[experiments]]` table; text and comments that stand there are kept.
+
+    Raises
+    ------
+    SubmissionError : the file cannot take it, or what comes of it would not be valid.
+    """
+    path = submission.folder / NAME
+    text = path.read_bytes().decode("utf-8-sig")
+    newline = "\r\n" if "\r\n" in text else "\n"
+    addition = toml_section("[[experiments]]", entry).replace("\n", newline)
+    new = text.rstrip() + 2 * newline + addition
+    try:
+        tomllib.loads(new)
+    except tomllib.TOMLDecodeError as error:
+        raise SubmissionError(
+            f"{submission.folder.resolve().name}/{NAME}: an [[experiments]] table cannot be added "
+            f"at its end ({error}); write every experiment as a table of its own"
+        ) from None
+    before = path.read_bytes()
+    write_file(path, new)
+    try:
+        return load_submission(submission.folder)
+    except SubmissionError:
+        write_file(path, before)
+        raise
+
+
+def prepare_submission(folder: Path, bench: Description, *, stock: bool) -> Submission:
+    """Return the submission with its scales, as stated there or by the bench.
+
+    A folder without one gets a new one from what the bench says of itself.
+
+    Raises
+    ------
+    ConfigError : a scale that nobody states, units that differ, or fewer carts on the bench.
+    """
+    if not (folder / NAME).exists():
+        if stock:
+            raise ConfigError(
+                f"{folder}: has no {NAME}, and the bench does not say what it is: begin with "
+                f"`cartlab new {folder} --carts N`"
+            )
+        _write_new(folder, bench)
+    submission = load_submission(folder)
+    system = submission.system
+    if system.carts > bench.encoders:
+        raise ConfigError(
+            f"{folder}: has {system.carts} carts, the bench has {bench.encoders} encoders"
+        )
+    if not stock and system.carts > bench.carts:
+        raise ConfigError(
+            f"{folder}: has {system.carts} carts, the bench {bench.name!r} has {bench.carts}: is "
+            "this the right port, the right folder?"
+        )
+    missing: dict[str, float] = {}
+    if system.position.per_count is None:
+        counts = stock or _is_count(system.position.unit)
+        stated = ("count", 1.0) if counts else (bench.position_unit, bench.position_per_count)
+        missing["position"] = _scale(folder, "position", system.position.unit, stated)
+    if system.input.per_count is None:
+        stated = ("V", DUTY_COUNT) if stock else (bench.input_unit, bench.input_per_count)
+        missing["input"] = _scale(folder, "input", system.input.unit, stated)
+    if missing:
+        _add_scales(folder / NAME, missing)
+    return load_submission(folder)
+
+
+def scale_remarks(submission: Submission, bench: Description) -> list[str]:
+    """Return where the submission's scales are not those that the bench states."""
+    system = submission.system
+    pairs = {
+        "input": (system.input, bench.input_unit, bench.input_per_count),
+        "position": (system.position, bench.position_unit, bench.position_per_count),
+    }
+    return [
+        f"{NAME} has {name}.per_count = {own.per_count:g}, the bench states {stated:g} {unit}; "
+        f"that of {NAME} is used"
+        for name, (own, unit, stated) in pairs.items()
+        if own.per_count and own.unit == unit and abs(own.per_count / stated - 1) > _SAME
+    ]
+
+
+def cart_remarks(submission: Submission, bench: Description) -> list[str]:
+    """Return what is to be said where the bench states more carts than the submission has."""
+    carts = submission.system.carts
+    if not bench.commands or bench.carts <= carts:
+        return []
+    return [
+        f"{NAME} has carts = {carts}, the bench {bench.name!r} has {bench.carts}: if this is not "
+        f"the wrong bench, hold the cart{'s' if bench.carts - carts > 1 else ''} after cart "
+        f"{carts} throughout"
+    ]
+
+
+def limit_words(limits: Limits, submission: Submission, bench: Description) -> str:
+    """Return the limits of a plan beside what the bench counts and can give.
+
+    Raises
+    ------
+    ConfigError : more input is allowed than the bench can give: shares of it would be too large.
+    """
+    system = submission.system
+    unit, position = system.input.unit, system.position.unit
+    full = FULL_SCALE * abs(system.input.per_count or bench.input_per_count)
+    if limits.input > _ROUNDED * full:
+        raise ConfigError(
+            f"plan.toml: limits.input is {limits.input:g} {unit}, the bench gives at most "
+            f"{full:g} {unit}: the plan was made for another bench; delete plan.toml and a new "
+            "one is proposed, or lower limits.input and every amplitude"
+        )
+    counts = limits.travel / abs(system.position.per_count or bench.position_per_count)
+    return (
+        f"limits: {limits.input:g} {unit} of {full:g} {unit} that the bench gives, "
+        f"{limits.travel:g} {position} ({counts:.0f} counts) from where it is zeroed"
+    )
+
+
+def _is_count(unit: str) -> bool:
+    return unit.rstrip("s") == "count"
+
+
+def _scale(folder: Path, name: str, unit: str, stated: tuple[str, float]) -> float:
+    stated_unit, per_count = stated
+    if unit != stated_unit and not (_is_count(unit) and _is_count(stated_unit)):
+        raise ConfigError(
+            f"{folder.resolve().name}/{NAME}: the bench counts {stated_unit}: say how many {unit} "
+            f'one count is: {name} = {{ unit = "{unit}", per_count = … }} under [system]'
+        )
+    return per_count
+
+
+def _add_scales(path: Path, scales: Mapping[str, float]) -> None:
+    import tomlkit  # costs 50 ms, and only a first session needs it
+
+    document = tomlkit.parse(path.read_bytes().decode("utf-8-sig"))
+    system = document["system"]
+    for name, per_count in scales.items():
+        if name not in system:  # pyright: ignore[reportOperatorIssue]
+            system[name] = tomlkit.inline_table()  # pyright: ignore[reportIndexIssue]
+        system[name]["per_count"] = per_count  # pyright: ignore[reportIndexIssue]
+    write_file(path, tomlkit.dumps(document))
+
+
+def _write_new(folder: Path, bench: Description) -> None:
+    system: dict[str, Value] = {
+        "carts": bench.carts,
+        "input": {"unit": bench.input_unit, "sign": 1, "per_count": bench.input_per_count},
+        "position": {"unit": bench.position_unit, "per_count": bench.position_per_count},
+    }
+    new_folder(folder).mkdir(parents=True, exist_ok=True)
+    there = ", ".join(["true"] * (bench.carts + 1))
+    names = ", ".join(spring_names(bench.carts))
+    springs = f"springs = [{there}]  # check: {names}; false where there is none"
+    sections = [
+        toml_section("", {"version": 1, "title": f"Recorded on the bench {bench.name}"}),
+        toml_section("[system]", system).rstrip() + f"\n{springs}\n",
+        _TO_ADD,
+    ]
+    write_file(folder / NAME, "\n".join(sections))

@@ -1,0 +1,284 @@
+"""Take files recorded by other programs into a submission as they appear in a folder."""
+
+import re
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.bench.host.experiments import add_experiment
+from pipeline.bench.planning.plan import Plan, Recording
+from pipeline.bench.planning.plan_file import load_plan, plan_path
+from pipeline.bench.planning.plan_words import hold_words
+from pipeline.bench.watch.observer import Observer
+from pipeline.errors import ConfigError, SubmissionError
+from pipeline.ingest.formats.recognise import read_table
+from pipeline.ingest.inspect import Inspection, inspect_file
+from pipeline.ingest.suggest import suggest_columns
+from pipeline.output import own_folder
+from pipeline.results import Kind
+from pipeline.submission import Submission, load_submission
+from pipeline.submission.load import MAX_DATA_BYTES
+from pipeline.synthesis.files import Value
+
+LOOK_EVERY = 0.5  # s
+_COMPLETE = 2  # looks in a row at which size and time of a file were the same
+_CUT_SHORT = 20  # … at which a file that ends in mid-line is taken to stay so
+_ENDINGS = (".txt", ".csv", ".mat", ".m", ".log", ".dat", ".tsv", ".asc")
+_SAME_FREQUENCY = 0.05  # of it: a dwell recorded for the one the plan asks for
+_NO_NAME = re.compile(r"[^\w.-]+", re.ASCII)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Imported:
+    """A file that was taken in.
+
+    Attributes
+    ----------
+    file : its name as it was found; `experiment` the id it has now.
+    planned : it is what the plan asked for next.
+    remarks : what to look at before a report is made of it.
+    """
+
+    file: str
+    experiment: str
+    kind: Kind
+    planned: bool
+    remarks: tuple[str, ...] = ()
+
+
+class Importer:
+    """Watches a folder on behalf of a submission.
+
+    Files that lie there when it is made are taken too, oldest first; one file is taken once, also
+    over several sessions, for a copy of it lies in the submission.
+    """
+
+    def __init__(self, folder: Path, source: Path, *, observer: Observer) -> None:
+        if not source.is_dir():
+            raise ConfigError(f"{source}: is no folder to watch")
+        self._folder = folder
+        self._source = source
+        self._observer = observer
+        self._submission = load_submission(folder)
+        self._plan: Plan | None = (
+            load_plan(self._submission) if plan_path(self._submission).exists() else None
+        )
+        self._seen: dict[Path, tuple[int, int]] = {}  # size and time when last looked at
+        self._looks: dict[Path, int] = {}
+        self._over: set[Path] = set()  # taken, refused or there before
+        self._locked: set[Path] = set()  # of which that was said
+        if self._plan:
+            self._observer.planned(self._plan, self._done)
+
+    def watch(
+        self, *, once: bool, wait: Callable[[float], None] = time.sleep
+    ) -> Iterator[Imported]:
+        """Yield each file as it is taken in; end when the plan is done, or nothing is left."""
+        self._ask()
+        while True:
+            for path in self._complete(at_once=once):
+                if (imported := self._try(path, final=once)) is not None:
+                    yield imported
+                    self._ask()
+            if once or (self._plan is not None and self._next is None):
+                return
+            wait(LOOK_EVERY)
+
+    @property
+    def _done(self) -> frozenset[str]:
+        return frozenset(experiment.id for experiment in self._submission.experiments)
+
+    @property
+    def _next(self) -> Recording | None:
+        recordings = self._plan.recordings if self._plan else ()
+        return next((r for r in recordings if r.id not in self._done), None)
+
+    def _ask(self) -> None:
+        if (recording := self._next) is not None:
+            held = hold_words(recording.carts, n=self._submission.system.carts)
+            hertz = f" at {recording.frequency:g} Hz" if recording.kind == "sine" else ""
+            self._observer.remark(f"next: {recording.id}, a {recording.kind}{hertz}; {held}")
+
+    def _complete(self, *, at_once: bool) -> list[Path]:
+        """Return the files that do not change any more, oldest first."""
+        ready = []
+        for path in self._source.iterdir():
+            hidden = path.name.startswith((".", "~"))  # or of a program at work
+            if path in self._over or hidden or self._is_other(path) or not self._opens(path):
+                continue
+            try:
+                info = path.stat()
+            except OSError:  # gone meanwhile
+                continue
+            state = info.st_size, info.st_mtime_ns
+            self._looks[path] = self._looks.get(path, 0) + 1 if self._seen.get(path) == state else 0
+            self._seen[path] = state
+            if info.st_size and (at_once or self._looks[path] >= _COMPLETE):
+                ready.append(path)
+        return sorted(ready, key=lambda path: (self._seen[path][1], path.name))
+
+    def _is_other(self, path: Path) -> bool:
+        """Tell whether this can be no data file, and say so."""
+        if path.is_dir():
+            why = "a folder"
+        elif path.suffix.casefold() not in _ENDINGS:
+            why = f"a data file ends in {', '.join(_ENDINGS)}"
+        else:
+            return not path.is_file()
+        self._over.add(path)
+        self._observer.remark(f"{path.name}: not taken, {why}")
+        return True
+
+    def _opens(self, path: Path) -> bool:
+        """Tell whether a file can be read; one that its program keeps to itself can be later."""
+        try:
+            path.open("rb").close()
+        except OSError as error:
+            if path not in self._locked:
+                self._locked.add(path)
+                self._observer.remark(f"{path.name}: cannot be read yet ({error.strerror})")
+            return False
+        return True
+
+    def _try(self, path: Path, *, final: bool) -> Imported | None:
+        """Take a file; one that vanishes or is locked meanwhile is looked at again."""
+        try:
+            return self._take(path, final=final)
+        except OSError:
+            if path.exists() and self._opens(path):
+                raise  # what failed is the folder of the submission
+            self._over.discard(path)
+            self._looks[path] = 0
+            return None
+
+    def _take(self, path: Path, *, final: bool) -> Imported | None:
+        """Copy a file into the submission and note it; None where it is refused or known.
+
+        A file that ends in mid-line may still grow, unless this is the `final` look.
+        """
+        self._over.add(path)
+        if path.stat().st_size > MAX_DATA_BYTES:
+            self._observer.remark(f"{path.name}: larger than {MAX_DATA_BYTES:,} bytes, not taken")
+            return None
+        if self._is_known(path):
+            return None
+        try:
+            inspection = inspect_file(path)
+        except SubmissionError as error:
+            self._observer.remark(f"not taken: {error}")
+            return None
+        if any("cut short" in problem for problem in inspection.problems):
+            if not final and self._looks[path] < _CUT_SHORT:
+                self._over.discard(path)
+            else:
+                self._observer.remark(f"{path.name}: not taken, {inspection.problems[0]}")
+            return None
+        planned = self._match(inspection, path)
+        kind = planned.kind if planned else inspection.kind
+        if kind is None:
+            why = "; ".join(inspection.problems)
+            self._observer.remark(f"{path.name}: not taken, nothing tells what it is: {why}")
+            return None
+        name = planned.id if planned else self._free_id(path.stem)
+        data = own_folder(self._folder, "data")
+        data.mkdir(exist_ok=True)
+        target = data / f"{name}{path.suffix.casefold()}"
+        if target.exists() or target.is_symlink():
+            self._observer.remark(f"{path.name}: not taken, {target} is there already")
+            return None
+        try:
+            shutil.copyfile(path, target)
+            entry = _entry(name, kind, target, inspection, planned, self._submission)
+            self._submission = add_experiment(load_submission(self._folder), entry)
+        except BaseException:
+            target.unlink(missing_ok=True)
+            raise
+        if self._plan:
+            self._observer.planned(self._plan, self._done)
+        return Imported(
+            file=path.name,
+            experiment=name,
+            kind=kind,
+            planned=planned is not None,
+            remarks=inspection.problems,
+        )
+
+    def _is_known(self, path: Path) -> bool:
+        """Tell whether a copy of the file lies in the submission."""
+        size = path.stat().st_size
+        copies = [self._folder / experiment.file for experiment in self._submission.experiments]
+        return any(
+            copy.is_file()
+            and copy.stat().st_size == size
+            and copy.read_bytes() == path.read_bytes()
+            for copy in copies
+        )
+
+    def _match(self, inspection: Inspection, path: Path) -> Recording | None:
+        """Return the next recording of the plan if the file looks like it.
+
+        A table without headings, whose columns can be guessed, looks like anything.
+        """
+        recording = self._next
+        if recording is None:
+            return None
+        if inspection.kind is None:
+            return recording if _columns(path) else None
+        if recording.kind == "sine":
+            found = inspection.frequency
+            near = found and abs(found / recording.frequency - 1) < _SAME_FREQUENCY
+            return recording if inspection.kind == "sine" and near else None
+        # A swept or switched input may look like either.
+        alike = {"sweep": ("sweep", "step"), "step": ("step", "sweep")}
+        return (
+            recording if inspection.kind in alike.get(recording.kind, (recording.kind,)) else None
+        )
+
+    def _free_id(self, stem: str) -> str:
+        base = _NO_NAME.sub("-", stem).strip("-.") or "record"
+        number, name = 1, base
+        while name in self._done:
+            number += 1
+            name = f"{base}-{number}"
+        return name
+
+
+def _entry(
+    name: str,
+    kind: Kind,
+    target: Path,
+    inspection: Inspection,
+    planned: Recording | None,
+    submission: Submission,
+) -> dict[str, Value]:
+    """Return the keys of the `[[experiments]]` table of an imported file."""
+    entry: dict[str, Value] = {"id": name, "kind": kind, "file": f"data/{target.name}"}
+    if planned is not None:
+        entry["carts"] = list(planned.carts)
+    elif carts := _measured(inspection, submission):
+        entry["carts"] = carts
+    if kind == "sine" and (hertz := planned.frequency if planned else inspection.frequency):
+        entry["frequency"] = hertz if planned else float(f"{hertz:.4g}")
+    columns = _columns(target)
+    if columns:
+        entry["columns"] = columns
+    return entry
+
+
+def _measured(inspection: Inspection, submission: Submission) -> list[int]:
+    """Return the one cart of a file that measures one, [] where all are there."""
+    roles = {column.role for column in inspection.columns if column.role}
+    carts = sorted(int(role[1:]) for role in roles if role[0] == "x" and role[1:].isdigit())
+    return carts if len(carts) == 1 < submission.system.carts else []
+
+
+def _columns(path: Path) -> dict[str, Value]:
+    """Return which column of a file without headings is what, as far as that can be guessed."""
+    table, _ = read_table(path.resolve().parent, path.resolve().name)
+    if not all(name.isdigit() for name in table.names):
+        return {}
+    line = suggest_columns(table)
+    pairs = re.findall(r"(\w+) = (\d+)", line or "")
+    return {role: int(number) for role, number in pairs}

@@ -1,0 +1,150 @@
+"""The raw file of a run: a line that says what it is, then the bytes exactly as they came.
+
+`<name>.raw` holds one line of JSON and the bytes of the port; `<name>.times` beside it tells when
+they came: sixteen bytes for each lump, the end of the lump in the stream and the time. Both are
+written as the bytes arrive and only ever grow, so whatever kills the program leaves them readable.
+"""
+
+import json
+import struct
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Self
+
+from pipeline.bench.planning.plan import Limits, Recording
+from pipeline.bench.protocol.messages import Description
+from pipeline.errors import DataError
+
+FOLDER = "raw"
+_VERSION = "cartlab-raw/1"
+_TIME = struct.Struct("<Qd")  # end of the lump in the stream, s since the run began
+_LONGEST_HEADER = 100_000  # bytes
+_LINE = ("target", "duty", "milliseconds")  # what follows the encoders
+
+
+@dataclass(frozen=True, kw_only=True)
+class RawHeader:
+    """What a raw file says of itself.
+
+    Attributes
+    ----------
+    recording, limits : as in the plan.
+    commands : what was sent to the bench to begin the run, in order.
+    bench : as it describes itself; of a stock bench only what is known.
+    begun : when, local time with the offset of its zone.
+    """
+
+    recording: Recording
+    limits: Limits
+    commands: tuple[str, ...]
+    bench: Description
+    begun: str
+
+    def to_json(self) -> str:
+        """Return the header as one line."""
+        bench = {**asdict(self.bench), "commands": "".join(sorted(self.bench.commands))}
+        content = {
+            "schema": _VERSION,
+            "recording": self.recording.model_dump(mode="json"),
+            "limits": self.limits.model_dump(mode="json"),
+            "commands": list(self.commands),
+            "bench": bench,
+            "line": [*(f"encoder {i + 1}" for i in range(self.bench.encoders)), *_LINE],
+            "begun": self.begun,
+        }
+        return json.dumps(content, ensure_ascii=False)
+
+
+class RawWriter:
+    """Writes what arrives, at once; what is written survives the program.
+
+    Raises
+    ------
+    FileExistsError : a raw file is never written over.
+    """
+
+    def __init__(self, path: Path, header: RawHeader) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # Unbuffered: each write is in the hands of the system when it returns.
+        self._bytes = path.open("xb", buffering=0)
+        times = path.with_suffix(".times")
+        times.unlink(missing_ok=True)  # of a raw file that is gone; a link is not followed
+        self._times = times.open("xb", buffering=0)
+        self._bytes.write(header.to_json().encode() + b"\n")
+        self._length = 0
+        self._began = time.monotonic()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._bytes.close()
+        self._times.close()
+
+    def write(self, data: bytes) -> None:
+        """Append bytes that arrived just now."""
+        self._bytes.write(data)
+        self._length += len(data)
+        self._times.write(_TIME.pack(self._length, time.monotonic() - self._began))
+
+
+@dataclass(frozen=True, kw_only=True)
+class RawRun:
+    """A raw file as it was read.
+
+    Attributes
+    ----------
+    content : the bytes as they came; the last line may be cut.
+    arrivals : (end of the lump in `content`, s since the run began), ascending.
+    """
+
+    header: RawHeader
+    content: bytes
+    arrivals: tuple[tuple[int, float], ...]
+
+    def lumps(self) -> Iterator[tuple[bytes, float]]:
+        """Yield the bytes of each lump and when they came; those without a time come last."""
+        start, at = 0, 0.0
+        for end, at in self.arrivals:
+            yield self.content[start:end], at
+            start = end
+        if start < len(self.content):
+            yield self.content[start:], at
+
+
+def read_raw(path: Path) -> RawRun:
+    """Read a raw file, also one whose writing was cut off anywhere.
+
+    Raises
+    ------
+    DataError : it is none; not even its header is whole.
+    """
+    raw = path.read_bytes()
+    head, newline, content = raw.partition(b"\n")
+    if not newline or len(head) > _LONGEST_HEADER:
+        raise DataError(f"{path.name}: is no raw file of a bench, its first line is no header")
+    header = _header(head, name=path.name)
+    times = path.with_suffix(".times")
+    packed = times.read_bytes() if times.exists() else b""
+    whole = len(packed) - len(packed) % _TIME.size
+    arrivals = [(end, at) for end, at in _TIME.iter_unpack(packed[:whole]) if end <= len(content)]
+    return RawRun(header=header, content=content, arrivals=tuple(arrivals))
+
+
+def _header(line: bytes, *, name: str) -> RawHeader:
+    try:
+        found: dict[str, Any] = json.loads(line)
+        if found["schema"] != _VERSION:
+            raise DataError(f"{name}: is of the form {found['schema']!r}, not {_VERSION!r}")
+        bench = {**found["bench"], "commands": frozenset(found["bench"]["commands"])}
+        return RawHeader(
+            recording=Recording.model_validate(found["recording"]),
+            limits=Limits.model_validate(found["limits"]),
+            commands=tuple(found["commands"]),
+            bench=Description(**bench),
+            begun=found["begun"],
+        )
+    except (ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{name}: is no raw file of a bench: {error!r}") from None

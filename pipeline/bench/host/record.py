@@ -1,0 +1,65 @@
+"""From a raw file to the data file of an experiment: the bench log that every reader knows."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from pipeline.bench.host.raw import RawRun, read_raw
+from pipeline.bench.host.stream import Stream
+from pipeline.bench.planning.plan import Recording
+from pipeline.bench.protocol.messages import Reading
+from pipeline.errors import DataError
+from pipeline.output import own_folder, write_file
+
+DATA = "data"
+_FEWEST_LINES = 8  # what a record needs at least
+
+
+def data_file(recording: Recording, *, partial: bool = False) -> str:
+    """Return the name of a recording's data file inside the submission, forward slashes."""
+    return f"{DATA}/{recording.id}{'.partial' if partial else ''}.txt"
+
+
+def readings_of(run: RawRun) -> tuple[Reading, ...]:
+    """Return the valid lines of a run, in order, judged as while they came."""
+    stream = Stream(
+        encoders=run.header.bench.encoders,
+        period=1e3 * run.header.bench.period,
+        free=run.header.recording.carts,
+        closed=run.header.recording.controller is not None,
+    )
+    lines = [reading for data, at in run.lumps() for reading in stream.feed(data, since=at, now=at)]
+    return (*lines, *stream.finish())
+
+
+def save_record(raw_path: Path, *, folder: Path, carts: int, partial: bool = False) -> str:
+    """Write the data file of a raw file; return its name inside the submission `folder`.
+
+    Raises
+    ------
+    DataError : the raw file holds next to no lines.
+    """
+    run = read_raw(raw_path)
+    readings = readings_of(run)
+    if len(readings) < _FEWEST_LINES:
+        raise DataError(f"{raw_path.name}: holds {len(readings)} lines, too few for a record")
+    name = data_file(run.header.recording, partial=partial)
+    own_folder(folder, DATA).mkdir(exist_ok=True)
+    closed = run.header.recording.controller is not None
+    write_file(folder / name, log_text(readings, carts=carts, reference=closed))
+    return name
+
+
+def log_text(readings: Sequence[Reading], *, carts: int, reference: bool) -> str:
+    """Return the bench log: counts as they came, stamps in s as they came (rounded to ms).
+
+    With `reference` the target is a column too, in encoder counts.
+    """
+    encoders = min(carts, len(readings[0].counts))
+    heading = ["Sample", "Time", *(f"Encoder {i + 1} Pos" for i in range(encoders))]
+    heading += ["Target", "Control Effort"] if reference else ["Control Effort"]
+    lines = ["\t".join(heading)]
+    for number, reading in enumerate(readings):
+        fields = [number, f"{1e-3 * reading.ms:.3f}", *reading.counts[:encoders]]
+        fields += [reading.target, reading.duty] if reference else [reading.duty]
+        lines.append("\t".join(map(str, fields)))
+    return "\n".join(lines) + "\n"

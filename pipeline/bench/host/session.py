@@ -1,0 +1,399 @@
+"""Runs on the bench, one at a time: rest, start, watch every line, stop; whatever happens, stop.
+
+A run is watched by one loop that looks at the port every few milliseconds, writes what came to the
+raw file, keeps the bench's watchdog awake and checks the limits. There is no thread: if this loop
+hangs, the heartbeat ends and the bench cuts its motor itself.
+"""
+
+import gc
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+
+from pipeline.bench.host.raw import RawHeader, RawWriter
+from pipeline.bench.host.serial_line import LUMP, SerialLine
+from pipeline.bench.host.stream import Stream
+from pipeline.bench.planning.orders import Order
+from pipeline.bench.planning.plan import Limits, Recording
+from pipeline.bench.planning.plan_words import hold_words
+from pipeline.bench.protocol.messages import (
+    HEARTBEAT_EVERY,
+    WATCHDOG,
+    Command,
+    Hands,
+    Reading,
+    Signal,
+    Start,
+    Wave,
+    encode,
+)
+from pipeline.bench.protocol.stamps import OTHER
+from pipeline.bench.watch.observer import Observer, Outcome
+from pipeline.errors import HardwareError
+
+_NOTHING_MOVED = (
+    "no cart that is free moved: is it held, is its encoder plugged in, is the motor on?"
+)
+STOPPED = "stopped: "  # begins why a run was ended that was not safe to go on with
+
+_LOOK = 0.003  # s between looks at the port
+_FORWARD = 0.05  # s between batches handed to the observers
+_FIRST_LINE = 1.0  # s a bench may take to begin
+_SILENCE = 0.5  # s without a byte in mid-run: the bench is gone
+_UNREADABLE = 0.25  # s of bytes that are no lines: the motor may be on, and nobody sees the carts
+_NEARLY = 100.0  # ms before the end at which silence is the end; after it lines are too many
+_AFTER_END = 0.02  # s the last lines may still be under way
+_REST_TRIES = 4
+_REST_WINDOW = 500.0  # ms at the end of a rest over which it is judged
+_ENOUGH = 1000  # lines that tell a clock's period
+_STILL = 4  # counts a cart at rest may flicker
+_ASTRAY = 5  # lines in a row of another target; a garbled line is alone
+_PULL_OUT = 1.7  # s a virtual hand takes to pull a cart out
+
+
+@contextmanager
+def _no_collection() -> Iterator[None]:
+    """Keep Python from looking for garbage: among all lines of a run that takes 0.1 s."""
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
+
+
+class Session:
+    """A bench and what is known of it: who holds which carts, how long its period is.
+
+    Parameters
+    ----------
+    carts : of the submission; a bench that describes itself may have more, whose travel is
+        watched as well.
+    """
+
+    def __init__(self, line: SerialLine, *, carts: int, limits: Limits, observer: Observer) -> None:
+        self._line = line
+        self._carts = carts
+        self._limits = limits
+        self._observer = observer
+        self._moving = max(carts, line.bench.carts) if line.bench.commands else carts
+        self._period = 1e3 * line.bench.period
+        self._is_zeroed = False  # with the carts at rest, on this line
+        self._free: tuple[int, ...] | None = None  # as a person was last told
+        self._beat = float("-inf")
+        self._latest_beat = 0.0  # s, the longest without a heartbeat in this run
+
+    def prepare(self, recording: Recording) -> str:
+        """Have the carts held or freed and at rest; return what is to be said of it, or ""."""
+        held = tuple(cart for cart in range(1, self._carts + 1) if cart not in recording.carts)
+        if self._line.knows("h"):
+            self._line.send(Hands(held=held))
+        elif recording.carts != self._free:
+            words = hold_words(recording.carts, n=self._carts)
+            self._observer.confirm(words[0].upper() + words[1:])
+            self._free = recording.carts
+        restless = self._rest(recording)
+        if self._line.knows("h"):
+            if recording.release:
+                self._line.send(Hands(held=held, released=recording.release))
+                time.sleep(_PULL_OUT)
+        elif recording.release:
+            self._observer.confirm(
+                f"Pull cart {recording.release} out and hold it still, nearer than limits.travel "
+                f"({self._limits.travel:g}) to its zero; let it go once the recording has begun"
+            )
+        return restless
+
+    def record(
+        self, order: Order, path: Path, *, let_in: Callable[[], None] = lambda: None
+    ) -> Outcome:
+        """Carry out one run and write its raw file.
+
+        Whatever ends it early (a limit, the line, Ctrl-C, a signal), the bench is told to stop and
+        what came is in the file; an interrupt goes on to the caller. One that is held is asked for
+        with `let_in` while lines come: once the last one is there, the run is whole.
+        """
+        header = RawHeader(
+            recording=order.recording,
+            limits=self._limits,
+            commands=tuple(encode(command).decode() for command in order.commands),
+            bench=self._line.bench,
+            begun=datetime.now().astimezone().isoformat(timespec="seconds"),
+        )
+        recording = order.recording
+        stream = self._stream(recording.carts, closed=recording.controller is not None)
+        watch = _Watch(
+            order,
+            carts=self._moving,
+            period=self._period if self._line.bench.commands else None,
+            stream=stream,
+            observer=self._observer,
+        )
+
+        def check(lines: Sequence[Reading]) -> str:
+            let_in()
+            return watch.check(lines)
+
+        partial = "stopped"
+        with RawWriter(path, header) as raw:
+            try:
+                self._start(order.commands)
+                self._observer.started(order.recording)
+                partial = self._listen(
+                    stream,
+                    seconds=order.recording.duration,
+                    arrived=raw.write,
+                    check=check,
+                )
+            except HardwareError as error:
+                partial = str(error)
+            finally:
+                self._stop(always=bool(partial))
+        watch.forward(stream.finish())
+        if not partial and recording.controller is None and stream.widest <= _STILL:
+            partial = _NOTHING_MOVED
+        fit = stream.fit()
+        if stream.lines > _ENOUGH and not partial:
+            self._say_other_period(fit.period)
+            self._period = fit.period
+        return Outcome(
+            recording=order.recording,
+            lines=stream.lines,
+            anomalies=stream.anomalies(fit),
+            partial=partial,
+        )
+
+    def _say_other_period(self, period: float) -> None:
+        """Say once that the bench does not keep to the period (ms) that it stated."""
+        stated = 1e3 * self._line.bench.period
+        if not self._line.bench.commands or abs(self._period / stated - 1) > OTHER:
+            return
+        if abs(period / stated - 1) > OTHER:
+            self._observer.remark(
+                f"the bench states a line every {stated:.3g} ms and sends one every {period:.3g} "
+                "ms: its times are right, but a controller that counts in its periods is not; "
+                "mend the period that it states"
+            )
+
+    def _stream(self, free: Sequence[int], *, closed: bool = False) -> Stream:
+        watched = tuple(cart for cart in free if cart <= self._carts)
+        bench = self._line.bench
+        return Stream(
+            encoders=bench.encoders,
+            period=self._period,
+            stated=bool(bench.commands),
+            free=watched,
+            closed=closed,
+        )
+
+    def _rest(self, recording: Recording) -> str:
+        """Wait, in a run that does nothing, until the carts have come to rest."""
+        if recording.settle <= 0:
+            return ""
+        moving: dict[int, int] = {}
+        for _ in range(_REST_TRIES):
+            self._observer.settling(recording, recording.settle)
+            last = _Tail(since=1e3 * recording.settle - _REST_WINDOW)
+            self._start([Start(wave=Wave.DELTA, frequency=1 / recording.settle, amplitude=0)])
+            trouble = self._listen(self._stream(()), seconds=recording.settle, check=last.keep)
+            if trouble:
+                raise HardwareError(f"{recording.id}: while the carts came to rest, {trouble}")
+            moving = {
+                cart: swing
+                for cart, swing in enumerate(last.swings[: self._carts], start=1)
+                if swing > _STILL
+            }
+            if not moving:
+                self._zero_at_rest(recording)
+                return ""
+        swings = ", ".join(f"cart {cart} by {swing} counts" for cart, swing in moving.items())
+        return f"not at rest when the run began: {swings} within half a second"
+
+    def _zero_at_rest(self, recording: Recording) -> None:
+        """Zero the bench before the motor's first run on this line: it was opened at any time.
+
+        After a line that was lost the carts still swing; where they were then is no zero for the
+        travel limit. A hand's run waits with the zero: what is held by hand is never quite at rest.
+        """
+        if self._is_zeroed or not recording.amplitude:
+            return
+        self._line.send(Signal.RESET)
+        self._line.drain()
+        self._beat = float("-inf")  # a reset disarms the watchdog
+        self._is_zeroed = True
+
+    def _start(self, commands: Sequence[Command]) -> None:
+        self._line.clear()  # nothing of an earlier run belongs to this one
+        self._heartbeat()
+        self._latest_beat = 0.0
+        self._line.send(*commands)
+
+    def _heartbeat(self) -> None:
+        now = time.monotonic()
+        if self._line.knows("k") and now - self._beat > HEARTBEAT_EVERY - _LOOK:
+            self._line.send(Signal.HEARTBEAT)
+            self._latest_beat = max(self._latest_beat, now - self._beat)
+            self._beat = now
+
+    def _lateness(self) -> str:
+        """Return what to say of a bench whose watchdog had reason to cut the motor, or ""."""
+        if self._latest_beat < WATCHDOG:
+            return ""
+        return (
+            f": this computer was too busy, it sent no heartbeat for {1e3 * self._latest_beat:.0f} "
+            "ms, upon which the bench cuts its motor; close other programs"
+        )
+
+    def _stop(self, *, always: bool) -> None:
+        """Stop the bench; a stock one, which that zeroes, only if the run did not end by itself."""
+        if not always and not self._line.knows("s"):
+            return
+        try:
+            try:
+                self._line.stop()
+            except KeyboardInterrupt:  # pressed twice: the stop still comes first
+                self._line.stop()
+                raise
+        except HardwareError as error:
+            guard = "" if self._line.knows("k") else "; the motor may be on: switch it off"
+            self._observer.remark(f"the stop could not be sent: {error}{guard}")
+
+    def _listen(
+        self,
+        stream: Stream,
+        *,
+        seconds: float,
+        check: Callable[[Sequence[Reading]], str],
+        arrived: Callable[[bytes], None] = lambda data: None,
+    ) -> str:
+        """Read lines until the run is over; return why it ended early, or ""."""
+        with _no_collection():
+            return self._look(stream, end=1e3 * seconds, arrived=arrived, check=check)
+
+    def _look(
+        self,
+        stream: Stream,
+        *,
+        end: float,
+        arrived: Callable[[bytes], None],
+        check: Callable[[Sequence[Reading]], str],
+    ) -> str:
+        since = last = time.monotonic()
+        first: int | None = None  # ms of the first line
+        unread: float | None = None  # since when what comes is no line
+        while True:
+            self._heartbeat()
+            now = time.monotonic()
+            if data := self._line.receive():
+                arrived(data)
+                last = now
+                lines = stream.feed(data, since=since, now=now)
+                if trouble := check(lines):
+                    return trouble
+                if stream.broken:
+                    return stream.broken
+                if lines:
+                    first, unread = lines[0].ms if first is None else first, None
+                    if lines[-1].ms - first > end + _NEARLY:
+                        return f"{STOPPED}the bench went on past the end of the run"
+                else:
+                    unread = now if unread is None else unread
+                    if now - unread > _UNREADABLE:
+                        return f"{STOPPED}what the bench sends cannot be read: nothing is watched"
+            quiet = now - last
+            if stream.latest >= end - 2 * self._period and quiet > _AFTER_END:
+                return ""
+            if stream.latest >= end - _NEARLY and quiet > 2 * _AFTER_END + _SILENCE / 2:
+                return ""
+            if quiet > (_SILENCE if stream.latest >= 0 else _FIRST_LINE):
+                return (
+                    f"the bench fell silent after {1e-3 * stream.latest:.3f} s{self._lateness()}"
+                    if stream.latest >= 0
+                    else "the bench did not begin to stream"
+                )
+            if len(data) < LUMP:  # nothing waits
+                since = now
+                time.sleep(_LOOK)
+
+
+class _Watch:
+    """Checks each line against the limits and the wave, and hands them on in batches.
+
+    Parameters
+    ----------
+    period : ms from line to line; None of a stock bench, whose waves nobody knows to the ms.
+    """
+
+    def __init__(
+        self,
+        order: Order,
+        *,
+        carts: int,
+        period: float | None,
+        stream: Stream,
+        observer: Observer,
+    ) -> None:
+        self._order = order
+        self._carts = carts
+        self._period = period
+        self._astray = self._off = 0  # lines in a row
+        self._before: Reading | None = None
+        self._stream = stream
+        self._observer = observer
+        self._batch: list[Reading] = []
+        self._forwarded = time.monotonic()
+
+    def check(self, batch: Sequence[Reading]) -> str:
+        """Return why the run must stop, or ""."""
+        self._batch += batch
+        for reading in batch:
+            if passed := self._order.passed(reading, carts=self._carts):
+                return f"{STOPPED}{passed}"  # before anybody is told: the stop goes out first
+            if self._period is not None:
+                strays = self._order.strays(reading, period=self._period)
+                self._astray = self._astray + 1 if strays else 0
+                if self._astray == _ASTRAY:
+                    return (
+                        f"the bench follows another wave than it was sent, {reading.target} counts "
+                        f"at {1e-3 * reading.ms:.3f} s: the line changed a digit"
+                    )
+            off = self._order.drives_off(reading, before=self._before or reading)
+            self._off, self._before = self._off + 1 if off else 0, reading
+            if self._off == _ASTRAY:
+                return (
+                    f"{STOPPED}the bench drives its motor with {reading.duty} duty counts where it "
+                    f"was told {reading.target}, at {1e-3 * reading.ms:.3f} s"
+                )
+        now = time.monotonic()
+        if now - self._forwarded > _FORWARD:
+            self._forwarded = now
+            self.forward(())
+        return ""
+
+    def forward(self, batch: Sequence[Reading]) -> None:
+        """Hand on what waits, and this."""
+        waiting, self._batch = [*self._batch, *batch], []
+        if waiting:
+            self._observer.readings(waiting, self._stream.anomalies())
+
+
+class _Tail:
+    """The last lines of a rest."""
+
+    def __init__(self, *, since: float) -> None:
+        self._since = since
+        self._readings: list[Reading] = []
+
+    def keep(self, batch: Sequence[Reading]) -> str:
+        """Keep what is late enough; nothing is wrong with it."""
+        self._readings += [reading for reading in batch if reading.ms >= self._since]
+        return ""
+
+    @property
+    def swings(self) -> list[int]:
+        """How far each encoder went, counts."""
+        columns = zip(*(reading.counts for reading in self._readings), strict=True)
+        return [max(column) - min(column) for column in columns]

@@ -1,0 +1,321 @@
+"""Lines out of lumps of bytes, and everything that went wrong on the way.
+
+A line is judged when the next one is there: a bench's clock never goes back and no cart jumps out
+and back within two lines, so a line that stands out between its neighbours was garbled though it
+can still be read. That costs one line of delay and no line that was right.
+"""
+
+from array import array
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from pipeline.bench.protocol.messages import FULL_SCALE, Reading, parse_reading
+from pipeline.bench.protocol.stamps import StampFit, even_period, fit_stamps
+from pipeline.bench.watch.observer import Anomalies
+
+_LONGEST_LINE = 512  # bytes; more without an end is noise
+_SPIKE = 32  # counts a true reading may stand out between its neighbours: a hit on an end stop
+_LATE = 0.02  # s behind the earliest lines: they waited somewhere for one another
+_FORGET = 1.0  # s after which the two clocks are set by one another anew
+_ODD = 0.005  # of the expected period: how far off a clock may well be
+_WINDOW = 1000  # ms over which an encoder is watched and losses are counted
+_MOVED, _NEIGHBOUR_MOVED = 20, 200  # counts
+_DRIVEN = 8  # duty counts; less moves no cart
+_LEAP = 1000  # ms between two stamps: no line for so long, or a clock that jumped
+_CROWD = 500  # lines whose stamps are looked at together …
+_CROWDED = 0.25  # … and the least share of their time the clock may go on meanwhile
+
+
+class Stream:
+    """The lines of one run.
+
+    Parameters
+    ----------
+    encoders : fields of a line that are counts.
+    period : ms from line to line, as expected; `stated`: by the bench itself.
+    free : the carts that can move; their encoders are watched.
+    closed : the loop is closed: its duty may kick for a single line when an encoder flickers.
+
+    Attributes
+    ----------
+    broken : what the bench's clock did, after which no line belongs to this run; "": nothing.
+    """
+
+    def __init__(
+        self,
+        *,
+        encoders: int,
+        period: float = 1.0,
+        stated: bool = False,
+        free: Sequence[int] = (),
+        closed: bool = False,
+    ) -> None:
+        self._encoders = encoders
+        self._stated = stated
+        self._closed = closed
+        self._expected = period
+        self._tail = b""
+        self._before: Reading | None = None  # the last line handed on
+        self._held: Reading | None = None  # waits for its successor
+        self._stamps = array("q")
+        self._missing = _MissingSoFar(period)
+        self._garbled = 0
+        self._garbled_lines = 0  # a merger of two is one garbled place and two lines
+        self._late = 0
+        self._resets = 0
+        self.broken = ""
+        # The least of arrival minus stamp, s: of the second before, and of this one.
+        self._lead, self._new_lead, self._lead_from = float("inf"), float("inf"), float("-inf")
+        self._watch = _EncoderWatch(cart for cart in free if cart <= encoders)
+
+    @property
+    def lines(self) -> int:
+        """How many valid lines were handed on."""
+        return len(self._stamps)
+
+    @property
+    def latest(self) -> int:
+        """The stamp of the newest line, judged or not, ms; -1 of none."""
+        newest = self._held or self._before
+        return -1 if newest is None else newest.ms
+
+    @property
+    def widest(self) -> int:
+        """The counts that the free cart which moved most went from end to end."""
+        return self._watch.widest
+
+    def fit(self) -> StampFit:
+        """Return the clock that explains the stamps; takes too long for a run under way."""
+        return fit_stamps(np.array(self._stamps), period=self._expected, stated=self._stated)
+
+    def anomalies(self, fit: StampFit | None = None) -> Anomalies:
+        """Return all that went wrong so far; lost lines are estimated until there is a `fit`."""
+        missing = self._missing.lines if fit is None else fit.missing
+        return Anomalies(
+            lost=max(0, missing - self._garbled_lines),
+            garbled=self._garbled,
+            late=self._late,
+            resets=self._resets,
+            stuck=self._watch.stuck,
+        )
+
+    def feed(self, data: bytes, *, since: float, now: float) -> list[Reading]:
+        """Return the lines that are now known to be valid.
+
+        The data came between `since`, when the port was last found empty, and `now` (s, of any
+        clock that runs on): a host that was busy elsewhere does not make lines late.
+        """
+        *lines, self._tail = (self._tail + data).split(b"\n")
+        if len(self._tail) > _LONGEST_LINE:
+            lines.append(self._tail)
+            self._tail = b""
+        valid: list[Reading] = []
+        for line in lines:
+            reading = self._read(line)
+            if reading is not None:
+                valid += self._judge(reading)
+                self._time(reading, since=since, now=now)
+        self._watch.see(valid)
+        return valid
+
+    def finish(self) -> list[Reading]:
+        """Return the line that still waited for its successor; the run is over."""
+        last, self._held = self._held, None
+        if last is None or (self._before is not None and last.ms < self._before.ms):
+            return []
+        self._keep(last)
+        self._watch.see([last])
+        return [last]
+
+    def _read(self, line: bytes) -> Reading | None:
+        if not line.strip():
+            return None
+        reading = parse_reading(line)
+        if (
+            reading is None
+            or len(reading.counts) != self._encoders
+            or abs(reading.duty) > FULL_SCALE
+        ):
+            whole = round(line.count(b":") / (self._encoders + 2))
+            self._reject(lines=max(1, whole))
+            return None
+        return reading
+
+    def _reject(self, *, lines: int = 1) -> None:
+        self._garbled += 1
+        self._garbled_lines += lines
+
+    def _judge(self, after: Reading) -> list[Reading]:
+        """Return the line held back if its neighbours bear it out, and hold this one."""
+        if self.broken:
+            return []
+        before, held, self._held = self._before, self._held, after
+        if held is None:
+            return []
+        last = 0 if before is None else before.ms
+        if before is None and after.ms < held.ms:  # left over from an earlier run, or garbled
+            self._reject()
+            return []
+        if held.ms < last and after.ms < last and after.ms >= held.ms:
+            self._resets += 1
+            return self._break("the bench began again in mid-run: its supply or its reset line")
+        if before is not None and _stands_out(before, held, after, closed=self._closed):
+            self._reject()
+            return []
+        if held.ms - last > _LEAP:
+            return self._break(
+                f"the bench's stamps leap from {1e-3 * last:.3f} to {1e-3 * held.ms:.3f} s: "
+                "its clock, or a second in which no line came"
+            )
+        self._keep(held)
+        if self.lines > _CROWD:
+            went_on = held.ms - self._stamps[-1 - _CROWD]
+            if went_on < _CROWDED * _CROWD * self._expected:
+                self._break(f"the bench's clock stands still: {_CROWD} lines in {went_on} ms of it")
+        return [held]
+
+    def _break(self, why: str) -> list[Reading]:
+        """End the run here."""
+        self.broken, self._held = why, None
+        return []
+
+    def _keep(self, reading: Reading) -> None:
+        self._before = reading
+        self._stamps.append(reading.ms)
+        self._missing.tick(reading.ms)
+
+    def _time(self, reading: Reading, *, since: float, now: float) -> None:
+        due = 1e-3 * reading.ms
+        if now - self._lead_from > _FORGET:
+            self._lead, self._new_lead, self._lead_from = self._new_lead, now - due, now
+        self._new_lead = min(self._new_lead, now - due)
+        self._late += since - due > min(self._lead, self._new_lead) + _LATE
+
+
+def _stands_out(before: Reading, held: Reading, after: Reading, *, closed: bool) -> bool:
+    """Tell a line that its two neighbours, which agree with one another, speak against."""
+    if before.ms <= after.ms and not before.ms <= held.ms <= after.ms:
+        return True
+    if held.ms < before.ms:
+        return True
+    room = _SPIKE * max(1, after.ms - before.ms)
+    signals = [*zip(before.counts, held.counts, after.counts, strict=True)]
+    signals.append((before.target, held.target, after.target))
+    if not closed:
+        signals.append((before.duty, held.duty, after.duty))
+    return any(abs(2 * b - a - c) > 2 * (room + 2 * abs(c - a)) for a, b, c in signals)
+
+
+class _MissingSoFar:
+    """Lines missing, second by second.
+
+    A clock skips a stamp now and then by itself; a second whose stamps one even clock explains
+    lacks none, and tells the period for those that do lack some. Until there was one, the least ms
+    a line of any second is nearer to the true period, if few lines are lost.
+    """
+
+    def __init__(self, period: float) -> None:
+        self._expected = self._period = period
+        self._seen_even = False
+        self._stamps: list[int] = []
+        self.lines = 0
+
+    def tick(self, ms: int) -> None:
+        """Take note of a stamp."""
+        self._stamps.append(ms)
+        span, count = ms - self._stamps[0], len(self._stamps) - 1
+        if span < _WINDOW or not count:
+            return
+        if (even := even_period(np.array(self._stamps))) is not None:
+            self._period, self._seen_even = even, True
+        else:
+            own = span / count
+            near = abs(own / self._expected - 1) < _ODD
+            first = self._period == self._expected
+            if near and not self._seen_even and (first or own < self._period):
+                self._period = own
+            self.lines += max(0, round(span / self._period) - count)
+        self._stamps = [ms]
+
+
+class _EncoderWatch:
+    """Notices encoders that stand still although the motor does not."""
+
+    def __init__(self, carts: Iterable[int]) -> None:
+        self._encoders = [cart - 1 for cart in carts]
+        self._ranges: dict[int, _Range] = {encoder: _Range() for encoder in self._encoders}
+        self._duty = _Range()
+        self._start = 0
+        self._earlier: tuple[dict[int, int], int] | None = None
+        self._overall: dict[int, _Range] = {encoder: _Range() for encoder in self._encoders}
+        self._driven = _Range()
+        self._frozen: set[int] = set()
+
+    @property
+    def stuck(self) -> int:
+        """How many encoders froze while driven on, or never moved though their carts had to."""
+        moved = {encoder: seen.width for encoder, seen in self._overall.items()}
+        pushed = self._driven.width >= _DRIVEN
+        never = {
+            encoder
+            for encoder, width in moved.items()
+            if width == 0
+            and pushed
+            and (encoder == 0 or max(moved.values()) >= _NEIGHBOUR_MOVED)
+            and self._earlier is not None  # a run of less than a window tells nothing
+        }
+        return len(self._frozen | never)
+
+    @property
+    def widest(self) -> int:
+        """The greatest range of any encoder watched, counts."""
+        return max((seen.width for seen in self._overall.values()), default=0)
+
+    def see(self, readings: Sequence[Reading]) -> None:
+        """Take note of valid lines, in order."""
+        if not readings:
+            return
+        for encoder in self._encoders:
+            counts = [reading.counts[encoder] for reading in readings]
+            self._ranges[encoder].widen(counts)
+            self._overall[encoder].widen(counts)
+        duties = [reading.duty for reading in readings]
+        self._duty.widen(duties)
+        self._driven.widen(duties)
+        if readings[-1].ms - self._start >= _WINDOW:
+            self._close(readings[-1].ms)
+
+    def _close(self, ms: int) -> None:
+        widths = {encoder: seen.width for encoder, seen in self._ranges.items()}
+        duty = self._duty.width
+        if self._earlier is not None:
+            earlier, earlier_duty = self._earlier
+            if duty >= max(_DRIVEN, earlier_duty / 2):
+                self._frozen |= {
+                    encoder
+                    for encoder, width in widths.items()
+                    if width == 0 and earlier[encoder] >= _MOVED
+                }
+        self._earlier, self._start = (widths, duty), ms
+        self._ranges = {encoder: _Range() for encoder in self._encoders}
+        self._duty = _Range()
+
+
+class _Range:
+    """The least and the greatest of whole numbers."""
+
+    def __init__(self) -> None:
+        self._low: int | None = None
+        self._high = 0
+
+    @property
+    def width(self) -> int:
+        """The distance from the least to the greatest; 0 of none."""
+        return 0 if self._low is None else self._high - self._low
+
+    def widen(self, values: Sequence[int]) -> None:
+        """Take in some more."""
+        low, high = min(values), max(values)
+        self._high = high if self._low is None else max(self._high, high)
+        self._low = low if self._low is None else min(self._low, low)

@@ -1,0 +1,1 @@
+"""What to record, with which controller, and what it asks of the bench."""

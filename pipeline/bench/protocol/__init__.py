@@ -1,0 +1,1 @@
+"""What host and bench say to each other, and the clock behind it."""

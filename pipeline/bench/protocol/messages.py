@@ -1,0 +1,399 @@
+"""What host and bench say to each other: one command or one line of text at a time.
+
+docs/protocol.md specifies it in words. Commands are fields that each end in a semicolon; the
+first letter tells which follow. The stock bench knows `d`, `g` and `z`; one that answers `?;` says
+which others it knows.
+"""
+
+import math
+import re
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any, TypeAlias
+
+from pipeline.errors import DataError
+
+FULL_SCALE = 4096  # duty counts: 5 V
+HEARTBEAT_EVERY = 0.03  # s
+WATCHDOG = 0.1  # s after the last heartbeat the motor is cut
+PULSE = 0.05  # s a delta wave is on
+NOMINAL_PERIOD = 1e-3  # s from line to line
+CHIRP_SPAN = 20.0  # a chirp ends at so many times the frequency it starts at, unless told
+FREQUENCIES = (1e-3, 1e3)  # Hz, of a wave; a command with any other is dropped
+EXTENSIONS = frozenset("cfhks")  # the commands, `?` aside, that the stock bench does not know
+
+# What firmware can hold in 32 bits, and no bench needs more.
+_LONGEST_FIELD = 32  # characters
+_LARGEST_NUMBER = 1e9
+_LARGEST_AMPLITUDE = 1_000_000
+_MOST_CYCLES = 1_000_000
+_LONGEST_COUNT = 10  # digits of a field of a line
+
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+_WHOLE = re.compile(r"[+-]?\d+", re.ASCII)
+_LINE = re.compile(rf"(?:-?\d{{1,{_LONGEST_COUNT}}}:){{4,5}}\d{{1,{_LONGEST_COUNT}}}", re.ASCII)
+
+
+class Wave(StrEnum):
+    """The shape of the target over one period 1/FREQ.
+
+    delta is a short pulse as the period begins; square is zero for half a period, then the
+    amplitude; sine, triangle and sawtooth start at zero and swing to both sides; chirp sweeps
+    once, logarithmically, over the whole run. `pipeline.bench.protocol.waves` has the formulas.
+    """
+
+    DELTA = "d"
+    SQUARE = "q"
+    SINE = "s"
+    TRIANGLE = "t"
+    SAWTOOTH = "w"
+    CHIRP = "c"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Start:
+    """`d`: start a run of cycles/frequency seconds.
+
+    Attributes
+    ----------
+    encoder : 1 or 2, whose count a PID follows; None: open loop.
+    frequency : Hz.
+    amplitude : duty counts in open loop, encoder counts in closed loop.
+    cycles : periods of the wave.
+    """
+
+    wave: Wave
+    encoder: int | None = None
+    frequency: float
+    amplitude: int
+    cycles: int = 1
+
+    @property
+    def duration(self) -> float:
+        """How long the bench streams, s of its clock."""
+        return self.cycles / self.frequency
+
+
+@dataclass(frozen=True, kw_only=True)
+class PidGains:
+    """`g`: duty = kp e + ki ∫e dt + kd de/dt, e in encoder counts; the loop of the next starts."""
+
+    kp: float
+    ki: float
+    kd: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class StateGains:
+    """`f`: duty = prefilter target - gains [x1, v1, x2, v2, …], counts and counts/s."""
+
+    gains: tuple[float, ...]
+    prefilter: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChirpEnd:
+    """`c`: where the chirps that follow end, Hz."""
+
+    frequency: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hands:
+    """`h`: a virtual bench's hands hold some carts and, in the next run, let one go.
+
+    Attributes
+    ----------
+    held : the carts that cannot move.
+    released : the cart pulled out and let go; 0: none.
+    """
+
+    held: tuple[int, ...] = ()
+    released: int = 0
+
+
+class Signal(StrEnum):
+    """Commands without fields."""
+
+    RESET = "z"  # stop, count and clock from zero, forget gains
+    STOP = "s"
+    HEARTBEAT = "k"  # the first since a reset arms the watchdog
+    QUERY = "?"
+
+
+Command: TypeAlias = Start | PidGains | StateGains | ChirpEnd | Hands | Signal
+
+# A bench that knows no `s` is stopped by a run that does nothing, then reset.
+STOCK_STOP: tuple[Command, ...] = (
+    Start(wave=Wave.DELTA, frequency=1.0, amplitude=0),
+    Signal.RESET,
+)
+
+
+def encode(command: Command) -> bytes:
+    """Return a command as it goes over the line."""
+    match command:
+        case Start(wave=wave, encoder=encoder):
+            loop = "o" if encoder is None else "c"
+            fields = ["d", wave, loop, "t" if encoder == 2 else "o"]
+            fields += [_number(command.frequency), str(command.amplitude), str(command.cycles)]
+        case PidGains(kp=kp, ki=ki, kd=kd):
+            fields = ["g", *map(_number, (kp, ki, kd))]
+        case StateGains(gains=gains, prefilter=prefilter):
+            fields = ["f", *map(_number, (*gains, prefilter))]
+        case ChirpEnd(frequency=frequency):
+            fields = ["c", _number(frequency)]
+        case Hands(held=held, released=released):
+            fields = ["h", str(sum(1 << (cart - 1) for cart in held)), str(released)]
+        case Signal():
+            # The empty field ends whatever a lost byte left open; stock benches know no stop.
+            fields = ["", "s"] if command is Signal.STOP else [command.value]
+    return "".join(f"{field};" for field in fields).encode("ascii")
+
+
+def _number(value: float) -> str:
+    return f"{value:.9g}"
+
+
+class CommandReader:
+    """Cuts what arrives at a bench into commands; what is none is counted and dropped.
+
+    A field that cannot stand where it stands ends the command before it and may begin another. If
+    it ends in the letter of a stop or a reset it is that, whatever noise comes before; so is an
+    `s` that seemed to be the wave of a start that then breaks off. So a lost byte never swallows
+    the stop that follows.
+
+    Parameters
+    ----------
+    encoders : of the bench; state feedback has two gains for each.
+    extensions : the letters it knows beyond the stock bench's; none: no query either.
+    """
+
+    def __init__(self, *, encoders: int, extensions: Collection[str] = EXTENSIONS) -> None:
+        self._kinds = _field_kinds(encoders, extensions)
+        self._halts = tuple({Signal.STOP.value, Signal.RESET.value} & self._kinds.keys())
+        self._rest = ""
+        self._letter = ""
+        self._values: list[str | float] = []
+        self.rejected = 0
+
+    def feed(self, data: bytes) -> list[Command]:
+        """Return the commands that are now complete, in order."""
+        *whole, rest = (self._rest + data.decode("latin-1")).split(";")
+        self._rest = rest[-_LONGEST_FIELD - 1 :]  # what is longer stays too long
+        return [command for field in whole for command in self._take(field.strip(" \t\r\n"))]
+
+    def _take(self, field: str) -> list[Command]:
+        broken_off: list[Command] = []
+        if self._letter:
+            try:
+                self._values.append(self._kinds[self._letter][len(self._values)](field))
+            except ValueError:
+                broken_off = self._break_off()
+        if not self._letter:
+            if field not in self._kinds:
+                self.rejected += bool(field)
+                if not field.endswith(self._halts):
+                    return broken_off
+                field = field[-1]
+            self._letter, self._values = field, []
+        if len(self._values) < len(self._kinds[self._letter]):
+            return broken_off
+        letter, self._letter = self._letter, ""
+        return [*broken_off, _command(letter, self._values)]
+
+    def _break_off(self) -> list[Command]:
+        self.rejected += 1
+        self._letter = ""
+        misread = Signal.STOP.value in self._halts and self._values == [Wave.SINE]
+        return [Signal.STOP] if misread else []
+
+
+_Reader: TypeAlias = Callable[[str], str | float]
+
+
+def _one_of(letters: str) -> _Reader:
+    def read(field: str) -> str:
+        if len(field) != 1 or field not in letters:
+            raise ValueError(field)
+        return field
+
+    return read
+
+
+def _number_within(lowest: float, highest: float, form: re.Pattern[str] = _NUMBER) -> _Reader:
+    def read(field: str) -> float:
+        if len(field) > _LONGEST_FIELD or not form.fullmatch(field):
+            raise ValueError(field)
+        value = int(field) if form is _WHOLE else float(field)
+        if not lowest <= value <= highest:
+            raise ValueError(field)
+        return value
+
+    return read
+
+
+def _whole_within(lowest: int, highest: int) -> _Reader:
+    return _number_within(lowest, highest, _WHOLE)
+
+
+def _field_kinds(encoders: int, extensions: Collection[str]) -> Mapping[str, tuple[_Reader, ...]]:
+    """Return what follows each letter."""
+    waves = "".join(wave for wave in Wave if wave != Wave.CHIRP or "c" in extensions)
+    frequency = _number_within(*FREQUENCIES)
+    gain = _number_within(-_LARGEST_NUMBER, _LARGEST_NUMBER)
+    amplitude = _whole_within(-_LARGEST_AMPLITUDE, _LARGEST_AMPLITUDE)
+    cycles = _whole_within(1, _MOST_CYCLES)
+    stock = {
+        "d": (_one_of(waves), _one_of("oc"), _one_of("ot"), frequency, amplitude, cycles),
+        "g": (gain,) * 3,
+        "z": (),
+    }
+    further: dict[str, tuple[_Reader, ...]] = {
+        "f": (gain,) * (2 * encoders + 1),
+        "c": (frequency,),
+        "h": (_whole_within(0, 2**encoders - 1), _whole_within(0, encoders)),
+        "s": (),
+        "k": (),
+    }
+    known = {letter: kinds for letter, kinds in further.items() if letter in extensions}
+    return {**stock, **known, **({"?": ()} if known else {})}
+
+
+def _command(letter: str, values: list[Any]) -> Command:
+    match letter, values:
+        case "d", [wave, loop, encoder, frequency, amplitude, cycles]:
+            return Start(
+                wave=Wave(wave),
+                encoder=None if loop == "o" else 1 + (encoder == "t"),
+                frequency=frequency,
+                amplitude=amplitude,
+                cycles=cycles,
+            )
+        case "g", [kp, ki, kd]:
+            return PidGains(kp=kp, ki=ki, kd=kd)
+        case "f", [*gains, prefilter]:
+            return StateGains(gains=tuple(gains), prefilter=prefilter)
+        case "c", [frequency]:
+            return ChirpEnd(frequency=frequency)
+        case "h", [mask, released]:
+            held = tuple(c + 1 for c in range(mask.bit_length()) if mask >> c & 1)
+            return Hands(held=held, released=released)
+    return Signal(letter)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """One line of the stream.
+
+    Attributes
+    ----------
+    counts : of the encoders, two or three.
+    target : duty counts in open loop, encoder counts in closed loop.
+    duty : duty counts that act from now on.
+    ms : whole milliseconds since the start of the run.
+    """
+
+    counts: tuple[int, ...]
+    target: int
+    duty: int
+    ms: int
+
+
+def format_reading(reading: Reading) -> bytes:
+    """Return the line, its end included."""
+    fields = (*reading.counts, reading.target, reading.duty, reading.ms)
+    return (":".join(map(str, fields)) + "\n").encode("ascii")
+
+
+def parse_reading(line: bytes) -> Reading | None:
+    """Return what a line says, its end stripped or not; None: it is no line of the stream."""
+    text = line.decode("latin-1").rstrip("\r\n")
+    if not _LINE.fullmatch(text):
+        return None
+    *counts, target, duty, ms = map(int, text.split(":"))
+    return Reading(counts=tuple(counts), target=target, duty=duty, ms=ms)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Description:
+    """What a bench answers to `?;`: itself, on one line that starts with a question mark.
+
+    Attributes
+    ----------
+    name : in one word.
+    encoders : how many fields of a line are counts: two or three.
+    carts : how many of them are carts.
+    period : s from line to line, as it should be.
+    baud : of the line.
+    commands : the letters beyond the stock ones that it knows, with `c` for the chirp too.
+    input_unit, input_per_count : the input in its unit is duty counts times this.
+    position_unit, position_per_count : likewise of the encoders.
+    """
+
+    name: str
+    encoders: int
+    carts: int
+    period: float = NOMINAL_PERIOD
+    baud: int = 115_200
+    commands: frozenset[str] = frozenset()
+    input_unit: str = "V"
+    input_per_count: float = 5.0 / FULL_SCALE
+    position_unit: str = "count"
+    position_per_count: float = 1.0
+
+
+def format_description(bench: Description) -> bytes:
+    """Return the answer to a query."""
+    entries = {
+        "name": bench.name,
+        "encoders": bench.encoders,
+        "carts": bench.carts,
+        "period": repr(bench.period),
+        "baud": bench.baud,
+        "commands": "".join(sorted(bench.commands)),
+        "input": f"{bench.input_per_count!r}{bench.input_unit}",
+        "position": f"{bench.position_per_count!r}{bench.position_unit}",
+    }
+    text = " ".join(f"{key}={value}" for key, value in entries.items())
+    return f"?cartlab/1 {text}\n".encode("ascii")
+
+
+def parse_description(line: bytes) -> Description:
+    """Read the answer to a query.
+
+    Raises
+    ------
+    DataError : it is none, or of a version this program does not speak.
+    """
+    text = line.decode("ascii", "replace").strip()
+    head, *words = text.split(" ")
+    entries = {key: value for key, _, value in (word.partition("=") for word in words)}
+    if head != "?cartlab/1":
+        raise DataError(f"the bench answers {text[:60]!r}, which is no description of a bench")
+    try:
+        input_per_count, input_unit = _scaled(entries["input"])
+        position_per_count, position_unit = _scaled(entries["position"])
+        return Description(
+            name=entries["name"],
+            encoders={"2": 2, "3": 3}[entries["encoders"]],
+            carts={"1": 1, "2": 2, "3": 3}[entries["carts"]],
+            period=abs(_scaled(entries["period"])[0]),
+            baud=int(entries["baud"]),
+            commands=frozenset(entries["commands"]),
+            input_unit=input_unit,
+            input_per_count=input_per_count,
+            position_unit=position_unit,
+            position_per_count=position_per_count,
+        )
+    except (KeyError, ValueError) as error:
+        raise DataError(f"the bench describes itself as {text[:200]!r}: {error} is wrong") from None
+
+
+def _scaled(text: str) -> tuple[float, str]:
+    """Split "0.00227cm" into the number and the unit."""
+    digits = len(text.rstrip("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ/%"))
+    if not 0.0 < abs(number := float(text[:digits])) < math.inf:  # of no use to a limit
+        raise ValueError(repr(text))
+    return number, text[digits:]

@@ -1,0 +1,48 @@
+"""The target of a run over time: what a bench follows, and what a plan can know beforehand."""
+
+import math
+
+from pipeline.bench.protocol.messages import CHIRP_SPAN, PULSE, Start, Wave
+
+
+def target_at(start: Start, t: float, *, chirp_end: float | None = None) -> int:
+    """Return the target `t` s after the start: duty counts in open loop, else encoder counts.
+
+    Parameters
+    ----------
+    chirp_end : Hz, where a chirp ends; None: at `CHIRP_SPAN` times the frequency it starts at.
+    """
+    return nearest_count(start.amplitude * _shape(start, t, chirp_end))
+
+
+def nearest_count(value: float) -> int:
+    """Round to a whole count, halves up."""
+    return math.floor(value + 0.5)
+
+
+def _shape(start: Start, t: float, chirp_end: float | None) -> float:
+    """Return the wave at unit amplitude."""
+    turns = t * start.frequency
+    phase = turns - math.floor(turns)
+    match start.wave:
+        case Wave.DELTA:
+            return float(phase < PULSE * start.frequency)
+        case Wave.SQUARE:
+            return float(phase >= 0.5)
+        case Wave.SINE:
+            return math.sin(2 * math.pi * phase)
+        case Wave.TRIANGLE:
+            return 1.0 - 4.0 * abs((phase + 0.25) % 1.0 - 0.5)
+        case Wave.SAWTOOTH:
+            return 2.0 * phase - (2.0 if phase >= 0.5 else 0.0)
+        case Wave.CHIRP:
+            return math.sin(2 * math.pi * _chirp_turns(start, t, chirp_end))
+
+
+def _chirp_turns(start: Start, t: float, chirp_end: float | None) -> float:
+    """Return the integral of a frequency that grows by the same factor in every second."""
+    span = CHIRP_SPAN if chirp_end is None else chirp_end / start.frequency
+    if span == 1.0:
+        return start.frequency * t
+    grown = start.duration / math.log(span)  # s in which it grows e-fold
+    return start.frequency * grown * math.expm1(t / grown)

@@ -1,0 +1,1 @@
+"""Who watches a session: the terminal, a page in the browser."""

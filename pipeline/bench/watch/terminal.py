@@ -1,0 +1,193 @@
+"""A session at the bench, watched in the terminal; next to silent where stderr is none."""
+
+import sys
+import time
+from collections import deque
+from collections.abc import Sequence
+from typing import Self
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from pipeline.bench.planning.plan import Plan, Recording
+from pipeline.bench.planning.plan_words import session_time, time_words
+from pipeline.bench.protocol.messages import Reading
+from pipeline.bench.watch.observer import Anomalies, Outcome
+from pipeline.errors import ConfigError
+
+_BARS = "▁▂▃▄▅▆▇█"
+_WIDTH = 60  # characters of a sparkline
+_RATE_OVER = 2.0  # s
+_REFRESH = 8.0  # Hz
+
+
+class Terminal:
+    """Shows the plan, the run and the positions while they change.
+
+    Parameters
+    ----------
+    yes : whatever a person is asked to do is taken as done.
+    """
+
+    def __init__(self, *, yes: bool = False, console: Console | None = None) -> None:
+        self._console = console or Console(stderr=True)
+        self._yes = yes
+        self._view = _View()
+        self._live = Live(
+            get_renderable=self._view.render,
+            console=self._console,
+            refresh_per_second=_REFRESH,
+            transient=True,
+        )
+
+    def __enter__(self) -> Self:
+        if self._console.is_terminal:
+            self._live.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._live.stop()
+
+    def planned(self, plan: Plan, done: frozenset[str]) -> None:
+        """Show what will be recorded."""
+        self._view.plan = plan.recordings
+        self._view.done = set(done)
+
+    def confirm(self, instruction: str) -> None:
+        """Ask the person at the keyboard and wait.
+
+        Raises
+        ------
+        ConfigError : nobody is there.
+        """
+        if self._yes:
+            self._say(f"{instruction}: taken as done")
+            return
+        if not sys.stdin.isatty():
+            raise ConfigError(f"{instruction}: nobody is at the keyboard (--yes: it is done)")
+        self._live.stop()
+        self._console.print(Text(f"{instruction}, then press Enter (Ctrl-C ends)"), end=" ")
+        try:
+            _forget_keys()
+            input()
+        except EOFError:
+            raise ConfigError(f"{instruction}: the keyboard was closed") from None
+        finally:
+            if self._console.is_terminal:
+                self._live.start()
+
+    def settling(self, recording: Recording, seconds: float) -> None:
+        """Show that the carts come to rest."""
+        self._view.begin(recording, f"coming to rest, {seconds:g} s")
+
+    def started(self, recording: Recording) -> None:
+        """Show the run."""
+        self._view.begin(recording, "")
+
+    def readings(self, batch: Sequence[Reading], anomalies: Anomalies) -> None:
+        """Show the newest lines."""
+        self._view.take(batch, anomalies)
+
+    def finished(self, outcome: Outcome) -> None:
+        """Print a line that stays."""
+        self._view.recording = None
+        name = outcome.recording.id
+        if not outcome.partial:
+            self._view.done.add(name)
+        if outcome.partial or outcome.remarks or self._console.is_terminal:
+            end = outcome.partial or f"{outcome.lines} lines"
+            self._say("; ".join([f"{name}: {end}", *outcome.remarks]))
+
+    def remark(self, sentence: str) -> None:
+        """Print a sentence."""
+        self._say(sentence)
+
+    def _say(self, sentence: str) -> None:
+        self._console.print(Text(sentence), soft_wrap=True)
+
+
+class _View:
+    """What is shown at the moment."""
+
+    def __init__(self) -> None:
+        self.plan: tuple[Recording, ...] = ()
+        self.done: set[str] = set()
+        self.recording: Recording | None = None
+        self._state = ""
+        self._ms = 0
+        self._anomalies = Anomalies()
+        self._traces: list[deque[int]] = []
+        self._arrived: deque[tuple[float, int]] = deque()
+
+    def begin(self, recording: Recording, state: str) -> None:
+        """Show another run."""
+        self.recording, self._state, self._ms = recording, state, 0
+        self._anomalies = Anomalies()
+        self._traces, self._arrived = [], deque()
+
+    def take(self, batch: Sequence[Reading], anomalies: Anomalies) -> None:
+        """Take in lines; one in a batch is as much as a sparkline shows."""
+        last, now = batch[-1], time.monotonic()
+        self._ms, self._anomalies = last.ms, anomalies
+        if len(self._traces) != len(last.counts):
+            self._traces = [deque(maxlen=_WIDTH) for _ in last.counts]
+        for trace, count in zip(self._traces, last.counts, strict=True):
+            trace.append(count)
+        self._arrived.append((now, len(batch)))
+        while now - self._arrived[0][0] > _RATE_OVER:
+            self._arrived.popleft()
+
+    def render(self) -> Group:
+        """Return the picture."""
+        left = [r for r in self.plan if r.id not in self.done]
+        seconds = max(0.0, session_time(left) - 1e-3 * self._ms)
+        head = Table.grid(padding=(0, 2))
+        head.add_row(
+            ProgressBar(total=max(1, len(self.plan)), completed=len(self.done), width=30),
+            Text(f"{len(self.done)} of {len(self.plan)} recorded, {time_words(seconds)} left"),
+        )
+        return Group(head, *self._run_lines())
+
+    def _run_lines(self) -> list[Text]:
+        run = self.recording
+        if run is None:
+            return []
+        state = self._state or (
+            f"{1e-3 * self._ms:.1f} of {run.duration:.1f} s, {self._rate():.0f} lines/s, "
+            f"line faults: {self._anomalies}"
+        )
+        lines = [Text(f"{run.id} ({run.kind}): {state}")]
+        for number, trace in enumerate(self._traces, start=1):
+            shown = list(trace)  # at once: the lines come in another thread
+            if shown:
+                lines.append(Text(f"  encoder {number} {shown[-1]:>7}  {sparkline(shown)}"))
+        return lines
+
+    def _rate(self) -> float:
+        arrived = list(self._arrived)  # at once: the lines come in another thread
+        if len(arrived) < 2 or arrived[-1][0] == arrived[0][0]:
+            return 0.0
+        return sum(n for _, n in arrived[1:]) / (arrived[-1][0] - arrived[0][0])
+
+
+def _forget_keys() -> None:
+    """Drop what was typed before the question: it is no answer to it, and a motor may start."""
+    try:
+        import termios
+    except ImportError:  # Windows
+        import msvcrt
+
+        while msvcrt.kbhit():  # pyright: ignore[reportAttributeAccessIssue]
+            msvcrt.getwch()  # pyright: ignore[reportAttributeAccessIssue]
+    else:
+        termios.tcflush(sys.stdin, termios.TCIFLUSH)
+
+
+def sparkline(values: Sequence[int]) -> str:
+    """Return values as a row of bars, the least lowest."""
+    low, high = min(values), max(values)
+    step = (high - low) / (len(_BARS) - 1) or 1.0
+    return "".join(_BARS[round((value - low) / step)] for value in values)

@@ -1,0 +1,1 @@
+"""The forms a data file may have, each read to a table of named columns."""

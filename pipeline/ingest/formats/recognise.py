@@ -1,0 +1,54 @@
+"""Recognise a data file by what is in it and read its columns."""
+
+import hashlib
+from collections.abc import Collection
+from pathlib import Path
+
+from pipeline.errors import SubmissionError
+from pipeline.ingest.formats.mat import is_mat, read_mat
+from pipeline.ingest.formats.table import Table
+from pipeline.ingest.formats.text import read_text
+from pipeline.submission.load import outside
+
+# Files that end up in a submission by mistake, by their first bytes, and what to do instead.
+_STRANGERS = (
+    (b"PK\x03\x04", "an Excel workbook or a zip archive; save the sheet as CSV"),
+    (b"\xd0\xcf\x11\xe0", "an old Excel workbook; save the sheet as CSV"),
+    (b"\x89HDF", "an HDF5 (MATLAB 7.3) file; save it again with save(…, '-v7')"),
+    (b"\x1f\x8b", "a gzip archive; unpack it"),
+    (b"%PDF", "a PDF document"),
+    (b"\x89PNG", "a picture"),
+    (b"\xff\xd8\xff", "a picture"),
+)
+
+
+def read_table(
+    folder: Path, name: str, *, shown: str | None = None, taken: Collection[str] = ()
+) -> tuple[Table, str]:
+    """Return the columns of a data file and the SHA-256 of its bytes.
+
+    Messages call the file `shown`, by default its name; where it is missing, the files `taken`
+    are not proposed.
+
+    Raises
+    ------
+    SubmissionError : outside the folder, missing, of no known form or broken; names the line.
+    """
+    if (problem := outside(folder, name, taken=taken)) is not None:
+        raise SubmissionError(problem if shown is None else f"{shown}: {problem}")
+    source = shown or name
+    try:
+        raw = (folder / name).read_bytes()
+    except OSError as error:
+        raise SubmissionError(f"{source}: cannot be read ({error.strerror})") from None
+    return parse_table(raw, source=source), hashlib.sha256(raw).hexdigest()
+
+
+def parse_table(raw: bytes, *, source: str) -> Table:
+    """Read the columns from the bytes of a data file."""
+    if not raw.strip():
+        raise SubmissionError(f"{source}: the file is empty")
+    for start, what in _STRANGERS:
+        if raw.startswith(start):
+            raise SubmissionError(f"{source}: {what}")
+    return read_mat(raw, source=source) if is_mat(raw) else read_text(raw, source=source)

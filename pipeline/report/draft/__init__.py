@@ -1,0 +1,1 @@
+"""The report of a submission as a whole, and what changed since an earlier one."""

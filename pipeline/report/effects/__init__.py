@@ -1,0 +1,1 @@
+"""The catalogue of effects, as text and as a page with pictures."""

@@ -1,0 +1,1 @@
+"""The equations of the carts: shown, worked out with numbers, derived."""

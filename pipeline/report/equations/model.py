@@ -1,0 +1,250 @@
+"""The model as mathematics: equations of motion, matrices, transfer functions.
+
+Symbolic terms follow the paper's notation; numbers are written with four digits.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeline.plant.chain import Array, Chain, ComplexArray, quadratic_factors
+from pipeline.report.document import Formula
+from pipeline.report.math.tree import (
+    Math,
+    Term,
+    dot,
+    fraction,
+    lines,
+    matrix,
+    negative,
+    number,
+    parens,
+    power,
+    row,
+    sub,
+    symbol,
+    to_text,
+    total,
+)
+from pipeline.report.numbers import significant
+
+_DIGITS = 4
+_ALL_DIGITS = 10  # as in results.json
+
+
+def formula(math: Math, *, copy: str = "") -> Formula:
+    """Return a displayed equation with its reading in plain text."""
+    return Formula(math=math, alt=to_text(math), copy=copy)
+
+
+# ------------------------------------------------------------------- symbols
+
+
+def _indexed(letter: str, i: int, *, n: int) -> Term:
+    """Return m_i; a lone cart needs no index."""
+    return letter if n == 1 else sub(letter, str(i))
+
+
+def _springs_at(cart: int, springs: Sequence[bool]) -> list[Term]:
+    """Return the symbols of the springs that end at a cart."""
+    n = len(springs) - 1
+    if n == 1:
+        return ["k"] if any(springs) else []
+    return [sub("k", str(j)) for j in (cart, cart + 1) if springs[j - 1]]
+
+
+def _between(cart: int, neighbour: int, springs: Sequence[bool]) -> Term | None:
+    """Return the symbol of the spring between two neighbours, None where there is none."""
+    j = max(cart, neighbour)
+    inside = 1 <= neighbour < len(springs)
+    return sub("k", str(j)) if inside and springs[j - 1] else None
+
+
+def equations_of_motion(
+    springs: Sequence[bool], *, forces: Sequence[Term] | None = None
+) -> Formula:
+    """Return Newton's law for every cart, with the springs that are there.
+
+    `forces` stand on the right, one for each cart; default: the input on the first.
+    """
+    n = len(springs) - 1
+    equations = []
+    for i in range(1, n + 1):
+        x = _position(i)
+        left: list[Term] = [
+            row(_indexed("m", i, n=n), _position(i, derivative=2)),
+            row(_indexed("c", i, n=n), _position(i, derivative=1)),
+        ]
+        held = _springs_at(i, springs)
+        if held:
+            left.append(row(held[0] if len(held) == 1 else parens(total(held)), x))
+        equation: list[Term] = [total(left)]
+        for neighbour in (i - 1, i + 1):
+            if k := _between(i, neighbour, springs):
+                equation += ["−", k, _position(neighbour)]
+        force = forces[i - 1] if forces else "u" if i == 1 else "0"
+        equations.append(row(*equation, "=", force))
+    return formula(lines(equations))
+
+
+# ------------------------------------------------------------------ state space
+
+
+def symbolic_state_space(springs: Sequence[bool]) -> Formula:
+    """Return q' = A q + B u with the entries of A and B as fractions of m, c and k."""
+    n = len(springs) - 1
+    size = range(2 * n)
+    A: list[list[Term]] = [["0"] * (2 * n) for _ in size]
+    B: list[list[Term]] = [["0"] for _ in size]
+    for i in range(1, n + 1):
+        place, speed = 2 * i - 2, 2 * i - 1
+        m = _indexed("m", i, n=n)
+        A[place][speed] = "1"
+        if held := _springs_at(i, springs):
+            A[speed][place] = negative(fraction(total(held), m))
+        A[speed][speed] = negative(fraction(_indexed("c", i, n=n), m))
+        for neighbour in (i - 1, i + 1):
+            if k := _between(i, neighbour, springs):
+                A[speed][2 * neighbour - 2] = fraction(k, m)
+    B[1][0] = fraction("1", _indexed("m", 1, n=n))
+    numbers = range(1, n + 1)
+    q = [[_position(i, derivative=order)] for i in numbers for order in (0, 1)]
+    q_dot = [[_position(i, derivative=order)] for i in numbers for order in (1, 2)]
+    return formula(row(matrix(q_dot), "=", matrix(A), matrix(q), "+", matrix(B), "u"))
+
+
+def _position(i: int, *, derivative: int = 0) -> Math:
+    return sub(dot("x", order=derivative) if derivative else "x", str(i))
+
+
+def numeric_state_space(chain: Chain) -> tuple[Formula, ...]:
+    """Return A, B, C and D with numbers, in s, position and input units."""
+    A, B, C, D = chain.state_space()
+    small = [
+        row("B", "=", number_matrix(B)),
+        row("C", "=", number_matrix(C)),
+        row("D", "=", number_matrix(D)),
+    ]
+    return (
+        formula(row("A", "=", number_matrix(A)), copy=matlab_matrix("A", A)),
+        formula(
+            _side_by_side(small),
+            copy="\n".join(matlab_matrix(name, M) for name, M in (("B", B), ("C", C), ("D", D))),
+        ),
+    )
+
+
+def matlab_matrix(name: str, values: Array) -> str:
+    """Return "A = [0 1; −2 −3];" with all digits: MATLAB, Octave and Julia read it."""
+    rows = "; ".join(
+        " ".join(f"{value + 0.0:.{_ALL_DIGITS}g}" for value in line) for line in values
+    )
+    return f"{name} = [{rows}];"
+
+
+def number_matrix(values: Array) -> Math:
+    """Return a matrix of numbers with four digits."""
+    return matrix([[_short(v) for v in line] for line in values])
+
+
+def _side_by_side(terms: Sequence[Math]) -> Math:
+    joined: list[Term] = []
+    for term in terms:
+        joined += [",", term] if joined else [term]
+    return row(*joined)
+
+
+# ----------------------------------------------------------- transfer functions
+
+
+def symbolic_transfer_functions(springs: Sequence[bool]) -> Formula | None:
+    """Return X_i/U as the paper writes them; None where they have no such names.
+
+    Named are one to three carts that some spring ties to a wall.
+    """
+    n = len(springs) - 1
+    if n > 3 or not all(springs[1:-1]) or not (springs[0] or springs[-1]):
+        return None
+    nulls = {1: [[]], 2: [["2"], []], 3: [["x", "y"], ["3"], []]}[n]
+    above = [[_symbolic_factor(null) for null in of_cart] for of_cart in nulls]
+    below = [_symbolic_factor(mode) for mode in (["n"] if n == 1 else "abc"[:n])]
+    gains = [_indexed("K", i, n=n) for i in range(1, n + 1)]
+    return _over_common_denominator(gains, above, below)
+
+
+def numeric_transfer_functions(chain: Chain) -> Formula:
+    """Return X_i/U with numbers: static gain and quadratic factors, or polynomials.
+
+    A chain that no wall holds has no static gain, so its polynomials are shown.
+    """
+    if not chain.is_tied:
+        return formula(lines(_polynomial_ratio(chain, i) for i in range(chain.n, 0, -1)))
+    gains = [_short(gain) for gain in chain.static_gains()]
+    below = _numeric_factors(chain.poles)
+    above = [_numeric_factors(chain.zeros(i)) for i in range(1, chain.n + 1)]
+    return _over_common_denominator(gains, above, below)
+
+
+def _over_common_denominator(
+    gains: Sequence[Term], above: Sequence[Sequence[Math]], below: Sequence[Math]
+) -> Formula:
+    """Return every X_i/U over D(s), last cart first, and D(s): that they share it is the point."""
+    D = row("D", parens("s"))
+    equations = [
+        row(_ratio(i), "=", fraction(gains[i - 1], D), *map(parens, above[i - 1]))
+        for i in range(len(gains), 0, -1)
+    ]
+    factors = below if len(below) == 1 else [parens(factor) for factor in below]
+    return formula(lines([*equations, row(D, "=", *factors)]))
+
+
+def _ratio(i: int) -> Math:
+    return fraction(row(sub("X", str(i)), parens("s")), row("U", parens("s")))
+
+
+def _symbolic_factor(index: str) -> Math:
+    omega = symbol(f"omega_{index}")
+    zeta = "ζ" if index == "n" else symbol(f"zeta_{index}")  # a lone cart's, as in Table 1
+    return _factor(
+        row(fraction("1", power(omega, "2")), power("s", "2")),
+        row(fraction(row("2", zeta), omega), "s"),
+    )
+
+
+def _numeric_factors(roots: ComplexArray) -> list[Math]:
+    return [
+        _factor(
+            row(fraction("1", power(_short(omega), "2")), power("s", "2")),
+            row(fraction(row("2", "·", _short(zeta)), _short(omega)), "s"),
+        )
+        for omega, zeta in zip(*quadratic_factors(roots), strict=True)
+    ]
+
+
+def _factor(*terms: Term) -> Math:
+    """Return the terms plus one: a quadratic factor in the paper's form."""
+    return row(total([*terms, "1"]))
+
+
+def _short(value: float) -> Term:
+    exact = value in (0.0, 1.0, -1.0)
+    return number(significant(float(value), digits=1 if exact else _DIGITS))
+
+
+def _polynomial_ratio(chain: Chain, cart: int) -> Math:
+    above, below = chain.transfer_function(cart)
+    return row(_ratio(cart), "=", fraction(_polynomial(above), _polynomial(below)))
+
+
+def _polynomial(coefficients: Array) -> Term:
+    degree = coefficients.size - 1
+    terms: list[Term] = []
+    for exponent, value in zip(range(degree, -1, -1), coefficients, strict=True):
+        # Below this share the coefficient is the rounding of an exact zero.
+        if abs(value) <= 1e-12 * np.abs(coefficients).max() and degree > 0:
+            continue
+        s: list[Term] = (
+            [] if exponent == 0 else ["s" if exponent == 1 else power("s", str(exponent))]
+        )
+        terms.append(row(*([] if value == 1 and s else [_short(value)]), *s))
+    return total(terms)

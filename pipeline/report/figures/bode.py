@@ -1,0 +1,152 @@
+"""Frequency response of one cart, measured and fitted (the paper's Figures 4, 6, 7, 9-11)."""
+
+from dataclasses import replace
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from pipeline.plant.chain import Array, Chain
+from pipeline.report.figures.style import (
+    MEASURED,
+    MODEL,
+    QUIET,
+    legend_above,
+    log_frequency_axis,
+    panels,
+)
+from pipeline.report.figures.svg import tell
+from pipeline.report.numbers import subscript
+from pipeline.results import FrequencyResponse
+
+_LINE_POINTS = 300
+_DB_PER_NEPER = 20 / np.log(10)
+_HIGHEST_PEAK = 100.0  # times the largest measured magnitude; without damping a peak has no end
+_WIDEST_BAR = 0.9  # of the magnitude: an error bar in decibels cannot reach down to zero
+
+
+def bode_figure(
+    response: FrequencyResponse, *, chain: Chain | None, position_unit: str, input_unit: str
+) -> Figure:
+    """Return magnitude, phase (where measured) and what the fit leaves, one below the other.
+
+    Zero magnitudes, which a logarithm cannot show, are left out.
+    """
+    response = _positive(response)
+    has_phase = response.phase is not None
+    heights = [1.4, *([0.65] if has_phase else []), *([0.55] if chain else [])]
+    figure, axes = panels(*heights)
+    log_frequency_axis(axes[0], response.omega)
+    plot_magnitude(
+        axes[0], response, chain=chain, position_unit=position_unit, input_unit=input_unit
+    )
+    legend_above(axes[0])
+    if has_phase:
+        plot_phase(axes[1], response, chain=chain)
+    if chain:
+        plot_residual(axes[-1], response, chain=chain)
+    axes[-1].set_xlabel("ω [rad/s]")
+    return figure
+
+
+def plot_magnitude(
+    ax: Axes,
+    response: FrequencyResponse,
+    *,
+    chain: Chain | None,
+    position_unit: str,
+    input_unit: str,
+) -> None:
+    """Plot the magnitude in dB: diamonds with error bars, the fit as a line."""
+    relative = np.clip(response.magnitude_std / response.magnitude, 0.0, _WIDEST_BAR)
+    _points(
+        ax,
+        response.omega,
+        _decibel(response.magnitude),
+        np.vstack([-_DB_PER_NEPER * np.log1p(-relative), _DB_PER_NEPER * np.log1p(relative)]),
+        label="measured",
+    )
+    if chain:
+        omega = _dense(response.omega, chain)
+        magnitude = np.abs(chain.frequency_response(omega)[response.cart - 1])
+        highest = float(response.magnitude.max()) * _HIGHEST_PEAK
+        ax.plot(omega, _decibel(np.minimum(magnitude, highest)), color=MODEL, label="fit")
+        _mark_modes(ax, response.omega, chain)
+    ax.set_ylabel(f"|X{subscript(response.cart)}/U| [dB re 1 {position_unit}/{input_unit}]")
+
+
+def plot_phase(ax: Axes, response: FrequencyResponse, *, chain: Chain | None) -> None:
+    """Plot the phase in degrees, measured values on the branch nearest the fit."""
+    assert response.phase is not None
+    phase = np.unwrap(response.phase)
+    if chain:
+        omega = _dense(response.omega, chain)
+        line = np.unwrap(np.angle(chain.frequency_response(omega)[response.cart - 1]))
+        line -= 2 * np.pi * np.round(line[0] / (2 * np.pi))
+        (drawn,) = ax.plot(omega, np.degrees(line), color=MODEL)
+        tell(drawn, omega, np.degrees(line), name="fit")
+        near = np.interp(response.omega, omega, line)
+        phase = near + (phase - near + np.pi) % (2 * np.pi) - np.pi
+    error = (
+        None if response.phase_std is None else np.degrees(np.clip(response.phase_std, 0, np.pi))
+    )
+    _points(ax, response.omega, np.degrees(phase), error)
+    ax.set_ylabel("phase [°]")
+
+
+def plot_residual(ax: Axes, response: FrequencyResponse, *, chain: Chain) -> None:
+    """Plot measured over fitted magnitude, as a difference in percent."""
+    fitted = np.abs(chain.frequency_response(response.omega)[response.cart - 1])
+    ax.axhline(0.0, color=MODEL)
+    _points(
+        ax,
+        response.omega,
+        100 * (response.magnitude / fitted - 1),
+        100 * response.magnitude_std / fitted,
+    )
+    ax.set_ylabel("residual [%]")
+
+
+def _positive(response: FrequencyResponse) -> FrequencyResponse:
+    keep = (response.magnitude > 0) & (response.omega > 0)
+    if keep.all():
+        return response
+    kept = {
+        name: values[keep]
+        for name in ("omega", "magnitude", "magnitude_std", "phase", "phase_std")
+        if (values := getattr(response, name)) is not None
+    }
+    return replace(response, **kept)
+
+
+def _points(ax: Axes, x: Array, y: Array, error: Array | None, *, label: str = "") -> None:
+    drawn = ax.errorbar(
+        x, y, error, fmt="D", ms=3.2, mew=0.8, mfc="white", color=MEASURED, elinewidth=0.7,
+        label=label or None, zorder=3,
+    )  # fmt: skip
+    tell(drawn.lines[0], x, y, name="measured")
+
+
+def _dense(omega: Array, chain: Chain) -> Array:
+    """Return a fine grid that also meets every resonance, so that sharp peaks are not cut."""
+    low, high = 0.9 * float(omega.min()), 1.1 * float(omega.max())
+    modes = np.abs(chain.poles)
+    grid = np.geomspace(low, high, _LINE_POINTS)
+    return np.unique(np.concatenate([grid, modes[(modes > low) & (modes < high)]]))
+
+
+def _mark_modes(ax: Axes, omega: Array, chain: Chain) -> None:
+    """Mark the resonances omega_a, omega_b, … by dotted lines with their letters."""
+    modes = np.unique(np.round(np.abs(chain.poles[chain.poles.imag > 0]), 9))
+    letters = "abcdefgh" if chain.n > 1 else "n"
+    for letter, mode in zip(letters, modes, strict=False):
+        if omega.min() < mode < omega.max():
+            ax.axvline(mode, color=QUIET, lw=0.8, ls=":")
+            ax.annotate(
+                letter, (mode, 0.0), xycoords=("data", "axes fraction"), xytext=(2, 2),
+                textcoords="offset points", color="#555555", fontsize=7.5, gid="mark",
+            )  # fmt: skip
+
+
+def _decibel(magnitude: Array) -> Array:
+    return _DB_PER_NEPER * np.log(magnitude)

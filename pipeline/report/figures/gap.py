@@ -1,0 +1,220 @@
+"""The gap: before and after in time, run by run, and as force against what causes it."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from pipeline.gap.residual_force import ResidualForce
+from pipeline.gap.types import FoundEffect, RecordGap, Trace
+from pipeline.plant.chain import Array
+from pipeline.report.figures.style import (
+    MEASURED,
+    MODEL,
+    QUIET,
+    SECOND,
+    SHADE,
+    legend_above,
+    panels,
+    plot_left,
+    plot_measured,
+    plot_model,
+    plot_second,
+    position_label,
+)
+from pipeline.report.numbers import subscript
+from pipeline.report.words import clean
+
+_ROW = 0.19  # inches, of one run in the overview
+_LONGEST_NAME = 30
+_MOST_POINTS = 500  # of a cloud
+_EDGE = (0.15, 0.5)  # s shown before and after an edge of the input
+_SPECTRUM = 600  # frequencies, evenly spaced
+_BEYOND = 1.5  # times the frequency below which nearly all of the motion is
+_NEARLY_ALL = 0.995
+_ROOM = 1.06
+
+
+# ---------------------------------------------------------------------- in time
+
+
+def before_after_figure(trace: Trace, *, noise: float, position_unit: str) -> Figure:
+    """Return one cart in one run: measured, both models, and what each leaves below."""
+    figure, (above, below) = panels(1.5, 1.0)
+    plot_measured(above, trace.t, trace.measured)
+    plot_second(above, trace.t, trace.baseline, label="linear model")
+    plot_model(above, trace.t, trace.final, label="with the effects")
+    above.set_ylabel(position_label(trace.cart, position_unit))
+    legend_above(above)
+    below.axhspan(-2 * noise, 2 * noise, color=SHADE, lw=0)
+    plot_left(
+        below,
+        trace.t,
+        {
+            "with the effects": trace.measured - trace.final,
+            "linear model": trace.measured - trace.baseline,
+        },
+    )
+    below.set_ylabel(f"left [{position_unit}]")
+    below.set_xlabel("time [s]")
+    return figure
+
+
+# ------------------------------------------------------------------- run by run
+
+
+def by_record_figure(rows: Sequence[RecordGap]) -> Figure:
+    """Return the error of every run and cart before and after, with its noise."""
+    figure, (ax,) = panels(_ROW * len(rows) + 0.1)
+    plot_by_record(ax, rows)
+    legend_above(ax)
+    ax.set_xlabel("error, share of the motion [%]")
+    # The names stand where the numbers of the axis would.
+    box = ax.get_position()
+    ax.set_position((0.36, box.y0, box.x1 - 0.36, box.height))
+    ax.xaxis.set_label_coords(0.5, -0.31 / (_ROW * len(rows) + 0.1))
+    return figure
+
+
+def plot_by_record(ax: Axes, rows: Sequence[RecordGap]) -> None:
+    """Plot a bar from before to after for each run and cart; a tick marks the noise."""
+    y = -np.arange(len(rows), dtype=float)
+    before, after, noise = (
+        100 * np.array([getattr(row, name) for row in rows])
+        for name in ("baseline", "final", "noise_floor")
+    )
+    ax.set_xscale("log")
+    ax.hlines(y, after, before, color=QUIET, lw=1.4)
+    ax.plot(before, y, "o", ms=4.5, mfc="white", mec=SECOND, mew=1.1, label="linear model")
+    ax.plot(after, y, "o", ms=4.5, color=MODEL, mec=MODEL, label="with the effects")
+    ax.plot(noise, y, "|", ms=8.0, color=MEASURED, mew=1.2, label="noise")
+    every = np.concatenate([before, after, noise])
+    every = every[every > 0]
+    ax.set_xlim(every.min() / 1.4, every.max() * 1.4)
+    ax.set_ylim(y[-1] - 0.7, 0.7)
+    ax.yaxis.set_visible(False)
+    for at, row in zip(y, rows, strict=True):
+        name = clean(row.experiment)
+        short = name if len(name) <= _LONGEST_NAME else f"{name[: _LONGEST_NAME - 1]}…"
+        text = f"{short}, x{subscript(row.cart)}"
+        ax.text(-0.02, at, text, transform=ax.get_yaxis_transform(), fontsize=7.5, ha="right",
+                va="center", color=MEASURED if row.held_out else QUIET)  # fmt: skip
+
+
+# ------------------------------------------------------------------- the force
+
+
+def force_figure(
+    found: FoundEffect, forces: Sequence[ResidualForce], *, units: tuple[str, str]
+) -> Figure | None:
+    """Return the force that the linear part leaves, against what the effect makes it depend on.
+
+    None where no run shows it: a neighbour was not measured, or the effect is one of timing.
+    """
+    axis = found.effect.axis
+    cart, spring = found.where.get("cart", 1), found.where.get("spring")
+    position, drive = units
+    figure, (ax,) = panels(2.1)
+    shown: list[tuple[Array, Array, Array]] = []
+    if spring is not None:
+        own = [f for f in forces if f.cart in (spring, spring - 1)]
+        carts = {f.cart for f in own}
+        own = [f for f in own if f.cart == max(carts)]
+        for f in own:
+            # Spring j pulls cart j back and cart j - 1 on.
+            sign, side = (-1.0, 0) if f.cart == spring else (1.0, 1)
+            rate = axis == "velocity"
+            middle = f.velocity if rate else f.position
+            other = (f.neighbours_velocity if rate else f.neighbours)[side]
+            stretch = -sign * (middle - other)
+            shown.append((stretch, sign * f.measured, sign * f.model))
+        what = f"rate of stretch [{position}/s]" if axis == "velocity" else f"stretch [{position}]"
+        ax.set_ylabel(f"extra force [{drive}]")
+    elif axis == "input":
+        own = [f for f in forces if f.cart == 1]
+        shown = [(f.u, f.measured + f.arriving, f.model + f.arriving) for f in own]
+        what = f"input u [{drive}]"
+        ax.set_ylabel(f"force that arrives [{drive}]")
+    else:
+        own = [f for f in forces if f.cart == cart]
+        shown = [
+            (f.velocity if axis == "velocity" else f.position, f.measured, f.model) for f in own
+        ]
+        what = f"velocity [{position}/s]" if axis == "velocity" else f"position [{position}]"
+        ax.set_ylabel(f"force left over [{drive}]")
+    if not shown:
+        return None
+    plot_force(ax, shown)
+    if axis == "input":
+        reach = np.max(np.abs(np.concatenate([x for x, _, _ in shown])))
+        ax.plot([-reach, reach], [-reach, reach], color=SECOND, ls="--", lw=1.0, label="linear")
+    ax.set_xlabel(what)
+    legend_above(ax)
+    return figure
+
+
+def plot_force(ax: Axes, shown: Sequence[tuple[Array, Array, Array]]) -> None:
+    """Plot clouds of (x, measured, model): measured as points, the model's as smaller ones."""
+    x, measured, model = (np.concatenate(parts) for parts in zip(*shown, strict=True))
+    order = np.linspace(0, x.size - 1, min(x.size, _MOST_POINTS)).astype(int)
+    ax.axhline(0.0, color=QUIET, lw=0.6)
+    ax.plot(x[order], measured[order], "o", ms=3.4, mfc="none", mec=MEASURED, mew=0.5,
+            label="measured")  # fmt: skip
+    ax.plot(x[order], model[order], ".", color=MODEL, ms=3.0, mew=0)
+    ax.plot([], [], ".", color=MODEL, ms=6.0, mew=0, label="with the effects")  # for the legend
+    ax.set_xlim(*(_ROOM * np.array([x.min(), x.max()]) if x.min() < 0 < x.max() else (None, None)))
+
+
+def timing_figure(forces: Sequence[ResidualForce], *, drive: str) -> Figure | None:
+    """Return the force that arrives on cart 1 around the sharpest edge of the input."""
+    own = [f for f in forces if f.cart == 1 and np.ptp(f.u) > 0]
+    if not own:
+        return None
+    steep = [float(np.max(np.abs(np.diff(f.u)) / np.diff(f.t))) for f in own]
+    force = own[int(np.argmax(steep))]
+    at = float(force.t[int(np.argmax(np.abs(np.diff(force.u))))])
+    kept = (force.t > at - _EDGE[0]) & (force.t < at + _EDGE[1])
+    figure, (ax,) = panels(1.8)
+    measured = (force.measured + force.arriving)[kept]
+    ax.plot(force.t[kept], measured, ".", color=MEASURED, ms=4.0, mew=0, label="measured")
+    ax.plot(force.t[kept], force.u[kept], color=SECOND, ls="--", lw=1.1, label="logged input")
+    ax.plot(force.t[kept], (force.model + force.arriving)[kept], color=MODEL, lw=1.1,
+            label="with the effects")  # fmt: skip
+    ax.set_ylabel(f"force on cart 1 [{drive}]")
+    ax.set_xlabel("time [s]")
+    legend_above(ax)
+    return figure
+
+
+def spectrum_figure(traces: Sequence[Trace], *, position_unit: str) -> Figure:
+    """Return the amplitude over frequency of motion and misfits, pooled over runs."""
+    longest = max(float(t.t[-1] - t.t[0]) for t in traces)
+    dt = max(float(np.median(np.diff(t.t))) for t in traces)
+    f = np.fft.rfftfreq(2 * int(longest / dt), dt)
+    pooled = np.zeros((3, f.size))
+    for trace in traces:
+        t = np.arange(trace.t[0], trace.t[-1], dt)
+        window = np.hanning(t.size)
+        for i, y in enumerate(
+            (trace.measured - trace.zero, trace.measured - trace.baseline,
+             trace.measured - trace.final)
+        ):  # fmt: skip
+            even = np.interp(t, trace.t, y)
+            spectrum = np.fft.rfft((even - even.mean()) * window, 2 * (f.size - 1))
+            pooled[i] += np.abs(spectrum / window.sum()) ** 2
+    motion, before, after = np.sqrt(pooled)
+    total = np.cumsum(motion**2)
+    end = _BEYOND * f[np.searchsorted(total, _NEARLY_ALL * total[-1])]
+    shown = (f > 0) & (f <= max(end, 8 * f[1]))
+    step = max(1, int(np.count_nonzero(shown) / _SPECTRUM))
+    index = np.flatnonzero(shown)[::step]
+    figure, (ax,) = panels(1.9)
+    ax.set_yscale("log")
+    ax.plot(f[index], motion[index], color=MEASURED, lw=0.8, ls=":", label="measured motion")
+    ax.plot(f[index], before[index], color=SECOND, ls="--", lw=1.0, label="left, linear model")
+    ax.plot(f[index], after[index], color=MODEL, lw=1.0, label="left, with the effects")
+    ax.set_ylabel(f"amplitude [{position_unit}]")
+    ax.set_xlabel("frequency [Hz]")
+    legend_above(ax)
+    return figure

@@ -1,0 +1,116 @@
+"""From a figure to SVG text, with the data of its lines for a page that lets readers explore it."""
+
+import io
+import json
+import re
+from base64 import b64encode
+from html import escape, unescape
+
+import matplotlib
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+
+from pipeline.plant.chain import Array
+from pipeline.report.figures.ticks import TAGS, draw_ticks
+
+_POINTS = 72.0  # units of the drawing in an inch
+_SAME = 1e-6  # of the figure
+_HUGE = 1e38  # the largest that float32 holds; only a model that runs away gets there
+_EVEN = 1e-5  # of the whole span: nobody sees a sample stand that far off
+_FINEST = 2  # decimals of a position on the page, in points
+
+# Names that matplotlib gives to groups: nobody refers to them, and each page needs them once.
+_GROUP_ID = re.compile(r' id="[a-zA-Z0-9.]+_\d+"')
+_TAG = re.compile(rf' id="({"|".join(TAGS)})"')
+_TOLD = re.compile(r""" id=(["'])(\{.*?\})\1""")
+_DATA = re.compile(r' data-[a-z]+="[^"]*"')
+_HEADER = re.compile(r"^.*?(?=<svg )", re.DOTALL)
+_METADATA = re.compile(r"\s*<metadata>.*?</metadata>", re.DOTALL)
+
+
+def tell(artist: Artist, x: Array, y: Array, *, name: str) -> None:
+    """Give a drawn series a name and its whole data, which the drawing itself may thin out."""
+    artist.set_gid(json.dumps({"name": name, "x": _packed_time(x), "y": _packed(y)}))
+
+
+def to_svg(figure: Figure, *, name: str, alt: str) -> str:
+    """Return the figure as an SVG element, its alternative text inside; the same bytes each time.
+
+    Panels carry their limits and series their data as `data-` attributes, which `plain_svg` takes
+    off. The canvas is called directly: `savefig` would draw everything twice.
+    """
+    for ax in figure.axes:
+        # Panels on one axis are labelled below the last of a column, left of the first of a row.
+        at = ax.get_position()
+        column = [
+            other for other in ax.get_shared_x_axes().get_siblings(ax)
+            if other.figure and abs(other.get_position().x0 - at.x0) < _SAME
+        ]  # fmt: skip
+        row = [
+            other for other in ax.get_shared_y_axes().get_siblings(ax)
+            if other.figure and abs(other.get_position().y0 - at.y0) < _SAME
+        ]  # fmt: skip
+        last = min(column, key=lambda other: other.get_position().y0)
+        first = min(row, key=lambda other: other.get_position().x0)
+        draw_ticks(ax, label_x=ax is last, label_y=ax is first)
+        ax.set_gid(json.dumps(_panel(ax, x_label=last.get_xlabel(), y_label=first.get_ylabel())))
+        for line in ax.lines:
+            label = str(line.get_label())
+            x, y = (np.asarray(v, dtype=float) for v in line.get_data())
+            if x.size and line.get_gid() is None and not label.startswith("_"):
+                tell(line, x, y, name=label)
+    buffer = io.StringIO()
+    with matplotlib.rc_context({"svg.hashsalt": name}):
+        FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None})
+    svg = _METADATA.sub("", _HEADER.sub("", buffer.getvalue()))
+    svg = _GROUP_ID.sub("", svg).replace("'DejaVu Sans'", "'DejaVu Sans', sans-serif")
+    svg = _TOLD.sub(_attributes, _TAG.sub(r' class="\1"', svg))
+    title = f"<title>{escape(alt, quote=False)}</title>"
+    return svg.replace("<svg ", '<svg role="img" ', 1).replace(">", f">{title}", 1)
+
+
+def plain_svg(svg: str) -> str:
+    """Return the drawing without the data, for print and for files of its own."""
+    return _DATA.sub("", svg)
+
+
+def _panel(ax: Axes, *, x_label: str, y_label: str) -> dict[str, object]:
+    """Return where a panel lies on the page (points), its limits, scales and titles."""
+    figure = ax.get_figure(root=True)
+    assert figure is not None
+    width, height = _POINTS * figure.get_size_inches()
+    at = ax.get_position()
+    box = (at.x0 * width, (1 - at.y1) * height, at.width * width, at.height * height)
+    return {
+        "box": [round(float(v), _FINEST) for v in box],
+        "x": [float(v) for v in ax.get_xlim()],
+        "y": [float(v) for v in ax.get_ylim()],
+        "log": [ax.get_xscale() == "log", ax.get_yscale() == "log"],
+        "titles": [x_label, y_label, ax.get_title(loc="left")],
+    }
+
+
+def _packed(values: Array) -> str:
+    """Return numbers as base64 of little-endian float32: seven digits in five characters."""
+    shown = np.clip(np.asarray(values, dtype=float), -_HUGE, _HUGE)
+    return b64encode(shown.astype("<f4").tobytes()).decode()
+
+
+def _packed_time(values: Array) -> str:
+    """Return evenly spaced numbers as "first last", others packed."""
+    if values.size < 2:
+        return _packed(values)
+    even = np.linspace(values[0], values[-1], values.size)
+    if np.max(np.abs(values - even)) > _EVEN * abs(even[-1] - even[0]):
+        return _packed(values)
+    return f"{float(values[0]):.9g} {float(values[-1]):.9g}"
+
+
+def _attributes(match: re.Match[str]) -> str:
+    told = json.loads(unescape(match[2]))
+    if "box" in told:
+        return f' class="panel" data-panel="{escape(json.dumps(told, ensure_ascii=False))}"'
+    return f' data-name="{escape(told["name"])}" data-x="{told["x"]}" data-y="{told["y"]}"'

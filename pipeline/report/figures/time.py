@@ -1,0 +1,256 @@
+"""Records in time: decays, steps, sine dwells (Figures 12-14), closed loops (Figures 15-17)."""
+
+from collections.abc import Sequence
+from itertools import cycle
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from pipeline.plant.chain import Array
+from pipeline.report.figures.style import (
+    CART_COLOURS,
+    CART_LINES,
+    LIFT,
+    MEASURED,
+    MODEL,
+    QUIET,
+    SECOND,
+    SHADE,
+    keep_in_sight,
+    legend_above,
+    panels,
+    plot_left,
+    plot_line,
+    plot_measured,
+    plot_model,
+    plot_second,
+    position_label,
+    small_multiples,
+)
+from pipeline.report.figures.svg import tell
+from pipeline.report.numbers import subscript
+from pipeline.report.words import clean
+from pipeline.results import (
+    FeedbackDesign,
+    HardwareCheck,
+    LogDecrement,
+    Record,
+    SinePoint,
+    StepGain,
+)
+
+_CYCLES_SHOWN = 10  # of the steady part: single cycles can still be seen
+_SINE_POINTS = 300
+_SETTLED_BAND = 0.02  # the 2 % of the settling time
+_ROOM = 1.12  # above the largest value
+_LOOPS = {"closed": "loop model", "open": "model on measured input"}
+_SMALL = 1.15  # inches, the height of a panel among many
+_ALIKE = 4.0  # times the smallest motion: larger ones are drawn on a scale of their own
+_AROUND = (0.15, 0.25)  # of a decay's length, shown before and after it
+
+
+# --------------------------------------------------------------------- decays
+
+
+def decay_figure(
+    decays: Sequence[LogDecrement], *, records: Sequence[Record], position_unit: str
+) -> Figure:
+    """Return the decays of one cart as small multiples, repeats side by side."""
+    swings = [float(np.ptp(decay.peak_y)) for decay in decays]
+    figure, axes = small_multiples(
+        [decay.experiment for decay in decays], height=_SMALL, share_y=_alike(swings)
+    )
+    for ax, decay, record in zip(axes, decays, records, strict=True):
+        plot_decay(ax, decay, record=record)
+    label_outer(axes, x="time [s]", y=position_label(decays[0].cart, position_unit))
+    legend_above(axes[0], lift=LIFT)
+    return figure
+
+
+def plot_decay(ax: Axes, decay: LogDecrement, *, record: Record) -> None:
+    """Plot one decay and what is near it: record, fit, envelope, and the extrema used."""
+    fit_t, zero = decay.fit_t - decay.release, decay.release
+    before, after = (share * (fit_t[-1] - fit_t[0]) for share in _AROUND)
+    t = record.t - zero
+    shown = (t >= min(fit_t[0], 0.0) - before) & (t <= fit_t[-1] + after)
+    t, y = t[shown], record.position(decay.cart)[shown]
+    plot_measured(ax, t, y)
+    for envelope, label in ((decay.envelope_upper, "envelope"), (decay.envelope_lower, "")):
+        plot_line(ax, fit_t, envelope, name=label or "envelope below", color=SECOND, ls="--",
+                  lw=0.9, in_legend=bool(label))  # fmt: skip
+    plot_model(ax, fit_t, decay.fit_y, label="fit")
+    ax.plot(decay.peak_t - zero, decay.peak_y, "D", ms=3.0, mfc="none", mec=MEASURED, mew=0.8,
+            label="extrema used")  # fmt: skip
+    if t[0] < 0:
+        ax.axvspan(float(t[0]), 0.0, color=SHADE, lw=0)
+
+
+def damping_figure(decays: Sequence[LogDecrement], *, position_unit: str) -> Figure:
+    """Return damping ratio against amplitude, a panel for each cart, a marker for each record."""
+    carts = sorted({decay.cart for decay in decays})
+    figure, axes = panels(1.35, columns=len(carts), share_x=False)
+    for ax, cart in zip(axes, carts, strict=True):
+        own = [decay for decay in decays if decay.cart == cart]
+        for decay, marker in zip(own, cycle("Dosv^P"), strict=False):
+            plot_damping(ax, decay, marker=marker)
+        ax.set_title(f"cart {cart}", loc="left", y=1.0)
+        ax.set_xlabel(f"swing [{position_unit}]")
+        most = np.max([decay.zeta_at_amplitude.max(axis=1) for decay in own], axis=0)
+        ax.set_xlim(0.0, _ROOM * most[0])
+        ax.set_ylim(0.0, _ROOM * most[1])
+    axes[0].set_ylabel("ζ")
+    return figure
+
+
+def plot_damping(ax: Axes, decay: LogDecrement, *, marker: str) -> None:
+    """Plot the local damping ratio against the amplitude it was seen at."""
+    amplitude, zeta = decay.zeta_at_amplitude
+    (line,) = ax.plot(amplitude, zeta, marker, ms=3.2, mfc="white", mec=MEASURED, mew=0.8, ls="-",
+                      lw=0.6, color=QUIET)  # fmt: skip
+    tell(line, amplitude, zeta, name=clean(decay.experiment))
+
+
+# ---------------------------------------------------------------------- steps
+
+
+def step_figure(
+    steps: Sequence[Sequence[StepGain]], *, records: Sequence[Record], position_unit: str
+) -> Figure:
+    """Return step records as small multiples; each entry of `steps` is one record's carts."""
+    swings = [
+        max(float(np.ptp(record.position(gain.cart))) for gain in gains)
+        for gains, record in zip(steps, records, strict=True)
+    ]
+    figure, axes = small_multiples(
+        [record.id for record in records], height=_SMALL, share_y=_alike(swings)
+    )
+    for ax, gains, record in zip(axes, steps, records, strict=True):
+        plot_step(ax, gains, record=record)
+    label_outer(axes, x="time [s]", y=f"position [{position_unit}]")
+    legend_above(axes[0], columns=5, lift=LIFT)
+    return figure
+
+
+def plot_step(ax: Axes, gains: Sequence[StepGain], *, record: Record) -> None:
+    """Plot the positions of all carts of a step record, with the levels that were read off."""
+    for gain in gains:
+        _plot_cart(ax, record.t, record.position(gain.cart), cart=gain.cart)
+        for edge in gain.edges:
+            for window, level in (
+                (edge.window_before, edge.level_before),
+                (edge.window_after, edge.level_after),
+            ):
+                ax.plot(window, (level, level), color=MEASURED, lw=2.2, solid_capstyle="butt")
+    ax.plot([], [], color=MEASURED, lw=2.2, label="level")
+    for t in sorted({edge.t for gain in gains for edge in gain.edges}):
+        ax.axvline(t, color=QUIET, lw=0.8, ls=":")
+
+
+def _plot_cart(ax: Axes, t: Array, y: Array, *, cart: int, lw: float = 1.0) -> None:
+    """Plot one of several carts that share a panel: its colour, and its own kind of line."""
+    style = (cart - 1) % len(CART_LINES)
+    plot_line(ax, t, y, name=f"x{subscript(cart)}", color=CART_COLOURS[style],
+              ls=CART_LINES[style], lw=lw)  # fmt: skip
+
+
+# ---------------------------------------------------------------------- sines
+
+
+def sine_figure(points: Sequence[SinePoint], *, record: Record, position_unit: str) -> Figure:
+    """Return one dwell, a panel for each cart, the transient shaded."""
+    figure, axes = panels(*[1.0] * len(points))
+    for ax, point in zip(axes, points, strict=True):
+        plot_sine(ax, point, record=record)
+        ax.set_ylabel(position_label(point.cart, position_unit))
+    legend_above(axes[0])
+    axes[-1].set_xlabel("time [s]")
+    end = max(p.steady_from for p in points) + _CYCLES_SHOWN * 2 * np.pi / points[0].omega
+    axes[0].set_xlim(float(record.t[0]), min(float(record.t[-1]), end))
+    return figure
+
+
+def plot_sine(ax: Axes, point: SinePoint, *, record: Record) -> None:
+    """Plot one cart's motion, transient shaded, the steady amplitude as a band."""
+    end = point.steady_from + _CYCLES_SHOWN * 2 * np.pi / point.omega
+    shown = record.t <= end
+    t, y = record.t[shown], record.position(point.cart)[shown]
+    steady = t >= point.steady_from
+    plot_line(ax, t, y, name="record", color=QUIET, lw=0.7, in_legend=False)
+    plot_measured(ax, t, y, most=_SINE_POINTS)
+    ax.axvspan(float(t[0]), point.steady_from, color=SHADE, lw=0, label="transient")
+    # The middle of the steady swing: mean over samples, near enough for ten cycles.
+    middle = float(np.mean(y[steady])) if np.any(steady) else float(np.mean(y))
+    for k, level in enumerate((middle - point.amplitude, middle + point.amplitude)):
+        ax.plot((point.steady_from, float(t[-1])), (level, level), color=MODEL, lw=1.1,
+                label="" if k else "steady amplitude")  # fmt: skip
+
+
+# ------------------------------------------------------------------- feedback
+
+
+def hardware_figure(checks: Sequence[Sequence[HardwareCheck]], *, position_unit: str) -> Figure:
+    """Return one run: each cart, and below it what its models leave.
+
+    An entry holds the one or two models of a cart.
+    """
+    figure, axes = panels(*[1.05, 0.45] * len(checks))
+    for above, below, group in zip(axes[::2], axes[1::2], checks, strict=True):
+        plot_hardware(above, group)
+        above.set_ylabel(position_label(group[0].cart, position_unit))
+        left = {_LOOPS[check.loop]: check.measured - check.model for check in group}
+        plot_left(below, group[0].t, left)
+        keep_in_sight(below, group[0].measured - np.median(group[0].measured))
+        below.set_ylabel(f"left [{position_unit}]")
+    legend_above(axes[0])
+    axes[-1].set_xlabel("time [s]")
+    return figure
+
+
+def plot_hardware(ax: Axes, checks: Sequence[HardwareCheck]) -> None:
+    """Plot measured points against the simulated loop, and the model under the measured input."""
+    plot_measured(ax, checks[0].t, checks[0].measured)
+    for check, plot in zip(checks, (plot_model, plot_second), strict=False):
+        plot(ax, check.t, check.model, label=_LOOPS[check.loop])
+    keep_in_sight(ax, checks[0].measured)
+
+
+def design_figure(design: FeedbackDesign, *, position_unit: str, input_unit: str) -> Figure:
+    """Return the simulated step of the designed loop: positions above, input below."""
+    figure, (above, below) = panels(1.5, 0.8)
+    plot_design(above, design)
+    above.set_ylabel(f"position [{position_unit}]")
+    legend_above(above, columns=5)
+    below.step(design.t, design.u, where="post", color=MODEL, lw=1.0, label="u")
+    below.set_ylabel(f"u [{input_unit}]")
+    below.set_xlabel("time [s]")
+    return figure
+
+
+def plot_design(ax: Axes, design: FeedbackDesign) -> None:
+    """Plot all carts' positions, the chosen cart's goal and its 2 % band."""
+    r = design.reference
+    ax.axhspan(r - _SETTLED_BAND * abs(r), r + _SETTLED_BAND * abs(r), color=SHADE, lw=0)
+    ax.axhline(r, color=QUIET, lw=0.8)
+    for cart, y in enumerate(design.y, start=1):
+        _plot_cart(ax, design.t, y, cart=cart, lw=1.8 if cart == design.cart else 1.0)
+    if design.settling_time is not None:
+        ax.axvline(design.settling_time, color=QUIET, lw=0.8, ls=":")
+
+
+# -------------------------------------------------------------------- helpers
+
+
+def _alike(swings: Sequence[float]) -> bool:
+    """Return whether motions are of a size to be drawn on one scale."""
+    return max(swings) < _ALIKE * min(swings)
+
+
+def label_outer(axes: Sequence[Axes], *, x: str, y: str) -> None:
+    """Title the axes at the left and at the lower end of each column."""
+    columns = len({ax.get_position().x0 for ax in axes})
+    for i, ax in enumerate(axes):
+        if i % columns == 0:
+            ax.set_ylabel(y)
+        if i + columns >= len(axes):
+            ax.set_xlabel(x)

@@ -1,0 +1,1 @@
+"""Mathematics as a small tree, which every page can set."""

@@ -1,0 +1,122 @@
+"""A document as one self-contained HTML file: nothing loaded from anywhere, one script of ours."""
+
+import base64
+import hashlib
+import math
+import re
+from collections.abc import Sequence
+from functools import cache
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup, escape
+
+from pipeline.report.document import Block, Document, Picture, Table, Tiles, flat
+from pipeline.report.figures.style import MEASURED, MODEL, QUIET, SECOND, SHADE, THIRD
+from pipeline.report.figures.ticks import GRID
+from pipeline.report.math.tree import Term, to_mathml
+from pipeline.resources import TEMPLATES
+
+# The style sheet says what each colour is in light and in dark.
+_ROLES = {
+    MEASURED: "ink", MODEL: "model", SECOND: "second", THIRD: "third", QUIET: "quiet",
+    SHADE: "shade", GRID: "grid", "#444444": "axis", "#555555": "mark",
+}  # fmt: skip
+_TITLE = re.compile(r"<title>.*?</title>", re.DOTALL)
+_NARROW = " .,()"  # half a digit wide
+_WIDE = "±×%"  # wider than a digit
+
+
+def render_html(document: Document) -> str:
+    """Return the page; every text is escaped, only our own SVG, MathML and script are not."""
+    script = "".join(_script(name) for name in _scripts(document))
+    return (
+        _environment()
+        .get_template("report.html.j2")
+        .render(
+            document=document,
+            math_font=_math_font(),
+            script=Markup(script),
+            script_hash=Markup(_hash(script)),
+        )
+    )
+
+
+def render_fragment(blocks: Sequence[Block]) -> str:
+    """Return blocks as a piece of a page that is not ours, such as a notebook; no script."""
+    return _environment().get_template("fragment.html.j2").render(blocks=blocks)
+
+
+def _scripts(document: Document) -> list[str]:
+    """Return the scripts that a page has something for."""
+    blocks = [block for section in document.sections for block in flat(section.blocks)]
+    names = ["page.js"]
+    if any(isinstance(block, Picture) for block in blocks):
+        names.append("explore.js")
+    if any(isinstance(block, Table) and block.finder for block in blocks):
+        names.append("finder.js")
+    return names
+
+
+@cache
+def _script(name: str) -> str:
+    return (TEMPLATES / name).read_text(encoding="utf-8")
+
+
+@cache
+def _environment() -> Environment:
+    environment = Environment(
+        loader=FileSystemLoader(TEMPLATES),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"mathml": _mathml, "svg": _svg, "tails": _tails, "board": _board}
+    return environment
+
+
+def _mathml(term: Term, display: bool = False, alt: str = "") -> Markup:
+    mathml = to_mathml(term, display=display)  # every leaf is escaped
+    return Markup(mathml.replace("<math", f'<math alttext="{escape(alt)}"', 1))
+
+
+def _svg(picture: Picture) -> Markup:
+    """Return the drawing, which matplotlib has escaped, in the colours of the page.
+
+    Its title becomes a label: browsers show a title wherever the pointer rests.
+    """
+    named = f'<svg aria-label="{escape(picture.alt)}" '
+    svg = _TITLE.sub("", picture.svg, count=1).replace("<svg ", named, 1)
+    svg = svg.replace("#ffffff", "var(--paper)")
+    for colour, role in _ROLES.items():
+        svg = svg.replace(colour, f"var(--f-{role})")
+    return Markup(svg)
+
+
+def _tails(table: Table) -> list[str]:
+    """Return how wide the part from the decimal mark on is in each column, "" where none is."""
+    columns = zip(*table.rows, strict=True)
+    return [
+        f"{math.ceil(max(_digits_wide(cell.parts[1]) for cell in column))}ch" if how == "d" else ""
+        for how, column in zip(table.align, columns, strict=False)
+    ]
+
+
+def _board(board: Tiles) -> str:
+    """Return how a board is laid out: letters of the longest value, and tiles side by side."""
+    return f"--least:{board.longest}ch;--across:{board.across}"
+
+
+def _digits_wide(text: str) -> float:
+    return sum(0.5 if c in _NARROW else 1.5 if c in _WIDE else 1.0 for c in text)
+
+
+def _hash(script: str) -> str:
+    """Return the hash by which the page's policy knows its one script."""
+    return f"sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}"
+
+
+@cache
+def _math_font() -> str:
+    """Return the font of the formulas: many phones have none, and brackets would not grow."""
+    return base64.b64encode((TEMPLATES / "fonts" / "mathematics.woff").read_bytes()).decode()

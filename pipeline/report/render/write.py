@@ -1,0 +1,25 @@
+"""Write a document as HTML and as PDF, with its figures beside them."""
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from pipeline.output import clear_files, own_folder, write_file
+from pipeline.report.document import Document
+from pipeline.report.figures.svg import plain_svg
+from pipeline.report.render.html import render_html
+from pipeline.report.render.pdf import render_pdf
+
+
+def write_document(document: Document, out: Path, *, name: str, pdf: bool) -> None:
+    """Write a document as `name.html`, `name.pdf` and `figures/*.svg` into the folder `out`."""
+    figures = own_folder(out, "figures")
+    figures.mkdir(parents=True, exist_ok=True)
+    clear_files(figures, "*.svg")
+    clear_files(out, f"{name}.pdf")
+    with ThreadPoolExecutor(max_workers=1) as beside:  # typst works outside the interpreter's lock
+        printed = beside.submit(render_pdf, document) if pdf else None
+        write_file(out / f"{name}.html", render_html(document))
+        for picture in document.pictures():
+            write_file(figures / f"{picture.name}.svg", plain_svg(picture.svg))
+        if printed:
+            write_file(out / f"{name}.pdf", printed.result())

@@ -1,0 +1,1 @@
+"""What sections of several reports share, and the sections on measurements and control."""

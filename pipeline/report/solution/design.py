@@ -1,0 +1,305 @@
+"""The controller worked: sampled plant, gains by Ackermann's formula or Riccati's equation."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solve_discrete_are
+
+from pipeline.plant.chain import Array, Chain, ComplexArray
+from pipeline.plant.loop import discretise
+from pipeline.report.document import Block, Code, bullet_list, paragraph, spans
+from pipeline.report.equations.algebra import value_term
+from pipeline.report.equations.model import formula, matlab_matrix, number_matrix
+from pipeline.report.math.tex import from_tex
+from pipeline.report.math.tree import Math, Term, matrix, parens, power, row, total
+from pipeline.report.numbers import percent, significant
+from pipeline.report.sections.page import Page
+from pipeline.report.tables import cell, make_table, margin_rows
+from pipeline.results import FeedbackDesign
+
+_INVERSE = row("−", "1")
+_WEIGHED = r"{R + \Gamma^T P \Gamma}"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class WorkedDesign:
+    """The numbers on the way to the gains.
+
+    Attributes
+    ----------
+    phi (2n, 2n), gamma (2n,) : the plant over one sample.
+    z : (2n,) poles that the loop has, in the z plane.
+    own, wanted : (2n + 1,) the polynomials of phi and of z, in falling powers.
+    P : (2n, 2n) cost to go of the linear quadratic regulator, or None.
+    gains : (2n,) by the formula shown; prefilter from them.
+    """
+
+    phi: Array
+    gamma: Array
+    z: ComplexArray
+    own: Array
+    wanted: Array
+    P: Array | None
+    gains: Array
+    prefilter: float
+
+
+def work_design(chain: Chain, design: FeedbackDesign) -> WorkedDesign:
+    """Work the gains of a design out anew, by the formulas a textbook has."""
+    phi, gamma = discretise(chain, design.sample_time)
+    poles = design.poles if design.requested_poles is None else design.requested_poles
+    z = np.exp(poles * design.sample_time)
+    wanted = _polynomial_of(z)
+    if design.Q is None:
+        P, gains = None, ackermann(phi, gamma, wanted)
+    else:
+        R = float(design.R or 1.0)
+        P = np.asarray(solve_discrete_are(phi, gamma[:, None], design.Q, [[R]]))
+        gains = (gamma @ P @ phi) / (R + gamma @ P @ gamma)
+    loop = np.eye(gamma.size) - phi + np.outer(gamma, gains)
+    level = np.linalg.solve(loop, gamma)[2 * design.cart - 2]
+    return WorkedDesign(
+        phi=phi,
+        gamma=gamma,
+        z=z,
+        own=_polynomial_of(np.linalg.eigvals(phi)),
+        wanted=wanted,
+        P=P,
+        gains=gains,
+        prefilter=float(1 / level),
+    )
+
+
+def _polynomial_of(roots: np.ndarray) -> Array:
+    """Return the monic polynomial of roots that come in conjugate pairs, in falling powers."""
+    return np.asarray(np.real(np.poly(roots)), dtype=np.float64)
+
+
+def ackermann(phi: Array, gamma: Array, wanted: Array) -> Array:
+    """Return the gains that give phi - gamma G the polynomial `wanted` (falling powers).
+
+    The columns of the controllability matrix are scaled to one: the formula is the same, and its
+    rounding smaller.
+    """
+    n = gamma.size
+    columns, value = [gamma], np.zeros_like(phi)
+    for _ in range(n - 1):
+        columns.append(phi @ columns[-1])
+    reach = np.column_stack(columns)
+    scale = np.abs(reach).max(axis=0)
+    last = np.linalg.solve((reach / scale).T, np.eye(n)[-1])
+    for coefficient in wanted:
+        value = value @ phi + coefficient * np.eye(n)
+    return last @ value / scale[-1]
+
+
+def design_blocks(page: Page) -> list[Block]:
+    """Work the state feedback out, with every number that a student needs to check his own."""
+    design, chain = page.analysis.feedback, page.analysis.chain
+    if design is None or chain is None:
+        return []
+    try:
+        worked = work_design(chain, design)
+    except np.linalg.LinAlgError:
+        return [paragraph("This plant's numbers lie too far apart for the formulas of a textbook.")]
+    T = significant(design.sample_time)
+    return [
+        paragraph(
+            f"The controller runs every {T} s and its effort acts one sample later. The gains "
+            "multiply the state predicted for that moment, so they are those of the sampled plant "
+            "without delay, x[k+1] = Φ x[k] + Γ u[k]:"
+        ),
+        formula(
+            row(
+                matrix([["Φ", "Γ"], ["0", "1"]]),
+                "=",
+                "exp",
+                parens(matrix([["A", "B"], ["0", "0"]]), "T"),
+            )
+        ),
+        _numbers("Φ", worked.phi, "Phi"),
+        _numbers("Γ", worked.gamma[:, None], "Gamma"),
+        *(_regulator(design, worked) if worked.P is not None else _placement(design, worked)),
+        _numbers("G", worked.gains[None, :], "G"),
+        paragraph(
+            f"The prefilter makes the static gain from the reference to cart {design.cart} one; "
+            "c picks its position:"
+        ),
+        formula(
+            row(
+                from_tex(r"\text{prefilter} = \frac{1}{c (I - \Phi + \Gamma G)^{-1} \Gamma}"),
+                "≈",
+                value_term(worked.prefilter),
+            )
+        ),
+        _pole_table(design, worked, number=page.table_number()),
+        paragraph("The same in Matlab:"),
+        Code(_matlab(design)),
+        paragraph(
+            f"Simulated with the delay and the input's limit, the step overshoots by "
+            f"{percent(design.overshoot_percent)}, settles "
+            + (
+                f"in {significant(design.settling_time, digits=3)} s"
+                if design.settling_time is not None
+                else "not within the time simulated"
+            )
+            + f" and needs {significant(design.peak_input, digits=3)} {page.drive} at most."
+        ),
+        *_margins(design),
+        paragraph("Gains are not unique. A student's own are right where"),
+        bullet_list(
+            spans(text)
+            for text in (
+                "the poles of Φ − ΓG with the student's Φ and Γ lie inside the unit circle, and "
+                "are the ones the student asked for;",
+                f"the prefilter is one over the static gain of the student's own loop to cart "
+                f"{design.cart};",
+                "the step, simulated with the reference chain, meets the goal of the task.",
+            )
+        ),
+    ]
+
+
+def _margins(design: FeedbackDesign) -> list[Block]:
+    rows = margin_rows(design.margins)
+    found = [f"{name} {value}{unit} {at}".strip() for name, value, unit, at in rows]
+    if not found:
+        return []
+    return [
+        paragraph(
+            "Cut where the effort drives cart 1, with the controller's observer and the delay in "
+            f"it, the loop has: {', '.join(found)}."
+        )
+    ]
+
+
+def _regulator(design: FeedbackDesign, worked: WorkedDesign) -> list[Block]:
+    assert design.Q is not None
+    assert worked.P is not None
+    return [
+        paragraph(
+            "The linear quadratic regulator minimises the sum of xᵀQx + R u² over all samples. Q "
+            "weighs the energy in the springs (positions) and in the masses (velocities); R is "
+            "one over the static gain of cart 1, so that both are energies:"
+        ),
+        _numbers("Q", design.Q, "Q"),
+        formula(row("R", "≈", value_term(float(design.R or 1.0)))),
+        paragraph("The cost to go, xᵀPx, obeys Riccati's equation:"),
+        formula(
+            from_tex(rf"P = Q + \Phi^T P \Phi - \frac{{\Phi^T P \Gamma \Gamma^T P \Phi}}{_WEIGHED}")
+        ),
+        _numbers("P", worked.P, "P"),
+        paragraph("and gives the gains:"),
+        formula(from_tex(rf"G = \frac{{\Gamma^T P \Phi}}{_WEIGHED}")),
+    ]
+
+
+def _numbers(letter: str, values: Array, name: str) -> Block:
+    """Return a matrix with its numbers, to be copied with all digits under a plain name."""
+    return formula(row(letter, "=", number_matrix(values)), copy=matlab_matrix(name, values))
+
+
+def _placement(design: FeedbackDesign, worked: WorkedDesign) -> list[Block]:
+    poles = design.poles if design.requested_poles is None else design.requested_poles
+    slow = poles[np.argmin(np.abs(poles))]
+    zeta = float(-slow.real / abs(slow))
+    words = (
+        f"The slowest pair has ω = {significant(float(abs(slow)), digits=3)} rad/s and ζ = "
+        f"{significant(zeta, digits=3)}; alone it would overshoot by "
+        f"{percent(_overshoot(zeta))} and settle in about 4/(ζω) = "
+        f"{significant(float(-4 / slow.real), digits=3)} s. "
+        if slow.imag != 0 and slow.real < 0
+        else ""
+    )
+    return [
+        paragraph(
+            f"{words}Every pole s becomes z = exp(sT), and the poles multiply out to the wanted "
+            "polynomial; the plant's own is that of Φ:"
+        ),
+        formula(_polynomial("p", worked.wanted)),
+        formula(_polynomial("a", worked.own)),
+        paragraph(
+            "Ackermann's formula puts the plant's matrix into the wanted polynomial; the last row "
+            "of the inverse of the controllability matrix gives the gains:"
+        ),
+        formula(
+            row(
+                "G", "=", matrix([[*["0"] * (worked.gamma.size - 1), "1"]]),
+                power(_controllability(worked.gamma.size), _INVERSE), "p", parens("Φ"),
+            )
+        ),
+    ]  # fmt: skip
+
+
+def _controllability(n: int) -> Math:
+    columns: list[Term] = ["Γ", row("Φ", "Γ")]
+    columns += ["…", row(power("Φ", str(n - 1)), "Γ")] if n > 2 else []
+    return matrix([columns])
+
+
+def _polynomial(name: str, falling: Array) -> Math:
+    degree = falling.size - 1
+    terms: list[Term] = []
+    for power_, value in zip(range(degree, -1, -1), falling, strict=True):
+        z: list[Term] = [power("z", str(power_))] if power_ > 1 else ["z"] if power_ else []
+        number = [] if power_ == degree else [value_term(value)]
+        terms.append(row(*number, *z))
+    return row(name, parens("z"), "=", total(terms))
+
+
+def _matlab(design: FeedbackDesign) -> str:
+    """Return the commands that give the same gains, A and B being those of the state model."""
+    c = f"c = zeros(1, {design.gains.size}); c({2 * design.cart - 1}) = 1;"
+    poles = design.poles if design.requested_poles is None else design.requested_poles
+    listed = "; ".join(
+        f"{p.real:.10g}{p.imag:+.10g}i" if p.imag else f"{p.real:.10g}" for p in poles
+    )
+    gains = (
+        [f"G = place(Phi, Gamma, exp(T*[{listed}]));"]
+        if design.Q is None
+        else [
+            matlab_matrix("Q", design.Q),
+            f"R = {design.R:.10g};",
+            "G = dlqr(Phi, Gamma, Q, R);",
+        ]
+    )
+    lines = [
+        f"T = {design.sample_time:.10g};  sampled = c2d(ss(A, B, eye({design.gains.size}), 0), T);",
+        "Phi = sampled.A;  Gamma = sampled.B;",
+        *gains,
+        f"{c}  prefilter = 1/(c/(eye({design.gains.size}) - Phi + Gamma*G)*Gamma)",
+    ]
+    return "\n".join(lines)
+
+
+def _overshoot(zeta: float) -> float:
+    return 100 * float(np.exp(-np.pi * zeta / np.sqrt(1 - zeta**2))) if zeta < 1 else 0.0
+
+
+def _pole_table(design: FeedbackDesign, worked: WorkedDesign, *, number: int) -> Block:
+    order = np.lexsort((worked.z.imag, -np.abs(worked.z)))
+    s = np.log(worked.z[order]) / design.sample_time
+    return make_table(
+        number,
+        "Poles of the worked loop, in the z plane and as continuous equivalents.",
+        ("z", "|z|", "s [rad/s]", "Frequency [rad/s]", "Damping ratio"),
+        [
+            [
+                cell(_complex(z)),
+                cell(significant(abs(z))),
+                cell(_complex(pole)),
+                cell(significant(abs(pole), digits=3)),
+                cell(significant(-pole.real / abs(pole), digits=3)),
+            ]
+            for z, pole in zip(worked.z[order], s, strict=True)
+        ],
+        "rrrrr",
+    )
+
+
+def _complex(value: complex) -> str:
+    real = significant(value.real)
+    if value.imag == 0:
+        return real
+    sign = "+" if value.imag > 0 else "−"
+    return f"{real} {sign} {significant(abs(value.imag))} j"

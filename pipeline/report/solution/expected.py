@@ -1,0 +1,236 @@
+"""What a rubric would expect: every number with its tolerance, and why so wide."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pipeline import __version__
+from pipeline.plant.chain import Array, Chain
+from pipeline.report.document import Block, bullet_list, paragraph, spans
+from pipeline.report.equations import derivation
+from pipeline.report.equations.algebra import evaluate, work_out
+from pipeline.report.numbers import percent, significant, unit_text
+from pipeline.report.sections.page import Page
+from pipeline.report.tables import cell, make_table
+from pipeline.report.words import clean, name_span
+from pipeline.results import Analysis
+
+SCHEMA = "cartlab-solution/1"
+# What two careful teams on one bench differ by: gains and frequencies by some percent, damping
+# ratios by ten times that, since they are small and dry friction adds to them.
+GAIN_AND_FREQUENCY_TOLERANCE = 0.03
+DAMPING_TOLERANCE = 0.30
+SIGMAS = 3.0  # standard errors of the reference itself that widen a tolerance
+
+
+@dataclass(frozen=True, kw_only=True)
+class Expected:
+    """A parameter with the half-width of what is accepted, both in its unit."""
+
+    name: str
+    unit: str
+    value: float
+    std: float | None
+    tolerance: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ExpectedModel:
+    """A (2n, 2n) and B (2n,) with what the parameters' tolerances make of every entry."""
+
+    A: Array
+    B: Array
+    A_tolerance: Array
+    B_tolerance: Array
+
+
+def expected_parameters(analysis: Analysis) -> tuple[Expected, ...]:
+    """Return the final estimates with their tolerances."""
+    found = []
+    for row in analysis.rows:
+        if row.final is None:
+            continue
+        share = _share(row.name) * abs(row.final.value)
+        found.append(
+            Expected(
+                name=row.name,
+                unit=row.unit,
+                value=row.final.value,
+                std=row.final.std,
+                tolerance=max(share, SIGMAS * (row.final.std or 0.0)),
+            )
+        )
+    return tuple(found)
+
+
+def _share(name: str) -> float:
+    return (
+        DAMPING_TOLERANCE
+        if name.startswith(("zeta", "damping"))
+        else (GAIN_AND_FREQUENCY_TOLERANCE)
+    )
+
+
+def expected_model(chain: Chain, tolerances: Mapping[str, float]) -> ExpectedModel:
+    """Return A and B, and how far each entry moves when the table moves within its tolerances.
+
+    The moves are combined as independent errors are, by the root of the sum of squares.
+    """
+    A, B, _, _ = chain.state_space()
+    if not chain.is_tied or chain.n > derivation.MOST_CARTS:
+        zero = np.zeros_like(A)
+        return ExpectedModel(A=A, B=B[:, 0], A_tolerance=zero, B_tolerance=zero[:, 0])
+    table = derivation.given(chain)
+    steps = derivation.state_steps(chain.n)
+    rows, column = derivation.state_entries(chain.n)
+    texts = [*(text for row in rows for text in row), *column]
+
+    def entries(values: Mapping[str, float]) -> Array:
+        worked = work_out(steps, values)
+        return np.array([evaluate(text, worked) for text in texts])
+
+    exact = entries(table)
+    moves = [
+        entries({**table, name: table[name] + tolerance}) - exact
+        for name, tolerance in tolerances.items()
+        if name in table
+    ]
+    moved = np.sqrt(np.sum(np.square(moves), axis=0))
+    size = A.size
+    return ExpectedModel(
+        A=A, B=B[:, 0], A_tolerance=moved[:size].reshape(A.shape), B_tolerance=moved[size:]
+    )
+
+
+def expected_blocks(page: Page) -> list[Block]:
+    """Return the tables of what is expected, and how to judge a hand-in by them."""
+    analysis = page.analysis
+    parameters = expected_parameters(analysis)
+    if not parameters or analysis.chain is None:
+        return []
+    blocks: list[Block] = [
+        paragraph(
+            "Gains and frequencies are accepted within "
+            f"{100 * GAIN_AND_FREQUENCY_TOLERANCE:g} %, damping ratios within "
+            f"{100 * DAMPING_TOLERANCE:g} %, and within {SIGMAS:g} standard errors of the "
+            "reference where that is more; half a unit of the last digit that a student typed "
+            "comes on top."
+        ),
+        make_table(
+            page.table_number(),
+            "Parameters of the transfer functions: expected, and accepted.",
+            ("Parameter", "Unit", "Expected", "± accepted", "from", "to", "In Hz: a slip"),
+            [
+                [
+                    cell(name_span(p.name)),
+                    cell(unit_text(clean(p.unit)) or "1"),
+                    cell(significant(p.value)),
+                    cell(percent(100 * p.tolerance / abs(p.value)) if p.value else "–"),
+                    cell(significant(p.value - p.tolerance)),
+                    cell(significant(p.value + p.tolerance)),
+                    cell(
+                        significant(p.value / (2 * np.pi)) if p.name.startswith("omega") else "–",
+                        "quiet",
+                    ),
+                ]
+                for p in parameters
+            ],
+            "llrrrrr",
+        ),
+    ]
+    if analysis.chain.is_tied and analysis.chain.n <= derivation.MOST_CARTS:
+        model = expected_model(analysis.chain, {p.name: p.tolerance for p in parameters})
+        blocks += [_state_table(model, number=page.table_number())]
+    return [*blocks, paragraph("How to judge a hand-in:"), _advice(analysis)]
+
+
+def _state_table(model: ExpectedModel, *, number: int) -> Block:
+    rows = []
+    for i, line in enumerate(model.A):
+        for j, value in enumerate(line):
+            if model.A_tolerance[i, j] > 0:
+                name = f"A({i + 1}, {j + 1})"
+                rows.append(_state_row(name, float(value), float(model.A_tolerance[i, j])))
+    rows += [
+        _state_row(f"B({i + 1})", float(value), float(tolerance))
+        for i, (value, tolerance) in enumerate(zip(model.B, model.B_tolerance, strict=True))
+        if tolerance > 0
+    ]
+    return make_table(
+        number,
+        "Entries of the state model: expected, and how far they move when every parameter moves "
+        "within its own tolerance. Entries not listed are 0 or 1 exactly.",
+        ("Entry", "Expected", "± accepted"),
+        rows,
+        "lrr",
+    )
+
+
+def _state_row(name: str, value: float, tolerance: float) -> list:
+    return [cell(name), cell(significant(value)), cell(percent(100 * tolerance / abs(value)))]
+
+
+def _advice(analysis: Analysis) -> Block:
+    advice = [
+        "A and B first against the student's own table, by the steps above: only rounding may "
+        "differ. Then the table against this one.",
+        "Where an entry's tolerance is large, it is a small difference of large numbers: there the "
+        "steps count, not the number.",
+        "Initial estimates are right where they follow from the student's own recordings; they "
+        "need not be near the final ones.",
+    ]
+    if analysis.carts > 1:
+        advice.append(
+            "The laws under “What must agree” tell a table that was fitted from one that was "
+            "copied together."
+        )
+    return bullet_list(spans(text) for text in advice)
+
+
+def solution_dict(analysis: Analysis) -> dict[str, Any]:
+    """Return the reference as plain data: what `solution.json` holds."""
+    parameters = expected_parameters(analysis)
+    chain, design = analysis.chain, analysis.feedback
+    model = chain and expected_model(chain, {p.name: p.tolerance for p in parameters})
+    return {
+        "schema": SCHEMA,
+        "submission": {
+            "title": analysis.title,
+            "carts": analysis.carts,
+            "springs": list(analysis.springs),
+            "units": {"position": analysis.position_unit, "input": analysis.input_unit},
+        },
+        "parameters": [
+            {
+                "name": p.name,
+                "unit": p.unit,
+                "value": p.value,
+                "std": p.std,
+                "tolerance": p.tolerance,
+            }
+            for p in parameters
+        ],
+        "state_space": model
+        and {
+            "A": model.A,
+            "A_tolerance": model.A_tolerance,
+            "B": model.B[:, None],
+            "B_tolerance": model.B_tolerance[:, None],
+        },
+        "feedback": design
+        and {
+            "cart": design.cart,
+            "method": design.method,
+            "sample_time": design.sample_time,
+            "gains": design.gains,
+            "prefilter": design.prefilter,
+            "poles": [[pole.real, pole.imag] for pole in design.poles],
+            "overshoot_percent": design.overshoot_percent,
+            "settling_time": design.settling_time,
+            "peak_input": design.peak_input,
+            "margins": design.margins and vars(design.margins),
+        },
+        "provenance": {"version": __version__, "files": dict(sorted(analysis.files.items()))},
+    }

@@ -1,0 +1,278 @@
+"""The worked model: free bodies, transfer functions, and the state model put in step by step."""
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from pipeline.report.document import Block, Formula, Heading, Paragraph, paragraph, spans
+from pipeline.report.equations import derivation
+from pipeline.report.equations.algebra import (
+    Equation,
+    addends,
+    evaluate,
+    shown,
+    shown_with,
+    value_term,
+    work_out,
+)
+from pipeline.report.equations.model import formula, symbolic_transfer_functions
+from pipeline.report.figures.carts import free_body_figure
+from pipeline.report.math.tree import Math, Term, lines, matrix, row, total
+from pipeline.report.sections.page import Page
+from pipeline.report.tables import fitted_chain_table
+from pipeline.report.words import rich
+
+_MOST_ADDENDS = 3  # of a sum whose products are written out with numbers
+_A_LINE = 7  # terms of a sum
+
+
+def motion_blocks(page: Page) -> list[Block]:
+    """Derive the equations of motion from the carts cut free."""
+    springs = page.analysis.springs
+    n = len(springs) - 1
+    return [
+        paragraph(
+            "Cut every cart free. A spring pulls with its stiffness times its stretch, a bearing "
+            "brakes with its damping times the speed, the motor pushes cart 1 with u, in input "
+            "units. Walls do not move."
+        ),
+        page.picture(
+            "free-bodies",
+            free_body_figure(springs),
+            caption="The carts cut free, with all forces along the rail, as they act where the "
+            "expression beside them is positive.",
+            alt=f"Free-body diagrams of {n} carts: springs and bearings pull each back, the motor "
+            "pushes cart 1.",
+        ),
+        paragraph("Mass times acceleration is the sum of the forces on each cart:"),
+        _written(derivation.newton(springs)),
+        paragraph(
+            "Transformed with all carts at rest at the start, and sorted by position, with "
+            "everything of the cart itself on the left:"
+        ),
+        _written(derivation.laplace(springs)),
+    ]
+
+
+def transfer_blocks(page: Page) -> list[Block]:
+    """Derive the transfer functions by eliminating the carts from the last to the first."""
+    springs = page.analysis.springs
+    n = len(springs) - 1
+    symbolic = symbolic_transfer_functions(springs)
+    if not all(springs[1:-1]) or n > derivation.MOST_CARTS:
+        return []
+    if n == 1:
+        return [
+            rich_paragraph(
+                "X_1/U follows at once. With the stiffness taken out it has the paper's form, "
+                "where K = 1/k, the square of omega_n is k/m, and 2 zeta omega_n is c/m:"
+                if symbolic
+                else "X_1/U follows at once: there is no spring, so it has no static gain."
+            ),
+            *([symbolic] if symbolic else [_written([Equation("X_1/U", "1/(m*s**2+c*s)")])]),
+        ]
+    last = f"carts 1 and {n}" if n > 2 else "the two carts"
+    blocks: list[Block] = [
+        paragraph(
+            "Each cart alone, the others held, is a cart on all its springs. It has a frequency "
+            "and a damping of its own:"
+        ),
+        _written(derivation.single_carts(springs)),
+        paragraph(
+            "Divide every equation by its mass, and write P(s) with the cart's index for its own "
+            "polynomial, s² + 2ζω s + ω²:"
+        ),
+        _written(derivation.per_mass(n)),
+        paragraph(
+            f"Eliminate from the last cart on. What couples {last} along the way is κ, a spring "
+            "squared over the two masses it joins:"
+        ),
+        _written(derivation.elimination(n)),
+        paragraph(
+            "Δ(s) is the characteristic polynomial: all transfer functions share it. The zeros of "
+            "a cart are the poles of what lies beyond it, with the cart itself held."
+            + (" N(s) belongs to carts 2 and 3." if n == 3 else "")
+        ),
+        _written(derivation.transfer(n)),
+        paragraph(
+            "At s = 0 they give the static gains; an index 0 marks the constant term of a "
+            "polynomial:"
+        ),
+        _written(derivation.static_gains(n)),
+    ]
+    if symbolic:
+        blocks += [
+            paragraph(
+                "Divide each polynomial by its constant term, Δ(s) to D(s): every quadratic factor "
+                "becomes one of the paper's, and what stands in front is the static gain."
+            ),
+            symbolic,
+        ]
+    return blocks
+
+
+# ------------------------------------------------------------------- the state model
+
+
+def state_blocks(page: Page) -> list[Block]:
+    """Put the numbers in: from the table of parameters to A and B, and to masses and springs."""
+    analysis = page.analysis
+    fit, springs = analysis.fit, analysis.springs
+    if fit is None:
+        return []
+    chain = fit.chain
+    n = chain.n
+    table = fitted_chain_table(
+        fit, number=page.table_number(), position_unit=page.position, input_unit=page.drive
+    )
+    if not chain.is_tied or n > derivation.MOST_CARTS:
+        return [
+            paragraph("No wall holds the carts, so A and B come from masses and dampings at once."),
+            table,
+        ]
+    values = derivation.work_state_model(chain)
+    values = work_out(derivation.physical(springs), values)
+    blocks: list[Block] = [
+        paragraph(
+            "From the final estimates to the entries of A and B. Numbers are shown with five "
+            "digits and carried with all of them; lengths, times and inputs are in "
+            f"{page.position}, s and {page.drive}."
+        )
+    ]
+    if unnamed := derivation.unnamed(chain):
+        known: list[Math] = [row(shown(k), "=", value_term(v)) for k, v in unnamed.items()]
+        blocks += [
+            paragraph("The zeros of the inner carts have no names, but coefficients in the fit:"),
+            _together(known),
+        ]
+    for title, words, equations in _steps(n):
+        blocks += [Heading(spans(title)), *([rich_paragraph(words)] if words else [])]
+        blocks += worked(equations, values)
+    blocks += [Heading(spans("The state model")), *_matrices(n, values)]
+    blocks += [
+        Heading(spans("Masses, dampings and springs")),
+        *worked(derivation.physical(springs), values),
+        table,
+    ]
+    if laws := derivation.redundancies(n):
+        blocks += [Heading(spans("What must agree")), *_redundancies(laws, values)]
+    return blocks
+
+
+def _steps(n: int) -> Iterable[tuple[str, str, Sequence[Equation]]]:
+    """Yield title, explanation and equations of each step from the table to the entries."""
+    if n > 1:
+        what = "Δ(s) and N(s)" if n == 3 else "Δ(s)"
+        yield (
+            f"Coefficients of {what}",
+            "Multiply the quadratic factors out; g stands for 2ζω of its factor.",
+            derivation.coefficients(n),
+        )
+        yield (
+            "Each cart alone",
+            "From the last cart, whose numbers stand in the table, to the first, by comparing "
+            "the coefficients of the two highest powers. Lower powers would do as well on paper, "
+            "but rounding grows along them.",
+            derivation.carts_alone(n),
+        )
+    yield (
+        "Couplings and input" if n > 1 else "The input",
+        "The static gains give what the step before cannot: how strongly one cart moves the next."
+        if n > 1
+        else "",
+        derivation.couplings(n),
+    )
+
+
+def _matrices(n: int, values: Mapping[str, float]) -> list[Block]:
+    A, B = derivation.state_entries(n)
+    names = "(x1, v1)" if n == 1 else "(x1, v1, x2, v2)" if n == 2 else "(x1, v1, x2, v2, …)"
+    return [
+        paragraph(f"With the state {names}, position before velocity:"),
+        formula(row("A", "=", matrix([[shown(entry) for entry in line] for line in A]))),
+        formula(row("B", "=", matrix([[shown(entry)] for entry in B]))),
+        paragraph("With numbers:"),
+        formula(row("A", "=", matrix([[_entry(entry, values) for entry in line] for line in A]))),
+        formula(row("B", "=", matrix([[_entry(entry, values)] for entry in B]))),
+    ]
+
+
+def _entry(text: str, values: Mapping[str, float]) -> Term:
+    return text if text in ("0", "1") else value_term(evaluate(text, values))
+
+
+def _redundancies(laws: Sequence[Equation], values: Mapping[str, float]) -> list[Block]:
+    count = "One law is" if len(laws) == 1 else f"{len(laws)} laws are"
+    return [
+        paragraph(
+            "There are more transfer-function parameters than masses, dampings and springs, and "
+            f"{count.lower()} left over. A table that was fitted transfer function by transfer "
+            "function need not obey, and one rounded to three digits obeys to a few percent; these "
+            "numbers belong to one chain:"
+        ),
+        *(_law(law, values) for law in laws),
+    ]
+
+
+def _law(law: Equation, values: Mapping[str, float]) -> Formula:
+    sides = (value_term(evaluate(side, values)) for side in (law.left, law.right))
+    left, right = sides
+    return formula(lines([row(shown(law.left), "=", shown(law.right)), row(left, "=", right)]))
+
+
+# ------------------------------------------------------------------------- formulas
+
+
+def rich_paragraph(text: str) -> Paragraph:
+    """Return a paragraph with parameter names as mathematics."""
+    return Paragraph(rich(text))
+
+
+def worked(equations: Sequence[Equation], values: Mapping[str, float]) -> list[Block]:
+    """Return each equation with names, with numbers put in, and its result.
+
+    Short ones share a formula, a line each; a sum of several terms takes two lines of its own.
+    """
+    blocks: list[Block] = []
+    short: list[Math] = []
+    for equation in equations:
+        terms = addends(equation.right)
+        left, right = shown(equation.left), shown(equation.right)
+        result = value_term(evaluate(equation.right, values))
+        if len(terms) == 1 and "-" not in equation.right:
+            put_in = row(shown_with(equation.right, values), "≈", result)
+            # The square of a frequency that the table holds has no other name.
+            short.append(row(left, "=", *(() if left == right else (right, row("="))), put_in))
+            continue
+        blocks += [_together(short)] if short else []
+        short = []
+        blocks.append(formula(lines(_long(left, terms, equation.right, values, result))))
+    return [*blocks, *([_together(short)] if short else [])]
+
+
+def _long(
+    left: Term, terms: Sequence[str], text: str, values: Mapping[str, float], result: Term
+) -> list[Math]:
+    """Return a sum in lines of a few terms, then with numbers, then what it comes to."""
+    if len(terms) <= _MOST_ADDENDS:
+        put_in = row("=", shown_with(text, values), "≈", result)
+        return [row(left, "=", shown(text)), put_in]
+    # The products of a long sum are worked out first, so that it can be read.
+    numbers = [value_term(evaluate(term, values)) for term in terms]
+    return [
+        *_broken((left, "="), [shown(term) for term in terms]),
+        *_broken(("=",), numbers),
+        row("=", result),
+    ]
+
+
+def _broken(head: Sequence[Term], terms: Sequence[Term]) -> list[Math]:
+    """Return a sum over as many lines as it needs."""
+    rows = [total(terms[i : i + _A_LINE]) for i in range(0, len(terms), _A_LINE)]
+    return [row(*head, rows[0]), *(row("+", terms) for terms in rows[1:])]
+
+
+def _together(equations: Sequence[Math]) -> Formula:
+    return formula(equations[0] if len(equations) == 1 else lines(equations))
+
+
+def _written(equations: Sequence[Equation]) -> Formula:
+    return _together([row(shown(e.left), "=", shown(e.right)) for e in equations])
