@@ -3,31 +3,26 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-from pipeline.checks.design import design_margins, verify_design
+from pipeline.checks.carts import check_carts
+from pipeline.checks.estimates import check_decays, check_rows, check_steps
+from pipeline.checks.loops import check_loops, design_margins, verify_design
+from pipeline.checks.recordings import (
+    check_dwells,
+    check_files,
+    check_left_out,
+    check_scales,
+    check_setup,
+    check_signs,
+)
 from pipeline.errors import DataError
 from pipeline.identify.carts import UNTIED
 from pipeline.identify.log import Log, Progress, by_note
+from pipeline.identify.remarks import reading_remarks, turn_of_the_gains
 from pipeline.identify.sound import identify_from_sound
-from pipeline.identify.soundness.encoder_units import find_other_units
-from pipeline.identify.soundness.faults import check_left_out
 from pipeline.ingest.read import read_data
-from pipeline.ingest.scales import check_scales
-from pipeline.ingest.signs import check_signs
-from pipeline.plant.chain import parameter_names
+from pipeline.names import parameter_names
 from pipeline.results import Analysis, ChainFit, FeedbackDesign, HardwareCheck, LeftOut, Record
-from pipeline.stages.compare import (
-    NOT_IDENTIFIED,
-    check_chain,
-    check_decays,
-    check_dwells,
-    check_files,
-    check_loops,
-    check_rows,
-    check_setup,
-    check_steps,
-    compare,
-    why_open,
-)
+from pipeline.stages.compare import compare, why_open
 from pipeline.stages.hardware_check import check_hardware
 from pipeline.stages.state_feedback import design_feedback
 from pipeline.submission import Design, Submission
@@ -49,24 +44,20 @@ def analyse(
     SubmissionError : none of the data files can be read.
     """
     system = submission.system
-    n, springs = system.carts, system.springs
+    position, drive = system.position.unit, system.input.unit
     log = Log()
 
     progress("reading the data")
     data = read_data(submission)
     for name, reason in data.unreadable.items():
         log.skip(f"reading {name}", reason)
-    log.warn(data.warnings)
-    log.warn(by_note((record.id, note) for record in data.records for note in record.notes))
-    harmless = "a decay gives no length, so no number is off"
-    units = find_other_units(data.records, decays=True)
-    log.warn(by_note((name, f"{one.reason}; {harmless}") for name, one in units.items()))
+    log.warn(reading_remarks(data))
+
     found, left_out = identify_from_sound(data, system=system, progress=progress)
     log.add(found.log)
     wrong = {one.experiment for one in left_out if one.is_wrong}
-    signs = check_signs(data.signs, without=wrong)
-    fit = found.fit
-    final = fit.parameters if fit else {}
+    sound = [record for record in data.records if record.id not in wrong]
+    fit, final = found.fit, found.fit.parameters if found.fit else {}
     if fit and not final:
         log.skip("named parameters", UNTIED)
     for name, estimate in final.items():
@@ -75,23 +66,24 @@ def analyse(
     rows = compare(
         found.initial,
         final=final,
-        names=list(final) or parameter_names(n, rigid=system.rigid),
-        position_unit=system.position.unit,
-        input_unit=system.input.unit,
+        names=list(final) or parameter_names(system.carts, rigid=system.rigid),
+        position_unit=position,
+        input_unit=drive,
     )
+    signs = check_signs(data.signs, without=wrong)
     checks = [
         *signs,
         *check_files(data.unreadable),
-        *check_scales([r for r in data.records if r.id not in wrong], system=system),
+        *check_scales(sound, system=system),
         *check_left_out(left_out, records=data.records),
         *check_setup(data.records),
         *check_dwells(data.records, found.sines),
         *found.repeats.checks,
         *check_rows(rows),
-        *check_decays(found.decays, position_unit=system.position.unit),
-        *check_steps(found.gains, gain_unit=f"{system.position.unit}/{system.input.unit}"),
+        *check_decays(found.decays, position_unit=position),
+        *check_steps(found.gains, gain_unit=f"{position}/{drive}"),
+        *check_carts(fit, springs=system.springs),
     ]
-    checks += check_chain(fit, springs=springs) if fit else [NOT_IDENTIFIED]
 
     feedback = None
     if design:
@@ -101,13 +93,7 @@ def analyse(
         margins = log.attempt("margins", design_margins, fit.chain, feedback)
         feedback = replace(feedback, margins=margins)
         checks.append(verify_design(fit.chain, feedback))
-    if feedback and is_reversed(data.records) and not signs:
-        log.warn(
-            [
-                "state feedback: the gains are for an input that pushes cart 1 towards positive x; "
-                "the bench's own input pushes the other way, so negate what the controller sends"
-            ]
-        )
+        log.warn([] if signs else turn_of_the_gains(data.records))
     progress("hardware against model")
     hardware = _hardware(submission, data.records, fit, left_out=left_out, log=log)
     checks += check_loops(hardware)
@@ -116,10 +102,10 @@ def analyse(
         title=submission.title,
         section=submission.section,
         authors=tuple((author.id, author.name) for author in submission.authors),
-        carts=n,
-        springs=springs,
-        position_unit=system.position.unit,
-        input_unit=system.input.unit,
+        carts=system.carts,
+        springs=system.springs,
+        position_unit=position,
+        input_unit=drive,
         records=data.records,
         log_decrements=tuple(found.decays),
         step_gains=tuple(found.gains),
@@ -175,12 +161,6 @@ def _design(submission: Submission, fit: ChainFit | None, *, log: Log) -> Feedba
     return log.attempt("state feedback", reference_design, submission, fit)
 
 
-def is_reversed(records: Sequence[Record]) -> bool:
-    """Whether a positive input, as the bench counts it, drives cart 1 towards negative x."""
-    signs = [r.input_scale for r in records if r.u is not None and r.kind != "closed_loop"]
-    return sum(1 if sign > 0 else -1 for sign in signs) < 0
-
-
 def _hardware(
     submission: Submission,
     records: Sequence[Record],
@@ -190,31 +170,25 @@ def _hardware(
     log: Log,
 ) -> list[HardwareCheck]:
     runs = {record.id: record for record in records if record.kind == "closed_loop"}
-    if not runs:
-        log.skip("hardware check", "no closed-loop run was recorded")
-        return []
-    if fit is None:
-        log.skip("hardware check", "the carts are not identified")
+    if not runs or fit is None:
+        missing = "the carts are not identified" if runs else "no closed-loop run was recorded"
+        log.skip("hardware check", missing)
         return []
     for one in left_out:
         if runs.pop(one.experiment, None):
             log.skip(f"hardware check, {one.experiment}", f"it is left out: {one.reason}")
-    limit = submission.design.input_limit if submission.design else None
     checks: list[HardwareCheck] = []
-    for experiment in submission.experiments:
-        if experiment.id in runs:
-            checks += (
-                log.attempt(
-                    f"hardware check, {experiment.id}",
-                    check_hardware,
-                    runs[experiment.id],
-                    fit.chain,
-                    controller=experiment.controller,
-                    controlled_cart=experiment.controlled_cart,
-                    input_limit=limit,
-                )
-                or ()
-            )
+    for experiment in [one for one in submission.experiments if one.id in runs]:
+        found = log.attempt(
+            f"hardware check, {experiment.id}",
+            check_hardware,
+            runs[experiment.id],
+            fit.chain,
+            controller=experiment.controller,
+            controlled_cart=experiment.controlled_cart,
+            input_limit=submission.design.input_limit if submission.design else None,
+        )
+        checks += found or ()
     log.warn(
         by_note((f"{c.experiment}, cart {c.cart}", c.note) for c in checks if not c.contradicted)
     )

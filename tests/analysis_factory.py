@@ -7,7 +7,8 @@ from functools import cache
 
 import numpy as np
 
-from pipeline.plant.chain import PRESETS, Array, Chain, parameter_unit
+from pipeline.names import read_name
+from pipeline.plant.chain import PRESETS, Array, Chain
 from pipeline.plant.simulate import simulate_linear
 from pipeline.results import (
     Analysis,
@@ -282,7 +283,7 @@ def _rows(fit: ChainFit, rng: np.random.Generator) -> tuple[ParameterRow, ...]:
         rows.append(
             ParameterRow(
                 name=name,
-                unit=parameter_unit(name, position="cm", input="V"),
+                unit=read_name(name).unit(position="cm", input="V"),
                 initial=initial,
                 final=final,
                 change_percent=100 * (final.value / initial.value - 1),

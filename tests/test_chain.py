@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from pipeline.errors import DataError
+from pipeline.names import read_name
 from pipeline.plant.chain import (
     PRESETS,
     Chain,
     parameter_names,
-    parameter_unit,
     quadratic_factors,
     recover_chain,
     recover_from_parameters,
@@ -117,7 +117,7 @@ def test_the_names_of_the_tables():
 def test_units_of_parameters():
     """Gains, frequencies and the rigid body's two carry units; damping ratios do not."""
     units = {
-        name: parameter_unit(name, position="cm", input="V")
+        name: read_name(name).unit(position="cm", input="V")
         for name in ("K_2", "omega_a", "zeta_1", "mass", "damping")
     }
     assert units == {

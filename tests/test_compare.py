@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.checks.carts import check_carts
+from pipeline.checks.estimates import check_rows
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.results import ChainFit, Estimate
 from pipeline.stages.compare import (
     DAMPING_LIMIT,
     GAIN_AND_FREQUENCY_LIMIT,
-    check_chain,
-    check_rows,
     compare,
 )
 
@@ -138,7 +138,7 @@ def test_real_chains_pass_every_law(n, data):
     """Whatever the masses and springs, a real lightly damped chain breaks no law."""
     draw = lambda size: np.array(data.draw(st.lists(positive, min_size=size, max_size=size)))  # noqa: E731
     chain = Chain(m=draw(n), c=0.02 * draw(n), k=draw(n + 1))
-    checks = check_chain(_fit(chain), springs=(True,) * (n + 1))
+    checks = check_carts(_fit(chain), springs=(True,) * (n + 1))
     assert [check.id for check in checks if check.outcome == "fail"] == []
 
 
@@ -146,7 +146,7 @@ def test_a_negative_spring_is_named():
     """A spring below zero by more than its standard error fails, by name."""
     chain = PRESETS["throne-3dof"]
     negative = replace(chain, k=np.array([-0.003, *chain.k[1:]]))
-    checks = {c.id: c for c in check_chain(_fit(negative), springs=(True,) * 4)}
+    checks = {c.id: c for c in check_carts(_fit(negative), springs=(True,) * 4)}
     assert checks["physical.signs"].outcome == "fail"
     assert "k_1" in checks["physical.signs"].message
 
@@ -160,7 +160,7 @@ def test_the_papers_third_table_breaks_the_laws_it_is_known_to_break():
     carts = {"omega_1": 20.0, "omega_2": 27.2, "omega_3": 25.6}
     alone = {"zeta_1": 0.08, "zeta_2": 0.02, "zeta_3": 0.04}
     table = {**gains, **modes, **dampings, **nulls, **carts, **alone}
-    checks = check_chain(_fit(PRESETS["throne-3dof"], table), springs=(True,) * 4)
+    checks = check_carts(_fit(PRESETS["throne-3dof"], table), springs=(True,) * 4)
     assert all(c.outcome == "pass" for c in checks if c.id.startswith("order."))
     value = {c.id: c.value for c in checks if c.value is not None}
     assert value["redundancy.R4"] > 0.1

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pipeline.checks.design import design_margins, verify_design
+from pipeline.checks.loops import design_margins, verify_design
 from pipeline.errors import DataError
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.plant.designed_loop import closed_loop, stability_margins

@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from pipeline import submission
+from pipeline.checks.loops import check_loops
 from pipeline.errors import DataError
 from pipeline.plant.chain import PRESETS, Array, Chain
 from pipeline.plant.loop import Controller, Pid, StateFeedback, simulate_loop
 from pipeline.plant.simulate import simulate_linear
 from pipeline.results import FeedbackDesign, HardwareCheck, Kind, Record
-from pipeline.stages.compare import check_loops
 from pipeline.stages.hardware_check import check_hardware
 from pipeline.stages.state_feedback import design_feedback
 

@@ -8,9 +8,9 @@ import pytest
 import scipy.io
 from numpy.testing import assert_allclose, assert_array_equal
 
+from pipeline.checks.recordings import check_signs
 from pipeline.errors import SubmissionError
 from pipeline.ingest.read import DUTY_COUNT, Ingested, read_data
-from pipeline.ingest.signs import check_signs
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.simulate import simulate_linear
 from pipeline.submission import load_submission

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.checks.recordings import check_signs
 from pipeline.ingest.drive import find_signs
 from pipeline.ingest.read import read_data
-from pipeline.ingest.signs import check_signs
 from pipeline.plant.chain import PRESETS, Array
 from pipeline.plant.simulate import simulate_linear
 from pipeline.report.sections.questions import ask

@@ -10,7 +10,7 @@ PIPELINE = Path(__file__).parents[1] / "pipeline"
 
 # From the ground up, rooms and the rooms within them; a module imports from its own room or below.
 LEVELS = (
-    ("__init__", "errors", "resources"),
+    ("__init__", "errors", "names", "resources"),
     ("output", "schemas"),
     ("lock",),
     ("plant",),

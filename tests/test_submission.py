@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from pipeline.errors import ConfigError, SubmissionError
 from pipeline.ingest.read import read_data
-from pipeline.plant.chain import parameter_names
+from pipeline.names import parameter_names
 from pipeline.submission import Pid, StateFeedback, load_submission, new_submission
 
 FULL = """\

@@ -6,16 +6,6 @@ import numpy as np
 
 from pipeline.plant.chain import Array
 
-LENGTH_SCALES = (10.0, 100.0, 1000.0, 2.54, 25.4)  # between mm, cm, m and inches
-# What a time column that counts so many times as much as it should looks like.
-TIME_FACTORS = {
-    1e3: "its time looks to be in milliseconds",
-    1e6: "its time looks to be in microseconds",
-    1e-3: "its time looks to be in thousands of seconds",
-    2.0: "its clock looks to run twice too fast",
-    0.5: "its clock looks to run at half its speed",
-}
-FASTEST = 1e-4  # s between samples: no bench reads its encoders more often
 _NEIGHBOURS = (-3, -2, -1, 1, 2, 3)  # a quintic through these follows any motion we sample
 _MEDIAN_TO_SIGMA = 1.4826  # median absolute value to standard deviation, normal noise
 _FLAT_INPUT = 0.02  # of the input's range: smaller changes are noise of the logged input

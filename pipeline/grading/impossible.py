@@ -5,14 +5,13 @@ from dataclasses import dataclass
 from decimal import Decimal
 
 from pipeline.grading.grade import Flag
-from pipeline.grading.orders import orders
 from pipeline.grading.tolerance import as_typed, rounding
+from pipeline.plant.laws import HEAVY_DAMPING, orders
 
 # How far an order may be broken: fitted numbers are good to some percent, and first estimates of
 # resonances and nulls are read off a plot.
 _FINAL_SLACK = 1.1
 _INITIAL_SLACK = 1.2
-_HEAVY_DAMPING = 0.3  # above it the orders, exact without damping, may bend
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +64,7 @@ def not_positive(table: Mapping[str, Decimal]) -> list[str]:
 def broken_orders(table: Mapping[str, Decimal], *, initial: bool) -> list[BrokenOrder]:
     """Return the orders that a table breaks by more than rounding and honest error."""
     slack = _INITIAL_SLACK if initial else _FINAL_SLACK
-    heavy = any(v > _HEAVY_DAMPING for n, v in table.items() if n.startswith("zeta"))
+    heavy = any(v > HEAVY_DAMPING for n, v in table.items() if n.startswith("zeta"))
     broken = []
     for lesser, greater, reason in orders(list(table)):
         if heavy and lesser.startswith("omega"):

@@ -12,10 +12,11 @@ from fractions import Fraction
 
 import numpy as np
 
-from pipeline.grading.orders import orders
 from pipeline.grading.rubric import is_damping
 from pipeline.grading.tolerance import rounding
-from pipeline.plant.chain import Array, parameter_names
+from pipeline.names import parameter_names
+from pipeline.plant.chain import Array
+from pipeline.plant.laws import orders
 
 MOST_WIDENING = 4  # tolerances; a law that then still fails is simply broken
 _PER_TOLERANCE = 2  # steps in which the box is widened by one

@@ -4,13 +4,12 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from pipeline.checks.recordings import SCALES, why_other_frequency
 from pipeline.grading.grade import Flag
 from pipeline.grading.reference import is_explained
 from pipeline.ingest.inspect import line_frequency
 from pipeline.ingest.problems import saturation
-from pipeline.ingest.scales import SCALES
 from pipeline.results import Analysis, Record
-from pipeline.stages.compare import why_other_frequency
 
 _FREQUENCY = 0.08  # relative: a stated frequency further from that of the input is another run's
 

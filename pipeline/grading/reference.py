@@ -5,13 +5,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pipeline.checks.recordings import POSITION_SCALE, SCALES
 from pipeline.estimation.chain.follow import FOLLOWED
 from pipeline.grading.rubric import is_damping
-from pipeline.ingest.scales import POSITION_SCALE, SCALES
 from pipeline.plant.chain import Chain
 from pipeline.results import Analysis, Estimate, ParameterRow, StepEdge
 from pipeline.stages.compare import (
-    CHI_SQUARE_LIMIT,
     GAIN_AND_FREQUENCY_LIMIT,
 )
 
@@ -166,7 +165,7 @@ def trusted_chain(analysis: Analysis) -> Chain | None:
 
 def is_explained(analysis: Analysis) -> bool:
     """Whether linear carts and noise explain the data; without a fit nothing says otherwise."""
-    return analysis.fit is None or analysis.fit.chi_square_per_dof <= CHI_SQUARE_LIMIT
+    return analysis.fit is None or analysis.fit.explains_data
 
 
 def is_followed(analysis: Analysis) -> bool:

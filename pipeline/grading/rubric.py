@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
 
-from pipeline.plant.chain import parameter_names
+from pipeline.names import parameter_names
 from pipeline.results import Kind
 from pipeline.submission import Design, System
 

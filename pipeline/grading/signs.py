@@ -3,9 +3,9 @@
 from collections.abc import Mapping, Sequence
 from decimal import Decimal
 
+from pipeline.identify.remarks import is_reversed
 from pipeline.results import Record
 from pipeline.submission import Feedback, Reported, StateSpace
-from pipeline.workflow import is_reversed
 
 _NOTE = (
     "a positive input drives these carts towards negative x: what is reported with that sign is "

@@ -12,7 +12,8 @@ from pipeline.grading.grade import Flag
 from pipeline.grading.reference import Reference
 from pipeline.grading.rubric import is_damping
 from pipeline.grading.tolerance import percent_off
-from pipeline.plant.chain import Array, Chain, parameter_names, recover_from_parameters
+from pipeline.names import parameter_names
+from pipeline.plant.chain import Array, Chain, recover_from_parameters
 from pipeline.submission import StateSpace
 
 Kind = Literal["exact", "stiffness", "damping"]

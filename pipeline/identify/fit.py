@@ -7,9 +7,9 @@ import numpy as np
 
 from pipeline.estimation.chain.follow import Followed, find_misread, follow, most_follow, near
 from pipeline.identify.log import Log
+from pipeline.names import own_zeta
 from pipeline.results import ChainFit, Estimate, FrequencyResponse, LeftOut, Record
 from pipeline.stages.bode_fit import fit_bode
-from pipeline.stages.compare import CHI_SQUARE_LIMIT
 from pipeline.stages.sine import FEW_COUNTS
 from pipeline.stages.time_fit import fit_records
 
@@ -112,7 +112,7 @@ def _is_doubted(fitted: Fitted, dwells: Sequence[Record]) -> bool:
     motions = [(r.position(cart), r.encoder_step(cart)) for r in dwells for cart in r.carts]
     counts = [float(np.ptp(y)) / step for y, step in motions if step > 0]
     coarse = bool(counts) and float(np.median(counts)) < 2 * FEW_COUNTS
-    return coarse and fitted.fit.chi_square_per_dof > CHI_SQUARE_LIMIT
+    return coarse and not fitted.fit.explains_data
 
 
 def _is_closer(fitted: Fitted, other: Fitted, dwells: Sequence[Record]) -> bool:
@@ -121,7 +121,7 @@ def _is_closer(fitted: Fitted, other: Fitted, dwells: Sequence[Record]) -> bool:
     lost = [
         sum(one.fits[r.id].share for r in dwells if r.id in one.fits) for one in (fitted, other)
     ]
-    return fitted.fit.chi_square_per_dof <= CHI_SQUARE_LIMIT and lost[0] < lost[1]
+    return fitted.fit.explains_data and lost[0] < lost[1]
 
 
 def _held(
@@ -196,7 +196,7 @@ def _conflict(
 
 def _decay_dampings(initial: dict[str, Estimate], *, n: int) -> dict[int, Estimate]:
     """Return by cart the damping ratio it has alone, as far as decays tell."""
-    own = {cart: initial.get("zeta" if n == 1 else f"zeta_{cart}") for cart in range(1, n + 1)}
+    own = {cart: initial.get(own_zeta(cart, n=n)) for cart in range(1, n + 1)}
     return {
         cart: zeta
         for cart, zeta in own.items()

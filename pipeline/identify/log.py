@@ -1,17 +1,16 @@
 """What could not run, and what a reader must know."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any, ParamSpec, TypeVar
 
 from pipeline.errors import DataError
+from pipeline.names import listed
 from pipeline.results import Skipped
 
 P = ParamSpec("P")
 T = TypeVar("T")
 Progress = Callable[[str], None]
-
-_LISTED = 4  # more runs than these are not named one by one
 
 
 @dataclass
@@ -68,10 +67,3 @@ def by_note(notes: Iterable[tuple[str, str]]) -> list[str]:
         if note:
             runs.setdefault(note, []).append(run)
     return [f"{listed(list(dict.fromkeys(ids)))}: {note}" for note, ids in runs.items()]
-
-
-def listed(ids: Sequence[str]) -> str:
-    """Return the names of runs, the middle of many left out."""
-    if len(ids) <= _LISTED:
-        return ", ".join(ids)
-    return f"{ids[0]}, {ids[1]} … {ids[-1]} ({len(ids)} runs)"

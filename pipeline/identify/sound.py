@@ -18,7 +18,6 @@ from pipeline.ingest.read import Ingested
 from pipeline.plant.chain import Chain
 from pipeline.results import LeftOut
 from pipeline.stages.bode_fit import fit_bode
-from pipeline.stages.compare import CHI_SQUARE_LIMIT
 from pipeline.submission import System
 
 _ROUNDS = 4  # of leaving out what the carts found without it show to be wrong
@@ -91,7 +90,7 @@ def _witness(
             )
         except DataError:
             continue
-        if fit.chi_square_per_dof <= CHI_SQUARE_LIMIT:
+        if fit.explains_data:
             return fit.chain, follow(data.records, fit.chain)
     if found.fit is None or not found.fit.converged:
         return None

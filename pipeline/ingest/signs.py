@@ -1,15 +1,16 @@
 """The sign of the input, record by record: stated, found from the data, or as in the others."""
 
-from collections.abc import Container, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pipeline.ingest.drive import find_signs
-from pipeline.results import SIGN, Check, Record
+from pipeline.names import listed
+from pipeline.results import Record
 from pipeline.submission import Submission
 
-_FEW_NAMES = 6  # more are not listed one by one
+FEW_NAMES = 6  # more are not listed one by one
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,42 +82,9 @@ def _say_signs(
     usual = 1 if sum(signs[name] for name in searched) >= 0 else -1
     text = f"sign of the input found from the data: {usual:+d}"
     if others := [name for name in searched if signs[name] != usual]:
-        text += f", but {-usual:+d} in {_some(others)}"
+        text += f", but {-usual:+d} in {listed(others, most=FEW_NAMES)}"
     if unsure := [name for name in searched if not found.get(name)]:
-        text += f"; taken from the others where the data do not tell: {_some(unsure)}"
+        text += (
+            f"; taken from the others where the data do not tell: {listed(unsure, most=FEW_NAMES)}"
+        )
     return [text]
-
-
-def check_signs(signs: Signs, *, without: Container[str]) -> list[Check]:
-    """Return a failed check where records contradict the sign that is stated of them.
-
-    `without` are records that do not hold what happened, so that their sign says nothing. A bench
-    has one sign: what a few dwells say against the others, a long delay makes them say.
-    """
-    says, wrong = [], 0
-    for sign in (1, -1):
-        told = [
-            name
-            for name, found in signs.found.items()
-            if signs.stated.get(name) == sign and found and name not in without
-        ]
-        contrary = [name for name in told if signs.found[name] == -sign]
-        if contrary and 2 * len(contrary) >= len(told):
-            those = "all" if contrary == told else f"{len(contrary)} of the {len(told)}"
-            says.append(
-                f"sign = {sign} of the input contradicts the data, which say {-sign:+d} in "
-                f"{_some(contrary)} ({those} that tell it): set sign = {-sign} there, or leave it "
-                "out."
-            )
-            wrong += len(contrary)
-    if not says:
-        return []
-    message = " ".join(says)
-    return [Check(id=SIGN, outcome="fail", value=float(wrong), limit=0.0, message=message)]
-
-
-def _some(names: list[str]) -> str:
-    """Return the names, the middle of a long list left out."""
-    if len(names) <= _FEW_NAMES:
-        return ", ".join(names)
-    return f"{', '.join(names[:2])} … {names[-1]} ({len(names)} runs)"

@@ -18,15 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import DataError
+from pipeline.names import MODES, NULLS, parameter_names
 
 if TYPE_CHECKING:
     import control  # half a second: imported where it is used
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
-
-_MODES = "abcdefgh"  # resonances: omega_a, omega_b, … ascending in frequency
-_NULLS = "xyz"  # zeros of cart 1 with three carts: omega_x, omega_y
 
 
 def frozen_array(values: object, *, name: str, shape: tuple[int, ...] | None = None) -> Array:
@@ -243,27 +241,6 @@ class Chain:
         return dict(zip(parameter_names(self.n), map(float, values), strict=True))
 
 
-def parameter_names(n: int, *, rigid: bool = False) -> list[str]:
-    """Return the names of `Chain.parameters`, in order."""
-    if n == 1:
-        return ["mass", "damping"] if rigid else ["K", "omega_n", "zeta"]
-    numbers = range(1, n + 1)
-    names = [f"K_{i}" for i in numbers]
-    names += [f"{symbol}_{mode}" for symbol in ("omega", "zeta") for mode in _MODES[:n]]
-    if n == 3:
-        names += [f"{symbol}_{null}" for symbol in ("omega", "zeta") for null in _NULLS[:2]]
-    return names + [f"{symbol}_{i}" for symbol in ("omega", "zeta") for i in numbers]
-
-
-def parameter_unit(name: str, *, position: str, input: str) -> str:
-    """Return the unit of a named parameter; "" for a damping ratio."""
-    if name.startswith("K"):
-        return f"{position}/{input}"
-    if name.startswith("omega"):
-        return "rad/s"
-    return {"mass": f"{input} s^2/{position}", "damping": f"{input} s/{position}"}.get(name, "")
-
-
 def quadratic_factors(roots: ComplexArray) -> tuple[Array, Array]:
     """Return omega and zeta of s² + 2 zeta omega s + omega² for pairs of roots, omega ascending.
 
@@ -360,7 +337,7 @@ def transfer_functions(values: Mapping[str, float]) -> tuple[Array, Sequence[Arr
     if "omega_n" in values:
         return np.array([values["K"]]), [_quadratic(values, "n", zeta="zeta")]
     n = 3 if "K_3" in values else 2
-    factors = [_MODES[:n], *([_NULLS[:2]] if n == 3 else []), str(n)]
+    factors = [MODES[:n], *([NULLS] if n == 3 else []), str(n)]
     tails = [_product([_quadratic(values, suffix) for suffix in group]) for group in factors]
     return np.array([values[f"K_{i}"] for i in range(1, n + 1)]), tails
 

@@ -4,7 +4,7 @@ The stage-by-stage result becomes a physical chain, which all carts then fit joi
 logarithmic scale, to get near, then by maximum likelihood, each point by its standard error.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,11 +19,12 @@ from pipeline.estimation.chain.parametrisation import (
     physical_start,
 )
 from pipeline.estimation.chain.staged_fit import LogMagnitude, StagedFit, fit_stage_by_stage
+from pipeline.estimation.last_point import LastPoint
+from pipeline.names import own_zeta
 from pipeline.plant.chain import Array, Chain, recover_chain
-from pipeline.results import ChainFit, Estimate, FrequencyResponse
+from pipeline.results import EXPLAINED, ChainFit, Estimate, FrequencyResponse
 
 _STARTS = 8  # random ones, tried where the first does not explain the data
-_GOOD_CHI_SQUARE = 2.0  # per degree of freedom: the data are explained
 _START_SPREAD = 0.5  # of ln m and ln k of a random start: half to double, mostly
 _START_ZETAS = (0.02, 0.3)
 _SEED = 2005  # of the random starts; any, but the same every time
@@ -180,35 +181,23 @@ class _Fitted:
         return self.chi_square / max(self.dof, 1)
 
 
-def _evaluator(
-    P: Parametrisation, data: Points, scale: Scale
-) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
-    """Return residuals and Jacobian by theta, each point computed once for both."""
-    last: list[tuple[Array, Array, Array]] = []
-
-    def evaluate(theta: Array) -> tuple[Array, Array]:
-        if not last or not np.array_equal(last[0][0], theta):
-            physical = P.physical(P.unpack(theta))
-            r, J = weighted_residuals(P, data, scale, physical)
-            J = J * P.slopes(theta)
-            if not np.isfinite(np.sum(J**2)):  # without slopes no step could go on from here
-                r = np.full_like(r, np.nan)
-            last[:] = [(theta.copy(), r, J)]
-        return last[0][1], last[0][2]
-
-    return lambda theta: evaluate(theta)[0], lambda theta: evaluate(theta)[1]
-
-
 def _solve(P: Parametrisation, data: Points, theta: Array, scale: Scale) -> _Fitted:
-    residuals, jacobian = _evaluator(P, data, scale)
+    def evaluate(theta: Array) -> tuple[Array, Array]:
+        r, J = weighted_residuals(P, data, scale, P.physical(P.unpack(theta)))
+        J = J * P.slopes(theta)
+        if not np.isfinite(np.sum(J**2)):  # without slopes no step could go on from here
+            r = np.full_like(r, np.nan)
+        return r, J
+
+    at = LastPoint(evaluate)
     # A step that goes astray may overflow; least_squares then takes a shorter one.
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
-        if not np.isfinite(np.sum(residuals(theta) ** 2)):
+        if not np.isfinite(np.sum(at(theta)[0] ** 2)):
             raise DataError("Bode fit: no chain comes near responses as far apart as these")
         solution = least_squares(
-            residuals,
+            lambda theta: at(theta)[0],
             theta,
-            jac=jacobian,  # pyright: ignore[reportArgumentType] - scipy's default is a string
+            jac=lambda theta: at(theta)[1],  # pyright: ignore[reportArgumentType] - scipy's default is a string
             x_scale="jac",
             ftol=_NEAR if scale == "log" else _PRECISION,
             max_nfev=_EVALUATIONS,
@@ -236,7 +225,7 @@ def _fit_from_starts(
         except DataError as error:
             failed.append(error)
             continue
-        if fits[-1].chi_square_per_dof <= _GOOD_CHI_SQUARE:
+        if fits[-1].chi_square_per_dof <= EXPLAINED:
             break
     if not fits:
         raise failed[0]
@@ -351,7 +340,7 @@ def _result(
         )
     parameters = named_estimates(chain, names=names, covariance=covariance, source="bode_fit")
     for cart in data.decays:
-        name = "zeta" if chain.n == 1 else f"zeta_{cart}"
+        name = own_zeta(cart, n=chain.n)
         parameters[name] = replace(parameters[name], source=data.decays[cart].source)
     if share > 0:
         remarks.append(

@@ -8,7 +8,8 @@ import numpy as np
 
 from pipeline.errors import DataError
 from pipeline.estimation.record_transforms import transfer_ratio, visible_band
-from pipeline.plant.chain import Array, ComplexArray, parameter_names
+from pipeline.names import parameter_names
+from pipeline.plant.chain import Array, ComplexArray
 from pipeline.results import Estimate, FrequencyResponse, Record, SinePoint
 
 # Two dwells are repeats where their frequencies differ by less than this: a fitted frequency is

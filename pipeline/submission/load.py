@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from pydantic import ValidationError
 
 from pipeline.errors import SubmissionError
-from pipeline.plant.chain import parameter_names
+from pipeline.names import parameter_names
 from pipeline.submission.complaints import (
     TOP_LEVEL,
     Location,

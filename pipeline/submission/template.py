@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from pipeline.errors import ConfigError
-from pipeline.plant.chain import parameter_names
+from pipeline.names import parameter_names
 from pipeline.resources import TEMPLATES
 from pipeline.submission.load import NAME, spring_names
 

@@ -15,13 +15,13 @@ import numpy as np
 from pipeline.bench.planning.plan import Limits, PidLoop, Recording, StateLoop
 from pipeline.bench.protocol.messages import FULL_SCALE, Description, PidGains, StateGains
 from pipeline.errors import DataError
+from pipeline.identify.remarks import is_reversed
 from pipeline.plant import step_response
 from pipeline.plant.chain import Array, Chain
 from pipeline.plant.loop import Controller, Pid, StateFeedback, discretise, simulate_loop
 from pipeline.plant.robustness import stays_stable
 from pipeline.results import Analysis, FeedbackDesign
 from pipeline.submission import Design, Submission
-from pipeline.workflow import is_reversed
 
 Table: TypeAlias = dict[str, Any]
 

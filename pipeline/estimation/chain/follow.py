@@ -15,7 +15,7 @@ from pipeline.errors import DataError
 from pipeline.estimation.chain.modal_response import Modes, find_modes
 from pipeline.estimation.chain.parametrisation import Parametrisation
 from pipeline.estimation.chain.time_window import Window, compare, open_window
-from pipeline.estimation.signals import FASTEST, LENGTH_SCALES, TIME_FACTORS
+from pipeline.estimation.mistakes import FASTEST, LENGTH_SCALES, TIME_FACTORS
 from pipeline.plant.chain import Array, Chain
 from pipeline.results import Record
 

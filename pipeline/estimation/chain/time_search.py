@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -12,12 +12,13 @@ from pipeline.estimation.chain.modal_response import find_modes
 from pipeline.estimation.chain.parametrisation import Parametrisation
 from pipeline.estimation.chain.time_start import WIDTHS, even_chains, regress_chain
 from pipeline.estimation.chain.time_window import Misfit, Window, compare
+from pipeline.estimation.last_point import LastPoint
 from pipeline.plant.chain import Array, Chain
+from pipeline.results import EXPLAINED
 
 # A chain that leaves more than this share of the motion's power unexplained is not the one
 # (carts with dry friction leave some 2 %), unless the rest is noise.
 _LOST = 0.1
-_NOISE_EXPLAINS = 2.0  # chi² per degree of freedom below which there is nothing more to find
 # A damping or spring that is not there sends its logarithm towards minus infinity: e^-15 of a
 # start is nothing, and no step may overflow.
 _LOG_REACH = 15.0
@@ -83,7 +84,7 @@ class Attempt:
     @property
     def follows(self) -> bool:
         """True where the chain explains the motion, down to its noise or nearly all of it."""
-        return self.lost < _LOST or self.cost < _NOISE_EXPLAINS * self.dof
+        return self.lost < _LOST or self.cost < EXPLAINED * self.dof
 
 
 def look(windows: Sequence[Window], parametrisation: Parametrisation, theta: Array) -> Attempt:
@@ -105,24 +106,14 @@ def descend(
     tolerance: float = _SEARCH_TOLERANCE,
 ) -> Attempt:
     """Minimise the sum of squared residuals from theta on, to a relative `tolerance`."""
-
-    @lru_cache(maxsize=2)  # the residual and its Jacobian are asked for one after the other
-    def condensed(theta_bytes: bytes) -> Array:
-        return condense(look(windows, parametrisation, np.frombuffer(theta_bytes)).misfits)
-
-    def residual(x: Array) -> Array:
-        return condensed(x.tobytes())[:, -1]
-
-    def jacobian(x: Array) -> Array:
-        return condensed(x.tobytes())[:, :-1]
-
+    at = LastPoint(lambda x: condense(look(windows, parametrisation, x).misfits))
     reach = np.where(parametrisation.logarithmic, _LOG_REACH, np.inf)
     lower = np.maximum(parametrisation.bounds[0], theta - reach)
     upper = np.minimum(parametrisation.bounds[1], theta + reach)
     solution = least_squares(
-        residual,
+        lambda x: at(x)[:, -1],
         np.clip(theta, lower, upper),
-        jac=jacobian,  # pyright: ignore[reportArgumentType]  # scipy's stub knows strings only
+        jac=lambda x: at(x)[:, :-1],  # pyright: ignore[reportArgumentType] - scipy's default is a string
         bounds=(lower, upper),
         x_scale="jac",
         ftol=tolerance,
@@ -194,7 +185,7 @@ def search(
         best = found if best is None or found.cost < best.cost else best
         # Even chains are far from the truth: the search may end beside it, so all are tried unless
         # one explains the records down to their noise.
-        if best.follows if tried <= len(near) else best.cost < _NOISE_EXPLAINS * best.dof:
+        if best.follows if tried <= len(near) else best.cost < EXPLAINED * best.dof:
             break
     if best is None:
         raise DataError("time fit: needs records that show a chain in motion, found no start")

@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 from scipy.optimize import least_squares
 
+from pipeline.estimation.last_point import LastPoint
 from pipeline.plant.chain import Array
 
 
@@ -48,18 +49,23 @@ def fit_separable(
     scale: Array | float = 1.0,
 ) -> SeparableFit:
     """Fit a model of p to y (n,) from `start` (n_p,) on; `scale` is the size of p."""
-    projection = _Projection(y, model)
+    at = LastPoint(lambda p: _solved(y, model(p)))
+
+    def jacobian(p: Array) -> Array:
+        J = at(p).model.derivatives(at(p).linear)
+        return J - at(p).basis @ (at(p).basis.T @ J)
+
     fit = least_squares(
-        projection.residual,
+        lambda p: at(p).residual,
         start,
-        jac=projection.jacobian,  # pyright: ignore[reportArgumentType] - scipy's default is a string
+        jac=jacobian,  # pyright: ignore[reportArgumentType] - scipy's default is a string
         method="lm",
         max_nfev=max_evaluations,
         x_scale=scale,
     )
-    at = projection.at(fit.x)
+    best = at(fit.x)
     return SeparableFit(
-        p=fit.x, linear=at.linear, residual=at.residual, converged=bool(fit.success)
+        p=fit.x, linear=best.linear, residual=best.residual, converged=bool(fit.success)
     )
 
 
@@ -67,39 +73,17 @@ def fit_separable(
 class _Point:
     """The model at some p (n_p,), its linear unknowns solved for; `basis` spans the columns."""
 
-    p: Array
     model: Model
     basis: Array
     linear: Array
     residual: Array
 
 
-class _Projection:
-    """The fit without its linear unknowns; residual and Jacobian ask for the same point."""
-
-    def __init__(self, y: Array, model: Callable[[Array], Model]) -> None:
-        self._y = y
-        self._model = model
-        self._last: _Point | None = None
-
-    def at(self, p: Array) -> _Point:
-        if self._last is None or not np.array_equal(self._last.p, p):
-            model = self._model(p)
-            X = model.columns
-            basis, sizes, turn = np.linalg.svd(X, full_matrices=False)
-            # Columns that are alike, far from the fit, share what they explain.
-            apart = np.maximum(sizes, np.finfo(np.float64).eps * len(X) * sizes[0])
-            linear = (self._y @ basis / apart) @ turn
-            residual = X @ linear - self._y
-            self._last = _Point(
-                p=p.copy(), model=model, basis=basis, linear=linear, residual=residual
-            )
-        return self._last
-
-    def residual(self, p: Array) -> Array:
-        return self.at(p).residual
-
-    def jacobian(self, p: Array) -> Array:
-        at = self.at(p)
-        J = at.model.derivatives(at.linear)
-        return J - at.basis @ (at.basis.T @ J)
+def _solved(y: Array, model: Model) -> _Point:
+    """Return the model with the linear unknowns that leave the least of y."""
+    X = model.columns
+    basis, sizes, turn = np.linalg.svd(X, full_matrices=False)
+    # Columns that are alike, far from the fit, share what they explain.
+    apart = np.maximum(sizes, np.finfo(np.float64).eps * len(X) * sizes[0])
+    linear = (y @ basis / apart) @ turn
+    return _Point(model=model, basis=basis, linear=linear, residual=X @ linear - y)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.estimation.signals import LENGTH_SCALES
+from pipeline.estimation.mistakes import LENGTH_SCALES
 from pipeline.results import LeftOut, Record
 
 _SAME = 0.02  # relative: as far as the step is seen alike in two recordings

@@ -20,10 +20,10 @@ from pipeline.estimation.chain.follow import (
     most_follow,
     near,
 )
-from pipeline.estimation.signals import FASTEST, TIME_FACTORS
+from pipeline.estimation.mistakes import FASTEST, TIME_FACTORS
 from pipeline.plant.chain import Chain
 from pipeline.plant.simulate import simulate_linear
-from pipeline.results import Check, LeftOut, Record, StepGain
+from pipeline.results import LeftOut, Record, StepGain
 
 _ACROSS = 0.5  # of the input's range: a reading that stays while the input changes so far
 _STILL_SHARE = 0.2  # … and for so long after it; of the record
@@ -38,8 +38,6 @@ _ELSEWHERE = 0.25  # of how far it was moved while it stood: what it misses the 
 _FARTHER, _GAIN_SIGMAS = 1.3, 4.0  # friction may hold carts a little out of the line
 _CYCLES = 1.5  # a dwell with fewer holds no steady state, whatever its length
 _UNIT = 100.0  # at least so many times as slow is another unit of time
-_SPELT_OUT = 3  # records of one kind, if all of it; more are told by their number
-_PLURAL = {"sine": "dwells", "step": "steps", "decay": "decays", "sweep": "sweeps"}
 _SAME_CLOCK = 0.02  # a bench samples at one rate, which a unit changes by exactly its factor
 
 
@@ -124,35 +122,6 @@ def find_impossible_gains(gains: Sequence[StepGain]) -> dict[str, LeftOut]:
             )
             found[run] = LeftOut(experiment=run, reason=reason, is_wrong=True)
     return found
-
-
-def check_left_out(left_out: Sequence[LeftOut], *, records: Sequence[Record]) -> list[Check]:
-    """Return a failed check for each reason for which some of the records are not used."""
-    runs: dict[str, list[str]] = {}
-    for one in left_out:
-        runs.setdefault(one.reason, []).append(one.experiment)
-    return [
-        Check(
-            id=f"record.{names[0]}",
-            outcome="fail",
-            value=float(len(names)),
-            limit=0.0,
-            message=f"Left out {'is' if len(names) == 1 else 'are'} {_named(names, records)}: "
-            f"{reason}.",
-        )
-        for reason, names in sorted(runs.items(), key=lambda item: -len(item[1]))
-    ]
-
-
-def _named(names: Sequence[str], records: Sequence[Record]) -> str:
-    """Return names of records, those of a whole kind as such: "all 29 dwells, step-2"."""
-    said: list[str] = []
-    for kind in dict.fromkeys(record.kind for record in records):
-        alike = [record.id for record in records if record.kind == kind]
-        of_kind = [name for name in alike if name in names]
-        whole = len(of_kind) == len(alike) > _SPELT_OUT
-        said += [f"all {len(alike)} {_PLURAL.get(kind, kind)}"] if whole else of_kind
-    return ", ".join(said)
 
 
 # ------------------------------------------------------------------ single channels

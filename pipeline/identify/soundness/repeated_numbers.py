@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.estimation.signals import TIME_FACTORS
+from pipeline.estimation.mistakes import TIME_FACTORS
 from pipeline.results import Check, Estimate, LeftOut, LogDecrement, StepGain
 
 TOLERANCE = 10.0  # percent; the same run made twice, with dry friction of some percent

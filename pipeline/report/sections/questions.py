@@ -25,7 +25,7 @@ from pipeline.report.numbers import count, listing, percent, significant
 from pipeline.report.sections.notes import discussion_blocks, even_headings
 from pipeline.report.words import SOURCES, clean, rich
 from pipeline.results import Analysis, HardwareCheck, ParameterRow
-from pipeline.stages.compare import CHI_SQUARE_LIMIT, DAMPING_LIMIT
+from pipeline.stages.compare import DAMPING_LIMIT
 
 _MOST = 6  # a report with more would be a questionnaire
 _LISTED = 4  # runs; of more the first
@@ -208,7 +208,7 @@ def _width(interval: tuple[float, float] | None) -> float:
 
 def _misfit(analysis: Analysis) -> Iterator[Asked]:
     fit = analysis.fit
-    if fit is None or fit.method != "bode_fit" or fit.chi_square_per_dof <= CHI_SQUARE_LIMIT:
+    if fit is None or fit.method != "bode_fit" or fit.explains_data:
         return
     worst: tuple[float, int, float] | None = None  # standard errors, cart, rad/s
     for response in analysis.frequency_responses:

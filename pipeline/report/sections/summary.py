@@ -34,7 +34,6 @@ _KINDS = {  # what carts are identified from
     "sweep": "sweep",
     "bode": "table of amplitude ratios",
 }
-_GOOD_FIT = 2.0  # chi-square per degree of freedom that stated noise still explains
 _MOST_TOLD = 3  # of one kind: a summary is short
 _OF_DATA = (
     "repeats.",
@@ -100,7 +99,7 @@ def _identified(analysis: Analysis) -> Block:
     what = {"bode_fit": "the frequency response", "time_fit": "the records in time"}[fit.method]
     quality = (
         "model and stated noise explain the data"
-        if fit.chi_square_per_dof <= _GOOD_FIT
+        if fit.explains_data
         else "more than the stated noise is left, so the linear model misses something"
     )
     converged = "" if fit.converged else f" The fit did not converge: {clean(fit.message)}."
@@ -132,7 +131,7 @@ def _verdict_board(analysis: Analysis) -> tuple[Tile, ...]:
     """Return what agrees and what does not, each leading to its section."""
     tiles = []
     if fit := analysis.fit:
-        good = fit.converged and fit.chi_square_per_dof <= _GOOD_FIT
+        good = fit.converged and fit.explains_data
         tiles.append(
             Tile(
                 label=spans("χ² per degree of freedom"),
@@ -363,7 +362,7 @@ def _next(analysis: Analysis) -> Items:
         )
     doubted = {check.experiment for check in analysis.hardware if check.contradicted}
     poor = [c for c in analysis.hardware if c.nrmse > _CLOSE and c.experiment not in doubted]
-    if poor or (fit is not None and fit.chi_square_per_dof > _GOOD_FIT):
+    if poor or (fit is not None and not fit.explains_data):
         advice.append(
             spans(
                 "Find what the linear model leaves out: compare where in the records the "

@@ -1,5 +1,6 @@
-"""Hold the designed state feedback against python-control: its margins, and its gains once more."""
+"""Checks of loops: the designed one held against python-control, those that ran against the log."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -8,7 +9,7 @@ from numpy.typing import ArrayLike
 from pipeline.errors import DataError
 from pipeline.plant.chain import Array, Chain
 from pipeline.plant.designed_loop import Margins, closed_loop, stability_margins
-from pipeline.results import Check, FeedbackDesign, Outcome
+from pipeline.results import Check, FeedbackDesign, HardwareCheck, Outcome
 
 if TYPE_CHECKING:
     import control
@@ -54,6 +55,18 @@ def verify_design(chain: Chain, design: FeedbackDesign) -> Check:
     if np.abs(theirs - wanted).max() > _SAME:
         return _check("skip", value, f"{names} miss the poles asked for; these gains do not")
     return _check("pass", value, f"{names} give the same loop")
+
+
+def check_loops(hardware: Sequence[HardwareCheck]) -> list[Check]:
+    """Return a failed check for each run of which the log or the stated controller is wrong."""
+    notes: dict[str, list[str]] = {}
+    for check in hardware:
+        if check.contradicted:
+            notes.setdefault(check.experiment, []).extend([check.note] if check.note else [])
+    return [
+        Check.of(f"hardware.{run}", False, f"{run}: {'; '.join(said)}.")
+        for run, said in notes.items()
+    ]
 
 
 def _check(outcome: Outcome, value: float | None, message: str) -> Check:

@@ -1,0 +1,116 @@
+"""Names: of parameters, as in the paper's Tables 1-3, read only here; and of runs in a list.
+
+`K_1` is the static gain of cart 1, `omega_2` and `zeta_2` belong to cart 2 alone, `omega_a`,
+`omega_b`, … are resonances and `omega_x`, `omega_y` the nulls of cart 1 with three carts. One
+cart has no index: `K`, `omega_n`, `zeta`; a body on no spring `mass`, `damping`.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cache
+
+MODES = "abcdefgh"  # resonances, ascending in frequency
+NULLS = "xy"  # of cart 1 with three carts
+
+
+@dataclass(frozen=True)
+class Name:
+    """A parameter's name, read: "omega_a" is the symbol "omega" with the suffix "a"."""
+
+    symbol: str
+    suffix: str
+
+    @property
+    def is_gain(self) -> bool:
+        """Whether it is a static gain: a length for an input, so that both scales are in it."""
+        return self.symbol == "K"
+
+    @property
+    def is_frequency(self) -> bool:
+        """Whether it is a frequency, rad/s."""
+        return self.symbol == "omega"
+
+    @property
+    def is_ratio(self) -> bool:
+        """Whether it is a damping ratio."""
+        return self.symbol == "zeta"
+
+    @property
+    def is_damping(self) -> bool:
+        """Whether it is a damping of either kind: worth half as many digits as the rest."""
+        return self.symbol in ("zeta", "damping")
+
+    @property
+    def is_mode(self) -> bool:
+        """Whether it belongs to a resonance of all carts together."""
+        return self.suffix == "n" or (self.suffix != "" and self.suffix in MODES)
+
+    @property
+    def cart(self) -> int | None:
+        """The cart it belongs to (of a chain of several), from 1."""
+        return int(self.suffix) if self.suffix.isdigit() else None
+
+    def unit(self, *, position: str, input: str) -> str:
+        """Return its unit; "" for a damping ratio."""
+        units = {
+            "K": f"{position}/{input}",
+            "omega": "rad/s",
+            "mass": f"{input} s^2/{position}",
+            "damping": f"{input} s/{position}",
+        }
+        return units.get(self.symbol, "")
+
+
+@cache
+def read_name(name: str) -> Name:
+    """Return what a name stands for."""
+    symbol, _, suffix = name.partition("_")
+    return Name(symbol, suffix)
+
+
+def gain_name(cart: int, *, n: int) -> str:
+    """Return the name of a cart's static gain, in a chain of n."""
+    return "K" if n == 1 else f"K_{cart}"
+
+
+def own_omega(cart: int, *, n: int) -> str:
+    """Return the name of the frequency that a cart has alone, the others held."""
+    return "omega_n" if n == 1 else f"omega_{cart}"
+
+
+def own_zeta(cart: int, *, n: int) -> str:
+    """Return the name of the damping ratio that a cart has alone, the others held."""
+    return "zeta" if n == 1 else f"zeta_{cart}"
+
+
+def mode_suffixes(n: int) -> list[str]:
+    """Return the suffixes of the n resonances, ascending in frequency."""
+    return ["n"] if n == 1 else list(MODES[:n])
+
+
+def mode_zeta(suffix: str) -> str:
+    """Return the name of the damping ratio of a resonance or null."""
+    return "zeta" if suffix == "n" else f"zeta_{suffix}"
+
+
+def omega_names(suffixes: Iterable[str]) -> list[str]:
+    """Return the names of the frequencies with these suffixes."""
+    return [f"omega_{suffix}" for suffix in suffixes]
+
+
+def parameter_names(n: int, *, rigid: bool = False) -> list[str]:
+    """Return the names of all parameters of n carts, in the order of the tables."""
+    if n == 1:
+        return ["mass", "damping"] if rigid else ["K", "omega_n", "zeta"]
+    carts = [str(cart) for cart in range(1, n + 1)]
+    names = [f"K_{cart}" for cart in carts]
+    for group in (MODES[:n], NULLS if n == 3 else "", carts):
+        names += [f"{symbol}_{suffix}" for symbol in ("omega", "zeta") for suffix in group]
+    return names
+
+
+def listed(ids: Sequence[str], *, most: int = 4) -> str:
+    """Return the names of runs, the middle of more than `most` left out."""
+    if len(ids) <= most:
+        return ", ".join(ids)
+    return f"{ids[0]}, {ids[1]} … {ids[-1]} ({len(ids)} runs)"

@@ -1,0 +1,67 @@
+"""The orders that gains, resonances and nulls of a real chain of carts stand in.
+
+Carts held still raise every frequency, so resonances and nulls interlace (Cauchy); without
+damping exactly, with heavy damping they may bend.
+"""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+from pipeline.names import MODES, NULLS, omega_names, read_name
+
+HEAVY_DAMPING = 0.3  # of a damping ratio: above it the orders of frequencies may bend
+
+_GAINS = "a cart further from the motor is moved less by a constant input"
+_MODES = "the resonances are listed in rising order"
+_ALONE = (
+    "a cart alone swings faster than all together at the first resonance, and slower than at the "
+    "last"
+)
+_NULLS = "each null of cart 1 lies between two resonances"
+_INNER = "carts 2 and 3 alone lie between the nulls of cart 1"
+
+
+class Bracket(NamedTuple):
+    """Of three frequencies by name, `middle` lies between the others."""
+
+    low: str
+    middle: str
+    high: str
+    why: str
+
+
+def brackets(n: int) -> list[Bracket]:
+    """Return what lies between what in a chain of n carts, two or more, all springs there."""
+    modes, alone = omega_names(MODES[:n]), omega_names(map(str, range(1, n + 1)))
+    found = [Bracket(modes[0], name, modes[-1], _ALONE) for name in alone]
+    if n == 3:
+        first, second = omega_names(NULLS)
+        found.append(Bracket(modes[0], first, modes[1], _NULLS))
+        found.append(Bracket(modes[1], second, modes[2], _NULLS))
+        found += [Bracket(first, name, second, _INNER) for name in alone[1:]]
+    return found
+
+
+def orders(names: Sequence[str]) -> list[tuple[str, str, str]]:
+    """Return (lesser, greater, why) of every order that the named parameters obey.
+
+    The names may come in any order, and some of a chain's may be missing.
+    """
+    names = sorted(names)
+    gains = [name for name in names if read_name(name).is_gain and read_name(name).cart]
+    modes = [name for name in names if name in omega_names(MODES)]
+    n = max(
+        [read_name(name).cart or 0 for name in names]
+        + [MODES.index(m[-1]) + 1 for m in modes[-1:]],
+        default=0,
+    )
+    found = [(far, near, _GAINS) for near, far in pairwise(gains)]
+    found += [(a, b, _MODES) for a, b in pairwise(modes)]
+    between = brackets(n) if n > 1 else []
+    alone, others = [b for b in between if b.why == _ALONE], [b for b in between if b.why != _ALONE]
+    found += [(b.low, b.middle, b.why) for b in alone]
+    found += [(b.middle, b.high, b.why) for b in alone]
+    for b in others:
+        found += [(b.low, b.middle, b.why), (b.middle, b.high, b.why)]
+    return [order for order in found if {order[0], order[1]} <= set(names)]
