@@ -46,8 +46,13 @@ class Name:
         return self.suffix == "n" or (self.suffix != "" and self.suffix in MODES)
 
     @property
+    def is_null(self) -> bool:
+        """Whether it belongs to a null of cart 1, with three carts."""
+        return self.suffix != "" and self.suffix in NULLS
+
+    @property
     def cart(self) -> int | None:
-        """The cart it belongs to (of a chain of several), from 1."""
+        """The cart (or spring) it belongs to, from 1."""
         return int(self.suffix) if self.suffix.isdigit() else None
 
     def unit(self, *, position: str, input: str) -> str:

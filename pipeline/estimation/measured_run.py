@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import DataError
-from pipeline.estimation.signals import local_noise
+from pipeline.estimation.noise import local_noise
 from pipeline.plant.chain import Array, Chain
 from pipeline.plant.simulate import simulate_linear
 from pipeline.results import Record

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from pipeline.estimation.noise import difference_gain
 from pipeline.plant.chain import Array, ComplexArray
 from pipeline.results import Record
 
@@ -115,7 +116,7 @@ def _ratio(Y: ComplexArray, U: ComplexArray, *, std: Array) -> TransferRatio:
 
 def _noise(run: Record) -> Array:
     """Standard deviation (n_carts,) of what changes from sample to sample, or the encoder's."""
-    white = np.std(np.diff(run.y, n=3, axis=1), axis=1) / np.sqrt(20.0)  # 1 + 9 + 9 + 1
+    white = np.std(np.diff(run.y, n=3, axis=1), axis=1) / difference_gain(3)
     return np.maximum(white, run.resolution / np.sqrt(12.0))
 
 

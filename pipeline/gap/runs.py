@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from pipeline.estimation.noise import difference_noise
 from pipeline.plant.chain import Array
 from pipeline.plant.simulate import interpolate_band_limited
 from pipeline.results import Record
@@ -87,7 +88,7 @@ def make_run(record: Record, *, n: int, in_motion: bool = False) -> Run:
     y = np.array([record.position(row + 1) for row in rows])
     resolution = np.array([record.encoder_step(row + 1) for row in rows])
     t, u = record.t, record.u if record.u is not None else np.zeros(record.t.size)
-    still = np.maximum(_STILL * resolution, 4.0 * _rough_noise(y))
+    still = np.maximum(_STILL * resolution, 4.0 * difference_noise(y, order=4))
     tail = y[:, -max(3, int(_TAIL * t.size)) :]
     settled = np.ptp(tail, axis=1) <= still
     quiet_end = bool(np.all(u[-tail.shape[1] :] == 0.0))
@@ -239,12 +240,6 @@ def high_frequency_noise(residual: Array, *, half_width: int = 4) -> float:
     rest = rest[half_width:-half_width]
     gain = 1.0 - 2.0 * smoother[half_width] + float(smoother @ smoother)
     return float(np.sqrt(np.mean(rest**2) / gain))
-
-
-def _rough_noise(y: Array) -> Array:
-    """Noise per row from fourth differences (smooth motion leaves almost nothing in them)."""
-    fourth = np.diff(y, n=4, axis=1)
-    return 1.4826 * np.median(np.abs(fourth), axis=1) / np.sqrt(70.0)
 
 
 def _dominant_frequency(t: Array, y: Array) -> float:

@@ -4,6 +4,7 @@ import re
 import unicodedata
 from collections.abc import Iterable
 
+from pipeline.names import read_name
 from pipeline.report.document import Block, Items, Paragraph, Span, Spans, plain
 from pipeline.report.math.tree import GREEK, symbol
 from pipeline.report.numbers import listing, typeset
@@ -32,8 +33,8 @@ def rich(text: str) -> Spans:
 
 def name_span(name: str) -> Span:
     """Return one parameter name as mathematics, with its plain form as text."""
-    base, _, index = name.partition("_")
-    plain = GREEK.get(base, base) + (f"_{index}" if index else "")
+    read = read_name(name)
+    plain = GREEK.get(read.symbol, read.symbol) + (f"_{read.suffix}" if read.suffix else "")
     return Span(plain, math=symbol(name))
 
 

@@ -20,7 +20,7 @@ from pipeline.estimation.chain.parametrisation import (
 )
 from pipeline.estimation.chain.staged_fit import LogMagnitude, StagedFit, fit_stage_by_stage
 from pipeline.estimation.last_point import LastPoint
-from pipeline.names import own_zeta
+from pipeline.names import own_zeta, read_name
 from pipeline.plant.chain import Array, Chain, recover_chain
 from pipeline.results import EXPLAINED, ChainFit, Estimate, FrequencyResponse
 
@@ -300,7 +300,7 @@ def _natural_sizes(P: Parametrisation, chain: Chain, data: Points) -> Array:
     """Return of what order each parameter (n_p,) is: damping m ω, the stiffest spring."""
     middle = float(np.median(data.omega[data.omega > 0]))
     sizes = {"m": chain.m, "c": chain.m * middle, "k": np.full(chain.n + 1, np.max(chain.k))}
-    return np.array([sizes[name[0]][int(name[2:]) - 1] for name in P.names])
+    return np.array([sizes[symbol][place] for symbol, place in P.places])
 
 
 def _phase_misfit(fitted: _Fitted, data: Points) -> float:
@@ -377,7 +377,7 @@ def _covariance(
     A damping that is held at zero is one of them where the data tell its error: no cart is without
     damping, and what rests on it is known no better. A far spring may well not be there.
     """
-    springs = tuple(name for name in P.zero if name[0] == "k")
+    springs = tuple(name for name in P.zero if read_name(name).symbol == "k")
     for Q in (replace(P, zero=springs), P):
         sizes = _natural_sizes(Q, chain, data)
         _, J = weighted_residuals(Q, data, scale, Q.physical(chain))

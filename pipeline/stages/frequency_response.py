@@ -8,7 +8,15 @@ import numpy as np
 
 from pipeline.errors import DataError
 from pipeline.estimation.record_transforms import transfer_ratio, visible_band
-from pipeline.names import parameter_names
+from pipeline.names import (
+    NULLS,
+    gain_name,
+    mode_suffixes,
+    mode_zeta,
+    omega_names,
+    own_omega,
+    parameter_names,
+)
 from pipeline.plant.chain import Array, ComplexArray
 from pipeline.results import Estimate, FrequencyResponse, Record, SinePoint
 
@@ -215,18 +223,18 @@ def find_resonances(responses: Sequence[FrequencyResponse], *, n: int) -> dict[s
     if len(modes) == n - 1 and n in by_cart:
         modes = _with_damped_mode(by_cart[n], modes)
     nulls = {cart: _between(_extrema(r, sign=-1), modes) for cart, r in by_cart.items()}
-    symbols = ["n"] if n == 1 else list("abcdefgh"[:n])
+    symbols = mode_suffixes(n)
     if len(modes) == n:
-        found |= _estimates([f"omega_{symbol}" for symbol in symbols], modes)
+        found |= _estimates(omega_names(symbols), modes)
     lowest = modes[0].omega if modes else None
     for cart, response in sorted(by_cart.items()):
         gain = _low_frequency_gain(response, resonance=lowest)
-        found |= {"K" if n == 1 else f"K_{cart}": gain} if gain else {}
+        found |= {gain_name(cart, n=n): gain} if gain else {}
     if n > 1 and n - 1 in by_cart:
-        found |= _estimates([f"omega_{n}"], _strongest(nulls[n - 1], 1))
+        found |= _estimates([own_omega(n, n=n)], _strongest(nulls[n - 1], 1))
     if n == 3 and 1 in by_cart:
-        found |= _estimates(["omega_x", "omega_y"], _strongest(nulls[1], 2))
-    assumed = ["zeta"] if n == 1 else [f"zeta_{symbol}" for symbol in (*symbols, "x", "y")]
+        found |= _estimates(omega_names(NULLS), _strongest(nulls[1], 2))
+    assumed = [mode_zeta(suffix) for suffix in (*symbols, *NULLS)]
     return found | {
         name: Estimate(value=ASSUMED_ZETA, std=None, source="assumed")
         for name in assumed

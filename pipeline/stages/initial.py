@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pipeline.names import gain_name, own_omega, own_zeta
 from pipeline.results import Estimate, LogDecrement, StepGain
 
 
@@ -22,22 +23,19 @@ def estimate_initially(
     *, carts: int, log_decrements: Sequence[LogDecrement], step_gains: Sequence[StepGain]
 ) -> dict[str, Estimate]:
     """Estimate the gains from steps, the frequency and damping of each cart alone from decays."""
-    estimates: dict[str, Estimate] = {}
-    for cart in range(1, carts + 1):
-        suffix = "" if carts == 1 else f"_{cart}"
-        decays = [d for d in log_decrements if d.cart == cart]
-        steps = [s for s in step_gains if s.cart == cart]
-        if decays:
-            estimates["omega_n" if carts == 1 else f"omega_{cart}"] = combine_repeats(
-                [d.omega_n for d in decays],
-                std=[d.omega_n_std for d in decays],
-                source="log_decrement",
-            )
-            estimates[f"zeta{suffix}"] = combine_repeats(
-                [d.zeta for d in decays], std=[d.zeta_std for d in decays], source="log_decrement"
-            )
-        if steps:
-            estimates[f"K{suffix}"] = combine_repeats(
-                [s.gain for s in steps], std=[s.gain_std for s in steps], source="step"
-            )
-    return estimates
+    measured: dict[str, list[tuple[float, float, str]]] = {}
+    for decay in log_decrements:
+        for name, value, std in (
+            (own_omega(decay.cart, n=carts), decay.omega_n, decay.omega_n_std),
+            (own_zeta(decay.cart, n=carts), decay.zeta, decay.zeta_std),
+        ):
+            measured.setdefault(name, []).append((value, std, "log_decrement"))
+    for step in step_gains:
+        name = gain_name(step.cart, n=carts)
+        measured.setdefault(name, []).append((step.gain, step.gain_std, "step"))
+    return {
+        name: combine_repeats(
+            [value for value, _, _ in ones], std=[std for _, std, _ in ones], source=ones[0][2]
+        )
+        for name, ones in measured.items()
+    }

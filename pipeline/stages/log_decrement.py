@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline.errors import DataError
 from pipeline.estimation.decay.free_decay import FreeDecay, find_decay, fit_decay
-from pipeline.estimation.signals import grain
+from pipeline.estimation.noise import grain
 from pipeline.plant.chain import Array
 from pipeline.results import LogDecrement, Record
 

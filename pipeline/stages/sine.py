@@ -6,7 +6,8 @@ from functools import cached_property
 import numpy as np
 
 from pipeline.errors import DataError
-from pipeline.estimation.signals import colour, grain, noise_beyond_rounding, rounding_left
+from pipeline.estimation.colour import colour
+from pipeline.estimation.noise import grain, noise_beyond_rounding, rounding_left
 from pipeline.plant.chain import Array
 from pipeline.results import Record, SinePoint
 

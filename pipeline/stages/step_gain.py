@@ -7,15 +7,10 @@ from itertools import pairwise
 import numpy as np
 
 from pipeline.errors import DataError
+from pipeline.estimation.colour import colour
 from pipeline.estimation.decay.ringing import find_poles, fit_ringing
-from pipeline.estimation.signals import (
-    colour,
-    extrema,
-    grain,
-    noise_beyond_rounding,
-    plateaus,
-    rounding_left,
-)
+from pipeline.estimation.noise import grain, noise_beyond_rounding, rounding_left
+from pipeline.estimation.peaks import extrema, plateaus
 from pipeline.plant.chain import Array
 from pipeline.results import Record, StepEdge, StepGain
 

@@ -22,7 +22,8 @@ from pipeline.estimation.chain.parametrisation import (
 )
 from pipeline.estimation.chain.time_search import Attempt, condense, descend, look, search
 from pipeline.estimation.chain.time_window import Window, open_window
-from pipeline.estimation.residual_colour import long_run_variance, score_covariance
+from pipeline.estimation.colour import long_run_variance, score_covariance
+from pipeline.names import read_name
 from pipeline.plant.chain import Array, Chain
 from pipeline.results import ChainFit, Estimate, Record
 
@@ -179,7 +180,7 @@ def _negligible(attempt: Attempt, covariance: Array) -> tuple[str, ...]:
     ]
     walls = tuple(name for name in gone if name in ("k_1", f"k_{chain.n + 1}"))
     is_held = chain.k[0] > 0 or chain.k[-1] > 0
-    return walls or tuple(name for name in gone if name[0] == "c" and is_held)
+    return walls or tuple(name for name in gone if read_name(name).symbol == "c" and is_held)
 
 
 def _released(attempt: Attempt) -> Attempt:
@@ -189,7 +190,7 @@ def _released(attempt: Attempt) -> Attempt:
     well not be there.
     """
     held, chain = attempt.parametrisation, attempt.chain
-    springs = tuple(name for name in held.zero if name[0] == "k")
+    springs = tuple(name for name in held.zero if read_name(name).symbol == "k")
     if springs == held.zero:
         return attempt
     free = replace(held, zero=springs)

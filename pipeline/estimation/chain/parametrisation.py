@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import DataError
+from pipeline.names import read_name
 from pipeline.plant.chain import Array, Chain
 from pipeline.results import Estimate
 
@@ -75,10 +76,15 @@ class Parametrisation:
         return np.where(self.logarithmic, -np.inf, 0.0), np.full(len(self.names), np.inf)
 
     @cached_property
+    def places(self) -> tuple[tuple[str, int], ...]:
+        """The free parameters as "m", "c" or "k" and the index among those of a chain."""
+        return tuple(_place(name) for name in self.names)
+
+    @cached_property
     def _places(self) -> NDArray[np.intp]:
         """Index (n_p,) of each free parameter in the flat vector (m, c, k)."""
         offset = {"m": 0, "c": self.n, "k": 2 * self.n}
-        return np.array([offset[name[0]] + int(name[2:]) - 1 for name in self.names])
+        return np.array([offset[symbol] + index for symbol, index in self.places])
 
     def physical(self, chain: Chain) -> Array:
         """Return the free parameters (n_p,) of a chain, in physical units."""
@@ -120,7 +126,7 @@ class Parametrisation:
     @cached_property
     def orders(self) -> NDArray[np.intp]:
         """Power of s (n_p,) a parameter stands at: 2 for a mass, 1 a damper, 0 a spring."""
-        return np.array(["kcm".index(name[0]) for name in self.names])
+        return np.array(["kcm".index(symbol) for symbol, _ in self.places])
 
     @cached_property
     def matrix_derivatives(self) -> tuple[Array, Array, Array]:
@@ -139,6 +145,13 @@ class Parametrisation:
         """Return the covariance (n_p, n_p) of the physical parameters from that of theta."""
         slopes = self.slopes(theta)
         return slopes[:, None] * covariance * slopes
+
+
+def _place(name: str) -> tuple[str, int]:
+    """Return "c" and 1 for "c_2"."""
+    read = read_name(name)
+    assert read.cart is not None
+    return read.symbol, read.cart - 1
 
 
 def named_estimates(
@@ -164,7 +177,7 @@ def named_estimates(
     variance = np.einsum("ij,jk,ik->i", J, covariance, J)
     return {
         name: Estimate(value=0.0, std=None, source=source, at_bound=True)
-        if name.startswith(("zeta", "damping")) and value <= _NO_DAMPING
+        if read_name(name).is_damping and value <= _NO_DAMPING
         else Estimate(value=value, std=float(np.sqrt(v)) if v >= 0 else None, source=source)
         for (name, value), v in zip(values.items(), variance, strict=True)
     }
@@ -175,11 +188,11 @@ def _parameter_jacobian(chain: Chain, names: Sequence[str]) -> Array:
     base = np.array(list(chain.parameters().values()))
     columns = []
     for name in names:
-        values: Array = getattr(chain, name[0])
-        i = int(name[2:]) - 1
+        symbol, i = _place(name)
+        values: Array = getattr(chain, symbol)
         step = _DIFFERENCE * (values[i] or np.max(values) or critical_damping(chain))
         moved = {"m": chain.m.copy(), "c": chain.c.copy(), "k": chain.k.copy()}
-        moved[name[0]][i] += step
+        moved[symbol][i] += step
         there = np.array(list(Chain(**moved).parameters().values()))
         columns.append((there - base) / step)
     return np.stack(columns, axis=1)
@@ -219,7 +232,7 @@ def even_chain(values: Mapping[str, float], *, n: int, springs: Sequence[bool]) 
     omegas = [
         value
         for name, value in values.items()
-        if name == "omega_n" or (name.startswith("omega_") and name[6:] in tuple("abcdefgh"))
+        if read_name(name).is_frequency and read_name(name).is_mode
     ]
     gain = values.get("K", values.get("K_1"))
     if not omegas or gain is None:

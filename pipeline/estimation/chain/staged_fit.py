@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
+from pipeline.names import NULLS, gain_name, mode_suffixes, mode_zeta, own_omega, own_zeta
 from pipeline.plant.chain import Array, Chain, quadratic_factors, recover_chain
 
-_MODES = "abcdefgh"
 _EVALUATIONS = 100  # a stage that gets there takes about ten
 _RUNAWAY = 7.0  # of a logarithm, a factor 1000: a stage that got there has lost its way
 _FARTHEST = 50.0  # of a logarithm: a step that goes astray must not overflow
@@ -52,7 +52,7 @@ def fit_stage_by_stage(
     like : a chain that stands in for those there are not.
     """
     known = {**like.parameters(), **initial}
-    gains = np.array([known["K" if n == 1 else f"K_{i}"] for i in range(1, n + 1)])
+    gains = np.array([known[gain_name(i, n=n)] for i in range(1, n + 1)])
     factors = [_start(known, i, n=n, like=like) for i in range(n)]
     for cart in range(n, 0, -1):
         if cart not in measured:
@@ -74,19 +74,17 @@ def _start(known: Mapping[str, float], i: int, *, n: int, like: Chain) -> Array:
     omega, zeta = quadratic_factors(roots)
     for j, suffix in enumerate(_suffixes(i, n=n)):
         omega[j] = known.get(f"omega_{suffix}", omega[j])
-        zeta[j] = known.get("zeta" if n == 1 else f"zeta_{suffix}", zeta[j])
+        zeta[j] = known.get(mode_zeta(suffix), zeta[j])
     return np.log([omega, np.clip(zeta, *_ZETA_RANGE)])
 
 
 def _suffixes(i: int, *, n: int) -> list[str]:
     """Name the quadratic factors of T_{i+1}; none for those that the tables do not list."""
-    if n == 1:
-        return ["n"]
     if i == 0:
-        return list(_MODES[:n])
+        return mode_suffixes(n)
     if i == n - 1:
         return [str(n)]
-    return ["x", "y"] if n == 3 else []
+    return list(NULLS) if n == 3 else []
 
 
 def _fit(
@@ -140,17 +138,17 @@ def _polynomial(factors: Array) -> Array:
 def _named(gains: Array, factors: list[Array], tails: list[Array]) -> dict[str, float]:
     """Name what was fitted, and the carts' own frequencies recomputed from it where they exist."""
     n = gains.size
-    values = {"K" if n == 1 else f"K_{i}": float(gain) for i, gain in enumerate(gains, start=1)}
+    values = {gain_name(i, n=n): float(gain) for i, gain in enumerate(gains, start=1)}
     for i, factor in enumerate(factors):
         order = np.argsort(factor[0])
         for suffix, omega, zeta in zip(_suffixes(i, n=n), *np.exp(factor[:, order]), strict=False):
             values[f"omega_{suffix}"] = float(omega)
-            values["zeta" if n == 1 else f"zeta_{suffix}"] = float(zeta)
+            values[mode_zeta(suffix)] = float(zeta)
     found = recover_chain(gains, tails)
     for i in range(1, n if n > 1 else 0):
         stiffness = found.k[i - 1] + found.k[i]
         if stiffness > 0 and found.m[i - 1] > 0:
             omega = float(np.sqrt(stiffness / found.m[i - 1]))
-            values[f"omega_{i}"] = omega
-            values[f"zeta_{i}"] = float(found.c[i - 1] / (2 * found.m[i - 1] * omega))
+            values[own_omega(i, n=n)] = omega
+            values[own_zeta(i, n=n)] = float(found.c[i - 1] / (2 * found.m[i - 1] * omega))
     return values

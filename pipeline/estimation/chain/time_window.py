@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline.errors import DataError
 from pipeline.estimation.chain.modal_response import Modes, drive_modes
-from pipeline.estimation.signals import local_noise
+from pipeline.estimation.noise import local_noise
 from pipeline.plant.chain import Array, ComplexArray
 from pipeline.plant.simulate import OVERSAMPLING, interpolate_band_limited
 from pipeline.results import Kind, Record

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.estimation.colour import colour
 from pipeline.estimation.decay.ringing import Ringing
 from pipeline.estimation.decay.separable import fit_separable
-from pipeline.estimation.signals import colour
 from pipeline.plant.chain import Array
 from pipeline.results import FrictionTest
 

@@ -8,7 +8,7 @@ import numpy as np
 from pipeline.errors import DataError
 from pipeline.estimation.decay.dry_friction import FrictionFit, fit_friction
 from pipeline.estimation.decay.ringing import Ringing, fit_ringing
-from pipeline.estimation.signals import extrema, plateaus
+from pipeline.estimation.peaks import extrema, plateaus
 from pipeline.plant.chain import Array
 from pipeline.results import Record
 

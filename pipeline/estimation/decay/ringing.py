@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.estimation.colour import colour
 from pipeline.estimation.decay.separable import fit_separable
-from pipeline.estimation.signals import colour
 from pipeline.plant.chain import Array, ComplexArray
 
 _PENCIL_SAMPLES = 300  # the matrix pencil only starts the fit; more samples would only cost time

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.estimation.mistakes import TIME_FACTORS
+from pipeline.names import gain_name, own_omega, own_zeta, read_name
 from pipeline.results import Check, Estimate, LeftOut, LogDecrement, StepGain
 
 TOLERANCE = 10.0  # percent; the same run made twice, with dry friction of some percent
@@ -72,10 +73,10 @@ def compare_repeats(
     """
     readings = _readings(decays, steps, carts=carts)
     # A fit's damping rests on the decays' own where its points do not tell it.
-    told = {name: one for name, one in fitted.items() if not name.startswith("zeta")}
+    told = {name: one for name, one in fitted.items() if not read_name(name).is_ratio}
     right = {name: _right_ones(all_, told.get(name)) for name, all_ in readings.items()}
     usual = {n: float(np.median([r.value for r in ones])) for n, ones in right.items() if ones}
-    for name in [name for name in usual if name in dwells and not name.startswith("zeta")]:
+    for name in [name for name in usual if name in dwells and not read_name(name).is_ratio]:
         if all(_is_far(reading, dwells[name], name=name) for reading in right[name]):
             usual[name], right[name] = dwells[name].value, []
     by_size = {name for name, ones in right.items() if ones and _only_by_size(readings[name])}
@@ -111,7 +112,7 @@ def _readings(
 ) -> dict[str, list[_Reading]]:
     found: dict[str, list[_Reading]] = {}
     for decay in decays:
-        name = "omega_n" if carts == 1 else f"omega_{decay.cart}"
+        name = own_omega(decay.cart, n=carts)
         slack = _SIGMAS * decay.omega_n_std
         found.setdefault(name, []).append(
             _Reading(
@@ -125,7 +126,7 @@ def _readings(
         # Dry friction adds the more damping the less the cart swings.
         sticks = decay.friction is not None and decay.friction.present
         ratios = [decay.zeta, *(decay.zeta_at_amplitude[1].tolist() if sticks else ())]
-        found.setdefault("zeta" if carts == 1 else f"zeta_{decay.cart}", []).append(
+        found.setdefault(own_zeta(decay.cart, n=carts), []).append(
             _Reading(
                 run=decay.experiment,
                 value=decay.zeta,
@@ -135,7 +136,7 @@ def _readings(
             )
         )
     for step in steps:
-        name, slack = "K" if carts == 1 else f"K_{step.cart}", _SIGMAS * step.gain_std
+        name, slack = gain_name(step.cart, n=carts), _SIGMAS * step.gain_std
         low, high = step.interval or (step.gain, step.gain)  # where the cart sticks
         found.setdefault(name, []).append(
             _Reading(
@@ -185,7 +186,7 @@ def _is_far(reading: _Reading, told: Estimate, *, name: str) -> bool:
     """Whether a reading and its errors are of another number than one that is well known."""
     if told.std is None or told.value <= 0 or _SIGMAS * told.std > _LIKE_THE_FIT * told.value:
         return False
-    factor = _BY_THE_BENCH[name.partition("_")[0]]
+    factor = _BY_THE_BENCH[read_name(name).symbol]
     return reading.high < told.value / factor or reading.low > told.value * factor
 
 
@@ -194,7 +195,7 @@ def _wrong_clock(values: Mapping[str, float], usual: Mapping[str, float]) -> str
     ratios = [
         usual[name] / value
         for name, value in values.items()
-        if name.startswith("omega") and usual.get(name)
+        if read_name(name).is_frequency and usual.get(name)
     ]
     looks = (
         words
@@ -206,7 +207,7 @@ def _wrong_clock(values: Mapping[str, float], usual: Mapping[str, float]) -> str
 
 def _is_reversed(values: Mapping[str, float], usual: Mapping[str, float]) -> bool:
     """Whether all carts went the other way: a log may count its input so by right."""
-    known = [name for name in values if name.startswith("K") and usual.get(name)]
+    known = [name for name in values if read_name(name).is_gain and usual.get(name)]
     return bool(known) and all(_near(values[name], -usual[name]) for name in known)
 
 

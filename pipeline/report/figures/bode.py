@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from pipeline.names import mode_suffixes
 from pipeline.plant.chain import Array, Chain
 from pipeline.report.figures.style import (
     MEASURED,
@@ -138,7 +139,7 @@ def _dense(omega: Array, chain: Chain) -> Array:
 def _mark_modes(ax: Axes, omega: Array, chain: Chain) -> None:
     """Mark the resonances omega_a, omega_b, … by dotted lines with their letters."""
     modes = np.unique(np.round(np.abs(chain.poles[chain.poles.imag > 0]), 9))
-    letters = "abcdefgh" if chain.n > 1 else "n"
+    letters = mode_suffixes(chain.n)
     for letter, mode in zip(letters, modes, strict=False):
         if omega.min() < mode < omega.max():
             ax.axvline(mode, color=QUIET, lw=0.8, ls=":")

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from html import escape
 from typing import Literal
 
+from pipeline.names import read_name
+
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 _OPERATORS = frozenset("+−=·,()[]≥≤<≈≠→")
 _RELATIONS = frozenset("=≥≤<≈≠→")
@@ -87,9 +89,9 @@ def negative(term: Term) -> Math:
 
 def symbol(name: str) -> Term:
     """Return a parameter name such as `omega_a`, `K_1` or `mass` as it is written by hand."""
-    base, _, index = name.partition("_")
-    base = GREEK.get(base, base)
-    return sub(base, index) if index else base
+    read = read_name(name)
+    base = GREEK.get(read.symbol, read.symbol)
+    return sub(base, read.suffix) if read.suffix else base
 
 
 GREEK = {"omega": "ω", "zeta": "ζ", "delta": "δ", "mass": "m", "damping": "c"}

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pipeline.names import mode_suffixes, omega_names
 from pipeline.report.document import Block, paragraph
 from pipeline.report.figures.bode import bode_figure
 from pipeline.report.figures.time import damping_figure, decay_figure, sine_figure, step_figure
@@ -53,7 +54,7 @@ def _bode_caption(page: Page, response: FrequencyResponse) -> str:
     omega, measured = response.omega[shown], response.magnitude[shown]
     off = 100 * (measured / np.abs(chain.frequency_response(omega)[response.cart - 1]) - 1)
     worst = int(np.argmax(np.abs(off)))
-    marks = listing([f"omega_{mode}" for mode in "abcdefgh"[:n]] if n > 1 else ["omega_n"])
+    marks = listing(omega_names(mode_suffixes(n)))
     half, most = (
         significant(float(v), digits=2) for v in (np.median(np.abs(off)), abs(off[worst]))
     )

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.names import read_name
 from pipeline.report.document import (
     Block,
     Heading,
@@ -89,7 +90,7 @@ def _damping(analysis: Analysis) -> Iterator[Asked]:
     off = [
         row
         for row in _off(analysis)
-        if row.name.startswith("zeta") and row.initial is not None and row.final is not None
+        if read_name(row.name).is_ratio and row.initial is not None and row.final is not None
     ]
     if not off:
         return
@@ -109,7 +110,7 @@ def _damping(analysis: Analysis) -> Iterator[Asked]:
 
 def _gains_and_frequencies(analysis: Analysis) -> Iterator[Asked]:
     for row in _off(analysis):
-        if row.name.startswith("zeta") or row.initial is None or row.final is None:
+        if read_name(row.name).is_ratio or row.initial is None or row.final is None:
             continue
         head = (
             f"{row.name} changed by {_change(row)} from the {_source(row.initial.source)} to the "
@@ -117,7 +118,7 @@ def _gains_and_frequencies(analysis: Analysis) -> Iterator[Asked]:
         )
         if row.initial.value * row.final.value < 0:
             tail = "why do their signs differ, and which of your files says which is right?"
-        elif row.name.startswith("K"):
+        elif read_name(row.name).is_gain:
             tail = (
                 "which way would a cart that stops short of where its springs put it move the gain "
                 "of a step, and is that the way yours moved?"
@@ -146,7 +147,7 @@ def _assumed(analysis: Analysis) -> Iterator[Asked]:
     assert row.initial is not None
     assert row.final is not None
     more = row.final.value > row.initial.value
-    feature = "null" if row.name.endswith(("_x", "_y")) else "peak"
+    feature = "null" if read_name(row.name).is_null else "peak"
     sharper = "flatter" if more else "sharper"
     yield Asked(
         id=row.name,

@@ -2,6 +2,7 @@
 
 from collections import Counter
 
+from pipeline.names import Name, read_name
 from pipeline.report.document import (
     Block,
     Items,
@@ -112,19 +113,19 @@ def _identified(analysis: Analysis) -> Block:
 
 def _numbers_board(analysis: Analysis) -> tuple[Tile, ...]:
     """Return the gains and the resonances."""
-    finals = {row.name: row for row in analysis.rows if row.final}
-    keys = ["K", "omega_n", "zeta", "mass", "damping"]
-    keys += [f"K_{i}" for i in range(1, analysis.carts + 1)]
-    keys += [f"omega_{mode}" for mode in "abcd"[: analysis.carts]]
     return tuple(
         Tile(
-            label=spans(name_span(name)),
+            label=spans(name_span(row.name)),
             value=spans(with_error(row.final.value, row.final.std)),
             note=spans(unit_text(clean(row.unit))),
         )
-        for name in keys
-        if (row := finals.get(name)) and row.final
+        for row in analysis.rows
+        if row.final and (analysis.carts == 1 or _is_told(read_name(row.name)))
     )
+
+
+def _is_told(name: Name) -> bool:
+    return name.is_gain or (name.is_frequency and name.is_mode)
 
 
 def _verdict_board(analysis: Analysis) -> tuple[Tile, ...]:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from pipeline import __version__
+from pipeline.names import read_name
 from pipeline.plant.chain import Array, Chain
 from pipeline.report.document import Block, bullet_list, paragraph, spans
 from pipeline.report.equations import derivation
@@ -66,11 +67,7 @@ def expected_parameters(analysis: Analysis) -> tuple[Expected, ...]:
 
 
 def _share(name: str) -> float:
-    return (
-        DAMPING_TOLERANCE
-        if name.startswith(("zeta", "damping"))
-        else (GAIN_AND_FREQUENCY_TOLERANCE)
-    )
+    return DAMPING_TOLERANCE if read_name(name).is_damping else (GAIN_AND_FREQUENCY_TOLERANCE)
 
 
 def expected_model(chain: Chain, tolerances: Mapping[str, float]) -> ExpectedModel:
@@ -131,7 +128,9 @@ def expected_blocks(page: Page) -> list[Block]:
                     cell(significant(p.value - p.tolerance)),
                     cell(significant(p.value + p.tolerance)),
                     cell(
-                        significant(p.value / (2 * np.pi)) if p.name.startswith("omega") else "–",
+                        significant(p.value / (2 * np.pi))
+                        if read_name(p.name).is_frequency
+                        else "–",
                         "quiet",
                     ),
                 ]

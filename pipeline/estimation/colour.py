@@ -7,11 +7,41 @@ would make every standard error too small.
 Reference: W. Newey & K. West, Econometrica 55, 1987; the lag window is Parzen's.
 """
 
+from functools import cache
+
 import numpy as np
 
 from pipeline.plant.chain import Array
 
+_MIN_LAGS = 8  # lags of the residual's correlation that are always looked at
 _LAGS_SHARE = 1 / 3  # of the samples; a rest after a step is correlated as long as it lasts
+
+
+def _parzen(x: Array) -> Array:
+    """Return Parzen's window at lags x, of the last."""
+    return np.where(x <= 0.5, 1 - 6 * x**2 * (1 - x), 2 * np.clip(1 - x, 0.0, None) ** 3)
+
+
+def colour(residual: Array, *, angle: float) -> float:
+    """Return the residual's spectral density at `angle` (rad per sample) over its mean; >= 1.
+
+    The variance of a fitted sinusoid's coefficients is that of white noise times this factor.
+    Parzen's lag window; never below one, because the fit itself takes power out at `angle`.
+    """
+    n = residual.size
+    lags = min(max(_MIN_LAGS, int(np.sqrt(n))), n // 2)
+    power = float(residual @ residual)
+    if power == 0 or lags < 2:
+        return 1.0
+    correlation = np.array([residual[:-lag] @ residual[lag:] for lag in range(1, lags)]) / power
+    wave = np.cos(angle * np.arange(1, lags))
+    return max(1.0, float(1 + 2 * np.sum(_window(lags) * correlation * wave)))
+
+
+@cache
+def _window(lags: int) -> Array:
+    """Return Parzen's window at the lags from 1 on."""
+    return _parzen(np.arange(1, lags) / lags)
 
 
 def long_run_variance(residual: Array) -> float:
@@ -51,5 +81,4 @@ def _tapered_correlation(residual: Array) -> Array:
     correlation = np.fft.irfft(R.conj()[:, None] * R, n_fft)
     lags = np.arange(n_fft)
     x = np.minimum(lags, n_fft - lags) / max(_LAGS_SHARE * n, 1.0)
-    window = np.where(x <= 0.5, 1 - 6 * x**2 * (1 - x), 2 * np.clip(1 - x, 0.0, None) ** 3)
-    return correlation * window
+    return correlation * _parzen(x)

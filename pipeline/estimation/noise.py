@@ -1,0 +1,73 @@
+"""The noise of a measured signal, from sample to sample, and what rounding adds to it."""
+
+from math import comb
+
+import numpy as np
+
+from pipeline.plant.chain import Array
+
+_NEIGHBOURS = (-3, -2, -1, 1, 2, 3)  # a quintic through these follows any motion we sample
+_MEDIAN_TO_SIGMA = 1.4826  # median absolute value to standard deviation, normal noise
+
+
+def local_noise(t: Array, y: Array) -> float:
+    """Return the noise's standard deviation (rounding included), from sample to sample.
+
+    Each sample is compared with the quintic through its six neighbours at their own times, so
+    neither the motion nor an uneven clock counts as noise. 0 for fewer than seven samples.
+    """
+    if t.size < 7:
+        return 0.0
+    nodes = _neighbours(t) - t[3:-3]  # (6, n - 6)
+    weights = np.empty_like(nodes)  # Lagrange's, at zero
+    for j, node in enumerate(nodes):
+        others = nodes[np.arange(len(nodes)) != j]
+        weights[j] = np.prod(others / (others - node), axis=0)
+    predicted = np.einsum("jn,jn->n", weights, _neighbours(y))
+    scaled = (y[3:-3] - predicted) / np.sqrt(1 + np.einsum("jn,jn->n", weights, weights))
+    moving = scaled[scaled != 0]  # a cart at rest on one count says nothing about the noise
+    return float(_MEDIAN_TO_SIGMA * np.median(np.abs(moving))) if moving.size else 0.0
+
+
+def _neighbours(x: Array) -> Array:
+    """Return the six neighbours (6, n - 6) of every sample that has them."""
+    return np.array([x[3 + j : x.size - 3 + j] for j in _NEIGHBOURS])
+
+
+def difference_noise(y: Array, *, order: int) -> Array:
+    """Return the noise's standard deviation of evenly sampled signals (…, n), by differences.
+
+    The higher the order the less of a smooth motion is in it. By their median: jumps do not count,
+    nor does a cart that rests on one count show any noise.
+    """
+    differences = np.diff(y, n=order, axis=-1)
+    return _MEDIAN_TO_SIGMA * np.median(np.abs(differences), axis=-1) / difference_gain(order)
+
+
+def difference_gain(order: int) -> float:
+    """Return how many times the standard deviation of white noise its differences have."""
+    return float(np.sqrt(comb(2 * order, order)))
+
+
+def grain(t: Array, y: Array, *, step: float) -> float:
+    """Return the smallest change that means something: encoder step or noise, if larger.
+
+    Noise counts by the step that would round as coarsely, sqrt(12) sigma. `step` is the encoder
+    step, 0 where none is known.
+    """
+    arithmetic = 1e-6 * float(np.ptp(y))  # a noise-free simulation has neither
+    return max(step, float(np.sqrt(12) * local_noise(t, y)), arithmetic)
+
+
+def rounding_left(sigma: float, *, step: float) -> float:
+    """Return which part (0 to 1) of the rounding error averaging leaves, with noise `sigma`.
+
+    Noise before the rounding acts as dither: the first harmonic of the rounding error shrinks
+    by exp(-2 pi² sigma²/step²) (Widrow & Kollár, Quantization Noise, 2008, chapter 4).
+    """
+    return float(np.exp(-2 * (np.pi * sigma / step) ** 2)) if step > 0 else 0.0
+
+
+def noise_beyond_rounding(rms: float, *, step: float) -> float:
+    """Return the noise that a residual's root-mean-square holds on top of the rounding."""
+    return float(np.sqrt(max(rms**2 - step**2 / 12, 0.0)))

@@ -1,0 +1,56 @@
+"""Where a measured signal turns, and where an input stands still."""
+
+import numpy as np
+
+from pipeline.estimation.noise import difference_noise
+from pipeline.plant.chain import Array
+
+_FLAT_INPUT = 0.02  # of the input's range: smaller changes are noise of the logged input
+
+
+def extrema(y: Array, *, prominence: float) -> list[int]:
+    """Return the indices of the turning points, maxima and minima in turn, ends included.
+
+    A turning point counts once the signal has gone back by `prominence`. On a flat top the
+    middle sample is taken.
+    """
+    found: list[int] = []
+    first = last = low = high = 0  # the running extreme is y[first] .. y[last]
+    direction = 0
+    for i, value in enumerate(y):
+        if direction == 0:  # until the first move shows which way it goes
+            low = i if value < y[low] else low
+            high = i if value > y[high] else high
+            if y[high] - y[low] >= prominence:
+                direction = 1 if high > low else -1
+                found.append(min(low, high))
+                first = last = i
+            continue
+        ahead = (value - y[first]) * direction
+        if ahead > 0:
+            first = last = i
+        elif ahead == 0 and i == last + 1:
+            last = i
+        elif -ahead >= prominence:
+            found.append((first + last) // 2)
+            first = last = i
+            direction = -direction
+    if direction:
+        found.append(first)  # a cart that has come to rest: where it got there
+    return found
+
+
+def plateaus(u: Array) -> list[tuple[int, int]]:
+    """Return [start, stop) of each stretch of constant input, in order.
+
+    Constant means: within 2 % of the input's range, or within its noise. A sine gives many short
+    stretches, a slow edge a few; how long a stretch must be, the caller knows.
+    """
+    noise = float(difference_noise(u, order=2)) if u.size > 2 else 0.0
+    tolerance = max(_FLAT_INPUT * float(np.ptp(u)), 6 * noise)
+    found, start = [], 0
+    for i, value in enumerate(u):
+        if abs(value - u[start]) > tolerance:
+            found.append((start, i))
+            start = i
+    return [*found, (start, u.size)]
