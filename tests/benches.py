@@ -1,16 +1,18 @@
 """A virtual bench in a process of its own, for tests and for whoever tries a host."""
 
 import json
+import os
 import queue
-import subprocess
-import sys
+import signal
+import socket
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from typing import Any
+from typing import IO, Any
 
-from tests.waiting import PATIENCE, started
+from tests.nursery import order
+from tests.waiting import PATIENCE
 
 
 @dataclass
@@ -25,7 +27,6 @@ class Emulator:
     """
 
     address: str
-    process: subprocess.Popen[str]
     said: list[str]
     runs: int = 0
     _events: "queue.Queue[dict[str, Any]]" = field(default_factory=queue.Queue)
@@ -51,30 +52,32 @@ def emulator(
 
     Its watchdog waits longer (s) than a bench's, for a host on a machine that may be busy.
     """
-    patient = f"from pipeline.bench.emulator import core; core.WATCHDOG = {watchdog}"
-    script = f"{patient}; from pipeline.cli import main; main()"
-    command = [sys.executable, "-c", script, "emulate", *options]
+    words = ["cartlab", "emulate", *options]
     if "--model" not in options:
-        command += ["--preset", preset]
-    with started(command, stderr=subprocess.PIPE, encoding="utf-8") as process:
-        running = Emulator(address="", process=process, said=[])
-        ready = threading.Event()
-        listener = threading.Thread(target=_listen, args=(running, ready), daemon=True)
+        words += ["--preset", preset]
+    running = Emulator(address="", said=[])
+    ready = threading.Event()
+    with socket.create_server(("127.0.0.1", 0)) as door:
+        door.settimeout(PATIENCE)
+        order(words=words, watchdog=watchdog, port=door.getsockname()[1])
+        line, _ = door.accept()
+    with line, line.makefile(encoding="utf-8") as said:
+        pid = int(said.readline())
+        listener = threading.Thread(target=_listen, args=(running, said, ready), daemon=True)
         listener.start()
         try:
             assert ready.wait(PATIENCE), "no bench became ready"
             assert running.address, "\n".join(running.said)
             yield running
         finally:
-            process.terminate()
-            process.wait(PATIENCE)
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGTERM)
             listener.join()
 
 
-def _listen(running: Emulator, ready: threading.Event) -> None:
+def _listen(running: Emulator, said: IO[str], ready: threading.Event) -> None:
     """Take down what the bench says until it says no more."""
-    assert running.process.stderr is not None
-    for line in running.process.stderr:
+    for line in said:
         if line.startswith("{"):
             event = json.loads(line)
             running.runs += event["event"] == "run"

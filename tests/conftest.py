@@ -47,6 +47,15 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int | None:
     return 0 if few else (os.cpu_count() or 1) + 1
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _patient_host() -> Iterator[None]:
+    """Bear with virtual benches, which have no processor of their own on a machine that is busy."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pipeline.bench.host.session._SILENCE", 3.0)
+        patch.setattr("pipeline.bench.host.session._FIRST_LINE", 5.0)
+        yield
+
+
 @pytest.fixture(scope="module")
 def browser():
     """A real browser; where there is none, what needs it skips."""

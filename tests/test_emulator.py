@@ -103,7 +103,7 @@ def test_hosts_talk_to_a_pseudo_terminal_one_after_the_other():
             assert took > 1.9
             assert [bench.event("client")["connected"] for _ in "io"] == [True, False]
         assert "hidden: coulomb_friction on cart 1: force 0.004 V" in bench.said
-    assert bench.process.returncode == 0
+    assert bench.event("exit")["status"] == 0
 
 
 def test_the_static_gain_comes_out(fast_bench):

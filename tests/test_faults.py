@@ -3,7 +3,7 @@
 import csv
 import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -112,8 +112,13 @@ SPOILT = {
 }
 
 
-@pytest.mark.parametrize("sign", ["", ", sign = 1"])
-@pytest.mark.parametrize("case", SPOILT)
+def _cases() -> Iterator[tuple[str, str]]:
+    """Every case where no sign of the input is stated; where one is, those that look like one."""
+    yield from ((case, "") for case in SPOILT)
+    yield from ((case, ", sign = 1") for case in SPOILT if "turned" in case or "exchanged" in case)
+
+
+@pytest.mark.parametrize(("case", "sign"), [*_cases()])
 def test_what_is_wrong_is_named_left_out_and_flagged(case, sign, bench, tmp_path):
     """The spoilt records and no others are out of all estimates; report and grade say why."""
     kind, which, how, word = SPOILT[case]

@@ -18,6 +18,8 @@ from pipeline.plant.chain import Chain
 from tests.grading_class import Team, make_team
 from tests.grading_slips import OF_SEVERAL_CARTS, SLIPS
 
+# The longest of those that once went wrong.
+LONG = [pytest.mark.slow, pytest.mark.sample]
 TIED = Chain(
     m=np.array([3.1e-4, 1.7e-4]), c=np.array([6.7e-4, 4.4e-4]), k=np.array([0.05, 0.127, 0.061])
 )
@@ -27,7 +29,7 @@ def flags(team: Team) -> list[str]:
     return [f"{flag.code}: {flag.message}" for flag in team.grade().flags]
 
 
-@pytest.mark.parametrize("seed", [5, 30, 90, 60023, 60066])
+@pytest.mark.parametrize("seed", [5, 30, 90, pytest.param(60023, marks=LONG), 60066])
 def test_little_damping_accuses_nobody(seed):
     """Where dwells put a damping at zero, or dry friction has a share in it, nobody is wrong."""
     team = make_team(seed)
@@ -44,7 +46,7 @@ def test_a_damping_that_the_fit_puts_at_zero_is_told_by_the_decay():
     assert wrong.flags[0].evidence["recomputed"] == pytest.approx(0.00316, rel=0.1)
 
 
-@pytest.mark.parametrize("seed", [18, 34, 38])
+@pytest.mark.parametrize("seed", [18, pytest.param(34, marks=LONG), 38])
 def test_coarse_encoders_cost_no_points(seed):
     """Steps of a few counts, and dwells whose points miss the carts that their records follow."""
     team = make_team(seed, count=0.2, travel=1.0, friction=0.0)
@@ -64,7 +66,7 @@ def test_a_table_of_three_carts_without_a_gain_is_none_of_two():
     assert "physically_impossible" in [flag.code for flag in grade.flags]
 
 
-@pytest.mark.parametrize(("seed", "digits"), [(11, 2), (17, 3)])
+@pytest.mark.parametrize(("seed", "digits"), [pytest.param(11, 2, marks=LONG), (17, 3)])
 def test_a_model_made_of_a_vague_table_is_no_wrong_one(seed, digits):
     """Couplings are differences of large numbers: rounding alone moves them by a third."""
     team = make_team(seed, digits=digits)

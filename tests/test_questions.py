@@ -183,19 +183,25 @@ Oil it.
 """
 
 
-@pytest.mark.parametrize(
-    "heading", ["zeta_b", "Question zeta_b", "Q: zeta_b: amplitudes", "`zeta_b`", "ζ_b", "ZETA_B."]
-)
-def test_an_answer_stands_beside_its_question(heading):
-    """Any spelling of the id in the heading will do; the rest stays the discussion."""
-    analysis = replace(off("zeta_b", 65.0), discussion=NOTES.format(heading=heading))
+def test_an_answer_stands_beside_its_question():
+    """It is in the question's section; the rest stays the discussion."""
+    analysis = replace(off("zeta_b", 65.0), discussion=NOTES.format(heading="zeta_b"))
     ((section, question),) = questions_of(analysis)
     assert section == "parameters"
     first = question.answer[0]
     assert isinstance(first, Paragraph)
     assert plain(first.text) == "The decay saw more."
     assert len(question.answer) == 4  # the smaller heading and what is under it are still answer
-    _, rest = split_notes(discussion_blocks(analysis.discussion or ""), ask(analysis))
+
+
+@pytest.mark.parametrize(
+    "heading", ["zeta_b", "Question zeta_b", "Q: zeta_b: amplitudes", "`zeta_b`", "ζ_b", "ZETA_B."]
+)
+def test_any_spelling_of_an_id_will_do(heading):
+    """The answer is out of the discussion, and nothing is left to answer."""
+    analysis = replace(off("zeta_b", 65.0), discussion=NOTES.format(heading=heading))
+    answers, rest = split_notes(discussion_blocks(analysis.discussion or ""), ask(analysis))
+    assert {name: len(blocks) for name, blocks in answers.items()} == {"zeta_b": 4}
     words = " ".join(plain(b.text) for b in rest if isinstance(b, Paragraph))
     assert words == "The bench squeaks. Oil it."
     assert open_line(analysis) == ""
