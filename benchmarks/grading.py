@@ -6,7 +6,8 @@ Benches lie all over what a lab may have (`tests/grading_class.py`): 1 to 3 cart
 from 0.003 to 0.15, 6 to 22 dwells, coarse and fine encoders, a trace of friction, two to four
 digits. Each team is graded as it is, honest, and once more for a few kinds of mistake in turn,
 made with what the team has in its own hands (`tests/grading_slips.py`). One JSON line a grading;
-at the end a line a kind, with 95 % confidence intervals (Clopper and Pearson, 1934).
+at the end a line a kind, with 95 % confidence intervals (Clopper and Pearson, 1934). Where a number
+is two mistakes' as well, a flag says both: "or" counts those whose planted one is said second.
 """
 
 import argparse
@@ -88,6 +89,9 @@ def main() -> None:
                     "kind": kind,
                     "codes": sorted(codes),
                     "found": sorted(found),
+                    "or_else": sorted(
+                        {c for f in grade.flags for c in f.evidence.get("or_else", ())}
+                    ),
                     "points": grade.points / grade.out_of,
                     "messages": [flag.message for flag in grade.flags],
                     "seconds": time.process_time() - start,
@@ -104,7 +108,7 @@ def main() -> None:
 
 def report(rows: list[dict]) -> None:
     """Print a line a kind: how many got all their codes, others beside, none."""
-    print(f"{'kind':44} teams  right code (95 %)         others too  no flag")
+    print(f"{'kind':44} teams  right code (95 %)         or  others too  no flag")
     kinds = dict.fromkeys(row["kind"] for row in rows)
     for kind in sorted(kinds, key=lambda k: (not k.startswith(HONEST), k)):
         print(_line(kind, [row for row in rows if row["kind"] == kind]))
@@ -117,13 +121,14 @@ def report(rows: list[dict]) -> None:
 def _line(kind: str, rows: list[dict]) -> str:
     honest = not any(row["codes"] for row in rows)
     right = sum(set(row["codes"]) <= set(row["found"]) for row in rows)
+    either = sum(set(row["codes"]) <= {*row["found"], *row["or_else"]} for row in rows) - right
     others = sum(bool(set(row["found"]) - set(row["codes"])) for row in rows)
     none = sum(not row["found"] for row in rows)
     hits = none if honest else right
     low, high = interval(hits, len(rows)) if rows else (0.0, 1.0)
     share = 100 * hits / max(len(rows), 1)
     shown = f"{hits:4d} = {share:5.1f} % ({100 * low:.1f}–{100 * high:.1f})"
-    return f"{kind:44} {len(rows):5d}  {shown:26} {others:6d}  {none:7d}"
+    return f"{kind:44} {len(rows):5d}  {shown:26}{either:4d}  {others:6d}  {none:7d}"
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from pipeline.grading.run import grade_submission
 from pipeline.grading.state_model import own_chain
 from pipeline.plant.chain import Chain
 from tests.grading_class import Team, make_team
-from tests.grading_slips import OF_SEVERAL_CARTS, SLIPS
+from tests.grading_slips import OF_SEVERAL_CARTS, SLIPS, scaled
 
 # The longest of those that once went wrong.
 LONG = [pytest.mark.slow, pytest.mark.sample]
@@ -102,6 +102,31 @@ def test_mistakes_get_their_codes():
             else:
                 missed.append((code, seed))
     assert named >= NAMED * (named + len(missed)), missed
+
+
+@pytest.mark.parametrize(
+    ("seed", "turn", "slips", "codes"),
+    [
+        (72014, 6, ("peak_count", "log10_for_ln"), {"peak_count", "log10_for_ln"}),
+        (73025, 0, ("hz_for_rad_s",), {"hz_for_rad_s"}),  # one resonance seen anywhere by eye
+        (73026, 0, ("peak_count",), {"peak_count"}),  # the seventh period, of one decay
+        (73035, 0, ("initial_off",), {"initial_off"}),  # between what two edges turn at
+        (72021, 0, ("hz_for_rad_s", "log10_for_ln"), {"hz_for_rad_s", "log10_for_ln"}),
+    ],
+)
+def test_what_makes_the_whole_table_likeliest_is_named(seed, turn, slips, codes):
+    """Two mistakes in one number, a vague one beside sharp ones, a chance meeting of one."""
+    team = replace(make_team(seed), rng=np.random.default_rng([9, seed, turn]))
+    for slip in slips:
+        team = SLIPS[slip](team)
+    assert {flag.code for flag in team.grade().flags} == codes
+
+
+def test_a_gain_that_two_mistakes_make_is_told_with_both():
+    """With little damping the step peaks at twice its level."""
+    team = scaled(make_team(72003), ["K"], 2.0, ["initial"])
+    (flag,) = team.grade().flags
+    assert {flag.code, *flag.evidence["or_else"]} == {"peak_for_steady_state", "peak_to_peak"}
 
 
 def tied(seed: int) -> tuple[Team, Grade]:

@@ -197,6 +197,18 @@ def test_a_worksheet_with_another_maximum_is_refused(tmp_path):
         write(tmp_path, HALF, platform="moodle", roster=roster.format("18.00"))
 
 
+def test_a_gradebook_with_other_points_possible_is_refused(tmp_path):
+    """Canvas keeps its own points possible: 20 of 18 would be shown."""
+    roster = (
+        "Student,ID,Section,Lab 3 (77),Lab 4 (78)\n"
+        "    Points Possible,,,{},40\n"
+        '"Doe, Jane",1024,A,,\n'
+    )
+    write(tmp_path, HALF, platform="canvas", title="Lab 3", roster=roster.format("20.00"))
+    with pytest.raises(ConfigError, match=r"maximum grade 18\.00, the rubric 20 points"):
+        write(tmp_path, HALF, platform="canvas", title="Lab 3", roster=roster.format("18.00"))
+
+
 def test_moodle_is_told_why_points_were_given_by_hand(tmp_path):
     """Also where they are all of them."""
     first = RUBRIC.criteria[0]

@@ -117,6 +117,7 @@ class _Judged:
 
     label: Label
     table: Table
+    known: Mapping[str, Reference]
     errors: dict[str, float]
     suspect: frozenset[str]
     unordered: frozenset[str]
@@ -128,7 +129,12 @@ class _Judged:
         """Return the mistakes that explain what is off."""
         off = [n for n in self.errors if n in self.suspect or n in self.unordered]
         return explain(
-            self.table, off=off, mistakes=self.mistakes, label=self.label, believed=believed
+            self.table,
+            known=self.known,
+            off=off,
+            mistakes=self.mistakes,
+            label=self.label,
+            believed=believed,
         )
 
 
@@ -163,9 +169,12 @@ def _judge(
         if len(suspect) >= min(2, analysis.carts):
             mistakes += transient_fits(analysis, table, known)
     laws = broken_orders(table, initial=label == "initial")
+    if any(law.is_of_gains for law in laws):  # a plain fact goes before a guess at one of them
+        mistakes = [m for m in mistakes if m.whole or not _is_of_gains(m)]
     return _Judged(
         label=label,
         table=table,
+        known={name: known[name] for name in errors},
         errors=errors,
         suspect=frozenset(suspect),
         unordered=_unordered(laws, label, reported, suspect=suspect) & errors.keys(),
@@ -194,6 +203,10 @@ def _agrees(final: Decimal, references: References, name: str) -> bool:
     """Whether a final number is what the recordings say."""
     known = references.final.get(name)
     return known is not None and percent_off(final, known, sigmas=SIGMAS) == 0
+
+
+def _is_of_gains(mistake: Mistake) -> bool:
+    return all(name.startswith("K") for name in mistake.predicted)
 
 
 def _near(a: Decimal, b: Decimal) -> bool:
@@ -261,15 +274,16 @@ def _specific_flags(
         evidence |= {"mistake_gives": predicted.value}
         if len(first.mistake.codes) > 1:
             evidence["together_with"] = [c for c in first.mistake.codes if c != code]
+        said = {"reported": as_typed(typed), "recomputed": f"{reference.value:.4g}", "name": name}
+        message = f"{name} ({_TOLD[first.table]}): {first.mistake.help.format(**said)}."
+        if first.rival and code not in first.rival.codes:
+            evidence["or_else"] = [c for c in first.rival.codes if c not in first.mistake.codes]
+            message += f" Or {first.rival.help.format(**said)}."
         flags.append(
             Flag(
                 code=code,
                 parameters=tuple(names),
-                message=f"{name} ({_TOLD[first.table]}): "
-                + first.mistake.help.format(
-                    reported=as_typed(typed), recomputed=f"{reference.value:.4g}", name=name
-                )
-                + ".",
+                message=message,
                 evidence=evidence,
             )
         )

@@ -64,7 +64,7 @@ def export(
     students, remarks = students_of(entries, platform=platform)
     if roster:
         own = Roster.read(roster, platform=platform)
-        own.check_maximum(rubric.out_of)
+        own.check_maximum(rubric.out_of, title=title)
         text, strangers = _filled(own, platform, students, rubric, title=title)
         remarks += strangers
     elif platform == "canvas":

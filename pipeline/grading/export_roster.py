@@ -65,14 +65,18 @@ class Roster:
             raise ConfigError(f"{path.name}: has two columns {quote(twice[0])}")
         return cls(file=path.name, table=table)
 
-    def check_maximum(self, out_of: float) -> None:
+    def check_maximum(self, out_of: float, *, title: str) -> None:
         """Refuse a table whose grades go up to another maximum: the platform keeps its own.
 
         Raises
         ------
-        ConfigError : it says so in a column "Maximum Grade".
+        ConfigError : so say Moodle's column of it, or Canvas' row of the points possible.
         """
-        for text in self.table[_MAXIMUM].unique() if _MAXIMUM in self.table else ():
+        column = self._title(title)
+        said = [*self.table[_MAXIMUM].unique()] if _MAXIMUM in self.table else []
+        if column in self.table:
+            said += [*self.table.loc[self._of_all(), column]]
+        for text in said:
             if (most := _number(text)) is not None and most != out_of:
                 raise ConfigError(
                     f"{self.file}: has the maximum grade {text}, the rubric {out_of:g} points: set "
@@ -101,9 +105,7 @@ class Roster:
         for name in titles.values():
             if name not in table:
                 table[name] = self.table.get(name, "")
-            if "Student" in table:
-                of_all = table["Student"].str.contains(POINTS_POSSIBLE, regex=False)
-                table.loc[of_all & (table[name] == ""), name] = possible
+            table.loc[self._of_all() & (table[name] == ""), name] = possible
         index = self._index()
         matched = [(_row_of(student, index), student) for student in students]
         found: dict[Any, list[Student]] = {}
@@ -139,6 +141,11 @@ class Roster:
                 f"authors: {', '.join(by_number)}"
             )
         return csv_text([*table.columns], table.itertuples(index=False)), remarks
+
+    def _of_all(self) -> "pd.Series":
+        """Return which rows are about the assignments, not about a student."""
+        students = self.table.get("Student", self.table.iloc[:, 0])
+        return students.str.contains(POINTS_POSSIBLE, regex=False)
 
     def _title(self, title: str) -> str:
         """Return a column's title as the table has it."""

@@ -16,19 +16,17 @@ from pipeline.results import Analysis
 _TURN = 2 * math.pi
 _LOG10 = math.log10(math.e)
 _OWN = "0123456789n"  # what the symbol of a cart alone ends in
-# Counted k periods where there were k ± 1. With many the ratios lie close together, so that they
-# only count where damping, or another cart, tells the same story.
-_FEW_PERIODS = range(1, 5)
-_MANY_PERIODS = range(5, 11)
-_RATIOS = 2 * (len(_FEW_PERIODS) + len(_MANY_PERIODS))
+_PERIODS = range(1, 11)  # counted one more, or one less
+_RATIOS = 2 * len(_PERIODS)
 
 _GAIN_OR_FREQUENCY = 0.03  # an honest reading after one slip: relative
 _UNMISTAKABLE, _FAR = 0.1, 4.0  # … by a factor that is nothing else's, from so much on
 _BLURRED = 0.05  # … of a gain where the carts stick
 _COUNTED = 0.02
-_COUNTED_ALONE = 0.012  # … where the damping is too blurred to tell the same story
-_COUNTED_ONLY = 0.006  # … of one cart, where its damping does not: nothing but the ratio tells
 _DAMPING = 0.2
+_LOG10_DAMPING = 0.3  # … beside which no other mistake of a damping lies as near
+_ONE_OF_SEVERAL = 5  # who miscounts one decay miscounts the others; once in so many not
+_ODD = 20  # a period miscounted for ω alone, where δ is of the same peaks: one in so many
 _BLURRED_DAMPING = 1.3  # high over low: such a damping tells no story
 _VAGUE = 3.0  # high over low: what any mistake would meet tells of none
 _SHARP = 1.05  # high over low of a reference that friction does not blur
@@ -47,6 +45,7 @@ class Mistake:
     least : so many numbers must be explained for it to be believed.
     table_wide : believed, it explains every other wrong number of the table too.
     tries : so many of its kind are tried, of which one meets the numbers the easier.
+    beside : numbers that are right where it is this mistake.
     help : a sentence with {name}, {reported} and {recomputed} to fill in.
     """
 
@@ -58,6 +57,7 @@ class Mistake:
     least: int = 1
     table_wide: bool = False
     tries: int = 1
+    beside: frozenset[str] = frozenset()
 
 
 def known_mistakes(references: Mapping[str, Reference], analysis: Analysis) -> list[Mistake]:
@@ -67,23 +67,24 @@ def known_mistakes(references: Mapping[str, Reference], analysis: Analysis) -> l
         for n, r in references.items()
         if r.low > 0 and (n == "zeta" or (is_damping(n) and n[-1] in _OWN))
     }
+    every_omega = {n: r for n, r in references.items() if n.startswith("omega") and r.low > 0}
     references = {n: r for n, r in references.items() if 0 < r.high <= _VAGUE * r.low}
     gains = {n: r for n, r in references.items() if n.startswith("K")}
     omegas = {n: r for n, r in references.items() if n.startswith("omega")}
     own_omegas = {n: r for n, r in omegas.items() if n[-1] in _OWN}
     own_zetas = {n: r for n, r in every_zeta.items() if n in references}
-    hertz, scales = _hertz(omegas), _gain_mistakes(gains, analysis)
+    hertz, scales = _hertz(omegas, every_omega), _gain_mistakes(gains, analysis)
     log10 = [
         Mistake(
             codes=("log10_for_ln",),
-            predicted=_times(every_zeta if own_zetas else {}, _LOG10),  # vague ones as well
-            tolerance=_DAMPING,
+            predicted=_times(every_zeta, _LOG10),  # vague ones as well
+            tolerance=_LOG10_DAMPING,
             help="{reported} is {recomputed}/2.303: the logarithmic decrement takes the natural "
             "logarithm, and this looks like log10",
             whole=True,
         )
     ]
-    single = [*hertz, *scales, *log10, *_miscounts(own_omegas, own_zetas)]
+    single = [*hertz, *scales, *log10, *_miscounts(own_omegas, own_zetas, every_zeta)]
     swaps = [*_swaps(gains), *_swaps(own_omegas), *_swaps(own_zetas)]
     if {_damping(name) for name in own_omegas} == own_zetas.keys():
         swaps += _swaps(own_omegas, {n: _with_slack(r) for n, r in own_zetas.items()})
@@ -91,7 +92,7 @@ def known_mistakes(references: Mapping[str, Reference], analysis: Analysis) -> l
     pairs += list(_in_counts(scales))
     for miscount in single:
         if miscount.codes == ("peak_count",):
-            pairs += _miscount_and(miscount, own_omegas, own_zetas)
+            pairs += _miscount_and(miscount, own_omegas, every_zeta)
     found = [m for m in (*single, *swaps, *pairs) if m.predicted]
     if is_explained(analysis):
         return found
@@ -110,14 +111,22 @@ def _times(references: Mapping[str, Reference], factor: float) -> dict[str, Refe
 # -------------------------------------------------------------------- frequencies
 
 
-def _hertz(omegas: Mapping[str, Reference]) -> list[Mistake]:
+def _hertz(omegas: Mapping[str, Reference], every: Mapping[str, Reference]) -> list[Mistake]:
+    """Hz for rad/s, or converted twice; of a vague number only beside a sharper one."""
+    in_hertz = [(omegas, 1)]
+    if every.keys() > omegas.keys():
+        in_hertz.append((every, 2))
     return [
-        Mistake(
-            codes=("hz_for_rad_s",),
-            predicted=_times(omegas, 1 / _TURN),
-            tolerance=_UNMISTAKABLE,
-            help="{reported} is {recomputed}/2π: this looks like Hz where rad/s is asked, "
-            "so multiply by 2π",
+        *(
+            Mistake(
+                codes=("hz_for_rad_s",),
+                predicted=_times(some, 1 / _TURN),
+                tolerance=_UNMISTAKABLE,
+                help="{reported} is {recomputed}/2π: this looks like Hz where rad/s is asked, "
+                "so multiply by 2π",
+                least=least,
+            )
+            for some, least in in_hertz
         ),
         Mistake(
             codes=("hz_for_rad_s",),
@@ -132,45 +141,42 @@ def _hertz(omegas: Mapping[str, Reference]) -> list[Mistake]:
 def _miscounts(
     omegas: Mapping[str, Reference],
     zetas: Mapping[str, Reference],
-) -> list[Mistake]:
+    every_zeta: Mapping[str, Reference],
+) -> Iterator[Mistake]:
     """One period too many or too few: ω is off by their ratio, and a decrement by its inverse."""
-    found = []
-    for name, omega in omegas.items():
-        zeta = _damping(name)
-        for counted, there in _counts():
-            help_ = _miscount_help(counted, there)
-            both = {name: omega.times(counted / there)}
-            blurred = zeta in zetas and zetas[zeta].high > zetas[zeta].low * _BLURRED_DAMPING
-            if zeta in zetas and not (blurred and len(omegas) > 1):
-                both[zeta] = _miscounted_damping(zetas[zeta], there / counted)
-                joint = _miscount(both, help_, whole=True, least=2)
-                found.append(replace(joint, tolerance=_COUNTED_ALONE) if blurred else joint)
-            if len(omegas) == 1 and min(counted, there) in _FEW_PERIODS:
-                alone = _miscount({name: both[name]}, help_)
-                found.append(replace(alone, tolerance=_COUNTED_ONLY))
-    for counted, there in _counts() if len(omegas) > 1 else ():
-        every = _times(omegas, counted / there)
-        found.append(_miscount(every, _miscount_help(counted, there), whole=True, least=2))
+    for counted, there in _counts():
+        help_ = _miscount_help(counted, there)
+        fast = _times(omegas, counted / there)
+        damped = {n: _miscounted_damping(r, there / counted) for n, r in every_zeta.items()}
+        damped = {n: r for n, r in damped.items() if n in map(_damping, omegas)}
+        least = min(2, len(omegas))
+        if damped:
+            yield _miscount({**fast, **damped}, help_, least=len(fast) + 1)
+        yield _miscount(fast, help_, least=least, tries=_ODD if damped else 1)
+        for name in omegas if len(omegas) > 1 else ():
+            zeta = _damping(name)
+            if zeta in zetas and zetas[zeta].high <= zetas[zeta].low * _BLURRED_DAMPING:
+                both = {name: fast[name], zeta: damped[zeta]}
+                yield _miscount(both, help_, least=2, tries=_ONE_OF_SEVERAL)
     for zeta, reference in zetas.items():
         if reference.high > reference.low * _SHARP:
             continue
         for factor, words in ((0.5, "half"), (2.0, "twice")):
             # The decrement alone, not blurred by friction: over half a period, or over two.
-            found.append(
-                Mistake(
-                    codes=("peak_count",),
-                    predicted={zeta: reference.times(factor)},
-                    tolerance=_GAIN_OR_FREQUENCY,
-                    help=f"{{reported}} is {words} of {{recomputed}}: δ is the logarithm of the "
-                    "ratio of two peaks a whole period apart, divided by the number of periods",
-                )
+            yield Mistake(
+                codes=("peak_count",),
+                predicted={zeta: reference.times(factor)},
+                tolerance=_GAIN_OR_FREQUENCY,
+                help=f"{{reported}} is {words} of {{recomputed}}: δ is the logarithm of the "
+                "ratio of two peaks a whole period apart, divided by the number of periods",
+                tries=2,
+                beside=frozenset(n for n in omegas if _damping(n) == zeta),
             )
-    return found
 
 
 def _counts() -> Iterator[tuple[int, int]]:
     """Yield (periods counted, periods there)."""
-    for k in (*_FEW_PERIODS, *_MANY_PERIODS):
+    for k in _PERIODS:
         yield k + 1, k
         yield k, k + 1
 
@@ -196,16 +202,16 @@ def _miscounted_damping(zeta: Reference, factor: float) -> Reference:
 
 
 def _miscount(
-    predicted: dict[str, Reference], help_: str, *, whole: bool = False, least: int = 1
+    predicted: dict[str, Reference], help_: str, *, least: int, tries: int = 1
 ) -> Mistake:
     return Mistake(
         codes=("peak_count",),
         predicted=predicted,
         tolerance=_COUNTED,
         help=help_,
-        whole=whole,
+        whole=True,
         least=least,
-        tries=_RATIOS,
+        tries=_RATIOS * tries,
     )
 
 
@@ -222,7 +228,8 @@ def _miscount_and(
             tolerance=_COUNTED,
             help=f"{miscount.help}; and it is in Hz where rad/s is asked",
             whole=True,
-            tries=_RATIOS,
+            least=miscount.least,
+            tries=miscount.tries,
         )
     if omega and zeta:
         yield Mistake(
@@ -232,7 +239,7 @@ def _miscount_and(
             help=f"{miscount.help}; and the decrement looks taken with log10",
             whole=True,
             least=2,
-            tries=_RATIOS,
+            tries=miscount.tries,
         )
 
 
@@ -262,20 +269,7 @@ def _gain_mistakes(gains: Mapping[str, Reference], analysis: Analysis) -> list[M
     ]
     turns = {name: step_turns(name, analysis) for name in gains}
     found += _peaks(turns)
-    for turn in (1, 2):
-        later = {n: e for n, t in turns.items() if (e := t.extreme(turn)) is not None}
-        later = {n: e for n, e in later.items() if _is_off(e, gains[n])}
-        found.append(
-            Mistake(
-                codes=("transient_used",),
-                predicted=later,
-                tolerance=_GAIN_OR_FREQUENCY,
-                help="{reported} is where the cart turns while it still swings: wait until it has "
-                "settled, at {recomputed} per unit of input",
-                whole=True,
-                least=min(2, len(gains)),
-            )
-        )
+    found += _swinging(turns, gains)
     counts = {name: _count(name, analysis) for name in gains}
     if all(counts.values()):
         far = all(abs(math.log(count)) > math.log(_FAR) for count in counts.values())
@@ -293,7 +287,7 @@ def _gain_mistakes(gains: Mapping[str, Reference], analysis: Analysis) -> list[M
 
 def _peaks(turns: Mapping[str, StepTurns]) -> Iterator[Mistake]:
     """Yield the peaks of one edge, or of any edges: of every cart, as one step moves them all."""
-    peaks = {n: e for n, t in turns.items() if (e := t.extreme(0)) is not None}
+    peaks = {n: e for n, t in turns.items() if (e := t.first()) is not None}
     edges = set.intersection(*({*t.by_edge} for t in turns.values())) if turns else set()
     one_edge = [{n: t.peak(edge) for n, t in turns.items()} for edge in sorted(edges)]
     for predicted in one_edge:
@@ -311,6 +305,25 @@ def _peak(predicted: dict[str, Reference], *, tries: int = 1) -> Mistake:
         whole=True,
         tries=tries,
     )
+
+
+def _swinging(turns: Mapping[str, StepTurns], gains: Mapping[str, Reference]) -> Iterator[Mistake]:
+    """Yield where the carts turn after the peak of one edge: next, and after that."""
+    edges = {edge for one in turns.values() for edge in one.by_edge}
+    tries = 2 * len(edges)
+    for edge, turn in itertools.product(sorted(edges), (1, 2)):
+        later = {n: e for n, t in turns.items() if (e := t.turn(edge, turn)) is not None}
+        later = {n: e for n, e in later.items() if _is_off(e, gains[n])}
+        yield Mistake(
+            codes=("transient_used",),
+            predicted=later,
+            tolerance=_GAIN_OR_FREQUENCY,
+            help="{reported} is where the cart turns while it still swings: wait until it has "
+            "settled, at {recomputed} per unit of input",
+            whole=True,
+            least=min(2, len(gains)),
+            tries=tries,
+        )
 
 
 def _sharp(references: Mapping[str, Reference]) -> dict[str, Reference]:

@@ -6,7 +6,7 @@ from math import exp
 
 from pipeline.grading.reference import Reference, References
 from pipeline.grading.rubric import is_damping
-from pipeline.grading.tolerance import percent_off, rounding
+from pipeline.grading.tolerance import half_digit, is_vague, percent_off, rounding
 from pipeline.submission import Reported
 
 # How far an initial and a final estimate of one number usually lie apart, relative: where the
@@ -26,11 +26,14 @@ def copied_final(reported: Reported, *, references: References) -> list[str]:
     """Return the final estimates that stand in the initial table too, if that is no coincidence.
 
     The numbers of a cart alone may honestly be taken over, so those that only a fit can give
-    must be among the copied. An initial damping that is the usual guess tells most.
+    must be among the copied. An initial damping that is the usual guess tells most. Tables of
+    single digits agree anyway.
     """
     both = [name for name in reported.final if name in reported.initial]
     same = [n for n in both if _same(reported, n)]
     if not both or len(same) < _SHARE * len(both):
+        return []
+    if 2 * sum(is_vague(reported.final[name]) for name in same) > len(same):
         return []
     fitted = [name for name in both if name[-1] in _FITTED_BY_EYE]
     if len([name for name in fitted if name in same]) < _SHARE * len(fitted):
@@ -50,18 +53,21 @@ def _coincidence(typed: Decimal, reference: Reference | None, name: str) -> floa
     if not typed:
         return 1.0
     damping = is_damping(name)
-    step = 2 * float(rounding(typed) / abs(Fraction(typed)))
-    apart = _APART_DAMPING_BLURRED if damping else _APART_BLURRED
-    if reference is None or reference.low <= 0:
-        return min(1.0, step / (apart * _NORMAL))
-    off = float(percent_off(typed, reference, sigmas=_SIGMAS)) / 100
-    if reference.high <= reference.low * (_SHARP_DAMPING if damping else _SHARP):
-        apart = _APART_DAMPING if damping else _APART
-        if off == 0:
-            return 1.0
-    measured = not is_damping(name) and name[-1] not in _FITTED_BY_EYE
-    surprise = 0.0 if measured and off > _SLIP else min(0.5 * (off / apart) ** 2, _SURPRISE)
-    return min(1.0, step / (apart * _NORMAL)) * exp(-surprise)
+    half = half_digit(typed) / abs(Fraction(typed))
+    apart, surprise = _APART_DAMPING_BLURRED if damping else _APART_BLURRED, 0.0
+    if reference is not None and reference.low > 0:
+        # A single digit stands for more than what grading excuses of it.
+        hidden = half - rounding(typed) / abs(Fraction(typed))
+        off = max(float(percent_off(typed, reference, sigmas=_SIGMAS) / 100 - hidden), 0.0)
+        if reference.high <= reference.low * (_SHARP_DAMPING if damping else _SHARP):
+            apart = _APART_DAMPING if damping else _APART
+            if off == 0:
+                return 1.0
+        measured = not damping and name[-1] not in _FITTED_BY_EYE
+        if not measured or off <= _SLIP:
+            surprise = min(0.5 * (off / apart) ** 2, _SURPRISE)
+    again = 1.0 if is_vague(typed) else min(1.0, 2 * float(half) / (apart * _NORMAL))
+    return again * exp(-surprise)
 
 
 def _same(reported: Reported, name: str) -> bool:

@@ -28,14 +28,17 @@ class StepTurns:
     by_edge: dict[Edge, list[list[float]]]
     furthest: dict[Edge, list[float]]
 
-    def extreme(self, turn: int) -> Reference | None:
-        """Return the turning point over all edges; None where one of those before is not real."""
-        turns = [one for repeats in self.by_edge.values() for one in repeats]
-        for earlier in range(turn + 1):
-            values = [one[earlier] for one in turns if len(one) > earlier]
-            if not values or min(values) <= 0:
-                return None
-        return _spread([one[turn] for one in turns if len(one) > turn])
+    def first(self) -> Reference | None:
+        """Return where the cart turns first over all edges; None where it does not."""
+        turns = [one[0] for repeats in self.by_edge.values() for one in repeats]
+        return _spread(turns) if turns else None
+
+    def turn(self, edge: Edge, number: int) -> Reference | None:
+        """Return a turning point after one kind of edge; None where one up to it is not real."""
+        repeats = [one for one in self.by_edge.get(edge, ()) if len(one) > number]
+        if not repeats or min(min(one[: number + 1]) for one in repeats) <= 0:
+            return None
+        return _spread([one[number] for one in repeats])
 
     def peak(self, edge: Edge) -> Reference:
         """Return where the cart peaks after one kind of edge, at first or furthest."""

@@ -29,6 +29,11 @@ def rounding(typed: Decimal) -> Fraction:
     return min(half_digit(typed), _MOST_ROUNDING * abs(Fraction(typed)))
 
 
+def is_vague(typed: Decimal) -> bool:
+    """Whether rounding may hide more of a number than is excused: one digit does."""
+    return half_digit(typed) > _MOST_ROUNDING * abs(Fraction(typed))
+
+
 def exact(value: float) -> Fraction:
     """Return a number of a rubric as its author typed it: 0.1 is a tenth."""
     return Fraction(repr(value))
