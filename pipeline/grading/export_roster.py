@@ -144,13 +144,13 @@ class Roster:
 
     def _of_all(self) -> "pd.Series":
         """Return which rows are about the assignments, not about a student."""
-        students = self.table.get("Student", self.table.iloc[:, 0])
+        students = self.table["Student" if "Student" in self.table else self.table.columns[0]]
         return students.str.contains(POINTS_POSSIBLE, regex=False)
 
     def _title(self, title: str) -> str:
         """Return a column's title as the table has it."""
         for name in self.table.columns:
-            found = _TITLE.fullmatch(name)
+            found = _TITLE.fullmatch(str(name))
             if name == title or (found and found[1] == title):
                 return name
         return title

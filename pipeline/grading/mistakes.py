@@ -20,6 +20,7 @@ _PERIODS = range(1, 11)  # counted one more, or one less
 _RATIOS = 2 * len(_PERIODS)
 
 _GAIN_OR_FREQUENCY = 0.03  # an honest reading after one slip: relative
+_TURN_READ = 0.015  # … of where a cart turns, which is sharper than where it settles
 _UNMISTAKABLE, _FAR = 0.1, 4.0  # … by a factor that is nothing else's, from so much on
 _BLURRED = 0.05  # … of a gain where the carts stick
 _COUNTED = 0.02
@@ -286,20 +287,20 @@ def _gain_mistakes(gains: Mapping[str, Reference], analysis: Analysis) -> list[M
 
 
 def _peaks(turns: Mapping[str, StepTurns]) -> Iterator[Mistake]:
-    """Yield the peaks of one edge, or of any edges: of every cart, as one step moves them all."""
-    peaks = {n: e for n, t in turns.items() if (e := t.first()) is not None}
+    """Yield the peaks of one edge, or of all: of every cart, as one step moves them all."""
+    peaks = {n: e for n, t in turns.items() if (e := t.mean_peak()) is not None}
     edges = set.intersection(*({*t.by_edge} for t in turns.values())) if turns else set()
     one_edge = [{n: t.peak(edge) for n, t in turns.items()} for edge in sorted(edges)]
     for predicted in one_edge:
-        yield _peak(predicted, tries=len(one_edge))
-    yield _peak(peaks)
+        yield _peak(predicted, tries=len(one_edge) + 1)
+    yield _peak(peaks, tries=len(one_edge) + 1)
 
 
-def _peak(predicted: dict[str, Reference], *, tries: int = 1) -> Mistake:
+def _peak(predicted: dict[str, Reference], *, tries: int) -> Mistake:
     return Mistake(
         codes=("peak_for_steady_state",),
         predicted=predicted,
-        tolerance=_GAIN_OR_FREQUENCY,
+        tolerance=_TURN_READ,
         help="{reported} is what the step peaks at: the static gain is the level it settles "
         "at, {recomputed}, per unit of input",
         whole=True,
@@ -317,7 +318,7 @@ def _swinging(turns: Mapping[str, StepTurns], gains: Mapping[str, Reference]) ->
         yield Mistake(
             codes=("transient_used",),
             predicted=later,
-            tolerance=_GAIN_OR_FREQUENCY,
+            tolerance=_TURN_READ,
             help="{reported} is where the cart turns while it still swings: wait until it has "
             "settled, at {recomputed} per unit of input",
             whole=True,

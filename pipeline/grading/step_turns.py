@@ -28,10 +28,10 @@ class StepTurns:
     by_edge: dict[Edge, list[list[float]]]
     furthest: dict[Edge, list[float]]
 
-    def first(self) -> Reference | None:
-        """Return where the cart turns first over all edges; None where it does not."""
-        turns = [one[0] for repeats in self.by_edge.values() for one in repeats]
-        return _spread(turns) if turns else None
+    def mean_peak(self) -> Reference | None:
+        """Return the mean over all edges of where the cart turns first; None without any."""
+        peaks = [one[0] for repeats in self.by_edge.values() for one in repeats]
+        return _spread([float(np.mean(peaks))]) if peaks else None
 
     def turn(self, edge: Edge, number: int) -> Reference | None:
         """Return a turning point after one kind of edge; None where one up to it is not real."""
