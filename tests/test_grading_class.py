@@ -110,7 +110,7 @@ def test_mistakes_get_their_codes():
         (72014, 6, ("peak_count", "log10_for_ln"), {"peak_count", "log10_for_ln"}),
         (73025, 0, ("hz_for_rad_s",), {"hz_for_rad_s"}),  # one resonance seen anywhere by eye
         (73026, 0, ("peak_count",), {"peak_count"}),  # the seventh period, of one decay
-        (73035, 0, ("initial_off",), {"initial_off"}),  # between what two edges turn at
+        (72007, 3, ("initial_off",), {"initial_off"}),  # typed too coarsely to be 6/5
         (72021, 0, ("hz_for_rad_s", "log10_for_ln"), {"hz_for_rad_s", "log10_for_ln"}),
     ],
 )
