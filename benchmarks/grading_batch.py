@@ -27,15 +27,15 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from pipeline.grading.batch import Prints
-from pipeline.grading.batch_run import grade_class
+from pipeline.grading.batch.batch_run import grade_class
+from pipeline.grading.batch.runner import Limits, grade_batch, run_here
 from pipeline.grading.grade import grade_text
-from pipeline.grading.gradebook import Gradebook
-from pipeline.grading.intake import find_hand_ins
-from pipeline.grading.load import load_rubric
-from pipeline.grading.runner import Limits, grade_batch, run_here
-from pipeline.grading.shared import find_shared
-from pipeline.grading.shared_prints import fingerprint
+from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.intake.hand_ins import find_hand_ins
+from pipeline.grading.outcome import Prints
+from pipeline.grading.rubric_file import load_rubric
+from pipeline.grading.similarity.prints import fingerprint
+from pipeline.grading.similarity.shared import find_shared
 from pipeline.ingest.read import read_data
 from pipeline.results import Record
 from pipeline.submission import load_submission

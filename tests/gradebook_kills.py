@@ -12,7 +12,7 @@ import signal
 import sys
 import time
 
-from pipeline.grading.gradebook import Gradebook
+from pipeline.grading.gradebook.book import Gradebook
 from tests.grades import hertz_flag, make_grade, make_outcome
 
 _MOST_PUTS = 4  # that are waited for

@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.grading.batch import Batch, Outcome
+from pipeline.grading.batch.worker import Setup, Task, grade_task
 from pipeline.grading.grade import Criterion, Flag, Grade, grade_text
-from pipeline.grading.gradebook import Gradebook
-from pipeline.grading.load import load_rubric
-from pipeline.grading.outputs import write_outputs
+from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.schema import FILE
+from pipeline.grading.outcome import Batch, Outcome
+from pipeline.grading.publish.outputs import write_outputs
 from pipeline.grading.rubric import Rubric
-from pipeline.grading.schema import FILE
-from pipeline.grading.worker import Setup, Task, grade_task
+from pipeline.grading.rubric_file import load_rubric
 from pipeline.plant.chain import PRESETS, transfer_functions
 from pipeline.report.figures.grading import reported_bode_figure
 from pipeline.report.figures.style import drawing

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import DataError
-from pipeline.grading.load import load_rubric
+from pipeline.grading.judge.run import under_rubric
+from pipeline.grading.mistakes.state_model import own_chain
+from pipeline.grading.references.springs import with_all_springs
 from pipeline.grading.rubric import Rubric, is_damping
-from pipeline.grading.run import under_rubric
-from pipeline.grading.springs import with_all_springs
-from pipeline.grading.state_model import own_chain
+from pipeline.grading.rubric_file import load_rubric
 from pipeline.plant.chain import Array, Chain
 from pipeline.plant.effects import Term, find_effect
 from pipeline.stages.state_feedback import design_feedback

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.grading.batch import Batch
-from pipeline.grading.changes import points_changes, rubric_changes
-from pipeline.grading.gradebook import Gradebook
+from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.changes import points_changes, rubric_changes
+from pipeline.grading.outcome import Batch
 from pipeline.synthesis import write_submission
 from tests.grades import make_grade, make_outcome, n_graded, two_cart_rubric
 from tests.waiting import started, until

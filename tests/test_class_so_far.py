@@ -11,14 +11,14 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import ConfigError
-from pipeline.grading.batch import Batch
-from pipeline.grading.batch_run import grade_class
-from pipeline.grading.gradebook import Gradebook
-from pipeline.grading.history import history_text
-from pipeline.grading.intake import find_hand_ins
-from pipeline.grading.outputs import write_outputs
-from pipeline.grading.runner import Limits
-from pipeline.grading.so_far import Row, class_so_far
+from pipeline.grading.batch.batch_run import grade_class
+from pipeline.grading.batch.runner import Limits
+from pipeline.grading.batch.so_far import Row, class_so_far
+from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.history import history_text
+from pipeline.grading.intake.hand_ins import find_hand_ins
+from pipeline.grading.outcome import Batch
+from pipeline.grading.publish.outputs import write_outputs
 from pipeline.resources import RUBRICS
 from pipeline.synthesis import write_submission
 from tests.grades import failed_grade, in_this_process, make_grade, make_outcome, two_cart_rubric
@@ -48,7 +48,9 @@ def school(tmp_path_factory) -> Path:
 @pytest.fixture(autouse=True)
 def _here(monkeypatch):
     """Grade in this process: what a worker does apart is no matter here."""
-    monkeypatch.setattr("pipeline.grading.batch_run.run_here", lambda *, jobs: in_this_process)
+    monkeypatch.setattr(
+        "pipeline.grading.batch.batch_run.run_here", lambda *, jobs: in_this_process
+    )
 
 
 def grade(*paths: Path, out: Path, rubric: Path = Path("throne-1dof")):

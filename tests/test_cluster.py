@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import ConfigError
-from pipeline.grading.cluster import run_on
-from pipeline.grading.gradebook import Gradebook
-from pipeline.grading.intake import find_hand_ins
-from pipeline.grading.load import load_rubric
-from pipeline.grading.runner import grade_batch, run_here
-from pipeline.grading.worker import Setup, Task
+from pipeline.grading.batch.cluster import run_on
+from pipeline.grading.batch.runner import grade_batch, run_here
+from pipeline.grading.batch.worker import Setup, Task
+from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.intake.hand_ins import find_hand_ins
+from pipeline.grading.rubric_file import load_rubric
 from pipeline.synthesis import write_submission
 
 RUBRIC = load_rubric(Path("throne-1dof"))
@@ -112,7 +112,7 @@ def test_an_address_that_is_no_schedulers_is_refused():
 
 def test_nobody_there_is_said(monkeypatch):
     """Where no scheduler listens the batch does not begin."""
-    monkeypatch.setattr("pipeline.grading.cluster._CONNECT_LIMIT", 1)
+    monkeypatch.setattr("pipeline.grading.batch.cluster._CONNECT_LIMIT", 1)
     setup = Setup(rubric="", time_limit=1.0, memory_limit=1, scratch="")
     with socket.socket() as bound:  # a port that answers nobody
         bound.bind(("127.0.0.1", 0))

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.grading.batch import Batch, Prints
-from pipeline.grading.doubles import Double, find_doubles, with_recordings
-from pipeline.grading.gradebook import Gradebook
-from pipeline.grading.outputs import write_outputs
-from pipeline.grading.shared_prints import fingerprint
+from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.outcome import Batch, Prints
+from pipeline.grading.publish.outputs import write_outputs
+from pipeline.grading.similarity.doubles import Double, find_doubles, with_recordings
+from pipeline.grading.similarity.prints import fingerprint
 from pipeline.ingest.read import read_data
 from pipeline.submission import load_submission
 from pipeline.synthesis import write_submission

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from pipeline.estimation.chain.follow import find_misread, follow
-from pipeline.grading.load import load_rubric
-from pipeline.grading.recordings import bad_runs
-from pipeline.grading.run import grade_submission
+from pipeline.grading.judge.run import grade_submission
+from pipeline.grading.mistakes.recordings import bad_runs
+from pipeline.grading.rubric_file import load_rubric
 from pipeline.plant.chain import PRESETS, Array
 from pipeline.results import Analysis
 from pipeline.submission import load_submission

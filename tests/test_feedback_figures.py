@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pipeline.grading.feedback_figures import draw_figures
+from pipeline.grading.publish.feedback_figures import draw_figures
 from pipeline.plant.chain import PRESETS, transfer_functions
 from pipeline.report.figures.grading import reported_magnitude
 from tests.grading_students import student

@@ -14,12 +14,12 @@ from pipeline.bench.planning.plan_file import load_plan, plan_path, plan_text
 from pipeline.bench.planning.propose import propose_plan
 from pipeline.errors import ConfigError
 from pipeline.gap.stored import gap_text, read_gap
-from pipeline.grading.export_roster import Roster
-from pipeline.grading.export_students import Student
-from pipeline.grading.late_table import LateTable
-from pipeline.grading.lms_names import Platform, gradescope_metadata
-from pipeline.grading.load import load_rubric
-from pipeline.grading.survey import read_survey, survey_dict, survey_text
+from pipeline.grading.intake.late_table import LateTable
+from pipeline.grading.intake.lms_names import Platform, gradescope_metadata
+from pipeline.grading.publish.roster import Roster
+from pipeline.grading.publish.students import Student
+from pipeline.grading.publish.survey import read_survey, survey_dict, survey_text
+from pipeline.grading.rubric_file import load_rubric
 from pipeline.report.draft.compare import compare_drafts, read_results
 from pipeline.report.gap.words import terminal_verdict
 from pipeline.resources import RUBRICS

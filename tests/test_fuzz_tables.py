@@ -10,10 +10,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import ConfigError
-from pipeline.grading.export_roster import Roster
-from pipeline.grading.export_students import Student
-from pipeline.grading.late_table import LateTable
-from pipeline.grading.survey import read_survey, survey_dict, survey_text
+from pipeline.grading.intake.late_table import LateTable
+from pipeline.grading.publish.roster import Roster
+from pipeline.grading.publish.students import Student
+from pipeline.grading.publish.survey import read_survey, survey_dict, survey_text
 from tests.grades import make_grade
 
 HEADS = ("Student", "ID", "SIS User ID", "Identifier", "ID number", "SID", "Email", "Lab 3 (7)",

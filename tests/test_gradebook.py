@@ -17,12 +17,12 @@ from sqlalchemy import create_engine, text
 from sqlalchemy.exc import DBAPIError
 
 from pipeline.errors import ConfigError
-from pipeline.grading.batch import Batch
 from pipeline.grading.grade import CODES
-from pipeline.grading.gradebook import Gradebook
-from pipeline.grading.history import history_dict, history_text
-from pipeline.grading.override import with_overrides
-from pipeline.grading.schema import FILE, metadata
+from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.history import history_dict, history_text
+from pipeline.grading.gradebook.override import with_overrides
+from pipeline.grading.gradebook.schema import FILE, metadata
+from pipeline.grading.outcome import Batch
 from tests import postgres
 from tests.grades import (
     failed_grade,

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.grading.gradebook import Gradebook
-from pipeline.grading.intake import find_hand_ins
-from pipeline.grading.intake_files import digest, packed, unpacked
-from pipeline.grading.load import load_rubric
-from pipeline.grading.runner import code_version, grade_batch, run_here
-from pipeline.grading.shared_prints import fingerprint
-from pipeline.grading.worker import Task, grade_task
+from pipeline.grading.batch.runner import code_version, grade_batch, run_here
+from pipeline.grading.batch.worker import Task, grade_task
+from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.intake.files import digest, packed, unpacked
+from pipeline.grading.intake.hand_ins import find_hand_ins
+from pipeline.grading.rubric_file import load_rubric
+from pipeline.grading.similarity.prints import fingerprint
 from pipeline.ingest.read import read_data
 from pipeline.submission import load_submission
 from pipeline.synthesis import write_submission
@@ -94,7 +94,7 @@ def test_the_version_covers_what_it_computes_with(monkeypatch):
     for name in ("numpy", "scipy"):
         with monkeypatch.context() as other:
             other.setattr(
-                "pipeline.grading.runner.version",
+                "pipeline.grading.batch.runner.version",
                 lambda asked, name=name: "0" if asked == name else version(asked),
             )
             assert code_version() != before

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.grading.class_lines import Line, wrong_springs
-from pipeline.grading.class_page import class_page
 from pipeline.grading.grade import Grade
-from pipeline.grading.load import load_rubric
-from pipeline.grading.run import grade_submission
-from pipeline.grading.state_model import own_chain
+from pipeline.grading.gradebook.class_lines import Line, wrong_springs
+from pipeline.grading.judge.run import grade_submission
+from pipeline.grading.mistakes.state_model import own_chain
+from pipeline.grading.publish.class_page import class_page
+from pipeline.grading.rubric_file import load_rubric
 from pipeline.plant.chain import Chain
 from tests.grading_class import Team, make_team
 from tests.grading_slips import OF_SEVERAL_CARTS, SLIPS, scaled

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from pipeline.cli import main
-from pipeline.grading.batch import Batch
-from pipeline.grading.gradebook import Gradebook
+from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.outcome import Batch
 from tests.grades import make_grade, make_outcome, two_cart_rubric, write_class
 from tests.test_survey import write_paper
 

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import ConfigError
-from pipeline.grading.batch import Batch
-from pipeline.grading.export import export
-from pipeline.grading.export_students import students_of
-from pipeline.grading.gradebook import Gradebook
+from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.outcome import Batch
+from pipeline.grading.publish.export import export
+from pipeline.grading.publish.students import students_of
 from tests.grades import (
     failed_grade,
     hertz_flag,

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.grading.laws import judge_laws
+from pipeline.grading.judge.laws import judge_laws
 from pipeline.plant.chain import PRESETS, Chain
 
 TABLE_2 = {

@@ -14,18 +14,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import ConfigError
-from pipeline.grading.anonymous import KEY_FILE, anonymise, pseudonyms
-from pipeline.grading.batch import Batch
-from pipeline.grading.class_lines import Line
-from pipeline.grading.class_page import class_page
-from pipeline.grading.export import results_text
-from pipeline.grading.feedback import feedback_page
-from pipeline.grading.feedback_words import PLACES, TITLES
 from pipeline.grading.grade import CODES, Flag
-from pipeline.grading.gradebook import Gradebook
-from pipeline.grading.outputs import grades_csv, write_outputs
-from pipeline.grading.override import Override, read_points, with_overrides
+from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.class_lines import Line
+from pipeline.grading.gradebook.override import Override, read_points, with_overrides
+from pipeline.grading.outcome import Batch
+from pipeline.grading.publish.anonymous import KEY_FILE, anonymise, pseudonyms
+from pipeline.grading.publish.class_page import class_page
+from pipeline.grading.publish.export import results_text
+from pipeline.grading.publish.feedback import feedback_page
+from pipeline.grading.publish.outputs import grades_csv, write_outputs
 from pipeline.grading.table import read_table
+from pipeline.grading.words import PLACES, TITLES
 from tests.grades import (
     failed_grade,
     hertz_flag,

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.grading.load import load_rubric
-from pipeline.grading.run import grade_analysis, under_rubric
+from pipeline.grading.judge.run import grade_analysis, under_rubric
+from pipeline.grading.rubric_file import load_rubric
 from pipeline.plant.chain import Chain
 from pipeline.results import Analysis
 from pipeline.submission import Reported, StateSpace, Submission, load_submission

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.grading.reduced import diagnose_reduced
+from pipeline.grading.mistakes.reduced import diagnose_reduced
 from pipeline.results import Analysis, FrequencyResponse
 from tests.grading_students import student
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import ConfigError
-from pipeline.grading.describe import rubric_dict, rubric_text
-from pipeline.grading.load import load_rubric
+from pipeline.grading.rubric_file import load_rubric
+from pipeline.grading.rubric_text import rubric_dict, rubric_text
 from pipeline.resources import RUBRICS
 
 SHIPPED = sorted(RUBRICS.glob("*.toml"))

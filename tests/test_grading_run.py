@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.grading.checks import between
 from pipeline.grading.grade import CODES, Flag, Grade, grade_text
-from pipeline.grading.load import load_rubric
-from pipeline.grading.run import grade_submission, under_rubric
-from pipeline.grading.springs import with_all_springs
-from pipeline.grading.state_model import StateModel, compare_entries
+from pipeline.grading.judge.checks import between
+from pipeline.grading.judge.run import grade_submission, under_rubric
+from pipeline.grading.mistakes.state_model import StateModel, compare_entries
+from pipeline.grading.references.springs import with_all_springs
+from pipeline.grading.rubric_file import load_rubric
 from pipeline.submission import Input, InputOverride, StateSpace, load_submission
 from pipeline.synthesis import write_submission
 from pipeline.synthesis.hidden import prepare_bench, write_bench
@@ -55,10 +55,10 @@ def test_grading_loads_neither_pandas_nor_control(folder):
     code = f"""
 import sys
 from pathlib import Path
-from pipeline.grading import worker
-from pipeline.grading.feedback_figures import draw_figures
-from pipeline.grading.load import load_rubric
-from pipeline.grading.run import grade_submission
+from pipeline.grading.batch import worker
+from pipeline.grading.publish.feedback_figures import draw_figures
+from pipeline.grading.rubric_file import load_rubric
+from pipeline.grading.judge.run import grade_submission
 from pipeline.submission import load_submission
 from pipeline.workflow import reference_design
 submission = load_submission(Path({str(folder)!r}))

@@ -7,8 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.grading.reference import Reference
-from pipeline.grading.tolerance import as_typed, credit, half_digit, percent_off, rounding
+from pipeline.grading.references.reference import Reference
+from pipeline.grading.references.tolerance import (
+    as_typed,
+    credit,
+    half_digit,
+    percent_off,
+    rounding,
+)
 
 percents = st.decimals("0", "500", places=2).map(float)
 

@@ -17,9 +17,9 @@ from urllib.parse import urlsplit
 import html5lib
 import pytest
 
-from pipeline.grading.gradebook import Gradebook
-from pipeline.grading.intake import find_hand_ins
-from pipeline.grading.intake_files import digest, open_submission
+from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.intake.files import digest, open_submission
+from pipeline.grading.intake.hand_ins import find_hand_ins
 from pipeline.synthesis import write_submission
 from tests.commandline import cartlab_here
 from tests.hostile import SECRET, write_hostile

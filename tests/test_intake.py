@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import ConfigError, SubmissionError
-from pipeline.grading.intake import find_hand_ins
-from pipeline.grading.intake_files import digest, open_submission, packed, unpacked
-from pipeline.grading.lms_names import parse_name
-from pipeline.grading.unpack import HAND_IN
+from pipeline.grading.intake.files import digest, open_submission, packed, unpacked
+from pipeline.grading.intake.hand_ins import find_hand_ins
+from pipeline.grading.intake.lms_names import parse_name
+from pipeline.grading.intake.unpack import HAND_IN
 
 TOML = "version = 1\n"
 
@@ -371,7 +371,7 @@ def test_nothing_to_grade_is_said(tmp_path):
 @given(st.lists(st.text(min_size=1, max_size=30), min_size=1, max_size=6))
 def test_any_name_becomes_a_folders(tmp_path_factory, names):
     """Ids are different, printable, not too long, and lie where they should."""
-    from pipeline.grading.intake import _Found, _with_ids
+    from pipeline.grading.intake.hand_ins import _Found, _with_ids
 
     found = [_Found(name=name, parent="p", sources=()) for name in names]
     ids = [hand_in.id for hand_in in _with_ids(found)]

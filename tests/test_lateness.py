@@ -7,10 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import ConfigError
-from pipeline.grading.intake import HandIn
-from pipeline.grading.late_table import LateTable, settle_lateness
-from pipeline.grading.load import load_rubric
+from pipeline.grading.intake.hand_ins import HandIn
+from pipeline.grading.intake.late_table import LateTable, settle_lateness
 from pipeline.grading.rubric import Late
+from pipeline.grading.rubric_file import load_rubric
 
 DUE = datetime.fromisoformat("2026-11-20T23:59:00-08:00")
 

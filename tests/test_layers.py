@@ -35,7 +35,11 @@ LEVELS = (
     ("grading", "bench", "bench.protocol"),
     ("bench.planning", "bench.emulator"),
     ("bench.watch",),
-    ("bench.host",),
+    ("bench.host", "grading.intake", "grading.references"),
+    ("grading.mistakes", "grading.similarity"),
+    ("grading.judge", "grading.gradebook"),
+    ("grading.publish",),
+    ("grading.batch",),
     ("cli", "notebook"),
     ("__main__",),
 )
@@ -51,7 +55,7 @@ HOMES = {
     "starlette": ("bench.watch",),
     "uvicorn": ("bench.watch",),
     "control": ("plant", "checks", "notebook"),
-    "sqlalchemy": ("grading",),
+    "sqlalchemy": ("grading.gradebook",),
     "pandas": ("exchange", "grading", "notebook"),
 }
 MODULES = sorted(PIPELINE.rglob("*.py"))

@@ -13,15 +13,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.grading import feedback_figures, worker_process
+from pipeline.grading.batch import worker_process
+from pipeline.grading.batch.runner import Limits, grade_batch, run_here
+from pipeline.grading.batch.worker import Setup, Task, grade_task
+from pipeline.grading.batch.worker_process import Worker
 from pipeline.grading.grade import grade_text
-from pipeline.grading.gradebook import Gradebook
-from pipeline.grading.intake import find_hand_ins
-from pipeline.grading.load import load_rubric
-from pipeline.grading.outputs import write_outputs
-from pipeline.grading.runner import Limits, grade_batch, run_here
-from pipeline.grading.worker import Setup, Task, grade_task
-from pipeline.grading.worker_process import Worker
+from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.intake.hand_ins import find_hand_ins
+from pipeline.grading.publish import feedback_figures
+from pipeline.grading.publish.outputs import write_outputs
+from pipeline.grading.rubric_file import load_rubric
 from pipeline.synthesis import write_submission
 from tests.grades import n_graded
 from tests.waiting import PATIENCE, started, until

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.grading.batch import Prints
-from pipeline.grading.shared import find_shared, shared_flag
-from pipeline.grading.shared_prints import fingerprint, unpack
+from pipeline.grading.outcome import Prints
+from pipeline.grading.similarity.prints import fingerprint, unpack
+from pipeline.grading.similarity.shared import find_shared, shared_flag
 from pipeline.ingest.read import read_data
 from pipeline.submission import load_submission
 from pipeline.synthesis import COUNT, write_submission

@@ -6,7 +6,7 @@ import re
 import pytest
 
 from pipeline.errors import ConfigError
-from pipeline.grading.survey import LEVELS, SCALE, read_survey, survey_dict, survey_text
+from pipeline.grading.publish.survey import LEVELS, SCALE, read_survey, survey_dict, survey_text
 
 # Table 4 of Throne (2005): whole percents of the twelve who answered each question.
 TABLE_4 = {

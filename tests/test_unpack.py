@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import SubmissionError
-from pipeline.grading.unpack import HAND_IN, Limits, is_debris, member_names, unpack
+from pipeline.grading.intake.unpack import HAND_IN, Limits, is_debris, member_names, unpack
 
 SMALL = Limits(members=20, total=100_000, ratio=200.0, directory=10_000)
 BRIEF = Limits(total=1_000_000, directory=10_000)
@@ -60,7 +60,7 @@ def test_what_is_no_name_on_windows_is_refused_there(tmp_path, monkeypatch, name
     """There it would be another file, a stream or a device; elsewhere it is a name."""
     packed = zipped(tmp_path / "a.zip", {name: "x", "good.txt": "good"})
     assert not unpack(packed, tmp_path / "here", limits=SMALL)
-    monkeypatch.setattr("pipeline.grading.unpack.sys.platform", "win32")
+    monkeypatch.setattr("pipeline.grading.intake.unpack.sys.platform", "win32")
     (why,) = unpack(packed, tmp_path / "there", limits=SMALL).values()
     assert why.endswith("is no name of a file on Windows")
     assert files_below(tmp_path / "there") == ["good.txt"]

@@ -51,8 +51,8 @@ def grade(
     ] = None,
 ) -> None:
     """Grade a class: gradebook, grades.csv, a page of the class, feedback for each student."""
-    from pipeline.grading.batch_run import grade_class
-    from pipeline.grading.runner import Limits
+    from pipeline.grading.batch.batch_run import grade_class
+    from pipeline.grading.batch.runner import Limits
 
     with _stopping(out), _batch_progress() as progress:
         done = grade_class(
@@ -172,10 +172,10 @@ def override(
     assignment: Lab = None,
 ) -> None:
     """Give a criterion points by hand, which every later grading keeps."""
-    from pipeline.grading.blind import meant
-    from pipeline.grading.gradebook import Gradebook
-    from pipeline.grading.outputs import write_outputs
-    from pipeline.grading.override import read_points
+    from pipeline.grading.gradebook.book import Gradebook
+    from pipeline.grading.gradebook.override import read_points
+    from pipeline.grading.publish.blind import meant
+    from pipeline.grading.publish.outputs import write_outputs
     from pipeline.lock import alone_in
 
     folder = Path(grades)
@@ -200,9 +200,9 @@ def remove(
     assignment: Lab = None,
 ) -> None:
     """Take submissions off the class list; their history stays."""
-    from pipeline.grading.blind import meant
-    from pipeline.grading.gradebook import Gradebook
-    from pipeline.grading.outputs import write_outputs
+    from pipeline.grading.gradebook.book import Gradebook
+    from pipeline.grading.publish.blind import meant
+    from pipeline.grading.publish.outputs import write_outputs
     from pipeline.lock import alone_in
 
     folder = Path(grades)
@@ -222,9 +222,9 @@ def remove(
 @app.command()
 def history(grades: Grades, team: Team, assignment: Lab = None, as_json: AsJson = False) -> None:
     """Show every grade and change of a team, with who, when and why."""
-    from pipeline.grading.blind import history_of
-    from pipeline.grading.gradebook import Gradebook
-    from pipeline.grading.history import history_dict, history_text
+    from pipeline.grading.gradebook.book import Gradebook
+    from pipeline.grading.gradebook.history import history_dict, history_text
+    from pipeline.grading.publish.blind import history_of
 
     with Gradebook(grades, assignment=assignment) as book:
         submission, events = history_of(book, team)
@@ -256,8 +256,8 @@ def export_grades(
     assignment: Lab = None,
 ) -> None:
     """Write the class grades for import into a learning platform."""
-    from pipeline.grading.export import export
-    from pipeline.grading.gradebook import Gradebook
+    from pipeline.grading.gradebook.book import Gradebook
+    from pipeline.grading.publish.export import export
     from pipeline.output import check_folder
 
     folder = Path(grades)
@@ -276,7 +276,7 @@ def survey(
     as_json: AsJson = False,
 ) -> None:
     """Make the tables of opinions and of knowledge and confidence from a questionnaire."""
-    from pipeline.grading.survey import read_survey, survey_dict, survey_text
+    from pipeline.grading.publish.survey import read_survey, survey_dict, survey_text
 
     found = read_survey(file)
     if found.left_out:
@@ -293,8 +293,8 @@ def check_rubric(
     as_json: AsJson = False,
 ) -> None:
     """Validate a rubric and show what it asks of a submission."""
-    from pipeline.grading.describe import rubric_dict, rubric_text
-    from pipeline.grading.load import load_rubric
+    from pipeline.grading.rubric_file import load_rubric
+    from pipeline.grading.rubric_text import rubric_dict, rubric_text
 
     rubric = load_rubric(file)
     if as_json:

@@ -1,0 +1,204 @@
+"""The whole of `cartlab grade`: intake, grading, the gradebook, and what is written from it."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.errors import ConfigError, PipelineError
+from pipeline.grading.batch.runner import Executor, Limits, Progress, grade_batch, run_here
+from pipeline.grading.batch.scratch import scratch_in
+from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.class_lines import wrong_springs
+from pipeline.grading.intake.files import digest
+from pipeline.grading.intake.hand_ins import find_hand_ins
+from pipeline.grading.intake.late_table import LateTable, settle_lateness
+from pipeline.grading.outcome import Batch
+from pipeline.grading.publish.outputs import write_outputs
+from pipeline.grading.rubric import Rubric
+from pipeline.grading.rubric_file import load_rubric
+from pipeline.grading.similarity.prints import fingerprint
+from pipeline.ingest.read import read_data
+from pipeline.lock import alone_in
+from pipeline.output import check_folder
+from pipeline.report.numbers import listing
+from pipeline.resources import EXAMPLES
+from pipeline.submission import load_submission
+from pipeline.submission.complaints import quote
+from pipeline.submission.load import NAME
+
+_MEMORY = ".compared.json"  # may be removed at any time
+_NAMED = 8  # submissions in a remark
+
+
+@dataclass(frozen=True, kw_only=True)
+class Summary:
+    """How many there were, which could not be graded (id, reason), how many share recordings.
+
+    `remarks` are what the person at the command line should know besides, `changes` what is
+    another than in the class list before.
+    """
+
+    total: int
+    failed: tuple[tuple[str, str], ...]
+    sharing: int
+    remarks: tuple[str, ...] = ()
+    changes: tuple[str, ...] = ()
+
+
+def grade_class(
+    paths: Sequence[Path],
+    *,
+    rubric_file: Path,
+    out: Path,
+    jobs: int,
+    cluster: str | None,
+    limits: Limits,
+    figures: bool,
+    progress: Progress,
+    anonymous: bool = False,
+    gradebook: str | None = None,
+    lateness: Path | None = None,
+) -> Summary:
+    """Grade everything in `paths` into the folder `out`.
+
+    Parameters
+    ----------
+    anonymous : leave names out of what is written, as a rubric may ask for itself.
+    gradebook : a database URL; default: `gradebook.sqlite` in `out`.
+    lateness : a table that says who was late.
+
+    Raises
+    ------
+    ConfigError : the rubric, the table, a path, the folder or the cluster cannot be used, the
+        folder holds another class, or another run is writing there.
+    """
+    rubric = load_rubric(rubric_file)
+    late_table = LateTable.read(lateness) if lateness else None
+    _refuse_submission(check_folder(out))
+    if gradebook is None:
+        _refuse_another_class(out, assignment=rubric_file.stem)
+    with alone_in(out), scratch_in(out) as scratch:
+        known = _names_so_far(gradebook or out, assignment=rubric_file.stem)
+        passed: list[str] = []
+        found = find_hand_ins(paths, scratch=scratch, skip=[out], known=known, say=passed.append)
+        hand_ins, remarks = settle_lateness(found, late=rubric.late, table=late_table)
+        # The rubric's file says which assignment it is: its title may be mended on the way.
+        with Gradebook(gradebook or out, assignment=rubric_file.stem, create=True) as book:
+            hidden = rubric.anonymous or anonymous
+            if hidden:  # it would tell who shares with whom
+                (out / _MEMORY).unlink(missing_ok=True)
+            batch = grade_batch(
+                hand_ins,
+                rubric=rubric,
+                store=book,
+                scratch=scratch,
+                execute=_executor(jobs=jobs, cluster=cluster),
+                limits=limits,
+                figures=figures,
+                examples=lambda: list(_handed_out(rubric, folder=rubric_file.parent)),
+                examples_digest=_examples_digest(rubric, folder=rubric_file.parent),
+                memory=None if hidden else out / _MEMORY,
+                progress=progress,
+            )
+            changes = book.finish(batch, rubric=rubric.model_copy(update={"anonymous": hidden}))
+            remarks = [*passed, *remarks, *_told(batch, book)]
+            total = len(hand_ins)
+            doubles = write_outputs(book, out, progress=lambda what: progress(total, total, what))
+            remarks += [f"{double}: see class.html" for double in doubles]
+    return Summary(
+        total=len(hand_ins),
+        failed=batch.failed,
+        sharing=len(batch.shared),
+        remarks=tuple(remarks),
+        changes=tuple(changes),
+    )
+
+
+def _refuse_submission(out: Path) -> None:
+    """Refuse to write into what is to be graded: it would be another submission afterwards."""
+    for folder in (out.resolve(), *out.resolve().parents):
+        if (folder / NAME).is_file():
+            raise ConfigError(f"{out}: is in a submission; name a folder outside of it with --out")
+
+
+def _refuse_another_class(out: Path, *, assignment: str) -> None:
+    """Refuse to write the class of another rubric's name over this one, points by hand and all."""
+    try:
+        with Gradebook(out) as book:
+            before = book.assignment
+    except ConfigError:
+        return  # no class there yet
+    if before != assignment:
+        raise ConfigError(
+            f"{out}: holds the class of {before}.toml, and a rubric of another name is another "
+            f"class: call the rubric {before}.toml to go on with it, or name another --out"
+        )
+
+
+def _told(batch: Batch, book: Gradebook) -> Iterator[str]:
+    """Yield whether the rubric's springs are the benches', and what became of the class before."""
+    graded = (grade for _, grade in batch.grades(book) if grade.status == "graded")
+    if asked := wrong_springs(grade.springs for grade in graded):
+        yield asked
+    hidden = book.rubric.anonymous
+    for before, now in batch.moved.items():
+        yield f"{before} is now called {now}; the points it was given by hand go on"
+    for name, before, now in batch.taken_over:
+        whose = "" if hidden else f", {_people(now)} in place of {_people(before)}"
+        yield f"{name} is now by others{whose}: where both count, give one folder another name"
+    if not batch.kept:
+        return
+    yield f"not in this run, kept as they were: {_names(batch.kept)} (cartlab remove takes one off)"
+    if others := sorted(set(book.by_other_rubrics()) & set(batch.kept)):
+        yield f"graded by the rubric as it was before, grade them again: {_names(others)}"
+
+
+def _people(authors: Sequence[str]) -> str:
+    return listing([quote(author) for author in authors])
+
+
+def _names(names: Sequence[str]) -> str:
+    more = [f"{len(names) - _NAMED} more"] * (len(names) > _NAMED)
+    return listing([*names[:_NAMED], *more])
+
+
+def _names_so_far(place: Path | str, *, assignment: str) -> list[str]:
+    """Return the submissions of the class list so far; making no gradebook."""
+    try:
+        with Gradebook(place, assignment=assignment) as book:
+            return book.names()
+    except ConfigError:
+        return []
+
+
+def _executor(*, jobs: int, cluster: str | None) -> Executor:
+    if cluster is None:
+        return run_here(jobs=jobs)
+    try:
+        from pipeline.grading.batch.cluster import run_on
+    except ModuleNotFoundError as error:
+        raise ConfigError(f"--cluster needs {error.name}: pip install 'cartlab[cluster]'") from None
+    return run_on(cluster)
+
+
+def _examples_digest(rubric: Rubric, *, folder: Path) -> str:
+    """Return a hash of all that `_handed_out` reads."""
+    own = (folder / example for example in rubric.examples)
+    return " ".join(digest([path]) for path in (*own, EXAMPLES))
+
+
+def _handed_out(rubric: Rubric, *, folder: Path) -> Iterator[bytes]:
+    """Yield the fingerprints of the rubric's examples and of those shipped for as many carts."""
+    for example in rubric.examples:
+        try:
+            data = read_data(load_submission(folder / example))
+        except PipelineError as error:
+            raise ConfigError(f"the rubric's example {example}: {error}") from None
+        for run, reason in data.unreadable.items():
+            raise ConfigError(f"the rubric's example {example}: {run}: {reason}")
+        yield fingerprint(data.records)
+    for shipped in sorted(EXAMPLES.iterdir()):
+        if (shipped / "submission.toml").is_file():
+            submission = load_submission(shipped)
+            if submission.system.carts == rubric.system.carts:
+                yield fingerprint(read_data(submission).records)

@@ -1,0 +1,149 @@
+"""The same tasks on a Dask cluster: the hand-ins travel along, every machine has its own workers.
+
+Each Dask worker keeps worker processes as a single machine does (`worker_process.py`): a hand-in
+that crashes or hangs takes one of them down, never the Dask worker.
+"""
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from urllib.parse import urlsplit
+from uuid import uuid4
+
+from distributed import Client, Security, WorkerPlugin, as_completed, get_worker
+from distributed.worker import Worker as DaskWorker
+
+from pipeline.errors import ConfigError
+from pipeline.grading.batch.runner import Executor, code_version
+from pipeline.grading.batch.worker import Setup, Task, failed, outcome_line, read_outcome
+from pipeline.grading.batch.worker_process import Worker
+from pipeline.grading.intake.files import packed, unpacked
+from pipeline.grading.outcome import Outcome
+
+_CONNECT_LIMIT = 20  # s
+_AHEAD = 2  # tasks under way for every thread of the cluster: none waits, few are in memory
+_LOOPBACK = ("localhost", "127.0.0.1", "::1")
+
+
+def run_on(address: str) -> Executor:
+    """Return what runs tasks on the cluster of a scheduler, `tcp://HOST:PORT` or `tls://…`.
+
+    Raises
+    ------
+    ConfigError : unencrypted to another machine (a scheduler runs what it is sent), or nobody
+        answers, or there are no certificates, or the cluster runs another version.
+    """
+    parts = urlsplit(address)
+    if parts.scheme not in ("tcp", "tls") or not parts.hostname:
+        raise ConfigError(f"{address}: expected a scheduler's address, tcp://HOST:PORT or tls://…")
+    if parts.scheme == "tcp" and parts.hostname not in _LOOPBACK:
+        raise ConfigError(
+            f"{address}: a scheduler runs whatever it is sent, so on another machine it needs "
+            "encryption: start it with TLS certificates and name it tls://…"
+        )
+    if parts.scheme == "tls" and Security().get_connection_args("client")["ssl_context"] is None:
+        raise ConfigError(
+            f"{address}: no certificates in Dask's configuration (distributed.comm.tls)"
+        )
+
+    def execute(tasks: Sequence[Task], setup: Setup, out_of: float) -> Iterator[Outcome]:
+        try:
+            client = Client(address, timeout=_CONNECT_LIMIT, set_as_default=False)
+        except (OSError, TimeoutError) as error:
+            raise ConfigError(f"{address}: no scheduler answers ({error})") from None
+        with client:
+            try:
+                client.wait_for_workers(1, timeout=_CONNECT_LIMIT)
+            except TimeoutError:
+                raise ConfigError(f"{address}: the scheduler has no workers") from None
+            # Runs on one cluster at once have graders of their own, with their own rubric.
+            graders = f"cartlab-graders-{uuid4()}"
+            client.register_plugin(Graders(setup, out_of=out_of), name=graders)
+            try:
+                yield from _through(client, tasks, graders=graders, out_of=out_of)
+            finally:
+                client.unregister_worker_plugin(graders)
+
+    return execute
+
+
+class Graders(WorkerPlugin):
+    """The worker processes of one Dask worker, started when needed, ended with it."""
+
+    def __init__(self, setup: Setup, *, out_of: float) -> None:
+        self._setup = setup
+        self._out_of = out_of
+        self._code = code_version()
+
+    def setup(self, worker: DaskWorker) -> None:
+        """Make a folder for hand-ins; processes start with the first of them."""
+        self._folder = tempfile.TemporaryDirectory(prefix="cartlab-", ignore_cleanup_errors=True)
+        self._idle: SimpleQueue[Worker] = SimpleQueue()
+        self._all: list[Worker] = []
+        self.same_code = self._code == code_version()
+
+    def teardown(self, worker: DaskWorker) -> None:
+        """End the processes."""
+        for process in self._all:
+            process.close()
+        self._folder.cleanup()
+
+    def grade(self, task: Task, archive: bytes) -> Outcome:
+        """Write the hand-in down and grade it in a process of its own."""
+        try:
+            process = self._idle.get_nowait()
+        except Empty:
+            process = Worker(replace(self._setup, scratch=self._folder.name), out_of=self._out_of)
+            self._all.append(process)
+        try:
+            with tempfile.TemporaryDirectory(
+                dir=self._folder.name, ignore_cleanup_errors=True
+            ) as folder:
+                unpacked(archive, Path(folder))
+                return process.run(replace(task, sources=(folder,)))
+        finally:
+            self._idle.put(process)
+
+
+def _grade(task: Task, archive: bytes, plugin: str) -> bytes:
+    """Run on a Dask worker: return the outcome as a line of JSON."""
+    graders = get_worker().plugins[plugin]
+    assert isinstance(graders, Graders)
+    if not graders.same_code:
+        raise ConfigError("the cluster's workers run another version of cartlab, numpy or scipy")
+    return outcome_line(graders.grade(task, archive))
+
+
+def _threads(client: Client) -> int:
+    """Return how many tasks the cluster can run at once just now."""
+    workers = client.scheduler_info(n_workers=-1)["workers"]
+    return sum(worker["nthreads"] for worker in workers.values())
+
+
+def _through(
+    client: Client, tasks: Sequence[Task], *, graders: str, out_of: float
+) -> Iterator[Outcome]:
+    """Yield the outcomes as they come; a worker that is lost has its tasks done by another."""
+    waiting = list(reversed(tasks))
+    under_way: dict[str, Task] = {}
+    answers = as_completed(loop=client.loop)
+    while waiting or under_way:
+        room = max(1, _AHEAD * _threads(client))
+        while waiting and len(under_way) < room:
+            task = waiting.pop()
+            archive = packed([Path(source) for source in task.sources])
+            key = f"{graders}-{task.key}"
+            future = client.submit(_grade, task, archive, graders, key=key, pure=False)
+            under_way[str(future.key)] = task
+            answers.add(future)
+        future = next(answers)
+        task = under_way.pop(str(future.key))
+        if future.status == "finished":
+            yield read_outcome(future.result())
+        elif isinstance(error := future.exception(), ConfigError):
+            raise error
+        else:
+            reason = f"the cluster gave up on it: {error}"
+            yield failed(task, reason, out_of=out_of, settled=False)

@@ -1,0 +1,238 @@
+"""A process that grades one hand-in after another, so that a bad one can be stopped.
+
+`python -m pipeline.grading.batch.worker` reads a line of JSON for each task on stdin and answers
+with one on stdout: the first line says how, every further one what. It ends with its stdin.
+"""
+
+import base64
+import faulthandler
+import json
+import os
+import sys
+import tempfile
+import traceback
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import PipelineError
+from pipeline.grading.grade import Grade, grade_text
+from pipeline.grading.intake.files import Changed, open_submission
+from pipeline.grading.judge.run import Graded, grade_submission
+from pipeline.grading.outcome import Outcome
+from pipeline.grading.rubric import Rubric
+from pipeline.grading.similarity.prints import fingerprint
+from pipeline.submission import Submission, load_submission
+from pipeline.submission.complaints import quote
+from pipeline.submission.named import named_authors
+
+_GRACE = 30.0  # s; a worker without a parent to stop it ends by itself so long after the limit
+OUT_OF_MEMORY = "needs more memory than allowed"
+_DETAIL = 20_000  # characters of a traceback
+
+
+@dataclass(frozen=True, kw_only=True)
+class Setup:
+    """How to grade: the same for all tasks of a worker.
+
+    Attributes
+    ----------
+    rubric : as JSON.
+    time_limit : s for each hand-in; memory_limit : bytes beyond what the worker needs itself.
+    scratch : where hand-ins are copied to while they are graded.
+    figures : draw those of the feedback, too.
+    """
+
+    rubric: str
+    time_limit: float
+    memory_limit: int
+    scratch: str
+    figures: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """One hand-in to grade; see `intake.HandIn` and, for the key, `batch.Outcome`.
+
+    `digest` is of the files that the key is of, "" where nobody asks whether those are graded.
+    """
+
+    id: str
+    key: str
+    sources: tuple[str, ...]
+    digest: str = ""
+    owner: str = ""
+    days_late: float = 0.0
+
+
+def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = False) -> Outcome:
+    """Open, analyse and grade one hand-in; whatever is wrong with it is the outcome's reason."""
+    authors: tuple[str, ...] = ()
+    reason = detail = ""
+    settled = True
+    try:
+        with tempfile.TemporaryDirectory(
+            dir=scratch, prefix="open-", ignore_cleanup_errors=True
+        ) as folder:
+            sources = [Path(source) for source in task.sources]
+            opened = open_submission(sources, Path(folder) / task.id, digest=task.digest)
+            authors = named_authors(opened)
+            submission = load_submission(opened)
+            authors = tuple(author.id for author in submission.authors)
+            graded = grade_submission(
+                submission, rubric=rubric, name=task.id, days_late=task.days_late
+            )
+            records = graded.analysis.records if graded.analysis else ()
+            drawn, detail = _figures(submission, graded) if figures else ((), "")
+            return Outcome(
+                submission=task.id,
+                authors=graded.grade.authors,
+                key=task.key,
+                status=graded.grade.status,
+                reason=graded.grade.reason,
+                days_late=task.days_late,
+                grade=grade_text(graded.grade),
+                fingerprints=fingerprint(records),
+                figures=drawn,
+                owner=task.owner,
+                settled=not detail,
+                detail=detail,
+            )
+    except Changed:  # by whoever synchronises the folder, say
+        reason, settled = "its files changed while the class was graded: grade it again", False
+    except PipelineError as error:
+        reason = str(error)
+    except OSError as error:  # a full disk, a folder gone: perhaps not the hand-in's fault
+        reason, settled = f"cannot be read ({error.strerror or error})", False
+    except MemoryError:
+        reason, settled = OUT_OF_MEMORY, False
+    except Exception as error:  # of ours, or of a library: a mended one is to have its try
+        reason = f"the grader failed: {type(error).__name__}: {quote(str(error))}"
+        detail, settled = _traceback(), False
+    return failed(
+        task, reason, authors=authors, out_of=rubric.out_of, settled=settled, detail=detail
+    )
+
+
+def _figures(submission: Submission, graded: Graded) -> tuple[tuple[tuple[str, str], ...], str]:
+    """Return the figures; or none and why: a grade stands whatever happens to its pictures."""
+    from pipeline.grading.publish.feedback_figures import (
+        draw_figures,  # costs half a second at first
+    )
+
+    if graded.analysis is None:
+        return (), ""
+    try:
+        return draw_figures(graded.analysis, submission.reported), ""
+    except Exception:
+        return (), _traceback()
+
+
+def _traceback() -> str:
+    return traceback.format_exc()[-_DETAIL:]
+
+
+def failed(
+    task: Task,
+    reason: str,
+    *,
+    out_of: float,
+    authors: Sequence[str] = (),
+    settled: bool = True,
+    detail: str = "",
+) -> Outcome:
+    """Return the outcome of a hand-in that could not be graded."""
+    reason = "".join(c if c.isprintable() else "�" for c in " ".join(reason.split()))
+    grade = Grade(
+        submission=task.id,
+        authors=tuple(authors),
+        status="failed",
+        points=0.0,
+        out_of=out_of,
+        days_late=task.days_late,
+        reason=reason,
+    )
+    return Outcome(
+        submission=task.id,
+        authors=tuple(authors),
+        key=task.key,
+        status="failed",
+        reason=reason,
+        settled=settled,
+        days_late=task.days_late,
+        grade=grade_text(grade),
+        owner=task.owner,
+        detail=detail,
+    )
+
+
+# ----------------------------------------------------------------------------- lines
+
+
+def outcome_line(outcome: Outcome) -> bytes:
+    """Return an outcome as one line of JSON."""
+    plain = asdict(outcome)
+    plain["fingerprints"] = base64.b64encode(outcome.fingerprints).decode()
+    return _line(plain)
+
+
+def read_outcome(line: bytes) -> Outcome:
+    """Return the outcome that `outcome_line` wrote."""
+    plain: dict[str, Any] = json.loads(line)
+    plain["fingerprints"] = base64.b64decode(plain["fingerprints"])
+    plain["authors"] = tuple(plain["authors"])
+    plain["figures"] = tuple((name, svg) for name, svg in plain["figures"])
+    return Outcome(**plain)
+
+
+def task_line(task: Task | Setup) -> bytes:
+    """Return a task or the setup as one line of JSON."""
+    return _line(asdict(task))
+
+
+def _line(plain: dict[str, Any]) -> bytes:
+    return json.dumps(plain).encode() + b"\n"
+
+
+# --------------------------------------------------------------------------- process
+
+
+def main() -> None:
+    """Answer every task on stdin; stdout is for answers only."""
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what a library prints is no answer
+    tasks = sys.stdin.buffer
+    setup = Setup(**json.loads(tasks.readline()))
+    rubric = Rubric.model_validate_json(setup.rubric)
+    _limit_memory(setup.memory_limit)
+    answers.write(b"ready\n")
+    answers.flush()
+    for line in tasks:
+        plain = json.loads(line)
+        task = Task(**{**plain, "sources": tuple(plain["sources"])})
+        faulthandler.dump_traceback_later(setup.time_limit + _GRACE, exit=True)
+        outcome = grade_task(
+            task, rubric=rubric, scratch=Path(setup.scratch), figures=setup.figures
+        )
+        faulthandler.cancel_dump_traceback_later()
+        answers.write(outcome_line(outcome))
+        answers.flush()
+        if not outcome.settled:
+            return  # after a fault a fresh process is surer
+
+
+def _limit_memory(more: int) -> None:
+    """Let the address space grow by so many bytes; elsewhere the parent watches alone."""
+    if sys.platform != "linux":
+        return
+    import resource
+
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+    limit = pages * resource.getpagesize() + more
+    _, hard = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (limit, hard))
+
+
+if __name__ == "__main__":
+    main()

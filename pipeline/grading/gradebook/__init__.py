@@ -1,0 +1,1 @@
+"""What was graded, changed, and by whom."""

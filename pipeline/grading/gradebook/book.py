@@ -1,0 +1,400 @@
+"""The gradebook: every grading kept, what counts now, and points given by hand.
+
+Grading puts each submission in as it comes, in a transaction of its own; a batch that ran to its
+end becomes the class list. Results carry no dates: those are here, and in `cartlab history`.
+"""
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sqlalchemy import Connection, Row, select
+
+from pipeline.errors import ConfigError
+from pipeline.grading.gradebook.changes import kept_by_hand, points_changes, rubric_changes
+from pipeline.grading.gradebook.class_lines import Line, class_frame
+from pipeline.grading.gradebook.history import Event, read_events
+from pipeline.grading.gradebook.lists import (
+    add_list,
+    by_other_rubrics,
+    is_of,
+    lines_of,
+    nearest,
+    points_of,
+)
+from pipeline.grading.gradebook.override import Override
+from pipeline.grading.gradebook.prints import pages, read_listed, read_prints, read_prints_of
+from pipeline.grading.gradebook.rows import (
+    Entry,
+    add_row,
+    carry_overrides,
+    class_list,
+    final_entry,
+    known_outcome,
+    last_named,
+    newest_of,
+    put_parts,
+    read_figures,
+    read_flag,
+    read_rubric,
+    storable,
+)
+from pipeline.grading.gradebook.schema import (
+    Database,
+    batches,
+    entries,
+    gradings,
+    overrides,
+    submissions,
+)
+from pipeline.grading.outcome import Batch, Listed, Outcome, Prints, read_grade
+from pipeline.grading.rubric import Rubric
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+class Gradebook:
+    """A store of outcomes (see `batch.Store`) and the class list made of them.
+
+    Parameters
+    ----------
+    place : a folder, a SQLite file or any SQLAlchemy URL.
+    assignment : whose class list it is about, so that one database can hold several; default: the
+        one that was graded last.
+    create : make a gradebook where there is none.
+    now : the clock that says when something was put in.
+
+    Raises
+    ------
+    ConfigError : the place cannot be reached or holds no gradebook.
+    """
+
+    def __init__(
+        self,
+        place: str | Path,
+        *,
+        assignment: str | None = None,
+        create: bool = False,
+        now: Callable[[], datetime] = lambda: datetime.now(UTC),
+    ) -> None:
+        self._database = Database(place, create=create)
+        self._now = now
+        self._assignment = assignment
+
+    def close(self) -> None:
+        """Let go of the database."""
+        self._database.close()
+
+    def __enter__(self) -> "Gradebook":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # ------------------------------------------------------------------ while grading
+
+    def known(self, key: str, *, figures: bool = True) -> Outcome | None:
+        """Return the newest outcome of this key, None where there is none; or without figures."""
+        with self._database.reading() as connection:
+            return known_outcome(
+                connection, key, assignment=self._assignment or "", figures=figures
+            )
+
+    def put(self, outcome: Outcome) -> None:
+        """Add an outcome: durable on return, and nothing of it there before.
+
+        Raises
+        ------
+        ValueError : its grade is none.
+        """
+        grade = read_grade(outcome.grade)
+        with self._database.writing() as connection:
+            number = self._submission(connection, outcome.submission)
+            row = {
+                "submission_id": number,
+                "at": self._at(),
+                "key": outcome.key,
+                "status": outcome.status,
+                "reason": storable(outcome.reason),
+                "settled": outcome.settled,
+                "points": grade.points,
+                "out_of": grade.out_of,
+                "days_late": outcome.days_late,
+                "deducted": grade.deducted,
+                "authors": json.dumps(outcome.authors),
+                "owner": storable(outcome.owner),
+                "detail": storable(outcome.detail),
+                "grade": storable(outcome.grade),
+                "fingerprints": outcome.fingerprints,
+            }
+            grading = add_row(connection, gradings, row)
+            put_parts(connection, grading, grade, outcome.figures)
+
+    def prints(self) -> Iterator[Prints]:
+        """Return all fingerprints that differ, of every submission under its authors.
+
+        Those of a first version count too: what was replaced may have been passed on before.
+        """
+        return read_prints(self._database, assignment=self._assignment or "")
+
+    def listed(self) -> Iterator[Listed]:
+        """Return the class list so far; nothing where no batch ran to its end yet."""
+        with self._database.reading() as connection:
+            last = self._newest(connection)
+            lines = [] if last is None else lines_of(connection, last)
+        return read_listed(self._database, [line["grading_id"] for line in lines])
+
+    def prints_of(self, numbers: Sequence[int]) -> list[Prints]:
+        """Return the fingerprints of gradings, see `Entry.grading`."""
+        return read_prints_of(self._database, numbers)
+
+    def names(self) -> list[str]:
+        """Return the submissions of the class list so far."""
+        with self._database.reading() as connection:
+            last = self._newest(connection)
+            return [] if last is None else list(points_of(connection, last))
+
+    def finish(self, batch: Batch, *, rubric: Rubric) -> list[str]:
+        """Make a batch that ran to its end the class list; one that changes nothing adds nothing.
+
+        Returns what is another than in the class list before, a phrase each: the rubric first.
+
+        Raises
+        ------
+        KeyError : an outcome of the batch was never put in.
+        """
+        listed, points, by_hand = [], {}, {}
+        with self._database.writing() as connection:
+            carry_overrides(connection, batch.moved, assignment=self._assignment or "")
+            for position, key in enumerate(batch.keys):
+                row = newest_of(connection, key, assignment=self._assignment or "")
+                shared = batch.shared.get(row.name)
+                entry = final_entry(connection, row, shared=shared, rubric=rubric)
+                points[row.name] = entry.grade.points
+                by_hand |= {row.name: entry.overrides} if entry.overrides else {}
+                listed.append(
+                    {
+                        "position": position,
+                        "submission_id": row.submission_id,
+                        "grading_id": row.id,
+                        "shared": json.dumps(asdict(shared)) if shared else "",
+                        "points": entry.grade.points,
+                        "out_of": entry.grade.out_of,
+                    }
+                )
+            text = rubric.model_dump_json()
+            last = self._newest(connection)
+            if last is not None and last.rubric == text and lines_of(connection, last) == listed:
+                return []
+            add_list(
+                connection, listed, assignment=self._assignment or "", at=self._at(), rubric=text
+            )
+            if last is None:
+                return []
+            told = [f"rubric: {change}" for change in rubric_changes(last.rubric, text)]
+            before = points_of(connection, last)
+            before = {batch.moved.get(name, name): had for name, had in before.items()}
+            told += kept_by_hand(last.rubric, text, by_hand)
+            return told + points_changes(before, points, by_hand=by_hand)
+
+    # ---------------------------------------------------------------- what counts now
+
+    @property
+    def assignment(self) -> str:
+        """Whose class list it is.
+
+        Raises
+        ------
+        ConfigError : no batch ran to its end yet.
+        """
+        with self._database.reading() as connection:
+            return self._last(connection).assignment
+
+    @property
+    def rubric(self) -> Rubric:
+        """The rubric of the class list.
+
+        Raises
+        ------
+        ConfigError : no batch ran to its end yet.
+        """
+        with self._database.reading() as connection:
+            return read_rubric(self._last(connection))
+
+    def entries(self) -> Iterator[Entry]:
+        """Yield the class list in the order of its submissions, some at a time in memory."""
+        with self._database.reading() as connection:
+            last = self._last(connection)
+            of_batch = select(entries.c.position).where(entries.c.batch_id == last.id)
+            positions = sorted(connection.scalars(of_batch))
+        rubric = read_rubric(last)
+        for page in pages(positions):
+            with self._database.reading() as connection:
+                rows = connection.execute(
+                    class_list().where(entries.c.batch_id == last.id, entries.c.position.in_(page))
+                ).all()
+                found = [
+                    final_entry(connection, r, shared=read_flag(r.shared), rubric=rubric)
+                    for r in rows
+                ]
+            yield from found
+
+    def entry(self, team: str) -> Entry:
+        """Return the line of a submission, named by its id or by one of its authors.
+
+        Raises
+        ------
+        ConfigError : there is none, or several.
+        """
+        with self._database.reading() as connection:
+            last, row = self._find(connection, team)
+            return final_entry(
+                connection, row, shared=read_flag(row.shared), rubric=read_rubric(last)
+            )
+
+    def to_frame(self) -> "pd.DataFrame":
+        """Return the class list, one row a submission and criterion; see `class_frame`."""
+        lines = (Line.of(entry.grade, by_hand=[*entry.overrides]) for entry in self.entries())
+        return class_frame(lines, rubric=self.rubric)
+
+    def by_other_rubrics(self) -> list[str]:
+        """Return the submissions of the class list that its rubric did not grade."""
+        with self._database.reading() as connection:
+            return by_other_rubrics(connection, self._last(connection))
+
+    def figures(self, entry: Entry) -> tuple[tuple[str, str], ...]:
+        """Return the figures of a submission's feedback: file names and SVG."""
+        with self._database.reading() as connection:
+            return read_figures(connection, entry.grading)
+
+    def history(self, team: str) -> tuple[str, list[Event]]:
+        """Return the submission's id and all that ever happened to it.
+
+        Raises
+        ------
+        ConfigError : there is no such submission, or several.
+        """
+        with self._database.reading() as connection:
+            row = self._find_ever(connection, team)
+            return row.name, read_events(connection, row.submission_id)
+
+    def remove(self, teams: Sequence[str]) -> list[str]:
+        """Take submissions off the class list and return their names.
+
+        What happened to them stays in their history; graded again, they are back.
+
+        Raises
+        ------
+        ConfigError : one is not on it, or there are several.
+        """
+        with self._database.writing() as connection:
+            found = [self._find(connection, team) for team in teams]
+            gone = {row.submission_id: row.name for _, row in found}
+            last = self._last(connection)
+            left = [e for e in lines_of(connection, last) if e["submission_id"] not in gone]
+            add_list(
+                connection,
+                [{**line, "position": i} for i, line in enumerate(left)],
+                assignment=last.assignment,
+                at=self._at(),
+                rubric=last.rubric,
+            )
+        return list(gone.values())
+
+    def override(
+        self, team: str, criterion: str, points: float | None, *, why: str, by: str
+    ) -> Override:
+        """Give a criterion points by hand, which every later grading keeps; None takes them back.
+
+        Raises
+        ------
+        ConfigError : there is no such submission or criterion, the points are none that it can
+            have, or who and why are not said.
+        """
+        why, by = storable(why).strip(), storable(by).strip()
+        if not why or not by:
+            raise ConfigError("an override needs a reason (--why) and a name (--by)")
+        with self._database.writing() as connection:
+            last, row = self._find(connection, team)
+            out_of = {c.id: c.points for c in read_rubric(last).criteria}
+            if criterion not in out_of:
+                hint = nearest(criterion, list(out_of))
+                raise ConfigError(f"{criterion}: the rubric has no such criterion; {hint}")
+            if points is not None and not 0 <= points <= out_of[criterion]:
+                raise ConfigError(f"{criterion}: has 0 to {out_of[criterion]:g} points")
+            authors = last_named(connection, row.submission_id)
+            given = Override(
+                criterion=criterion,
+                points=points,
+                why=why,
+                by=by,
+                at=self._at(),
+                authors=tuple(json.loads(authors)),
+            )
+            values = {**asdict(given), "authors": authors, "submission_id": row.submission_id}
+            add_row(connection, overrides, values)
+        return given
+
+    # ----------------------------------------------------------------------- in parts
+
+    def _at(self) -> str:
+        return self._now().astimezone(UTC).isoformat(timespec="microseconds")
+
+    def _submission(self, connection: Connection, name: str) -> int:
+        """Return the number of a submission, new or not."""
+        values = {"assignment": self._assignment or "", "name": storable(name)}
+        mine = select(submissions.c.id).filter_by(**values)
+        number = connection.scalar(mine)
+        return add_row(connection, submissions, values) if number is None else number
+
+    def _last(self, connection: Connection) -> Row:
+        """Return the last batch that ran to its end."""
+        newest = select(batches).order_by(batches.c.id.desc()).limit(1)
+        if self._assignment is not None:
+            newest = newest.where(batches.c.assignment == self._assignment)
+        row = connection.execute(newest).one_or_none()
+        if row is None:
+            what = f"no grading of {self._assignment!r}" if self._assignment else "no grading"
+            raise ConfigError(
+                f"{self._database.name}: {what} ran to its end yet: run cartlab grade again"
+            )
+        return row
+
+    def _find(self, connection: Connection, team: str) -> tuple[Row, Row]:
+        """Return the last batch and the line of a team in it."""
+        last = self._last(connection)
+        of_batch = class_list(detail=False).where(entries.c.batch_id == last.id)
+        rows = connection.execute(of_batch).all()
+        exact = [r.position for r in rows if r.name == team]
+        found = exact or [r.position for r in rows if is_of(r.authors, team)]
+        if len(found) != 1:
+            hint = f"no such submission; {nearest(team, [row.name for row in rows])}"
+            raise ConfigError(f"{team}: {'is in several submissions: name one' if found else hint}")
+        line = class_list().where(entries.c.batch_id == last.id, entries.c.position == found[0])
+        return last, connection.execute(line).one()
+
+    def _find_ever(self, connection: Connection, team: str) -> Row:
+        """Return a team on the class list, or one that was graded and is not on it."""
+        try:
+            return self._find(connection, team)[1]
+        except ConfigError:
+            columns = gradings.c.submission_id, submissions.c.name, gradings.c.authors
+            ever = select(*columns).join(submissions).order_by(gradings.c.id)
+            if self._assignment is not None:
+                ever = ever.where(submissions.c.assignment == self._assignment)
+            rows = connection.execute(ever).all()
+            found = {r.submission_id: r for r in rows if r.name == team} or {
+                r.submission_id: r for r in rows if is_of(r.authors, team)
+            }
+            if len(found) != 1:
+                raise
+            return found.popitem()[1]
+
+    def _newest(self, connection: Connection) -> Row | None:
+        """Return the batch of this assignment before the one that ends now."""
+        mine = select(batches).where(batches.c.assignment == (self._assignment or ""))
+        return connection.execute(mine.order_by(batches.c.id.desc()).limit(1)).one_or_none()

@@ -1,0 +1,82 @@
+"""What is another since the class list before: the rubric, and whose points."""
+
+from collections.abc import Container, Mapping
+from typing import Any
+
+from pydantic import ValidationError
+
+from pipeline.grading.gradebook.override import Override
+from pipeline.grading.rubric import Rubric
+from pipeline.grading.words import points_text
+
+
+def rubric_changes(before: str, now: str) -> list[str]:
+    """Return what is another in a rubric, kept as JSON, a phrase each."""
+    if before == now:
+        return []
+    try:
+        rubrics = [Rubric.model_validate_json(text) for text in (before, now)]
+    except ValidationError:
+        return ["the rubric before is of another version of cartlab"]
+    old, new = ({c.id: c for c in rubric.criteria} for rubric in rubrics)
+    changes = [f"criterion {id_} is gone" for id_ in old if id_ not in new]
+    for id_, criterion in new.items():
+        if id_ not in old:
+            changes.append(f"criterion {id_} is new")
+        else:
+            differing = _differing(old[id_].model_dump(), criterion.model_dump())
+            changes += [f"{id_}: {change}" for change in differing]
+    if not changes and list(old) != list(new):
+        changes.append("the criteria stand in another order")
+    old, new = (rubric.model_dump(exclude={"criteria"}) for rubric in rubrics)
+    return changes + _differing(old, new)
+
+
+def kept_by_hand(before: str, now: str, given: Mapping[str, Mapping[str, Override]]) -> list[str]:
+    """Return which points given by hand, by submission, stay as they are under other points."""
+    try:
+        rubrics = [Rubric.model_validate_json(text) for text in (before, now)]
+    except ValidationError:
+        return []
+    old, new = ({c.id: c.points for c in rubric.criteria} for rubric in rubrics)
+    return [
+        f"{name}: {id_} was given {points_text(one.points)} of {points_text(old[id_])} points by "
+        f"hand; it has {points_text(new[id_])} now"
+        for name, overrides in given.items()
+        for id_, one in overrides.items()
+        if one.points is not None and id_ in old and id_ in new and old[id_] != new[id_]
+    ]
+
+
+def points_changes(
+    before: Mapping[str, float], now: Mapping[str, float], *, by_hand: Container[str] = ()
+) -> list[str]:
+    """Return whose points are another, and who is new or gone."""
+    changes = [
+        f"{name}: {points_text(before[name])} → {points_text(points)}"
+        + (" (with points given by hand)" if name in by_hand else "")
+        for name, points in now.items()
+        if name in before and points != before[name]
+    ]
+    changes += [f"{name} is new" for name in now if name not in before]
+    return changes + [f"{name} is gone" for name in before if name not in now]
+
+
+def _differing(before: Mapping[str, Any], now: Mapping[str, Any], at: str = "") -> list[str]:
+    changes = []
+    for key in {**before, **now}:
+        old, new = before.get(key), now.get(key)
+        if isinstance(old, Mapping) and isinstance(new, Mapping):
+            changes += _differing(old, new, f"{at}{key}.")
+        elif old != new:
+            changes.append(f"{at}{key} {_shown(old)} → {_shown(new)}")
+    return changes
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, list | tuple | Mapping):
+        return f"({len(value)})" if len(str(value)) > 40 else str(value)
+    text = (
+        "nothing" if value in (None, "") else f"{value:g}" if type(value) is float else f"{value}"
+    )
+    return text if len(text) <= 40 else f"{text[:39]}…"

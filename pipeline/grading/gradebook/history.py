@@ -1,0 +1,156 @@
+"""All that ever happened to a submission, in order: graded, listed, overridden."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from datetime import datetime
+from typing import Any, Literal
+
+from sqlalchemy import Connection, and_, select
+
+from pipeline.grading.gradebook.changes import rubric_changes
+from pipeline.grading.gradebook.schema import (
+    batches,
+    entries,
+    flags,
+    gradings,
+    overrides,
+    submissions,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Event:
+    """One line of a history.
+
+    Attributes
+    ----------
+    at : ISO 8601, UTC.
+    what : `graded`: by the rubric alone; `listed`: in a class list, with shared data and
+        overrides; `removed`: off the class list; `override`: by hand, `points` None where it was
+        taken back.
+    points, out_of : of the submission, or of the one criterion that an override is about.
+    text : flags, or why.
+    by : who, of an override.
+    """
+
+    at: str
+    what: Literal["graded", "listed", "removed", "override"]
+    points: float | None
+    out_of: float | None = None
+    criterion: str = ""
+    text: str = ""
+    by: str = ""
+
+
+def read_events(connection: Connection, submission: int) -> list[Event]:
+    """Return the events of one submission, oldest first."""
+    found = [
+        *_graded(connection, submission),
+        *_overridden(connection, submission),
+        *_listed(connection, submission),
+    ]
+    return sorted(found, key=lambda event: event.at)
+
+
+def _graded(connection: Connection, submission: int) -> Iterator[Event]:
+    codes: dict[int, list[str]] = {}
+    of_grading = select(flags.c.grading_id, flags.c.code).join(gradings)
+    mine = gradings.c.submission_id == submission
+    for grading, code in connection.execute(of_grading.where(mine).order_by(flags.c.position)):
+        codes.setdefault(grading, []).append(code)
+    for row in connection.execute(select(gradings).where(mine).order_by(gradings.c.id)):
+        failed = row.status == "failed"
+        text = f"could not be graded: {row.reason}" if failed else ", ".join(codes.get(row.id, ()))
+        yield Event(at=row.at, what="graded", points=row.points, out_of=row.out_of, text=text)
+
+
+def _overridden(connection: Connection, submission: int) -> Iterator[Event]:
+    mine = select(overrides).where(overrides.c.submission_id == submission)
+    for row in connection.execute(mine.order_by(overrides.c.id)):
+        yield Event(
+            at=row.at,
+            what="override",
+            points=row.points,
+            criterion=row.criterion,
+            text=row.why,
+            by=row.by,
+        )
+
+
+def _listed(connection: Connection, submission: int) -> Iterator[Event]:
+    """Yield the class lists in which something was new, and those it is no longer in."""
+    own = and_(entries.c.batch_id == batches.c.id, entries.c.submission_id == submission)
+    of_batch = batches.c.id, batches.c.at, batches.c.rubric
+    columns = *of_batch, entries.c.points, entries.c.out_of, entries.c.shared
+    of_class = select(submissions.c.assignment).where(submissions.c.id == submission)
+    lists = select(*columns).select_from(batches.outerjoin(entries, own))
+    lists = lists.where(batches.c.assignment == of_class.scalar_subquery())
+    before, judged_by, last = None, "", None
+    for batch, at, rubric, points, out_of, shared in connection.execute(
+        lists.order_by(batches.c.id)
+    ):
+        previous, last = last, batch
+        if points is None:
+            if before is not None:
+                now = _other_name(connection, submission, of=previous, among=batch)
+                text = "off the class list" + (f": goes on as {now}" if now else "")
+                yield Event(at=at, what="removed", points=None, text=text)
+            before = None
+            continue
+        said = ["shared_data"] if shared else []
+        if before is None and (
+            then := _other_name(connection, submission, of=batch, among=previous)
+        ):
+            said.append(f"was {then} before")
+        if judged_by and rubric != judged_by:
+            said += [f"rubric: {change}" for change in rubric_changes(judged_by, rubric)]
+        if ((points, out_of, shared), rubric) != (before, judged_by):
+            yield Event(at=at, what="listed", points=points, out_of=out_of, text="; ".join(said))
+        before, judged_by = (points, out_of, shared), rubric
+
+
+def _other_name(
+    connection: Connection, submission: int, *, of: int | None, among: int | None
+) -> str:
+    """Return what a submission of one class list is called in another where only its people are."""
+
+    def listed(batch: int | None) -> dict[int, tuple[str, str]]:
+        rows = select(submissions.c.id, submissions.c.name, gradings.c.authors)
+        rows = rows.select_from(entries.join(submissions).join(gradings))
+        rows = rows.where(entries.c.batch_id == batch)
+        return {row.id: (row.name, row.authors) for row in connection.execute(rows)}
+
+    here, there = listed(of), listed(among)
+    people = here[submission][1]
+    found = [name for i, (name, by) in there.items() if i not in here and by == people != "[]"]
+    return found[0] if len(found) == 1 else ""
+
+
+def history_dict(submission: str, events: Sequence[Event]) -> dict[str, Any]:
+    """Return a history as plain data."""
+    return {
+        "schema": "cartlab-history/1",
+        "submission": submission,
+        "events": [asdict(event) for event in events],
+    }
+
+
+def history_text(submission: str, events: Sequence[Event]) -> str:
+    """Return a history as lines to read."""
+    return "\n".join(
+        [submission, *(f"{_to_the_second(event.at)}  {_words(event)}" for event in events)]
+    )
+
+
+def _to_the_second(at: str) -> str:
+    return datetime.fromisoformat(at).strftime("%Y-%m-%d %H:%M:%S UTC")
+
+
+def _words(event: Event) -> str:
+    if event.what == "override":
+        points = "automatic points again" if event.points is None else f"{event.points:g} by hand"
+        return f"override  {event.criterion}: {points}, by {event.by}: {event.text}"
+    if event.what == "removed":
+        return f"removed   {event.text}"
+    note = f"  ({event.text})" if event.text else ""
+    return f"{event.what:8}  {event.points:g} of {event.out_of:g}{note}"

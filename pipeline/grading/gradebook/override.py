@@ -1,0 +1,99 @@
+"""Points given by hand: who, when and why, and the grade with them in."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from fractions import Fraction
+
+from pipeline.errors import ConfigError
+from pipeline.grading.grade import Criterion, Grade
+from pipeline.grading.outcome import person
+from pipeline.grading.references.tolerance import exact, late_deduction
+from pipeline.grading.rubric import Rubric
+
+
+@dataclass(frozen=True, kw_only=True)
+class Override:
+    """Points that a person gave one criterion of one submission.
+
+    Attributes
+    ----------
+    points : None where the automatic points are to hold again.
+    at : ISO 8601, UTC.
+    authors : of the submission at the time; the override goes with them.
+    """
+
+    criterion: str
+    points: float | None
+    why: str
+    by: str
+    at: str
+    authors: tuple[str, ...] = ()
+
+    def concerns(self, authors: tuple[str, ...]) -> bool:
+        """Whether the submission is still that of the people it was given to.
+
+        A submission that cannot be read names no authors: then its name decides.
+        """
+        if not authors or not self.authors:
+            return True
+        return not set(map(person, authors)).isdisjoint(map(person, self.authors))
+
+
+def read_points(text: str) -> float | None:
+    """Return points as typed, None for "auto".
+
+    Raises
+    ------
+    ConfigError : it is neither.
+    """
+    if text.strip().casefold() == "auto":
+        return None
+    try:
+        return float(text.replace(",", "."))
+    except ValueError:
+        raise ConfigError(f"{text}: points are a number, or auto") from None
+
+
+def with_overrides(grade: Grade, overrides: Mapping[str, Override], *, rubric: Rubric) -> Grade:
+    """Return the grade with points given by hand, by criterion; lateness is taken off anew.
+
+    A criterion that was never judged, as the submission could not be graded, is added.
+    """
+    given = {key: o.points for key, o in overrides.items() if o.points is not None}
+    if not given:
+        return grade
+    judged = {criterion.id: criterion for criterion in grade.criteria}
+    criteria = []
+    for asked in rubric.criteria:
+        own = judged.get(asked.id)
+        if asked.id in given:
+            own = _by_hand(own or _unjudged(asked.id, asked.title, asked.points), given[asked.id],
+                           why=overrides[asked.id].why)  # fmt: skip
+        if own is not None:
+            criteria.append(own)
+    earned = sum((exact(criterion.points) for criterion in criteria), Fraction(0))
+    deducted = late_deduction(earned, late=rubric.late, days_late=grade.days_late)
+    return replace(
+        grade,
+        criteria=tuple(criteria),
+        points=float(earned - deducted),
+        deducted=float(deducted),
+    )
+
+
+def _unjudged(id_: str, title: str, out_of: float) -> Criterion:
+    return Criterion(
+        id=id_, title=title, outcome="skip", points=0.0, out_of=out_of,
+        message="Not graded automatically.", expected={}, found={},
+    )  # fmt: skip
+
+
+def _by_hand(criterion: Criterion, points: float, *, why: str) -> Criterion:
+    points = min(points, criterion.out_of)  # the rubric may have asked for more at the time
+    return replace(
+        criterion,
+        points=points,
+        outcome="pass" if points >= criterion.out_of else "partial" if points > 0 else "fail",
+        message=f"{criterion.message} Set by hand from {criterion.points:g} to {points:g} "
+        f"of {criterion.out_of:g}: {why}",
+    )

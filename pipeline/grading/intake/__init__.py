@@ -1,0 +1,1 @@
+"""Archives, folders and platforms' downloads to submissions."""

@@ -1,0 +1,183 @@
+"""Open a hand-in: its files in a folder of our own, the submission in it found, nothing followed.
+
+Graded is a copy, on this machine as on a cluster: regular files only, so that what is graded, what
+is hashed and what travels is the same.
+"""
+
+import hashlib
+import io
+import os
+import shutil
+import stat
+import zipfile
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+
+from pipeline.errors import SubmissionError
+from pipeline.grading.intake.lms_names import parse_name
+from pipeline.grading.intake.unpack import HAND_IN, STRANGE_ARCHIVES, Limits, is_debris, unpack
+from pipeline.submission.complaints import quote
+from pipeline.submission.load import MAX_DATA_BYTES, NAME
+
+_DEEPEST = 12  # folders below the hand-in's
+_ARCHIVES_IN_ARCHIVES = 3
+_CHUNK = 1 << 20
+_FIXED_TIME = (1980, 1, 1, 0, 0, 0)  # in archives of ours: same files, same bytes
+
+
+class Changed(Exception):
+    """The files of a hand-in are not those that its key is of."""
+
+
+def digest(sources: Sequence[Path]) -> str:
+    """Return the SHA-256 of everything in a hand-in that could be graded.
+
+    What cannot be read stands in it as such: the hand-in's row will say so.
+    """
+    total = hashlib.sha256()
+    try:
+        for name, path in _files(sources):
+            total.update(_line(name, path))
+    except OSError as error:
+        total.update(f"cannot be read: {error.errno}\n".encode())
+    return total.hexdigest()
+
+
+def _line(name: str, path: Path) -> bytes:
+    with path.open("rb") as file:
+        own = hashlib.file_digest(file, "sha256").hexdigest()
+    return f"{len(name)} {name} {own}\n".encode()
+
+
+def packed(sources: Sequence[Path]) -> bytes:
+    """Return a hand-in as one archive, to travel to another machine."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, path in _files(sources):
+            info = zipfile.ZipInfo(name, _FIXED_TIME)
+            archive.writestr(info, path.read_bytes(), zipfile.ZIP_DEFLATED, 1)
+    return buffer.getvalue()
+
+
+def unpacked(archive: bytes, into: Path) -> None:
+    """Write the files that `packed` put together into a folder."""
+    with zipfile.ZipFile(io.BytesIO(archive)) as opened:
+        opened.extractall(into)
+
+
+def open_submission(sources: Sequence[Path], into: Path, *, digest: str = "") -> Path:
+    """Copy or unpack a hand-in into a folder and return the folder of the submission in it.
+
+    Archives are looked into where there is no `submission.toml` beside them.
+
+    Parameters
+    ----------
+    digest : what the copy's must be; "" where anything is right.
+
+    Raises
+    ------
+    SubmissionError : there is none, or more than one to choose from, or an archive is bad.
+    OSError : a file cannot be read.
+    Changed : the copy has another digest.
+    """
+    into.mkdir(parents=True, exist_ok=True)
+    total = hashlib.sha256()
+    for name, path in _files(sources):
+        target = into / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(path, target)
+        total.update(_line(name, target))
+    if digest and total.hexdigest() != digest:
+        raise Changed
+    left = HAND_IN
+    for _ in range(_ARCHIVES_IN_ARCHIVES):
+        if _submissions(into):
+            break
+        for path in _archives(into):
+            folder = path.with_suffix("")
+            if folder.exists():
+                folder = path.with_name(f"{path.stem} (unpacked)")
+            refused = unpack(path, folder, limits=left)
+            if refused:
+                raise SubmissionError(f"{quote(path.name)}: {next(iter(refused.values()))}")
+            path.unlink()
+            left = _less(left, folder)
+    if tomls := _submissions(into):
+        return _the_one(tomls, into)
+    raise SubmissionError(_nothing_in(into))
+
+
+def _files(sources: Sequence[Path]) -> Iterator[tuple[str, Path]]:
+    """Yield (name below the hand-in, path) of the files to grade, sorted by name, each once.
+
+    Of too many or too large files the smallest are taken: data files are small, films are not.
+    Bytes that are no text in a name are replaced, here as on another machine.
+    """
+    found: list[tuple[int, str, Path]] = []
+    for source in sources:
+        if source.is_dir():
+            found += _walk(source, PurePosixPath())
+        elif (info := source.lstat()) and stat.S_ISREG(info.st_mode):
+            upload = parse_name(source.name)
+            name = upload.file if upload and upload.file else source.name
+            found.append((info.st_size, PurePosixPath(name.replace("\\", "/")).name, source))
+    chosen, left = {}, HAND_IN.total
+    for size, name, path in sorted(found, key=lambda one: one[:2])[: HAND_IN.members]:
+        left -= size
+        if left < 0:
+            break
+        chosen[name.encode("utf-8", "replace").decode()] = path
+    yield from sorted(chosen.items())
+
+
+def _walk(folder: Path, below: PurePosixPath) -> Iterator[tuple[int, str, Path]]:
+    if len(below.parts) > _DEEPEST:
+        return
+    with os.scandir(folder) as entries:
+        for entry in sorted(entries, key=lambda entry: entry.name):
+            name = below / entry.name
+            if is_debris(name):
+                continue
+            if entry.is_dir(follow_symlinks=False):
+                yield from _walk(Path(entry.path), name)
+            elif entry.is_file(follow_symlinks=False):
+                size = entry.stat(follow_symlinks=False).st_size
+                if size <= MAX_DATA_BYTES:
+                    yield size, str(name), Path(entry.path)
+
+
+def _less(limits: Limits, folder: Path) -> Limits:
+    """Return what is left of the limits beside what is in a folder."""
+    sizes = [path.stat().st_size for path in folder.rglob("*") if path.is_file()]
+    return replace(limits, members=limits.members - 1 - len(sizes), total=limits.total - sum(sizes))
+
+
+def _submissions(folder: Path) -> list[Path]:
+    """Return the submission files at the least depth, that of a wrapping folder not counted."""
+    tomls = sorted(path for path in folder.rglob(NAME) if path.is_file())
+    depth = min((len(path.parts) for path in tomls), default=0)
+    return [path for path in tomls if len(path.parts) == depth]
+
+
+def _archives(folder: Path) -> list[Path]:
+    return sorted(p for p in folder.rglob("*") if p.suffix.lower() == ".zip" and p.is_file())
+
+
+def _the_one(tomls: Sequence[Path], into: Path) -> Path:
+    if len(tomls) > 1:
+        names = " and ".join(quote(path.relative_to(into).as_posix()) for path in tomls[:2])
+        more = f" and {len(tomls) - 2} more" if len(tomls) > 2 else ""
+        raise SubmissionError(f"which one is to be graded? There are {names}{more}")
+    return tomls[0].parent
+
+
+def _nothing_in(into: Path) -> str:
+    files = [path for path in sorted(into.rglob("*")) if path.is_file()]
+    if not files:
+        return f"no {NAME} in it: it is empty"
+    named = ", ".join(quote(path.name) for path in files[:3])
+    more = f" and {len(files) - 3} more" if len(files) > 3 else ""
+    strange = [path.name for path in files if path.suffix.lower() in STRANGE_ARCHIVES]
+    hint = f"; {quote(strange[0])} cannot be opened, pack a zip file" if strange else ""
+    return f"no {NAME} in it, only {named}{more}{hint}"

@@ -1,0 +1,365 @@
+"""Find the hand-ins in what a TA has: folders, trees, zip files, a platform's download."""
+
+import os
+import re
+import unicodedata
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+
+from pipeline.errors import ConfigError, SubmissionError
+from pipeline.grading.intake.lms_names import (
+    Upload,
+    current,
+    gradescope_metadata,
+    owner_text,
+    parse_name,
+)
+from pipeline.grading.intake.unpack import (
+    CLASS,
+    DEEPEST,
+    STRANGE_ARCHIVES,
+    is_debris,
+    member_names,
+    unpack,
+)
+from pipeline.submission.complaints import quote
+from pipeline.submission.load import NAME
+
+_DAYS_OF_A_LATE_MARK = 1.0  # Canvas marks lateness without saying how much: a day begun
+_LONGEST_ID, _MOST_BYTES = 100, 200  # letters and bytes: a folder's name, on every system
+_NOT_IN_NAMES = re.compile(r'[<>:"/\\|?*\x00-\x1f\x7f-\x9f]')
+_RESULTS = ("class.html", "feedback/.made.json")  # of a grading: its folder is no hand-in
+_PARTS_OF_RESULTS = ("feedback", "gradescope")
+_DATA = "data"  # where a submission has its recordings: the name of nobody's hand-in
+_RESERVED = re.compile(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?")
+
+
+@dataclass(frozen=True, kw_only=True)
+class HandIn:
+    """What one team handed in, not opened yet.
+
+    Attributes
+    ----------
+    id : unique in the batch, fit for a folder's name.
+    sources : one folder, or files of which archives are to be unpacked.
+    owner : who handed it in, as the learning platform calls them, with the number that it knows
+        them by: "Jane Doe (moodle 1024)"; or "".
+    handed_in : when, in ISO 8601, where the platform says so; or "".
+    problem : why it cannot be opened, where that is plain already.
+    """
+
+    id: str
+    sources: tuple[Path, ...]
+    owner: str = ""
+    handed_in: str = ""
+    days_late: float = 0.0
+    problem: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Walk:
+    """What is no hand-in where folders are looked through, and whom to tell of what was none."""
+
+    skip: set[Path]
+    say: Callable[[str], None]
+
+
+def _silent(text: str) -> None:
+    pass
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Found:
+    """A hand-in before its id is settled: its name, and that of the folder around it."""
+
+    name: str
+    parent: str
+    sources: tuple[Path, ...]
+    owner: str = ""
+    handed_in: str = ""
+    days_late: float = 0.0
+    problem: str = ""
+
+
+def find_hand_ins(
+    paths: Iterable[Path],
+    *,
+    scratch: Path,
+    skip: Iterable[Path] = (),
+    known: Iterable[str] = (),
+    say: Callable[[str], None] = _silent,
+) -> tuple[HandIn, ...]:
+    """Return the hand-ins in folders, trees and archives, in the order of their ids.
+
+    Parameters
+    ----------
+    scratch : where archives of a whole class are unpacked.
+    skip : folders that are no hand-ins, such as the one results go to.
+    known : ids of the class so far: one of several "team-1", by itself, keeps the id it had.
+    say : told of every folder that was passed over for the results of a grading.
+
+    Raises
+    ------
+    ConfigError : a path is not there, or there is nothing in it.
+    """
+    walk = _Walk(skip={path.resolve() for path in skip} | {scratch.resolve()}, say=say)
+    found: list[_Found] = []
+    for number, path in enumerate(dict.fromkeys(path.resolve() for path in paths)):
+        here = _at(path, scratch=scratch / f"class-{number}", walk=walk)
+        if not here:
+            raise ConfigError(
+                f"{path}: nothing to grade in it: no folder or zip file with a {NAME}"
+            )
+        found += here
+    return tuple(sorted(_with_ids(found, known=known), key=lambda hand_in: hand_in.id))
+
+
+def _at(path: Path, *, scratch: Path, walk: _Walk) -> list[_Found]:
+    if path.name == NAME:
+        path = path.parent
+    if path.is_dir():
+        return _in_folder(path, walk=walk)
+    if not path.is_file():
+        raise ConfigError(f"{path}: there is no such file or folder")
+    if path.suffix.lower() != ".zip":
+        raise ConfigError(
+            f"{path}: neither a folder nor a zip file; name the folder with the {NAME}"
+        )
+    if not _holds_a_class(path):
+        return [_archive(path)]
+    folder = scratch / path.stem
+    try:
+        refused = unpack(path, folder, limits=CLASS)
+    except SubmissionError as error:
+        raise ConfigError(str(error)) from None
+    found = _in_folder(folder, walk=walk)
+    return _with_refused(found, refused, folder=folder)
+
+
+def _with_refused(
+    found: Sequence[_Found], refused: Mapping[PurePosixPath, str], *, folder: Path
+) -> list[_Found]:
+    """Return the hand-ins of an archive with what was refused of them, and those refused whole."""
+    whose = {
+        source.relative_to(folder).parts: i for i, one in enumerate(found) for source in one.sources
+    }
+    depths = sorted({len(parts) for parts in whose}) or [1]
+    problems: dict[int, str] = {}
+    lost: dict[str, str] = {}
+    for member, why in sorted(refused.items()):
+        owner = next((i for d in depths if (i := whose.get(member.parts[:d])) is not None), None)
+        if owner is None:
+            lost.setdefault(member.parts[: depths[0]][-1], why)
+        else:
+            problems.setdefault(owner, why)
+    return [
+        *(_Found(name=x, parent=folder.name, sources=(), problem=why) for x, why in lost.items()),
+        *(replace(one, problem=problems.get(i, one.problem)) for i, one in enumerate(found)),
+    ]
+
+
+def _holds_a_class(archive: Path) -> bool:
+    """Tell a download of many hand-ins from the archive of one student."""
+    names = member_names(archive, limits=CLASS)
+    tops = {path.parts[0] for path in names} | {path.parts[1] for path in names if path.parts[1:]}
+    return (
+        sum(path.name == NAME for path in names) > 1
+        or any(parse_name(top) is not None for top in tops)
+        or (
+            sum(path.suffix.lower() == ".zip" for path in names) > 1
+            and not any(path.name == NAME for path in names)
+        )
+    )
+
+
+# ------------------------------------------------------------------------ folders
+
+
+def _in_folder(folder: Path, *, walk: _Walk, top: bool = True, depth: int = 0) -> list[_Found]:
+    """Return the hand-ins in a folder; one that cannot be looked into is itself one."""
+    try:
+        return _looked_into(folder, walk=walk, top=top, depth=depth)
+    except OSError as error:
+        problem = f"cannot be read ({error.strerror or error})"
+        return [_Found(name=folder.name, parent=folder.parent.name, sources=(), problem=problem)]
+
+
+def _looked_into(folder: Path, *, walk: _Walk, top: bool, depth: int) -> list[_Found]:
+    if _is_submission(folder) or depth > DEEPEST:
+        return [_Found(name=folder.name, parent=folder.parent.name, sources=(folder,))]
+    entries = [
+        entry
+        for entry in sorted(folder.iterdir())
+        if entry not in walk.skip and not _is_passed_over(entry, walk=walk)
+    ]
+    uploads = {entry: upload for entry in entries if (upload := parse_name(entry.name))}
+    if uploads:
+        rest = [entry for entry in entries if entry not in uploads and _may_be_one(entry)]
+        return _from_platform(folder, uploads, top=top) + [_single(entry) for entry in rest]
+    entries = [entry for entry in entries if _may_be_one(entry)]
+    if len(entries) == 1 and entries[0].is_dir() and not entries[0].is_symlink():
+        deeper = _in_folder(entries[0], walk=walk, top=top, depth=depth + 1)
+        if deeper or not top:
+            return deeper
+        return [_single(folder if entries[0].name.lower() == _DATA else entries[0])]
+    found, without = [], []
+    for entry in entries:
+        if entry.suffix.lower() in STRANGE_ARCHIVES:
+            without.append(_single(entry))
+        elif entry.is_symlink() or not entry.is_dir():
+            found.append(_single(entry))
+        elif here := _in_folder(entry, walk=walk, top=False, depth=depth + 1):
+            found += here
+        else:
+            without.append(_single(entry))
+    if not found and any(entry.name.lower() == _DATA for entry in entries):
+        return [_single(folder)]  # a submission that lacks its file
+    # Beside one submission, a folder without any is a student's own pictures or drafts.
+    return found + without if top or len(found) > 1 else found
+
+
+def _is_submission(folder: Path) -> bool:
+    toml = folder / NAME
+    return toml.is_symlink() or toml.exists()
+
+
+def _is_passed_over(entry: Path, *, walk: _Walk) -> bool:
+    """Whether an entry is none of the students': debris, results, hidden without a submission."""
+    if not entry.is_dir() or entry.name == "__MACOSX":
+        return is_debris(PurePosixPath(entry.name)) or entry.name.startswith(".")
+    if os.access(entry / NAME, os.F_OK):
+        return False
+    if entry.name.startswith("."):
+        return True
+    results = entry.parent if entry.name in _PARTS_OF_RESULTS else entry
+    if not all(os.access(results / name, os.F_OK) for name in _RESULTS):
+        return False
+    if results not in walk.skip:  # a student's own folder may look so
+        walk.say(
+            f"{quote(f'{entry.parent.name}/{entry.name}')} is passed over: it looks like the "
+            f"results of a grading; if it is a hand-in, take {_RESULTS[0]} out of it"
+        )
+    return True
+
+
+def _may_be_one(entry: Path) -> bool:
+    return (
+        entry.is_dir() or entry.is_symlink() or entry.suffix.lower() in (".zip", *STRANGE_ARCHIVES)
+    )
+
+
+def _single(entry: Path) -> _Found:
+    """Return a folder or archive that is one hand-in."""
+    if entry.is_symlink():
+        return _Found(
+            name=entry.stem,
+            parent=entry.parent.name,
+            sources=(),
+            problem=f"{quote(entry.name)} is a link; hand in the files themselves",
+        )
+    if entry.is_dir():
+        return _Found(name=entry.name, parent=entry.parent.name, sources=(entry,))
+    return _archive(entry)
+
+
+def _archive(path: Path) -> _Found:
+    name, own = _folder_inside(path), path.stem.removesuffix(".tar")
+    return _Found(name=name or own, parent=own if name else path.parent.name, sources=(path,))
+
+
+def _folder_inside(archive: Path) -> str:
+    """Return the name of the folder in an archive that is the submission, "" for its top."""
+    tomls = [path for path in member_names(archive) if path.name == NAME]
+    return min(tomls, key=lambda path: (len(path.parts), path)).parent.name if tomls else ""
+
+
+# ---------------------------------------------------------------- learning platforms
+
+
+def _from_platform(folder: Path, uploads: dict[Path, Upload], *, top: bool) -> list[_Found]:
+    """Return a hand-in for every student, whatever number of files they uploaded."""
+    # Further down, a student may have put metadata of their own.
+    metadata = gradescope_metadata(folder) if top else {}
+    by_student: dict[tuple[str, str, str], dict[Path, Upload]] = defaultdict(dict)
+    for path, upload in uploads.items():
+        # Canvas makes no folders: one named so is an archive that somebody has unpacked.
+        own = path.name if upload.platform == "canvas" and path.is_dir() else ""
+        by_student[upload.owner, upload.user, own][path] = upload
+    found = []
+    for (owner, user, own), files in sorted(by_student.items()):
+        sources = tuple(current(files))
+        inside = own or _name_inside(sources)
+        platform = next(iter(files.values())).platform
+        sent = metadata.get(owner)
+        shown = sent.names if sent and sent.names else owner
+        found.append(
+            _Found(
+                name=inside or shown,
+                parent=shown if inside and not own else folder.name,
+                sources=sources,
+                owner=owner_text(shown, platform, user),
+                handed_in=sent.at if sent else "",
+                days_late=_DAYS_OF_A_LATE_MARK if any(u.late for u in files.values()) else 0.0,
+                problem="it is a link" if any(path.is_symlink() for path in sources) else "",
+            )
+        )
+    return found
+
+
+def _name_inside(sources: Sequence[Path]) -> str:
+    """Return the name of the folder that the student packed or uploaded, "" without one."""
+    for source in sources:
+        if source.is_dir():
+            tomls = [path for path in sorted(source.rglob(NAME)) if path.parent != source]
+            if tomls and not _is_submission(source):
+                return min(tomls, key=lambda path: len(path.parts)).parent.name
+            sources_in = [path for path in sorted(source.glob("*.zip")) if path.is_file()]
+            if not tomls and not _is_submission(source) and len(sources_in) == 1:
+                return _folder_inside(sources_in[0])
+        elif source.suffix.lower() == ".zip" and (name := _folder_inside(source)):
+            return name
+    return ""
+
+
+# ---------------------------------------------------------------------------- ids
+
+
+def _with_ids(found: Sequence[_Found], *, known: Iterable[str] = ()) -> list[HandIn]:
+    """Give every hand-in its folder's name; where two are the same, the parent's before it."""
+    names = [_fit(one.name) for one in found]
+    longer = [_fit(f"{one.parent}-{one.name}") for one in found]
+    often, before = Counter(name.casefold() for name in names), set(known)
+    names = [
+        long if often[name.casefold()] > 1 or (long in before and name not in before) else name
+        for name, long in zip(names, longer, strict=True)
+    ]
+    taken: set[str] = set()
+    hand_ins = []
+    for one, name in zip(found, names, strict=True):
+        unique, number = name, 1
+        while unique.casefold() in taken:
+            number += 1
+            unique = f"{name}-{number}"
+        taken.add(unique.casefold())
+        hand_ins.append(
+            HandIn(
+                id=unique,
+                sources=one.sources,
+                owner=one.owner,
+                handed_in=one.handed_in,
+                days_late=one.days_late,
+                problem=one.problem,
+            )
+        )
+    return hand_ins
+
+
+def _fit(name: str) -> str:
+    """Return a name that is a folder's on every system, and nothing but text on a terminal."""
+    text = unicodedata.normalize("NFC", name)
+    text = _NOT_IN_NAMES.sub("_", text.encode("utf-8", "replace").decode())
+    text = "".join(c if c.isprintable() else "_" for c in text)[:_LONGEST_ID]
+    text = text.encode()[:_MOST_BYTES].decode(errors="ignore").strip(" .")
+    return f"_{text}" if not text or _RESERVED.fullmatch(text) else text

@@ -1,0 +1,1 @@
+"""The checks of one submission, what each earns, and the grade."""

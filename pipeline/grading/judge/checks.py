@@ -1,0 +1,239 @@
+"""The checks of a rubric: each gives a share of the points, and says why."""
+
+from collections.abc import Mapping, Sequence
+from decimal import Decimal
+from fractions import Fraction
+
+from pipeline.grading import rubric as asked
+from pipeline.grading.judge.checks_loop import (
+    judge_claims,
+    judge_gains,
+    judge_hardware,
+    judge_prefilter,
+)
+from pipeline.grading.judge.laws import MOST_WIDENING, judge_laws
+from pipeline.grading.judge.pieces import asked_pieces
+from pipeline.grading.judge.work import ALL, NONE, Verdict, Work, mean_share
+from pipeline.grading.mistakes.impossible import not_positive
+from pipeline.grading.mistakes.state_model import compare_entries
+from pipeline.grading.references.reference import OFF_SCALE, Reference, off_scale
+from pipeline.grading.references.tolerance import NO_CREDIT, as_typed, credit, percent_off, rounding
+from pipeline.grading.rubric import is_damping, matching
+
+_NAMED = 4  # so many are named in a message
+
+
+def judge(criterion: asked.Criterion, work: Work) -> Verdict:
+    """Judge one criterion on its own; what it requires is seen to elsewhere."""
+    match criterion:
+        case asked.RequiredPieces():
+            return _required(work)
+        case asked.DataQuality():
+            return _data(work)
+        case asked.Parameters():
+            return _parameters(criterion, work)
+        case asked.InitialFinal():
+            return _initial_final(criterion, work)
+        case asked.Laws():
+            return _laws(criterion, work)
+        case asked.StateModel():
+            return _state_space(criterion, work)
+        case asked.Gains():
+            return judge_gains(criterion, work)
+        case asked.Claims():
+            return judge_claims(criterion, work)
+        case asked.Prefilter():
+            return judge_prefilter(criterion, work)
+        case asked.Hardware():
+            return judge_hardware(criterion, work)
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return ", ".join(names[:_NAMED]) + more
+
+
+# ------------------------------------------------------------------- pieces and data
+
+
+def _required(work: Work) -> Verdict:
+    pieces, missing = asked_pieces(work.rubric), work.missing
+    if not pieces:
+        return Verdict(share=ALL, message="Nothing in particular was asked for.")
+    unread = _listed(list(work.analysis.unreadable))
+    here = "All that was asked for is here" + (
+        f", without {unread}, not readable" if unread else ""
+    )
+    return Verdict(
+        share=ALL - Fraction(len(missing), len(pieces)),
+        message=f"Missing: {_listed(missing)}." if missing else f"{here}.",
+        expected={"pieces": pieces},
+        found={"missing": missing},
+    )
+
+
+def _data(work: Work) -> Verdict:
+    runs = len(work.submission.experiments)
+    bad = work.bad
+    return Verdict(
+        share=ALL - Fraction(min(len(bad), runs), runs) if runs else NONE,
+        message="; ".join(f"{run}: {why.rstrip('.')}" for run, why in list(bad.items())[:_NAMED])
+        + "."
+        if bad
+        else "The recordings hold what they should.",
+        found={"problems": dict(bad)},
+    )
+
+
+# ------------------------------------------------------------------------ parameters
+
+
+def _parameters(criterion: asked.Parameters, work: Work) -> Verdict:
+    """Reported against recomputed; a parameter that is not reported earns nothing."""
+    table: Mapping[str, Decimal] = getattr(work.reported, criterion.check)
+    known: Mapping[str, Reference] = getattr(work.references, criterion.check)
+    names = matching(criterion.parameters, work.rubric.names)
+    impossible = not_positive(table)
+    judged = [n for n in names if n in known or n in impossible]
+    guessed = [n for n in names if n not in known and n not in judged]
+    if not judged:
+        reasons = [s.reason for s in work.analysis.skipped]
+        if off_scale(work.analysis):
+            reasons = [OFF_SCALE]
+        why = reasons[0] if reasons else "these are first guesses, and no recording decides them"
+        return Verdict(share=None, message=f"Not checked: {why}.")
+    shares, off, wrong = [], [], set()
+    for name in judged:
+        if name not in table:
+            wrong.add(name)
+            shares.append(NONE)
+            off.append(f"{name} is not reported")
+            continue
+        error = (
+            percent_off(table[name], known[name], sigmas=criterion.sigmas)
+            if name in known
+            else NO_CREDIT
+        )
+        shares.append(_credit(error, name, criterion))
+        if shares[-1] < 1:
+            wrong.add(name)
+            there = f", your recordings give {known[name].said}" if name in known else ""
+            off.append(f"{name}: you report {as_typed(table[name])}{there}")
+    left = f" Not judged: {_listed(guessed)}." if guessed and criterion.check == "final" else ""
+    message = f"{'; '.join(off[:_NAMED])}." if off else "As your own recordings say."
+    return Verdict(
+        share=mean_share(shares),
+        message=message + left,
+        explained=bool(wrong) and wrong <= work.named[criterion.check],
+        expected={n: known[n].value for n in judged if n in known},
+        found={n: float(table[n]) for n in judged if n in table},
+    )
+
+
+def _credit(error: Fraction, name: str, limits: asked.Parameters | asked.InitialFinal) -> Fraction:
+    if is_damping(name):
+        full, none = limits.damping_full_percent, limits.damping_none_percent
+    else:
+        full, none = limits.full_percent, limits.none_percent
+    return credit(error, full=full, none=none)
+
+
+def _initial_final(criterion: asked.InitialFinal, work: Work) -> Verdict:
+    """The two tables against each other, rounding of both off; guessed dampings are left out."""
+    initial, final = work.reported.initial, work.reported.final
+    names = matching(criterion.parameters, work.rubric.names)
+    both = [
+        n
+        for n in names
+        if n in initial and n in final and not (is_damping(n) and n not in work.references.initial)
+    ]
+    if not both:
+        return Verdict(share=None, message="Not checked: no parameter is in both tables.")
+    shares, apart = [], []
+    for name in both:
+        shares.append(_credit(between(initial[name], final[name]), name, criterion))
+        if shares[-1] < 1:
+            apart.append(f"{name}: first {as_typed(initial[name])}, then {as_typed(final[name])}")
+    return Verdict(
+        share=mean_share(shares),
+        message=f"{'; '.join(apart[:_NAMED])}." if apart else "Both estimates agree.",
+        expected={n: float(initial[n]) for n in both},
+        found={n: float(final[n]) for n in both},
+    )
+
+
+def between(initial: Decimal, final: Decimal) -> Fraction:
+    """Return how far two typed numbers are apart, in percent, the rounding of each off.
+
+    Two of one sign agree, whichever it is: that it is wrong is told elsewhere.
+    """
+    if initial * final <= 0:
+        return NO_CREDIT
+    initial, final = abs(initial), abs(final)
+    value, half = float(initial), float(rounding(initial))
+    reference = Reference(value=value, low=value, high=value, std=half, source="initial")
+    return percent_off(final, reference, sigmas=1.0)
+
+
+def _laws(criterion: asked.Laws, work: Work) -> Verdict:
+    laws = judge_laws(
+        work.reported.final,
+        n=work.rubric.system.carts,
+        frequency_percent=criterion.frequency_percent,
+        damping_percent=criterion.damping_percent,
+    )
+    if laws is None:
+        return Verdict(share=None, message="Not checked: the final table is not complete.")
+    broken = [law for law in laws if law.widening > 0]
+    meanings = dict.fromkeys(law.meaning for law in broken)  # two may mean the same
+    worst = max((law.widening for law in laws), default=Fraction(0))
+    return Verdict(
+        share=ALL - worst / MOST_WIDENING,
+        message=f"This does not hold: {'; '.join(list(meanings)[:_NAMED])}."
+        if broken
+        else f"All {len(laws)} laws hold within the rounding.",
+        expected={"laws": [law.name for law in laws]},
+        found={"broken": [law.name for law in broken]},
+    )
+
+
+# ------------------------------------------------------------- state model and controller
+
+
+def _state_space(criterion: asked.StateModel, work: Work) -> Verdict:
+    space = work.reported.state_space
+    if space is None or not (space.A and space.B):
+        return Verdict(share=NONE, message="A and B are not both reported.")
+    entries = compare_entries(space, models=work.state_models, n=work.rubric.system.carts)
+    if not entries:
+        return Verdict(
+            share=None, message="Not checked: neither a table nor a fit to compare with."
+        )
+    shares = []
+    for entry in entries:
+        damping = entry.kind == "damping"
+        shares.append(
+            credit(
+                entry.error,
+                full=criterion.damping_full_percent if damping else criterion.full_percent,
+                none=criterion.damping_none_percent if damping else criterion.none_percent,
+            )
+        )
+    # The noughts and ones are given away; a wrong one among them costs as a wrong number does.
+    counted = [
+        share
+        for share, entry in zip(shares, entries, strict=True)
+        if entry.kind != "exact" or share < 1
+    ]
+    off = [e for e, share in zip(entries, shares, strict=True) if share < 1]
+    return Verdict(
+        share=mean_share(counted),
+        message="; ".join(
+            f"{e.name} = {as_typed(e.typed)}, expected {e.right[0]:.4g}" for e in off[:_NAMED]
+        )
+        + "."
+        if off
+        else "A and B follow from the table.",
+        expected={e.name: e.right[0] for e in entries if e.kind != "exact" or e in off},
+        found={e.name: float(e.typed) for e in entries if e.kind != "exact" or e in off},
+    )

@@ -1,0 +1,176 @@
+"""The checks of the closed loop: gains, claims, prefilter, hardware."""
+
+from fractions import Fraction
+
+import numpy as np
+
+from pipeline.grading import rubric as asked
+from pipeline.grading.judge.work import NONE, Verdict, Work, mean_share
+from pipeline.grading.mistakes.controller import Controller, same_gains
+from pipeline.grading.references.reference import OFF_SCALE, Reference, off_scale
+from pipeline.grading.references.tolerance import as_typed, credit, exact, percent_off, rounding
+from pipeline.plant.chain import Array
+
+
+def _loop(work: Work) -> tuple[Controller, Array] | Verdict:
+    """Return the controller and its gains, or why there is nothing to judge."""
+    feedback = work.reported.feedback
+    if feedback is None or not feedback.gains:
+        return Verdict(share=NONE, message="No gains are reported.")
+    if work.controller is None or work.controller.gains is None:
+        return Verdict(share=None, message="Not checked: the carts are not identified.")
+    return work.controller, work.controller.gains
+
+
+def judge_gains(criterion: asked.Gains, work: Work) -> Verdict:
+    """What the gains do on the carts, against the goal; the better of the models counts."""
+    loop = _loop(work)
+    if isinstance(loop, Verdict):
+        return loop
+    controller, gains = loop
+    goal = controller.goal
+    best, found = NONE, {}
+    for numbers in controller.numbers(gains):
+        share = NONE
+        if numbers.stable and numbers.settling_time is not None:
+            over = Fraction(max(numbers.overshoot - goal.overshoot_percent, 0.0))
+            late = Fraction(100 * max(numbers.settling_time / goal.settling_time - 1, 0.0))
+            share = min(
+                credit(over, full=criterion.overshoot_full, none=criterion.overshoot_none),
+                credit(
+                    late,
+                    full=criterion.settling_full_percent,
+                    none=criterion.settling_none_percent,
+                ),
+            )
+        if not found or share > best:
+            best = share
+            found = {
+                "stable": numbers.stable,
+                "overshoot_percent": numbers.overshoot if np.isfinite(numbers.overshoot) else None,
+                "settling_time": numbers.settling_time,
+                "poles": [[p.real, p.imag] for p in numbers.poles],
+            }
+    if not found:
+        return Verdict(share=NONE, message="These gains cannot be simulated.")
+    overshoot, settling = found["overshoot_percent"], found["settling_time"]
+    does = (
+        "the loop is unstable"
+        if not found["stable"]
+        else f"overshoot {round(overshoot, 2):.3g} %, "
+        + (f"settling in {settling:.3g} s" if settling is not None else "no settling in sight")
+    )
+    return Verdict(
+        share=best,
+        message=f"On your carts: {does}; the goal is {goal.overshoot_percent:g} % and "
+        f"{goal.settling_time:g} s.",
+        expected={
+            "overshoot_percent": goal.overshoot_percent,
+            "settling_time": goal.settling_time,
+        },
+        found=found,
+    )
+
+
+def judge_claims(criterion: asked.Claims, work: Work) -> Verdict:
+    """The overshoot and settling time reported, against what the gains give."""
+    loop = _loop(work)
+    if isinstance(loop, Verdict):
+        return loop
+    controller, gains = loop
+    claims = {"overshoot_percent": controller.overshoot, "settling_time": controller.settling}
+    best, expected = None, {}
+    for numbers in controller.numbers(gains):
+        shares = [NONE, NONE]
+        if controller.overshoot is not None and np.isfinite(numbers.overshoot):
+            off = abs(Fraction(controller.overshoot) - Fraction(numbers.overshoot))
+            off = max(off - rounding(controller.overshoot), Fraction(0))
+            shares[0] = credit(off, full=criterion.overshoot_full, none=criterion.overshoot_none)
+        if controller.settling is not None and numbers.settling_time is not None:
+            point = numbers.settling_time
+            reference = Reference(value=point, low=point, high=point, std=0.0, source="")
+            shares[1] = credit(
+                percent_off(controller.settling, reference, sigmas=0.0),
+                full=criterion.settling_full_percent,
+                none=criterion.settling_none_percent,
+            )
+        if best is None or mean_share(shares) > best:
+            best = mean_share(shares)
+            expected = {
+                "overshoot_percent": numbers.overshoot if np.isfinite(numbers.overshoot) else None,
+                "settling_time": numbers.settling_time,
+            }
+    return Verdict(
+        share=best if best is not None else NONE,
+        message="What the gains give."
+        if best == 1
+        else "Simulated on your carts these gains give "
+        + ", ".join(f"{k} {v:.3g}" for k, v in expected.items() if v is not None)
+        + ".",
+        expected=expected,
+        found={name: float(v) for name, v in claims.items() if v is not None},
+    )
+
+
+def judge_prefilter(criterion: asked.Prefilter, work: Work) -> Verdict:
+    """The prefilter, against one over the static gain of the loop with these gains."""
+    loop = _loop(work)
+    if isinstance(loop, Verdict):
+        return loop
+    controller, gains = loop
+    typed = controller.prefilter
+    if typed is None:
+        return Verdict(share=NONE, message="No prefilter is reported.")
+    best, right = NONE, None
+    for numbers in controller.numbers(gains):
+        size = abs(numbers.prefilter)
+        reference = Reference(value=size, low=size, high=size, std=0.0, source="")
+        signed = typed if numbers.prefilter > 0 else -typed
+        error = percent_off(signed, reference, sigmas=0.0)
+        share = credit(error, full=criterion.full_percent, none=criterion.none_percent)
+        if right is None or share > best:
+            best, right = share, numbers.prefilter
+    if right is None:
+        return Verdict(share=NONE, message="These gains cannot be simulated.")
+    return Verdict(
+        share=best,
+        message="One over the static gain of the loop, as it should be."
+        if best == 1
+        else f"These gains need {right:.4g}, you report {as_typed(typed)}.",
+        expected={"prefilter": right},
+        found={"prefilter": float(typed)},
+    )
+
+
+def judge_hardware(criterion: asked.Hardware, work: Work) -> Verdict:
+    """The closed loop that ran, simulated; the best of several runs counts."""
+    runs = {e.id for e in work.submission.experiments if e.kind == "closed_loop"}
+    if not runs:
+        return Verdict(share=NONE, message="No closed-loop run was handed in.")
+    if off_scale(work.analysis):
+        return Verdict(share=None, message=f"Not checked: {OFF_SCALE}.")
+    closed: dict[str, list[float]] = {}
+    for check in work.analysis.hardware:
+        if check.experiment in runs and check.loop == "closed":
+            closed.setdefault(check.experiment, []).append(check.nrmse)
+    if not closed:
+        reasons = [s.reason for s in work.analysis.skipped if s.stage.startswith("hardware")]
+        why = reasons[0] if reasons else "the controller that ran is not stated"
+        return Verdict(share=NONE, message=f"The loop cannot be compared: {why}.")
+    errors = {run: 100 * float(np.sqrt(np.mean(np.square(e)))) for run, e in closed.items()}
+    run = min(errors, key=lambda name: errors[name])
+    error = exact(errors[run])
+    return Verdict(
+        share=credit(error, full=criterion.full_percent, none=criterion.none_percent),
+        message=f"{run}: model and measurement differ by {errors[run]:.3g} % of the motion."
+        + (" The gains that ran are not those reported." if _others_ran(work) else ""),
+        expected={"nrmse_percent": criterion.full_percent},
+        found={"nrmse_percent": errors[run]},
+    )
+
+
+def _others_ran(work: Work) -> bool:
+    controller = work.controller
+    if controller is None or controller.ran is None or controller.gains is None:
+        return False
+    return not same_gains(controller.ran, controller.gains)

@@ -1,0 +1,270 @@
+"""Grade one submission: its own recordings are analysed anew, nothing it brings is believed."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from fractions import Fraction
+
+from pipeline.errors import SubmissionError
+from pipeline.grading.grade import CODES, Criterion, Flag, Grade, Outcome
+from pipeline.grading.judge.checks import judge
+from pipeline.grading.judge.pieces import missing_flag
+from pipeline.grading.judge.work import Work
+from pipeline.grading.mistakes.controller import diagnose_controller, reported_controller
+from pipeline.grading.mistakes.recordings import bad_runs, data_flag
+from pipeline.grading.mistakes.reduced import diagnose_reduced
+from pipeline.grading.mistakes.state_model import diagnose_state_space, state_models
+from pipeline.grading.mistakes.tables import diagnose_tables
+from pipeline.grading.references.reference import in_scale, recompute, trusted_chain
+from pipeline.grading.references.signs import turned_round
+from pipeline.grading.references.springs import with_all_springs
+from pipeline.grading.references.tolerance import exact, late_deduction, rounding
+from pipeline.grading.rubric import Rubric
+from pipeline.ingest.columns import conversion
+from pipeline.results import Analysis
+from pipeline.submission import Experiment, InputOverride, Reported, Submission, System
+from pipeline.workflow import analyse
+
+_CENTS = 100  # points are given to the hundredth
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Graded:
+    """A grade, and the analysis of the student's recordings it rests on (None where it failed)."""
+
+    grade: Grade
+    analysis: Analysis | None
+
+
+def grade_submission(
+    submission: Submission,
+    *,
+    rubric: Rubric,
+    name: str,
+    days_late: float = 0.0,
+    progress: Callable[[str], None] | None = None,
+) -> Graded:
+    """Analyse a submission's recordings under the rubric's system and grade what it reports.
+
+    Recordings that cannot be read are flagged. Where none can be, or the carts are
+    not as many as the rubric's, the grade is `failed` with its reason.
+    """
+    count = submission.system.carts
+    if count != rubric.system.carts:
+        carts = f"{count} cart{'s' if count > 1 else ''}"
+        reason = f"the submission is for {carts}, the rubric for {rubric.system.carts}"
+        return _failed(submission, rubric, name=name, reason=reason, days_late=days_late)
+    submission, notes = under_rubric(submission, rubric)
+    say = progress or (lambda text: None)
+    try:
+        analysis = analyse(submission, design=False, progress=say)
+    except SubmissionError as error:
+        return _failed(submission, rubric, name=name, reason=str(error), days_late=days_late)
+    analysis, springs = with_all_springs(submission, analysis, progress=say)
+    if springs:
+        asked = f"these recordings ask for springs that the rubric has not: {', '.join(springs)}"
+        notes = (*notes, f"{asked}; judged with them")
+    grade = grade_analysis(submission, analysis, rubric=rubric, name=name, days_late=days_late)
+    grade = replace(grade, springs=springs, notes=(*notes, *grade.notes))
+    return Graded(grade=grade, analysis=analysis)
+
+
+def grade_analysis(
+    submission: Submission,
+    analysis: Analysis,
+    *,
+    rubric: Rubric,
+    name: str,
+    days_late: float = 0.0,
+) -> Grade:
+    """Grade a submission against the analysis of its own recordings: a pure function.
+
+    Parameters
+    ----------
+    submission : under the rubric's system, see `under_rubric`.
+    """
+    reported, signed = turned_round(submission.reported or Reported(), analysis.records)
+    submission, n = submission.model_copy(update={"reported": reported}), rubric.system.carts
+    references, chain = in_scale(
+        recompute(analysis),
+        trusted_chain(analysis),
+        analysis=analysis,
+        per_count=submission.system.position.per_count,
+    )
+    diagnosis = diagnose_tables(reported, references=references, analysis=analysis)
+    tables = [{name: float(typed) for name, typed in reported.final.items() if typed > 0}]
+    if diagnosis.corrected != tables[0]:
+        tables.append(diagnosis.corrected)
+    if chain is None and not diagnosis.possible:
+        tables = []  # a model may well be right where its table was copied wrongly
+    digits = {
+        name: float(rounding(typed) / abs(Fraction(typed)))
+        for name, typed in reported.final.items()
+        if typed > 0
+    }
+    work = Work(
+        submission=submission,
+        analysis=analysis,
+        rubric=rubric,
+        references=references,
+        controller=reported_controller(submission, analysis, chain=chain, tables=tables),
+        state_models=state_models(
+            tables, rounding=digits, known=references.final, chain=chain, n=n
+        ),
+        bad=bad_runs(analysis),
+        named=diagnosis.named,
+    )
+    criteria = _criteria(work)
+    earned = sum((Fraction(str(c.points)) for c in criteria), Fraction(0))
+    deducted = late_deduction(earned, late=rubric.late, days_late=days_late)
+    return Grade(
+        submission=name,
+        authors=tuple(author.id for author in submission.authors),
+        status="graded",
+        points=float(earned - deducted),
+        out_of=rubric.out_of,
+        days_late=days_late,
+        deducted=float(deducted),
+        criteria=criteria,
+        flags=tuple(
+            sorted([*diagnosis.flags, *_flags(work)], key=lambda flag: CODES.index(flag.code))
+        ),
+        notes=signed,
+    )
+
+
+def under_rubric(submission: Submission, rubric: Rubric) -> tuple[Submission, tuple[str, ...]]:
+    """Return the submission with the rubric's system in the place of its own, and what to note.
+
+    Where the rubric leaves a sign or a calibration open the submission's own stands. A length
+    unit other than the rubric's is kept, as the students' numbers are in it; the calibration is
+    converted.
+    """
+    own, set_ = submission.system, rubric.system
+    notes = []
+    unit, per_count = set_.position.unit, set_.position.per_count
+    factor = None if own.position.unit == "count" else conversion(unit, own.position.unit)
+    if factor is not None and own.position.unit != unit:
+        unit = own.position.unit
+        per_count = None if per_count is None else per_count * factor
+        notes.append(f"lengths are in {unit}, as handed in; the rubric has {set_.position.unit}")
+    if own.springs != set_.springs and set_.carts > 1:  # one cart has one stiffness
+        notes.append("the springs are the rubric's, not those of the submission")
+    system = System(
+        carts=set_.carts,
+        springs=set_.springs,
+        input=set_.input.model_copy(
+            update={
+                "sign": set_.input.sign or own.input.sign,
+                "per_count": set_.input.per_count or own.input.per_count,
+            }
+        ),
+        position=set_.position.model_copy(
+            update={"unit": unit, "per_count": per_count or own.position.per_count}
+        ),
+    )
+    experiments = tuple(_under_calibration(e, set_) for e in submission.experiments)
+    if experiments != submission.experiments:
+        notes.append("the input's scale is the rubric's, also where a record states its own")
+    update = {
+        "system": system,
+        "design": rubric.design or submission.design,
+        "experiments": experiments,
+    }
+    return submission.model_copy(update=update), tuple(notes)
+
+
+def _under_calibration(experiment: Experiment, system: System) -> Experiment:
+    """Return the experiment without an input scale of its own where the rubric states one.
+
+    Under feedback a bench may log another signal as its input, so there the record's own stands.
+    Between its own sign and the rubric's the data decide, as everywhere.
+    """
+    own = experiment.input
+    if own is None or experiment.kind == "closed_loop" or not system.input.per_count:
+        return experiment
+    return experiment.model_copy(update={"input": InputOverride(sign=own.sign)})
+
+
+def _failed(
+    submission: Submission, rubric: Rubric, *, name: str, reason: str, days_late: float
+) -> Graded:
+    grade = Grade(
+        submission=name,
+        authors=tuple(author.id for author in submission.authors),
+        status="failed",
+        points=0.0,
+        out_of=rubric.out_of,
+        days_late=days_late,
+        reason=reason,
+    )
+    return Graded(grade=grade, analysis=None)
+
+
+# ------------------------------------------------------------------ criteria and flags
+
+
+def _criteria(work: Work) -> tuple[Criterion, ...]:
+    done: dict[str, Criterion] = {}
+    for asked in work.rubric.criteria:
+        parents = [p for p in asked.requires if done[p].outcome in ("fail", "skip")]
+        if parents:
+            title = done[parents[0]].title or parents[0]
+            found = Criterion(
+                id=asked.id,
+                title=asked.title,
+                outcome="skip",
+                points=0.0,
+                out_of=asked.points,
+                message=f"Not checked: it builds on {parents[0]!r} ({title}), "
+                f"which was {'not passed' if done[parents[0]].outcome == 'fail' else 'skipped'}.",
+                expected={},
+                found={},
+            )
+        else:
+            verdict = judge(asked, work)
+            points = _points(verdict.share, asked.points)
+            outcome = _outcome(verdict.share)
+            advised = outcome in ("partial", "fail") and not verdict.explained
+            more = f" {asked.message}" if asked.message and advised else ""
+            found = Criterion(
+                id=asked.id,
+                title=asked.title,
+                outcome=outcome,
+                points=points,
+                out_of=asked.points,
+                message=verdict.message + more,
+                expected=verdict.expected,
+                found=verdict.found,
+            )
+        done[asked.id] = found
+    return tuple(done.values())
+
+
+def _outcome(share: Fraction | None) -> Outcome:
+    if share is None:
+        return "skip"
+    return "pass" if share == 1 else "fail" if share == 0 else "partial"
+
+
+def _points(share: Fraction | None, points: float) -> float:
+    """Return the points to the hundredth, halves up: exact, so that no share loses its order."""
+    return float(
+        Fraction(math.floor((share or 0) * exact(points) * _CENTS + Fraction(1, 2)), _CENTS)
+    )
+
+
+def _flags(work: Work) -> list[Flag]:
+    """Return the flags beside those of the parameter tables."""
+    flags, space = [], work.reported.state_space
+    if space is not None and space.A:
+        n = work.rubric.system.carts
+        flags += diagnose_state_space(space, models=work.state_models, n=n)
+    if work.controller is not None:
+        flags += diagnose_controller(work.controller)
+    flags += diagnose_reduced(work.analysis)
+    if work.missing:
+        flags.append(missing_flag(work.missing))
+    if work.bad:
+        flags.append(data_flag(work.bad))
+    return flags

@@ -1,0 +1,404 @@
+"""The reported controller: do its gains reach the goal, are the claims theirs, is N 1/DC gain?"""
+
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from decimal import Decimal
+
+import numpy as np
+
+from pipeline.errors import DataError
+from pipeline.grading.grade import Flag
+from pipeline.grading.mistakes.loop_numbers import LoopNumbers, loop_numbers
+from pipeline.grading.mistakes.state_model import own_chain
+from pipeline.grading.references.reference import is_explained
+from pipeline.grading.references.tolerance import as_typed, rounding
+from pipeline.plant.chain import Array, Chain
+from pipeline.plant.robustness import MASS_SPRING_ERROR, level_error_percent, static_levels
+from pipeline.results import Analysis
+from pipeline.submission import Design, StateFeedback, Submission
+from pipeline.workflow import reference_design
+
+# Where a controller is wrong rather than a matter of taste or of the model's error.
+_OVERSHOOT = 20.0  # percentage points above the goal
+_SETTLING = 2.0  # times the goal
+_CLAIM_OVERSHOOT, _CLAIM_SETTLING = 12.0, 1.6  # percentage points, times
+_OTHER_GAINS = 2.5  # times: claims so far off are of other gains, whatever the prefilter
+_PREFILTER, _PREFILTER_BLURRED = 0.10, 0.20  # relative
+_SIGMAS = 2.0  # of the fitted static gains, which a prefilter may be off by
+_SAME_GAINS = 0.02  # relative to the largest of its kind: typed again with fewer digits
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Controller:
+    """The reported controller with all there is to judge it by.
+
+    Attributes
+    ----------
+    gains : (2n,) as reported; None if they were not.
+    ran : (2n,) gains stated for a closed-loop run, if any.
+    models : the reference chain and the student's own.
+    goal : what must be met; what a reference design reaches where neither it nor these gains do.
+    blurred : the reference's gains are as uncertain as friction makes them.
+    doubt : relative error of the prefilter that the models' own errors leave.
+    own : the student's table is complete, so that what they designed for is known.
+    """
+
+    gains: Array | None
+    prefilter: Decimal | None
+    overshoot: Decimal | None
+    settling: Decimal | None
+    ran: Array | None
+    models: tuple[Chain, ...]
+    goal: Design
+    blurred: bool
+    own: bool
+    doubt: float = 0.0
+
+    def numbers(self, gains: Array) -> list[LoopNumbers]:
+        """Return what gains do on each of the models."""
+        found = [
+            loop_numbers(
+                chain,
+                gains,
+                cart=self.goal.cart,
+                settling=self.goal.settling_time,
+                sample_time=self.goal.sample_time,
+            )
+            for chain in self.models
+        ]
+        return [numbers for numbers in found if numbers is not None]
+
+    def reaches_goal(self, gains: Array) -> bool:
+        """Whether gains do what is asked for on one of the models."""
+        return any(
+            numbers.stable
+            and numbers.overshoot <= self.goal.overshoot_percent
+            and numbers.settling_time is not None
+            and numbers.settling_time <= self.goal.settling_time
+            for numbers in self.numbers(gains)
+        )
+
+    def meets(self, numbers: LoopNumbers) -> bool:
+        """Whether a loop comes near enough to the goal not to be called wrong."""
+        return (
+            numbers.stable
+            and numbers.overshoot <= self.goal.overshoot_percent + _OVERSHOOT
+            and numbers.settling_time is not None
+            and numbers.settling_time <= _SETTLING * self.goal.settling_time
+        )
+
+    def is_claimed(self, numbers: LoopNumbers) -> bool:
+        """Whether a loop does about what was reported of it."""
+        if self.overshoot is not None and not (
+            abs(numbers.overshoot - float(self.overshoot)) <= _CLAIM_OVERSHOOT
+        ):
+            return False
+        if self.settling is None or self.settling <= 0:
+            return True
+        settles = numbers.settling_time
+        ratio = None if settles is None else settles / float(self.settling)
+        return ratio is not None and 1 / _CLAIM_SETTLING <= ratio <= _CLAIM_SETTLING
+
+    def is_of_other_gains(self, numbers: LoopNumbers) -> bool:
+        """Whether a loop settles so much sooner or later than reported that it is not meant."""
+        if self.settling is None or self.settling <= 0 or numbers.settling_time is None:
+            return False
+        ratio = numbers.settling_time / float(self.settling)
+        return max(ratio, 1 / ratio) > _OTHER_GAINS
+
+    def prefilter_fits(self, numbers: LoopNumbers, *, sharp: bool = False) -> bool:
+        """Whether the reported prefilter is one over the static gain of this loop.
+
+        A student's own numbers leave less room than recordings that friction blurs: `sharp`.
+        """
+        if self.prefilter is None:
+            return True
+        off = abs(float(self.prefilter) - numbers.prefilter) - float(rounding(self.prefilter))
+        allowed = _PREFILTER_BLURRED if self.blurred and not sharp else _PREFILTER
+        return off <= (allowed + self.doubt) * abs(numbers.prefilter)
+
+
+def reported_controller(
+    submission: Submission,
+    analysis: Analysis,
+    *,
+    chain: Chain | None,
+    tables: Sequence[Mapping[str, float]],
+) -> Controller | None:
+    """Return the controller of a submission; None without one, or nothing to judge it by.
+
+    Parameters
+    ----------
+    chain : the reference, if there is one.
+    tables : the student's final table, as typed and with the mistakes found in it undone.
+    """
+    feedback = submission.reported.feedback if submission.reported else None
+    n = submission.system.carts
+    own = [own_chain(values, n=n) for values in tables]
+    models = [model for model in (chain, *own) if model is not None]
+    if feedback is None or not models:
+        return None
+    ran = [
+        e.controller.gains
+        for e in submission.experiments
+        if isinstance(e.controller, StateFeedback) and e.controller.gains
+    ]
+    controller = Controller(
+        gains=np.array([float(g) for g in feedback.gains]) if feedback.gains else None,
+        prefilter=feedback.prefilter,
+        overshoot=feedback.overshoot_percent,
+        settling=feedback.settling_time,
+        ran=np.array(ran[0]) if ran else None,
+        models=tuple(models),
+        goal=submission.design or Design(cart=n),
+        blurred=not is_explained(analysis),
+        own=any(model is not None for model in own),
+    )
+    controller = replace(controller, doubt=_doubt(controller, submission, analysis))
+    if controller.gains is None or controller.reaches_goal(controller.gains):
+        return controller
+    return replace(controller, goal=_reachable(controller.goal, submission, analysis))
+
+
+def _doubt(controller: Controller, submission: Submission, analysis: Analysis) -> float:
+    """Return the relative error that those of the models, fitted or typed, leave in a prefilter.
+
+    Gains that cancel much of the plant's stiffness make more of them than there was.
+    """
+    chain, gains, cart = controller.models[0], controller.gains, controller.goal.cart
+    if gains is None or gains.size != 2 * chain.n:
+        return 0.0
+    share = float(level_error_percent(chain, gains, cart=cart)) / 100 / MASS_SPRING_ERROR
+    fitted = [
+        _SIGMAS * row.final.std / abs(row.final.value)
+        for row in analysis.rows
+        if row.name.startswith("K") and row.final and row.final.std and row.final.value
+    ]
+    typed = submission.reported.final if submission.reported else {}
+    return max(share * max(fitted, default=0.0), _by_rounding(typed, gains, cart=cart))
+
+
+def _by_rounding(typed: Mapping[str, Decimal], gains: Array, *, cart: int) -> float:
+    """Return how far the rounding of a typed table moves the prefilter on its own carts."""
+    values = {name: float(value) for name, value in typed.items()}
+
+    def level(table: Mapping[str, float]) -> float:
+        chain = own_chain(table, n=gains.size // 2)
+        try:
+            return np.nan if chain is None else float(static_levels(chain, gains)[cart - 1])
+        except np.linalg.LinAlgError:  # the gains cancel all stiffness: nothing holds a level
+            return np.nan
+
+    half = {name: float(rounding(value)) for name, value in typed.items()}
+    moved = [level({**values, name: values[name] + half[name]}) for name in values]
+    relative = np.nan_to_num(np.array(moved) / level(values) - 1)
+    return _SIGMAS / np.sqrt(3) * float(np.linalg.norm(relative))
+
+
+def _reachable(goal: Design, submission: Submission, analysis: Analysis) -> Design:
+    """Return the goal or, where the reference design comes short of it, what that reaches."""
+    try:
+        design = reference_design(submission, analysis.fit)
+    except DataError:
+        return goal
+    if design.reachable or design.settling_time is None:
+        return goal
+    return goal.model_copy(
+        update={
+            "overshoot_percent": max(goal.overshoot_percent, design.overshoot_percent),
+            "settling_time": max(goal.settling_time, design.settling_time),
+        }
+    )
+
+
+# ------------------------------------------------------------------------- flags
+
+
+def diagnose_controller(controller: Controller) -> list[Flag]:
+    """Return the flags of the gains and of the prefilter; a wrong gain excuses its prefilter."""
+    if controller.gains is None:
+        return []
+    numbers = controller.numbers(controller.gains)
+    if not numbers:
+        return []
+    flags = []
+    fits = any(controller.prefilter_fits(one) for one in numbers)
+    meets = any(controller.meets(one) for one in numbers)
+    claimed = any(controller.is_claimed(one) for one in numbers)
+    # Gains that reach the goal, and do what is claimed of them, are the ones meant.
+    told = controller.overshoot is not None or controller.settling is not None
+    slip, intended = ("", None) if meets and told and claimed else _slip(controller)
+    ran = controller.ran
+    # The gains that ran tell which of the reported numbers does not belong to the others.
+    other_ran = ran is not None and not same_gains(ran, controller.gains)
+    sharply = any(controller.prefilter_fits(one, sharp=True) for one in numbers)
+    wrong = not meets or (slip and not (fits and claimed)) or (not claimed and not sharply)
+    wrong = wrong or all(controller.is_of_other_gains(one) for one in numbers)
+    if other_ran and ran is not None:
+        of_ran = controller.numbers(ran)
+        better = any(
+            controller.prefilter_fits(one) and controller.is_claimed(one) for one in of_ran
+        )
+        wrong = wrong or (better and not (fits and claimed))
+    if wrong:
+        flags.append(_gains_flag(controller, numbers[0], slip=slip, other_ran=other_ran))
+        sources = [g for g in (intended, ran if other_ran else None) if g is not None]
+        known = [one for gains in sources for one in controller.numbers(gains)]
+        fits = fits or not known or any(controller.prefilter_fits(one) for one in known)
+    if not fits and controller.prefilter is not None:
+        slip = _prefilter_slip(controller, numbers[0].prefilter)
+        # What is right on the student's own carts may be off on those of the reference.
+        if controller.own or slip:
+            flags.append(_prefilter_flag(controller, numbers[0], slip=slip))
+    return flags
+
+
+def same_gains(a: Array, b: Array) -> bool:
+    """Whether two sets of gains are one, typed with different numbers of digits."""
+    if a.shape != b.shape:
+        return False
+    scale = np.empty_like(a)
+    for part in (0, 1):
+        scale[part::2] = max(float(np.abs(a[part::2]).max()), float(np.abs(b[part::2]).max()))
+    return bool(np.all(np.abs(a - b) <= _SAME_GAINS * np.maximum(scale, 1e-300)))
+
+
+def _slip(controller: Controller) -> tuple[str, Array | None]:
+    """Return the known slip that, undone, makes the gains right, and the gains meant; or ""."""
+    gains = controller.gains
+    assert gains is not None
+    for text, meant in _undone(gains):
+        if controller.ran is not None:
+            if same_gains(meant, controller.ran):
+                return text, meant
+            continue
+        better = [
+            one
+            for one in controller.numbers(meant)
+            if controller.meets(one)
+            and controller.prefilter_fits(one)
+            and controller.is_claimed(one)
+        ]
+        if better:
+            return text, meant
+    return "", None
+
+
+def _undone(gains: Array) -> Iterator[tuple[str, Array]]:
+    """Yield (the slip in words, the gains without it); none that changes nothing."""
+    n = gains.size // 2
+    found = [("all signs are reversed: u = prefilter·r − G·x takes the gains with a minus", -gains)]
+    if n > 1:
+        ordered = np.empty_like(gains)
+        ordered[0::2], ordered[1::2] = gains[:n], gains[n:]
+        found.append(
+            ("the gains are listed positions first; the order is (x1, v1, x2, v2, …)", ordered)
+        )
+        pairs = gains.reshape(n, 2)
+        found += [
+            (
+                "the gains belong to other carts; cart 1 is the one at the motor",
+                np.ravel(pairs[p, :]),
+            )
+            for p in map(list, itertools.permutations(range(n)))
+            if p != sorted(p)
+        ]
+    exchanged = gains.copy()
+    exchanged[0::2], exchanged[1::2] = gains[1::2], gains[0::2]
+    found.append(("position and velocity gains are exchanged", exchanged))
+    for i in range(gains.size):
+        flipped = gains.copy()
+        flipped[i] = -flipped[i]
+        found.append((f"the sign of gain {i + 1} is reversed", flipped))
+    for text, meant in found:
+        if not same_gains(meant, gains):
+            yield text, meant
+
+
+def _gains_flag(
+    controller: Controller, numbers: LoopNumbers, *, slip: str, other_ran: bool
+) -> Flag:
+    goal = controller.goal
+    settles = numbers.settling_time
+    does = (
+        f"overshoot {round(numbers.overshoot, 2):.3g} %, settling "
+        + (f"in {settles:.3g} s" if settles is not None else "not in sight")
+        if numbers.stable
+        else "the loop is unstable"
+    )
+    why = slip or (
+        "they are not the gains that ran on the bench"
+        if other_ran
+        else f"you report {controller.settling} s"
+        if controller.meets(numbers)
+        else f"the goal was {goal.overshoot_percent:g} % and {goal.settling_time:g} s"
+    )
+    assert controller.gains is not None
+    return Flag(
+        code="wrong_gains",
+        parameters=("gains",),
+        message=f"with these gains on your carts: {does}; {why}.",
+        evidence={
+            "reported": controller.gains.tolist(),
+            "ran": None if controller.ran is None else controller.ran.tolist(),
+            "stable": numbers.stable,
+            "overshoot_percent": numbers.overshoot if np.isfinite(numbers.overshoot) else None,
+            "settling_time": settles,
+            "slip": slip,
+        },
+    )
+
+
+def _prefilter_slip(controller: Controller, right: float) -> str:
+    """Return the known slip that gives the reported prefilter, or ""."""
+    typed = controller.prefilter
+    assert typed is not None
+    for text, value in _prefilter_slips(controller, right):
+        if abs(float(typed) - value) <= 0.5 * _PREFILTER * abs(value) + float(rounding(typed)):
+            return text
+    return ""
+
+
+def _prefilter_flag(controller: Controller, numbers: LoopNumbers, *, slip: str) -> Flag:
+    typed, right = controller.prefilter, numbers.prefilter
+    assert typed is not None
+    hint = (
+        slip or "it is one over the static gain of the loop, from r to the cart that is controlled"
+    )
+    return Flag(
+        code="wrong_prefilter",
+        parameters=("prefilter",),
+        message=f"prefilter: these gains need {right:.4g}, you report {as_typed(typed)}: {hint}.",
+        evidence={
+            "parameter": "prefilter",
+            "reported": float(typed),
+            "recomputed": right,
+            "ratio": float(typed) / right if right else None,
+        },
+    )
+
+
+def _prefilter_slips(controller: Controller, right: float) -> Iterator[tuple[str, float]]:
+    chain, goal = controller.models[0], controller.goal
+    yield "this is the loop's static gain itself, so take its reciprocal", 1 / right
+    yield "its sign is reversed", -right
+    if chain.is_tied:
+        static = 1 / float(chain.static_gains()[goal.cart - 1])
+        yield "this is 1/K of the cart without feedback; the gains add their share", static
+    for cart in range(1, chain.n + 1):
+        if cart != goal.cart and controller.gains is not None:
+            other = loop_numbers(
+                chain,
+                controller.gains,
+                cart=cart,
+                settling=goal.settling_time,
+                sample_time=goal.sample_time,
+            )
+            if other is not None:
+                yield (
+                    f"this one is for cart {cart}, and cart {goal.cart} is controlled",
+                    (other.prefilter),
+                )
+    if right != 1.0:
+        yield "no prefilter was designed", 1.0

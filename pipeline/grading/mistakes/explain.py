@@ -1,0 +1,241 @@
+"""Find the mistakes that make the numbers of a table likeliest, where they are likely enough."""
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from decimal import Decimal
+from fractions import Fraction
+from typing import Literal
+
+from pipeline.grading.grade import Code
+from pipeline.grading.mistakes.catalogue import Mistake
+from pipeline.grading.references.reference import Reference
+from pipeline.grading.references.tolerance import half_digit, percent_off
+from pipeline.grading.rubric import is_damping
+
+SIGMAS = 3.0  # standard errors of the recordings' own number that are no mistake
+_NEAR = 0.1  # relative: as far off is an honest first estimate, with a mistake in it or without
+_NEAR_BY_EYE = 0.3  # … of a resonance or null that is read off a plot
+
+# How far honest numbers lie outside their bounds: half of the logarithms of them by less (Cauchy).
+_GAIN, _FREQUENCY, _BY_EYE, _DAMPING = 0.01, 0.004, 0.06, 0.2
+# A number that is off, and nothing explains it, lies anywhere within so many e-folds. One in twenty
+# is; a known mistake is made in one table of ten.
+_ANYWHERE = 3.0
+_SLIP, _KNOWN_SLIP = math.log(20), math.log(10)
+_MARGIN = 2.0  # e-folds: of two explanations the other is out where it is so much less likely
+# With little damping a step peaks at twice its level, which is also what peak to peak gives: of a
+# first estimate it is then true that the step peaks there, whatever was done.
+_TRUE_ANYWAY: Code = "peak_for_steady_state"
+
+Table = Mapping[str, Decimal]
+Label = Literal["initial", "final"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Explained:
+    """Numbers of one table that a mistake explains; `rival` explains them as well."""
+
+    mistake: Mistake
+    table: Label
+    names: tuple[str, ...]
+    rival: Mistake | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Explanation:
+    """The mistakes found, and the numbers that none explains or several do."""
+
+    explained: tuple[Explained, ...]
+    left: tuple[str, ...]
+
+    @property
+    def codes(self) -> set[Code]:
+        """The codes of all mistakes found."""
+        return {code for one in self.explained for code in one.mistake.codes}
+
+
+def explain(
+    table: Table,
+    *,
+    known: Mapping[str, Reference],
+    off: Sequence[str],
+    mistakes: Sequence[Mistake],
+    label: Label,
+    believed: frozenset[Code] = frozenset(),
+) -> Explanation:
+    """Find the mistakes that make the whole table likeliest; those `believed` count as no more.
+
+    Where others make it about as likely, none is named.
+    """
+    remaining, codes = list(off), frozenset[Code]()
+    possible = [m for m in mistakes if not m.beside.intersection(off)]
+    found: list[Explained] = []
+    ways = _by_way(possible)
+    while remaining:
+        nothing = _Cover(codes=frozenset(), fits=())
+        covers = [_cover(way, table, remaining, label=label) for way in ways]
+        covers = [nothing, *(cover for cover in covers if cover.explained)]
+        scores = [_score(c, table, known, off=remaining, free=codes | believed) for c in covers]
+        score = {id(c): one for c, one in zip(covers, scores, strict=True)}
+        best = max(covers, key=lambda c: (score[id(c)], -len(c.codes)))
+        if best is nothing:
+            break
+        rivals = [
+            c
+            for c in covers
+            if not best.codes <= c.codes
+            and best.explained & c.explained
+            and score[id(c)] > score[id(best)] - _MARGIN
+        ]
+        rival = None
+        shared = frozenset.intersection(best.codes, *(c.codes for c in rivals))
+        supported = [c for c in (best, *rivals) if c.codes - shared <= believed]
+        less = [c for c in rivals if c.codes <= shared]
+        if rivals and len(supported) == 1:
+            best, rivals = supported[0], []
+        elif less:  # sure of one mistake, not of the other
+            best, rivals = less[0], []
+        if rivals and label == "initial":
+            true = [c for c in (best, *rivals) if _TRUE_ANYWAY in c.codes]
+            others = [c for c in (best, *rivals) if _TRUE_ANYWAY not in c.codes]
+            if len(true) == 1 and others:
+                best, rivals, rival = true[0], [], others[0].fits[0][0]
+        if not rivals:
+            codes |= best.codes
+            for mistake, names in best.fits:
+                own = remaining if mistake.table_wide else names
+                found.append(Explained(mistake=mistake, table=label, names=tuple(own), rival=rival))
+        wide = any(m.table_wide for m, _ in best.fits) and not rivals
+        remaining = [n for n in remaining if n not in best.explained and not wide]
+    explained = {name for one in found for name in one.names}
+    return Explanation(
+        explained=tuple(found), left=tuple(name for name in off if name not in explained)
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Cover:
+    """What some codes explain, each number by one mistake."""
+
+    codes: frozenset[Code]
+    fits: tuple[tuple[Mistake, list[str]], ...]
+
+    @property
+    def explained(self) -> frozenset[str]:
+        """The wrong numbers that are explained."""
+        return frozenset(name for _, names in self.fits for name in names)
+
+
+def _by_way(mistakes: Sequence[Mistake]) -> list[list[Mistake]]:
+    """Return the mistakes that are one and the same way to be wrong, of whatever numbers."""
+    ways: dict[tuple[tuple[Code, ...], str], list[Mistake]] = {}
+    for mistake in mistakes:
+        ways.setdefault((mistake.codes, mistake.help), []).append(mistake)
+    return [*ways.values()]
+
+
+def _cover(
+    way: Sequence[Mistake], table: Table, remaining: Sequence[str], *, label: Label
+) -> _Cover:
+    """Explain what one way to be wrong can, with mistakes that explain more numbers first."""
+    fits: list[tuple[Mistake, list[str]]] = []
+    open_ = list(remaining)
+    while tried := [(m, names) for m in way if (names := _explains(m, table, open_, label=label))]:
+        mistake, names = min(
+            tried, key=lambda fit: (-len(fit[1]), _distance(fit[0], table, fit[1]))
+        )
+        fits.append((mistake, names))
+        open_ = [name for name in open_ if name not in names]
+    used = frozenset(way[0].codes) if fits else frozenset[Code]()
+    return _Cover(codes=used, fits=tuple(fits))
+
+
+def _score(
+    cover: _Cover,
+    table: Table,
+    known: Mapping[str, Reference],
+    *,
+    off: Collection[str],
+    free: Collection[Code],
+) -> float:
+    """Return the logarithm of how likely some mistakes are, and the table with them in it."""
+    predicted: dict[str, Reference] = dict(known)
+    for mistake, names in reversed(cover.fits):
+        touched = [n for n in mistake.predicted if n in table] if mistake.whole else names
+        predicted |= {n: mistake.predicted[n] for n in touched}
+    # What is off is no honest number; a mistake of the whole table may make any of it.
+    wide = any(m.table_wide for m, _ in cover.fits)
+    unexplained = -math.log(_ANYWHERE) - (0.0 if wide else _SLIP)
+    told = sum(
+        unexplained
+        if name in off and name not in cover.explained
+        else _log_density(table[name], predicted[name], name)
+        for name in known
+        if table[name] > 0
+    )
+    tries = max((mistake.tries for mistake, _ in cover.fits), default=1)
+    return told - math.log(tries) - _KNOWN_SLIP * len(cover.codes - set(free))
+
+
+def _log_density(typed: Decimal, reference: Reference, name: str) -> float:
+    """Return the logarithm of the density of ln(number), that of one anywhere at the least.
+
+    Even between the bounds that rounding leaves, with Cauchy's tails outside them: some numbers
+    are read far worse than most.
+    """
+    half = float(half_digit(typed) / abs(Fraction(typed)))
+    low, high = reference.low, reference.high
+    anywhere = -math.log(_ANYWHERE) - _SLIP
+    if low <= 0:
+        return anywhere
+    usual = {"K": _GAIN, "z": _DAMPING}.get(name[0], _FREQUENCY)
+    if _is_by_eye(name):
+        usual = _BY_EYE
+    # What a mistake is made with was typed to as many digits before.
+    digits = 10.0 ** (1 - len(typed.as_tuple().digits)) / 4
+    usual = math.hypot(usual, digits, reference.std / reference.value)
+    outside = max(math.log(low / float(typed)), math.log(float(typed) / high)) - half
+    room = math.log(high / low) + 2 * half + math.pi * usual
+    return max(-math.log(room) - math.log1p((max(outside, 0.0) / usual) ** 2), anywhere)
+
+
+def _explains(
+    mistake: Mistake, table: Table, remaining: Sequence[str], *, label: Label
+) -> list[str]:
+    """Return which of the remaining numbers a mistake reproduces, if it may be believed.
+
+    Half of them must be met; the others may be as far off as honest numbers are.
+    """
+    asked = [name for name in mistake.predicted if name in table]
+    met = [name for name in asked if _off_by(mistake, table, name) <= 1]
+    near = [name for name in asked if name in met or _is_near(mistake, table, name, label=label)]
+    if len(met) < mistake.least or 2 * len(met) < len(near):
+        return []
+    if mistake.whole and len(near) < len(asked):
+        return []
+    wrong = [name for name in remaining if name in near]
+    # Of two carts swapped both numbers are wrong, not only near the other's.
+    return [] if "carts_swapped" in mistake.codes and len(wrong) < mistake.least else wrong
+
+
+def _off_by(mistake: Mistake, table: Table, name: str) -> float:
+    """Return how far a number is off what a mistake predicts, as share of what it may be."""
+    error = percent_off(table[name], mistake.predicted[name], sigmas=SIGMAS)
+    return float(error) / (100 * mistake.tolerance)
+
+
+def _is_near(mistake: Mistake, table: Table, name: str, *, label: Label) -> bool:
+    """Whether a number beside others that a mistake makes is off it as honest numbers are off."""
+    error = percent_off(table[name], mistake.predicted[name], sigmas=SIGMAS)
+    by_eye = label == "initial" and _is_by_eye(name)
+    return not is_damping(name) and float(error) <= 100 * (_NEAR_BY_EYE if by_eye else _NEAR)
+
+
+def _is_by_eye(name: str) -> bool:
+    """Whether a parameter is a resonance or a null, which is read off a plot."""
+    return name.startswith("omega") and name[-1] in "abcdefghxy"
+
+
+def _distance(mistake: Mistake, table: Table, names: Sequence[str]) -> float:
+    return sum(_off_by(mistake, table, name) for name in names) / len(names)

@@ -1,0 +1,79 @@
+"""What no real chain of carts can do, whatever the data: signs and orders of reported numbers."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from decimal import Decimal
+
+from pipeline.grading.grade import Flag
+from pipeline.grading.references.tolerance import as_typed, rounding
+from pipeline.plant.laws import HEAVY_DAMPING, orders
+
+# How far an order may be broken: fitted numbers are good to some percent, and first estimates of
+# resonances and nulls are read off a plot.
+_FINAL_SLACK = 1.1
+_INITIAL_SLACK = 1.2
+
+
+@dataclass(frozen=True, kw_only=True)
+class BrokenOrder:
+    """The law `lesser ≤ greater`, broken by two numbers of a table."""
+
+    lesser: str
+    greater: str
+    reason: str
+
+    @property
+    def names(self) -> tuple[str, str]:
+        """Both parameters."""
+        return self.lesser, self.greater
+
+    @property
+    def is_of_gains(self) -> bool:
+        """Whether it is about how far carts are moved by a constant input."""
+        return self.lesser.startswith("K")
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether everybody sees it: of gains or resonances; nulls and single carts need thought.
+
+        There the recordings' own value of the one number that is off is the better help.
+        """
+        return self.is_of_gains or {self.lesser[-1], self.greater[-1]} <= set("abcdefgh")
+
+    def flag(self, table: Mapping[str, Decimal], label: str) -> Flag:
+        """Return the flag for it."""
+        low, high = table[self.lesser], table[self.greater]
+        return Flag(
+            code="physically_impossible",
+            parameters=self.names,
+            message=f"{self.lesser} = {as_typed(low)} cannot be above {self.greater} = "
+            f"{as_typed(high)} ({label} estimates): {self.reason}.",
+            evidence={
+                "table": label,
+                "reported": {self.lesser: float(low), self.greater: float(high)},
+                "ratio": float(low / high),
+            },
+        )
+
+
+def not_positive(table: Mapping[str, Decimal]) -> list[str]:
+    """Return the parameters that are zero or negative."""
+    return [name for name, typed in table.items() if typed <= 0]
+
+
+def broken_orders(table: Mapping[str, Decimal], *, initial: bool) -> list[BrokenOrder]:
+    """Return the orders that a table breaks by more than rounding and honest error."""
+    slack = _INITIAL_SLACK if initial else _FINAL_SLACK
+    heavy = any(v > HEAVY_DAMPING for n, v in table.items() if n.startswith("zeta"))
+    broken = []
+    for lesser, greater, reason in orders(list(table)):
+        if heavy and lesser.startswith("omega"):
+            continue
+        low, high = table[lesser], table[greater]
+        if low <= 0 or high <= 0:
+            continue
+        least = low - Decimal(float(rounding(low)))
+        most = high + Decimal(float(rounding(high)))
+        if float(least) > slack * float(most):
+            broken.append(BrokenOrder(lesser=lesser, greater=greater, reason=reason))
+    return broken

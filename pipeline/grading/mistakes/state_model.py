@@ -1,0 +1,401 @@
+"""The reported A and B: every entry against the student's own table or the reference."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from decimal import Decimal
+from fractions import Fraction
+from typing import Literal
+
+import numpy as np
+
+from pipeline.grading.grade import Flag
+from pipeline.grading.references.reference import Reference
+from pipeline.grading.references.tolerance import percent_off
+from pipeline.grading.rubric import is_damping
+from pipeline.names import parameter_names
+from pipeline.plant.chain import Array, Chain, recover_from_parameters
+from pipeline.submission import StateSpace
+
+Kind = Literal["exact", "stiffness", "damping"]
+
+# From here on an entry is wrong rather than imprecise: percent. Couplings are differences of
+# large numbers, dampings are what friction adds to.
+_WRONG = {"exact": 0.0, "stiffness": 20.0, "damping": 100.0}
+# A 0 or 1 of A is met within what a computer adds to it: 1.2e-17 is zero.
+_EXACT = 1e-6
+# Standard errors of an honest table's numbers, relative, and how many of them its A and B may lie
+# off: two routes from the table to one coupling part by as much.
+_HONEST, _HONEST_DAMPING = 0.01, 0.1
+_SIGMAS = 2.0
+_NAMED = 3  # carts whose chain the named parameters give back
+_MODES = ("omega_a", "omega_b", "omega_c")
+_NULLS = ("omega_x", "omega_y")
+_EXPLAINED = {"exact": 0.0, "stiffness": 12.0, "damping": 60.0}  # what a named slip must meet
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StateModel:
+    """What [A B] may rightly be, (2n, 2n + 1), NaN where unknown, and how vaguely that is known."""
+
+    right: Array
+    slack: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class Entry:
+    """One entry of A or B: as typed, what it may be, and how far it is off (percent).
+
+    `error` is what is left beyond the slack of the models, `bare` what it is without.
+    """
+
+    name: str
+    kind: Kind
+    typed: Decimal
+    right: tuple[float, ...]
+    error: Fraction
+    bare: Fraction
+
+    @property
+    def wrong(self) -> bool:
+        """Whether it is wrong rather than imprecise."""
+        return self.error > _WRONG[self.kind]
+
+    @property
+    def suspect(self) -> bool:
+        """Whether it would be wrong if the models were exact."""
+        return self.bare > _WRONG[self.kind]
+
+
+def compare_entries(space: StateSpace, *, models: Sequence[StateModel], n: int) -> list[Entry]:
+    """Compare every entry with what the right A and B may be.
+
+    An entry is as good as its best match: an A that follows from a wrong table is right.
+    """
+    kinds, entries = _kinds(n), []
+    for (i, j), number in _matrix(space, n).items():
+        known = [
+            (float(model.right[i, j]), float(model.slack[i, j]))
+            for model in models
+            if np.isfinite(model.right[i, j])
+        ]
+        if not known:
+            continue
+        kind = kinds[i][j]
+        entries.append(
+            Entry(
+                name=f"A({i + 1}, {j + 1})" if j < 2 * n else f"B({i + 1})",
+                kind=kind,
+                typed=number,
+                right=tuple(value for value, _ in known),
+                error=min(_entry_error(number, value, kind, slack=s) for value, s in known),
+                bare=min(_entry_error(number, value, kind) for value, _ in known),
+            )
+        )
+    return entries
+
+
+def state_models(
+    tables: Sequence[Mapping[str, float]],
+    *,
+    rounding: Mapping[str, float],
+    known: Mapping[str, Reference],
+    chain: Chain | None,
+    n: int,
+) -> list[StateModel]:
+    """Return [A B] of the reference and of the student's tables.
+
+    A table gives a cart's own terms directly; its couplings only as differences of large numbers,
+    so that the errors of a table, of which there are always some, are carried through. Those of
+    the reference are as vague: a student's come from a table like it.
+
+    Parameters
+    ----------
+    rounding : by parameter, how far it may have moved a number of the table, relative.
+    known : the references of the final table: of dampings they tell more than the chain.
+    """
+    models = []
+    reference = chain.parameters() if chain is not None and chain.is_tied and n <= _NAMED else None
+    if chain is not None and reference is None:
+        right = _matrices(chain)
+        models.append(StateModel(right=right, slack=np.zeros_like(right)))
+    for values in (*([reference] if reference else []), *tables):
+        for make in (_implied, _direct, _by_own_frequencies):
+            right = make(values, n)
+            if right is None:
+                continue
+            slack = _spread(make, values, right, rounding=rounding, n=n)
+            if values is reference:
+                _put_dampings(right, slack, values, known=known)
+            models.append(StateModel(right=right, slack=slack))
+    return models
+
+
+def _put_dampings(
+    right: Array, slack: Array, values: Mapping[str, float], *, known: Mapping[str, Reference]
+) -> None:
+    """Put in each cart's own damping, anywhere between what was measured of it; NaN if nothing."""
+    n = right.shape[0] // 2
+    for i in range(n):
+        omega, zeta = _own_names(i, n)
+        at, told = 2 * i + 1, known.get(zeta)
+        if told is None:
+            right[at, at] = np.nan
+            continue
+        middle, half = (told.high + told.low) / 2, (told.high - told.low) / 2
+        right[at, at] = -2 * middle * values[omega]
+        slack[at, at] = 2 * (half + _SIGMAS * _HONEST_DAMPING * middle) * values[omega]
+
+
+def _own_names(i: int, n: int) -> tuple[str, str]:
+    return ("omega_n", "zeta") if n == 1 else (f"omega_{i + 1}", f"zeta_{i + 1}")
+
+
+def _implied(values: Mapping[str, float], n: int) -> Array | None:
+    """Return the [A B] that a table's transfer functions imply; None where they imply no chain."""
+    chain = own_chain(values, n=n)
+    return None if chain is None else _matrices(chain)
+
+
+def _matrices(chain: Chain) -> Array:
+    A, B, _, _ = chain.state_space()
+    return np.hstack([A, B])
+
+
+def _direct(values: Mapping[str, float], n: int) -> Array:
+    """Return the terms of each cart alone, from its own frequency and damping."""
+    direct = np.full((2 * n, 2 * n + 1), np.nan)
+    for i in range(n):
+        omega, zeta = _own_names(i, n)
+        if omega in values:
+            direct[2 * i + 1, 2 * i] = -(values[omega] ** 2)
+            if zeta in values:
+                direct[2 * i + 1, 2 * i + 1] = -2 * values[zeta] * values[omega]
+    return direct
+
+
+def _by_own_frequencies(values: Mapping[str, float], n: int) -> Array | None:
+    """Return the [A B] of two or three carts from each cart's own frequency as it was found.
+
+    The transfer functions alone give those once more; the couplings are then other differences.
+    With T_i the square of all frequencies of carts i to n alone, T_i = ω_i² T_i+1 − κ_i+1 T_i+2.
+    """
+    if n not in (2, 3) or not {*parameter_names(n)} <= values.keys():
+        return None
+    last = [f"omega_{n}"]
+    groups = [["omega_a", "omega_b"], last] if n == 2 else [[*_MODES], [*_NULLS], last]
+    T = [*(np.prod([values[name] ** 2 for name in group]) for group in groups), 1.0]
+    model = np.nan_to_num(_direct(values, n))
+    model[0::2, 1:-1:2] = np.eye(n)
+    model[1, -1] = values["K_1"] * T[0] / T[1]
+    for i in range(1, n):
+        back = values[f"K_{i + 1}"] / values[f"K_{i}"] * T[i] / T[i + 1]  # k/m of cart i + 1
+        kappa = (values[f"omega_{i}"] ** 2 * T[i] - T[i - 1]) / T[i + 1]
+        model[2 * i + 1, 2 * i - 2], model[2 * i - 1, 2 * i] = back, kappa / back
+    return model
+
+
+def _spread(
+    make: Callable[[Mapping[str, float], int], Array | None],
+    values: Mapping[str, float],
+    right: Array,
+    *,
+    rounding: Mapping[str, float],
+    n: int,
+) -> Array:
+    """Return how far the errors of a table's numbers move the [A B] made of them."""
+    variance = np.zeros_like(right)
+    for name, value in values.items():
+        error = np.hypot(
+            _HONEST_DAMPING if is_damping(name) else _HONEST,
+            rounding.get(name, 0.0) / np.sqrt(3.0),
+        )
+        moved = make({**values, name: value * (1 + error)}, n)
+        if moved is not None:
+            variance += (moved - right) ** 2
+    return _SIGMAS * np.sqrt(variance)
+
+
+def own_chain(values: Mapping[str, float], *, n: int) -> Chain | None:
+    """Return the chain of n carts that a student's final table implies; None where it has none.
+
+    Without one gain a table of three carts reads as one of two.
+    """
+    try:
+        with np.errstate(all="ignore"):
+            chain = recover_from_parameters(values).chain() if n <= _NAMED else None
+    except (KeyError, ZeroDivisionError, ValueError):
+        return None
+    if chain is None or chain.n != n:
+        return None
+    finite = np.all(np.isfinite([*chain.m, *chain.c, *chain.k]))
+    return chain if finite and np.all(chain.m > 0) else None
+
+
+def _kinds(n: int) -> list[list[Kind]]:
+    """Return the kind of every entry of [A B]."""
+    kinds: list[list[Kind]] = [["exact"] * (2 * n + 1) for _ in range(2 * n)]
+    for i in range(n):
+        for j in (i - 1, i, i + 1):
+            if 0 <= j < n:
+                kinds[2 * i + 1][2 * j] = "stiffness"
+        kinds[2 * i + 1][2 * i + 1] = "damping"
+    kinds[1][2 * n] = "stiffness"
+    return kinds
+
+
+def _matrix(space: StateSpace, n: int) -> dict[tuple[int, int], Decimal]:
+    typed = {(i, j): value for i, row in enumerate(space.A) for j, value in enumerate(row)}
+    return typed | {(i, 2 * n): value for i, value in enumerate(space.B)}
+
+
+def _entry_error(typed: Decimal, right: float, kind: Kind, *, slack: float = 0.0) -> Fraction:
+    if kind == "exact":
+        return Fraction(0) if abs(float(typed) - right) <= _EXACT else Fraction(10**6)
+    if right == 0:
+        return Fraction(0) if abs(typed) <= _EXACT else Fraction(10**6)
+    size = abs(right)
+    reference = Reference(
+        value=size, low=max(size - slack, 0.0), high=size + slack, std=0.0, source=""
+    )
+    return percent_off(typed if right > 0 else -typed, reference, sigmas=0.0)
+
+
+# ------------------------------------------------------------------------- the flag
+
+
+def diagnose_state_space(space: StateSpace, *, models: Sequence[StateModel], n: int) -> list[Flag]:
+    """Return a flag where entries are wrong, with the slip that explains them all, if any.
+
+    A known slip that makes all of A and B is evidence even where a table is too vague for one
+    entry alone to be.
+    """
+    entries = compare_entries(space, models=models, n=n)
+    suspects = [entry for entry in entries if entry.suspect]
+    slip = _slip(space, models=models, n=n) if suspects else ""
+    wrong = suspects if slip else [entry for entry in entries if entry.wrong]
+    if not wrong:
+        return []
+    worst = max(wrong, key=lambda entry: entry.error)
+    names = ", ".join(entry.name for entry in wrong[:4]) + (" …" if len(wrong) > 4 else "")
+    what = slip or "derive the row again from the equation of motion of its cart"
+    return [
+        Flag(
+            code="wrong_state_space",
+            parameters=tuple(entry.name for entry in wrong),
+            message=f"{names}: {what}.",
+            evidence={
+                "parameter": worst.name,
+                "reported": float(worst.typed),
+                "recomputed": worst.right[0],
+                "slip": slip,
+            },
+        )
+    ]
+
+
+def _slip(space: StateSpace, *, models: Sequence[StateModel], n: int) -> str:
+    """Return the first known slip that turns the right [A B] into the one reported, or ""."""
+    typed, kinds = _matrix(space, n), _kinds(n)
+    for model in (one.right for one in models if np.all(np.isfinite(one.right))):
+        for text, slipped, moved in _slips(model, n):
+            of_states: list[list[Kind]] = [
+                [kinds[i][_column(moved, j)] for j in range(2 * n + 1)] for i in moved
+            ]
+            # Who orders the states anew in A may have left B as it was.
+            if _met(typed, slipped, of_states) or (
+                moved != sorted(moved)
+                and _met({at: x for at, x in typed.items() if at[1] < 2 * n}, slipped, of_states)
+                and _met({at: x for at, x in typed.items() if at[1] == 2 * n}, model, kinds)
+            ):
+                return text
+    return ""
+
+
+def _met(
+    typed: Mapping[tuple[int, int], Decimal], slipped: Array, kinds: Sequence[Sequence[Kind]]
+) -> bool:
+    """Whether all typed entries are those of a slipped [A B]."""
+    return all(
+        _entry_error(number, float(slipped[i, j]), kinds[i][j]) <= _EXPLAINED[kinds[i][j]]
+        for (i, j), number in typed.items()
+    )
+
+
+def _column(moved: list[int], column: int) -> int:
+    return moved[column] if column < len(moved) else column
+
+
+def _slips(model: Array, n: int) -> Iterator[tuple[str, Array, list[int]]]:
+    """Yield (in words, the [A B] it gives, which state stands where)."""
+    same = list(range(2 * n))
+
+    def reordered(order: list[int]) -> Array:
+        return np.hstack([model[np.ix_(order, order)], model[order, -1:]])
+
+    first = [*range(0, 2 * n, 2), *range(1, 2 * n, 2)]
+    yield (
+        "the states are in another order than (x1, v1, x2, v2, …): all positions come first",
+        reordered(first),
+        first,
+    )
+    back = [2 * i + part for i in reversed(range(n)) for part in (0, 1)]
+    yield "the carts are in reverse order: cart 1 is the one at the motor", reordered(back), back
+    transposed = model.copy()
+    transposed[:, :-1] = model[:, :-1].T
+    yield "A looks transposed", transposed, same
+    yield from _entry_slips(model, n)
+
+
+def _entry_slips(model: Array, n: int) -> Iterator[tuple[str, Array, list[int]]]:
+    same = list(range(2 * n))
+    own = [(2 * i + 1, 2 * i) for i in range(n)]
+    dampings = [(2 * i + 1, 2 * i + 1) for i in range(n)]
+    couplings = [(2 * i + 1, 2 * j) for i in range(n) for j in (i - 1, i + 1) if 0 <= j < n]
+
+    def changed(where: list[tuple[int, int]], factor: object) -> Array:
+        slipped = model.copy()
+        for at in where:
+            slipped[at] = model[at] * factor if isinstance(factor, float) else slipped[at]
+        return slipped
+
+    signs = {
+        "the stiffness": own,
+        "the damping": dampings,
+        "the coupling": couplings,
+    }
+    for words, where in signs.items():
+        if where:
+            yield f"the sign of {words} terms is reversed", changed(where, -1.0), same
+            for at in where:
+                text = f"the sign of A({at[0] + 1}, {at[1] + 1}) is reversed"
+                yield text, changed([at], -1.0), same
+    yield "the damping terms miss the 2 of 2ζω", changed(dampings, 0.5), same
+    root = model.copy()
+    for at in own:
+        root[at] = -np.sqrt(abs(model[at]))
+    yield "the stiffness terms hold ω where ω² belongs", root, same
+    hertz = model.copy()
+    for at in own:
+        hertz[at] = model[at] / (2 * np.pi) ** 2
+    yield "the stiffness terms are made of Hz instead of rad/s", hertz, same
+    if couplings:
+        yield "the couplings between the carts are missing", changed(couplings, 0.0), same
+        exchanged = model.copy()
+        for i in range(n - 1):
+            a, b = (2 * i + 1, 2 * i + 2), (2 * i + 3, 2 * i)
+            exchanged[a], exchanged[b] = model[b], model[a]
+        text = "the couplings k/m of neighbours are exchanged: divide by the mass of the row's cart"
+        yield text, exchanged, same
+        for i in range(n - 1):
+            a, b = (2 * i + 1, 2 * i + 2), (2 * i + 3, 2 * i)
+            one = model.copy()
+            one[a], one[b] = model[b], model[a]
+            yield f"the couplings of carts {i + 1} and {i + 2} are exchanged", one, same
+    for row in range(1, 2 * n, 2):
+        if row != 1:
+            moved = model.copy()
+            moved[row, -1], moved[1, -1] = model[1, -1], 0.0
+            yield "the input acts on cart 1, so B belongs in row 2", moved, same
+    inverse = model.copy()
+    inverse[1, -1] = 1 / model[1, -1]
+    yield "B holds the mass where its reciprocal belongs", inverse, same

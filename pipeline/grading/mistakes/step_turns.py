@@ -1,0 +1,89 @@
+"""Where a cart turns after an edge of a step: what may be read for the level it settles at."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.grading.references.reference import Reference
+from pipeline.plant.chain import Array
+from pipeline.results import Analysis, Record, StepGain
+
+_TURNS = 3  # the peak, the trough after it, the second peak
+_DIGITS = 2  # to which two edges of one size agree
+
+Edge = tuple[int, float]  # which of the record, and how large
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StepTurns:
+    """The turning points of one cart, per unit of input.
+
+    Attributes
+    ----------
+    by_edge : for every kind of edge, of each repeat where the cart turns first, next, after that.
+    furthest : … how far it ever goes: where two motions beat, that is not where it turns first.
+    """
+
+    by_edge: dict[Edge, list[list[float]]]
+    furthest: dict[Edge, list[float]]
+
+    def mean_peak(self) -> Reference | None:
+        """Return the mean over all edges of where the cart turns first; None without any."""
+        peaks = [one[0] for repeats in self.by_edge.values() for one in repeats]
+        return _spread([float(np.mean(peaks))]) if peaks else None
+
+    def turn(self, edge: Edge, number: int) -> Reference | None:
+        """Return a turning point after one kind of edge; None where one up to it is not real."""
+        repeats = [one for one in self.by_edge.get(edge, ()) if len(one) > number]
+        if not repeats or min(min(one[: number + 1]) for one in repeats) <= 0:
+            return None
+        return _spread([one[number] for one in repeats])
+
+    def peak(self, edge: Edge) -> Reference:
+        """Return where the cart peaks after one kind of edge, at first or furthest."""
+        return _spread([*(repeat[0] for repeat in self.by_edge[edge]), *self.furthest[edge]])
+
+
+def step_turns(name: str, analysis: Analysis) -> StepTurns:
+    """Return where the cart of a gain (`K` or `K_i`) turns in the steps."""
+    cart = 1 if name == "K" else int(name.removeprefix("K_"))
+    records = {record.id: record for record in analysis.records}
+    found: dict[Edge, list[list[float]]] = {}
+    furthest: dict[Edge, list[float]] = {}
+    for step in analysis.step_gains:
+        if step.cart == cart:
+            for edge, moved, turns in _turns(step, records[step.experiment]):
+                if turns and turns[0] > 0:
+                    found.setdefault(edge, []).append(turns)
+                    furthest.setdefault(edge, []).append(float(moved.max()))
+    return StepTurns(by_edge=found, furthest=furthest)
+
+
+def _spread(values: Sequence[float]) -> Reference:
+    return Reference(
+        value=float(np.median(values)), low=min(values), high=max(values), std=0.0, source="step"
+    )
+
+
+def _turns(step: StepGain, record: Record) -> Iterator[tuple[Edge, Array, list[float]]]:
+    """Yield every edge, how far the cart is moved after it per unit of input, where it turns."""
+    y = record.position(step.cart)
+    for number, edge in enumerate(step.edges):
+        change = edge.u_after - edge.u_before
+        inside = (record.t >= edge.t) & (record.t <= edge.window_after[1])
+        moved = (y[inside] - edge.level_before) / change
+        level = (edge.level_after - edge.level_before) / change
+        turns, side, rest = [], 1.0, moved
+        while rest.size and len(turns) < _TURNS:
+            # Up to where it crosses its level again, its furthest point is where it turns.
+            beyond = side * (rest - level) > 0
+            first = int(np.argmax(beyond)) if beyond.any() else rest.size
+            back = np.flatnonzero(~beyond[first:])
+            last = first + int(back[0]) if back.size else rest.size
+            if first == last:
+                break
+            stretch = rest[first:last]
+            turns.append(float(stretch[np.argmax(side * stretch)]))
+            rest, side = rest[last:], -side
+        yield (number, float(f"{change:.{_DIGITS}g}")), moved, turns

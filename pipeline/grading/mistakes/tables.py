@@ -1,0 +1,396 @@
+"""Name the mistake behind a wrong number, where one reproduces it and the others do not."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from decimal import Decimal
+
+from pipeline.grading.grade import CODES, Code, Flag
+from pipeline.grading.mistakes.catalogue import Mistake, known_mistakes
+from pipeline.grading.mistakes.explain import SIGMAS, Explained, Explanation, Label, Table, explain
+from pipeline.grading.mistakes.impossible import BrokenOrder, broken_orders, not_positive
+from pipeline.grading.mistakes.no_fit import copied_final
+from pipeline.grading.mistakes.transient import transient_fits
+from pipeline.grading.references.reference import Reference, References
+from pipeline.grading.references.tolerance import as_typed, percent_off
+from pipeline.grading.rubric import is_damping
+from pipeline.results import Analysis
+from pipeline.submission import Reported
+
+# From here on a number is worth a remark. Two careful teams on one bench differ by some percent in
+# gains and frequencies, the paper's own tables by up to 14 % (29 % at a null read off by eye);
+# dampings differ by half and more.
+_OFF_FINAL = 7.0
+_OFF_INITIAL = 10.0
+_OFF_BY_EYE = 30.0  # resonances and nulls before any fit
+_OFF_DAMPING = 80.0
+_SUSPECT_DAMPING = 40.0  # enough to look for a known mistake, not for a remark of its own
+_OFF_EACH_OTHER = 25.0
+_CONFIRMED = Decimal("0.05")  # relative: the other table says the same
+_TOLD: dict[Label, str] = {"initial": "first estimate", "final": "final estimate"}
+_OTHER: dict[Label, Label] = {"initial": "final", "final": "initial"}
+
+# What comes of reading a decay or a step; in a final table only where it was taken over.
+_FROM_TIME_RECORDS = {"peak_count", "log10_for_ln", "peak_for_steady_state", "transient_used"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Diagnosis:
+    """The flags of the tables, and the final table with what is off in it put right.
+
+    `named`: by table, the numbers that a known mistake explains. `possible`: what is left of the
+    final table once it is put right may be that of real carts.
+    """
+
+    flags: tuple[Flag, ...]
+    corrected: dict[str, float]
+    named: dict[Label, frozenset[str]]
+    possible: bool
+
+
+def diagnose_tables(reported: Reported, *, references: References, analysis: Analysis) -> Diagnosis:
+    """Return the flags of the two tables of parameters."""
+    tables: dict[Label, Table] = {"initial": reported.initial, "final": reported.final}
+    copied = copied_final(reported, references=references)
+    judged: dict[Label, _Judged] = {
+        label: _judge(label, reported, references=references, analysis=analysis, copied=copied)
+        for label in tables
+    }
+    # What one table alone leaves open the mistakes of the other may decide.
+    found: dict[Label, Explanation] = {
+        label: one.explain(believed=frozenset(judged[_OTHER[label]].explain().codes))
+        for label, one in judged.items()
+    }
+    flags = [flag for one in judged.values() for flag in one.flags]
+    left: dict[Label, list[str]] = {}
+    for label, one in judged.items():
+        rest = [n for n in found[label].left if one.errors[n] > limit(n, label)]
+        broken = [
+            law
+            for law in one.laws
+            if not one.errors
+            or (set(law.names) & set(rest) and (law.is_plain or set(law.names) <= set(rest)))
+        ]
+        flags += [law.flag(tables[label], label) for law in broken]
+        impossible = {name for law in broken for name in law.names}
+        left[label] = [name for name in rest if name not in impossible]
+    if copied:
+        flags.append(_copied_flag(reported, copied, references))
+    explained = [
+        e
+        for label, one in found.items()
+        for e in one.explained
+        if not judged[label].suspect.isdisjoint(e.names)
+    ]
+    flags += _specific_flags(explained, tables, references)
+    flags += [
+        _off_flag(tables[label], names, getattr(references, label), label)
+        for label, names in left.items()
+        if names
+    ]
+    named = {name for flag in flags for name in flag.parameters}
+    apart = _disagreements(reported, references, blurred=True)
+    # A mistake in one of the tables parts them; also where the recordings give no number.
+    kinds = {name[0] for one in explained for name in one.names}
+    if apart := [one for one in apart if one[1] not in named and one[1][0] not in kinds]:
+        flags.append(_disagreement_flag(reported, apart))
+    corrected = _corrected(reported.final, explained, references.final)
+    corrected |= {name: references.final[name].value for name in left["final"]}
+    named_in: dict[Label, frozenset[str]] = {
+        label: frozenset(n for e in explained if e.table == label for n in e.names)
+        for label in tables
+    }
+    possible = not broken_orders({n: Decimal(v) for n, v in corrected.items()}, initial=False)
+    return Diagnosis(flags=tuple(flags), corrected=corrected, named=named_in, possible=possible)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Judged:
+    """A table against its references.
+
+    Attributes
+    ----------
+    errors : of every number that has a reference and is not flagged already, percent.
+    suspect : enough off, or in enough doubt, to look for a known mistake.
+    unordered : gains that may be right one by one, and are not in their order.
+    flags : what is wrong whatever the recordings say.
+    """
+
+    label: Label
+    table: Table
+    known: Mapping[str, Reference]
+    errors: dict[str, float]
+    suspect: frozenset[str]
+    unordered: frozenset[str]
+    mistakes: list[Mistake]
+    laws: list[BrokenOrder]
+    flags: list[Flag]
+
+    def explain(self, *, believed: frozenset[Code] = frozenset()) -> Explanation:
+        """Return the mistakes that explain what is off."""
+        off = [n for n in self.errors if n in self.suspect or n in self.unordered]
+        return explain(
+            self.table,
+            known=self.known,
+            off=off,
+            mistakes=self.mistakes,
+            label=self.label,
+            believed=believed,
+        )
+
+
+def _judge(
+    label: Label,
+    reported: Reported,
+    *,
+    references: References,
+    analysis: Analysis,
+    copied: Sequence[str],
+) -> _Judged:
+    """Hold one table against the recordings."""
+    table: Table = getattr(reported, label)
+    known: dict[str, Reference] = getattr(references, label)
+    impossible = not_positive(table)
+    taken = {*impossible, *(copied if label == "final" else ())}
+    errors = {
+        name: float(percent_off(typed, known[name], sigmas=SIGMAS))
+        for name, typed in table.items()
+        if name in known and name not in taken
+    }
+    suspect = [n for n, e in errors.items() if e > min(limit(n, label), _SUSPECT_DAMPING)]
+    if (
+        label == "initial"
+    ):  # friction may leave room for what the student's own, right, fit does not
+        apart = _disagreements(reported, references, blurred=False)
+        apart = [name for _, name in apart if name.startswith("K")]
+        suspect += [n for n in apart if n in errors and _agrees(reported.final[n], references, n)]
+    mistakes = known_mistakes({n: r for n, r in known.items() if n in table}, analysis)
+    if label == "final":
+        mistakes = [m for m in mistakes if _may_be_final(m, reported)]
+        if len(suspect) >= min(2, analysis.carts):
+            mistakes += transient_fits(analysis, table, known)
+    laws = broken_orders(table, initial=label == "initial")
+    if any(law.is_of_gains for law in laws):  # a plain fact goes before a guess at one of them
+        mistakes = [m for m in mistakes if m.whole or not _is_of_gains(m)]
+    return _Judged(
+        label=label,
+        table=table,
+        known={name: known[name] for name in errors},
+        errors=errors,
+        suspect=frozenset(suspect),
+        unordered=_unordered(laws, label, reported, suspect=suspect) & errors.keys(),
+        mistakes=mistakes,
+        laws=laws,
+        flags=[_impossible_flag(table, impossible, known, label)] if impossible else [],
+    )
+
+
+def _unordered(
+    laws: Sequence[BrokenOrder], label: Label, reported: Reported, *, suspect: Sequence[str]
+) -> frozenset[str]:
+    """Return the gains that are not in their order and not as in the other table."""
+    other: Table = getattr(reported, _OTHER[label])
+    table: Table = getattr(reported, label)
+    gains = [law for law in laws if law.is_of_gains and not set(law.names).isdisjoint(suspect)]
+    return frozenset(
+        name
+        for law in gains
+        if not any(n in other and _near(table[n], other[n]) for n in law.names)
+        for name in law.names
+    )
+
+
+def _agrees(final: Decimal, references: References, name: str) -> bool:
+    """Whether a final number is what the recordings say."""
+    known = references.final.get(name)
+    return known is not None and percent_off(final, known, sigmas=SIGMAS) == 0
+
+
+def _is_of_gains(mistake: Mistake) -> bool:
+    return all(name.startswith("K") for name in mistake.predicted)
+
+
+def _near(a: Decimal, b: Decimal) -> bool:
+    return abs(a - b) <= _CONFIRMED * abs(b)
+
+
+def _may_be_final(mistake: Mistake, reported: Reported) -> bool:
+    """Whether a mistake can be in a final table: one of a decay or a step only if taken over."""
+    if not _FROM_TIME_RECORDS & set(mistake.codes):
+        return True
+    both = [n for n in mistake.predicted if n in reported.final and n in reported.initial]
+    return all(reported.final[n] == reported.initial[n] for n in both)
+
+
+def _corrected(
+    final: Table, explained: Sequence[Explained], known: Mapping[str, Reference]
+) -> dict[str, float]:
+    """Return the final table as it would be without the mistakes found in it."""
+    corrected = {name: float(typed) for name, typed in final.items() if typed > 0}
+    for one in explained:
+        inside = [n for n in one.names if n in one.mistake.predicted]
+        for name in inside if one.table == "final" else ():
+            corrected[name] *= known[name].value / one.mistake.predicted[name].value
+    return corrected
+
+
+def limit(name: str, table: str) -> float:
+    """Return from how many percent on a reported number is worth a remark."""
+    if is_damping(name):
+        return _OFF_DAMPING
+    if table == "final":
+        return _OFF_FINAL
+    by_eye = name.startswith("omega") and name[-1] in "abcdefghxy"
+    return _OFF_BY_EYE if by_eye else _OFF_INITIAL
+
+
+# ------------------------------------------------------------------------ flags
+
+
+def _evidence(name: str, typed: Decimal, reference: Reference | None, table: str) -> dict:
+    evidence: dict = {"parameter": name, "table": table, "reported": float(typed)}
+    if reference is not None:
+        evidence["recomputed"] = reference.value
+        if reference.value:
+            evidence["ratio"] = float(typed) / reference.value
+    return evidence
+
+
+def _specific_flags(
+    explained: Sequence[Explained], tables: Mapping[Label, Table], references: References
+) -> list[Flag]:
+    """Return one flag a code, over both tables; the first number stands for all in the text."""
+    flags = []
+    for code in CODES:
+        mine = [one for one in explained if code in one.mistake.codes]
+        if not mine:
+            continue
+        names = list(dict.fromkeys(name for one in mine for name in one.names))
+        first = min(mine, key=lambda one: len(one.mistake.codes))
+        name = next(name for name in first.names if name in first.mistake.predicted)
+        typed = tables[first.table][name]
+        reference: Reference = getattr(references, first.table)[name]
+        predicted = first.mistake.predicted[name]
+        evidence = _evidence(name, typed, reference, first.table)
+        evidence |= {"mistake_gives": predicted.value}
+        if len(first.mistake.codes) > 1:
+            evidence["together_with"] = [c for c in first.mistake.codes if c != code]
+        said = {"reported": as_typed(typed), "recomputed": f"{reference.value:.4g}", "name": name}
+        message = f"{name} ({_TOLD[first.table]}): {first.mistake.help.format(**said)}."
+        if first.rival and code not in first.rival.codes:
+            evidence["or_else"] = [c for c in first.rival.codes if c not in first.mistake.codes]
+            message += f" Or {first.rival.help.format(**said)}."
+        flags.append(
+            Flag(
+                code=code,
+                parameters=tuple(names),
+                message=message,
+                evidence=evidence,
+            )
+        )
+    return flags
+
+
+def _off_flag(
+    table: Table, names: Sequence[str], known: Mapping[str, Reference], label: str
+) -> Flag:
+    def error(name: str) -> float:
+        return float(percent_off(table[name], known[name], sigmas=SIGMAS)) / limit(name, label)
+
+    worst = max(names, key=error)
+    reference, typed = known[worst], table[worst]
+    ratio = float(typed) / reference.value if reference.value else 0.0
+    look = {
+        "K": "look at the levels before and after the step, and at the lowest frequencies",
+        "o": "look again at the peaks of the decay, or of the Bode plot",
+        "z": "look again at how fast the peaks fall, or how high the resonance is",
+    }.get(worst[0], "look again at how it was read")
+    if any(abs(ratio / 10.0**power - 1) < 0.05 for power in (-3, -2, -1, 1, 2, 3)):
+        look = "it is off by a power of ten, so check the units and the decimal point"
+    code: Code = "initial_off" if label == "initial" else "final_off"
+    return Flag(
+        code=code,
+        parameters=tuple(names),
+        message=f"{worst}: your recordings give {reference.said}, you report "
+        f"{as_typed(typed)}: {look}.",
+        evidence=_evidence(worst, typed, reference, label),
+    )
+
+
+def _impossible_flag(
+    table: Table, names: Sequence[str], known: Mapping[str, Reference], label: Label
+) -> Flag:
+    name = names[0]
+    hint = "is a sign wrong?" if table[name] else "type as many digits as show how large it is."
+    return Flag(
+        code="physically_impossible",
+        parameters=tuple(names),
+        message=f"{name} = {as_typed(table[name])} ({_TOLD[label]}): gains, frequencies and "
+        f"dampings of carts on springs are positive; {hint}",
+        evidence=_evidence(name, table[name], known.get(name), label),
+    )
+
+
+def _copied_flag(reported: Reported, copied: Sequence[str], references: References) -> Flag:
+    def error(name: str) -> float:
+        known = references.final.get(name)
+        return float(percent_off(reported.final[name], known, sigmas=0.0)) if known else 0.0
+
+    worst = max(copied, key=error)
+    return Flag(
+        code="no_fit_done",
+        parameters=tuple(copied),
+        message="the final estimates are the initial ones, digit for digit: fit the transfer "
+        f"functions to the measured Bode points; {worst} for one then changes.",
+        evidence=_evidence(worst, reported.final[worst], references.final.get(worst), "final"),
+    )
+
+
+def _disagreements(
+    reported: Reported, references: References, *, blurred: bool
+) -> list[tuple[float, str]]:
+    """Return (how much, name) of what the tables contradict each other in, the worst first.
+
+    With `blurred`, two numbers may be as far apart as the readings of the recordings are.
+    """
+    apart: list[tuple[float, str]] = []
+    for name, final in reported.final.items():
+        initial = reported.initial.get(name)
+        guess = is_damping(name) and name not in references.initial
+        if initial is None or guess or final <= 0 or initial <= 0:
+            continue
+        bounds = [float(final)]
+        if name in references.initial and name in references.final:
+            if references.final[name].low <= 0:
+                continue
+            # The data's own two estimates may differ as much.
+            ratio = references.initial[name].value / references.final[name].value
+            bounds.append(float(final) * ratio)
+            if blurred:
+                spread = references.initial[name].high / references.initial[name].low
+                bounds += [bounds[0] / spread, bounds[0] * spread]
+        allowed = Reference(
+            value=float(final), low=min(bounds), high=max(bounds), std=0.0, source="final"
+        )
+        error = float(percent_off(initial, allowed, sigmas=0.0))
+        worth = 2 * _OFF_DAMPING if is_damping(name) else _OFF_EACH_OTHER
+        by_eye = limit(name, "initial") == _OFF_BY_EYE
+        if error > (worth + _OFF_BY_EYE if by_eye else worth):
+            apart.append((error / worth, name))
+    return sorted(apart, reverse=True)
+
+
+def _disagreement_flag(reported: Reported, apart: Sequence[tuple[float, str]]) -> Flag:
+    _, worst = apart[0]
+    initial, final = reported.initial[worst], reported.final[worst]
+    return Flag(
+        code="initial_final_disagree",
+        parameters=tuple(name for _, name in apart),
+        message=f"{worst}: your first estimate is {as_typed(initial)}, the final one "
+        f"{as_typed(final)}: one of the two is worth another look.",
+        evidence={
+            "parameter": worst,
+            "initial": float(initial),
+            "final": float(final),
+            "ratio": float(final / initial),
+        },
+    )

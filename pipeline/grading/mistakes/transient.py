@@ -1,0 +1,123 @@
+"""Amplitudes read before the steady state, and the table a fit to them gives."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from decimal import Decimal
+
+import numpy as np
+
+from pipeline.errors import DataError
+from pipeline.grading.mistakes.catalogue import Mistake
+from pipeline.grading.references.reference import Reference
+from pipeline.grading.rubric import is_damping
+from pipeline.plant.chain import Array
+from pipeline.results import Analysis, FrequencyResponse, Record
+from pipeline.stages.bode_fit import fit_bode
+
+_TOLERANCE = 0.06  # the fit of a student weighs the points its own way
+_DAMPING = 0.2
+_MET = 0.65  # of the numbers: a wrong response has no exact fit, so not every one is met
+_NEW, _NEW_DAMPING = 0.12, 0.5  # of a number: moved by less, the right one would be met as well
+
+Reading = Callable[[Record, Array], float]
+
+
+def transient_fits(
+    analysis: Analysis, table: Mapping[str, Decimal], known: Mapping[str, Reference]
+) -> list[Mistake]:
+    """Return what fits to the amplitudes of the transient give, one for each way to read them."""
+    runs = {r.id: r for r in analysis.records if r.kind == "sine" and r.u is not None}
+    if analysis.fit is None or not runs or len(runs) < len(analysis.sine_points) / analysis.carts:
+        return []
+    found = []
+    for reading in early_readings():
+        predicted = _refit(analysis, runs, reading)
+        moved = {
+            name: r
+            for name, r in predicted.items()
+            if name in known and known[name].low > 0 and _is_new(name, r.value / known[name].value)
+        }
+        asked = [name for name in moved if name in table]
+        if asked:
+            found.append(
+                Mistake(
+                    codes=("transient_used",),
+                    predicted=moved,
+                    tolerance=_TOLERANCE,
+                    help="{reported} is what a fit to amplitudes of the first swings gives; after "
+                    "the transient the same recordings give {recomputed}",
+                    least=max(2, round(_MET * len(asked))),
+                    table_wide=True,
+                )
+            )
+    return found
+
+
+def _is_new(name: str, ratio: float) -> bool:
+    return abs(np.log(ratio)) > np.log1p(_NEW_DAMPING if is_damping(name) else _NEW)
+
+
+def early_readings() -> Iterator[Reading]:
+    """Yield ways to read an amplitude too early."""
+    yield lambda record, y: float(np.max(np.abs(y - np.median(y))))
+    for cycles in (1.0, 2.0, 3.0, 5.0):
+        yield lambda record, y, cycles=cycles: _half_swing(record, y, cycles=cycles)
+
+
+def _half_swing(record: Record, y: Array, *, cycles: float) -> float:
+    """Return half the distance from peak to peak over the first cycles."""
+    end = record.t[0] + cycles * 2 * np.pi / (record.omega or np.inf)
+    first = y[record.t <= end]
+    return float(np.ptp(first)) / 2
+
+
+def _refit(
+    analysis: Analysis, runs: Mapping[str, Record], reading: Reading
+) -> dict[str, Reference]:
+    """Return the parameters fitted to amplitudes so read; none where the fit fails."""
+    responses = []
+    for response in analysis.frequency_responses:
+        points = [
+            (p.omega, reading(runs[p.experiment], runs[p.experiment].position(p.cart)), p)
+            for p in analysis.sine_points
+            if p.cart == response.cart and p.experiment in runs and runs[p.experiment].omega
+        ]
+        if not points or response.source != "dwells":
+            return {}
+        points.sort(key=lambda point: point[0])
+        magnitude = np.array([amplitude / p.input_amplitude for _, amplitude, p in points])
+        if not np.all(magnitude > 0):
+            return {}
+        responses.append(
+            FrequencyResponse(
+                cart=response.cart,
+                omega=np.array([omega for omega, _, _ in points]),
+                magnitude=magnitude,
+                magnitude_std=0.01 * magnitude,
+                phase=None,
+                phase_std=None,
+                source="table",
+            )
+        )
+    assert analysis.fit is not None
+    start = {name: e.value for name, e in analysis.fit.parameters.items()}
+    try:
+        fit = fit_bode(responses, n=analysis.carts, springs=analysis.springs, initial=start)
+    except DataError:
+        return {}
+    references = {}
+    for name, estimate in fit.parameters.items():
+        if estimate.value <= 0:
+            continue
+        slack = _DAMPING if is_damping(name) else 0.0
+        reference = Reference(
+            value=estimate.value,
+            low=estimate.value,
+            high=estimate.value,
+            std=0.0,
+            source="transient",
+        )
+        references[name] = replace(
+            reference, low=reference.low / (1 + slack), high=reference.high * (1 + slack)
+        )
+    return references

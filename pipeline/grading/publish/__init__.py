@@ -1,0 +1,1 @@
+"""What a class is shown: feedback, the class page, exports, surveys."""

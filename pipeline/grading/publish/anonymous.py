@@ -1,0 +1,82 @@
+"""Results without names, and the key that reveals them."""
+
+import hashlib
+import re
+from base64 import b32encode
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import replace
+
+from pipeline.grading.grade import Flag, Grade
+from pipeline.grading.similarity.shared import shared_message
+from pipeline.output import csv_text
+
+KEY_FILE = "anonymous-key.csv"
+_PREFIX = "anon-"
+_SHORTEST = 6  # letters: a thousand submissions rarely need one more
+STRANGER = "another submission"
+_ARCHIVE = re.compile(r"^.*?\.zip\W?: ", re.IGNORECASE)  # at the beginning of a reason
+
+
+def pseudonyms(first_keys: Mapping[str, str]) -> dict[str, str]:
+    """Return a name for each submission that says nothing about it.
+
+    Parameters
+    ----------
+    first_keys : by submission, the hash of what was first handed in: whoever has not seen that
+        cannot work the name out, and a later hand-in does not change it.
+    """
+    hashes = {
+        name: b32encode(hashlib.sha256(f"anonymous {key}".encode()).digest()).decode().lower()
+        for name, key in first_keys.items()
+    }
+    length = _SHORTEST
+    while max(Counter(code[:length] for code in hashes.values()).values(), default=1) > 1:
+        length += 1
+    return {name: f"{_PREFIX}{code[:length]}" for name, code in hashes.items()}
+
+
+def is_pseudonym(name: str) -> bool:
+    """Whether a name looks like one that stands in for another."""
+    return name.startswith(_PREFIX)
+
+
+def anonymise(grade: Grade, names: Mapping[str, str]) -> Grade:
+    """Return the grade without authors, and without the names of submissions.
+
+    Those stand in the flag for shared data, and before the files of a submission in the reason why
+    it could not be graded; platforms put the student's name into that of an archive. What students
+    call their runs and files stays.
+    """
+    own = names[grade.submission]
+    name = re.escape(grade.submission)
+    path = re.compile(rf"^{name}(?=:)|(?<![^\s'\"(]){name}(?=[/\\])")
+    return replace(
+        grade,
+        submission=own,
+        authors=(),
+        reason=path.sub(own, _ARCHIVE.sub("the archive: ", grade.reason)),
+        flags=tuple(
+            _hidden(flag, names) if flag.code == "shared_data" else flag for flag in grade.flags
+        ),
+    )
+
+
+def _hidden(flag: Flag, names: Mapping[str, str]) -> Flag:
+    """Return a flag for shared data that calls submissions by other names."""
+    others = list(dict.fromkeys(names.get(o, STRANGER) for o in flag.evidence["submissions"]))
+    recordings = [
+        {**recording, "submission": names.get(recording["submission"], STRANGER)}
+        for recording in flag.evidence["recordings"]
+    ]
+    return replace(
+        flag,
+        message=shared_message(flag.parameters, others),
+        evidence={"submissions": others, "recordings": recordings},
+    )
+
+
+def key_text(names: Mapping[str, str], authors: Mapping[str, tuple[str, ...]]) -> str:
+    """Return the key as CSV: for each name that stands in for one, whose it is."""
+    rows = sorted((names[name], name, " ".join(authors[name])) for name in names)
+    return csv_text(("anonymous", "submission", "authors"), rows)

@@ -1,0 +1,249 @@
+"""Class grades in the forms that Canvas, Moodle and Gradescope import.
+
+Each form is a table with a row for every student. Given the table that the platform itself exports
+(a roster), its rows and columns stay as they are and the grades are filled in.
+
+- Canvas: the gradebook's CSV, read by `lib/gradebook_importer.rb`: the student is found by `ID`,
+  `SIS User ID` or `SIS Login ID`, the assignment by its title, or its id in brackets behind it.
+- Moodle: the offline grading worksheet of one assignment (`mod/assign/feedback/offline`), where
+  participant numbers are known; else the table of the gradebook's *Import CSV*.
+- Gradescope: the table of its *Download Grades*, and for each submission the `results.json` by
+  which an autograder gives scores.
+"""
+
+import html
+import json
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.grading.grade import Grade
+from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.rows import Entry
+from pipeline.grading.intake.lms_names import Platform
+from pipeline.grading.publish.roster import POINTS_POSSIBLE, Roster
+from pipeline.grading.publish.students import Student, students_of
+from pipeline.grading.rubric import Rubric
+from pipeline.grading.similarity.shared import told
+from pipeline.grading.words import OUTCOMES, points_text
+from pipeline.output import csv_text, own_folder, write_file
+
+_HOURS = 24.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Exported:
+    """What was written, and what the person who uploads it should know."""
+
+    files: tuple[Path, ...]
+    remarks: tuple[str, ...]
+
+
+def export(
+    book: Gradebook,
+    platform: Platform,
+    out: Path,
+    *,
+    title: str | None = None,
+    roster: Path | None = None,
+) -> Exported:
+    """Write the class grades for a learning platform.
+
+    Parameters
+    ----------
+    title : of the assignment as the platform has it; default: the rubric's.
+    roster : the table that the platform exports.
+
+    Raises
+    ------
+    ConfigError : the roster is no such table, or its grades go up to another maximum.
+    """
+    rubric = book.rubric
+    title = title or rubric.title or "cartlab"
+    entries = list(book.entries())
+    students, remarks = students_of(entries, platform=platform)
+    if roster:
+        own = Roster.read(roster, platform=platform)
+        own.check_maximum(rubric.out_of, title=title)
+        text, strangers = _filled(own, platform, students, rubric, title=title)
+        remarks += strangers
+    elif platform == "canvas":
+        text = _canvas([s for s in students if not s.uploader], rubric, title=title)
+        sent = [f"{s.name} ({s.grade.submission})" for s in students if s.uploader]
+        if sent:
+            remarks.append(
+                "found by their authors' ids alone; with a roster also by the number in the "
+                f"file's name: {', '.join(sent)}"
+            )
+    elif platform == "moodle":
+        text = _moodle(students, rubric, title=title)
+    else:
+        text = _gradescope(students, rubric)
+    out.mkdir(parents=True, exist_ok=True)
+    files = [out / f"{platform}.csv"]
+    write_file(files[0], text)
+    if platform == "gradescope":
+        files += _write_results(entries, own_folder(out, "gradescope"))
+    return Exported(files=tuple(files), remarks=tuple(remarks))
+
+
+def _filled(
+    roster: Roster, platform: Platform, students: Sequence[Student], rubric: Rubric, *, title: str
+) -> tuple[str, list[str]]:
+    """Return a platform's own table with the grades in it, and what did not fit."""
+    most = points_text(rubric.out_of)
+    columns: dict[str, Callable[[Student], str]]
+    if platform == "canvas":
+        columns = {title: lambda student: student.points}
+        return roster.filled(students, columns, keep=_CANVAS, possible=most)
+    if platform == "moodle":
+        grade = "Grade" if "Identifier" in roster.table else f"{title} (Real)"
+        columns = {grade: lambda student: student.points}
+        if "Feedback comments" in roster.table:
+            columns["Feedback comments"] = _comment
+        return roster.filled(students, columns)
+    columns = {"Total Score": lambda student: student.points, "Max Points": lambda student: most}
+    return roster.filled(students, columns)
+
+
+# --------------------------------------------------------------------------- Canvas
+
+# All that is about the student: the importer wants "Section" to be the last of them.
+_CANVAS = (
+    "Student", "ID", "SIS User ID", "SIS Login ID", "Integration ID", "Root Account", "Section",
+)  # fmt: skip
+
+
+def _canvas(students: Sequence[Student], rubric: Rubric, *, title: str) -> str:
+    head = ("Student", "ID", "SIS User ID", "SIS Login ID", "Section", title)
+    possible = (f"    {POINTS_POSSIBLE}", "", "", "", "", points_text(rubric.out_of))
+    rows = [(s.name or s.id, s.number, s.id, s.id, "", s.points) for s in students]
+    return csv_text(head, [possible, *rows])
+
+
+# --------------------------------------------------------------------------- Moodle
+
+
+def _moodle(students: Sequence[Student], rubric: Rubric, *, title: str) -> str:
+    if students and all(s.number for s in students):
+        head = (
+            "Identifier", "Full name", "ID number", "Status", "Grade", "Maximum Grade",
+            "Grade can be changed", "Last modified (submission)", "Last modified (grade)",
+            "Feedback comments",
+        )  # fmt: skip
+        most = points_text(rubric.out_of)
+        rows = [
+            (f"Participant {s.number}", s.name, s.id, "", s.points, most, "Yes", "-", "-",
+             _comment(s))
+            for s in students
+        ]  # fmt: skip
+        return csv_text(head, rows)
+    head = ("ID number", f"{title} (Real)", f"{title} (Feedback)")
+    return csv_text(head, [(s.id or s.name, s.points, _comment(s)) for s in students])
+
+
+def _comment(student: Student) -> str:
+    """Return the feedback in short, as the HTML that Moodle takes it for."""
+    if student.undecided:
+        return ""
+    said = _said(student.grade, by_hand=student.by_hand)
+    return "<br>".join(html.escape(line, quote=False) for line in said)
+
+
+def _said(grade: Grade, *, by_hand: Collection[str]) -> list[str]:
+    """Return what was lost or given by hand, and what to look at, a line each."""
+    if grade.status == "failed" and not grade.criteria:
+        return [f"Could not be graded: {grade.reason}"]
+    lost = [
+        f"{c.title or c.id}: {points_text(c.points)} of {points_text(c.out_of)}. {c.message}"
+        for c in grade.criteria
+        if c.points < c.out_of or c.id in by_hand
+    ]
+    late = [f"Late: {points_text(grade.deducted)} points off."] if grade.deducted else []
+    return [*lost, *map(told, grade.flags), *late]
+
+
+# ----------------------------------------------------------------------- Gradescope
+
+
+def _gradescope(students: Sequence[Student], rubric: Rubric) -> str:
+    head = [
+        "First Name", "Last Name", "SID", "Email", "Sections", "Total Score", "Max Points",
+        "Status", "Submission ID", "Submission Time", "Lateness (H:M:S)", "View Count",
+        "Submission Count",
+    ]  # fmt: skip
+    head += [
+        f"{i}: {c.title or c.id} ({c.points} pts)" for i, c in enumerate(rubric.criteria, start=1)
+    ]
+    rows = []
+    for s in students:
+        first, _, last = s.name.partition(" ")
+        given = {c.id: c.points for c in s.grade.criteria if not s.undecided}
+        rows.append(
+            [
+                first,
+                last,
+                "" if "@" in s.id else s.id,
+                s.id if "@" in s.id else "",
+                "",
+                s.points,
+                points_text(rubric.out_of),
+                "Graded" if s.points else "Ungraded",
+                s.number,
+                "",
+                _clock(s.grade.days_late),
+                "",
+                "",
+                *(points_text(given[c.id]) if c.id in given else "" for c in rubric.criteria),
+            ]
+        )
+    return csv_text(head, rows)
+
+
+def _clock(days: float) -> str:
+    """Return days as H:M:S."""
+    seconds = round(days * _HOURS * 3600)
+    return f"{seconds // 3600:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}"
+
+
+def _write_results(entries: Iterable[Entry], folder: Path) -> list[Path]:
+    files = []
+    for entry in entries:
+        own = own_folder(folder, entry.submission)
+        own.mkdir(parents=True, exist_ok=True)
+        write_file(own / "results.json", results_text(entry.grade, by_hand=bool(entry.overrides)))
+        files.append(own / "results.json")
+    return files
+
+
+def results_text(grade: Grade, *, by_hand: bool = False) -> str:
+    """Return a grade as the `results.json` of a Gradescope autograder."""
+    how = " automatically, points were given by hand" if by_hand else ""
+    failed = grade.status == "failed"
+    output = [f"Could not be graded{how}: {grade.reason}"] if failed else []
+    output += map(told, grade.flags)
+    if grade.deducted:
+        output.append(f"Late: {points_text(grade.deducted)} points off.")
+    document = {
+        "score": grade.points,
+        "output": "\n".join(output),
+        "output_format": "text",
+        "test_output_format": "text",
+        "test_name_format": "text",
+        "stdout_visibility": "hidden",
+        "tests": [
+            {
+                "score": c.points,
+                "max_score": c.out_of,
+                "status": "passed" if c.outcome == "pass" else "failed",
+                "name": c.title or c.id,
+                "number": str(i),
+                "output": f"{OUTCOMES[c.outcome]}: {c.message}",
+                "tags": [c.id],
+                "visibility": "visible",
+            }
+            for i, c in enumerate(grade.criteria, start=1)
+        ],
+        "extra_data": {"flags": [flag.code for flag in grade.flags]},
+    }
+    return json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n"

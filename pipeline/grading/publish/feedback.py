@@ -1,0 +1,294 @@
+"""The feedback to one submission: their numbers beside ours, why, and where to look."""
+
+import re
+from collections.abc import Mapping, Sequence
+from html import unescape
+from itertools import count
+from numbers import Real
+from typing import Any
+
+from pipeline import __version__
+from pipeline.grading.grade import Criterion, Flag, Grade
+from pipeline.grading.gradebook.override import Override
+from pipeline.grading.rubric import Rubric
+from pipeline.grading.similarity.shared import told
+from pipeline.grading.words import OUTCOMES, PLACES, TITLES, TONES, points_text
+from pipeline.report.document import (
+    Block,
+    Details,
+    Document,
+    Heading,
+    Picture,
+    Section,
+    Span,
+    Table,
+    Tile,
+    Tiles,
+    bullet_list,
+    paragraph,
+    spans,
+)
+from pipeline.report.figures.style import WIDTH
+from pipeline.report.numbers import NOTHING, percent, significant, typeset
+from pipeline.report.numbers import count as counted
+from pipeline.report.render.html import render_html
+from pipeline.report.tables import cell, make_table
+from pipeline.report.words import clean, name_span, rich
+
+_TITLE = re.compile(r"<title>(.*?)</title>", re.DOTALL)
+_NAME = re.compile(r"(omega|zeta|K)(_\w)?")
+_MOST_ROWS = 60  # of one criterion
+_LONGEST_TEXT = 200  # letters of a value that is no number
+
+
+def feedback_page(
+    grade: Grade,
+    *,
+    rubric: Rubric,
+    overrides: Mapping[str, Override],
+    figures: Sequence[tuple[str, str]],
+    name: str,
+) -> str:
+    """Return `feedback.html`; same grade, same bytes.
+
+    Parameters
+    ----------
+    overrides : in force, by criterion.
+    figures : file names and SVG.
+    name : what the submission is called on the page.
+    """
+    numbers = count(1)
+    sections = [Section("summary", "Summary", tuple(_summary(grade, overrides)))]
+    if grade.flags:
+        sections.append(Section("remarks", "What to look at", tuple(_remarks(grade.flags))))
+    if grade.criteria:
+        blocks = tuple(_criteria(grade, rubric, numbers))
+        sections.append(Section("criteria", "Criteria, one by one", blocks))
+    if figures:
+        blocks = tuple(_picture(i, *figure) for i, figure in enumerate(figures, start=1))
+        sections.append(Section("figures", "Your recordings", blocks))
+    document = Document(
+        title=clean(name),
+        subtitle=clean(f"Feedback · {rubric.title}" if rubric.title else "Feedback"),
+        authors=tuple(clean(author) for author in grade.authors),
+        sections=tuple(sections),
+        footer=f"cartlab {__version__}",
+    )
+    return render_html(document)
+
+
+# -------------------------------------------------------------------------- summary
+
+
+def _summary(grade: Grade, overrides: Mapping[str, Override]) -> list[Block]:
+    points = f"{points_text(grade.points)} of {points_text(grade.out_of)}"
+    by_hand = Tile(spans("Set by hand"), spans(counted_criteria(len(overrides))))
+    if grade.status == "failed":
+        tile = Tile(spans("Points"), spans(points), tone="" if overrides else "bad")
+        how, then = "", "Mend it and hand it in again, or talk to your instructor."
+        if overrides:
+            how, then = " automatically", "Its points were given by hand."
+        return [
+            Tiles((tile, by_hand) if overrides else (tile,)),
+            paragraph(
+                Span(f"This submission could not be graded{how}. ", "strong"),
+                f"{_sentence(grade.reason)} {then}",
+            ),
+            *_notes(grade),
+        ]
+    passed = sum(c.outcome == "pass" for c in grade.criteria)
+    tiles = [
+        Tile(spans("Points"), spans(points)),
+        Tile(
+            spans("Criteria passed"),
+            spans(f"{passed} of {len(grade.criteria)}"),
+            tone="good" if passed == len(grade.criteria) else "",
+            url="#criteria" if grade.criteria else "",
+        ),
+        Tile(
+            spans("To look at"),
+            spans(counted(len(grade.flags), "remark") if grade.flags else "nothing"),
+            tone="" if grade.flags else "good",
+            url="#remarks" if grade.flags else "",
+        ),
+    ]
+    if grade.days_late > 0:
+        late = f"{counted_days(grade.days_late)}, −{points_text(grade.deducted)} points"
+        tiles.append(Tile(spans("Late"), spans(late), tone="bad" if grade.deducted else ""))
+    if overrides:
+        tiles.append(by_hand)
+    return [Tiles(tuple(tiles)), *_lost(grade), *_notes(grade)]
+
+
+def counted_days(days: float) -> str:
+    """Return "1 day", "1.5 days"."""
+    return f"{days:.3g} day{'' if days == 1 else 's'}"
+
+
+def counted_criteria(n: int) -> str:
+    """Return "1 criterion", "2 criteria"."""
+    return f"{n} {'criterion' if n == 1 else 'criteria'}"
+
+
+def _lost(grade: Grade) -> list[Block]:
+    """Return where points were lost, most first."""
+    lost = [c for c in grade.criteria if c.points < c.out_of]
+    if not lost:
+        praise = "" if grade.flags else " Well done."
+        return [paragraph(f"All points were earned.{praise}")]
+    lost.sort(key=lambda c: c.points - c.out_of)
+    return [
+        paragraph("Points were lost here, most first:"),
+        bullet_list(
+            spans(
+                Span(clean(c.title or c.id), "strong"),
+                f" ({points_text(c.points)} of {points_text(c.out_of)}): ",
+                rich(_sentence(c.message)),
+            )
+            for c in lost
+        ),
+    ]
+
+
+def _notes(grade: Grade) -> list[Block]:
+    if not grade.notes:
+        return []
+    notes = bullet_list(rich(_sentence(note)) for note in grade.notes)
+    return [paragraph("To know, without points lost for it:"), notes]
+
+
+def _sentence(text: str) -> str:
+    """Return a message as a sentence: a capital where it starts with a word, and a full stop."""
+    text = clean(text).strip()
+    word = text.split(" ", 1)[0]
+    if word.isascii() and word.isalpha() and word.islower():
+        text = text[0].upper() + text[1:]
+    return text if not text or text[-1] in ".!?" else f"{text}."
+
+
+# -------------------------------------------------------------------------- remarks
+
+
+def _remarks(flags: Sequence[Flag]) -> list[Block]:
+    blocks: list[Block] = []
+    for flag in flags:
+        blocks += [
+            Heading(rich(_capital(TITLES[flag.code]))),
+            paragraph(rich(_sentence(told(flag)))),
+            paragraph(Span("Where to look: ", "strong"), rich(PLACES[flag.code])),
+        ]
+    return blocks
+
+
+def _capital(text: str) -> str:
+    return text[0].upper() + text[1:] if text.split(" ", 1)[0].isalpha() else text
+
+
+# ------------------------------------------------------------------------- criteria
+
+
+def _criteria(grade: Grade, rubric: Rubric, numbers: count) -> list[Block]:
+    """Return every criterion with its numbers; those passed are folded."""
+    checks = {criterion.id: criterion.check for criterion in rubric.criteria}
+    overview = make_table(
+        next(numbers),
+        "Points by criterion.",
+        ("Criterion", "Points", "Outcome"),
+        [
+            [
+                cell(clean(c.title or c.id)),
+                cell(f"{points_text(c.points)} of {points_text(c.out_of)}"),
+                cell(OUTCOMES[c.outcome], TONES[c.outcome]),
+            ]
+            for c in grade.criteria
+        ],
+        "lrl",
+    )
+    blocks: list[Block] = [overview]
+    for criterion in grade.criteria:
+        title = _capital(clean(criterion.title or criterion.id))
+        said = paragraph(rich(_sentence(criterion.message)))
+        table = _numbers(criterion, check=checks.get(criterion.id, ""), numbers=numbers)
+        inside: list[Block] = [said, *([table] if table else [])]
+        if criterion.outcome == "pass":
+            blocks.append(Details(spans(f"{title}: passed"), tuple(inside)))
+        else:
+            blocks += [Heading(spans(f"{title}: {OUTCOMES[criterion.outcome]}")), *inside]
+    return blocks
+
+
+def _numbers(criterion: Criterion, *, check: str, numbers: count) -> Table | None:
+    """Return the numbers of a criterion side by side, None where it has none."""
+    names = [
+        name
+        for name in dict.fromkeys((*criterion.expected, *criterion.found))
+        if _is_shown(criterion.expected.get(name)) or _is_shown(criterion.found.get(name))
+    ]
+    if not names:
+        return None
+    head = {
+        "initial": ("Yours", "From your recordings"),
+        "final": ("Yours", "From your recordings"),
+        "initial_final": ("Final", "Initial"),
+        "claims": ("Yours", "What the gains give"),
+        "gains": ("What the gains give", "Goal"),
+        "hardware": ("Measured", "Full points up to"),
+    }.get(check, ("Yours", "Expected"))
+    compared = check not in ("gains", "hardware")
+    rows = []
+    for name in names[:_MOST_ROWS]:
+        expected, found = criterion.expected.get(name), criterion.found.get(name)
+        row = [cell(_label(name)), cell(_value(found)), cell(_value(expected))]
+        rows.append([*row, cell(_off(found, expected))] if compared else row)
+    more = len(names) - len(rows)
+    caption = f"{_capital(clean(criterion.title or criterion.id))}, in numbers."
+    return make_table(
+        next(numbers),
+        caption + (f" {more} more are in grade.json." if more > 0 else ""),
+        ("Quantity", *head, *(["Difference"] if compared else [])),
+        rows,
+        "lddd" if compared else "ldd",
+    )
+
+
+def _is_shown(value: Any) -> bool:
+    return isinstance(value, Real | str)
+
+
+def _label(name: str) -> str | tuple[Span, ...]:
+    """Return a quantity, parameters of the carts as mathematics."""
+    if not _NAME.fullmatch(name):
+        return clean(name).replace("_", " ")
+    return spans(name_span(name), " [rad/s]" if name.startswith("omega") else "")
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, Real):
+        # A number that was typed with fewer digits is shown as it was.
+        return min(significant(float(value)), typeset(f"{float(value):.6g}"), key=len)
+    return clean(value)[:_LONGEST_TEXT] if isinstance(value, str) else NOTHING
+
+
+def _off(found: Any, expected: Any) -> str:
+    numbers = [v for v in (found, expected) if isinstance(v, Real) and not isinstance(v, bool)]
+    if len(numbers) < 2 or float(numbers[1]) == 0:
+        return NOTHING
+    return percent(100 * (float(numbers[0]) / float(numbers[1]) - 1), signed=True)
+
+
+# -------------------------------------------------------------------------- figures
+
+
+def _picture(number: int, file: str, svg: str) -> Picture:
+    title = _TITLE.search(svg)
+    alt = unescape(title[1]) if title else "A figure of your recordings."
+    return Picture(
+        number=number,
+        name=file.removesuffix(".svg"),
+        caption=rich(alt),
+        alt=alt,
+        svg=svg,
+        width=WIDTH,
+    )

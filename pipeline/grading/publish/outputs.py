@@ -1,0 +1,207 @@
+"""All that a grading writes: `grades.csv`, `class.html`, and everybody's feedback.
+
+The files are a function of the gradebook alone: written again at any time, they are the same.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from pipeline.errors import ConfigError
+from pipeline.grading.grade import Flag, Grade, grade_dict
+from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.class_lines import Line
+from pipeline.grading.gradebook.rows import Entry
+from pipeline.grading.publish.anonymous import KEY_FILE, STRANGER, anonymise, key_text, pseudonyms
+from pipeline.grading.publish.class_page import class_page
+from pipeline.grading.publish.feedback import feedback_page
+from pipeline.grading.rubric import Rubric
+from pipeline.grading.similarity.clusters import find_clusters, renamed
+from pipeline.grading.similarity.doubles import Double, find_doubles, with_recordings
+from pipeline.output import csv_text, own_folder, write_file
+from pipeline.resources import TEMPLATES
+from pipeline.results_json import plain_json
+
+FEEDBACK = "feedback"
+_PAGE, _JSON, _CLASS = "feedback.html", "grade.json", "class.html"
+_WHOLE = ""  # among what each submission's pages were made of, that of the class; none is called so
+# What each page was made of: a page of the same is not made again.
+_MADE = ".made.json"
+_BEFORE = ("submission", "authors", "status", "points", "out_of", "days_late", "deducted")
+_AFTER = ("remarks", "by_hand", "reason")
+
+
+def write_outputs(
+    book: Gradebook, out: Path, *, progress: Callable[[str], None] = lambda text: None
+) -> list[Double]:
+    """Write the class list of a gradebook into a folder; return who stands on it several times.
+
+    A rubric that is `anonymous` leaves out all names, and `anonymous-key.csv` says whose is what.
+    Feedback that an earlier batch left is removed; what is not ours stays.
+    """
+    rubric = book.rubric
+    names = _names(book, out) if rubric.anonymous else None
+    folder = own_folder(out, FEEDBACK)
+    folder.mkdir(parents=True, exist_ok=True)
+    made_of = _read_made(folder)
+    look = _look(rubric)
+    lines: list[Line] = []
+    now_of: dict[str, str] = {}
+    gradings: dict[str, int] = {}
+    authors: dict[str, tuple[str, ...]] = {}
+    shared: dict[str, Flag] = {}
+    for entry in book.entries():
+        shared |= dict(
+            (entry.submission, flag) for flag in entry.grade.flags if flag.code == "shared_data"
+        )
+        grade = anonymise(entry.grade, names) if names is not None else entry.grade
+        lines.append(Line.of(grade, by_hand=sorted(entry.overrides)))
+        gradings[entry.submission], authors[entry.submission] = entry.grading, entry.grade.authors
+        now_of[grade.submission] = _digest(look, entry.key, repr((grade, _by_hand(entry))))
+        own = own_folder(folder, _checked(grade.submission))
+        there = (own / _PAGE).is_file() and (own / _JSON).is_file()
+        if there and made_of.get(grade.submission) == now_of[grade.submission]:
+            continue
+        progress(f"feedback: {grade.submission}")
+        (folder / _MADE).unlink(missing_ok=True)  # until all of it is true again
+        own.mkdir(exist_ok=True)
+        page = feedback_page(
+            grade,
+            rubric=rubric,
+            overrides=entry.overrides,
+            figures=book.figures(entry),
+            name=grade.submission,
+        )
+        write_file(own / _PAGE, page)
+        write_file(own / _JSON, _grade_text(grade, entry))
+    if names is not None:
+        lines.sort(key=lambda line: line.name)  # the order of the names would tell
+    _remove_stale(folder, keep=set(now_of))
+    write_file(out / "grades.csv", grades_csv(lines, rubric=rubric))
+    doubles = _doubles(book, authors, gradings=gradings, names=names)
+    clusters = find_clusters(shared)
+    if names is not None:
+        clusters = renamed(clusters, names, other=STRANGER)
+    now_of[_WHOLE] = _digest(look, repr((lines, doubles, clusters)), *now_of.values())
+    if made_of.get(_WHOLE) != now_of[_WHOLE] or not (out / _CLASS).is_file():
+        page = class_page(lines, rubric=rubric, doubles=doubles, clusters=clusters)
+        write_file(out / _CLASS, page)
+    write_file(
+        folder / _MADE, json.dumps(now_of, indent=0, ensure_ascii=False, sort_keys=True) + "\n"
+    )
+    return doubles
+
+
+def _doubles(
+    book: Gradebook,
+    authors: Mapping[str, Sequence[str]],
+    *,
+    gradings: Mapping[str, int],
+    names: Mapping[str, str] | None,
+) -> list[Double]:
+    """Return who stands in several submissions, nameless where `names` stand in for those."""
+    found = find_doubles(authors)
+    concerned = dict.fromkeys(name for double in found for name in double.submissions)
+    found = with_recordings(found, book.prints_of([gradings[name] for name in concerned]))
+    if names is None:
+        return found
+    return sorted(
+        (
+            replace(
+                double, author="", submissions=tuple(sorted(names[s] for s in double.submissions))
+            )
+            for double in found
+        ),
+        key=lambda double: double.submissions,
+    )
+
+
+def grades_csv(lines: Sequence[Line], *, rubric: Rubric) -> str:
+    """Return `grades.csv`: a row a submission, a column a criterion."""
+    taken = {*_BEFORE, *_AFTER}
+    ids = [criterion.id for criterion in rubric.criteria]
+    heads = [f"criterion {id_}" if id_ in taken else id_ for id_ in ids]
+    rows = [
+        (
+            line.name,
+            " ".join(line.authors),
+            line.status,
+            line.points,
+            line.out_of,
+            line.days_late,
+            line.deducted,
+            *(line.criteria[id_][1] if id_ in line.criteria else "" for id_ in ids),
+            " ".join(line.codes),
+            " ".join(line.by_hand),
+            line.reason,
+        )
+        for line in lines
+    ]
+    return csv_text((*_BEFORE, *heads, *_AFTER), rows)
+
+
+def _names(book: Gradebook, out: Path) -> dict[str, str]:
+    """Return the pseudonyms of a class, and write the key that reveals them."""
+    keys: dict[str, str] = {}
+    authors: dict[str, tuple[str, ...]] = {}
+    for entry in book.entries():
+        keys[entry.submission] = entry.first_key
+        authors[entry.submission] = entry.grade.authors
+    names = pseudonyms(keys)
+    out.mkdir(parents=True, exist_ok=True)
+    write_file(out / KEY_FILE, key_text(names, authors))
+    return names
+
+
+def _grade_text(grade: Grade, entry: Entry) -> str:
+    """Return `grade.json` with the points given by hand."""
+    plain = plain_json({**grade_dict(grade), "overrides": _by_hand(entry)})
+    return json.dumps(plain, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def _by_hand(entry: Entry) -> list[dict[str, str | float | None]]:
+    return [
+        {"criterion": o.criterion, "points": o.points, "why": o.why}
+        for _, o in sorted(entry.overrides.items())
+    ]
+
+
+def _look(rubric: Rubric) -> str:
+    """Return a hash of all that pages have in common."""
+    names = ("report.html.j2", "blocks.html.j2", "report.css", "page.js", "explore.js")
+    parts = [(TEMPLATES / name).read_text(encoding="utf-8") for name in names]
+    return _digest(*parts, rubric.model_dump_json())
+
+
+def _digest(*parts: str) -> str:
+    total = hashlib.sha256()
+    for part in parts:
+        total.update(part.encode() + b"\0")
+    return total.hexdigest()
+
+
+def _read_made(folder: Path) -> dict[str, str]:
+    try:
+        made = json.loads((folder / _MADE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return made if isinstance(made, dict) else {}
+
+
+def _checked(name: str) -> str:
+    """Return a submission's name where it is that of a folder, and nothing else."""
+    if Path(name).name != name or name in ("", ".", ".."):
+        raise ConfigError(f"{name!r}: is no name for a folder of feedback")
+    return name
+
+
+def _remove_stale(folder: Path, *, keep: set[str]) -> None:
+    for own in folder.iterdir():
+        if own.name in keep or own.is_symlink() or not own.is_dir():
+            continue
+        for name in (_PAGE, _JSON):
+            (own / name).unlink(missing_ok=True)
+        if not any(own.iterdir()):
+            own.rmdir()

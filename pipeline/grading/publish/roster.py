@@ -1,0 +1,200 @@
+"""The table of students that a learning platform exports, with grades filled in."""
+
+import re
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.errors import ConfigError
+from pipeline.grading.intake.lms_names import Platform
+from pipeline.grading.publish.students import Student, one_of
+from pipeline.grading.table import read_table
+from pipeline.output import csv_text
+from pipeline.submission.complaints import quote
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+POINTS_POSSIBLE = "Points Possible"  # Canvas' row on top, about the assignments
+_MAXIMUM = "Maximum Grade"  # Moodle's, of the assignment: its import refuses a grade above it
+# Columns that say who a row is about.
+_NUMBERS = ("ID", "Identifier", "Submission ID")
+_IDS = ("SIS User ID", "SIS Login ID", "ID number", "SID", "Username", "Email", "Email address")
+_NAMES = ("Student", "Full name", "Name")
+# What a platform's own table has for certain, any of these; no other platform's has it.
+_OWN: Mapping[Platform, tuple[frozenset[str], ...]] = {
+    "canvas": (frozenset({"Student", "ID"}),),
+    "moodle": (
+        frozenset({"Identifier"}),
+        frozenset({"ID number"}),
+        frozenset({"Username"}),
+        frozenset({"Email address"}),
+    ),
+    "gradescope": (frozenset({"SID"}), frozenset({"Email"}), frozenset({"Submission ID"})),
+}
+_PARTICIPANT = re.compile(r"^\D+ (\d+)$")  # of Moodle, in any language
+_TITLE = re.compile(r"(.*?)(?: \(\d+\))?")  # of Canvas, with the assignment's id behind it
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Roster:
+    """A platform's own table, all texts; cells that are not filled in stay as they are."""
+
+    file: str
+    table: "pd.DataFrame"
+
+    @classmethod
+    def read(cls, path: Path, *, platform: Platform) -> "Roster":
+        """Read a platform's roster: CSV with commas, semicolons or tabs.
+
+        Raises
+        ------
+        ConfigError : it is no table, has not the columns that say who a row is about there, or has
+            two of one name.
+        """
+        table = read_table(path)
+        if not any(columns <= set(table.columns) for columns in _OWN[platform]):
+            wanted = ", or ".join(" and ".join(sorted(columns)) for columns in _OWN[platform])
+            raise ConfigError(
+                f"{path.name}: is not {platform.capitalize()}'s table; "
+                f"that has the columns {wanted}"
+            )
+        twice = table.columns[table.columns.duplicated() & (table.columns != "")]
+        if len(twice):
+            raise ConfigError(f"{path.name}: has two columns {quote(twice[0])}")
+        return cls(file=path.name, table=table)
+
+    def check_maximum(self, out_of: float, *, title: str) -> None:
+        """Refuse a table whose grades go up to another maximum: the platform keeps its own.
+
+        Raises
+        ------
+        ConfigError : so say Moodle's column of it, or Canvas' row of the points possible.
+        """
+        column = self._title(title)
+        said = [*self.table[_MAXIMUM].unique()] if _MAXIMUM in self.table else []
+        if column in self.table:
+            said += [*self.table.loc[self._of_all(), column]]
+        for text in said:
+            if (most := _number(text)) is not None and most != out_of:
+                raise ConfigError(
+                    f"{self.file}: has the maximum grade {text}, the rubric {out_of:g} points: set "
+                    "the assignment's maximum on the platform and download the table again"
+                )
+
+    def filled(
+        self,
+        students: Sequence[Student],
+        columns: Mapping[str, Callable[[Student], str]],
+        *,
+        keep: Collection[str] | None = None,
+        possible: str = "",
+    ) -> tuple[str, list[str]]:
+        """Return the table with these columns filled in, and what did not fit.
+
+        Parameters
+        ----------
+        columns : by title; one that is not there yet comes last.
+        keep : the columns to keep beside them, default: all.
+        possible : the points possible, for Canvas' row of them.
+        """
+        titles = {title: self._title(title) for title in columns}
+        kept = [name in (keep or self.table.columns) for name in self.table.columns]
+        table = self.table.loc[:, kept].copy()
+        for name in titles.values():
+            if name not in table:
+                table[name] = self.table.get(name, "")
+            table.loc[self._of_all() & (table[name] == ""), name] = possible
+        index = self._index()
+        matched = [(_row_of(student, index), student) for student in students]
+        found: dict[Any, list[Student]] = {}
+        for at, student in matched:
+            if at is not None:
+                found.setdefault(at, []).append(student)
+        settled = {at: one_of(several) for at, several in found.items()}
+        for at, student in settled.items():
+            for title, value in columns.items():
+                if not student.undecided:
+                    table.loc[at, titles[title]] = value(student)
+        # One of the authors, who are named, handed it in.
+        strangers = [s.called for at, s in matched if at is None and not s.uploader]
+        remarks = [s.undecided for s in settled.values() if s.undecided and s not in students]
+        if strangers:
+            remarks.append(f"not in {self.file}, so not exported: {', '.join(strangers)}")
+        reached = {student.grade.submission for several in found.values() for student in several}
+        lost = dict.fromkeys(
+            s.grade.submission
+            for s in students
+            if len(s.grade.authors) > 1 and s.grade.submission not in reached
+        )
+        if lost:
+            remarks.append(f"nobody of these is in {self.file}: {', '.join(lost)}")
+        by_number = [
+            f"{s.name} ({s.grade.submission})"
+            for s in settled.values()
+            if s.uploader and not s.undecided
+        ]
+        if by_number:
+            remarks.append(
+                "found by the number in the file's name, so the same person as one of the "
+                f"authors: {', '.join(by_number)}"
+            )
+        return csv_text([*table.columns], table.itertuples(index=False)), remarks
+
+    def _of_all(self) -> "pd.Series":
+        """Return which rows are about the assignments, not about a student."""
+        students = self.table["Student" if "Student" in self.table else self.table.columns[0]]
+        return students.str.contains(POINTS_POSSIBLE, regex=False)
+
+    def _title(self, title: str) -> str:
+        """Return a column's title as the table has it."""
+        for name in self.table.columns:
+            found = _TITLE.fullmatch(str(name))
+            if name == title or (found and found[1] == title):
+                return name
+        return title
+
+    def _index(self) -> dict[tuple[str, str], Any]:
+        """Return the row of everything that says who it is about; none that two rows share."""
+        import pandas as pd
+
+        words = []
+        for name, cells in self.table.items():
+            if name in _NUMBERS:
+                words.append(("number", cells.str.replace(_PARTICIPANT, r"\1", regex=True)))
+            if name in _IDS or name == "ID":
+                ids = cells.str.casefold()
+                words += [("id", ids), ("id", ids.str.split("@").str[0])]
+            if name in _NAMES:
+                words.append(("name", cells.map(_letters)))
+        found = pd.concat(
+            pd.DataFrame({"kind": kind, "word": cells, "row": cells.index}) for kind, cells in words
+        )
+        rows = found[found["word"] != ""].drop_duplicates().set_index(["kind", "word"])["row"]
+        return rows.loc[~rows.index.duplicated(keep=False)].to_dict()
+
+
+def _row_of(student: Student, index: Mapping[tuple[str, str], Any]) -> Any:
+    for word in (
+        ("number", student.number),
+        ("id", student.id.casefold()),
+        ("name", _letters(student.name)),
+    ):
+        at = index.get(word)
+        if at is not None:
+            return at
+    return None
+
+
+def _number(text: str) -> float | None:
+    """Return a number as the platform writes it, perhaps with a decimal comma; None for words."""
+    try:
+        return float(text.replace(",", "."))
+    except ValueError:
+        return None
+
+
+def _letters(name: str) -> str:
+    """Return a name as Canvas has it in names of files: "Doe, Jane" is "doejane"."""
+    return "".join(c for c in name.casefold() if c.isalnum())

@@ -1,0 +1,1 @@
+"""What the recordings say a number is, and how far off one may be."""

@@ -1,0 +1,66 @@
+"""The carts' springs, where those of the rubric leave the recordings unexplained."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from pipeline.errors import PipelineError
+from pipeline.grading.references.reference import is_explained, is_followed
+from pipeline.results import Analysis, ChainFit
+from pipeline.submission import Submission
+from pipeline.submission.load import spring_names
+from pipeline.workflow import analyse
+
+# Friction and the like remain whatever the springs: of χ², a missing spring leaves many times more.
+_BETTER = 10.0
+# A spring is there where it is so many standard errors from none, these as wide as what the fit
+# leaves, and such a share of the stiffest: a delay or friction is easily taken for a weak one.
+_SIGMAS, _SHARE = 10.0, 0.02
+
+
+def with_all_springs(
+    submission: Submission,
+    analysis: Analysis,
+    *,
+    progress: Callable[[str], None] = lambda text: None,
+) -> tuple[Analysis, tuple[str, ...]]:
+    """Return the analysis with all springs, and those that are added, where these recordings ask.
+
+    A spring that is not there is fitted as none, so no other set of springs explains more; where
+    none of those added is there, the carts are the rubric's, found on another way. One cart has
+    one stiffness, whatever it stands for.
+    """
+    fit, springs = analysis.fit, submission.system.springs
+    if analysis.carts == 1 or all(springs) or (fit is not None and is_explained(analysis)):
+        return analysis, ()
+    system = submission.system.model_copy(update={"springs": (True,) * len(springs)})
+    try:
+        other = analyse(
+            submission.model_copy(update={"system": system}), design=False, progress=progress
+        )
+    except PipelineError:
+        return analysis, ()
+    if other.fit is None or not (
+        is_explained(other)
+        or (
+            fit is not None
+            and fit.method == other.fit.method
+            and fit.chi_square_per_dof > _BETTER * other.fit.chi_square_per_dof
+            and is_followed(other)
+        )
+    ):
+        return analysis, ()
+    names = zip(spring_names(analysis.carts), springs, _there(other.fit), strict=True)
+    return other, tuple(name for name, asked, there in names if there and not asked)
+
+
+def _there(fit: ChainFit) -> list[bool]:
+    """Return whether each spring is there for certain, whatever the fit leaves unexplained."""
+    wider = max(1.0, fit.chi_square_per_dof) ** 0.5
+    std = dict(zip(fit.names, wider * np.sqrt(np.diag(fit.covariance)), strict=True))
+    k = fit.chain.k
+    # One that the fit holds at none has no standard error.
+    return [
+        bool(k[j] > max(_SIGMAS * std.get(f"k_{j + 1}", np.inf), _SHARE * k.max()))
+        for j in range(k.size)
+    ]

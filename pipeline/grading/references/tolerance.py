@@ -1,0 +1,81 @@
+"""How far off a number is, and what that earns: exact arithmetic, so that an edge is an edge."""
+
+import math
+from decimal import Decimal
+from fractions import Fraction
+
+from pipeline.grading.references.reference import Reference
+from pipeline.grading.rubric import Late
+
+_CENTS = 100  # points are taken to the hundredth
+NO_CREDIT = Fraction(10**6)  # percent; of a number that is zero or has the wrong sign
+# The most that rounding may excuse, of the number: that of two digits, 10 for 10.5. One digit says
+# too little of what was measured, and "0e2" nothing at all.
+_MOST_ROUNDING = Fraction(1, 20)
+
+
+def half_digit(typed: Decimal) -> Fraction:
+    """Return half a unit of the last digit as typed: 0.005 for 0.10, 0.5 for 29."""
+    exponent = typed.as_tuple().exponent
+    if not isinstance(exponent, int):
+        raise ValueError(f"{typed} is no finite number")
+    return Fraction(10) ** exponent / 2
+
+
+def as_typed(typed: Decimal) -> str:
+    """Return a number as its author wrote it: `0e2` where Python would write `0E+2`."""
+    return str(typed).replace("E+", "e").replace("E", "e")
+
+
+def rounding(typed: Decimal) -> Fraction:
+    """Return how far rounding may have moved a number: half a digit, at most 5 % of it."""
+    return min(half_digit(typed), _MOST_ROUNDING * abs(Fraction(typed)))
+
+
+def is_vague(typed: Decimal) -> bool:
+    """Whether rounding may hide more of a number than is excused: one digit does."""
+    return half_digit(typed) > _MOST_ROUNDING * abs(Fraction(typed))
+
+
+def exact(value: float) -> Fraction:
+    """Return a number of a rubric as its author typed it: 0.1 is a tenth."""
+    return Fraction(repr(value))
+
+
+def percent_off(typed: Decimal, reference: Reference, *, sigmas: float) -> Fraction:
+    """Return how far a number is off its reference, in percent of the smaller of the two.
+
+    5 % is a factor of 1.05 either way. What `rounding` excuses and `sigmas` standard errors of the
+    reference come off first; any value between the reference's bounds is right.
+    """
+    slack = exact(sigmas) * Fraction(reference.std)
+    low, high = Fraction(reference.low) - slack, Fraction(reference.high) + slack
+    half = rounding(typed)
+    least, most = Fraction(typed) - half, Fraction(typed) + half
+    if most < low:
+        above, below = low, most
+    elif least > high:
+        above, below = least, high
+    else:
+        return Fraction(0)
+    return min(100 * (above / below - 1), NO_CREDIT) if below > 0 else NO_CREDIT
+
+
+def credit(error: Fraction, *, full: float, none: float) -> Fraction:
+    """Return the share of the points: all up to and at `full`, none from `none`, a line between.
+
+    Where the two are the same, an error of exactly that much still earns all.
+    """
+    top, bottom = exact(full), exact(none)
+    if error <= top:
+        return Fraction(1)
+    if error >= bottom:
+        return Fraction(0)
+    return (bottom - error) / (bottom - top)
+
+
+def late_deduction(earned: Fraction, *, late: Late, days_late: float) -> Fraction:
+    """Return the points off those earned: so much for every day begun after the grace."""
+    days = max(0, math.ceil(days_late - late.grace_days))
+    share = min(exact(late.percent_per_day) * days, exact(late.most_percent)) / 100
+    return Fraction(math.floor(earned * share * _CENTS + Fraction(1, 2)), _CENTS)

@@ -1,0 +1,1 @@
+"""Recordings and people that stand twice in a class."""

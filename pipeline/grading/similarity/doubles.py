@@ -1,0 +1,68 @@
+"""People who stand in several submissions of a class.
+
+Submissions with an author in common are one team, whose sharing is no one's fault: whoever adds
+another's id to a copy would go unseen. So a TA is told, and no student accused.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from pipeline.grading.outcome import Prints, person
+from pipeline.grading.similarity.shared import find_shared
+from pipeline.report.numbers import count, listing
+from pipeline.report.words import clean
+
+_NAMED = 8  # submissions named of one person
+
+
+@dataclass(frozen=True, kw_only=True)
+class Double:
+    """Somebody in several submissions.
+
+    Attributes
+    ----------
+    author : "" where names are left out.
+    recordings : the most that one of the submissions has in common with the others.
+    """
+
+    author: str
+    submissions: tuple[str, ...]
+    recordings: int = 0
+
+    def __str__(self) -> str:
+        """What a TA is told."""
+        who = " ".join(clean(self.author).split()) or "One person"
+        more = [f"{len(self.submissions) - _NAMED} more"] * (len(self.submissions) > _NAMED)
+        where = listing([*map(clean, self.submissions[:_NAMED]), *more])
+        common = count(self.recordings, "recording") if self.recordings else "no recording"
+        return f"{who} is in {where}, which have {common} in common"
+
+
+def find_doubles(authors: Mapping[str, Sequence[str]]) -> list[Double]:
+    """Return who stands in several submissions, given the authors of each."""
+    typed: dict[str, str] = {}
+    found: dict[str, dict[str, None]] = {}
+    for submission, people in authors.items():
+        for author in people:
+            typed.setdefault(person(author), author)
+            found.setdefault(person(author), {})[submission] = None
+    return [
+        Double(author=typed[who], submissions=tuple(submissions))
+        for who, submissions in sorted(found.items())
+        if len(submissions) > 1
+    ]
+
+
+def with_recordings(doubles: Iterable[Double], prints: Iterable[Prints]) -> list[Double]:
+    """Return them with what their submissions share; recordings handed out with the task count."""
+    shared = find_shared([replace(one, authors=(one.submission,)) for one in prints])
+    return [
+        replace(
+            double,
+            recordings=max(
+                len({r.experiment for r in shared.get(name, ()) if r.other in double.submissions})
+                for name in double.submissions
+            ),
+        )
+        for double in doubles
+    ]
