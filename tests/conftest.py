@@ -3,9 +3,13 @@
 import os
 import shutil
 import signal
+import subprocess
 import sys
+from collections import Counter
 from collections.abc import Iterator
-from pathlib import Path
+from contextlib import ExitStack
+from pathlib import Path, PurePath
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -29,8 +33,13 @@ settings.load_profile("cartlab")
 
 # Real measurements may be used in place but not passed on, so they lie outside the project.
 REAL_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+ROOT = Path(__file__).resolve().parents[1]
 
 CHROMIUM = shutil.which("chromium")
+_BENCHES = "benches"  # the group of the files that wait for them most of their time
+_WITH_BENCHES = {
+    "test_acquire", "test_acquire_mistakes", "test_bench_safety", "test_emulator", "test_live_page",
+}  # fmt: skip
 _FEW = 2  # files that are sooner done here than other processes are started
 
 # A shell starts what runs in the background deaf to Ctrl-C, and its children inherit that.
@@ -40,11 +49,48 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 FLAGS = "--headless --no-sandbox --disable-gpu --no-first-run --disable-background-networking"
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Compile the simulator while the workers collect their tests; each of them would, else."""
+    if config.getoption("numprocesses") and "PYTEST_XDIST_WORKER" not in os.environ:
+        command = [sys.executable, "-c", "from tests.nursery import fork_benches as f; f()"]
+        until_the_end = ExitStack()
+        config.add_cleanup(until_the_end.close)
+        until_the_end.enter_context(subprocess.Popen(command, stdin=subprocess.DEVNULL, cwd=ROOT))
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int | None:
     """Run a file or two in this process; one of several waits for a bench, not the processor."""
     few = len(config.args) <= _FEW and all(".py" in argument for argument in config.args)
     return 0 if few else (os.cpu_count() or 1) + 1
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Have those begin that wait for benches, then files of few tests, which have the longest.
+
+    So at the end no worker is left alone with a long one.
+    """
+    groups = [_group(item.nodeid) for item in items]
+    size = Counter(groups)
+    order = {group: (group != _BENCHES, size[group], group) for group in size}
+    items.sort(key=lambda item: order[_group(item.nodeid)])
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
+    """Give each file to one worker, and to one all that wait for benches, which they share."""
+    from xdist.scheduler import LoadScopeScheduling
+
+    class ByGroup(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return _group(nodeid)
+
+    return ByGroup(config, log)
+
+
+def _group(nodeid: str) -> str:
+    file = nodeid.partition("::")[0]
+    return _BENCHES if PurePath(file).stem in _WITH_BENCHES else file
 
 
 @pytest.fixture(scope="session", autouse=True)
