@@ -10,15 +10,20 @@ from pipeline.errors import DataError
 from pipeline.gap.account import repeatability
 from pipeline.gap.document import gap_json
 from pipeline.gap.explain import explain_gap
+from pipeline.gap.fit import fit_model, project
 from pipeline.gap.investigate import investigate
 from pipeline.gap.runs import make_run
+from pipeline.gap.screen import candidates_at, find_teams
+from pipeline.gap.structure import Structure
 from pipeline.gap.types import Gap
-from pipeline.plant.effects import CATALOGUE
+from pipeline.plant.chain import Chain
+from pipeline.plant.effects import CATALOGUE, find_effect
 from pipeline.results import Record
 from pipeline.submission import load_submission
 from pipeline.synthesis.hidden import prepare_bench, write_bench
 from pipeline.workflow import analyse
-from tests.truth.cases import make_case
+from tests.truth.bench import Hidden, simulate_truth
+from tests.truth.cases import COUNT, make_case, make_rig
 
 
 def explain(case, **options) -> Gap:
@@ -194,6 +199,107 @@ def test_two_effects_are_found_together():
 
     assert names(gap) == [("coulomb_friction", 1), ("saturation", 0)]
     assert gap.effects[-1].nrmse_after == gap.final
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_friction_on_all_carts_is_found_at_once():
+    """What a real rig does together: friction on all carts, a braking motor, hands that let go.
+
+    Its errors fall to the noise, the two frictions come from one step, each with its own force.
+    """
+    case = make_rig(seed=1, n=2)
+
+    told: list[str] = []
+    gap = explain(case, tell=told.append)
+
+    assert gap.verdict == "named"
+    assert names(gap) == sorted((h.effect, h.place) for h in case.hidden)
+    assert gap.final < 1.2 * gap.noise_floor
+    for hidden in case.hidden:
+        (found,) = (
+            f
+            for f in gap.effects
+            if (f.effect.key, f.where.get("cart", 0)) == (hidden.effect, hidden.place)
+        )
+        for name, true in hidden.parameters.items():
+            # Each run has 8 % of its own: the force that all share is known to 3 or 4 %.
+            assert found.parameters[name].value == pytest.approx(float(true), rel=0.1)
+
+
+def test_effects_that_only_together_explain_are_found_together():
+    """Of three directions two, each of which explains little alone, add up to the residual."""
+    case = make_case(seed=44, n=2, rate=113.1)
+    structure = Structure(springs=case.springs)
+    chain = structure.chain(
+        structure.vector(Chain(m=np.array(case.m), c=np.array(case.c), k=np.array(case.k)))
+    )
+    runs = [make_run(record, n=2) for record in case.records]
+    trials = [
+        candidates_at(find_effect(key), 1, runs=runs, chain=chain)[0]
+        for key in ("quadratic_drag", "cubic_spring", "load_friction")
+    ]
+    directions = np.array([[1.0, 0.0, 0.0], [-0.9, 0.3, 0.0], [0.3, 0.1, 1.0]]).T
+    residual = directions[:, 0] + directions[:, 1]
+
+    (team,) = find_teams(trials, directions, residual)
+
+    assert [c.effect.key for c in team.candidates] == ["quadratic_drag", "cubic_spring"]
+    assert team.share == pytest.approx(1.0)
+
+
+def test_what_no_run_shows_absorbs_nothing():
+    """A held cart's mass and the share of two springs that act as one project nothing off."""
+    m, c, k = np.array([3e-4]), np.array([6e-4]), 0.08
+    t = np.asarray(np.arange(400) / 113.1, dtype=np.float64)
+    u = np.where(t > 0.05, 0.1, 0.0)
+    y = simulate_truth(m=m, c=c, k=[k, 0.0], hidden=[], t=t, u=u, free=(1,))
+    one = Record(
+        id="a", kind="step", t=t, u=u, y=y, carts=(1,), free=(1,), resolution=np.array([COUNT])
+    )
+    two = replace(one, y=np.vstack([y, 0 * t]), carts=(1, 2), resolution=np.full(2, COUNT))
+    chains = (
+        (one, Chain(m=1.1 * m, c=c, k=np.array([k, 0.0])), (True, False)),
+        (
+            two,
+            Chain(m=np.append(1.1 * m, m), c=np.append(c, c), k=np.array([k - 0.03, 0.03, 0.01])),
+            (True,) * 3,
+        ),
+    )
+    left = []
+    for record, chain, springs in chains:
+        structure = Structure(springs=springs)
+        run = make_run(record, n=len(springs) - 1)
+        fit = fit_model(structure, structure.vector(chain), [run], iterations=0)
+        wave = np.sign(np.sin(7.0 * t))[None, None]
+        directions, residual = project(fit, [run], [wave])
+        left.append((float((directions**2).sum()), float((residual**2).sum())))
+
+    assert left[1] == pytest.approx(left[0], rel=1e-3)
+
+
+@pytest.mark.parametrize("said", [(1,), (1, 2)])
+def test_a_cart_held_in_all_runs_is_a_wall(said):
+    """Runs of cart 1 alone in a folder of two carts give what one cart would, in its own words."""
+    hidden = Hidden(effect="coulomb_friction", place=1, parameters={"force": 0.0025})
+    case = make_case(seed=45, n=2, effects=[hidden], rate=113.1)
+    alone = [r for r in case.records if r.id.startswith("decay-1")]
+    m, c, k = (np.array(values) for values in (case.m, case.c, case.k))
+    t = np.asarray(np.arange(678) / 113.1, dtype=np.float64)
+    for number, size in enumerate((0.15, 0.09, -0.12, 0.15)):
+        u = np.where((t > 0.05) & (t < 3.0), size, 0.0)
+        y = simulate_truth(m=m, c=c, k=k, hidden=[hidden], t=t, u=u, free=(1,))
+        y = np.round(y / COUNT) * COUNT
+        alone.append(replace(alone[0], id=f"step-{number}", kind="step", t=t, u=u, y=y))
+    records = [replace(r, free=said) if r.kind == "step" else r for r in alone]
+
+    gap = explain_gap(records, springs=(True, True, True))
+
+    assert gap.verdict == "named"
+    assert names(gap) == [("coulomb_friction", 1)]
+    assert gap.effects[0].parameters["force"].value == pytest.approx(0.0025, rel=0.03)
+    assert gap.final < 1.2 * gap.noise_floor
+    assert any("cart 2" in note for note in gap.notes) == (2 in said)
 
 
 @pytest.fixture(scope="module")

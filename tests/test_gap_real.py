@@ -9,6 +9,9 @@ from scipy.io import loadmat
 from pipeline.gap.explain import explain_gap
 from pipeline.gap.types import Gap
 from pipeline.results import Record
+from pipeline.submission import load_submission
+from pipeline.workflow import analyse
+from tests.ucsd import write_two_cart_submission
 
 DRY = ("coulomb_friction", "stiction", "presliding_friction")
 
@@ -65,6 +68,19 @@ def test_released_cart_has_dry_friction(real_data):
     assert gap.effects[0].effect.key in DRY
     assert gap.final < 0.036
     assert all(found.nrmse_after < found.nrmse_before for found in gap.effects)
+
+
+def test_a_cart_held_in_all_runs_is_a_wall(real_data, tmp_path):
+    """The steps of cart 1 in a folder of two carts: as near as with a folder of one cart."""
+    folder = write_two_cart_submission(tmp_path / "lab", real_data, steps=())
+    analysis = analyse(load_submission(folder), design=False)
+    records = [r for r in analysis.records if r.id.startswith("alone-1")]
+
+    gap = explain_gap(records, springs=analysis.springs, chain=analysis.chain)
+
+    assert gap.effects[0].effect.key in DRY
+    assert gap.effects[0].where == {"cart": 1}
+    assert gap.final < 0.027
 
 
 def test_silverbox_has_a_hardening_spring(real_data):

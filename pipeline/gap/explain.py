@@ -231,7 +231,7 @@ def _with_offset(
     grown = structure.with_effect(candidate)
     theta = np.append(chosen.fit.theta, np.sign(offset.force))
     fit = fit_whole(grown, theta, loose)
-    final = judge(fit, loose, added=candidate)
+    final = judge(fit, loose, added=(candidate,))
     if final.error > min(0.9 * without[-1].error, _AS_FREE * chosen.error):
         return path, None
     return (*without, final), loose

@@ -28,6 +28,8 @@ _SCATTER_START = 0.05  # spread of friction from run to run, before anything is 
 _SCATTER_FLOOR, _SCATTER_TOP = 0.004, 0.2
 _SCATTER_PRIOR = (3.0, 0.04)  # weight in runs, and spread, of the prior on that spread
 _LOCAL_SCALES = (1.0, 0.3, 0.05)  # of a run's own step, where the whole one raises its cost
+_SHOWN = 3e-4  # of a column: two that differ by less differ by their difference steps
+_DEAD = 1e-9  # of the strongest column: a weaker one is rounding
 _ANCHOR = 1e6  # standard errors per unit of log mass
 _DAMP, _RELAX, _STIFFEN = 1e-3, 6.0, 6.0
 
@@ -296,9 +298,16 @@ def project(
         )
 
     linear = list(mapper(share, zip(runs, fit.locals_, extras, strict=True)))
-    R = triangle(np.concatenate([part.reduced for part in linear]))
-    shared = fit.theta.size
-    return R[shared:, shared:-1], R[shared:, -1]
+    stacked = np.concatenate([part.reduced for part in linear])
+    shared, wide = stacked[:, : fit.theta.size], stacked[:, fit.theta.size :]
+    # What no run shows, a held cart's mass or the share of two springs that act as one, absorbs
+    # nothing.
+    scale = np.linalg.norm(shared, axis=0)
+    shared = shared / np.maximum(scale, _DEAD * scale.max())
+    basis, power, _ = np.linalg.svd(shared, full_matrices=False)
+    basis = basis[:, power > _SHOWN]
+    left = triangle(wide - basis @ (basis.T @ wide))
+    return left[:, :-1], left[:, -1]
 
 
 def covariance(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:

@@ -12,7 +12,7 @@ from pipeline.gap.hypothesis import AT_FLOOR, CONTACT, THINNING, Bench, Hypothes
 from pipeline.gap.restart import restart_runs
 from pipeline.gap.rugged import polish, zoom
 from pipeline.gap.runs import Run, cut_shots
-from pipeline.gap.screen import Suspect, candidates_at, extend, screen
+from pipeline.gap.screen import Suspect, Team, candidates_at, extend, screen
 from pipeline.gap.structure import Candidate, Structure
 from pipeline.plant.chain import Array
 from pipeline.plant.effects.base import Effect
@@ -23,6 +23,8 @@ _FULL_SCREEN = 3  # … with the best of a screen on whole runs
 _OUT_OF_SIGHT = 8.0  # a suspect that leaves this many times the best one's misfit is out
 _BESIDE_THE_FLOOR = 1.5  # … where that one leaves no more than noise
 _IN_THE_RUNNING = 3.0  # times the best sibling's misfit: what may still win when refined
+_TOGETHER = 0.9  # of the best single one's misfit, which a team must leave at most
+_NO_LESS = 1.03  # of the same: what a part of a team leaves that does as well alone
 _POLISHED = 0.1  # of the chi-square without it: a contact that is there explains more
 _NOISE_ALONE = 1.05  # chi-square that no richer law of friction lowers
 _HINT = 2.0  # what the criterion must fall by, by the screen's estimate, to be worth a refit
@@ -34,32 +36,51 @@ _LEADING = 0.4  # of the first suspect's share, for what is dear to refit
 
 
 def grow(parent: Hypothesis, bench: Bench) -> Iterator[Hypothesis]:
-    """Yield the children of a hypothesis: one further effect each, fully refitted.
+    """Yield the children of a hypothesis, fully refitted: an effect more, or a team of them.
 
     What is dear is done last, and only for those who can still win: contacts are polished, and
     dry friction grows into its richer laws.
     """
-    fits: list[tuple[Candidate, Fit]] = []
-    for candidate, start in _starts(parent, bench):
-        fits.append((candidate, fit_whole(start.structure, start.theta, bench)))
-        if candidate.effect.key not in CONTACT:
-            yield judge(fits[-1][1], bench, added=candidate)
+    fits: list[tuple[tuple[Candidate, ...], Fit]] = []
+    for candidates, start in _starts(parent, bench):
+        fits.append((candidates, fit_whole(start.structure, start.theta, bench)))
+        if not _is_contact(candidates):
+            yield judge(fits[-1][1], bench, added=candidates)
     lowest = min((fit.cost for _, fit in fits), default=np.inf)
     contacts: dict[tuple[str, int], Fit] = {}
-    for candidate, fit in sorted(fits, key=lambda pair: pair[1].cost):
-        if candidate.effect.key in CONTACT and candidate.key not in contacts:
+    for candidates, fit in sorted(fits, key=lambda pair: pair[1].cost):
+        if _is_contact(candidates) and candidates[0].key not in contacts:
             if fit.cost < _IN_THE_RUNNING * lowest and fit.chi < _POLISHED * parent.fit.chi:
                 fit = polish(fit, bench.training, enough=AT_FLOOR, mapper=bench.mapper)
-            contacts[candidate.key] = fit
-            yield judge(fit, bench, added=candidate)
-    for candidate, fit in fits:
-        running = _NOISE_ALONE * fit.n_points < fit.cost < _IN_THE_RUNNING * lowest
-        for effect in bench.catalogue if running else ():
-            if effect.grows_from == candidate.effect.key:
-                yield _grown_friction(effect, fit, bench)
+            contacts[candidates[0].key] = fit
+            yield judge(fit, bench, added=candidates)
+    for candidates, fit in fits:
+        equals = min(f.cost for others, f in fits if len(others) == len(candidates))
+        running = _NOISE_ALONE * fit.n_points < fit.cost < _IN_THE_RUNNING * equals
+        if not running or _better_told(candidates, fit, fits):
+            continue
+        for effect in bench.catalogue:
+            if any(c.effect.key == effect.grows_from for c in candidates):
+                yield _grown_friction(effect, candidates, fit, bench)
 
 
-def _starts(parent: Hypothesis, bench: Bench) -> list[tuple[Candidate, Fit]]:
+def _better_told(
+    candidates: Sequence[Candidate], fit: Fit, fits: Sequence[tuple[tuple[Candidate, ...], Fit]]
+) -> bool:
+    """Does a team explain more than this part of it, or a part no less than this team?"""
+    keys = {c.key for c in candidates}
+    return any(
+        (keys < (others := {c.key for c in more}) and f.cost < _TOGETHER * fit.cost)
+        or (others < keys and f.cost < _NO_LESS * fit.cost)
+        for more, f in fits
+    )
+
+
+def _is_contact(candidates: Sequence[Candidate]) -> bool:
+    return any(candidate.effect.key in CONTACT for candidate in candidates)
+
+
+def _starts(parent: Hypothesis, bench: Bench) -> list[tuple[tuple[Candidate, ...], Fit]]:
     """Return the suspects worth a full refit, each with a fit to start from.
 
     Pieces forgive a wrong structure, so most suspects come from them; whole runs show what adds
@@ -81,7 +102,8 @@ def _starts(parent: Hypothesis, bench: Bench) -> list[tuple[Candidate, Fit]]:
         scatter_free=False,
         mapper=bench.mapper,
     )
-    suspects = [s for s in look(loose, pieces) if _promises(s, loose)]
+    suspects, teams = look(loose, pieces)
+    suspects = [s for s in suspects if _promises(s.share, loose)]
     short = [
         _short_refit(loose, s, pieces, bench, top=suspects[0].share) for s in _short_list(suspects)
     ]
@@ -92,22 +114,29 @@ def _starts(parent: Hypothesis, bench: Bench) -> list[tuple[Candidate, Fit]]:
     chosen = [pair for pair in short[:_FULL_LIST] if pair[1].cost < within]
     if closed:
         return chosen
-    suspects = [s for s in look(parent.fit, bench.training) if _promises(s, parent.fit)]
+    best = short[0][1].cost if short else np.inf
+    for team in teams:
+        if _promises(team.share, loose) and not _is_contact(team.candidates):
+            pair = _refit_team(loose, team, pieces, bench)
+            if team.family or pair[1].cost < _TOGETHER * best:
+                chosen.append(pair)
+    suspects, _ = look(parent.fit, bench.training)
+    suspects = [s for s in suspects if _promises(s.share, parent.fit)]
     for suspect in suspects[:_FULL_SCREEN]:
         key, top = suspect.candidate.key, suspects[0].share
         if _needs_starts(suspect.candidate) and suspect.share > _LEADING * top:
             chosen.append(_short_refit(parent.fit, suspect, bench.training, bench, top=top))
-        elif key not in (candidate.key for candidate, _ in chosen):
-            pair = next((p for p in short if p[0].key == key), None)
+        elif (key,) not in (tuple(c.key for c in candidates) for candidates, _ in chosen):
+            pair = next((p for p in short if p[0][0].key == key), None)
             pair = pair or _short_refit(loose, suspect, pieces, bench, top=0.0)
             if pair[1].cost < within:
                 chosen.append(pair)
     return chosen
 
 
-def _promises(suspect: Suspect, fit: Fit) -> bool:
-    """Would the suspect, as screened, lower the criterion at all?"""
-    return -fit.n_points / THINNING * np.log1p(-min(suspect.share, 0.999)) > _HINT
+def _promises(share: float, fit: Fit) -> bool:
+    """Would who explains this share of the gap, as screened, lower the criterion at all?"""
+    return -fit.n_points / THINNING * np.log1p(-min(share, 0.999)) > _HINT
 
 
 def _short_list(suspects: Sequence[Suspect]) -> list[Suspect]:
@@ -128,7 +157,7 @@ def _needs_starts(candidate: Candidate) -> bool:
 
 def _short_refit(
     start: Fit, suspect: Suspect, pieces: Sequence[Run], bench: Bench, *, top: float
-) -> tuple[Candidate, Fit]:
+) -> tuple[tuple[Candidate, ...], Fit]:
     """Refit a suspect on pieces; where the landscape is rugged, from several starts.
 
     `top` is the share of the gap the first suspect explains.
@@ -136,19 +165,19 @@ def _short_refit(
     several = _needs_starts(suspect.candidate)
     if suspect.candidate.effect.key in _RUGGED and suspect.share > _ZOOM_SHARE * top:
         suspect = zoom(start, pieces, suspect, mapper=bench.mapper)
-    fits = []
-    for values in suspect.starts[: 3 if several else 1]:
-        structure, theta = extend(start, suspect.candidate, values)
-        fits.append(
-            fit_model(
-                structure,
-                theta,
-                pieces,
-                iterations=3 if several else 5,
-                scatter_free=False,
-                mapper=bench.mapper,
-            )
+    starts = [extend(start, suspect.candidate, values) for values in suspect.starts]
+    starts = starts[:3] if several else [_best_start(starts, pieces, bench)]
+    fits = [
+        fit_model(
+            structure,
+            theta,
+            pieces,
+            iterations=3 if several else 5,
+            scatter_free=False,
+            mapper=bench.mapper,
         )
+        for structure, theta in starts
+    ]
     best = min(fits, key=lambda fit: fit.cost)
     if several:
         best = fit_model(
@@ -160,7 +189,33 @@ def _short_refit(
             scatter_free=False,
             mapper=bench.mapper,
         )
-    return suspect.candidate, best
+    return (suspect.candidate,), best
+
+
+def _refit_team(
+    start: Fit, team: Team, pieces: Sequence[Run], bench: Bench
+) -> tuple[tuple[Candidate, ...], Fit]:
+    """Refit the members of a team together on pieces."""
+    starts = []
+    for values in team.starts:
+        grown = start
+        for candidate, own in zip(team.candidates, values, strict=True):
+            structure, theta = extend(grown, candidate, own)
+            grown = replace(start, structure=structure, theta=theta)
+        starts.append((grown.structure, grown.theta))
+    structure, theta = _best_start(starts, pieces, bench)
+    fit = fit_model(structure, theta, pieces, iterations=5, scatter_free=False, mapper=bench.mapper)
+    return team.candidates, fit
+
+
+def _best_start(
+    starts: Sequence[tuple[Structure, Array]], pieces: Sequence[Run], bench: Bench
+) -> tuple[Structure, Array]:
+    """Return the start that leaves least: the screen's is a trial's multiple, not simulated."""
+    return min(
+        starts,
+        key=lambda start: fit_model(*start, pieces, iterations=0, mapper=bench.mapper).cost,
+    )
 
 
 def fit_whole(structure: Structure, theta: Array, bench: Bench) -> Fit:
@@ -196,28 +251,37 @@ def fit_whole(structure: Structure, theta: Array, bench: Bench) -> Fit:
     return fit
 
 
-def _grown_friction(effect: Effect, simple: Fit, bench: Bench) -> Hypothesis:
-    """Fit a richer friction law from the simpler one's fit."""
+def _grown_friction(
+    effect: Effect, added: Sequence[Candidate], simple: Fit, bench: Bench
+) -> Hypothesis:
+    """Fit a richer friction law in the places of the simpler one, just added, from its fit."""
     structure = simple.structure
-    index = len(structure.effects) - 1
-    place = structure.effects[index].place
-    force = structure.model(simple.theta).terms[index].values[0]
-    base = simple.theta[: structure.span(index).start]
-    trials = candidates_at(effect, place, runs=bench.training, chain=structure.chain(simple.theta))
-    without = structure.without(index)
+    simpler = [c for c in added if c.effect.key == effect.grows_from]
+    at = [structure.effects.index(c) for c in simpler]
+    terms = structure.model(simple.theta).terms
+    forces = [terms[index].values[0] for index in at]
+    chain = structure.chain(simple.theta)
+    spans = np.r_[tuple(structure.span(index) for index in at)]
+    base = replace(simple, structure=structure.without(*at), theta=np.delete(simple.theta, spans))
+    trials = [candidates_at(effect, c.place, runs=bench.training, chain=chain) for c in simpler]
     fits = []
     tried = set()
-    for candidate, values in trials:
-        start = _friction_start(effect, force, values)
-        if start in tried:
+    for trial in zip(*trials, strict=True):
+        starts = tuple(
+            _friction_start(effect, force, values)
+            for force, (_, values) in zip(forces, trial, strict=True)
+        )
+        if starts in tried:
             continue
-        tried.add(start)
-        grown = without.with_effect(candidate)
-        theta = extend(replace(simple, structure=without, theta=base), candidate, start)[1]
+        tried.add(starts)
+        start = base
+        for (candidate, _), values in zip(trial, starts, strict=True):
+            grown, theta = extend(start, candidate, values)
+            start = replace(base, structure=grown, theta=theta)
         fits.append(
             fit_model(
-                grown,
-                theta,
+                start.structure,
+                start.theta,
                 bench.training,
                 iterations=4,
                 scatter_free=False,
@@ -226,7 +290,7 @@ def _grown_friction(effect: Effect, simple: Fit, bench: Bench) -> Hypothesis:
         )
     best = min(fits, key=lambda fit: fit.cost)
     fit = fit_whole(best.structure, best.theta, bench)
-    return judge(fit, bench, added=best.structure.effects[-1])
+    return judge(fit, bench, added=best.structure.effects[-len(added) :])
 
 
 def _friction_start(effect: Effect, force: float, values: tuple[float, ...]) -> tuple[float, ...]:

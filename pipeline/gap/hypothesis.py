@@ -1,6 +1,6 @@
 """A hypothesis: effects at places, fitted, and judged on runs the fit has not seen."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +15,7 @@ from pipeline.plant.effects.base import Effect
 AT_FLOOR = 1.15  # chi-square per point below this is noise
 THINNING = 10.0  # neighbouring residuals are not independent: N / 10 count
 BIC_DROP = 20.0  # by which the criterion must fall for one more effect
+_SAME_LAW = 6.0  # … and for one that another cart already has
 CONTACT = ("end_stop", "backlash")
 _ENOUGH_NOISE, _ENOUGH_REPEATS = 2.0, 1.5  # times the floor, or what repeats differ by
 _HELD_OUT_GAIN = 0.95  # an effect must lower the held-out error by this factor …
@@ -29,8 +30,8 @@ _BOUND_MARGIN = 0.01  # in logarithms, or in scales
 class Hypothesis:
     """A model with its fit on training runs and what it leaves on held-out ones.
 
-    `at_floor`: nothing is left but noise, on training and on held-out runs. `added` is the effect
-    added last.
+    `at_floor`: nothing is left but noise, on training and on held-out runs. `added` are
+    the effects added last.
     """
 
     fit: Fit
@@ -38,12 +39,18 @@ class Hypothesis:
     error: float
     bic: float
     at_floor: bool
-    added: Candidate | None = None
+    added: tuple[Candidate, ...] = ()
 
     @property
     def key(self) -> frozenset[tuple[str, int]]:
         """Which effects act where."""
         return frozenset(c.key for c in self.fit.structure.effects)
+
+    @property
+    def size(self) -> int:
+        """How many laws act: one of dry friction counts once, on however many carts it acts."""
+        effects = self.fit.structure.effects
+        return len({c.effect.key if c.effect.family else c.key for c in effects})
 
     @property
     def sound(self) -> bool:
@@ -89,7 +96,7 @@ class Bench:
         return hypothesis.error <= enough
 
 
-def judge(fit: Fit, bench: Bench, *, added: Candidate | None = None) -> Hypothesis:
+def judge(fit: Fit, bench: Bench, *, added: Sequence[Candidate] = ()) -> Hypothesis:
     """Return the hypothesis a fit stands for."""
     held = fit_locals(fit, bench.held_out, mapper=bench.mapper)
     errors, sizes = [], []
@@ -106,7 +113,7 @@ def judge(fit: Fit, bench: Bench, *, added: Candidate | None = None) -> Hypothes
         error=error,
         bic=float(bic),
         at_floor=fit.chi < AT_FLOOR and held.chi < AT_FLOOR,
-        added=added,
+        added=tuple(added),
     )
 
 
@@ -123,7 +130,8 @@ def worth_it(child: Hypothesis, parent: Hypothesis, bench: Bench) -> bool:
         return False
     contact = any(effect in CONTACT for effect, _ in parent.key)
     gain = _CONTACT_GAIN if contact else _HELD_OUT_GAIN
-    if child.bic > parent.bic - BIC_DROP or child.held.chi > gain**2 * parent.held.chi:
+    drop = BIC_DROP if child.size != parent.size else _SAME_LAW
+    if child.bic > parent.bic - drop or child.held.chi > gain**2 * parent.held.chi:
         return False
     better = child.held.run_chi < _RUN_GAIN**2 * parent.held.run_chi
     # A run with nothing but noise left cannot become better.

@@ -10,7 +10,7 @@ from pipeline.gap.grow import fit_whole, grow
 from pipeline.gap.hypothesis import BIC_DROP, CONTACT, Bench, Hypothesis, judge, worth_it
 from pipeline.gap.structure import Candidate
 
-_BEAM = (3, 2)  # hypotheses kept after one effect, two; then one
+_BEAM = (2,)  # hypotheses kept after the first step; then one
 _DEPTH = 6  # effects
 _HOPELESS = 5.0  # a hypothesis with this many times the best one's chi-square is not grown
 _STEP = 0.81  # of the chi-square: a tenth of the error, which a further effect must take
@@ -52,36 +52,40 @@ def _grow_beam(
         unique = {child.key: child for child in sorted(children, key=lambda h: -h.bic)}
         worthy = [child for child in unique.values() if not _needlessly_rich(child, unique)]
         worthy.sort(key=lambda h: h.bic)
-        bench.tell(f"{level + 1} effect{'s' * (level > 0)}: " + _names(worthy[0]))
+        count = len(worthy[0].key)
+        bench.tell(f"{count} effect{'s' * (count > 1)}: " + _names(worthy[0]))
         if worthy[0].at_floor:
             break
         before = min(h.fit.chi for h in beam)
         within = _HOPELESS * worthy[0].fit.chi
-        kept = [h for h in worthy if h.fit.chi <= within and _leads_on(h, before)]
-        beam = kept[: _BEAM[level] if level < len(_BEAM) else 1]
-        if not beam:
+        beam = []
+        for child in worthy:
+            # What grows from a part grows from the whole that explains more too.
+            if child.fit.chi <= within and not any(child.key < h.key for h in beam):
+                beam += [child] if _leads_on(child, before) else []
+        beam = beam[: _BEAM[level] if level < len(_BEAM) else 1]
+        if not beam or max(h.size for h in beam) >= depth:
             break
 
 
 def _leads_on(child: Hypothesis, before: float) -> bool:
     """May a further effect still make this one the best? `before` is the chi-square without."""
-    if child.added is not None and child.added.effect.key in CONTACT:
+    if any(c.effect.key in CONTACT for c in child.added):
         return _CONTACT_LAW < child.fit.chi < _CONTACT_STEP * before
     if any(key in CONTACT for key, _ in child.key) and child.fit.chi < _CONTACT_LAW:
         return False
     # One of two effects may do little by itself.
-    return len(child.key) == 1 or child.fit.chi < _STEP * before
+    return child.size == 1 or child.fit.chi < _STEP * before
 
 
 def _needlessly_rich(
     child: Hypothesis, others: Mapping[frozenset[tuple[str, int]], Hypothesis]
 ) -> bool:
-    """Does a simpler law in the place of the effect added last explain no less?"""
-    added = child.added
-    if added is None or added.effect.grows_from is None:
-        return False
-    simpler = others.get(child.key - {added.key} | {(added.effect.grows_from, added.place)})
-    return simpler is not None and simpler.bic < child.bic
+    """Does a simpler law in the places of the effects added last explain no less?"""
+    grown = {c.key: c.effect.grows_from for c in child.added if c.effect.grows_from}
+    simple = {(key, place) for (_, place), key in grown.items()}
+    simpler = others.get(child.key - frozenset(grown) | simple)
+    return bool(grown) and simpler is not None and simpler.bic < child.bic
 
 
 def _names(hypothesis: Hypothesis) -> str:
@@ -92,7 +96,7 @@ def choose(found: Sequence[Hypothesis], baseline: Hypothesis, bench: Bench) -> H
     """Return the best hypothesis whose every effect is worth it, the smaller where in doubt."""
     best = baseline
     for size in range(1, _DEPTH + 1):
-        level = [h for h in found if len(h.key) == size]
+        level = [h for h in found if h.size == size]
         level = [h for h in level if worth_it(h, best, bench)]
         if level:
             best = min(level, key=lambda h: h.bic)
@@ -116,7 +120,7 @@ def _without(hypothesis: Hypothesis, effect: Candidate, bench: Bench) -> Hypothe
     index = structure.effects.index(effect)
     theta = np.delete(hypothesis.fit.theta, np.r_[structure.span(index)])
     fit = fit_whole(structure.without(index), theta, bench)
-    return judge(fit, bench, added=fit.structure.effects[-1] if fit.structure.effects else None)
+    return judge(fit, bench, added=fit.structure.effects[-1:])
 
 
 def steps_to(

@@ -13,6 +13,7 @@ from pipeline.results import Record
 _LAST_SHARE = 0.4  # of a single run is held out
 _MOST_DWELLS = 4  # sine dwells used; they say little beyond their frequency
 _LEAST_MOTION = 8.0  # encoder steps
+_STILL = 3.0  # encoder steps within which a cart stands still
 _FEWEST, _SHORTEST = 50, 0.5  # samples, s
 _WINDOW = 0.5  # s; a chain without springs drifts, so it is judged over windows
 
@@ -40,6 +41,7 @@ def prepare(records: Sequence[Record], *, springs: tuple[bool, ...], notes: list
     if open_loop and len(open_loop) < len(usable):
         notes.append("runs under feedback are left out: open-loop runs tell more")
         usable = open_loop
+    usable = _with_still_carts_held(usable, notes=notes)
     dwells = [r for r in usable if r.kind == "sine"]
     if len(dwells) > _MOST_DWELLS:
         dwells.sort(key=lambda r: r.omega or 0.0)
@@ -69,9 +71,24 @@ def _is_usable(record: Record) -> bool:
 
 
 def _moves(record: Record) -> bool:
-    spans = [np.ptp(record.position(c)) for c in record.carts if c in record.free]
-    steps = [record.encoder_step(c) for c in record.carts if c in record.free]
-    return any(span > _LEAST_MOTION * step for span, step in zip(spans, steps, strict=True))
+    moving = (c for c in record.carts if c in record.free)
+    return any(_span(record, c) > _LEAST_MOTION * record.encoder_step(c) for c in moving)
+
+
+def _span(record: Record, cart: int) -> float:
+    return float(np.ptp(record.position(cart)))
+
+
+def _with_still_carts_held(records: list[Record], *, notes: list[str]) -> list[Record]:
+    """Return the records with the carts held that none of them moves, whatever they say."""
+    seen = [(r, cart) for r in records for cart in r.free if cart in r.carts]
+    moving = {cart for r, cart in seen if _span(r, cart) > _STILL * r.encoder_step(cart)}
+    still = {cart for _, cart in seen} - moving
+    if not still:
+        return records
+    carts = " and ".join(f"cart {cart}" for cart in sorted(still))
+    notes.append(f"{carts} stands still in every recording and is taken as held, not as free")
+    return [replace(r, free=tuple(c for c in r.free if c not in still)) for r in records]
 
 
 def take_sides(runs: list[Run], *, notes: list[str]) -> tuple[list[Run], list[Run]]:

@@ -83,9 +83,9 @@ class Structure:
         """Return the structure with one more effect."""
         return Structure(springs=self.springs, effects=(*self.effects, candidate))
 
-    def without(self, index: int) -> "Structure":
-        """Return the structure without one of its effects."""
-        kept = tuple(c for i, c in enumerate(self.effects) if i != index)
+    def without(self, *indices: int) -> "Structure":
+        """Return the structure without some of its effects."""
+        kept = tuple(c for i, c in enumerate(self.effects) if i not in indices)
         return Structure(springs=self.springs, effects=kept)
 
     # ------------------------------------------------------------ the vector

@@ -1,7 +1,6 @@
 """The verdict on a search: how much is explained, how surely, and what would settle it."""
 
 from collections.abc import Sequence
-from itertools import pairwise
 
 import numpy as np
 
@@ -62,7 +61,8 @@ def reach_verdict(
         and not _same_thing(rival, chosen, sample_time=sample_time)
         and (explained or not _same_kind(rival, chosen))
     ]
-    helpful = all(lowers_error(after, before, bench) for before, after in pairwise(steps))
+    # The others were dropped already, had they not paid beside it.
+    helpful = lowers_error(chosen, steps[-2], bench)
     disputed = bool(close) and chosen.error > _MOSTLY * baseline.error
     if not explained and (disputed or not helpful):
         return reach_verdict(steps[:-1], found, bench=bench, sample_time=sample_time)

@@ -170,6 +170,7 @@ def simulate_truth(
     u: np.ndarray,
     free: Sequence[int],
     x0: np.ndarray | None = None,
+    v0: np.ndarray | None = None,
     scatter: np.ndarray | None = None,
     step: float | None = None,
 ) -> np.ndarray:
@@ -198,7 +199,7 @@ def simulate_truth(
         t,
         np.asarray(u, dtype=float),
         np.zeros(n) if x0 is None else np.asarray(x0, dtype=float),
-        np.zeros(n),
+        np.zeros(n) if v0 is None else np.asarray(v0, dtype=float),
         np.ones(n) if scatter is None else scatter,
         step,
     )

@@ -58,12 +58,12 @@ def make_case(
     *,
     seed: int,
     n: int,
-    effects: Sequence[str] = (),
+    effects: Sequence[str | Hidden] = (),
     severity: float = 1.0,
     dirt: bool = False,
     rate: float | None = None,
 ) -> Case:
-    """Make a bench with the named effects at random places and sizes.
+    """Make a bench with the named effects at random places and sizes, or with those given.
 
     `dirt` adds what real benches do: friction that varies by 4 % from run to run, encoders
     zeroed where the cart happens to rest, time stamps rounded to a tenth of a millisecond.
@@ -84,7 +84,10 @@ def make_case(
         for _, _, t, u, free, x0 in plan
     ]
     hidden = tuple(
-        _draw(name, n, m, c, k, stiffness, large, rate, linear, severity, rng) for name in effects
+        effect
+        if isinstance(effect, Hidden)
+        else _draw(effect, n, m, c, k, stiffness, large, rate, linear, severity, rng)
+        for effect in effects
     )
     records = []
     for name, kind, t, u, free, x0 in plan:
@@ -114,6 +117,76 @@ def make_case(
                 resolution=np.full(n, COUNT),
             )
         )
+    return Case(
+        n=n,
+        springs=tuple(bool(s > 0) for s in k),
+        hidden=hidden,
+        records=tuple(records),
+        m=tuple(m),
+        c=tuple(c),
+        k=tuple(k),
+    )
+
+
+def make_rig(*, seed: int, n: int) -> Case:
+    """Make a bench as a class meets it, with several effects that none shows alone.
+
+    Dry friction of nearly one size on every cart, which differs from run to run; viscous damping
+    of cart 1 that doubles while the motor drives; decays let go by hand, with a speed and a zero
+    of their own; a coarse encoder; three repeats of each run and no other sizes.
+    """
+    rng = np.random.default_rng(seed)
+    m = np.array(_M[n - 1]) * rng.uniform(0.8, 1.25, n)
+    c = np.array(_C[n - 1]) * rng.uniform(0.7, 1.4, n)
+    k = np.array(_K[n - 1]) * rng.uniform(0.8, 1.25, n + 1)
+    stiffness = np.diag(k[:-1] + k[1:]) - np.diag(k[1:-1], 1) - np.diag(k[1:-1], -1)
+    force = rng.uniform(0.015, 0.025) * stiffness[0, 0]
+    friction = [
+        Hidden(
+            effect="coulomb_friction",
+            place=i + 1,
+            parameters={"force": force * rng.uniform(0.85, 1.15)},
+        )
+        for i in range(n)
+    ]
+    braking = Hidden(effect="drive_damping", parameters={"coefficient": c[0]})
+    hidden = (*friction, braking)
+    count = 4.0 * COUNT
+    everything, dt = tuple(range(1, n + 1)), 1.0 / 113.1
+    runs = [("alone", "step", (1,)), *(("both", "step", everything),) * (n > 1)]
+    runs += [(f"hand-{cart}", "decay", (cart,)) for cart in everything]
+    records = []
+    for name, kind, free in runs:
+        held = stiffness[0, 0] if name == "alone" else 1.0 / np.linalg.inv(stiffness)[0, 0]
+        size = held * rng.uniform(1.2, 1.8)
+        for trial in range(3):
+            t = np.asarray(np.arange(round(6.0 / dt)) * dt, dtype=np.float64)
+            x0, v0 = np.zeros(n), np.zeros(n)
+            u = np.zeros(t.size)
+            if kind == "step":
+                u[:] = np.where((t >= 0.05) & (t < 3.05), size, 0.0)
+            else:
+                i = free[0] - 1
+                x0[i] = rng.uniform(1.2, 2.2) * rng.choice([-1.0, 1.0])
+                v0[i] = rng.uniform(-0.2, 0.2) * x0[i] * np.sqrt(stiffness[i, i] / m[i])
+            scatter = (1.0 + 0.08 * rng.standard_normal()) * (1.0 + 0.02 * rng.standard_normal(n))
+            y = simulate_truth(
+                m=m, c=c, k=k, hidden=hidden, t=t, u=u, free=free, x0=x0, v0=v0, scatter=scatter
+            )
+            y = y + rng.uniform(-0.05, 0.05, (n, 1)) * np.array([[i in free] for i in everything])
+            y = np.round((y + 0.3 * COUNT * rng.standard_normal(y.shape)) / count) * count
+            records.append(
+                Record(
+                    id=f"{name}-{trial}",
+                    kind=kind,
+                    t=t,
+                    u=u,
+                    y=y,
+                    carts=everything,
+                    free=free,
+                    resolution=np.full(n, count),
+                )
+            )
     return Case(
         n=n,
         springs=tuple(bool(s > 0) for s in k),
