@@ -157,7 +157,7 @@ def _session(bench: Emulator, *, carts: int = 2, observer: Notes | None = None):
 def test_a_changed_digit_of_a_start_is_noticed(tmp_path, monkeypatch, change, real):
     """The targets in the lines are not those of the wave: the run ends, to be tried again."""
     with _session(real) as (session, line, ask):
-        order = make_order(sine("dwell", seconds=5), **ask)
+        order = make_order(sine("dwell", seconds=2), **ask)
         send = line.send
 
         def changed(*commands: Command) -> None:

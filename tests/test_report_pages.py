@@ -29,7 +29,7 @@ from tests.ucsd import write_one_cart_submission, write_two_cart_submission
 from tests.waiting import PATIENCE
 
 CASES = (
-    "one", "two", "three", "gap", "solution", "effects", "class", "feedback",
+    "one", "three", "gap", "solution", "effects", "class", "feedback",
     *(pytest.param(case, marks=[pytest.mark.slow, pytest.mark.sample])
       for case in ("real-one", "real-two")),
 )  # fmt: skip
