@@ -201,6 +201,38 @@ def test_two_effects_are_found_together():
     assert gap.effects[-1].nrmse_after == gap.final
 
 
+@pytest.mark.parametrize(
+    ("effect", "hardness", "part"),
+    [
+        ("end_stop", 25.0, 0.6),
+        ("slack_spring", 3.0, 0.6),
+        pytest.param("end_stop", 5.0, 0.9, marks=[pytest.mark.slow, pytest.mark.sample]),
+        pytest.param("end_stop", 5.0, 0.6, marks=[pytest.mark.slow, pytest.mark.sample]),
+        pytest.param("slack_spring", 0.5, 0.9, marks=[pytest.mark.slow, pytest.mark.sample]),
+        pytest.param("slack_spring", 8.0, 0.6, marks=[pytest.mark.slow, pytest.mark.sample]),
+    ],
+)
+def test_a_stop_and_a_stiffening_spring_are_told_apart(effect, hardness, part):
+    """Met just before the largest swing or far from it, neither is taken for the other.
+
+    Where the spring is as hard as a stop, both may be listed.
+    """
+    bare = make_case(seed=7, n=1, rate=200.0)
+    top = part * max(float(r.y.max()) for r in bare.records if r.kind == "step")
+    k = sum(bare.k)
+    sizes = {
+        "end_stop": {"position": top, "stiffness": hardness * k},
+        "slack_spring": {"stretch": top, "stiffness_change": hardness * k / bare.k[0]},
+    }
+    hidden = Hidden(effect=effect, place=1, parameters=sizes[effect])
+
+    gap = explain(make_case(seed=7, n=1, effects=[hidden], rate=200.0))
+
+    assert gap.verdict == "named" or (gap.verdict == "ambiguous" and hardness > 4.0)
+    assert names(gap) == [(effect, 1)]
+    assert gap.final < 1.2 * gap.noise_floor
+
+
 @pytest.mark.slow
 @pytest.mark.sample
 def test_friction_on_all_carts_is_found_at_once():

@@ -15,6 +15,7 @@ from pipeline.gap.runs import Run, cut_shots
 from pipeline.gap.screen import Suspect, Team, candidates_at, extend, screen
 from pipeline.gap.structure import Candidate, Structure
 from pipeline.plant.chain import Array
+from pipeline.plant.effects import find_effect
 from pipeline.plant.effects.base import Effect
 
 _SHORT_LIST = 9  # suspects refitted on pieces
@@ -25,6 +26,7 @@ _BESIDE_THE_FLOOR = 1.5  # … where that one leaves no more than noise
 _IN_THE_RUNNING = 3.0  # times the best sibling's misfit: what may still win when refined
 _TOGETHER = 0.9  # of the best single one's misfit, which a team must leave at most
 _NO_LESS = 1.03  # of the same: what a part of a team leaves that does as well alone
+_HARD = 4.0  # times its stiffness: a spring that much stiffer past a stretch may be a contact
 _POLISHED = 0.1  # of the chi-square without it: a contact that is there explains more
 _NOISE_ALONE = 1.05  # chi-square that no richer law of friction lowers
 _HINT = 2.0  # what the criterion must fall by, by the screen's estimate, to be worth a refit
@@ -46,6 +48,9 @@ def grow(parent: Hypothesis, bench: Bench) -> Iterator[Hypothesis]:
         fits.append((candidates, fit_whole(start.structure, start.theta, bench)))
         if not _is_contact(candidates):
             yield judge(fits[-1][1], bench, added=candidates)
+    for candidates, fit in fits[:]:
+        for stop, structure, theta in _stops_like(candidates, fit, bench):
+            fits.append(((stop,), fit_whole(structure, theta, bench)))
     lowest = min((fit.cost for _, fit in fits), default=np.inf)
     contacts: dict[tuple[str, int], Fit] = {}
     for candidates, fit in sorted(fits, key=lambda pair: pair[1].cost):
@@ -74,6 +79,33 @@ def _better_told(
         or (others < keys and f.cost < _NO_LESS * fit.cost)
         for more, f in fits
     )
+
+
+def _stops_like(
+    added: Sequence[Candidate], fit: Fit, bench: Bench
+) -> Iterator[tuple[Candidate, Structure, Array]]:
+    """Yield the end stop that a wall spring, just added and hard past its stretch, may be."""
+    if {c.effect.key for c in added} != {"slack_spring"}:
+        return
+    index = len(fit.structure.effects) - 1
+    spring, structure = added[0].place, fit.structure.without(index)
+    change, stretch = fit.structure.model(fit.theta).terms[index].values
+    chain = fit.structure.chain(fit.theta)
+    # A spring's stretch is its right end's position, or minus its left end's.
+    carts = [
+        (cart, side) for cart, side in ((spring, 1.0), (spring - 1, -1.0)) if 0 < cart <= chain.n
+    ]
+    taken = {c.key for c in structure.effects}
+    if change < _HARD or len(carts) > 1 or ("end_stop", carts[0][0]) in taken:
+        return
+    ((cart, side),) = carts
+    base = replace(
+        fit, structure=structure, theta=np.delete(fit.theta, np.r_[fit.structure.span(index)])
+    )
+    trials = candidates_at(find_effect("end_stop"), cart, runs=bench.training, chain=chain)
+    stop, (_, _, *rest) = next(t for t in trials if t[1][0] * side * stretch > 0.0)
+    values = (side * stretch, change * float(chain.k[spring - 1]), *rest)
+    yield stop, *extend(base, stop, values)
 
 
 def _is_contact(candidates: Sequence[Candidate]) -> bool:
