@@ -268,6 +268,27 @@ def test_a_description_is_believed_when_it_came_twice():
         open_line(port.address, baud=115_200)
 
 
+def test_a_stock_bench_may_take_half_a_second_to_begin(monkeypatch):
+    """A busy computer hands over the lines of the trial when it can."""
+    monkeypatch.setattr("pipeline.bench.host.serial_line._ANSWER", 0.05)  # to what it cannot answer
+    door = socket.create_server(("127.0.0.1", 0))
+
+    def late() -> None:
+        peer, _ = door.accept()
+        with door, peer:
+            heard = b""
+            while not heard.endswith(b"d;d;o;o;10;0;1;"):
+                heard += peer.recv(4096)
+            time.sleep(0.5)
+            peer.sendall(b"".join(b"0:0:0:0:0:%d\n" % ms for ms in range(100)))
+            while peer.recv(4096):
+                pass
+
+    threading.Thread(target=late, daemon=True).start()
+    with open_line(f"socket://127.0.0.1:{door.getsockname()[1]}", baud=115_200) as line:
+        assert (line.bench.name, line.bench.encoders) == ("stock", 3)
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows knows no SIGHUP")
 def test_a_closed_terminal_stops_the_motor(tmp_path, real):
     """SIGHUP ends a run with a stop, not a watchdog, and what came is saved."""
