@@ -3,6 +3,11 @@
 Units throughout: the submission's own position unit (say cm) and input unit (say V), seconds,
 radians. Time is the last axis. Carts and springs count from 1. A standard error ("std") is one
 sigma; `None` means it could not be had.
+
+The map goes on where a package has types of its own: `Ingested` (`ingest/read.py`, what was read),
+`Identified` and `Fitted` (`identify/`, what the stages make of the records, up to the fit),
+`Repeats` (`identify/soundness/repeated_numbers.py`), `Gap` (`gap/types.py`, what the linear carts
+leave out and what explains it) and `Grade` (`grading/grade.py`). `results_json.py` writes it all.
 """
 
 from dataclasses import dataclass, field

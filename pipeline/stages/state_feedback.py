@@ -22,19 +22,12 @@ from pipeline.plant import step_response
 from pipeline.plant.chain import Array, Chain, ComplexArray, quadratic_factors
 from pipeline.plant.feedback import lqr_gains, place_poles
 from pipeline.plant.loop import StateFeedback, check_ticks, discretise, simulate_loop
-from pipeline.plant.robustness import (
-    DAMPING_ERROR,
-    MASS_SPRING_ERROR,
-    level_error_percent,
-    stays_stable,
-)
+from pipeline.plant.robustness import DAMPING_ERROR, MASS_SPRING_ERROR, level_error_percent
+from pipeline.plant.sampled import RADIANS_PER_SAMPLE, SampledPlant, energy_weights
 from pipeline.results import FeedbackDesign
 
 Method = Literal["poles", "lqr"]
 
-_SAMPLE_TIME = 0.00884  # s; the laboratory's controller
-_RADIANS_PER_SAMPLE = 0.5  # of the fastest mode, at most: 12 samples a period
-_SAMPLES_TO_SETTLE = 25  # at least
 _HORIZON = 3.0  # settling times of the goal that a candidate's step is followed for
 _SHOWN = 2.0  # settling times of the chosen design's step in the result
 _LATEST = 10.0  # settling times of the goal at which a design that misses it is given up
@@ -105,7 +98,9 @@ def design_feedback(
     try:
         # A candidate may well be unstable and run away; it is judged by the numbers it ends in.
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
-            plant = _Sampled.of(chain, cart=cart, settling=settling_time, sample_time=sample_time)
+            plant = SampledPlant.of(
+                chain, cart=cart, settling=settling_time, sample_time=sample_time
+            )
             return _design(plant, goal, method=method)
     except np.linalg.LinAlgError:
         raise DataError(
@@ -118,14 +113,14 @@ def _range(values: Array) -> str:
     return f"{values.min():.1e} to {values.max():.1e}"
 
 
-def _design(plant: "_Sampled", goal: "_Goal", *, method: Method) -> FeedbackDesign:
+def _design(plant: SampledPlant, goal: "_Goal", *, method: Method) -> FeedbackDesign:
     """Choose among the candidates of a method and simulate the one chosen."""
     if method == "lqr":
-        requested, costs = None, _energies(plant, _WEIGHTS)
+        requested, costs = None, energy_weights(plant, _WEIGHTS)
         candidates = _try_step(plant, lqr_gains(plant.phi, plant.gamma, costs), goal)
         best, met = _choose(plant, candidates, goal)
         if not met:  # perhaps the goal is much faster than the plant
-            costs = _energies(plant, _HEAVY_WEIGHTS)
+            costs = energy_weights(plant, _HEAVY_WEIGHTS)
             candidates = _try_step(plant, lqr_gains(plant.phi, plant.gamma, costs), goal)
             best, met = _choose(plant, candidates, goal)
     else:
@@ -158,79 +153,10 @@ class _Goal:
         return f"overshoot {self.overshoot:.3g} % and settling in {self.settling:.3g} s{within}"
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Sampled:
-    """The sampled plant, free of units: x over 1, v over `rate`, u over `stiffness`."""
-
-    chain: Chain
-    cart: int
-    sample_time: float
-    rate: float  # rad/s
-    stiffness: float  # input unit per position unit
-    phi: Array  # (2n, 2n)
-    gamma: Array  # (2n,)
-
-    @classmethod
-    def of(
-        cls, chain: Chain, *, cart: int, settling: float, sample_time: float | None
-    ) -> "_Sampled":
-        speeds = np.maximum(np.abs(chain.poles), 4 / settling)
-        rate = float(np.exp(np.log(speeds).mean()))
-        if sample_time is None:
-            sample_time = min(
-                _SAMPLE_TIME, _RADIANS_PER_SAMPLE / speeds.max(), settling / _SAMPLES_TO_SETTLE
-            )
-        tied = chain.k[0] > 0 or chain.k[-1] > 0
-        stiffness = 1 / chain.static_gains()[0] if tied else chain.m.sum() * rate**2
-        phi, gamma = discretise(chain, sample_time)
-        if not (np.all(np.isfinite(phi)) and np.all(np.isfinite(gamma * stiffness))):
-            raise np.linalg.LinAlgError("the sampled plant is not finite")
-        unit = np.tile([1.0, rate], chain.n)
-        return cls(
-            chain=chain,
-            cart=cart,
-            sample_time=float(sample_time),
-            rate=rate,
-            stiffness=float(stiffness),
-            phi=phi * unit / unit[:, None],
-            gamma=gamma * stiffness / unit,
-        )
-
-    @property
-    def row(self) -> int:
-        return 2 * (self.cart - 1)
-
-    def to_units(self, gains: Array) -> Array:
-        return gains * self.stiffness / np.tile([1.0, self.rate], self.chain.n)
-
-    def cost_to_units(self, weights: Array) -> Array:
-        """Return Q of the cost in which the input's square is weighed by 1/stiffness."""
-        unit = np.tile([1.0, self.rate], self.chain.n)
-        return self.stiffness * weights / np.outer(unit, unit)
-
-    def stays_stable(self, gains: Array) -> bool:
-        controller = StateFeedback(gains=gains, prefilter=1.0, model=self.chain)
-        return stays_stable(self.chain, controller, sample_time=self.sample_time)
-
-
 # -------------------------------------------------------------- candidate gains
 
 
-def _energies(plant: _Sampled, weights: Array) -> Array:
-    """Return Q (n_candidates, 2n, 2n) for a grid of weights of either energy, R being one."""
-    chain, n = plant.chain, plant.chain.n
-    stiffness = chain.stiffness / plant.stiffness
-    if chain.k[0] == chain.k[-1] == 0:
-        # Nothing holds the carts as a whole: weigh their mean displacement as a spring would.
-        stiffness = stiffness + np.ones((n, n)) / n**2
-    potential, kinetic = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 * n))
-    potential[0::2, 0::2] = stiffness
-    kinetic[1::2, 1::2] = np.diag(chain.m) * plant.rate**2 / plant.stiffness
-    alpha, beta = (w.ravel()[:, None, None] for w in np.meshgrid(weights, weights, indexing="ij"))
-    return alpha * potential + beta * kinetic
-
-
-def _pole_candidates(plant: _Sampled, goal: _Goal) -> ComplexArray:
+def _pole_candidates(plant: SampledPlant, goal: _Goal) -> ComplexArray:
     """Return continuous pole sets (n_candidates, 2n), rad/s."""
     omega, zeta = quadratic_factors(plant.chain.poles)
     shares = np.array([overshoot for _, overshoot in _AIMS])
@@ -273,7 +199,7 @@ class _Candidates:
     level_error: Array  # percent of the step, from errors in the model
 
 
-def _try_step(plant: _Sampled, gains: Array, goal: _Goal) -> _Candidates:
+def _try_step(plant: SampledPlant, gains: Array, goal: _Goal) -> _Candidates:
     """Follow the step of every candidate at once; exact at the points looked at.
 
     They lie close enough to miss no peak, even if that ends the view before the goal's time:
@@ -281,7 +207,7 @@ def _try_step(plant: _Sampled, gains: Array, goal: _Goal) -> _Candidates:
     """
     loop = plant.phi - plant.gamma[:, None] * gains[:, None, :]
     fastest = np.abs(plant.chain.poles).max() + 4 / goal.settling
-    apart = min(_HORIZON * goal.settling / _POINTS, _RADIANS_PER_SAMPLE / fastest)
+    apart = min(_HORIZON * goal.settling / _POINTS, RADIANS_PER_SAMPLE / fastest)
     stride = max(1, round(apart / plant.sample_time))
     level = np.linalg.solve(np.eye(plant.gamma.size) - loop, plant.gamma[:, None])
     prefilter = 1 / level[:, plant.row]
@@ -309,7 +235,7 @@ def _try_step(plant: _Sampled, gains: Array, goal: _Goal) -> _Candidates:
     )
 
 
-def _choose(plant: _Sampled, candidates: _Candidates, goal: _Goal) -> tuple[int, bool]:
+def _choose(plant: SampledPlant, candidates: _Candidates, goal: _Goal) -> tuple[int, bool]:
     """Return the index of the best candidate and whether it meets the goal, or comes nearest."""
     within = candidates.peak <= goal.limit
     if not within.any():  # a step of this size is out of reach: design for a smaller one
@@ -336,7 +262,7 @@ def _choose(plant: _Sampled, candidates: _Candidates, goal: _Goal) -> tuple[int,
 
 
 def _finish(
-    plant: _Sampled,
+    plant: SampledPlant,
     goal: _Goal,
     *,
     gains: Array,
@@ -391,7 +317,7 @@ def _finish(
     return replace(design, message=_message(plant, goal, design))
 
 
-def _message(plant: _Sampled, goal: _Goal, design: FeedbackDesign) -> str:
+def _message(plant: SampledPlant, goal: _Goal, design: FeedbackDesign) -> str:
     """Say what is reachable where the goal is not, and what model error does; often nothing."""
     said = []
     tied = plant.chain.k[0] > 0 or plant.chain.k[-1] > 0

@@ -1,0 +1,86 @@
+"""A chain as its controller sees it: sampled, free of units, and the energies in its state."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.plant.chain import Array, Chain
+from pipeline.plant.loop import StateFeedback, discretise
+from pipeline.plant.robustness import stays_stable
+
+RADIANS_PER_SAMPLE = 0.5  # of the fastest mode, at most: 12 samples a period
+_SAMPLE_TIME = 0.00884  # s; the laboratory's controller
+_SAMPLES_TO_SETTLE = 25  # at least
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SampledPlant:
+    """The sampled plant, free of units: x over 1, v over `rate`, u over `stiffness`."""
+
+    chain: Chain
+    cart: int
+    sample_time: float
+    rate: float  # rad/s
+    stiffness: float  # input unit per position unit
+    phi: Array  # (2n, 2n)
+    gamma: Array  # (2n,)
+
+    @classmethod
+    def of(
+        cls, chain: Chain, *, cart: int, settling: float, sample_time: float | None
+    ) -> "SampledPlant":
+        """Sample a chain, fast enough for its modes and for the settling (s) asked for."""
+        speeds = np.maximum(np.abs(chain.poles), 4 / settling)
+        rate = float(np.exp(np.log(speeds).mean()))
+        if sample_time is None:
+            sample_time = min(
+                _SAMPLE_TIME, RADIANS_PER_SAMPLE / speeds.max(), settling / _SAMPLES_TO_SETTLE
+            )
+        tied = chain.k[0] > 0 or chain.k[-1] > 0
+        stiffness = 1 / chain.static_gains()[0] if tied else chain.m.sum() * rate**2
+        phi, gamma = discretise(chain, sample_time)
+        if not (np.all(np.isfinite(phi)) and np.all(np.isfinite(gamma * stiffness))):
+            raise np.linalg.LinAlgError("the sampled plant is not finite")
+        unit = np.tile([1.0, rate], chain.n)
+        return cls(
+            chain=chain,
+            cart=cart,
+            sample_time=float(sample_time),
+            rate=rate,
+            stiffness=float(stiffness),
+            phi=phi * unit / unit[:, None],
+            gamma=gamma * stiffness / unit,
+        )
+
+    @property
+    def row(self) -> int:
+        """Which state is the position of the cart."""
+        return 2 * (self.cart - 1)
+
+    def to_units(self, gains: Array) -> Array:
+        """Return gains (…, 2n) in input unit per position unit, and per its rate."""
+        return gains * self.stiffness / np.tile([1.0, self.rate], self.chain.n)
+
+    def cost_to_units(self, weights: Array) -> Array:
+        """Return Q of the cost in which the input's square is weighed by 1/stiffness."""
+        unit = np.tile([1.0, self.rate], self.chain.n)
+        return self.stiffness * weights / np.outer(unit, unit)
+
+    def stays_stable(self, gains: Array) -> bool:
+        """Whether the loop is stable whatever the usual errors of the chain; gains in units."""
+        controller = StateFeedback(gains=gains, prefilter=1.0, model=self.chain)
+        return stays_stable(self.chain, controller, sample_time=self.sample_time)
+
+
+def energy_weights(plant: SampledPlant, weights: Array) -> Array:
+    """Return Q (n_candidates, 2n, 2n) for a grid of weights of either energy, R being one."""
+    chain, n = plant.chain, plant.chain.n
+    stiffness = chain.stiffness / plant.stiffness
+    if chain.k[0] == chain.k[-1] == 0:
+        # Nothing holds the carts as a whole: weigh their mean displacement as a spring would.
+        stiffness = stiffness + np.ones((n, n)) / n**2
+    potential, kinetic = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 * n))
+    potential[0::2, 0::2] = stiffness
+    kinetic[1::2, 1::2] = np.diag(chain.m) * plant.rate**2 / plant.stiffness
+    alpha, beta = (w.ravel()[:, None, None] for w in np.meshgrid(weights, weights, indexing="ij"))
+    return alpha * potential + beta * kinetic
