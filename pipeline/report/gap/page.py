@@ -6,13 +6,11 @@ from pathlib import Path
 from pipeline import __version__
 from pipeline.gap.residual_force import ResidualForce, residual_forces
 from pipeline.gap.types import FoundEffect, Gap, RecordGap, Trace
-from pipeline.plant.effects.base import Term
 from pipeline.report.document import (
     Block,
     Details,
     Document,
     Section,
-    Span,
     bullet_list,
     paragraph,
     spans,
@@ -33,6 +31,8 @@ from pipeline.report.gap.tables import (
     window_table,
 )
 from pipeline.report.gap.words import (
+    WORDS,
+    capital,
     contenders,
     effect_name,
     error_board,
@@ -83,7 +83,7 @@ def build_gap_document(
         parts.append(
             (
                 f"effect-{i + 1}",
-                title[:1].upper() + title[1:],
+                capital(title),
                 lambda i=i: _effect(page, gap, i, forces=forces),
             )
         )
@@ -123,46 +123,45 @@ def _where(page: Page, gap: Gap) -> list[Block]:
     if not rows:
         return []
     shown = rows[:_MOST_ROWS]
-    top = shown[0]
+    top, more = shown[0], left_out(len(rows) - len(shown))
+    alt = WORDS.text(
+        "by_record_alt",
+        runs=count(len(shown), "run"),
+        run=top.experiment,
+        cart=top.cart,
+        **_shares(top),
+    )
+    caption = WORDS.text("by_record", more=more)
     blocks: list[Block] = [
-        page.picture(
-            "by-record",
-            by_record_figure(shown),
-            caption="Error of each run and cart before (ring) and after (dot); the tick is what "
-            "noise alone makes. Names in black were held out: the models were not fitted to them."
-            f"{left_out(len(rows) - len(shown))}",
-            alt=f"Errors of {count(len(shown), 'run')} on a logarithmic axis. The worst held-out "
-            f"one is {top.experiment}, cart {top.cart}: {share(top.baseline)} before, "
-            f"{share(top.final)} after, noise {share(top.noise_floor)}.",
-        )
+        page.picture("by-record", by_record_figure(shown), caption=caption, alt=alt)
     ]
     if gap.where:
-        number = page.table_number()
-        blocks.append(window_table(gap.where, model="the linear model", number=number))
+        blocks.append(window_table(gap.where, model="linear_model", number=page.table_number()))
     return blocks
+
+
+def _shares(row: RecordGap) -> dict[str, str]:
+    errors = {"baseline": row.baseline, "final": row.final, "noise_floor": row.noise_floor}
+    return {name: share(error) for name, error in errors.items()}
 
 
 def _before_after(page: Page, gap: Gap, trace: Trace, *, number: int) -> Block:
     row = _row(gap, trace)
-    size = page_noise = 0.0
+    noise = 0.0
     if row is not None and row.final > 0:
         left = trace.measured - trace.final
-        size = float((left**2).mean() ** 0.5) / row.final
-        page_noise = row.noise_floor * size
-    errors = (
-        f" Error {share(row.baseline)} of the motion before, {share(row.final)} after; noise "
-        f"{share(row.noise_floor)}."
-        if row
-        else ""
-    )
-    held = "held out, so no model was fitted to it" if trace.held_out else "used to fit"
+        noise = row.noise_floor * (float((left**2).mean() ** 0.5) / row.final)
+    said = {
+        "cart": str(trace.cart),
+        "run": trace.experiment,
+        "held": WORDS.text("held_out" if trace.held_out else "used"),
+        "errors": WORDS.text("run_errors", **_shares(row)) if row else "",
+    }
     return page.picture(
         f"before-after-{number}",
-        before_after_figure(trace, noise=page_noise, position_unit=page.position),
-        caption=f"Cart {trace.cart} in {trace.experiment} ({held}): measured and simulated, and "
-        f"what each model leaves (the band is twice the noise).{errors}",
-        alt=f"Measured motion of cart {trace.cart} in {trace.experiment} with the linear model and "
-        f"the model with its effects.{errors}",
+        before_after_figure(trace, noise=noise, position_unit=page.position),
+        caption=WORDS.text("before_after", **said),
+        alt=WORDS.text("before_after_alt", **said),
     )
 
 
@@ -172,26 +171,22 @@ def _before_after(page: Page, gap: Gap, trace: Trace, *, number: int) -> Block:
 def _effect(page: Page, gap: Gap, index: int, *, forces: Sequence[ResidualForce]) -> list[Block]:
     found = gap.effects[index]
     effect = found.effect
-    terms = _terms(gap)
-    step = (
-        f"Added to the model, it takes the error on held-out runs from "
-        f"{share(found.nrmse_before)} of the motion to {share(found.nrmse_after)}."
-    )
+    before, after = share(found.nrmse_before), share(found.nrmse_after)
     blocks: list[Block] = [
-        paragraph(effect.sentence, f" {step}"),
-        law(terms, index),
+        paragraph(WORDS.spans("step", sentence=effect.sentence, before=before, after=after)),
+        law(gap.model.terms, index),
         *_evidence(page, gap, found, forces=forces, number=index + 1),
         effect_parameter_table(found, number=page.table_number()),
     ]
     if found.rivals:
         blocks.append(rival_table(found, gap, number=page.table_number()))
-    facts = [
-        ("Its fingerprint: ", effect.fingerprint),
-        ("The run that decides: ", effect.deciding_run),
-        ("What these data could not tell from it: ", effect.equivalent),
-        ("Read: ", f"{effect.reference}."),
-    ]
-    blocks.append(bullet_list(spans(Span(lead, "strong"), text) for lead, text in facts if text))
+    facts = {
+        "fingerprint": effect.fingerprint,
+        "decides": effect.deciding_run,
+        "equivalent": effect.equivalent,
+        "read": effect.reference,
+    }
+    blocks.append(bullet_list(WORDS.spans(key, text=text) for key, text in facts.items() if text))
     return blocks
 
 
@@ -199,41 +194,24 @@ def _evidence(
     page: Page, gap: Gap, found: FoundEffect, *, forces: Sequence[ResidualForce], number: int
 ) -> list[Block]:
     """Return the figure that shows the effect: force against what causes it, or in time."""
-    name = effect_name(found.effect, found.where)
-    others = " Other effects act in the same runs and are part of both." * (len(gap.effects) > 1)
     axis = found.effect.axis
     if axis == "frequency":
         held_out = [trace for trace in gap.traces if trace.held_out]
         if not held_out:
             return []
-        figure = spectrum_figure(held_out, position_unit=page.position)
-        caption = (
-            "Amplitude over frequency in the held-out runs: the motion, and what the models leave."
-        )
+        shown, figure = "shown_frequency", spectrum_figure(held_out, position_unit=page.position)
     elif axis == "time":
-        figure = timing_figure(forces, drive=page.drive)
-        caption = (
-            "The force that reaches cart 1 around an edge of the input: masses, dampings and "
-            f"springs times the measured motion, against the logged input.{others}"
-        )
+        shown, figure = "shown_time", timing_figure(forces, drive=page.drive)
     else:
-        figure = force_figure(found, forces, units=(page.position, page.drive))
-        caption = (
-            "The force that masses, dampings and springs do not account for, each point a mean "
-            "over a short window of a run; the same from the motion that the model with "
-            f"its effects gives.{others}"
-        )
+        units = (page.position, page.drive)
+        shown, figure = "shown_force", force_figure(found, forces, units=units)
     if figure is None:
         return []
-    return [
-        page.picture(
-            f"effect-{number}",
-            figure,
-            caption=f"The evidence for {name}. {caption}",
-            alt=f"Evidence for {name}: measured points and model against "
-            f"{'time' if axis == 'time' else axis}. {found.effect.fingerprint}",
-        )
-    ]
+    name = effect_name(found.effect, found.where)
+    others = WORDS.text("others") if len(gap.effects) > 1 else ""
+    caption = WORDS.text("evidence", name=name, shown=WORDS.text(shown, others=others))
+    alt = WORDS.text("evidence_alt", name=name, axis=axis, fingerprint=found.effect.fingerprint)
+    return [page.picture(f"effect-{number}", figure, caption=caption, alt=alt)]
 
 
 # --------------------------------------------------------------- runs and rivals
@@ -246,7 +224,7 @@ def _runs(page: Page, gap: Gap, worst: Sequence[Trace]) -> list[Block]:
     ]
     if gap.left and gap.effects:
         number = page.table_number()
-        blocks.append(window_table(gap.left, model="the model with its effects", number=number))
+        blocks.append(window_table(gap.left, model="model_with_effects", number=number))
     return blocks
 
 
@@ -255,109 +233,59 @@ def _apart(gap: Gap) -> list[Block]:
         return []
     last, rival = contenders(gap)
     pair = [(last.effect, last.where), *([(rival.effect, rival.where)] if rival else [])]
-    return [
-        paragraph(
-            "Both explanations leave errors too alike to choose by. The experiments that each of "
-            "them asks for:"
-        ),
-        bullet_list(
-            spans(Span(f"{effect_name(effect, where)}: ", "strong"), effect.deciding_run)
-            for effect, where in pair
-        ),
-    ]
+    runs = bullet_list(
+        WORDS.spans("apart_run", name=effect_name(effect, where), run=effect.deciding_run)
+        for effect, where in pair
+    )
+    return [paragraph(WORDS.spans("apart")), runs]
 
 
 # --------------------------------------------------------------------- the model
 
 
-def _terms(gap: Gap) -> tuple[Term, ...]:
-    return gap.model.terms
-
-
 def _model(page: Page, gap: Gap) -> list[Block]:
-    if not gap.model.terms:
+    terms = gap.model.terms
+    if not terms:
         return []
-    springs = page.analysis.springs
     blocks: list[Block] = [
-        paragraph(
-            f"The input u (in {page.drive}) pushes cart 1; each effect adds a force f, or changes "
-            "the input, under a letter of its own:"
-        ),
-        augmented_equations(springs, gap.model.terms),
+        paragraph(WORDS.spans("model", drive=page.drive)),
+        augmented_equations(page.analysis.springs, terms),
     ]
-    for index, term in enumerate(gap.model.terms):
-        blocks += [
-            paragraph(f"{_where_words(term)}:"),
-            law(gap.model.terms, index),
-        ]
-    blocks.append(
-        chain_table(
-            gap.model.chain,
-            std=gap.chain_std,
-            number=page.table_number(),
-            position_unit=page.position,
-            input_unit=page.drive,
-        )
+    for index, term in enumerate(terms):
+        name, place = effect_name(term.effect, term.where), place_name(term.where)
+        where = WORDS.spans(f"where_{term.effect.place}", name=capital(name), place=place)
+        blocks += [paragraph(where), law(terms, index)]
+    table = chain_table(
+        gap.model.chain,
+        std=gap.chain_std,
+        number=page.table_number(),
+        position_unit=page.position,
+        input_unit=page.drive,
     )
     scatter = [
-        f"On cart {cart} the dry friction varies by {percent(100 * spread)} from run to run "
-        "(one standard deviation, learnt from the runs)."
+        WORDS.text("scatter", cart=cart, spread=percent(100 * spread))
         for cart, spread in sorted(gap.spread.items())
     ]
-    blocks += remarks(scatter)
-    blocks.append(
-        paragraph(
-            "The file ",
-            Span("gap.json", "code"),
-            " holds this model; ",
-            Span("cartlab simulate --model gap.json", "code"),
-            " simulates it.",
-        )
-    )
-    return blocks
-
-
-def _where_words(term: Term) -> str:
-    name = effect_name(term.effect, term.where)
-    meaning = {
-        "cart": f"x and v are position and velocity of {place_name(term.where)}",
-        "spring": f"d is the stretch of {place_name(term.where)}, x on its right less x on its "
-        "left",
-        "input": "u on the right is the logged input",
-    }[term.effect.place]
-    return f"{name[:1].upper() + name[1:]} ({meaning})"
+    return [*blocks, table, *remarks(scatter), paragraph(WORDS.spans("model_file"))]
 
 
 # ------------------------------------------------------------------ housekeeping
 
 
 def _method(gap: Gap) -> list[Block]:
-    blocks: list[Block] = [
-        paragraph(
-            "The linear chain was fitted to all training runs at once, so that wrong parameters "
-            "are taken up and only missing structure is left. Every effect of the catalogue was "
-            "then tried at every place; the best were fitted in full, together with the chain. "
-            "An effect is believed only if it shrinks the error on runs that no fit has seen."
-        ),
-        bullet_list(
-            spans(Span(lead, "strong"), clean(listing(list(runs))))
-            for lead, runs in (
-                ("Runs fitted to: ", gap.training),
-                ("Runs held out: ", gap.held_out),
-            )
-            if runs
-        ),
-    ]
-    return blocks + remarks(list(gap.notes))
+    runs = bullet_list(
+        WORDS.spans(key, runs=clean(listing(list(names))))
+        for key, names in (("fitted_to", gap.training), ("runs_held_out", gap.held_out))
+        if names
+    )
+    return [paragraph(WORDS.spans("method")), runs, *remarks(list(gap.notes))]
 
 
 def _provenance(page: Page, gap: Gap) -> list[Block]:
     files = file_table(page.analysis, number=page.table_number())
+    made = WORDS.spans("made" if gap.complete else "made_so_far", version=__version__)
     return [
-        paragraph(
-            f"Made by cartlab {__version__}. The same input gives the same report"
-            + ("." if gap.complete else ", but for a search that the time allowed has ended.")
-        ),
+        paragraph(made),
         Details(spans(count(len(page.analysis.files), "data file")), (files,)),
     ]
 

@@ -14,7 +14,7 @@ from pipeline.gap.stored import read_gap
 from pipeline.gap.types import Gap
 from pipeline.plant.chain import Array
 from pipeline.plant.effects import AugmentedChain
-from pipeline.report.document import Block, Span, paragraph
+from pipeline.report.document import Block, paragraph
 from pipeline.report.equations.effects import augmented_equations, law
 from pipeline.report.figures.style import (
     keep_in_sight,
@@ -27,6 +27,7 @@ from pipeline.report.figures.style import (
 )
 from pipeline.report.gap.tables import error_table
 from pipeline.report.gap.words import (
+    WORDS,
     effect_name,
     error_board,
     next_block,
@@ -83,16 +84,14 @@ def gap_in_short(gap: Gap | None) -> list[Block]:
         return []
     name = listing([effect_name(found.effect, found.where) for found in gap.effects])
     names = f" ({name})" if name and gap.verdict in ("named", "partial") else ""
-    return [
-        paragraph(
-            Span("The gap analysis. ", "strong"),
-            f"{verdict_title(gap)}{names}: on runs the model had not seen the error is "
-            f"{share(gap.baseline)} of the motion with the linear model and {share(gap.final)} "
-            f"in the end; noise makes {share(gap.noise_floor)}. See ",
-            Span("below", url="#gap"),
-            ".",
-        )
-    ]
+    said = WORDS.spans(
+        "in_short",
+        verdict=f"{verdict_title(gap)}{names}",
+        baseline=share(gap.baseline),
+        final=share(gap.final),
+        noise_floor=share(gap.noise_floor),
+    )
+    return [paragraph(said)]
 
 
 def gap_blocks(page: Page, gap: Gap | None) -> list[Block]:
@@ -104,8 +103,7 @@ def gap_blocks(page: Page, gap: Gap | None) -> list[Block]:
     if terms:
         blocks.append(augmented_equations(page.analysis.springs, terms))
         blocks += [law(terms, index) for index in range(len(terms))]
-    story = paragraph("The whole story is told by ", Span("gap.html", "code"), ".")
-    return [*blocks, *next_block(gap), story]
+    return [*blocks, *next_block(gap), paragraph(WORDS.spans("story"))]
 
 
 # ---------------------------------------------------------------------- the bench
@@ -135,14 +133,10 @@ def augmented_hardware_blocks(page: Page, gap: Gap | None) -> list[Block]:
     if not every:
         return []
     blocks: list[Block] = [
-        paragraph(
-            "The same input, measured on the bench, drives the linear model and the model with "
-            "the effects that the gap analysis found:"
-        ),
+        paragraph(WORDS.spans("replay")),
         make_table(
             page.table_number(),
-            "Difference from the measurement under the measured input, before and after the "
-            "effects are in the model.",
+            WORDS.text("replay_table"),
             ("Record", "Cart", "Linear model", "With the effects"),
             [
                 [
@@ -159,14 +153,13 @@ def augmented_hardware_blocks(page: Page, gap: Gap | None) -> list[Block]:
     drawn = [(run, found) for run, found in replays.items() if found][:_MOST_RUNS]
     for i, (run, found) in enumerate(drawn, start=1):
         worst = max(found, key=lambda replay: replay.nrmse)
+        cart, error = worst.check.cart, share(worst.nrmse)
         blocks.append(
             page.picture(
                 f"hardware-effects-{i}",
                 _replay_figure(found, position_unit=page.position),
-                caption=f"{run}: measured, and simulated with the measured input by the linear "
-                "model and by the model with the effects.",
-                alt=f"Measured motion in {run} with both models; the model with the effects is "
-                f"off by at most {share(worst.nrmse)} of the motion, at cart {worst.check.cart}.",
+                caption=WORDS.text("replay_caption", run=run),
+                alt=WORDS.text("replay_alt", run=run, error=error, cart=cart),
             )
         )
     return blocks

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from pipeline.gap.types import FoundEffect, Gap, GapWindow
 from pipeline.report.document import Cell, Table
-from pipeline.report.gap.words import effect_name, share
+from pipeline.report.gap.words import WORDS, effect_name, share
 from pipeline.report.numbers import percent, unit_text, with_error
 from pipeline.report.tables import cell, make_table
 from pipeline.report.words import clean
@@ -27,8 +27,7 @@ def error_table(gap: Gap, *, number: int) -> Table:
         )
     return make_table(
         number,
-        "Error on runs that were not used to fit: root mean square of measured minus simulated, "
-        "over that of the motion.",
+        WORDS.text("error_table"),
         ("Model", "Error"),
         rows,
         "ld",
@@ -36,11 +35,10 @@ def error_table(gap: Gap, *, number: int) -> Table:
 
 
 def window_table(windows: Sequence[GapWindow], *, model: str, number: int) -> Table:
-    """Return where a model fails most."""
+    """Return where a model, named by a key of the catalogue, fails most."""
     return make_table(
         number,
-        f"Where {model} fails most: the stretch of each run that holds most of its misfit "
-        "(squared), and what the cart does while the misfit grows.",
+        WORDS.text("window_table", model=WORDS.text(model)),
         ("Run", "Cart", "From [s]", "To [s]", "What happens", "Share"),
         [
             [
@@ -88,8 +86,7 @@ def rival_table(found: FoundEffect, gap: Gap, *, number: int) -> Table:
 
     return make_table(
         number,
-        "In its stead: other effects in the same role, each fitted to the end. The weight is by "
-        "the Bayesian information criterion, among all fitted models of the same size.",
+        WORDS.text("rival_table"),
         ("Effect", "Error on held-out runs", "Weight"),
         [
             line(effect_name(found.effect, found.where), gap.final, found.confidence, "good"),

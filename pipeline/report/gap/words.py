@@ -1,21 +1,25 @@
 """The gap in plain words: what explains it, how well, and what to do next."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 from pipeline.gap.types import FoundEffect, Gap, NamedValue, Rival
 from pipeline.plant.effects.base import Effect
 from pipeline.report.document import (
     Block,
-    Span,
     Spans,
     Tile,
     Tiles,
+    Tone,
     bullet_list,
     paragraph,
     spans,
 )
 from pipeline.report.numbers import count, listing, significant, unit_text, with_error
+from pipeline.report.phrases import phrases
 from pipeline.report.words import clean, plain_lines
+
+WORDS = phrases("gap")
 
 _AS_GOOD = 1.15  # times the error: a rival that the data do not tell from what was chosen
 _NEGLIGIBLE = 1e-3  # of a value: an error this small stands in the table alone
@@ -23,83 +27,49 @@ _NEGLIGIBLE = 1e-3  # of a value: an error this small stands in the table alone
 
 def verdict_title(gap: Gap) -> str:
     """Return the verdict in a few words."""
-    return {
-        "none": "The linear model is enough",
-        "named": "The gap has a name",
-        "partial": "Part of the gap has a name",
-        "ambiguous": "Two explanations fit alike",
-        "unexplained": "A gap that nothing in the catalogue explains",
-    }[gap.verdict]
+    return WORDS.text(f"title_{gap.verdict}")
 
 
 def error_board(gap: Gap) -> Tiles:
     """Return the error on runs no fit has seen: before, after, and what noise alone makes."""
     effects = count(len(gap.effects), "effect") if gap.effects else "no effect"
+    tone: Tone = "good" if gap.verdict in ("none", "named") else "bad"
     tiles = [
-        Tile(spans("Linear model"), spans(share(gap.baseline)), spans("of the motion is left")),
-        Tile(
-            spans(f"With {effects}"),
-            spans(share(gap.final)),
-            spans("is left"),
-            "good" if gap.verdict in ("none", "named") else "bad",
-        ),
-        Tile(spans("Noise alone"), spans(share(gap.noise_floor)), spans("cannot be explained")),
+        _tile("linear", gap.baseline),
+        replace(_tile("effects", gap.final, effects=effects), tone=tone),
+        _tile("noise", gap.noise_floor),
     ]
     if gap.repeatability is not None:
-        tiles.append(
-            Tile(
-                spans("Repeats differ by"), spans(share(gap.repeatability)), spans("of the motion")
-            )
-        )
+        tiles.append(_tile("repeats", gap.repeatability))
     return Tiles(tuple(tiles))
+
+
+def _tile(key: str, error: float, **values: str) -> Tile:
+    label, note = WORDS.spans(f"tile_{key}", **values), WORDS.spans(f"tile_{key}_note")
+    return Tile(label, spans(share(error)), note)
 
 
 def verdict_blocks(gap: Gap) -> list[Block]:
     """Say what explains the gap and how well; under `ambiguous`, both explanations."""
-    return [*_so_far(gap), *_verdict(gap)]
-
-
-def _so_far(gap: Gap) -> list[Block]:
-    if gap.complete:
-        return []
-    return [
-        paragraph(
-            Span("The best answer so far. ", "strong"),
-            "The time allowed ended the search before every explanation was tried: more time "
-            "(the option ",
-            Span("--budget", "code"),
-            ") may find a better one, and a faster computer may come further in the same time.",
-        )
-    ]
-
-
-def _verdict(gap: Gap) -> list[Block]:
+    so_far = [] if gap.complete else [paragraph(WORDS.spans("so_far"))]
     match gap.verdict:
         case "none":
-            return [
-                paragraph(
-                    Span("The linear model explains the data. ", "strong"),
-                    f"On runs it had not seen it is off by {share(gap.baseline)} of the motion; "
-                    f"noise alone makes {share(gap.noise_floor)}. No effect is needed.",
-                )
-            ]
+            said: list[Block] = [paragraph(WORDS.spans("none", **_shares(gap)))]
         case "named" | "partial":
-            return [_named(gap)]
+            said = [_named(gap)]
         case "ambiguous":
-            return _ambiguous(gap)
+            said = _ambiguous(gap)
         case "unexplained":
-            return [_unexplained(gap)]
+            said = [_unexplained(gap)]
+    return [*so_far, *said]
 
 
 def next_block(gap: Gap) -> list[Block]:
     """Say which experiment comes next, nothing where none is needed."""
     if not gap.next_experiment:
         return []
-    lead = {
-        "named": "The experiment that would confirm it. ",
-        "ambiguous": "What would tell them apart. ",
-    }.get(gap.verdict, "What to measure next. ")
-    return [paragraph(Span(lead, "strong"), clean(gap.next_experiment))]
+    key = f"next_{gap.verdict}" if gap.verdict in ("named", "ambiguous") else "next"
+    return [paragraph(WORDS.spans(key, experiment=clean(gap.next_experiment)))]
 
 
 def terminal_verdict(gap: Gap) -> str:
@@ -112,73 +82,53 @@ def terminal_verdict(gap: Gap) -> str:
 
 def _named(gap: Gap) -> Block:
     names = [effect_name(found.effect, found.where) for found in gap.effects]
-    sizes = "; ".join(sizes_text(found.parameters) for found in gap.effects)
-    verb = "explains" if len(names) == 1 else "together explain"
-    what = "part of what" if gap.verdict == "partial" else "what"
     return paragraph(
-        Span(f"{_capital(listing(names))} {verb} {what} the linear model leaves out: ", "strong"),
-        f"{sizes}. {' '.join(found.effect.sentence for found in gap.effects)} ",
-        _errors(gap),
+        WORDS.spans(
+            "named",
+            names=capital(listing(names)),
+            explain="explains" if len(names) == 1 else "together explain",
+            what="part of what" if gap.verdict == "partial" else "what",
+            sizes="; ".join(sizes_text(found.parameters) for found in gap.effects),
+            sentences=" ".join(found.effect.sentence for found in gap.effects),
+            errors=_errors(gap),
+        )
     )
 
 
 def _ambiguous(gap: Gap) -> list[Block]:
     last, rival = contenders(gap)
     others = [effect_name(f.effect, f.where) for f in gap.effects if f is not last]
-    beside = f", beside {listing(others)}" if others else ""
-    return [
-        paragraph(
-            Span(
-                f"{_capital(effect_name(last.effect, last.where))}, or "
-                f"{effect_name(rival.effect, rival.where)}{beside}: "
-                "these data cannot tell which. ",
-                "strong",
-            )
-            if rival
-            else Span(
-                f"{_capital(effect_name(last.effect, last.where))}{beside}, "
-                "or another effect that these data cannot tell from it. ",
-                "strong",
-            ),
-            _errors(gap),
-        ),
-        bullet_list(
-            [
-                _explanation(last.effect, last.where, gap.final, sizes_text(last.parameters)),
-                *(
-                    [_explanation(rival.effect, rival.where, rival.nrmse_after, "")]
-                    if rival
-                    else []
-                ),
-            ]
-        ),
-    ]
+    said = {
+        "name": capital(effect_name(last.effect, last.where)),
+        "beside": f", beside {listing(others)}" if others else "",
+        "errors": _errors(gap),
+    }
+    both = [_explanation(last.effect, last.where, gap.final, sizes_text(last.parameters))]
+    if rival is None:
+        return [paragraph(WORDS.spans("ambiguous_alone", **said)), bullet_list(both)]
+    both.append(_explanation(rival.effect, rival.where, rival.nrmse_after, ""))
+    named = effect_name(rival.effect, rival.where)
+    return [paragraph(WORDS.spans("ambiguous", rival=named, **said)), bullet_list(both)]
 
 
 def _explanation(effect: Effect, where: Mapping[str, int], error: float, sizes: str) -> Spans:
-    values = f" ({sizes})" if sizes else ""
-    return spans(
-        Span(_capital(effect_name(effect, where)), "strong"),
-        f"{values}: leaves {share(error)} of the motion. {effect.sentence} {effect.fingerprint}",
+    return WORDS.spans(
+        "explanation",
+        name=capital(effect_name(effect, where)),
+        values=f" ({sizes})" if sizes else "",
+        error=share(error),
+        sentence=effect.sentence,
+        fingerprint=effect.fingerprint,
     )
 
 
 def _unexplained(gap: Gap) -> Block:
+    said = {"noise": _noise(gap), "suspicion": _suspicion(gap), **_shares(gap)}
     if not gap.effects:
-        return paragraph(
-            Span("Something is missing, and nothing in the catalogue explains it. ", "strong"),
-            f"On runs it had not seen the linear model is off by {share(gap.baseline)} of the "
-            f"motion; {_noise(gap)}. No effect shrinks that enough to be believed."
-            + _suspicion(gap),
-        )
+        return paragraph(WORDS.spans("unexplained", **said))
     suspects = listing([effect_name(found.effect, found.where) for found in gap.effects])
     are = "suspect is" if len(gap.effects) == 1 else "suspects, together, are"
-    return paragraph(
-        Span("Something is missing that nothing in the catalogue explains. ", "strong"),
-        f"The best {are} {suspects}. The error on runs the model had not seen then falls from "
-        f"{share(gap.baseline)} of the motion to {share(gap.final)}, but {_noise(gap)}. "
-        f"Too much is left for a name.{_suspicion(gap)}",
-    )
+    return paragraph(WORDS.spans("suspected", are=are, suspects=suspects, **said))
 
 
 def _suspicion(gap: Gap) -> str:
@@ -192,27 +142,36 @@ def _suspicion(gap: Gap) -> str:
     return f" {also}: {listing(named)}."
 
 
+def _shares(gap: Gap) -> dict[str, str]:
+    return {
+        "baseline": share(gap.baseline),
+        "final": share(gap.final),
+        "noise_floor": share(gap.noise_floor),
+    }
+
+
 def _noise(gap: Gap) -> str:
     """Return what no model can be better than, as a clause."""
     if gap.repeatability is not None and gap.repeatability >= gap.noise_floor:
-        return f"repeats of one run differ by {share(gap.repeatability)}"
-    return f"noise alone makes {share(gap.noise_floor)}"
+        return WORDS.text("repeats_differ", share=share(gap.repeatability))
+    return WORDS.text("noise_makes", share=share(gap.noise_floor))
 
 
 def _errors(gap: Gap) -> str:
-    text = (
-        "On runs the model had not seen the error falls from "
-        f"{share(gap.baseline)} of the motion to {share(gap.final)}; {_noise(gap)}."
-    )
+    errors = WORDS.text("errors", noise=_noise(gap), **_shares(gap))
     if not gap.left:
-        return text
+        return errors
     least = max(gap.noise_floor, gap.repeatability or 0.0)
     worst = gap.left[0]
-    times = f"So {significant(gap.final / least, digits=2)} times as much" if least else "More"
-    return (
-        f"{text} {times} is left, most of it in {clean(worst.experiment)}, cart {worst.cart}, from "
-        f"{worst.start:.2f} to {worst.end:.2f} s ({clean(worst.what)}): this is the main part, not "
-        "all of it."
+    return WORDS.text(
+        "left",
+        errors=errors,
+        times=f"So {significant(gap.final / least, digits=2)} times as much" if least else "More",
+        run=clean(worst.experiment),
+        cart=worst.cart,
+        start=f"{worst.start:.2f}",
+        end=f"{worst.end:.2f}",
+        what=clean(worst.what),
     )
 
 
@@ -268,5 +227,6 @@ def share(value: float) -> str:
     return f"{significant(100 * value, digits=digits)} %"
 
 
-def _capital(text: str) -> str:
+def capital(text: str) -> str:
+    """Return a phrase as a sentence begins."""
     return text[:1].upper() + text[1:]

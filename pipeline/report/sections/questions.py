@@ -6,7 +6,7 @@ with the question's id; what stands under no such heading is the discussion.
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,14 +20,15 @@ from pipeline.report.document import (
     Span,
     paragraph,
     plain,
-    spans,
 )
 from pipeline.report.numbers import count, listing, percent, significant
+from pipeline.report.phrases import phrases
 from pipeline.report.sections.notes import discussion_blocks, even_headings
 from pipeline.report.words import SOURCES, clean, rich
 from pipeline.results import Analysis, HardwareCheck, ParameterRow
 from pipeline.stages.compare import DAMPING_LIMIT
 
+_WORDS = phrases("questions")
 _MOST = 6  # a report with more would be a questionnaire
 _LISTED = 4  # runs; of more the first
 _FAR = 0.10  # of the motion: a difference between bench and model worth a question
@@ -70,15 +71,10 @@ def _turned(analysis: Analysis) -> Iterator[Asked]:
     if not turned:
         return
     names = [record.id for record in turned]
-    listed = listing(names) if len(names) <= _LISTED else f"{names[0]} and {len(names) - 1} more"
+    runs = listing(names) if len(names) <= _LISTED else f"{names[0]} and {len(names) - 1} more"
     there = {"step": "steps", "sine": "frequency-response", "closed_loop": "hardware"}
-    yield Asked(
-        id="sign",
-        section=there.get(turned[0].kind, "discussion"),
-        text=f"The logged input of {listed} counts the other way than that of your other runs, and "
-        "was turned: no delay explains such a motion. What was different there: a plug, the "
-        "amplifier, or which signal is logged? State it in submission.toml, input = { sign = … }.",
-    )
+    section = there.get(turned[0].kind, "discussion")
+    yield Asked(id="sign", section=section, text=_WORDS.text("sign", runs=runs))
 
 
 def _off(analysis: Analysis) -> list[ParameterRow]:
@@ -87,54 +83,38 @@ def _off(analysis: Analysis) -> list[ParameterRow]:
 
 
 def _damping(analysis: Analysis) -> Iterator[Asked]:
-    off = [
-        row
-        for row in _off(analysis)
-        if read_name(row.name).is_ratio and row.initial is not None and row.final is not None
-    ]
-    if not off:
-        return
-    row, *others = off
-    assert row.initial is not None
-    assert row.final is not None
-    also = listing([f"{other.name} by {_change(other)}" for other in others])
-    yield Asked(
-        id=row.name,
-        section="parameters",
-        text=f"{row.name} changed by {_change(row)} from the {_source(row.initial.source)} to the "
-        f"{_source(row.final.source)}{f' ({also})' if also else ''}: which of your two methods saw "
-        "the larger amplitude, and what does dry friction do to a damping ratio as the amplitude "
-        "falls?",
-    )
+    off = [row for row in _off(analysis) if read_name(row.name).is_ratio]
+    if off:
+        row, *others = off
+        also = listing([f"{other.name} by {_change(other)}" for other in others])
+        yield _of_row(row, "damping", also=f" ({also})" if also else "")
 
 
 def _gains_and_frequencies(analysis: Analysis) -> Iterator[Asked]:
     for row in _off(analysis):
-        if read_name(row.name).is_ratio or row.initial is None or row.final is None:
+        name = read_name(row.name)
+        if name.is_ratio or row.initial is None or row.final is None:
             continue
-        head = (
-            f"{row.name} changed by {_change(row)} from the {_source(row.initial.source)} to the "
-            f"{_source(row.final.source)}: "
-        )
-        if row.initial.value * row.final.value < 0:
-            tail = "why do their signs differ, and which of your files says which is right?"
-        elif read_name(row.name).is_gain:
-            tail = (
-                "which way would a cart that stops short of where its springs put it move the gain "
-                "of a step, and is that the way yours moved?"
-            )
-        else:
-            tail = (
-                "which masses and which springs were at work in the one experiment and in the "
-                "other, and what would have to differ between them?"
-            )
-        yield Asked(id=row.name, section="parameters", text=head + tail)
+        differ = row.initial.value * row.final.value < 0
+        yield _of_row(row, "signs_differ" if differ else "gain" if name.is_gain else "frequency")
         return  # the largest change stands for the others
+
+
+def _of_row(row: ParameterRow, key: str, **values: str) -> Asked:
+    """Ask why two estimates differ."""
+    initial, final = (
+        SOURCES.get(one.source, clean(one.source)) if one else ""
+        for one in (row.initial, row.final)
+    )
+    text = _WORDS.text(
+        key, name=row.name, change=_change(row), initial=initial, final=final, **values
+    )
+    return Asked(id=row.name, section="parameters", text=text)
 
 
 def _assumed(analysis: Analysis) -> Iterator[Asked]:
     guessed = [
-        row
+        (row, row.initial.value, row.final.value)
         for row in analysis.rows
         if row.initial is not None
         and row.final is not None
@@ -143,20 +123,16 @@ def _assumed(analysis: Analysis) -> Iterator[Asked]:
     ]
     if not guessed:
         return
-    row = max(guessed, key=lambda row: abs(row.change_percent or 0.0))
-    assert row.initial is not None
-    assert row.final is not None
-    more = row.final.value > row.initial.value
-    feature = "null" if read_name(row.name).is_null else "peak"
-    sharper = "flatter" if more else "sharper"
-    yield Asked(
-        id=row.name,
-        section="frequency-response",
-        text=f"{row.name} was assumed to be {significant(row.initial.value, digits=2)} and came "
-        f"out as {significant(row.final.value, digits=2)}: at which cart and which frequencies do "
-        f"your points show that its {feature} is {sharper} than you assumed, and how few points "
-        "would have been enough to see it?",
+    row, initial, final = max(guessed, key=lambda one: abs(one[0].change_percent or 0.0))
+    text = _WORDS.text(
+        "assumed",
+        name=row.name,
+        initial=significant(initial, digits=2),
+        final=significant(final, digits=2),
+        feature="null" if read_name(row.name).is_null else "peak",
+        sharper="flatter" if final > initial else "sharper",
     )
+    yield Asked(id=row.name, section="frequency-response", text=text)
 
 
 def _friction(analysis: Analysis) -> Iterator[Asked]:
@@ -166,111 +142,81 @@ def _friction(analysis: Analysis) -> Iterator[Asked]:
             (d for d in sticking if d.cart == cart),
             key=lambda d: d.friction.f_statistic if d.friction else 0.0,
         )
-        seen = decay.zeta_at_amplitude
-        rise = ""
+        seen, rise = decay.zeta_at_amplitude, ""
         if seen.shape[1] > 1:
             order = np.argsort(seen[0])
             (small, large), (at_small, at_large) = seen[:, order[[0, -1]]]
             if at_small > at_large > 0:
+                sizes = {"small": small, "large": large, "at_small": at_small, "at_large": at_large}
+                told = {name: significant(value, digits=2) for name, value in sizes.items()}
                 unit = clean(analysis.position_unit)
-                rise = (
-                    f", its damping ratio rising from {significant(at_large, digits=2)} at "
-                    f"{significant(large, digits=2)} {unit} to {significant(at_small, digits=2)} "
-                    f"at {significant(small, digits=2)} {unit}"
-                )
-        yield Asked(
-            id=f"friction-{cart}",
-            section="decays",
-            text=f"In {decay.experiment} cart {cart} does not decay exponentially{rise}: which "
-            "force on the cart does that, how large is it in input units, and how far from its "
-            "springs' rest point may the cart stop?",
-        )
+                rise = _WORDS.text("friction_rises", unit=unit, **told)
+        text = _WORDS.text("friction", run=decay.experiment, cart=cart, rise=rise)
+        yield Asked(id=f"friction-{cart}", section="decays", text=text)
 
 
 def _sticking(analysis: Analysis) -> Iterator[Asked]:
-    stuck = [gain for gain in analysis.step_gains if gain.interval is not None]
+    stuck = [(g, *g.interval) for g in analysis.step_gains if g.interval is not None]
     if not stuck:
         return
-    worst = max(stuck, key=lambda gain: _width(gain.interval) / abs(gain.gain or 1.0))
-    assert worst.interval is not None
-    low, high = (significant(value, digits=3) for value in worst.interval)
-    yield Asked(
-        id=f"sticking-{worst.cart}",
-        section="steps",
-        text=f"Cart {worst.cart} does not settle at one place in {worst.experiment}: its gain lies "
-        f"anywhere from {low} to {high}. How large must a step be for the gain to be known to two "
-        "digits, and what does the sticking mean for the level that your controller reaches?",
+    worst, low, high = max(stuck, key=lambda one: (one[2] - one[1]) / abs(one[0].gain or 1.0))
+    text = _WORDS.text(
+        "sticking",
+        cart=worst.cart,
+        run=worst.experiment,
+        low=significant(low, digits=3),
+        high=significant(high, digits=3),
     )
-
-
-def _width(interval: tuple[float, float] | None) -> float:
-    return 0.0 if interval is None else interval[1] - interval[0]
+    yield Asked(id=f"sticking-{worst.cart}", section="steps", text=text)
 
 
 def _misfit(analysis: Analysis) -> Iterator[Asked]:
     fit = analysis.fit
     if fit is None or fit.method != "bode_fit" or fit.explains_data:
         return
-    worst: tuple[float, int, float] | None = None  # standard errors, cart, rad/s
+    found: list[tuple[float, int, float]] = []  # standard errors, cart, rad/s
     for response in analysis.frequency_responses:
         residual = np.abs(fit.standardised.get(str(response.cart), np.zeros(0)))
-        if residual.size != response.omega.size or not residual.size:
-            continue
-        at = int(np.argmax(residual))
-        if worst is None or residual[at] > worst[0]:
-            worst = float(residual[at]), response.cart, float(response.omega[at])
-    if worst is None:
-        return
-    sigmas, cart, omega = worst
-    yield Asked(
-        id="misfit",
-        section="frequency-response",
-        text=f"Model and measurement are furthest apart at cart {cart} at "
-        f"{significant(omega, digits=3)} rad/s, by {significant(sigmas, digits=2)} standard errors "
-        f"(χ² per degree of freedom is {significant(fit.chi_square_per_dof, digits=3)}). What do "
-        "the carts do there that a chain of masses, springs and dampers does not?",
-    )
+        if residual.size and residual.size == response.omega.size:
+            at = int(np.argmax(residual))
+            found.append((float(residual[at]), response.cart, float(response.omega[at])))
+    if found:
+        sigmas, cart, omega = max(found, key=lambda one: one[0])
+        text = _WORDS.text(
+            "misfit",
+            cart=cart,
+            omega=significant(omega, digits=3),
+            sigmas=significant(sigmas, digits=2),
+            chi_square=significant(fit.chi_square_per_dof, digits=3),
+        )
+        yield Asked(id="misfit", section="frequency-response", text=text)
 
 
 def _hardware(analysis: Analysis) -> Iterator[Asked]:
     closed = [check for check in analysis.hardware if check.loop == "closed"]
     design = analysis.feedback
     controlled = [c for c in closed if design is None or c.cart == design.cart] or closed
-    off_level = max(controlled, key=_level_error, default=None)
-    if off_level and _level_error(off_level) > _LEVEL:
-        measured, model = (
-            significant(value, digits=3)
-            for value in (off_level.steady_state_measured, off_level.steady_state_model)
-        )
-        unit = clean(analysis.position_unit)
-        yield Asked(
-            id="level",
-            section="hardware",
-            text=f"In {off_level.experiment} cart {off_level.cart} stops at {measured} {unit} "
-            f"where the model stops at {model} {unit}. Which force, or which error of the model, "
-            "explains this, how would you tell one from the other, and what would an integrator in "
-            "the controller do about it?",
+    off = max(controlled, key=_level_error, default=None)
+    if off and _level_error(off) > _LEVEL:
+        yield _of_run(
+            off,
+            "level",
+            measured=significant(off.steady_state_measured, digits=3),
+            model=significant(off.steady_state_model, digits=3),
+            unit=clean(analysis.position_unit),
         )
     over = max(controlled, key=_overshoot_error, default=None)
     if over and _overshoot_error(over) > _OVERSHOOT:
-        yield Asked(
-            id="overshoot",
-            section="hardware",
-            text=f"In {over.experiment} cart {over.cart} overshoots by "
-            f"{percent(over.overshoot_measured)} where the model overshoots by "
-            f"{percent(over.overshoot_model)}: is there more or less damping on the bench than in "
-            "the model, and which of your measurements says so as well?",
-        )
+        measured, model = percent(over.overshoot_measured), percent(over.overshoot_model)
+        yield _of_run(over, "overshoot", measured=measured, model=model)
     far = max(analysis.hardware, key=lambda check: check.nrmse, default=None)
     if far and far.nrmse > _FAR:
-        yield Asked(
-            id="hardware",
-            section="hardware",
-            text=f"In {far.experiment} cart {far.cart} moves otherwise than the model by "
-            f"{percent(100 * far.nrmse)} of the motion. Does the difference lie in the transient, "
-            "in the level or all along, and which one change to the model would take most of it "
-            "away?",
-        )
+        yield _of_run(far, "hardware", share=percent(100 * far.nrmse))
+
+
+def _of_run(check: HardwareCheck, key: str, **values: str) -> Asked:
+    text = _WORDS.text(key, run=check.experiment, cart=check.cart, **values)
+    return Asked(id=key, section="hardware", text=text)
 
 
 def _level_error(check: HardwareCheck) -> float:
@@ -287,10 +233,6 @@ def _overshoot_error(check: HardwareCheck) -> float:
 
 def _change(row: ParameterRow) -> str:
     return percent(abs(row.change_percent or 0.0))
-
-
-def _source(source: str) -> str:
-    return SOURCES.get(source, clean(source))
 
 
 # --------------------------------------------------------------------- the answers
@@ -335,9 +277,8 @@ def placed(
     """Return the sections with each question at the end of its own, else of the discussion."""
     there = {section.id for section in sections}
     return tuple(
-        Section(
-            id=section.id,
-            title=section.title,
+        replace(
+            section,
             blocks=(
                 *section.blocks,
                 *(
@@ -363,21 +304,20 @@ def open_questions(
     if not asked:
         return []
     missing = [question for question in asked if question.id not in answers]
-    state = (
-        "The notes answer all of them"
-        if not missing
-        else "The notes answer none of them yet"
-        if len(missing) == len(asked)
-        else f"The notes do not answer {len(missing)} of them yet"
-    )
-    parts: list[Span] = []
+    missed = "none" if not missing else "all" if len(missing) == len(asked) else "some"
+    links: list[Span] = []
     for question in asked:
-        parts += [
-            Span(", " if parts else ""),
+        links += [
+            Span(", " if links else ""),
             Span(question.id, "code", url=f"#question-{question.id}"),
         ]
-    raised = f"This data raises {count(len(asked), 'question')}: "
-    return [paragraph(spans(raised, tuple(parts), f". {state}."))]
+    raised = _WORDS.spans(
+        "raised",
+        questions=count(len(asked), "question"),
+        ids=tuple(links),
+        state=_WORDS.text(f"{missed}_missing", count=len(missing)),
+    )
+    return [paragraph(raised)]
 
 
 def open_line(analysis: Analysis) -> str:

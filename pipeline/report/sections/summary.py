@@ -1,6 +1,7 @@
 """The summary: what was identified, what agrees, what does not, and what to do next."""
 
 from collections import Counter
+from collections.abc import Iterator, Sequence
 
 from pipeline.names import Name, read_name
 from pipeline.report.document import (
@@ -25,9 +26,11 @@ from pipeline.report.numbers import (
     unit_text,
     with_error,
 )
+from pipeline.report.phrases import phrases
 from pipeline.report.words import clean, name_span, names_spans, plain_lines, rich, stage_name
 from pipeline.results import SIGN, Analysis, Check, HardwareCheck
 
+_WORDS = phrases("summary")
 _KINDS = {  # what carts are identified from
     "decay": "decay",
     "step": "step",
@@ -57,7 +60,7 @@ def summary(analysis: Analysis) -> list[Block]:
     problems = [text for good, text in _findings(analysis) if not good]
     if problems:
         blocks.append(bullet_list(problems))
-    return [*blocks, paragraph(Span("What to do next", "strong")), _next(analysis)]
+    return [*blocks, paragraph(Span(_WORDS.text("next"), "strong")), _next(analysis)]
 
 
 def terminal_summary(analysis: Analysis) -> str:
@@ -68,7 +71,7 @@ def terminal_summary(analysis: Analysis) -> str:
     ]
     it_has = [paragraph(f"It has {'; '.join(numbers)}.")] if numbers else []
     told = bullet_list(text for _, text in _findings(analysis))
-    next_ = [paragraph("What to do next."), _next(analysis)]
+    next_ = [paragraph(f"{_WORDS.text('next')}."), _next(analysis)]
     return plain_lines([_identified(analysis), *it_has, told, *next_])
 
 
@@ -82,32 +85,27 @@ def _identified(analysis: Analysis) -> Block:
     unused = {one.experiment for one in analysis.left_out}
     kinds = Counter(record.kind for record in analysis.records if record.id not in unused)
     used = listing([count(kinds[kind], noun) for kind, noun in _KINDS.items() if kinds[kind]])
-    carts = "single cart" if analysis.carts == 1 else f"chain of {analysis.carts} carts"
-    source = f"from {used}" if used else "from the data given"
-    fit = analysis.fit
+    single, fit = analysis.carts == 1, analysis.fit
+    carts = _WORDS.text("one_cart" if single else "carts", n=analysis.carts)
+    source = _WORDS.text("from_runs" if used else "from_data", runs=used)
     if fit is None:
-        reasons = (
-            Span(" The reasons stand under "),
-            Span("What was skipped", url="#skipped"),
-            Span("."),
-        )
+        reasons = _WORDS.spans("reasons") if analysis.skipped else ""
         return paragraph(
-            Span("No model ", "strong"),
-            f"of the {carts} could be identified {source}.",
-            reasons if analysis.skipped else (),
+            _WORDS.spans("not_identified", carts=carts, source=source, reasons=reasons)
         )
-    joint = "a fit" if analysis.carts == 1 else "a joint fit of all carts"
-    what = {"bode_fit": "the frequency response", "time_fit": "the records in time"}[fit.method]
-    quality = (
-        "model and stated noise explain the data"
-        if fit.explains_data
-        else "more than the stated noise is left, so the linear model misses something"
-    )
-    converged = "" if fit.converged else f" The fit did not converge: {clean(fit.message)}."
+    failed = "" if fit.converged else _WORDS.text("not_converged", message=clean(fit.message))
     return paragraph(
-        Span(f"A {carts} was identified ", "strong"),
-        f"{source}, by {joint} to {what} ({fit.n_points} points; χ² per degree of freedom "
-        f"{significant(fit.chi_square_per_dof, digits=3)}: {quality}).{converged}",
+        _WORDS.spans(
+            "identified",
+            carts=carts,
+            source=source,
+            fit=_WORDS.text("one_fit" if single else "joint_fit"),
+            what=_WORDS.text(fit.method),
+            points=str(fit.n_points),
+            chi_square=significant(fit.chi_square_per_dof, digits=3),
+            quality=_WORDS.text("explained" if fit.explains_data else "unexplained"),
+            failed=failed,
+        )
     )
 
 
@@ -133,55 +131,37 @@ def _verdict_board(analysis: Analysis) -> tuple[Tile, ...]:
     tiles = []
     if fit := analysis.fit:
         good = fit.converged and fit.explains_data
-        tiles.append(
-            Tile(
-                label=spans("χ² per degree of freedom"),
-                value=spans(significant(fit.chi_square_per_dof, digits=3)),
-                note=spans(
-                    "noise explains the rest" if good else "the linear model misses something"
-                ),
-                tone=_tone(good),
-                url="#frequency-response" if analysis.frequency_responses else "#parameters",
-            )
-        )
-    judged = [row.consistent for row in analysis.rows if row.consistent is not None]
-    if judged:
-        agree = sum(judged)
-        note = "parameters agree" if agree == len(judged) else "parameters agree, the rest differ"
-        tiles.append(_tally("Measured in two ways", agree, len(judged), note, "#parameters"))
-    done = [check.outcome == "pass" for check in analysis.checks if check.outcome != "skip"]
-    if done:
-        tiles.append(_tally("Consistency checks", sum(done), len(done), "checks passed", "#checks"))
+        url = "#frequency-response" if analysis.frequency_responses else "#parameters"
+        value = significant(fit.chi_square_per_dof, digits=3)
+        note = _WORDS.text("tile_explained" if good else "tile_unexplained")
+        tiles.append(_tile("tile_chi_square", value, note, good=good, url=url))
+    if judged := [row.consistent for row in analysis.rows if row.consistent is not None]:
+        key = "tile_agree" if all(judged) else "tile_disagree"
+        tiles.append(_tally("tile_two_ways", judged, key, url="#parameters"))
+    if done := [c.outcome == "pass" for c in analysis.checks if c.outcome != "skip"]:
+        tiles.append(_tally("tile_checks", done, "tile_passed", url="#checks"))
     if design := analysis.feedback:
-        settling = design.settling_time
-        tiles.append(
-            Tile(
-                label=spans(f"Feedback, cart {design.cart}"),
-                value=spans(f"{significant(settling, digits=3)} s" if settling else NOTHING),
-                note=spans(
-                    f"to settle, {percent(design.overshoot_percent)} overshoot: goal "
-                    f"{'met' if design.reachable else 'not met'}"
-                ),
-                tone=_tone(design.reachable),
-                url="#feedback",
-            )
-        )
+        settling, good = design.settling_time, design.reachable
+        value = f"{significant(settling, digits=3)} s" if settling else NOTHING
+        overshoot, verdict = percent(design.overshoot_percent), "met" if good else "not met"
+        note = _WORDS.text("tile_settles", overshoot=overshoot, verdict=verdict)
+        label = _WORDS.text("tile_feedback", cart=design.cart)
+        tiles.append(Tile(spans(label), spans(value), spans(note), _tone(good), "#feedback"))
     if analysis.hardware:
         best, worst = _extremes(analysis)
-        tiles.append(
-            Tile(
-                label=spans("Bench against model"),
-                value=spans(_range(best, worst).replace(" to ", "–")),
-                note=spans("of the motion apart"),
-                tone=_tone(worst.nrmse <= _CLOSE),
-                url="#hardware",
-            )
-        )
+        good, note = worst.nrmse <= _CLOSE, _WORDS.text("tile_apart")
+        value = _range(best, worst, to="–")
+        tiles.append(_tile("tile_hardware", value, note, good=good, url="#hardware"))
     return tuple(tiles)
 
 
-def _tally(label: str, good: int, of: int, note: str, url: str) -> Tile:
-    return Tile(spans(label), spans(f"{good} of {of}"), spans(note), _tone(good == of), url)
+def _tile(key: str, value: str, note: str, *, good: bool, url: str) -> Tile:
+    return Tile(spans(_WORDS.text(key)), spans(value), spans(note), _tone(good), url)
+
+
+def _tally(key: str, judged: Sequence[bool | None], note: str, *, url: str) -> Tile:
+    good, of = sum(map(bool, judged)), len(judged)
+    return _tile(key, f"{good} of {of}", _WORDS.text(note), good=good == of, url=url)
 
 
 def _tone(good: bool) -> Tone:
@@ -191,7 +171,7 @@ def _tone(good: bool) -> Tone:
 def _sign(analysis: Analysis) -> tuple[bool, Spans] | None:
     """Everything that follows hangs on it, so it comes first."""
     wrong = _wrong_sign(analysis)
-    return (False, spans(Span("Wrong sign: ", "strong"), wrong)) if wrong else None
+    return (False, _WORDS.spans("sign", message=wrong)) if wrong else None
 
 
 def _wrong_sign(analysis: Analysis) -> str:
@@ -202,16 +182,12 @@ def _agreement(analysis: Analysis) -> tuple[bool, Spans] | None:
     judged = [row for row in analysis.rows if row.consistent is not None]
     if not judged:
         return None
+    parameters = count(len(judged), "parameter")
     off = [row for row in judged if not row.consistent]
-    two_ways = f"{count(len(judged), 'parameter')} measured in two ways"
     if not off:
-        return True, spans(Span("Agrees: ", "strong"), f"all {two_ways}.")
+        return True, _WORDS.spans("agree", parameters=parameters)
     changes = [f"{row.name} ({percent(row.change_percent, signed=True)})" for row in off]
-    return False, spans(
-        Span("Does not agree: ", "strong"),
-        rich(listing(changes)),
-        f". The rest of the {two_ways} agree.",
-    )
+    return False, _WORDS.spans("disagree", changes=rich(listing(changes)), parameters=parameters)
 
 
 def _checks(analysis: Analysis) -> tuple[bool, Spans] | None:
@@ -219,10 +195,9 @@ def _checks(analysis: Analysis) -> tuple[bool, Spans] | None:
     failed = [c for c in done if c.outcome == "fail"]
     if not done:
         return None
+    checks = count(len(done), "check")
     if not failed:
-        return True, spans(
-            Span("Consistent: ", "strong"), f"all {count(len(done), 'check')} passed."
-        )
+        return True, _WORDS.spans("consistent", checks=checks)
     # Initial against final and dry friction are told on their own; of each kind, the first.
     kinds: dict[str, Check] = {}
     for check in failed:
@@ -230,13 +205,11 @@ def _checks(analysis: Analysis) -> tuple[bool, Spans] | None:
         if check.id != SIGN and not kind.startswith(("initial_final", "decay")):
             kinds.setdefault(kind, check)
     told = list(kinds.values())[:_MOST_TOLD]
-    return False, spans(
-        Span("Inconsistent: ", "strong"),
-        f"{len(failed)} of {count(len(done), 'check')} failed.",
-        rich(clean("".join(f" {_sentence(check.message)}" for check in told))),
-        *([Span(" The report lists all under "), Span("Consistency checks", url="#checks"),
-           Span(".")] if len(failed) > len(told) else []),
-    )  # fmt: skip
+    said = rich(clean("".join(f" {_sentence(check.message)}" for check in told)))
+    more = _WORDS.spans("all_checks") if len(failed) > len(told) else ()
+    return False, _WORDS.spans(
+        "inconsistent", failed=str(len(failed)), checks=checks, told=(*said, *more)
+    )
 
 
 def _sentence(text: str) -> str:
@@ -245,29 +218,25 @@ def _sentence(text: str) -> str:
 
 def _friction(analysis: Analysis) -> tuple[bool, Spans] | None:
     carts = sorted({d.cart for d in analysis.log_decrements if d.friction and d.friction.present})
-    if not carts:
-        return None
-    return False, spans(
-        Span("Dry friction ", "strong"),
-        f"shows in the decays of {_carts(carts)}: the damping ratio there depends on the "
-        "amplitude, and a single number for it is biased.",
-    )
+    return (False, _WORDS.spans("friction", carts=_carts(carts))) if carts else None
 
 
 def _design(analysis: Analysis) -> tuple[bool, Spans] | None:
     design = analysis.feedback
     if design is None:
         return None
+    settling = design.settling_time
     settles = (
-        "does not settle within the simulated time"
-        if design.settling_time is None
-        else f"settles in {significant(design.settling_time, digits=3)} s"
+        _WORDS.text("never_settles")
+        if settling is None
+        else _WORDS.text("settles", seconds=significant(settling, digits=3))
     )
-    verdict = "meets the goal" if design.reachable else "cannot meet the goal"
-    return design.reachable, spans(
-        Span("Feedback ", "strong"),
-        f"for cart {design.cart} {verdict}: the simulated step {settles} with "
-        f"{percent(design.overshoot_percent)} overshoot.",
+    return design.reachable, _WORDS.spans(
+        "feedback",
+        cart=str(design.cart),
+        verdict=_WORDS.text("met" if design.reachable else "not_met"),
+        settles=settles,
+        overshoot=percent(design.overshoot_percent),
     )
 
 
@@ -275,10 +244,11 @@ def _hardware(analysis: Analysis) -> tuple[bool, Spans] | None:
     if not analysis.hardware:
         return None
     best, worst = _extremes(analysis)
-    return worst.nrmse <= _CLOSE, spans(
-        Span("Hardware: ", "strong"),
-        f"measured and modelled motion differ by {_range(best, worst)} of the motion "
-        f"(root mean square), most at cart {worst.cart} in {clean(worst.experiment)}.",
+    return worst.nrmse <= _CLOSE, _WORDS.spans(
+        "hardware",
+        range=_range(best, worst, to=" to "),
+        cart=str(worst.cart),
+        run=clean(worst.experiment),
     )
 
 
@@ -287,9 +257,9 @@ def _extremes(analysis: Analysis) -> tuple[HardwareCheck, HardwareCheck]:
     return ordered[0], ordered[-1]
 
 
-def _range(best: HardwareCheck, worst: HardwareCheck) -> str:
+def _range(best: HardwareCheck, worst: HardwareCheck, *, to: str) -> str:
     low, high = percent(100 * best.nrmse), percent(100 * worst.nrmse)
-    return low if low == high else f"{low.removesuffix(' %')} to {high}"
+    return low if low == high else f"{low.removesuffix(' %')}{to}{high}"
 
 
 def _skipped(analysis: Analysis) -> tuple[bool, Spans] | None:
@@ -298,12 +268,7 @@ def _skipped(analysis: Analysis) -> tuple[bool, Spans] | None:
     names = list(dict.fromkeys(stage_name(skip.stage) for skip in analysis.skipped))
     more = len(names) - _MOST_TOLD
     stages = listing(names[:_MOST_TOLD] + ([f"{more} more"] if more > 0 else []))
-    return False, spans(
-        Span("Skipped: ", "strong"),
-        f"{stages}; the report has the reasons under ",
-        Span("What was skipped", url="#skipped"),
-        ".",
-    )
+    return False, _WORDS.spans("skipped", stages=stages)
 
 
 def _carts(carts: list[int]) -> str:
@@ -316,71 +281,44 @@ def _carts(carts: list[int]) -> str:
 
 def _next(analysis: Analysis) -> Items:
     if wrong := _wrong_sign(analysis):  # what else is odd may come from it
-        return bullet_list([spans(wrong), spans("Then make the report again.")])
-    advice: list[Spans] = []
-    fit = analysis.fit
-    for what, which in (
-        ("Give a sound file, or the right name of it, for", list(analysis.unreadable)),
-        ("Mend or record again", [one.experiment for one in analysis.left_out]),
-    ):
-        if which:
-            more = " …" if len(which) > _MOST_TOLD else ""
-            named = clean(listing(which[:_MOST_TOLD]))
-            advice.append(spans(f"{what} {named}{more}: the checks say what is wrong."))
-    if not advice and any(
-        c.outcome == "fail" and c.id.startswith(_OF_DATA) for c in analysis.checks
-    ):
-        advice.append(spans("Mend first what the failed checks say of the recordings."))
-    if fit is None and not analysis.left_out:
+        return bullet_list([spans(wrong), _WORDS.spans("next_again")])
+    return bullet_list(list(_advice(analysis)) or [_look_into(analysis)])
+
+
+def _advice(analysis: Analysis) -> Iterator[Spans]:
+    """Yield what to do about each thing that is not well."""
+    say, fit, design = _WORDS.spans, analysis.fit, analysis.feedback
+    unreadable, left_out = list(analysis.unreadable), [o.experiment for o in analysis.left_out]
+    failed = [check for check in analysis.checks if check.outcome == "fail"]
+    for key, runs in (("next_unreadable", unreadable), ("next_left_out", left_out)):
+        if runs:
+            more = " …" if len(runs) > _MOST_TOLD else ""
+            yield say(key, runs=clean(listing(runs[:_MOST_TOLD])) + more)
+    if not (unreadable or left_out) and any(c.id.startswith(_OF_DATA) for c in failed):
+        yield say("next_recordings")
+    if fit is None and not left_out:
         reasons = [skip.reason for skip in analysis.skipped if skip.stage == "final estimates"]
-        advice.append(
-            spans(f"No carts were identified: {clean(reasons[-1])}")
-            if reasons
-            else spans(
-                "Record what the fit needs: sine dwells over the resonances, a step or a sweep."
-            )
-        )
-    off = [row.name for row in analysis.rows if row.consistent is False]
-    if off:
-        advice.append(
-            spans(
-                "Look again at how ",
-                names_spans(off),
-                " came about: the figures of the decays, steps and dwells show what was used.",
-            )
-        )
-    short = sorted({point.experiment for point in analysis.sine_points if not point.settled})
-    if short:
-        advice.append(
-            spans(f"Record {clean(listing(short))} again and longer: no steady state was reached.")
-        )
+        yield (say("next_no_carts", reason=clean(reasons[-1])) if reasons else say("next_no_data"))
+    if off := [row.name for row in analysis.rows if row.consistent is False]:
+        yield say("next_off", names=names_spans(off))
+    if short := sorted({point.experiment for point in analysis.sine_points if not point.settled}):
+        yield say("next_short", runs=clean(listing(short)))
     if any(d.friction and d.friction.present for d in analysis.log_decrements):
-        advice.append(
-            spans(
-                "Repeat a decay from two release heights: a viscous damping ratio stays the same, "
-                "with dry friction it grows as the amplitude falls."
-            )
-        )
+        yield say("next_friction")
     doubted = {check.experiment for check in analysis.hardware if check.contradicted}
     poor = [c for c in analysis.hardware if c.nrmse > _CLOSE and c.experiment not in doubted]
     if poor or (fit is not None and not fit.explains_data):
-        advice.append(
-            spans(
-                "Find what the linear model leaves out: compare where in the records the "
-                "difference arises (near rest, at speed, at large swings)."
-            )
-        )
-    if analysis.feedback is not None and not any(r.kind == "closed_loop" for r in analysis.records):
-        advice.append(spans("Run the designed feedback on the bench and add the record."))
-    if analysis.skipped and not analysis.left_out:
-        advice.append(spans("Add the experiments that the skipped stages ask for."))
-    design = analysis.feedback
+        yield say("next_left")
+    if design is not None and not any(r.kind == "closed_loop" for r in analysis.records):
+        yield say("next_run")
+    if analysis.skipped and not left_out:
+        yield say("next_skipped")
     if design and not design.reachable:
-        advice.append(spans(f"Relax the goal of the design: {clean(design.message)}."))
-    if not advice and any(check.outcome == "fail" for check in analysis.checks):
-        advice.append(spans("Look into what the failed checks say."))
-    if not advice and analysis.warnings:
-        advice.append(spans("Look into the report's ", Span("Warnings", url="#warnings"), "."))
-    if not advice:
-        advice.append(spans("Nothing stands out. Discuss the remaining differences in the notes."))
-    return bullet_list(advice)
+        yield say("next_goal", message=clean(design.message))
+
+
+def _look_into(analysis: Analysis) -> Spans:
+    """Return what is left to do where nothing asks for more."""
+    if any(check.outcome == "fail" for check in analysis.checks):
+        return _WORDS.spans("next_checks")
+    return _WORDS.spans("next_warnings" if analysis.warnings else "next_nothing")
