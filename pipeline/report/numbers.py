@@ -43,6 +43,15 @@ def with_error(value: float, std: float | None) -> str:
     return f"({inside}) × 10{_superscript(size)}"
 
 
+def complex_text(value: complex, *, digits: int) -> str:
+    """Return "−1.2 + 3.4 j"; a real number as one."""
+    real = significant(value.real, digits=digits)
+    if value.imag == 0:
+        return real
+    sign = "+" if value.imag > 0 else "−"
+    return f"{real} {sign} {significant(abs(value.imag), digits=digits)} j"
+
+
 def percent(value: float | None, *, signed: bool = False) -> str:
     """Return a percentage: one decimal below 100 %, none above."""
     if value is None or not math.isfinite(value):

@@ -10,11 +10,13 @@ from pipeline.report.document import Cell, Span, Spans, Table, plain, spans
 from pipeline.report.numbers import (
     NOTHING,
     at_decimal,
+    complex_text,
     percent,
     significant,
     unit_text,
     with_error,
 )
+from pipeline.report.phrases import phrases
 from pipeline.report.words import SOURCES, clean, name_span, rich
 from pipeline.results import (
     Analysis,
@@ -29,6 +31,7 @@ from pipeline.results import (
     StepGain,
 )
 
+_WORDS = phrases("report")
 _OUTCOMES = {"pass": "passed", "fail": "failed", "skip": "not checked"}
 _TONES = {"pass": "good", "fail": "bad", "skip": "quiet"}
 
@@ -70,8 +73,7 @@ def parameter_table(rows: Sequence[ParameterRow], *, number: int, carts: int) ->
     words = {1: "one", 2: "two", 3: "three", 4: "four"}
     return make_table(
         number,
-        f"Initial and final estimates of the parameters for the {words.get(carts, carts)} degree "
-        "of freedom model, with standard errors.",
+        _WORDS.text("parameter_table", carts=words.get(carts, carts)),
         ("Parameter", "Unit", "Initial estimate", "from", "Final estimate", "Change", "Verdict"),
         [_parameter_row(row) for row in rows],
         "lldlddl",
@@ -152,8 +154,7 @@ def chain_table(
             )
     return make_table(
         number,
-        "The identified chain. The input gain is one, so masses, dampings and stiffnesses are in "
-        "input units.",
+        _WORDS.text("chain_table"),
         ("Symbol", "Meaning", "Value", "Unit"),
         rows,
         "lldl",
@@ -196,8 +197,7 @@ def decay_table(decays: Sequence[LogDecrement], *, number: int, position_unit: s
         )
     return make_table(
         number,
-        "Free decays of single carts: the fitted decay, and the logarithmic decrement of its "
-        "extrema; d is half the width of the band in which dry friction can hold the cart.",
+        _WORDS.text("decay_table"),
         (
             "Record", "Cart", spans(name_span("omega_n"), " [rad/s]"),
             spans(name_span("zeta"), " of the fit"), spans(name_span("zeta"), " of the extrema"),
@@ -228,8 +228,7 @@ def step_table(gains: Sequence[StepGain], *, number: int, units: tuple[str, str]
         )
     return make_table(
         number,
-        "Static gains from steps: change of level over change of input. An interval stands where "
-        "a cart sticks; the last column is how far its rest point moved.",
+        _WORDS.text("step_table"),
         ("Record", "Cart", "Edges", f"K [{position}/{drive}]", f"Rest moved by [{position}]"),
         rows,
         "lccdd",
@@ -263,9 +262,9 @@ def feedback_table(design: FeedbackDesign, *, number: int, units: tuple[str, str
     ]
     return make_table(
         number,
-        f"State feedback for cart {design.cart}, its simulated step of "
-        f"{significant(design.reference)} {position}, and the margins of the loop, "
-        "cut at the motor.",
+        _WORDS.text(
+            "feedback_table", cart=design.cart, goal=significant(design.reference), unit=position
+        ),
         ("Quantity", "Value", "Unit"),
         [[cell(what), cell(value), cell(unit_text(unit))] for what, value, unit in rows],
         "ldl",
@@ -301,7 +300,7 @@ def pole_table(design: FeedbackDesign, *, number: int) -> Table:
     head = ["Pole [rad/s]", "Frequency [rad/s]", "Damping ratio"]
     rows = [
         [
-            cell(_complex(pole)),
+            cell(complex_text(pole, digits=3)),
             cell(significant(abs(pole), digits=3)),
             cell(significant(-pole.real / abs(pole), digits=3) if pole != 0 else NOTHING),
         ]
@@ -312,16 +311,10 @@ def pole_table(design: FeedbackDesign, *, number: int) -> Table:
         requested = requested[np.lexsort((requested.imag, np.abs(requested)))]
         for i, cells in enumerate(rows):
             # A delay adds poles that nobody asked for.
-            cells.insert(0, cell(_complex(requested[i]) if i < requested.size else NOTHING))
+            cells.insert(
+                0, cell(complex_text(requested[i], digits=3) if i < requested.size else NOTHING)
+            )
     return make_table(number, "Poles of the closed loop.", head, rows, "r" * len(head))
-
-
-def _complex(value: complex) -> str:
-    real = significant(value.real, digits=3)
-    if value.imag == 0:
-        return real
-    sign = "+" if value.imag > 0 else "−"
-    return f"{real} {sign} {significant(abs(value.imag), digits=3)} j"
 
 
 def hardware_table(checks: Sequence[HardwareCheck], *, number: int, position_unit: str) -> Table:
@@ -340,8 +333,7 @@ def hardware_table(checks: Sequence[HardwareCheck], *, number: int, position_uni
     ]
     return make_table(
         number,
-        "Model against measurement; pairs are model / measured. The difference is the root mean "
-        "square of measured minus model, over that of the measured motion.",
+        _WORDS.text("hardware_table"),
         (
             "Record", "Cart", "Simulated", "Difference", "Overshoot [%]", "Settling [s]",
             f"Steady state [{clean(position_unit)}]",
@@ -390,7 +382,7 @@ def file_table(analysis: Analysis, *, number: int) -> Table:
     """Return the data files with their SHA-256."""
     return make_table(
         number,
-        "The data files this report was made from, with their SHA-256.",
+        _WORDS.text("file_table"),
         ("File", "SHA-256"),
         [
             [cell(Span(clean(name), "code")), cell(Span(clean(digest), "code"))]

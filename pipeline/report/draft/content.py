@@ -26,6 +26,7 @@ from pipeline.report.equations.model import (
 from pipeline.report.figures.style import drawing
 from pipeline.report.gap.section import augmented_hardware_blocks, gap_blocks, gap_in_short
 from pipeline.report.numbers import count, percent
+from pipeline.report.phrases import phrases
 from pipeline.report.sections.loops import feedback_blocks, hardware_blocks
 from pipeline.report.sections.measurements import (
     decay_blocks,
@@ -49,6 +50,7 @@ from pipeline.results import Analysis
 
 Part = tuple[str, str, Callable[[Page], list[Block]]]  # anchor, title, blocks
 
+_WORDS = phrases("report")
 _NO_CHANGE = 0.05  # percent: nothing to speak of
 
 
@@ -106,17 +108,14 @@ def build_document(
 def _model(page: Page) -> list[Block]:
     analysis = page.analysis
     blocks: list[Block] = [
-        paragraph(
-            f"The input u (in {page.drive}) pushes cart 1; x with its index is a cart's position "
-            f"(in {page.position}), a dot is a derivative by time."
-        ),
+        paragraph(_WORDS.text("model", drive=page.drive, position=page.position)),
         equations_of_motion(analysis.springs),
         Heading(spans("State space")),
         symbolic_state_space(analysis.springs),
     ]
     chain = analysis.chain
     if chain:
-        blocks += [paragraph("With the identified numbers, and the positions as outputs:")]
+        blocks += [paragraph(_WORDS.text("state_numbers"))]
         blocks += numeric_state_space(chain)
     blocks.append(Heading(spans("Transfer functions")))
     if symbolic := symbolic_transfer_functions(analysis.springs):
@@ -140,11 +139,7 @@ def _parameters(page: Page) -> list[Block]:
     if not rows:
         return []
     blocks: list[Block] = [
-        paragraph(
-            "Initial estimates come from steps (gains), free decays of single carts, and the "
-            "resonances seen in the frequency response; final estimates from the joint fit. The "
-            "change in brackets is in combined standard errors (σ)."
-        ),
+        paragraph(_WORDS.text("parameters")),
         parameter_table(rows, number=page.table_number(), carts=page.analysis.carts),
     ]
     if remarks := parameter_notes(rows):
@@ -169,12 +164,11 @@ def _staged_differences(page: Page) -> Block | None:
         return None
     worst = max(changes, key=lambda name: abs(changes[name]))
     if abs(changes[worst]) < _NO_CHANGE:
-        return paragraph("The fit cart by cart, the last one first, gives the same numbers.")
+        return paragraph(_WORDS.text("staged_same"))
     return paragraph(
-        "The fit cart by cart, the last one first, differs from the joint fit of all carts by up "
-        f"to {percent(abs(changes[worst]))}, most in ",
+        _WORDS.text("staged_differs", share=percent(abs(changes[worst]))),
         names_spans([worst]),
-        ". The joint fit is the one reported: its numbers belong to one chain and agree.",
+        _WORDS.text("joint_reported"),
     )
 
 
@@ -225,7 +219,7 @@ def _skipped(page: Page) -> list[Block]:
 
 
 def _provenance(page: Page) -> list[Block]:
-    made = paragraph(f"Made by cartlab {__version__}. The same input gives the same report.")
+    made = paragraph(_WORDS.text("made", version=__version__))
     if not page.analysis.files:
         return [made]
     files = file_table(page.analysis, number=page.table_number())

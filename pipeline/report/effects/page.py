@@ -24,10 +24,12 @@ from pipeline.report.figures.style import WIDTH, drawing
 from pipeline.report.figures.svg import to_svg
 from pipeline.report.math.tex import from_tex
 from pipeline.report.numbers import significant
+from pipeline.report.phrases import phrases
 from pipeline.report.render.write import write_document
 from pipeline.report.tables import cell, make_table
 from pipeline.synthesis.hidden import usual_term
 
+_WORDS = phrases("report")
 _BENCH = "throne-2dof"  # the smallest with a spring between two carts
 
 
@@ -60,15 +62,10 @@ def build_gallery(
 
 def _overview(effects: Sequence[Effect]) -> list[Block]:
     return [
-        paragraph(
-            "Each effect is a hypothesis with a law, a fingerprint in the data, and an experiment "
-            "that decides. Forces are in input units, as masses and springs are; x is a cart's "
-            "position, v its velocity, d the stretch of a spring (positive where it is longer "
-            "than at rest), u the logged input."
-        ),
+        paragraph(_WORDS.text("effects")),
         make_table(
             1,
-            "The effects, where each can sit, and its parameters.",
+            _WORDS.text("effects_table"),
             ("Effect", "Where", "Parameters", "In a sentence"),
             [
                 [
@@ -105,13 +102,20 @@ def _entry(effect: Effect, *, number: int) -> list[Block]:
 def _picture(term: Term, *, number: int) -> Picture:
     effect = term.effect
     place = f" on {effect.place} {term.place}" if term.place else ""
-    alt = (
-        f"{effect.title}{place} of a simulated bench: its fingerprint against {effect.axis}, and "
-        f"a run with and without it. {effect.fingerprint}"
+    alt = _WORDS.text(
+        "effect_alt",
+        title=effect.title,
+        place=place,
+        axis=effect.axis,
+        fingerprint=effect.fingerprint,
     )
-    caption = (
-        f"{effect.title}{place} of {_BENCH}, {_sizes(term)}. Left: {fingerprint_words(effect)}. "
-        "Right: one run without and with it."
+    caption = _WORDS.text(
+        "effect",
+        title=effect.title,
+        place=place,
+        bench=_BENCH,
+        sizes=_sizes(term),
+        seen=fingerprint_words(effect),
     )
     figure = effect_figure(term, PRESETS[_BENCH])
     svg = to_svg(figure, name=effect.key, alt=alt)

@@ -12,11 +12,13 @@ from pipeline.report.equations.algebra import value_term
 from pipeline.report.equations.model import formula, matlab_matrix, number_matrix
 from pipeline.report.math.tex import from_tex
 from pipeline.report.math.tree import Math, Term, matrix, parens, power, row, total
-from pipeline.report.numbers import percent, significant
+from pipeline.report.numbers import complex_text, percent, significant
+from pipeline.report.phrases import phrases
 from pipeline.report.sections.page import Page
 from pipeline.report.tables import cell, make_table, margin_rows
 from pipeline.results import FeedbackDesign
 
+_WORDS = phrases("solution")
 _INVERSE = row("−", "1")
 _WEIGHED = r"{R + \Gamma^T P \Gamma}"
 
@@ -101,14 +103,10 @@ def design_blocks(page: Page) -> list[Block]:
     try:
         worked = work_design(chain, design)
     except np.linalg.LinAlgError:
-        return [paragraph("This plant's numbers lie too far apart for the formulas of a textbook.")]
+        return [paragraph(_WORDS.text("too_far_apart"))]
     T = significant(design.sample_time)
     return [
-        paragraph(
-            f"The controller runs every {T} s and its effort acts one sample later. The gains "
-            "multiply the state predicted for that moment, so they are those of the sampled plant "
-            "without delay, x[k+1] = Φ x[k] + Γ u[k]:"
-        ),
+        paragraph(_WORDS.text("sampled", seconds=T)),
         formula(
             row(
                 matrix([["Φ", "Γ"], ["0", "1"]]),
@@ -121,10 +119,7 @@ def design_blocks(page: Page) -> list[Block]:
         _numbers("Γ", worked.gamma[:, None], "Gamma"),
         *(_regulator(design, worked) if worked.P is not None else _placement(design, worked)),
         _numbers("G", worked.gains[None, :], "G"),
-        paragraph(
-            f"The prefilter makes the static gain from the reference to cart {design.cart} one; "
-            "c picks its position:"
-        ),
+        paragraph(_WORDS.text("prefilter", cart=design.cart)),
         formula(
             row(
                 from_tex(r"\text{prefilter} = \frac{1}{c (I - \Phi + \Gamma G)^{-1} \Gamma}"),
@@ -146,15 +141,13 @@ def design_blocks(page: Page) -> list[Block]:
             + f" and needs {significant(design.peak_input, digits=3)} {page.drive} at most."
         ),
         *_margins(design),
-        paragraph("Gains are not unique. A student's own are right where"),
+        paragraph(_WORDS.text("not_unique")),
         bullet_list(
             spans(text)
             for text in (
-                "the poles of Φ − ΓG with the student's Φ and Γ lie inside the unit circle, and "
-                "are the ones the student asked for;",
-                f"the prefilter is one over the static gain of the student's own loop to cart "
-                f"{design.cart};",
-                "the step, simulated with the reference chain, meets the goal of the task.",
+                _WORDS.text("right_poles"),
+                _WORDS.text("right_prefilter", cart=design.cart),
+                _WORDS.text("right_step"),
             )
         ),
     ]
@@ -165,26 +158,17 @@ def _margins(design: FeedbackDesign) -> list[Block]:
     found = [f"{name} {value}{unit} {at}".strip() for name, value, unit, at in rows]
     if not found:
         return []
-    return [
-        paragraph(
-            "Cut where the effort drives cart 1, with the controller's observer and the delay in "
-            f"it, the loop has: {', '.join(found)}."
-        )
-    ]
+    return [paragraph(_WORDS.text("margins", margins=", ".join(found)))]
 
 
 def _regulator(design: FeedbackDesign, worked: WorkedDesign) -> list[Block]:
     assert design.Q is not None
     assert worked.P is not None
     return [
-        paragraph(
-            "The linear quadratic regulator minimises the sum of xᵀQx + R u² over all samples. Q "
-            "weighs the energy in the springs (positions) and in the masses (velocities); R is "
-            "one over the static gain of cart 1, so that both are energies:"
-        ),
+        paragraph(_WORDS.text("regulator")),
         _numbers("Q", design.Q, "Q"),
         formula(row("R", "≈", value_term(float(design.R or 1.0)))),
-        paragraph("The cost to go, xᵀPx, obeys Riccati's equation:"),
+        paragraph(_WORDS.text("riccati")),
         formula(
             from_tex(rf"P = Q + \Phi^T P \Phi - \frac{{\Phi^T P \Gamma \Gamma^T P \Phi}}{_WEIGHED}")
         ),
@@ -219,8 +203,7 @@ def _placement(design: FeedbackDesign, worked: WorkedDesign) -> list[Block]:
         formula(_polynomial("p", worked.wanted)),
         formula(_polynomial("a", worked.own)),
         paragraph(
-            "Ackermann's formula puts the plant's matrix into the wanted polynomial; the last row "
-            "of the inverse of the controllability matrix gives the gains:"
+            _WORDS.text("ackermann")
         ),
         formula(
             row(
@@ -281,13 +264,13 @@ def _pole_table(design: FeedbackDesign, worked: WorkedDesign, *, number: int) ->
     s = np.log(worked.z[order]) / design.sample_time
     return make_table(
         number,
-        "Poles of the worked loop, in the z plane and as continuous equivalents.",
+        _WORDS.text("worked_poles"),
         ("z", "|z|", "s [rad/s]", "Frequency [rad/s]", "Damping ratio"),
         [
             [
-                cell(_complex(z)),
+                cell(complex_text(z, digits=4)),
                 cell(significant(abs(z))),
-                cell(_complex(pole)),
+                cell(complex_text(pole, digits=4)),
                 cell(significant(abs(pole), digits=3)),
                 cell(significant(-pole.real / abs(pole), digits=3)),
             ]
@@ -295,11 +278,3 @@ def _pole_table(design: FeedbackDesign, worked: WorkedDesign, *, number: int) ->
         ],
         "rrrrr",
     )
-
-
-def _complex(value: complex) -> str:
-    real = significant(value.real)
-    if value.imag == 0:
-        return real
-    sign = "+" if value.imag > 0 else "−"
-    return f"{real} {sign} {significant(abs(value.imag))} j"

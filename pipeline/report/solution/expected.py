@@ -13,11 +13,13 @@ from pipeline.report.document import Block, bullet_list, paragraph, spans
 from pipeline.report.equations import derivation
 from pipeline.report.equations.algebra import evaluate, work_out
 from pipeline.report.numbers import percent, significant, unit_text
+from pipeline.report.phrases import phrases
 from pipeline.report.sections.page import Page
 from pipeline.report.tables import cell, make_table
 from pipeline.report.words import clean, name_span
 from pipeline.results import Analysis
 
+_WORDS = phrases("solution")
 SCHEMA = "cartlab-solution/1"
 # What two careful teams on one bench differ by: gains and frequencies by some percent, damping
 # ratios by ten times that, since they are small and dry friction adds to them.
@@ -109,15 +111,16 @@ def expected_blocks(page: Page) -> list[Block]:
         return []
     blocks: list[Block] = [
         paragraph(
-            "Gains and frequencies are accepted within "
-            f"{100 * GAIN_AND_FREQUENCY_TOLERANCE:g} %, damping ratios within "
-            f"{100 * DAMPING_TOLERANCE:g} %, and within {SIGMAS:g} standard errors of the "
-            "reference where that is more; half a unit of the last digit that a student typed "
-            "comes on top."
+            _WORDS.text(
+                "accepted",
+                share=f"{100 * GAIN_AND_FREQUENCY_TOLERANCE:g}",
+                damping_share=f"{100 * DAMPING_TOLERANCE:g}",
+                sigmas=f"{SIGMAS:g}",
+            )
         ),
         make_table(
             page.table_number(),
-            "Parameters of the transfer functions: expected, and accepted.",
+            _WORDS.text("expected_table"),
             ("Parameter", "Unit", "Expected", "± accepted", "from", "to", "In Hz: a slip"),
             [
                 [
@@ -159,8 +162,7 @@ def _state_table(model: ExpectedModel, *, number: int) -> Block:
     ]
     return make_table(
         number,
-        "Entries of the state model: expected, and how far they move when every parameter moves "
-        "within its own tolerance. Entries not listed are 0 or 1 exactly.",
+        _WORDS.text("state_table"),
         ("Entry", "Expected", "± accepted"),
         rows,
         "lrr",
@@ -173,18 +175,12 @@ def _state_row(name: str, value: float, tolerance: float) -> list:
 
 def _advice(analysis: Analysis) -> Block:
     advice = [
-        "A and B first against the student's own table, by the steps above: only rounding may "
-        "differ. Then the table against this one.",
-        "Where an entry's tolerance is large, it is a small difference of large numbers: there the "
-        "steps count, not the number.",
-        "Initial estimates are right where they follow from the student's own recordings; they "
-        "need not be near the final ones.",
+        _WORDS.text("advice_order"),
+        _WORDS.text("advice_large"),
+        _WORDS.text("advice_initial"),
     ]
     if analysis.carts > 1:
-        advice.append(
-            "The laws under “What must agree” tell a table that was fitted from one that was "
-            "copied together."
-        )
+        advice.append(_WORDS.text("advice_laws"))
     return bullet_list(spans(text) for text in advice)
 
 

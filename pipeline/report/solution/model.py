@@ -16,10 +16,12 @@ from pipeline.report.equations.algebra import (
 from pipeline.report.equations.model import formula, symbolic_transfer_functions
 from pipeline.report.figures.carts import free_body_figure
 from pipeline.report.math.tree import Math, Term, lines, matrix, row, total
+from pipeline.report.phrases import phrases
 from pipeline.report.sections.page import Page
 from pipeline.report.tables import fitted_chain_table
 from pipeline.report.words import rich
 
+_WORDS = phrases("solution")
 _MOST_ADDENDS = 3  # of a sum whose products are written out with numbers
 _A_LINE = 7  # terms of a sum
 
@@ -29,25 +31,16 @@ def motion_blocks(page: Page) -> list[Block]:
     springs = page.analysis.springs
     n = len(springs) - 1
     return [
-        paragraph(
-            "Cut every cart free. A spring pulls with its stiffness times its stretch, a bearing "
-            "brakes with its damping times the speed, the motor pushes cart 1 with u, in input "
-            "units. Walls do not move."
-        ),
+        paragraph(_WORDS.text("cut_free")),
         page.picture(
             "free-bodies",
             free_body_figure(springs),
-            caption="The carts cut free, with all forces along the rail, as they act where the "
-            "expression beside them is positive.",
-            alt=f"Free-body diagrams of {n} carts: springs and bearings pull each back, the motor "
-            "pushes cart 1.",
+            caption=_WORDS.text("free_bodies"),
+            alt=_WORDS.text("free_bodies_alt", n=n),
         ),
-        paragraph("Mass times acceleration is the sum of the forces on each cart:"),
+        paragraph(_WORDS.text("newton")),
         _written(derivation.newton(springs)),
-        paragraph(
-            "Transformed with all carts at rest at the start, and sorted by position, with "
-            "everything of the cart itself on the left:"
-        ),
+        paragraph(_WORDS.text("laplace")),
         _written(derivation.laplace(springs)),
     ]
 
@@ -62,29 +55,17 @@ def transfer_blocks(page: Page) -> list[Block]:
     if n == 1:
         return [
             rich_paragraph(
-                "X_1/U follows at once. With the stiffness taken out it has the paper's form, "
-                "where K = 1/k, the square of omega_n is k/m, and 2 zeta omega_n is c/m:"
-                if symbolic
-                else "X_1/U follows at once: there is no spring, so it has no static gain."
+                _WORDS.text("one_cart") if symbolic else _WORDS.text("one_cart_no_spring")
             ),
             *([symbolic] if symbolic else [_written([Equation("X_1/U", "1/(m*s**2+c*s)")])]),
         ]
     last = f"carts 1 and {n}" if n > 2 else "the two carts"
     blocks: list[Block] = [
-        paragraph(
-            "Each cart alone, the others held, is a cart on all its springs. It has a frequency "
-            "and a damping of its own:"
-        ),
+        paragraph(_WORDS.text("carts_alone")),
         _written(derivation.single_carts(springs)),
-        paragraph(
-            "Divide every equation by its mass, and write P(s) with the cart's index for its own "
-            "polynomial, s² + 2ζω s + ω²:"
-        ),
+        paragraph(_WORDS.text("per_mass")),
         _written(derivation.per_mass(n)),
-        paragraph(
-            f"Eliminate from the last cart on. What couples {last} along the way is κ, a spring "
-            "squared over the two masses it joins:"
-        ),
+        paragraph(_WORDS.text("eliminate", last=last)),
         _written(derivation.elimination(n)),
         paragraph(
             "Δ(s) is the characteristic polynomial: all transfer functions share it. The zeros of "
@@ -92,18 +73,12 @@ def transfer_blocks(page: Page) -> list[Block]:
             + (" N(s) belongs to carts 2 and 3." if n == 3 else "")
         ),
         _written(derivation.transfer(n)),
-        paragraph(
-            "At s = 0 they give the static gains; an index 0 marks the constant term of a "
-            "polynomial:"
-        ),
+        paragraph(_WORDS.text("static_gains")),
         _written(derivation.static_gains(n)),
     ]
     if symbolic:
         blocks += [
-            paragraph(
-                "Divide each polynomial by its constant term, Δ(s) to D(s): every quadratic factor "
-                "becomes one of the paper's, and what stands in front is the static gain."
-            ),
+            paragraph(_WORDS.text("paper_form")),
             symbolic,
         ]
     return blocks
@@ -125,22 +100,18 @@ def state_blocks(page: Page) -> list[Block]:
     )
     if not chain.is_tied or n > derivation.MOST_CARTS:
         return [
-            paragraph("No wall holds the carts, so A and B come from masses and dampings at once."),
+            paragraph(_WORDS.text("no_wall")),
             table,
         ]
     values = derivation.work_state_model(chain)
     values = work_out(derivation.physical(springs), values)
     blocks: list[Block] = [
-        paragraph(
-            "From the final estimates to the entries of A and B. Numbers are shown with five "
-            "digits and carried with all of them; lengths, times and inputs are in "
-            f"{page.position}, s and {page.drive}."
-        )
+        paragraph(_WORDS.text("to_entries", position=page.position, drive=page.drive))
     ]
     if unnamed := derivation.unnamed(chain):
         known: list[Math] = [row(shown(k), "=", value_term(v)) for k, v in unnamed.items()]
         blocks += [
-            paragraph("The zeros of the inner carts have no names, but coefficients in the fit:"),
+            paragraph(_WORDS.text("unnamed")),
             _together(known),
         ]
     for title, words, equations in _steps(n):
@@ -163,21 +134,17 @@ def _steps(n: int) -> Iterable[tuple[str, str, Sequence[Equation]]]:
         what = "Δ(s) and N(s)" if n == 3 else "Δ(s)"
         yield (
             f"Coefficients of {what}",
-            "Multiply the quadratic factors out; g stands for 2ζω of its factor.",
+            _WORDS.text("coefficients"),
             derivation.coefficients(n),
         )
         yield (
             "Each cart alone",
-            "From the last cart, whose numbers stand in the table, to the first, by comparing "
-            "the coefficients of the two highest powers. Lower powers would do as well on paper, "
-            "but rounding grows along them.",
+            _WORDS.text("alone_from_last"),
             derivation.carts_alone(n),
         )
     yield (
         "Couplings and input" if n > 1 else "The input",
-        "The static gains give what the step before cannot: how strongly one cart moves the next."
-        if n > 1
-        else "",
+        _WORDS.text("couplings") if n > 1 else "",
         derivation.couplings(n),
     )
 
@@ -202,12 +169,7 @@ def _entry(text: str, values: Mapping[str, float]) -> Term:
 def _redundancies(laws: Sequence[Equation], values: Mapping[str, float]) -> list[Block]:
     count = "One law is" if len(laws) == 1 else f"{len(laws)} laws are"
     return [
-        paragraph(
-            "There are more transfer-function parameters than masses, dampings and springs, and "
-            f"{count.lower()} left over. A table that was fitted transfer function by transfer "
-            "function need not obey, and one rounded to three digits obeys to a few percent; these "
-            "numbers belong to one chain:"
-        ),
+        paragraph(_WORDS.text("laws_left", count=count.lower())),
         *(_law(law, values) for law in laws),
     ]
 
