@@ -51,7 +51,7 @@ def test_matrices_are_the_sum_of_the_directions(chain):
         assert_allclose(built, matrix, rtol=1e-14, atol=1e-14 * np.max(np.abs(matrix)))
 
 
-def test_slopes_are_the_derivative_of_the_physical_parameters():
+def test_dp_dtheta_is_the_derivative_of_the_physical_parameters():
     """dp/dtheta agrees with a central difference."""
     chain = PRESETS["throne-3dof"]
     P = Parametrisation(n=3, springs=(True,) * 4)
@@ -60,7 +60,7 @@ def test_slopes_are_the_derivative_of_the_physical_parameters():
     for i, e in enumerate(np.eye(theta.size)):
         ends = [P.physical(P.unpack(theta + sign * h * e)) for sign in (1, -1)]
         # The difference errs by h²/6 and by rounding, 1e-16 / h.
-        assert_allclose((ends[0] - ends[1])[i] / (2 * h), P.slopes(theta)[i], rtol=1e-9)
+        assert_allclose((ends[0] - ends[1])[i] / (2 * h), P.dp_dtheta(theta)[i], rtol=1e-9)
 
 
 def test_only_a_spring_that_may_be_missing_is_linear():

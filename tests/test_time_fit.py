@@ -45,7 +45,7 @@ def misfit(record: Record, chain: Chain, parametrisation: Parametrisation, *, at
         chain,
         free=record.free,
         parametrisation=parametrisation,
-        slopes=parametrisation.slopes(theta),
+        dp_dtheta=parametrisation.dp_dtheta(theta),
     )
     return compare(replace(open_window(record), at_rest=at_rest), modes)
 
@@ -69,8 +69,8 @@ def test_modes_and_simulation_agree(free, jitter):
 
 @pytest.mark.parametrize("zeta", [0.1, 1.0, 1.5])
 @pytest.mark.parametrize("at_rest", [True, False])
-def test_slopes_are_those_of_the_misfit(zeta, at_rest):
-    """The gradient from the slopes is that of the cost, also where a cart's poles meet."""
+def test_the_jacobian_is_that_of_the_misfit(zeta, at_rest):
+    """The gradient from the Jacobian is that of the cost, also where a cart's poles meet."""
     m, k = np.array([2e-4, 1e-4]), np.array([0.03, 0.04, 0.02])
     chain = Chain(m=m, c=2 * zeta * np.sqrt(m * (k[:-1] + k[1:])), k=k)
     record = step_record(chain, rng=np.random.default_rng(1), noise=0.01)
@@ -84,7 +84,7 @@ def test_slopes_are_those_of_the_misfit(zeta, at_rest):
         )
 
     here = misfit(record, parametrisation.unpack(theta), parametrisation, at_rest=at_rest)
-    gradient = np.einsum("pij,ij->p", here.slopes, here.residual)
+    gradient = np.einsum("pij,ij->p", here.jacobian, here.residual)
     step = 1e-5 * np.eye(theta.size)
     numeric = [(cost(theta + e) - cost(theta - e)) / 2e-5 for e in step]
     # Central differences err by the step's square times the third derivative: 1e-10 of a cost

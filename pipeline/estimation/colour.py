@@ -55,20 +55,20 @@ def long_run_variance(residual: Array) -> float:
     return max(total, float(np.mean(residual**2)))
 
 
-def score_covariance(residual: Array, slopes: Array) -> Array:
-    """Return the covariance (n_p, n_p) of sum(slopes * residual) over carts and samples.
+def score_covariance(residual: Array, jacobian: Array) -> Array:
+    """Return the covariance (n_p, n_p) of sum(jacobian * residual) over carts and samples.
 
-    `residual` (p, n) is taken as stationary, its carts as correlated; `slopes` (n_p, p, n).
+    `residual` (p, n) is taken as stationary, its carts as correlated; `jacobian` (n_p, p, n).
     """
     n = residual.shape[1]
     correlation = _tapered_correlation(residual)
     n_fft = correlation.shape[-1]
     spectrum = np.fft.rfft(correlation)  # (p, p, n_f)
-    J = np.fft.rfft(slopes, n_fft)  # (n_p, p, n_f)
+    J = np.fft.rfft(jacobian, n_fft)  # (n_p, p, n_f)
     weight = np.full(J.shape[-1], 2.0)  # each frequency stands for its negative too
     weight[[0, -1]] = 1.0
     coloured = np.einsum("jkf,qkf->qjf", spectrum.conj(), J) * (weight / (n * n_fft))
-    n_p = slopes.shape[0]
+    n_p = jacobian.shape[0]
     meat = (J.conj().reshape(n_p, -1) @ coloured.reshape(n_p, -1).T).real
     return (meat + meat.T) / 2
 

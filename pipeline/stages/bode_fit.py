@@ -184,8 +184,8 @@ class _Fitted:
 def _solve(P: Parametrisation, data: Points, theta: Array, scale: Scale) -> _Fitted:
     def evaluate(theta: Array) -> tuple[Array, Array]:
         r, J = weighted_residuals(P, data, scale, P.physical(P.unpack(theta)))
-        J = J * P.slopes(theta)
-        if not np.isfinite(np.sum(J**2)):  # without slopes no step could go on from here
+        J = J * P.dp_dtheta(theta)
+        if not np.isfinite(np.sum(J**2)):  # without a Jacobian no step could go on from here
             r = np.full_like(r, np.nan)
         return r, J
 

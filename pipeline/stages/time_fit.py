@@ -31,7 +31,7 @@ _NEGLIGIBLE = 0.05  # of its standard error: such a damping or wall spring is he
 _REST_SIGMAS = 5.0  # how far beyond chance a free start must improve the fit to be kept
 _STRUCTURE_VALUES = 20  # independent values of the chain's own error in a record
 _DETERMINED = 1e-9  # smallest singular value of the scaled Jacobian over its largest
-_NO_DAMPING = 1e-6  # of the critical one: as good as none, and its logarithm has slopes
+_NO_DAMPING = 1e-6  # of the critical one: as good as none, and its logarithm has derivatives
 _TOLERANCE = 1e-9  # of the cost, relative; far below one standard error for any record
 
 
@@ -125,7 +125,7 @@ def _starts_at_rest(attempt: Attempt, index: int) -> bool:
     gain = condense([*others, held])[-1, -1] ** 2 - condense([*others, misfit])[-1, -1] ** 2
     structure = (np.sum(misfit.residual**2) - misfit.residual.size) / _STRUCTURE_VALUES
     chance = max(long_run_variance(misfit.residual), structure)
-    freed = misfit.n_local - held.n_local
+    freed = misfit.n_nuisance - held.n_nuisance
     return bool(gain <= chance * (freed + _REST_SIGMAS * np.sqrt(2 * freed)))
 
 
@@ -140,20 +140,20 @@ def _covariance(attempt: Attempt) -> Array:
     DataError : the records do not determine a parameter.
     """
     names = attempt.parametrisation.names
-    to_physical = attempt.parametrisation.slopes(attempt.theta)[:, None, None]
-    slopes = [misfit.slopes / to_physical for misfit in attempt.misfits]
-    scale = np.sqrt(sum(np.sum(s**2, axis=(1, 2)) for s in slopes))
+    to_physical = attempt.parametrisation.dp_dtheta(attempt.theta)[:, None, None]
+    jacobians = [misfit.jacobian / to_physical for misfit in attempt.misfits]
+    scale = np.sqrt(sum(np.sum(s**2, axis=(1, 2)) for s in jacobians))
     if not np.all(scale > 0):
         raise _undetermined(names[int(np.argmin(scale))])
-    slopes = [s / scale[:, None, None] for s in slopes]
-    long = np.concatenate([s.reshape(scale.size, -1) for s in slopes], axis=1)
+    jacobians = [s / scale[:, None, None] for s in jacobians]
+    long = np.concatenate([s.reshape(scale.size, -1) for s in jacobians], axis=1)
     R = np.asarray(np.linalg.qr(long.T, mode="r"))
     _, singular, Vt = np.linalg.svd(R)
     if singular[-1] < _DETERMINED * singular[0]:
         raise _undetermined(names[int(np.argmax(np.abs(Vt[-1])))])
-    whitening = np.linalg.inv(R)  # slopes @ whitening are orthonormal
+    whitening = np.linalg.inv(R)  # jacobians @ whitening are orthonormal
     scores = np.zeros_like(R)
-    for misfit, s in zip(attempt.misfits, slopes, strict=True):
+    for misfit, s in zip(attempt.misfits, jacobians, strict=True):
         white = (whitening.T @ s.reshape(scale.size, -1)).reshape(s.shape)
         scores += score_covariance(misfit.residual, white)
     values, vectors = np.linalg.eigh(scores * (attempt.n_points / attempt.dof))

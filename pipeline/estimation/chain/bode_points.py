@@ -116,28 +116,28 @@ def response_at(
         inverse = np.full_like(Z, np.nan)
     G = inverse[:, :, 0]
     stretch = (G @ b.T) * -powers  # (n_w, n_p)
-    slopes = (inverse @ b.T) * stretch[:, None, :]  # (n_w, n, n_p)
-    return G[data.at, data.cart], slopes[data.at, data.cart]
+    dG = (inverse @ b.T) * stretch[:, None, :]  # (n_w, n, n_p)
+    return G[data.at, data.cart], dG[data.at, data.cart]
 
 
 def weighted_residuals(
     P: Parametrisation, data: Points, scale: Scale, physical: Array
 ) -> tuple[Array, Array]:
-    """Return the weighted residuals (model minus measured) and their slopes by p."""
+    """Return the weighted residuals (model minus measured) and their Jacobian by p."""
     G, dG = response_at(P, data, physical)
     r, J = _response_residuals(data, scale, G, dG)
     if not data.decays:
         return r, J
-    own, slopes = _decay_residuals(P, data.decays, physical)
-    return np.concatenate([r, own]), np.vstack([J, slopes])
+    own, own_J = _decay_residuals(P, data.decays, physical)
+    return np.concatenate([r, own]), np.vstack([J, own_J])
 
 
 def _decay_residuals(
     P: Parametrisation, decays: Mapping[int, Estimate], physical: Array
 ) -> tuple[Array, Array]:
-    """Return ln ζ_i over the decay's, in standard errors, and its slopes; ζ² = c² / 4mk."""
+    """Return ln ζ_i over the decay's, in standard errors, and its derivatives; ζ² = c² / 4mk."""
     chain = P.chain(physical)
-    residuals, slopes = [], []
+    residuals, jacobian = [], []
     for cart, measured in decays.items():
         i, weight = cart - 1, measured.value / (measured.std or np.inf)
         held = chain.k[i] + chain.k[i + 1]
@@ -148,8 +148,8 @@ def _decay_residuals(
             f"k_{cart + 1}": -0.5 / held,
         }
         residuals.append(weight * np.log(chain.zeta_carts[i] / measured.value))
-        slopes.append([weight * by_name.get(name, 0.0) for name in P.names])
-    return np.array(residuals), np.array(slopes)
+        jacobian.append([weight * by_name.get(name, 0.0) for name in P.names])
+    return np.array(residuals), np.array(jacobian)
 
 
 def _response_residuals(

@@ -197,12 +197,12 @@ def _say(carts: Sequence[int], weights: Array) -> tuple[Misread, Array] | None:
 
 
 def _modes(chain: Chain) -> _ModesOf:
-    """Return what finds the chain's modes by its free carts, without slopes: none are needed."""
+    """Return what finds the chain's modes by its free carts, without derivatives."""
     P = Parametrisation(n=chain.n, springs=tuple(bool(k) for k in chain.k))
 
     @cache
     def find(free: tuple[int, ...]) -> Modes:
-        modes = find_modes(chain, free=free, parametrisation=P, slopes=np.zeros(len(P.names)))
+        modes = find_modes(chain, free=free, parametrisation=P, dp_dtheta=np.zeros(len(P.names)))
         return replace(
             modes,
             d_poles=modes.d_poles[:0],

@@ -1,7 +1,7 @@
-"""Exact response of a chain to a measured input, and its slopes by the fit vector, by modes.
+"""Exact response of a chain to a measured input, and its Jacobian by the fit vector, by modes.
 
 In modal coordinates every state is alone, z' = lambda z + b u, so an input held between samples
-gives an exact scalar recursion at any sample times, and the slope of the whole response by any
+gives an exact scalar recursion at any sample times, and the derivative of the whole response by any
 number of parameters needs only one more recursion a mode (by lambda) and constant matrices.
 """
 
@@ -13,10 +13,10 @@ import numpy as np
 from pipeline.estimation.chain.parametrisation import Parametrisation
 from pipeline.plant.chain import Array, Chain, ComplexArray
 
-# Below this |lambda dt| the slope of expm1(z)/z is taken from its series: rounding would leave
+# Below this |lambda dt| the derivative of expm1(z)/z is taken from its series: rounding would leave
 # it 1e-16/|z|, the series errs by z²/8.
 _SMALL_EXPONENT = 1e-6
-# Poles closer than this (relative) lose the third power of it in the slopes. More damping on one
+# Poles closer than this (relative) lose the third power of it in the Jacobian. More damping on one
 # cart, by a share no record can tell, sets them apart by twice its root.
 _MEETING = 1e-3
 _PARTING = 1e-5
@@ -24,7 +24,7 @@ _PARTING = 1e-5
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Modes:
-    """The modes of the free carts, one of each conjugate pair, with their slopes by theta.
+    """The modes of the free carts, one of each conjugate pair, with their derivatives by theta.
 
     Attributes
     ----------
@@ -46,12 +46,13 @@ class Modes:
 
 
 def find_modes(
-    chain: Chain, *, free: Sequence[int], parametrisation: Parametrisation, slopes: Array
+    chain: Chain, *, free: Sequence[int], parametrisation: Parametrisation, dp_dtheta: Array
 ) -> Modes:
     """Decompose the free part of a chain into modes.
 
-    `slopes` (n_p,) is dp/dtheta. Where two poles meet (a critically damped cart) there are no
-    separate modes, and near there rounding spoils the slopes: such poles are first parted.
+    `dp_dtheta` (n_p,) is that of `Parametrisation`. Where two poles meet (a critically damped
+    cart) there are no separate modes, and near there rounding spoils the derivatives: such poles
+    are first parted.
     """
     A, B, _, _ = chain.state_space(free=free)
     if _poles_meet(A):
@@ -60,8 +61,8 @@ def find_modes(
         c[first] *= 1 + _PARTING
         chain = replace(chain, c=c)
         A, B, _, _ = chain.state_space(free=free)
-    dA, dB = _state_space_slopes(chain, free, parametrisation)
-    dA, dB = slopes[:, None, None] * dA, slopes[:, None] * dB
+    dA, dB = _state_space_derivatives(chain, free, parametrisation)
+    dA, dB = dp_dtheta[:, None, None] * dA, dp_dtheta[:, None] * dB
     poles, V = map(np.asarray, np.linalg.eig(A))  # of a real matrix: exact conjugate pairs
     poles, V = poles.astype(np.complex128), V.astype(np.complex128)
     W = np.asarray(np.linalg.inv(V), dtype=np.complex128)
@@ -93,7 +94,7 @@ def _poles_meet(A: Array) -> bool:
     return bool(np.min(gap) < _MEETING * np.max(np.abs(poles)))
 
 
-def _state_space_slopes(
+def _state_space_derivatives(
     chain: Chain, free: Sequence[int], parametrisation: Parametrisation
 ) -> tuple[Array, Array]:
     """Return dA/dp (n_p, 2f, 2f) and dB/dp (n_p, 2f) by the physical parameters."""

@@ -109,7 +109,7 @@ class Parametrisation:
         exponent = np.clip(np.where(self.logarithmic, theta, 0.0), -_FARTHEST, _FARTHEST)
         return np.where(self.logarithmic, np.exp(exponent), theta)
 
-    def slopes(self, theta: Array) -> Array:
+    def dp_dtheta(self, theta: Array) -> Array:
         """Return dp/dtheta (n_p,): p itself for a logarithm, 1 for the linear spring."""
         return np.where(self.logarithmic, self._physical_of(theta), 1.0)
 
@@ -140,11 +140,6 @@ class Parametrisation:
     def holding_at_zero(self, *names: str) -> "Parametrisation":
         """Return the same with further parameters held at zero."""
         return Parametrisation(n=self.n, springs=self.springs, zero=(*self.zero, *names))
-
-    def physical_covariance(self, theta: Array, covariance: Array) -> Array:
-        """Return the covariance (n_p, n_p) of the physical parameters from that of theta."""
-        slopes = self.slopes(theta)
-        return slopes[:, None] * covariance * slopes
 
 
 def _place(name: str) -> tuple[str, int]:

@@ -99,9 +99,9 @@ def _fit(
         return points.weight * (theta[0] + power * level - target)
 
     def jacobian(theta: Array) -> Array:
-        _, slopes = _log_factors(points.omega, theta[1:].reshape(shape))
+        _, jacobian = _log_factors(points.omega, theta[1:].reshape(shape))
         ones = np.ones((points.omega.size, 1))
-        return points.weight[:, None] * np.hstack([ones, power * slopes])
+        return points.weight[:, None] * np.hstack([ones, power * jacobian])
 
     start = np.concatenate([[np.log(gain)], factors.ravel()])
     if points.omega.size < start.size:
@@ -118,13 +118,13 @@ def _fit(
 
 
 def _log_factors(omega: Array, factors: Array) -> tuple[Array, Array]:
-    """Return Σ ln|Q_j| (n_w,) and its slopes (n_w, 2 n_j) by ln omega_j, then by ln zeta_j."""
+    """Return Σ ln|Q_j| (n_w,) and its Jacobian (n_w, 2 n_j) by ln omega_j, then by ln zeta_j."""
     size, zeta = np.exp(np.clip(factors, -_FARTHEST, _FARTHEST))
     r = omega[:, None] / size
     damping = 2j * zeta * r
     Q = 1 - r**2 + damping
-    slopes = np.hstack([((2 * r**2 - damping) / Q).real, (damping / Q).real])
-    return np.sum(np.log(np.abs(Q)), axis=1), slopes
+    jacobian = np.hstack([((2 * r**2 - damping) / Q).real, (damping / Q).real])
+    return np.sum(np.log(np.abs(Q)), axis=1), jacobian
 
 
 def _polynomial(factors: Array) -> Array:

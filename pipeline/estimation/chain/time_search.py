@@ -69,8 +69,8 @@ class Attempt:
 
     @property
     def dof(self) -> int:
-        """Degrees of freedom: positions less all that was fitted, local unknowns included."""
-        return self.n_points - self.theta.size - sum(misfit.n_local for misfit in self.misfits)
+        """Degrees of freedom: positions less all that was fitted, nuisance parameters included."""
+        return self.n_points - self.theta.size - sum(misfit.n_nuisance for misfit in self.misfits)
 
     @cached_property
     def lost(self) -> float:
@@ -89,9 +89,9 @@ class Attempt:
 
 def look(windows: Sequence[Window], parametrisation: Parametrisation, theta: Array) -> Attempt:
     """Compare the chain of theta with all windows."""
-    chain, slopes = parametrisation.unpack(theta), parametrisation.slopes(theta)
+    chain, dp_dtheta = parametrisation.unpack(theta), parametrisation.dp_dtheta(theta)
     modes = {
-        free: find_modes(chain, free=free, parametrisation=parametrisation, slopes=slopes)
+        free: find_modes(chain, free=free, parametrisation=parametrisation, dp_dtheta=dp_dtheta)
         for free in {window.free for window in windows}
     }
     misfits = [compare(window, modes[window.free]) for window in windows]
@@ -127,15 +127,15 @@ def descend(
 
 
 def condense(misfits: Sequence[Misfit]) -> Array:
-    """Condense slopes and residuals to (n_p + 1, n_p + 1), the residuals in the last column.
+    """Condense Jacobians and residuals to (n_p + 1, n_p + 1), the residuals in the last column.
 
     The triangle of their QR decomposition: its columns have the products of the long ones, so
     least squares sees the same problem with n_p + 1 residuals instead of thousands.
     """
     triangles = []
     for misfit in misfits:
-        slopes = misfit.slopes.reshape(misfit.slopes.shape[0], -1)
-        columns = np.vstack([slopes, misfit.residual.reshape(1, -1)]).T
+        jacobian = misfit.jacobian.reshape(misfit.jacobian.shape[0], -1)
+        columns = np.vstack([jacobian, misfit.residual.reshape(1, -1)]).T
         triangles.append(np.asarray(np.linalg.qr(columns, mode="r")))
     return np.asarray(np.linalg.qr(np.concatenate(triangles), mode="r"))
 

@@ -15,7 +15,7 @@ from pipeline.results import Kind, Record
 # cart has let go of it by then.
 _RELEASED_BELOW = 0.5
 _DECAY_START_SHARE = 0.95  # of the largest swing: the end of the hold
-_RANK = 1e-9  # relative singular value below which two local unknowns are one
+_RANK = 1e-9  # relative singular value below which two nuisance parameters are one
 _NOISE_FREE = 1e-6  # of the motion: the error to assume where neither noise nor steps are seen
 _FEWEST_SAMPLES = 16
 
@@ -56,18 +56,18 @@ class Window:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Misfit:
-    """How a chain misses one window, its local unknowns (start, encoder zeros) at their best.
+    """How a chain misses one window, its nuisance parameters (start, encoder zeros) at their best.
 
     Attributes
     ----------
     residual : (p, n) model minus measured, over sigma.
-    slopes : (n_p, p, n) of the residual by theta, with the local unknowns following.
-    n_local : how many local unknowns were eliminated.
+    jacobian : (n_p, p, n) of the residual by theta, with the nuisance parameters following.
+    n_nuisance : how many nuisance parameters were eliminated.
     """
 
     residual: Array
-    slopes: Array
-    n_local: int
+    jacobian: Array
+    n_nuisance: int
 
 
 def usable_segment(record: Record) -> slice:
@@ -147,7 +147,7 @@ def open_window(record: Record) -> Window:
 def compare(window: Window, modes: Modes) -> Misfit:
     """Compare a chain, given by its modes, with a window.
 
-    Start and encoder zeros enter linearly and are eliminated: residual and slopes are projected
+    Start and encoder zeros enter linearly and are eliminated: residual and jacobian are projected
     off them (variable projection in Kaufman's form, G. Golub & V. Pereyra, Inverse Problems 19,
     2003, section 3).
     """
@@ -167,7 +167,7 @@ def compare(window: Window, modes: Modes) -> Misfit:
     kept = s > _RANK * s[0]
     basis = Q @ U[:, kept]
 
-    signals, d_weights = [], []  # modal signals, and their weights in the slopes
+    signals, d_weights = [], []  # modal signals, and their weights in the jacobian
     rest = -window.y
     if window.drive_u is not None:
         q, dq = drive_modes(modes.poles, window.drive_t, window.drive_u)
@@ -191,15 +191,15 @@ def compare(window: Window, modes: Modes) -> Misfit:
         ]
     n_p = modes.d_poles.shape[0]
     if signals:
-        slopes = _real_part(np.concatenate(d_weights, axis=2), np.concatenate(signals))
+        jacobian = _real_part(np.concatenate(d_weights, axis=2), np.concatenate(signals))
     else:
-        slopes = np.zeros((n_p, p, n))
-    slopes = (slopes / window.sigma[:, None]).reshape(n_p, p * n)
-    slopes = slopes - (slopes @ basis) @ basis.T
+        jacobian = np.zeros((n_p, p, n))
+    jacobian = (jacobian / window.sigma[:, None]).reshape(n_p, p * n)
+    jacobian = jacobian - (jacobian @ basis) @ basis.T
     return Misfit(
         residual=(rest - basis @ along).reshape(p, n),
-        slopes=slopes.reshape(n_p, p, n),
-        n_local=int(np.count_nonzero(kept)),
+        jacobian=jacobian.reshape(n_p, p, n),
+        n_nuisance=int(np.count_nonzero(kept)),
     )
 
 
