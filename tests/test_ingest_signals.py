@@ -6,8 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from pipeline.ingest.problems import saturation, stuck_spans
-from pipeline.ingest.signals import encoder_step, mirrors
+from pipeline.ingest.channels import encoder_step, mirrors, saturation, stuck_spans
 
 RATE = 113.0
 T = np.arange(900, dtype=np.float64) / RATE

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from pipeline.identify.log import by_note
-from pipeline.identify.soundness.encoder_units import find_other_units
+from pipeline.identify.soundness.encoders import find_other_units
 from pipeline.ingest.read import Ingested
 from pipeline.results import Record
 

@@ -9,11 +9,10 @@ from pipeline.errors import DataError
 from pipeline.estimation.chain.follow import Followed, follow, most_follow
 from pipeline.identify.carts import Identified, identify
 from pipeline.identify.log import Progress
-from pipeline.identify.soundness.encoder_units import find_other_units
+from pipeline.identify.soundness.encoders import find_other_units, find_stuck
 from pipeline.identify.soundness.faults import find_faults, find_impossible_gains, standing_still
 from pipeline.identify.soundness.other_kind import find_other_kinds
 from pipeline.identify.soundness.repeats import find_outlier_repeats
-from pipeline.identify.soundness.stuck import find_stuck
 from pipeline.ingest.read import Ingested
 from pipeline.plant.chain import Chain
 from pipeline.results import LeftOut

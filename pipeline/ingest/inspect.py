@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.errors import SubmissionError
+from pipeline.ingest.channels import channel_problems, encoder_step, mirrors
 from pipeline.ingest.clock import SLOW, Clock, read_clock
 from pipeline.ingest.columns import Column, assign_columns, conversion, holds_counts
 from pipeline.ingest.formats.recognise import read_table
 from pipeline.ingest.formats.table import FORM_TITLES, Table
-from pipeline.ingest.problems import channel_problems
-from pipeline.ingest.signals import encoder_step, mirrors
 from pipeline.ingest.suggest import suggest_columns
 from pipeline.plant.chain import Array
 from pipeline.results import Kind

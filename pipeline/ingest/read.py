@@ -8,12 +8,11 @@ import numpy as np
 
 from pipeline.errors import SubmissionError
 from pipeline.ingest.bode import Points, frequency_responses, read_points
+from pipeline.ingest.channels import channel_problems, encoder_step, mirrors
 from pipeline.ingest.clock import Clock, read_clocks
 from pipeline.ingest.columns import Column, assign_columns, conversion, holds_counts
 from pipeline.ingest.formats.recognise import read_table
 from pipeline.ingest.formats.table import Table, refuse_extreme
-from pipeline.ingest.problems import channel_problems
-from pipeline.ingest.signals import encoder_step, mirrors
 from pipeline.ingest.signs import Signs, with_signs
 from pipeline.ingest.times import FEWEST_SAMPLES, clock_notes, time_stamps
 from pipeline.plant.chain import Array

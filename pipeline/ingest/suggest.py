@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from pipeline.ingest.channels import mirrors
 from pipeline.ingest.clock import SLOW, read_clock
 from pipeline.ingest.formats.table import Table
-from pipeline.ingest.signals import mirrors
 from pipeline.plant.chain import Array
 
 _QUICK = 1e-5  # s between samples; no bench records faster, a slow signal that only rises does

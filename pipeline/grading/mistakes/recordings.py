@@ -7,8 +7,8 @@ import numpy as np
 from pipeline.checks.recordings import SCALES, why_other_frequency
 from pipeline.grading.grade import Flag
 from pipeline.grading.references.reference import is_explained
+from pipeline.ingest.channels import saturation
 from pipeline.ingest.inspect import line_frequency
-from pipeline.ingest.problems import saturation
 from pipeline.results import Analysis, Record
 
 _FREQUENCY = 0.08  # relative: a stated frequency further from that of the input is another run's

@@ -1,14 +1,18 @@
-"""Recordings in another unit of length: one encoder has one step, whatever the experiment."""
+"""What encoders alone show: that one is in another unit of length, or that it stuck."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
+from pipeline.estimation.chain.follow import measured
 from pipeline.estimation.mistakes import LENGTH_SCALES
+from pipeline.ingest.channels import stuck_spans
 from pipeline.results import LeftOut, Record
 
 _SAME = 0.02  # relative: as far as the step is seen alike in two recordings
 _WITNESSES = 2  # kinds of experiment that have the usual step; of two alone either may be wrong
+_FASTEST = 0.98  # quantile of the moves from sample to sample: the odd jump does not count
+_AT_SPEED, _AWAY = 0.6, 1.5  # of the fastest
 
 
 def find_other_units(records: Sequence[Record], *, decays: bool = False) -> dict[str, LeftOut]:
@@ -52,3 +56,27 @@ def _alike(step: float, other: float) -> bool:
 def _is_decimal(step: float) -> bool:
     """Whether a step is 1 of some decimal place, as numbers are written."""
     return step > 0 and _alike(step, 10.0 ** round(np.log10(step)))
+
+
+def find_stuck(records: Sequence[Record]) -> dict[str, LeftOut]:
+    """Return the records in which a free cart's encoder stuck, by id.
+
+    Static friction stops a cart from a crawl; it does not stop one at speed, nor is it elsewhere
+    when it moves on.
+    """
+    found: dict[str, LeftOut] = {}
+    for record in records:
+        for cart in measured(record):
+            y = record.position(cart)
+            moves = np.abs(np.diff(y))
+            fastest = float(np.quantile(moves, _FASTEST))
+            for first, last in stuck_spans(y):
+                away = last < moves.size and moves[last] >= _AWAY * fastest
+                if away or moves[first - 1] >= _AT_SPEED * fastest:
+                    reason = (
+                        f"the encoder of cart {cart} stands still at speed from "
+                        f"{record.t[first]:.4g} s to {record.t[last]:.4g} s: it stuck"
+                    )
+                    one = LeftOut(experiment=record.id, reason=reason, is_wrong=True)
+                    found.setdefault(record.id, one)
+    return found
