@@ -72,13 +72,16 @@ def grow(parent: Hypothesis, bench: Bench) -> Iterator[Hypothesis]:
 def _better_told(
     candidates: Sequence[Candidate], fit: Fit, fits: Sequence[tuple[tuple[Candidate, ...], Fit]]
 ) -> bool:
-    """Does a team explain more than this part of it, or a part no less than this team?"""
+    """Does a whole family explain more than this part of it, or a part no less than this team?"""
     keys = {c.key for c in candidates}
-    return any(
-        (keys < (others := {c.key for c in more}) and f.cost < _TOGETHER * fit.cost)
-        or (others < keys and f.cost < _NO_LESS * fit.cost)
-        for more, f in fits
-    )
+    for more, other in fits:
+        others = {c.key for c in more}
+        family = len({c.effect.key for c in more}) == 1
+        if family and keys < others and other.cost < _TOGETHER * fit.cost:
+            return True
+        if others < keys and other.cost < _NO_LESS * fit.cost:
+            return True
+    return False
 
 
 def _stops_like(
