@@ -143,7 +143,7 @@ def fit_locals(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
             runs,
             locals_=own,
             spread=fit.spread,
-            fixed=range(fit.theta.size),
+            shared=False,
             iterations=10,
             mapper=mapper,
         )

@@ -117,7 +117,7 @@ def fit_model(
     locals_: Sequence[Locals] | None = None,
     spread: Array | None = None,
     iterations: int = 12,
-    fixed: Sequence[int] = (),
+    shared: bool = True,
     scatter_free: bool = True,
     learn_spread: bool = False,
     tolerance: float = 1e-3,
@@ -127,7 +127,7 @@ def fit_model(
 
     Parameters
     ----------
-    theta : (size,) start. `fixed` lists entries that stay (all of them: only locals move).
+    theta : (size,) start; without `shared` it stays, and only the runs' own unknowns move.
     spread : (n,) expected spread of the dry friction from run to run; learnt if `learn_spread`.
     tolerance : relative fall of the cost below which the fit has converged.
     """
@@ -136,7 +136,7 @@ def fit_model(
     theta = np.clip(theta, low, high)
     own = tuple(locals_) if locals_ is not None else tuple(fresh_locals(run) for run in runs)
     spread = np.full(structure.n, _SCATTER_START) if spread is None else spread
-    moving = np.array([i for i in range(theta.size) if i not in set(fixed)], dtype=int)
+    moving = np.arange(theta.size if shared else 0)
     damp = _DAMP
     inflate = 1.0
     best = evaluate(structure, theta, runs, own, spread=spread, inflate=inflate, mapper=mapper)
@@ -152,10 +152,11 @@ def fit_model(
                 inflate=inflate,
                 spread=at.spread,
                 scatter_free=scatter_free,
+                shared=shared,
             )
 
         linear = list(mapper(share, zip(runs, best.locals_, strict=True)))
-        stacked = np.concatenate([*(part.reduced for part in linear), _anchor(runs, theta.size)])
+        stacked = np.concatenate([*(part.reduced for part in linear), _anchor(runs, moving.size)])
         if not np.all(np.isfinite(stacked)):
             break
         J, r = stacked[:, :-1], stacked[:, -1]
@@ -199,7 +200,7 @@ def fit_model(
                 part, run, own, before = job
                 tried = []
                 for scale in _LOCAL_SCALES:
-                    moved = move_locals(part, own, delta, scale)
+                    moved = move_locals(part, own, delta[moving], scale)
                     cost = run_cost(structure, there, run, moved, spread=at.spread)
                     tried.append((cost[0] + inflate**2 * cost[1], moved, cost))
                     if tried[-1][0] <= before:
@@ -239,6 +240,8 @@ def _anchor(runs: Sequence[Run], size: int) -> Array:
     """Return a row that holds the first free mass where no input gives forces a scale."""
     if any(np.any(run.command) for run in runs):
         return np.zeros((0, size + 1))
+    if not size:
+        return np.zeros((0, 1))
     row = np.zeros((1, size + 1))
     row[0, int(np.argmax(np.any([run.free for run in runs], axis=0)))] = _ANCHOR
     return row

@@ -4,21 +4,32 @@ A run's own unknowns are the carts' start (and restart) states, those of hidden 
 carts already move, the encoders' zeros, and a factor on the dry friction of each cart, which varies
 from run to run. They enter the residual almost
 linearly, so a QR factorisation of each run leaves a small problem in the shared parameters.
-All derivatives are differences, simulated in one batch per run.
 
 Reference: G. H. Golub, V. Pereyra, Inverse Problems 19 (2003), R1 (separable least squares).
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pipeline.gap.runs import Run
 from pipeline.gap.structure import Structure
 from pipeline.plant.chain import Array
-from pipeline.plant.kernel import simulate_batch
+from pipeline.plant.kernel import simulate_with_derivatives
+from pipeline.plant.sensitivity import (
+    BY_DAMPING,
+    BY_FRICTION,
+    BY_MASS,
+    BY_POSITION,
+    BY_STIFFNESS,
+    BY_VELOCITY,
+)
 
-_LOCAL_STEP = 1e-3  # of the run's swing, for derivatives with respect to start states
+_START_STEP = 1e-3  # for differences, of the swing or of the friction
+_TALL = 400  # rows of a matrix that are factorised at once
+_HOME = 0.1  # how firmly the priors hold starts that the data do not show …
+_HELD = 1e6  # … and a velocity that is known to be zero
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -49,23 +60,43 @@ def fresh_locals(run: Run) -> Locals:
 
 def simulate_run(structure: Structure, thetas: Array, run: Run, own: Locals) -> Array:
     """Return (b, rows, samples) readings of one run for many vectors, zeros included."""
+    y, _ = simulate_variants(structure, thetas, run, own)
+    return y + own.zero[list(run.rows)][:, None]
+
+
+def simulate_variants(
+    structure: Structure,
+    thetas: Array,
+    run: Run,
+    own: Locals,
+    *,
+    lanes: Sequence[tuple[int, int]] = (),
+) -> tuple[Array, Array]:
+    """Return (b, rows, samples) readings of one run for many vectors, zeros left out.
+
+    And the derivatives (lanes, rows, samples) of the first, by what `lanes` tell: a kind of
+    `pipeline.plant.sensitivity` and a cart or spring, from 0.
+    """
     cart, spring, drive = structure.tables(thetas)
     b = len(thetas)
-    y = simulate_batch(
+    y, by = simulate_with_derivatives(
         cart,
         spring,
         drive,
-        np.broadcast_to(own.x0, (b, *own.x0.shape)),
-        np.broadcast_to(own.v0, (b, *own.v0.shape)),
-        np.broadcast_to(own.scatter, (b, own.scatter.size)),
+        np.broadcast_to(own.x0, (b, *own.x0.shape[-2:])),
+        np.broadcast_to(own.v0, (b, *own.v0.shape[-2:])),
+        np.broadcast_to(own.scatter, (b, own.scatter.shape[-1])),
         np.array(run.free),
         run.t,
         run.knots,
         run.command,
         np.array(run.shots),
         1.0,  # the simulator chooses its steps
+        np.array(lanes, dtype=np.int64).reshape(-1, 2).T,
     )
-    return y[:, list(run.rows)] + own.zero[list(run.rows)][:, None]
+    if len(run.rows) == structure.n:
+        return y, by
+    return y[:, list(run.rows)], by[:, list(run.rows)]
 
 
 # ------------------------------------------------------------------- one run linearised
@@ -126,9 +157,24 @@ def residual_points(run: Run) -> float:
 
 
 def triangle(matrix: Array) -> Array:
-    """Return R of the QR factorisation of one matrix or a stack of them."""
-    R: Array = np.linalg.qr(matrix, mode="r")  # pyright: ignore[reportAssignmentType]
-    return R
+    """Return R of the QR factorisation of one matrix or a stack of them.
+
+    Tall ones part by part, each small enough for the processor's cache, then of what they leave.
+
+    Reference: J. Demmel, L. Grigori, M. Hoemmen, J. Langou, SIAM J. Sci. Comput. 34 (2012), A206.
+    """
+    *stack, rows, columns = matrix.shape
+    parts = rows // _TALL
+    if parts > 1:
+        even = rows // parts * parts
+        tall = matrix[..., :even, :].reshape(*stack, parts, even // parts, columns)
+        left = _r(tall).reshape(*stack, -1, columns)
+        matrix = np.concatenate([left, matrix[..., even:, :]], axis=-2)
+    return _r(matrix)
+
+
+def _r(matrix: Array) -> Array:
+    return np.linalg.qr(matrix, mode="r")  # pyright: ignore[reportReturnType]
 
 
 def linearise(
@@ -140,102 +186,120 @@ def linearise(
     inflate: float,
     spread: Array,
     scatter_free: bool,
+    shared: bool = True,
     extras: Array | None = None,
 ) -> Linear:
     """Return a run's residual and its derivatives, with its own unknowns eliminated.
 
     `inflate` widens the noise to the misfit of a model that is still wrong, as far as priors are
-    concerned; `extras` (k, rows, samples of `run.thin`) are further columns to project.
+    concerned; without `shared` only the run's own unknowns move; `extras` (k, rows, samples of
+    `run.thin`) are further columns to project.
     """
     run = run.thin
     layout = _layout(structure, run, scatter_free=scatter_free)
-    n, P = structure.n, theta.size
-    shots = len(run.shots) - 1
-    steps = structure.steps()
-    size = np.array([max(1e-9, s) for s in run.swing])
-    by_cart = np.full(n, size.max())
-    by_cart[list(run.rows)] = size
-    by_cart = np.tile(by_cart, 2)
-    lanes_x, lanes_v, lanes_g = len(layout.x0), len(layout.v0), len(layout.scatter)
-    b = 1 + P + lanes_x + lanes_v + lanes_g
-    thetas = np.repeat(theta[None], b, axis=0)
-    thetas[1 : P + 1] += np.diag(steps)
-    x0 = np.repeat(own.x0[None], b, axis=0)
-    v0 = np.repeat(own.v0[None], b, axis=0)
-    g = np.repeat(own.scatter[None], b, axis=0)
-    divisors = [*steps]
-    lane = P + 1
-    rate = np.sqrt(np.diag(structure.chain(theta).stiffness) / np.exp(theta[:n]))
-    rate = np.tile(np.maximum(rate, 1.0), 2)
-    for i in layout.x0:
-        divisors.append(_LOCAL_STEP * by_cart[i])
-        x0[lane, :, i] += divisors[-1]
-        lane += 1
-    for i in layout.v0:
-        divisors.append(_LOCAL_STEP * by_cart[i] * rate[i])
-        v0[lane, :, i] += divisors[-1]
-        lane += 1
-    for i in layout.scatter:
-        divisors.append(1e-3)
-        g[lane, i] += 1e-3
-        lane += 1
-    base = structure.tables(thetas[: P + 1])
-    cart, spring, drive = (np.concatenate([a, np.repeat(a[:1], b - P - 1, axis=0)]) for a in base)
-    y = simulate_batch(
-        cart,
-        spring,
-        drive,
-        x0,
-        v0,
-        g,
-        np.array(run.free),
-        run.t,
-        run.knots,
-        run.command,
-        np.array(run.shots),
-        1.0,  # the simulator chooses its steps
-    )[:, list(run.rows)]
-    sigma = run.sigma[:, None]
-    model = y[0] + own.zero[list(run.rows)][:, None]
-    residual = _by_shot((run.y - model) / sigma, run)  # (shots, points)
-    jac = (y[1:] - y[0]) / sigma / np.array(divisors)[:, None, None]
-    jac = _by_shot(jac, run)  # (b - 1, shots, points)
-    ones = np.zeros((len(layout.zero), len(run.rows), run.t.size))
-    for z, i in enumerate(layout.zero):
-        ones[z, run.rows.index(i)] = 1.0 / run.sigma[run.rows.index(i)]
-    zero_columns = _by_shot(ones, run)
-    theta_columns, local_columns = jac[:P], jac[P:]
-    shot_columns = local_columns[: lanes_x + lanes_v]
-    scatter_columns = local_columns[lanes_x + lanes_v :]
-    further = [] if extras is None else [_by_shot(extras / sigma, run)]
-    wide = np.concatenate(
-        [shot_columns, scatter_columns, zero_columns, theta_columns, *further, residual[None]]
-    )  # (columns, shots, points)
-    matrix = np.moveaxis(wide, 0, -1)  # (shots, points, columns)
-    lanes_s = lanes_x + lanes_v
-    # Weak priors keep what the data do not show from wandering: start states in units of the
-    # swing; where a run starts at rest, its first velocity stays zero.
-    prior = np.zeros((shots, lanes_s, matrix.shape[-1]))
-    for j in range(lanes_s):
-        i = (*layout.x0, *layout.v0)[j]
-        weight = 1.0 / (by_cart[i] * (1.0 if j < lanes_x else rate[i]))
-        prior[:, j, j] = weight * inflate * 1e-1
-        if j >= lanes_x and not layout.first_v0:
-            prior[0, j, j] = weight * 1e6
-    R = triangle(np.concatenate([matrix, prior], axis=1))
-    rest = R[:, lanes_s:, lanes_s:].reshape(-1, R.shape[-1] - lanes_s)
-    lanes_o = lanes_g + len(layout.zero)
-    own_prior = np.zeros((lanes_o, rest.shape[-1]))
+    derive = _differences if structure.has_contact else _derivatives
+    model, by_own, by_shared = derive(structure, theta, run, own, layout, shared=shared)
+    residual = run.y - model - own.zero[list(run.rows)][:, None]
+    by_zero = np.zeros((len(layout.zero), *residual.shape))
+    by_zero[range(len(layout.zero)), [run.rows.index(i) for i in layout.zero]] = 1.0
+    columns = [by_own, by_zero, by_shared, *([] if extras is None else [extras]), residual[None]]
+    points = _by_shot(np.concatenate(columns) / run.sigma[:, None], run)
+    prior = _start_prior(layout, run, _sizes(structure, theta, run), inflate=inflate)
+    starts = prior.shape[1]
+    wide = np.zeros((*prior.shape[:2], points.shape[0]))
+    wide[:, :, :starts] = prior
+    R = triangle(np.concatenate([np.moveaxis(points, 0, -1), wide], axis=1))
+    rest = R[:, starts:, starts:].reshape(-1, R.shape[-1] - starts)
+    lanes = len(layout.scatter) + len(layout.zero)
+    expected = np.zeros((lanes, rest.shape[-1]))
     for j, i in enumerate(layout.scatter):
-        own_prior[j, j] = inflate / spread[i]
-        own_prior[j, -1] = (1.0 - own.scatter[i]) * own_prior[j, j]
-    for j, i in enumerate(layout.zero, start=lanes_g):
-        own_prior[j, j] = inflate / run.zero_std[i]
-        own_prior[j, -1] = (run.zero[i] - own.zero[i]) * own_prior[j, j]
-    own_R = triangle(np.concatenate([rest, own_prior]))
+        expected[j, j] = inflate / spread[i]
+        expected[j, -1] = (1.0 - own.scatter[i]) * expected[j, j]
+    for j, i in enumerate(layout.zero, start=len(layout.scatter)):
+        expected[j, j] = inflate / run.zero_std[i]
+        expected[j, -1] = (run.zero[i] - own.zero[i]) * expected[j, j]
+    own_R = triangle(np.concatenate([rest, expected]))
     return Linear(
-        reduced=own_R[lanes_o:, lanes_o:], own=own_R[:lanes_o], shots=R[:, :lanes_s], layout=layout
+        reduced=own_R[lanes:, lanes:], own=own_R[:lanes], shots=R[:, :starts], layout=layout
     )
+
+
+def _derivatives(
+    structure: Structure, theta: Array, run: Run, own: Locals, layout: Layout, *, shared: bool
+) -> tuple[Array, Array, Array]:
+    """Return the readings (rows, samples) and their derivatives (., rows, samples).
+
+    By the run's starts and friction factors, and by the shared parameters: of the chain they are
+    carried beside the state, of the effects they are differences.
+    """
+    lanes = [(BY_POSITION, i) for i in layout.x0] + [(BY_VELOCITY, i) for i in layout.v0]
+    lanes += [(BY_FRICTION, i) for i in layout.scatter]
+    local, steps = len(lanes), np.zeros(0)
+    if shared:
+        lanes += [(kind, i) for kind in (BY_MASS, BY_DAMPING) for i in range(structure.n)]
+        lanes += [(BY_STIFFNESS, j) for j in structure.rows]
+        steps = structure.steps()[structure.base_size :]
+    thetas = np.repeat(theta[None], 1 + steps.size, axis=0)
+    thetas[1:, theta.size - steps.size :] += np.diag(steps)
+    y, by = simulate_variants(structure, thetas, run, own, lanes=lanes)
+    # By the logarithm of a number: by itself, times the number.
+    by[local:] *= np.exp(theta[: len(lanes) - local])[:, None, None]
+    by_effects = (y[1:] - y[0]) / steps[:, None, None]
+    return y[0], by[:local], np.concatenate([by[local:], by_effects])
+
+
+def _differences(
+    structure: Structure, theta: Array, run: Run, own: Locals, layout: Layout, *, shared: bool
+) -> tuple[Array, Array, Array]:
+    """Return what `_derivatives` does, by differences alone.
+
+    Behind a contact the misfit is full of narrow valleys: a finite step looks across them.
+    """
+    position, velocity = _sizes(structure, theta, run)
+    steps = structure.steps() if shared else np.zeros(0)
+    x_steps = _START_STEP * position[list(layout.x0)]
+    v_steps = _START_STEP * velocity[list(layout.v0)]
+    g_steps = np.full(len(layout.scatter), _START_STEP)
+    divisors = np.concatenate([x_steps, v_steps, g_steps, steps])
+    b, lane = 1 + divisors.size, 1
+    x0, v0, scatter = (np.repeat(a[None], b, axis=0) for a in (own.x0, own.v0, own.scatter))
+    for values, places, sizes in (
+        (np.moveaxis(x0, 1, -1), layout.x0, x_steps),
+        (np.moveaxis(v0, 1, -1), layout.v0, v_steps),
+        (scatter, layout.scatter, g_steps),
+    ):
+        for i, size in zip(places, sizes, strict=True):
+            values[lane, i] += size
+            lane += 1
+    thetas = np.repeat(theta[None], b, axis=0)
+    if shared:
+        thetas[lane:] += np.diag(steps)
+    y, _ = simulate_variants(structure, thetas, run, replace(own, x0=x0, v0=v0, scatter=scatter))
+    by = (y[1:] - y[0]) / divisors[:, None, None]
+    return y[0], by[: lane - 1], by[lane - 1 :]
+
+
+def _sizes(structure: Structure, theta: Array, run: Run) -> tuple[Array, Array]:
+    """Return the usual positions and velocities (2 n,) of the carts and what hides on them."""
+    size = np.maximum(run.swing, 1e-9)
+    position = np.full(structure.n, size.max())
+    position[list(run.rows)] = size
+    rate = np.sqrt(np.diag(structure.chain(theta).stiffness) / np.exp(theta[: structure.n]))
+    return np.tile(position, 2), np.tile(position * np.maximum(rate, 1.0), 2)
+
+
+def _start_prior(layout: Layout, run: Run, sizes: tuple[Array, Array], *, inflate: float) -> Array:
+    """Return (shots, starts, starts) weak priors that keep starts the data do not show at home.
+
+    In units of the swing; where a run starts at rest, its first velocity stays zero.
+    """
+    position, velocity = sizes
+    weight = 1.0 / np.concatenate([position[list(layout.x0)], velocity[list(layout.v0)]])
+    prior = np.tile(np.diag(_HOME * inflate * weight), (len(run.shots) - 1, 1, 1))
+    if not layout.first_v0:
+        for j in range(len(layout.x0), weight.size):
+            prior[0, j, j] = _HELD * weight[j]
+    return prior
 
 
 def move_locals(linear: Linear, own: Locals, delta: Array, scale: float = 1.0) -> Locals:

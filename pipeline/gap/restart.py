@@ -46,7 +46,7 @@ def restart_runs(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
                 [run],
                 locals_=[start],
                 spread=fit.spread,
-                fixed=range(fit.theta.size),
+                shared=False,
                 iterations=6,
             )
             if trial.chi_square < lowest:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -46,30 +47,35 @@ class Structure:
     springs: tuple[bool, ...]
     effects: tuple[Candidate, ...] = ()
 
-    @property
+    @cached_property
     def n(self) -> int:
         """Number of carts."""
         return len(self.springs) - 1
 
-    @property
+    @cached_property
     def rows(self) -> tuple[int, ...]:
         """Rows of the spring table that are free parameters."""
         present = tuple(j for j, there in enumerate(self.springs) if there)
         return present[:1] if self.n == 1 else present
 
-    @property
+    @cached_property
     def base_size(self) -> int:
         """Parameters of the linear chain."""
         return 2 * self.n + len(self.rows)
 
-    @property
+    @cached_property
     def dry(self) -> tuple[bool, ...]:
         """(n,) on which carts dry friction acts."""
         places = {c.place for c in self.effects if c.effect.family == "dry friction"}
         places |= {c.place for c in self.effects if c.effect.key == "load_friction"}
         return tuple(i + 1 in places for i in range(self.n))
 
-    @property
+    @cached_property
+    def has_contact(self) -> bool:
+        """Whether an effect has details that only describe a contact."""
+        return any(not p.reported for c in self.effects for p in c.effect.parameters)
+
+    @cached_property
     def hidden(self) -> tuple[int, ...]:
         """Indices of the carts that carry a hidden mass."""
         return tuple(sorted(c.place - 1 for c in self.effects if c.effect.key == "extra_mode"))

@@ -15,6 +15,7 @@ from pipeline.errors import DataError
 from pipeline.plant import kernel
 from pipeline.plant.chain import Array
 from pipeline.plant.effects.base import AugmentedChain
+from pipeline.plant.sensitivity import make_sensitivities
 from pipeline.plant.tables import Cart, Drive, Spring, Tables
 
 _REFINE = 4.0  # divides the kernel's step: this is what others are judged by
@@ -136,6 +137,7 @@ class SteppedBench:
         for i in range(n, self._N):
             parent = 0 if i == self._motor else parents[i]
             self._state[kernel.X, i] = self._state[kernel.X, parent]
+        self._no_sensitivities = make_sensitivities(kernel.NO_LANES, self._N)
         self._step, self._contact_step = self._step_lengths()
         self._switches = self._possible_switches()
         self._active = np.zeros(self._switches.size, dtype=np.bool_)
@@ -226,6 +228,7 @@ class SteppedBench:
             self._switches,
             self._active,
             self._contact_step,
+            *self._no_sensitivities,
         )
 
     def _shaped(self, command: float) -> float:

@@ -15,10 +15,75 @@ VIII.2; for the friction events B. Armstrong-Hélouvry, P. Dupont, C. Canudas de
 Automatica 30 (1994), section 4.
 """
 
-# The compiled functions index flat tables and are long: numba cannot see dataclasses.
-
 import numpy as np
-from numba import njit
+
+from pipeline.plant.compiled import (
+    ACC,
+    CHANGE,
+    CONTACT_D,
+    CONTACT_K,
+    COULOMB,
+    COUPLING,
+    CUBIC,
+    D2,
+    D3,
+    D4,
+    D5,
+    D6,
+    DAHL,
+    DAMPING,
+    DEAD,
+    DECAY,
+    DELAY,
+    DISTANCE,
+    DRAG,
+    DRIVE_C,
+    FIX,
+    FORCE,
+    GAIN,
+    GAP,
+    GRIP,
+    HID_C,
+    HID_K,
+    HID_M,
+    INV,
+    LAG,
+    LIMIT,
+    LOAD,
+    MASS,
+    MID_V,
+    MID_X,
+    MOTOR,
+    OFFSET,
+    PAST,
+    ROWS,
+    RUB,
+    SIDE,
+    STATIC,
+    STIFF,
+    STOP,
+    STOP_D,
+    STOP_K,
+    STRETCH,
+    STRIBECK,
+    V,
+    X,
+    Z,
+    inlined,
+    jit,
+    lean,
+    pair,
+    stretch,
+    tie,
+)
+from pipeline.plant.sensitivity import (
+    bend_presliding,
+    carry,
+    make_sensitivities,
+    meet,
+    restart,
+    stop,
+)
 
 _SERIES_REACH = 0.2  # omega h: the series' sixth order then leaves 1e-8 after seconds
 _LONGEST_LINEAR = 4.5e-3  # s; springs, dampers and dry friction are exact at any step
@@ -30,32 +95,7 @@ _MOST_EVENTS = 12  # in one substep; more would be chatter
 _BLOWN_UP = 1e9  # positions beyond this are a diverged model
 
 
-# The columns of `pipeline.plant.tables` as plain integers, which compile to constants.
-MASS, DAMPING, COULOMB, STATIC, STRIBECK, DAHL, DISTANCE, LOAD = (int(i) for i in range(8))
-DRAG, OFFSET, STOP, STOP_K, STOP_D, GAIN, HID_M, HID_K, HID_C = (int(i) for i in range(8, 17))
-STIFF, CUBIC, CHANGE, STRETCH, COUPLING = (int(i) for i in range(5))
-DEAD, LIMIT, DELAY, LAG, DRIVE_C, GAP, MOTOR, CONTACT_K, CONTACT_D = (int(i) for i in range(9))
-
-# Rows of the state table: position, velocity, presliding state, last acceleration, inverse mass,
-# state in the middle of the step, force, time derivatives 2 to 6 of the position, and the dry
-# friction's direction, the inverse mass it leaves (0 for a cart that sticks), and the decay of the
-# presliding state over half a step; constant forces of closed contacts.
-X, V, Z, ACC, INV, MID_X, MID_V, FORCE, D2, D3, D4, D5, D6, SIDE, GRIP, DECAY, FIX = range(17)
-ROWS = 17
-
-_jit = njit(
-    cache=True, nogil=True, fastmath={"contract", "reassoc", "arcp", "nsz"}, error_model="numpy"
-)
-_inl = njit(
-    cache=True,
-    nogil=True,
-    fastmath={"contract", "reassoc", "arcp", "nsz"},
-    error_model="numpy",
-    inline="always",
-)
-
-
-@_jit
+@jit
 def _assemble(cart, spring, drive, free, s, K, C):
     """Fill the linear matrices; returns dof count, motor index or -1, parents of hidden masses."""
     n = cart.shape[0]
@@ -65,18 +105,8 @@ def _assemble(cart, spring, drive, free, s, K, C):
         s[INV, i] = 1.0 / cart[i, MASS] if free[i] else 0.0
         C[i, i] += cart[i, DAMPING]
     for j in range(n + 1):
-        k, c = spring[j, STIFF], spring[j, COUPLING]
-        if j > 0:
-            K[j - 1, j - 1] += k
-            C[j - 1, j - 1] += c
-        if j < n:
-            K[j, j] += k
-            C[j, j] += c
-        if 0 < j < n:
-            K[j - 1, j] -= k
-            K[j, j - 1] -= k
-            C[j - 1, j] -= c
-            C[j, j - 1] -= c
+        tie(K, j, n, spring[j, STIFF])
+        tie(C, j, n, spring[j, COUPLING])
     N = n
     motor = -1
     if drive[GAP] > 0.0 and free[0]:
@@ -87,22 +117,15 @@ def _assemble(cart, spring, drive, free, s, K, C):
     parent = np.full(2 * n + 1, -1)
     for i in range(n):
         if cart[i, HID_M] > 0.0:
-            k, c = cart[i, HID_K], cart[i, HID_C]
             s[INV, N] = 1.0 / cart[i, HID_M]
-            K[N, N] += k
-            K[i, i] += k
-            K[i, N] -= k
-            K[N, i] -= k
-            C[N, N] += c
-            C[i, i] += c
-            C[i, N] -= c
-            C[N, i] -= c
+            pair(K, i, N, cart[i, HID_K])
+            pair(C, i, N, cart[i, HID_C])
             parent[N] = i
             N += 1
     return N, motor, parent
 
 
-@_jit
+@lean
 def _smooth_forces(cart, spring, n, s):
     """Add the forces that are neither linear nor dry, at the state in the middle of the step."""
     for i in range(n):
@@ -111,15 +134,14 @@ def _smooth_forces(cart, spring, n, s):
             s[FORCE, i] -= cart[i, DRAG] * s[MID_V, i] * abs(s[MID_V, i])
     for j in range(n + 1):
         if spring[j, CUBIC] != 0.0:
-            stretch = (s[MID_X, j] if j < n else 0.0) - (s[MID_X, j - 1] if j > 0 else 0.0)
-            f = spring[j, CUBIC] * stretch * stretch * stretch
+            f = spring[j, CUBIC] * stretch(s, MID_X, j, n) ** 3
             if j < n:
                 s[FORCE, j] -= f
             if j > 0:
                 s[FORCE, j - 1] += f
 
 
-@_jit
+@lean
 def _position(s, i, h):
     return s[X, i] + h * (
         s[V, i]
@@ -127,14 +149,14 @@ def _position(s, i, h):
     )
 
 
-@_jit
+@lean
 def _rate(s, i, h):
     return s[V, i] + h * (
         s[D2, i] + h / 2.0 * (s[D3, i] + h / 3.0 * (s[D4, i] + h / 4.0 * s[D5, i]))
     )
 
 
-@_jit
+@lean
 def _guard(which, active, cart, spring, drive, n, motor, s, h):
     """Return how far past its switch a contact or slack is, h from now; positive: it switches.
 
@@ -143,11 +165,9 @@ def _guard(which, active, cart, spring, drive, n, motor, s, h):
     """
     if n <= which <= 2 * n:
         j = which - n
-        stretch = (_position(s, j, h) if j < n else 0.0) - (
-            _position(s, j - 1, h) if j > 0 else 0.0
-        )
+        reach = (_position(s, j, h) if j < n else 0.0) - (_position(s, j - 1, h) if j > 0 else 0.0)
         side = 1.0 if spring[j, STRETCH] >= 0.0 else -1.0
-        beyond = side * (stretch - spring[j, STRETCH])
+        beyond = side * (reach - spring[j, STRETCH])
         return -beyond if active else beyond
     if which < n:
         side = 1.0 if cart[which, STOP] > 0.0 else -1.0
@@ -161,7 +181,7 @@ def _guard(which, active, cart, spring, drive, n, motor, s, h):
     return -push if active else min(depth, push)
 
 
-@_jit
+@lean
 def _switch(which, sign, cart, spring, drive, n, motor, s, K, C):
     """Put a contact or slack into the linear matrices (sign 1) or take it out (sign -1)."""
     if which < n:
@@ -171,32 +191,23 @@ def _switch(which, sign, cart, spring, drive, n, motor, s, K, C):
     elif which <= 2 * n:
         j = which - n
         k = sign * spring[j, CHANGE] * spring[j, STIFF]
+        tie(K, j, n, k)
+        s[PAST, j] += sign
         if j < n:
-            K[j, j] += k
             s[FIX, j] += k * spring[j, STRETCH]
         if j > 0:
-            K[j - 1, j - 1] += k
             s[FIX, j - 1] -= k * spring[j, STRETCH]
-        if 0 < j < n:
-            K[j, j - 1] -= k
-            K[j - 1, j] -= k
     else:
         side = 1.0 if which == 2 * n + 1 else -1.0
-        k, c = sign * drive[CONTACT_K], sign * drive[CONTACT_D]
+        k = sign * drive[CONTACT_K]
         half = 0.5 * drive[GAP] * side
-        K[0, 0] += k
-        K[motor, motor] += k
-        K[0, motor] -= k
-        K[motor, 0] -= k
-        C[0, 0] += c
-        C[motor, motor] += c
-        C[0, motor] -= c
-        C[motor, 0] -= c
+        pair(K, 0, motor, k)
+        pair(C, 0, motor, sign * drive[CONTACT_D])
         s[FIX, 0] -= k * half
         s[FIX, motor] += k * half
 
 
-@_inl
+@inlined
 def _taylor(s, K, C, N):
     """Fill D2 to D6, the Taylor coefficients of the linear flow under a constant force."""
     for i in range(N):
@@ -217,7 +228,7 @@ def _taylor(s, K, C, N):
             s[row + 2, i] = s[GRIP, i] * f
 
 
-@_inl
+@inlined
 def _advance(
     cart,
     spring,
@@ -237,8 +248,15 @@ def _advance(
     switches,
     active,
     contact_step,
+    lanes,
+    T,
+    phi,
+    work,
 ):
-    """Advance x, v and the presliding state z by h, from friction event to friction event."""
+    """Advance x, v and the presliding state z by h, from friction event to friction event.
+
+    Sensitivities go along, see `make_sensitivities`.
+    """
     driven = motor if motor >= 0 else 0
     left = h
     events = 0
@@ -259,12 +277,13 @@ def _advance(
         s[FORCE, 0] -= drive_c * s[MID_V, 0]
         if dry:
             for i in range(n):
+                s[RUB, i] = 0.0
                 if cart[i, DAHL] > 0.0 and s[INV, i] > 0.0:
                     sign = 1.0 if s[MID_V, i] > 0.0 else -1.0
                     path = 0.5 * abs(s[MID_V, i]) * step / cart[i, DISTANCE]
                     s[DECAY, i] = np.exp(-path)
                     held = sign + (s[Z, i] - sign) * s[DECAY, i]
-                    s[FORCE, i] -= scatter[i] * cart[i, DAHL] * held
+                    s[RUB, i] -= cart[i, DAHL] * held
             for i in range(n):
                 # side: the direction the cart slides in, 0 where nothing dry acts on it.
                 s[SIDE, i] = 0.0
@@ -272,7 +291,7 @@ def _advance(
                 if slide + cart[i, STATIC] <= 0.0 or s[INV, i] == 0.0:
                     continue
                 if s[V, i] == 0.0:
-                    net = s[FORCE, i]
+                    net = s[FORCE, i] + scatter[i] * s[RUB, i]
                     for j in range(N):
                         net -= K[i, j] * s[X, j] + C[i, j] * s[V, j]
                     if abs(net) <= scatter[i] * (slide + cart[i, STATIC]):
@@ -286,7 +305,9 @@ def _advance(
                 if cart[i, STATIC] != 0.0:
                     ratio = speed / cart[i, STRIBECK]
                     slide += cart[i, STATIC] * np.exp(-ratio * ratio)
-                s[FORCE, i] -= scatter[i] * slide * s[SIDE, i]
+                s[RUB, i] -= slide * s[SIDE, i]
+            for i in range(n):
+                s[FORCE, i] += scatter[i] * s[RUB, i]
         # The usual sizes as constants: the compiler then unrolls the loops.
         if N == 1:
             _taylor(s, K, C, 1)
@@ -338,6 +359,8 @@ def _advance(
                     step = high
                     switching = e
                     stopping = -1
+        if lanes.size > 0:
+            carry(lanes, T, phi, work, s, K, C, N, n, cart, spring, scatter, drive_c, whole, step)
         for i in range(N):
             s[X, i] += step * (
                 s[V, i]
@@ -366,23 +389,30 @@ def _advance(
                 if s[SIDE, i] != 0.0 and s[SIDE, i] * s[V, i] < 0.0:
                     s[V, i] = 0.0
         if stopping >= 0:
+            stop(T, s, N, stopping)
             s[V, stopping] = 0.0
             s[ACC, stopping] = 0.0
             events += 1
         if switching >= 0:
+            which, ends = switches[switching], 1.0 if active[switching] else 0.0
+            if which < n:
+                meet(T, s, N, which, -1, cart[which, STOP_K], ends * cart[which, STOP_D])
+            elif which > 2 * n:
+                meet(T, s, N, motor, 0, drive[CONTACT_K], ends * drive[CONTACT_D])
             active[switching] = not active[switching]
             sign = 1.0 if active[switching] else -1.0
-            _switch(switches[switching], sign, cart, spring, drive, n, motor, s, K, C)
+            phi[2 * N, 0] = -1.0  # its matrix is no longer that of the carts
+            _switch(which, sign, cart, spring, drive, n, motor, s, K, C)
             events += 1
         left -= step
 
 
-@_jit
+@lean
 def _velocity(v, d2, d3, d4, d5, d6, h):
     return v + h * (d2 + h / 2.0 * (d3 + h / 3.0 * (d4 + h / 4.0 * (d5 + h / 5.0 * d6))))
 
 
-@_jit
+@lean
 def _integral(time, knots, u, total, twice, at):
     """Integrate the held input up to `time`, once and twice; `at` is the interval found last."""
     last = knots.size - 1
@@ -395,9 +425,14 @@ def _integral(time, knots, u, total, twice, at):
     return once, twice[at] + 0.5 * (total[at] + once) * since, at
 
 
-@_jit
-def _simulate(cart, spring, drive, x0, v0, scatter, free, t, knots, command, starts, refine, y):
-    """Fill y (n, samples) with the readings of one run; False where the model diverged."""
+@jit
+def _simulate(
+    cart, spring, drive, x0, v0, scatter, free, t, knots, command, starts, refine, of, y, dy
+):
+    """Fill y (n, samples) with the readings of one run; False where the model diverged.
+
+    And dy (lanes, n, samples) with their derivatives, `of` (2, lanes) tells by what.
+    """
     n = cart.shape[0]
     size = 2 * n + 1
     s, K, C = np.zeros((ROWS, size)), np.zeros((size, size)), np.zeros((size, size))
@@ -467,6 +502,7 @@ def _simulate(cart, spring, drive, x0, v0, scatter, free, t, knots, command, sta
             held = knots[i] - knots[i - 1]
             total[i] = total[i - 1] + u[i - 1] * held
             twice[i] = twice[i - 1] + 0.5 * (total[i - 1] + total[i]) * held
+    lanes, T, phi, work = make_sensitivities(of, N)
     lagged = u[0]
     driven = motor if motor >= 0 else 0
     at = 0
@@ -474,6 +510,7 @@ def _simulate(cart, spring, drive, x0, v0, scatter, free, t, knots, command, sta
 
     for shot in range(starts.size - 1):
         first, end = starts[shot], starts[shot + 1]
+        restart(lanes, T, shot, free, parent, motor, n, N)
         for i in range(n):
             if free[i]:
                 # Hidden masses and the motor keep their place relative to their cart.
@@ -507,9 +544,13 @@ def _simulate(cart, spring, drive, x0, v0, scatter, free, t, knots, command, sta
                     s[Z, i] = min(max(net / (scatter[i] * cart[i, DAHL]), -1.0), 1.0)
                     if abs(s[V, i]) > 0.0:
                         s[Z, i] = np.sign(s[V, i])
+                    elif abs(s[Z, i]) < 1.0:
+                        bend_presliding(lanes, T, s, K, cart, scatter, i, n, N)
         for sample in range(first, end):
             for i in range(n):
                 y[i, sample] = cart[i, GAIN] * s[X, i]
+                for lane in range(of.shape[1]):
+                    dy[lane, i, sample] = cart[i, GAIN] * T[i, lane // 4, lane % 4]
             if sample == end - 1:
                 break
             interval = t[sample + 1] - t[sample]
@@ -553,12 +594,19 @@ def _simulate(cart, spring, drive, x0, v0, scatter, free, t, knots, command, sta
                     switches,
                     active,
                     contact_step,
+                    lanes,
+                    T,
+                    phi,
+                    work,
                 )
                 if not dry or s[V, driven] != 0.0:
                     s[X, driven] += early * s[INV, driven]
             if not abs(s[X, 0]) + abs(s[X, n - 1]) < _BLOWN_UP:
                 return False
     return True
+
+
+NO_LANES = np.zeros((2, 0), dtype=np.int64)
 
 
 def simulate_batch(cart, spring, drive, x0, v0, scatter, free, t, knots, command, starts, refine):
@@ -580,21 +628,48 @@ def simulate_batch(cart, spring, drive, x0, v0, scatter, free, t, knots, command
     -------
     (b, n, samples) readings, encoder zero excluded; NaN where a variant diverged.
     """
+    return simulate_with_derivatives(
+        cart, spring, drive, x0, v0, scatter, free, t, knots, command, starts, refine, NO_LANES
+    )[0]
+
+
+def simulate_with_derivatives(
+    cart, spring, drive, x0, v0, scatter, free, t, knots, command, starts, refine, of
+):
+    """Simulate many variants of one run, as `simulate_batch` does, the first with derivatives.
+
+    Parameters
+    ----------
+    of : (2, lanes) by what: a kind of `pipeline.plant.sensitivity`, and a cart or spring, from 0.
+
+    Returns
+    -------
+    (b, n, samples) readings, and (lanes, n, samples) derivatives of the first variant's.
+    """
     # numba compiles anew, for 20 s, for every mix of arrays that may or may not be written to.
     floats = (cart, spring, drive, x0, v0, scatter, t, knots, command)
     cart, spring, drive, x0, v0, scatter, t, knots, command = (
-        np.require(array, np.float64, ["C", "W"]) for array in floats
+        _plain(array, np.float64) for array in floats
     )
-    free = np.require(free, np.bool_, ["C", "W"])
-    starts = np.require(starts, np.int64, ["C", "W"])
+    free, starts, of = _plain(free, np.bool_), _plain(starts, np.int64), _plain(of, np.int64)
     return _simulate_batch(
-        cart, spring, drive, x0, v0, scatter, free, t, knots, command, starts, float(refine)
+        cart, spring, drive, x0, v0, scatter, free, t, knots, command, starts, float(refine), of
     )
 
 
-@_jit
-def _simulate_batch(cart, spring, drive, x0, v0, scatter, free, t, knots, command, starts, refine):
-    y = np.empty((cart.shape[0], cart.shape[1], t.size))
+def _plain(array, dtype):
+    """Return an array of the one kind the compiled function takes: whole, and writable."""
+    fits = array.dtype == dtype and array.flags.carray
+    return array if fits else np.array(array, dtype=dtype, order="C")
+
+
+@jit
+def _simulate_batch(
+    cart, spring, drive, x0, v0, scatter, free, t, knots, command, starts, refine, of
+):
+    n = cart.shape[1]
+    y = np.empty((cart.shape[0], n, t.size))
+    dy = np.empty((of.shape[1], n, t.size))
     for b in range(cart.shape[0]):
         if not _simulate(
             cart[b],
@@ -609,7 +684,10 @@ def _simulate_batch(cart, spring, drive, x0, v0, scatter, free, t, knots, comman
             command,
             starts,
             refine,
+            of,
             y[b],
+            dy,
         ):
             y[b] = np.nan
-    return y
+        of = of[:, :0].copy()
+    return y, dy

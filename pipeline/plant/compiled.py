@@ -1,0 +1,65 @@
+"""What the compiled functions share: columns, rows and lanes as plain integers, and the compiler.
+
+The compiled functions index flat tables: numba cannot see dataclasses. It looks only at a
+function's own file to see whether what it has stored is out of date: who changes one of these
+files (`kernel`, `sensitivity` and this) removes `pipeline/plant/__pycache__`.
+"""
+
+from typing import Any
+
+from numba import njit
+
+# The columns of `pipeline.plant.tables` as plain integers, which compile to constants.
+MASS, DAMPING, COULOMB, STATIC, STRIBECK, DAHL, DISTANCE, LOAD = (int(i) for i in range(8))
+DRAG, OFFSET, STOP, STOP_K, STOP_D, GAIN, HID_M, HID_K, HID_C = (int(i) for i in range(8, 17))
+STIFF, CUBIC, CHANGE, STRETCH, COUPLING = (int(i) for i in range(5))
+DEAD, LIMIT, DELAY, LAG, DRIVE_C, GAP, MOTOR, CONTACT_K, CONTACT_D = (int(i) for i in range(9))
+
+# Rows of the state table: position, velocity, presliding state, last acceleration, inverse mass,
+# state in the middle of the step, force, time derivatives 2 to 6 of the position, and the dry
+# friction's direction, the inverse mass it leaves (0 for a cart that sticks), and the decay of the
+# presliding state over half a step; constant forces of closed contacts; the dry friction force;
+# the acceleration before an event, and whether one has just changed it; which springs are past
+# their stretch; position, velocity and acceleration in the middle of what the step has become.
+X, V, Z, ACC, INV, MID_X, MID_V, FORCE, D2, D3, D4, D5, D6, SIDE, GRIP, DECAY, FIX = range(17)
+RUB, BEFORE, TURNED, PAST, HALF_X, HALF_V, HALF_A = range(17, 24)
+ROWS = 24
+
+_OPTIONS: dict[str, Any] = {
+    "cache": True,
+    "nogil": True,
+    "fastmath": {"contract", "reassoc", "arcp", "nsz"},
+    "error_model": "numpy",
+}
+jit = njit(**_OPTIONS)
+# Without counting references to arrays, which costs more than a step's arithmetic: for what makes
+# no array of its own.
+lean = njit(**_OPTIONS, _nrt=False)
+inlined = njit(**_OPTIONS, _nrt=False, inline="always")
+
+
+@lean
+def tie(M, j, n, value):
+    """Add `value` between both ends of spring j (0 to n) of n carts to a symmetric matrix."""
+    if j < n:
+        M[j, j] += value
+    if j > 0:
+        M[j - 1, j - 1] += value
+    if 0 < j < n:
+        M[j, j - 1] -= value
+        M[j - 1, j] -= value
+
+
+@lean
+def pair(M, i, j, value):
+    """Add `value` between bodies i and j to a symmetric matrix."""
+    M[i, i] += value
+    M[j, j] += value
+    M[i, j] -= value
+    M[j, i] -= value
+
+
+@lean
+def stretch(s, row, j, n):
+    """Return by how much spring j of n carts is stretched, by a row of the state table."""
+    return (s[row, j] if j < n else 0.0) - (s[row, j - 1] if j > 0 else 0.0)

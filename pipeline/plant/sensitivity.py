@@ -1,0 +1,272 @@
+"""How the motion answers to parameters and start: sensitivities carried beside the state.
+
+A small change of a parameter acts like a small force on the same linear system: a change of mass
+like the force -a per unit, of damping -v, of a spring its stretch, of friction the friction
+itself. So each sensitivity is a motion of its own: every step takes it on by the matrix
+exponential of the carts' own equations, with half of the small forces' impulse before and half
+after. Where dry friction lets a cart stop or a contact switches, the instant moves with the
+parameter, and the velocity's sensitivity jumps with the acceleration (a saltation).
+
+Impulses are right to second order in the step: 1e-3 of a derivative, which only steers a fit.
+
+Reference: I. A. Hiskens, M. A. Pai, IEEE Trans. Circuits and Systems I 47 (2000), 204-220.
+"""
+
+import numpy as np
+
+from pipeline.plant.compiled import (
+    ACC,
+    BEFORE,
+    CHANGE,
+    CUBIC,
+    D2,
+    D3,
+    DAHL,
+    DECAY,
+    DISTANCE,
+    DRAG,
+    GRIP,
+    HALF_A,
+    HALF_V,
+    HALF_X,
+    MID_V,
+    MID_X,
+    PAST,
+    RUB,
+    SIDE,
+    STATIC,
+    STRETCH,
+    STRIBECK,
+    TURNED,
+    V,
+    X,
+    Z,
+    jit,
+    lean,
+    stretch,
+)
+
+# What a lane is the derivative with respect to: the table's own number, of a cart or a spring; the
+# factor on a cart's dry friction; or its start (from n on, that of the hidden mass on it).
+BY_MASS, BY_DAMPING, BY_STIFFNESS, BY_FRICTION, BY_POSITION, BY_VELOCITY = range(6)
+_UNUSED = 6  # a lane that fills a block
+_BLOCK = 4  # lanes that a processor takes at once: the last axis
+_SAME = 1e-9  # relative; steps as near as this share their matrix
+
+
+@jit
+def make_sensitivities(of, N):
+    """Return the lanes `of` (2, lanes: by what, of which), in whole blocks, and room for them.
+
+    The rows of `T` (5 N + 2, blocks, 4) are, of N bodies: N positions, N velocities, N presliding
+    states; when the event comes that is now; a force; 2 N to work in. `phi` (2 N + 1, 2 N) takes
+    positions and velocities on; its last row keeps the step and the inverse masses it is for. The
+    last array is room to make it in.
+    """
+    wanted = of.shape[1]
+    blocks = (wanted + _BLOCK - 1) // _BLOCK
+    lanes = np.full((2, blocks * _BLOCK), _UNUSED)
+    for lane in range(wanted):
+        lanes[0, lane], lanes[1, lane] = of[0, lane], of[1, lane]
+    T, phi = np.zeros((5 * N + 2, blocks, _BLOCK)), np.full((2 * N + 1, 2 * N), -1.0)
+    return lanes, T, phi, np.empty((7, N))
+
+
+@lean
+def _add(T, row, factor, other):
+    """Add a multiple of another row to one."""
+    for block in range(T.shape[1]):
+        for q in range(_BLOCK):
+            T[row, block, q] += factor * T[other, block, q]
+
+
+@lean
+def carry(lanes, T, phi, work, s, K, C, N, n, cart, spring, scatter, drive_c, whole, step):
+    """Move the sensitivities on by `step`, before the state moves.
+
+    Forces were taken in the middle of the `whole` step.
+    """
+    moved = 3 * N + 2
+    changed = abs(step - phi[2 * N, 0]) > _SAME * step
+    for i in range(N):
+        if s[TURNED, i] != 0.0:
+            _add(T, N + i, s[BEFORE, i] - s[D2, i], 3 * N)
+            s[TURNED, i] = 0.0
+        changed = changed or s[GRIP, i] != phi[2 * N, N + i]
+        s[HALF_X, i] = s[X, i] + 0.5 * step * (s[V, i] + 0.25 * step * s[D2, i])
+        s[HALF_V, i] = s[V, i] + 0.5 * step * s[D2, i]
+        s[HALF_A, i] = s[D2, i] + 0.5 * step * s[D3, i]
+    if changed:
+        _exponential(phi, work, s, K, C, N, step)
+    for lane in range(lanes.shape[1]):
+        if lanes[0, lane] > BY_FRICTION:
+            continue
+        force = _force(lanes[0, lane], lanes[1, lane], s, n, spring)
+        T[3 * N + 1, lane // _BLOCK, lane % _BLOCK] = force
+    _kick(lanes, T, s, N, n, cart, spring, scatter, drive_c, whole, 0.5 * step)
+    for row in range(2 * N):
+        for block in range(T.shape[1]):
+            a = b = c = d = 0.0
+            for column in range(2 * N):
+                p = phi[row, column]
+                a += p * T[column, block, 0]
+                b += p * T[column, block, 1]
+                c += p * T[column, block, 2]
+                d += p * T[column, block, 3]
+            T[moved + row, block, 0] = a
+            T[moved + row, block, 1] = b
+            T[moved + row, block, 2] = c
+            T[moved + row, block, 3] = d
+    for i in range(n):
+        if cart[i, DAHL] > 0.0:
+            sign = 1.0 if s[MID_V, i] > 0.0 else -1.0
+            decay = np.exp(-abs(s[MID_V, i]) * step / cart[i, DISTANCE])
+            slope = (1.0 - sign * s[Z, i]) * decay * step / cart[i, DISTANCE]
+            _add(T, 2 * N + i, decay - 1.0, 2 * N + i)
+            _add(T, 2 * N + i, 0.5 * slope, N + i)
+            _add(T, 2 * N + i, 0.5 * slope, moved + N + i)
+    for row in range(2 * N):
+        for block in range(T.shape[1]):
+            for q in range(_BLOCK):
+                T[row, block, q] = T[moved + row, block, q]
+    _kick(lanes, T, s, N, n, cart, spring, scatter, drive_c, whole, 0.5 * step)
+
+
+@lean
+def _exponential(phi, work, s, K, C, N, step):
+    """Fill `phi`, column by column, by the series to sixth order."""
+    for column in range(2 * N):
+        for i in range(N):
+            work[0, i] = 1.0 if column == i else 0.0
+            work[1, i] = 1.0 if column == N + i else 0.0
+        for row in range(2, 7):
+            for i in range(N):
+                f = 0.0
+                for j in range(N):
+                    f -= K[i, j] * work[row - 2, j] + C[i, j] * work[row - 1, j]
+                work[row, i] = s[GRIP, i] * f
+        for i in range(N):
+            x, v = 0.0, 0.0
+            for row in range(6, 1, -1):
+                x = (x + work[row, i]) * step / row
+                v = (v + work[row, i]) * step / (row - 1)
+            phi[i, column] = work[0, i] + step * (work[1, i] + x)
+            phi[N + i, column] = work[1, i] + v
+    phi[2 * N, 0] = step
+    for i in range(N):
+        phi[2 * N, N + i] = s[GRIP, i]
+
+
+@lean
+def _force(kind, at, s, n, spring):
+    """Return the force that a unit change of a parameter adds, in the middle of the step.
+
+    On its cart; of a spring, what draws both its ends together.
+    """
+    if kind == BY_MASS:
+        return -s[HALF_A, at]
+    if kind == BY_DAMPING:
+        return -s[HALF_V, at]
+    if kind == BY_FRICTION:
+        return s[RUB, at]
+    reach = stretch(s, HALF_X, at, n)
+    if s[PAST, at] != 0.0:
+        reach += spring[at, CHANGE] * (reach - spring[at, STRETCH])
+    return -reach
+
+
+@lean
+def _kick(lanes, T, s, N, n, cart, spring, scatter, drive_c, whole, span):
+    """Give the lanes the impulse of `span` s of their forces and of the nonlinear slopes."""
+    for lane in range(lanes.shape[1]):
+        kind, at, block, q = lanes[0, lane], lanes[1, lane], lane // _BLOCK, lane % _BLOCK
+        if kind > BY_FRICTION:
+            continue
+        pull = span * T[3 * N + 1, block, q]
+        if at < n:
+            T[N + at, block, q] += s[GRIP, at] * pull
+        if kind == BY_STIFFNESS and at > 0:
+            T[N + at - 1, block, q] -= s[GRIP, at - 1] * pull
+    for j in range(n + 1):
+        if spring[j, CUBIC] != 0.0:
+            k = 3.0 * span * spring[j, CUBIC] * stretch(s, MID_X, j, n) ** 2
+            for body, near in ((j, j - 1), (j - 1, j)):
+                if 0 <= body < n:
+                    _add(T, N + body, -s[GRIP, body] * k, body)
+                    if 0 <= near < n:
+                        _add(T, N + body, s[GRIP, body] * k, near)
+    for i in range(n):
+        c = 2.0 * cart[i, DRAG] * abs(s[MID_V, i]) + (drive_c if i == 0 else 0.0)
+        if cart[i, STATIC] != 0.0 and s[SIDE, i] != 0.0 and s[V, i] != 0.0:
+            ratio = abs(s[MID_V, i]) / cart[i, STRIBECK]
+            fall = 2.0 * ratio / cart[i, STRIBECK] * np.exp(-ratio * ratio)
+            c -= scatter[i] * cart[i, STATIC] * fall
+        if cart[i, DAHL] > 0.0:
+            force = scatter[i] * cart[i, DAHL] * s[DECAY, i]
+            sign = 1.0 if s[MID_V, i] > 0.0 else -1.0
+            c += force * (1.0 - sign * s[Z, i]) * 0.5 * whole / cart[i, DISTANCE]
+            _add(T, N + i, -s[GRIP, i] * span * force, 2 * N + i)
+        if c != 0.0:
+            _add(T, N + i, -s[GRIP, i] * span * c, N + i)
+
+
+@lean
+def stop(T, s, N, i):
+    """Note that dry friction brings body i to a stop now: when, per lane."""
+    before = s[ACC, i]
+    _add(T, 3 * N, -1.0, 3 * N)
+    if before != 0.0:
+        _add(T, 3 * N, -1.0 / before, N + i)
+    s[BEFORE, i], s[TURNED, i] = before, 1.0
+
+
+@lean
+def meet(T, s, N, body, other, stiffness, damping):
+    """Note that a contact of a body, with another or (-1) a wall, begins or ends now: when.
+
+    It ends where its push, of stiffness and damping, does; it begins (damping 0) where they touch.
+    """
+    rate = stiffness * s[V, body] + damping * s[ACC, body]
+    if other >= 0:
+        rate -= stiffness * s[V, other] + damping * s[ACC, other]
+    _add(T, 3 * N, -1.0, 3 * N)
+    if rate == 0.0:
+        return
+    for end, sign in ((body, -1.0), (other, 1.0)):
+        if end >= 0:
+            _add(T, 3 * N, sign * stiffness / rate, end)
+            _add(T, 3 * N, sign * damping / rate, N + end)
+            s[BEFORE, end], s[TURNED, end] = s[ACC, end], 1.0
+
+
+@lean
+def restart(lanes, T, shot, free, parent, motor, n, N):
+    """Let the sensitivities begin anew where a shot does."""
+    for lane in range(lanes.shape[1]):
+        kind, at, block, q = lanes[0, lane], lanes[1, lane], lane // _BLOCK, lane % _BLOCK
+        for first, by in ((0, BY_POSITION), (N, BY_VELOCITY)):
+            for i in range(n):
+                if not free[i]:
+                    continue
+                start = 1.0 if kind == by and at == i else 0.0
+                for j in range(n, N):
+                    if parent[j] == i or (j == motor and i == 0):
+                        T[first + j, block, q] += start - T[first + i, block, q]
+                        if shot == 0 and j != motor and kind == by and at == n + i:
+                            T[first + j, block, q] += 1.0
+                T[first + i, block, q] = start
+
+
+@lean
+def bend_presliding(lanes, T, s, K, cart, scatter, i, n, N):
+    """Start the presliding state of cart i where the others' sensitivities bend it."""
+    for lane in range(lanes.shape[1]):
+        kind, at, block, q = lanes[0, lane], lanes[1, lane], lane // _BLOCK, lane % _BLOCK
+        net = 0.0
+        for j in range(N):
+            net -= K[i, j] * T[j, block, q]
+        if kind == BY_STIFFNESS and (at == i or at == i + 1):
+            net += stretch(s, X, at, n) * (1.0 if at == i + 1 else -1.0)
+        T[2 * N + i, block, q] = net / (scatter[i] * cart[i, DAHL])
+        if kind == BY_FRICTION and at == i:
+            T[2 * N + i, block, q] -= s[Z, i] / scatter[i]
