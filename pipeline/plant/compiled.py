@@ -34,8 +34,9 @@ _OPTIONS: dict[str, Any] = {
 jit = njit(**_OPTIONS)
 # Without counting references to arrays, which costs more than a step's arithmetic: for what makes
 # no array of its own.
-lean = njit(**_OPTIONS, _nrt=False)
-inlined = njit(**_OPTIONS, _nrt=False, inline="always")
+_LEAN: dict[str, Any] = {**_OPTIONS, "_nrt": False}
+lean = njit(**_LEAN)
+inlined = njit(**_LEAN, inline="always")
 
 
 @lean
