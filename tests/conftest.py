@@ -52,7 +52,7 @@ FLAGS = "--headless --no-sandbox --disable-gpu --no-first-run --disable-backgrou
 def pytest_configure(config: pytest.Config) -> None:
     """Compile the simulator while the workers collect their tests; each of them would, else."""
     if config.getoption("numprocesses") and "PYTEST_XDIST_WORKER" not in os.environ:
-        command = [sys.executable, "-c", "from tests.nursery import fork_benches as f; f()"]
+        command = [sys.executable, "-c", "from tests.nursery import load_bench; load_bench()"]
         until_the_end = ExitStack()
         config.add_cleanup(until_the_end.close)
         until_the_end.enter_context(subprocess.Popen(command, stdin=subprocess.DEVNULL, cwd=ROOT))
@@ -79,6 +79,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
     """Give each file to one worker, and to one all that wait for benches, which they share."""
+    if config.getoption("dist") != "loadscope":
+        return None  # whoever runs the tests wants another way
     from xdist.scheduler import LoadScopeScheduling
 
     class ByGroup(LoadScopeScheduling):

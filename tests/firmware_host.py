@@ -95,13 +95,20 @@ def kept_going(serve: Callable[[Callable[[], bool]], None]) -> Iterator[None]:
         beside.join()
 
 
+# A bench that has no processor of its own may be silent for a while.
+_PATIENT = (
+    "from pipeline.bench.host import session; session._SILENCE = 5.0; "
+    "from pipeline.cli import main; main()"
+)
+
+
 def acquire(folder: Path, *, port: str, only: Sequence[str]) -> None:
     """Run `cartlab acquire` in a process of its own; hands are taken to do what they are asked."""
     chosen = [word for name in only for word in ("--only", name)]
     command = [
         sys.executable,
-        "-m",
-        "pipeline",
+        "-c",
+        _PATIENT,
         "acquire",
         folder,
         "--port",

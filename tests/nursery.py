@@ -56,12 +56,17 @@ def _nursery() -> "subprocess.Popen[str]":
 
 def fork_benches() -> None:
     """Fork a bench for each line of stdin."""
-    from pipeline.bench.emulator.bench import open_bench
-    from pipeline.synthesis.hidden import prepare_bench
-
-    open_bench(prepare_bench(preset="throne-1dof")).close()  # compiles the simulator
+    load_bench()
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for those that ended
     for line in sys.stdin:
         if os.fork() == 0:
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)
             be(**json.loads(line))
+
+
+def load_bench() -> None:
+    """Import all that a bench needs, and compile its simulator where nobody has yet."""
+    from pipeline.bench.emulator.bench import open_bench
+    from pipeline.synthesis.hidden import prepare_bench
+
+    open_bench(prepare_bench(preset="throne-1dof")).close()

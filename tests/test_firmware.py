@@ -4,6 +4,7 @@ import ctypes
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from contextlib import closing
 from functools import partial
 
@@ -205,6 +206,14 @@ controller = { type = "state_feedback", cart = 1 }
 """
 
 
+class SlowToBite(FirmwareCore):
+    """Its watchdog waits for 10 s, for a host on a machine that may be busy."""
+
+    def tick(self, counts: Sequence[int], *, stamp: int, now: int) -> int:
+        """Return the duty that acts from now on."""
+        return super().tick(counts, stamp=stamp, now=now // 100)
+
+
 @pytest.mark.slow
 @pytest.mark.sample
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
@@ -213,7 +222,7 @@ def test_acquire_records_with_the_firmware(library, tmp_path):
     (tmp_path / "submission.toml").write_text(SUBMISSION, encoding="utf-8")
     (tmp_path / "plan.toml").write_text(PLAN, encoding="utf-8")
     bench = prepare_bench(preset="throne-1dof")
-    server = open_bench(bench, port="pty", core=partial(FirmwareCore, library))
+    server = open_bench(bench, port="pty", core=partial(SlowToBite, library))
     with closing(server), kept_going(lambda until: server.serve(until=until)):
         acquire(tmp_path, port=server.address, only=["step", "control"])
     analysis = analyse(load_submission(tmp_path))
