@@ -36,7 +36,7 @@ from pipeline.grading.gradebook.rows import (
     known_outcome,
     last_named,
     newest_of,
-    put_parts,
+    put_figures,
     read_figures,
     read_flag,
     read_rubric,
@@ -132,7 +132,7 @@ class Gradebook:
                 "fingerprints": outcome.fingerprints,
             }
             grading = add_row(connection, gradings, row)
-            put_parts(connection, grading, grade, outcome.figures)
+            put_figures(connection, grading, outcome.figures)
 
     def prints(self) -> Iterator[Prints]:
         """Return all fingerprints that differ, of every submission under its authors.

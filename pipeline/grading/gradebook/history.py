@@ -11,11 +11,11 @@ from pipeline.grading.gradebook.changes import rubric_changes
 from pipeline.grading.gradebook.schema import (
     batches,
     entries,
-    flags,
     gradings,
     overrides,
     submissions,
 )
+from pipeline.grading.outcome import read_grade
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,14 +53,11 @@ def read_events(connection: Connection, submission: int) -> list[Event]:
 
 
 def _graded(connection: Connection, submission: int) -> Iterator[Event]:
-    codes: dict[int, list[str]] = {}
-    of_grading = select(flags.c.grading_id, flags.c.code).join(gradings)
-    mine = gradings.c.submission_id == submission
-    for grading, code in connection.execute(of_grading.where(mine).order_by(flags.c.position)):
-        codes.setdefault(grading, []).append(code)
-    for row in connection.execute(select(gradings).where(mine).order_by(gradings.c.id)):
-        failed = row.status == "failed"
-        text = f"could not be graded: {row.reason}" if failed else ", ".join(codes.get(row.id, ()))
+    mine = select(gradings).where(gradings.c.submission_id == submission)
+    for row in connection.execute(mine.order_by(gradings.c.id)):
+        text = f"could not be graded: {row.reason}"
+        if row.status != "failed":
+            text = ", ".join(flag.code for flag in read_grade(row.grade).flags)
         yield Event(at=row.at, what="graded", points=row.points, out_of=row.out_of, text=text)
 
 

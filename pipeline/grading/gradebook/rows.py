@@ -12,10 +12,8 @@ from pipeline.errors import ConfigError
 from pipeline.grading.grade import Flag, Grade
 from pipeline.grading.gradebook.override import Override, with_overrides
 from pipeline.grading.gradebook.schema import (
-    criteria,
     entries,
     figures,
-    flags,
     gradings,
     overrides,
     submissions,
@@ -54,29 +52,15 @@ def add_row(connection: Connection, table: Table, values: dict) -> int:
     return key[0]
 
 
-def put_parts(
-    connection: Connection, grading: int, grade: Grade, drawn: tuple[tuple[str, str], ...]
-) -> None:
-    """Add criteria, flags and figures of a grading."""
-    lines = [
-        {"grading_id": grading, "position": i, "criterion": c.id, "title": storable(c.title),
-         "outcome": c.outcome, "points": c.points, "out_of": c.out_of,
-         "message": storable(c.message)}
-        for i, c in enumerate(grade.criteria)
-    ]  # fmt: skip
-    notes = [
-        {"grading_id": grading, "position": i, "code": f.code, "message": storable(f.message),
-         "parameters": json.dumps(f.parameters), "evidence": json.dumps(f.evidence)}
-        for i, f in enumerate(grade.flags)
-    ]  # fmt: skip
+def put_figures(connection: Connection, grading: int, drawn: tuple[tuple[str, str], ...]) -> None:
+    """Add the figures of a grading."""
     pictures = [
         {"grading_id": grading, "position": i, "name": storable(name),
          "svg": zlib.compress(svg.encode())}
         for i, (name, svg) in enumerate(drawn)
     ]  # fmt: skip
-    for table, rows in ((criteria, lines), (flags, notes), (figures, pictures)):
-        if rows:
-            connection.execute(insert(table), rows)
+    if pictures:
+        connection.execute(insert(figures), pictures)
 
 
 def read_figures(connection: Connection, grading: int) -> tuple[tuple[str, str], ...]:

@@ -85,30 +85,6 @@ gradings = Table(
     Index("gradings_by_submission", "submission_id"),
 )
 
-criteria = Table(
-    "criteria",
-    metadata,
-    Column("grading_id", ForeignKey("gradings.id"), primary_key=True),
-    Column("criterion", String(60), primary_key=True),
-    Column("position", Integer, nullable=False),
-    Column("title", Text, nullable=False),
-    Column("outcome", Text, nullable=False),
-    Column("points", Float, nullable=False),
-    Column("out_of", Float, nullable=False),
-    Column("message", Text, nullable=False),
-)
-
-flags = Table(
-    "flags",
-    metadata,
-    Column("grading_id", ForeignKey("gradings.id"), primary_key=True),
-    Column("position", Integer, primary_key=True),
-    Column("code", Text, nullable=False),
-    Column("parameters", Text, nullable=False),
-    Column("message", Text, nullable=False),
-    Column("evidence", Text, nullable=False),
-)
-
 figures = Table(
     "figures",
     metadata,
