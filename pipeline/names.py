@@ -51,6 +51,11 @@ class Name:
         return self.suffix != "" and self.suffix in NULLS
 
     @property
+    def is_by_eye(self) -> bool:
+        """Whether a first estimate is read off a plot: resonances and nulls of several carts."""
+        return self.suffix != "" and self.suffix in MODES + NULLS
+
+    @property
     def cart(self) -> int | None:
         """The cart (or spring) it belongs to, from 1."""
         return int(self.suffix) if self.suffix.isdigit() else None

@@ -174,7 +174,7 @@ def override(
     """Give a criterion points by hand, which every later grading keeps."""
     from pipeline.grading.gradebook.book import Gradebook
     from pipeline.grading.gradebook.override import read_points
-    from pipeline.grading.publish.blind import meant
+    from pipeline.grading.publish.anonymous import meant
     from pipeline.grading.publish.outputs import write_outputs
     from pipeline.lock import alone_in
 
@@ -201,7 +201,7 @@ def remove(
 ) -> None:
     """Take submissions off the class list; their history stays."""
     from pipeline.grading.gradebook.book import Gradebook
-    from pipeline.grading.publish.blind import meant
+    from pipeline.grading.publish.anonymous import meant
     from pipeline.grading.publish.outputs import write_outputs
     from pipeline.lock import alone_in
 
@@ -224,7 +224,7 @@ def history(grades: Grades, team: Team, assignment: Lab = None, as_json: AsJson 
     """Show every grade and change of a team, with who, when and why."""
     from pipeline.grading.gradebook.book import Gradebook
     from pipeline.grading.gradebook.history import history_dict, history_text
-    from pipeline.grading.publish.blind import history_of
+    from pipeline.grading.publish.anonymous import history_of
 
     with Gradebook(grades, assignment=assignment) as book:
         submission, events = history_of(book, team)

@@ -1,12 +1,15 @@
 """The whole of `cartlab grade`: intake, grading, the gradebook, and what is written from it."""
 
+import os
+import re
+import shutil
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import ConfigError, PipelineError
 from pipeline.grading.batch.runner import Executor, Limits, Progress, grade_batch, run_here
-from pipeline.grading.batch.scratch import scratch_in
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.class_lines import wrong_springs
 from pipeline.grading.intake.files import digest
@@ -19,13 +22,14 @@ from pipeline.grading.rubric_file import load_rubric
 from pipeline.grading.similarity.prints import fingerprint
 from pipeline.ingest.read import read_data
 from pipeline.lock import alone_in
-from pipeline.output import check_folder
+from pipeline.output import check_folder, own_folder
 from pipeline.report.numbers import listing
 from pipeline.resources import EXAMPLES
 from pipeline.submission import load_submission
 from pipeline.submission.complaints import quote
 from pipeline.submission.load import NAME
 
+_SCRATCH = re.compile(r"\.scratch(-\d+)?")
 _MEMORY = ".compared.json"  # may be removed at any time
 _NAMED = 8  # submissions in a remark
 
@@ -202,3 +206,20 @@ def _handed_out(rubric: Rubric, *, folder: Path) -> Iterator[bytes]:
             submission = load_submission(shipped)
             if submission.system.carts == rubric.system.carts:
                 yield fingerprint(read_data(submission).records)
+
+
+@contextmanager
+def scratch_in(out: Path) -> Iterator[Path]:
+    """Make a scratch folder that is removed at the end; only whoever is alone there may ask.
+
+    What is left of runs that were stopped is removed first.
+    """
+    for left in sorted(out.iterdir()):
+        if _SCRATCH.fullmatch(left.name) and left.is_dir() and not left.is_symlink():
+            shutil.rmtree(left, ignore_errors=True)
+    scratch = own_folder(out, f".scratch-{os.getpid()}")
+    scratch.mkdir(exist_ok=True)
+    try:
+        yield scratch
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)

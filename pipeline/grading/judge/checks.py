@@ -170,8 +170,7 @@ def between(initial: Decimal, final: Decimal) -> Fraction:
     if initial * final <= 0:
         return NO_CREDIT
     initial, final = abs(initial), abs(final)
-    value, half = float(initial), float(rounding(initial))
-    reference = Reference(value=value, low=value, high=value, std=half, source="initial")
+    reference = Reference.at(float(initial), std=float(rounding(initial)), source="initial")
     return percent_off(final, reference, sigmas=1.0)
 
 

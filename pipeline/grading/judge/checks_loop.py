@@ -87,10 +87,8 @@ def judge_claims(criterion: asked.Claims, work: Work) -> Verdict:
             off = max(off - rounding(controller.overshoot), Fraction(0))
             shares[0] = credit(off, full=criterion.overshoot_full, none=criterion.overshoot_none)
         if controller.settling is not None and numbers.settling_time is not None:
-            point = numbers.settling_time
-            reference = Reference(value=point, low=point, high=point, std=0.0, source="")
             shares[1] = credit(
-                percent_off(controller.settling, reference, sigmas=0.0),
+                percent_off(controller.settling, Reference.at(numbers.settling_time), sigmas=0.0),
                 full=criterion.settling_full_percent,
                 none=criterion.settling_none_percent,
             )
@@ -123,10 +121,8 @@ def judge_prefilter(criterion: asked.Prefilter, work: Work) -> Verdict:
         return Verdict(share=NONE, message="No prefilter is reported.")
     best, right = NONE, None
     for numbers in controller.numbers(gains):
-        size = abs(numbers.prefilter)
-        reference = Reference(value=size, low=size, high=size, std=0.0, source="")
         signed = typed if numbers.prefilter > 0 else -typed
-        error = percent_off(signed, reference, sigmas=0.0)
+        error = percent_off(signed, Reference.at(abs(numbers.prefilter)), sigmas=0.0)
         share = credit(error, full=criterion.full_percent, none=criterion.none_percent)
         if right is None or share > best:
             best, right = share, numbers.prefilter

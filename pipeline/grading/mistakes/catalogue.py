@@ -11,11 +11,11 @@ from pipeline.grading.grade import Code
 from pipeline.grading.mistakes.step_turns import StepTurns, step_turns
 from pipeline.grading.references.reference import Reference, is_explained
 from pipeline.grading.rubric import is_damping
+from pipeline.names import read_name
 from pipeline.results import Analysis
 
 _TURN = 2 * math.pi
 _LOG10 = math.log10(math.e)
-_OWN = "0123456789n"  # what the symbol of a cart alone ends in
 _PERIODS = range(1, 11)  # counted one more, or one less
 _RATIOS = 2 * len(_PERIODS)
 
@@ -66,13 +66,13 @@ def known_mistakes(references: Mapping[str, Reference], analysis: Analysis) -> l
     every_zeta = {
         n: r
         for n, r in references.items()
-        if r.low > 0 and (n == "zeta" or (is_damping(n) and n[-1] in _OWN))
+        if r.low > 0 and read_name(n).is_ratio and not read_name(n).is_by_eye
     }
-    every_omega = {n: r for n, r in references.items() if n.startswith("omega") and r.low > 0}
+    every_omega = {n: r for n, r in references.items() if read_name(n).is_frequency and r.low > 0}
     references = {n: r for n, r in references.items() if 0 < r.high <= _VAGUE * r.low}
-    gains = {n: r for n, r in references.items() if n.startswith("K")}
-    omegas = {n: r for n, r in references.items() if n.startswith("omega")}
-    own_omegas = {n: r for n, r in omegas.items() if n[-1] in _OWN}
+    gains = {n: r for n, r in references.items() if read_name(n).is_gain}
+    omegas = {n: r for n, r in references.items() if read_name(n).is_frequency}
+    own_omegas = {n: r for n, r in omegas.items() if not read_name(n).is_by_eye}
     own_zetas = {n: r for n, r in every_zeta.items() if n in references}
     hertz, scales = _hertz(omegas, every_omega), _gain_mistakes(gains, analysis)
     log10 = [
@@ -333,7 +333,7 @@ def _sharp(references: Mapping[str, Reference]) -> dict[str, Reference]:
 
 def _count(name: str, analysis: Analysis) -> float:
     """Return the encoder step of the gain's cart in position units; 0 where it says nothing."""
-    cart = 1 if name == "K" else int(name.removeprefix("K_"))
+    cart = read_name(name).cart or 1
     steps = [r.encoder_step(cart) for r in analysis.records if cart in r.carts and cart in r.free]
     step = float(np.median(steps)) if steps else 0.0
     return 0.0 if step == 1.0 else step  # positions in counts

@@ -13,6 +13,7 @@ from pipeline.grading.mistakes.loop_numbers import LoopNumbers, loop_numbers
 from pipeline.grading.mistakes.state_model import own_chain
 from pipeline.grading.references.reference import is_explained
 from pipeline.grading.references.tolerance import as_typed, rounding
+from pipeline.names import read_name
 from pipeline.plant.chain import Array, Chain
 from pipeline.plant.robustness import MASS_SPRING_ERROR, level_error_percent, static_levels
 from pipeline.results import Analysis
@@ -173,7 +174,7 @@ def _doubt(controller: Controller, submission: Submission, analysis: Analysis) -
     fitted = [
         _SIGMAS * row.final.std / abs(row.final.value)
         for row in analysis.rows
-        if row.name.startswith("K") and row.final and row.final.std and row.final.value
+        if read_name(row.name).is_gain and row.final and row.final.std and row.final.value
     ]
     typed = submission.reported.final if submission.reported else {}
     return max(share * max(fitted, default=0.0), _by_rounding(typed, gains, cart=cart))

@@ -12,6 +12,7 @@ from pipeline.grading.mistakes.catalogue import Mistake
 from pipeline.grading.references.reference import Reference
 from pipeline.grading.references.tolerance import half_digit, percent_off
 from pipeline.grading.rubric import is_damping
+from pipeline.names import read_name
 
 SIGMAS = 3.0  # standard errors of the recordings' own number that are no mistake
 _NEAR = 0.1  # relative: as far off is an honest first estimate, with a mistake in it or without
@@ -189,8 +190,12 @@ def _log_density(typed: Decimal, reference: Reference, name: str) -> float:
     anywhere = -math.log(_ANYWHERE) - _SLIP
     if low <= 0:
         return anywhere
-    usual = {"K": _GAIN, "z": _DAMPING}.get(name[0], _FREQUENCY)
-    if _is_by_eye(name):
+    read, usual = read_name(name), _FREQUENCY
+    if read.is_gain:
+        usual = _GAIN
+    elif read.is_damping:
+        usual = _DAMPING
+    elif read.is_by_eye:
         usual = _BY_EYE
     # What a mistake is made with was typed to as many digits before.
     digits = 10.0 ** (1 - len(typed.as_tuple().digits)) / 4
@@ -228,13 +233,8 @@ def _off_by(mistake: Mistake, table: Table, name: str) -> float:
 def _is_near(mistake: Mistake, table: Table, name: str, *, label: Label) -> bool:
     """Whether a number beside others that a mistake makes is off it as honest numbers are off."""
     error = percent_off(table[name], mistake.predicted[name], sigmas=SIGMAS)
-    by_eye = label == "initial" and _is_by_eye(name)
+    by_eye = label == "initial" and read_name(name).is_by_eye
     return not is_damping(name) and float(error) <= 100 * (_NEAR_BY_EYE if by_eye else _NEAR)
-
-
-def _is_by_eye(name: str) -> bool:
-    """Whether a parameter is a resonance or a null, which is read off a plot."""
-    return name.startswith("omega") and name[-1] in "abcdefghxy"
 
 
 def _distance(mistake: Mistake, table: Table, names: Sequence[str]) -> float:

@@ -6,6 +6,7 @@ from decimal import Decimal
 
 from pipeline.grading.grade import Flag
 from pipeline.grading.references.tolerance import as_typed, rounding
+from pipeline.names import read_name
 from pipeline.plant.laws import HEAVY_DAMPING, orders
 
 # How far an order may be broken: fitted numbers are good to some percent, and first estimates of
@@ -30,7 +31,7 @@ class BrokenOrder:
     @property
     def is_of_gains(self) -> bool:
         """Whether it is about how far carts are moved by a constant input."""
-        return self.lesser.startswith("K")
+        return read_name(self.lesser).is_gain
 
     @property
     def is_plain(self) -> bool:
@@ -38,7 +39,7 @@ class BrokenOrder:
 
         There the recordings' own value of the one number that is off is the better help.
         """
-        return self.is_of_gains or {self.lesser[-1], self.greater[-1]} <= set("abcdefgh")
+        return self.is_of_gains or all(read_name(name).is_mode for name in self.names)
 
     def flag(self, table: Mapping[str, Decimal], label: str) -> Flag:
         """Return the flag for it."""
@@ -64,10 +65,10 @@ def not_positive(table: Mapping[str, Decimal]) -> list[str]:
 def broken_orders(table: Mapping[str, Decimal], *, initial: bool) -> list[BrokenOrder]:
     """Return the orders that a table breaks by more than rounding and honest error."""
     slack = _INITIAL_SLACK if initial else _FINAL_SLACK
-    heavy = any(v > HEAVY_DAMPING for n, v in table.items() if n.startswith("zeta"))
+    heavy = any(v > HEAVY_DAMPING for n, v in table.items() if read_name(n).is_ratio)
     broken = []
     for lesser, greater, reason in orders(list(table)):
-        if heavy and lesser.startswith("omega"):
+        if heavy and read_name(lesser).is_frequency:
             continue
         low, high = table[lesser], table[greater]
         if low <= 0 or high <= 0:

@@ -7,6 +7,7 @@ from math import exp
 from pipeline.grading.references.reference import Reference, References
 from pipeline.grading.references.tolerance import half_digit, is_vague, percent_off, rounding
 from pipeline.grading.rubric import is_damping
+from pipeline.names import read_name
 from pipeline.submission import Reported
 
 # How far an initial and a final estimate of one number usually lie apart, relative: where the
@@ -18,7 +19,6 @@ _SLIP = 0.2  # relative: a number measured further off is wrong by a slip, maybe
 _SURPRISE = 3.0  # at most so much (e-folds) does the wrong number tell, as some fit badly
 _NORMAL, _SIGMAS = 3.5, 3.0  # one over the density of a normal difference at zero
 _CHANCE = 3e-3  # of a table that a fit gave agreeing so by coincidence
-_FITTED_BY_EYE = "abcdefghxy"  # symbols of resonances and nulls: only a fit gives those
 _SHARE = 0.75  # of the numbers in both tables
 
 
@@ -35,7 +35,7 @@ def copied_final(reported: Reported, *, references: References) -> list[str]:
         return []
     if 2 * sum(is_vague(reported.final[name]) for name in same) > len(same):
         return []
-    fitted = [name for name in both if name[-1] in _FITTED_BY_EYE]
+    fitted = [name for name in both if read_name(name).is_by_eye]
     if len([name for name in fitted if name in same]) < _SHARE * len(fitted):
         return []
     chance = 1.0
@@ -63,7 +63,7 @@ def _coincidence(typed: Decimal, reference: Reference | None, name: str) -> floa
             apart = _APART_DAMPING if damping else _APART
             if off == 0:
                 return 1.0
-        measured = not damping and name[-1] not in _FITTED_BY_EYE
+        measured = not damping and not read_name(name).is_by_eye
         if not measured or off <= _SLIP:
             surprise = min(0.5 * (off / apart) ** 2, _SURPRISE)
     again = 1.0 if is_vague(typed) else min(1.0, 2 * float(half) / (apart * _NORMAL))

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.grading.references.reference import Reference
+from pipeline.names import read_name
 from pipeline.plant.chain import Array
 from pipeline.results import Analysis, Record, StepGain
 
@@ -47,7 +48,7 @@ class StepTurns:
 
 def step_turns(name: str, analysis: Analysis) -> StepTurns:
     """Return where the cart of a gain (`K` or `K_i`) turns in the steps."""
-    cart = 1 if name == "K" else int(name.removeprefix("K_"))
+    cart = read_name(name).cart or 1
     records = {record.id: record for record in analysis.records}
     found: dict[Edge, list[list[float]]] = {}
     furthest: dict[Edge, list[float]] = {}

@@ -13,6 +13,7 @@ from pipeline.grading.mistakes.transient import transient_fits
 from pipeline.grading.references.reference import Reference, References
 from pipeline.grading.references.tolerance import as_typed, percent_off
 from pipeline.grading.rubric import is_damping
+from pipeline.names import read_name
 from pipeline.results import Analysis
 from pipeline.submission import Reported
 
@@ -161,7 +162,7 @@ def _judge(
         label == "initial"
     ):  # friction may leave room for what the student's own, right, fit does not
         apart = _disagreements(reported, references, blurred=False)
-        apart = [name for _, name in apart if name.startswith("K")]
+        apart = [name for _, name in apart if read_name(name).is_gain]
         suspect += [n for n in apart if n in errors and _agrees(reported.final[n], references, n)]
     mistakes = known_mistakes({n: r for n, r in known.items() if n in table}, analysis)
     if label == "final":
@@ -206,7 +207,7 @@ def _agrees(final: Decimal, references: References, name: str) -> bool:
 
 
 def _is_of_gains(mistake: Mistake) -> bool:
-    return all(name.startswith("K") for name in mistake.predicted)
+    return all(read_name(name).is_gain for name in mistake.predicted)
 
 
 def _near(a: Decimal, b: Decimal) -> bool:
@@ -239,8 +240,7 @@ def limit(name: str, table: str) -> float:
         return _OFF_DAMPING
     if table == "final":
         return _OFF_FINAL
-    by_eye = name.startswith("omega") and name[-1] in "abcdefghxy"
-    return _OFF_BY_EYE if by_eye else _OFF_INITIAL
+    return _OFF_BY_EYE if read_name(name).is_by_eye else _OFF_INITIAL
 
 
 # ------------------------------------------------------------------------ flags

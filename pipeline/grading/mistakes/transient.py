@@ -1,7 +1,6 @@
 """Amplitudes read before the steady state, and the table a fit to them gives."""
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
 from decimal import Decimal
 
 import numpy as np
@@ -110,14 +109,6 @@ def _refit(
         if estimate.value <= 0:
             continue
         slack = _DAMPING if is_damping(name) else 0.0
-        reference = Reference(
-            value=estimate.value,
-            low=estimate.value,
-            high=estimate.value,
-            std=0.0,
-            source="transient",
-        )
-        references[name] = replace(
-            reference, low=reference.low / (1 + slack), high=reference.high * (1 + slack)
-        )
+        reference = Reference.at(estimate.value, source="transient")
+        references[name] = reference.widened(1 + slack)
     return references

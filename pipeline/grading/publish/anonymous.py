@@ -1,13 +1,15 @@
-"""Results without names, and the key that reveals them."""
+"""Results without names, the key that reveals them, and commands that name a team as they do."""
 
 import hashlib
 import re
 from base64 import b32encode
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from pipeline.grading.grade import Flag, Grade
+from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.history import Event
 from pipeline.grading.similarity.shared import shared_message
 from pipeline.output import csv_text
 
@@ -80,3 +82,27 @@ def key_text(names: Mapping[str, str], authors: Mapping[str, tuple[str, ...]]) -
     """Return the key as CSV: for each name that stands in for one, whose it is."""
     rows = sorted((names[name], name, " ".join(authors[name])) for name in names)
     return csv_text(("anonymous", "submission", "authors"), rows)
+
+
+def meant(book: Gradebook, team: str) -> str:
+    """Return the submission that a name stands in for; any other name as it is."""
+    if not is_pseudonym(team):
+        return team
+    names = pseudonyms({entry.submission: entry.first_key for entry in book.entries()})
+    return {shown: name for name, shown in names.items()}.get(team, team)
+
+
+def history_of(book: Gradebook, team: str) -> tuple[str, list[Event]]:
+    """Return what to call a team, and its history without the name it was not asked by.
+
+    Raises
+    ------
+    ConfigError : there is no such submission, or several.
+    """
+    name = meant(book, team)
+    submission, events = book.history(name)
+    return (submission, events) if name == team else (team, _renamed(events, name, team))
+
+
+def _renamed(events: Sequence[Event], name: str, shown: str) -> list[Event]:
+    return [replace(event, text=event.text.replace(name, shown)) for event in events]

@@ -8,6 +8,7 @@ import numpy as np
 from pipeline.checks.recordings import POSITION_SCALE, SCALES
 from pipeline.estimation.chain.follow import FOLLOWED
 from pipeline.grading.rubric import is_damping
+from pipeline.names import read_name
 from pipeline.plant.chain import Chain
 from pipeline.results import Analysis, Estimate, ParameterRow, StepEdge
 from pipeline.stages.compare import (
@@ -43,6 +44,11 @@ class Reference:
     high: float
     std: float
     source: str
+
+    @classmethod
+    def at(cls, value: float, *, std: float = 0.0, source: str = "") -> "Reference":
+        """Return the reference of a single number."""
+        return cls(value=value, low=value, high=value, std=std, source=source)
 
     @property
     def said(self) -> str:
@@ -97,8 +103,8 @@ def in_scale(
     factor = per_count if wrong == {POSITION_SCALE} else None
 
     def scaled(table: Mapping[str, Reference]) -> dict[str, Reference]:
-        kept = {n: r for n, r in table.items() if factor or not n.startswith("K")}
-        return {n: r.times(factor or 1.0) if n.startswith("K") else r for n, r in kept.items()}
+        kept = {n: r for n, r in table.items() if factor or not read_name(n).is_gain}
+        return {n: r.times(factor or 1.0) if read_name(n).is_gain else r for n, r in kept.items()}
 
     return (
         References(initial=scaled(references.initial), final=scaled(references.final)),
@@ -127,10 +133,12 @@ def recompute(analysis: Analysis) -> References:
         elif measured is not None:
             final[row.name] = measured
             # Where our fit of a gain goes astray, the students' may; they see it if it goes far.
-            astray = row.final.value if row.final and row.name.startswith("K") else measured.value
+            astray = (
+                row.final.value if row.final and read_name(row.name).is_gain else measured.value
+            )
             if measured.value / _FAR < astray < measured.value * _FAR:
                 final[row.name] = measured.including(astray)
-        if not trusted and row.name.startswith("K"):
+        if not trusted and read_name(row.name).is_gain:
             for table in (initial, final):
                 if row.name in table:
                     table[row.name] = table[row.name].widened(_STUCK)
@@ -155,7 +163,7 @@ def trusted_chain(analysis: Analysis) -> Chain | None:
         if row.initial is None or row.final is None or is_damping(row.name):
             continue
         before, after = row.initial.value, row.final.value
-        limit = _ASTRAY if row.name.startswith("omega") else _ASTRAY_GAIN
+        limit = _ASTRAY if read_name(row.name).is_frequency else _ASTRAY_GAIN
         if min(before, after) <= 0 or max(before / after, after / before) > limit:
             return None
         if _SIGMAS * (row.final.std or 0.0) > (limit - 1) * after:
@@ -269,21 +277,21 @@ def _readings(name: str, analysis: Analysis) -> list[float]:
     The damping of a decay is read with and without the dry friction that fits it best, also where
     no test is sure of friction: with little damping a trace of it counts.
     """
-    symbol, _, suffix = name.partition("_")
-    if not (suffix.isdigit() or suffix in ("", "n")):
+    read = read_name(name)
+    if read.is_by_eye:
         return []
-    cart = int(suffix) if suffix.isdigit() else 1
+    cart = read.cart or 1
     readings: list[float] = []
-    if symbol == "K":
+    if read.is_gain:
         held = _held(cart, analysis)
         for step in analysis.step_gains:
             if step.cart == cart:
                 readings += [step.gain, *(step.interval or ())]
                 readings += [_shortest(edge, held=held) for edge in step.edges if held]
     for decay in analysis.log_decrements:
-        if decay.cart == cart and symbol == "omega":
+        if decay.cart == cart and read.is_frequency:
             readings.append(decay.omega_n)
-        if decay.cart == cart and symbol == "zeta":
+        if decay.cart == cart and read.is_ratio:
             without = decay.friction.zeta if decay.friction else decay.zeta
             readings += [zeta for zeta in (decay.zeta, without) if zeta > 0]
     return readings

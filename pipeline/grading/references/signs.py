@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from decimal import Decimal
 
 from pipeline.identify.remarks import is_reversed
+from pipeline.names import read_name
 from pipeline.results import Record
 from pipeline.submission import Feedback, Reported, StateSpace
 
@@ -33,7 +34,7 @@ def turned_round(reported: Reported, records: Sequence[Record]) -> tuple[Reporte
 
 
 def _gains(table: Mapping[str, Decimal]) -> dict[str, Decimal]:
-    gains = {name: -value for name, value in table.items() if name.startswith("K")}
+    gains = {name: -value for name, value in table.items() if read_name(name).is_gain}
     return {**table, **gains} if gains and min(gains.values()) > 0 else dict(table)
 
 
