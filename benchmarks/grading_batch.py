@@ -139,7 +139,7 @@ def memory(folder: Path, out: Path, *, preset: str) -> tuple[Cost, list[float]]:
         grade_batch(
             find_hand_ins([folder], scratch=scratch),
             rubric=load_rubric(Path(preset)),
-            store=book,
+            book=book,
             scratch=scratch,
             execute=run_here(jobs=2),
             progress=progress,

@@ -109,7 +109,7 @@ def test_mended_examples_are_compared_anew(school, tmp_path):
             batch = grade_batch(
                 find_hand_ins([school], scratch=tmp_path),
                 rubric=RUBRIC,
-                store=book,
+                book=book,
                 scratch=tmp_path,
                 execute=run_here(jobs=1),
                 examples=lambda given=given: given,

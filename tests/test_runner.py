@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from pipeline.grading.batch import worker_process
-from pipeline.grading.batch.runner import Limits, grade_batch, run_here
+from pipeline.grading.batch.runner import Limits, grade_batch, grades_of, run_here
 from pipeline.grading.batch.worker import Setup, Task, grade_task
 from pipeline.grading.batch.worker_process import Worker
 from pipeline.grading.grade import grade_text
@@ -58,13 +58,13 @@ def run(paths, out, *, jobs=1, limits=None, execute=None, progress=lambda *_: No
         batch = grade_batch(
             find_hand_ins(paths, scratch=scratch),
             rubric=RUBRIC,
-            store=book,
+            book=book,
             scratch=scratch,
             execute=execute or run_here(jobs=jobs),
             limits=limits or Limits(time=PATIENCE),
             progress=progress,
         )
-        return batch, {o.submission: (o, grade_text(g)) for o, g in batch.grades(book)}
+        return batch, {o.submission: (o, grade_text(g)) for o, g in grades_of(batch, book)}
 
 
 @pytest.fixture(scope="module")

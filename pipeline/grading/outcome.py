@@ -1,11 +1,11 @@
-"""What the runner and the gradebook share: an outcome per submission, the store, the batch."""
+"""What the runner and the gradebook share: an outcome per submission, its prints, the batch."""
 
 import json
 import unicodedata
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Literal, Protocol
+from typing import Literal
 
 from pydantic import TypeAdapter
 
@@ -79,33 +79,9 @@ class Listed:
     grading: int
 
 
-class Store(Protocol):
-    """Where outcomes are kept: the gradebook."""
-
-    def known(self, key: str, *, figures: bool = True) -> Outcome | None:
-        """Return the stored outcome of this key, None where there is none; or without figures."""
-        ...
-
-    def put(self, outcome: Outcome) -> None:
-        """Store an outcome durably, in the place of one with the same key."""
-        ...
-
-    def prints(self) -> Iterator[Prints]:
-        """Yield all fingerprints that differ, of every submission under its authors."""
-        ...
-
-    def listed(self) -> Iterator[Listed]:
-        """Yield the class list so far; nothing where no batch ran to its end yet."""
-        ...
-
-    def prints_of(self, numbers: Sequence[int]) -> list[Prints]:
-        """Return the fingerprints of such lines, by their numbers."""
-        ...
-
-
 @dataclass(frozen=True, kw_only=True)
 class Batch:
-    """A batch that ran to its end; the outcomes themselves stay in the store.
+    """A batch that ran to its end; the outcomes themselves stay in the gradebook.
 
     Attributes
     ----------
@@ -121,16 +97,6 @@ class Batch:
     kept: tuple[str, ...] = ()
     moved: Mapping[str, str] = field(default_factory=dict)
     taken_over: tuple[tuple[str, tuple[str, ...], tuple[str, ...]], ...] = ()
-
-    def grades(self, store: Store) -> Iterator[tuple[Outcome, Grade]]:
-        """Yield every outcome with its grade, shared data flagged; one at a time in memory."""
-        for key in self.keys:
-            outcome = store.known(key)
-            if outcome is None:
-                raise KeyError(key)
-            grade = read_grade(outcome.grade)
-            flag = self.shared.get(outcome.submission)
-            yield outcome, grade.with_flags(flag) if flag else grade
 
 
 def read_grade(text: str) -> Grade:

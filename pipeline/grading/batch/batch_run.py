@@ -9,7 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import ConfigError, PipelineError
-from pipeline.grading.batch.runner import Executor, Limits, Progress, grade_batch, run_here
+from pipeline.grading.batch.runner import (
+    Executor,
+    Limits,
+    Progress,
+    grade_batch,
+    grades_of,
+    run_here,
+)
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.class_lines import wrong_springs
 from pipeline.grading.intake.files import digest
@@ -94,7 +101,7 @@ def grade_class(
             batch = grade_batch(
                 hand_ins,
                 rubric=rubric,
-                store=book,
+                book=book,
                 scratch=scratch,
                 execute=_executor(jobs=jobs, cluster=cluster),
                 limits=limits,
@@ -141,7 +148,7 @@ def _refuse_another_class(out: Path, *, assignment: str) -> None:
 
 def _told(batch: Batch, book: Gradebook) -> Iterator[str]:
     """Yield whether the rubric's springs are the benches', and what became of the class before."""
-    graded = (grade for _, grade in batch.grades(book) if grade.status == "graded")
+    graded = (grade for _, grade in grades_of(batch, book) if grade.status == "graded")
     if asked := wrong_springs(grade.springs for grade in graded):
         yield asked
     hidden = book.rubric.anonymous

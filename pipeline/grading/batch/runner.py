@@ -15,10 +15,11 @@ import pipeline
 from pipeline.grading.batch.so_far import Row, class_so_far
 from pipeline.grading.batch.worker import Setup, Task, failed
 from pipeline.grading.batch.worker_process import Worker
-from pipeline.grading.grade import SCHEMA, Flag
+from pipeline.grading.grade import SCHEMA, Flag, Grade
+from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.intake.files import digest
 from pipeline.grading.intake.hand_ins import HandIn
-from pipeline.grading.outcome import Batch, Outcome, Prints, Store
+from pipeline.grading.outcome import Batch, Outcome, Prints, read_grade
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.shared import find_shared, same_recordings, same_team, shared_flag
 from pipeline.output import write_file
@@ -47,7 +48,7 @@ def grade_batch(
     hand_ins: Sequence[HandIn],
     *,
     rubric: Rubric,
-    store: Store,
+    book: Gradebook,
     scratch: Path,
     execute: Executor,
     limits: Limits | None = None,
@@ -57,9 +58,9 @@ def grade_batch(
     memory: Path | None = None,
     progress: Progress = _silent,
 ) -> Batch:
-    """Grade what the store does not know yet; every outcome is in the store as soon as it is had.
+    """Grade what the gradebook does not know yet; every outcome is in it as soon as it is had.
 
-    The class is all that the store lists: what is not among `hand_ins` stays as it was, and is
+    The class is all that the gradebook lists: what is not among `hand_ins` stays as it was, and is
     compared with them as before.
 
     Stopped at any moment and started again, it ends as if it had not been.
@@ -79,10 +80,10 @@ def grade_batch(
     new = []
     for hand_in in hand_ins:
         task = _task(hand_in, basis=(code, text, figures))
-        outcome = store.known(task.key, figures=False)
+        outcome = book.known(task.key, figures=False)
         if outcome is None and hand_in.problem:
             outcome = failed(task, hand_in.problem, out_of=rubric.out_of)
-            store.put(outcome)
+            book.put(outcome)
         if outcome is None or not outcome.settled:
             new.append(task)
         else:
@@ -98,18 +99,18 @@ def grade_batch(
             figures=figures,
         )
         for outcome in execute(new, setup, rubric.out_of):
-            store.put(outcome)
+            book.put(outcome)
             rows[outcome.submission] = Row.of(outcome)
             progress(len(rows), total, outcome.submission)
     progress(total, total, "comparing the recordings")
-    before = class_so_far(rows, store)
+    before = class_so_far(rows, book)
     rows |= before.kept
     in_order = [rows[name] for name in sorted(rows)]
     return Batch(
         keys=tuple(row.key for row in in_order),
         shared=_shared(
             in_order,
-            store,
+            book,
             basis=(code, text, examples_digest),
             memory=memory,
             examples=examples,
@@ -198,7 +199,7 @@ def _task(hand_in: HandIn, *, basis: tuple[str, str, bool]) -> Task:
 
 def _shared(
     rows: Sequence[Row],
-    store: Store,
+    book: Gradebook,
     *,
     basis: Sequence[str],
     memory: Path | None,
@@ -210,7 +211,7 @@ def _shared(
     here = {(prints.authors, prints.fingerprints) for prints in batch}  # under another name, too
     earlier = [
         prints
-        for prints in store.prints()
+        for prints in book.prints()
         if prints.fingerprints
         and (prints.authors, prints.fingerprints) not in here
         and not _is_before(prints, names.get(prints.submission))
@@ -260,3 +261,14 @@ def _remembered(memory: Path, compared: str) -> dict[str, Flag] | None:
         return TypeAdapter(dict[str, Flag]).validate_python(document["flags"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
+
+
+def grades_of(batch: Batch, book: Gradebook) -> Iterator[tuple[Outcome, Grade]]:
+    """Yield every outcome with its grade, shared data flagged; one at a time in memory."""
+    for key in batch.keys:
+        outcome = book.known(key)
+        if outcome is None:
+            raise KeyError(key)
+        grade = read_grade(outcome.grade)
+        flag = batch.shared.get(outcome.submission)
+        yield outcome, grade.with_flags(flag) if flag else grade

@@ -9,14 +9,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
+from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.intake.lms_names import read_owner, same_number
-from pipeline.grading.outcome import Listed, Outcome, Prints, Store, content, person
+from pipeline.grading.outcome import Listed, Outcome, Prints, content, person
 from pipeline.grading.similarity.shared import same_recordings
 
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """What a batch itself needs of an outcome: all else stays in the store."""
+    """What a batch itself needs of an outcome: all else stays in the book."""
 
     key: str
     prints: Prints
@@ -59,12 +60,12 @@ class SoFar:
     taken_over: tuple[tuple[str, tuple[str, ...], tuple[str, ...]], ...]
 
 
-def class_so_far(rows: Mapping[str, Row], store: Store) -> SoFar:
+def class_so_far(rows: Mapping[str, Row], book: Gradebook) -> SoFar:
     """Return what the run with these rows makes of the class list so far."""
     now = {name.casefold(): name for name in rows}
     left: dict[str, Listed] = {}
     new, moved = dict(rows), {}
-    lines = list(store.listed())
+    lines = list(book.listed())
     for line in lines:
         name = now.get(line.submission.casefold())
         if name is None or _others(_row(line), rows[name]):
@@ -73,7 +74,7 @@ def class_so_far(rows: Mapping[str, Row], store: Store) -> SoFar:
             del new[name]
             if name != line.submission:  # in capitals, say
                 moved[line.submission] = name
-    prints = store.prints_of([line.grading for line in left.values()])
+    prints = book.prints_of([line.grading for line in left.values()])
     before = {one.submission: _row(left[one.submission], one.fingerprints) for one in prints}
     moved |= _matched(before, new)
     return SoFar(

@@ -58,7 +58,7 @@ if TYPE_CHECKING:
 
 
 class Gradebook:
-    """A store of outcomes (see `batch.Store`) and the class list made of them.
+    """A store of outcomes and the class list made of them.
 
     Parameters
     ----------
