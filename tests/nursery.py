@@ -66,7 +66,7 @@ def fork_benches() -> None:
 
 def load_bench() -> None:
     """Import all that a bench needs, and compile its simulator where nobody has yet."""
-    from pipeline.bench.emulator.bench import open_bench
+    from pipeline.bench.emulator.assemble import open_bench
     from pipeline.synthesis.hidden import prepare_bench
 
     open_bench(prepare_bench(preset="throne-1dof")).close()

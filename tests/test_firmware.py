@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.bench.emulator.bench import open_bench
+from pipeline.bench.emulator.assemble import open_bench
 from pipeline.bench.emulator.core import ReferenceCore
 from pipeline.bench.protocol.messages import (
     FULL_SCALE,

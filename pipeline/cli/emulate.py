@@ -39,7 +39,7 @@ def emulate(
     ] = False,
 ) -> None:
     """Run a virtual bench that speaks the serial protocol; its address is said on stderr."""
-    from pipeline.bench.emulator.bench import open_bench
+    from pipeline.bench.emulator.assemble import open_bench
     from pipeline.synthesis.hidden import prepare_bench
 
     bench = prepare_bench(preset=preset, model=model, hide=hide or ())

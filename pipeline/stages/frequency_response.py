@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.errors import DataError
+from pipeline.estimation.chain.parametrisation import ASSUMED_ZETA
 from pipeline.estimation.record_transforms import transfer_ratio, visible_band
 from pipeline.names import (
     NULLS,
@@ -38,7 +39,6 @@ _CLEAR = 0.1  # relative error above which a point shows no peak
 _CLEAR_FALL = 3.0  # below the low-frequency level: a mode has been passed, twice its frequency
 _LOW_SHARE = 0.7  # of the first resonance: below, a gain can be told from the magnitude
 _SAME_PEAK = 0.15  # of ln(omega): carts share their resonances
-ASSUMED_ZETA = 0.1  # the paper's usual guess for a mode or a null
 
 
 # ---------------------------------------------------------------------- dwells

@@ -17,7 +17,9 @@ from pipeline.names import read_name
 from pipeline.plant.chain import Array, Chain
 from pipeline.results import Estimate
 
-START_ZETA = 0.05  # damping ratio of each cart alone to start from: what a cart on bearings has
+# Damping ratios to begin with, where none is measured:
+START_ZETA = 0.05  # of each cart alone: what a cart on bearings has
+ASSUMED_ZETA = 0.1  # of a mode or a null: the usual guess of the paper
 _DIFFERENCE = 1e-6  # relative step; a forward difference errs by as much, rounding by 1e-9
 _NO_DAMPING = 1e-10  # far below any bench's, above the rounding of a pole on the imaginary axis
 _FARTHEST = 100.0  # of a logarithm: a step that goes astray must not overflow
