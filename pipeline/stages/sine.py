@@ -178,8 +178,6 @@ class Dwell:
             note="; ".join(note for note in notes if note),
         )
 
-    # ------------------------------------------------------------ what all carts share
-
     @cached_property
     def _driven(self) -> slice:
         return _driven(self._record)
