@@ -46,7 +46,7 @@ def stream(folder: Path, *, minutes: float) -> None:
     """Stream at 1 kHz: lines lost, and what the host and the emulator take of a core."""
     write_work(folder, [sine("long", seconds=60 * minutes)])
     with emulator() as bench:
-        process = psutil.Process(bench.process.pid)
+        process = psutil.Process(bench.pid)
         notes, own = _Once(), psutil.Process()
         began, before, bench_before = time.monotonic(), own.cpu_times(), process.cpu_times()
         acquire(folder, port=bench.address, observers=[notes], only=["long"])

@@ -23,11 +23,13 @@ class Emulator:
     ----------
     address : what pyserial's `serial_for_url` opens.
     said : the lines on stderr so far, but for the events.
+    pid : its process.
     runs : how many have ended so far.
     """
 
     address: str
     said: list[str]
+    pid: int = 0
     runs: int = 0
     _events: "queue.Queue[dict[str, Any]]" = field(default_factory=queue.Queue)
 
@@ -62,7 +64,7 @@ def emulator(
         order(words=words, watchdog=watchdog, port=door.getsockname()[1])
         line, _ = door.accept()
     with line, line.makefile(encoding="utf-8") as said:
-        pid = int(said.readline())
+        running.pid = int(said.readline())
         listener = threading.Thread(target=_listen, args=(running, said, ready), daemon=True)
         listener.start()
         try:
@@ -71,7 +73,7 @@ def emulator(
             yield running
         finally:
             with suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGTERM)
+                os.kill(running.pid, signal.SIGTERM)
             listener.join()
 
 
