@@ -360,8 +360,8 @@ def transfer_functions(values: Mapping[str, float | Array]) -> tuple[Array, Sequ
 
 def _product(polynomials: Sequence[Array]) -> Array:
     """Return the product of polynomials, coefficients along the first axis."""
-    result, *others = polynomials
-    for other in others:
+    result: Array = polynomials[0]
+    for other in polynomials[1:]:
         if result.ndim == 1:
             result = np.convolve(result, other)
             continue
