@@ -7,17 +7,27 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.errors import ConfigError
 from pipeline.report.document import Span
+from pipeline.report.effects import page
 from pipeline.report.phrases import Phrases, phrases
 from pipeline.resources import TEMPLATES
+from tests.commandline import cartlab_here
 
 REPORT = Path(__file__).parents[1] / "pipeline" / "report"
 SUBJECTS = sorted(path.stem for path in (TEMPLATES / "words").glob("*.toml"))
 
 
+def written(folder: Path, text: str) -> Phrases:
+    """Return the sentences of a file of one's own."""
+    path = folder / "gap.toml"
+    path.write_text(text + "\n", encoding="utf-8")
+    return Phrases(path)
+
+
 @pytest.mark.parametrize("subject", SUBJECTS)
 def test_every_sentence_is_said_somewhere(subject):
-    """A catalogue holds no sentence that nothing asks for, and each names its values once known."""
+    """A catalogue holds no sentence that nothing asks for."""
     users = [p.read_text(encoding="utf-8") for p in REPORT.rglob("*.py")]
     users = [text for text in users if f'"{subject}"' in text or "WORDS" in text]
     strings = {
@@ -33,9 +43,9 @@ def test_every_sentence_is_said_somewhere(subject):
         assert said or key in ("bode_fit", "time_fit"), key  # the fit's own name
 
 
-def test_marks_are_set_and_values_are_never_markup():
+def test_marks_are_set_and_values_are_never_markup(tmp_path):
     """Strong, code and links come from the sentence alone."""
-    words = Phrases({"a": "**Yes: **{name}, see `f` under [here](#x)."})
+    words = written(tmp_path, 'a = "**Yes: **{name}, see `f` under [here](#x)."')
     assert words.spans("a", name="**no** [b](#y)") == (
         Span("Yes: ", "strong"),
         Span("**no** [b](#y), see "),
@@ -56,3 +66,35 @@ def test_a_catalogue_is_plain_toml(subject):
     for key, text in found.items():
         assert isinstance(text, str), key
         assert re.sub(r"\{\w+\}|\{ [^{}]* \}", "", text).count("{") == 0, key
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ('a = "off by {shaer}"', "gap.toml: a names {shaer}; it may name {cart}, {share}"),
+        (
+            'b = "off by {share}"',
+            "gap.toml: the sentence a is missing; it may name {cart}, {share}",
+        ),
+        ("a = 3", "gap.toml: a needs a sentence in quotes, found 3"),
+        ('b = "x"\na = "off by {share}', "gap.toml line 2"),
+    ],
+)
+def test_a_slip_in_a_sentence_is_told_in_one_line(tmp_path, text, named):
+    """The file, the key and the values that it may name; with marks and without."""
+    words = written(tmp_path, text)
+    for say in (words.text, words.spans):
+        with pytest.raises(ConfigError) as error:
+            say("a", share="3 %", cart="1")
+        assert named in str(error.value)
+        assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("text", ['effects = "{shaer}"', 'effects = "All', 'made = "By hand"'])
+def test_a_slip_ends_a_command_in_one_line(tmp_path, monkeypatch, text):
+    """Exit status 2 and no traceback."""
+    monkeypatch.setattr(page, "_WORDS", written(tmp_path, text))
+    done = cartlab_here("effects", "coulomb_friction", "--out", tmp_path / "out")
+    assert done.returncode == 2
+    (line,) = done.stderr.strip().splitlines()
+    assert "templates/words/gap.toml" in line
