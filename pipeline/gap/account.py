@@ -43,8 +43,13 @@ def list_effects(
         (added,) = after.key - before.key
         index = places.index(added)
         term, rest = terms[index], chosen.key - {added}
+        # One effect instead of this one, or none of those chosen.
         rivals = sorted(
-            ((key, h) for key, h in same_size.items() if rest < key and key != chosen.key),
+            (
+                (key, h)
+                for key, h in same_size.items()
+                if key != chosen.key and (rest < key or not key & chosen.key)
+            ),
             key=lambda pair: pair[1].bic,
         )
         # In one of many narrow valleys the curvature says nothing of the error.
@@ -67,8 +72,8 @@ def list_effects(
                 nrmse_after=after.error,
                 rivals=tuple(
                     Rival(
-                        effect=find_effect(next(iter(key - rest))[0]),
-                        where=_where(next(iter(key - rest))),
+                        effect=find_effect(_stand_in(added, key - rest)[0]),
+                        where=_where(_stand_in(added, key - rest)),
                         nrmse_after=h.error,
                         confidence=weight[key] / total,
                     )
@@ -77,6 +82,11 @@ def list_effects(
             )
         )
     return tuple(out)
+
+
+def _stand_in(effect: tuple[str, int], others: frozenset[tuple[str, int]]) -> tuple[str, int]:
+    """Return which of the others is at the effect's place, or the first."""
+    return min(others, key=lambda other: (other[1] != effect[1], other))
 
 
 def list_suspects(found: Sequence[Hypothesis], effects: Sequence[FoundEffect]) -> tuple[Rival, ...]:

@@ -303,6 +303,8 @@ def project(
     linear = list(mapper(share, zip(runs, fit.locals_, extras, strict=True)))
     stacked = np.concatenate([part.reduced for part in linear])
     shared, wide = stacked[:, : fit.theta.size], stacked[:, fit.theta.size :]
+    if not np.all(np.isfinite(shared)):
+        return np.full_like(wide[:, :-1], np.nan), wide[:, -1]  # no direction leads on from here
     # What no run shows, a held cart's mass or the share of two springs that act as one, absorbs
     # nothing.
     scale = np.linalg.norm(shared, axis=0)

@@ -88,7 +88,7 @@ def _stops_like(
     added: Sequence[Candidate], fit: Fit, bench: Bench
 ) -> Iterator[tuple[Candidate, Structure, Array]]:
     """Yield the end stop that a wall spring, just added and hard past its stretch, may be."""
-    if {c.effect.key for c in added} != {"slack_spring"}:
+    if [c.effect.key for c in added] != ["slack_spring"]:
         return
     index = len(fit.structure.effects) - 1
     spring, structure = added[0].place, fit.structure.without(index)

@@ -6,6 +6,7 @@ import numpy as np
 
 from pipeline.gap.hypothesis import THINNING, Bench, Hypothesis, lowers_error
 from pipeline.gap.linearise import simulate_run
+from pipeline.gap.search import steps_to
 from pipeline.gap.types import GapWindow, Verdict
 from pipeline.plant.effects import find_effect
 
@@ -42,7 +43,8 @@ def reach_verdict(
     """Return the verdict, the steps that stand, and under `ambiguous` the rivals.
 
     `steps` lead from the linear model to the one chosen; `found` are all hypotheses judged. Where
-    much is left, a step that another could stand in for is taken back.
+    much is left, a step that another could stand in for is taken back, and so is every effect
+    without which a hypothesis does about as well.
     """
     baseline, chosen = steps[0], steps[-1]
     if not chosen.key:
@@ -55,20 +57,28 @@ def reach_verdict(
         rival
         for rival in found
         if len(rival.key) == len(chosen.key)
-        and len(rival.key - chosen.key) == 1
+        and rival.key != chosen.key
         and rival.error < _CLOSE_ERROR * chosen.error
         and _evidence(chosen, rival, bench) < min(_CLOSE_GAIN * gain, _CLOSE_BIC)
         and not _same_thing(rival, chosen, sample_time=sample_time)
         and (explained or not _same_kind(rival, chosen))
     ]
-    # The others were dropped already, had they not paid beside it.
-    helpful = lowers_error(chosen, steps[-2], bench)
-    disputed = bool(close) and chosen.error > _MOSTLY * baseline.error
-    if not explained and (disputed or not helpful):
-        return reach_verdict(steps[:-1], found, bench=bench, sample_time=sample_time)
+    if not explained:
+        without = _needless(chosen, [*found, *steps], bench)
+        disputed = bool(close) and chosen.error > _MOSTLY * baseline.error
+        if without is not None or disputed:
+            back = steps[:-1] if without is None else steps_to(without, [*found, *steps], bench)
+            return reach_verdict(back, found, bench=bench, sample_time=sample_time)
     if close:
         return "ambiguous", steps, close
     return ("named" if explained else "partial"), steps, []
+
+
+def _needless(chosen: Hypothesis, found: Sequence[Hypothesis], bench: Bench) -> Hypothesis | None:
+    """Return the best hypothesis without one of the effects, if that effect does not pay."""
+    smaller = [h for h in found if h.key < chosen.key and len(h.key) == len(chosen.key) - 1]
+    as_good = [h for h in smaller if not lowers_error(chosen, h, bench)]
+    return min(as_good, key=lambda h: h.error, default=None)
 
 
 def _evidence(chosen: Hypothesis, rival: Hypothesis, bench: Bench) -> float:
@@ -102,18 +112,38 @@ def _independent_points(hypothesis: Hypothesis, bench: Bench) -> float:
     return total
 
 
+def _stand_ins(
+    rival: Hypothesis, chosen: Hypothesis
+) -> list[tuple[tuple[str, int], tuple[str, int]]]:
+    """Return the effects of the chosen that the rival lacks, each with what it has instead."""
+    mine = sorted(chosen.key - rival.key, key=_place)
+    other = sorted(rival.key - chosen.key, key=_place)
+    return list(zip(mine, other, strict=True))
+
+
+def _place(key: tuple[str, int]) -> tuple[int, str]:
+    return key[1], key[0]
+
+
 def _same_kind(rival: Hypothesis, chosen: Hypothesis) -> bool:
-    """Are the two laws of one family at one place, dry friction on one cart, say?"""
-    (mine,) = chosen.key - rival.key
-    (other,) = rival.key - chosen.key
-    families = {find_effect(key).family for key, _ in (mine, other)}
-    return mine[1] == other[1] and len(families) == 1 and "" not in families
+    """Are the laws of one family at the same places, dry friction on one cart, say?"""
+    return all(
+        mine[1] == other[1] and find_effect(mine[0]).family == find_effect(other[0]).family != ""
+        for mine, other in _stand_ins(rival, chosen)
+    )
 
 
 def _same_thing(rival: Hypothesis, chosen: Hypothesis, *, sample_time: float) -> bool:
-    """Is a rival a richer form of the same law, or one the data provably cannot tell from it?"""
-    (mine,) = chosen.key - rival.key
-    (other,) = rival.key - chosen.key
+    """Is a rival a richer form of the same laws, or one the data provably cannot tell from it?"""
+    return all(
+        _same_law(mine, other, chosen, sample_time=sample_time)
+        for mine, other in _stand_ins(rival, chosen)
+    )
+
+
+def _same_law(
+    mine: tuple[str, int], other: tuple[str, int], chosen: Hypothesis, *, sample_time: float
+) -> bool:
     if find_effect(other[0]).grows_from == mine[0] and other[1] == mine[1]:
         return True
     names = {mine[0], other[0]}
@@ -138,9 +168,7 @@ def choose_experiment(
     `left` are the windows in which the chosen model still departs, the worst first.
     """
     if verdict == "ambiguous":
-        own = next(iter(chosen.key - close[0].key))
-        other = next(iter(close[0].key - chosen.key))
-        texts = {find_effect(key[0]).deciding_run for key in (own, other)}
+        texts = {find_effect(key).deciding_run for key, _ in chosen.key ^ close[0].key}
         return " ".join(sorted(texts))
     if verdict == "named":
         return chosen.fit.structure.effects[-1].effect.deciding_run

@@ -92,6 +92,8 @@ def carry(lanes, T, phi, work, s, K, C, N, n, cart, spring, scatter, drive_c, wh
         if s[TURNED, i] != 0.0:
             _add(T, N + i, s[BEFORE, i] - s[D2, i], 3 * N)
             s[TURNED, i] = 0.0
+        if s[GRIP, i] == 0.0:
+            _add(T, N + i, -1.0, N + i)  # a cart that is held, also one gripped anew, has no speed
         changed = changed or s[GRIP, i] != phi[2 * N, N + i]
         s[HALF_X, i] = s[X, i] + 0.5 * step * (s[V, i] + 0.25 * step * s[D2, i])
         s[HALF_V, i] = s[V, i] + 0.5 * step * s[D2, i]

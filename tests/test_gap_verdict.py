@@ -1,0 +1,81 @@
+"""What is said of a search, as a table: hypotheses with their errors in, verdicts out."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from pipeline.gap.verdict import reach_verdict
+from pipeline.plant.effects import find_effect
+
+FLOOR = 0.01
+COULOMB, SECOND = ("coulomb_friction", 1), ("coulomb_friction", 2)
+DELAY, CUBIC, DRAG, DEAD = (
+    ("input_delay", 0),
+    ("cubic_spring", 1),
+    ("quadratic_drag", 1),
+    ("dead_zone", 0),
+)
+
+
+def hypothesis(*keys: tuple[str, int], error: float, bic: float) -> Any:
+    """Return what a verdict looks at of a hypothesis: no fit is made here."""
+    effects = [SimpleNamespace(key=key, effect=find_effect(key[0])) for key in keys]
+    structure = SimpleNamespace(effects=effects)
+    return SimpleNamespace(
+        key=frozenset(keys),
+        error=error,
+        bic=bic,
+        at_floor=False,
+        fit=SimpleNamespace(chi=1.0, n_points=100_000, structure=structure),
+    )
+
+
+BENCH: Any = SimpleNamespace(
+    floor=FLOOR, repeatability=0.0, training=(), explains=lambda h: h.error <= 2 * FLOOR
+)
+LINEAR = hypothesis(error=0.3, bic=0.0)
+
+
+def verdict_on(*steps: Any, others: tuple[Any, ...] = ()) -> tuple[str, set[Any], list[Any]]:
+    """Return the verdict, the effects that stand, and the rivals."""
+    path = (LINEAR, *steps)
+    verdict, stand, close = reach_verdict(path, [*path, *others], bench=BENCH, sample_time=0.01)
+    assert [len(h.key) for h in stand] == list(range(len(stand)))  # one effect a step
+    return verdict, set(stand[-1].key), close
+
+
+def test_an_effect_beside_which_another_does_as_well_alone_is_taken_back():
+    """The last step does not pay; then the first does not, for the second does it alone."""
+    delay = hypothesis(DELAY, error=0.25, bic=-10)
+    both = hypothesis(DELAY, COULOMB, error=0.2, bic=-500)
+    three = hypothesis(DELAY, COULOMB, CUBIC, error=0.195, bic=-600)
+    alone = hypothesis(COULOMB, error=0.2, bic=-505)
+    assert verdict_on(delay, both, three)[:2] == ("partial", {DELAY, COULOMB})
+    assert verdict_on(delay, both, three, others=(alone,))[:2] == ("partial", {COULOMB})
+
+
+@pytest.mark.parametrize(
+    ("rival", "verdict"),
+    [
+        ((("stiction", 1), ("stiction", 2)), "named"),  # a richer form of the same laws
+        ((DRAG, DEAD), "ambiguous"),
+        ((DRAG, SECOND), "ambiguous"),
+    ],
+)
+def test_effects_that_only_together_explain_have_rivals_too(rival, verdict):
+    """Two others that fit alike, instead of one or of both."""
+    one = hypothesis(COULOMB, error=0.2, bic=-100)
+    both = hypothesis(COULOMB, SECOND, error=0.015, bic=-1000)
+    same = hypothesis(*rival, error=0.015, bic=-999.5)
+    said, stand, close = verdict_on(one, both, others=(same,))
+    assert (said, stand) == (verdict, {COULOMB, SECOND})
+    assert close == ([same] if verdict == "ambiguous" else [])
+
+
+def test_a_rival_far_less_likely_is_none():
+    """A criterion forty higher tells them apart."""
+    one = hypothesis(COULOMB, error=0.2, bic=-100)
+    both = hypothesis(COULOMB, SECOND, error=0.015, bic=-1000)
+    other = hypothesis(DRAG, DEAD, error=0.0151, bic=-950)
+    assert verdict_on(one, both, others=(other,))[0] == "named"
