@@ -99,10 +99,21 @@ def test_a_guess_that_was_far_off_asks_where_the_data_show_it():
     """A damping assumed three times too large: its peak is sharper; one too small: flatter."""
     (question,) = ask(off("zeta_b", -67.0, source="assumed"))
     assert question.section == "frequency-response"
-    assert "is sharper than you assumed" in question.text
+    assert "is sharper than that" in question.text
     (question,) = ask(off("zeta_a", 148.0, source="assumed"))
-    assert "is flatter than you assumed" in question.text
+    assert "is flatter than that" in question.text
+    assert "the program assumed" in question.text
     assert ask(off("zeta_a", 20.0, source="assumed")) == ()
+
+
+def test_points_are_not_asked_for_where_the_fit_had_none():
+    """A guess that a fit in time moved: no point of a Bode plot shows it."""
+    analysis = off("zeta_a", 148.0, source="assumed")
+    rows = tuple(
+        replace(row, final=row.final and replace(row.final, source="time_fit"))
+        for row in analysis.rows
+    )
+    assert ask(replace(analysis, rows=rows)) == ()
 
 
 def test_bench_against_model_asks_level_overshoot_and_shape_apart():

@@ -118,6 +118,7 @@ def _assumed(analysis: Analysis) -> Iterator[Asked]:
         for row in analysis.rows
         if row.initial is not None
         and row.final is not None
+        and row.final.source == "bode_fit"  # else no points show it
         and row.initial.source == "assumed"
         and abs(row.change_percent or 0.0) > DAMPING_LIMIT
     ]
