@@ -8,7 +8,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -289,7 +289,19 @@ def test_a_stock_bench_may_take_half_a_second_to_begin(monkeypatch):
         assert (line.bench.name, line.bench.encoders) == ("stock", 3)
 
 
+@pytest.fixture
+def _hearing() -> Iterator[None]:
+    """Have programs that are started here end with their terminal, under nohup as well.
+
+    They inherit that a signal is ignored, as nohup wants it, but not a function that ignores it.
+    """
+    before = signal.signal(signal.SIGHUP, lambda number, frame: None)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows knows no SIGHUP")
+@pytest.mark.usefixtures("_hearing")
 def test_a_closed_terminal_stops_the_motor(tmp_path, real):
     """SIGHUP ends a run with a stop, not a watchdog, and what came is saved."""
     work = write_work(tmp_path, [sine("dwell", seconds=30)])
