@@ -171,6 +171,27 @@ def test_a_name_stands_on_top_with_its_numbers():
     assert text.index("explains what") < text.rindex("Where the linear model fails")
 
 
+def test_each_size_has_its_cart_and_each_sentence_is_said_once():
+    """Dry friction on both carts: which force is whose, and what dry friction is."""
+    gap = make_gap()
+    (one,) = gap.effects
+    said = terminal_verdict(replace(gap, effects=(replace(one, where={"cart": 1}), one)))
+
+    assert re.search(r"force [^;]+ V on cart 1; force [^;]+ V on cart 2\. ", said)
+    assert said.count(one.effect.sentence) == 1
+    assert " V on cart" not in terminal_verdict(gap)  # one effect: its name says where
+
+
+def test_a_stretch_without_a_phase_is_told_in_words():
+    """No phase of the motion stands out: the sentence and the table say so."""
+    gap = replace(make_gap("partial"), noise_floor=0.01)
+    (window,) = gap.left
+    text = page_of(replace(gap, left=(replace(window, what="throughout"),))).text
+
+    assert "(the whole stretch alike)" in text
+    assert "throughout" not in text
+
+
 def test_repeats_are_the_measure_where_they_differ_by_more_than_noise():
     """No model is asked to be closer to a run than the next repeat of it."""
     gap = replace(make_gap(), repeatability=0.035)

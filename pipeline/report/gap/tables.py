@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from pipeline.gap.types import FoundEffect, Gap, GapWindow
 from pipeline.report.document import Cell, Table
-from pipeline.report.gap.words import WORDS, effect_name, share
+from pipeline.report.gap.words import WORDS, effect_name, phase, share
 from pipeline.report.numbers import percent, unit_text, with_error
 from pipeline.report.tables import cell, make_table
 from pipeline.report.words import clean
@@ -46,7 +46,7 @@ def window_table(windows: Sequence[GapWindow], *, model: str, number: int) -> Ta
                 cell(str(w.cart)),
                 cell(f"{w.start:.2f}"),
                 cell(f"{w.end:.2f}"),
-                cell(clean(w.what)),
+                cell(phase(w.what)),
                 cell(percent(100 * w.share)),
             ]
             for w in windows

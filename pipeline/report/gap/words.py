@@ -88,8 +88,8 @@ def _named(gap: Gap) -> Block:
             names=capital(listing(names)),
             explain="explains" if len(names) == 1 else "together explain",
             what="part of what" if gap.verdict == "partial" else "what",
-            sizes="; ".join(sizes_text(found.parameters) for found in gap.effects),
-            sentences=" ".join(found.effect.sentence for found in gap.effects),
+            sizes="; ".join(_sizes_there(found, several=len(names) > 1) for found in gap.effects),
+            sentences=" ".join(dict.fromkeys(found.effect.sentence for found in gap.effects)),
             errors=_errors(gap),
         )
     )
@@ -171,7 +171,7 @@ def _errors(gap: Gap) -> str:
         cart=worst.cart,
         start=f"{worst.start:.2f}",
         end=f"{worst.end:.2f}",
-        what=clean(worst.what),
+        what=phase(worst.what),
     )
 
 
@@ -214,11 +214,22 @@ def sizes_text(parameters: Mapping[str, NamedValue]) -> str:
     )
 
 
+def _sizes_there(found: FoundEffect, *, several: bool) -> str:
+    """Return the sizes of one effect; of several, with the cart or spring that they belong to."""
+    place = place_name(found.where) if several else ""
+    return sizes_text(found.parameters) + (f" on {place}" if place else "")
+
+
 def _size(value: NamedValue) -> str:
     unit = unit_text(clean(value.unit))
     exact = value.std is not None and value.std < _NEGLIGIBLE * abs(value.value)
     text = significant(value.value) if exact else with_error(value.value, value.std)
     return text + (f" {unit}" if unit else "")
+
+
+def phase(what: str) -> str:
+    """Return what a cart does in a stretch of time, as the gap's windows name it, in words."""
+    return WORDS.text("throughout") if what == "throughout" else clean(what)
 
 
 def share(value: float) -> str:
