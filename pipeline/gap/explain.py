@@ -130,7 +130,9 @@ def explain_gap(
         repeatability=bench.repeatability or None,
         by_record=compare_by_record(traces, bench),
         where=find_windows(path[0].fit, bench.training) if verdict != "none" else (),
-        next_experiment=choose_experiment(verdict, chosen, close, left),
+        next_experiment=choose_experiment(
+            verdict, chosen, close, left, repeated=bench.repeatability > 0
+        ),
         linear=path[0].fit.structure.model(path[0].fit.theta),
         model=replace(model, terms=_in_order(model.terms, effects)),
         training=tuple(run.id for run in bench.training),

@@ -17,15 +17,15 @@ _NOTHING = 1.05  # times the noise: too little to speak of
 _REPEAT = "Repeat each run, so that what differs from run to run is known."
 # What shows more of what is left, by what the cart does there.
 _SHOWS = {
-    "velocity near zero": "Then small free decays, and a slow ramp of the input: what holds a cart "
+    "velocity near zero": "Small free decays, and a slow ramp of the input: what holds a cart "
     "near its rest shows there.",
-    "fast motion": "Then free decays of one cart at a time from two release heights: what is in "
+    "fast motion": "Free decays of one cart at a time from two release heights: what is in "
     "the carts shows there, what is in the drive does not.",
-    "large displacement, positive side": "Then static steps of both signs and several sizes: a "
+    "large displacement, positive side": "Static steps of both signs and several sizes: a "
     "spring or a stop that changes with the position bends the line of level against input.",
-    "after an edge of the input": "Then steps of several sizes at the highest sampling rate: what "
+    "after an edge of the input": "Steps of several sizes at the highest sampling rate: what "
     "is late, lost or soft in the drive shows at their edges.",
-    "input on": "Then steps of several sizes and both signs, and the same swing released by hand: "
+    "input on": "Steps of several sizes and both signs, and the same swing released by hand: "
     "what only the driven cart does is in the drive.",
 }
 _SHOWS["large displacement, negative side"] = _SHOWS["large displacement, positive side"]
@@ -162,10 +162,13 @@ def choose_experiment(
     chosen: Hypothesis,
     close: Sequence[Hypothesis],
     left: Sequence[GapWindow],
+    *,
+    repeated: bool,
 ) -> str:
     """Return what to record next: what tells the rivals apart, settles the name, or shows more.
 
-    `left` are the windows in which the chosen model still departs, the worst first.
+    `left` are the windows in which the chosen model still departs, the worst first; `repeated`:
+    runs of one input tell already by how much they differ.
     """
     if verdict == "ambiguous":
         texts = {find_effect(key).deciding_run for key, _ in chosen.key ^ close[0].key}
@@ -175,4 +178,5 @@ def choose_experiment(
     if verdict == "none":
         return ""
     phase = next((_SHOWS[w.what] for w in left if w.what in _SHOWS), "")
-    return f"{_REPEAT} {phase or _SHOWS['fast motion']}"
+    shows = phase or _SHOWS["fast motion"]
+    return shows if repeated else f"{_REPEAT} {shows}"
