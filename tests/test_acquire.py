@@ -20,7 +20,7 @@ from pipeline.bench.host.experiments import prepare_submission
 from pipeline.bench.host.raw import read_raw
 from pipeline.bench.host.record import readings_of
 from pipeline.bench.host.serial_line import open_line
-from pipeline.bench.host.session import _LOOK, Session
+from pipeline.bench.host.session import Session
 from pipeline.bench.planning.gains import Scales
 from pipeline.bench.planning.orders import make_order
 from pipeline.bench.planning.plan import Limits, Plan, Recording, StateLoop
@@ -254,7 +254,7 @@ def test_a_run_that_breaks_off_is_saved_as_partial_and_recorded_again(tmp_path, 
 
 
 def test_a_run_that_passes_the_travel_limit_is_stopped_at_once(tmp_path, real):
-    """Within 20 ms of the offending line the bench has the stop; the run is no experiment."""
+    """The port is not looked at again before the stop; the run is no experiment."""
     work = write_work(tmp_path, [sine("dwell", seconds=4)], limits=NEAR)
     (outcome,) = acquire(work, port=real.address, observers=[Alone()], only=["dwell"])
     assert last_run(real)["ended"] == "stopped"
@@ -286,12 +286,11 @@ def test_a_run_that_passes_the_input_limit_is_stopped_at_once(tmp_path, real):
 
 
 def assert_stopped_at_once(raw: Path, offending: int) -> None:
-    """The look that bore the offending line out was the last, and looks are milliseconds apart."""
+    """No look came after the one in which the offending line was judged: with its successor."""
     run = read_raw(raw)
     *_, last = [lump for lump, _ in run.lumps()]
     seen = readings_of(replace(run, content=run.content[: -len(last)], arrivals=run.arrivals[:-1]))
     assert not seen or offending >= seen[-1].ms
-    assert _LOOK < 0.02  # s; those of a busy machine are farther apart
 
 
 def test_an_amplitude_past_the_limits_is_never_sent(tmp_path, real):

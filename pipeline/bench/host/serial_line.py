@@ -26,7 +26,7 @@ LUMP = 8192  # bytes read at most at a time: what is read within one heartbeat, 
 _WRITE_TIMEOUT = 0.5  # s
 _QUERIES, _ANSWER = 4, 0.6  # s; some boards boot for two seconds when the port is opened
 _LOOK = 0.005  # s between looks at the port
-_FIRST_LINE = 2.0  # s a stock bench may take to begin
+FIRST_LINE = 2.0  # s a bench may take to begin
 _TRIAL = 0.1  # s of a run that does nothing, to see whether a stock bench is there at all
 _NETWORK = re.compile(r"[\w.-]+:\d+|\d+|\[.*\]:\d+")  # a host and a port, or a port, alone
 _QUIET = 0.05  # s without a byte: what was under way has arrived
@@ -177,7 +177,7 @@ class SerialLine:
     def _try_stock(self) -> None:
         """Have a stock bench stream for a moment, which tells how many encoders it has."""
         self.send(Start(wave=Wave.DELTA, frequency=1 / _TRIAL, amplitude=0))
-        heard, end = b"", time.monotonic() + _FIRST_LINE
+        heard, end = b"", time.monotonic() + FIRST_LINE
         while not heard and time.monotonic() < end:
             time.sleep(_LOOK)
             heard = self.receive()

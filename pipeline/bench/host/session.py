@@ -13,7 +13,7 @@ from datetime import datetime
 from pathlib import Path
 
 from pipeline.bench.host.raw import RawHeader, RawWriter
-from pipeline.bench.host.serial_line import LUMP, SerialLine
+from pipeline.bench.host.serial_line import FIRST_LINE, LUMP, SerialLine
 from pipeline.bench.host.stream import Stream
 from pipeline.bench.planning.orders import Order
 from pipeline.bench.planning.plan import Limits, Recording
@@ -40,7 +40,6 @@ STOPPED = "stopped: "  # begins why a run was ended that was not safe to go on w
 
 _LOOK = 0.003  # s between looks at the port
 _FORWARD = 0.05  # s between batches handed to the observers
-_FIRST_LINE = 1.0  # s a bench may take to begin
 _SILENCE = 0.5  # s without a byte in mid-run: the bench is gone
 _UNREADABLE = 0.25  # s of bytes that are no lines: the motor may be on, and nobody sees the carts
 _NEARLY = 100.0  # ms before the end at which silence is the end; after it lines are too many
@@ -308,7 +307,7 @@ class Session:
                 return ""
             if stream.latest >= end - _NEARLY and quiet > 2 * _AFTER_END + _SILENCE / 2:
                 return ""
-            if quiet > (_SILENCE if stream.latest >= 0 else _FIRST_LINE):
+            if quiet > (_SILENCE if stream.latest >= 0 else FIRST_LINE):
                 return (
                     f"the bench fell silent after {1e-3 * stream.latest:.3f} s{self._lateness()}"
                     if stream.latest >= 0
