@@ -8,7 +8,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -239,7 +239,7 @@ def test_a_new_line_is_zeroed_once_the_carts_rest(tmp_path, real):
 class Answers(threading.Thread):
     """A port where each query is answered with the next of some lines."""
 
-    def __init__(self, *answers: bytes) -> None:
+    def __init__(self, answers: Iterable[bytes]) -> None:
         super().__init__(daemon=True)
         self._answers = iter(answers)
         self._door = socket.create_server(("127.0.0.1", 0))
@@ -258,14 +258,39 @@ def test_a_description_is_believed_when_it_came_twice():
     """A digit that changed on the line would move every limit; what differs is asked again."""
     true = DESCRIPTION.encode() + b"\n"
     wrong = [true.replace(b"0.002cm", b"0.00%dcm" % digit) for digit in (1, 3, 6)]
-    port = Answers(wrong[0], true, true)
+    port = Answers([wrong[0], true, true])
     port.start()
     with open_line(port.address, baud=115_200) as line:
         assert line.bench.position_per_count == 0.002
-    port = Answers(*wrong, true)
+    port = Answers([*wrong, true])
     port.start()
     with pytest.raises(HardwareError, match=r"never describes itself twice alike.*check cable"):
         open_line(port.address, baud=115_200)
+
+
+def test_a_late_answer_leaves_none_under_way():
+    """Asked again, a bench answers twice: a run begins behind both, and behind what lies between.
+
+    An answer that is lost, here by a byte before it, keeps nobody from going on.
+    """
+    described = DESCRIPTION.encode() + b"\n"
+
+    def answers() -> Iterator[bytes]:
+        yield from (described, described)  # of the handshake
+        time.sleep(0.8)
+        yield described
+        time.sleep(0.1)
+        yield b"1:1:0:0:7\n" + described
+        yield b"#" + described
+        yield described
+
+    port = Answers(answers())
+    port.start()
+    with open_line(port.address, baud=115_200) as line:
+        line.clear()
+        time.sleep(0.3)
+        assert line.receive() == b""
+        line.clear()
 
 
 def test_a_stock_bench_may_take_half_a_second_to_begin(monkeypatch):

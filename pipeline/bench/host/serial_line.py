@@ -45,6 +45,7 @@ class SerialLine:
         self._name = name
         self.bench = Description(name="stock", encoders=2, carts=2)
         self._described = b""  # the line in which it describes itself; b"": a stock bench does not
+        self._asked = 0  # queries whose answers may still be under way
 
     def __enter__(self) -> Self:
         return self
@@ -125,7 +126,6 @@ class SerialLine:
             self.drain()
             return
         for _ in range(_QUERIES):
-            self.send(Signal.QUERY)
             if self._answer(self._described) is not None:
                 return
         raise HardwareError(f"{self._name}: the bench answers no more; is it still switched on?")
@@ -141,7 +141,6 @@ class SerialLine:
         before: bytes | None = None
         for _ in range(_QUERIES):
             self.drain()
-            self.send(Signal.QUERY)
             if (answer := self._answer()) is None:
                 continue
             if answer == before:  # a changed digit of a scale would move every limit
@@ -164,15 +163,28 @@ class SerialLine:
         self.send(Signal.RESET)
 
     def _answer(self, beginning: bytes = b"?") -> bytes | None:
-        """Return the line that answers a query, which begins so, or None."""
-        heard, end = b"", time.monotonic() + _ANSWER
-        while time.monotonic() < end:
+        """Send a query; return the line that answers it, which begins so, or None.
+
+        Answers to earlier queries may still come, before it; where some came and then none for a
+        while, the others are lost.
+        """
+        self.send(Signal.QUERY)
+        self._asked += 1
+        heard, answers, end = b"", [], time.monotonic() + _ANSWER
+        while len(answers) < self._asked:
+            now = time.monotonic()
             heard += self.receive()
-            for line in heard.split(b"\n")[:-1]:
-                if line.startswith(beginning):
-                    return line
-            time.sleep(_LOOK)
-        return None
+            lines = [line for line in heard.split(b"\n")[:-1] if line.startswith(beginning)]
+            if len(lines) > len(answers):
+                answers, end = lines, now + _ANSWER
+            elif now > end:  # seen before a look at the port: this computer may pause
+                break
+            else:
+                time.sleep(_LOOK)
+        if not answers:
+            return None
+        self._asked = 0
+        return answers[-1]
 
     def _try_stock(self) -> None:
         """Have a stock bench stream for a moment, which tells how many encoders it has."""
