@@ -105,27 +105,8 @@ def make_case(
             y -= y[:, :1] if kind != "decay" else y[:, -1:]
         y = np.round(y / COUNT) * COUNT
         stamps = np.round(t, 4) if dirt else t
-        records.append(
-            Record(
-                id=name,
-                kind=kind,
-                t=stamps,
-                u=u,
-                y=y,
-                carts=tuple(range(1, n + 1)),
-                free=free,
-                resolution=np.full(n, COUNT),
-            )
-        )
-    return Case(
-        n=n,
-        springs=tuple(bool(s > 0) for s in k),
-        hidden=hidden,
-        records=tuple(records),
-        m=tuple(m),
-        c=tuple(c),
-        k=tuple(k),
-    )
+        records.append(_record(name, kind, stamps, u, y, free=free, count=COUNT))
+    return _case(m, c, k, hidden, records)
 
 
 def make_rig(*, seed: int, n: int) -> Case:
@@ -175,20 +156,27 @@ def make_rig(*, seed: int, n: int) -> Case:
             )
             y = y + rng.uniform(-0.05, 0.05, (n, 1)) * np.array([[i in free] for i in everything])
             y = np.round((y + 0.3 * COUNT * rng.standard_normal(y.shape)) / count) * count
-            records.append(
-                Record(
-                    id=f"{name}-{trial}",
-                    kind=kind,
-                    t=t,
-                    u=u,
-                    y=y,
-                    carts=everything,
-                    free=free,
-                    resolution=np.full(n, count),
-                )
-            )
+            records.append(_record(f"{name}-{trial}", kind, t, u, y, free=free, count=count))
+    return _case(m, c, k, hidden, records)
+
+
+def _record(name, kind, t, u, y, *, free, count):
+    n = len(y)
+    return Record(
+        id=name,
+        kind=kind,
+        t=t,
+        u=u,
+        y=y,
+        carts=tuple(range(1, n + 1)),
+        free=free,
+        resolution=np.full(n, count),
+    )
+
+
+def _case(m, c, k, hidden, records):
     return Case(
-        n=n,
+        n=len(m),
         springs=tuple(bool(s > 0) for s in k),
         hidden=hidden,
         records=tuple(records),
