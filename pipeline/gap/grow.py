@@ -257,7 +257,7 @@ def fit_whole(structure: Structure, theta: Array, bench: Bench) -> Fit:
     """Fit whole runs; friction first with one size for all runs, then run by run."""
     whole = bench.training
     dry = any(structure.dry)
-    contact = any(c.effect.key in CONTACT for c in structure.effects)
+    contact = structure.has_contact
     fit = fit_model(
         structure,
         theta,

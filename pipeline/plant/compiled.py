@@ -32,14 +32,10 @@ _OPTIONS: dict[str, Any] = {
     "error_model": "numpy",
 }
 jit = njit(**_OPTIONS)
-# Without counting references to arrays, which costs more than a step's arithmetic: for what makes
-# no array of its own.
-_LEAN: dict[str, Any] = {**_OPTIONS, "_nrt": False}
-lean = njit(**_LEAN)
-inlined = njit(**_LEAN, inline="always")
+inlined = njit(**_OPTIONS, inline="always")
 
 
-@lean
+@jit
 def tie(M, j, n, value):
     """Add `value` between both ends of spring j (0 to n) of n carts to a symmetric matrix."""
     if j < n:
@@ -51,7 +47,7 @@ def tie(M, j, n, value):
         M[j - 1, j] -= value
 
 
-@lean
+@jit
 def pair(M, i, j, value):
     """Add `value` between bodies i and j to a symmetric matrix."""
     M[i, i] += value
@@ -60,7 +56,7 @@ def pair(M, i, j, value):
     M[j, i] -= value
 
 
-@lean
+@jit
 def stretch(s, row, j, n):
     """Return by how much spring j of n carts is stretched, by a row of the state table."""
     return (s[row, j] if j < n else 0.0) - (s[row, j - 1] if j > 0 else 0.0)

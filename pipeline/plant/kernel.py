@@ -71,7 +71,6 @@ from pipeline.plant.compiled import (
     Z,
     inlined,
     jit,
-    lean,
     pair,
     stretch,
     tie,
@@ -125,7 +124,7 @@ def _assemble(cart, spring, drive, free, s, K, C):
     return N, motor, parent
 
 
-@lean
+@jit
 def _smooth_forces(cart, spring, n, s):
     """Add the forces that are neither linear nor dry, at the state in the middle of the step."""
     for i in range(n):
@@ -141,7 +140,7 @@ def _smooth_forces(cart, spring, n, s):
                 s[FORCE, j - 1] += f
 
 
-@lean
+@jit
 def _position(s, i, h):
     return s[X, i] + h * (
         s[V, i]
@@ -149,14 +148,14 @@ def _position(s, i, h):
     )
 
 
-@lean
+@jit
 def _rate(s, i, h):
     return s[V, i] + h * (
         s[D2, i] + h / 2.0 * (s[D3, i] + h / 3.0 * (s[D4, i] + h / 4.0 * s[D5, i]))
     )
 
 
-@lean
+@jit
 def _guard(which, active, cart, spring, drive, n, motor, s, h):
     """Return how far past its switch a contact or slack is, h from now; positive: it switches.
 
@@ -181,7 +180,7 @@ def _guard(which, active, cart, spring, drive, n, motor, s, h):
     return -push if active else min(depth, push)
 
 
-@lean
+@jit
 def _switch(which, sign, cart, spring, drive, n, motor, s, K, C):
     """Put a contact or slack into the linear matrices (sign 1) or take it out (sign -1)."""
     if which < n:
@@ -407,12 +406,12 @@ def _advance(
         left -= step
 
 
-@lean
+@jit
 def _velocity(v, d2, d3, d4, d5, d6, h):
     return v + h * (d2 + h / 2.0 * (d3 + h / 3.0 * (d4 + h / 4.0 * (d5 + h / 5.0 * d6))))
 
 
-@lean
+@jit
 def _integral(time, knots, u, total, twice, at):
     """Integrate the held input up to `time`, once and twice; `at` is the interval found last."""
     last = knots.size - 1

@@ -42,7 +42,6 @@ from pipeline.plant.compiled import (
     X,
     Z,
     jit,
-    lean,
     stretch,
 )
 
@@ -72,7 +71,7 @@ def make_sensitivities(of, N):
     return lanes, T, phi, np.empty((7, N))
 
 
-@lean
+@jit
 def _add(T, row, factor, other):
     """Add a multiple of another row to one."""
     for block in range(T.shape[1]):
@@ -80,7 +79,7 @@ def _add(T, row, factor, other):
             T[row, block, q] += factor * T[other, block, q]
 
 
-@lean
+@jit
 def carry(lanes, T, phi, work, s, K, C, N, n, cart, spring, scatter, drive_c, whole, step):
     """Move the sensitivities on by `step`, before the state moves.
 
@@ -134,7 +133,7 @@ def carry(lanes, T, phi, work, s, K, C, N, n, cart, spring, scatter, drive_c, wh
     _kick(lanes, T, s, N, n, cart, spring, scatter, drive_c, whole, 0.5 * step)
 
 
-@lean
+@jit
 def _exponential(phi, work, s, K, C, N, step):
     """Fill `phi`, column by column, by the series to sixth order."""
     for column in range(2 * N):
@@ -159,7 +158,7 @@ def _exponential(phi, work, s, K, C, N, step):
         phi[2 * N, N + i] = s[GRIP, i]
 
 
-@lean
+@jit
 def _force(kind, at, s, n, spring):
     """Return the force that a unit change of a parameter adds, in the middle of the step.
 
@@ -177,7 +176,7 @@ def _force(kind, at, s, n, spring):
     return -reach
 
 
-@lean
+@jit
 def _kick(lanes, T, s, N, n, cart, spring, scatter, drive_c, whole, span):
     """Give the lanes the impulse of `span` s of their forces and of the nonlinear slopes."""
     for lane in range(lanes.shape[1]):
@@ -212,7 +211,7 @@ def _kick(lanes, T, s, N, n, cart, spring, scatter, drive_c, whole, span):
             _add(T, N + i, -s[GRIP, i] * span * c, N + i)
 
 
-@lean
+@jit
 def stop(T, s, N, i):
     """Note that dry friction brings body i to a stop now: when, per lane."""
     before = s[ACC, i]
@@ -222,7 +221,7 @@ def stop(T, s, N, i):
     s[BEFORE, i], s[TURNED, i] = before, 1.0
 
 
-@lean
+@jit
 def meet(T, s, N, body, other, stiffness, damping):
     """Note that a contact of a body, with another or (-1) a wall, begins or ends now: when.
 
@@ -241,7 +240,7 @@ def meet(T, s, N, body, other, stiffness, damping):
             s[BEFORE, end], s[TURNED, end] = s[ACC, end], 1.0
 
 
-@lean
+@jit
 def restart(lanes, T, shot, free, parent, motor, n, N):
     """Let the sensitivities begin anew where a shot does."""
     for lane in range(lanes.shape[1]):
@@ -259,7 +258,7 @@ def restart(lanes, T, shot, free, parent, motor, n, N):
                 T[first + i, block, q] = start
 
 
-@lean
+@jit
 def bend_presliding(lanes, T, s, K, cart, scatter, i, n, N):
     """Start the presliding state of cart i where the others' sensitivities bend it."""
     for lane in range(lanes.shape[1]):
