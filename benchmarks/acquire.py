@@ -25,8 +25,8 @@ from pipeline.errors import ConfigError
 from pipeline.plant.chain import PRESETS
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
-from tests.acquisitions import Notes, host, sine, write_work
-from tests.benches import emulator
+from tests.helpers.acquisitions import Notes, host, sine, write_work
+from tests.helpers.benches import emulator
 
 FAULTS = ("drop", "garble", "merge", "delay")
 

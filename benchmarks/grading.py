@@ -2,12 +2,12 @@
 
     python benchmarks/grading.py --start 50000 --count 300 --out grading.jsonl
 
-Benches lie all over what a lab may have (`tests/grading_class.py`): 1 to 3 carts, damping ratios
-from 0.003 to 0.15, 6 to 22 dwells, coarse and fine encoders, a trace of friction, two to four
-digits. Each team is graded as it is, honest, and once more for a few kinds of mistake in turn,
-made with what the team has in its own hands (`tests/grading_slips.py`). One JSON line a grading;
-at the end a line a kind, with 95 % confidence intervals (Clopper and Pearson, 1934). Where a number
-is two mistakes' as well, a flag says both: "or" counts those whose planted one is said second.
+Benches lie all over what a lab may have (`tests/helpers/grading_class.py`): 1 to 3 carts, damping
+ratios from 0.003 to 0.15, 6 to 22 dwells, coarse and fine encoders, a trace of friction, two to
+four digits. Each team is graded as it is, honest, and once more for a few kinds of mistake in turn,
+made with what the team has in its own hands (`tests/helpers/grading_slips.py`). One JSON line a
+grading; at the end a line a kind, with 95 % confidence intervals (Clopper and Pearson, 1934). Where
+a number is two mistakes' as well, a flag says both: "or" counts those whose planted one is second.
 """
 
 import argparse
@@ -23,8 +23,8 @@ os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
 import numpy as np
 from scipy.stats import beta
 
-from tests.grading_class import Team, make_team, with_spoilt_data, with_wrong_rubric
-from tests.grading_slips import DOUBLE, OF_SEVERAL_CARTS, ONE_NUMBER, SLIPS
+from tests.helpers.grading_class import Team, make_team, with_spoilt_data, with_wrong_rubric
+from tests.helpers.grading_slips import DOUBLE, OF_SEVERAL_CARTS, ONE_NUMBER, SLIPS
 
 HONEST = "honest"
 WRONG_RUBRIC = "honest, rubric lacks a spring"  # every so many teams, as each is analysed anew

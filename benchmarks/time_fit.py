@@ -13,7 +13,7 @@ import numpy as np
 
 from pipeline.plant.chain import PRESETS
 from pipeline.stages.time_fit import fit_records
-from tests.time_records import random_chain, step_record
+from tests.helpers.time_records import random_chain, step_record
 
 N_TIMED = 15
 N_SEEDS = 200

@@ -8,14 +8,15 @@ import sys
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
 
-from tests.benches import Emulator, emulator
-from tests.waiting import PATIENCE
+from tests.helpers.benches import Emulator, emulator
+from tests.helpers.places import REAL_DATA, ROOT
+from tests.helpers.waiting import PATIENCE
 
 # Where Python is told to keep nothing that it compiled, as in containers, each of the hundred
 # programs that tests start would compile the package anew, and each worker all tests.
@@ -31,14 +32,11 @@ settings.register_profile(
 )
 settings.load_profile("cartlab")
 
-# Real measurements may be used in place but not passed on, so they lie outside the project.
-REAL_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
-ROOT = Path(__file__).resolve().parents[1]
-
 CHROMIUM = shutil.which("chromium")
 _BENCHES = "benches"  # the group of the files that wait for them most of their time
 _WITH_BENCHES = {
-    "test_acquire", "test_acquire_mistakes", "test_bench_safety", "test_emulator", "test_live_page",
+    "bench/test_acquire", "bench/test_mistakes", "bench/test_safety", "bench/test_emulator",
+    "system/test_live_page",
 }  # fmt: skip
 _FEW = 2  # files that are sooner done here than other processes are started
 
@@ -52,10 +50,12 @@ FLAGS = "--headless --no-sandbox --disable-gpu --no-first-run --disable-backgrou
 def pytest_configure(config: pytest.Config) -> None:
     """Compile the simulator while the workers collect their tests; each of them would, else."""
     if config.getoption("numprocesses") and "PYTEST_XDIST_WORKER" not in os.environ:
-        command = [sys.executable, "-c", "from tests.nursery import load_bench; load_bench()"]
+        script = "from tests.helpers.nursery import load_bench; load_bench()"
         until_the_end = ExitStack()
         config.add_cleanup(until_the_end.close)
-        until_the_end.enter_context(subprocess.Popen(command, stdin=subprocess.DEVNULL, cwd=ROOT))
+        until_the_end.enter_context(
+            subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.DEVNULL, cwd=ROOT)
+        )
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -91,8 +91,8 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
 
 
 def _group(nodeid: str) -> str:
-    file = nodeid.partition("::")[0]
-    return _BENCHES if PurePath(file).stem in _WITH_BENCHES else file
+    file = nodeid.partition("::")[0].removesuffix(".py").removeprefix("tests/")
+    return _BENCHES if file in _WITH_BENCHES else file
 
 
 @pytest.fixture(scope="session", autouse=True)

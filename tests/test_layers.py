@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 
-PIPELINE = Path(__file__).parents[1] / "pipeline"
+from tests.helpers.places import ROOT
+
+PIPELINE = ROOT / "pipeline"
 
 # From the ground up, rooms and the rooms within them; a module imports from its own room or below.
 LEVELS = (
@@ -131,3 +133,12 @@ def test_each_package_has_a_home(path):
         homes = HOMES.get(name.split(".")[0])
         at_home = homes is None or any(place.startswith(f"{home}.") for home in homes)
         assert at_home, f"{path.name} imports {name}"
+
+
+def test_tests_stand_in_folders_named_as_what_they_test():
+    """Beside those of the whole system, of statistics, and what tests are made with."""
+    others = {"helpers", "truth", "system", "statistics"}
+    folders = {path.parent.relative_to(ROOT / "tests") for path in ROOT.glob("tests/**/test_*.py")}
+    homeless = [str(f) for f in folders if f.parts and f.parts[0] not in others
+                and not (PIPELINE / f).is_dir()]  # fmt: skip
+    assert not homeless

@@ -5,7 +5,6 @@ import json
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
@@ -21,9 +20,10 @@ from pipeline.resources import EXAMPLES
 from pipeline.results_json import results_dict, results_text
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse as run
-from tests.test_report import Page
+from tests.helpers.places import ROOT
+from tests.report.test_report import Page
 
-NOTEBOOK = Path(__file__).parents[1] / "docs" / "example.ipynb"
+NOTEBOOK = ROOT / "docs" / "example.ipynb"
 
 
 @pytest.fixture(scope="module")

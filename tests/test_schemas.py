@@ -4,7 +4,6 @@ import json
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import jsonschema
 import pytest
@@ -18,11 +17,12 @@ from pipeline.schemas.base import DIALECT
 from pipeline.schemas.export import MODELS, schema_text
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
-from tests.analysis_factory import make_analysis
-from tests.grades import write_class
-from tests.test_gap_report import make_gap
+from tests.helpers.analysis_factory import make_analysis
+from tests.helpers.grades import write_class
+from tests.helpers.places import ROOT
+from tests.report.test_gap import make_gap
 
-DOCS = Path(__file__).parents[1] / "docs"
+DOCS = ROOT / "docs"
 
 
 def assert_fits(name: str, text: str) -> None:

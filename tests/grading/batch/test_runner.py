@@ -1,0 +1,278 @@
+"""The batch: one row each whatever happens, the same in any order, nothing done twice."""
+
+import json
+import random
+import shutil
+import subprocess
+import sys
+import time
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.grading.batch import worker_process
+from pipeline.grading.batch.runner import Limits, grade_batch, grades_of, run_here
+from pipeline.grading.batch.worker import Setup, Task, grade_task
+from pipeline.grading.batch.worker_process import Worker
+from pipeline.grading.grade import grade_text
+from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.intake.hand_ins import find_hand_ins
+from pipeline.grading.publish import feedback_figures
+from pipeline.grading.publish.outputs import write_outputs
+from pipeline.grading.rubric_file import load_rubric
+from pipeline.synthesis import write_submission
+from tests.helpers.grades import n_graded
+from tests.helpers.waiting import PATIENCE, started, until
+
+RUBRIC = load_rubric(Path("throne-1dof"))
+
+
+@pytest.fixture(scope="module")
+def school(tmp_path_factory):
+    """A small class: three teams, one of which has another's step, and a broken hand-in."""
+    folder = tmp_path_factory.mktemp("class")
+    for number in range(3):
+        write_submission(
+            folder / f"team-{number}",
+            chain="throne-1dof",
+            seed=number,
+            authors=(f"s{number}",),
+            compact=True,
+            reported=True,
+        )
+    step = (folder / "team-0" / "data" / "step-1.csv").read_bytes()
+    (folder / "team-2" / "data" / "step-2.csv").write_bytes(step)
+    (folder / "team-3").mkdir()
+    (folder / "team-3" / "submission.toml").write_text("version = [", encoding="utf-8")
+    return folder
+
+
+def run(paths, out, *, jobs=1, limits=None, execute=None, progress=lambda *_: None):
+    """Grade into a gradebook of our own; return the batch, and outcomes and grades by id."""
+    scratch = out / "scratch"
+    scratch.mkdir(parents=True, exist_ok=True)
+    with Gradebook(out, create=True) as book:
+        batch = grade_batch(
+            find_hand_ins(paths, scratch=scratch),
+            rubric=RUBRIC,
+            book=book,
+            scratch=scratch,
+            execute=execute or run_here(jobs=jobs),
+            limits=limits or Limits(time=PATIENCE),
+            progress=progress,
+        )
+        return batch, {o.submission: (o, grade_text(g)) for o, g in grades_of(batch, book)}
+
+
+@pytest.fixture(scope="module")
+def graded(school, tmp_path_factory):
+    """The class graded by two processes: the folder, the batch, the rows, and what was said."""
+    out, seen = tmp_path_factory.mktemp("graded"), []
+    batch, rows = run([school], out, jobs=2, progress=lambda *what: seen.append(what[0]))
+    return out, batch, rows, seen
+
+
+def test_a_class_is_graded_and_sharing_is_flagged(graded):
+    """Every hand-in has a row in the order of ids; the copied step is flagged on both sides."""
+    _, batch, rows, seen = graded
+    assert list(rows) == ["team-0", "team-1", "team-2", "team-3"]
+    assert [outcome.status for outcome, _ in rows.values()] == ["graded"] * 3 + ["failed"]
+    assert "not valid TOML" in rows["team-3"][0].reason
+    assert set(batch.shared) == {"team-0", "team-2"}
+    (flag,) = [f for f in json.loads(rows["team-2"][1])["flags"] if f["code"] == "shared_data"]
+    assert flag["parameters"] == ["step-2"]
+    assert flag["evidence"]["recordings"][0]["other_experiment"] == "step-1"
+    assert seen == [0, 1, 2, 3, 4, 4]
+
+
+def test_the_number_of_processes_does_not_show(school, graded, tmp_path):
+    """One process after another gives the rows that two at once gave, in whatever order."""
+    _, _, rows, _ = graded
+    _, alone = run([school], tmp_path, jobs=1)
+    assert alone == rows
+
+
+def test_only_what_changed_is_graded_again(school, graded, tmp_path):
+    """A second run starts no process; a changed file costs its own submission only."""
+
+    def nobody(tasks, setup, out_of):
+        raise AssertionError([task.id for task in tasks])
+
+    out, _, first, _ = graded
+    copy = shutil.copytree(school, tmp_path / "class")
+    book = shutil.copytree(out, tmp_path / "out")
+    _, second = run([copy], book, execute=nobody)
+    assert second == first
+    (copy / "team-1" / "notes.md").write_text("one more word", encoding="utf-8")
+    with pytest.raises(AssertionError, match=r"\['team-1'\]"):
+        run([copy], book, execute=nobody)
+
+
+@pytest.fixture
+def task(school):
+    return Task(id="team-0", key="k", sources=(str(school / "team-0"),))
+
+
+@pytest.fixture
+def setup(tmp_path):
+    return Setup(
+        rubric=RUBRIC.model_dump_json(),
+        time_limit=PATIENCE,
+        memory_limit=1_000_000_000,
+        scratch=str(tmp_path),
+    )
+
+
+@pytest.fixture
+def kill_next(monkeypatch):
+    """Return what has the next process that is sent a line killed as it gets it."""
+    send, doomed = worker_process._send, []
+
+    def send_and_kill(process, line):
+        send(process, line)
+        if doomed:
+            doomed.pop()
+            process.kill()
+
+    monkeypatch.setattr(worker_process, "_send", send_and_kill)
+    return lambda: doomed.append(True)
+
+
+def test_a_crash_costs_one_row_and_the_worker_is_replaced(task, setup, kill_next):
+    """A worker that dies in the middle of a task is that task's reason; the next one is graded."""
+    with closing(Worker(setup, out_of=RUBRIC.out_of)) as worker:
+        assert worker.run(task).status == "graded"
+        kill_next()
+        outcome = worker.run(task)
+        assert (outcome.status, outcome.settled) == ("failed", False)
+        assert "the grader crashed" in outcome.reason
+        assert worker.run(task).status == "graded"
+
+
+def test_a_worker_killed_while_it_starts_is_started_again(task, setup, kill_next):
+    """It costs nothing: the hand-in that it was started for is graded."""
+    kill_next()
+    with closing(Worker(setup, out_of=RUBRIC.out_of)) as worker:
+        assert worker.run(task).status == "graded"
+
+
+def test_a_grade_stands_where_its_figures_fail(school, tmp_path, monkeypatch):
+    """The row has its points and no figure; the next run tries again."""
+
+    def undrawable(*_):
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    monkeypatch.setattr(feedback_figures, "draw_figures", undrawable)
+    (hand_in, *_) = find_hand_ins([school], scratch=tmp_path)
+    sources = tuple(str(source) for source in hand_in.sources)
+    task = Task(id=hand_in.id, key="", sources=sources)
+    outcome = grade_task(task, rubric=RUBRIC, scratch=tmp_path, figures=True)
+
+    assert (outcome.status, outcome.figures, outcome.settled) == ("graded", (), False)
+    assert json.loads(outcome.grade)["points"] > 0
+    assert "Singular matrix" in outcome.detail
+
+
+def test_what_this_machine_fails_at_is_tried_again(task, setup, tmp_path):
+    """Where the scratch is full or gone the row says so, and does not stand for good."""
+    (tmp_path / "scratch").touch()  # no folder can be made in it
+    setup = replace(setup, scratch=str(tmp_path / "scratch"))
+    with closing(Worker(setup, out_of=RUBRIC.out_of)) as worker:
+        outcome = worker.run(task)
+    assert (outcome.status, outcome.settled) == ("failed", False)
+    assert outcome.reason.startswith("cannot be read (")
+
+
+def test_memory_is_limited(school, setup, tmp_path):
+    """A hand-in that needs more than the limit is a row that says so; the next one is graded."""
+    large = shutil.copytree(school / "team-0", tmp_path / "large")
+    rows = "".join(f"{i / 1000:.3f},1,{i % 7}\n" for i in range(1_500_000))
+    (large / "data" / "step-1.csv").write_text("time,input,x1\n" + rows, encoding="utf-8")
+    small = replace(setup, memory_limit=100_000_000)
+    with closing(Worker(small, out_of=RUBRIC.out_of)) as worker:
+        outcome = worker.run(Task(id="large", key="k", sources=(str(large),)))
+        assert outcome.reason == "needed more than 0.1 GB of memory"
+        assert not outcome.settled
+        again = worker.run(Task(id="t", key="k", sources=(str(school / "team-0"),)))
+        assert again.status == "graded"
+
+
+def test_a_hang_is_stopped_and_tried_again(school, tmp_path):
+    """Past the time limit there is a row that says so; a run that gives it more time grades it."""
+    _, hung = run([school / "team-0"], tmp_path, limits=Limits(time=0.01))
+    assert hung["team-0"][0].reason == "stopped after 0.01 s"
+    _, graded = run([school / "team-0"], tmp_path)
+    assert graded["team-0"][0].status == "graded"
+
+
+def killed_within(rng, book, command):
+    """Run a command and kill it, and what it started, at some moment of its way.
+
+    That is by how much it has done: what takes a moment on one machine takes long on another.
+    """
+    enough = n_graded(book) + rng.randrange(3)
+    with started(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        until(lambda: process.poll() is not None or n_graded(book) >= enough)
+        time.sleep(rng.uniform(0.0, 0.5))
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_killed_at_any_moment_it_goes_on(school, graded, tmp_path):
+    """Killed again and again at random times, a run ends as one that was left alone."""
+    killed = tmp_path / "killed"
+    command = [sys.executable, "-m", "pipeline", "grade", school, "--rubric", "throne-1dof",
+               "--no-figures", "--out", killed]  # fmt: skip
+    rng = random.Random(30)
+    for _ in range(30):
+        killed_within(rng, killed, [*command, "--jobs", "2"])
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 1, done.stderr  # team-3 could not be graded
+    assert "team-3: team-3/submission.toml line 1" in done.stderr
+    out, batch, rows, _ = graded
+    with Gradebook(killed) as book:
+        assert {e.submission: grade_text(e.grade) for e in book.entries()} == {
+            name: text for name, (_, text) in rows.items()
+        }
+    with Gradebook(shutil.copytree(out, tmp_path / "whole")) as book:
+        book.finish(batch, rubric=RUBRIC)
+        write_outputs(book, tmp_path / "whole")
+    for file in (p for p in (tmp_path / "whole").rglob("*") if p.is_file()):
+        if file.suffix != ".sqlite":
+            other = killed / file.relative_to(tmp_path / "whole")
+            assert other.read_bytes() == file.read_bytes(), file.name
+
+
+HOSTILE = {
+    "giant number": "version = 1\n[system]\ncarts = 1\n[reported.final]\nK = 1" + "0" * 5000,
+    "deep lists": "x = " + "[" * 20_000,
+    "deep keys": "a." * 5_000 + "b = 1",
+    "not text": "\x00\x01\x02",
+    "empty": "",
+    "<script>alert(1)</script>": 'version = 1\ntitle = "<script>"\n[system]\ncarts = 1\n',
+    "=cmd|'/c calc'!A1": "version = 1\n[system]\ncarts = 1\n",
+    "#import sys; $x$ *b*": "version = 1\n[system]\ncarts = 1\n",
+    "leaves": 'version = 1\n[system]\ncarts = 1\n[[experiments]]\nid = "a"\nkind = "step"\n'
+    'file = "../../../../etc/passwd"\n',
+    "mat junk": 'version = 1\n[system]\ncarts = 1\n[[experiments]]\nid = "a"\nkind = "step"\n'
+    'file = "junk.mat"\n',
+}
+
+
+def test_hostile_submissions_are_rows(tmp_path):
+    """Whatever is handed in has a row with one line of reason, and nothing of it gets out."""
+    for name, text in HOSTILE.items():
+        folder = tmp_path / "class" / name.replace("/", "_")
+        folder.mkdir(parents=True)
+        (folder / "submission.toml").write_bytes(text.encode())
+        (folder / "junk.mat").write_bytes(b"MATLAB 5.0 MAT-file" + bytes(range(256)) * 8)
+    _, rows = run([tmp_path / "class"], tmp_path / "out")
+    assert len(rows) == len(HOSTILE)
+    for outcome, _ in rows.values():
+        assert outcome.status == "failed"
+        assert outcome.reason.isprintable()
+        assert not outcome.detail, outcome.detail
+        assert "root:" not in outcome.reason

@@ -1,0 +1,106 @@
+"""What is said of a regrade: what is another in the rubric, and whose points."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.changes import points_changes, rubric_changes
+from pipeline.grading.outcome import Batch
+from pipeline.synthesis import write_submission
+from tests.helpers.grades import make_grade, make_outcome, n_graded, two_cart_rubric
+from tests.helpers.places import ROOT
+from tests.helpers.waiting import started, until
+
+RUBRIC = two_cart_rubric()
+
+
+def test_a_rubric_is_compared_by_its_criteria():
+    """New, gone, another number in one, another order; the rest of it by its keys."""
+    first, second, *rest = RUBRIC.criteria
+    dearer = first.model_copy(update={"points": first.points + 1})
+    late = RUBRIC.late.model_copy(update={"percent_per_day": 50.0})
+
+    def told(**update) -> list[str]:
+        changed = RUBRIC.model_copy(update=update)
+        return rubric_changes(RUBRIC.model_dump_json(), changed.model_dump_json())
+
+    assert told() == []
+    assert told(criteria=(dearer, second, *rest)) == [
+        f"{first.id}: points {first.points:g} → {first.points + 1:g}"
+    ]
+    assert told(criteria=(second, *rest)) == [f"criterion {first.id} is gone"]
+    assert told(criteria=(second, first, *rest)) == ["the criteria stand in another order"]
+    assert told(late=late, title="") == [
+        f"title {RUBRIC.title[:39]}{'…' if len(RUBRIC.title) > 40 else ''} → nothing",
+        "late.percent_per_day 10 → 50",
+    ]
+
+
+def test_a_rubric_of_another_version_is_said_to_be_one():
+    """Nothing is guessed about what cannot be read."""
+    assert rubric_changes('{"version": 0}', RUBRIC.model_dump_json()) == [
+        "the rubric before is of another version of cartlab"
+    ]
+
+
+def test_points_are_compared_by_name():
+    """Who has others, who is new, who is gone."""
+    assert points_changes({"a": 1.0, "b": 2.0, "c": 3.0}, {"a": 1.5, "b": 2.0, "d": 0.0}) == [
+        "a: 1 → 1.5", "d is new", "c is gone",
+    ]  # fmt: skip
+
+
+def test_the_gradebook_tells_and_history_keeps_it(tmp_path):
+    """The first class list is no change; a second run of the same says nothing."""
+    outcome = make_outcome(make_grade("a", share=0.5))
+    batch = Batch(keys=(outcome.key,), shared={})
+    late = RUBRIC.model_copy(update={"anonymous": True})
+    with Gradebook(tmp_path, assignment="lab", create=True) as book:
+        book.put(outcome)
+        assert book.finish(batch, rubric=RUBRIC) == []
+        assert book.finish(batch, rubric=RUBRIC) == []
+        book.override("a", "laws", 1.0, why="w", by="b")
+        assert book.finish(batch, rubric=late) == [
+            "rubric: anonymous False → True",
+            f"a: 10 → {book.entry('a').grade.points:g} (with points given by hand)",
+        ]
+        _, events = book.history("a")
+        dearer = [
+            c.model_copy(update={"points": c.points + 2}) if c.id == "laws" else c
+            for c in late.criteria
+        ]
+        told = book.finish(batch, rubric=late.model_copy(update={"criteria": tuple(dearer)}))
+        worth = next(c.points for c in dearer if c.id == "laws")
+        said = f"a: laws was given 1 of {worth - 2:g} points by hand; it has {worth:g} now"
+        assert said in told
+    assert events[-1].text == "rubric: anonymous False → True"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Ctrl-C is a signal on POSIX")
+def test_ctrl_c_says_how_to_go_on(tmp_path):
+    """One line, the status of an interrupt, no worker left; the same command goes on."""
+    for number in range(3):
+        write_submission(tmp_path / "c" / f"t{number}", chain="throne-1dof", seed=number,
+                         authors=(f"s{number}",), compact=True)  # fmt: skip
+    command = [sys.executable, "-m", "pipeline", "grade", str(tmp_path / "c"), "--rubric",
+               "throne-1dof", "--out", str(tmp_path / "out"), "--jobs", "1",
+               "--no-figures"]  # fmt: skip
+    with started(command, stderr=subprocess.PIPE, text=True, start_new_session=True,
+                 cwd=ROOT) as process:  # fmt: skip
+        until(lambda: n_graded(tmp_path / "out") or process.poll() is not None)
+        os.killpg(process.pid, signal.SIGINT)
+        _, said = process.communicate()
+    assert process.returncode == 130, said
+    assert said == (
+        f"stopped; what is graded is kept in {tmp_path / 'out'}, and the same command goes on "
+        "from there\n"
+    )
+    before = n_graded(tmp_path / "out")
+    again = subprocess.run(command, capture_output=True, text=True, check=True,
+                           cwd=ROOT)  # fmt: skip
+    assert "3 of 3 graded" in again.stderr
+    assert 1 <= before < n_graded(tmp_path / "out") == 3

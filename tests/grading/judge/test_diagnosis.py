@@ -1,0 +1,411 @@
+"""Named mistakes: each gets its code and no other; an honest student gets none."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from decimal import Decimal
+
+import numpy as np
+import pytest
+
+from pipeline.grading.grade import Flag
+from pipeline.submission import Reported, StateSpace
+from tests.helpers.grading_students import Student, student, typed
+from tests.helpers.textbook_student import by_eye, final_table, initial_table
+
+TURN = 2 * np.pi
+FRICTION = ("coulomb_friction",)
+FROM_TABLES = {"initial", "final", "comparison", "laws", "state"}  # criteria begin so
+
+
+def codes(one: Student) -> list[str]:
+    return [flag.code for flag in one.grade().flags]
+
+
+def only_flag(one: Student) -> Flag:
+    (flag,) = one.grade().flags
+    return flag
+
+
+def own(start: str, n: int) -> list[str]:
+    if n == 1:
+        return ["omega_n" if start == "omega" else start]
+    return [f"{start}_{i}" for i in range(1, n + 1)]
+
+
+def with_table(one: Student, table: str, numbers: dict[str, float]) -> Student:
+    return one.reporting(initial=numbers) if table == "initial" else one.reporting(final=numbers)
+
+
+def scaled(one: Student, table: str, names: list[str], factor: float) -> Student:
+    return with_table(one, table, {n: factor * one.value(table, n) for n in names})
+
+
+@pytest.mark.parametrize(
+    ("carts", "seed", "hide"),
+    [*((carts, seed, ()) for carts in (1, 2, 3) for seed in (3, 4)), (2, 3, FRICTION)],
+)
+def test_an_honest_student_gets_no_flag(carts, seed, hide):
+    """Rounded numbers, some percent of error, guessed dampings, a sticking cart: no flag."""
+    one = student(carts, seed=seed, hide=hide)
+    assert one.grade().flags == ()
+    assert one.grade().points >= 0.95 * one.rubric.out_of
+
+
+@pytest.mark.parametrize("carts", [1, 2, 3])
+def test_numbers_typed_with_two_digits_are_honest_too(carts):
+    """As in the paper's tables: 0.10, 13, 29."""
+    one = student(carts)
+    coarse = {
+        table: {n: Decimal(f"{float(v):.1e}") for n, v in getattr(one.reported, table).items()}
+        for table in ("initial", "final")
+    }
+    assert codes(one.reporting(initial=coarse["initial"], final=coarse["final"])) == []
+
+
+@pytest.mark.parametrize(("carts", "hide"), [(1, ()), (2, ()), (3, ()), (2, FRICTION)])
+def test_a_student_with_a_textbook_is_honest(carts, hide):
+    """Means, peaks, half the swing and a fit in dB, last cart first: no flag."""
+    one = student(carts, hide=hide)
+    records = one.analysis.records
+    initial = by_eye(records, carts) if carts > 1 else {}
+    initial |= initial_table(records, carts)
+    reported = Reported(
+        initial={n: typed(v) for n, v in initial.items()},
+        final={n: typed(v) for n, v in final_table(records, carts, initial).items()},
+    )
+    submission = one.submission.model_copy(update={"reported": reported})
+    assert set(codes(replace(one, submission=submission))) <= {"missing"}
+
+
+@pytest.mark.parametrize("digits", [2, 3])
+def test_a_right_first_estimate_may_be_found_again(digits):
+    """Of one cart on a quiet bench both estimates of a careful student are the same."""
+    one = student(1)
+    right = {row.name: row.final.value for row in one.analysis.rows if row.final}
+    table = {name: Decimal(f"{value:.{digits - 1}e}") for name, value in right.items()}
+    assert codes(one.reporting(initial=table, final=table)) == []
+
+
+@pytest.mark.parametrize("carts", [2, 3])
+def test_the_order_in_which_numbers_are_listed_does_not_matter(carts):
+    """Who writes the last cart first has the same table."""
+    one = student(carts)
+    reported = one.reported.model_copy(
+        update={
+            "initial": dict(reversed(one.reported.initial.items())),
+            "final": dict(reversed(one.reported.final.items())),
+        }
+    )
+    submission = one.submission.model_copy(update={"reported": reported})
+    assert codes(replace(one, submission=submission)) == []
+    swapped = replace(one, submission=submission).reporting(
+        final={"K_2": 1.25 * one.value("final", "K_1")}
+    )
+    assert only_flag(swapped).code == "physically_impossible"
+
+
+def test_a_student_who_reports_first_estimates_only_misses_the_rest():
+    """What is not there is missing; nothing else is held against them."""
+    one = student(2)
+    reported = Reported(initial=one.reported.initial)
+    submission = one.submission.model_copy(update={"reported": reported})
+    assert codes(replace(one, submission=submission)) == ["missing"]
+
+
+@pytest.mark.parametrize("carts", [1, 2, 3])
+@pytest.mark.parametrize("table", ["initial", "final"])
+def test_frequencies_in_hz(carts, table):
+    """All frequencies of a table divided by 2π are Hz; the sentence says how it is seen."""
+    one = student(carts)
+    names = [n for n in getattr(one.reported, table) if n.startswith("omega")]
+    flag = only_flag(scaled(one, table, names, 1 / TURN))
+    assert flag.code == "hz_for_rad_s"
+    assert set(flag.parameters) == set(names)
+    assert flag.evidence["ratio"] == pytest.approx(1 / TURN, rel=0.15)  # read off by eye: 10 %
+    assert "/2π" in flag.message
+
+
+def test_a_named_mistake_is_told_once_and_nothing_else_is_advised():
+    """Hz in both tables: one flag that says of which number it speaks, and no talk of peaks."""
+    one = student(2)
+    names = [n for n in one.reported.final if n.startswith("omega")]
+    hertz = scaled(scaled(one, "initial", names, 1 / TURN), "final", names, 1 / TURN).grade()
+    (flag,) = hertz.flags
+    assert "first estimate" in flag.message
+    assert flag.evidence["table"] == "initial"
+    lost = {c.id: c.message for c in hertz.criteria if c.outcome in ("partial", "fail")}
+    advice = {c.id: c.message for c in one.rubric.criteria if c.message}
+    assert advice["initial-decays"] not in lost["initial-decays"]
+
+
+@pytest.mark.parametrize("carts", [1, 2, 3])
+def test_numbers_beside_a_slip_are_as_far_off_as_honest_ones(carts):
+    """Gains in counts, one of them 7 % off as first estimates are: one number, one flag."""
+    one, names = student(carts), own("K", carts)
+    counted = {n: one.value("initial", n) / 0.00227 for n in names}
+    counted[names[-1]] *= 1.07
+    flag = only_flag(one.reporting(initial=counted))
+    assert (flag.code, set(flag.parameters)) == ("counts_for_length", set(names))
+
+
+@pytest.mark.parametrize("carts", [2, 3])
+def test_a_mistake_that_is_made_everywhere_shows_everywhere(carts):
+    """One damping that is 2.3 times too small beside right ones tells of no logarithm."""
+    one = student(carts)
+    flag = only_flag(scaled(one, "initial", ["zeta_1"], np.log10(np.e)))
+    assert (flag.code, flag.parameters) == ("initial_off", ("zeta_1",))
+
+
+@pytest.mark.parametrize("carts", [1, 2, 3])
+@pytest.mark.parametrize("k", [1, 2, 3])
+def test_one_period_counted_too_many(carts, k):
+    """ω is (k + 1)/k of what it should be, and ζ less by as much."""
+    one = student(carts)
+    omegas, zetas = own("omega", carts), own("zeta", carts)
+    wrong = scaled(one, "initial", omegas, (k + 1) / k)
+    flag = only_flag(scaled(wrong, "initial", zetas, k / (k + 1)))
+    assert flag.code == "peak_count"
+    assert set(omegas) <= set(flag.parameters)
+
+
+@pytest.mark.parametrize("carts", [1, 2, 3])
+def test_a_decrement_with_log10(carts):
+    """Every ζ of a decay is 2.303 times too small."""
+    one = student(carts)
+    flag = only_flag(scaled(one, "initial", own("zeta", carts), np.log10(np.e)))
+    assert flag.code == "log10_for_ln"
+    assert flag.parameters == tuple(own("zeta", carts))
+
+
+@pytest.mark.parametrize("carts", [1, 2, 3])
+@pytest.mark.parametrize("table", ["initial", "final"])
+def test_gains_from_peak_to_peak_and_in_counts(carts, table):
+    """Twice the gain is peak to peak, over the encoder step it is in counts; both are both."""
+    one, names = student(carts), own("K", carts)
+    count = 0.00227  # cm, of the simulated encoder
+    assert codes(scaled(one, table, names, 2.0)) == ["peak_to_peak"]
+    assert codes(scaled(one, table, names, 1 / count)) == ["counts_for_length"]
+    both = codes(scaled(one, table, names, 2 / count))
+    assert both == ["peak_to_peak", "counts_for_length"]
+
+
+@pytest.mark.parametrize("carts", [1, 2, 3])
+def test_the_peak_of_the_step(carts):
+    """A gain that is the peak of the student's own step, not its settled level."""
+    one = student(carts)
+    record = next(r for r in one.analysis.records if r.kind == "step")
+    assert record.u is not None
+    on = np.flatnonzero(record.u)
+    moved = record.y[:, on] - record.y[:, :1]
+    peaks = (moved / record.u[on]).max(axis=1)
+    flag = only_flag(one.reporting(initial=dict(zip(own("K", carts), peaks.tolist(), strict=True))))
+    assert flag.code == "peak_for_steady_state"
+    assert flag.parameters == tuple(own("K", carts))
+
+
+@pytest.mark.parametrize("vague", ["0e2", "0.0"])
+@pytest.mark.parametrize("carts", [1, 2, 3])
+def test_digits_that_say_nothing_earn_nothing(carts, vague):
+    """A table of zeros, however they are typed, is impossible, and so are dampings of 0.0."""
+    one = student(carts)
+    zeros = dict.fromkeys(one.rubric.names, Decimal(vague))
+    space = StateSpace(
+        A=tuple((Decimal(vague),) * (2 * carts) for _ in range(2 * carts)),
+        B=(Decimal(vague),) * (2 * carts),
+    )
+    grade = one.reporting(initial=zeros, final=zeros, state_space=space).grade()
+    told = [flag.message for flag in grade.flags if flag.code == "physically_impossible"]
+    assert len(told) == len(set(told)) == 2  # one of each table
+    assert all(vague in message for message in told)
+    tables = [c for c in grade.criteria if c.id.split("-")[0] in FROM_TABLES]
+    assert tables
+    assert sum(c.points for c in tables) == 0
+    undamped = {name: zero for name, zero in zeros.items() if name.startswith("zeta")}
+    grade = one.reporting(final=undamped).grade()
+    (flag,) = [flag for flag in grade.flags if flag.code == "physically_impossible"]
+    assert set(flag.parameters) == set(undamped)
+    assert {c.points for c in grade.criteria if c.id in ("final-dampings", "laws")} == {0}
+
+
+@pytest.mark.parametrize("hide", [(), FRICTION])
+def test_the_peak_of_one_edge_of_both_carts(hide):
+    """Where friction blurs the gains, the peaks of one edge are still those of one edge."""
+    one = student(2, hide=hide)
+    record = next(r for r in one.analysis.records if r.kind == "step")
+    assert record.u is not None
+    on = np.flatnonzero(record.u)
+    peaks = ((record.y[:, on] - record.y[:, :1]) / record.u[on]).max(axis=1)
+    flag = only_flag(one.reporting(initial={"K_1": peaks[0], "K_2": peaks[1]}))
+    assert flag.code == "peak_for_steady_state"
+
+
+@pytest.mark.parametrize("carts", [2, 3])
+@pytest.mark.parametrize("table", ["initial", "final"])
+def test_carts_swapped(carts, table):
+    """The numbers of cart 1 stand in the last cart's place and the other way round."""
+    one = student(carts)
+    swapped = {}
+    for symbol in ("K", "omega", "zeta"):
+        first, last = f"{symbol}_1", f"{symbol}_{carts}"
+        swapped |= {first: one.value(table, last), last: one.value(table, first)}
+    flag = only_flag(with_table(one, table, swapped))
+    assert flag.code == "carts_swapped"
+    assert {"K_1", f"K_{carts}"} <= set(flag.parameters)
+
+
+def test_two_mistakes_in_one_number():
+    """Swapped frequencies in Hz are both: one reason alone reproduces neither."""
+    one = student(2)
+    wrong = {
+        "omega_1": one.value("initial", "omega_2") / TURN,
+        "omega_2": one.value("initial", "omega_1") / TURN,
+    }
+    flags = one.reporting(initial=wrong).grade().flags
+    assert [flag.code for flag in flags] == ["hz_for_rad_s", "carts_swapped"]
+    assert flags[0].evidence["together_with"] == ["carts_swapped"]
+
+
+@pytest.mark.parametrize("carts", [1, 2, 3])
+def test_a_final_table_copied_from_the_first(carts):
+    """Digit for digit the same: no fit was made; that is the one remark."""
+    one = student(carts)
+    flag = only_flag(one.reporting(final=one.reported.initial))
+    assert flag.code == "no_fit_done"
+    assert set(flag.parameters) == set(one.reported.initial)
+
+
+@pytest.mark.parametrize("carts", [2, 3])
+def test_tables_of_single_digits_agree_anyway(carts):
+    """Whoever types one digit finds it again in the fit."""
+    one = student(carts)
+    coarse = {n: Decimal(f"{float(v):.0e}") for n, v in one.reported.final.items()}
+    assert "no_fit_done" not in codes(one.reporting(initial=coarse, final=coarse))
+
+
+@pytest.mark.parametrize("carts", [1, 2, 3])
+def test_a_number_that_no_mistake_explains_is_only_off(carts):
+    """A frequency 33 % too high in the final table, a gain 19 % too low in the first."""
+    one = student(carts)
+    omega, gain = own("omega", carts)[0], own("K", carts)[-1]
+    flag = only_flag(scaled(one, "final", [omega], 1.33))
+    assert (flag.code, flag.parameters) == ("final_off", (omega,))
+    flag = only_flag(scaled(one, "initial", [gain], 0.81))
+    assert (flag.code, flag.parameters) == ("initial_off", (gain,))
+
+
+def test_a_frequency_out_of_order_is_told_by_the_recordings():
+    """One wrong number that also breaks the order of the nulls: what it should be helps more."""
+    one = student(3)
+    flag = only_flag(scaled(one, "final", ["omega_2"], 1.4))
+    assert (flag.code, flag.parameters) == ("final_off", ("omega_2",))
+
+
+def test_what_no_carts_can_do():
+    """A negative damping, and a far cart that moves more than the near one."""
+    one = student(2)
+    flag = only_flag(scaled(one, "final", ["zeta_a"], -1.0))
+    assert (flag.code, flag.parameters) == ("physically_impossible", ("zeta_a",))
+    flag = only_flag(one.reporting(final={"K_2": 1.25 * one.value("final", "K_1")}))
+    assert (flag.code, flag.parameters) == ("physically_impossible", ("K_2", "K_1"))
+
+
+def flip(A: list, n: int) -> list:
+    A[1][1] = -A[1][1]
+    return A
+
+
+def positions_first(A: list, n: int) -> list:
+    order = [*range(0, 2 * n, 2), *range(1, 2 * n, 2)]
+    return [[A[i][j] for j in order] for i in order]
+
+
+def no_square(A: list, n: int) -> list:
+    for i in range(n):
+        A[2 * i + 1][2 * i] = typed(-np.sqrt(abs(float(A[2 * i + 1][2 * i]))))
+    return A
+
+
+def exchanged(A: list, n: int) -> list:
+    A[1][2], A[3][0] = A[3][0], A[1][2]
+    return A
+
+
+@pytest.mark.parametrize("carts", [2, 3])
+@pytest.mark.parametrize(
+    ("slip", "said"),
+    [
+        (flip, "the sign of A(2, 2) is reversed"),
+        (positions_first, "all positions come first"),
+        (no_square, "ω where ω² belongs"),
+        (exchanged, "exchanged"),
+    ],
+)
+def test_a_wrong_state_model_says_which_slip_made_it(carts, slip: Callable, said):
+    """Sign, order of the states, a square forgotten, couplings exchanged."""
+    one = student(carts)
+    space = one.reported.state_space
+    assert space is not None
+    A = slip([list(row) for row in space.A], carts)
+    changed = space.model_copy(update={"A": tuple(map(tuple, A))})
+    flag = only_flag(one.reporting(state_space=changed))
+    assert flag.code == "wrong_state_space"
+    assert said in flag.message
+
+
+def test_a_state_model_that_follows_from_a_wrong_table_is_right():
+    """Who has ω in Hz and builds A from it is told of the Hz, not of A too."""
+    one = student(1)
+    hertz = one.value("final", "omega_n") / TURN
+    space = one.reported.state_space
+    assert space is not None
+    zeta = one.value("final", "zeta")
+    row = (typed(-(hertz**2)), typed(-2 * zeta * hertz))
+    changed = space.model_copy(update={"A": (space.A[0], row)})
+    assert codes(one.reporting(final={"omega_n": hertz}, state_space=changed)) == ["hz_for_rad_s"]
+
+
+@pytest.mark.parametrize("carts", [1, 2, 3])
+def test_wrong_gains_and_wrong_prefilters_are_told_apart(carts):
+    """Gains of reversed sign are wrong gains; a prefilter that is the static gain is its own."""
+    one = student(carts)
+    feedback = one.reported.feedback
+    assert feedback is not None
+    assert feedback.prefilter is not None
+    gains = feedback.model_copy(update={"gains": tuple(-g for g in feedback.gains)})
+    flag = only_flag(one.reporting(feedback=gains))
+    assert flag.code == "wrong_gains"
+    assert "signs are reversed" in flag.message
+    inverse = feedback.model_copy(update={"prefilter": typed(1 / float(feedback.prefilter))})
+    flag = only_flag(one.reporting(feedback=inverse))
+    assert flag.code == "wrong_prefilter"
+    assert "take its reciprocal" in flag.message
+
+
+def test_claims_of_other_gains_are_not_these_gains():
+    """Two and a half times the gains settle later than was reported of them."""
+    one = student(1)
+    feedback = one.reported.feedback
+    assert feedback is not None
+    gains = feedback.model_copy(
+        update={"gains": tuple(typed(2.5 * float(g)) for g in feedback.gains)}
+    )
+    runs = [e.model_copy(update={"controller": None}) for e in one.submission.experiments]
+    submission = one.submission.model_copy(update={"experiments": tuple(runs)})
+    flag = only_flag(replace(one, submission=submission).reporting(feedback=gains))
+    assert flag.code == "wrong_gains"
+
+
+def test_what_is_missing_is_named():
+    """A parameter that is not reported, and a state model that is not there."""
+    one = student(2).without("final", "zeta_b")
+    flag = only_flag(one)
+    assert (flag.code, flag.parameters) == ("missing", ("final.zeta_b",))
+
+
+def test_gains_that_cancel_all_stiffness_are_judged():
+    """Where they leave no spring at all to the typed table no prefilter follows from it."""
+    one = student(1)
+    feedback = one.reported.feedback
+    assert feedback is not None
+    cancelling = feedback.model_copy(update={"gains": (Decimal("-0.25"), Decimal("0.01"))})
+    assert "wrong_gains" in codes(one.reporting(final={"K": 4}, feedback=cancelling))

@@ -1,0 +1,297 @@
+"""Grading a submission from its folder: points, parents, lateness, and nothing believed unseen."""
+
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from decimal import Decimal
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.grading.grade import CODES, Flag, Grade, grade_text
+from pipeline.grading.judge.checks import between
+from pipeline.grading.judge.run import grade_submission, under_rubric
+from pipeline.grading.mistakes.state_model import StateModel, compare_entries
+from pipeline.grading.references.springs import with_all_springs
+from pipeline.grading.rubric_file import load_rubric
+from pipeline.submission import Input, InputOverride, StateSpace, load_submission
+from pipeline.synthesis import write_submission
+from pipeline.synthesis.hidden import prepare_bench, write_bench
+from pipeline.workflow import analyse
+from tests.helpers.grading_students import student
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """One cart's submission on disk."""
+    path = tmp_path_factory.mktemp("grading") / "team-07"
+    write_submission(path, chain="throne-1dof", seed=3, compact=True, reported=True)
+    return path
+
+
+def grade(path: Path) -> Grade:
+    rubric = load_rubric(Path("throne-1dof"))
+    return grade_submission(load_submission(path), rubric=rubric, name=path.name).grade
+
+
+def test_the_same_submission_gives_the_same_bytes(folder):
+    """`grade.json` holds what the contract says, byte for byte the same each time."""
+    text = grade_text(grade(folder))
+    assert text == grade_text(grade(folder))
+    document = json.loads(text)
+    assert document["schema"] == "cartlab-grade/1"
+    assert document["status"] == "graded"
+    assert document["points"] == document["out_of"] == 20
+    assert {"id", "outcome", "points", "out_of", "message", "expected", "found"} <= set(
+        document["criteria"][0]
+    )
+
+
+def test_grading_loads_neither_pandas_nor_control(folder):
+    """They cost half a second a worker; a reference design and the figures need neither."""
+    code = f"""
+import sys
+from pathlib import Path
+from pipeline.grading.batch import worker
+from pipeline.grading.publish.feedback_figures import draw_figures
+from pipeline.grading.rubric_file import load_rubric
+from pipeline.grading.judge.run import grade_submission
+from pipeline.submission import load_submission
+from pipeline.workflow import reference_design
+submission = load_submission(Path({str(folder)!r}))
+graded = grade_submission(submission, rubric=load_rubric(Path("throne-1dof")), name="team-07")
+draw_figures(graded.analysis, submission.reported)
+reference_design(submission, graded.analysis.fit)
+print({{"pandas", "control", "scipy.signal"}} & set(sys.modules))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, encoding="utf-8", check=True
+    )
+    assert done.stdout.strip() == "set()"
+
+
+def test_results_that_a_submission_brings_along_are_not_believed(folder, tmp_path):
+    """A planted results.json and gap.json change nothing."""
+    planted = tmp_path / "team-07"
+    shutil.copytree(folder, planted)
+    for name in ("results.json", "gap.json", "grade.json", "report/results.json", "gap/gap.json"):
+        (planted / name).parent.mkdir(exist_ok=True)
+        (planted / name).write_text('{"schema": "cartlab-results/1", "points": 20}', "utf-8")
+    assert grade_text(grade(planted)) == grade_text(grade(folder))
+
+
+def test_a_record_s_own_scale_does_not_win_over_the_rubric_s(folder):
+    """Only under feedback, where benches log other signals, it stands; a sign of its own does."""
+    submission, rubric = load_submission(folder), load_rubric(Path("throne-1dof"))
+    system = rubric.system.model_copy(update={"input": Input(sign=1, per_count=1e-4)})
+    own = InputOverride(sign=-1, per_count=0.5)
+    claiming = submission.model_copy(
+        update={
+            "experiments": tuple(
+                e.model_copy(update={"input": own}) for e in submission.experiments
+            )
+        }
+    )
+
+    read, notes = under_rubric(claiming, rubric.model_copy(update={"system": system}))
+
+    for experiment in read.experiments:
+        left = own if experiment.kind == "closed_loop" else InputOverride(sign=-1)
+        assert experiment.input == left
+    assert any("scale is the rubric's" in note for note in notes)
+
+
+@pytest.mark.parametrize("turned", [True, False])
+def test_between_a_record_s_own_sign_and_the_rubric_s_the_data_decide(folder, tmp_path, turned):
+    """Steps said to be logged the other way are used as they are: turned, or not."""
+    other = tmp_path / "team-07"
+    shutil.copytree(folder, other)
+    for path in (other / "data").glob("step-*.csv") if turned else ():
+        heading, *rows = path.read_text("utf-8").splitlines()
+        column = heading.split(",").index("input")
+        cells = [row.split(",") for row in rows]
+        for row in cells:
+            row[column] = repr(-float(row[column]))
+        path.write_text("\n".join([heading, *map(",".join, cells)]) + "\n", "utf-8", newline="\n")
+    text = (other / "submission.toml").read_text("utf-8")
+    assert 'kind = "step"\n' in text
+    text = text.replace('kind = "step"\n', 'kind = "step"\ninput = { sign = -1 }\n')
+    (other / "submission.toml").write_text(text, "utf-8", newline="\n")
+    graded = grade_submission(
+        load_submission(other), rubric=load_rubric(Path("throne-1dof")), name="team-07"
+    )
+    assert graded.analysis is not None
+    assert graded.analysis.left_out == ()
+    assert graded.grade.flags == ()
+    assert graded.grade.points == grade(folder).points
+
+
+def test_rounding_is_no_error():
+    """What MATLAB leaves in an A of noughts and ones is right."""
+    model = np.array([[0.0, 1.0, 0.0], [-174.0, -2.6, 5000.0]])
+    exactly = StateModel(right=model, slack=np.zeros_like(model))
+    noisy = [["1.2e-17", "1.0000000001"], ["-174", "-2.6"]]
+    space = StateSpace(
+        A=tuple(tuple(map(Decimal, row)) for row in noisy), B=(Decimal("-3e-14"), Decimal(5000))
+    )
+    assert not any(entry.error for entry in compare_entries(space, models=[exactly], n=1))
+
+
+def test_the_rubric_s_system_wins(folder, tmp_path):
+    """A submission that says no spring is there, and another sign, is read as the rubric says."""
+    other = tmp_path / "team-07"
+    shutil.copytree(folder, other)
+    toml = other / "submission.toml"
+    text = toml.read_text("utf-8")
+    changed = text.replace("springs = [true, false]", "springs = [false, true]")
+    changed = changed.replace("sign = 1", "sign = -1")
+    assert changed != text
+    toml.write_text(changed, "utf-8", newline="\n")
+    assert grade(other).points == grade(folder).points
+    assert grade(other).flags == ()
+    assert grade(other).notes == ()  # one cart has one stiffness, whichever spring it stands for
+
+
+def test_a_delay_is_not_read_as_a_spring(tmp_path):
+    """A spring that the fit puts at none is not asked for, however well it then explains."""
+    bench = prepare_bench(preset="throne-2dof", model=None, hide=["input_delay"])
+    write_bench(tmp_path, bench, seed=304)
+    rubric = load_rubric(Path("throne-2dof"))
+    submission, _ = under_rubric(load_submission(tmp_path), rubric)
+    _, springs = with_all_springs(submission, analyse(submission, design=False))
+    assert springs == ()
+
+
+def test_two_first_and_final_numbers_of_one_sign_agree(folder):
+    """A sign that both tables have is no difference between them; two signs are one."""
+    assert between(Decimal("-24.4"), Decimal("-24.3")) == between(Decimal("24.4"), Decimal("24.3"))
+    assert between(Decimal("-24.4"), Decimal("24.3")) == between(Decimal("0"), Decimal("24.3"))
+
+
+def test_a_submission_for_another_bench_fails_with_its_reason(folder):
+    """One cart under the rubric for two: no grade, and why."""
+    rubric = load_rubric(Path("throne-2dof"))
+    failed = grade_submission(load_submission(folder), rubric=rubric, name="team-07").grade
+    assert (failed.status, failed.points, failed.out_of) == ("failed", 0.0, 20)
+    assert "is for 1 cart, the rubric for 2" in failed.reason
+
+
+def test_a_cut_file_costs_its_own_run_only(folder, tmp_path):
+    """The rest is graded; the run is named with the line at which its file breaks off."""
+    cut = tmp_path / "team-07"
+    shutil.copytree(folder, cut)
+    path = cut / "data" / "sine-05.csv"
+    text = path.read_text("utf-8")
+    path.write_text(text[: len(text) // 2].rsplit(",", 1)[0], "utf-8", newline="\n")
+    found = grade(cut)
+    (flag,) = found.flags
+    assert (flag.code, flag.parameters) == ("data_problem", ("sine-05",))
+    assert "line" in flag.message
+    assert found.status == "graded"
+    assert found.points > 19
+
+
+def test_a_missing_file_costs_what_was_to_be_in_it(folder, tmp_path):
+    """One of two decays: its run is flagged. The only control run: the piece is missing, too."""
+    whole, less = grade(folder), tmp_path / "team-07"
+    shutil.copytree(folder, less)
+    (less / "data" / "decay-1a.csv").unlink()
+    one = grade(less)
+    assert {(flag.code, flag.parameters) for flag in one.flags} == {("data_problem", ("decay-1a",))}
+    assert "there is no file 'data/decay-1a.csv'" in one.flags[0].message
+    (less / "data" / "control.csv").write_bytes(bytes(range(256)))
+    two = grade(less)
+    assert {(flag.code, flag.parameters) for flag in two.flags} == {
+        ("data_problem", ("decay-1a", "control")),
+        ("missing", ("closed_loop",)),
+    }
+    assert whole.points > one.points > two.points > 15
+
+
+def test_a_copied_file_and_another_experiment_s_are_seen(folder, tmp_path):
+    """A decay in the place of a step: the copy and the missing step are one remark."""
+    other = tmp_path / "team-07"
+    shutil.copytree(folder, other)
+    shutil.copyfile(other / "data" / "decay-1a.csv", other / "data" / "step-1.csv")
+    (flag,) = grade(other).flags
+    assert flag.code == "data_problem"
+    assert "step-1" in flag.parameters
+
+
+def test_what_builds_on_a_failed_criterion_is_skipped_and_says_so():
+    """Unstable gains fail; the claims about them are skipped, and the parent is named."""
+    one = student(2)
+    feedback = one.reported.feedback
+    assert feedback is not None
+    reversed_ = feedback.model_copy(update={"gains": tuple(-g for g in feedback.gains)})
+    graded = one.reporting(feedback=reversed_).grade()
+    outcomes = {c.id: c for c in graded.criteria}
+    assert outcomes["feedback"].outcome == "fail"
+    assert outcomes["feedback-claims"].outcome == "skip"
+    assert outcomes["feedback-claims"].points == 0
+    assert "builds on 'feedback'" in outcomes["feedback-claims"].message
+
+
+@pytest.mark.parametrize("table", ["initial", "final"])
+@pytest.mark.parametrize("side", [1, -1])
+def test_points_never_rise_with_the_error(table, side):
+    """A gain further and further off never earns more; far off it earns nothing of its share."""
+    one = student(1)
+    right = one.value(table, "K")
+    errors = (0.0, 0.02, 0.06, 0.08, 0.1, 0.15, 0.2, 0.3, 0.5)
+    name = f"{table}-gains"
+    points = []
+    for error in errors:
+        wrong = {"K": right * (1 + error) ** side}
+        other = one.reporting(initial=wrong) if table == "initial" else one.reporting(final=wrong)
+        points.append(next(c.points for c in other.grade().criteria if c.id == name))
+    assert points == sorted(points, reverse=True)
+    assert (points[0], points[-1]) == (
+        next(c.points for c in one.rubric.criteria if c.id == name),
+        0,
+    )
+
+
+def test_a_broken_law_is_told_in_words():
+    """What does not hold, and why it should; the laws' own ids are in the data only."""
+    honest = student(2)
+    final = honest.reported.final
+    swapped = honest.reporting(final={"K_1": final["K_2"], "K_2": final["K_1"]})
+    (laws,) = [c for c in swapped.grade().criteria if c.id == "laws"]
+    assert laws.message.startswith(
+        "This does not hold: K_2 ≤ K_1 (a cart further from the motor is moved less"
+    )
+    assert not any(law in laws.message for law in laws.expected["laws"])
+    assert "order.K_2.K_1" in laws.found["broken"]
+
+
+def test_lateness_takes_its_share_for_every_day_begun():
+    """Ten percent a day, after an hour of grace, at most half."""
+    one = student(1)
+    full = one.grade().points
+    for days, share in ((0.0, 0), (0.04, 0), (0.5, 0.1), (1.04, 0.1), (2.0, 0.2), (30.0, 0.5)):
+        graded = one.grade(days_late=days)
+        assert graded.deducted == pytest.approx(share * full, abs=0.005)  # to the hundredth
+        assert graded.points == pytest.approx(full - graded.deducted)
+
+
+def test_a_submission_that_reports_nothing_is_graded_for_its_recordings():
+    """Without [reported] everything reported is missing, and the recordings still earn theirs."""
+    one = student(2)
+    silent = replace(one, submission=one.submission.model_copy(update={"reported": None}))
+    graded = silent.grade()
+    assert [flag.code for flag in graded.flags] == ["missing"]
+    earned = {c.id: c.points for c in graded.criteria if c.points}
+    assert set(earned) == {"pieces", "data", "hardware"}
+
+
+def test_further_flags_keep_the_order_of_the_codes():
+    """What the batch adds stands where its code does."""
+    graded = student(2).without("final", "zeta_b").grade()
+    flag = Flag(code="shared_data", parameters=("step-1",), message="…", evidence={})
+    data = Flag(code="data_problem", parameters=("step-1",), message="…", evidence={})
+    codes = [f.code for f in graded.with_flags(data, flag).flags]
+    assert codes == sorted(codes, key=CODES.index) == ["missing", "shared_data", "data_problem"]

@@ -1,0 +1,410 @@
+"""Recordings that do not hold what happened are named and left out; honest ones are not."""
+
+import csv
+import re
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.estimation.chain.follow import find_misread, follow
+from pipeline.grading.judge.run import grade_submission
+from pipeline.grading.mistakes.recordings import bad_runs
+from pipeline.grading.rubric_file import load_rubric
+from pipeline.plant.chain import PRESETS, Array
+from pipeline.results import Analysis
+from pipeline.submission import load_submission
+from pipeline.synthesis import write_submission
+from pipeline.workflow import analyse
+
+PRESET = "throne-2dof"
+TRUE = PRESETS[PRESET].parameters()
+
+Columns = dict[str, Array]
+Spoil = Callable[[Columns], Columns]
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory) -> Path:
+    """A whole session: two decays a cart, four steps, dwells, a sweep, a closed loop."""
+    folder = tmp_path_factory.mktemp("bench")
+    write_submission(folder, chain=PRESET, seed=3, compact=True, reported=True)
+    return folder
+
+
+def files(folder: Path, start: str) -> list[Path]:
+    return sorted((folder / "data").glob(f"{start}*.csv"))
+
+
+def spoil(path: Path, how: Spoil) -> None:
+    """Write a data file anew."""
+    with path.open(encoding="utf-8", newline="") as text:
+        heading, *rows = csv.reader(text)
+    values = how(dict(zip(heading, np.array(rows, dtype=np.float64).T, strict=True)))
+    lines = [
+        ",".join(heading),
+        *(",".join(map(repr, r.tolist())) for r in np.array([*values.values()]).T),
+    ]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def exchanged(columns: Columns) -> Columns:
+    return {**columns, "x1": columns["x2"], "x2": columns["x1"]}
+
+
+def in_milliseconds(columns: Columns) -> Columns:
+    return {**columns, "time": 1000 * columns["time"]}
+
+
+def dead(name: str) -> Spoil:
+    return lambda columns: {**columns, name: 0 * columns[name]}
+
+
+def times(factor: float, *names: str) -> Spoil:
+    return lambda columns: {**columns, **{name: factor * columns[name] for name in names}}
+
+
+def cut(columns: Columns) -> Columns:
+    return {name: values[:60] for name, values in columns.items()}
+
+
+def frozen(name: str) -> Spoil:
+    """Freeze an encoder where the cart first turns after the input stepped on."""
+
+    def freeze(columns: Columns) -> Columns:
+        x = columns[name].copy()
+        on = np.flatnonzero(columns["input"])
+        turning = on[0] + np.argmax(np.abs(x[on] - x[0]))
+        x[turning:] = x[turning]
+        return {**columns, name: x}
+
+    return freeze
+
+
+# kind, which of its files, what happened to them, a word of the reason
+SPOILT = {
+    "a decay in milliseconds": ("decay-1", slice(1), in_milliseconds, "milliseconds"),
+    "a decay in thousands of seconds": ("decay-1", slice(1), times(1e-3, "time"), "thousands"),
+    "two of four steps exchanged": ("step", slice(2, 4), exchanged, "exchanged"),
+    "cart 2 dead in every step": ("step", slice(None), dead("x2"), "encoder of cart 2"),
+    "cart 1 dead in a step": ("step", slice(1), dead("x1"), "encoder of cart 1"),
+    "all dwells exchanged": ("sine", slice(None), exchanged, "exchanged"),
+    "four dwells exchanged": ("sine", slice(1, 22, 6), exchanged, "exchanged"),
+    "every second dwell exchanged": ("sine", slice(None, None, 2), exchanged, "exchanged"),
+    "a step exchanged": ("step", slice(1), exchanged, "exchanged"),
+    "the sweep exchanged": ("sweep", slice(None), exchanged, "exchanged"),
+    "a dwell ten times too far": ("sine", slice(3, 4), times(10, "x1", "x2"), "another unit"),
+    "a step ten times too far": ("step", slice(1), times(10, "x1", "x2"), "another unit"),
+    "cart 1 turned in four dwells": ("sine", slice(1, 22, 6), times(-1, "x1"), "sign of x1"),
+    "cart 1 turned in the sweep": ("sweep", slice(None), times(-1, "x1"), "sign of x1"),
+    "cart 1 frozen in a step": ("step", slice(1), frozen("x1"), "froze"),
+    "cart 2 frozen in a step": ("step", slice(1, 2), frozen("x2"), "froze"),
+    "all steps in millimetres": ("step", slice(None), times(10, "x1", "x2"), "another unit"),
+    "all dwells in millimetres": ("sine", slice(None), times(10, "x1", "x2"), "another unit"),
+    "a tenth of the input in every step": ("step", slice(None), times(0.1, "input"), "its input"),
+    "a third of the input in every step": ("step", slice(None), times(1 / 3, "input"), "K_1 = "),
+    "cart 1 turned in every step": ("step", slice(None), times(-1, "x1"), "sign of x1"),
+    "all decays at half speed": ("decay", slice(None), times(2, "time"), "clock"),
+}
+
+
+def _cases() -> Iterator[tuple[str, str]]:
+    """Every case where no sign of the input is stated; where one is, those that look like one."""
+    yield from ((case, "") for case in SPOILT)
+    yield from ((case, ", sign = 1") for case in SPOILT if "turned" in case or "exchanged" in case)
+
+
+@pytest.mark.parametrize(("case", "sign"), [*_cases()])
+def test_what_is_wrong_is_named_left_out_and_flagged(case, sign, bench, tmp_path):
+    """The spoilt records and no others are out of all estimates; report and grade say why."""
+    kind, which, how, word = SPOILT[case]
+    folder = shutil.copytree(bench, tmp_path / "spoilt")
+    _change(folder, ", sign = 1", sign)
+    paths = files(folder, kind)[which]
+    for path in paths:
+        spoil(path, how)
+    graded = grade_submission(
+        load_submission(folder), rubric=load_rubric(Path(PRESET)), name="team"
+    )
+    analysis = graded.analysis
+    assert analysis is not None
+    assert {one.experiment for one in analysis.left_out} == {path.stem for path in paths}
+    assert all(one.is_wrong and word in one.reason for one in analysis.left_out)
+    assert f"record.{paths[0].stem}" in _failed(analysis)
+    (flag,) = graded.grade.flags
+    assert flag.code == "data_problem"
+    assert set(flag.parameters) == {path.stem for path in paths}
+    _numbers_are_right(analysis)
+
+
+def _change(folder: Path, old: str, new: str) -> None:
+    path = folder / "submission.toml"
+    text = path.read_text(encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, new), encoding="utf-8")
+
+
+def _failed(analysis: Analysis) -> set[str]:
+    return {check.id for check in analysis.checks if check.outcome == "fail"}
+
+
+def _numbers_are_right(analysis: Analysis) -> None:
+    """No spoilt record is in any estimate."""
+    for row in analysis.rows:
+        assert row.final is not None
+        assert row.final.value == pytest.approx(TRUE[row.name], rel=0.02)
+        if row.initial is not None and row.initial.source in ("step", "log_decrement"):
+            assert row.initial.value == pytest.approx(TRUE[row.name], rel=0.02)
+
+
+def test_dwells_that_were_cut_are_flagged(bench, tmp_path):
+    """Sixty rows are no steady state where they hold fewer than one and a half cycles."""
+    folder = shutil.copytree(bench, tmp_path / "cut")
+    for path in files(folder, "sine"):
+        spoil(path, cut)
+    graded = grade_submission(
+        load_submission(folder), rubric=load_rubric(Path(PRESET)), name="team"
+    )
+    assert graded.analysis is not None
+    (flag,) = graded.grade.flags
+    frequency = {r.id: (r.omega or 0.0) / (2 * np.pi) for r in graded.analysis.records}
+    assert len(flag.parameters) >= 8
+    assert all(60 * 0.00884 * frequency[name] < 1.5 for name in flag.parameters)
+
+
+@pytest.mark.parametrize(
+    ("kind", "stated", "word"),
+    [("step", "decay", "free decay"), ("sine", "step", "no step"), ("step", "cut", "cut")],
+)
+def test_a_recording_of_another_kind_or_a_cut_one_fails_report_and_grade(
+    kind, stated, word, bench, tmp_path
+):
+    """What is flagged where it is graded fails a check of the report, and is in no number."""
+    folder = shutil.copytree(bench, tmp_path / "kind")
+    path = files(folder, kind)[1]
+    if stated == "cut":
+        spoil(path, lambda columns: {k: v[: v.size // 3] for k, v in columns.items()})
+    else:
+        table = f'id = "{path.stem}"\nkind = '
+        _change(folder, f'{table}"{kind}"', f'{table}"{stated}"')
+    graded = grade_submission(
+        load_submission(folder), rubric=load_rubric(Path(PRESET)), name="team"
+    )
+    assert graded.analysis is not None
+    (one,) = graded.analysis.left_out
+    assert (one.experiment, one.is_wrong) == (path.stem, True)
+    assert word in one.reason
+    assert f"record.{path.stem}" in _failed(graded.analysis)
+    assert path.stem in {name for flag in graded.grade.flags for name in flag.parameters}
+    _numbers_are_right(graded.analysis)
+
+
+@pytest.mark.parametrize("which", [slice(1), slice(None)])
+def test_decays_in_millimetres_are_told_and_used(which, bench, tmp_path):
+    """One or all: a warning names them, and no number is the worse for them."""
+    folder = shutil.copytree(bench, tmp_path / "spoilt")
+    paths = files(folder, "decay")[which]
+    for path in paths:
+        spoil(path, times(10, "x1", "x2"))
+    analysis = analyse(load_submission(folder), design=False)
+    assert not analysis.left_out
+    assert not _failed(analysis)
+    told = [text for text in analysis.warnings if "another unit" in text]
+    assert paths[0].stem in told[0]
+
+
+def test_grading_says_what_the_stated_frequencies_are_in(bench, tmp_path):
+    """Rad/s where hertz are asked for: no dwell is the file of another experiment."""
+    folder = shutil.copytree(bench, tmp_path / "spoilt")
+    path = folder / "submission.toml"
+    path.write_text(
+        re.sub(
+            r"frequency = ([\d.]+)",
+            lambda found: f"frequency = {2 * np.pi * float(found[1]):.3f}",
+            path.read_text(encoding="utf-8"),
+        ),
+        encoding="utf-8",
+    )
+    problems = bad_runs(analyse(load_submission(folder), design=False))
+    assert problems
+    assert all("rad/s" in why for why in problems.values())
+
+
+def test_a_held_cart_that_nobody_called_free_is_told_with_its_cure(bench, tmp_path):
+    """Where `carts` is left out all are free: the line that mends it is named."""
+    folder = shutil.copytree(bench, tmp_path / "spoilt")
+    path = folder / "submission.toml"
+    text = path.read_text(encoding="utf-8").replace("carts = [1]\n", "", 1)
+    path.write_text(text, encoding="utf-8")
+    (one,) = analyse(load_submission(folder), design=False).left_out
+    assert "write carts = [1]" in one.reason
+
+
+def test_a_loop_that_is_left_out_is_held_against_nothing(bench, tmp_path):
+    """A clock in milliseconds is no run to hold the model against, and the reason is there."""
+    folder = shutil.copytree(bench, tmp_path / "loop")
+    for path in files(folder, "control"):
+        spoil(path, in_milliseconds)
+    analysis = analyse(load_submission(folder))
+    assert [one.experiment for one in analysis.left_out] == ["control"]
+    assert analysis.hardware == ()
+    (skip,) = [s for s in analysis.skipped if s.stage == "hardware check, control"]
+    assert "milliseconds" in skip.reason
+
+
+def test_the_sound_repeats_stay_where_most_are_exchanged(bench, tmp_path):
+    """Three of four exchanged steps are out, the one as it was is not, and no sign is advised."""
+    folder = shutil.copytree(bench, tmp_path / "most")
+    steps = files(folder, "step")
+    for path in steps[:3]:
+        spoil(path, exchanged)
+    analysis = analyse(load_submission(folder))
+    assert {one.experiment for one in analysis.left_out} == {path.stem for path in steps[:3]}
+    assert {gain.experiment for gain in analysis.step_gains} == {steps[3].stem}
+    assert not any("sign = " in warning for warning in analysis.warnings)
+
+
+def test_one_clock_in_milliseconds_throughout_fails_the_dwells(bench, tmp_path):
+    """All times a thousand times too long agree with one another, but not with what is stated."""
+    folder = shutil.copytree(bench, tmp_path / "slow")
+    for path in files(folder, ""):
+        spoil(path, in_milliseconds)
+    graded = grade_submission(
+        load_submission(folder), rubric=load_rubric(Path(PRESET)), name="team"
+    )
+    assert graded.grade.status == "graded"
+    assert graded.analysis is not None
+    (check,) = [c for c in graded.analysis.checks if c.id == "dwells.frequency"]
+    assert check.outcome == "fail"
+    assert check.value == pytest.approx(1000, rel=0.01)
+    assert "milliseconds" in check.message
+
+
+def test_one_recording_in_two_experiments_counts_once(bench, tmp_path):
+    """A repeat that names the file of another is left out, and flagged."""
+    folder = shutil.copytree(bench, tmp_path / "copied")
+    _change(folder, "data/step-2.csv", "data/step-1.csv")
+    graded = grade_submission(
+        load_submission(folder), rubric=load_rubric(Path(PRESET)), name="team"
+    )
+    assert graded.analysis is not None
+    assert {one.experiment for one in graded.analysis.left_out} == {"step-2"}
+    assert ["step-2"] in [list(f.parameters) for f in graded.grade.flags]
+
+
+def test_columns_exchanged_in_every_recording_are_named(bench, tmp_path):
+    """No record follows any carts as it is, all of them do exchanged: nothing is identified."""
+    folder = shutil.copytree(bench, tmp_path / "exchanged")
+    driven = [*files(folder, "step"), *files(folder, "sine"), *files(folder, "sweep")]
+    for path in driven:
+        spoil(path, exchanged)
+    analysis = analyse(load_submission(folder))
+    assert {one.experiment for one in analysis.left_out} == {path.stem for path in driven}
+    assert {one.reason for one in analysis.left_out} == {analysis.left_out[0].reason}
+    assert 'columns = { x1 = "x2", x2 = "x1" }' in analysis.left_out[0].reason
+    assert "fit.identified" in _failed(analysis)
+
+
+def test_dwells_and_steps_that_contradict_one_another_identify_nothing(bench, tmp_path):
+    """The input of all dwells or all steps is ten times off, nobody knows which: both are said."""
+    folder = shutil.copytree(bench, tmp_path / "undecided")
+    for path in files(folder, "sine"):
+        spoil(path, times(10, "input"))
+    path = folder / "submission.toml"
+    text = path.read_text(encoding="utf-8")
+    runs = text.split("[[experiments]]")
+    kept = [run for run in runs if 'kind = "sweep"' not in run]
+    assert len(kept) == len(runs) - 1
+    path.write_text("[[experiments]]".join(kept), encoding="utf-8")
+    analysis = analyse(load_submission(folder))
+    both = {path.stem for path in [*files(folder, "sine"), *files(folder, "step")]}
+    assert {one.experiment for one in analysis.left_out} == both
+    assert all("nothing tells which" in one.reason for one in analysis.left_out)
+    assert analysis.chain is None
+    initial = {row.name for row in analysis.rows if row.initial is not None}
+    assert initial == {"omega_1", "omega_2", "zeta_1", "zeta_2"}
+
+
+def test_a_record_that_follows_no_carts_is_left_out_without_an_accusation(bench, tmp_path):
+    """What moves in a dwell is not what its input moves."""
+    folder = shutil.copytree(bench, tmp_path / "stray")
+    path = files(folder, "sine")[4]
+
+    def another(columns: Columns) -> Columns:
+        x = 2 * np.sin(17 * columns["time"] + 5 * columns["time"] ** 2)
+        return {**columns, "x1": x, "x2": x}
+
+    spoil(path, another)
+    analysis = analyse(load_submission(folder), design=False)
+    assert [(one.experiment, one.is_wrong) for one in analysis.left_out] == [(path.stem, False)]
+    _numbers_are_right(analysis)
+
+
+def test_records_of_two_carts_identify_no_third(bench, tmp_path):
+    """Without a recording of the last cart there is no model, and the report fails."""
+    folder = shutil.copytree(bench, tmp_path / "three")
+    path = folder / "submission.toml"
+    text = path.read_text(encoding="utf-8").partition('[[experiments]]\nid = "control"')[0]
+    text = text.replace("carts = 2", "carts = 3")
+    text = text.replace("springs = [false, true, true]", "springs = [false, true, true, true]")
+    path.write_text(text, encoding="utf-8")
+    analysis = analyse(load_submission(folder))
+    assert analysis.chain is None
+    assert analysis.feedback is None
+    assert "fit.identified" in _failed(analysis)
+    assert any("cart 3 moves in no recording" in skip.reason for skip in analysis.skipped)
+
+
+@pytest.mark.parametrize("kind", ["step-3", "sine-05"])
+def test_a_coarse_encoder_that_freezes_for_half_a_second_is_found(kind, tmp_path):
+    """At two counts a sample no reading shows it by itself: the cart moves on, and far."""
+    write_submission(tmp_path, chain=PRESET, seed=5, compact=True, count=0.03)
+    (path,) = files(tmp_path, kind)
+
+    def freeze(columns: Columns) -> Columns:
+        x = columns["x1"].copy()
+        first = int(np.argmax(np.abs(np.diff(x))))
+        x[first : first + 60] = x[first]
+        return {**columns, "x1": x}
+
+    spoil(path, freeze)
+    analysis = analyse(load_submission(tmp_path), design=False)
+    assert [(one.experiment, one.is_wrong) for one in analysis.left_out] == [(path.stem, True)]
+    assert "froze" in analysis.left_out[0].reason
+
+
+def test_fewer_decimals_in_some_files_are_no_other_unit(bench, tmp_path):
+    folder = shutil.copytree(bench, tmp_path / "rounded")
+    for kind, decimals in {"decay": 1, "step": 1, "sine": 2}.items():
+        for path in files(folder, kind):
+            spoil(path, lambda c, d=decimals: {**c, **{x: c[x].round(d) for x in ("x1", "x2")}})
+    assert analyse(load_submission(folder), design=False).left_out == ()
+
+
+def test_carts_that_stick_and_creep_are_in_no_other_unit_of_time(bench):
+    """In a microsecond the carts may do anything slow: no such reading makes a record follow."""
+    chain = PRESETS[PRESET]
+    dwell = next(r for r in analyse(load_submission(bench)).records if r.kind == "sine")
+    creep = 0.02 * dwell.t / dwell.t[-1]  # cm: nine encoder steps in all
+    stuck = replace(dwell, y=np.array([creep, 0.7 * creep]))
+    assert find_misread(stuck, chain, follow([stuck], chain)[stuck.id]) is None
+
+
+def test_a_cart_that_moves_farther_than_the_one_that_pulls_it_accuses_no_gain(bench, tmp_path):
+    """One column in another unit in every file: no model, and no right number is called wrong."""
+    folder = shutil.copytree(bench, tmp_path / "millimetres")
+    for path in files(folder, ""):
+        head = path.read_text(encoding="utf-8").partition("\n")[0]
+        if "x2" in head.split(","):
+            spoil(path, times(10, "x2"))
+    graded = grade_submission(
+        load_submission(folder), rubric=load_rubric(Path(PRESET)), name="team"
+    )
+    assert graded.analysis is not None
+    steps = [one for one in graded.analysis.left_out if one.experiment.startswith("step")]
+    assert len(steps) == len(files(folder, "step"))
+    assert all("cart 2" in one.reason for one in steps)
+    assert [flag.code for flag in graded.grade.flags] == ["data_problem"]

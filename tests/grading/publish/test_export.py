@@ -1,0 +1,385 @@
+"""Exports as the platforms themselves read them: their importers' rules, written anew."""
+
+import csv
+import io
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from pipeline.errors import ConfigError
+from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.outcome import Batch
+from pipeline.grading.publish.export import export
+from pipeline.grading.publish.students import students_of
+from tests.helpers.grades import (
+    failed_grade,
+    hertz_flag,
+    make_grade,
+    make_outcome,
+    shared_flag,
+    two_cart_rubric,
+)
+
+RUBRIC = two_cart_rubric()
+
+
+def write(tmp_path: Path, *outcomes, platform, roster: str = "", overrides=(), **options):
+    """Export a class; return the rows of its table and what was said."""
+    with Gradebook(tmp_path / "g.sqlite", assignment="lab", create=True) as book:
+        for outcome in outcomes:
+            book.put(outcome)
+        book.finish(Batch(keys=tuple(o.key for o in outcomes), shared={}), rubric=RUBRIC)
+        for team, criterion, points in overrides:
+            book.override(team, criterion, points, why="x", by="y")
+        if roster:
+            (tmp_path / "roster.csv").write_text(roster, encoding="utf-8-sig")
+            options["roster"] = tmp_path / "roster.csv"
+        done = export(book, platform, tmp_path / "out", **options)
+    text = done.files[0].read_bytes().decode()
+    return list(csv.reader(io.StringIO(text, newline=""))), done.remarks
+
+
+def test_a_grade_is_better_than_none(tmp_path):
+    """Who stands in a hand-in that could not be graded and in one without points has those."""
+    unread = failed_grade("a", "too slow")
+    unread = replace(unread, authors=("bob",))
+    nothing = make_grade("b", share=0.0, authors=("bob",))
+    outcomes = make_outcome(unread), make_outcome(nothing)
+    with Gradebook(tmp_path, assignment="lab", create=True) as book:
+        for outcome in outcomes:
+            book.put(outcome)
+        book.finish(Batch(keys=tuple(o.key for o in outcomes), shared={}), rubric=RUBRIC)
+        for order in (1, -1):
+            (bob,), _ = students_of(list(book.entries())[::order], platform="canvas")
+            assert (bob.grade.submission, bob.points) == ("b", "0")
+
+
+def canvas_import(rows: list[list[str]]) -> dict[str, dict[str, str]]:
+    """Read grades as `gradebook_importer.rb` does; return them by assignment and student."""
+    head = rows[0]
+    assert len(head) > 3
+    assert "Student" in head[0]
+    assert "ID" in head[1]
+    columns = 3
+    assert re.search(r"SIS\s+User\s+ID", head[2])
+    assert re.search(r"SIS\s+Login\s+ID", head[3])
+    columns += 2 + ("Integration ID" in head[4])
+    columns += "Root Account" in head[columns - 1]
+    assert "Section" in head[columns - 1]  # the last that is about the student
+    grades: dict[str, dict[str, str]] = {title: {} for title in head[columns:]}
+    for row in rows[1:]:
+        if "Points Possible" in row[0]:
+            assert [float(cell) for cell in row[columns:]] == [20.0] * len(grades)
+            continue
+        who = row[1] or row[2] or row[3] or row[0]
+        for title, cell in zip(grades, row[columns:], strict=True):
+            grades[title][who] = cell
+    return grades
+
+
+def moodle_import(rows: list[list[str]]) -> dict[str, tuple[str, str]]:
+    """Read a worksheet as `importgradeslib.php` does; return grade and feedback by participant."""
+    head = rows[0]
+    at = {name: head.index(name) for name in ("Identifier", "Grade", "Feedback comments")}
+    assert "Last modified (grade)" in head
+    return {
+        row[at["Identifier"]].removeprefix("Participant "): (
+            row[at["Grade"]],
+            row[at["Feedback comments"]],
+        )
+        for row in rows[1:]
+    }
+
+
+HALF = make_outcome(make_grade("team-1", share=0.5, flags=(hertz_flag(),)), owner="doejane (1024)")
+FULL = make_outcome(make_grade("team-2", authors=("=ann", "bo")), owner="poeann (1025)")
+BROKEN = make_outcome(failed_grade("team-3", "<b>broken</b>"), owner="roeric (1026)")
+
+
+def test_canvas_takes_the_grades(tmp_path):
+    """A row for every author; who could not be graded is blank, and said."""
+    rows, remarks = write(tmp_path, HALF, FULL, BROKEN, platform="canvas", title="Lab 3 (77)")
+
+    assert canvas_import(rows) == {
+        "Lab 3 (77)": {"1024": "10", "'=ann": "20", "bo": "20", "1026": ""}
+    }
+    assert remarks[0] == "could not be graded, left blank: team-3"
+    assert remarks[1].endswith("by the number in the file's name: poeann (team-2)")
+
+
+def test_a_broken_submission_graded_by_hand_is_exported(tmp_path):
+    """Then somebody did grade it, even with no points."""
+    rows, remarks = write(
+        tmp_path, BROKEN, platform="canvas", overrides=[("team-3", "pieces", 0.0)]
+    )
+    assert canvas_import(rows) == {RUBRIC.title: {"1026": "0"}}
+    assert remarks == ()
+
+
+def test_a_submission_that_names_nobody_is_said(tmp_path):
+    """A row without a student is no use to a platform; a person has to find out whose it is."""
+    nobody = make_outcome(failed_grade("team-8", "broken"))
+    rows, remarks = write(tmp_path, FULL, nobody, platform="canvas")
+    assert len(rows) == 4
+    assert remarks[0] == "nobody is named in it, so not exported: team-8"
+
+
+@pytest.mark.parametrize("platform", ["canvas", "moodle", "gradescope"])
+def test_a_number_of_another_platform_is_nobodys(tmp_path, platform):
+    """The same number means another student there: nobody gets somebody else's grade."""
+    others = {"canvas", "moodle", "gradescope"} - {platform}
+    entries = [
+        make_outcome(make_grade(f"team-{of}"), owner=f"Jane Doe ({of} 1024)") for of in others
+    ]
+    rows, _ = write(tmp_path, *entries, platform=platform)
+    assert not any("1024" in cell for row in rows for cell in row)
+    (tmp_path / "own").mkdir()
+    rows, _ = write(
+        tmp_path / "own", make_outcome(make_grade("t"), owner=f"Jane ({platform} 1024)"),
+        platform=platform,
+    )  # fmt: skip
+    assert any("1024" in cell for row in rows for cell in row)
+
+
+def test_canvas_own_export_is_filled_in(tmp_path):
+    """By id, login or name; its assignment's column is found by its title; others are left out."""
+    roster = (
+        "Student,ID,SIS User ID,SIS Login ID,Section,Lab 3 (77),Final Score\n"
+        "    Points Possible,,,,,20,(read only)\n"
+        '"Doe, Jane",1024,u1,jane@x.edu,A,3,90\n'
+        '"Lee, Bo",7,u2,bo@x.edu,A,,80\n'
+        '"Poe, Ann",8,=ann,ap@x.edu,B,,70\n'
+        '"Zed, Al",9,u9,al@x.edu,B,5,60\n'
+    )
+    rows, remarks = write(
+        tmp_path, HALF, FULL, BROKEN, platform="canvas", title="Lab 3", roster=roster
+    )
+    assert canvas_import(rows) == {"Lab 3 (77)": {"1024": "10", "7": "20", "8": "20", "9": "5"}}
+    assert remarks[-1] == "not in roster.csv, so not exported: roeric"
+
+
+def test_moodle_takes_a_worksheet_where_participants_are_known(tmp_path):
+    """With feedback as harmless HTML, within the maximum grade."""
+    rows, _ = write(tmp_path, HALF, BROKEN, platform="moodle")
+
+    found = moodle_import(rows)
+    assert {number: grade for number, (grade, _) in found.items()} == {"1024": "10", "1026": ""}
+    assert "this looks like Hz where rad/s is asked." in found["1024"][1]
+    assert found["1026"][1] == "Could not be graded: &lt;b&gt;broken&lt;/b&gt;"
+    assert all(row[rows[0].index("Maximum Grade")] == "20" for row in rows[1:])
+
+
+def test_moodle_own_worksheet_is_filled_in(tmp_path):
+    """By participant, id number or email; every other cell stays as it was."""
+    roster = (
+        "Identifier,Full name,ID number,Email address,Status,Grade,Maximum Grade,"
+        "Grade can be changed,Last modified (submission),Last modified (grade),Feedback comments\n"
+        'Participant 1024,Jane Doe,,j@x.edu,Submitted,,20.00,Yes,"Friday, 3 May",-,\n'
+        "Participant 5,Bo Lee,,bo@x.edu,Submitted,,20.00,Yes,-,-,\n"
+        "Participant 6,Al Zed,,al@x.edu,No submission,,20.00,Yes,-,-,kept\n"
+    )
+    rows, remarks = write(tmp_path, HALF, FULL, platform="moodle", roster=roster)
+    found = moodle_import(rows)
+    assert {k: g for k, (g, _) in found.items()} == {"1024": "10", "5": "20", "6": ""}
+    assert found["6"][1] == "kept"
+    assert rows[1][8:10] == ["Friday, 3 May", "-"]
+    assert remarks == ("not in roster.csv, so not exported: =ann",)
+
+
+def test_a_worksheet_with_another_maximum_is_refused(tmp_path):
+    """Moodle keeps its own maximum, so that every grade would be of the wrong one."""
+    roster = "Identifier,Full name,Grade,Maximum Grade\nParticipant 1024,Jane Doe,,{}\n"
+    write(tmp_path, HALF, platform="moodle", roster=roster.format('"20,00"'))
+    with pytest.raises(ConfigError, match=r"maximum grade 18\.00, the rubric 20 points"):
+        write(tmp_path, HALF, platform="moodle", roster=roster.format("18.00"))
+
+
+def test_a_gradebook_with_other_points_possible_is_refused(tmp_path):
+    """Canvas keeps its own points possible: 20 of 18 would be shown."""
+    roster = (
+        "Student,ID,Section,Lab 3 (77),Lab 4 (78)\n"
+        "    Points Possible,,,{},40\n"
+        '"Doe, Jane",1024,A,,\n'
+    )
+    write(tmp_path, HALF, platform="canvas", title="Lab 3", roster=roster.format("20.00"))
+    with pytest.raises(ConfigError, match=r"maximum grade 18\.00, the rubric 20 points"):
+        write(tmp_path, HALF, platform="canvas", title="Lab 3", roster=roster.format("18.00"))
+
+
+def test_moodle_is_told_why_points_were_given_by_hand(tmp_path):
+    """Also where they are all of them."""
+    first = RUBRIC.criteria[0]
+    given = [("team-b", first.id, first.points)]
+    outcome = make_outcome(make_grade("team-b", share=0.0, authors=("bo",)))
+    rows, _ = write(tmp_path, outcome, platform="moodle", overrides=given)
+    assert "by hand from 0 to" in rows[1][2]
+
+
+def test_moodle_takes_a_table_of_grades_otherwise(tmp_path):
+    """Where nobody's participant number is known: by id number."""
+    rows, _ = write(tmp_path, FULL, platform="moodle", title="Lab 3")
+    assert rows == [
+        ["ID number", "Lab 3 (Real)", "Lab 3 (Feedback)"],
+        ["'=ann", "20", ""],
+        ["bo", "20", ""],
+    ]
+
+
+def test_gradescope_gets_a_result_for_each_submission(tmp_path):
+    """With the keys and the values that its specification of autograders allows, and no others."""
+    late = make_outcome(make_grade("team-4", share=0.5, days_late=1.25, deducted=1.0, points=9.0))
+    rows, _ = write(tmp_path, HALF, FULL, BROKEN, late, platform="gradescope")
+
+    head = rows[0]
+    assert head[5:11] == [
+        "Total Score", "Max Points", "Status", "Submission ID", "Submission Time",
+        "Lateness (H:M:S)",
+    ]  # fmt: skip
+    assert [row[5] for row in rows[1:]] == ["10", "20", "20", "", "9"]
+    assert [row[10] for row in rows[1:]][-1] == "30:00:00"
+    results = {
+        path.parent.name: json.loads(path.read_text(encoding="utf-8"))
+        for path in (tmp_path / "out" / "gradescope").glob("*/results.json")
+    }
+    assert sorted(results) == ["team-1", "team-2", "team-3", "team-4"]
+    top = {"score", "output", "output_format", "test_output_format", "test_name_format",
+           "stdout_visibility", "tests", "extra_data"}  # fmt: skip
+    inner = {"score", "max_score", "status", "name", "number", "output", "tags", "visibility"}
+    for result in results.values():
+        assert set(result) == top
+        assert all(set(test) == inner for test in result["tests"])
+        assert {test["status"] for test in result["tests"]} <= {"passed", "failed"}
+    assert results["team-4"]["score"] == 9.0
+    assert sum(test["max_score"] for test in results["team-1"]["tests"]) == 20.0
+    assert results["team-1"]["extra_data"] == {"flags": ["hz_for_rad_s"]}
+
+
+@pytest.mark.parametrize("platform", ["canvas", "moodle", "gradescope"])
+@pytest.mark.parametrize("author", ["s-team-1", " S-Team-1"])
+def test_who_is_in_two_submissions_has_no_points_until_somebody_decides(tmp_path, platform, author):
+    """Not the higher ones, in no table and no comment; a person is told where they stand."""
+    other = make_outcome(make_grade("team-9", share=0.25, authors=(author,)))
+    rows, remarks = write(tmp_path, HALF, other, platform=platform)
+    assert not [cell for row in rows for cell in row if re.search(r"^(10|5)$|omega_1", cell)]
+    assert remarks == (
+        "s-team-1 is in team-1 (10) and team-9 (5): left out, until cartlab remove takes the "
+        "wrong one off",
+    )
+
+
+def test_two_submissions_with_the_same_points_leave_nothing_to_decide(tmp_path):
+    """Partners who each hand in what both did."""
+    other = make_outcome(make_grade("team-9", share=0.5, authors=("s-team-1",)))
+    rows, remarks = write(tmp_path, HALF, other, platform="canvas")
+    assert (canvas_import(rows), remarks) == ({RUBRIC.title: {"1024": "10"}}, ())
+
+
+def test_a_row_that_two_submissions_lead_to_stays_as_it_was(tmp_path):
+    """One by an author's id, one by the number of who handed it in: nobody chose either."""
+    roster = 'Student,ID,SIS User ID,SIS Login ID,Section,Lab 3\n"Doe, Jane",1001,S1,jane,A,3\n'
+    by_id = make_outcome(make_grade("team-1", share=0.5, authors=("s1",)))
+    by_number = make_outcome(make_grade("o", authors=("x", "y")), owner="doejane (canvas 1001)")
+    for order in (1, -1):
+        (tmp_path / f"{order}").mkdir()
+        rows, remarks = write(
+            tmp_path / f"{order}", *[by_id, by_number][::order],
+            platform="canvas", title="Lab 3", roster=roster,
+        )  # fmt: skip
+        assert canvas_import(rows) == {"Lab 3": {"1001": "3"}}
+        assert [r for r in remarks if "team-1 (10)" in r and "o (20)" in r and "left out" in r]
+
+
+def test_the_number_of_who_handed_in_decides_nothing(tmp_path):
+    """An author of two submissions handed one of them in: which counts is still open, said once."""
+    roster = 'Student,ID,SIS User ID,SIS Login ID,Section,Lab 3\n"Doe, Jane",1001,s1,jane,A,3\n'
+    one = make_outcome(make_grade("a", share=0.5, authors=("s1", "x")), owner="doejane (1001)")
+    other = make_outcome(make_grade("b", share=0.25, authors=("s1",)))
+    rows, remarks = write(tmp_path, one, other, platform="canvas", title="Lab 3", roster=roster)
+    assert canvas_import(rows) == {"Lab 3": {"1001": "3"}}
+    assert [r for r in remarks if "left out" in r] == [
+        "s1 is in a (10) and b (5): left out, until cartlab remove takes the wrong one off"
+    ]
+
+
+@pytest.mark.parametrize("platform", ["canvas", "moodle", "gradescope"])
+def test_points_by_hand_of_a_submission_without_names_are_exported(tmp_path, platform):
+    """As who its folder is called, which is said; or as those it named before it broke."""
+    broken = make_outcome(failed_grade("team-8", "no TOML"))
+    rows, remarks = write(
+        tmp_path, broken, platform=platform, overrides=[("team-8", "pieces", 0.75)]
+    )
+    (row,) = [row for row in rows if "team-8" in row]
+    assert "0.75" in row
+    assert remarks == ("nobody is named in it, so exported as who its folder is called: team-8",)
+
+    outcomes = make_outcome(make_grade("team-8"), key="1"), replace(broken, key="2")
+    (tmp_path / "again").mkdir()
+    with Gradebook(tmp_path / "again", assignment="lab", create=True) as book:
+        for outcome in outcomes:
+            book.put(outcome)
+            book.finish(Batch(keys=(outcome.key,), shared={}), rubric=RUBRIC)
+        book.override("team-8", "pieces", 0.75, why="x", by="y")
+        (student,), remarks = students_of(list(book.entries()), platform="canvas")
+    assert (student.id, student.points, remarks) == ("s-team-8", "0.75", [])
+
+
+def test_of_several_authors_the_one_who_handed_it_in_is_found(tmp_path):
+    """By the number in the file's name, where no author's id is Canvas'; who is lost is named."""
+    roster = 'Student,ID,SIS User ID,SIS Login ID,Section\n"Doe, Jane",1001,S1,doejane,A\n'
+    team = make_outcome(make_grade("t", authors=("u1a", "u1b")), owner="doejane (canvas 1001)")
+    other = make_outcome(make_grade("o", authors=("x", "y")), owner="roeric (canvas 9)")
+    rows, remarks = write(tmp_path, team, other, platform="canvas", roster=roster)
+    assert canvas_import(rows) == {RUBRIC.title: {"1001": "20"}}
+    assert remarks[:2] == (
+        "not in roster.csv, so not exported: u1a, u1b, x, y",
+        "nobody of these is in roster.csv: o",
+    )
+    assert remarks[2].endswith("one of the authors: doejane (t)")
+
+
+@pytest.mark.parametrize(
+    ("platform", "head", "wanted"),
+    [
+        ("canvas", "a,b", "ID and Student"),
+        ("moodle", "Student,ID,SIS User ID,SIS Login ID,Section", "Identifier, or ID number"),
+        ("gradescope", "Identifier,Full name,Email address", "SID, or Email"),
+        ("canvas", "First Name,Last Name,SID,Email", "ID and Student"),
+    ],
+)
+def test_a_table_that_is_no_roster_is_refused(tmp_path, platform, head, wanted):
+    """Another platform's as well: the columns that it should have are named."""
+    with pytest.raises(
+        ConfigError, match=rf"roster\.csv: is not {platform.capitalize()}.*{wanted}"
+    ):
+        write(tmp_path, HALF, platform=platform, roster=f"{head}\n1,2,3\n")
+
+
+def test_a_roster_with_two_columns_of_one_name_is_refused(tmp_path):
+    """Nobody says which is to be filled in; columns without a name are no matter."""
+    with pytest.raises(ConfigError, match=r"roster\.csv: has two columns 'Lab'"):
+        write(tmp_path, HALF, platform="canvas", roster="Student,ID,Lab,Lab\na,1,,\n")
+    rows, _ = write(tmp_path, HALF, platform="gradescope", roster="SID,,Name,\ns-team-1,x,y,z\n")
+    assert rows == [["SID", "", "Name", "", "Total Score", "Max Points"],
+                    ["s-team-1", "x", "y", "z", "10", "20"]]  # fmt: skip
+
+
+def test_gradescope_must_have_a_score(tmp_path):
+    """Zero where nothing could be graded, and the person who uploads it is told."""
+    _, remarks = write(tmp_path, BROKEN, platform="gradescope")
+    (path,) = (tmp_path / "out" / "gradescope").glob("*/results.json")
+    assert json.loads(path.read_text("utf-8"))["score"] == 0
+    assert "but 0 in results.json" in remarks[0]
+
+
+@pytest.mark.parametrize("platform", ["moodle", "gradescope"])
+def test_no_comment_names_the_other_team(tmp_path, platform):
+    """That a recording stands in another submission is said; in whose, the TA may say."""
+    shared = make_outcome(make_grade("a", flags=(shared_flag("b-team"),)), owner="Ann (1024)")
+    write(tmp_path, shared, platform=platform)
+    texts = [path.read_text("utf-8") for path in (tmp_path / "out").rglob("*.*")]
+    said = [text for text in texts if "step-1 also stands in another submission" in text]
+    assert said
+    assert not any("b-team" in text for text in texts)

@@ -1,0 +1,56 @@
+"""The figures of the feedback: the curve drawn is that of the numbers reported."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from pipeline.grading.publish.feedback_figures import draw_figures
+from pipeline.plant.chain import PRESETS, transfer_functions
+from pipeline.report.figures.grading import reported_magnitude
+from tests.helpers.grading_students import student
+
+
+@pytest.mark.parametrize("preset", sorted(PRESETS))
+def test_the_curve_is_that_of_the_table(preset):
+    """The parameters of a chain give the magnitude of its own frequency response."""
+    chain = PRESETS[preset]
+    omega = np.geomspace(1.0, 100.0, 50)
+    reported = transfer_functions(chain.parameters())
+    for cart in range(1, chain.n + 1):
+        expected = 20 * np.log10(np.abs(chain.frequency_response(omega)[cart - 1]))
+        # Roots and products of at most sixth order, in double precision: far below 1e-6 dB.
+        got = reported_magnitude(omega, cart=cart, reported=reported)
+        assert_allclose(got, expected, atol=1e-6)
+
+
+def test_each_cart_has_a_figure_with_the_reported_curve():
+    """Drawn dashed beside the fit; the same bytes each time."""
+    two = student(2)
+    figures = draw_figures(two.analysis, two.reported)
+
+    assert [name for name, _ in figures] == ["response-1.svg", "response-2.svg"]
+    assert all("your numbers" in svg and "<title>Measured" in svg for _, svg in figures)
+    assert draw_figures(two.analysis, two.reported) == figures
+
+
+@pytest.mark.parametrize("left", ["K_1", "omega_a", "zeta_2"])
+def test_a_table_that_is_not_complete_has_no_curve(left):
+    """The measured response and the fit are shown all the same."""
+    two = student(2).without("final", left)
+    figures = draw_figures(two.analysis, two.reported)
+    assert len(figures) == 2
+    assert not any("your numbers" in svg for _, svg in figures)
+
+
+def test_a_table_without_damping_has_a_curve():
+    """Its peaks and nulls have no end, which does not end the drawing."""
+    zetas = {name: 0.0 for name in ("zeta_a", "zeta_b", "zeta_1", "zeta_2")}
+    two = student(2).reporting(final=zetas)
+    assert all("your numbers" in svg for _, svg in draw_figures(two.analysis, two.reported))
+
+
+@pytest.mark.parametrize("value", [0.0, 1e300, 1e-300])
+def test_numbers_that_stand_for_no_response_have_no_curve(value):
+    """A frequency of zero or beyond all bounds."""
+    two = student(2).reporting(final={"omega_a": value})
+    assert not any("your numbers" in svg for _, svg in draw_figures(two.analysis, two.reported))

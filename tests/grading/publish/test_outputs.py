@@ -1,0 +1,448 @@
+"""What a grading writes: files that are a function of the gradebook, harmless and complete."""
+
+import csv
+import io
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from urllib.parse import unquote
+
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.errors import ConfigError
+from pipeline.grading.grade import CODES, Flag
+from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.class_lines import Line
+from pipeline.grading.gradebook.override import Override, read_points, with_overrides
+from pipeline.grading.outcome import Batch
+from pipeline.grading.publish.anonymous import KEY_FILE, anonymise, pseudonyms
+from pipeline.grading.publish.class_page import class_page
+from pipeline.grading.publish.export import results_text
+from pipeline.grading.publish.feedback import feedback_page
+from pipeline.grading.publish.outputs import grades_csv, write_outputs
+from pipeline.grading.table import read_table
+from pipeline.grading.words import PLACES, TITLES
+from tests.helpers.grades import (
+    failed_grade,
+    hertz_flag,
+    make_grade,
+    make_outcome,
+    shared_flag,
+    two_cart_rubric,
+    write_class,
+)
+
+RUBRIC = two_cart_rubric()
+
+
+@pytest.fixture(scope="module")
+def graded(tmp_path_factory) -> Path:
+    """A class with all sorts of submissions in it."""
+    return write_class(tmp_path_factory.mktemp("class"))
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO(path.read_bytes().decode(), newline="")))
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    """Return all files but the gradebook itself."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.name != "gradebook.sqlite"
+    }
+
+
+# ------------------------------------------------------------------------ grades.csv
+
+
+def test_every_submission_has_its_row(graded):
+    """A broken one too, with its reason; points by criterion, lateness, and points by hand."""
+    rows = {row["submission"].lstrip("'"): row for row in rows_of(graded / "grades.csv")}
+
+    assert len(rows) == 16
+    broken = rows["broken"]
+    assert (broken["status"], broken["points"], broken["pieces"]) == ("failed", "0", "")
+    assert broken["reason"] == "submission.toml line 3: <b>cart</b> is no key"
+    by_hand = rows["team-02"]  # 95 % of 20, 1 in place of 0.95 for one criterion, 1 day late
+    assert float(by_hand["points"]) == pytest.approx((19 - 0.95 + 1) * 0.9, abs=0.006)
+    assert (by_hand["laws"], by_hand["by_hand"], by_hand["remarks"]) == ("1", "laws", "shared_data")
+    assert rows["team-03"]["pieces"] == "0.9"
+    assert rows["team-05"]["authors"] == "s4 <script>alert(1)</script>"
+
+
+def test_no_cell_is_a_formula(graded):
+    """Text that a spreadsheet would run begins with an apostrophe; numbers stay numbers."""
+    cells = [cell for row in rows_of(graded / "grades.csv") for cell in row.values()]
+    assert "'=cmd'C'!A0" in cells
+    assert not [cell for cell in cells if cell.startswith(tuple("=@\t\r"))]
+
+
+def test_a_criterion_may_be_called_like_a_column():
+    """Its column is told apart."""
+    criteria = (RUBRIC.criteria[0].model_copy(update={"id": "points"}),)
+    rubric = RUBRIC.model_copy(update={"criteria": criteria})
+    (head,) = csv.reader([grades_csv([], rubric=rubric).strip()])
+    assert len(head) == len(set(head))
+    assert "criterion points" in head
+
+
+# ------------------------------------------------------------------------- the files
+
+
+def test_the_same_class_gives_the_same_bytes(graded, tmp_path):
+    """In another folder, and where everything is graded in another order in between."""
+    again = write_class(tmp_path)
+    assert tree(again) == tree(graded)
+
+
+def test_nothing_of_a_student_is_markup(graded):
+    """Names, reasons and messages are text on every page."""
+    for path in (graded / "class.html", graded / "feedback" / "team-02" / "feedback.html"):
+        html = path.read_text(encoding="utf-8")
+        assert "<b>cart" not in html
+        assert "<i>as told" not in html
+        assert "<script>alert" not in html
+    assert "&lt;b&gt;cart" in (graded / "class.html").read_text(encoding="utf-8")
+
+
+def test_every_link_of_the_class_leads_to_feedback(graded):
+    """Whatever the names."""
+    html = (graded / "class.html").read_text(encoding="utf-8")
+    links = set(re.findall(r'href="(feedback/[^"]*)"', html))
+    assert len(links) == 16
+    assert all((graded / unquote(link)).is_file() for link in links)
+
+
+def test_grade_json_says_what_was_given_by_hand(graded):
+    """The reason, but not who: that is in the gradebook."""
+    text = (graded / "feedback" / "team-02" / "grade.json").read_text(encoding="utf-8")
+    grade = json.loads(text)
+    assert grade["schema"] == "cartlab-grade/1"
+    assert grade["overrides"] == [
+        {"criterion": "laws", "points": 1.0, "why": "right, <i>as told</i>"}
+    ]
+    assert "Ada" not in text
+    assert grade["flags"][0]["code"] == "shared_data"
+
+
+def test_only_what_changed_is_written_again(tmp_path):
+    """An override writes one feedback; what is missing is made again; what is stale goes."""
+    with Gradebook(tmp_path, assignment="lab", create=True) as book:
+        outcomes = [make_outcome(make_grade(name, share=0.5)) for name in "abc"]
+        for outcome in outcomes:
+            book.put(outcome)
+        book.finish(Batch(keys=tuple(o.key for o in outcomes), shared={}), rubric=RUBRIC)
+        told: list[str] = []
+        write_outputs(book, tmp_path, progress=told.append)
+        first = tree(tmp_path)
+        write_outputs(book, tmp_path, progress=told.append)
+        assert (told, tree(tmp_path)) == ([f"feedback: {n}" for n in "abc"], first)
+
+        book.override("b", "laws", 1.0, why="x", by="y")
+        (tmp_path / "feedback" / "c" / "feedback.html").unlink()
+        (tmp_path / "feedback" / "a" / "notes.txt").write_text("mine", encoding="utf-8")
+        write_outputs(book, tmp_path, progress=told.append)
+        assert told[3:] == ["feedback: b", "feedback: c"]
+
+        book.finish(Batch(keys=(outcomes[1].key,), shared={}), rubric=RUBRIC)
+        write_outputs(book, tmp_path)
+        assert sorted(p.name for p in (tmp_path / "feedback").iterdir()) == [".made.json", "a", "b"]
+        assert [p.name for p in (tmp_path / "feedback" / "a").iterdir()] == ["notes.txt"]
+
+
+@pytest.mark.parametrize("name", ["../out", "a/b", "..", ""])
+def test_a_name_that_leads_elsewhere_is_refused(tmp_path, name):
+    """Should a gradebook hold one, nothing is written outside."""
+    with Gradebook(tmp_path / "g.sqlite", assignment="lab", create=True) as book:
+        book.put(make_outcome(make_grade(name), key="k"))
+        book.finish(Batch(keys=("k",), shared={}), rubric=RUBRIC)
+        (tmp_path / "out").mkdir()
+        with pytest.raises(ConfigError, match="no name for a folder"):
+            write_outputs(book, tmp_path / "out")
+    assert [p.name for p in (tmp_path / "out").rglob("*") if p.is_file()] == []
+
+
+# --------------------------------------------------------------------- without names
+
+
+def test_without_names_nothing_tells_who_it_was(tmp_path):
+    """Not the pages, not the table, not its order; the key does."""
+    outcomes = [
+        make_outcome(make_grade("zoe-lab", authors=("zoe",), share=0.5)),
+        make_outcome(make_grade("ann-lab", authors=("ann",))),
+        make_outcome(failed_grade("bob-lab", "bob-lab: no submission.toml")),
+    ]
+    shared = {"zoe-lab": shared_flag("ann-lab"), "ann-lab": shared_flag("zoe-lab")}
+    with Gradebook(tmp_path / "g.sqlite", assignment="lab", create=True) as book:
+        for outcome in outcomes:
+            book.put(outcome)
+        rubric = RUBRIC.model_copy(update={"anonymous": True})
+        book.finish(Batch(keys=tuple(o.key for o in outcomes), shared=shared), rubric=rubric)
+        out = tmp_path / "out"
+        out.mkdir()
+        write_outputs(book, out)
+        before = tree(out)
+        book.put(make_outcome(make_grade("ann-lab", authors=("ann",), share=0.2), key="later"))
+        keys = (outcomes[0].key, "later", outcomes[2].key)
+        book.finish(Batch(keys=keys, shared=shared), rubric=rubric)
+        write_outputs(book, out)
+
+    key = {row["anonymous"]: row for row in rows_of(out / KEY_FILE)}
+    assert {row["submission"] for row in key.values()} == {"zoe-lab", "ann-lab", "bob-lab"}
+    names = [row["submission"] for row in rows_of(out / "grades.csv")]
+    assert names == sorted(key)
+    for name, content in tree(out).items():
+        if name != KEY_FILE:
+            told = re.sub(rb'url\("data:[^"]*"\)', b"", content)  # a font may spell anything
+            assert not re.search(rb"zoe|\bann\b|bob", told), name
+            assert not re.search(r"zoe|ann-|bob", name)
+    (ann,) = [n for n, row in key.items() if row["authors"] == "ann"]
+    (zoe,) = [n for n, row in key.items() if row["authors"] == "zoe"]
+    flag = json.loads(before[f"feedback/{zoe}/grade.json"])["flags"][0]
+    assert flag["evidence"]["submissions"] == [ann]  # handing in again changes no name
+    assert ann in flag["message"]
+
+
+def test_a_name_that_is_a_number_or_a_word_garbles_nothing():
+    """Teams are called 3, or step: numbers and experiments in their feedback stay."""
+    grade = make_grade("3", share=0.5, flags=(hertz_flag(), shared_flag("step")))
+    hidden = anonymise(grade, {"3": "anon-a", "step": "anon-b"})
+    assert [c.message for c in hidden.criteria] == [c.message for c in grade.criteria]
+    assert hidden.flags[0] == grade.flags[0]
+    assert hidden.flags[1].message.startswith("step-1 also stands in anon-b: ")
+    assert hidden.flags[1].evidence["recordings"][0]["submission"] == "anon-b"
+
+
+@pytest.mark.parametrize(
+    ("reason", "shown"),
+    [
+        ("3/submission.toml line 3: no key", "anon-a/submission.toml line 3: no key"),
+        ("doejane_1024_77_lab.zip: not a whole zip", "the archive: not a whole zip"),
+    ],
+)
+def test_a_reason_names_nobody(reason, shown):
+    """Neither the folder before a file nor an archive with the student's name stays."""
+    assert anonymise(failed_grade("3", reason), {"3": "anon-a"}).reason == shown
+
+
+def test_names_that_stand_in_are_all_different():
+    """Ten thousand of them, made from what was handed in alone."""
+    names = pseudonyms({f"team-{n}": f"key {n}" for n in range(10_000)})
+    assert len(set(names.values())) == 10_000
+    assert names["team-7"].startswith(pseudonyms({"renamed": "key 7"})["renamed"])
+
+
+# -------------------------------------------------------------------------- the pages
+
+
+def test_every_flag_has_a_name_and_a_place_to_look():
+    """In words, for all codes there are."""
+    assert list(TITLES) == list(PLACES) == list(CODES)
+
+
+def test_the_feedback_puts_their_numbers_beside_ours():
+    """Both, the difference, the message, the help, and what lateness took."""
+    grade = make_grade("team-1", share=0.5, days_late=1.5, deducted=2.0, flags=(hertz_flag(),))
+    html = feedback_page(grade, rubric=RUBRIC, overrides={}, figures=(), name="team-1")
+
+    text = re.sub(r"<[^>]+>", "", html)
+    assert "this looks like Hz where rad/s is asked." in text
+    assert "Where to look: the unit of every frequency" in text
+    assert "1.5 days, −2 points" in text
+    assert re.search(r"YoursFrom your recordingsDifference\s+.*rad/s\]3\.1219\.6−84\.1 %", text)
+
+
+def test_feedback_on_shared_data_names_nobody_and_does_not_praise():
+    """All points or not, the page asks to talk; in whose submission it stands, it leaves open."""
+    grade = make_grade("team-1", flags=(shared_flag("b-team"),))
+    html = feedback_page(grade, rubric=RUBRIC, overrides={}, figures=(), name="team-1")
+
+    assert "also stands in another submission" in html
+    assert "All points were earned." in html
+    assert not re.search("b-team|Well done", html)
+
+
+def test_a_submission_that_could_not_be_graded_hears_why():
+    """The reason, and what to do."""
+    grade = failed_grade("team-1", "no submission.toml in it")
+    html = feedback_page(grade, rubric=RUBRIC, overrides={}, figures=(), name="team-1")
+    assert "No submission.toml in it." in html
+    assert "Mend it and hand it in again" in html
+
+
+_VALUES = (
+    st.none()
+    | st.booleans()
+    | st.floats()
+    | st.text(max_size=8)
+    | st.lists(st.integers(), max_size=2)
+)
+
+
+@settings(max_examples=40)
+@given(st.dictionaries(st.text(max_size=8), _VALUES, max_size=4))
+def test_any_numbers_can_be_shown(values):
+    """Infinite, missing, text or nested: a page comes of it, with its control characters gone."""
+    grade = make_grade("team-1", share=0.5)
+    found = dict(reversed(values.items()))
+    first = replace(grade.criteria[0], expected=values, found=found)
+    grade = make_grade("team-1", criteria=(first, *grade.criteria[1:]))
+    html = feedback_page(grade, rubric=RUBRIC, overrides={}, figures=(), name="team-1")
+    assert not re.search(r"[\x00-\x08\x0b\x0c\x0e-\x1f]", html)
+
+
+@pytest.mark.parametrize(("points", "percent"), [(19.95, "99"), (4.6, "23")])
+def test_only_all_points_are_100_percent(points, percent):
+    """19.95 of 20 is 99 %, 4.6 of 20 is 23 %: decimals as typed, rounded down."""
+    page = class_page([Line.of(make_grade("a", points=points), by_hand=())], rubric=RUBRIC)
+    cells = re.sub(r"<[^>]+>", " ", page.split("All submissions.")[-1]).split()
+    assert cells[cells.index(str(points)) + 1] == percent
+
+
+def test_the_class_page_counts_what_there_is():
+    """Mean and median of those graded, outcomes by criterion, mistakes by how many made them."""
+    grades = [make_grade("a"), make_grade("b", share=0.5, flags=(hertz_flag(),)),
+              make_grade("c", share=0.0, flags=(hertz_flag(), missing_flag()))]  # fmt: skip
+    lines = [Line.of(grade, by_hand=()) for grade in grades]
+    lines.append(Line.of(failed_grade("d", "broken"), by_hand=()))
+    html = re.sub(r"<[^>]+>", " ", class_page(lines, rubric=RUBRIC))
+    text = " ".join(html.split())
+
+    assert "Could not be graded 1" in text
+    assert "Mean 10.00 of 20" in text
+    assert "Median 10.00 of 20" in text
+    assert "static gains from the steps 1 50 % 1 1 1 0" in text
+    assert re.search(r"hz_for_rad_s \) 2 50 % b , c .* missing \) 1 25 % c ", text)
+
+
+def shares(*found: tuple[str, str, str]) -> Flag:
+    """Return the flag of (own recording, other submission, its recording)s."""
+    keys = ("experiment", "submission", "other_experiment")
+    recordings = [{**dict(zip(keys, one, strict=True)), "sigmas": 9.5} for one in found]
+    return replace(shared_flag("x"), evidence={"submissions": [], "recordings": recordings})
+
+
+def test_the_class_page_groups_who_shares_with_whom(tmp_path):
+    """Clusters, and in each what stands where; a submission of an earlier batch has no page."""
+    shared = {
+        "a": shares(("step-1", "b", "step-2"), ("sine-1", "b", "sine-1")),
+        "b": shares(("step-2", "a", "step-1"), ("sine-1", "a", "sine-1"), ("d", "c", "d")),
+        "c": shares(("d", "b", "d")),
+        "e": shares(("d", "old (an earlier batch)", "d")),
+    }
+    outcomes = [make_outcome(make_grade(name)) for name in "abcde"]
+    with Gradebook(tmp_path / "g.sqlite", assignment="lab", create=True) as book:
+        for outcome in outcomes:
+            book.put(outcome)
+        batch = Batch(keys=tuple(o.key for o in outcomes), shared=shared)
+        texts = {}
+        for anonymous in (False, True):
+            rubric = RUBRIC.model_copy(update={"anonymous": anonymous})
+            book.finish(batch, rubric=rubric)
+            write_outputs(book, tmp_path)
+            html = (tmp_path / "class.html").read_text(encoding="utf-8")
+            found = re.search(r'id="shared".*?(<tbody.*?)</table>', html, re.DOTALL)
+            assert found
+            rows = re.findall(r"<tr.*?</tr>", found[1], re.DOTALL)
+            texts[anonymous] = [" ".join(re.sub(r"<[^>]+>", " ", row).split()) for row in rows]
+    assert texts[False] == [
+        "1 a , b 2 sine-1, step-1 (step-2 in b)",
+        "1 b , c 1 d",
+        "2 e , old (an earlier batch) 1 d",
+    ]
+    assert len(texts[True]) == 3
+    assert not [text for text in texts[True] if re.search(r"\b[abce]\b|old", text)]
+    assert [text for text in texts[True] if re.search(r"anon-\w+ , another submission", text)]
+
+
+def test_the_class_is_a_frame(tmp_path):
+    """A row a submission and criterion; what was never judged is there without points."""
+    outcomes = [make_outcome(make_grade("a", authors=("ann", "bo"), flags=(hertz_flag(),))),
+                make_outcome(make_grade("b", share=0.5, days_late=1.0, deducted=1.0, points=9.0)),
+                make_outcome(failed_grade("c", "broken"))]  # fmt: skip
+    with Gradebook(tmp_path, assignment="lab", create=True) as book:
+        for outcome in outcomes:
+            book.put(outcome)
+        book.finish(Batch(keys=tuple(o.key for o in outcomes), shared={}), rubric=RUBRIC)
+        book.override("c", "pieces", 0.75, why="x", by="y")
+        write_outputs(book, tmp_path)
+        frame = book.to_frame()
+    ids = [criterion.id for criterion in RUBRIC.criteria]
+    assert frame["submission"].to_list() == [name for name in "abc" for _ in ids]
+    assert frame["criterion"].to_list() == 3 * ids
+    wide = frame.pivot(index="submission", columns="criterion", values="points")
+    assert wide.sum(axis="columns").to_dict() == {"a": 20.0, "b": 10.0, "c": 0.75}
+    assert wide.count(axis="columns").to_dict() == {"a": len(ids), "b": len(ids), "c": 1}
+    totals = frame.pivot(index="submission", columns="criterion", values="total")["pieces"]
+    assert totals.to_list() == [20.0, 9.0, 0.75]
+    assert frame.loc[frame["by_hand"], ["submission", "criterion"]].to_numpy().tolist() == [
+        ["c", "pieces"]
+    ]
+    assert frame.loc[0, ["authors", "remarks", "outcome"]].to_list() == [
+        "ann bo", "hz_for_rad_s", "pass",
+    ]  # fmt: skip
+    table = pd.read_csv(tmp_path / "grades.csv").set_index("submission")
+    assert (table[ids].fillna(-1).to_numpy() == wide[ids].fillna(-1).to_numpy()).all()
+
+
+def missing_flag() -> Flag:
+    return Flag(code="missing", parameters=("K_1",), message="K_1 is missing.", evidence={})
+
+
+def test_points_by_hand_are_not_asked_for_again():
+    """Who was graded by hand reads so, on the page and in Gradescope, and hands in nothing anew."""
+    grade = failed_grade("team-7", "no submission.toml in it")
+    given = Override(criterion=RUBRIC.criteria[0].id, points=1.0, why="x", by="y", at="")
+    given = {given.criterion: given}
+    by_hand = with_overrides(grade, given, rubric=RUBRIC)
+    page = feedback_page(by_hand, rubric=RUBRIC, overrides=given, figures=(), name="team-7")
+    text = re.sub(r"<[^>]+>", "", page)
+    assert "could not be graded automatically" in text
+    assert "Its points were given by hand." in text
+    assert "Set by hand" in text
+    assert "hand it in again" not in text
+    told = json.loads(results_text(by_hand, by_hand=True))["output"]
+    assert told.startswith("Could not be graded automatically, points were given by hand: ")
+
+
+@pytest.mark.parametrize("grades", [[], [failed_grade("a", "broken")]])
+def test_a_class_without_grades_has_a_page(grades):
+    """Nobody handed in, or nothing could be graded."""
+    html = class_page([Line.of(grade, by_hand=()) for grade in grades], rubric=RUBRIC)
+    assert "Submissions" in html
+
+
+@pytest.mark.parametrize(("text", "points"), [("2", 2.0), ("1,5", 1.5), ("AUTO", None)])
+def test_points_are_read_as_typed(text, points):
+    """With either decimal mark; auto means the automatic ones."""
+    assert read_points(text) == points
+
+
+def test_points_that_are_none_are_refused():
+    """With what they may be."""
+    with pytest.raises(ConfigError, match="two: points are a number, or auto"):
+        read_points("two")
+
+
+def test_a_table_of_a_platform_is_read_whatever_its_separators(tmp_path):
+    """Semicolons, tabs, a byte-order mark, blank lines; with the lines its rows end on."""
+    path = tmp_path / "t.csv"
+    path.write_text('\ufeffa;b\n\n"x\ny";"1;2"\n', encoding="utf-8")
+    table = read_table(path)
+    assert list(table.columns) == ["a", "b"]
+    assert list(table.itertuples(name=None)) == [(4, "x\ny", "1;2")]
+    path.write_text("a,b\n1\n1,2,3\n", encoding="utf-8")
+    assert list(read_table(path).itertuples(name=None)) == [(2, "1", ""), (3, "1", "2")]
+    path.write_bytes(b"a,b\n\xff\xfe,1\n")
+    with pytest.raises(ConfigError, match=r"t\.csv: is not UTF-8"):
+        read_table(path)
+    for much in ("a\n" * 200_000, "," * 5_000):
+        path.write_text(f"a{much}\n", encoding="utf-8")
+        with pytest.raises(ConfigError, match=r"t\.csv: has more than 2000 columns or 100000 rows"):
+            read_table(path)

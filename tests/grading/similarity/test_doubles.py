@@ -1,0 +1,83 @@
+"""People in several submissions of a class: told to the TA, accused of nothing."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.outcome import Batch, Prints
+from pipeline.grading.publish.outputs import write_outputs
+from pipeline.grading.similarity.doubles import Double, find_doubles, with_recordings
+from pipeline.grading.similarity.prints import fingerprint
+from pipeline.ingest.read import read_data
+from pipeline.submission import load_submission
+from pipeline.synthesis import write_submission
+from tests.helpers.grades import make_grade, make_outcome, two_cart_rubric
+
+RUBRIC = two_cart_rubric()
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory) -> list[bytes]:
+    """The fingerprints of two submissions with recordings of their own."""
+    folder = tmp_path_factory.mktemp("teams")
+    for seed in (0, 1):
+        write_submission(folder / f"{seed}", chain="throne-1dof", seed=seed, compact=True)
+    return [fingerprint(read_data(load_submission(folder / f"{seed}")).records) for seed in (0, 1)]
+
+
+def told(folder: Path, recordings, *, anonymous: bool = False) -> list[Double]:
+    """Write a class in which Eve hands in Bob's recordings with his id beside hers."""
+    teams = {"team-1": ("bob",), "team-2": ("carl",), "team-9": ("eve", "Bob ")}
+    prints = {"team-1": recordings[0], "team-2": recordings[1], "team-9": recordings[0]}
+    outcomes = [
+        make_outcome(make_grade(name, authors=authors), fingerprints=prints[name])
+        for name, authors in teams.items()
+    ]
+    with Gradebook(folder, assignment="lab", create=True) as book:
+        for outcome in outcomes:
+            book.put(outcome)
+        rubric = RUBRIC.model_copy(update={"anonymous": anonymous})
+        book.finish(Batch(keys=tuple(o.key for o in outcomes), shared={}), rubric=rubric)
+        return write_outputs(book, folder)
+
+
+def test_a_copy_with_the_victims_id_is_told(recordings, tmp_path):
+    """Who is in both, and how many recordings both have, on the page and to the caller."""
+    (double,) = told(tmp_path, recordings)
+    assert (double.author, double.submissions) == ("bob", ("team-1", "team-9"))
+    assert double.recordings >= 3
+    said = f"bob is in team-1 and team-9, which have {double.recordings} recordings in common"
+    assert str(double) == said
+    assert said in re.sub(r"<[^>]+>", "", (tmp_path / "class.html").read_text(encoding="utf-8"))
+    feedback = (tmp_path / "feedback/team-9/feedback.html").read_text(encoding="utf-8")
+    assert "in common" not in feedback
+
+
+def test_without_names_nobody_is_named(recordings, tmp_path):
+    """The submissions go by the names that stand in for theirs, the person by none."""
+    (double,) = told(tmp_path, recordings, anonymous=True)
+    assert re.fullmatch(
+        r"One person is in anon-\w+ and anon-\w+, which have \d+ recordings in common", str(double)
+    )
+
+
+def test_recordings_are_counted_not_pairs_of_submissions(recordings):
+    """Four submissions with one set of recordings have that many in common, not six times it."""
+    prints = [
+        Prints(submission=f"t{i}", authors=("s1",), fingerprints=recordings[0]) for i in range(4)
+    ]
+    counted = []
+    for some in (prints[:2], prints):
+        doubles = find_doubles({one.submission: one.authors for one in some})
+        counted += [double.recordings for double in with_recordings(doubles, some)]
+    assert counted[0] == counted[1] >= 3
+
+
+def test_one_submission_each_is_nothing_to_tell():
+    """Two authors of one team, or one id typed twice in it, stand nowhere else."""
+    assert find_doubles({"a": ("x", "y"), "b": ("z", "Z ")}) == []
+    (double,) = find_doubles({f"t{i}": ("S\n1",) for i in range(10)})
+    assert str(double).startswith("S 1 is in t0, t1, ")
+    assert str(double).endswith("and 2 more, which have no recording in common")

@@ -1,0 +1,266 @@
+"""Shared recordings: found however disguised, and never where two teams only used one bench."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.grading.outcome import Prints
+from pipeline.grading.similarity.prints import fingerprint, unpack
+from pipeline.grading.similarity.shared import find_shared, shared_flag
+from pipeline.ingest.read import read_data
+from pipeline.submission import load_submission
+from pipeline.synthesis import COUNT, write_submission
+from tests.helpers.ucsd import write_two_cart_submission
+
+
+@pytest.fixture(scope="module")
+def teams(tmp_path_factory):
+    """The recordings of four teams that used the same bench in the same way."""
+    folder = tmp_path_factory.mktemp("teams")
+    for seed in range(4):
+        write_submission(folder / str(seed), chain="throne-2dof", seed=seed, compact=True)
+    return [read_data(load_submission(folder / str(seed))).records for seed in range(4)]
+
+
+def prints(name, records, authors=None):
+    return Prints(
+        submission=name, authors=authors or (f"s-{name}",), fingerprints=fingerprint(records)
+    )
+
+
+def disguised(record, rng, *, noise=0.0, scale=1.0, keep=1.0, later=0.0):
+    """Return a copy: cut, shifted in time, rescaled, renamed and with noise (in counts) added."""
+    n = record.t.size
+    start = int(rng.integers(0, round((1 - keep) * n) + 1))
+    part = slice(start, start + round(keep * n))
+    y = (np.array(record.y) + noise * COUNT * rng.standard_normal(record.y.shape)) * scale
+    return replace(
+        record,
+        id=f"{record.id} mine",
+        t=record.t[part] + later,
+        u=None if record.u is None else record.u[part],
+        y=y[:, part],
+        reference=None if record.reference is None else record.reference[part],
+    )
+
+
+@pytest.fixture(scope="module")
+def quiet_teams(tmp_path_factory):
+    """What three teams would read on one bench, with encoders too fine to tell any noise."""
+    folder = tmp_path_factory.mktemp("quiet")
+    for seed in range(3):
+        write_submission(
+            folder / str(seed), chain="throne-2dof", seed=seed, compact=True, count=COUNT / 100
+        )
+    return [read_data(load_submission(folder / str(seed))).records for seed in range(3)]
+
+
+def rounded(records, *, count, seed):
+    """Return recordings by an encoder of that step, whose zero is anywhere and which has no noise.
+
+    Only what no controller drives: a controller would have read the coarse encoder, too.
+    """
+    rng = np.random.default_rng(seed)
+    zeros = [rng.uniform(-2, 2, size=(record.y.shape[0], 1)) for record in records]
+    return [
+        replace(
+            record,
+            y=count * np.round(record.y / count + zero),
+            resolution=np.full_like(record.resolution, count),
+        )
+        for record, zero in zip(records, zeros, strict=True)
+        if record.kind != "closed_loop"
+    ]
+
+
+def of_kind(records, kind):
+    return next(record for record in records if record.kind == kind)
+
+
+def test_honest_teams_on_one_bench_share_nothing(teams):
+    """The same carts under the same inputs move alike; their noise does not."""
+    assert find_shared([prints(str(i), records) for i, records in enumerate(teams)]) == {}
+
+
+@pytest.mark.parametrize("per_cm", [5, 20, 37, 100, 500])
+def test_rounding_of_one_motion_is_nobodys(quiet_teams, per_cm):
+    """Without noise one motion is rounded alike where the zeros happen to agree: no evidence."""
+    honest = [
+        rounded(records, count=1 / per_cm, seed=seed) for seed, records in enumerate(quiet_teams)
+    ]
+    batch = [prints(str(seed), records) for seed, records in enumerate(honest)]
+    assert find_shared(batch) == {}
+    rng = np.random.default_rng(4)
+    if per_cm >= 100:  # a whole hand-in has too many zeros in common
+        copied = [disguised(r, rng, keep=0.8, later=2.0) for r in honest[0]]
+        assert set(find_shared([*batch, prints("copy", copied)])) == {"0", "copy"}
+
+
+@pytest.mark.parametrize("per_cm", [5, 20])
+def test_honest_teams_with_coarse_encoders_share_nothing(tmp_path, per_cm):
+    """Also where the carts move by one or two counts, and under feedback the input by as few."""
+    for seed in (1, 2, 7):
+        write_submission(
+            tmp_path / str(seed),
+            chain="throne-2dof",
+            seed=seed,
+            compact=True,
+            count=1 / per_cm,
+            travel=0.3,
+        )
+    batch = [
+        prints(str(seed), read_data(load_submission(tmp_path / str(seed))).records)
+        for seed in (1, 2, 7)
+    ]
+    assert find_shared(batch) == {}
+
+
+@pytest.mark.parametrize("kind", ["decay", "step", "sweep", "closed_loop"])
+@pytest.mark.parametrize(
+    "disguise",
+    [
+        {},
+        {"scale": -10.0, "later": 3.0},
+        {"scale": 1.07, "keep": 0.75},
+        {"noise": 0.4},
+        {"noise": 0.3, "scale": 2.54, "keep": 0.9, "later": 1.0},
+    ],
+    ids=str,
+)
+def test_one_copied_recording_is_found_however_disguised(teams, kind, disguise):
+    """A single recording among honest ones is found, and named on both sides."""
+    rng = np.random.default_rng(7)
+    copied = disguised(of_kind(teams[0], kind), rng, **disguise)
+    found = find_shared([prints("a", teams[0]), prints("b", [*teams[1], copied])])
+    (mine,), (theirs,) = found["b"], found["a"]
+    assert (mine.other, mine.other_experiment) == ("a", theirs.experiment)
+    assert (theirs.other, theirs.other_experiment) == ("b", mine.experiment)
+    assert mine.experiment == copied.id
+
+
+def test_under_feedback_the_input_gives_a_copy_away(teams):
+    """The controller has made the input of the carts' noise: further noise in the carts is no veil.
+
+    The start, where the reference steps, is cut off as well.
+    """
+    rng = np.random.default_rng(9)
+    record = of_kind(teams[0], "closed_loop")
+    n = record.t.size // 8
+    cut = replace(
+        record,
+        t=record.t[n:],
+        u=record.u[n:],
+        y=record.y[:, n:],
+        reference=record.reference[n:],
+    )
+    found = find_shared(
+        [prints("a", teams[0]), prints("b", [*teams[1], disguised(cut, rng, noise=1.0, scale=2.0)])]
+    )
+    assert {r.experiment for r in found["a"]} == {record.id}
+
+
+def test_a_whole_copy_is_found_under_much_noise(teams):
+    """Noise of six times the encoder's own hides single recordings, not all of them."""
+    rng = np.random.default_rng(8)
+    copied = [disguised(r, rng, noise=1.5, scale=0.9, keep=0.8) for r in teams[0]]
+    found = find_shared(
+        [prints("a", teams[0]), prints("b", copied), *(prints(str(i), teams[i]) for i in (1, 2))]
+    )
+    assert set(found) == {"a", "b"}
+    assert {record.other for record in found["a"]} == {"b"}
+
+
+def test_teammates_and_repeats_do_not_count(teams):
+    """Who has an author in common, or hands in one recording twice, shares with nobody."""
+    twice = [*teams[0], replace(of_kind(teams[0], "step"), id="again")]
+    a = prints("a", twice, authors=("ann", "bob"))
+    b = prints("b", teams[0], authors=("bob", "carl"))
+    assert find_shared([a, b]) == {}
+
+
+def test_what_was_handed_out_may_be_used_by_all(teams):
+    """Recordings of an example are nobody's; one that is not among them is still found."""
+    given, own = teams[0][:-1], teams[0][-1]
+    example = fingerprint(given)
+    batch = [prints("a", teams[0]), prints("b", [*teams[1][:3], *given])]
+    assert find_shared(batch, examples=[example]) == {}
+    batch.append(prints("c", [own]))
+    found = find_shared(batch, examples=[example])
+    assert {name: [r.experiment for r in records] for name, records in found.items()} == {
+        "a": [own.id],
+        "c": [own.id],
+    }
+
+
+def test_what_was_handed_out_may_be_used_by_a_whole_class(teams):
+    """However many hold the same recording, each is held against what was handed out."""
+    rng = np.random.default_rng(11)
+    copies = [[disguised(r, rng, noise=0.1) for r in teams[0][:2]] for _ in range(40)]
+    batch = [prints(f"t{number:02d}", records) for number, records in enumerate(copies)]
+    assert len(find_shared(batch)) == 40
+    assert find_shared(batch, examples=[fingerprint(teams[0][:2])]) == {}
+
+
+def test_earlier_batches_count(teams):
+    """A recording of last year is found, and said to be; last year's copies are no news."""
+    old = [prints("x", teams[0]), prints("y", teams[0])]
+    found = find_shared([prints("a", teams[0][:4])], earlier=old)
+    assert set(found) == {"a"}
+    assert {r.other for r in found["a"]} == {"x (an earlier batch)", "y (an earlier batch)"}
+    flag = shared_flag(found["a"])
+    assert flag.parameters == tuple(r.id for r in teams[0][:4])
+    assert "does not say whose" in flag.message
+
+
+def test_a_recording_under_many_names_is_compared_once(teams):
+    """Two hand-ins of a thousand names for one file cost no more than two recordings."""
+    record = of_kind(teams[0], "decay")
+    many = [replace(record, id=f"decay-{number}") for number in range(1_000)]
+    a, b = prints("a", many), prints("b", many)
+    assert len(unpack(a.fingerprints)) == 1_000
+    assert sum(one.residual.size for one in unpack(a.fingerprints)) <= 2_000_000
+    start = time.process_time()
+    found = find_shared([a, b])
+    assert time.process_time() - start < 10  # s; all of them held against all: an hour
+    assert [r.experiment for r in found["a"]] == ["decay-0"]
+
+
+@pytest.mark.parametrize("alike", ["cuts of one run", "one hum in all"])
+def test_the_cost_grows_with_the_recordings_not_their_square(teams, alike):
+    """Two hand-ins made to look alike everywhere take no longer than their number asks."""
+    rng = np.random.default_rng(5)
+    record = of_kind(teams[0], "decay")
+    if alike == "cuts of one run":
+        made = lambda: disguised(record, rng, noise=0.01, keep=0.8)  # noqa: E731
+    else:
+        hum = np.resize(3 * COUNT * rng.standard_normal(37), record.t.size)
+        made = lambda: disguised(replace(record, y=record.y + hum), rng, noise=1.0)  # noqa: E731
+    batch = [prints(name, [replace(made(), id=str(k)) for k in range(100)]) for name in "ab"]
+    start = time.process_time()
+    find_shared(batch)
+    assert time.process_time() - start < 15  # s
+
+
+@pytest.mark.parametrize("kind", ["step", "decay"])
+def test_real_repeats_on_one_bench_are_not_shared(real_data, tmp_path, kind):
+    """Real runs of one experiment on one real bench, as if by as many teams, are no copies."""
+    folder = write_two_cart_submission(tmp_path / "s", real_data, steps=(1, 2, 3, 4, 5))
+    records = [r for r in read_data(load_submission(folder)).records if r.kind == kind]
+    teams = [prints(str(i), [record]) for i, record in enumerate(records)]
+    assert find_shared(teams) == {}
+    copy = disguised(records[2], np.random.default_rng(3), scale=0.5, keep=0.8)
+    found = find_shared([*teams, prints("copy", [copy])])
+    assert {r.other for r in found["copy"]} == {"2"}
+
+
+def test_still_or_short_recordings_have_no_fingerprint(teams):
+    """Where nothing moves there is nothing to compare; packing keeps what there is."""
+    record = of_kind(teams[0], "step")
+    still = replace(record, y=np.zeros_like(record.y))
+    short = replace(record, t=record.t[:50], u=record.u[:50], y=record.y[:, :50])
+    assert fingerprint([still, short]) == b""
+    (kept,) = unpack(fingerprint([still, record]))
+    assert kept.experiment == record.id
+    assert np.abs(kept.residual).max() <= 5

@@ -1,0 +1,123 @@
+"""Teams and classes that once were judged wrongly, on benches all over what a lab may have."""
+
+import tempfile
+from dataclasses import replace
+from decimal import Decimal
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.grading.grade import Grade
+from pipeline.grading.gradebook.class_lines import Line, wrong_springs
+from pipeline.grading.judge.run import grade_submission
+from pipeline.grading.mistakes.state_model import own_chain
+from pipeline.grading.publish.class_page import class_page
+from pipeline.grading.rubric_file import load_rubric
+from pipeline.plant.chain import Chain
+from tests.helpers.grading_class import Team, make_team
+from tests.helpers.grading_slips import SLIPS, scaled
+
+# The longest of those that once went wrong.
+LONG = [pytest.mark.slow, pytest.mark.sample]
+TIED = Chain(
+    m=np.array([3.1e-4, 1.7e-4]), c=np.array([6.7e-4, 4.4e-4]), k=np.array([0.05, 0.127, 0.061])
+)
+
+
+def flags(team: Team) -> list[str]:
+    return [f"{flag.code}: {flag.message}" for flag in team.grade().flags]
+
+
+@pytest.mark.parametrize("seed", [5, 30, 90, pytest.param(60023, marks=LONG), 60066])
+def test_little_damping_accuses_nobody(seed):
+    """Where dwells put a damping at zero, or dry friction has a share in it, nobody is wrong."""
+    team = make_team(seed)
+    assert team.bench.chain.zeta_carts.max() < 0.02
+    assert flags(team) == []
+
+
+def test_a_damping_that_the_fit_puts_at_zero_is_told_by_the_decay():
+    """A fit that ends at its bound has measured nothing; a damping ten times too large is."""
+    team = make_team(30)
+    assert team.analysis.chain is not None
+    wrong = team.reporting(final={"zeta": Decimal("0.031")}).grade()
+    assert [flag.code for flag in wrong.flags] == ["final_off"]
+    assert wrong.flags[0].evidence["recomputed"] == pytest.approx(0.00316, rel=0.1)
+
+
+@pytest.mark.parametrize("seed", [18, pytest.param(34, marks=LONG), 38])
+def test_coarse_encoders_cost_no_points(seed):
+    """Steps of a few counts, and dwells whose points miss the carts that their records follow."""
+    team = make_team(seed, count=0.2, travel=1.0, friction=0.0)
+    grade = team.grade()
+    assert [flag.code for flag in grade.flags] == []
+    assert grade.points >= 0.99 * grade.out_of
+
+
+def test_a_table_of_three_carts_without_a_gain_is_none_of_two():
+    """What is left of a table once a negative gain is out implies no carts."""
+    team = make_team(2)
+    table = {x: float(v) for x, v in team.reported.final.items()}
+    assert own_chain(table, n=3) is not None
+    del table["K_3"]
+    assert own_chain(table, n=3) is None
+    grade = team.reporting(final={"K_3": -team.reported.final["K_3"]}).grade()
+    assert "physically_impossible" in [flag.code for flag in grade.flags]
+
+
+@pytest.mark.parametrize(("seed", "digits"), [pytest.param(11, 2, marks=LONG), (17, 3)])
+def test_a_model_made_of_a_vague_table_is_no_wrong_one(seed, digits):
+    """Couplings are differences of large numbers: rounding alone moves them by a third."""
+    team = make_team(seed, digits=digits)
+    assert [f for f in flags(team) if f.startswith("wrong_state_space")] == []
+
+
+@pytest.mark.parametrize(
+    ("seed", "turn", "slips", "codes"),
+    [
+        (72014, 6, ("peak_count", "log10_for_ln"), {"peak_count", "log10_for_ln"}),
+        (73025, 0, ("hz_for_rad_s",), {"hz_for_rad_s"}),  # one resonance seen anywhere by eye
+        (73026, 0, ("peak_count",), {"peak_count"}),  # the seventh period, of one decay
+        (72007, 3, ("initial_off",), {"initial_off"}),  # typed too coarsely to be 6/5
+        (72021, 0, ("hz_for_rad_s", "log10_for_ln"), {"hz_for_rad_s", "log10_for_ln"}),
+    ],
+)
+def test_what_makes_the_whole_table_likeliest_is_named(seed, turn, slips, codes):
+    """Two mistakes in one number, a vague one beside sharp ones, a chance meeting of one."""
+    team = replace(make_team(seed), rng=np.random.default_rng([9, seed, turn]))
+    for slip in slips:
+        team = SLIPS[slip](team)
+    assert {flag.code for flag in team.grade().flags} == codes
+
+
+def test_a_gain_that_two_mistakes_make_is_told_with_both():
+    """With little damping the step peaks at twice its level."""
+    team = scaled(make_team(72003), ["K"], 2.0, ["initial"])
+    (flag,) = team.grade().flags
+    assert {flag.code, *flag.evidence["or_else"]} == {"peak_for_steady_state", "peak_to_peak"}
+
+
+def tied(seed: int) -> tuple[Team, Grade]:
+    """Return a team of two carts tied to both walls, graded by a rubric without the near spring."""
+    with tempfile.TemporaryDirectory() as folder:
+        team = make_team(seed, folder=Path(folder), digits=3, chain=TIED)
+        rubric = load_rubric(Path("throne-2dof"))
+        submission = team.submission.model_copy(
+            update={"system": rubric.system.model_copy(update={"springs": (False, True, True)})}
+        )
+        required = team.rubric.required
+        rubric = rubric.model_copy(update={"required": required})
+        return team, grade_submission(submission, rubric=rubric, name="team-07").grade
+
+
+def test_springs_that_the_rubric_does_not_have_accuse_nobody():
+    """What the rubric's springs leave unexplained and others explain is judged with those."""
+    team, grade = tied(1)
+    assert grade.springs == ("wall-1",)
+    assert [flag.code for flag in grade.flags] == []
+    assert grade.points >= 0.95 * grade.out_of
+    assert "wall-1" in wrong_springs([grade.springs, ()])
+    lines = [Line.of(grade, by_hand=())]
+    assert "1 of 1 submissions" in class_page(lines, rubric=team.rubric)
+    assert wrong_springs([(), ()]) == ""

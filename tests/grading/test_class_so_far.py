@@ -1,0 +1,365 @@
+"""A class is all that was graded: one hand-in by itself changes nothing of the others."""
+
+import csv
+import json
+import re
+import shutil
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from pipeline.errors import ConfigError
+from pipeline.grading.batch.batch_run import grade_class
+from pipeline.grading.batch.runner import Limits
+from pipeline.grading.batch.so_far import Row, class_so_far
+from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.history import history_text
+from pipeline.grading.intake.hand_ins import find_hand_ins
+from pipeline.grading.outcome import Batch
+from pipeline.grading.publish.outputs import write_outputs
+from pipeline.resources import RUBRICS
+from pipeline.synthesis import write_submission
+from tests.helpers.grades import (
+    failed_grade,
+    in_this_process,
+    make_grade,
+    make_outcome,
+    two_cart_rubric,
+)
+from tests.test_schemas import assert_fits
+
+RUBRIC = two_cart_rubric()
+
+
+@pytest.fixture(scope="module")
+def school(tmp_path_factory) -> Path:
+    """Two sections with a team-1 each, and a team-2 that has the step of the first one."""
+    folder = tmp_path_factory.mktemp("school")
+    for seed, name in enumerate(("A/team-1", "B/team-1", "B/team-2")):
+        write_submission(
+            folder / name,
+            chain="throne-1dof",
+            seed=seed,
+            authors=(f"s{seed}",),
+            compact=True,
+            reported=True,
+        )
+    step = (folder / "A/team-1/data/step-1.csv").read_bytes()
+    (folder / "B/team-2/data/step-2.csv").write_bytes(step)
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def _here(monkeypatch):
+    """Grade in this process: what a worker does apart is no matter here."""
+    monkeypatch.setattr(
+        "pipeline.grading.batch.batch_run.run_here", lambda *, jobs: in_this_process
+    )
+
+
+def grade(*paths: Path, out: Path, rubric: Path = Path("throne-1dof")):
+    return grade_class(
+        paths,
+        rubric_file=rubric,
+        out=out,
+        jobs=1,
+        cluster=None,
+        limits=Limits(),
+        figures=False,
+        progress=lambda done, total, last: None,
+    )
+
+
+def give(out: Path, team: str, points: float) -> None:
+    with Gradebook(out) as book:
+        book.override(team, "pieces", points, why="x", by="y")
+        write_outputs(book, out)
+
+
+def rows(out: Path) -> dict[str, dict[str, str]]:
+    with (out / "grades.csv").open(encoding="utf-8", newline="") as file:
+        return {row["submission"]: row for row in csv.DictReader(file)}
+
+
+def pages(out: Path) -> dict[str, bytes]:
+    return {name: (out / name).read_bytes() for name in ("grades.csv", "class.html")}
+
+
+def test_a_late_hand_in_by_itself_keeps_the_class(school, tmp_path):
+    """Its id, everybody's rows and feedback, and the sharing on both sides are as if all ran."""
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    grade(school, out=whole)
+    grade(school, out=parts)
+    done = grade(school / "A" / "team-1", out=parts)
+    assert (done.total, done.sharing) == (1, 2)
+    assert done.remarks == (
+        "not in this run, kept as they were: B-team-1 and team-2 (cartlab remove takes one off)",
+    )
+    for file in (parts / "feedback").glob("*/grade.json"):
+        assert_fits("grade", file.read_text(encoding="utf-8"))
+    assert rows(parts) == rows(whole)
+    assert list(rows(parts)) == ["A-team-1", "B-team-1", "team-2"]
+    assert pages(parts) == pages(whole)
+    assert sorted(path.name for path in (parts / "feedback").iterdir() if path.is_dir()) == [
+        "A-team-1", "B-team-1", "team-2",
+    ]  # fmt: skip
+
+
+def test_a_renamed_folder_is_the_same_submission(school, tmp_path):
+    """One row, under the name it has now, which is told; what its people were given goes on."""
+    out = tmp_path / "out"
+    grade(school / "B" / "team-1", out=out)
+    give(out, "team-1", 0.25)
+    copy = shutil.copytree(school / "B" / "team-1", tmp_path / "team-one")
+    for name in ("team-one", "TEAM-one", "team-1"):
+        done = grade(copy.rename(tmp_path / name), out=out)
+        copy = tmp_path / name
+        assert f" is now called {name}; " in done.remarks[0]
+        assert len(done.remarks) == 1
+        assert not re.search("is (new|gone)", " ".join(done.changes))
+        assert {n: (r["by_hand"], r["pieces"]) for n, r in rows(out).items()} == {
+            name: ("pieces", "0.25")
+        }
+    with Gradebook(out) as book:
+        book.override("team-1", "pieces", None, why="x", by="y")
+    grade(copy.rename(tmp_path / "team-one"), out=out)
+    assert rows(out)["team-one"]["by_hand"] == ""
+
+
+@pytest.mark.parametrize("author", ["s0", "s1"])
+def test_a_folder_in_a_strangers_zip_takes_nothing_from_a_team(school, tmp_path, author):
+    """It makes the names longer; the rows of those who had them, and points by hand, go on.
+
+    So with the id of the team in it, too, and where a submission cannot be read.
+    """
+    out, folder = tmp_path / "out", tmp_path / "class"
+    shutil.copytree(school / "B" / "team-1", folder / "team-1")
+    (folder / "team-2").mkdir()
+    (folder / "team-2" / "submission.toml").write_text("carts = ?", encoding="utf-8")
+    grade(folder, out=out)
+    give(out, "team-1", 0.25)
+    give(out, "team-2", 0.75)
+    before = rows(out)
+    stranger = school / "A" / "team-1"
+    toml = (stranger / "submission.toml").read_text(encoding="utf-8")
+    with zipfile.ZipFile(folder / "stranger.zip", "w") as archive:
+        archive.writestr("team-1/submission.toml", toml.replace('"s0"', f'"{author}"'))
+        for file in (stranger / "data").iterdir():
+            archive.write(file, f"team-1/data/{file.name}")
+    with zipfile.ZipFile(folder / "other.zip", "w") as archive:
+        archive.writestr("team-2/submission.toml", "carts = !")
+    grade(folder, out=out)
+    now = rows(out)
+    assert list(now) == ["class-team-1", "class-team-2", "other-team-2", "stranger-team-1"]
+    for name, row in before.items():
+        same = {key: row[key] for key in row if key not in ("submission", "reason")}
+        assert now[f"class-{name}"] | same == now[f"class-{name}"]
+    assert {now[name]["by_hand"] for name in ("stranger-team-1", "other-team-2")} == {""}
+
+
+def test_a_rubric_of_another_name_replaces_no_class(school, tmp_path):
+    """Its files, and what was given by hand, would be gone without a word."""
+    out, rubric = tmp_path / "out", tmp_path / "lab.toml"
+    shutil.copy(RUBRICS / "throne-1dof.toml", rubric)
+    grade(school / "B" / "team-1", out=out, rubric=rubric)
+    give(out, "team-1", 0.25)
+    before = pages(out)
+    mended = rubric.rename(tmp_path / "lab-mended.toml")
+    with pytest.raises(ConfigError, match=r"holds the class of lab\.toml"):
+        grade(school / "B" / "team-1", out=out, rubric=mended)
+    assert pages(out) == before
+    grade(school / "B" / "team-1", out=out, rubric=mended.rename(rubric))
+    assert rows(out)["team-1"]["by_hand"] == "pieces"
+
+
+def test_a_mended_id_and_another_folder_accuse_nobody(school, tmp_path):
+    """The platform's number says whose it is; so in the runs after that one, too."""
+    out, folder = tmp_path / "out", tmp_path / "class"
+    for inside, id_ in (("lab", "s 1"), ("lab-final", "s1")):
+        shutil.rmtree(folder, ignore_errors=True)
+        own = folder / "Jane Doe_1024_assignsubmission_file_" / inside
+        shutil.copytree(school / "B" / "team-1", own)
+        text = (own / "submission.toml").read_text(encoding="utf-8")
+        mended = text.replace('"s1"', f'"{id_}"')
+        (own / "submission.toml").write_text(mended, encoding="utf-8")
+        shutil.copytree(school / "A" / "team-1", folder / "Bo_7_assignsubmission_file_" / "other")
+        done = [grade(folder, out=out) for _ in range(2)]
+        assert [one.sharing for one in done] == [0, 0]
+        if inside == "lab":
+            give(out, "lab", 0.25)
+        else:  # by another id it is another's, and that is said
+            assert [r for r in done[0].remarks if "'s1' in place of 's 1'" in r]
+    assert {name: row["authors"] for name, row in rows(out).items()} == {
+        "lab-final": "s1", "other": "s0",
+    }  # fmt: skip
+
+
+def test_who_exchanges_folders_keeps_what_was_given(tmp_path):
+    """Two teams, each in the folder of the other now, the recordings made anew."""
+    with Gradebook(tmp_path, assignment="lab", create=True) as book:
+        for run, names in enumerate(((("a", "ann"), ("b", "bo")), (("a", "bo"), ("b", "ann")))):
+            outcomes = [
+                make_outcome(make_grade(n, authors=(who,)), key=f"{run} {n}", fingerprints=b"")
+                for n, who in names
+            ]
+            found = class_so_far({o.submission: Row.of(o) for o in outcomes}, book)
+            assert (dict(found.kept), found.taken_over) == ({}, ())
+            assert found.moved == ({"a": "b", "b": "a"} if run else {})
+            for outcome in outcomes:
+                book.put(outcome)
+            keys = tuple(o.key for o in outcomes)
+            book.finish(Batch(keys=keys, shared={}, moved=found.moved), rubric=RUBRIC)
+            if not run:
+                book.override("ann", "pieces", 0.25, why="x", by="y")
+        assert {e.submission: list(e.overrides) for e in book.entries()} == {
+            "a": [],
+            "b": ["pieces"],
+        }
+
+
+def test_what_makes_two_the_same_submission(tmp_path):
+    """The platform's number before the files, those before the people; never other people's."""
+    old = make_outcome(make_grade("old", authors=("ann",)), key="k-files", owner="A (canvas 7)")
+    with Gradebook(tmp_path, assignment="lab", create=True) as book:
+        book.put(old)
+        book.finish(Batch(keys=(old.key,), shared={}), rubric=RUBRIC)
+
+        def goes_on_as(**others) -> str:
+            found = {}
+            for name, (who, key, owner) in others.items():
+                new = make_outcome(make_grade(name, authors=who), key=key, owner=owner)
+                found[name] = Row.of(replace(new, fingerprints=b""))
+            return class_so_far(found, book).moved.get("old", "")
+
+        number = (("ann l",), "1-x", "A (canvas 7)")
+        files = (("ann",), "2-files", "B (canvas 8)")
+        people = (("Ann ",), "3-y", "")
+        assert goes_on_as(people=people, files=files, number=number) == "number"
+        assert goes_on_as(people=people, files=files) == "files"
+        assert goes_on_as(people=people) == "people"
+        assert goes_on_as(another=(("ann", "bo"), "3-y", "")) == ""
+        assert goes_on_as(another=(("ann",), "3-y", "B (canvas 8)")) == ""
+        assert goes_on_as(another=((), "3-y", "")) == ""
+
+
+def test_two_that_hand_in_nothing_are_not_the_same(tmp_path):
+    """Of files that name nobody the folder says whose they are; a longer name is no other one."""
+    old = make_outcome(failed_grade("team-3", "empty"), key="k-none", fingerprints=b"")
+    with Gradebook(tmp_path, assignment="lab", create=True) as book:
+        book.put(old)
+        book.finish(Batch(keys=(old.key,), shared={}), rubric=RUBRIC)
+        new = [Row.of(replace(old, submission=name)) for name in ("team-9", "class-team-3")]
+        rows = {row.prints.submission: row for row in new}
+        assert class_so_far(rows, book).moved == {"team-3": "class-team-3"}
+        assert class_so_far({"team-9": new[0]}, book).moved == {}
+
+
+def test_a_mended_id_of_an_author_accuses_nobody(school, tmp_path):
+    """Capitals, blanks, or another id for the same recordings, are no other team."""
+    own, out = shutil.copytree(school / "B" / "team-1", tmp_path / "team-1"), tmp_path / "out"
+    file = own / "submission.toml"
+    text = file.read_text(encoding="utf-8")
+    for typed in ("s1", " S1 ", "s 17"):
+        file.write_text(text.replace('"s1"', f'"{typed}"'), encoding="utf-8")
+        done = grade(own, out=out)
+        assert done.sharing == 0
+    assert done.remarks == (
+        "team-1 is now by others, 's 17' in place of ' S1 ': where both count, give one folder "
+        "another name",
+    )
+
+
+def test_the_rubric_of_those_kept_is_told(tmp_path):
+    """Who stays on the list is by the rubric that graded them, whatever it is called now."""
+    a, b = make_outcome(make_grade("a")), make_outcome(make_grade("b"))
+    other = RUBRIC.model_copy(update={"criteria": RUBRIC.criteria[:-1]})
+    with Gradebook(tmp_path, assignment="lab", create=True) as book:
+        for outcome in (a, b):
+            book.put(outcome)
+        book.finish(Batch(keys=(a.key,), shared={}), rubric=other)
+        both = Batch(keys=(a.key, b.key), shared={})
+        book.finish(both, rubric=other.model_copy(update={"title": "Lab", "anonymous": True}))
+        assert book.by_other_rubrics() == []
+        book.finish(both, rubric=RUBRIC)
+        assert book.by_other_rubrics() == ["a", "b"]
+
+
+def test_who_is_removed_is_off_every_list_but_history(tmp_path):
+    """The pages are without them; their history tells it, and graded again they are back."""
+    outcomes = [make_outcome(make_grade(name)) for name in ("a", "b", "c")]
+    everybody = Batch(keys=tuple(o.key for o in outcomes), shared={})
+    with Gradebook(tmp_path, assignment="lab", create=True) as book:
+        for outcome in outcomes:
+            book.put(outcome)
+        book.finish(everybody, rubric=RUBRIC)
+        assert book.remove(["S-B", "c"]) == ["b", "c"]
+        write_outputs(book, tmp_path)
+        assert list(rows(tmp_path)) == ["a"]
+        assert [p.name for p in (tmp_path / "feedback").iterdir() if p.is_dir()] == ["a"]
+        assert book.names() == ["a"]
+        for team in ("b", "s-b"):
+            name, events = book.history(team)
+            assert (name, [event.what for event in events]) == (
+                "b",
+                ["graded", "listed", "removed"],
+            )
+        assert history_text(name, events).endswith("removed   off the class list")
+        with pytest.raises(ConfigError, match="b: no such submission"):
+            book.remove(["b"])
+        book.finish(everybody, rubric=RUBRIC)
+        assert book.names() == ["a", "b", "c"]
+        book.remove(["a", "b", "c"])
+        write_outputs(book, tmp_path)
+        assert rows(tmp_path) == {}
+
+
+def test_a_failed_second_try_hides_no_recordings(tmp_path):
+    """What was handed in first is still known after a timeout, and a replaced version too."""
+    grade_ = make_grade("team")
+    with Gradebook(tmp_path, assignment="lab", create=True) as book:
+        for key, prints in (("1", b"first"), ("2", b""), ("3", b"second"), ("4", b"first")):
+            book.put(make_outcome(grade_, key=key, fingerprints=prints))
+        assert [p.fingerprints for p in book.prints()] == [b"first", b"second"]
+        assert all(p.of_class for p in book.prints())
+    with Gradebook(tmp_path, assignment="another", create=True) as book:
+        assert not any(p.of_class for p in book.prints())
+
+
+def test_an_override_stays_with_the_same_person(tmp_path):
+    """An id in capitals is the same person's; another id is another's."""
+    grades = [make_grade("team", authors=(who,)) for who in ("ada 1", " Ada  1", "bob")]
+    with Gradebook(tmp_path, assignment="lab", create=True) as book:
+        kept = []
+        for key, one in enumerate(grades):
+            book.put(make_outcome(one, key=str(key)))
+            book.finish(Batch(keys=(str(key),), shared={}), rubric=RUBRIC)
+            if not kept:
+                book.override("ADA 1", RUBRIC.criteria[0].id, 0.0, why="x", by="y")
+            kept.append(bool(book.entry("team").overrides))
+        assert kept == [True, True, False]
+
+
+def test_the_id_of_a_class_so_far_is_kept(school, tmp_path):
+    """Only where the longer id is on the list and the plain one is not."""
+    path = [school / "A" / "team-1"]
+    for known, id_ in (
+        ((), "team-1"),
+        (("A-team-1", "B-team-1"), "A-team-1"),
+        (("A-team-1", "team-1"), "team-1"),
+    ):
+        found = find_hand_ins(path, scratch=tmp_path / "scratch", known=known)
+        assert [hand_in.id for hand_in in found] == [id_]
+
+
+def test_only_the_feedback_that_changes_is_written_again(school, tmp_path):
+    """A kept submission's page is the very file it was, unless a newcomer shares with it."""
+    out = tmp_path / "out"
+    grade(school / "B", out=out)
+    before = {p: p.stat().st_mtime_ns for p in (out / "feedback").glob("team-1/*")}
+    grade(shutil.copytree(school / "A" / "team-1", tmp_path / "team-0"), out=out)
+    assert len(before) == 2
+    assert {p: p.stat().st_mtime_ns for p in before} == before
+    document = json.loads((out / "feedback/team-2/grade.json").read_text(encoding="utf-8"))
+    assert [flag["code"] for flag in document["flags"]].count("shared_data") == 1

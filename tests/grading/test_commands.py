@@ -1,0 +1,204 @@
+"""The commands for what comes after grading, as they are typed."""
+
+import csv
+import io
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from pipeline.cli import main
+from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.outcome import Batch
+from tests.grading.publish.test_survey import write_paper
+from tests.helpers.grades import make_grade, make_outcome, two_cart_rubric, write_class
+
+
+@pytest.fixture
+def run(monkeypatch, capsys):
+    """Type a command; return its exit status, stdout and stderr."""
+
+    def typed(*words: str | Path) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["cartlab", *map(str, words)])
+        with pytest.raises(SystemExit) as end:
+            main()
+        told = capsys.readouterr()
+        return int(end.value.code or 0), told.out, told.err
+
+    return typed
+
+
+@pytest.fixture(scope="module")
+def grades(tmp_path_factory) -> Path:
+    """A graded class that no test changes."""
+    return write_class(tmp_path_factory.mktemp("grades"))
+
+
+def points_of(folder: Path, team: str) -> float:
+    text = (folder / "feedback" / team / "grade.json").read_text(encoding="utf-8")
+    return json.loads(text)["points"]
+
+
+def test_an_override_reaches_the_pages_at_once(run, tmp_path):
+    """And is taken back by `auto`; history tells both."""
+    grades = write_class(tmp_path)
+    before = points_of(grades, "team-03")
+
+    status, out, err = run(
+        "override", grades, "s2", "pieces", "1", "--why", "all there", "--by", "Ada"
+    )
+
+    assert (status, out) == (0, "")
+    assert err == f"team-03: {before + 0.1:g} of 20 points\n"
+    assert points_of(grades, "team-03") == pytest.approx(before + 0.1)
+    assert "all there" in (grades / "feedback/team-03/feedback.html").read_text(encoding="utf-8")
+    run("override", grades, "team-03", "pieces", "auto", "--why", "no", "--by", "Ada")
+    assert points_of(grades, "team-03") == before
+    status, out, _ = run("history", grades, "team-03")
+    assert (status, len(out.splitlines())) == (0, 5)
+    assert "override  pieces: 1 by hand, by Ada: all there" in out
+    _, out, _ = run("history", grades, "team-03", "--json")
+    assert [event["what"] for event in json.loads(out)["events"]] == [
+        "graded", "listed", "override", "override",
+    ]  # fmt: skip
+
+
+def test_what_is_remembered_names_nobody(run, tmp_path):
+    """Without names no file beside the gradebook and the key has any, not even one from before."""
+    (tmp_path / "class" / "Jane Doe").mkdir(parents=True)
+    (tmp_path / "class" / "Jane Doe" / "submission.toml").write_text("x", encoding="utf-8")
+    for more in ([], ["--anonymous"]):
+        grade = ("grade", tmp_path / "class", "--rubric", "throne-1dof", "--out", tmp_path / "out")
+        assert run(*grade, "--jobs", "1", *more)[0] == 1
+        left = {path.name for path in (tmp_path / "out").rglob("*") if path.is_file()}
+        assert (".compared.json" in left) == (not more)
+
+
+def test_a_team_is_corrected_by_the_name_that_stands_in_for_it(run, tmp_path):
+    """Who grades without names need not look one up, and is not told one."""
+    grades = write_class(tmp_path, anonymous=True)
+    with (grades / "anonymous-key.csv").open(newline="", encoding="utf-8") as file:
+        names = {row["submission"]: row["anonymous"] for row in csv.DictReader(file)}
+    anon, broken = names["team-03"], names["broken"]
+    status, _, err = run("override", grades, anon, "pieces", "1", "--why", "all", "--by", "Ada")
+    assert (status, err.startswith(f"{anon}: ")) == (0, True)
+    assert points_of(grades, anon) == pytest.approx(float(err.split()[1]))
+    _, out, _ = run("history", grades, anon)
+    assert out.startswith(f"{anon}\n")
+    assert "team-03" not in out
+    assert "pieces: 1 by hand, by Ada: all" in out
+    _, out, _ = run("history", grades, broken)
+    assert "could not be graded" in out
+    assert run("history", grades, "anon-nobody")[0] == 2
+
+
+def test_what_was_given_by_hand_is_not_taken_off_without_a_word(run, tmp_path):
+    """Who removes a submission reads whose points by hand go with it."""
+    grades = write_class(tmp_path)
+    status, _, err = run("remove", grades, "team-02", "s2")
+    assert status == 0
+    assert err.splitlines() == [
+        "no longer in the class: team-02, team-03",
+        "with points given by hand, which count no more: team-02",
+    ]
+    assert run("remove", grades, "team-02")[0] == 2
+
+
+def test_a_name_writes_nothing_over_what_is_said(run, tmp_path):
+    """Control characters of an author's id are blanks on the terminal."""
+    outcomes = [make_outcome(make_grade(name, share=1 / n, authors=("eve\r\x1b[2Kbob",)))
+                for n, name in ((1, "a"), (2, "b"))]  # fmt: skip
+    with Gradebook(tmp_path, assignment="lab", create=True) as book:
+        for outcome in outcomes:
+            book.put(outcome)
+        book.finish(Batch(keys=tuple(o.key for o in outcomes), shared={}), rubric=two_cart_rubric())
+    _, _, err = run("export", tmp_path, "--lms", "canvas")
+    assert err.startswith("eve  [2Kbob is in a (20) and b (10): left out")
+
+
+def test_a_console_of_few_letters_is_no_error(grades, monkeypatch):
+    """What it has no letter for is shown by its number; the JSON stays valid."""
+    raw = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(raw, encoding="cp1252"))
+    monkeypatch.setattr(
+        sys, "argv", ["cartlab", "history", str(grades), "Ünal 学生 & co", "--json"]
+    )
+    with pytest.raises(SystemExit) as end:
+        main()
+    sys.stdout.flush()
+    assert not end.value.code
+    assert json.loads(raw.getvalue().decode("cp1252"))["submission"] == "Ünal 学生 & co"
+
+
+@pytest.mark.parametrize("lms", ["canvas", "moodle", "gradescope"])
+def test_an_export_lies_beside_the_grades(run, grades, tmp_path, lms):
+    """Or where it is told to; what a person must know is said."""
+    status, out, err = run("export", grades, "--lms", lms)
+    assert (status, out) == (0, "")
+    assert f"wrote {grades / lms}.csv" in err
+    assert "nobody is named in it, so not exported: broken" in err
+    run("export", grades, "--lms", lms, "--out", tmp_path / "elsewhere", "--title", "Lab")
+    assert (tmp_path / "elsewhere" / f"{lms}.csv").is_file()
+
+
+def test_a_class_that_nobody_could_be_graded_of(run, tmp_path):
+    """The rubric may be another lab's, and is asked about; lateness is known all the same."""
+    for name in ("team-1", "team-2"):
+        (tmp_path / "c" / name).mkdir(parents=True)
+        (tmp_path / "c" / name / "submission.toml").write_text(
+            "version = 1\n[system]\ncarts = 1\n", encoding="utf-8"
+        )
+    late = tmp_path / "late.csv"
+    late.write_text("submission,days_late\nteam-1,2.5\nteam-9,1\n", encoding="utf-8")
+    out = tmp_path / "out"
+    status, _, err = run(
+        "grade", tmp_path / "c", "--rubric", "throne-2dof", "--out", out, "--lateness", late,
+        "--jobs", 1,
+    )  # fmt: skip
+    assert status == 1
+    assert err.splitlines() == [
+        "late.csv: no such submission: team-9",
+        "team-1: the submission is for 1 cart, the rubric for 2",
+        "team-2: the submission is for 1 cart, the rubric for 2",
+        "not one could be graded: is throne-2dof the rubric for these submissions?",
+        f"0 of 2 graded; wrote {out}",
+    ]
+    with (out / "grades.csv").open(newline="", encoding="utf-8") as file:
+        assert [row["days_late"] for row in csv.DictReader(file)] == ["2.5", "0"]
+    inside = tmp_path / "c" / "team-1" / "grades"
+    status, _, err = run("grade", tmp_path / "c", "--rubric", "throne-2dof", "--out", inside)
+    assert (status, inside.exists()) == (2, False)
+    assert "is in a submission; name a folder outside of it" in err
+
+
+def test_a_survey_is_told_on_stdout(run, tmp_path):
+    """As Markdown or JSON; columns that are left out on stderr."""
+    file = write_paper(tmp_path / "answers.csv")
+    status, out, err = run("survey", file)
+    assert status == 0
+    assert out.startswith("| Question ")
+    assert err == "left out, no question of either table: Timestamp\n"
+    assert json.loads(run("survey", file, "--json")[1])["students"] == 13
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("history", "nowhere", "team-1"), "nowhere: holds no gradebook.sqlite"),
+        (("history", "{grades}", "team-99"), "team-99: no such submission; there is team-09"),
+        (("override", "{grades}", "team-01", "pieces", "lots", "--why", "x", "--by", "y"), "lots:"),
+        (("export", "{grades}", "--lms", "blackboard"), "blackboard"),
+        (("export", "{grades}", "--lms", "canvas", "--roster", "none.csv"), "none.csv"),
+        (("survey", "none.csv"), "none.csv"),
+        (("export", "mysql://u:secret@h/d", "--lms", "canvas"), "no driver"),
+    ],
+)
+def test_what_cannot_be_done_is_one_line(run, grades, tmp_path, monkeypatch, words, message):
+    """Exit status 2, a clear message, no traceback, no password."""
+    monkeypatch.chdir(tmp_path)
+    status, out, err = run(*(word.replace("{grades}", str(grades)) for word in words))
+    assert (status, out) == (2, "")
+    assert message in err
+    assert err.count("\n") == 1
+    assert "secret" not in err

@@ -1,0 +1,96 @@
+"""Submissions with a plan to carry out, and an observer that takes notes."""
+
+import subprocess
+import sys
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+
+from pipeline.bench.planning.plan import Limits, Plan, Recording
+from pipeline.bench.planning.plan_file import save_plan
+from pipeline.bench.protocol.messages import Reading
+from pipeline.bench.watch.observer import Anomalies, Outcome
+from pipeline.submission import load_submission
+from pipeline.submission.load import NAME
+from tests.helpers.waiting import started, until
+
+LIMITS = Limits(input=0.5, travel=2.5)  # V, cm: what the virtual benches state as theirs
+
+
+def sine(name: str, *, seconds: float, frequency: float = 2.0, settle: float = 0.0) -> Recording:
+    """Return a dwell with both carts free, well within the limits."""
+    return Recording(
+        id=name,
+        kind="sine",
+        carts=(1, 2),
+        wave="sine",
+        amplitude=0.01,
+        frequency=frequency,
+        cycles=round(seconds * frequency),
+        settle=settle,
+    )
+
+
+def write_work(
+    folder: Path, recordings: Sequence[Recording], *, limits: Limits = LIMITS, scales: str = ""
+) -> Path:
+    """Write a submission of two carts with this plan; its scales are the bench's to state."""
+    folder.mkdir(parents=True, exist_ok=True)
+    text = f'version = 1\n\n[system]  # ours\ncarts = 2\nposition = {{ unit = "cm" }}\n{scales}'
+    (folder / NAME).write_text(text, encoding="utf-8")
+    save_plan(Plan(limits=limits, recordings=tuple(recordings)), load_submission(folder))
+    return folder
+
+
+class Notes:
+    """Takes down what it is told; confirms everything."""
+
+    def __init__(self) -> None:
+        self.confirmed: list[str] = []
+        self.remarks: list[str] = []
+        self.outcomes: list[Outcome] = []
+        self.readings_seen: list[Reading] = []
+        self.plans: list[tuple[int, frozenset[str]]] = []
+
+    def planned(self, plan: Plan, done: frozenset[str]) -> None:
+        """Note the length of the plan and what is done."""
+        self.plans.append((len(plan.recordings), done))
+
+    def confirm(self, instruction: str) -> None:
+        """Note the instruction and do it."""
+        self.confirmed.append(instruction)
+
+    def settling(self, recording: Recording, seconds: float) -> None:
+        """Note nothing."""
+
+    def started(self, recording: Recording) -> None:
+        """Forget the lines of the run before."""
+        self.readings_seen = []
+
+    def readings(self, batch: Sequence[Reading], anomalies: Anomalies) -> None:
+        """Note the lines."""
+        self.readings_seen += batch
+
+    def finished(self, outcome: Outcome) -> None:
+        """Note the outcome."""
+        self.outcomes.append(outcome)
+
+    def remark(self, sentence: str) -> None:
+        """Note the sentence."""
+        self.remarks.append(sentence)
+
+
+def host(folder: Path, port: str, *options: str) -> AbstractContextManager[subprocess.Popen[str]]:
+    """Run `cartlab acquire` in a process of its own beside a block."""
+    command = [sys.executable, "-m", "pipeline", "acquire", folder, "--port", port, *options]
+    return started(command, stderr=subprocess.PIPE, encoding="utf-8")
+
+
+def until_bytes(raw: Path, process: subprocess.Popen[str], *, least: int = 5_000) -> None:
+    """Wait until a host has written so much of a run."""
+
+    def written() -> bool:
+        assert process.poll() is None, "the host ended before"
+        return raw.exists() and raw.stat().st_size >= least
+
+    until(written, "a run")

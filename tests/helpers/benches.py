@@ -1,0 +1,92 @@
+"""A virtual bench in a process of its own, for tests and for whoever tries a host."""
+
+import json
+import os
+import queue
+import signal
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from typing import IO, Any
+
+from tests.helpers.nursery import order
+from tests.helpers.waiting import PATIENCE
+
+
+@dataclass
+class Emulator:
+    """A running `cartlab emulate`.
+
+    Attributes
+    ----------
+    address : what pyserial's `serial_for_url` opens.
+    said : the lines on stderr so far, but for the events.
+    pid : its process.
+    runs : how many have ended so far.
+    """
+
+    address: str
+    said: list[str]
+    pid: int = 0
+    runs: int = 0
+    _events: "queue.Queue[dict[str, Any]]" = field(default_factory=queue.Queue)
+
+    def event(self, name: str, *, timeout: float = PATIENCE) -> dict[str, Any]:
+        """Wait for the next event of that name; others before it are passed over.
+
+        Raises
+        ------
+        queue.Empty : none came in `timeout` s.
+        """
+        while True:
+            event = self._events.get(timeout=timeout)
+            if event["event"] == name:
+                return event
+
+
+@contextmanager
+def emulator(
+    *options: str, preset: str = "throne-2dof", watchdog: float = PATIENCE
+) -> Iterator[Emulator]:
+    """Run `cartlab emulate` with these options for as long as the block lasts.
+
+    Its watchdog waits longer (s) than a bench's, for a host on a machine that may be busy.
+    """
+    words = ["cartlab", "emulate", *options]
+    if "--model" not in options:
+        words += ["--preset", preset]
+    running = Emulator(address="", said=[])
+    ready = threading.Event()
+    with socket.create_server(("127.0.0.1", 0)) as door:
+        door.settimeout(PATIENCE)
+        order(words=words, watchdog=watchdog, port=door.getsockname()[1])
+        line, _ = door.accept()
+    with line, line.makefile(encoding="utf-8") as said:
+        running.pid = int(said.readline())
+        listener = threading.Thread(target=_listen, args=(running, said, ready), daemon=True)
+        listener.start()
+        try:
+            assert ready.wait(PATIENCE), "no bench became ready"
+            assert running.address, "\n".join(running.said)
+            yield running
+        finally:
+            with suppress(ProcessLookupError):
+                os.kill(running.pid, signal.SIGTERM)
+            listener.join()
+
+
+def _listen(running: Emulator, said: IO[str], ready: threading.Event) -> None:
+    """Take down what the bench says until it says no more."""
+    for line in said:
+        if line.startswith("{"):
+            event = json.loads(line)
+            running.runs += event["event"] == "run"
+            running._events.put(event)
+        else:
+            running.said.append(line.rstrip())
+        if line.startswith("ready: "):
+            running.address = line.removeprefix("ready: ").strip()
+            ready.set()
+    ready.set()

@@ -1,0 +1,71 @@
+"""Where virtual benches come from: a process that has loaded all that one needs forks each.
+
+That takes two seconds of a processor, once. Where nothing can be forked each bench loads it anew.
+"""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from functools import cache
+from typing import Any
+from unittest.mock import patch
+
+from tests.helpers.places import ROOT
+
+
+def order(**bench: Any) -> None:
+    """Have a bench made; it connects to `port`, as `be` says."""
+    if sys.platform == "win32":
+        script = f"from tests.helpers.nursery import be; be(**{bench!r})"
+        subprocess.Popen([sys.executable, "-c", script], cwd=ROOT)
+        return
+    wishes = _nursery().stdin
+    assert wishes is not None
+    print(json.dumps(bench), file=wishes, flush=True)
+
+
+def be(*, words: list[str], watchdog: float, port: int) -> None:
+    """Be the command of these words, whose stderr is a line to that port; first comes its pid."""
+    from pipeline.bench.emulator import core
+    from pipeline.cli import main
+
+    core.WATCHDOG = watchdog
+    with socket.create_connection(("127.0.0.1", port)) as line:
+        with line.makefile("w", buffering=1, encoding="utf-8") as stderr:
+            print(os.getpid(), file=stderr)
+            try:
+                with patch.multiple(sys, argv=words, stderr=stderr):
+                    main()
+            except SystemExit as end:
+                print(json.dumps({"event": "exit", "status": end.code or 0}), file=stderr)
+                raise
+
+
+@cache
+def _nursery() -> "subprocess.Popen[str]":
+    """Start the process, which ends with this one: with its stdin."""
+    script = "from tests.helpers.nursery import fork_benches; fork_benches()"
+    return subprocess.Popen(
+        [sys.executable, "-c", script], stdin=subprocess.PIPE, text=True, cwd=ROOT
+    )
+
+
+def fork_benches() -> None:
+    """Fork a bench for each line of stdin."""
+    load_bench()
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for those that ended
+    for line in sys.stdin:
+        if os.fork() == 0:
+            signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+            be(**json.loads(line))
+
+
+def load_bench() -> None:
+    """Import all that a bench needs, and compile its simulator where nobody has yet."""
+    from pipeline.bench.emulator.assemble import open_bench
+    from pipeline.synthesis.hidden import prepare_bench
+
+    open_bench(prepare_bench(preset="throne-1dof")).close()

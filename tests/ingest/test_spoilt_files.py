@@ -1,0 +1,203 @@
+"""Damaged files: whatever the damage, a clear error or a record, never a crash, never a hang."""
+
+import time
+from contextlib import contextmanager
+from io import BytesIO
+
+import numpy as np
+import pytest
+import scipy.io
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from pipeline.errors import PipelineError
+from pipeline.ingest.formats.recognise import parse_table
+from pipeline.ingest.inspect import format_inspection, inspect_file
+from pipeline.ingest.read import read_data
+from pipeline.submission import Submission, load_submission
+from tests.helpers.places import ROOT
+
+N = 60
+T = np.round(0.00884 * np.arange(N), 3)
+X = np.round(300 * np.sin(20 * T))
+U = np.round(0.5 * np.sign(np.sin(9 * T)), 4)
+
+# A damaged file may take no longer than this even on a loaded machine; a good one takes 2 ms.
+MOST_TIME = 10.0  # s of the processor
+
+
+def _ecp() -> bytes:
+    rows = [
+        f"{i} {t:.3f} 0 {x:.0f} {u:.4f}" for i, (t, x, u) in enumerate(zip(T, X, U, strict=True))
+    ]
+    head = " Sample   Time   Commanded Pos   Encoder 1 Pos   Control Effort\r\n\n"
+    return (head + "data =[" + ";\r\n".join(rows) + "];\n").encode()
+
+
+def _text(delimiter: str, decimal: str) -> bytes:
+    lines = [delimiter.join(("time", "input", "x1"))]
+    lines += [
+        delimiter.join(f"{v:.4f}".replace(".", decimal) for v in row)
+        for row in zip(T, U, X, strict=True)
+    ]
+    return "\n".join(lines).encode()
+
+
+def _log() -> bytes:
+    rows = [
+        f"{i}\t{t:g}\t{x:g}\t{400 * u:g}" for i, (t, x, u) in enumerate(zip(T, X, U, strict=True))
+    ]
+    return ("Sample\tTime\tEncoder 1 Pos\tControl Effort\n" + "\n".join(rows)).encode()
+
+
+def _mat(version: str, compress: bool) -> bytes:
+    stream = BytesIO()
+    variables = {"time": T, "enc1": X.astype("i2"), "duty": (400 * U).astype("i2")}
+    if version == "5":
+        variables["run"] = {"P": 1.0, "wave": "Square"}  # type: ignore[assignment]
+    scipy.io.savemat(stream, variables, format=version, do_compression=compress)
+    return stream.getvalue()
+
+
+def _matrix() -> bytes:
+    stream = BytesIO()
+    scipy.io.savemat(stream, {"data": np.column_stack([T, U, X])})
+    return stream.getvalue()
+
+
+FILES = {
+    "ecp": _ecp(),
+    "csv": _text(",", "."),
+    "decimal commas": _text(";", ","),
+    "bench log": _log(),
+    "usb logger": b"Time [us],Displacement [mm]\n"
+    + b"".join(b"%d,%d\n" % (8840 * i, i % 7) for i in range(N)),
+    "bode": b"frequency,x1\n" + b"".join(b"%g,%g\n" % (0.5 * i, 1 / i) for i in range(1, N)),
+    "mat": _mat("5", False),
+    "mat, compressed": _mat("5", True),
+    "mat, version 4": _mat("4", False),
+    "mat, matrix": _matrix(),
+}
+
+positions = st.floats(0.0, 1.0, exclude_max=True)
+damage = st.one_of(
+    st.tuples(st.just("cut"), positions, st.just(b"")),
+    st.tuples(st.just("flip"), positions, st.binary(min_size=1, max_size=8)),
+    st.tuples(st.just("insert"), positions, st.binary(min_size=1, max_size=40)),
+    st.tuples(
+        st.just("insert"),
+        positions,
+        st.sampled_from(
+            [b"nan", b"-inf", b"1e999", b"[", b"]", b";", b"\0", b"\n\n", b",", b"\xff\xfe", b"%",
+             b"9" * 400, b"\r", b"time,x1\n", b"-", b".", b"\xe2\x88\x92", b"1_0", b"0x1F"]
+        ),
+    ),
+    st.tuples(st.just("remove"), positions, st.binary(min_size=1, max_size=60)),
+    st.tuples(st.just("repeat"), positions, st.just(b"")),
+)  # fmt: skip
+
+
+def damaged(raw: bytes, hits: list[tuple[str, float, bytes]]) -> bytes:
+    """Apply each hit to the bytes."""
+    for what, where, junk in hits:
+        at = int(where * len(raw))
+        if what == "cut":
+            raw = raw[:at]
+        elif what == "flip":
+            end = min(at + len(junk), len(raw))
+            raw = (
+                raw[:at] + bytes(a ^ b for a, b in zip(raw[at:end], junk, strict=False)) + raw[end:]
+            )
+        elif what == "insert":
+            raw = raw[:at] + junk + raw[at:]
+        elif what == "remove":
+            raw = raw[:at] + raw[at + len(junk) :]
+        else:
+            raw = raw[:at] + raw[at // 2 :]
+    return raw
+
+
+@pytest.fixture(scope="module")
+def submission(tmp_path_factory) -> Submission:
+    """One experiment of each kind of reading, all on the same file."""
+    folder = tmp_path_factory.mktemp("fuzz")
+    kinds = ('kind = "step"', 'kind = "closed_loop"', 'kind = "bode"', 'kind = "decay"')
+    matrix = "columns = { time = 1, input = 2, x1 = 3 }\n"
+    toml = 'version = 1\n[system]\ncarts = 1\nposition = { unit = "cm", per_count = 0.00227 }\n'
+    for i, kind in enumerate((*kinds, kinds[0] + "\n" + matrix)):
+        toml += f'[[experiments]]\nid = "e{i}"\nfile = "a.dat"\n{kind}\n'
+    (folder / "submission.toml").write_text(toml)
+    (folder / "a.dat").write_bytes(b"time,x1\n")
+    return load_submission(folder)
+
+
+@contextmanager
+def one_line_at_most():
+    """Let a complaint pass if it is one line; anything else that is raised is a failure."""
+    message = ""
+    began = time.process_time()
+    try:
+        yield
+    except PipelineError as error:
+        message = str(error)
+    assert len(message.splitlines()) <= 1
+    assert len(message) < 1_000
+    assert time.process_time() - began < MOST_TIME
+
+
+def try_everything(submission: Submission, raw: bytes) -> None:
+    """Read the bytes as every kind of experiment and inspect them."""
+    path = submission.folder / "a.dat"
+    path.write_bytes(raw)
+    for experiment in submission.experiments:
+        with one_line_at_most():
+            data = read_data(submission.model_copy(update={"experiments": (experiment,)}))
+            for record in data.records:
+                assert np.isfinite(record.y).all()
+                assert (np.diff(record.t) > 0).all()
+    with one_line_at_most():
+        format_inspection(inspect_file(path))
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_the_undamaged_file_is_read(name, submission):
+    """What is damaged below is sound before."""
+    assert parse_table(FILES[name], source="a.dat").values.shape[1] >= N - 1
+
+
+@pytest.mark.parametrize("name", FILES)
+@settings(
+    max_examples=60,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+@given(hits=st.lists(damage, min_size=1, max_size=4))
+def test_a_damaged_file_is_an_error_or_a_record(name, hits, submission):
+    """Cuts, flipped bits, junk and repeats: one line of complaint, or finite data in time."""
+    try_everything(submission, damaged(FILES[name], hits))
+
+
+@settings(max_examples=150)
+@given(
+    raw=st.one_of(
+        st.binary(max_size=400),
+        st.text(max_size=300).map(str.encode),
+        st.text(alphabet="0123456789.,;\t -+eE[]%\nxt", max_size=300).map(str.encode),
+        st.binary(max_size=300).map(
+            lambda b: b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM" + b
+        ),
+    )
+)
+def test_junk_is_an_error_or_a_record(raw, submission):
+    """Bytes of no known form."""
+    try_everything(submission, raw)
+
+
+@settings(max_examples=150)
+@given(hits=st.lists(damage, min_size=1, max_size=4))
+def test_a_damaged_submission_file_is_an_error_or_a_submission(hits, tmp_path_factory):
+    """`submission.toml` itself may be cut and garbled."""
+    example = ROOT / "submissions" / "two-cart" / "submission.toml"
+    folder = tmp_path_factory.mktemp("toml")
+    (folder / "submission.toml").write_bytes(damaged(example.read_bytes()[:3000], hits))
+    with one_line_at_most():
+        load_submission(folder)

@@ -1,0 +1,149 @@
+"""Two drafts side by side: what moved, which checks turned, which files are others."""
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from pipeline.errors import ConfigError
+from pipeline.report.document import Table, plain
+from pipeline.report.draft.changes import changes_line
+from pipeline.report.draft.compare import compare_drafts, read_results
+from pipeline.report.draft.content import build_document
+from pipeline.resources import EXAMPLES
+from pipeline.results import Analysis, Estimate
+from pipeline.results_json import results_text
+from pipeline.schemas.results import Results
+from pipeline.submission import load_submission
+from pipeline.workflow import analyse
+from tests.helpers.analysis_factory import make_analysis
+from tests.helpers.commandline import cartlab_here
+
+
+def draft_of(analysis: Analysis) -> Results:
+    return Results.model_validate_json(results_text(analysis))
+
+
+def with_final(analysis: Analysis, name: str, factor: float) -> Analysis:
+    """Return the analysis with one final estimate multiplied."""
+    rows = tuple(
+        replace(row, final=replace(row.final, value=row.final.value * factor))
+        if row.name == name and row.final
+        else row
+        for row in analysis.rows
+    )
+    return replace(analysis, rows=rows)
+
+
+def test_a_draft_does_not_differ_from_itself():
+    """The same analysis, written and read, has no changes at all."""
+    analysis = make_analysis(3)
+    changes = compare_drafts(draft_of(analysis), analysis)
+    assert not changes.numbers
+    assert not changes.checks
+    assert not changes.files
+    assert changes_line(changes) == "since the earlier draft: nothing changed"
+
+
+def test_a_number_that_moved_is_told_in_combined_standard_errors():
+    """A gain two percent up, with a standard error of one percent in both drafts, moved 1.4 σ."""
+    analysis = make_analysis(2)
+    row = next(row for row in analysis.rows if row.name == "K_1")
+    assert row.final is not None
+    value = row.final.value
+    before, after = (
+        replace(
+            analysis,
+            rows=tuple(
+                replace(r, final=Estimate(value=v, std=0.01 * value, source="bode_fit"))
+                if r.name == "K_1"
+                else r
+                for r in analysis.rows
+            ),
+        )
+        for v in (value, 1.02 * value)
+    )
+    (change,) = compare_drafts(draft_of(before), after).numbers
+    assert (change.what, change.name) == ("final", "K_1")
+    assert change.percent == pytest.approx(2.0, rel=1e-6)
+    assert change.sigmas == pytest.approx(2 / 2**0.5, rel=1e-6)
+    line = changes_line(compare_drafts(draft_of(before), after))
+    assert line == "since the earlier draft: 1 final estimate moved, K_1 most (+2.0 %, 1.4 σ)"
+
+
+def test_checks_that_turned_and_files_that_changed_are_named():
+    """A check that now fails, a file with another hash, one gone and one new are each told."""
+    analysis = make_analysis(2)
+    checks = tuple(replace(c, outcome="pass") for c in analysis.checks)
+    names = sorted(analysis.files)
+    files = {name: digest for name, digest in analysis.files.items() if name != names[0]}
+    files |= {names[1]: "f" * 64, "data/added.csv": "0" * 64}
+    after = replace(
+        analysis, checks=checks, files=files, warnings=("step-2: does not settle",), skipped=()
+    )
+    changes = compare_drafts(draft_of(analysis), after)
+    turned = {change.id: (change.before, change.after) for change in changes.checks}
+    was = {check.id: check.outcome for check in analysis.checks}
+    assert turned == {id_: (outcome, "pass") for id_, outcome in was.items() if outcome != "pass"}
+    assert changes.files == {names[0]: "gone", names[1]: "changed", "data/added.csv": "new"}
+    assert changes.new_warnings == ("step-2: does not settle",)
+    assert changes.gone_warnings == analysis.warnings
+    assert changes.no_longer_skipped == ("sweep",)
+
+
+def test_the_report_has_a_section_on_the_changes():
+    """It stands after the summary, with both values; without an earlier draft there is none."""
+    before, after = make_analysis(2), with_final(make_analysis(2), "omega_b", 1.1)
+    document = build_document(after, changes=compare_drafts(draft_of(before), after), progress=None)
+    assert [section.id for section in document.sections[:2]] == ["summary", "changes"]
+    table = next(block for block in document.sections[1].blocks if isinstance(block, Table))
+    (row,) = table.rows
+    assert plain(row[0].text) == "ω_b"
+    assert "+10.0 %" in plain(row[-1].text)
+    bare = build_document(after, progress=None)
+    assert "changes" not in [section.id for section in bare.sections]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("not json", "no results.json of cartlab"),
+        ('{"schema": "cartlab-gap/1"}', "schema: Input should be 'cartlab-results/1'"),
+        ("[" * 10_000, "no results.json of cartlab"),
+        ("{}", "schema: Field required"),
+    ],
+)
+def test_what_is_no_results_json_is_refused_in_one_line(tmp_path, text, expected):
+    """Anything but a results file of cartlab is named, with what is wrong in it."""
+    path = tmp_path / "results.json"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"results\.json: ") as error:
+        read_results(path)
+    assert expected in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_missing_file_is_refused(tmp_path):
+    """The path that is not there is named."""
+    with pytest.raises(ConfigError, match=r"none\.json: cannot be read"):
+        read_results(tmp_path / "none.json")
+
+
+def test_other_benches_are_not_compared():
+    """Drafts of two and of three carts have no number in common."""
+    with pytest.raises(ConfigError, match=r"2 carts in cm and V, this one of 3 in cm and V"):
+        compare_drafts(draft_of(make_analysis(2)), make_analysis(3))
+
+
+def test_the_command_tells_the_change_in_one_line_of_stderr(tmp_path):
+    """`--compare` with a results.json whose gain was edited says so, in the page and on stderr."""
+    earlier = json.loads(results_text(analyse(load_submission(EXAMPLES / "one-cart"))))
+    earlier["parameters"][0]["final"] *= 0.9
+    path = tmp_path / "earlier.json"
+    path.write_text(json.dumps(earlier), encoding="utf-8")
+    arguments = ("--no-pdf", "--out", tmp_path / "out", "--compare", path)
+    done = cartlab_here("report", EXAMPLES / "one-cart", *arguments)
+    assert done.returncode == 0
+    (line,) = [text for text in done.stderr.splitlines() if text.startswith("since the earlier")]
+    assert "1 final estimate moved, K most (+11.1 %" in line
+    assert 'id="changes"' in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")

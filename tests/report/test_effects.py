@@ -1,0 +1,101 @@
+"""The catalogue of effects on the screen, as JSON and as a page with pictures."""
+
+import json
+import re
+
+import pytest
+
+from pipeline.plant.effects import CATALOGUE, find_effect
+from pipeline.report.effects.page import build_gallery, render_effects
+from pipeline.report.effects.words import catalogue_data, catalogue_text
+from tests.helpers.commandline import cartlab_here
+
+
+def test_the_list_has_every_effect_with_its_parameters():
+    """Each entry names its place, parameters with units, fingerprint, experiment and source."""
+    text = " ".join(catalogue_text(CATALOGUE).split())
+
+    for effect in CATALOGUE:
+        for part in (effect.key, effect.sentence, effect.fingerprint, effect.deciding_run):
+            assert part in text
+        assert effect.reference in text
+        assert all(f"{p.name} {p.symbol}" in text for p in effect.parameters)
+    assert "coefficient q [V s²/cm²]" in text.replace("\u00a0", " ")
+
+
+def test_json_is_for_programs():
+    """`cartlab effects --json` prints the catalogue as data, NAME picks one entry."""
+    done = cartlab_here("effects", "stiction", "--json")
+
+    (entry,) = json.loads(done.stdout)
+    assert entry == catalogue_data([find_effect("stiction")])[0]
+    assert entry["where"] == "cart"
+    assert [p["name"] for p in entry["parameters"]] == ["force", "static_force", "velocity"]
+    assert entry["parameters"][2]["unit"] == "cm/s"
+    assert [e["effect"] for e in catalogue_data(CATALOGUE)] == [e.key for e in CATALOGUE]
+
+
+def test_a_wrong_name_is_one_line_with_the_nearest():
+    """A misspelt effect ends with status 2 and the name that was meant."""
+    done = cartlab_here("effects", "back_lash")
+
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "cartlab: no effect 'back_lash'; did you mean 'backlash'?\n"
+
+
+def test_wrong_options_of_simulate_are_one_line(tmp_path):
+    """A wrong effect and a missing model end with status 2, one line, and nothing written."""
+    for arguments, expected in (
+        (("--preset", "throne-1dof", "--hide", "friction:force=1"), "no effect 'friction'"),
+        (("--model", tmp_path / "no.json"), "no.json: cannot be read (No such file or directory)"),
+        ((), "either --preset or --model"),
+    ):
+        done = cartlab_here("simulate", *arguments, "--out", tmp_path / "out")
+
+        assert done.returncode == 2
+        assert expected in done.stderr
+        assert len(done.stderr.splitlines()) == 1
+        assert not (tmp_path / "out").exists()
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    """The gallery of the whole catalogue."""
+    out = tmp_path_factory.mktemp("gallery")
+    render_effects(CATALOGUE, out)
+    return out
+
+
+def test_the_page_stands_alone(page):
+    """One file that loads nothing, with a picture of each effect."""
+    html = (page / "effects.html").read_text(encoding="utf-8")
+
+    assert html.count("<svg ") == len(CATALOGUE)
+    assert html.count("<script>") == 1
+    assert not re.search(r'(src|href)="(?!#|data:)', html)
+    for effect in CATALOGUE:
+        assert f'id="{effect.key}"' in html
+        assert (page / "figures" / f"{effect.key}.svg").is_file()
+
+
+def test_the_page_is_the_same_every_time(page, tmp_path):
+    """Same catalogue, same bytes."""
+    chosen = [find_effect("coulomb_friction"), find_effect("actuator_lag")]
+
+    render_effects(chosen, tmp_path / "again")
+
+    for effect in chosen:
+        name = f"figures/{effect.key}.svg"
+        assert (tmp_path / "again" / name).read_bytes() == (page / name).read_bytes()
+
+
+@pytest.mark.parametrize("key", ["coulomb_friction", "sensor_gain", "input_delay"])
+def test_every_entry_shows_how_to_hide_it(key):
+    """The command under a picture is one that `cartlab simulate` takes."""
+    from pipeline.synthesis.hidden import prepare_bench
+
+    document = build_gallery([find_effect(key)])
+
+    (command,) = re.findall(r"--hide (\S+)", str(document))
+    (term,) = prepare_bench(preset="throne-2dof", hide=[command]).effects
+    assert term.effect.key == key

@@ -1,0 +1,337 @@
+"""Figures: what is drawn, at which ticks, and that the same data give the same bytes."""
+
+import subprocess
+import sys
+from base64 import b64decode
+from dataclasses import replace
+from itertools import combinations, pairwise
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from matplotlib.text import Text
+
+from pipeline.plant.chain import Chain
+from pipeline.report.figures.bode import bode_figure
+from pipeline.report.figures.style import (
+    drawing,
+    panels,
+    plot_measured,
+    plot_model,
+    small_multiples,
+    thin,
+)
+from pipeline.report.figures.svg import plain_svg, to_svg
+from pipeline.report.figures.ticks import linear_ticks, log_ticks, tick_labels
+from pipeline.report.figures.time import (
+    damping_figure,
+    decay_figure,
+    design_figure,
+    hardware_figure,
+    sine_figure,
+    step_figure,
+)
+from pipeline.results import FrequencyResponse
+from tests.helpers.analysis_factory import make_analysis
+
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+def bode_svg(carts: int = 2) -> str:
+    analysis = make_analysis(carts)
+    with drawing():
+        figure = bode_figure(
+            analysis.frequency_responses[0],
+            chain=analysis.chain,
+            position_unit="cm",
+            input_unit="V",
+        )
+        return to_svg(figure, name="bode", alt="Bode <plot>")
+
+
+def test_a_figure_is_well_formed_and_says_what_it_shows():
+    """The SVG parses, has its alternative text, and its labels are text."""
+    root = ElementTree.fromstring(bode_svg())
+    assert root.attrib["role"] == "img"
+    assert root.findtext(f"{SVG}title") == "Bode <plot>"
+    texts = ["".join(text.itertext()) for text in root.iter(f"{SVG}text")]
+    assert "ω [rad/s]" in texts
+    assert "|X₁/U| [dB re 1 cm/V]" in texts
+    assert root.find(f"{SVG}metadata") is None
+
+
+def test_the_same_data_give_the_same_bytes():
+    """Neither a date, nor a random id, nor the order of drawing gets in."""
+    assert bode_svg() == bode_svg()
+
+
+def test_every_dwell_is_drawn_as_a_diamond():
+    """Three panels of 24 measured points each, and the one in the legend."""
+    root = ElementTree.fromstring(bode_svg())
+    marks = [use for use in root.iter(f"{SVG}use")]
+    assert len(marks) == 3 * 24 + 1
+
+
+def test_measured_phase_lies_on_the_branch_of_the_fit():
+    """A measured phase wrapped into (-π, π] is drawn beside the unwrapped model."""
+    analysis = make_analysis(3)
+    response = analysis.frequency_responses[2]  # cart 3 goes down to -540°
+    with drawing():
+        figure = bode_figure(response, chain=analysis.chain, position_unit="cm", input_unit="V")
+    _, phase, _ = figure.axes
+    line, points = (np.asarray(drawn.get_ydata(), dtype=float) for drawn in phase.lines[:2])
+    assert response.phase is not None
+    assert np.min(response.phase) > -np.pi
+    assert line.min() < -500
+    # Noise of 0.01 rad and a grid of 300 points on the line: well within 15°.
+    at = np.interp(response.omega, np.asarray(phase.lines[0].get_xdata(), dtype=float), line)
+    assert np.max(np.abs(points - at)) < 15
+
+
+def test_a_peak_without_end_does_not_hide_the_measurement():
+    """The curve of carts without damping is cut above what was measured."""
+    chain = Chain(m=np.array([1.0]), c=np.zeros(1), k=np.array([4.0, 0.0]))
+    omega = np.array([0.5, 1.0, 3.0, 4.0])
+    magnitude = np.abs(chain.frequency_response(omega)[0])
+    response = FrequencyResponse(
+        cart=1,
+        omega=omega,
+        magnitude=magnitude,
+        magnitude_std=0.01 * magnitude,
+        phase=np.zeros(4),
+        phase_std=np.full(4, 0.01),
+        source="dwells",
+    )
+    with drawing():
+        figure = bode_figure(response, chain=chain, position_unit="cm", input_unit="V")
+        ElementTree.fromstring(to_svg(figure, name="x", alt=""))
+    assert figure.axes[0].get_ylim()[1] < 20 * np.log10(magnitude.max()) + 50
+
+
+def test_a_student_s_dollar_signs_are_no_formula():
+    """An id with dollar signs draws as it is."""
+    with drawing():
+        figure, (ax,) = panels(1.0)
+        plot_measured(ax, np.linspace(0, 1, 5), np.zeros(5))
+        ax.set_ylim(-1, 1)
+        ax.set_title("$\\frac{$ <b> 中文 &", loc="left")
+        svg = to_svg(figure, name="x", alt="")
+    assert "$\\frac{$ &lt;b&gt; 中文 &amp;" in svg
+
+
+def test_an_unstable_model_does_not_hide_the_measurement():
+    """A model that runs away is cut one span beyond what was measured."""
+    check = make_analysis(1).hardware[0]
+    growth = np.append(np.exp(np.linspace(0, 700, check.t.size - 1)), np.inf)
+    for model in (1e12 * check.model, growth):
+        with drawing():
+            figure = hardware_figure([[replace(check, model=model)]], position_unit="cm")
+            to_svg(figure, name="x", alt="")
+        low, high = figure.axes[0].get_ylim()
+        assert high - low <= 3.01 * np.ptp(check.measured)
+
+
+def test_a_zero_in_a_table_of_ratios_is_left_out():
+    """A logarithmic axis has no place for zero; the other points are drawn."""
+    (response,) = make_analysis(1).frequency_responses
+    magnitude = response.magnitude.copy()
+    magnitude[3] = 0.0
+    with drawing():
+        figure = bode_figure(
+            replace(response, magnitude=magnitude, phase=None, phase_std=None),
+            chain=None,
+            position_unit="cm",
+            input_unit="V",
+        )
+        root = ElementTree.fromstring(to_svg(figure, name="x", alt=""))
+    assert len(list(root.iter(f"{SVG}use"))) == 23 + 1  # and the one in the legend
+
+
+def test_a_dwell_shades_the_transient():
+    """The shaded span ends where the steady part begins."""
+    analysis = make_analysis(2)
+    points = [p for p in analysis.sine_points if p.experiment == "sine-10"]
+    record = next(r for r in analysis.records if r.id == "sine-10")
+    with drawing():
+        figure = sine_figure(points, record=record, position_unit="cm")
+    for ax in figure.axes:
+        (span,) = (patch for patch in ax.patches if isinstance(patch, Rectangle))
+        span = span.get_extents().transformed(ax.transData.inverted())
+        assert span.x0 == pytest.approx(0.0, abs=1e-9)
+        assert span.x1 == pytest.approx(4.0)
+
+
+@given(
+    st.integers(10, 3000),
+    st.integers(0, 2**32 - 1),
+)
+def test_thinning_keeps_the_envelope(n, seed):
+    """The largest and smallest value stay, times ascend, and few points are left."""
+    rng = np.random.default_rng(seed)
+    t, y = np.sort(rng.uniform(0, 1, n)), rng.normal(size=n)
+    thin_t, thin_y = thin(t, y)
+    assert thin_y.max() == y.max()
+    assert thin_y.min() == y.min()
+    assert np.all(np.diff(thin_t) >= 0)
+    assert thin_t.size <= 480
+
+
+@given(st.floats(-1e6, 1e6), st.floats(1e-6, 1e6), st.integers(2, 9))
+def test_ticks_are_round_numbers_inside_the_axis(low, span, most):
+    """At least two ticks, evenly spaced by 1, 2 or 5 times a power of ten, none outside."""
+    high = low + span
+    assume(span > 1e-9 * abs(low))
+    ticks = linear_ticks(low, high, most=most)
+    step = ticks[1] - ticks[0]
+    assert ticks.size >= 2
+    assert ticks[0] >= low - 1e-8 * step
+    assert ticks[-1] <= high + 1e-8 * step
+    mantissa = step / 10.0 ** np.floor(np.log10(step * (1 + 1e-6)))
+    # Cancellation: the step is a difference of numbers up to 1e9 times larger.
+    assert min(abs(mantissa - m) for m in (1, 2, 5)) < 1e-5 * (1 + abs(low) / step * 1e-9)
+
+
+def test_tick_labels_share_their_decimals():
+    """Labels of one axis have one form, and a true minus sign."""
+    assert tick_labels(np.array([-0.5, 0.0, 0.5])) == ["−0.5", "0.0", "0.5"]
+    assert tick_labels(np.array([-200.0, 0.0])) == ["−200", "0"]
+    assert tick_labels(log_ticks(0.4, 7.0)) == ["0.5", "1", "2", "5"]
+    assert tick_labels(log_ticks(8.0, 27.0)) == ["10", "15", "20"]
+    assert tick_labels(log_ticks(0.05, 900.0)) == ["0.1", "1", "10", "100"]
+    assert tick_labels(np.array([0.0, 5e-6])) == ["0", "5e−06"]
+
+
+def test_the_user_s_own_settings_do_not_matter(monkeypatch):
+    """A matplotlibrc with other fonts and colours changes nothing."""
+    import matplotlib
+
+    before = bode_svg()
+    with matplotlib.rc_context({"font.size": 30, "lines.linewidth": 9, "svg.fonttype": "path"}):
+        assert bode_svg() == before
+
+
+def test_the_report_imports_only_what_it_needs():
+    """No pyplot, no pandas, no control: they would cost a second before the first number."""
+    code = (
+        "import sys, pipeline.report.render.write; "
+        "print([m for m in ('matplotlib.pyplot', 'pandas', 'control', 'numba', 'scipy.signal') "
+        "if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_panels_leave_room_for_their_labels():
+    """Every panel lies inside the figure, below the one before."""
+    figure, axes = panels(1.0, 0.5, 0.7)
+    assert isinstance(figure, Figure)
+    boxes = [ax.get_position() for ax in axes]
+    assert all(0.05 < box.x0 < box.x1 < 1 and 0.05 < box.y0 < box.y1 < 1 for box in boxes)
+    assert all(lower.y1 < upper.y0 for upper, lower in pairwise(boxes))
+
+
+_TOUCH = 2.0  # points of the canvas: boxes hold room above and below the letters
+
+
+def figures_of(carts: int) -> dict[str, Figure]:
+    """Return every kind of figure of a report, with long and odd names of records."""
+    analysis = make_analysis(carts)
+    records = {r.id: replace(r, id=f"{r.id} the second try of Tuesday") for r in analysis.records}
+    long = {id_: record.id for id_, record in records.items()}
+    decays = [replace(d, experiment=long[d.experiment]) for d in analysis.log_decrements]
+    own = [decay for decay in decays if decay.cart == 1]
+    runs = list(dict.fromkeys(gain.experiment for gain in analysis.step_gains))
+    dwell = analysis.sine_points[-1].experiment
+    checks = [[c for c in analysis.hardware if c.cart == cart] for cart in range(1, carts + 1)]
+    assert analysis.feedback is not None
+    return {
+        "bode": bode_figure(
+            analysis.frequency_responses[0], chain=analysis.chain, position_unit="count",
+            input_unit="V",
+        ),
+        "decay": decay_figure(
+            own, records=[next(r for r in records.values() if r.id == d.experiment) for d in own],
+            position_unit="count",
+        ),
+        "damping": damping_figure(
+            [d for d in decays if d.zeta_at_amplitude.size], position_unit="count"
+        ),
+        "steps": step_figure(
+            [[g for g in analysis.step_gains if g.experiment == run] for run in runs],
+            records=[records[run] for run in runs], position_unit="count",
+        ),
+        "sine": sine_figure(
+            [p for p in analysis.sine_points if p.experiment == dwell], record=records[dwell],
+            position_unit="count",
+        ),
+        "hardware": hardware_figure(checks, position_unit="count"),
+        "feedback": design_figure(analysis.feedback, position_unit="count", input_unit="V"),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("carts", [1, 2, 3])
+def test_no_text_of_a_figure_is_cut_or_covered(carts):
+    """Every text lies on the canvas, and no two overlap, as matplotlib measures them."""
+    with drawing():
+        for name, figure in figures_of(carts).items():
+            to_svg(figure, name=name, alt="")  # draws the ticks
+            canvas = FigureCanvasAgg(figure)
+            renderer = canvas.get_renderer()
+            canvas.draw()
+            texts = [
+                text for text in figure.findobj(Text)
+                if isinstance(text, Text) and text.get_visible() and text.get_text()
+            ]  # fmt: skip
+            boxes = [(t.get_text(), t.get_window_extent(renderer)) for t in texts]
+            assert len(boxes) > 8
+            for text, box in boxes:
+                inside = min(box.min) >= 0 and bool(np.all(box.max <= figure.bbox.max))
+                assert inside, (name, text)
+            for (text, box), (other, near) in combinations(boxes, 2):
+                apart = np.maximum(box.min, near.min) >= np.minimum(box.max, near.max) - _TOUCH
+                assert apart.any(), (name, text, other)
+
+
+def test_every_series_carries_all_its_data():
+    """A page gets what was measured whole, however few points are drawn; files and print do not."""
+    rng = np.random.default_rng(3)
+    t = np.linspace(0.0, 9.0, 5001)
+    y = rng.normal(size=t.size)
+    uneven = np.sort(rng.uniform(0.0, 9.0, 40))
+    with drawing():
+        figure, (ax,) = panels(1.0)
+        plot_measured(ax, t, y)
+        plot_model(ax, uneven, np.sin(uneven), label="\"quoted\" <b> 'model'")
+        svg = to_svg(figure, name="x", alt="")
+
+    series = [g.attrib for g in ElementTree.fromstring(svg).iter() if "data-x" in g.attrib]
+    model, measured = sorted(series, key=lambda attributes: attributes["data-name"])
+    assert measured["data-name"] == "measured"
+    assert measured["data-x"] == "0 9"
+    # Numbers travel as float32.
+    np.testing.assert_allclose(unpacked(measured["data-y"]), y, rtol=1e-6)
+    assert model["data-name"] == "\"quoted\" <b> 'model'"
+    np.testing.assert_allclose(unpacked(model["data-x"]), uneven, rtol=1e-6)
+    assert "data-" not in plain_svg(svg)
+    assert len(plain_svg(svg)) < 40_000
+
+
+def unpacked(text: str) -> np.ndarray:
+    return np.frombuffer(b64decode(text), dtype="<f4")
+
+
+def test_repeats_stand_on_one_time_axis():
+    """Small multiples share time; a panel is titled once, the axis below each column."""
+    with drawing():
+        figure, axes = small_multiples(list("abcde"), height=1.0, share_y=True)
+        axes[0].set_xlim(0, 3)
+    assert len(axes) == 5
+    assert len({ax.get_xlim() for ax in axes}) == 1
+    assert len({round(ax.get_position().x0, 6) for ax in axes}) == 3
+    assert [ax.get_title(loc="left") for ax in axes] == list("abcde")
+    assert len(figure.axes) == 5

@@ -1,0 +1,526 @@
+"""The gap report: all verdicts, every effect, the file read back, the verdict in the report."""
+
+import json
+import re
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pypdf
+import pytest
+from numpy.testing import assert_allclose
+
+from pipeline.errors import ConfigError
+from pipeline.gap.residual_force import residual_forces
+from pipeline.gap.stored import gap_text, read_gap
+from pipeline.gap.types import (
+    FoundEffect,
+    Gap,
+    GapWindow,
+    NamedValue,
+    RecordGap,
+    Rival,
+    Trace,
+    Verdict,
+)
+from pipeline.plant.augmented import simulate_augmented
+from pipeline.plant.chain import PRESETS
+from pipeline.plant.effects import CATALOGUE, AugmentedChain, Term, find_effect, make_term
+from pipeline.plant.effects.base import chain_scales
+from pipeline.report.document import Formula
+from pipeline.report.draft.content import build_document
+from pipeline.report.equations.effects import augmented_equations, law
+from pipeline.report.gap.page import build_gap_document, render_gap
+from pipeline.report.gap.section import with_gap
+from pipeline.report.gap.words import terminal_verdict
+from pipeline.report.math.tex import from_tex
+from pipeline.report.math.tree import to_text
+from pipeline.report.render.html import render_html
+from pipeline.submission import load_submission
+from pipeline.workflow import analyse
+from tests.helpers.analysis_factory import make_analysis
+from tests.helpers.commandline import cartlab_here
+from tests.report.test_report import HOSTILE, Page
+from tests.truth.cases import make_case
+
+CHAIN = PRESETS["throne-2dof"]
+T = np.arange(0.0, 4.0, 0.00884)
+U = np.where((T > 0.1) & (T < 2.0), 0.05, 0.0)
+
+
+# -------------------------------------------------------------- gaps made by hand
+
+
+def usual_values(effect, place):
+    """Return parameter values of a usual size."""
+    scales = chain_scales(CHAIN, place=effect.place, at=place, input=0.05)
+    return {
+        p.name: p.scale(scales) * multiple
+        for p, multiple in zip(effect.parameters, effect.trial_points[0], strict=True)
+    }
+
+
+def make_gap(verdict: Verdict = "named", keys=("coulomb_friction",)) -> Gap:
+    """Return what the workflow could find on the two-cart bench; the first cart's runs drawn."""
+    terms: list[Term] = []
+    for key in keys:
+        effect = find_effect(key)
+        place = effect.places((True, True, True))[-1]
+        terms.append(
+            make_term(effect, place=place, values=usual_values(effect, place), chain=CHAIN)
+        )
+    linear, model = AugmentedChain(chain=CHAIN), AugmentedChain(chain=CHAIN, terms=tuple(terms))
+    rng = np.random.default_rng(7)
+    before, after = (simulate_augmented(m, T, U) for m in (linear, model))
+    traces = [
+        Trace(
+            experiment=run, cart=cart, held_out=held, t=T, u=U, baseline=before[cart - 1],
+            measured=after[cart - 1] + rng.normal(0.0, 0.001, T.size), final=after[cart - 1],
+        )
+        for run, held in (("step-a", True), ("step-b", False))
+        for cart in (1, 2)
+    ]  # fmt: skip
+    errors = np.linspace(0.153, 0.041, len(terms) + 1)
+    rivals = (
+        Rival(
+            effect=find_effect("quadratic_drag"), where={"cart": 2}, nrmse_after=0.042,
+            confidence=0.4,
+        ),
+        Rival(
+            effect=find_effect("stiction"), where={"cart": 2}, nrmse_after=0.3, confidence=0.001
+        ),
+    )  # fmt: skip
+    effects = tuple(
+        FoundEffect(
+            effect=term.effect,
+            where=term.where,
+            parameters={
+                p.name: NamedValue(
+                    value=value, std=0.02 * abs(value),
+                    unit=p.unit_text(position="cm", input="V"),
+                )
+                for p, value in zip(term.effect.parameters, term.values, strict=True)
+                if p.reported
+            },
+            details={},
+            confidence=0.6,
+            nrmse_before=float(errors[i]),
+            nrmse_after=float(errors[i + 1]),
+            rivals=rivals if i + 1 == len(terms) else (),
+        )
+        for i, term in enumerate(terms)
+    )  # fmt: skip
+    return Gap(
+        verdict=verdict,
+        effects=effects,
+        baseline=0.153,
+        final=float(errors[-1]),
+        noise_floor=0.03,
+        repeatability=None,
+        by_record=tuple(
+            RecordGap(
+                experiment=t.experiment, cart=t.cart, held_out=t.held_out, baseline=0.153,
+                final=0.041, noise_floor=0.03,
+            )
+            for t in traces
+        ),
+        where=(
+            GapWindow(
+                experiment="step-b", cart=2, start=2.0, end=2.6, what="velocity near zero",
+                share=0.62,
+            ),
+        ),
+        left=()
+        if verdict in ("none", "named")
+        else (
+            GapWindow(
+                experiment="step-b", cart=2, start=2.0, end=2.6, what="velocity near zero",
+                share=0.31,
+            ),
+        ),
+        next_experiment="" if verdict == "none" else "Steps of three sizes.",
+        linear=linear,
+        model=model,
+        training=("step-b",),
+        held_out=("step-a",),
+        traces=tuple(traces),
+        chain_std={f"{letter}_{i}": 1e-7 for letter in "mck" for i in (1, 2)},
+        spread={2: 0.05} if "coulomb_friction" in keys else {},
+        notes=("one run of each kind: the last 40 % of the longest is held out",),
+    )  # fmt: skip
+
+
+def two_cart_analysis():
+    """Return an analysis whose records are those of the gaps made by hand."""
+    analysis = make_analysis(2)
+    step = next(record for record in analysis.records if record.id == "step-a")
+    return replace(analysis, records=(step, replace(step, id="step-b")))
+
+
+def page_of(gap: Gap) -> Page:
+    """Return the parsed page of a gap report."""
+    return Page(render_html(build_gap_document(gap, two_cart_analysis())))
+
+
+def test_a_name_stands_on_top_with_its_numbers():
+    """The first paragraph names effect, place, size, error before and after, and the noise."""
+    text = page_of(make_gap()).text
+
+    assert "Dry (Coulomb) friction on cart 2 explains what the linear model leaves out" in text
+    assert "falls from 15.3 % of the motion to 4.1 %; noise alone makes 3.0 %" in text
+    assert text.index("explains what") < text.rindex("Where the linear model fails")
+
+
+def test_each_size_has_its_cart_and_each_sentence_is_said_once():
+    """Dry friction on both carts: which force is whose, and what dry friction is."""
+    gap = make_gap()
+    (one,) = gap.effects
+    said = terminal_verdict(replace(gap, effects=(replace(one, where={"cart": 1}), one)))
+
+    assert re.search(r"force [^;]+ V on cart 1; force [^;]+ V on cart 2\. ", said)
+    assert said.count(one.effect.sentence) == 1
+    assert " V on cart" not in terminal_verdict(gap)  # one effect: its name says where
+
+
+def test_a_stretch_without_a_phase_is_told_in_words():
+    """No phase of the motion stands out: the sentence and the table say so."""
+    gap = replace(make_gap("partial"), noise_floor=0.01)
+    (window,) = gap.left
+    text = page_of(replace(gap, left=(replace(window, what="throughout"),))).text
+
+    assert "(the whole stretch alike)" in text
+    assert "throughout" not in text
+
+
+def test_repeats_are_the_measure_where_they_differ_by_more_than_noise():
+    """No model is asked to be closer to a run than the next repeat of it."""
+    gap = replace(make_gap(), repeatability=0.035)
+    text = page_of(gap).text
+
+    assert "to 4.1 %; repeats of one run differ by 3.5 %" in text
+
+
+def test_suspects_are_listed_as_such():
+    """Verdict unexplained: no name, and who is suspected with what each would leave."""
+    suspect = Rival(effect=find_effect("backlash"), where={}, nrmse_after=0.12, confidence=0.9)
+    gap = replace(make_gap("unexplained", ()), final=0.153, suspects=(suspect,))
+    text = page_of(gap).text
+
+    assert "Suspected, though not proven: backlash between motor and cart 1 (leaves 12.0 %)" in text
+    assert read_gap(gap_text(gap, two_cart_analysis()))[0].suspects == gap.suspects
+
+
+def test_nothing_to_name_is_said():
+    """Verdict none: no effects, no equations, and the reader is told that none is needed."""
+    gap = replace(make_gap("none", ()), final=0.031, baseline=0.031)
+    text = page_of(gap).text
+
+    assert "The linear model explains the data" in text
+    assert "No effect is needed" in text
+    assert "The model with its effects" not in text
+
+
+def test_two_explanations_are_both_told():
+    """Verdict ambiguous: both are described, and what would tell them apart."""
+    text = page_of(make_gap("ambiguous")).text
+
+    assert "Dry (Coulomb) friction on cart 2, or quadratic drag on cart 2" in text
+    assert "these data cannot tell which" in text
+    assert "What would tell them apart. Steps of three sizes." in text
+    assert find_effect("quadratic_drag").deciding_run in text
+    assert "explains what" not in text
+
+
+@pytest.mark.parametrize("keys", [(), ("coulomb_friction",)])
+def test_what_stays_unexplained_has_suspects_only(keys):
+    """Verdict unexplained: suspects, if any, are called so; nothing is said to explain."""
+    text = page_of(make_gap("unexplained", keys)).text
+
+    assert "nothing in the catalogue explains" in text
+    assert ("best suspect is dry (Coulomb) friction" in text) == bool(keys)
+    assert "explains what" not in text
+
+
+def test_a_part_of_the_gap_says_what_is_left_and_where():
+    """Verdict partial: the effects, how much is left, in which run, cart and phase."""
+    gap = replace(make_gap("partial"), noise_floor=0.01)
+    text = page_of(gap).text
+
+    assert "explains part of what the linear model leaves out" in text
+    assert "So 4.1 times as much is left" in text
+    assert "step-b, cart 2, from 2.00 to 2.60 s (velocity near zero)" in text
+    assert "Where the model with its effects fails most" in text
+    assert "is left, most of it" not in terminal_verdict(make_gap())
+
+
+def test_an_answer_so_far_is_said_to_be_one():
+    """What the time allowed has ended is told on top, and no page promises it again."""
+    text = page_of(replace(make_gap("unexplained", ()), complete=False)).text
+
+    assert "best answer so far" in text
+    assert "The same input gives the same report." not in text
+    assert "best answer so far" not in page_of(make_gap()).text
+
+
+@pytest.mark.parametrize("effect", CATALOGUE, ids=lambda effect: effect.key)
+def test_every_effect_has_its_page(effect):
+    """Any effect of the catalogue gets a figure, a typeset law and its entry's texts."""
+    page = page_of(make_gap("named", (effect.key,)))
+
+    assert effect.fingerprint in page.text
+    assert effect.reference in page.text
+    assert f"The evidence for {effect.title[:1].lower()}" in page.text
+    assert "\\" not in page.text
+    assert not re.search(r"\b(None|nan|inf)\b", page.text)
+    alts = [alt for alt in page.values("aria-label") if alt.startswith("Evidence for")]
+    alts = [alt for alt in alts if effect.fingerprint in alt]
+    assert alts
+
+
+def test_two_effects_share_the_equations():
+    """Each effect has a letter: friction on cart 2 the second, the drive's change the first."""
+    terms = make_gap("named", ("saturation", "coulomb_friction")).model.terms
+
+    motion = to_text(augmented_equations((True, True, True), terms).math)
+    assert motion.endswith("= f_b")
+    assert "= u_a;" in motion
+    assert to_text(law(terms, 0).math).startswith("u_a = ")
+    assert to_text(law(terms, 1).math).startswith("f_b = −F")
+
+
+def test_a_spring_pulls_both_its_carts():
+    """The extra force of spring 2 acts on cart 2 and, the other way, on cart 1."""
+    terms = (
+        make_term(find_effect("cubic_spring"), place=2, values={"coefficient": 1.0}, chain=CHAIN),
+    )
+    motion = to_text(augmented_equations((True, True, True), terms).math)
+    first, second = motion.split("; ")
+    assert first.endswith("= u + f_a")
+    assert second.endswith("= −f_a")
+    assert to_text(law(terms, 0).math) == "f_a = ad^3"
+
+
+@pytest.mark.parametrize(
+    ("tex", "text"),
+    [
+        (r"\frac{1}{2} \dot x^2", "(1)/(2)x′^2"),
+        (r"\left(F + (S - F)\right) \operatorname{sign} v", "(F + (S−F))\u2009sign\u2009v"),
+        (r"u_\text{at rest} \le \delta", "u_at\u00a0rest ≤ δ"),
+        (r"\unknown", "unknown"),
+        ("", ""),
+    ],
+)
+def test_tex_becomes_mathematics(tex, text):
+    """Fractions, scripts, brackets, upright words; what is unknown stands by its name."""
+    assert to_text(from_tex(tex)) == text
+
+
+def test_laws_are_all_formulas():
+    """No law leaves a brace or a backslash behind."""
+    for effect in CATALOGUE:
+        assert not set(to_text(from_tex(effect.equation))) & set("{}\\$"), effect.key
+
+
+def test_pdf_and_files_are_the_same_each_time(tmp_path):
+    """Two renderings are equal byte for byte, and the PDF has the verdict on its first page."""
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        render_gap(make_gap(), two_cart_analysis(), tmp_path / name)
+    files = sorted(p.relative_to(tmp_path / "one") for p in (tmp_path / "one").rglob("*.*"))
+    assert {"gap.html", "gap.pdf"} < {str(file) for file in files}
+    for file in files:
+        assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes()
+    first = pypdf.PdfReader(tmp_path / "one" / "gap.pdf").pages[0].extract_text()
+    assert "explains what the linear model leaves out" in first
+    assert "The experiment that would confirm it" in first
+
+
+# ------------------------------------------------------------------ residual force
+
+
+def test_residual_force_of_a_constant_force_is_that_force():
+    """A constant push on cart 2 shows as such, whatever the carts do."""
+    pushed = make_term(find_effect("force_offset"), place=2, values={"force": 0.004}, chain=CHAIN)
+    model = AugmentedChain(chain=CHAIN, terms=(pushed,))
+    x = simulate_augmented(model, T, U)
+    traces = tuple(
+        Trace(experiment="a", cart=cart, held_out=True, t=T, u=U, measured=x[cart - 1],
+              baseline=x[cart - 1], final=x[cart - 1])
+        for cart in (1, 2)
+    )  # fmt: skip
+    first, second = residual_forces(
+        replace(make_gap(), model=model, traces=traces), free={"a": (1, 2)}
+    )
+
+    # Windows of 9 samples: the weight is exact for parabolas. The fourth-order rest is
+    # m x'''' T²/50, and (18 rad/s · 0.07 s)²/50 is 3 % of the forces, here 0.05 V at the edges.
+    assert_allclose(second.measured, 0.004, atol=0.03 * 0.05)
+    assert_allclose(np.median(second.measured), 0.004, rtol=1e-3)
+    assert_allclose(np.median(first.measured), 0.0, atol=1e-5)
+    assert_allclose(first.measured, first.model)
+
+
+def test_a_cart_beside_one_that_was_not_measured_has_no_residual_force():
+    """The neighbour's spring force is not known, so nothing is made up."""
+    gap = make_gap()
+    alone = replace(gap, traces=tuple(t for t in gap.traces if t.cart == 1))
+
+    assert residual_forces(alone, free={"step-a": (1, 2), "step-b": (1, 2)}) == ()
+    assert len(residual_forces(alone, free={"step-a": (1,), "step-b": (1,)})) == 2
+
+
+# --------------------------------------------------------------------- the file
+
+
+@pytest.mark.parametrize("verdict", ["named", "partial", "none", "ambiguous", "unexplained"])
+def test_the_file_is_read_back_as_it_was(verdict):
+    """What is read from `gap.json` writes the same file again, and tells the same verdict."""
+    keys = () if verdict == "none" else ("end_stop", "input_delay")
+    gap, analysis = make_gap(verdict, keys), two_cart_analysis()
+    text = gap_text(gap, analysis)
+
+    again, files = read_gap(text)
+
+    assert gap_text(again, analysis) == text
+    assert files == analysis.files
+    assert terminal_verdict(again) == terminal_verdict(gap)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[]",
+        "{}",
+        '{"schema": "cartlab-gap/2", "verdict": "named"}',
+        '{"schema": "cartlab-gap/1", "verdict": "named", "gap": {}, "model": {}}',
+        "[" * 200_000,
+        '{"gap":' * 200_000,
+    ],
+)
+def test_what_is_no_gap_file_is_refused_in_one_line(text):
+    """Broken or foreign JSON is one error, never a traceback."""
+    with pytest.raises(ConfigError, match=r"cartlab gap|cartlab-gap/1"):
+        read_gap(text)
+
+
+# ------------------------------------------------------- one real run, end to end
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory):
+    """A submission of one cart with dry friction, and `cartlab gap` run on it."""
+    folder = tmp_path_factory.mktemp("bench")
+    (folder / "data").mkdir()
+    case = make_case(seed=41, n=1, effects=["coulomb_friction"], rate=113.1)
+    toml = (
+        'version = 1\ntitle = "Bench 7"\n[system]\ncarts = 1\n'
+        'position = { unit = "cm" }\ninput = { unit = "V", sign = 1 }\n'
+    )
+    for record in case.records:
+        if record.id == "sweep":
+            continue
+        # The last step plays the run under feedback: its input was measured.
+        kind = "closed_loop" if record.id == "step-d" else record.kind
+        reference = np.zeros(record.t.size)
+        columns = [record.t, record.u, reference, record.y[0]]
+        rows = [f"{t:.6f},{u:.6f},{r:.1f},{x:.5f}" for t, u, r, x in zip(*columns, strict=True)]
+        name = f"data/{record.id}.csv"
+        text = "\n".join(["time,input,reference,x1", *rows]) + "\n"
+        (folder / name).write_text(text, encoding="utf-8")
+        toml += f'[[experiments]]\nid = "{record.id}"\nkind = "{kind}"\nfile = "{name}"\n'
+    (folder / "submission.toml").write_text(toml, encoding="utf-8")
+    done = cartlab_here("gap", folder, "--json")
+    (hidden,) = case.hidden
+    return SimpleNamespace(folder=folder, done=done, force=hidden.parameters["force"])
+
+
+def test_command_writes_everything_and_names_the_friction(bench):
+    """Exit status 0, the files, JSON on stdout, and the friction that was put in."""
+    assert bench.done.returncode == 0, bench.done.stderr
+    out = bench.folder / "gap"
+    text = (out / "gap.json").read_text(encoding="utf-8")
+    assert bench.done.stdout == text
+    assert (out / "gap.pdf").read_bytes().startswith(b"%PDF")
+    assert list((out / "figures").glob("effect-1.svg"))
+    document = json.loads(text)
+    assert document["verdict"] == "named"
+    (effect,) = document["effects"]
+    assert (effect["effect"], effect["where"]) == ("coulomb_friction", {"cart": 1})
+    # The two simulators differ by some 1e-3 of the force; noise adds as much.
+    assert_allclose(effect["parameters"]["force"]["value"], bench.force, rtol=5e-3)
+    assert effect["nrmse_after"] == document["gap"]["final"]
+    assert set(document["chain"]) == {"m", "c", "k", "units"}
+    assert document["springs"] == [True, True]
+    assert set(document["provenance"]["files"]) == {
+        f"data/{path.name}" for path in (bench.folder / "data").iterdir()
+    }
+    assert "Dry (Coulomb) friction on cart 1 explains" in bench.done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_report_shows_the_verdict_and_the_better_simulation(bench):
+    """Beside a gap analysis of its data, the report tells it and simulates with the effects."""
+    analysis, gap = with_gap(analyse(load_submission(bench.folder)), bench.folder)
+    assert gap is not None
+    assert analysis.warnings == analyse(load_submission(bench.folder)).warnings
+
+    page = Page(render_html(build_document(analysis, gap=gap, progress=None)))
+
+    assert "What the linear model leaves out" in page.text
+    assert "Dry (Coulomb) friction on cart 1 explains" in page.text
+    linear, augmented = map(
+        float, re.findall(r"step-d1(\d+(?:\.\d+)?) %(\d+(?:\.\d+)?) %", page.text)[-1]
+    )
+    # The run was never fitted; what is left is the encoder's step.
+    assert augmented < 0.2 * linear
+    assert {href[1:] for href in page.values("href") if href.startswith("#")} <= set(
+        page.values("id")
+    )
+
+
+def test_gap_analysis_of_other_data_is_only_a_warning(bench, tmp_path):
+    """One changed byte in the data: the verdict is not shown, and the reader is told why."""
+    analysis = analyse(load_submission(bench.folder))
+    changed = replace(analysis, files=analysis.files | {"data/step-a.csv": "0" * 64})
+
+    warned, gap = with_gap(changed, bench.folder)
+
+    assert gap is None
+    assert warned.warnings[-1].startswith("gap/gap.json is of other data than this report")
+    assert with_gap(analysis, tmp_path) == (analysis, None)
+    for text in ("{", "[" * 200_000, " " * 20_000_000):
+        (tmp_path / "gap.json").write_text(text, encoding="utf-8")
+        assert "gap.json cannot be used" in with_gap(analysis, tmp_path)[0].warnings[-1]
+
+
+def test_hostile_words_in_a_gap_file_stay_words(bench):
+    """Texts of a `gap.json` that somebody wrote are shown, never obeyed."""
+    analysis = analyse(load_submission(bench.folder))
+    text = (bench.folder / "gap" / "gap.json").read_text(encoding="utf-8")
+    document = json.loads(text) | {"next_experiment": HOSTILE}
+    gap, _ = read_gap(json.dumps(document))
+
+    page = Page(render_html(build_document(analysis, gap=gap, progress=None)))
+
+    assert not {tag for tag, _ in page.tags} & {"img", "iframe"}
+    assert sum(tag == "script" for tag, _ in page.tags) == 1
+    assert "<script>alert(1)</script>" in page.text
+
+
+def test_without_usable_runs_the_command_says_so_in_one_line(tmp_path):
+    """A folder that is no submission ends in one line and status 2."""
+    done = cartlab_here("gap", tmp_path / "nowhere")
+
+    assert done.returncode == 2
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_every_law_in_a_report_has_a_reading():
+    """Formulas carry their reading in words for those who cannot see them."""
+    document = build_gap_document(make_gap("named", ("extra_mode",)), two_cart_analysis())
+    formulas = [b for s in document.sections for b in s.blocks if isinstance(b, Formula)]
+
+    assert formulas
+    assert all(formula.alt for formula in formulas)

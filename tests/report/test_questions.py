@@ -1,0 +1,306 @@
+"""The report asks what this data raises, and sets each answer beside its question."""
+
+import re
+from dataclasses import replace
+from io import BytesIO
+
+import numpy as np
+import pypdf
+import pytest
+
+from pipeline.report.document import (
+    Document,
+    Paragraph,
+    Question,
+    Section,
+    flat,
+    paragraph,
+    plain,
+    spans,
+)
+from pipeline.report.draft.content import build_document
+from pipeline.report.draft.write import render_report
+from pipeline.report.render.pdf import render_pdf
+from pipeline.report.sections.notes import discussion_blocks
+from pipeline.report.sections.questions import ask, open_line, split_notes
+from pipeline.resources import EXAMPLES
+from pipeline.results import Analysis, Estimate, StepGain
+from pipeline.submission import load_submission, new_submission
+from pipeline.workflow import analyse
+from tests.helpers.analysis_factory import make_analysis
+from tests.helpers.ucsd import write_two_cart_submission
+
+
+def well(carts: int = 2) -> Analysis:
+    """Return an analysis in which everything agrees."""
+    analysis = make_analysis(carts)
+    rows = tuple(replace(row, consistent=True, change_percent=1.0) for row in analysis.rows)
+    decays = tuple(replace(decay, friction=None) for decay in analysis.log_decrements)
+    hardware = tuple(
+        replace(
+            check,
+            nrmse=0.01,
+            overshoot_measured=check.overshoot_model,
+            steady_state_measured=check.steady_state_model,
+        )
+        for check in analysis.hardware
+    )
+    return replace(analysis, rows=rows, log_decrements=decays, hardware=hardware)
+
+
+def off(name: str, percent: float, **initial) -> Analysis:
+    """Return an analysis in which one parameter changed."""
+    analysis = well()
+    rows = []
+    for row in analysis.rows:
+        if row.name == name and row.final:
+            value = row.final.value / (1 + percent / 100)
+            source = initial.get("source", "log_decrement")
+            row = replace(
+                row,
+                initial=Estimate(value=value, std=None, source=source),
+                change_percent=percent,
+                consistent=None if source == "assumed" else False,
+            )
+        rows.append(row)
+    return replace(analysis, rows=tuple(rows))
+
+
+def test_nothing_is_asked_where_all_is_well():
+    """Data that agree throughout raise no question, and the report has no place for one."""
+    analysis = well()
+    assert ask(analysis) == ()
+    assert questions_of(analysis) == []
+    assert open_line(analysis) == ""
+
+
+def test_a_damping_that_changed_asks_for_the_amplitudes():
+    """The change and both methods are named as they are in the table."""
+    (question,) = ask(off("zeta_b", 65.0))
+    assert (question.id, question.section) == ("zeta_b", "parameters")
+    assert question.text.startswith(
+        "zeta_b changed by 65.0 % from the decay to the Bode fit: which"
+    )
+    assert "saw the larger amplitude" in question.text
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [("K_1", "stops short of where its springs"), ("omega_1", "which masses and which springs")],
+)
+def test_other_parameters_ask_for_what_may_have_moved_them(name, expected):
+    """A gain asks for sticking, a frequency for what was free to move."""
+    (question,) = ask(off(name, 40.0))
+    assert question.id == name
+    assert expected in question.text
+
+
+def test_a_guess_that_was_far_off_asks_where_the_data_show_it():
+    """A damping assumed three times too large: its peak is sharper; one too small: flatter."""
+    (question,) = ask(off("zeta_b", -67.0, source="assumed"))
+    assert question.section == "frequency-response"
+    assert "is sharper than that" in question.text
+    (question,) = ask(off("zeta_a", 148.0, source="assumed"))
+    assert "is flatter than that" in question.text
+    assert "the program assumed" in question.text
+    assert ask(off("zeta_a", 20.0, source="assumed")) == ()
+
+
+def test_points_are_not_asked_for_where_the_fit_had_none():
+    """A guess that a fit in time moved: no point of a Bode plot shows it."""
+    analysis = off("zeta_a", 148.0, source="assumed")
+    rows = tuple(
+        replace(row, final=row.final and replace(row.final, source="time_fit"))
+        for row in analysis.rows
+    )
+    assert ask(replace(analysis, rows=rows)) == ()
+
+
+def test_bench_against_model_asks_level_overshoot_and_shape_apart():
+    """Each difference raises its own question, with both numbers in it."""
+    analysis = well()
+    first, *others = analysis.hardware
+    assert first.steady_state_model is not None
+    assert first.overshoot_model is not None
+    worse = replace(
+        first,
+        cart=analysis.feedback.cart if analysis.feedback else 1,
+        nrmse=0.23,
+        steady_state_measured=0.9 * first.steady_state_model,
+        overshoot_measured=first.overshoot_model + 9.0,
+    )
+    asked = ask(replace(analysis, hardware=(worse, *others)))
+    assert [question.id for question in asked] == ["level", "overshoot", "hardware"]
+    assert {question.section for question in asked} == {"hardware"}
+    assert "21.0 %" in asked[1].text
+    assert "23.0 %" in asked[2].text
+
+
+def test_a_cart_that_sticks_is_asked_about_with_its_interval():
+    """The two ends of the gain's interval stand in the question."""
+    analysis = well()
+    stuck = replace(analysis.step_gains[0], interval=(23.1, 26.4))
+    assert isinstance(stuck, StepGain)
+    (question,) = ask(replace(analysis, step_gains=(stuck,)))
+    assert question.id == "sticking-1"
+    assert "23.1 to 26.4" in question.text
+
+
+def test_a_fit_that_leaves_more_than_noise_asks_at_its_worst_point():
+    """The cart and the frequency of the largest standardised residual are named."""
+    analysis = well()
+    assert analysis.fit is not None
+    response = analysis.frequency_responses[1]
+    residual = {str(r.cart): np.zeros(r.omega.size) for r in analysis.frequency_responses}
+    residual[str(response.cart)][3] = -8.1
+    fit = replace(analysis.fit, chi_square_per_dof=5.0, standardised=residual)
+    (question,) = ask(replace(analysis, fit=fit))
+    assert question.id == "misfit"
+    assert f"at cart {response.cart} at {response.omega[3]:.3g} rad/s, by 8.1" in question.text
+
+
+# ------------------------------------------------------------------------- answers
+
+
+def questions_of(analysis: Analysis) -> list[tuple[str, Question]]:
+    """Return the questions of the report, each with the section it stands in."""
+    document = build_document(analysis, progress=None)
+    return [
+        (section.id, block)
+        for section in document.sections
+        for block in flat(section.blocks)
+        if isinstance(block, Question)
+    ]
+
+
+NOTES = """
+## Discussion
+
+The bench squeaks.
+
+## {heading}
+
+The decay saw more.
+
+- Half a centimetre.
+
+### In detail
+
+Much more.
+
+## What we would do next
+
+Oil it.
+"""
+
+
+def test_an_answer_stands_beside_its_question():
+    """It is in the question's section; the rest stays the discussion."""
+    analysis = replace(off("zeta_b", 65.0), discussion=NOTES.format(heading="zeta_b"))
+    ((section, question),) = questions_of(analysis)
+    assert section == "parameters"
+    first = question.answer[0]
+    assert isinstance(first, Paragraph)
+    assert plain(first.text) == "The decay saw more."
+    assert len(question.answer) == 4  # the smaller heading and what is under it are still answer
+
+
+@pytest.mark.parametrize(
+    "heading", ["zeta_b", "Question zeta_b", "Q: zeta_b: amplitudes", "`zeta_b`", "ζ_b", "ZETA_B."]
+)
+def test_any_spelling_of_an_id_will_do(heading):
+    """The answer is out of the discussion, and nothing is left to answer."""
+    analysis = replace(off("zeta_b", 65.0), discussion=NOTES.format(heading=heading))
+    answers, rest = split_notes(discussion_blocks(analysis.discussion or ""), ask(analysis))
+    assert {name: len(blocks) for name, blocks in answers.items()} == {"zeta_b": 4}
+    words = " ".join(plain(b.text) for b in rest if isinstance(b, Paragraph))
+    assert words == "The bench squeaks. Oil it."
+    assert open_line(analysis) == ""
+
+
+def test_an_answer_to_nothing_that_is_asked_stays_in_the_discussion():
+    """Notes lose no word when new data no longer raise the question."""
+    analysis = replace(well(), discussion=NOTES.format(heading="zeta_b"))
+    _, rest = split_notes(discussion_blocks(analysis.discussion or ""), ask(analysis))
+    assert len(rest) == len(discussion_blocks(analysis.discussion or ""))
+
+
+def test_an_empty_heading_is_no_answer():
+    """A heading with nothing under it leaves the marked place."""
+    analysis = replace(off("zeta_b", 65.0), discussion="## zeta_b\n\n## Rest\n\nText.\n")
+    ((_, question),) = questions_of(analysis)
+    assert question.answer == ()
+    assert open_line(analysis) == "1 question to answer in notes.md, under “## zeta_b”"
+
+
+def test_page_and_print_mark_the_place_and_show_the_answer(tmp_path):
+    """Unanswered, both say under which heading to write; answered, both show the words, inert."""
+    analysis = off("zeta_b", 65.0)
+    for name, discussion in (("open", None), ("done", "## zeta_b\n\n<b>Ours</b> & *more*\n")):
+        out = tmp_path / name
+        out.mkdir()
+        render_report(replace(analysis, discussion=discussion), out)
+    pages = {
+        n: (tmp_path / n / "report.html").read_text(encoding="utf-8") for n in ("open", "done")
+    }
+    prints = {
+        n: " ".join(
+            " ".join(page.extract_text().split())
+            for page in pypdf.PdfReader(tmp_path / n / "report.pdf").pages
+        )
+        for n in ("open", "done")
+    }
+    assert "under the heading <code>## zeta_b</code>" in pages["open"]
+    assert 'under the heading "## zeta_b"' in prints["open"].replace("“", '"').replace("”", '"')
+    assert "&lt;b&gt;Ours&lt;/b&gt; &amp; <em>more</em>" in pages["done"]
+    assert "<b>Ours</b> & more" in prints["done"]
+    assert "To be answered" not in pages["done"] + prints["done"]
+    for page in pages.values():  # the discussion's list leads to every question
+        assert page.count('href="#question-zeta_b"') == page.count('id="question-zeta_b"') == 1
+
+
+@pytest.mark.parametrize("answered", [False, True])
+def test_a_question_is_printed_with_what_answers_it(answered):
+    """Wherever on a page it comes to stand."""
+    answer = (paragraph("Our answer. " + "It sticks. " * 40),) if answered else ()
+    question = Question(id="q", text=spans("Why so? " * 30), answer=answer)
+    line = paragraph("A line.")
+    blocks = tuple(block for n in range(60) for block in (question, *[line] * (n % 7)))
+    section = Section(id="s", title="S", blocks=blocks)
+    document = Document(title="T", subtitle="", authors=(), sections=(section,), footer="")
+    pages = pypdf.PdfReader(BytesIO(render_pdf(document))).pages
+    texts = [page.extract_text() for page in pages]
+    asked, said = ("Question.", "Our answer." if answered else "To be answered")
+    assert sum(text.count(asked) for text in texts) == 60
+    assert [text.count(asked) for text in texts] == [text.count(said) for text in texts]
+
+
+def test_a_new_submission_says_how_to_answer_without_answering(tmp_path):
+    """The template's own example is a comment: it answers nothing and is in no report."""
+    new_submission(tmp_path / "team", carts=2)
+    notes = tmp_path / "team" / "notes.md"
+    assert "## zeta_b" in notes.read_text(encoding="utf-8")
+    notes.write_text(notes.read_text(encoding="utf-8") + "\nOur words.\n", encoding="utf-8")
+    source = EXAMPLES / "two-cart" / "submission.toml"
+    toml = re.sub(r"\[\[experiments\]\].*", "", source.read_text(encoding="utf-8"), flags=re.DOTALL)
+    (tmp_path / "team" / "submission.toml").write_text(toml, encoding="utf-8")
+    discussion = load_submission(tmp_path / "team").discussion
+    assert discussion is not None
+    assert discussion.strip() == "Our words."
+
+
+def test_the_three_cart_example_answers_what_it_is_asked():
+    """The shipped example's one question is answered in its notes."""
+    analysis = analyse(load_submission(EXAMPLES / "three-cart"))
+    ((section, question),) = questions_of(analysis)
+    assert (section, question.id) == ("frequency-response", "zeta_a")
+    assert question.answer
+
+
+def test_real_carts_raise_friction_and_damping(tmp_path, real_data):
+    """The real two-cart data ask about dampings, dry friction and the bench, six at most."""
+    folder = write_two_cart_submission(tmp_path / "real", real_data, steps=(2, 3, 4, 5))
+    ids = [question.id for question in ask(analyse(load_submission(folder)))]
+    assert ids[:4] == ["sign", "zeta_2", "friction-1", "friction-2"]
+    assert "hardware" in ids
+    assert len(ids) <= 6

@@ -1,0 +1,444 @@
+"""The whole report: both files complete, inert, self-contained, the same bytes each time."""
+
+import base64
+import hashlib
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pypdf
+import pytest
+
+from pipeline.plant.chain import Chain
+from pipeline.report.draft.write import render_report
+from pipeline.report.render.pdf import missing_characters
+from pipeline.report.sections.summary import terminal_summary
+from pipeline.results import (
+    SIGN,
+    Analysis,
+    Check,
+    Estimate,
+    LeftOut,
+    ParameterRow,
+    Skipped,
+)
+from tests.helpers.analysis_factory import make_analysis
+
+VOID = {"meta", "link", "br", "img", "hr", "input"}
+
+
+class Page(HTMLParser):
+    """Collects what the tests ask of a page, and checks that tags are closed in order."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.text = ""
+        self._open: list[str] = []
+        self.feed(html)
+        assert self._open == []
+
+    def handle_starttag(self, tag, attrs):
+        """Note an opening tag."""
+        self.tags.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self._open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        """Note a tag that closes itself."""
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag):
+        """Insist that the tag closed is the last one opened."""
+        assert self._open.pop() == tag
+
+    def handle_data(self, data):
+        """Collect the text that a reader sees."""
+        if self._open[-1:] not in (["style"], ["script"]):
+            self.text += data
+
+    def values(self, attribute: str) -> list[str]:
+        """Return all values of one attribute."""
+        return [value for _, attrs in self.tags if (value := attrs.get(attribute)) is not None]
+
+
+def render(analysis: Analysis, out: Path, *, pdf: bool = True) -> tuple[Page, str]:
+    """Render, and return the parsed page and the PDF's text."""
+    render_report(analysis, out, pdf=pdf)
+    return read(out)
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory) -> dict[int, Path]:
+    """Reports of 1, 2 and 3 carts, made once."""
+    made = {}
+    for carts in (1, 2, 3):
+        made[carts] = tmp_path_factory.mktemp(f"report-{carts}")
+        render_report(make_analysis(carts), made[carts])
+    return made
+
+
+def read(folder: Path) -> tuple[Page, str]:
+    """Return the parsed page and the PDF's text, "" where there is no PDF."""
+    page = Page((folder / "report.html").read_text(encoding="utf-8"))
+    if not (folder / "report.pdf").exists():
+        return page, ""
+    reader = pypdf.PdfReader(folder / "report.pdf")
+    return page, "\n".join(p.extract_text() for p in reader.pages).replace("\u00a0", " ")
+
+
+@pytest.mark.parametrize("carts", [1, 2, 3])
+def test_every_part_is_there(carts, folders):
+    """Summary, model, tables, figures in the paper's order, checks, notes, what was skipped."""
+    page, pdf = read(folders[carts])
+
+    headings = [
+        "Summary", "The model", "Initial and final estimates", "Frequency response",
+        "Free decays", "Steps and static gains", "Sinusoidal steady state", "State feedback",
+        "Model and measurement", "Consistency checks", "Discussion", "Warnings",
+        "What was skipped", "Provenance",
+    ]  # fmt: skip
+    for heading in headings:
+        assert heading in page.text
+        assert heading in pdf
+    names = sorted(path.stem for path in (folders[carts] / "figures").iterdir())
+    expected = [f"bode-cart-{i}" for i in range(1, carts + 1)]
+    expected += [f"decay-cart-{i}" for i in range(1, carts + 1)]
+    assert names == sorted([*expected, "damping", "feedback", "hardware-1", "sine", "steps"])
+    bode = re.findall(r"Bode plot of cart (\d)", " ".join(page.values("aria-label")))
+    assert bode == [str(i) for i in range(carts, 0, -1)]  # last cart first, as the paper
+    assert "Émilie du Châtelet (s1025)" in page.text
+    assert "Émilie du Châtelet (s1025)" in pdf
+
+
+def test_the_page_stands_alone(folders):
+    """Nothing is loaded from anywhere, nothing runs but the page's own script, says the policy."""
+    page, _ = read(folders[2])
+
+    (policy,) = (
+        attrs["content"] for tag, attrs in page.tags
+        if tag == "meta" and attrs.get("http-equiv") == "Content-Security-Policy"
+    )  # fmt: skip
+    assert policy is not None
+    assert policy.startswith("default-src 'none'")
+    assert not {tag for tag, _ in page.tags} & {"link", "iframe", "object", "img"}
+    assert page.values("src") == []
+    assert all(href.startswith("#") for href in page.values("href"))
+    html = (folders[2] / "report.html").read_text(encoding="utf-8")
+    (script,) = re.findall(r"<script>(.*?)</script>", html, re.DOTALL)
+    known = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    assert f"script-src 'sha256-{known}';" in policy
+    assert all(url.startswith(('"data:', "#")) for url in re.findall(r"url\(([^)]*)", html))
+    assert not re.search(r"\son\w+=", html)
+
+
+def test_the_page_can_be_found_and_heard(folders):
+    """Every section is linked, every figure is described, every formula is mathematics."""
+    page, _ = read(folders[3])
+
+    ids = set(page.values("id"))
+    links = [href[1:] for href in page.values("href") if href.startswith("#")]
+    assert links
+    assert set(links) <= ids
+    sections = [attrs["id"] for tag, attrs in page.tags if tag == "section"]
+    assert set(sections) <= set(links)
+    figures = [tag for tag, _ in page.tags if tag == "figure"]
+    drawings = [attrs for tag, attrs in page.tags if tag == "svg"]
+    assert len(figures) == len(drawings) > 5
+    assert all(attrs.get("role") == "img" for attrs in drawings)
+    assert all(attrs.get("aria-label") for attrs in drawings)
+    assert sum(tag == "title" for tag, _ in page.tags) == 1  # one in a drawing would pop up
+    assert sum(attrs.get("display") == "block" for tag, attrs in page.tags if tag == "math") >= 6
+    assert ("html", {"lang": "en"}) in page.tags
+
+
+def test_the_same_analysis_gives_the_same_bytes(folders, tmp_path):
+    """HTML, PDF and every figure are reproducible."""
+    render_report(make_analysis(2), tmp_path)
+    first = sorted(folders[2].rglob("*.*"))
+    assert len(first) > 8
+    for path in first:
+        again = tmp_path / path.relative_to(folders[2])
+        assert path.read_bytes() == again.read_bytes(), path.name
+
+
+def test_the_pdf_is_archival_and_navigable(folders):
+    """PDF/A-2a and PDF/UA-1, with bookmarks, title, authors, pages, described figures."""
+    reader = pypdf.PdfReader(folders[3] / "report.pdf")
+
+    assert reader.metadata is not None
+    assert reader.metadata.title == "The 3-cart system, bench 4"
+    assert "Ada Lovelace" in str(reader.metadata.author)
+    titles = [item.title for item in reader.outline if not isinstance(item, list)]
+    assert titles[0] == "Summary"
+    assert titles[-1] == "Provenance"
+    xmp = reader.xmp_metadata
+    assert xmp is not None
+    packet = xmp.stream.get_data().decode()
+    assert "<pdfaid:part>2</pdfaid:part>" in packet
+    assert "<pdfaid:conformance>A</pdfaid:conformance>" in packet
+    assert "<pdfuaid:part>1</pdfuaid:part>" in packet
+    n = len(reader.pages)
+    assert f"1 of {n}" in reader.pages[0].extract_text()
+    alts = [
+        str(entry.get("/Alt"))
+        for entry in (reader.get_object(i + 1) for i in range(len(reader.xref[0])))
+        if isinstance(entry, dict) and "/Alt" in entry
+    ]
+    assert sum(alt.startswith("Bode plot of cart") for alt in alts) == 3
+
+
+HOSTILE = '#import "/etc/passwd": * $x^2$ <script>alert(1)</script> {{ 7*7 }} `#panic()` \\ [a](b)'
+
+
+def test_hostile_text_stays_text(tmp_path):
+    """Markup of typst, HTML, Jinja and Markdown in every field is shown, never obeyed."""
+    analysis = make_analysis(2)
+    evil = replace(
+        analysis,
+        title=HOSTILE,
+        section=HOSTILE,
+        authors=((HOSTILE, HOSTILE), ("'\"><img src=x>", "")),
+        position_unit="<i>c$m",
+        input_unit="#V",
+        records=tuple(replace(r, id=HOSTILE) if r.id == "step-a" else r for r in analysis.records),
+        step_gains=tuple(replace(g, experiment=HOSTILE, note=HOSTILE) for g in analysis.step_gains),
+        warnings=(HOSTILE,),
+        skipped=(Skipped(stage=HOSTILE, reason=HOSTILE),),
+        files={HOSTILE: "0" * 64},
+        discussion=HOSTILE + '\n\n#read("report.typ")\n\n<iframe src=x>',
+    )
+    page, pdf = render(evil, tmp_path)
+
+    assert not {tag for tag, _ in page.tags} & {"img", "iframe", "i"}
+    assert sum(tag == "script" for tag, _ in page.tags) == 1
+    assert page.text.count("<script>alert(1)</script>") > 5
+    assert "49" not in re.findall(r"\{\{.*?\}\}|49", page.text)[:1]
+    flat = re.sub(r"\s", "", pdf)
+    assert '#import"/etc/passwd":*$x^2$<script>alert(1)</script>{{7*7}}`#panic()`' in flat
+    assert '#read("report.typ")' in flat
+
+
+def test_names_that_the_fonts_lack_are_warned_of(tmp_path):
+    """Chinese and emoji show in the page; the PDF shows boxes, and both say so."""
+    said = []
+    analysis = replace(make_analysis(1), authors=(("s1", "李雷 😀"), ("s2", "Žofie Ελένη Иван")))
+    render_report(analysis, tmp_path, progress=said.append)
+    html = (tmp_path / "report.html").read_text(encoding="utf-8")
+    reader = pypdf.PdfReader(tmp_path / "report.pdf")
+    text = "\n".join(page.extract_text() for page in reader.pages)
+
+    assert "李雷 😀" in html
+    assert "no font there has" in html
+    assert "no font there has" in text
+    assert "□□" in text
+    assert "Žofie Ελένη Иван" in text
+    assert any("李" in line for line in said)
+    assert missing_characters("Žofie Ελένη Иван, naïve → ± ²") == ""
+
+
+def test_control_characters_do_no_harm(tmp_path):
+    """Ids and titles with bytes that XML and PDF forbid still give both files."""
+    analysis = make_analysis(1)
+    odd = "a\x00b\x0bc\ud800d\ufffee"
+    render_report(
+        replace(
+            analysis,
+            title=odd,
+            records=tuple(replace(r, id=f"{r.id}{odd}") for r in analysis.records),
+            log_decrements=tuple(
+                replace(d, experiment=f"{d.experiment}{odd}") for d in analysis.log_decrements
+            ),
+        ),
+        tmp_path,
+    )
+    assert "a�b�c�d�e" in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+def bare(analysis: Analysis, **parts) -> Analysis:
+    """Return an analysis that found nothing, except the given parts."""
+    empty = replace(
+        analysis,
+        records=(),
+        log_decrements=(),
+        step_gains=(),
+        sine_points=(),
+        frequency_responses=(),
+        fit=None,
+        rows=(),
+        checks=(),
+        feedback=None,
+        hardware=(),
+        skipped=(Skipped(stage="Bode fit", reason="no dwells: needs 8 points, found 0"),),
+        warnings=(),
+        files={},
+        discussion=None,
+    )
+    return replace(empty, **parts)
+
+
+def test_without_anything_the_reasons_are_told(tmp_path):
+    """No data at all still gives a report, which says what could not be done and why."""
+    page, pdf = render(bare(make_analysis(2)), tmp_path)
+    for text in (page.text, pdf):
+        assert "No model of the chain of 2 carts could be identified" in text
+        assert "needs 8 points, found 0" in text
+        assert "Free decays" not in text
+    assert list((tmp_path / "figures").iterdir()) == []
+
+
+def test_without_anything_and_without_reasons_there_is_still_a_report(tmp_path):
+    """No link leads to a section that is not there."""
+    page, pdf = render(bare(make_analysis(1), skipped=()), tmp_path)
+    assert "No model of the single cart could be identified" in pdf
+    assert {href[1:] for href in page.values("href")} <= set(page.values("id"))
+
+
+@pytest.mark.parametrize(
+    "part",
+    ["records", "log_decrements", "step_gains", "sine_points", "frequency_responses", "fit", "rows",
+     "checks", "feedback", "hardware", "discussion"],
+)  # fmt: skip
+def test_any_part_may_be_missing(part, tmp_path):
+    """Without one part the rest of the page is there."""
+    analysis = make_analysis(1, repeats=1)
+    empty = None if part in ("fit", "feedback", "discussion") else ()
+    page, _ = render(replace(analysis, **{part: empty}), tmp_path, pdf=False)
+    assert "Summary" in page.text
+    assert "Provenance" in page.text
+    assert not re.search(r"\b(None|nan|inf)\b", page.text)
+
+
+@pytest.mark.parametrize(
+    "part",
+    ["log_decrements", "step_gains", "sine_points", "frequency_responses", "feedback", "hardware"],
+)
+def test_any_part_may_stand_alone(part, tmp_path):
+    """One stage's results, with their records, give a page and a PDF."""
+    analysis = make_analysis(1)
+    kept = bare(analysis, records=analysis.records, **{part: getattr(analysis, part)})
+    page, pdf = render(kept, tmp_path)
+    assert "Figure 1" in page.text
+    assert "Figure 1" in pdf
+
+
+def test_a_table_of_ratios_has_no_phase(tmp_path):
+    """Without phase the Bode figure has magnitude and residual only, and the source is said."""
+    analysis = make_analysis(1)
+    (response,) = analysis.frequency_responses
+    table = replace(response, phase=None, phase_std=None, source="table")
+    page, _ = render(replace(analysis, frequency_responses=(table,)), tmp_path, pdf=False)
+    assert "which has no phase" in page.text
+    svg = (tmp_path / "figures" / "bode-cart-1.svg").read_text(encoding="utf-8")
+    assert "phase [°]" not in svg
+    assert "residual [%]" in svg
+
+
+CHAINS = {
+    "rigid": Chain(m=np.array([2e-4]), c=np.array([5e-4]), k=np.zeros(2)),
+    "overdamped": Chain(m=np.array([2e-4]), c=np.array([1e-2]), k=np.array([0.03, 0.0])),
+    "loose": Chain(m=np.array([2e-4, 2e-4]), c=np.array([5e-4, 5e-4]), k=np.array([0, 0.1, 0])),
+    "four": Chain(
+        m=np.array([3e-4, 2.5e-4, 2e-4, 1.8e-4]),
+        c=np.array([1.5e-3, 4e-4, 3e-4, 3e-4]),
+        k=np.array([0.05, 0.12, 0.07, 0.06, 0.06]),
+    ),
+    "negative": Chain(
+        m=np.array([2e-4, 2e-4]), c=np.array([5e-4, 0]), k=np.array([-0.01, 0.1, 0.1])
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CHAINS)
+def test_unusual_chains_are_shown(name, tmp_path):
+    """A rigid body, heavy damping, no walls, four carts, a negative spring: all have a model."""
+    chain = CHAINS[name]
+    analysis = make_analysis(min(chain.n, 3))
+    assert analysis.fit is not None
+    names = tuple(
+        f"{letter}_{i}" for letter, n in (("m", chain.n), ("c", chain.n)) for i in range(1, n + 1)
+    )
+    fit = replace(
+        analysis.fit,
+        method="time_fit",
+        chain=chain,
+        names=names,
+        covariance=np.diag(np.full(len(names), 1e-12)),
+        parameters={"mass": Estimate(value=chain.m[0], std=1e-6, source="time_fit")},
+        staged={},
+    )
+    row = ParameterRow(
+        name="mass", unit="V s^2/cm", initial=None, final=fit.parameters["mass"],
+        change_percent=None, change_sigmas=None, consistent=None,
+    )  # fmt: skip
+    springs = tuple(bool(k != 0) for k in chain.k)
+    page, pdf = render(
+        bare(analysis, carts=chain.n, springs=springs, fit=fit, rows=(row,)), tmp_path
+    )
+    assert "to the records in time" in page.text
+    assert "The identified chain" in pdf
+
+
+def test_a_poor_result_is_called_so(tmp_path):
+    """What disagrees, fails or does not converge stands in the summary, with what to do."""
+    analysis = make_analysis(2)
+    assert analysis.fit is not None
+    fit = replace(analysis.fit, converged=False, message="k_1 at its bound", chi_square_per_dof=9.0)
+    rows = tuple(
+        replace(row, consistent=False, change_percent=23.4) if row.name == "K_1" else row
+        for row in analysis.rows
+    )
+    hardware = tuple(replace(check, nrmse=0.4) for check in analysis.hardware)
+    text = terminal_summary(replace(analysis, fit=fit, rows=rows, hardware=hardware))
+    assert "The fit did not converge: k_1 at its bound" in text
+    assert "more than the stated noise is left" in text
+    assert "K_1 (+23.4 %)" in text
+    assert "1 of 2 checks failed" in text
+    assert "Record sine-04 again and longer" in text
+    assert "Find what the linear model leaves out" in text
+
+
+def test_what_was_not_used_is_not_said_to_be():
+    """A record left out is no source of the model; a file that is not there is asked for."""
+    analysis = make_analysis(2)
+    dwells = [record.id for record in analysis.records if record.kind == "sine"]
+    left_out = LeftOut(experiment=dwells[0], reason="froze", is_wrong=True)
+    whole = terminal_summary(analysis)
+    text = terminal_summary(
+        replace(analysis, left_out=(left_out,), unreadable={"step-9": "there is no file"})
+    )
+    assert f"{len(dwells)} sine dwells" in whole
+    assert f"{len(dwells) - 1} sine dwells" in text
+    assert "the right name of it, for step-9" in text
+    assert f"Mend or record again {dwells[0]}:" in text
+
+
+def test_a_good_result_is_called_so():
+    """Nothing to complain of: the summary says so in a few lines."""
+    analysis = make_analysis(1, repeats=1)
+    rows = tuple(replace(row, consistent=True) for row in analysis.rows)
+    checks = tuple(check for check in analysis.checks if check.outcome == "pass")
+    points = tuple(replace(point, settled=True) for point in analysis.sine_points)
+    good = replace(analysis, rows=rows, checks=checks, sine_points=points, skipped=(), warnings=())
+    text = terminal_summary(good)
+    assert "all 3 parameters measured in two ways" in text
+    assert "Nothing stands out" in text
+    assert good.feedback is not None
+    missed = replace(good.feedback, reachable=False, message="settling in 1 ms cannot be met")
+    for worse in (replace(good, warnings=("odd",)), replace(good, feedback=missed)):
+        assert "Nothing stands out" not in terminal_summary(worse)
+
+
+def test_a_wrong_sign_is_said_first_and_nothing_else_is_advised():
+    """A stated sign that the data contradict comes first; what may follow from it is not sought."""
+    analysis = make_analysis(1, repeats=1)
+    wrong = Check(id=SIGN, outcome="fail", value=3.0, limit=0.0, message="set sign = 1 there")
+    off = tuple(replace(row, consistent=False) for row in analysis.rows)
+    text = terminal_summary(replace(analysis, checks=(wrong, *analysis.checks), rows=off))
+    findings, _, advice = text.partition("What to do next.")
+    first = next(line for line in findings.splitlines() if line.startswith("- "))
+    assert first == "- Wrong sign: set sign = 1 there"
+    assert advice.count("- ") == 2
+    assert "set sign = 1 there" in advice

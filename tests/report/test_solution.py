@@ -1,0 +1,375 @@
+"""The worked reference: every formula it prints is a true one, and its numbers are the model's."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import sympy
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from sympy.parsing.sympy_parser import parse_expr
+
+from pipeline.plant.chain import PRESETS, Chain
+from pipeline.report.document import Formula
+from pipeline.report.equations import derivation
+from pipeline.report.equations.algebra import evaluate, shown, shown_with, value_term, work_out
+from pipeline.report.equations.derivation import work_state_model
+from pipeline.report.math.tree import to_text
+from pipeline.report.solution.design import work_design
+from pipeline.report.solution.expected import expected_model, expected_parameters
+from pipeline.report.solution.write import build_solution, solution_text
+from pipeline.stages.state_feedback import design_feedback
+from tests.helpers.analysis_factory import make_analysis
+from tests.plant.test_chain import chains
+
+s = sympy.Symbol("s")
+SPRINGS = [(True, True), (False, True, True), (True, True, False), (True,) * 3]
+SPRINGS += [(False, True, True, True), (True,) * 4]
+
+
+def parsed(text: str, names: Mapping[str, Any] | None = None) -> Any:
+    """Return an expression of the derivation for the computer algebra system."""
+    return parse_expr(text, local_dict=dict(names or {}))
+
+
+class Truth:
+    """A chain in symbols, solved by the impedance matrix alone."""
+
+    def __init__(self, springs) -> None:
+        n = self.n = len(springs) - 1
+        self.m, self.c = (sympy.symbols(f"{x}_1:{n + 1}", positive=True) for x in "mc")
+        k = sympy.symbols(f"k_1:{n + 2}", positive=True)
+        self.k = [k[j] if springs[j] else sympy.Integer(0) for j in range(n + 1)]
+        if n == 1:
+            self.k = [sympy.Symbol("k", positive=True), sympy.Integer(0)]
+            self.m, self.c = (
+                (sympy.Symbol("m", positive=True),),
+                (sympy.Symbol("c", positive=True),),
+            )
+        Z = sympy.zeros(n, n)
+        for i in range(n):
+            Z[i, i] = self.m[i] * s**2 + self.c[i] * s + self.k[i] + self.k[i + 1]
+            if i:
+                Z[i, i - 1] = Z[i - 1, i] = -self.k[i]
+        self.Z = Z
+        self.X = (Z.adjugate()[:, 0] / Z.det()).applyfunc(sympy.together)
+
+    def polynomial(self, first: int) -> Any:
+        """Return the monic characteristic polynomial of the carts from `first` on."""
+        det = self.Z[first - 1 :, first - 1 :].det() if first <= self.n else sympy.Integer(1)
+        return sympy.expand(det / sympy.prod(self.m[first - 1 :]))
+
+    def names(self) -> dict[str, Any]:
+        """Return what every name of the derivation stands for, in masses, dampings, springs."""
+        n, m, k = self.n, self.m, self.k
+        found: dict[str, Any] = {"s": s, "U": sympy.Integer(1), "u": sympy.Integer(1)}
+        for i in range(1, n + 1):
+            index = "" if n == 1 else f"_{i}"
+            omega = sympy.sqrt((k[i - 1] + k[i]) / m[i - 1])
+            found |= {
+                f"m{index}": m[i - 1], f"c{index}": self.c[i - 1], f"X_{i}": self.X[i - 1],
+                f"x_{i}": self.X[i - 1], f"dx_{i}": s * self.X[i - 1],
+                f"ddx_{i}": s**2 * self.X[i - 1], f"omega_{i}": omega, f"w_{i}": omega**2,
+                f"zeta_{i}": self.c[i - 1] / (2 * m[i - 1] * omega),
+                f"g_{i}": self.c[i - 1] / m[i - 1],
+                f"left_{i}": k[i - 1] / m[i - 1], f"right_{i}": k[i] / m[i - 1],
+                f"P_{i}": sympy.expand(self.Z[i - 1, i - 1] / m[i - 1]),
+                f"K_{i}": sympy.simplify(self.X[i - 1].subs(s, 0)),
+                f"inverse_m{index}": 1 / m[i - 1],
+            }  # fmt: skip
+            if i > 1:
+                found[f"kappa_{i}"] = k[i - 1] ** 2 / (m[i - 2] * m[i - 1])
+        for j, stiffness in enumerate(k, start=1):
+            found["k" if n == 1 else f"k_{j}"] = stiffness if n > 1 else k[0]
+        for i, letter in enumerate("dnr"[: max(n - 1, 0)], start=1):
+            whole = self.polynomial(i)
+            found[("Delta", "N", "R")[i - 1]] = whole
+            found |= {f"{letter}_{p}": whole.coeff(s, p) for p in range(2 * (n - i + 1))}
+        if n == 1:
+            found |= {"K": 1 / k[0], "omega_n": sympy.sqrt(k[0] / m[0])}
+            found["zeta"] = self.c[0] / (2 * m[0] * found["omega_n"])
+        return found
+
+
+def is_zero(text: str, names: dict[str, Any]) -> bool:
+    """Say whether an expression vanishes identically once all its names are put in."""
+    return sympy.fraction(sympy.together(parsed(text, names)))[0].expand() == 0
+
+
+def numbered(springs) -> str:
+    return "".join("01"[present] for present in springs)
+
+
+@pytest.fixture(scope="module", params=SPRINGS, ids=numbered)
+def truth(request):
+    return request.param, Truth(request.param)
+
+
+def test_motion_and_elimination_are_true_of_the_impedance_matrix(truth):
+    """Newton's laws, their transforms and every step of the elimination hold identically."""
+    springs, chain = truth
+    n = len(springs) - 1
+    equations = [*derivation.newton(springs), *derivation.laplace(springs)]
+    if n > 1:
+        equations += [
+            *derivation.single_carts(springs), *derivation.per_mass(n),
+            *derivation.elimination(n), *derivation.transfer(n), *derivation.static_gains(n),
+        ]  # fmt: skip
+    names = chain.names()
+    for equation in equations:
+        assert is_zero(f"({equation.left})-({equation.right})", names), equation
+
+
+def test_the_way_back_is_true_of_the_impedance_matrix(truth):
+    """Each step from coefficients to single carts, couplings, masses and springs is an identity."""
+    springs, chain = truth
+    n = len(springs) - 1
+    names = chain.names()
+    steps = [*derivation.couplings(n), *derivation.physical(springs)]
+    if n > 1:
+        steps += [*derivation.carts_alone(n), *derivation.redundancies(n)]
+    for step in steps:
+        assert is_zero(f"({step.left})-({step.right})", names), step
+
+
+@pytest.mark.parametrize("n", [2, 3, 4])
+def test_coefficients_are_those_of_the_product_of_factors(n):
+    """The printed sums are the expanded product of the table's quadratic factors."""
+    modes = {"d": "abcd"[:n]} | ({"n": "xy"} if n == 3 else {})
+    table = {
+        f"{greek}_{mode}": sympy.Symbol(f"{greek}_{mode}")
+        for mode in "".join(modes.values())
+        for greek in ("omega", "zeta")
+    }
+    found: dict[str, Any] = dict(table)
+    for equation in derivation.coefficients(n):
+        found[equation.left] = parsed(equation.right, found)
+    for letter, group in modes.items():
+        factors = (
+            s**2
+            + 2 * table[f"zeta_{mode}"] * table[f"omega_{mode}"] * s
+            + table[f"omega_{mode}"] ** 2
+            for mode in group
+        )
+        whole = sympy.Poly(sympy.prod(factors), s)
+        for power in range(2 * len(group)):
+            difference = found[f"{letter}_{power}"] - whole.coeff_monomial(s**power)
+            assert sympy.expand(difference) == 0
+
+
+def test_the_redundancies_are_as_many_as_the_checks():
+    """One for two carts, five for three: 8 parameters for 7, 15 for 10."""
+    assert [len(derivation.redundancies(n)) for n in (1, 2, 3)] == [0, 1, 5]
+
+
+@given(chains())
+def test_numbers_put_in_step_by_step_end_in_the_state_model(chain):
+    """Worked out from the named parameters, the entries are those of the chain's own matrices."""
+    values = work_state_model(chain)
+    n = chain.n
+    A, B, _, _ = chain.state_space()
+    entries, column = derivation.state_entries(n)
+    got = np.array([[evaluate(text, values) for text in line] for line in entries])
+    # kappa is the small difference of products of omega²: rounding grows by their ratio.
+    scale = np.abs(A).max() * (chain.poles.__abs__().max() / np.abs(chain.poles).min()) ** 2
+    assert_allclose(got, A, rtol=1e-9, atol=1e-13 * scale)
+    assert_allclose([evaluate(text, values) for text in column], B[:, 0], rtol=1e-9)
+
+
+# ----------------------------------------------------------- what is shown is what is true
+
+WRITTEN = {
+    "ω": "omega", "ζ": "zeta", "κ": "kappa", "Δ": "Delta", "·": "*",
+}  # fmt: skip
+
+
+def read_back(term) -> str:
+    """Return mathematics as a reader takes it: what stands side by side is multiplied."""
+    if isinstance(term, str):
+        return WRITTEN.get(term, term.replace("−", "-"))
+    parts = [read_back(part) for part in term.parts]
+    match term.kind:
+        case "fraction":
+            return f"(({parts[0]})/({parts[1]}))"
+        case "sub":
+            return f"{parts[0]}_{parts[1]}"
+        case "sup":
+            return f"({parts[0]})**({parts[1]})"
+        case "parens":
+            return f"({''.join(side_by_side(parts))})"
+        case "dot" | "ddot":
+            return f"{'d' * (len(term.kind) - 2)}{parts[0]}"
+        case _:
+            return f"{''.join(side_by_side(parts))}"
+
+
+def side_by_side(parts):
+    for before, part in zip(["+", *parts], parts, strict=False):
+        operator = part[:1] in "+-*" or before[-1:] in "+-*" or part == "(s)"
+        yield ("" if operator else "*") + ("" if part == "(s)" else part)
+
+
+@pytest.mark.parametrize("springs", SPRINGS, ids=numbered)
+def test_a_formula_reads_as_the_text_it_is_made_from(springs):
+    """Brackets stand where they must: read back, every formula shown is the expression tested."""
+    n = len(springs) - 1
+    equations = [*derivation.newton(springs), *derivation.laplace(springs)]
+    equations += [*derivation.couplings(n), *derivation.physical(springs)]
+    if n > 1:
+        equations += [
+            *derivation.single_carts(springs), *derivation.per_mass(n),
+            *derivation.elimination(n), *derivation.transfer(n), *derivation.static_gains(n),
+            *derivation.coefficients(n), *derivation.carts_alone(n), *derivation.redundancies(n),
+        ]  # fmt: skip
+    spelt: dict[str, Any] = {f"w_{i}": sympy.Symbol(f"omega_{i}") ** 2 for i in range(1, n + 1)}
+    for i in range(1, n + 1):
+        spelt |= {
+            f"left_{i}": sympy.Symbol(f"k_{i}") / sympy.Symbol(f"m_{i}"),
+            f"right_{i}": sympy.Symbol(f"k_{i + 1}") / sympy.Symbol(f"m_{i}"),
+            f"inverse_m_{i}": 1 / sympy.Symbol(f"m_{i}"),
+        }
+    spelt |= {
+        "inverse_m": 1 / sympy.Symbol("m"),
+        **{x: sympy.Symbol(x) for x in ("Delta", *"NRUs", "zeta")},
+    }
+    for text in (side for equation in equations for side in (equation.left, equation.right)):
+        seen = parsed(read_back(shown(text)), spelt)
+        assert sympy.expand(seen - parsed(text, spelt)) == 0, text
+
+
+def test_numbers_put_in_are_worked_out_as_written():
+    """With numbers for names, signs and powers of ten included, the shown line gives the result."""
+    values = {"a": -2.0, "b": 3e-7, "c": 0.5}
+    for text in ("a*b-c", "(a-b)/c", "c-a*(b+a)", "-a**2+c", "a-(b-c)", "a/b*c"):
+        seen = parsed(read_back(shown_with(text, values)))
+        assert_allclose(float(seen), evaluate(text, values), rtol=1e-4)
+
+
+# ------------------------------------------------------------------------- the design
+
+
+@pytest.mark.parametrize("method", ["lqr", "poles"])
+@pytest.mark.parametrize("preset", ["throne-1dof", "throne-2dof", "throne-3dof"])
+def test_the_worked_gains_are_the_designed_ones(preset, method):
+    """Riccati's equation and Ackermann's formula give the gains that the design stage found."""
+    chain = PRESETS[preset]
+    design = design_feedback(
+        chain, cart=chain.n, reference=1.0, overshoot_percent=10, settling_time=1.0, method=method
+    )
+    worked = work_design(chain, design)
+    # Six poles near 1: the controllability matrix of six states loses some nine digits.
+    assert_allclose(worked.gains, design.gains, rtol=1e-5, atol=1e-6 * np.abs(design.gains).max())
+    assert_allclose(worked.prefilter, design.prefilter, rtol=1e-6)
+    if worked.P is not None and design.Q is not None and design.R is not None:
+        R, P, phi = design.R, worked.P, worked.phi
+        G = worked.gains
+        residual = (
+            design.Q
+            + phi.T @ P @ phi
+            - P
+            - (R + worked.gamma @ P @ worked.gamma) * (np.outer(G, G))
+        )
+        assert_allclose(residual, 0.0, atol=1e-9 * np.abs(P).max())
+
+
+def test_ackermann_is_exact_in_symbols():
+    """For any two-state plant the formula gives phi - gamma G the polynomial asked for."""
+    a, b, c, d, e, f, p, q = sympy.symbols("a:f p q")
+    phi, gamma, z = sympy.Matrix([[a, b], [c, d]]), sympy.Matrix([e, f]), sympy.Symbol("z")
+    reach = sympy.Matrix.hstack(gamma, phi * gamma)
+    G = sympy.Matrix([[0, 1]]) * reach.inv() * (phi**2 + p * phi + q * sympy.eye(2))
+    loop = (z * sympy.eye(2) - phi + gamma * G).det()
+    assert sympy.simplify(loop - (z**2 + p * z + q)) == 0
+
+
+# ---------------------------------------------------------------------- what is expected
+
+
+def test_the_reference_passes_its_own_tolerances_and_a_slip_does_not():
+    """Every expected value lies within, a frequency in Hz or a doubled gain far outside."""
+    for p in expected_parameters(make_analysis(3)):
+        assert p.tolerance > 0
+        if p.name.startswith("omega"):
+            assert abs(p.value / (2 * np.pi) - p.value) > p.tolerance
+        if p.name.startswith("K"):
+            assert abs(2 * p.value - p.value) > p.tolerance
+
+
+@given(chains(min_carts=2, max_carts=3), st.integers(0, 2**32 - 1))
+@settings(max_examples=20)
+def test_entry_tolerances_cover_tables_that_are_off_as_accepted(chain, seed):
+    """A table off by a third of its tolerances, at random, moves most entries within theirs."""
+    rng = np.random.default_rng(seed)
+    table = derivation.given(chain)
+    tolerances = {name: 1e-3 * value for name, value in table.items()}
+    model = expected_model(chain, tolerances)
+    rows, _ = derivation.state_entries(chain.n)
+    inside = []
+    for _ in range(20):
+        moved = {
+            name: value * (1 + 1e-3 / 3 * rng.standard_normal()) for name, value in table.items()
+        }
+        worked = work_out(derivation.state_steps(chain.n), moved)
+        A = np.array([[evaluate(text, worked) for text in line] for line in rows])
+        inside.append(np.abs(A - model.A) <= model.A_tolerance + 1e-6 * np.abs(model.A))
+    # A third of the tolerance is one standard error: three hold 99.7 %.
+    assert np.mean(inside) > 0.97
+
+
+# ------------------------------------------------------------------------- the document
+
+
+@pytest.mark.parametrize("carts", [1, 2, 3])
+def test_the_document_works_everything_out(carts):
+    """Each worked section is there, and the model's numbers stand in it."""
+    analysis = make_analysis(carts)
+    document = build_solution(analysis)
+    ids = [section.id for section in document.sections]
+    assert ids[:6] == [
+        "summary", "motion", "transfer-functions", "state-model", "worked-design", "expected",
+    ]  # fmt: skip
+    alts = " ".join(
+        block.alt for section in document.sections for block in section.blocks
+        if isinstance(block, Formula)
+    )  # fmt: skip
+    assert analysis.chain is not None
+    A, B, _, _ = analysis.chain.state_space()
+    for value in (*A[(A != 0) & (A != 1)], *B[B != 0]):
+        assert to_text(value_term(float(abs(value)))) in alts
+
+
+def test_what_has_no_table_is_left_out():
+    """Without a fit only the derivation stands; a rigid cart has its own, short one."""
+    bare = replace(make_analysis(2), fit=None, rows=(), feedback=None)
+    ids = [section.id for section in build_solution(bare).sections]
+    assert ids[1:3] == ["motion", "transfer-functions"]
+    assert not {"state-model", "worked-design", "expected"} & set(ids)
+    rigid = analyse_rigid()
+    document = build_solution(rigid)
+    assert {"motion", "transfer-functions", "state-model"} <= {s.id for s in document.sections}
+
+
+def analyse_rigid():
+    analysis = make_analysis(1)
+    assert analysis.fit is not None
+    chain = Chain(m=np.array([2e-4]), c=np.array([5e-4]), k=np.zeros(2))
+    fit = replace(
+        analysis.fit, chain=chain, names=("m_1", "c_1"), covariance=1e-12 * np.eye(2), parameters={}
+    )
+    return replace(analysis, springs=(False, False), fit=fit, rows=(), feedback=None)
+
+
+def test_solution_json_is_the_reference_for_programs():
+    """All parameters with tolerances, A and B with theirs, and the gains; the same text twice."""
+    analysis = make_analysis(2)
+    text = solution_text(analysis)
+    assert text == solution_text(analysis)
+    found = json.loads(text)
+    assert found["schema"] == "cartlab-solution/1"
+    assert {p["name"] for p in found["parameters"]} == {row.name for row in analysis.rows}
+    assert np.shape(found["state_space"]["A_tolerance"]) == (4, 4)
+    assert len(found["feedback"]["gains"]) == 4

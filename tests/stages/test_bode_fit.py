@@ -1,0 +1,432 @@
+"""The fit of one chain to all frequency responses: truth, coverage, starts, hard cases."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from scipy.stats import binom
+
+from benchmarks.identification import PAPER_STARTS, measure, quality
+from pipeline.errors import DataError
+from pipeline.plant.chain import PRESETS, Array, Chain
+from pipeline.results import Estimate, FrequencyResponse
+from pipeline.stages.bode_fit import fit_bode
+
+BENCH_BAND = 2 * np.pi * np.geomspace(0.3, 7.0, 30)
+FOUR_CARTS = Chain(
+    m=np.array([3e-4, 2.5e-4, 2e-4, 2.5e-4]),
+    c=np.array([1e-3, 5e-4, 4e-4, 5e-4]),
+    k=np.array([0.02, 0.12, 0.07, 0.06, 0.08]),
+)
+
+
+def exact(chain: Chain, omega: Array = BENCH_BAND) -> tuple[FrequencyResponse, ...]:
+    """Return magnitudes without error, said to be good to 1 %."""
+    size = np.abs(chain.frequency_response(omega))
+    return tuple(
+        FrequencyResponse(
+            cart=i + 1,
+            omega=omega,
+            magnitude=size[i],
+            magnitude_std=0.01 * size[i],
+            phase=None,
+            phase_std=None,
+            source="dwells",
+        )
+        for i in range(chain.n)
+    )
+
+
+def noisy(preset: str, *, seed: int = 0, phases: bool = False) -> tuple[FrequencyResponse, ...]:
+    return measure(PRESETS[preset], rng=np.random.default_rng(seed), phases=phases)
+
+
+def thinned(responses: tuple[FrequencyResponse, ...], points: slice) -> list[FrequencyResponse]:
+    return [
+        replace(
+            r, omega=r.omega[points], magnitude=r.magnitude[points],
+            magnitude_std=r.magnitude_std[points],
+        )
+        for r in responses
+    ]  # fmt: skip
+
+
+# ----------------------------------------------------------------------- truth
+
+
+@pytest.mark.parametrize("chain", [*PRESETS.values(), FOUR_CARTS], ids=lambda c: f"{c.n}-carts")
+def test_exact_magnitudes_give_the_chain_back_without_a_start(chain):
+    """From error-free magnitudes and nothing else, every named parameter is right."""
+    got = fit_bode(exact(chain), n=chain.n, springs=(True,) * (chain.n + 1))
+
+    assert got.converged
+    for name, value in chain.parameters().items():
+        # The fit stops where its cost or step changes by 1e-8; the cost is quadratic, so a
+        # parameter is then good to about 1e-5 of its standard error's scale, 1 %.
+        assert_allclose(got.parameters[name].value, value, rtol=1e-5)
+
+
+@st.composite
+def chains(draw: st.DrawFn) -> Chain:
+    """Benches of one to three carts with modes between 1 and 8 Hz or so."""
+    n = draw(st.integers(1, 3))
+    size = st.floats(0.5, 2.0)
+    m, zeta, k = (
+        np.array(draw(st.lists(size, min_size=length, max_size=length))) for length in (n, n, n + 1)
+    )
+    m, k = 2.5e-4 * m, 0.08 * k
+    if n == 1:
+        k[1] = 0.0
+    return Chain(m=m, c=2 * 0.05 * zeta * np.sqrt(m * (k[:-1] + k[1:])), k=k)
+
+
+@settings(max_examples=25, deadline=None)
+@given(chain=chains())
+def test_any_bench_is_found(chain):
+    """Error-free magnitudes of random benches, without a start, give them back."""
+    omega = 2 * np.pi * np.geomspace(0.5, 10.0, 40)
+
+    got = fit_bode(exact(chain, omega), n=chain.n, springs=(True,) * (chain.n + 1))
+
+    # As above; a wrong minimum would be off by per cents.
+    assert_allclose(got.chain.m, chain.m, rtol=1e-4)
+    assert_allclose(got.chain.k, chain.k, rtol=1e-4)
+
+
+@pytest.mark.parametrize("unit", [1.0, 440.0, 0.01], ids=["cm", "count", "m"])
+def test_the_position_unit_does_not_matter(unit):
+    """The same bench in counts or metres gives the same frequencies and scaled gains."""
+    chain = PRESETS["throne-3dof"]
+    scaled = Chain(m=chain.m / unit, c=chain.c / unit, k=chain.k / unit)
+
+    got = fit_bode(exact(scaled), n=3, springs=(True,) * 4)
+
+    truth = chain.parameters()
+    assert_allclose(got.parameters["omega_c"].value, truth["omega_c"], rtol=1e-5)
+    assert_allclose(got.parameters["K_2"].value, unit * truth["K_2"], rtol=1e-5)
+
+
+def test_a_rigid_body_has_mass_and_damping():
+    """Without any spring the fit gives the mass and the damping of the cart."""
+    cart = Chain(m=np.array([3e-4]), c=np.array([1e-3]), k=np.zeros(2))
+
+    got = fit_bode(exact(cart), n=1, springs=(False, False))
+
+    assert_allclose(got.parameters["mass"].value, 3e-4, rtol=1e-5)
+    assert_allclose(got.parameters["damping"].value, 1e-3, rtol=1e-5)
+    assert got.staged == {}
+
+
+def test_the_staged_fit_is_reported_as_well():
+    """On exact data the stage-by-stage fit finds the same parameters, recomputed ones included."""
+    chain = PRESETS["throne-3dof"]
+
+    got = fit_bode(exact(chain), n=3, springs=(True,) * 4, initial=PAPER_STARTS[3])
+
+    truth = chain.parameters()
+    assert set(got.staged) == set(truth)
+    for name, value in truth.items():
+        # Each stage stops as the joint fit does; recomputing omega_1 multiplies by some ten.
+        assert_allclose(got.staged[name], value, rtol=1e-3)
+
+
+# ------------------------------------------------------------------ statistics
+
+
+@pytest.mark.parametrize("phases", [False, True], ids=["magnitudes", "phases"])
+@pytest.mark.parametrize("preset", PRESETS)
+def test_intervals_cover_the_truth(preset, phases):
+    """Over 40 noisy sets, each parameter's 95 % interval holds the truth as often as it should."""
+    got = quality(PRESETS[preset], seeds=40, phases=phases)
+
+    # A right interval falls below this once in 1e4 tries.
+    assert np.all(got.coverage >= binom.ppf(1e-4, 40, 0.95) / 40)
+    # The mean of 40 chi²/dof with 17 dof and more: its standard error is 0.054 at most; 4 of them.
+    assert_allclose(np.mean(got.chi_square), 1.0, atol=0.22)
+
+
+# ------------------------------------------------------------------ hard cases
+
+
+def test_a_spring_that_is_not_there_is_held_at_zero():
+    """With k_1 = 0 half the noisy sets want it negative: it is held at zero, and said."""
+    fits = [
+        fit_bode(noisy("throne-2dof", seed=seed), n=2, springs=(True,) * 3) for seed in range(20)
+    ]
+
+    held = [fit for fit in fits if "k_1" not in fit.names]
+    # Binomial with one half: fewer than 3 or more than 17 once in 2000.
+    assert 3 <= len(held) <= 17
+    assert all(fit.chain.k[0] >= 0 for fit in fits)
+    assert all(fit.chain.k[0] == 0 and "k_1 is at its bound" in fit.message for fit in held)
+
+
+def test_a_far_spring_and_a_damper_that_are_not_there_are_held_at_zero():
+    """Without a far spring and a damper on cart 2, both are found to be zero."""
+    chain = PRESETS["throne-2dof"]
+    loose = Chain(m=chain.m, c=np.array([6e-4, 0.0]), k=np.array([0.05, 0.127, 0.0]))
+
+    got = fit_bode(exact(loose), n=2, springs=(True,) * 3)
+
+    assert_allclose(got.chain.k, loose.k, atol=1e-5)
+    assert_allclose(got.chain.c, loose.c, atol=1e-7)
+    assert_allclose(got.parameters["K_1"].value, got.parameters["K_2"].value, rtol=1e-4)
+
+
+# Beside a peak so sharp that none of six points sees its damping.
+SHARP = Chain(m=np.array([2e-3]), c=np.array([0.0]), k=np.array([0.6, 0.0]))
+BESIDE = np.sqrt(300.0) * np.array([0.4, 0.6, 0.8, 1.25, 1.5, 2.0])
+
+
+def test_a_damping_at_its_bound_is_no_measurement():
+    """Held at zero, it says so and has no standard error; gain and frequency are known."""
+    got = fit_bode(exact(SHARP, BESIDE), n=1, springs=(True, True))
+
+    assert got.at_bound == ("c_1",)
+    zeta = got.parameters["zeta"]
+    assert (zeta.value, zeta.std, zeta.at_bound) == (0.0, None, True)
+    assert not got.parameters["K"].at_bound
+    assert_allclose(got.parameters["omega_n"].value, np.sqrt(300.0), rtol=1e-4)
+
+
+def test_what_rests_on_a_damping_at_its_bound_is_known_no_better_than_it():
+    """One of two dampings at zero: the modes keep an error that allows for it on both sides."""
+    chain = replace(PRESETS["throne-2dof"], c=np.array([6e-4, 0.0]))
+    got = fit_bode(exact(chain), n=2, springs=(False, True, True))
+
+    assert got.at_bound == ("c_2",)
+    assert got.parameters["zeta_2"].at_bound
+    row = got.names.index("c_2")
+    damping_std = float(np.sqrt(got.covariance[row, row]))
+    # Of the second mode's damping rate, c_2 has the share of its kinetic energy: over a third.
+    std = got.parameters["zeta_b"].std
+    assert std is not None
+    assert std > 0.3 * damping_std / (2 * chain.m[1] * got.parameters["omega_b"].value)
+
+
+def test_the_decay_tells_a_damping_that_the_response_leaves_open():
+    """Six points beside a sharp peak allow any small damping, so the decay's is the answer."""
+    decay = Estimate(value=0.017, std=0.0005, source="log_decrement")
+    got = fit_bode(exact(SHARP, BESIDE), n=1, springs=(True, True), decays={1: decay})
+
+    zeta = got.parameters["zeta"]
+    assert zeta.std is not None
+    assert_allclose([zeta.value, zeta.std], [0.017, 0.0005], rtol=0.02)
+    assert (zeta.source, zeta.at_bound, got.at_bound) == ("log_decrement", False, ("c_1",))
+    assert_allclose(got.chain.zeta_carts, 0.017, rtol=0.02)
+
+
+def test_where_one_damping_is_open_all_decays_are_fitted_along():
+    """The response alone puts one of two dampings at zero: both decays tell."""
+    chain = PRESETS["throne-2dof"]
+    decays = {
+        cart: Estimate(value=float(zeta), std=0.02 * float(zeta), source="log_decrement")
+        for cart, zeta in enumerate(chain.zeta_carts, start=1)
+    }
+    low = exact(replace(chain, c=np.array([0.0, 1.0]) * chain.c))
+    vague = [replace(r, magnitude_std=0.3 * r.magnitude) for r in low]
+    alone = fit_bode(vague, n=2, springs=(False, True, True))
+    assert alone.at_bound == ("c_1",)
+
+    got = fit_bode(vague, n=2, springs=(False, True, True), decays=decays)
+    assert got.at_bound == ("c_1", "c_2")
+    # Two standard errors of the decays; a response 30 % uncertain adds nothing.
+    assert_allclose(got.chain.zeta_carts, chain.zeta_carts, rtol=0.04)
+    assert {got.parameters[f"zeta_{cart}"].source for cart in (1, 2)} == {"log_decrement"}
+
+
+def test_a_decay_that_the_response_rules_out_is_not_used():
+    """Points on a peak of 1 in 1000 damping contradict 0.05: the two are not mixed."""
+    undamped = exact(SHARP, np.sqrt(300.0) * np.array([0.5, 0.9, 0.99, 0.998, 1.002, 1.01, 1.1]))
+    decay = Estimate(value=0.05, std=0.001, source="log_decrement")
+    got = fit_bode(undamped, n=1, springs=(True, True), decays={1: decay})
+
+    assert got.parameters["zeta"].at_bound
+    assert got.chain.c[0] == 0
+
+
+def test_a_decay_is_not_used_where_the_response_tells():
+    """Initial and final estimate then come from different data."""
+    responses = noisy("throne-1dof")
+    decay = Estimate(value=0.3, std=1e-4, source="log_decrement")
+    alone, given = (
+        fit_bode(responses, n=1, springs=(True, True), decays=decays)
+        for decays in (None, {1: decay})
+    )
+    assert given.parameters == alone.parameters
+
+
+def test_a_spring_known_to_be_missing_is_not_fitted():
+    """The mask takes the spring out, and the other errors get no larger."""
+    responses = noisy("throne-3dof")
+
+    free = fit_bode(responses, n=3, springs=(True,) * 4)
+    known = fit_bode(responses, n=3, springs=(False, True, True, True))
+
+    assert "k_1" not in known.names
+    assert known.chain.k[0] == 0
+    for name, estimate in known.parameters.items():
+        free_std, std = free.parameters[name].std, estimate.std
+        assert std is not None
+        assert free_std is not None
+        assert std <= free_std * 1.02  # the two fits' errors differ by their values, per cents
+
+
+@pytest.mark.parametrize("change", ["delay", "sign"])
+def test_phases_that_contradict_the_magnitudes_are_left_out(change):
+    """A sample's delay or a turned sign in the phases does not reach the parameters."""
+    responses = noisy("throne-2dof", phases=True)
+    wrong = [
+        replace(r, phase=r.phase - 0.00884 * r.omega if change == "delay" else r.phase + np.pi)
+        for r in responses
+        if r.phase is not None
+    ]
+
+    got = fit_bode(wrong, n=2, springs=(True,) * 3)
+
+    bare = [replace(r, phase=None, phase_std=None) for r in responses]
+    expected = fit_bode(bare, n=2, springs=(True,) * 3)
+    assert "the phases do not agree" in got.message
+    assert got.parameters == expected.parameters
+
+
+def test_good_phases_sharpen_the_dampings():
+    """With phases as good as the magnitudes, the errors get smaller."""
+    responses = noisy("throne-3dof", phases=True)
+
+    both = fit_bode(responses, n=3, springs=(True,) * 4)
+    bare = fit_bode(
+        [replace(r, phase=None, phase_std=None) for r in responses], n=3, springs=(True,) * 4
+    )
+
+    for name in ("zeta_a", "zeta_b", "zeta_c", "omega_b"):
+        sharp, blunt = both.parameters[name].std, bare.parameters[name].std
+        assert sharp is not None
+        assert blunt is not None
+        assert sharp < blunt
+
+
+def test_a_misfit_widens_the_errors():
+    """Points that lie 5 % off but claim 0.01 % give errors of a 5 % measurement."""
+    chain = PRESETS["throne-2dof"]
+    rng = np.random.default_rng(4)
+    scattered = [
+        replace(
+            r,
+            magnitude=r.magnitude * (1 + 0.05 * rng.standard_normal(r.omega.size)),
+            magnitude_std=1e-4 * r.magnitude,
+        )
+        for r in exact(chain)
+    ]
+
+    got = fit_bode(scattered, n=2, springs=(True,) * 3)
+
+    honest = fit_bode(
+        [replace(r, magnitude_std=1e-4 * r.magnitude) for r in exact(chain)],
+        n=2,
+        springs=(True,) * 3,
+    )
+    assert "off the model" in got.message
+    assert got.chi_square_per_dof > 1e4
+    for name, value in chain.parameters().items():
+        estimate = got.parameters[name]
+        assert estimate.std is not None
+        # Ten parameters of one draw: none beyond 4 standard errors.
+        assert abs(estimate.value - value) < 4 * estimate.std
+        # 500 times the error that 0.01 % would give, so 100 times is safe.
+        claimed = honest.parameters[name].std
+        assert claimed is not None
+        assert estimate.std > 100 * claimed
+
+
+def test_a_table_is_judged_by_its_own_scatter():
+    """A table rounded to three digits, its errors not known, has errors of that rounding."""
+    chain = PRESETS["throne-3dof"]
+    rounded = [
+        replace(r, magnitude=np.array([float(f"{m:.3g}") for m in r.magnitude]), source="table")
+        for r in exact(chain)
+    ]
+
+    got = fit_bode(rounded, n=3, springs=(True,) * 4)
+
+    gain = got.parameters["K_1"]
+    assert gain.std is not None
+    # Rounding to 3 digits is uniform within 0.05 to 0.5 %: 0.1 % rms, over 90 points for 10 values.
+    assert 5e-5 < gain.std / gain.value < 1e-3
+    assert abs(gain.value - chain.parameters()["K_1"]) < 4 * gain.std
+
+
+def test_one_measured_cart_may_do():
+    """The first cart alone determines two carts whose near spring is known to be missing."""
+    got = fit_bode(
+        noisy("throne-2dof")[:1], n=2, springs=(False, True, True), initial=PAPER_STARTS[2]
+    )
+
+    for name, value in PRESETS["throne-2dof"].parameters().items():
+        estimate = got.parameters[name]
+        assert estimate.std is not None
+        assert abs(estimate.value - value) < 4 * estimate.std  # ten parameters of one draw
+    assert set(got.standardised) == {"1"}
+
+
+def test_the_last_cart_alone_does_not_determine_two():
+    """X_2/U has five coefficients, two carts have seven parameters: this is said."""
+    with pytest.raises(DataError, match="response of cart 2 does not determine all of m_1"):
+        fit_bode(noisy("throne-2dof")[1:], n=2, springs=(True,) * 3)
+
+
+def test_few_points_are_refused():
+    """Six points for seven parameters: the message counts both."""
+    few = thinned(noisy("throne-2dof"), slice(0, 3))
+    with pytest.raises(DataError, match=r"2 carts with 7 parameters .* found 6"):
+        fit_bode(few, n=2, springs=(True,) * 3)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"magnitude": np.full(20, np.nan)}, "must be finite"),
+        ({"omega": np.linspace(-1, 1, 20)}, "must be finite"),
+        ({"cart": 2}, "a response of cart 2, with 1 in the system"),
+    ],
+)
+def test_impossible_responses_are_refused(change, message):
+    """Numbers that are none, negative frequencies and carts that do not exist are named."""
+    (response,) = noisy("throne-1dof")
+    with pytest.raises(DataError, match=message):
+        fit_bode([replace(response, **change)], n=1, springs=(True, True))
+
+
+def test_no_response_is_refused():
+    """Without a response there is nothing to fit."""
+    with pytest.raises(DataError, match="needs a frequency response, found none"):
+        fit_bode([], n=1, springs=(True, True))
+
+
+def test_residuals_belong_to_their_points():
+    """One magnitude raised by ten errors has a residual near ten at its own place."""
+    responses = list(noisy("throne-3dof"))
+    raised = responses[1].magnitude.copy()
+    raised[7] += 10 * responses[1].magnitude_std[7]
+    responses[1] = replace(responses[1], magnitude=raised)
+
+    got = fit_bode(responses, n=3, springs=(True,) * 4)
+
+    assert {name: z.shape for name, z in got.standardised.items()} == {
+        str(r.cart): r.omega.shape for r in responses
+    }
+    # The point draws the fit towards itself, but 90 points share 10 parameters.
+    assert 5 < got.standardised["2"][7] < 13
+
+
+def test_the_same_data_give_the_same_fit():
+    """Two runs agree to the last bit, random starts included."""
+    responses = thinned(noisy("throne-3dof"), slice(2, 30, 5))
+
+    first, second = (fit_bode(responses, n=3, springs=(True,) * 4) for _ in range(2))
+
+    assert first.parameters == second.parameters
+    assert first.n_starts == second.n_starts

@@ -1,0 +1,440 @@
+"""Free decay: damping, frequency, dry friction, and where the decay begins."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from pipeline.errors import DataError
+from pipeline.estimation.decay.ringing import Ringing
+from pipeline.ingest.read import read_data
+from pipeline.plant.chain import PRESETS
+from pipeline.plant.simulate import simulate_linear
+from pipeline.results import Kind, Record
+from pipeline.stages.log_decrement import fit_log_decrement
+from pipeline.submission import load_submission
+from tests.helpers.ucsd import write_two_cart_submission
+
+COUNT = 0.00227  # cm, the encoder of the ECP 210
+FS = 113.1  # Hz, its usual logging rate
+OMEGA, RELEASE = 20.0, 0.4  # rad/s, s
+
+
+def held_then_free(t, *, zeta, omega_n=OMEGA, start=1.2, release=RELEASE, d=0.0):
+    """Hold a cart at `start`, release it: exact, half cycle by half cycle, dry friction d = F/k.
+
+    While the cart moves one way it swings about d to the other side; where it turns within d of
+    its rest point it stays.
+    """
+    omega_d, decay = omega_n * np.sqrt(1 - zeta**2), zeta * omega_n
+    half = np.pi / omega_d
+    y, turning = np.full_like(t, start), start
+    for k in range(int((t[-1] - release) / half) + 1):
+        now = t >= release + k * half
+        if abs(turning) <= d:
+            y[now] = turning
+            break
+        middle, tau = np.copysign(d, turning), t[now] - release - k * half
+        swing = np.cos(omega_d * tau) + decay / omega_d * np.sin(omega_d * tau)
+        y[now] = middle + (turning - middle) * np.exp(-decay * tau) * swing
+        turning = middle - (turning - middle) * np.exp(-decay * half)
+    return y
+
+
+def record(t, y, *, u=None, kind: Kind = "decay", count=COUNT):
+    return Record(
+        id="decay",
+        kind=kind,
+        t=t,
+        u=u,
+        y=(np.round(y / count) * count if count else y)[None],
+        carts=(1,),
+        free=(1,),
+        resolution=np.array([count]),
+    )
+
+
+def released(*, zeta, fs=FS, duration=None, count=COUNT, noise=0.0, rng=None, **motion):
+    """A record of a release by hand; long enough for 4.5 time constants."""
+    t = np.arange(0, duration or RELEASE + min(4.5 / (zeta * OMEGA), 10.0), 1 / fs)
+    y = held_then_free(t, zeta=zeta, **motion)
+    if rng is not None:
+        y = y + noise * rng.normal(size=t.size)
+    return record(t, y, count=count)
+
+
+def friction_of(got):
+    """The outcome of the friction test."""
+    assert got.friction is not None
+    return got.friction
+
+
+# ------------------------------------------------------------------ the numbers
+
+
+@pytest.mark.parametrize("zeta", [0.01, 0.03, 0.07, 0.15])
+@pytest.mark.parametrize("fs", [113.1, 333.0, 1000.0])
+@pytest.mark.parametrize("start", [1.2, -0.8])
+def test_recovers_the_damping_that_made_the_data(zeta, fs, start):
+    """Damping to 0.2 % and frequency to 0.02 % at any usual damping, rate and side."""
+    got = fit_log_decrement(released(zeta=zeta, fs=fs, start=start), cart=1)
+    assert_allclose(got.zeta, zeta, rtol=2e-3)
+    assert_allclose(got.omega_n, OMEGA, rtol=2e-4)
+    # Rounding: 0.29 count on each turning point, of at most 500 counts and only six at ζ = 0.15;
+    # at the smallest, 4 counts, it moves the turning point by 0.07 rad of the 19 rad they span.
+    assert_allclose(got.zeta_peaks, zeta, rtol=1e-2)
+    assert_allclose(got.omega_n_peaks, OMEGA, rtol=4e-3)
+    assert_allclose(got.delta, 2 * np.pi * zeta / np.sqrt(1 - zeta**2), rtol=1e-2)
+    assert not friction_of(got).present
+    assert got.note == ""
+
+
+def test_an_exact_decay_comes_back_exactly():
+    """Without rounding the exponential fit is exact, the peaks to the parabola's error."""
+    got = fit_log_decrement(released(zeta=0.05, count=0.0), cart=1)
+    assert_allclose([got.zeta, got.omega_n], [0.05, OMEGA], rtol=1e-9)
+    assert_allclose(got.zeta_peaks, 0.05, rtol=2e-4)
+
+
+def test_the_error_of_clean_decays_is_half_a_per_mille():
+    """Over 40 decays with rounding only, ζ errs by 0.05 % root-mean-square."""
+    rng = np.random.default_rng(1)
+    errors = []
+    for _ in range(40):
+        zeta, start = rng.uniform(0.01, 0.15), rng.uniform(0.8, 1.8)
+        got = fit_log_decrement(released(zeta=zeta, start=start), cart=1)
+        errors.append(got.zeta / zeta - 1)
+    assert np.sqrt(np.mean(np.square(errors))) < 6e-4
+    assert np.max(np.abs(errors)) < 2e-3
+
+
+@pytest.mark.parametrize("zeta", [0.3, 0.45, 0.6])
+def test_heavy_damping_still_gives_an_answer(zeta):
+    """A cart that swings but once or twice is fitted from its release on."""
+    got = fit_log_decrement(released(zeta=zeta, duration=3.0), cart=1)
+    assert_allclose(got.zeta, zeta, rtol=5e-3)
+    assert_allclose(got.omega_n, OMEGA, rtol=5e-3)
+    assert got.release < RELEASE + 0.05
+    assert ("too few" in got.note) == (got.peak_t.size < 4)
+
+
+def test_standard_errors_of_heavy_damping_are_those_of_the_fit():
+    """With fewer than four peaks, delta and its error come from the exponential fit."""
+    got = fit_log_decrement(released(zeta=0.6, duration=3.0), cart=1)
+    assert got.peak_t.size < 4
+    assert_allclose(got.zeta_peaks, got.zeta, rtol=1e-9)
+    assert got.zeta_peaks_std > 0
+
+
+def test_the_figure_shows_the_fit_within_its_envelope():
+    """Fit and envelope share their times; the decay touches the envelope and stays inside."""
+    got = fit_log_decrement(released(zeta=0.05), cart=1)
+    assert got.fit_t.shape == got.fit_y.shape == got.envelope_upper.shape
+    assert np.all(got.fit_y <= got.envelope_upper + 1e-9)
+    assert np.all(got.fit_y >= got.envelope_lower - 1e-9)
+    assert got.fit_t[0] == got.release
+    # Turning points lie on the exponential itself, not on the envelope: lower by 1 - zeta²/2.
+    inside = np.interp(got.peak_t, got.fit_t, got.fit_y)
+    assert_allclose(got.peak_y, inside, atol=COUNT)
+    assert got.amplitude.size == got.peak_t.size - 2
+    assert_allclose(got.zeta_at_amplitude[1][:6], 0.05, rtol=0.05)
+
+
+# ----------------------------------------------------------- finding the decay
+
+
+def test_the_hold_before_the_release_is_left_out():
+    """The decay begins where the hand lets go."""
+    got = fit_log_decrement(released(zeta=0.05, release=1.7, duration=6.0), cart=1)
+    assert 1.7 <= got.release < 1.75
+    assert_allclose(got.zeta, 0.05, rtol=2e-3)
+
+
+def test_a_record_may_begin_at_the_release():
+    """Where the first sample is already free, all of it counts."""
+    t = np.arange(0, 4, 1 / FS)
+    got = fit_log_decrement(record(t, held_then_free(t, zeta=0.05, release=-0.1)), cart=1)
+    assert got.release == 0.0
+    assert_allclose(got.zeta, 0.05, rtol=2e-3)
+
+
+@pytest.mark.parametrize("hand", [12.0, 18.0, 20.0, 25.0])
+def test_a_hand_that_shakes_the_cart_is_told_from_the_decay(hand):
+    """Shaken ever further at some rhythm, let go in mid-swing: only the decay is fitted."""
+    t, zeta, release = np.arange(0, 6, 1 / FS), 0.04, 1.9
+    decay, omega_d = zeta * OMEGA, OMEGA * np.sqrt(1 - zeta**2)
+    x0 = 0.8 * np.sin(hand * release)
+    v0 = 0.8 * (np.sin(hand * release) / release + hand * np.cos(hand * release))
+    tau = np.maximum(t - release, 0.0)
+    swing = x0 * np.cos(omega_d * tau) + (v0 + decay * x0) / omega_d * np.sin(omega_d * tau)
+    y = np.where(t < release, 0.8 * t / release * np.sin(hand * t), np.exp(-decay * tau) * swing)
+    got = fit_log_decrement(record(t, y), cart=1)
+    assert_allclose(got.zeta, zeta, rtol=2e-3)
+    assert got.release > release - 0.06
+
+
+def test_a_touch_after_the_decay_is_left_out():
+    """Someone takes the cart away after a while."""
+    run = released(zeta=0.05, duration=5.0)
+    y = run.position(1) + np.where(run.t > 2.5, np.sin(9 * (run.t - 2.5)), 0.0)
+    got = fit_log_decrement(record(run.t, y), cart=1)
+    assert_allclose(got.zeta, 0.05, rtol=3e-3)
+    assert got.peak_t[-1] < 2.6
+
+
+@pytest.mark.parametrize("on_off", [True, False])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_the_ring_down_of_a_step_is_a_decay(on_off, sign):
+    """After an edge the cart swings about its new rest point; without input where that is seen."""
+    chain, t = PRESETS["throne-1dof"], np.arange(0, 8, 1 / FS)
+    u = sign * 0.03 * ((t > 0.5) & ((t < 4.0) | (not on_off)))
+    run = record(t, simulate_linear(chain, t, u)[0], u=u, kind="step")
+    got = fit_log_decrement(run, cart=1)
+    assert_allclose(got.zeta, chain.zeta_carts[0], rtol=2e-3)
+    assert_allclose(got.omega_n, chain.omega_carts[0], rtol=2e-4)
+    assert got.release >= (4.0 if on_off else 0.5)
+    assert ("while the input holds" in got.note) != on_off
+
+
+def test_the_driven_part_of_a_decay_is_left_out():
+    """A cart set going by the motor decays once the input is zero."""
+    chain, t = PRESETS["throne-1dof"], np.arange(0, 8, 1 / FS)
+    u = 0.03 * np.sin(14 * t) * (t < 3.0)
+    got = fit_log_decrement(record(t, simulate_linear(chain, t, u)[0], u=u), cart=1)
+    assert 3.0 <= got.release < 3.2
+    assert_allclose(got.zeta, chain.zeta_carts[0], rtol=2e-3)
+
+
+# --------------------------------------------------------------- real conditions
+
+
+def test_a_noisy_log_of_an_input_at_rest_is_no_drive():
+    """Noise about zero in the input column does not hide the decay."""
+    run = released(zeta=0.05)
+    noise = 1e-3 * np.random.default_rng(0).normal(size=run.t.size)
+    assert_allclose(fit_log_decrement(replace(run, u=noise), cart=1).zeta, 0.05, rtol=2e-3)
+
+
+@pytest.mark.parametrize("drift", [0.02, -0.2])
+def test_a_drifting_rest_point_does_no_harm(drift):
+    """An offset and a drift of the rest point are part of the model."""
+    run = released(zeta=0.05, count=0.0)
+    got = fit_log_decrement(record(run.t, run.position(1) + 0.4 + drift * run.t), cart=1)
+    assert_allclose(got.zeta, 0.05, rtol=3e-3)
+
+
+def test_an_uneven_clock_does_no_harm():
+    """Measured times are used as they are, gaps included."""
+    rng = np.random.default_rng(2)
+    t = np.sort(np.arange(0, 4, 1 / FS) + rng.uniform(-0.3, 0.3, size=453) / FS)
+    t = np.delete(t, np.arange(100, 120))
+    got = fit_log_decrement(record(t, held_then_free(t, zeta=0.05)), cart=1)
+    assert_allclose(got.zeta, 0.05, rtol=2e-3)
+
+
+@pytest.mark.parametrize("scale", [0.01, 1 / COUNT])
+def test_units_do_not_matter(scale):
+    """Metres, centimetres and counts give the same damping."""
+    run = released(zeta=0.05)
+    scaled = replace(run, y=run.y * scale, resolution=run.resolution * scale)
+    assert_allclose(
+        fit_log_decrement(scaled, cart=1).zeta, fit_log_decrement(run, cart=1).zeta, rtol=1e-6
+    )
+
+
+def test_a_small_decay_is_measured_within_its_error():
+    """A release by thirty counts gives an answer, and an error to match."""
+    got = fit_log_decrement(released(zeta=0.03, start=30 * COUNT), cart=1)
+    assert abs(got.zeta - 0.03) < 4 * got.zeta_std
+    assert got.zeta_std > 1e-3 * 0.03
+
+
+# ----------------------------------------------------------------- dry friction
+
+
+@pytest.mark.parametrize("d", [0.002, 0.01, 0.03])
+@pytest.mark.parametrize("zeta", [0.01, 0.05, 0.1])
+def test_dry_friction_is_found_and_taken_out(d, zeta):
+    """The friction band, and the viscous damping that is left, come back; the note says so."""
+    got = fit_log_decrement(released(zeta=zeta, d=d, duration=4.0), cart=1)
+    assert friction_of(got).present
+    assert abs(friction_of(got).drop - d) < 4 * friction_of(got).drop_std + 1e-5
+    assert abs(friction_of(got).zeta - zeta) < 4 * friction_of(got).zeta_std + 1e-5
+    assert_allclose(friction_of(got).drop, d, rtol=0.15)
+    assert got.zeta > friction_of(got).zeta  # viscous damping alone claims the friction's share
+    assert "dry friction" in got.note
+    # As friction's share of the loss grows, so does the damping from swing to swing.
+    local = got.zeta_at_amplitude
+    assert local[1, local[0].argmin()] > local[1, local[0].argmax()]
+
+
+def test_damping_that_grows_with_amplitude_is_no_friction():
+    """Quadratic drag bends the envelope the other way: not exponential, but no friction."""
+    fine = np.linspace(0, 4, 40001)
+    y, x, v = np.empty_like(fine), 1.2, 0.0
+    for i in range(fine.size):
+        y[i] = x
+        v += 1e-4 * (-(OMEGA**2) * x - 2 * 0.02 * OMEGA * v - 0.05 * v * abs(v))
+        x += 1e-4 * v
+    t = fine[::90]
+    got = fit_log_decrement(record(t, y[::90]), cart=1)
+    assert not friction_of(got).present
+    assert "the damping grows with the amplitude" in got.note
+
+
+def flags(seeds, *, d):
+    """Of so many decays with friction band d: how many are called friction."""
+    found = []
+    for seed in range(seeds):
+        rng = np.random.default_rng(seed)
+        run = released(
+            zeta=rng.uniform(0.01, 0.2),
+            d=d,
+            omega_n=rng.uniform(12, 35),
+            start=rng.choice([-1, 1]) * rng.uniform(0.7, 1.8),
+            fs=rng.choice([113.1, 250.0]),
+            duration=rng.uniform(2.0, 5.0),
+            noise=rng.choice([0.0, 0.2, 0.5]) * COUNT,
+            rng=rng,
+        )
+        found.append(friction_of(fit_log_decrement(run, cart=1)).present)
+    return np.array(found)
+
+
+def test_friction_is_told_from_none():
+    """In forty decays each, none is seen where there is none, all where d = 0.01 cm."""
+    assert not flags(40, d=0.0).any()
+    assert flags(40, d=0.01).all()
+
+
+# ---------------------------------------------------------------- standard errors
+
+
+def standardised(seeds):
+    """(ζ, ω_n, ζ by peaks) minus truth over standard error, of decays with noise and rounding."""
+    errors = []
+    for seed in range(seeds):
+        rng = np.random.default_rng(1000 + seed)
+        zeta, omega_n = rng.uniform(0.01, 0.15), rng.uniform(12, 35)
+        noise = rng.choice([0.2, 0.5, 1.0]) * COUNT
+        run = released(zeta=zeta, omega_n=omega_n, noise=noise, rng=rng)
+        got = fit_log_decrement(run, cart=1)
+        errors.append(
+            [
+                (got.zeta - zeta) / got.zeta_std,
+                (got.omega_n - omega_n) / got.omega_n_std,
+                (got.zeta_peaks - zeta) / got.zeta_peaks_std,
+            ]
+        )
+    return np.array(errors)
+
+
+def test_the_standard_errors_are_about_right():
+    """Over 60 noisy decays the standardised errors of the fit spread by about one."""
+    spread = np.sqrt(np.mean(standardised(60) ** 2, axis=0))
+    assert np.all((0.65 < spread[:2]) & (spread[:2] < 1.35))  # 1 ± 4/sqrt(120)
+    assert spread[2] < 1.35
+
+
+# ----------------------------------------------------------------------- errors
+
+
+def test_a_cart_at_rest_is_refused():
+    """No motion, no decay: the message says what was needed and found."""
+    t = np.arange(0, 4, 1 / FS)
+    with pytest.raises(DataError, match=r"^decay: log decrement needs 3 turning points.*found 0$"):
+        fit_log_decrement(record(t, np.zeros_like(t)), cart=1)
+
+
+def test_a_motion_without_return_is_refused():
+    """A ramp turns nowhere."""
+    t = np.arange(0, 4, 1 / FS)
+    with pytest.raises(DataError, match="needs 3 turning points"):
+        fit_log_decrement(record(t, t), cart=1)
+
+
+def test_a_motion_that_does_not_decay_is_refused():
+    """A steady sine has no damping ratio."""
+    t = np.arange(0, 4, 1 / FS)
+    with pytest.raises(DataError, match="needs a decaying oscillation of cart 1"):
+        fit_log_decrement(record(t, np.sin(9 * t)), cart=1)
+
+
+def test_a_hold_without_release_is_refused():
+    """A hand that never lets go leaves noise."""
+    run = released(zeta=0.05)
+    held = run.t < RELEASE
+    with pytest.raises(DataError, match="needs 3 turning points"):
+        fit_log_decrement(replace(run, t=run.t[held], y=run.y[:, held]), cart=1)
+
+
+@pytest.mark.parametrize("n", [1, 2, 6, 7, 12])
+def test_a_handful_of_samples_is_refused(n):
+    """A file that was cut off gives the same clear error."""
+    t = np.arange(n) / FS
+    with pytest.raises(DataError, match="needs 3 turning points"):
+        fit_log_decrement(record(t, np.cos(20 * t)), cart=1)
+
+
+# -------------------------------------------------------------------- real carts
+
+
+@pytest.fixture(scope="module")
+def real_records(real_data, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("decays") / "two"
+    write_two_cart_submission(folder, real_data, steps=())
+    return {r.id: r for r in read_data(load_submission(folder)).records}
+
+
+@pytest.mark.parametrize("repeat", range(1, 6))
+def test_the_real_first_cart(real_records, repeat):
+    """Both edges of a real step: viscous-only damping, larger while the motor holds."""
+    run = real_records[f"alone-1-{repeat}"]
+    off = fit_log_decrement(run, cart=1)
+    assert 23.2 <= off.omega_n <= 23.7
+    assert_allclose(off.zeta, 0.139, rtol=0.1)
+    first = run.t < 2.9
+    on = replace(run, t=run.t[first], u=run.u[first], y=run.y[:, first])
+    assert_allclose(fit_log_decrement(on, cart=1).zeta, 0.155, rtol=0.1)
+
+
+@pytest.mark.parametrize("repeat", range(1, 6))
+def test_the_real_second_cart_pulled_by_hand(real_records, repeat):
+    """Dry friction is found in each repeat; with it little viscous damping is left."""
+    got = fit_log_decrement(real_records[f"alone-2-{repeat}"], cart=2)
+    assert 15.6 <= got.omega_n <= 15.9
+    assert friction_of(got).present
+    assert 0.02 <= friction_of(got).zeta <= 0.035
+    assert 24 <= friction_of(got).drop <= 34  # encoder counts
+    assert 0.06 <= got.zeta <= 0.08
+
+
+def test_a_crest_of_equal_readings_turns_in_its_middle():
+    """Where an encoder is too coarse for a crest to curve, the turning point is still right."""
+    zeta = 0.05
+    run = released(zeta=zeta, count=0.03)
+    got = fit_log_decrement(run, cart=1)
+    # Half a radian to either side a parabola is fitted, where there is one.
+    crests = [run.y[0, np.abs(run.t - peak) <= 0.5 / OMEGA] for peak in got.peak_t]
+    flat = got.peak_t[[np.ptp(crest) == 0 for crest in crests]]
+    assert flat.size >= 3
+    half = np.pi / (OMEGA * np.sqrt(1 - zeta**2))
+    # The middle of a whole number of samples, the first and last of them up to one off.
+    assert_allclose((flat - RELEASE) / half, np.round((flat - RELEASE) / half), atol=1 / FS / half)
+
+
+def test_a_fit_of_spikes_is_finite_before_its_start():
+    """A fit to values of 1e12 is no decay; carried back over those before it, nothing overflows."""
+    fit = Ringing(
+        t0=1.25,
+        level=0.0,
+        slope=0.0,
+        poles=np.array([-1578 + 66_102j]),
+        amplitudes=np.array([1e14 + 0j]),
+        covariance=np.zeros((4, 4)),
+        rms=1.0,
+        converged=True,
+    )
+    assert np.isfinite(fit(np.linspace(0.0, 2.0, 50))).all()
+    assert fit.growth(np.array([1.25]))[0] == pytest.approx(1.0)

@@ -1,0 +1,285 @@
+"""Sinusoidal steady state: amplitude, phase, frequency, and where the steady part begins."""
+
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from pipeline.errors import DataError
+from pipeline.plant.chain import PRESETS
+from pipeline.plant.simulate import simulate_linear
+from pipeline.results import Record
+from pipeline.stages.sine import Dwell, fit_sine
+
+CHAIN = PRESETS["throne-1dof"]
+COUNT = 0.00227  # cm, the encoder of the ECP 210
+FS = 113.1  # Hz, its usual logging rate
+
+
+def dwell(t, *, hertz=3.0, amplitude=1.0, chain=CHAIN, noise=0.0, count=COUNT, rng=None):
+    """Drive the chain from rest, cart 1 to about `amplitude`; also the true response."""
+    omega = 2 * np.pi * hertz
+    truth = chain.frequency_response(np.array([omega]))[:, 0]
+    half = omega * np.mean(np.diff(t)) / 2  # a held sine is smaller by sin(half)/half
+    u = amplitude / abs(truth[0]) * half / np.sin(half) * np.sin(omega * t)
+    y = simulate_linear(chain, t, u)
+    if rng is not None:
+        y = y + noise * rng.normal(size=y.shape)
+    return record(t, u, y, omega=omega, count=count), truth
+
+
+def record(t, u, y, *, omega, count=COUNT):
+    carts = tuple(range(1, y.shape[0] + 1))
+    return Record(
+        id="dwell",
+        kind="sine",
+        t=t,
+        u=u,
+        y=np.round(y / count) * count if count else y,
+        carts=carts,
+        free=carts,
+        omega=omega,
+        resolution=np.full(len(carts), count),
+    )
+
+
+def cut(run, keep):
+    """Keep some of the samples."""
+    assert run.u is not None
+    return replace(run, t=run.t[keep], u=run.u[keep], y=run.y[:, keep])
+
+
+def sampled(duration, *, fs=FS):
+    return np.arange(0, duration, 1 / fs)
+
+
+@pytest.mark.parametrize("hertz", [0.8, 2.09, 3.0, 6.0])
+@pytest.mark.parametrize("fs", [113.1, 500.0])
+def test_one_centimetre_is_measured_to_half_a_per_mille(hertz, fs):
+    """Below, at and above the resonance, a settled dwell of 1 cm gives amplitude and phase."""
+    run, truth = dwell(sampled(9.0, fs=fs), hertz=hertz)
+    got = fit_sine(run, cart=1)
+    assert got.settled
+    assert got.note == ""
+    # The rounding of 200 and more samples leaves 0.29 count sqrt(2/200) = 7e-5 of 440 counts;
+    # what is left of a transient at resonance adds up to 3e-4.
+    assert_allclose(got.amplitude, 1.0, rtol=5e-4)
+    assert_allclose(got.gain, abs(truth[0]), rtol=5e-4)
+    assert_allclose(got.phase, np.angle(truth[0]), atol=5e-4)
+
+
+def test_an_exact_steady_state_comes_back_exactly():
+    """Without rounding, the response to the held staircase is the chain's to its sine."""
+    run, truth = dwell(sampled(40.0), hertz=4.0, count=0.0)
+    late = slice(int(30 * FS), None)  # 40 time constants: the transient is down to 1e-17
+    run = cut(run, late)
+    got = fit_sine(run, cart=1)
+    # A staircase also holds images about the sampling rate, which fold back onto the sine; the
+    # plant passes (4/113)² of their 4/113: 5e-5 each.
+    assert_allclose(got.gain, abs(truth[0]), rtol=2e-4)
+    assert_allclose(got.phase, np.angle(truth[0]), atol=2e-4)
+    assert got.steady_from < run.t[0] + 0.25 / 6  # from the input's first half amplitude on
+
+
+def test_a_smooth_input_is_taken_as_sampled():
+    """With a band-limited input nothing is held, and amplitudes are those of the samples."""
+    t, omega = sampled(4.0), 2 * np.pi * 5.0
+    run = record(t, 0.5 * np.sin(omega * t), np.sin(omega * t - 1.0)[None], omega=omega, count=0.0)
+    got = fit_sine(replace(run, hold="band_limited"), cart=1)
+    assert_allclose([got.input_amplitude, got.amplitude, got.phase], [0.5, 1.0, -1.0], rtol=1e-9)
+
+
+def test_every_cart_of_a_chain_has_its_own_amplitude_and_phase():
+    """All carts of three are fitted from one record, also beyond a phase of pi."""
+    run, truth = dwell(sampled(12.0), chain=PRESETS["throne-3dof"], hertz=3.0)
+    for cart in (1, 2, 3):
+        got = fit_sine(run, cart=cart)
+        assert_allclose(got.gain, abs(truth[cart - 1]), rtol=2e-3)
+        assert_allclose(np.exp(1j * got.phase), np.exp(1j * np.angle(truth[cart - 1])), atol=2e-3)
+
+
+def test_what_the_carts_of_a_dwell_share_changes_none_of_their_numbers():
+    """Fitted one after another, in any order, carts have the numbers they have alone."""
+    run, _ = dwell(sampled(6.0), chain=PRESETS["throne-3dof"], hertz=3.0)
+    together = Dwell(run)
+    for cart in (3, 1, 2):
+        assert asdict(together.fit(cart=cart)) == asdict(fit_sine(run, cart=cart))
+
+
+def test_the_transient_is_left_out():
+    """The steady part starts where the transient of a dwell from rest has died away."""
+    run, _ = dwell(sampled(9.0), hertz=3.0)
+    got = fit_sine(run, cart=1)
+    # 1 cm e^(-1.32 t) is one encoder step at 4.6 s.
+    assert 3.0 < got.steady_from < 7.0
+    # The input's last sine is used to 30 degrees before its end: 0.03 s at 3 Hz.
+    assert 0 <= np.count_nonzero(run.t >= got.steady_from) - got.n_points <= 4
+
+
+@pytest.mark.parametrize("clock", ["jittered", "rounded", "gap"])
+def test_the_measured_times_are_used_as_they_are(clock):
+    """An uneven clock costs nothing."""
+    rng = np.random.default_rng(3)
+    t = np.sort(sampled(9.0) + rng.uniform(-0.3, 0.3, size=sampled(9.0).size) / FS)
+    if clock == "rounded":
+        t = np.unique(np.round(sampled(9.0), 3))
+    run, truth = dwell(sampled(9.0) if clock == "gap" else t, hertz=3.0)
+    if clock == "gap":
+        keep = np.delete(np.arange(run.t.size), np.arange(800, 840))
+        run = cut(run, keep)
+    got = fit_sine(run, cart=1)
+    assert_allclose(got.gain, abs(truth[0]), rtol=2e-3)  # the held input is uneven, too
+
+
+def test_an_offset_and_a_drift_do_no_harm():
+    """The carts swing about some rest point, which may creep."""
+    run, truth = dwell(sampled(9.0), hertz=3.0, count=0.0)
+    y = np.round((run.y + 0.7 + 0.02 * run.t) / COUNT) * COUNT
+    got = fit_sine(replace(run, y=y, resolution=np.array([COUNT])), cart=1)
+    assert_allclose(got.gain, abs(truth[0]), rtol=5e-4)
+
+
+def test_without_a_stated_frequency_it_is_found():
+    """The frequency comes from the input, to better than a thousandth of a line."""
+    run, truth = dwell(sampled(9.0), hertz=3.217)
+    got = fit_sine(replace(run, omega=None), cart=1)
+    assert_allclose(got.omega, 2 * np.pi * 3.217, rtol=1e-9)  # the input is exact
+    assert_allclose(got.gain, abs(truth[0]), rtol=5e-4)
+
+
+def test_a_frequency_that_the_input_contradicts_is_not_believed():
+    """Rad/s typed for Hz, or a clock that runs wrong: the input's own frequency is used."""
+    run, truth = dwell(sampled(9.0), hertz=3.0)
+    got = fit_sine(replace(run, omega=2 * np.pi * 3.0 * 1.01), cart=1)
+    assert_allclose(got.omega, 2 * np.pi * 3.0, rtol=1e-6)
+    assert_allclose(got.gain, abs(truth[0]), rtol=5e-4)
+    assert "3.03 Hz stated" in got.note
+
+
+def test_a_noisy_input_leaves_the_stated_frequency():
+    """Noise on the logged input is no reason to doubt the stated frequency."""
+    rng = np.random.default_rng(4)
+    run, truth = dwell(sampled(9.0), hertz=3.0)
+    assert run.u is not None
+    noisy = run.u + 0.05 * np.ptp(run.u) * rng.normal(size=run.t.size)
+    got = fit_sine(replace(run, u=noisy), cart=1)
+    assert got.omega == run.omega
+    assert abs(got.gain - abs(truth[0])) < 4 * got.gain_std
+    assert got.input_amplitude_std > 1e-3 * got.input_amplitude
+
+
+def test_an_input_that_stops_ends_the_dwell():
+    """What follows the input's end, or precedes its start, is no part of the steady state."""
+    t = sampled(14.0)
+    omega = 2 * np.pi * 3.0
+    truth = CHAIN.frequency_response(np.array([omega]))[0, 0]
+    on = (t > 1.0) & (t < 10.0)
+    u = np.where(on, np.sin(omega * t) / abs(truth), 0.0)
+    got = fit_sine(record(t, u, simulate_linear(CHAIN, t, u), omega=omega), cart=1)
+    assert got.settled
+    assert got.steady_from + (got.n_points - 1) / FS < 10.0
+    assert_allclose(got.gain, abs(truth), rtol=5e-4)
+
+
+def test_a_dwell_cut_short_is_said_not_to_be_settled():
+    """Where the transient still runs the estimate is given, marked, and its error is large."""
+    run, truth = dwell(sampled(1.6), hertz=2.4)
+    got = fit_sine(run, cart=1)
+    assert not got.settled
+    assert "no steady state" in got.note
+    assert abs(got.gain - abs(truth[0])) < 5 * got.gain_std
+
+
+def test_two_cycles_of_steady_state_are_enough_for_an_estimate():
+    """A record that begins in steady state may be as short as that."""
+    run, truth = dwell(sampled(12.0), hertz=3.0)
+    late = slice(int(11.3 * FS), None)
+    got = fit_sine(cut(run, late), cart=1)
+    assert got.settled
+    assert abs(got.gain - abs(truth[0])) < 4 * got.gain_std
+
+
+def test_few_counts_are_mentioned():
+    """An amplitude below twenty encoder counts is worth a word."""
+    run, _ = dwell(sampled(9.0), amplitude=10 * COUNT)
+    got = fit_sine(run, cart=1)
+    assert "10.0 encoder counts" in got.note
+    assert_allclose(got.amplitude, 10 * COUNT, rtol=0.02)
+
+
+def test_a_motion_that_is_no_sine_is_mentioned():
+    """A third harmonic, as friction makes, is named with its size and enters the error."""
+    t, omega = sampled(6.0), 2 * np.pi * 3.0
+    y = np.sin(omega * t) + 0.05 * np.sin(3 * omega * t)
+    got = fit_sine(record(t, np.sin(omega * t), y[None], omega=omega), cart=1)
+    assert "3.5 % of the motion" in got.note  # 0.05 / sqrt(2)
+    assert_allclose(got.amplitude, 1.0, rtol=1e-3)
+
+
+def test_without_an_input_the_error_says_what_to_do():
+    """Amplitude and phase are against the input: a file without it cannot be used."""
+    run, _ = dwell(sampled(9.0))
+    with pytest.raises(DataError, match=r"needs the input beside the positions.*`columns`"):
+        fit_sine(replace(run, u=None), cart=1)
+
+
+def test_an_input_at_rest_is_refused():
+    """A constant input is no dwell."""
+    run, _ = dwell(sampled(9.0))
+    with pytest.raises(DataError, match="needs an input that oscillates, found 0 throughout"):
+        fit_sine(replace(run, u=np.zeros_like(run.t)), cart=1)
+
+
+def test_less_than_a_cycle_is_refused():
+    """Half a cycle could be anything."""
+    t = sampled(0.5)
+    run = record(t, np.sin(6.0 * t), np.sin(6.0 * t)[None], omega=6.0)
+    with pytest.raises(DataError, match="needs a full cycle"):
+        fit_sine(run, cart=1)
+
+
+def coverage(seeds, *, from_rest):
+    """Standardised errors of gain and phase over random dwells of one to three carts."""
+    errors = []
+    for seed in range(seeds):
+        rng = np.random.default_rng(seed)
+        chain = PRESETS[f"throne-{1 + seed % 3}dof"]
+        hertz = rng.uniform(0.7, 7.0)
+        wait = 7 / np.min(-chain.poles.real)
+        t = sampled(wait + max(7 / hertz, 1.6))
+        run, truth = dwell(
+            t,
+            hertz=hertz,
+            amplitude=rng.uniform(0.3, 1.5),
+            chain=chain,
+            noise=rng.choice([0.0, 0.2, 0.5]) * COUNT,
+            rng=rng,
+        )
+        if not from_rest:
+            run = cut(run, t > wait)
+        got = fit_sine(run, cart=1)
+        phase = np.angle(np.exp(1j * (got.phase - np.angle(truth[0]))))
+        errors.append([(got.gain - abs(truth[0])) / got.gain_std, phase / got.phase_std])
+    return np.array(errors)
+
+
+def test_the_standard_errors_are_about_right():
+    """Over 60 dwells the standardised errors spread by about one."""
+    spread = np.sqrt(np.mean(coverage(60, from_rest=False) ** 2, axis=0))
+    assert np.all((0.75 < spread) & (spread < 1.35))  # 1 ± 4/sqrt(120)
+
+
+def test_another_signal_is_refused():
+    """Random input is no dwell, whatever the experiment is called."""
+    t = sampled(5.0)
+    u = np.random.default_rng(0).normal(size=t.size)
+    with pytest.raises(DataError, match="needs an input of one frequency"):
+        fit_sine(record(t, u, u[None], omega=9.0), cart=1)
+
+
+def test_a_cart_that_does_not_move_is_refused():
+    """An unplugged encoder has no phase."""
+    run, _ = dwell(sampled(5.0))
+    with pytest.raises(DataError, match="cart 1 does not move"):
+        fit_sine(replace(run, y=np.zeros_like(run.y)), cart=1)

@@ -1,0 +1,315 @@
+"""Static gain from step runs: levels found, gains, friction, what cannot be used."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from pipeline.errors import DataError
+from pipeline.ingest.read import read_data
+from pipeline.plant.chain import PRESETS, Chain
+from pipeline.plant.simulate import simulate_linear
+from pipeline.results import Record
+from pipeline.stages.step_gain import fit_step_gain
+from pipeline.submission import load_submission
+from tests.helpers.ucsd import write_two_cart_submission
+
+COUNT = 0.00227  # cm, the encoder of the ECP 210
+FS = 113.1  # Hz, its usual logging rate
+FOUR = Chain(
+    m=np.array([3e-4, 2.5e-4, 2e-4, 2e-4]),
+    c=np.array([1.5e-3, 8e-4, 6e-4, 6e-4]),
+    k=np.array([0.02, 0.12, 0.07, 0.06, 0.06]),
+)
+
+
+def staircase(t, *edges):
+    """An input that goes to a level at each (time, level)."""
+    u = np.zeros_like(t)
+    for time, level in edges:
+        u[t >= time] = level
+    return u
+
+
+def run_of(chain, t, u, *, count=COUNT, offset=0.0, noise=0.0):
+    y = simulate_linear(chain, t, u) + offset
+    y = y + noise * np.random.default_rng(1).normal(size=y.shape)
+    return record(t, u, y, count=count)
+
+
+def record(t, u, y, *, count=COUNT):
+    carts = tuple(range(1, y.shape[0] + 1))
+    return Record(
+        id="step",
+        kind="step",
+        t=t,
+        u=u,
+        y=np.round(y / count) * count if count else y,
+        carts=carts,
+        free=carts,
+        resolution=np.full(len(carts), count),
+    )
+
+
+def seconds(duration):
+    return np.arange(0, duration, 1 / FS)
+
+
+# ------------------------------------------------------------------ the numbers
+
+
+@pytest.mark.parametrize("name", ["throne-1dof", "throne-2dof", "throne-3dof"])
+@pytest.mark.parametrize("size", [0.03, -0.02])
+def test_every_cart_has_its_static_gain(name, size):
+    """A step on and off gives the gain of every cart of one, two and three, of either sign."""
+    chain = PRESETS[name]
+    t = seconds(14.0)
+    run = run_of(chain, t, staircase(t, (0.5, size), (7.0, 0.0)), offset=0.3)
+    for cart, truth in enumerate(chain.static_gains(), start=1):
+        got = fit_step_gain(run, cart=cart)
+        # Rounding moves each of two levels by up to half a count: one count of |size| K in all.
+        assert_allclose(got.gain, truth, atol=COUNT / abs(size))
+        assert abs(got.gain - truth) < 3 * got.gain_std
+        assert len(got.edges) == 2
+        assert got.interval is None
+        assert got.note == ""
+        assert got.rest_shift is not None
+        assert abs(got.rest_shift) <= COUNT
+
+
+def test_four_carts():
+    """Nothing is special about three."""
+    t = seconds(16.0)
+    run = run_of(FOUR, t, staircase(t, (0.5, 0.03), (8.0, 0.0)))
+    for cart, truth in enumerate(FOUR.static_gains(), start=1):
+        assert_allclose(fit_step_gain(run, cart=cart).gain, truth, atol=COUNT / 0.03)
+
+
+def test_an_exact_record_gives_the_exact_gain():
+    """Without rounding, the level comes from the sinusoids and is exact before they have died."""
+    chain, t = PRESETS["throne-2dof"], seconds(5.0)
+    run = run_of(chain, t, staircase(t, (0.5, 0.03)), count=0.0)
+    got = fit_step_gain(run, cart=2)
+    assert_allclose(got.gain, chain.static_gains()[1], rtol=1e-7)
+
+
+def test_several_sizes_and_signs_in_one_record():
+    """Each edge counts for itself, between any two levels."""
+    chain, t = PRESETS["throne-1dof"], seconds(24.0)
+    u = staircase(t, (0.5, 0.02), (5.0, 0.04), (10.0, -0.03), (15.0, 0.0), (20.0, -0.01))
+    got = fit_step_gain(run_of(chain, t, u), cart=1)
+    assert [round(edge.u_after - edge.u_before, 9) for edge in got.edges] == [
+        0.02,
+        0.02,
+        -0.07,
+        0.03,
+        -0.01,
+    ]
+    assert_allclose(got.gain, chain.static_gains()[0], rtol=2e-3)
+    assert all(abs(edge.gain - got.gain) < 4 * edge.gain_std for edge in got.edges)
+
+
+def test_the_windows_are_found():
+    """A level is taken where nothing moves: up to the edge, and after the ringing."""
+    t = seconds(14.0)
+    run = run_of(PRESETS["throne-1dof"], t, staircase(t, (2.0, 0.03), (8.0, 0.0)))
+    on, off = fit_step_gain(run, cart=1).edges
+    assert on.window_before == (0.0, t[t < 2.0][-1])
+    # 0.87 cm e^(-1.32 t) is 1.5 counts at 4.2 s.
+    assert 5.0 < on.window_after[0] < 7.0
+    assert on.window_after[1] == t[t < 8.0][-1] == off.window_before[1]
+    assert (on.t, off.t) == (t[t >= 2.0][0], t[t >= 8.0][0])
+
+
+# ------------------------------------------------------------- records cut short
+
+
+@pytest.mark.parametrize("wait", [0.9, 1.5, 3.0])
+@pytest.mark.parametrize("name", ["throne-1dof", "throne-2dof", "throne-3dof"])
+def test_a_record_that_ends_before_the_carts_settle(name, wait):
+    """The level is that of damped sinusoids, one per cart, with an error to match; it is said."""
+    chain, t = PRESETS[name], seconds(0.5 + wait)
+    run = run_of(chain, t, staircase(t, (0.5, 0.03)), noise=0.2 * COUNT)
+    for cart, truth in enumerate(chain.static_gains(), start=1):
+        got = fit_step_gain(run, cart=cart)
+        assert abs(got.gain - truth) < 4 * got.gain_std
+        assert_allclose(got.gain, truth, rtol=1e-2)
+        assert "still ringing" in got.note
+
+
+def test_an_edge_before_the_carts_have_settled():
+    """Where the input goes off too soon, both edges still count."""
+    chain, t = PRESETS["throne-2dof"], seconds(8.0)
+    got = fit_step_gain(run_of(chain, t, staircase(t, (0.5, 0.03), (1.7, 0.0))), cart=1)
+    assert len(got.edges) == 2
+    assert_allclose(got.gain, chain.static_gains()[0], rtol=2e-3)
+
+
+def test_a_cart_that_never_settles_is_refused():
+    """Without a spring a constant force has no rest point."""
+    rigid, t = Chain(m=np.array([3e-4]), c=np.array([1e-3]), k=np.zeros(2)), seconds(3.0)
+    with pytest.raises(DataError, match="cart 1 settles, found 1 edge"):
+        fit_step_gain(run_of(rigid, t, staircase(t, (0.5, 0.01))), cart=1)
+
+
+# --------------------------------------------------------------- real conditions
+
+
+def test_an_input_that_is_on_from_the_first_sample():
+    """A record may start with the edge itself: the cart sets off from its first position."""
+    chain, t = PRESETS["throne-1dof"], seconds(6.0)
+    got = fit_step_gain(run_of(chain, t, np.full_like(t, 0.03), offset=-0.2), cart=1)
+    assert_allclose(got.gain, chain.static_gains()[0], atol=COUNT / 0.03)
+    assert "on from the first sample" in got.note
+    assert got.edges[0].t == 0.0
+
+
+def test_a_single_sample_of_rest_before_the_edge():
+    """The UCSD bench logs one sample of rest."""
+    chain, t = PRESETS["throne-1dof"], seconds(6.0)
+    got = fit_step_gain(run_of(chain, t, staircase(t, (t[1], 0.03))), cart=1)
+    assert_allclose(got.gain, chain.static_gains()[0], atol=COUNT / 0.03)
+
+
+@pytest.mark.parametrize("noise", [0.5, 3.0])
+def test_noise_is_averaged(noise):
+    """Noise on the position shrinks in the mean, and the error says how far."""
+    chain, t = PRESETS["throne-2dof"], seconds(14.0)
+    u = staircase(t, (1.0, 0.03), (7.0, 0.0))
+    got = fit_step_gain(run_of(chain, t, u, noise=noise * COUNT), cart=1)
+    assert abs(got.gain - chain.static_gains()[0]) < 4 * got.gain_std
+    assert got.gain_std < noise * COUNT / 0.03 / 1.5  # below that of a single sample
+
+
+def test_a_noisy_input_still_has_its_edges():
+    """Noise on a logged input makes no edges of its own."""
+    chain, t = PRESETS["throne-1dof"], seconds(12.0)
+    run = run_of(chain, t, staircase(t, (0.5, 0.03), (6.0, 0.0)))
+    assert run.u is not None
+    noisy = run.u + 3e-4 * np.random.default_rng(0).normal(size=t.size)
+    got = fit_step_gain(replace(run, u=noisy), cart=1)
+    assert len(got.edges) == 2
+    assert_allclose(got.gain, chain.static_gains()[0], rtol=3e-3)
+
+
+def test_a_slow_edge_is_one_edge():
+    """An input that takes ten samples to its level steps once."""
+    chain, t = PRESETS["throne-1dof"], seconds(7.0)
+    u = 0.03 * np.clip((t - 0.5) / 0.09, 0, 1)
+    got = fit_step_gain(run_of(chain, t, u), cart=1)
+    assert len(got.edges) == 1
+    assert_allclose(got.gain, chain.static_gains()[0], atol=COUNT / 0.03)
+
+
+def test_a_drift_is_taken_out():
+    """A rest point that creeps alike before and after the edges shifts no gain."""
+    chain, t = PRESETS["throne-1dof"], seconds(16.0)
+    u = staircase(t, (3.0, 0.03), (9.0, 0.0))
+    y = simulate_linear(chain, t, u) + 0.01 * t
+    got = fit_step_gain(record(t, u, y), cart=1)
+    assert "a drift of" in got.note
+    assert_allclose(got.gain, chain.static_gains()[0], rtol=3e-3)
+    assert got.interval is None
+
+
+# ----------------------------------------------------------------------- friction
+
+
+def sticking(t, *, rests, levels=(0.0, 0.9, 0.0)):
+    """Exponential moves between levels, each missed by what friction holds."""
+    y = np.full_like(t, rests[0])
+    for edge, level, miss in zip((1.0, 6.0), levels[1:], rests[1:], strict=True):
+        after = t >= edge
+        y[after] = (level + miss) + (y[after][0] - level - miss) * np.exp(-4 * (t[after] - edge))
+    return y
+
+
+def test_a_rest_point_that_does_not_return_is_reported():
+    """A cart that sticks gives an interval, which holds what the gain would be without."""
+    t = seconds(11.0)
+    u = staircase(t, (1.0, 0.03), (6.0, 0.0))
+    got = fit_step_gain(record(t, u, sticking(t, rests=(0.0, -0.01, 0.03))[None]), cart=1)
+    assert got.rest_shift is not None
+    assert_allclose(got.rest_shift, 0.03, atol=COUNT)
+    assert got.interval is not None
+    low, high = got.interval
+    assert low < 30.0 < high
+    assert low < got.gain < high
+    assert "the rest point did not return" in got.note
+    # The two edges differ by the shift: their spread is in the error.
+    assert got.gain_std > 0.4 * 0.03 / 0.03 / 2
+
+
+def test_a_step_too_small_to_move_the_cart():
+    """An edge that friction swallows is named and does not count."""
+    t = seconds(11.0)
+    u = staircase(t, (1.0, 0.03), (6.0, 0.035))
+    got = fit_step_gain(
+        record(t, u, sticking(t, rests=(0.0, 0.0, 0.0), levels=(0, 0.9, 0.9))[None]), cart=1
+    )
+    assert_allclose(got.gain, 30.0, atol=COUNT / 0.03)
+    assert "did not move: it sticks" in got.note
+    assert got.interval is not None
+
+
+# ----------------------------------------------------------------------- refused
+
+
+def test_without_an_input_the_error_says_what_to_do():
+    """A gain is per input unit: a file without the input cannot be used."""
+    run = run_of(PRESETS["throne-1dof"], seconds(4.0), seconds(4.0) * 0)
+    with pytest.raises(DataError, match=r"^step: step gain needs the input.*`columns`$"):
+        fit_step_gain(replace(run, u=None), cart=1)
+
+
+@pytest.mark.parametrize("shape", ["zero", "sine", "ramp"])
+def test_an_input_without_a_step_is_refused(shape):
+    """No edge, a sine, a ramp: no static gain."""
+    t = seconds(8.0)
+    u = {"zero": 0 * t, "sine": 0.03 * np.sin(9 * t), "ramp": 0.01 * t}[shape]
+    with pytest.raises(DataError, match="needs an input that steps and then stays"):
+        fit_step_gain(run_of(PRESETS["throne-1dof"], t, u), cart=1)
+
+
+def test_a_held_cart_is_refused():
+    """A cart that somebody holds has no gain."""
+    t = seconds(8.0)
+    run = run_of(PRESETS["throne-2dof"], t, staircase(t, (0.5, 0.03)))
+    with pytest.raises(DataError, match="cart 2 is held"):
+        fit_step_gain(replace(run, free=(1,)), cart=2)
+
+
+def test_a_cart_that_does_not_move_is_refused():
+    """An unplugged encoder is no gain of zero."""
+    t = seconds(8.0)
+    u = staircase(t, (0.5, 0.03), (4.0, 0.0))
+    with pytest.raises(DataError, match="needs motion, cart 1 does not move"):
+        fit_step_gain(record(t, u, np.zeros((1, t.size))), cart=1)
+    with pytest.raises(DataError, match="needs cart 1 to move by more than 6 encoder steps"):
+        fit_step_gain(record(t, u, COUNT * (u > 0)[None]), cart=1)
+
+
+# -------------------------------------------------------------------- real carts
+
+
+def test_real_steps_agree_within_their_spread(real_data, tmp_path):
+    """Repeats 2 to 5 of the real two-cart step: gains within 5 %, a rest that hardly returns."""
+    folder = write_two_cart_submission(tmp_path / "two", real_data, steps=(2, 3, 4, 5))
+    runs = [r for r in read_data(load_submission(folder)).records if r.id.startswith("both")]
+    for cart, truth in ((1, 560.0), (2, 550.0)):  # counts per volt: 281 and 275 at 0.5 V
+        got = [fit_step_gain(run, cart=cart) for run in runs]
+        assert_allclose([abs(g.gain) for g in got], truth, rtol=0.05)
+        assert all(g.rest_shift is not None and abs(g.rest_shift) < 10 for g in got)
+        assert any(g.interval is not None for g in got)
+
+
+def test_a_real_repeat_that_sticks_far_off(real_data, tmp_path):
+    """The first repeat's second cart stays 32 counts off its rest, which its interval shows."""
+    folder = write_two_cart_submission(tmp_path / "two", real_data, steps=(1,))
+    run = next(r for r in read_data(load_submission(folder)).records if r.id == "both-1")
+    got = fit_step_gain(run, cart=2)
+    assert got.rest_shift is not None
+    assert abs(abs(got.rest_shift) - 32) < 1
+    assert got.interval is not None
+    assert got.interval[1] - got.interval[0] > 100

@@ -1,0 +1,373 @@
+"""The joint fit on time records finds chains it has not seen, from nothing."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from pipeline.errors import DataError
+from pipeline.estimation.chain.modal_response import find_modes
+from pipeline.estimation.chain.parametrisation import Parametrisation
+from pipeline.estimation.chain.time_search import search
+from pipeline.estimation.chain.time_window import compare, open_window, usable_segment
+from pipeline.estimation.colour import long_run_variance, score_covariance
+from pipeline.ingest.read import read_data
+from pipeline.plant.chain import PRESETS, Chain
+from pipeline.plant.simulate import simulate_linear
+from pipeline.results import ChainFit, Record
+from pipeline.stages.time_fit import fit_records
+from pipeline.submission import load_submission
+from tests.helpers.time_records import decay_record, measure, random_chain, step_record
+from tests.helpers.ucsd import write_two_cart_submission
+
+
+def std(fit: ChainFit, name: str) -> float:
+    """Return the standard error of a named parameter, which must be there."""
+    found = fit.parameters[name].std
+    assert found is not None
+    return found
+
+
+def errors(fit: ChainFit, chain: Chain) -> np.ndarray:
+    """Return how many standard errors each named parameter is off."""
+    return np.array(
+        [
+            (fit.parameters[name].value - v) / std(fit, name)
+            for name, v in chain.parameters().items()
+        ]
+    )
+
+
+def misfit(record: Record, chain: Chain, parametrisation: Parametrisation, *, at_rest: bool = True):
+    theta = parametrisation.pack(chain)
+    modes = find_modes(
+        chain,
+        free=record.free,
+        parametrisation=parametrisation,
+        dp_dtheta=parametrisation.dp_dtheta(theta),
+    )
+    return compare(replace(open_window(record), at_rest=at_rest), modes)
+
+
+# ------------------------------------------------------------------ the response
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.5])
+@pytest.mark.parametrize("free", [(1, 2, 3), (1, 3), (1,)])
+def test_modes_and_simulation_agree(free, jitter):
+    """The response by modes is the simulated one, for any free carts and sample times."""
+    chain, rng = PRESETS["throne-3dof"], np.random.default_rng(0)
+    x0 = rng.standard_normal(2 * len(free))
+    record = step_record(chain, rng=rng, free=free, jitter=jitter, noise=0.0, count=0.0, x0=x0)
+    parametrisation = Parametrisation(n=3, springs=(True, True, True, True))
+    left = misfit(record, chain, parametrisation, at_rest=False)
+    # Intervals are rounded to 1e-12 s in the simulation: 1e-12 s times some 100 cm/s.
+    sigma = open_window(record).sigma
+    assert np.max(np.abs(left.residual * sigma[:, None])) < 1e-9
+
+
+@pytest.mark.parametrize("zeta", [0.1, 1.0, 1.5])
+@pytest.mark.parametrize("at_rest", [True, False])
+def test_the_jacobian_is_that_of_the_misfit(zeta, at_rest):
+    """The gradient from the Jacobian is that of the cost, also where a cart's poles meet."""
+    m, k = np.array([2e-4, 1e-4]), np.array([0.03, 0.04, 0.02])
+    chain = Chain(m=m, c=2 * zeta * np.sqrt(m * (k[:-1] + k[1:])), k=k)
+    record = step_record(chain, rng=np.random.default_rng(1), noise=0.01)
+    parametrisation = Parametrisation(n=2, springs=(True, True, True))
+    theta = parametrisation.pack(chain) + 0.01
+
+    def cost(theta):
+        return 0.5 * np.sum(
+            misfit(record, parametrisation.unpack(theta), parametrisation, at_rest=at_rest).residual
+            ** 2
+        )
+
+    here = misfit(record, parametrisation.unpack(theta), parametrisation, at_rest=at_rest)
+    gradient = np.einsum("pij,ij->p", here.jacobian, here.residual)
+    step = 1e-5 * np.eye(theta.size)
+    numeric = [(cost(theta + e) - cost(theta - e)) / 2e-5 for e in step]
+    # Central differences err by the step's square times the third derivative: 1e-10 of a cost
+    # of 1e5 to 1e6 over gradients of 1e3 to 1e5.
+    assert_allclose(gradient, numeric, rtol=1e-4, atol=1e-5 * np.max(np.abs(gradient)))
+
+
+def test_a_band_limited_input_is_used_as_such():
+    """A smooth input between samples is followed to 1e-4 of the motion, a held one is not."""
+    chain, rng = PRESETS["throne-2dof"], np.random.default_rng(2)
+    t = np.arange(600) / 113.0
+    u = 0.05 * np.sin(15 * t) * np.sin(np.pi * t / t[-1]) ** 2
+    y = simulate_linear(chain, t, u, hold="band_limited")
+    record = measure(
+        y, t, u, kind="sweep", carts=(1, 2), rng=rng, noise=0.0, count=0.0, hold="band_limited"
+    )
+    parametrisation = Parametrisation(n=2, springs=(True, True, True))
+
+    def off(record):
+        left = misfit(record, chain, parametrisation)
+        return np.max(np.abs(left.residual * open_window(record).sigma[:, None])) / np.ptp(y)
+
+    # Held at eight times the rate, its middle: (15 rad/s / 8 / 113 Hz)² / 24 = 1e-5.
+    assert off(record) < 1e-4
+    assert off(replace(record, hold="zero_order")) > 1e-2
+
+
+# ------------------------------------------------------------------- convergence
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4])
+def test_exact_records_give_the_chain_back(n):
+    """Without noise or rounding all masses, dampings and springs come back, from no guess."""
+    rng = np.random.default_rng(n)
+    chain, springs = random_chain(n, rng)
+    record = step_record(chain, rng=rng, noise=0.0, count=0.0)
+    fit = fit_records([record], n=n, springs=springs)
+    assert fit.converged
+    assert fit.n_starts == 1
+    # The search ends at 1e-9 of the cost left by sample times rounded to 1e-12 s.
+    assert_allclose(fit.chain.m, chain.m, rtol=1e-6)
+    assert_allclose(fit.chain.c, chain.c, rtol=1e-5)
+    assert_allclose(fit.chain.k, chain.k, rtol=1e-6)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4])
+@pytest.mark.parametrize("all_springs", [False, True])
+def test_unseen_chains_are_found_from_noisy_records(n, all_springs):
+    """Three steps of a random chain are enough, whether or not the missing spring is known."""
+    rng = np.random.default_rng(10 + n)
+    for _ in range(3):
+        chain, springs = random_chain(n, rng)
+        records = [
+            step_record(chain, rng=rng, swing=swing, jitter=0.2, noise=0.001, id=f"step {swing}")
+            for swing in (1.0, 0.6, -1.0)
+        ]
+        fit = fit_records(records, n=n, springs=(True,) * (n + 1) if all_springs else springs)
+        assert fit.converged
+        # 3 × 4 × at most 17 numbers: none beyond 4.5 standard errors but in 1 of 700 such tests.
+        assert np.max(np.abs(errors(fit, chain))) < 4.5
+        # chi² of over 2000 positions is within 0.1 of 1; a rounding error that is not uniform
+        # (a cart at rest stays on one count) takes up to 0.3 off.
+        assert 0.6 < fit.chi_square_per_dof < 1.15
+
+
+def test_held_carts_and_hand_releases_join_in():
+    """Steps with a cart held and decays of single carts are fitted together with the others."""
+    rng = np.random.default_rng(3)
+    chain = PRESETS["throne-3dof"]
+    records = [
+        step_record(chain, rng=rng, id="all"),
+        step_record(chain, rng=rng, free=(1, 2), id="two", duration=5.0, rate=200.0),
+        decay_record(chain, free=(2,), rng=rng, id="second"),
+        decay_record(chain, free=(2, 3), rng=rng, id="last two"),
+    ]
+    fit = fit_records(records, n=3, springs=(True,) * 4)
+    assert fit.converged
+    assert np.max(np.abs(errors(fit, chain))) < 4
+    alone = fit_records(records[:1], n=3, springs=(True,) * 4)
+    # Decays of cart 3 tell more of it than a step that reaches it through two springs.
+    assert std(fit, "zeta_3") < 0.8 * std(alone, "zeta_3")
+
+
+def test_a_record_that_starts_in_motion_is_told_from_one_at_rest():
+    """A window cut out of a motion is recognised, said, and does no harm."""
+    rng = np.random.default_rng(4)
+    chain = PRESETS["throne-2dof"]
+    x0 = np.array([0.3, -4.0, -0.2, 3.0])  # cm, cm/s
+    records = [
+        step_record(chain, rng=rng, id="quiet"),
+        step_record(chain, rng=rng, x0=x0, id="cut"),
+    ]
+    fit = fit_records(records, n=2, springs=(True,) * 3)
+    assert "not at rest at their start: cut" in fit.message
+    assert np.max(np.abs(errors(fit, chain))) < 4
+
+
+def test_a_cart_that_was_not_measured_is_still_found():
+    """With the middle cart's encoder missing, the other two carry all there is to know."""
+    rng = np.random.default_rng(5)
+    chain = PRESETS["throne-3dof"]
+    whole = [step_record(chain, rng=rng, swing=swing, id=f"{swing}") for swing in (1.0, 0.5)]
+    records = [replace(r, y=r.y[[0, 2]], carts=(1, 3), resolution=r.resolution[:2]) for r in whole]
+    fit = fit_records(records, n=3, springs=(False, True, True, True))
+    assert fit.converged
+    assert np.max(np.abs(errors(fit, chain))) < 4
+
+
+def test_a_long_fast_sweep_is_fitted_whole():
+    """Twenty seconds at 1 kHz are fitted from the first start, and every sample counts."""
+    rng = np.random.default_rng(17)
+    chain = PRESETS["throne-2dof"]
+    t = np.arange(20_000) / 1000.0
+    u = 0.02 * np.sin(2 * np.pi * (0.2 * t + 0.17 * t**2))  # 0.2 to 7 Hz
+    y = simulate_linear(chain, t, u)
+    record = measure(y, t, u, kind="sweep", carts=(1, 2), rng=rng, noise=0.001)
+    fit = fit_records([record], n=2, springs=(True,) * 3)
+    assert fit.converged
+    assert fit.n_starts == 1
+    assert fit.n_points == 2 * t.size
+    assert np.max(np.abs(errors(fit, chain))) < 4
+
+
+def test_a_body_on_no_spring_has_mass_and_damping():
+    """One cart without springs is fitted as a rigid body, also where springs were expected."""
+    truth = Chain(m=np.array([2e-4]), c=np.array([5e-4]), k=np.zeros(2))
+    t = np.arange(500) / 113.0
+    u = 0.01 * np.sign(np.sin(4 * t))
+    y = simulate_linear(truth, t, u)
+    rng = np.random.default_rng(6)
+    record = measure(y, t, u, kind="step", carts=(1,), rng=rng, noise=0.0005)
+    for springs in ((False, False), (True, True)):
+        fit = fit_records([record], n=1, springs=springs)
+        assert np.max(np.abs(errors(fit, truth))) < 4
+    assert "held at zero, their bound: k_1" in fit.message
+
+
+def test_a_damping_at_its_bound_is_no_measurement():
+    """An undamped cart's step: held at zero or not, the damping is never known to be zero."""
+    chain = Chain(m=np.array([2e-3]), c=np.array([0.0]), k=np.array([0.6, 0.0]))
+    fits = [
+        fit_records([step_record(chain, rng=np.random.default_rng(seed))], n=1, springs=(True,) * 2)
+        for seed in range(6)
+    ]
+    held = [fit for fit in fits if fit.at_bound]
+    assert held
+    for fit in held:
+        zeta = fit.parameters["zeta"]
+        assert (zeta.value, zeta.std, zeta.at_bound) == (0.0, None, True)
+        assert fit.at_bound == ("c_1",)
+        assert fit.names == ("m_1", "c_1", "k_1")  # with a standard error of its own
+        assert fit.covariance[1, 1] > 0
+
+
+def test_a_spring_that_is_not_there_is_held_at_zero():
+    """The last spring, expected but missing, is found to be zero and said to be held there."""
+    rng = np.random.default_rng(1)
+    chain = Chain(m=np.array([3e-4, 2e-4]), c=np.array([6e-4, 4e-4]), k=np.array([0.1, 0.06, 0]))
+    fit = fit_records([step_record(chain, rng=rng)], n=2, springs=(True,) * 3)
+    assert fit.converged
+    assert np.max(np.abs(errors(fit, chain))) < 4
+    spring = fit.chain.k[2]
+    assert ("k_3" in fit.message) == (spring == 0)
+    if "k_3" in fit.names:
+        variance = fit.covariance[fit.names.index("k_3"), fit.names.index("k_3")]
+        assert spring < 4 * np.sqrt(variance)
+
+
+def test_the_same_records_give_the_same_fit():
+    """Nothing in the search is random: two fits agree to the last bit."""
+    record = step_record(PRESETS["throne-2dof"], rng=np.random.default_rng(7))
+    first, second = (fit_records([record], n=2, springs=(True,) * 3) for _ in range(2))
+    assert np.array_equal(first.chain.k, second.chain.k)
+    assert np.array_equal(first.covariance, second.covariance)
+
+
+# ------------------------------------------------------------- what cannot be done
+
+
+def test_without_an_input_there_is_no_scale():
+    """Decays alone give no mass in input units, and the fit says what it needs."""
+    record = decay_record(PRESETS["throne-2dof"], free=(1, 2), rng=np.random.default_rng(8))
+    with pytest.raises(DataError, match="needs a record that drives cart 1, found none"):
+        fit_records([record], n=2, springs=(True,) * 3)
+
+
+def test_what_the_records_do_not_determine_is_named():
+    """A step with cart 2 held says nothing about its mass."""
+    record = step_record(PRESETS["throne-2dof"], rng=np.random.default_rng(9), free=(1,))
+    with pytest.raises(DataError, match=r"the records do not determine \w_\d"):
+        fit_records([record], n=2, springs=(True,) * 3)
+
+
+def test_a_broken_chain_is_refused():
+    """No spring between the carts: the motor does not reach the second."""
+    record = step_record(PRESETS["throne-2dof"], rng=np.random.default_rng(9))
+    with pytest.raises(DataError, match="spring between carts 1 and 2"):
+        fit_records([record], n=2, springs=(True, False, True))
+
+
+def test_a_record_without_motion_is_left_out_and_said():
+    """A decay in which nothing moves does not stop the fit; the message names it."""
+    rng = np.random.default_rng(11)
+    chain = PRESETS["throne-1dof"]
+    good = step_record(chain, rng=rng)
+    still = replace(good, id="still", kind="decay", u=None, y=np.zeros_like(good.y))
+    fit = fit_records([good, still], n=1, springs=(True, True))
+    assert "left out: still: time fit needs a cart that moves" in fit.message
+    assert np.max(np.abs(errors(fit, chain))) < 4
+
+
+def test_an_input_that_explains_nothing_is_not_called_a_fit():
+    """With the input's sign reversed no chain follows, and the fit says so."""
+    rng = np.random.default_rng(12)
+    record = step_record(PRESETS["throne-1dof"], rng=rng)
+    assert record.u is not None
+    fit = fit_records([replace(record, u=-record.u)], n=1, springs=(True, True))
+    assert not fit.converged
+    assert "no chain was found that follows the records" in fit.message
+
+
+def test_a_search_that_nothing_ends_is_cut_short_with_the_best_so_far():
+    """Beyond the comparisons it may take no start is tried; what was found first is returned."""
+    rng = np.random.default_rng(12)
+    record = step_record(PRESETS["throne-1dof"], rng=rng)
+    assert record.u is not None
+    windows = [open_window(replace(record, u=-record.u))]
+    P = Parametrisation(n=1, springs=(True, True))
+    whole, short = (
+        search(windows, P, given=None),
+        search(windows, P, given=None, most_comparisons=1),
+    )
+    assert not whole.cut_short
+    assert not whole.best.follows
+    assert short.cut_short
+    assert short.n_starts == 1 < whole.n_starts
+    assert short.best.cost >= whole.best.cost
+
+
+def test_a_decay_is_used_from_its_release_on():
+    """Pull and hold are left out, whatever the encoder's zero."""
+    record = decay_record(PRESETS["throne-1dof"], free=(1,), rng=np.random.default_rng(13))
+    start = record.t[usable_segment(record)][0]
+    # Released at 1.5 s; half the swing is lost within a quarter of the 0.48 s period.
+    assert 1.5 < start < 1.5 + 0.12
+
+
+# ------------------------------------------------------------- standard errors
+
+
+def test_correlated_residuals_count_for_less():
+    """Sums over an AR(1) series are as uncertain as its spectrum at their frequency says."""
+    rng = np.random.default_rng(14)
+    n, phi, runs = 1000, 0.8, 60
+    slow, fast = np.ones((1, 1, n)), (-1.0) ** np.arange(n, dtype=np.float64)[None, None]
+    ratios = np.zeros(3)
+    for _ in range(runs):
+        residual = np.zeros((1, n))
+        for i, shock in enumerate(rng.standard_normal(n - 1), start=1):
+            residual[0, i] = phi * residual[0, i - 1] + shock
+        ratios[0] += long_run_variance(residual) * (1 - phi) ** 2
+        ratios[1] += score_covariance(residual, slow)[0, 0] / n * (1 - phi) ** 2
+        ratios[2] += score_covariance(residual, fast)[0, 0] / n * (1 + phi) ** 2
+    # Parzen's window over n/3 lags has 11 degrees of freedom, half of them at either end of the
+    # spectrum: sqrt(2/5.5) = 0.6, and 0.08 for the mean of 60.
+    assert_allclose(ratios / runs, 1.0, atol=0.3)
+    assert long_run_variance(fast[0]) == 1.0  # never below the mean square
+
+
+# -------------------------------------------------------------------- real carts
+
+
+def test_real_repeats_give_the_masses_and_springs_found_before(real_data, tmp_path):
+    """Four real steps, no guess: masses and springs as an independent viscous fit found them."""
+    folder = write_two_cart_submission(tmp_path / "two", real_data, steps=(2, 3, 4, 5))
+    records = [r for r in read_data(load_submission(folder)).records if r.free == (1, 2)]
+    steps = [record for record in records if record.kind == "step"]
+    fit = fit_records(steps, n=2, springs=(True, True, False))
+    assert fit.converged
+    # The reference is given to two digits, and a chain without friction is not the whole truth.
+    assert_allclose(fit.chain.m, [5.5e-6, 3.7e-6], rtol=0.1)
+    assert_allclose(fit.chain.k, [1.79e-3, 1.03e-3, 0], rtol=0.1)
+    assert_allclose(fit.parameters["omega_1"].value, 22.6, rtol=0.1)
+    assert_allclose(fit.parameters["omega_2"].value, 16.6, rtol=0.1)
+    # Friction leaves far more than encoder noise, and the residuals show it.
+    assert fit.chi_square_per_dof > 10

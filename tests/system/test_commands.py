@@ -1,0 +1,181 @@
+"""The command line as people meet it: exit codes, one clear line, files where they belong."""
+
+import html
+import json
+import re
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+from pipeline.resources import EXAMPLES
+from tests.helpers.commandline import cartlab, cartlab_here
+
+README = EXAMPLES.parent / "README.md"
+
+
+def _commands():
+    from typer.main import get_command
+
+    from pipeline.cli import app
+
+    return sorted(get_command(app).commands)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+@pytest.mark.parametrize("command", _commands())
+def test_every_command_has_help_and_is_in_the_readme(command):
+    """`--help` works and says something; the README names the command."""
+    done = cartlab_here(command, "--help")
+    assert done.returncode == 0
+    assert "Usage" in done.stdout
+    if README.exists():  # absent only where the tests run against an installed wheel
+        assert f"`cartlab {command}" in README.read_text(encoding="utf-8")
+
+
+def test_help_imports_nothing_heavy():
+    """`--help` answers at once because numpy is not even loaded."""
+    code = "import sys, pipeline.cli; print('numpy' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+
+
+def test_report_writes_everything_and_ends_well(tmp_path):
+    """A consistent submission gives all files and exit status 0; --json prints results.json."""
+    out = tmp_path / "out"
+    done = cartlab("report", EXAMPLES / "one-cart", "--out", out, "--json")
+    assert done.returncode == 0
+    assert done.stdout == (out / "results.json").read_text(encoding="utf-8")
+    assert (out / "report.pdf").read_bytes().startswith(b"%PDF")
+    assert "<html" in (out / "report.html").read_text(encoding="utf-8")
+    assert (
+        json.loads((out / "results.json").read_text(encoding="utf-8"))["submission"]["carts"] == 1
+    )
+    assert list((out / "figures").glob("*.svg"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["report", "no-such-folder"], "no-such-folder"),
+        (["inspect", "no-such-file.csv"], "no-such-file.csv"),
+        (["simulate", "--preset", "throne-9dof", "--out", "x"], "throne-3dof"),
+        (["report", str(EXAMPLES / "one-cart"), "--out", "blocked"], "is a file"),
+        (["new", "blocked", "--carts", "2"], "blocked"),
+        (["new", "team", "--carts", "9"], "--carts"),
+        (["report"], "DIR"),
+        (["rport"], "rport"),
+    ],
+)
+def test_what_cannot_run_is_one_line_and_status_two(tmp_path, arguments, expected):
+    """A wrong name or a blocked path ends in one line on stderr that names it."""
+    (tmp_path / "blocked").write_text("in the way")
+    done = cartlab_here(*arguments, cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert expected in done.stderr
+    assert "Traceback" not in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_failed_checks_are_status_one(tmp_path):
+    """A submission whose steps have a wrong scale is reported, and the exit status says so."""
+    folder = tmp_path / "scaled"
+    shutil.copytree(EXAMPLES / "one-cart", folder)
+    for file in (folder / "data").glob("step-*.csv"):
+        lines = file.read_text(encoding="utf-8").splitlines()
+        head = lines[0].split(",")
+        column = head.index("x1")
+        rows = [line.split(",") for line in lines[1:]]
+        for row in rows:
+            row[column] = f"{2 * float(row[column]):.5f}"
+        file.write_text("\n".join([lines[0], *map(",".join, rows)]) + "\n", encoding="utf-8")
+    done = cartlab_here("report", folder, "--no-pdf", "--json")
+    checks = {check["id"]: check["outcome"] for check in json.loads(done.stdout)["checks"]}
+    assert checks["record.step-1"] == "fail"
+    assert done.returncode == 1
+
+
+def test_a_file_that_cannot_be_read_is_its_own_run_s_problem(tmp_path):
+    """One missing, one broken: told on stderr and in results.json with status 1, the rest is there.
+
+    Without a single file that can be read there is nothing to report.
+    """
+    folder = tmp_path / "team"
+    shutil.copytree(EXAMPLES / "one-cart", folder)
+    (folder / "data" / "decay-1a.csv").unlink()
+    step = folder / "data" / "step-1.csv"
+    lines = step.read_text(encoding="utf-8").splitlines()
+    step.write_text("\n".join([*lines[:40], "0.3,x,0.1", *lines[40:]]), encoding="utf-8")
+    done = cartlab_here("report", folder, "--no-pdf", "--json")
+    found = json.loads(done.stdout)
+
+    assert done.returncode == 1
+    reasons = {
+        "decay-1a": "there is no file 'data/decay-1a.csv'",
+        "step-1": "data/step-1.csv line 41: 'input' is no number: 'x'",
+    }
+    failed = {check["id"] for check in found["checks"] if check["outcome"] == "fail"}
+    assert failed == {f"data.{name}" for name in reasons}
+    for name, reason in reasons.items():
+        assert f"cartlab: {name}: {reason}" in done.stderr
+        assert any(
+            skip["stage"] == f"reading {name}" and reason in skip["reason"]
+            for skip in found["skipped"]
+        )
+    page = html.unescape((folder / "report" / "report.html").read_text(encoding="utf-8"))
+    assert all(reason.partition(";")[0] in page for reason in reasons.values())
+    assert all(parameter["initial"] and parameter["final"] for parameter in found["parameters"])
+
+    for file in (folder / "data").iterdir():
+        file.unlink()
+    done = cartlab_here("report", folder, "--no-pdf")
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert re.search(r"there is no file 'data/decay-1a\.csv' \(and \d+ more\)$", line)
+
+
+def test_a_damping_at_its_bound_is_reported_as_unknown(tmp_path):
+    """Points beside a sharp peak: no final ζ, with its reason, and the pictures are drawn.
+
+    One of the points of the fit's curve lies on the pole.
+    """
+    hertz = [0.5, 1.0, 1.5, 2.5, 3.0, 4.0]  # resonance at 2 Hz, K = 20 cm/V
+    rows = [f"{f},{20 / abs(1 - (f / 2) ** 2):.6g}" for f in hertz]
+    (tmp_path / "bode.csv").write_text("\n".join(["frequency,x1", *rows]), encoding="utf-8")
+    (tmp_path / "submission.toml").write_text(
+        "version = 1\n[system]\ncarts = 1\n"
+        '[[experiments]]\nid = "bode"\nkind = "bode"\nfile = "bode.csv"\n',
+        encoding="utf-8",
+    )
+    done = cartlab_here("report", tmp_path, "--no-pdf", "--json")
+    found = json.loads(done.stdout)
+    assert done.returncode in (0, 1)
+    assert "Traceback" not in done.stderr
+    zeta = {parameter["name"]: parameter for parameter in found["parameters"]}["zeta"]
+    assert (zeta["final"], zeta["final_std"], zeta["consistent"]) == (None, None, None)
+    assert "bound" in {skip["stage"]: skip["reason"] for skip in found["skipped"]}["final zeta"]
+    assert found["chain"]["c"] == [0.0]
+
+
+def test_new_then_report_tells_what_to_do_next(tmp_path):
+    """A fresh folder cannot be reported yet; the message says what is missing."""
+    assert cartlab_here("new", tmp_path / "team", "--carts", "2").returncode == 0
+    done = cartlab_here("report", tmp_path / "team")
+    assert done.returncode == 2
+    assert "experiments" in done.stderr
+
+
+def test_simulate_makes_a_submission_that_report_takes(tmp_path):
+    """A simulated bench goes through the whole pipeline, reported values included."""
+    folder = tmp_path / "bench"
+    done = cartlab_here(
+        "simulate", "--preset", "throne-1dof", "--seed", 5, "--reported", "--out", folder
+    )
+    assert done.returncode == 0
+    assert "[reported.final]" in (folder / "submission.toml").read_text(encoding="utf-8")
+    done = cartlab("report", folder, "--no-pdf")
+    assert (done.returncode, done.stdout) == (0, "")
+    assert not (folder / "report" / "report.pdf").exists()
+    again = cartlab_here("simulate", "--preset", "throne-1dof", "--out", folder)
+    assert (again.returncode, "is not empty" in again.stderr) == (2, True)

@@ -1,0 +1,113 @@
+"""The documentation is true: its commands run, its links lead somewhere, it leaves nothing out."""
+
+import re
+import shlex
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from typer.main import get_command
+
+from pipeline.cli import app, main
+from tests.helpers.places import ROOT
+
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+_BLOCK = re.compile(r"^```sh\n(.*?)^```", re.DOTALL | re.MULTILINE)
+_LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
+COMMANDS = get_command(app).commands  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def examples(page: Path) -> Iterator[tuple[list[str], int, bool]]:
+    """Yield arguments, the exit status stated and whether it is slow, of every command to type."""
+    for block in _BLOCK.findall(page.read_text(encoding="utf-8")):
+        for line in block.splitlines():
+            command, _, remark = line.partition("#")
+            words = shlex.split(command)
+            if words and words[0] == "cartlab":
+                status = re.search(r"exit status (\d)", remark)
+                yield words[1:], int(status[1]) if status else 0, "slow" in remark
+
+
+def run_page(page: Path, monkeypatch, folder: Path, *, slow: bool) -> int:
+    """Run a page's commands from top to bottom in an empty folder; return how many ran."""
+    monkeypatch.chdir(folder)
+    ran = 0
+    for words, status, is_slow in examples(page):
+        if is_slow and not slow:
+            continue
+        monkeypatch.setattr(sys, "argv", ["cartlab", *words])
+        with pytest.raises(SystemExit) as end:
+            main()
+        assert (end.value.code or 0) == status, " ".join(words)
+        ran += 1
+    return ran
+
+
+TUTORIALS = [page for page in PAGES if page.name.startswith(("tutorial", "commands"))]
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, marks=[pytest.mark.slow, pytest.mark.sample])
+        if page.stem in ("tutorial-instructor", "tutorial-ta")  # which are the longest
+        else page
+        for page in TUTORIALS
+    ],
+    ids=lambda page: page.stem,
+)
+def test_what_a_page_says_to_type_works(page, monkeypatch, tmp_path, capsys):
+    """From an empty folder, every command ends with the exit status that the page states.
+
+    What a page quotes of the terminal's line on open questions is what its own commands print.
+    """
+    assert run_page(page, monkeypatch, tmp_path, slow=False) >= 4
+    text, printed = page.read_text(encoding="utf-8"), capsys.readouterr().err
+    for quoted in re.findall(r"^\d questions? to answer in .*$", text, re.MULTILINE):
+        assert quoted in printed.splitlines()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
+def test_the_slow_commands_of_a_page_work_too(page, monkeypatch, tmp_path):
+    """The same with the gap workflow, where the page has it."""
+    run_page(page, monkeypatch, tmp_path, slow=True)
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_every_command_and_option_is_documented(command):
+    """`docs/commands.md` has a section a command, and names each of its options there."""
+    text = (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
+    sections = re.split(r"^## ", text, flags=re.MULTILINE)
+    (section,) = [s for s in sections if re.match(rf"`cartlab {command}\b", s)]
+    for parameter in COMMANDS[command].params:
+        for option in (*parameter.opts, *parameter.secondary_opts):
+            if option.startswith("--") and option not in ("--help", "--pdf"):
+                assert option in section, f"{command} {option}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_links_lead_somewhere(page):
+    """Every file that a page links or shows is there, and so is the heading it points at."""
+    for target in _LINK.findall(page.read_text(encoding="utf-8")):
+        if target.startswith(("http://", "https://")):
+            continue
+        name, _, anchor = target.partition("#")
+        file = page.parent / name if name else page
+        assert file.is_file(), target
+        if anchor:
+            headings = re.findall(r"^#+ (.*)$", file.read_text(encoding="utf-8"), re.MULTILINE)
+            slugs = {re.sub(r"[^\w -]", "", h.lower()).replace(" ", "-") for h in headings}
+            assert anchor in slugs, target
+
+
+def test_every_picture_is_shown_somewhere():
+    """No picture lies about that no page shows."""
+    shown = {
+        (page.parent / target).resolve()
+        for page in PAGES
+        for target in _LINK.findall(page.read_text(encoding="utf-8"))
+    }
+    for picture in (ROOT / "docs" / "images").iterdir():
+        assert picture.resolve() in shown, picture.name

@@ -1,0 +1,458 @@
+"""The firmware's C core does what the reference controller in Python does, byte for byte."""
+
+import ctypes
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from contextlib import closing
+from functools import partial
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.bench.emulator.assemble import open_bench
+from pipeline.bench.emulator.core import ReferenceCore
+from pipeline.bench.protocol.messages import (
+    FULL_SCALE,
+    ChirpEnd,
+    Description,
+    PidGains,
+    Signal,
+    Start,
+    StateGains,
+    Wave,
+    encode,
+    parse_description,
+    parse_reading,
+)
+from pipeline.submission import load_submission
+from pipeline.synthesis.hidden import prepare_bench
+from pipeline.workflow import analyse
+from tests.helpers.firmware_host import (
+    COMPILER,
+    FIRMWARE,
+    SOURCES,
+    FirmwareCore,
+    acquire,
+    build_library,
+    compile_c,
+    kept_going,
+)
+
+pytestmark = pytest.mark.skipif(COMPILER is None, reason="no C compiler is here")
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    return build_library(tmp_path_factory.mktemp("firmware"))
+
+
+def _description(encoders=2):
+    return Description(name="test", encoders=encoders, carts=encoders, commands=frozenset("cfks"))
+
+
+def _both(library, encoders=2):
+    description = _description(encoders)
+    return FirmwareCore(library, description), ReferenceCore(description)
+
+
+# ------------------------------------------------------------------- the same as the reference
+
+FREQUENCIES = st.floats(1e-3, 1e3) | st.floats(0.1, 10.0)
+GAINS = st.floats(-1e3, 1e3) | st.sampled_from([0.0, 1e9, -1e9, 1e-9])
+STARTS = st.builds(
+    Start,
+    wave=st.sampled_from(Wave),
+    encoder=st.sampled_from([None, 1, 2]),
+    frequency=FREQUENCIES,
+    amplitude=st.integers(-6000, 6000) | st.sampled_from([-1_000_000, 1_000_000]),
+    cycles=st.integers(1, 1000),
+)
+COMMANDS = st.one_of(
+    STARTS,
+    st.builds(PidGains, kp=GAINS, ki=GAINS, kd=GAINS),
+    st.builds(
+        StateGains, gains=st.lists(GAINS, min_size=4, max_size=6).map(tuple), prefilter=GAINS
+    ),
+    st.builds(ChirpEnd, frequency=FREQUENCIES),
+    st.sampled_from(Signal),
+).map(encode)
+
+
+@st.composite
+def _damaged(draw):
+    """Commands that lost a byte, got one too many, or one for another."""
+    data = bytearray(b"".join(draw(st.lists(COMMANDS, min_size=1, max_size=3))))
+    at = draw(st.integers(0, len(data) - 1))
+    data[at : at + draw(st.integers(0, 1))] = draw(st.binary(max_size=1))
+    return bytes(data)
+
+
+BYTES = COMMANDS | _damaged() | st.text("dgfczskh?;qtwo01.+-e \n", max_size=40).map(str.encode)
+TICKS = st.tuples(
+    st.lists(st.integers(-3000, 3000), min_size=3, max_size=3),
+    st.integers(0, 60),  # ms to the next
+)
+
+
+@given(
+    encoders=st.sampled_from([2, 3]),
+    session=st.lists(st.tuples(BYTES, st.lists(TICKS, max_size=12)), max_size=8),
+)
+@settings(max_examples=200)
+def test_any_session_is_that_of_the_reference(library, encoders, session):
+    """Whatever arrives, in whatever condition, duties and lines are those of the reference."""
+    firmware, reference = _both(library, encoders)
+    stamp = 0
+    for data, ticks in session:
+        firmware.receive(data)
+        reference.receive(data)
+        for counts, interval in ticks:
+            stamp += interval
+            clocks = {"stamp": stamp, "now": 2 * stamp}
+            counts = counts[:encoders]
+            assert firmware.tick(counts, **clocks) == reference.tick(counts, **clocks)
+            assert firmware.take() == reference.take()
+
+
+@pytest.mark.parametrize("wave", Wave)
+def test_whole_runs_are_those_of_the_reference(library, wave):
+    """Ten seconds of each wave at an odd frequency are the same line by line, to the last one."""
+    firmware, reference = _both(library)
+    start = Start(wave=wave, frequency=3.7, amplitude=4321, cycles=37)
+    for core in (firmware, reference):
+        core.receive(encode(start))
+    lines = 0
+    for stamp in range(10_002):
+        duty = firmware.tick((stamp, -stamp), stamp=stamp, now=stamp)
+        assert duty == reference.tick((stamp, -stamp), stamp=stamp, now=stamp)
+        line = firmware.take()
+        assert line == reference.take()
+        lines += bool(line)
+    assert lines == 10_000
+
+
+@pytest.mark.parametrize("end", [0.5, 2.0, 30.0])
+def test_chirps_end_where_they_are_told(library, end):
+    """Below where they start, there (which is a sine), and above."""
+    firmware, reference = _both(library)
+    start = Start(wave=Wave.CHIRP, frequency=2.0, amplitude=1500, cycles=8)
+    for core in (firmware, reference):
+        core.receive(encode(ChirpEnd(frequency=end)) + encode(start))
+    for stamp in range(4000):
+        assert firmware.tick((0, 0), stamp=stamp, now=0) == reference.tick(
+            (0, 0), stamp=stamp, now=0
+        )
+
+
+@pytest.mark.parametrize(
+    "gains",
+    [PidGains(kp=2.0, ki=3.0, kd=0.05), StateGains(gains=(3.0, 0.2, -1.0, 0.1), prefilter=2.0)],
+)
+def test_loops_are_those_of_the_reference(library, gains):
+    """Both laws on a bench that answers them: a mass that the duty pushes, rounded to counts."""
+    firmware, reference = _both(library)
+    start = Start(wave=Wave.SQUARE, encoder=1, frequency=1.0, amplitude=700, cycles=3)
+    for core in (firmware, reference):
+        core.receive(encode(gains) + encode(start))
+    x = v = 0.0
+    for stamp in range(3000):
+        counts = (round(x), round(x / 3))
+        duty = firmware.tick(counts, stamp=stamp, now=stamp)
+        assert duty == reference.tick(counts, stamp=stamp, now=stamp)
+        assert firmware.take() == reference.take()
+        v += 1e-3 * (30.0 * duty - 2.0 * v)
+        x += 1e-3 * v
+    assert abs(x) > 100  # the loop did something
+
+
+# ------------------------------------------------------------------- a whole bench
+
+SUBMISSION = """
+version = 1
+[system]
+carts = 1
+position = { unit = "cm" }
+[design]
+cart = 1
+reference = 0.5
+overshoot_percent = 10.0
+settling_time = 0.8
+"""
+PLAN = """
+version = 1
+[limits]
+input = 0.5
+travel = 2.5
+[[recordings]]
+id = "step"
+kind = "step"
+carts = [1]
+wave = "square"
+amplitude = 0.03
+frequency = 0.25
+settle = 0.1
+[[recordings]]
+id = "control"
+kind = "closed_loop"
+carts = [1]
+wave = "square"
+amplitude = 0.5
+frequency = 0.5
+settle = 0.1
+controller = { type = "state_feedback", cart = 1 }
+"""
+
+
+class SlowToBite(FirmwareCore):
+    """Its watchdog waits for 10 s, for a host on a machine that may be busy."""
+
+    def tick(self, counts: Sequence[int], *, stamp: int, now: int) -> int:
+        """Return the duty that acts from now on."""
+        return super().tick(counts, stamp=stamp, now=now // 100)
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
+def test_acquire_records_with_the_firmware(library, tmp_path):
+    """Behind a pty with simulated carts it records a step, then the loop designed from it."""
+    (tmp_path / "submission.toml").write_text(SUBMISSION, encoding="utf-8")
+    (tmp_path / "plan.toml").write_text(PLAN, encoding="utf-8")
+    bench = prepare_bench(preset="throne-1dof")
+    server = open_bench(bench, port="pty", core=partial(SlowToBite, library))
+    with closing(server), kept_going(lambda until: server.serve(until=until)):
+        acquire(tmp_path, port=server.address, only=["step", "control"])
+    analysis = analyse(load_submission(tmp_path))
+    loop = next(check for check in analysis.hardware if check.loop == "closed")
+    # Noise and rounding are 0.2 % of the motion and the model is known to about 1 %; gains in wrong
+    # units, or at the wrong encoder, would leave tens of per cent.
+    assert loop.nrmse < 0.02
+    assert loop.settling_measured is not None
+    assert loop.settling_measured < 0.8  # s, as designed
+
+
+# ------------------------------------------------------------------- guards
+
+
+def test_the_motor_is_cut_100_ms_after_the_last_heartbeat(library):
+    """The first heartbeat arms the watchdog; it cuts at 100 ms, not at 99; a reset disarms it."""
+    core, _ = _both(library)
+    start = encode(Start(wave=Wave.SQUARE, frequency=1e-3, amplitude=-900))
+    core.receive(start)
+
+    def duty(now):
+        return core.tick((0, 0), stamp=600_000 + now if now else 0, now=now)
+
+    assert (duty(0), duty(5000)) == (0, -900)  # not armed
+    core.receive(b"k;")
+    assert (duty(5010), duty(5109), duty(5110)) == (-900, -900, 0)
+    core.receive(b"k;")
+    assert duty(5111) == 0  # a heartbeat alone starts nothing
+    core.receive(b"z;" + start)
+    assert core.tick((0, 0), stamp=0, now=9000) == 0
+    assert core.tick((0, 0), stamp=600_000, now=9900) == -900
+
+
+STOPPING = [
+    b"s;", b";s;", b"z;", b"\r\n s\t;", b"d;q;o;s;", b"d;s;k;", b"d;s;;", b"g;1;s;",
+    b"noises;", b"noisez;", b"9" * 50 + b"s;",
+    b"\r\nd; q;o\r;\no;\t1 ;5;1;",  # a start, whose first half is zero
+]  # fmt: skip
+NOT_STOPPING = [
+    b"s", b"d;s;", b"k;", b"?;", b"noise;", b"ss k;", b"s\x00;", b"d;s;o;o;1;5;0;",
+    b"d;q;o;o;1;" + b"0" * 40 + b"5;1;", b"d;q;o;o;9e-4;5;1;", b"d;q;o;o;1001;5;1;",
+    b"d;q;o;o;1;1000001;1;", b"d;q;o;o;1;5.0;1;", b"d;q;o;o;1;5;1000001;",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("data", "stops"),
+    [(data, True) for data in STOPPING] + [(data, False) for data in NOT_STOPPING],
+)
+def test_no_lost_byte_swallows_a_stop(library, data, stops):
+    """A stop behind anything stops; what is no stop lets the run go on; the reference agrees."""
+    duties = []
+    for core in _both(library):
+        core.receive(encode(Start(wave=Wave.SQUARE, frequency=1e-3, amplitude=70)))
+        core.tick((0, 0), stamp=0, now=0)
+        core.receive(data)
+        duties.append(core.tick((0, 0), stamp=600_000, now=600_000))
+    assert duties == [0 if stops else 70] * 2
+
+
+def test_a_reset_forgets_gains_and_chirp_end(library):
+    """After a reset a chirp ends where it does unasked, and a closed loop has gains of zero."""
+    firmware, reference = _both(library)
+    told = encode(PidGains(kp=1.0, ki=0.0, kd=0.0)) + encode(ChirpEnd(frequency=2.0))
+    chirp = Start(wave=Wave.CHIRP, encoder=1, frequency=1.0, amplitude=1000)
+    for core in (firmware, reference):
+        core.receive(told + b"z;" + encode(chirp))
+    for stamp in range(1000):
+        assert firmware.tick((0, 0), stamp=stamp, now=0) == 0
+        reference.tick((0, 0), stamp=stamp, now=0)
+        assert firmware.take() == reference.take()
+
+
+def test_the_clock_may_go_round(library):
+    """A run and the watchdog go on where 32 bits of milliseconds begin again."""
+    core, _ = _both(library)
+    core.receive(b"k;" + encode(Start(wave=Wave.SQUARE, frequency=0.1, amplitude=50)))
+    turn = 2**32
+    for ms in range(0, 6000, 50):
+        core.receive(b"k;")
+        duty = core.tick((0, 0), stamp=(turn - 3000 + ms) % turn, now=(turn - 3000 + ms) % turn)
+        assert duty == (50 if ms >= 5000 else 0)
+        reading = parse_reading(core.take())
+        assert reading is not None
+        assert reading.ms == ms
+
+
+def test_a_host_that_does_not_read_loses_whole_lines(library):
+    """What finds no room on its way out is left out line by line, so that every line is whole."""
+    core, _ = _both(library)
+    core.receive(encode(Start(wave=Wave.SINE, frequency=1.0, amplitude=4000, cycles=9)))
+    for stamp in range(500):
+        core.tick((-12345, 12345), stamp=stamp, now=stamp)
+    sent = core.take()
+    readings = [parse_reading(line) for line in sent.splitlines()]
+    assert sent.endswith(b"\n")
+    assert 200 < len(sent) < 256  # the ring's room, but for a line
+    assert [reading.ms for reading in readings if reading] == list(range(len(readings)))
+
+
+def test_the_answer_to_a_query_is_a_description(library):
+    """The firmware hands out the description it was built with."""
+    core, _ = _both(library)
+    core.receive(b"?;")
+    assert parse_description(core.take()) == _description()
+
+
+def test_noise_breaks_nothing(tmp_path):
+    """Half a million ticks of noise, extreme gains and jumping clocks touch no foreign memory."""
+    sanitize = ("-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+    probe = tmp_path / "probe.c"
+    probe.write_text("int main(void) { return 0; }\n", encoding="utf-8")
+    try:
+        compile_c(tmp_path / "probe", *sanitize, probe)
+    except AssertionError:
+        pytest.skip("the C compiler has no sanitizers")
+    program = compile_c(tmp_path / "fuzz", *sanitize, FIRMWARE / "host" / "fuzz.c", *SOURCES, "-lm")
+    for seed in (1, 2):
+        done = subprocess.run([program, str(seed), "250000"], capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+
+
+# What the sketch asks of a board with 32 bits and Teensy's additions to Arduino, without a body.
+ARDUINO = """
+#include <stdint.h>
+#include <stdlib.h>
+enum { OUTPUT, INPUT_PULLUP, CHANGE };
+static inline int min(int a, int b) { return a < b ? a : b; }
+void pinMode(uint8_t, uint8_t), digitalWrite(uint8_t, uint8_t), analogWrite(uint8_t, int);
+void analogWriteResolution(uint32_t), analogWriteFrequency(uint8_t, float);
+uint8_t digitalRead(uint8_t);
+int digitalPinToInterrupt(uint8_t);
+void attachInterrupt(uint8_t, void (*)(), int), noInterrupts(), interrupts();
+uint32_t micros();
+struct Line { void begin(long); int available(), read(), availableForWrite(), write(uint8_t); };
+extern Line Serial;
+"""
+
+
+@pytest.mark.parametrize("options", [[], ["-DTEENSYDUINO"], ["-DMOTOR_DAC=40"]])
+def test_the_sketch_compiles_for_other_boards(tmp_path, options):
+    """The parts of the sketch that no simulated board runs fit together, without a warning."""
+    compiler = shutil.which("c++")
+    if compiler is None:
+        pytest.skip("no C++ compiler is here")
+    (tmp_path / "Arduino.h").write_text(ARDUINO, encoding="utf-8")
+    command = [
+        compiler, "-std=c++11", "-fsyntax-only", "-Wall", "-Wextra", "-Werror", *options,
+        "-I", tmp_path, "-I", FIRMWARE / "core", "-include", "Arduino.h",
+        "-x", "c++", FIRMWARE / "cartlab_bench" / "cartlab_bench.ino",
+    ]  # fmt: skip
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+# ------------------------------------------------------------------- the parts
+
+
+@given(
+    size=st.floats(1e-13, 1e9) | st.just(0.0),
+    sign=st.sampled_from(["", "-", "+"]),
+    form=st.sampled_from([".9g", ".8e"]),
+)
+def test_numbers_are_read_as_python_reads_them(library, size, sign, form):
+    """Nine digits, as the host sends them, come out to the last bit."""
+    text, read = sign + format(size, form), ctypes.c_double()
+    assert library.read_number(text.encode(), False, ctypes.byref(read))
+    assert read.value == float(text)
+
+
+@pytest.mark.parametrize(
+    "text", ["12345678901234567890123", "0.1234567890123456789012", "98765432109876543210.5e-3"]
+)
+def test_more_digits_than_fit_keep_their_place(library, text):
+    """Beyond 18 digits only the size counts: the rest is less than double can tell."""
+    read = ctypes.c_double()
+    assert library.read_number(text.encode(), False, ctypes.byref(read))
+    assert read.value == pytest.approx(float(text), rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "+", ".", "e5", "1e", "1e+", "--1", "1.2.3", "0x10", "inf", "nan", "1_0", "1 ", "1e999"],
+)
+def test_what_is_no_number_is_refused(library, text):
+    """Neither words nor halves of numbers nor infinities pass for a number."""
+    assert not library.read_number(text.encode(), False, ctypes.byref(ctypes.c_double()))
+
+
+@given(value=st.integers(-(2**31), 2**31 - 1))
+def test_integers_are_written_as_python_writes_them(library, value):
+    """All 32 bits of them."""
+    text = ctypes.create_string_buffer(12)
+    length = library.write_integer(text, value)
+    assert text.raw[:length] == str(value).encode()
+
+
+class _Quadrature(ctypes.Structure):
+    _fields_ = (
+        ("count", ctypes.c_int32),
+        ("missed", ctypes.c_uint16),
+        ("state", ctypes.c_uint8),
+    )
+
+
+RING = (0b00, 0b10, 0b11, 0b01)  # the channels A and B, one forward step after the other
+
+
+@given(steps=st.lists(st.integers(-1, 1), max_size=60))
+def test_every_edge_of_an_encoder_counts(library, steps):
+    """Counts are the steps along the ring of states, forwards less backwards; none is missed."""
+    encoder, at = _Quadrature(), 0
+    for step in steps:
+        at += step
+        library.quadrature_update(ctypes.byref(encoder), RING[at % 4])
+    assert (encoder.count, encoder.missed) == (sum(steps), 0)
+
+
+@pytest.mark.parametrize("at", range(4))
+def test_a_transition_that_cannot_be_is_counted_as_missed(library, at):
+    """Both channels at once: the count stays, and goes on rightly from the new state."""
+    encoder = _Quadrature(state=RING[at])
+    for state in (RING[(at + 2) % 4], RING[(at + 3) % 4]):
+        library.quadrature_update(ctypes.byref(encoder), state)
+    assert (encoder.count, encoder.missed) == (1, 1)
+
+
+def test_full_scale_is_the_protocols(library):
+    """A target beyond full scale is clipped to what the protocol calls full scale."""
+    core, _ = _both(library)
+    core.receive(encode(Start(wave=Wave.SQUARE, frequency=1.0, amplitude=-5000)))
+    core.tick((0, 0), stamp=0, now=0)
+    assert core.tick((0, 0), stamp=500, now=500) == -FULL_SCALE

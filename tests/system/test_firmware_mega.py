@@ -1,0 +1,266 @@
+"""The firmware's sketch on a simulated Arduino Mega: pins, interrupts, timers, serial line."""
+
+import time
+from collections.abc import Callable
+from contextlib import closing
+from functools import partial
+
+import numpy as np
+import pytest
+
+from pipeline.bench.emulator.carts import VirtualCarts
+from pipeline.bench.emulator.core import ReferenceCore
+from pipeline.bench.emulator.links import Link, open_link
+from pipeline.bench.protocol.messages import (
+    Description,
+    PidGains,
+    Reading,
+    Start,
+    StateGains,
+    Wave,
+    encode,
+    format_description,
+    parse_description,
+    parse_reading,
+)
+from pipeline.submission import load_submission
+from pipeline.synthesis.hidden import prepare_bench
+from pipeline.workflow import analyse
+from tests.helpers.firmware_host import acquire, kept_going
+from tests.helpers.firmware_mega import Mega, build_sketch, memory, missing
+
+pytestmark = pytest.mark.skipif(bool(missing()), reason=f"{missing()} is not here")
+
+PERIOD = 0.004  # s, of the Mega's ticks at 115200 baud
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory):
+    return build_sketch(tmp_path_factory.mktemp("sketch"))
+
+
+@pytest.fixture(scope="module")
+def board(program, tmp_path_factory):
+    """One board for all tests; each resets it."""
+    return Mega(program, tmp_path_factory.mktemp("board"))
+
+
+@pytest.fixture
+def mega(board):
+    board.send(b";s;z;")
+    board.run(0.05)
+    board.take()
+    return board
+
+
+def _readings(mega: Mega) -> list[Reading]:
+    *lines, _ = mega.take().split(b"\n")  # the last one may still be on its way
+    readings = [parse_reading(line) for line in lines]
+    assert None not in readings
+    return [reading for reading in readings if reading]
+
+
+def test_the_sketch_leaves_room(program):
+    """It takes less than a quarter of the Mega's flash and of its RAM; the rest is the stack's."""
+    flash, ram = memory(program)
+    assert flash < 64 * 1024
+    assert ram < 2 * 1024
+
+
+def _describe(mega: Mega) -> Description:
+    mega.send(b"?;")
+    mega.run(0.05)
+    answer = mega.take()
+    description = parse_description(answer)
+    assert format_description(description) == answer
+    return description
+
+
+def test_it_says_what_it_is(mega):
+    """The answer to a query is a description in the protocol's own form."""
+    description = _describe(mega)
+    assert (description.encoders, description.period) == (2, PERIOD)
+    assert description.commands == frozenset("cfks")
+
+
+def test_every_edge_at_the_pins_counts(mega):
+    """Some thousand edges back and forth, two encoders in turn at 50,000 a second, all counted."""
+    rng = np.random.default_rng(5)
+    turns = rng.integers(-60, 61, size=(50, 2))
+    mega.send(encode(Start(wave=Wave.SINE, frequency=1.0, amplitude=1000)))
+    mega.run(0.05)
+    for turn in turns:
+        mega.turn(0, int(turn[0]))
+        mega.turn(1, int(turn[1]))
+    mega.run(2 * PERIOD)
+    assert _readings(mega)[-1].counts == tuple(turns.sum(axis=0))
+
+
+def test_a_third_encoder_is_a_change_of_one_line(tmp_path):
+    """Built for three encoders, the sketch counts at pins 20 and 21 as well, and says so."""
+    mega = Mega(build_sketch(tmp_path, encoders=3), tmp_path)
+    mega.run(0.05)
+    assert _describe(mega).encoders == 3
+    mega.send(b"z;" + encode(Start(wave=Wave.SINE, frequency=1.0, amplitude=1000)))
+    mega.run(0.05)
+    for encoder, counts in enumerate((30, -20, 10)):
+        mega.turn(encoder, counts)
+    mega.run(2 * PERIOD)
+    assert _readings(mega)[-1].counts == (30, -20, 10)
+
+
+def test_a_run_lasts_and_ticks_as_told(mega):
+    """A tenth of a second is 25 lines, 4 ms apart, and the motor is off after it."""
+    mega.send(encode(Start(wave=Wave.DELTA, frequency=10.0, amplitude=-4096)))
+    mega.run(0.03)
+    assert mega.duty == -4096
+    mega.run(0.17)
+    assert mega.duty == 0
+    assert [reading.ms for reading in _readings(mega)] == list(range(0, 100, 4))
+
+
+@pytest.mark.parametrize("wave", [wave for wave in Wave if wave not in "dq"])
+def test_waves_are_those_of_the_reference(mega, wave):
+    """Numbers of 32 bits are at most a count off: 2000 counts are known to a thousandth of one."""
+    start = Start(wave=wave, frequency=2.0, amplitude=2000)
+    mega.send(encode(start))
+    mega.run(0.55)
+    readings = _readings(mega)
+    reference = ReferenceCore(_describe(mega))
+    reference.receive(encode(start))
+    for reading in readings:
+        reference.tick(reading.counts, stamp=reading.ms, now=0)
+        expected = parse_reading(reference.take())
+        assert expected is not None
+        # A sawtooth that falls at half its period may fall a tick late.
+        falls = wave is Wave.SAWTOOTH and abs(reading.ms - 250) <= 4
+        assert abs(reading.target - expected.target) <= 1 or falls
+    assert len(readings) == 125
+
+
+@pytest.mark.parametrize(
+    "gains",
+    [PidGains(kp=0.8, ki=1.0, kd=0.04), StateGains(gains=(0.9, 0.05, 0.2, 0.01), prefilter=1.5)],
+)
+def test_it_closes_the_loop_over_its_pins(mega, gains):
+    """A simulated cart, felt by encoder edges and moved by PWM, follows; duties are to the count.
+
+    Each line is handed to the reference as it is, so only rounding to 24 bits is left: the duty of
+    some thousand counts is known to a thousandth, and may be rounded either way.
+    """
+    start = Start(wave=Wave.SQUARE, encoder=1, frequency=0.5, amplitude=800)
+    mega.send(encode(gains) + encode(start))
+    x, v, at, before = 0.0, 0.0, 0, mega.clock
+    while mega.clock - before < 2.1:
+        last = mega.clock
+        mega.run(0.001)
+        for encoder, counts in enumerate((round(x) - at, 0)):
+            mega.turn(encoder, counts)
+        at = round(x)
+        step = mega.clock - last
+        v += step * (200.0 * mega.duty - 2.0 * v - 100.0 * x)
+        x += step * v
+    readings = _readings(mega)
+    assert [reading.ms for reading in readings] == list(range(0, 2000, 4))
+    assert 400 < readings[-1].counts[0] < 1200  # the cart follows the target of 800
+    reference = ReferenceCore(_describe(mega))
+    reference.receive(encode(gains) + encode(start))
+    for reading in readings:
+        duty = reference.tick(reading.counts, stamp=reading.ms, now=0)
+        assert abs(reading.duty - duty) <= 1
+
+
+def test_a_silent_host_stops_the_motor(mega):
+    """The motor's pins go off 100 ms after the last heartbeat, at the first tick from then on."""
+    mega.send(encode(Start(wave=Wave.SQUARE, frequency=1e-3, amplitude=0)))
+    mega.send(b"k;" + encode(Start(wave=Wave.SINE, frequency=1.0, amplitude=3000)))
+    before = mega.clock
+    while mega.duty == 0:
+        mega.run(0.0005)
+        assert mega.clock - before < 0.1
+    while mega.duty:
+        mega.run(0.0005)
+    # The heartbeat came up to 3 ms before the run began, at most a tick before the motor moved.
+    assert 0.095 < mega.clock - before < 0.115
+
+
+def test_a_storm_of_edges_does_not_keep_the_motor_on(program, tmp_path):
+    """A wire that flickers 250,000 times a second leaves no time for a tick: the board resets."""
+    mega = Mega(program, tmp_path)
+    mega.run(0.05)
+    mega.send(encode(Start(wave=Wave.SQUARE, frequency=10.0, amplitude=2000, cycles=9)))
+    mega.run(0.08)
+    assert mega.duty == 2000
+    mega.flicker(1, 0.2, every=4e-6)
+    assert mega.duty == 0
+    mega.flicker(1, 0.3, every=4e-6)
+    assert mega.duty == 0
+    mega.run(0.3)  # the wire is whole again: it answers, and rests
+    mega.take()
+    assert _describe(mega).encoders == 2
+    assert mega.duty == 0
+
+
+def test_a_stop_stops_the_motor_at_the_next_tick(mega):
+    """Three bytes on the line and a tick after the stop is sent the motor is off."""
+    mega.send(encode(Start(wave=Wave.SQUARE, frequency=10.0, amplitude=2000, cycles=9)))
+    mega.run(0.08)
+    assert mega.duty == 2000
+    mega.send(b";s;")
+    mega.run(3 * 87e-6 + PERIOD + 0.0005)
+    assert mega.duty == 0
+
+
+SUBMISSION = """
+version = 1
+[system]
+carts = 1
+position = { unit = "cm", per_count = 0.00227 }
+input = { unit = "V" }
+"""
+PLAN = """
+version = 1
+[limits]
+input = 0.5
+travel = 2.5
+[[recordings]]
+id = "step"
+kind = "step"
+carts = [1]
+wave = "square"
+amplitude = 0.03
+frequency = 0.1
+settle = 0.1
+"""
+STEP = 1e-3  # s from edge to edge of what the carts and the board know of each other
+
+
+def _serve(mega: Mega, carts: VirtualCarts, link: Link, until: Callable[[], bool]) -> None:
+    """Let board and carts move each other at the pace of the clock, or as fast as it goes."""
+    at, ahead = carts.counts(), mega.clock - time.monotonic()
+    volts = 5 / 4096 / carts.input_per_count  # the sketch's duty counts in the carts' own
+    while not until():
+        time.sleep(max(0.0, mega.clock - time.monotonic() - ahead))
+        mega.send(link.receive())
+        begun, counts = mega.clock, carts.counts()
+        for encoder, (new, old) in enumerate(zip(counts, at, strict=True)):
+            mega.turn(encoder, new - old)
+        at = counts
+        mega.run(max(0.0, begun + STEP - mega.clock))
+        carts.move(round(mega.duty * volts))
+        link.send(mega.take())
+
+
+@pytest.mark.slow
+def test_acquire_records_with_the_board(mega, tmp_path):
+    """Host, pty, UART, PWM, carts, encoder pins, and back: the gain is the cart's."""
+    (tmp_path / "submission.toml").write_text(SUBMISSION, encoding="utf-8")
+    (tmp_path / "plan.toml").write_text(PLAN, encoding="utf-8")
+    bench = prepare_bench(preset="throne-1dof")
+    carts = VirtualCarts(bench, seed=1, period=STEP)
+    with closing(open_link("pty")) as link, kept_going(partial(_serve, mega, carts, link)):
+        acquire(tmp_path, port=link.address, only=["step"])
+    [gain] = analyse(load_submission(tmp_path)).step_gains
+    # A level of 390 encoder counts, a noise of a fifth of one: a tenth of a per cent; the last
+    # swing of 1 % of it that is left after 5 s is in the mean once.
+    assert gain.gain == pytest.approx(bench.chain.static_gains()[0], rel=0.01)

@@ -1,0 +1,553 @@
+"""The live page: who may see it, what it shows in a real browser, that it never holds a run up."""
+
+import http.client
+import json
+import logging
+import re
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, suppress
+from urllib.parse import urlsplit
+
+import numpy as np
+import psutil
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import expect
+
+from pipeline.bench.planning.plan import Limits, Plan, Recording, StateLoop
+from pipeline.bench.protocol.messages import HEARTBEAT_EVERY, Reading
+from pipeline.bench.watch.live_state import LiveState
+from pipeline.bench.watch.observer import Anomalies, Outcome
+from pipeline.bench.watch.web import LivePage
+from pipeline.errors import ConfigError, HardwareError
+from tests.helpers.acquisitions import sine, write_work
+from tests.helpers.benches import emulator
+from tests.helpers.waiting import PATIENCE, started, until
+from tests.system.test_report_pages import PHONE, WIDE
+
+DUTY, COUNT = 1e-4, 0.002  # V, cm
+SUBMISSION = f"""
+version = 1
+title = "Bench <9> & co"
+[system]
+carts = 2
+input = {{ unit = "V", per_count = {DUTY} }}
+position = {{ unit = "cm", per_count = {COUNT} }}
+"""
+SINE = Recording(
+    id="sine-01", kind="sine", carts=(1, 2), wave="sine", amplitude=0.1, frequency=2.0, cycles=20
+)
+DECAY = Recording(
+    id="decay-1",
+    kind="decay",
+    carts=(1,),
+    wave="delta",
+    amplitude=0.0,
+    frequency=0.1,
+    release=1,
+    settle=1.0,
+)
+LOOP = Recording(
+    id="control",
+    kind="closed_loop",
+    carts=(1, 2),
+    wave="square",
+    amplitude=1.0,
+    frequency=0.2,
+    controller=StateLoop(cart=2),
+)
+PLAN = Plan(limits=Limits(input=0.4, travel=2.5), recordings=(DECAY, SINE, LOOP))
+
+
+def lines(first: int, last: int) -> list[Reading]:
+    """Return what a bench sends from one ms to another."""
+    return [
+        Reading(counts=(ms, -ms), target=100, duty=round(100 * np.sin(0.0126 * ms)), ms=ms)
+        for ms in range(first, last)
+    ]
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "submission.toml").write_text(SUBMISSION, encoding="utf-8")
+    return tmp_path
+
+
+@pytest.fixture
+def page(folder) -> Iterator[LivePage]:
+    """A page that is served, with a plan of which one run is done."""
+    with LivePage(folder) as page:
+        page.planned(PLAN, frozenset({"decay-1"}))
+        yield page
+
+
+# ------------------------------------------------------------------------ what it keeps
+
+
+def test_points_are_few_in_units_and_of_this_run(folder):
+    """One line in five, volts and centimetres; a new run forgets the old one's."""
+    state = LiveState(folder)
+    state.planned(PLAN, frozenset())
+    state.started(SINE)
+    state.readings(lines(0, 1000), Anomalies(lost=2))
+
+    found = state.points(run=0, start=0)
+    assert (found.run, found.start, found.end, len(found.points)) == (1, 0, 200, 200)
+    assert found.points[10] == (0.05, round(100 * np.sin(0.63)) * DUTY, 0.01, 0.1, -0.1)
+    assert found.counters == {
+        "lines": 1000, "lost": 2, "garbled": 0, "late": 0, "resets": 0, "stuck": 0,
+    }  # fmt: skip
+    state.readings(lines(1000, 1010), Anomalies(lost=2))
+    assert [p[0] for p in state.points(run=1, start=200).points] == [1.0, 1.005]
+
+    state.started(LOOP)
+    state.readings(lines(0, 1), Anomalies())
+    fresh = state.points(run=1, start=202)
+    assert (fresh.run, fresh.points) == (2, [(0.0, 0.0, 0.2, 0.0, 0.0)])  # a target of 100 counts
+
+
+def test_a_slow_reader_gets_less_and_not_later(folder):
+    """After a minute nobody read, the last twelve seconds are there and nothing has grown."""
+    state = LiveState(folder)
+    state.planned(PLAN, frozenset())
+    state.started(SINE)
+    for second in range(60):
+        state.readings(lines(1000 * second, 1000 * second + 1000), Anomalies())
+    found = state.points(run=1, start=10)
+    assert (found.end, len(found.points)) == (12_000, 2400)
+    assert found.points[0][0] == 48.0
+
+
+def test_the_plan_says_what_is_done_now_and_broken(folder):
+    """Each recording has its state; a partial one its reason, until it comes off."""
+    state = LiveState(folder)
+    state.planned(PLAN, frozenset({"decay-1"}))
+    state.started(SINE)
+    assert [e["state"] for e in state.snapshot()["plan"]] == ["done", "now", "to come"]
+    assert state.snapshot()["seconds_left"] == 13.0 + 8.0
+    state.finished(Outcome(recording=SINE, lines=5, partial="the cable was pulled"))
+    entry = state.snapshot()["plan"][1]
+    assert (entry["state"], entry["why"]) == ("partial", "the cable was pulled")
+    state.finished(Outcome(recording=SINE, lines=9000, remarks=("the clock is slow",)))
+    assert state.snapshot()["plan"][1]["state"] == "done"
+    assert state.snapshot()["remarks"] == ["sine-01: the clock is slow"]
+
+
+def test_an_instruction_waits_for_its_own_answer(folder):
+    """The word for an earlier instruction is void; closing the page ends the wait."""
+    state = LiveState(folder)
+    assert not state.answer(1)
+    waiting = threading.Thread(target=state.confirm, args=("hold cart 2",))
+    waiting.start()
+    until(lambda: state.snapshot()["instruction"] == {"number": 1, "text": "hold cart 2"})
+    assert not state.answer(7)
+    assert state.answer(1)
+    waiting.join()
+    assert state.snapshot()["instruction"] is None
+    threading.Timer(0.1, state.end).start()
+    with pytest.raises(ConfigError, match="nobody confirmed: let cart 1 go"):
+        state.confirm("let cart 1 go")
+
+
+# ------------------------------------------------------------------------- who may see it
+
+
+def ask(page: LivePage, path: str = "", method: str = "GET", body: str | None = None, **headers):
+    """Make one request as any program could; returns the response, read."""
+    url = urlsplit(page.url)
+    connection = http.client.HTTPConnection(url.hostname or "", url.port or 0, timeout=PATIENCE)
+    named = {key.replace("_", "-"): value for key, value in headers.items()}
+    connection.request(
+        method, path if path.startswith("/") else url.path + path, body=body, headers=named
+    )
+    response = connection.getresponse()
+    text = response.read().decode()
+    connection.close()
+    return response, text
+
+
+def news(page: LivePage, opened: ExitStack) -> http.client.HTTPResponse:
+    """Open the page's stream of events for as long as `opened` lasts."""
+    url = urlsplit(page.url)
+    connection = http.client.HTTPConnection(url.hostname or "", url.port or 0, timeout=PATIENCE)
+    opened.callback(connection.close)
+    connection.request("GET", f"{url.path}events")
+    return opened.enter_context(closing(connection.getresponse()))
+
+
+def test_it_is_served_to_this_computer_only_with_strict_headers(page):
+    """Loopback, no script or style but its own files, no framing, no referrer, no cache."""
+    assert urlsplit(page.url).hostname == "127.0.0.1"
+    response, text = ask(page)
+    assert response.status == 200
+    policy = response.headers["Content-Security-Policy"]
+    assert "default-src 'none'; script-src 'self'; style-src 'self'" in policy
+    assert "unsafe" not in policy
+    assert "frame-ancestors 'none'" in policy
+    assert response.headers["Referrer-Policy"] == "no-referrer"
+    assert response.headers["Cache-Control"] == "no-store"
+    assert response.headers["X-Content-Type-Options"] == "nosniff"
+    assert "//" not in text  # nothing from anywhere else
+    for name in ("live.js", "live.css", "report.css"):
+        assert ask(page, name)[0].status == 200
+
+
+def test_who_does_not_know_the_secret_sees_nothing(page):
+    """No secret, a wrong one, one cut short or without its slash: 403, whatever is asked for."""
+    path = urlsplit(page.url).path
+    for other in ("/", "/x/", path[:-2] + "/", path[:-1], "/events", "/live.js", f"/x{path}"):
+        response, text = ask(page, other)
+        assert response.status == 403, other
+        assert path.strip("/") not in text
+    assert ask(page, "../../secret")[0].status in (403, 404)
+    assert ask(page, "submission.toml")[0].status == 404
+
+
+def test_requests_of_other_pages_are_refused(page):
+    """A name that leads here, another origin, a request a browser calls cross-site: 403."""
+    port = urlsplit(page.url).port
+    good = f"http://127.0.0.1:{port}"
+    assert ask(page, Host=f"evil.example:{port}")[0].status == 403
+    assert ask(page, Host="127.0.0.1")[0].status == 403
+    assert ask(page, Host=f"localhost:{port}")[0].status == 200
+    assert ask(page, Origin="http://evil.example")[0].status == 403
+    assert ask(page, Origin="null")[0].status == 403
+    assert ask(page, Origin=good, Host=f"localhost:{port}")[0].status == 403
+    assert ask(page, Sec_Fetch_Site="cross-site")[0].status == 403
+    assert ask(page, "confirm", "POST", '{"number": 1}')[0].status == 403
+    assert ask(page, "confirm", "POST", '{"number": 1}', Origin=good)[0].status == 409
+
+
+@pytest.mark.parametrize(
+    ("body", "status"),
+    [("", 400), ("[1]", 400), ('{"n": 1}', 400), ('{"number": "1"}', 409), ("1" * 500, 413)],
+)
+def test_nonsense_confirms_nothing(page, body, status):
+    """Broken, strange or long answers are refused and the page goes on."""
+    origin = page.url[: page.url.index("/", 8)]
+    assert ask(page, "confirm", "POST", body, Origin=origin)[0].status == status
+    assert ask(page)[0].status == 200
+
+
+def test_the_secret_is_new_each_time_and_written_nowhere(folder, caplog, capfd):
+    """Two pages differ; no log line and nothing printed holds the secret."""
+    caplog.set_level(logging.DEBUG)
+    secrets = set()
+    for _ in range(2):
+        with LivePage(folder) as page:
+            ask(page)
+            ask(page, "confirm", "POST", "", Origin="http://evil.example")
+            secrets.add(urlsplit(page.url).path.strip("/"))
+    assert len(secrets) == 2
+    assert all(len(secret) >= 32 for secret in secrets)
+    written = caplog.text + "".join(capfd.readouterr())
+    assert not any(secret in written for secret in secrets)
+
+
+def test_a_port_that_is_taken_is_one_clear_line(page, folder):
+    """Asking for a busy port says so."""
+    with pytest.raises(HardwareError, match="is not free for the page"):
+        LivePage(folder, port=urlsplit(page.url).port or 0)
+
+
+def test_news_come_as_events_and_too_many_pages_are_turned_away(page):
+    """The first event is the whole state, then points; a ninth page gets 503 and costs nothing."""
+    with ExitStack() as opened:
+        stream, *_ = [news(page, opened) for _ in range(8)]
+        assert stream.headers["Content-Type"].startswith("text/event-stream")
+        assert stream.readline() == b"event: state\n"
+        state = json.loads(stream.readline().removeprefix(b"data: "))
+        assert (state["title"], state["units"]) == (
+            "Bench <9> & co", {"position": "cm", "input": "V"},
+        )  # fmt: skip
+        page.started(SINE)
+        page.readings(lines(0, 50), Anomalies())
+        found = b""
+        while not found.startswith(b"event: points"):
+            found = stream.readline()
+        points = json.loads(stream.readline().removeprefix(b"data: "))
+        assert points["points"][0] == [0.0, 0.0, 0.01, 0.0, 0.0]
+        assert ask(page, "events")[0].status == 503
+
+
+def _held(page: LivePage) -> int:
+    """Return how many connections the page holds open at this moment."""
+    port = urlsplit(page.url).port
+    mine = psutil.Process().net_connections("tcp")
+    return sum(c.laddr[1:] == (port,) and c.status == psutil.CONN_ESTABLISHED for c in mine)
+
+
+def test_strangers_leave_the_run_its_descriptors(page):
+    """Of 400 idle connections some are held, half a request or not; who has the secret gets in."""
+    url = urlsplit(page.url)
+    with ExitStack() as opened:
+        stream = news(page, opened)
+        for number in range(400):
+            stranger = socket.create_connection((url.hostname, url.port), timeout=PATIENCE)
+            opened.enter_context(stranger)
+            if number % 2:
+                stranger.sendall(b"GET / HTTP/1.1\r\nHost: ")
+            if number % 30 == 0:  # fewer than are accepted at once
+                until(lambda: _held(page) <= 140)
+        until(lambda: _held(page) <= 140)
+        assert ask(page)[0].status == 200
+        assert stream.readline() == b"event: state\n"
+
+
+def test_nobody_is_faster_than_who_has_the_secret(page, monkeypatch):
+    """As many others as can be waiting, all accepted at once with it, drive no request out."""
+    url, held, go_on = urlsplit(page.url), threading.Event(), threading.Event()
+    snapshot = page.snapshot
+
+    def slow() -> object:
+        held.set()
+        assert go_on.wait(PATIENCE)
+        return snapshot()
+
+    monkeypatch.setattr(page, "snapshot", slow)
+    with ExitStack() as opened:
+        threading.Thread(target=news, args=(page, opened), daemon=True).start()
+        assert held.wait(PATIENCE)  # the server's loop stands still
+        rightful = socket.create_connection((url.hostname, url.port), timeout=PATIENCE)
+        opened.enter_context(rightful)
+        rightful.sendall(f"GET {url.path} HTTP/1.1\r\nHost: {url.netloc}\r\n\r\n".encode())
+        for _ in range(200):  # more than can wait
+            stranger = opened.enter_context(socket.socket())
+            stranger.setblocking(False)
+            stranger.connect_ex((url.hostname, url.port))
+        go_on.set()
+        assert rightful.recv(12) == b"HTTP/1.1 200"
+
+
+def test_a_stranger_is_turned_out_in_time_and_a_reader_is_not(folder, monkeypatch):
+    """An idle connection ends by itself; one that has shown the secret goes on."""
+    monkeypatch.setattr("pipeline.bench.watch.web._TO_SHOW_IT", 0.2)
+    with LivePage(folder) as page, ExitStack() as opened:
+        stream = news(page, opened)
+        assert stream.readline() == b"event: state\n"
+        url = urlsplit(page.url)
+        with socket.create_connection((url.hostname, url.port), timeout=PATIENCE) as stranger:
+            with suppress(ConnectionResetError):
+                assert stranger.recv(1) == b""
+        page.planned(PLAN, frozenset())  # told to who still listens
+        while line := stream.readline():
+            if line == b"event: state\n":
+                break
+        assert line
+
+
+def test_a_run_is_not_held_up(folder):
+    """With two pages that read and one that does not, 50 lines are handed on within a heartbeat."""
+    took = []
+    with ExitStack() as opened:
+        with LivePage(folder) as page:
+            news(page, opened)
+            readers = [threading.Thread(target=news(page, opened).read) for _ in range(2)]
+            for reader in readers:
+                reader.start()
+            page.started(SINE)
+            for k in range(0, 2000, 50):
+                batch = lines(k, k + 50)
+                began = time.perf_counter()
+                page.readings(batch, Anomalies())
+                took.append(time.perf_counter() - began)
+                time.sleep(0.02)  # which a bench needs for them
+        for reader in readers:
+            reader.join()
+    assert np.median(took) < HEARTBEAT_EVERY
+
+
+def test_pages_hear_the_end_and_the_server_is_gone(folder):
+    """Leaving the context ends every stream with the last state, and frees the port."""
+    with ExitStack() as opened:
+        with LivePage(folder) as page:
+            page.planned(PLAN, frozenset())
+            stream = news(page, opened)
+        text = stream.read().decode()
+    assert '"phase":"over"' in text
+    with pytest.raises(ConnectionRefusedError):
+        ask(page)
+
+
+# --------------------------------------------------------------------------- in the browser
+
+
+@pytest.fixture
+def show(browser, page):
+    """Open the page in a window of its own; errors and requests to elsewhere fail the test."""
+    contexts, errors = [], []
+
+    def opened(*, size=WIDE, **options):
+        context = browser.new_context(
+            viewport={"width": size[0], "height": size[1]}, reduced_motion="reduce", **options
+        )
+        context.set_default_timeout(1e3 * PATIENCE)
+        contexts.append(context)
+        window = context.new_page()
+        window.on("pageerror", lambda error: errors.append(str(error)))
+        window.on("console", lambda m: errors.append(m.text) if m.type == "error" else None)
+        window.on(
+            "request",
+            lambda r: None if r.url.startswith(page.url) else errors.append(r.url),
+        )
+        window.goto(page.url)
+        expect(window.locator("#title")).to_have_text("Bench <9> & co")
+        return window
+
+    yield opened
+    for context in contexts:
+        context.close()
+    assert errors == []
+
+
+def record(page: LivePage) -> None:
+    """Have two seconds of a sine come in."""
+    page.settling(SINE, 3.0)
+    page.started(SINE)
+    page.readings(lines(0, 2000), Anomalies(lost=3))
+
+
+INK = """(id) => {
+  const canvas = document.getElementById(id);
+  const data = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data;
+  const colours = new Set();
+  for (let i = 0; i < data.length; i += 4)
+    if (data[i + 3] === 255) colours.add([data[i], data[i + 1], data[i + 2]].join());
+  return [...colours];
+}"""
+BLUE, ORANGE = "0,114,178", "213,94,0"
+
+
+def test_it_shows_plan_progress_counters_and_curves(page, show):
+    """What the acquisition tells stands on the page, curves in the colours of their keys."""
+    window = show()
+    record(page)
+
+    expect(window.locator("#status")).to_have_text("Recording sine-01.")
+    expect(window.locator("#plan .now b")).to_have_text("sine-01")
+    expect(window.locator("#plan .done b")).to_have_text("decay-1")
+    expect(window.locator("#left")).to_have_text("16 s left")  # 21 s less 3 s and 2 s
+    expect(window.locator(".counters .bad")).to_have_text("lost3")
+    expect(window.locator(".counters")).to_contain_text("lines2000")
+    expect(window.locator("#plots .keys").first).to_contain_text("cart 1 3.99")
+    expect(window.locator("#plots .keys").first).to_contain_text("cart 2 −3.99")
+    assert {BLUE, ORANGE} <= set(window.evaluate(INK, "positions"))
+    assert BLUE in window.evaluate(INK, "inputs")
+    assert ORANGE not in window.evaluate(INK, "inputs")
+
+    page.finished(Outcome(recording=SINE, lines=2000, partial="a cart passed the limit"))
+    expect(window.locator("#plan .partial .why")).to_have_text("a cart passed the limit")
+    page.started(LOOP)
+    expect(window.locator("#plots .keys").first).to_contain_text("target")
+
+
+@pytest.mark.parametrize("how", ["click", "Enter"])
+def test_an_instruction_is_confirmed_with_its_button(page, show, how):
+    """It appears with the focus on its button, and goes once it is done."""
+    window = show()
+    done = threading.Event()
+
+    def asked() -> None:
+        page.confirm("hold cart 2; pull cart 1 out")
+        done.set()
+
+    threading.Thread(target=asked).start()
+    expect(window.get_by_role("alert")).to_have_text("hold cart 2; pull cart 1 out")
+    button = window.get_by_role("button", name="Done")
+    expect(button).to_be_focused()
+    if how == "click":
+        button.click()
+    else:
+        window.keyboard.press(how)
+    assert done.wait(PATIENCE)
+    expect(window.locator("#ask")).to_be_hidden()
+
+
+def test_every_page_open_sees_the_same(page, show):
+    """A second page opened in mid-run has the points from before; confirming on one clears both."""
+    first = show()
+    record(page)
+    second = show(size=PHONE)
+    expect(second.locator("#plots .keys").first).to_contain_text("cart 1 3.99")
+    threading.Thread(target=page.confirm, args=("let go",)).start()
+    expect(first.locator("#ask")).to_be_visible()
+    second.get_by_role("button", name="Done").click()
+    expect(first.locator("#ask")).to_be_hidden()
+
+
+@pytest.mark.parametrize("size", [WIDE, PHONE], ids=["wide", "phone"])
+def test_everybody_can_read_it(page, show, size):
+    """Axe finds nothing, by day and by night; nothing is wider than the screen."""
+    window = show(size=size)
+    record(page)
+    threading.Thread(target=page.confirm, args=("let go of all carts",)).start()
+    page.remark("the bench has no watchdog")
+    expect(window.locator("#told")).to_be_visible()
+    for scheme in ("light", "dark"):
+        window.emulate_media(color_scheme=scheme)
+        found = Axe().run(window).response["violations"]
+        assert [(v["id"], [n["target"] for n in v["nodes"]][:3]) for v in found] == []
+    assert window.evaluate("document.documentElement.scrollWidth") <= size[0]
+    page.answer(1)
+
+
+def test_by_night_the_curves_change_colour(page, show):
+    """The canvas follows the colour scheme while the page is open."""
+    window = show(color_scheme="light")
+    record(page)
+    expect(window.locator("#plots .keys").first).to_contain_text("3.99")
+    window.emulate_media(color_scheme="dark")
+    until(lambda: "86,180,233" in window.evaluate(INK, "positions"))
+    assert BLUE not in window.evaluate(INK, "positions")
+
+
+def test_the_end_is_told(folder, browser):
+    """Once the session is over the page says so, keeps its curves, and asks no more."""
+    context = browser.new_context()
+    context.set_default_timeout(1e3 * PATIENCE)
+    window = context.new_page()
+    with LivePage(folder) as page:
+        page.planned(PLAN, frozenset())
+        window.goto(page.url)
+        record(page)
+        expect(window.locator("#status")).to_have_text("Recording sine-01.")
+    expect(window.locator("#status")).to_have_text("The session is over.")
+    assert BLUE in window.evaluate(INK, "positions")
+    context.close()
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_a_session_is_watched_and_confirmed_in_the_browser(tmp_path, browser):
+    """`acquire --web` on a stock bench: a button lets it start; no file holds the secret."""
+    work = write_work(tmp_path / "work", [sine("dwell", seconds=1, settle=0.3)])
+    toml = work / "submission.toml"
+    scaled = toml.read_text(encoding="utf-8").replace('"cm"', '"cm", per_count = 0.00227')
+    toml.write_text(scaled, encoding="utf-8")
+    command = [sys.executable, "-m", "pipeline", "acquire", str(work), "--web"]
+    context = browser.new_context()
+    context.set_default_timeout(1e3 * PATIENCE)
+    with emulator("--stock", "--speed", "5") as bench:
+        command += ["--port", bench.address, "--only", "dwell"]
+        with started(command, stderr=subprocess.PIPE, encoding="utf-8") as host:
+            assert host.stderr is not None
+            url = re.search(r"http://\S+", host.stderr.readline())
+            assert url is not None
+            window = context.new_page()
+            window.goto(url[0])
+            expect(window.get_by_role("alert")).to_have_text("All carts free")
+            window.get_by_role("button", name="Done").click()
+            expect(window.locator("#status")).to_have_text("The session is over.")
+            expect(window.locator("#plan .done b")).to_have_text("dwell")
+            host.stderr.read()
+    assert host.returncode == 0
+    secret = urlsplit(url[0]).path.strip("/").encode()
+    files = [path.read_bytes() for path in work.rglob("*") if path.is_file()]
+    assert len(files) >= 4
+    assert not any(secret in file for file in files)
+    context.close()

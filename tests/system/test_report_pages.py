@@ -1,0 +1,418 @@
+"""Reports as a reader meets them: in a real browser, on a phone, in the dark, on paper."""
+
+import math
+import re
+import shutil
+import subprocess
+from collections import Counter
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+from unicodedata import normalize
+
+import html5lib
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from pypdf import PdfReader
+
+from pipeline.plant.effects import CATALOGUE
+from pipeline.report.draft.write import render_report
+from pipeline.report.effects.page import render_effects
+from pipeline.report.gap.page import render_gap
+from pipeline.report.solution.write import render_solution
+from pipeline.resources import EXAMPLES
+from pipeline.submission import load_submission
+from pipeline.workflow import analyse
+from tests.helpers.grades import write_class
+from tests.helpers.ucsd import write_one_cart_submission, write_two_cart_submission
+from tests.helpers.waiting import PATIENCE
+from tests.report.test_gap import make_gap, two_cart_analysis
+
+CASES = (
+    "one", "three", "gap", "solution", "effects", "class", "feedback",
+    *(pytest.param(case, marks=[pytest.mark.slow, pytest.mark.sample])
+      for case in ("real-one", "real-two")),
+)  # fmt: skip
+LARGEST = 3_000_000  # bytes of a page
+WIDE, PHONE = (1280, 900), (390, 844)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Return the folder of a case's report, made when first asked for."""
+    made: dict[str, Path] = {}
+
+    def of(case: str, request) -> Path:
+        if case not in made:
+            out = tmp_path_factory.mktemp(case)
+            if case == "gap":
+                gap = make_gap(keys=("coulomb_friction", "input_delay", "cubic_spring"))
+                render_gap(gap, two_cart_analysis(), out)
+            elif case in ("class", "feedback"):
+                out = write_class(out)
+                out = out / "feedback" / "team-02" if case == "feedback" else out
+            elif case == "effects":
+                render_effects(CATALOGUE, out)
+            elif case == "solution":
+                render_solution(analyse(load_submission(EXAMPLES / "two-cart")), out)
+            else:
+                render_report(analyse(load_submission(_submission(case, out, request))), out)
+            made[case] = out
+        return made[case]
+
+    return of
+
+
+def _submission(case: str, out: Path, request) -> Path:
+    if case == "real-one":
+        return write_one_cart_submission(out / "data", request.getfixturevalue("real_data"))
+    if case == "real-two":
+        data = request.getfixturevalue("real_data")
+        return write_two_cart_submission(out / "data", data, steps=(1, 2, 3))
+    return EXAMPLES / f"{case}-cart"
+
+
+@pytest.fixture(params=CASES)
+def made(request, folder) -> Path:
+    """The folder of one case after the other."""
+    return folder(request.param, request)
+
+
+@pytest.fixture
+def three(request, folder) -> Path:
+    """The folder of the shipped three-cart report."""
+    return folder("three", request)
+
+
+def page_of(made: Path) -> Path:
+    (page,) = made.glob("*.html")
+    return page
+
+
+@pytest.fixture
+def show(browser):
+    """Open a page in a window of its own; errors of its script fail the test."""
+    contexts, errors = [], []
+
+    def opened(path: Path, *, size=WIDE, **options):
+        context = browser.new_context(
+            viewport={"width": size[0], "height": size[1]}, reduced_motion="reduce", **options
+        )
+        context.set_default_timeout(1e3 * PATIENCE)
+        contexts.append(context)
+        page = context.new_page()
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.on("console", lambda line: errors.append(line.text) if line.type == "error" else None)
+        page.goto(path.as_uri())
+        return page
+
+    yield opened
+    for context in contexts:
+        context.close()
+    assert errors == []
+
+
+# ------------------------------------------------------------------------ as files
+
+
+def test_the_page_is_valid_html(made):
+    """A strict parser finds no fault, every id stands once, and the file is small."""
+    html = page_of(made).read_text(encoding="utf-8")
+
+    html5lib.HTMLParser(strict=True).parse(html)
+
+    ids = Counter(re.findall(r'\sid="([^"]*)"', html))
+    assert [id_ for id_, n in ids.items() if n > 1] == []
+    assert len(html.encode()) < LARGEST
+
+
+# Word boxes are those of the fonts, ascent and descent included: letters on lines that touch may
+# overlap by a little; a word that lies on another does so by more than half.
+_MOST_OVERLAP = 0.25
+_WORD = re.compile(r'<word xMin="(.*?)" yMin="(.*?)" xMax="(.*?)" yMax="(.*?)">(.*?)</word>')
+
+
+@pytest.mark.skipif(shutil.which("pdftotext") is None, reason="no pdftotext: poppler-utils")
+def test_no_word_of_the_pdf_is_cut_or_covered(made):
+    """All words lie on their page, and none on another."""
+    pdf = next(made.glob("*.pdf"), None)
+    if pdf is None:
+        pytest.skip("a page alone, without a PDF")
+    boxes = subprocess.run(
+        ["pdftotext", "-bbox", pdf, "-"],
+        capture_output=True,
+        text=True,
+        encoding="utf-8",
+        check=True,
+    ).stdout
+    pages = re.findall(r'<page width="(.*?)" height="(.*?)">(.*?)</page>', boxes, re.DOTALL)
+    assert len(pages) >= 4
+    for width, height, body in pages:
+        words = [Box._make([*map(float, m.groups()[:4]), m[5]]) for m in _WORD.finditer(body)]
+        page = Box(0.0, 0.0, float(width), float(height), "")
+        assert [word for word in words if not word.lies_in(page)] == []
+        assert covered(words) == []
+
+
+class Box(NamedTuple):
+    """A text and where it stands."""
+
+    left: float
+    top: float
+    right: float
+    bottom: float
+    text: str
+
+    def lies_in(self, other: "Box") -> bool:
+        """Return whether nothing sticks out of the other box."""
+        across = other.left <= self.left and self.right <= other.right
+        return across and other.top <= self.top and self.bottom <= other.bottom
+
+    @property
+    def area(self) -> float:
+        """Return width times height."""
+        return (self.right - self.left) * (self.bottom - self.top)
+
+
+def covered(boxes: list[Box]) -> list[tuple[str, str]]:
+    """Return pairs of texts of which one lies on the other."""
+    pairs = []
+    boxes = sorted(boxes)
+    for i, a in enumerate(boxes):
+        for b in boxes[i + 1 :]:
+            if b.left >= a.right:
+                break
+            across = min(a.right, b.right) - b.left
+            down = min(a.bottom, b.bottom) - max(a.top, b.top)
+            if across > 0 and across * down > _MOST_OVERLAP * min(a.area, b.area) > 0:
+                pairs.append((a.text, b.text))
+    return pairs
+
+
+# ------------------------------------------------------------------- in the browser
+
+
+def test_everybody_can_read_it(made, show):
+    """Axe finds nothing serious or critical: names, roles, order of headings, contrast by night."""
+    page = show(page_of(made), color_scheme="light", bypass_csp=True)
+    page.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
+
+    found = Axe().run(page).response["violations"]
+    page.emulate_media(color_scheme="dark")
+    found += Axe().run(page, options={"runOnly": ["color-contrast"]}).response["violations"]
+
+    grave = [
+        (v["id"], v["impact"], [node["target"] for node in v["nodes"]][:3])
+        for v in found
+        if v["impact"] in ("serious", "critical")
+    ]
+    assert grave == []
+
+
+# Every run of text outside mathematics and drawings, every formula as a whole, and every text of
+# a drawing: with its box, and the box that may cut it.
+BOXES = """() => {
+  const found = [];
+  const add = (rect, text, owner) => {
+    const scroller = owner.closest('.wide, nav ul, pre');
+    found.push([rect.left, rect.top, rect.right, rect.bottom, text, Boolean(scroller)]);
+  };
+  const walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+  for (let node = walker.nextNode(); node; node = walker.nextNode()) {
+    const owner = node.parentElement;
+    if (!node.textContent.trim() || owner.closest('math, svg, script, .skip')) continue;
+    if (!owner.checkVisibility()) continue;
+    const range = document.createRange();
+    range.selectNodeContents(node);
+    for (const rect of range.getClientRects()) add(rect, node.textContent.trim(), owner);
+  }
+  for (const math of document.querySelectorAll('main math'))
+    if (math.checkVisibility()) add(math.getBoundingClientRect(), math.textContent, math);
+  return found;
+}"""
+DRAWN = """() => [...document.querySelectorAll('figure svg')].map((svg) => {
+  const box = svg.getBoundingClientRect();
+  const texts = [...svg.querySelectorAll('text')].filter((t) => t.checkVisibility());
+  return [[box.left, box.top, box.right, box.bottom], texts.map((t) => {
+    const r = t.getBoundingClientRect();
+    return [r.left, r.top, r.right, r.bottom, t.textContent];
+  })];
+})"""
+
+
+def test_no_text_is_cut_or_covered(made, show):
+    """Nothing sticks out but what can be scrolled, no text lies on another, figures hold theirs."""
+    page = show(page_of(made))
+    page.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
+    for width, height in (WIDE, PHONE):
+        page.set_viewport_size({"width": width, "height": height})
+
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        boxes = [(Box(*box), scrolled) for *box, scrolled in page.evaluate(BOXES)]
+        assert len(boxes) > 100
+        # Half a pixel: boxes of letters are rounded outwards.
+        fixed = [box for box, scrolled in boxes if not scrolled]
+        assert [box for box in fixed if box.left < -0.5 or box.right > width + 0.5] == []
+        assert covered([box for box, _ in boxes]) == []
+        for edge, texts in page.evaluate(DRAWN):
+            drawn = [Box(*text) for text in texts]
+            assert [text for text in drawn if not text.lies_in(Box._make([*edge, ""]))] == []
+            assert covered(drawn) == []
+
+
+@pytest.mark.parametrize("case", ["class", "feedback"])
+def test_a_phone_shows_the_numbers_of_a_table(case, folder, request, show):
+    """The column of names stays in sight and takes at most half of the view."""
+    page = show(page_of(folder(case, request)), size=PHONE)
+    widths = page.evaluate("""() => Array.from(document.querySelectorAll('details'),
+        (fold) => fold.open = true) && Array.from(
+        document.querySelectorAll('.numbered :is(th, td):first-child'),
+        (cell) => cell.getBoundingClientRect().width)""")
+    assert 0 < max(widths) <= PHONE[0] / 2
+
+
+def test_a_class_is_searched_and_sorted(folder, request, show):
+    """Words narrow the table, headings sort it by number or name, up and down; names are links."""
+    page = show(page_of(folder("class", request)))
+    table = page.locator("table.finder")
+    rows = table.locator("tbody tr:visible")
+
+    def column(n: int) -> list[str]:
+        return [text.strip() for text in rows.locator(f"td:nth-child({n})").all_inner_texts()]
+
+    assert rows.count() == 16
+    page.get_by_label("Search").fill("UNAL s12")
+    assert column(1) == ["Ünal 学生 & co"]
+    assert page.locator(".find output").inner_text() == "1 of 16"
+    page.get_by_label("Search").fill("hz_for_rad_s")
+    assert rows.count() == 5
+    page.get_by_label("Search").fill("")
+    page.get_by_role("button", name="Points").last.click()
+    points = [float(text) for text in column(3)]
+    assert points == sorted(points)
+    page.get_by_role("button", name="Points").last.click()
+    assert [float(text) for text in column(3)] == points[::-1]
+    heading = table.locator("th", has_text="Points")
+    assert heading.get_attribute("aria-sort") == "descending"
+
+    rows.get_by_role("link", name="Ünal").click()
+    assert page.locator("h1").inner_text() == "Ünal 学生 & co"
+
+
+def numbers(text: str) -> list[float]:
+    return [float(n.replace("−", "-")) for n in re.findall(r"−?\d+(?:\.\d+)?(?:e−?\d+)?", text)]
+
+
+def test_a_figure_says_the_values_under_the_pointer(three, show):
+    """Over a measured point of the Bode figure its frequency, magnitude and phase are told."""
+    analysis = analyse(load_submission(EXAMPLES / "three-cart"))
+    response = next(r for r in analysis.frequency_responses if r.cart == 3)
+    page = show(page_of(three))
+    figure = page.locator("figure").first
+    figure.scroll_into_view_if_needed()
+    box = figure.locator("svg use").nth(10).bounding_box()  # the legend's own comes last
+
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+
+    told = figure.locator("output").inner_text()
+    assert "|X₃/U| measured" in told
+    omega, magnitude = numbers(told.replace("X₃", ""))[:2]
+    index = int(abs(response.omega - omega).argmin())
+    # Four digits are told.
+    assert omega == pytest.approx(response.omega[index], rel=1e-3)
+    decibel = 20 * math.log10(response.magnitude[index])
+    assert magnitude == pytest.approx(decibel, abs=0.01)
+
+
+def test_a_figure_zooms_where_it_is_dragged_and_comes_back(three, show):
+    """Dragging shows a part on all panels of one axis; the button shows all again, as it was."""
+    page = show(page_of(three))
+    figure = page.locator("figure").first
+    figure.scroll_into_view_if_needed()
+    before = geometry(figure)
+    labels = visible_ticks(figure)
+    box = figure.locator("svg").bounding_box()
+
+    page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 0.2 * box["height"])
+    page.mouse.down()
+    page.mouse.move(box["x"] + 0.7 * box["width"], box["y"] + 0.3 * box["height"], steps=3)
+    page.mouse.up()
+
+    zoomed = visible_ticks(figure)
+    assert zoomed != labels
+    assert len(zoomed) >= 8
+    assert all(low != high for low, high in pairwise(zoomed))
+    assert "NaN" not in figure.locator("svg").inner_html()
+    figure.get_by_role("button", name="Show all").click()
+    assert visible_ticks(figure) == labels
+    assert geometry(figure) == before
+
+
+def visible_ticks(figure) -> list[str]:
+    script = "(all) => all.filter((t) => t.checkVisibility()).map((t) => t.textContent)"
+    return figure.locator("svg .panel text").evaluate_all(script)
+
+
+def geometry(figure) -> list[list[str | None]]:
+    script = "(all) => all.map((e) => ['d', 'x', 'y', 'transform'].map((n) => e.getAttribute(n)))"
+    return figure.locator("svg .panel *").evaluate_all(script)
+
+
+def test_a_figure_answers_to_the_keyboard(three, show):
+    """Arrow keys go from point to point, plus zooms, 0 shows all."""
+    page = show(page_of(three))
+    figure = page.locator("figure").first
+    figure.locator(".stage").focus()
+
+    told = []
+    for _ in range(3):
+        page.keyboard.press("ArrowRight")
+        told.append(numbers(figure.locator("output").inner_text())[0])
+    labels = visible_ticks(figure)
+    page.keyboard.press("+")
+
+    assert told == sorted(set(told))
+    assert visible_ticks(figure) != labels
+    page.keyboard.press("0")
+    assert visible_ticks(figure) == labels
+
+
+def test_numbers_can_be_copied(three, show):
+    """A table goes to the clipboard with tabs and plain numbers, value and error apart."""
+    page = show(page_of(three), permissions=["clipboard-read", "clipboard-write"])
+
+    page.get_by_role("button", name="Copy Table 2").click()
+    table = page.evaluate("navigator.clipboard.readText()")
+    page.get_by_role("button", name="Copy the matrices").first.click()
+    matrix = page.evaluate("navigator.clipboard.readText()")
+
+    rows = [line.split("\t") for line in table.splitlines()]
+    assert rows[0][:4] == ["Parameter", "Unit", "Initial estimate", "std"]
+    assert len({len(row) for row in rows}) == 1
+    K_1 = next(row for row in rows if row[0] == "K_1")
+    assert float(K_1[2]) == pytest.approx(39.07, rel=0.01)
+    assert 0 < float(K_1[3]) < 0.1
+    assert re.fullmatch(r"A = \[[-\d.e ;]+\];", matrix)
+    assert matrix.count(";") == 6
+
+
+def test_without_scripts_the_page_is_whole(three, show):
+    """Figures, numbers and what is folded can be read where no script runs."""
+    page = show(page_of(three), java_script_enabled=False)
+
+    assert page.locator("figure svg").count() == page.locator("figure").count() > 5
+    assert page.locator("button").count() == 0
+    page.locator("summary").first.click()
+    assert page.get_by_text("The fit converged").is_visible()
+
+
+def test_paper_shows_what_a_page_folds(three, show, tmp_path):
+    """Printing opens the folded tables and leaves out what only works on a screen."""
+    page = show(page_of(three))
+    paper = tmp_path / "paper.pdf"
+    page.pdf(path=paper, format="A4")
+
+    text = normalize("NFKC", "\n".join(p.extract_text() for p in PdfReader(paper).pages))
+    assert "The fit converged" in text
+    assert "drag to zoom" not in text
+    assert "Figure 3." in text

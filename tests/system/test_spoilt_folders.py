@@ -1,0 +1,167 @@
+"""Whole submissions spoilt at random, given to the commands: a result or one line, each in time."""
+
+import json
+import re
+import tempfile
+import time
+from functools import cache
+from pathlib import Path
+from random import Random
+
+import numpy as np
+import pytest
+
+from pipeline.synthesis import write_submission
+from tests.helpers.commandline import cartlab_here
+from tests.helpers.poison import poisoned
+from tests.system.test_any_submission import CHANNELS
+
+# Of the processor, on a machine of any load; `gap` has its own budget beside it.
+MOST_TIME = 60.0  # s
+KINDS = ("decay", "step", "sine", "sweep", "closed_loop", "bode")
+FACTORS = (1e-9, 1e-3, 0.1, 0.5, 0.97, 2, 10, 1e3, 1e9)
+ADDED = (
+    "window = [1.0, 2.0]", "window = [0.0, 0.05]", "window = [3.0, 1e9]", "sample_rate = 1000.0",
+    "reference = 1e-9", "reference = -1.0", "input = { sign = -1 }", "input = { per_count = 1e6 }",
+    "columns = { time = 2, x1 = 1 }", 'columns = { time = "time", input = "x1", x1 = "x1" }',
+    'hold = "band_limited"', "controlled_cart = 1", "frequency = 60.0", "frequency = 1e-3",
+    'controller = { type = "pid", kp = 0.05, ki = 1e9, kd = 0.0 }',
+    'controller = { type = "state_feedback", gains = [0.01, 0.001], prefilter = 0.0 }',
+    'controller = { type = "state_feedback", gains = [1e9, 0, 0, -1e9] }',
+)  # fmt: skip
+
+
+@cache
+def good(carts: int) -> dict[str, bytes]:
+    """Return the files of a small submission: few dwells, few repeats."""
+    with tempfile.TemporaryDirectory() as folder:
+        write_submission(
+            Path(folder), chain=f"throne-{carts}dof", seed=1, compact=True, reported=True
+        )
+        files = {
+            path.relative_to(folder).as_posix(): path.read_bytes()
+            for path in Path(folder).rglob("*.*")
+        }
+    head, *runs = files.pop("submission.toml").decode().split("[[experiments]]\n")
+    tail = runs[-1].partition("\n[reported")
+    runs[-1] = tail[0] + "\n"
+    kept = [run for run in runs if not re.match(r'id = "sine-(?!04|08|11|14|17|20)', run)]
+    named = {re.search(r'file = "(.*)"', run)[1] for run in kept}  # type: ignore[index]
+    toml = "[[experiments]]\n".join([head, *kept]) + "".join(tail[1:])
+    return {name: files[name] for name in sorted(named)} | {"submission.toml": toml.encode()}
+
+
+def odd(files: dict[str, bytes], rng: Random) -> None:
+    """Change what a submission says of its bench and its runs into something it may well say."""
+    toml = files["submission.toml"].decode("utf-8", "replace")
+
+    def change(pattern: str, *new: str) -> str:
+        there = list(re.finditer(pattern, toml, re.MULTILINE))
+        if not there:
+            return toml
+        at = rng.choice(there)
+        return toml[: at.start()] + rng.choice(new) + toml[at.end() :]
+
+    n = rng.randint(1, 4)
+    springs = ", ".join(rng.choice(["true", "false"]) for _ in range(n + 1))
+    free = sorted(rng.sample(range(1, n + 1), rng.randint(1, n)))
+    typed = re.findall(r"^file = .*$", toml, re.MULTILINE) or [""]
+    number = rng.choice(list(re.finditer(r"(?<== )-?[\d.]+(?:e-?\d+)?$", toml, re.MULTILINE)))
+    scaled = f"{float(number[0]) * rng.choice(FACTORS) or 1.0:.6g}"
+    files["submission.toml"] = rng.choice(
+        [
+            change(r"^carts = \d\nsprings = .*$", f"carts = {n}\nsprings = [{springs}]"),
+            change(r"^springs = .*$", f"springs = [{springs}]"),
+            change(r"^carts = \[.*\]$", f"carts = {free}"),
+            change(r"^kind = .*$", *(f'kind = "{kind}"' for kind in KINDS)),
+            change(r"^kind = .*$", *(f'kind = "{kind}"' for kind in KINDS)),
+            change(r"^file = .*$", *typed),
+            change(r"^(?=file = )", *(f"{line}\n" for line in ADDED)),
+            change(r"^(?=file = )", *(f"{line}\n" for line in ADDED)),
+            change(r'unit = "cm"', 'unit = "cm", per_count = 0.00227', 'unit = "µm"'),
+            change(r'method = "lqr"', 'method = "poles"'),
+            change(r"^overshoot_percent = .*$", "overshoot_percent = 0", "overshoot_percent = 99"),
+            toml[: number.start()] + scaled + toml[number.end() :],
+        ]
+    ).encode()
+
+
+def spoil_channel(files: dict[str, bytes], rng: Random, *, every: bool) -> None:
+    """Do to a column of a table, or of all tables, what a bench may do to it."""
+    tables = sorted(name for name in files if name.endswith(".csv"))
+    how, column = CHANNELS[rng.choice(sorted(CHANNELS))], rng.randrange(1, 5)
+    for name in tables if every else [rng.choice(tables)]:
+        try:
+            head, *rows = files[name].decode().splitlines()
+            values = np.array([row.split(",") for row in rows], dtype=float)
+        except ValueError:  # spoilt already
+            continue
+        if values.ndim == 2 and len(values) and column < values.shape[1]:
+            values[:, column] = how(values[:, column])
+            lines = [head, *(",".join(f"{value:.9g}" for value in row) for row in values)]
+            files[name] = "\n".join(lines).encode()
+
+
+def spoilt(carts: int, rng: Random) -> dict[str, bytes]:
+    """Return a submission of so many carts with a few things wrong."""
+    files = dict(good(carts))
+    for _ in range(rng.choice([1, 1, 2, 4])):
+        if rng.random() < 0.6:
+            odd(files, rng)
+        else:
+            spoil_channel(files, rng, every=rng.random() < 0.4)
+    return poisoned(files, rng) if rng.random() < 0.3 else files
+
+
+def run(command: str, folder: Path) -> None:
+    """Give the submission in a folder to a command, and look at what comes of it."""
+    out = folder.parent / "out"
+    document = {"report": "results.json"}.get(command, f"{command}.json")
+    began = time.process_time()
+    if command == "import":
+        (folder / "submission.toml").replace(folder / "data" / "submission.toml")
+        cartlab_here("new", folder / "work", "--carts", "2")
+        document = ""
+        done = cartlab_here("acquire", folder / "work", "--import", folder / "data", "--once")
+    else:
+        done = cartlab_here(command, folder, "--out", out, "--no-pdf")
+    assert time.process_time() - began < MOST_TIME
+    assert done.returncode in (0, 1, 2)
+    if done.returncode == 2:
+        *_, last = done.stderr.splitlines()
+        assert re.fullmatch(r"cartlab: .{10,1000}", last), done.stderr
+    elif document:
+        json.loads((out / document).read_text(encoding="utf-8"), parse_constant=_refuse)
+
+
+def _refuse(constant: str) -> None:
+    raise AssertionError(f"{constant} is no JSON")
+
+
+def try_seed(command: str, seed: int) -> None:
+    """Spoil a submission and give it to a command."""
+    rng = Random(f"{command} {seed}")
+    with tempfile.TemporaryDirectory() as base:
+        folder = Path(base) / "work"
+        for name, raw in spoilt(1 + seed % (2 if command == "gap" else 3), rng).items():
+            path = folder / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(raw)
+        run(command, folder)
+
+
+@pytest.mark.parametrize("command", ["report", "import"])
+def test_a_spoilt_submission_is_a_report_or_a_complaint(command):
+    """A few seeds, of one cart."""
+    for seed in (0, 3):
+        try_seed(command, seed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("command", "seeds"), [("report", 300), ("solution", 100), ("import", 300), ("gap", 30)]
+)
+def test_no_spoilt_submission_ends_in_a_traceback(command, seeds):
+    """Hundreds."""
+    for seed in range(seeds):
+        try_seed(command, seed)

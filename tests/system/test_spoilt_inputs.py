@@ -1,0 +1,150 @@
+"""Files of teachers and of earlier runs, spoilt at random: one line a complaint, or a result."""
+
+import json
+import tempfile
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from random import Random
+
+import pytest
+
+from pipeline.bench.host.importing import Importer
+from pipeline.bench.planning.plan_file import load_plan, plan_path, plan_text
+from pipeline.bench.planning.propose import propose_plan
+from pipeline.errors import ConfigError
+from pipeline.gap.stored import gap_text, read_gap
+from pipeline.grading.intake.late_table import LateTable
+from pipeline.grading.intake.lms_names import Platform, gradescope_metadata
+from pipeline.grading.publish.roster import Roster
+from pipeline.grading.publish.students import Student
+from pipeline.grading.publish.survey import read_survey, survey_dict, survey_text
+from pipeline.grading.rubric_file import load_rubric
+from pipeline.report.draft.compare import compare_drafts, read_results
+from pipeline.report.gap.words import terminal_verdict
+from pipeline.resources import RUBRICS
+from pipeline.results_json import results_text
+from pipeline.submission import load_submission
+from pipeline.synthesis.hidden import prepare_bench
+from tests.grading.publish.test_survey import write_paper
+from tests.helpers.acquisitions import Notes, write_work
+from tests.helpers.grades import make_grade
+from tests.helpers.poison import damaged, poisoned_json, poisoned_table, poisoned_toml
+from tests.ingest.test_spoilt_files import FILES, one_line_at_most
+from tests.report.test_gap import make_gap, two_cart_analysis
+
+ROSTERS: dict[Platform, str] = {
+    "canvas": "Student,ID,SIS User ID,Section,Lab 3 (77)\nJane Doe,7,s1,A,\nBob,8,s2,A,4\n",
+    "moodle": "Identifier,Full name,Email address,Grade\nParticipant 7,Jane Doe,s1,\n",
+    "gradescope": "Name,SID,Email,Total Score\nJane Doe,s1,j@x,\nBob,s2,b@x,3\n",
+}
+NAMES = ("survey.csv", *(f"{name}.csv" for name in ROSTERS), "late.csv",
+         "submission_metadata.yml", "rubric.toml", "plan.toml", "results.json", "gap.json",
+         "model.json", "import")  # fmt: skip
+LATE = "submission,days_late\nteam-1,0.5\nteam-2,2\nteam-3,0\n"
+SENT = """submission_77001:
+  :submitters:
+  - :name: Jane Doe
+  :created_at: 2024-05-01 10:00:00 Z
+"""
+
+
+@cache
+def sound() -> dict[str, bytes]:
+    """Return what is spoilt below, by the name of the file."""
+    with tempfile.TemporaryDirectory() as folder:
+        submission = load_submission(write_work(Path(folder), []))
+        plan = plan_text(propose_plan(submission), submission.system).encode()
+        survey = write_paper(Path(folder) / "survey.csv").read_bytes()
+    analysis = two_cart_analysis()
+    gap = gap_text(make_gap(keys=("coulomb_friction", "input_delay")), analysis).encode()
+    return {
+        "survey.csv": survey,
+        **{f"{name}.csv": text.encode() for name, text in ROSTERS.items()},
+        "late.csv": LATE.encode(),
+        "submission_metadata.yml": SENT.encode(),
+        "rubric.toml": (RUBRICS / "throne-2dof.toml").read_bytes(),
+        "plan.toml": plan,
+        "results.json": results_text(analysis).encode(),
+        "gap.json": gap,
+        "model.json": gap,
+    }
+
+
+def spoilt(name: str, rng: Random) -> bytes:
+    """Return a sound file with something done to its bytes, or to what they mean."""
+    raw = FILES[rng.choice(sorted(FILES))] if name == "import" else sound()[name]
+    if rng.random() < 0.5:
+        return damaged(raw, rng)
+    if name.endswith(".json"):
+        return json.dumps(poisoned_json(json.loads(raw), rng)).encode()
+    if name.endswith(".toml"):
+        return poisoned_toml(raw.decode(), rng).encode("utf-8", "replace")
+    if name.endswith(".csv"):
+        try:
+            return poisoned_table(raw.decode(), rng).encode("utf-8", "replace")
+        except ValueError:  # words where numbers are scaled
+            return damaged(raw, rng)
+    return damaged(raw, rng)
+
+
+def use(name: str, path: Path) -> None:
+    """Read a file, and write what would be written of it."""
+    student = Student(
+        id="s1", name="Jane Doe", number="7", grade=make_grade("a"), by_hand=frozenset()
+    )
+    if name == "survey.csv":
+        survey = read_survey(path)
+        json.dumps(survey_dict(survey), allow_nan=False)
+        survey_text(survey)
+    elif path.stem in ROSTERS:
+        roster = Roster.read(path, platform=path.stem)  # type: ignore[arg-type]
+        roster.filled([student], {"Lab 3": lambda student: "1"})
+    elif name == "late.csv":
+        LateTable.read(path)
+    elif name == "submission_metadata.yml":
+        gradescope_metadata(path.parent)
+    elif name == "rubric.toml":
+        load_rubric(path)
+    elif name == "plan.toml":
+        work = write_work(path.parent / "work", [])
+        plan_path(load_submission(work)).write_bytes(path.read_bytes())
+        load_plan(load_submission(work))
+    elif name == "results.json":
+        compare_drafts(read_results(path), two_cart_analysis())
+    elif name == "gap.json":
+        gap, _ = read_gap(path.read_text(encoding="utf-8", errors="replace"))
+        terminal_verdict(gap)
+        gap_text(gap, two_cart_analysis())
+    elif name == "model.json":
+        prepare_bench(model=path)
+    elif name == "import":
+        work = write_work(path.parent / "work", [])
+        (path.parent / "bench").mkdir()
+        path.rename(path.parent / "bench" / "run.csv")
+        list(Importer(work, path.parent / "bench", observer=Notes()).watch(once=True))
+        load_submission(work)
+
+
+def try_seed(name: str, seed: int) -> None:
+    """Spoil a file and read it: one line of complaint (a rubric's: one a mistake), or none."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / name
+        path.write_bytes(spoilt(name, Random(f"{name} {seed}")))
+        with one_line_at_most() if name != "rubric.toml" else suppress(ConfigError):
+            use(name, path)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_spoilt_file_is_a_complaint_or_a_result(name):
+    """A few seeds of each kind of file."""
+    for seed in range(30):
+        try_seed(name, seed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_no_spoilt_file_ends_in_a_traceback(name):
+    """Thousands of each."""
+    for seed in range(30, 3_000):
+        try_seed(name, seed)
