@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from pipeline.errors import DataError
-from pipeline.gap.account import repeatability
+from pipeline.gap.data.runs import make_run
 from pipeline.gap.document import gap_json
 from pipeline.gap.explain import explain_gap
-from pipeline.gap.fit import fit_model, project
-from pipeline.gap.runs import make_run
-from pipeline.gap.screen import candidates_at, find_teams
-from pipeline.gap.structure import Structure
+from pipeline.gap.fit.levenberg_marquardt import fit_model, project
+from pipeline.gap.fit.structure import Structure
+from pipeline.gap.search.screen import candidates_at, find_teams
 from pipeline.gap.types import Gap
+from pipeline.gap.verdict.account import repeatability
 from pipeline.plant.chain import Chain
 from pipeline.plant.effects import CATALOGUE, find_effect
 from pipeline.results import Record

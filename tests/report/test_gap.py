@@ -9,9 +9,9 @@ import numpy as np
 import pypdf
 import pytest
 from numpy.testing import assert_allclose
+from pipeline.gap.verdict.decision.residual_force import residual_forces
 
 from pipeline.errors import ConfigError
-from pipeline.gap.residual_force import residual_forces
 from pipeline.gap.stored import gap_text, read_gap
 from pipeline.gap.types import (
     FoundEffect,

@@ -4,8 +4,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from pipeline import __version__
-from pipeline.gap.residual_force import ResidualForce, residual_forces
 from pipeline.gap.types import FoundEffect, Gap, RecordGap, Trace
+from pipeline.gap.verdict.decision.residual_force import ResidualForce, residual_forces
 from pipeline.report.document import (
     Block,
     Details,

@@ -10,9 +10,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.gap.fit import Fit, Mapper, evaluate, fit_model, project
-from pipeline.gap.runs import Run
-from pipeline.gap.screen import Suspect, added_signals, extend
+from pipeline.gap.data.runs import Run
+from pipeline.gap.fit.levenberg_marquardt.levenberg_marquardt import (
+    Fit,
+    Mapper,
+    evaluate,
+    fit_model,
+    project,
+)
+from pipeline.gap.search.beam.screen import Suspect, added_signals, extend
 from pipeline.plant.chain import Array
 
 _ELITE, _SCATTERED = 5, 32

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.gap.baseline import fit_locals
-from pipeline.gap.fit import Fit, Mapper
-from pipeline.gap.linearise import simulate_run
-from pipeline.gap.runs import Run
-from pipeline.gap.structure import Candidate
+from pipeline.gap.data.runs import Run
+from pipeline.gap.fit.levenberg_marquardt.baseline import fit_locals
+from pipeline.gap.fit.levenberg_marquardt.levenberg_marquardt import Fit, Mapper
+from pipeline.gap.fit.levenberg_marquardt.linearise import simulate_run
+from pipeline.gap.fit.levenberg_marquardt.structure import Candidate
 from pipeline.plant.effects.base import Effect
 
 AT_FLOOR = 1.15  # chi-square per point below this is noise

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.errors import DataError
-from pipeline.gap.runs import Run, cut_shots, make_run
-from pipeline.gap.split import split, without_twins
+from pipeline.gap.data.runs import Run, cut_shots, make_run
+from pipeline.gap.data.split import split, without_twins
 from pipeline.results import Record
 
 _LAST_SHARE = 0.4  # of a single run is held out

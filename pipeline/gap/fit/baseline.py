@@ -6,11 +6,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from pipeline.gap.fit import Fit, Mapper, fit_model
-from pipeline.gap.linearise import Locals, fresh_locals, simulate_run
-from pipeline.gap.restart import restart_runs
-from pipeline.gap.runs import Run, cut_shots, high_frequency_noise
-from pipeline.gap.structure import Structure
+from pipeline.gap.data.runs import Run, cut_shots, high_frequency_noise
+from pipeline.gap.fit.levenberg_marquardt.levenberg_marquardt import Fit, Mapper, fit_model
+from pipeline.gap.fit.levenberg_marquardt.linearise import Locals, fresh_locals, simulate_run
+from pipeline.gap.fit.levenberg_marquardt.restart import restart_runs
+from pipeline.gap.fit.levenberg_marquardt.structure import Structure
 from pipeline.plant.chain import Array, Chain
 
 SHOT_LENGTH = 0.6  # s; a wrong structure does little harm over it

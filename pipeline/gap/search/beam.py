@@ -5,10 +5,17 @@ from contextlib import suppress
 
 import numpy as np
 
-from pipeline.gap.deadline import OutOfTime
-from pipeline.gap.grow import fit_whole, grow
-from pipeline.gap.hypothesis import BIC_DROP, CONTACT, Bench, Hypothesis, judge, worth_it
-from pipeline.gap.structure import Candidate
+from pipeline.gap.fit.levenberg_marquardt.structure import Candidate
+from pipeline.gap.search.beam.deadline import OutOfTime
+from pipeline.gap.search.beam.grow import fit_whole, grow
+from pipeline.gap.search.beam.hypothesis import (
+    BIC_DROP,
+    CONTACT,
+    Bench,
+    Hypothesis,
+    judge,
+    worth_it,
+)
 
 _BEAM = (2,)  # hypotheses kept after the first step; then one
 _DEPTH = 6  # effects

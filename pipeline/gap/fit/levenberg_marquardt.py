@@ -8,7 +8,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pipeline.gap.linearise import (
+from pipeline.gap.data.runs import Run
+from pipeline.gap.fit.levenberg_marquardt.linearise import (
     Linear,
     Locals,
     fresh_locals,
@@ -18,8 +19,7 @@ from pipeline.gap.linearise import (
     run_cost,
     triangle,
 )
-from pipeline.gap.runs import Run
-from pipeline.gap.structure import Structure
+from pipeline.gap.fit.levenberg_marquardt.structure import Structure
 from pipeline.plant.chain import Array
 
 Mapper = Callable[..., Iterable]

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.gap.runs import high_frequency_noise
+from pipeline.gap.data.runs import high_frequency_noise
 from pipeline.gap.types import Gap, Trace
 from pipeline.plant.chain import Array, Chain
 from pipeline.plant.effects.base import AugmentedChain

@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from pipeline.gap.runs import Run
+from pipeline.gap.data.runs import Run
 from pipeline.plant.chain import Array, Chain
 from pipeline.plant.effects.base import AugmentedChain, Effect, Scales, Term, chain_scales
 from pipeline.plant.tables import Cart, Tables

@@ -4,9 +4,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.gap.fit import Fit, Mapper, evaluate, fit_model
-from pipeline.gap.linearise import Locals, residual_points
-from pipeline.gap.runs import Run
+from pipeline.gap.data.runs import Run
+from pipeline.gap.fit.levenberg_marquardt.levenberg_marquardt import (
+    Fit,
+    Mapper,
+    evaluate,
+    fit_model,
+)
+from pipeline.gap.fit.levenberg_marquardt.linearise import Locals, residual_points
 from pipeline.plant.chain import Array
 from pipeline.plant.tables import Cart
 

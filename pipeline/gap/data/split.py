@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.gap.runs import Run
+from pipeline.gap.data.runs import Run
 
 _SAME_SIZE = 0.06  # relative; sizes closer than this are repeats
 

@@ -1,0 +1,1 @@
+"""What the search amounts to: the verdict, its account, and where the model still departs."""
