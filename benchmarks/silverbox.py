@@ -12,12 +12,12 @@ import time
 from pathlib import Path
 
 import numpy as np
-from pipeline.gap.fit.levenberg_marquardt.linearise import fresh_locals, simulate_run
-from pipeline.gap.fit.levenberg_marquardt.structure import Candidate, Structure
 from scipy.io import loadmat
 
 from pipeline.gap.data.runs import make_run
 from pipeline.gap.explain import explain_gap
+from pipeline.gap.fit.linearise import fresh_locals, simulate_run
+from pipeline.gap.fit.structure import Candidate, Structure
 from pipeline.gap.types import Gap
 from pipeline.results import Record
 

@@ -10,16 +10,16 @@ from threadpoolctl import threadpool_limits
 
 from pipeline.gap.data.runs import Run
 from pipeline.gap.data.sides import prepare, take_sides
-from pipeline.gap.fit.levenberg_marquardt.baseline import fit_baseline, measure_noise
-from pipeline.gap.fit.levenberg_marquardt.levenberg_marquardt import Fit, covariance, fit_model
-from pipeline.gap.fit.levenberg_marquardt.restart import dry_force
-from pipeline.gap.fit.levenberg_marquardt.structure import Candidate
-from pipeline.gap.search.beam.beam import choose, prune, search, steps_to
-from pipeline.gap.search.beam.deadline import Deadline, OutOfTime
-from pipeline.gap.search.beam.grow import fit_whole
-from pipeline.gap.search.beam.hypothesis import Bench, Hypothesis, judge
+from pipeline.gap.fit.baseline import fit_baseline, measure_noise
+from pipeline.gap.fit.levenberg_marquardt import Fit, covariance, fit_model
+from pipeline.gap.fit.restart import dry_force
+from pipeline.gap.fit.structure import Candidate
+from pipeline.gap.search.beam import choose, prune, search, steps_to
+from pipeline.gap.search.deadline import Deadline, OutOfTime
+from pipeline.gap.search.grow import fit_whole
+from pipeline.gap.search.hypothesis import Bench, Hypothesis, judge
 from pipeline.gap.types import FoundEffect, Gap
-from pipeline.gap.verdict.decision.account import (
+from pipeline.gap.verdict.account import (
     chain_std,
     compare_by_record,
     list_effects,
@@ -27,9 +27,9 @@ from pipeline.gap.verdict.decision.account import (
     make_traces,
     repeatability,
 )
-from pipeline.gap.verdict.decision.decision import AS_REPEATS, choose_experiment, reach_verdict
-from pipeline.gap.verdict.decision.offset import find_offset
-from pipeline.gap.verdict.decision.where import find_windows
+from pipeline.gap.verdict.decision import AS_REPEATS, choose_experiment, reach_verdict
+from pipeline.gap.verdict.offset import find_offset
+from pipeline.gap.verdict.where import find_windows
 from pipeline.plant.chain import Chain
 from pipeline.plant.effects import CATALOGUE, find_effect
 from pipeline.plant.effects.base import Effect, Term

@@ -4,8 +4,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from pipeline.gap.verdict.decision.decision import reach_verdict
 
+from pipeline.gap.verdict.decision import reach_verdict
 from pipeline.plant.effects import find_effect
 
 FLOOR = 0.01

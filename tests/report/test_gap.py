@@ -9,7 +9,6 @@ import numpy as np
 import pypdf
 import pytest
 from numpy.testing import assert_allclose
-from pipeline.gap.verdict.decision.residual_force import residual_forces
 
 from pipeline.errors import ConfigError
 from pipeline.gap.stored import gap_text, read_gap
@@ -23,6 +22,7 @@ from pipeline.gap.types import (
     Trace,
     Verdict,
 )
+from pipeline.gap.verdict.residual_force import residual_forces
 from pipeline.plant.augmented import simulate_augmented
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.effects import CATALOGUE, AugmentedChain, Term, find_effect, make_term

@@ -7,10 +7,10 @@ from itertools import pairwise
 import numpy as np
 
 from pipeline.gap.data.runs import Run, cut_shots, high_frequency_noise
-from pipeline.gap.fit.levenberg_marquardt.levenberg_marquardt import Fit, Mapper, fit_model
-from pipeline.gap.fit.levenberg_marquardt.linearise import Locals, fresh_locals, simulate_run
-from pipeline.gap.fit.levenberg_marquardt.restart import restart_runs
-from pipeline.gap.fit.levenberg_marquardt.structure import Structure
+from pipeline.gap.fit.levenberg_marquardt import Fit, Mapper, fit_model
+from pipeline.gap.fit.linearise import Locals, fresh_locals, simulate_run
+from pipeline.gap.fit.restart import restart_runs
+from pipeline.gap.fit.structure import Structure
 from pipeline.plant.chain import Array, Chain
 
 SHOT_LENGTH = 0.6  # s; a wrong structure does little harm over it

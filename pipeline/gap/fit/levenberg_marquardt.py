@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pipeline.gap.data.runs import Run
-from pipeline.gap.fit.levenberg_marquardt.linearise import (
+from pipeline.gap.fit.linearise import (
     Linear,
     Locals,
     fresh_locals,
@@ -19,7 +19,7 @@ from pipeline.gap.fit.levenberg_marquardt.linearise import (
     run_cost,
     triangle,
 )
-from pipeline.gap.fit.levenberg_marquardt.structure import Structure
+from pipeline.gap.fit.structure import Structure
 from pipeline.plant.chain import Array
 
 Mapper = Callable[..., Iterable]

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.gap.data.runs import Run
-from pipeline.gap.fit.levenberg_marquardt.structure import Structure
+from pipeline.gap.fit.structure import Structure
 from pipeline.plant.chain import Array
 from pipeline.plant.kernel import simulate_with_derivatives
 from pipeline.plant.sensitivity import (

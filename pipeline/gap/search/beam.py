@@ -5,10 +5,10 @@ from contextlib import suppress
 
 import numpy as np
 
-from pipeline.gap.fit.levenberg_marquardt.structure import Candidate
-from pipeline.gap.search.beam.deadline import OutOfTime
-from pipeline.gap.search.beam.grow import fit_whole, grow
-from pipeline.gap.search.beam.hypothesis import (
+from pipeline.gap.fit.structure import Candidate
+from pipeline.gap.search.deadline import OutOfTime
+from pipeline.gap.search.grow import fit_whole, grow
+from pipeline.gap.search.hypothesis import (
     BIC_DROP,
     CONTACT,
     Bench,

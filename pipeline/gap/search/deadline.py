@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
-from pipeline.gap.fit.levenberg_marquardt.levenberg_marquardt import Mapper
+from pipeline.gap.fit.levenberg_marquardt import Mapper
 
 
 class OutOfTime(Exception):

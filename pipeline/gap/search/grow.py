@@ -7,11 +7,11 @@ from functools import partial
 import numpy as np
 
 from pipeline.gap.data.runs import Run, cut_shots
-from pipeline.gap.fit.levenberg_marquardt.baseline import SHOT_LENGTH
-from pipeline.gap.fit.levenberg_marquardt.levenberg_marquardt import Fit, fit_model
-from pipeline.gap.fit.levenberg_marquardt.restart import restart_runs
-from pipeline.gap.fit.levenberg_marquardt.structure import Candidate, Structure
-from pipeline.gap.search.beam.hypothesis import (
+from pipeline.gap.fit.baseline import SHOT_LENGTH
+from pipeline.gap.fit.levenberg_marquardt import Fit, fit_model
+from pipeline.gap.fit.restart import restart_runs
+from pipeline.gap.fit.structure import Candidate, Structure
+from pipeline.gap.search.hypothesis import (
     AT_FLOOR,
     CONTACT,
     THINNING,
@@ -19,8 +19,8 @@ from pipeline.gap.search.beam.hypothesis import (
     Hypothesis,
     judge,
 )
-from pipeline.gap.search.beam.rugged import polish, zoom
-from pipeline.gap.search.beam.screen import Suspect, Team, candidates_at, extend, screen
+from pipeline.gap.search.rugged import polish, zoom
+from pipeline.gap.search.screen import Suspect, Team, candidates_at, extend, screen
 from pipeline.plant.chain import Array
 from pipeline.plant.effects import find_effect
 from pipeline.plant.effects.base import Effect

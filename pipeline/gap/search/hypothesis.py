@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.gap.data.runs import Run
-from pipeline.gap.fit.levenberg_marquardt.baseline import fit_locals
-from pipeline.gap.fit.levenberg_marquardt.levenberg_marquardt import Fit, Mapper
-from pipeline.gap.fit.levenberg_marquardt.linearise import simulate_run
-from pipeline.gap.fit.levenberg_marquardt.structure import Candidate
+from pipeline.gap.fit.baseline import fit_locals
+from pipeline.gap.fit.levenberg_marquardt import Fit, Mapper
+from pipeline.gap.fit.linearise import simulate_run
+from pipeline.gap.fit.structure import Candidate
 from pipeline.plant.effects.base import Effect
 
 AT_FLOOR = 1.15  # chi-square per point below this is noise

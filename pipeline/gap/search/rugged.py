@@ -11,14 +11,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.gap.data.runs import Run
-from pipeline.gap.fit.levenberg_marquardt.levenberg_marquardt import (
+from pipeline.gap.fit.levenberg_marquardt import (
     Fit,
     Mapper,
     evaluate,
     fit_model,
     project,
 )
-from pipeline.gap.search.beam.screen import Suspect, added_signals, extend
+from pipeline.gap.search.screen import Suspect, added_signals, extend
 from pipeline.plant.chain import Array
 
 _ELITE, _SCATTERED = 5, 32

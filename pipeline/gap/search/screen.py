@@ -14,9 +14,9 @@ from itertools import combinations, product
 import numpy as np
 
 from pipeline.gap.data.runs import Run
-from pipeline.gap.fit.levenberg_marquardt.levenberg_marquardt import Fit, Mapper, project
-from pipeline.gap.fit.levenberg_marquardt.linearise import Locals, simulate_run
-from pipeline.gap.fit.levenberg_marquardt.structure import Candidate, Structure, bench_scales
+from pipeline.gap.fit.levenberg_marquardt import Fit, Mapper, project
+from pipeline.gap.fit.linearise import Locals, simulate_run
+from pipeline.gap.fit.structure import Candidate, Structure, bench_scales
 from pipeline.plant.chain import Array, Chain
 from pipeline.plant.effects.base import Effect, Parameter
 

@@ -6,9 +6,9 @@ from itertools import pairwise
 import numpy as np
 
 from pipeline.gap.data.runs import Run
-from pipeline.gap.fit.levenberg_marquardt.levenberg_marquardt import Fit
-from pipeline.gap.fit.levenberg_marquardt.linearise import Locals, simulate_run
-from pipeline.gap.search.beam.hypothesis import AT_FLOOR, CONTACT, Bench, Hypothesis
+from pipeline.gap.fit.levenberg_marquardt import Fit
+from pipeline.gap.fit.linearise import Locals, simulate_run
+from pipeline.gap.search.hypothesis import AT_FLOOR, CONTACT, Bench, Hypothesis
 from pipeline.gap.types import FoundEffect, NamedValue, RecordGap, Rival, Trace
 from pipeline.plant.chain import Array
 from pipeline.plant.effects import find_effect

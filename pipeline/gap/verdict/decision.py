@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.gap.fit.levenberg_marquardt.linearise import simulate_run
-from pipeline.gap.search.beam.beam import steps_to
-from pipeline.gap.search.beam.hypothesis import THINNING, Bench, Hypothesis, lowers_error
+from pipeline.gap.fit.linearise import simulate_run
+from pipeline.gap.search.beam import steps_to
+from pipeline.gap.search.hypothesis import THINNING, Bench, Hypothesis, lowers_error
 from pipeline.gap.types import GapWindow, Verdict
 from pipeline.plant.effects import find_effect
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.gap.data.runs import Run
-from pipeline.gap.fit.levenberg_marquardt.linearise import Locals
+from pipeline.gap.fit.linearise import Locals
 from pipeline.plant.chain import Array, Chain
 
 _SURE = 6.0  # standard errors

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.gap.data.runs import Run
-from pipeline.gap.fit.levenberg_marquardt.levenberg_marquardt import Fit
-from pipeline.gap.fit.levenberg_marquardt.linearise import simulate_run
+from pipeline.gap.fit.levenberg_marquardt import Fit
+from pipeline.gap.fit.linearise import simulate_run
 from pipeline.gap.types import GapWindow
 from pipeline.plant.chain import Array
 

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pipeline.gap.types import FoundEffect, RecordGap, Trace
-from pipeline.gap.verdict.decision.residual_force import ResidualForce
+from pipeline.gap.verdict.residual_force import ResidualForce
 from pipeline.plant.chain import Array
 from pipeline.report.figures.style import (
     MEASURED,

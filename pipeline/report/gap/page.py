@@ -5,7 +5,7 @@ from pathlib import Path
 
 from pipeline import __version__
 from pipeline.gap.types import FoundEffect, Gap, RecordGap, Trace
-from pipeline.gap.verdict.decision.residual_force import ResidualForce, residual_forces
+from pipeline.gap.verdict.residual_force import ResidualForce, residual_forces
 from pipeline.report.document import (
     Block,
     Details,
