@@ -43,7 +43,7 @@ def gap_json(gap: Gap, *, position_unit: str = "cm", input_unit: str = "V") -> d
                 {
                     "effect": term.effect.key,
                     "where": term.where,
-                    "parameters": dict(zip(term.effect.names, term.values, strict=True)),
+                    "parameters": term.effect.named(term.values),
                 }
                 for term in gap.model.terms
             ],

@@ -31,7 +31,7 @@ from pipeline.gap.verdict.decision import AS_REPEATS, choose_experiment, reach_v
 from pipeline.gap.verdict.offset import find_offset
 from pipeline.gap.verdict.where import find_windows
 from pipeline.plant.chain import Chain
-from pipeline.plant.effects import CATALOGUE, find_effect
+from pipeline.plant.effects import CATALOGUE
 from pipeline.plant.effects.base import Effect, Term
 from pipeline.results import Record
 
@@ -201,10 +201,11 @@ def _with_offset(
     """
     chosen = path[-1]
     structure = chosen.fit.structure
+    effect = next((effect for effect in bench.catalogue if effect.only_rest), None)
     runs = [*bench.training, *bench.held_out]
     own = [*chosen.fit.locals_, *chosen.held.locals_]
     offset = find_offset(structure.chain(chosen.fit.theta), runs, own)
-    if offset is None:
+    if effect is None or offset is None:
         return path, None
     cart, _, _ = structure.model(chosen.fit.theta).tables()
     if abs(offset.force) < dry_force(cart)[offset.cart - 1]:
@@ -218,7 +219,6 @@ def _with_offset(
         )
         for width in (1e-4, 0.5)
     )
-    effect = find_effect("force_offset")
     candidate = Candidate(
         effect=effect, place=offset.cart, signs=(1.0,), scales=(abs(offset.force),)
     )

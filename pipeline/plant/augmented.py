@@ -16,7 +16,7 @@ from pipeline.plant import kernel
 from pipeline.plant.chain import Array
 from pipeline.plant.effects.base import AugmentedChain
 from pipeline.plant.sensitivity import make_sensitivities
-from pipeline.plant.tables import Cart, Drive, Spring, Tables
+from pipeline.plant.tables import DRY, Cart, Drive, Spring, Tables
 
 _REFINE = 4.0  # divides the kernel's step: this is what others are judged by
 _LONGEST_STEP = 5e-4  # s, of the stepped bench
@@ -24,7 +24,6 @@ _SERIES_REACH = 0.2  # omega h, as in the kernel
 _DAMPED_REACH = 1.0  # c h / m: a light hidden mass may be damped faster than it swings
 _CONTACT_REACH = 0.4  # omega h inside a contact, as in the kernel
 _TO_REST = 40.0  # periods of the slowest motion, heavily damped: nothing is left of the start
-_DRY = [Cart.COULOMB, Cart.STATIC, Cart.LOAD, Cart.DAHL]
 _IN_HAND = 1e-30  # inverse mass of a carried cart: no force moves it, yet its friction is felt
 _RUN_AWAY = "with these effects the carts run away: a spring softens too much, or a force is huge"
 
@@ -69,7 +68,7 @@ def rest_positions(model: AugmentedChain, *, free: Sequence[int] | None = None) 
     n = model.chain.n
     if not (np.any(cart[:, Cart.OFFSET]) and model.chain.is_tied):
         return np.zeros(n)
-    cart[:, _DRY] = 0.0
+    cart[:, DRY] = 0.0
     cart[:, Cart.GAIN] = 1.0
     stiffness, m = model.chain.stiffness, model.chain.m
     cart[:, Cart.DAMPING] = 2.0 * np.sqrt(np.diag(stiffness) * m)
@@ -223,7 +222,7 @@ class SteppedBench:
             force,
             braking,
             h,
-            bool(np.any(self._cart[:, _DRY])),
+            bool(np.any(self._cart[:, DRY])),
             False,  # smooth forces are looked for: a few more additions
             self._switches,
             self._active,

@@ -56,6 +56,8 @@ class Drive(IntEnum):
     CONTACT_DAMPING = 8
 
 
+# Dry friction: what holds a cart at rest, and differs from run to run by a factor of its own.
+DRY = (Cart.COULOMB, Cart.STATIC, Cart.LOAD, Cart.DAHL)
 NO_LIMIT = 1e30  # a saturation nobody reaches
 
 Tables = tuple[Array, Array, Array]

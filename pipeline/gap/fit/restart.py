@@ -5,12 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.gap.data.runs import Run
-from pipeline.gap.fit.levenberg_marquardt import (
-    Fit,
-    Mapper,
-    evaluate,
-    fit_model,
-)
+from pipeline.gap.fit.levenberg_marquardt import Fit, Mapper, evaluate, fit_model
 from pipeline.gap.fit.linearise import Locals, residual_points
 from pipeline.plant.chain import Array
 from pipeline.plant.tables import Cart

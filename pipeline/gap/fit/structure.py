@@ -35,6 +35,11 @@ class Candidate:
         """Effect and place."""
         return self.effect.key, self.place
 
+    def has_signs_of(self, values: Sequence[float]) -> bool:
+        """Whether values are on the sides that the candidate keeps."""
+        sided = zip(self.effect.parameters, self.signs, values, strict=True)
+        return all(sign * value > 0.0 for p, sign, value in sided if p.side)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Structure:
@@ -66,19 +71,18 @@ class Structure:
     @cached_property
     def dry(self) -> tuple[bool, ...]:
         """(n,) on which carts dry friction acts."""
-        places = {c.place for c in self.effects if c.effect.family == "dry friction"}
-        places |= {c.place for c in self.effects if c.effect.key == "load_friction"}
+        places = {c.place for c in self.effects if c.effect.dry}
         return tuple(i + 1 in places for i in range(self.n))
 
     @cached_property
     def has_contact(self) -> bool:
-        """Whether an effect has details that only describe a contact."""
-        return any(not p.reported for c in self.effects for p in c.effect.parameters)
+        """Whether bodies meet."""
+        return any(c.effect.contact for c in self.effects)
 
     @cached_property
     def hidden(self) -> tuple[int, ...]:
         """Indices of the carts that carry a hidden mass."""
-        return tuple(sorted(c.place - 1 for c in self.effects if c.effect.key == "extra_mode"))
+        return tuple(sorted(c.place - 1 for c in self.effects if c.effect.hides_mass))
 
     def span(self, index: int) -> slice:
         """Return where the parameters of an effect stand in the vector."""
@@ -167,8 +171,10 @@ class Structure:
         steps = [np.full(self.base_size, 1e-4)]
         for c in self.effects:
             # Contacts answer to small changes with noise of their own.
-            fine = 1.0 if all(p.reported for p in c.effect.parameters) else 5.0
-            steps.append(fine * np.array([2e-4 if p.signed else 1e-3 for p in c.effect.parameters]))
+            coarse = 5.0 if c.effect.contact else 1.0
+            steps.append(
+                coarse * np.array([2e-4 if p.signed else 1e-3 for p in c.effect.parameters])
+            )
         return np.concatenate(steps)
 
     def reach(self) -> Array:

@@ -8,14 +8,7 @@ import numpy as np
 from pipeline.gap.fit.structure import Candidate
 from pipeline.gap.search.deadline import OutOfTime
 from pipeline.gap.search.grow import fit_whole, grow
-from pipeline.gap.search.hypothesis import (
-    BIC_DROP,
-    CONTACT,
-    Bench,
-    Hypothesis,
-    judge,
-    worth_it,
-)
+from pipeline.gap.search.hypothesis import BIC_DROP, Bench, Hypothesis, judge, worth_it
 
 _BEAM = (2,)  # hypotheses kept after the first step; then one
 _DEPTH = 6  # effects
@@ -77,9 +70,9 @@ def _grow_beam(
 
 def _leads_on(child: Hypothesis, before: float) -> bool:
     """May a further effect still make this one the best? `before` is the chi-square without."""
-    if any(c.effect.key in CONTACT for c in child.added):
+    if any(c.effect.contact for c in child.added):
         return _CONTACT_LAW < child.fit.chi < _CONTACT_STEP * before
-    if any(key in CONTACT for key, _ in child.key) and child.fit.chi < _CONTACT_LAW:
+    if child.has_contact and child.fit.chi < _CONTACT_LAW:
         return False
     # One of two effects may do little by itself.
     return child.size == 1 or child.fit.chi < _STEP * before

@@ -11,18 +11,10 @@ from pipeline.gap.fit.baseline import SHOT_LENGTH
 from pipeline.gap.fit.levenberg_marquardt import Fit, fit_model
 from pipeline.gap.fit.restart import restart_runs
 from pipeline.gap.fit.structure import Candidate, Structure
-from pipeline.gap.search.hypothesis import (
-    AT_FLOOR,
-    CONTACT,
-    THINNING,
-    Bench,
-    Hypothesis,
-    judge,
-)
+from pipeline.gap.search.hypothesis import AT_FLOOR, THINNING, Bench, Hypothesis, judge
 from pipeline.gap.search.rugged import polish, zoom
 from pipeline.gap.search.screen import Suspect, Team, candidates_at, extend, screen
 from pipeline.plant.chain import Array
-from pipeline.plant.effects import find_effect
 from pipeline.plant.effects.base import Effect
 
 _SHORT_LIST = 9  # suspects refitted on pieces
@@ -33,13 +25,11 @@ _BESIDE_THE_FLOOR = 1.5  # … where that one leaves no more than noise
 _IN_THE_RUNNING = 3.0  # times the best sibling's misfit: what may still win when refined
 _TOGETHER = 0.9  # of the best single one's misfit, which a team must leave at most
 _NO_LESS = 1.03  # of the same: what a part of a team leaves that does as well alone
-_HARD = 4.0  # times its stiffness: a spring that much stiffer past a stretch may be a contact
 _POLISHED = 0.1  # of the chi-square without it: a contact that is there explains more
 _NOISE_ALONE = 1.05  # chi-square that no richer law of friction lowers
 _HINT = 2.0  # what the criterion must fall by, by the screen's estimate, to be worth a refit
 _FRICTION_ROUNDS = 2  # of run-by-run friction, the worst runs started anew before each
 _NEARLY_RIGHT = 6.0  # chi-square of the better runs, below which the bad ones are worth a new start
-_RUGGED = ("extra_mode", "slack_spring", *CONTACT)
 _ZOOM_SHARE = 0.15  # of the first suspect's, below which one start must do
 _LEADING = 0.4  # of the first suspect's share, for what is dear to refit
 
@@ -56,8 +46,8 @@ def grow(parent: Hypothesis, bench: Bench) -> Iterator[Hypothesis]:
         if not _is_contact(candidates):
             yield judge(fits[-1][1], bench, added=candidates)
     for candidates, fit in fits[:]:
-        for stop, structure, theta in _stops_like(candidates, fit, bench):
-            fits.append(((stop,), fit_whole(structure, theta, bench)))
+        for other, structure, theta in _lookalikes(candidates, fit, bench):
+            fits.append(((other,), fit_whole(structure, theta, bench)))
     lowest = min((fit.cost for _, fit in fits), default=np.inf)
     contacts: dict[tuple[str, int], Fit] = {}
     for candidates, fit in sorted(fits, key=lambda pair: pair[1].cost):
@@ -91,35 +81,34 @@ def _better_told(
     return False
 
 
-def _stops_like(
+def _lookalikes(
     added: Sequence[Candidate], fit: Fit, bench: Bench
 ) -> Iterator[tuple[Candidate, Structure, Array]]:
-    """Yield the end stop that a wall spring, just added and hard past its stretch, may be."""
-    if [c.effect.key for c in added] != ["slack_spring"]:
+    """Yield what the values of an effect, just added by itself, hint at in its stead."""
+    if len(added) > 1:
         return
-    index = len(fit.structure.effects) - 1
-    spring, structure = added[0].place, fit.structure.without(index)
-    change, stretch = fit.structure.model(fit.theta).terms[index].values
-    chain = fit.structure.chain(fit.theta)
-    # A spring's stretch is its right end's position, or minus its left end's.
-    carts = [
-        (cart, side) for cart, side in ((spring, 1.0), (spring - 1, -1.0)) if 0 < cart <= chain.n
-    ]
-    taken = {c.key for c in structure.effects}
-    if change < _HARD or len(carts) > 1 or ("end_stop", carts[0][0]) in taken:
+    index, chain = len(fit.structure.effects) - 1, fit.structure.chain(fit.theta)
+    term = fit.structure.model(fit.theta).terms[index]
+    hint = term.effect.lookalike(term.effect.named(term.values), term.place, chain)
+    if hint is None or hint.effect not in bench.catalogue:
         return
-    ((cart, side),) = carts
+    structure = fit.structure.without(index)
+    if (hint.effect.key, hint.place) in (c.key for c in structure.effects):
+        return
     base = replace(
         fit, structure=structure, theta=np.delete(fit.theta, np.r_[fit.structure.span(index)])
     )
-    trials = candidates_at(find_effect("end_stop"), cart, runs=bench.training, chain=chain)
-    stop, (_, _, *rest) = next(t for t in trials if t[1][0] * side * stretch > 0.0)
-    values = (side * stretch, change * float(chain.k[spring - 1]), *rest)
-    yield stop, *extend(base, stop, values)
+    for candidate, usual in candidates_at(
+        hint.effect, hint.place, runs=bench.training, chain=chain
+    ):
+        values = hint.effect.named(usual) | hint.values
+        if candidate.has_signs_of(tuple(values.values())):
+            yield candidate, *extend(base, candidate, tuple(values.values()))
+            return
 
 
 def _is_contact(candidates: Sequence[Candidate]) -> bool:
-    return any(candidate.effect.key in CONTACT for candidate in candidates)
+    return any(candidate.effect.contact for candidate in candidates)
 
 
 def _starts(parent: Hypothesis, bench: Bench) -> list[tuple[tuple[Candidate, ...], Fit]]:
@@ -187,14 +176,18 @@ def _short_list(suspects: Sequence[Suspect]) -> list[Suspect]:
     return [
         suspect
         for suspect in suspects[:_SHORT_LIST]
-        if suspect.candidate.effect.key not in CONTACT or suspect.share > _LEADING * top
+        if not suspect.candidate.effect.contact or suspect.share > _LEADING * top
     ]
 
 
 def _needs_starts(candidate: Candidate) -> bool:
     """Would one start not do? The screen cannot scale a trial of a limit to the data either."""
     effect = candidate.effect
-    return effect.key in _RUGGED or effect.parameters[0].neutral is None
+    return _is_rugged(effect) or effect.parameters[0].neutral is None
+
+
+def _is_rugged(effect: Effect) -> bool:
+    return effect.rugged or effect.contact
 
 
 def _short_refit(
@@ -205,7 +198,7 @@ def _short_refit(
     `top` is the share of the gap the first suspect explains.
     """
     several = _needs_starts(suspect.candidate)
-    if suspect.candidate.effect.key in _RUGGED and suspect.share > _ZOOM_SHARE * top:
+    if _is_rugged(suspect.candidate.effect) and suspect.share > _ZOOM_SHARE * top:
         suspect = zoom(start, pieces, suspect, mapper=bench.mapper)
     starts = [extend(start, suspect.candidate, values) for values in suspect.starts]
     starts = starts[:3] if several else [_best_start(starts, pieces, bench)]
@@ -301,7 +294,7 @@ def _grown_friction(
     simpler = [c for c in added if c.effect.key == effect.grows_from]
     at = [structure.effects.index(c) for c in simpler]
     terms = structure.model(simple.theta).terms
-    forces = [terms[index].values[0] for index in at]
+    known = [effect.grown(terms[i].effect.named(terms[i].values)) for i in at]
     chain = structure.chain(simple.theta)
     spans = np.r_[tuple(structure.span(index) for index in at)]
     base = replace(simple, structure=structure.without(*at), theta=np.delete(simple.theta, spans))
@@ -310,8 +303,8 @@ def _grown_friction(
     tried = set()
     for trial in zip(*trials, strict=True):
         starts = tuple(
-            _friction_start(effect, force, values)
-            for force, (_, values) in zip(forces, trial, strict=True)
+            tuple((effect.named(values) | told).values())
+            for told, (_, values) in zip(known, trial, strict=True)
         )
         if starts in tried:
             continue
@@ -333,16 +326,3 @@ def _grown_friction(
     best = min(fits, key=lambda fit: fit.cost)
     fit = fit_whole(best.structure, best.theta, bench)
     return judge(fit, bench, added=best.structure.effects[-len(added) :])
-
-
-def _friction_start(effect: Effect, force: float, values: tuple[float, ...]) -> tuple[float, ...]:
-    """Return start values: the simpler law's force, and trial values for what is new."""
-    start = []
-    for parameter, value in zip(effect.parameters, values, strict=True):
-        if parameter.name == "force":
-            start.append(force)
-        elif parameter.name == "static_force":
-            start.append(1.5 * force)
-        else:
-            start.append(value)
-    return tuple(start)

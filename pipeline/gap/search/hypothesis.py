@@ -10,13 +10,13 @@ from pipeline.gap.fit.baseline import fit_locals
 from pipeline.gap.fit.levenberg_marquardt import Fit, Mapper
 from pipeline.gap.fit.linearise import simulate_run
 from pipeline.gap.fit.structure import Candidate
+from pipeline.plant.effects import find_effect
 from pipeline.plant.effects.base import Effect
 
 AT_FLOOR = 1.15  # chi-square per point below this is noise
 THINNING = 10.0  # neighbouring residuals are not independent: N / 10 count
 BIC_DROP = 20.0  # by which the criterion must fall for one more effect
 _SAME_LAW = 6.0  # … and for one that another cart already has
-CONTACT = ("end_stop", "backlash")
 _ENOUGH_NOISE, _ENOUGH_REPEATS = 2.0, 1.5  # times the floor, or what repeats differ by
 _HELD_OUT_GAIN = 0.95  # an effect must lower the held-out error by this factor …
 _PARTIAL_GAIN = 0.9  # … by this one where too much for a name is left …
@@ -47,6 +47,11 @@ class Hypothesis:
         return frozenset(c.key for c in self.fit.structure.effects)
 
     @property
+    def has_contact(self) -> bool:
+        """Whether bodies meet."""
+        return self.fit.structure.has_contact
+
+    @property
     def size(self) -> int:
         """How many laws act: one of dry friction counts once, on however many carts it acts."""
         effects = self.fit.structure.effects
@@ -60,7 +65,7 @@ class Hypothesis:
         at_bound = (theta <= low + _BOUND_MARGIN) | (theta >= high - _BOUND_MARGIN)
         for index, term in enumerate(structure.model(theta).terms):
             reported = np.array([p.reported for p in term.effect.parameters])
-            values = dict(zip(term.effect.names, term.values, strict=True))
+            values = term.effect.named(term.values)
             if np.any(at_bound[structure.span(index)] & reported):
                 return False
             if not term.effect.genuine(values):
@@ -120,7 +125,8 @@ def judge(fit: Fit, bench: Bench, *, added: Sequence[Candidate] = ()) -> Hypothe
 def lowers_error(child: Hypothesis, parent: Hypothesis, bench: Bench) -> bool:
     """Is the held-out error lower, and by enough where too much for a name is left?"""
     added = child.key - parent.key
-    gain = _PARTIAL_CONTACT if any(key in CONTACT for key, _ in added) else _PARTIAL_GAIN
+    contact = any(find_effect(key).contact for key, _ in added)
+    gain = _PARTIAL_CONTACT if contact else _PARTIAL_GAIN
     return child.error < (1.0 if bench.explains(child) else gain) * parent.error
 
 
@@ -128,8 +134,7 @@ def worth_it(child: Hypothesis, parent: Hypothesis, bench: Bench) -> bool:
     """Does a further effect help on runs the model has not seen?"""
     if not lowers_error(child, parent, bench):
         return False
-    contact = any(effect in CONTACT for effect, _ in parent.key)
-    gain = _CONTACT_GAIN if contact else _HELD_OUT_GAIN
+    gain = _CONTACT_GAIN if parent.has_contact else _HELD_OUT_GAIN
     drop = BIC_DROP if child.size != parent.size else _SAME_LAW
     if child.bic > parent.bic - drop or child.held.chi > gain**2 * parent.held.chi:
         return False

@@ -11,13 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.gap.data.runs import Run
-from pipeline.gap.fit.levenberg_marquardt import (
-    Fit,
-    Mapper,
-    evaluate,
-    fit_model,
-    project,
-)
+from pipeline.gap.fit.levenberg_marquardt import Fit, Mapper, evaluate, fit_model, project
 from pipeline.gap.search.screen import Suspect, added_signals, extend
 from pipeline.plant.chain import Array
 

@@ -76,7 +76,6 @@ def screen(
     whole: Sequence[Run],
     springs: Sequence[bool],
     catalogue: Sequence[Effect],
-    skip: Sequence[str] = ("force_offset",),
     mapper: Mapper = map,
 ) -> tuple[list[Suspect], list[Team]]:
     """Return all suspects, one for each effect and place, and the best teams of them.
@@ -85,14 +84,14 @@ def screen(
     give the typical sizes.
     """
     taken = {c.key for c in fit.structure.effects}
-    dry = {c.place for c in fit.structure.effects if c.effect.family == "dry friction"}
+    families = {(c.effect.family, c.place) for c in fit.structure.effects if c.effect.family}
     chain = fit.structure.chain(fit.theta)
     trials: list[tuple[Candidate, tuple[float, ...]]] = []
     for effect in catalogue:
-        if effect.grows_from or effect.key in skip:
+        if effect.grows_from or effect.only_rest:
             continue  # what grows from a simpler effect starts from that one's fit
         for place in shown_places(effect, springs, whole):
-            if (effect.key, place) in taken or (effect.family == "dry friction" and place in dry):
+            if (effect.key, place) in taken or (effect.family, place) in families:
                 continue
             trials += candidates_at(effect, place, runs=whole, chain=chain)
     signals = added_signals(fit, runs, trials, mapper=mapper)

@@ -8,7 +8,7 @@ import numpy as np
 from pipeline.gap.data.runs import Run
 from pipeline.gap.fit.levenberg_marquardt import Fit
 from pipeline.gap.fit.linearise import Locals, simulate_run
-from pipeline.gap.search.hypothesis import AT_FLOOR, CONTACT, Bench, Hypothesis
+from pipeline.gap.search.hypothesis import AT_FLOOR, Bench, Hypothesis
 from pipeline.gap.types import FoundEffect, NamedValue, RecordGap, Rival, Trace
 from pipeline.plant.chain import Array
 from pipeline.plant.effects import find_effect
@@ -53,7 +53,7 @@ def list_effects(
             key=lambda pair: pair[1].bic,
         )
         # In one of many narrow valleys the curvature says nothing of the error.
-        rugged = term.effect.key in CONTACT and final.chi > AT_FLOOR
+        rugged = term.effect.contact and final.chi > AT_FLOOR
         values = _named_values(
             term,
             None if std is None or rugged else std[structure.span(index)],

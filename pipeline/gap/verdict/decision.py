@@ -144,17 +144,14 @@ def _same_thing(rival: Hypothesis, chosen: Hypothesis, *, sample_time: float) ->
 def _same_law(
     mine: tuple[str, int], other: tuple[str, int], chosen: Hypothesis, *, sample_time: float
 ) -> bool:
+    effect = find_effect(mine[0])
     if find_effect(other[0]).grows_from == mine[0] and other[1] == mine[1]:
         return True
-    names = {mine[0], other[0]}
-    if names == {"sensor_gain"}:
-        return True  # only ratios of gains show
-    if names == {"input_delay", "actuator_lag"}:
-        term = next(
-            t for t in chosen.fit.structure.model(chosen.fit.theta).terms if t.effect.key == mine[0]
-        )
-        return abs(term.values[0]) < 0.5 * sample_time
-    return False
+    if effect.same_as != other[0]:
+        return False
+    places = [candidate.key for candidate in chosen.fit.structure.effects]
+    term = chosen.fit.structure.model(chosen.fit.theta).terms[places.index(mine)]
+    return abs(term.values[0]) < effect.same_below * sample_time
 
 
 def choose_experiment(

@@ -3,6 +3,10 @@
 from pipeline.plant.effects.base import Effect, Parameter
 from pipeline.plant.tables import Drive
 
+# Sample times: a delay and a lag of one size T are late by the same mean time, and differ first by
+# T²/2 in the second moment, an eighth of a sample squared.
+_MUCH_SHORTER = 0.5
+
 DRIVE_DAMPING = Effect(
     key="drive_damping",
     title="Braking by the driven motor",
@@ -97,6 +101,8 @@ DELAY = Effect(
     reference="K. J. Åström, B. Wittenmark, Computer-Controlled Systems, section 2.3",
     axis="time",
     equivalent="A lag much shorter than the sample time.",
+    same_as="actuator_lag",
+    same_below=_MUCH_SHORTER,
 )
 
 LAG = Effect(
@@ -121,6 +127,8 @@ LAG = Effect(
     reference="K. J. Åström, R. M. Murray, Feedback Systems, section 3.2",
     axis="frequency",
     equivalent="A delay, where the time constant is much shorter than the sample time.",
+    same_as="input_delay",
+    same_below=_MUCH_SHORTER,
 )
 
 BACKLASH = Effect(

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cached_property
 from itertools import product
 from typing import Literal
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from pipeline.errors import ConfigError
 from pipeline.plant.chain import Array, Chain
-from pipeline.plant.tables import Cart, Drive, Tables, linear_tables
+from pipeline.plant.tables import DRY, Cart, Drive, Tables, linear_tables
 
 Place = Literal["cart", "spring", "input"]
 Axis = Literal["velocity", "position", "stretch", "input", "time", "frequency"]
@@ -82,9 +83,15 @@ class Effect:
     axis : what to plot the force (or reading) against, to see it.
     between_carts : on a spring to a wall it would be part of the linear chain.
     fewest_carts : with fewer it is part of the linear chain.
-    family : effects of one family exclude each other at one place.
+    family : effects of one family exclude each other at one place; on several carts they are one.
     grows_from : the simpler effect whose fit is the start of this one's.
+    grown : the values that the simpler effect's tell of this one's; the others are tried.
+    rugged : its misfit has many valleys, so that a fit needs several starts.
+    only_rest : shows in nothing but where the carts rest, like an encoder's zero; found from those.
     equivalent : what the data cannot tell from it, and why.
+    same_as, same_below : the key of an effect that provably cannot be told from it while its first
+        parameter is below this many sample times.
+    lookalike : another effect that the values at a place of a chain hint at, to be fitted beside.
     genuine : False where the values have degenerated into another law.
     """
 
@@ -104,7 +111,15 @@ class Effect:
     between_carts: bool = False
     fewest_carts: int = 1
     grows_from: str | None = None
+    grown: Callable[[Mapping[str, float]], dict[str, float]] = lambda p: {}
+    rugged: bool = False
+    only_rest: bool = False
     equivalent: str = ""
+    same_as: str = ""
+    same_below: float = np.inf
+    lookalike: "Callable[[Mapping[str, float], int, Chain], Lookalike | None]" = (
+        lambda p, place, chain: None
+    )
     genuine: Callable[[Mapping[str, float]], bool] = lambda p: True
 
     @property
@@ -123,6 +138,29 @@ class Effect:
     def names(self) -> tuple[str, ...]:
         """The parameters' names, in order."""
         return tuple(p.name for p in self.parameters)
+
+    @property
+    def contact(self) -> bool:
+        """Whether bodies meet: it then has details of the contact that nobody asks for."""
+        return not all(p.reported for p in self.parameters)
+
+    @cached_property
+    def _writes(self) -> frozenset[IntEnum]:
+        return frozenset(self.columns(dict.fromkeys(self.names, 1.0)))
+
+    @property
+    def dry(self) -> bool:
+        """Whether it is friction whose size differs from run to run."""
+        return not self._writes.isdisjoint(DRY)
+
+    @property
+    def hides_mass(self) -> bool:
+        """Whether something moves that no sensor reads."""
+        return Cart.HIDDEN_MASS in self._writes
+
+    def named(self, values: Sequence[float]) -> dict[str, float]:
+        """Return parameter values by their names."""
+        return dict(zip(self.names, values, strict=True))
 
     def places(self, springs: Sequence[bool]) -> tuple[int, ...]:
         """Return where it can sit on a bench: cart or spring numbers, or 0 for the input.
@@ -148,7 +186,7 @@ class Effect:
     def fill(self, tables: Tables, place: int, values: Sequence[float]) -> None:
         """Write this effect into the simulator's tables."""
         cart, spring, drive = tables
-        columns = self.columns(dict(zip(self.names, values, strict=True)))
+        columns = self.columns(self.named(values))
         for column, value in columns.items():
             if isinstance(column, Drive):
                 drive[column] = value
@@ -156,6 +194,15 @@ class Effect:
                 cart[place - 1, column] = value
             else:
                 spring[place - 1, column] = value
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lookalike:
+    """An effect at a place, with those of its values that are known."""
+
+    effect: Effect
+    place: int
+    values: dict[str, float]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,6 +3,7 @@
 from pipeline.plant.effects.base import Effect, Parameter, Scales
 from pipeline.plant.tables import Cart
 
+_BREAKAWAY = 1.5  # times the sliding force: a start in the middle of what dry surfaces show
 _LEAST_SLIDING = 0.01  # of the force at rest
 
 
@@ -72,6 +73,7 @@ STICTION = Effect(
     axis="velocity",
     family="dry friction",
     grows_from="coulomb_friction",
+    grown=lambda p: {"force": p["force"], "static_force": _BREAKAWAY * p["force"]},
     # Without a drop it is Coulomb's law; without sliding friction no dry surface behaves like it.
     genuine=lambda p: _LEAST_SLIDING * p["static_force"] < p["force"] < p["static_force"],
 )
@@ -100,6 +102,7 @@ PRESLIDING = Effect(
     axis="velocity",
     family="dry friction",
     grows_from="coulomb_friction",
+    grown=lambda p: {"force": p["force"]},
 )
 
 LOAD = Effect(
@@ -173,5 +176,6 @@ OFFSET = Effect(
     "changes with the springs that carry it.",
     reference="statics of the chain",
     axis="position",
+    only_rest=True,
     equivalent="The encoder zero, in one configuration of held carts alone.",
 )

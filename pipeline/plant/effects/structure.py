@@ -70,6 +70,7 @@ SENSOR_GAIN = Effect(
     reference="statics of the chain",
     axis="position",
     fewest_carts=2,
+    same_as="sensor_gain",
     equivalent="Another cart's gain: only ratios show, and none without a spring at both ends.",
 )
 
@@ -118,4 +119,5 @@ EXTRA_MODE = Effect(
     deciding_run="A sweep through the extra resonance; then hold the suspect part by hand.",
     reference="J. P. Den Hartog, Mechanical Vibrations, section 3.2",
     axis="frequency",
+    rugged=True,
 )

@@ -1,0 +1,20 @@
+"""The search knows effects by what they say of themselves, never by their names."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import pipeline.gap
+from pipeline.plant.effects import CATALOGUE
+
+MODULES = sorted(Path(pipeline.gap.__path__[0]).rglob("*.py"))
+NAMES = {name for effect in CATALOGUE for name in (effect.key, effect.family) if name}
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: path.stem)
+def test_no_effect_is_written_in_the_search(path):
+    """Neither a key nor a family of the catalogue is a string of its own anywhere in it."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    written = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
+    assert not NAMES & {text for text in written if isinstance(text, str)}
