@@ -29,15 +29,15 @@ import psutil
 
 from pipeline.grading.batch.batch_run import grade_class
 from pipeline.grading.batch.runner import Limits, grade_batch, run_here
-from pipeline.grading.grade import grade_text
 from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradings import Prints
 from pipeline.grading.intake.hand_ins import find_hand_ins
-from pipeline.grading.outcome import Prints
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.grading.similarity.prints import fingerprint
 from pipeline.grading.similarity.shared import find_shared
 from pipeline.ingest.read import read_data
 from pipeline.results import Record
+from pipeline.schemas.grade import grade_text
 from pipeline.submission import load_submission
 from pipeline.synthesis import COUNT, write_submission
 from pipeline.synthesis.hidden import prepare_bench, write_bench

@@ -15,7 +15,7 @@ from scipy.io import savemat
 from pipeline.exchange.frames import RESPONSE, record_series, tables
 from pipeline.output import csv_text, own_folder, write_file
 from pipeline.results import Analysis, Estimate, FrequencyResponse
-from pipeline.results_json import plain_json
+from pipeline.schemas.base import plain_json
 
 if TYPE_CHECKING:
     import pandas as pd

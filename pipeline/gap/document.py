@@ -4,6 +4,8 @@ from typing import Any
 
 from pipeline.gap.types import FoundEffect, Gap, GapWindow, NamedValue, Rival
 from pipeline.plant.chain import Chain
+from pipeline.schemas import gap as schema
+from pipeline.schemas.base import fields_of
 
 SCHEMA = "cartlab-gap/1"
 
@@ -16,19 +18,9 @@ def gap_json(gap: Gap, *, position_unit: str = "cm", input_unit: str = "V") -> d
         "complete": gap.complete,
         "effects": [_effect(found) for found in gap.effects],
         "suspects": [_rival(rival) for rival in gap.suspects],
-        "gap": {"baseline": gap.baseline, "final": gap.final, "noise_floor": gap.noise_floor},
+        "gap": fields_of(schema.Errors, gap),
         "repeatability": gap.repeatability,
-        "by_record": [
-            {
-                "experiment": r.experiment,
-                "cart": r.cart,
-                "held_out": r.held_out,
-                "baseline": r.baseline,
-                "final": r.final,
-                "noise_floor": r.noise_floor,
-            }
-            for r in gap.by_record
-        ],
+        "by_record": [fields_of(schema.RecordErrors, one) for one in gap.by_record],
         "where": [_window(window) for window in gap.where],
         "left": [_window(window) for window in gap.left],
         "next_experiment": gap.next_experiment,
@@ -53,40 +45,26 @@ def gap_json(gap: Gap, *, position_unit: str = "cm", input_unit: str = "V") -> d
 
 
 def _effect(found: FoundEffect) -> dict[str, Any]:
-    return {
-        "effect": found.effect.key,
-        "where": found.where,
-        "parameters": {name: _value(value) for name, value in found.parameters.items()},
-        "details": {name: _value(value) for name, value in found.details.items()},
-        "confidence": found.confidence,
-        "nrmse_before": found.nrmse_before,
-        "nrmse_after": found.nrmse_after,
-        "rivals": [_rival(rival) for rival in found.rivals],
-    }
+    return fields_of(
+        schema.Effect,
+        found,
+        effect=found.effect.key,
+        parameters=_values(found.parameters),
+        details=_values(found.details),
+        rivals=[_rival(rival) for rival in found.rivals],
+    )
+
+
+def _values(values: dict[str, NamedValue]) -> dict[str, Any]:
+    return {name: fields_of(schema.Value, value) for name, value in values.items()}
 
 
 def _window(window: GapWindow) -> dict[str, Any]:
-    return {
-        "experiment": window.experiment,
-        "cart": window.cart,
-        "from": window.start,
-        "to": window.end,
-        "what": window.what,
-        "share": window.share,
-    }
+    return fields_of(schema.Window, window, from_=window.start, to=window.end)
 
 
 def _rival(rival: Rival) -> dict[str, Any]:
-    return {
-        "effect": rival.effect.key,
-        "where": rival.where,
-        "nrmse_after": rival.nrmse_after,
-        "confidence": rival.confidence,
-    }
-
-
-def _value(value: NamedValue) -> dict[str, Any]:
-    return {"value": value.value, "std": value.std, "unit": value.unit}
+    return fields_of(schema.Rival, rival, effect=rival.effect.key)
 
 
 def _chain(chain: Chain) -> dict[str, list[float]]:

@@ -1,45 +1,35 @@
 """`gap.json` as a file: written with the model's units and the data's hashes, and read back."""
 
-import json
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
 
-from pipeline import __version__
 from pipeline.errors import ConfigError
 from pipeline.gap.document import gap_json
 from pipeline.gap.types import FoundEffect, Gap, GapWindow, NamedValue, RecordGap, Rival
 from pipeline.plant.chain import Chain
 from pipeline.plant.effects import AugmentedChain, Term, find_effect
 from pipeline.results import Analysis
-from pipeline.results_json import plain_json
+from pipeline.results_json import chain_entry, provenance
+from pipeline.schemas.base import fields_of, json_text
 from pipeline.schemas.gap import Gap as GapDocument
+from pipeline.schemas.gap import GapSubmission
 from pipeline.submission.complaints import quote
 
 
 def gap_text(gap: Gap, analysis: Analysis) -> str:
     """Return `gap.json` as text, numbers at ten significant digits: same input, same bytes."""
     position, drive = analysis.position_unit, analysis.input_unit
-    chain = gap.model.chain
     document = gap_json(gap, position_unit=position, input_unit=drive) | {
-        "submission": {"title": analysis.title, "carts": analysis.carts},
-        "springs": list(analysis.springs),
-        "chain": {
-            "m": chain.m,
-            "c": chain.c,
-            "k": chain.k,
-            "units": {
-                "m": f"{drive} s^2/{position}",
-                "c": f"{drive} s/{position}",
-                "k": f"{drive}/{position}",
-            },
-        },
+        "submission": fields_of(GapSubmission, analysis),
+        "springs": analysis.springs,
+        "chain": chain_entry(gap.model.chain, position=position, drive=drive),
         "chain_std": gap.chain_std,
-        "provenance": {"version": __version__, "files": dict(sorted(analysis.files.items()))},
+        "provenance": provenance(analysis),
     }
-    return json.dumps(plain_json(document), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    return json_text(document)
 
 
 def read_gap(text: str) -> tuple[Gap, dict[str, str]]:

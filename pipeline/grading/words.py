@@ -1,7 +1,7 @@
 """The grading in words: what each flag is called, and where a student looks."""
 
-from pipeline.grading.grade import Code, Outcome
 from pipeline.report.document import Tone
+from pipeline.schemas.grade import Code, Outcome
 
 TITLES: dict[Code, str] = {
     "hz_for_rad_s": "Hz where rad/s is asked",

@@ -1,8 +1,13 @@
-"""What all JSON files share."""
+"""What all JSON files share: their smaller tables, how they are filled in, and how written."""
 
+import json
+import math
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
+
+_DIGITS = 10  # significant: below that, processors and library versions differ
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
@@ -76,3 +81,37 @@ def json_schema(model: type[Document], *, title: str) -> dict[str, Any]:
         "title": title,
         "$defs": dict(sorted(definitions.items())),
     }
+
+
+def fields_of(model: type[Document], source: object, **made: Any) -> dict[str, Any]:
+    """Return what a table of a file holds: each field as made, else the attribute of its name."""
+    return {
+        own.alias or name: made[name] if name in made else getattr(source, name)
+        for name, own in model.model_fields.items()
+    }
+
+
+def json_text(document: Any) -> str:
+    """Return a file as text: same numbers, same bytes."""
+    return json.dumps(plain_json(document), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def plain_json(value: Any) -> Any:
+    """Return JSON's own types, floats at `_DIGITS` significant digits, NaN and infinity as None."""
+    match value:
+        case dict():
+            return {key: plain_json(item) for key, item in value.items()}
+        case list() | tuple():
+            return [plain_json(item) for item in value]
+        case np.ndarray():
+            return plain_json(value.tolist())
+        case bool() | None | str() | int():
+            return value
+        case np.bool_():
+            return bool(value)
+        case np.integer():
+            return int(value)
+        case _ if math.isfinite(value):
+            return float(f"{value:.{_DIGITS}g}") + 0.0  # no minus zero
+        case _:
+            return None

@@ -1,10 +1,10 @@
-"""`grade.json`, schema `cartlab-grade/1`."""
+"""The grade of a submission as it is made, stored and published: `grade.json`."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
-from pipeline.schemas.base import Document
+from pipeline.schemas.base import Document, json_text
 
 Outcome = Literal["pass", "partial", "fail", "skip"]
 Code = Literal[
@@ -28,6 +28,7 @@ Code = Literal[
     "shared_data",
     "data_problem",
 ]
+CODES: tuple[Code, ...] = get_args(Code)
 Values = dict[str, Any]  # numbers, texts, or lists of them
 
 
@@ -67,20 +68,42 @@ class Override(Document):
 class Grade(Document):
     """The grade of one submission."""
 
-    schema_: Annotated[Literal["cartlab-grade/1"], Field(alias="schema")]
+    model_config = ConfigDict(json_schema_serialization_defaults_required=True)
+
+    schema_: Annotated[Literal["cartlab-grade/1"], Field(alias="schema")] = "cartlab-grade/1"
     submission: str
     authors: Annotated[tuple[str, ...], Field(description="none where names are left out")]
     status: Literal["graded", "failed"]
     points: float
     out_of: float
-    days_late: float
-    deducted: Annotated[float, Field(description="for lateness, already out of `points`")]
-    reason: Annotated[str, Field(description="why it could not be graded, or empty")]
-    criteria: tuple[Criterion, ...]
-    flags: tuple[Flag, ...]
-    notes: tuple[str, ...]
+    days_late: float = 0.0
+    deducted: Annotated[float, Field(description="for lateness, already out of `points`")] = 0.0
+    reason: Annotated[str, Field(description="why it could not be graded, or empty")] = ""
+    criteria: tuple[Criterion, ...] = ()
+    flags: tuple[Flag, ...] = ()
+    notes: tuple[str, ...] = ()
     springs: Annotated[
         tuple[str, ...],
         Field(description="that the recordings ask for and the rubric does not have"),
-    ]
-    overrides: tuple[Override, ...]
+    ] = ()
+    overrides: tuple[Override, ...] = ()
+
+    def with_flags(self, *flags: Flag) -> "Grade":
+        """Return the grade with further flags, in the order of the codes."""
+        together = sorted((*self.flags, *flags), key=lambda flag: CODES.index(flag.code))
+        return self.model_copy(update={"flags": tuple(together)})
+
+
+def grade_text(grade: Grade) -> str:
+    """Return `grade.json` as text; same grade, same bytes."""
+    return json_text(grade.model_dump(by_alias=True))
+
+
+def read_grade(text: str) -> Grade:
+    """Return the grade that a `grade.json` holds.
+
+    Raises
+    ------
+    ValueError : it is none.
+    """
+    return Grade.model_validate_json(text)

@@ -7,7 +7,7 @@ from pydantic import Field
 from pipeline.schemas.base import Document, Margins, Number, Numbers, Provenance, Units
 
 
-class Bench(Document):
+class SolutionSubmission(Document):
     """Which submission it was made from."""
 
     title: str
@@ -54,7 +54,7 @@ class Solution(Document):
     """What a rubric would expect, with tolerances."""
 
     schema_: Annotated[Literal["cartlab-solution/1"], Field(alias="schema")]
-    submission: Bench
+    submission: SolutionSubmission
     parameters: tuple[ExpectedParameter, ...]
     state_space: ExpectedStateSpace | None
     feedback: ReferenceFeedback | None

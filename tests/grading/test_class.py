@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.grading.grade import Grade
 from pipeline.grading.gradebook.class_lines import Line, wrong_springs
 from pipeline.grading.judge.run import grade_submission
 from pipeline.grading.mistakes.state_model import own_chain
 from pipeline.grading.publish.class_page import class_page
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.plant.chain import Chain
+from pipeline.schemas.grade import Grade
 from tests.helpers.grading_class import Team, make_team
 from tests.helpers.grading_slips import SLIPS, scaled
 
@@ -118,6 +118,6 @@ def test_springs_that_the_rubric_does_not_have_accuse_nobody():
     assert [flag.code for flag in grade.flags] == []
     assert grade.points >= 0.95 * grade.out_of
     assert "wall-1" in wrong_springs([grade.springs, ()])
-    lines = [Line.of(grade, by_hand=())]
+    lines = [Line.of(grade)]
     assert "1 of 1 submissions" in class_page(lines, rubric=team.rubric)
     assert wrong_springs([(), ()]) == ""

@@ -16,8 +16,8 @@ from pipeline.grading.batch.runner import Limits
 from pipeline.grading.batch.so_far import Row, class_so_far
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.history import history_text
+from pipeline.grading.gradings import Batch
 from pipeline.grading.intake.hand_ins import find_hand_ins
-from pipeline.grading.outcome import Batch
 from pipeline.grading.publish.outputs import write_outputs
 from pipeline.resources import RUBRICS
 from pipeline.synthesis import write_submission

@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.cli import main
 from pipeline.grading.gradebook.book import Gradebook
-from pipeline.grading.outcome import Batch
+from pipeline.grading.gradings import Batch
 from tests.grading.publish.test_survey import write_paper
 from tests.helpers.grades import make_grade, make_outcome, two_cart_rubric, write_class
 

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from pipeline.grading.batch.worker import Setup, Task, grade_task
-from pipeline.grading.grade import Criterion, Flag, Grade, grade_text
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.schema import FILE
-from pipeline.grading.outcome import Batch, Outcome
+from pipeline.grading.gradings import Batch, Grading
 from pipeline.grading.publish.outputs import write_outputs
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.rubric_file import load_rubric
@@ -22,6 +21,7 @@ from pipeline.report.figures.style import drawing
 from pipeline.report.figures.svg import to_svg
 from pipeline.resources import RUBRICS
 from pipeline.results import FrequencyResponse
+from pipeline.schemas.grade import Criterion, Flag, Grade, grade_text
 
 
 def two_cart_rubric() -> Rubric:
@@ -29,7 +29,7 @@ def two_cart_rubric() -> Rubric:
     return load_rubric(RUBRICS / "throne-2dof.toml")
 
 
-def in_this_process(tasks: Sequence[Task], setup: Setup, out_of: float) -> Iterator[Outcome]:
+def in_this_process(tasks: Sequence[Task], setup: Setup, out_of: float) -> Iterator[Grading]:
     """Run tasks without a worker, which takes longer to start than to grade a small class."""
     rubric = Rubric.model_validate_json(setup.rubric)
     for task in tasks:
@@ -100,7 +100,7 @@ def shared_flag(other: str) -> Flag:
     )
 
 
-def make_outcome(grade: Grade, *, key: str = "", **changes: Any) -> Outcome:
+def make_outcome(grade: Grade, *, key: str = "", **changes: Any) -> Grading:
     """Return the outcome that such a grade comes with."""
     fields: dict[str, Any] = {
         "submission": grade.submission,
@@ -112,7 +112,7 @@ def make_outcome(grade: Grade, *, key: str = "", **changes: Any) -> Outcome:
         "grade": grade_text(grade),
         "fingerprints": grade.submission.encode(),
     }
-    return Outcome(**{**fields, **changes})
+    return Grading(**{**fields, **changes})
 
 
 def write_class(folder: Path, *, anonymous: bool = False) -> Path:

@@ -8,11 +8,11 @@ from functools import cache
 from pathlib import Path
 from types import MappingProxyType
 
-from pipeline.grading.grade import Grade
 from pipeline.grading.judge.run import grade_analysis, under_rubric
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.results import Analysis
+from pipeline.schemas.grade import Grade
 from pipeline.submission import Feedback, Reported, StateSpace, Submission, load_submission
 from pipeline.synthesis import write_submission
 from pipeline.synthesis.hidden import prepare_bench

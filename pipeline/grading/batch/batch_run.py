@@ -19,10 +19,10 @@ from pipeline.grading.batch.runner import (
 )
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.class_lines import wrong_springs
+from pipeline.grading.gradings import Batch
 from pipeline.grading.intake.files import digest
 from pipeline.grading.intake.hand_ins import find_hand_ins
 from pipeline.grading.intake.late_table import LateTable, settle_lateness
-from pipeline.grading.outcome import Batch
 from pipeline.grading.publish.outputs import write_outputs
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.rubric_file import load_rubric

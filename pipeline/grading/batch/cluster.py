@@ -17,10 +17,10 @@ from distributed.worker import Worker as DaskWorker
 
 from pipeline.errors import ConfigError
 from pipeline.grading.batch.runner import Executor, code_version
-from pipeline.grading.batch.worker import Setup, Task, failed, outcome_line, read_outcome
+from pipeline.grading.batch.worker import Setup, Task, failed, grading_line, read_grading
 from pipeline.grading.batch.worker_process import Worker
+from pipeline.grading.gradings import Grading
 from pipeline.grading.intake.files import packed, unpacked
-from pipeline.grading.outcome import Outcome
 
 _CONNECT_LIMIT = 20  # s
 _AHEAD = 2  # tasks under way for every thread of the cluster: none waits, few are in memory
@@ -48,7 +48,7 @@ def run_on(address: str) -> Executor:
             f"{address}: no certificates in Dask's configuration (distributed.comm.tls)"
         )
 
-    def execute(tasks: Sequence[Task], setup: Setup, out_of: float) -> Iterator[Outcome]:
+    def execute(tasks: Sequence[Task], setup: Setup, out_of: float) -> Iterator[Grading]:
         try:
             client = Client(address, timeout=_CONNECT_LIMIT, set_as_default=False)
         except (OSError, TimeoutError) as error:
@@ -90,7 +90,7 @@ class Graders(WorkerPlugin):
             process.close()
         self._folder.cleanup()
 
-    def grade(self, task: Task, archive: bytes) -> Outcome:
+    def grade(self, task: Task, archive: bytes) -> Grading:
         """Write the hand-in down and grade it in a process of its own."""
         try:
             process = self._idle.get_nowait()
@@ -113,7 +113,7 @@ def _grade(task: Task, archive: bytes, plugin: str) -> bytes:
     assert isinstance(graders, Graders)
     if not graders.same_code:
         raise ConfigError("the cluster's workers run another version of cartlab, numpy or scipy")
-    return outcome_line(graders.grade(task, archive))
+    return grading_line(graders.grade(task, archive))
 
 
 def _threads(client: Client) -> int:
@@ -124,7 +124,7 @@ def _threads(client: Client) -> int:
 
 def _through(
     client: Client, tasks: Sequence[Task], *, graders: str, out_of: float
-) -> Iterator[Outcome]:
+) -> Iterator[Grading]:
     """Yield the outcomes as they come; a worker that is lost has its tasks done by another."""
     waiting = list(reversed(tasks))
     under_way: dict[str, Task] = {}
@@ -141,7 +141,7 @@ def _through(
         future = next(answers)
         task = under_way.pop(str(future.key))
         if future.status == "finished":
-            yield read_outcome(future.result())
+            yield read_grading(future.result())
         elif isinstance(error := future.exception(), ConfigError):
             raise error
         else:

@@ -15,21 +15,21 @@ import pipeline
 from pipeline.grading.batch.so_far import Row, class_so_far
 from pipeline.grading.batch.worker import Setup, Task, failed
 from pipeline.grading.batch.worker_process import Worker
-from pipeline.grading.grade import SCHEMA, Flag, Grade
 from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradings import Batch, Grading, Prints
 from pipeline.grading.intake.files import digest
 from pipeline.grading.intake.hand_ins import HandIn
-from pipeline.grading.outcome import Batch, Outcome, Prints, read_grade
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.shared import find_shared, same_recordings, same_team, shared_flag
 from pipeline.output import write_file
+from pipeline.schemas.grade import Flag, Grade, read_grade
 
 TIME_LIMIT = 120.0  # s for each hand-in
 MEMORY_LIMIT = 1_000_000_000  # bytes
 _COMPUTE_WITH = ("numpy", "scipy")
 
 Progress = Callable[[int, int, str], None]
-Executor = Callable[[Sequence[Task], Setup, float], Iterator[Outcome]]
+Executor = Callable[[Sequence[Task], Setup, float], Iterator[Grading]]
 
 
 def _silent(done: int, total: int, what: str) -> None:
@@ -125,12 +125,12 @@ def grade_batch(
 def run_here(*, jobs: int) -> Executor:
     """Return what runs tasks in so many worker processes on this machine."""
 
-    def execute(tasks: Sequence[Task], setup: Setup, out_of: float) -> Iterator[Outcome]:
+    def execute(tasks: Sequence[Task], setup: Setup, out_of: float) -> Iterator[Grading]:
         waiting: queue.SimpleQueue[Task] = queue.SimpleQueue()
         for task in tasks:
             waiting.put(task)
         # At most one outcome a worker waits to be stored: memory stays flat.
-        answers: queue.Queue[Outcome | Exception] = queue.Queue(maxsize=jobs)
+        answers: queue.Queue[Grading | Exception] = queue.Queue(maxsize=jobs)
         stop = threading.Event()
         workers = [Worker(setup, out_of=out_of) for _ in range(min(jobs, len(tasks)))]
         threads = [
@@ -156,7 +156,7 @@ def run_here(*, jobs: int) -> Executor:
 def _work(
     worker: Worker,
     waiting: "queue.SimpleQueue[Task]",
-    answers: "queue.Queue[Outcome | Exception]",
+    answers: "queue.Queue[Grading | Exception]",
     stop: threading.Event,
 ) -> None:
     while not stop.is_set():
@@ -185,7 +185,7 @@ def _task(hand_in: HandIn, *, basis: tuple[str, str, bool]) -> Task:
     """Return the task of a hand-in; its key covers all that the outcome depends on."""
     files = digest(hand_in.sources)
     plain = asdict(hand_in) | {"sources": files}
-    everything = json.dumps([SCHEMA, *basis, plain], sort_keys=True)
+    everything = json.dumps([*basis, plain], sort_keys=True)
     whole = hashlib.sha256(everything.encode("utf-8", "surrogateescape")).hexdigest()
     return Task(
         id=hand_in.id,
@@ -224,7 +224,7 @@ def _shared(
         found = find_shared(batch, earlier=earlier, examples=handed_out)
     flags = {submission: shared_flag(records) for submission, records in found.items()}
     if memory is not None:
-        plain = {name: asdict(flag) for name, flag in flags.items()}
+        plain = {name: flag.model_dump() for name, flag in flags.items()}
         write_file(memory, json.dumps({"compared": compared, "flags": plain}))
     return flags
 
@@ -263,7 +263,7 @@ def _remembered(memory: Path, compared: str) -> dict[str, Flag] | None:
         return None
 
 
-def grades_of(batch: Batch, book: Gradebook) -> Iterator[tuple[Outcome, Grade]]:
+def grades_of(batch: Batch, book: Gradebook) -> Iterator[tuple[Grading, Grade]]:
     """Yield every outcome with its grade, shared data flagged; one at a time in memory."""
     for key in batch.keys:
         outcome = book.known(key)

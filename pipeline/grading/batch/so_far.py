@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradings import Grading, Listed, Prints, content, person
 from pipeline.grading.intake.lms_names import read_owner, same_number
-from pipeline.grading.outcome import Listed, Outcome, Prints, content, person
 from pipeline.grading.similarity.shared import same_recordings
 
 
@@ -24,7 +24,7 @@ class Row:
     reason: str = ""
 
     @classmethod
-    def of(cls, outcome: Outcome) -> "Row":
+    def of(cls, outcome: Grading) -> "Row":
         """Return the row of an outcome."""
         return cls(
             key=outcome.key,

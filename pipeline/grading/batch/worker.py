@@ -17,12 +17,12 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import PipelineError
-from pipeline.grading.grade import Grade, grade_text
+from pipeline.grading.gradings import Grading
 from pipeline.grading.intake.files import Changed, open_submission
 from pipeline.grading.judge.run import Graded, grade_submission
-from pipeline.grading.outcome import Outcome
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.prints import fingerprint
+from pipeline.schemas.grade import Grade, grade_text
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.complaints import quote
 from pipeline.submission.named import named_authors
@@ -53,7 +53,7 @@ class Setup:
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """One hand-in to grade; see `intake.HandIn` and, for the key, `batch.Outcome`.
+    """One hand-in to grade; see `intake.HandIn` and, for the key, `batch.Grading`.
 
     `digest` is of the files that the key is of, "" where nobody asks whether those are graded.
     """
@@ -66,7 +66,7 @@ class Task:
     days_late: float = 0.0
 
 
-def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = False) -> Outcome:
+def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = False) -> Grading:
     """Open, analyse and grade one hand-in; whatever is wrong with it is the outcome's reason."""
     authors: tuple[str, ...] = ()
     reason = detail = ""
@@ -85,7 +85,7 @@ def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = Fal
             )
             records = graded.analysis.records if graded.analysis else ()
             drawn, detail = _figures(submission, graded) if figures else ((), "")
-            return Outcome(
+            return Grading(
                 submission=task.id,
                 authors=graded.grade.authors,
                 key=task.key,
@@ -141,7 +141,7 @@ def failed(
     authors: Sequence[str] = (),
     settled: bool = True,
     detail: str = "",
-) -> Outcome:
+) -> Grading:
     """Return the outcome of a hand-in that could not be graded."""
     reason = "".join(c if c.isprintable() else "�" for c in " ".join(reason.split()))
     grade = Grade(
@@ -153,7 +153,7 @@ def failed(
         days_late=task.days_late,
         reason=reason,
     )
-    return Outcome(
+    return Grading(
         submission=task.id,
         authors=tuple(authors),
         key=task.key,
@@ -170,20 +170,20 @@ def failed(
 # ----------------------------------------------------------------------------- lines
 
 
-def outcome_line(outcome: Outcome) -> bytes:
+def grading_line(outcome: Grading) -> bytes:
     """Return an outcome as one line of JSON."""
     plain = asdict(outcome)
     plain["fingerprints"] = base64.b64encode(outcome.fingerprints).decode()
     return _line(plain)
 
 
-def read_outcome(line: bytes) -> Outcome:
-    """Return the outcome that `outcome_line` wrote."""
+def read_grading(line: bytes) -> Grading:
+    """Return the outcome that `grading_line` wrote."""
     plain: dict[str, Any] = json.loads(line)
     plain["fingerprints"] = base64.b64decode(plain["fingerprints"])
     plain["authors"] = tuple(plain["authors"])
     plain["figures"] = tuple((name, svg) for name, svg in plain["figures"])
-    return Outcome(**plain)
+    return Grading(**plain)
 
 
 def task_line(task: Task | Setup) -> bytes:
@@ -216,7 +216,7 @@ def main() -> None:
             task, rubric=rubric, scratch=Path(setup.scratch), figures=setup.figures
         )
         faulthandler.cancel_dump_traceback_later()
-        answers.write(outcome_line(outcome))
+        answers.write(grading_line(outcome))
         answers.flush()
         if not outcome.settled:
             return  # after a fault a fresh process is surer

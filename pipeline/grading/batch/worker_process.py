@@ -18,10 +18,10 @@ from pipeline.grading.batch.worker import (
     Setup,
     Task,
     failed,
-    read_outcome,
+    read_grading,
     task_line,
 )
-from pipeline.grading.outcome import Outcome
+from pipeline.grading.gradings import Grading
 
 _GLANCE = 0.05  # s between looks at the clock and the memory
 _START_LIMIT = 120.0  # s; a cold start on a busy machine takes ten
@@ -51,7 +51,7 @@ class Worker:
         self._stderr: IO[bytes] | None = None
         self._done = 0
 
-    def run(self, task: Task) -> Outcome:
+    def run(self, task: Task) -> Grading:
         """Return the outcome of a task: a crash or a limit passed is one, too.
 
         Raises
@@ -78,7 +78,7 @@ class Worker:
                 process.wait()
                 return self._fault(task, f"the grader crashed ({_ending(process.returncode)})")
             self._done += 1
-            outcome = read_outcome(line)
+            outcome = read_grading(line)
             if not outcome.settled or self._done >= _TASKS_EACH:
                 self.close()
             if outcome.reason != OUT_OF_MEMORY:
@@ -101,7 +101,7 @@ class Worker:
     def _too_large(self) -> str:
         return f"needed more than {self._setup.memory_limit / 1e9:g} GB of memory"
 
-    def _fault(self, task: Task, reason: str) -> Outcome:
+    def _fault(self, task: Task, reason: str) -> Grading:
         detail = self._said()
         self.close()
         return failed(task, reason, out_of=self._out_of, settled=False, detail=detail)

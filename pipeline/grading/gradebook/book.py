@@ -33,7 +33,7 @@ from pipeline.grading.gradebook.rows import (
     carry_overrides,
     class_list,
     final_entry,
-    known_outcome,
+    known_grading,
     last_named,
     newest_of,
     put_figures,
@@ -50,8 +50,9 @@ from pipeline.grading.gradebook.schema import (
     overrides,
     submissions,
 )
-from pipeline.grading.outcome import Batch, Listed, Outcome, Prints, read_grade
+from pipeline.grading.gradings import Batch, Grading, Listed, Prints
 from pipeline.grading.rubric import Rubric
+from pipeline.schemas.grade import read_grade
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -97,14 +98,14 @@ class Gradebook:
 
     # ------------------------------------------------------------------ while grading
 
-    def known(self, key: str, *, figures: bool = True) -> Outcome | None:
+    def known(self, key: str, *, figures: bool = True) -> Grading | None:
         """Return the newest outcome of this key, None where there is none; or without figures."""
         with self._database.reading() as connection:
-            return known_outcome(
+            return known_grading(
                 connection, key, assignment=self._assignment or "", figures=figures
             )
 
-    def put(self, outcome: Outcome) -> None:
+    def put(self, outcome: Grading) -> None:
         """Add an outcome: durable on return, and nothing of it there before.
 
         Raises
@@ -181,7 +182,7 @@ class Gradebook:
                         "position": position,
                         "submission_id": row.submission_id,
                         "grading_id": row.id,
-                        "shared": json.dumps(asdict(shared)) if shared else "",
+                        "shared": json.dumps(shared.model_dump()) if shared else "",
                         "points": entry.grade.points,
                         "out_of": entry.grade.out_of,
                     }
@@ -258,7 +259,7 @@ class Gradebook:
 
     def to_frame(self) -> "pd.DataFrame":
         """Return the class list, one row a submission and criterion; see `class_frame`."""
-        lines = (Line.of(entry.grade, by_hand=[*entry.overrides]) for entry in self.entries())
+        lines = (Line.of(entry.grade) for entry in self.entries())
         return class_frame(lines, rubric=self.rubric)
 
     def by_other_rubrics(self) -> list[str]:

@@ -1,12 +1,12 @@
 """The class as a table: a line a submission, or a row a submission and criterion."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from math import nan
 from typing import TYPE_CHECKING
 
-from pipeline.grading.grade import Code, Grade, Outcome
 from pipeline.grading.rubric import Rubric
+from pipeline.schemas.grade import Code, Grade, Outcome
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -43,7 +43,7 @@ class Line:
     springs: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, grade: Grade, *, by_hand: Sequence[str]) -> "Line":
+    def of(cls, grade: Grade) -> "Line":
         """Return the line of a grade."""
         return cls(
             name=grade.submission,
@@ -56,7 +56,7 @@ class Line:
             reason=grade.reason,
             criteria={c.id: (c.outcome, c.points) for c in grade.criteria},
             codes=tuple(dict.fromkeys(flag.code for flag in grade.flags)),
-            by_hand=tuple(by_hand),
+            by_hand=tuple(given.criterion for given in grade.overrides),
             springs=grade.springs,
         )
 

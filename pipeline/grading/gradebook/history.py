@@ -15,7 +15,7 @@ from pipeline.grading.gradebook.schema import (
     overrides,
     submissions,
 )
-from pipeline.grading.outcome import read_grade
+from pipeline.schemas.grade import read_grade
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,7 +8,7 @@ from sqlalchemy import Connection, Row, func, insert, select
 
 from pipeline.grading.gradebook.rows import add_row, read_rubric
 from pipeline.grading.gradebook.schema import batches, entries, gradings, submissions
-from pipeline.grading.outcome import person
+from pipeline.grading.gradings import person
 from pipeline.grading.rubric import Rubric
 
 _NAMED = 8  # names of what there is, where none is near

@@ -1,14 +1,15 @@
 """Points given by hand: who, when and why, and the grade with them in."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
 
 from pipeline.errors import ConfigError
-from pipeline.grading.grade import Criterion, Grade
-from pipeline.grading.outcome import person
+from pipeline.grading.gradings import person
 from pipeline.grading.references.tolerance import exact, late_deduction
 from pipeline.grading.rubric import Rubric
+from pipeline.schemas.grade import Criterion, Grade
+from pipeline.schemas.grade import Override as ByHand
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,12 +74,16 @@ def with_overrides(grade: Grade, overrides: Mapping[str, Override], *, rubric: R
             criteria.append(own)
     earned = sum((exact(criterion.points) for criterion in criteria), Fraction(0))
     deducted = late_deduction(earned, late=rubric.late, days_late=grade.days_late)
-    return replace(
-        grade,
-        criteria=tuple(criteria),
-        points=float(earned - deducted),
-        deducted=float(deducted),
-    )
+    changed = {
+        "criteria": tuple(criteria),
+        "points": float(earned - deducted),
+        "deducted": float(deducted),
+        "overrides": tuple(
+            ByHand(criterion=key, points=points, why=overrides[key].why)
+            for key, points in sorted(given.items())
+        ),
+    }
+    return grade.model_copy(update=changed)
 
 
 def _unjudged(id_: str, title: str, out_of: float) -> Criterion:
@@ -90,10 +95,10 @@ def _unjudged(id_: str, title: str, out_of: float) -> Criterion:
 
 def _by_hand(criterion: Criterion, points: float, *, why: str) -> Criterion:
     points = min(points, criterion.out_of)  # the rubric may have asked for more at the time
-    return replace(
-        criterion,
-        points=points,
-        outcome="pass" if points >= criterion.out_of else "partial" if points > 0 else "fail",
-        message=f"{criterion.message} Set by hand from {criterion.points:g} to {points:g} "
+    changed = {
+        "points": points,
+        "outcome": "pass" if points >= criterion.out_of else "partial" if points > 0 else "fail",
+        "message": f"{criterion.message} Set by hand from {criterion.points:g} to {points:g} "
         f"of {criterion.out_of:g}: {why}",
-    )
+    }
+    return criterion.model_copy(update=changed)

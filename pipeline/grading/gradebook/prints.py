@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from sqlalchemy import select
 
 from pipeline.grading.gradebook.schema import Database, gradings, submissions
-from pipeline.grading.outcome import Listed, Prints
+from pipeline.grading.gradings import Listed, Prints
 
 _PAGE = 100  # rows read at a time: memory stays flat, and a writer need not wait long
 

@@ -9,7 +9,6 @@ from pydantic import ValidationError
 from sqlalchemy import Connection, Row, Select, Table, insert, select
 
 from pipeline.errors import ConfigError
-from pipeline.grading.grade import Flag, Grade
 from pipeline.grading.gradebook.override import Override, with_overrides
 from pipeline.grading.gradebook.schema import (
     entries,
@@ -18,8 +17,9 @@ from pipeline.grading.gradebook.schema import (
     overrides,
     submissions,
 )
-from pipeline.grading.outcome import Outcome, read_grade
+from pipeline.grading.gradings import Grading
 from pipeline.grading.rubric import Rubric
+from pipeline.schemas.grade import Flag, Grade, read_grade
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,16 +70,16 @@ def read_figures(connection: Connection, grading: int) -> tuple[tuple[str, str],
     return tuple((name, zlib.decompress(svg).decode()) for name, svg in rows)
 
 
-def known_outcome(
+def known_grading(
     connection: Connection, key: str, *, assignment: str, figures: bool
-) -> Outcome | None:
+) -> Grading | None:
     """Return the newest outcome of a key, None where there is none; or without its figures."""
     newest = select(gradings, submissions.c.name).join(submissions)
     newest = newest.where(gradings.c.key == key, submissions.c.assignment == assignment)
     row = connection.execute(newest.order_by(gradings.c.id.desc()).limit(1)).one_or_none()
     if row is None:
         return None
-    return Outcome(
+    return Grading(
         submission=row.name,
         authors=tuple(json.loads(row.authors)),
         key=row.key,
@@ -193,10 +193,7 @@ def carry_overrides(connection: Connection, moved: Mapping[str, str], *, assignm
 
 def read_flag(text: str) -> Flag | None:
     """Return the flag for shared data of a line of the class list, None where there is none."""
-    if not text:
-        return None
-    document = json.loads(text)
-    return Flag(**{**document, "parameters": tuple(document["parameters"])})
+    return Flag.model_validate_json(text) if text else None
 
 
 def read_rubric(batch: Row) -> Rubric:

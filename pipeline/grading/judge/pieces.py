@@ -2,8 +2,8 @@
 
 from collections.abc import Collection
 
-from pipeline.grading.grade import Flag
 from pipeline.grading.rubric import RequiredRuns, Rubric, matching
+from pipeline.schemas.grade import Flag
 from pipeline.submission import Experiment, Submission
 
 # Runs that serve as well: a ring-down after a step is a decay, a reduced table holds all dwells.

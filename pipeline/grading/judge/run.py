@@ -2,11 +2,10 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
 
 from pipeline.errors import SubmissionError
-from pipeline.grading.grade import CODES, Criterion, Flag, Grade, Outcome
 from pipeline.grading.judge.checks import judge
 from pipeline.grading.judge.pieces import missing_flag
 from pipeline.grading.judge.work import Work
@@ -22,6 +21,7 @@ from pipeline.grading.references.tolerance import exact, late_deduction, roundin
 from pipeline.grading.rubric import Rubric
 from pipeline.ingest.columns import conversion
 from pipeline.results import Analysis
+from pipeline.schemas.grade import CODES, Criterion, Flag, Grade, Outcome
 from pipeline.submission import Experiment, InputOverride, Reported, Submission, System
 from pipeline.workflow import analyse
 
@@ -65,7 +65,7 @@ def grade_submission(
         asked = f"these recordings ask for springs that the rubric has not: {', '.join(springs)}"
         notes = (*notes, f"{asked}; judged with them")
     grade = grade_analysis(submission, analysis, rubric=rubric, name=name, days_late=days_late)
-    grade = replace(grade, springs=springs, notes=(*notes, *grade.notes))
+    grade = grade.model_copy(update={"springs": springs, "notes": (*notes, *grade.notes)})
     return Graded(grade=grade, analysis=analysis)
 
 

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.grading.grade import Code
 from pipeline.grading.mistakes.step_turns import StepTurns, step_turns
 from pipeline.grading.references.reference import Reference, is_explained
 from pipeline.grading.rubric import is_damping
 from pipeline.names import read_name
 from pipeline.results import Analysis
+from pipeline.schemas.grade import Code
 
 _TURN = 2 * math.pi
 _LOG10 = math.log10(math.e)

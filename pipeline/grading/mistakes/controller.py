@@ -8,7 +8,6 @@ from decimal import Decimal
 import numpy as np
 
 from pipeline.errors import DataError
-from pipeline.grading.grade import Flag
 from pipeline.grading.mistakes.loop_numbers import LoopNumbers, loop_numbers
 from pipeline.grading.mistakes.state_model import own_chain
 from pipeline.grading.references.reference import is_explained
@@ -17,6 +16,7 @@ from pipeline.names import read_name
 from pipeline.plant.chain import Array, Chain
 from pipeline.plant.robustness import MASS_SPRING_ERROR, level_error_percent, static_levels
 from pipeline.results import Analysis
+from pipeline.schemas.grade import Flag
 from pipeline.submission import Design, StateFeedback, Submission
 from pipeline.workflow import reference_design
 

@@ -7,12 +7,12 @@ from decimal import Decimal
 from fractions import Fraction
 from typing import Literal
 
-from pipeline.grading.grade import Code
 from pipeline.grading.mistakes.catalogue import Mistake
 from pipeline.grading.references.reference import Reference
 from pipeline.grading.references.tolerance import half_digit, percent_off
 from pipeline.grading.rubric import is_damping
 from pipeline.names import read_name
+from pipeline.schemas.grade import Code
 
 SIGMAS = 3.0  # standard errors of the recordings' own number that are no mistake
 _NEAR = 0.1  # relative: as far off is an honest first estimate, with a mistake in it or without

@@ -4,10 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from decimal import Decimal
 
-from pipeline.grading.grade import Flag
 from pipeline.grading.references.tolerance import as_typed, rounding
 from pipeline.names import read_name
 from pipeline.plant.laws import HEAVY_DAMPING, orders
+from pipeline.schemas.grade import Flag
 
 # How far an order may be broken: fitted numbers are good to some percent, and first estimates of
 # resonances and nulls are read off a plot.

@@ -5,11 +5,11 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from pipeline.checks.recordings import SCALES, why_other_frequency
-from pipeline.grading.grade import Flag
 from pipeline.grading.references.reference import is_explained
 from pipeline.ingest.channels import saturation
 from pipeline.ingest.inspect import line_frequency
 from pipeline.results import Analysis, Record
+from pipeline.schemas.grade import Flag
 
 _FREQUENCY = 0.08  # relative: a stated frequency further from that of the input is another run's
 

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.grading.grade import Code, Flag
 from pipeline.grading.mistakes.transient import early_readings
 from pipeline.grading.references.reference import is_explained
 from pipeline.plant.chain import Array
 from pipeline.results import Analysis, SinePoint
+from pipeline.schemas.grade import Code, Flag
 
 _SAME_FREQUENCY = 0.02  # relative: a row of the table is of this dwell
 _MET = 0.06  # relative: a ratio read off the right way, or by one slip

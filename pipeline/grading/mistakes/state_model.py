@@ -8,12 +8,12 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.grading.grade import Flag
 from pipeline.grading.references.reference import Reference
 from pipeline.grading.references.tolerance import percent_off
 from pipeline.grading.rubric import is_damping
 from pipeline.names import parameter_names
 from pipeline.plant.chain import Array, Chain, recover_from_parameters
+from pipeline.schemas.grade import Flag
 from pipeline.submission import StateSpace
 
 Kind = Literal["exact", "stiffness", "damping"]

@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 
-from pipeline.grading.grade import CODES, Code, Flag
 from pipeline.grading.mistakes.catalogue import Mistake, known_mistakes
 from pipeline.grading.mistakes.explain import SIGMAS, Explained, Explanation, Label, Table, explain
 from pipeline.grading.mistakes.impossible import BrokenOrder, broken_orders, not_positive
@@ -15,6 +14,7 @@ from pipeline.grading.references.tolerance import as_typed, percent_off
 from pipeline.grading.rubric import is_damping
 from pipeline.names import read_name
 from pipeline.results import Analysis
+from pipeline.schemas.grade import CODES, Code, Flag
 from pipeline.submission import Reported
 
 # From here on a number is worth a remark. Two careful teams on one bench differ by some percent in

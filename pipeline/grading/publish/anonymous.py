@@ -7,11 +7,11 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from pipeline.grading.grade import Flag, Grade
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.history import Event
 from pipeline.grading.similarity.shared import shared_message
 from pipeline.output import csv_text
+from pipeline.schemas.grade import Flag, Grade
 
 KEY_FILE = "anonymous-key.csv"
 _PREFIX = "anon-"
@@ -53,15 +53,15 @@ def anonymise(grade: Grade, names: Mapping[str, str]) -> Grade:
     own = names[grade.submission]
     name = re.escape(grade.submission)
     path = re.compile(rf"^{name}(?=:)|(?<![^\s'\"(]){name}(?=[/\\])")
-    return replace(
-        grade,
-        submission=own,
-        authors=(),
-        reason=path.sub(own, _ARCHIVE.sub("the archive: ", grade.reason)),
-        flags=tuple(
+    hidden = {
+        "submission": own,
+        "authors": (),
+        "reason": path.sub(own, _ARCHIVE.sub("the archive: ", grade.reason)),
+        "flags": tuple(
             _hidden(flag, names) if flag.code == "shared_data" else flag for flag in grade.flags
         ),
-    )
+    }
+    return grade.model_copy(update=hidden)
 
 
 def _hidden(flag: Flag, names: Mapping[str, str]) -> Flag:
@@ -71,8 +71,9 @@ def _hidden(flag: Flag, names: Mapping[str, str]) -> Flag:
         {**recording, "submission": names.get(recording["submission"], STRANGER)}
         for recording in flag.evidence["recordings"]
     ]
-    return replace(
-        flag,
+    return Flag(
+        code=flag.code,
+        parameters=flag.parameters,
         message=shared_message(flag.parameters, others),
         evidence={"submissions": others, "recordings": recordings},
     )

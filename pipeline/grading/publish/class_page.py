@@ -10,7 +10,6 @@ from urllib.parse import quote
 import numpy as np
 
 from pipeline import __version__
-from pipeline.grading.grade import CODES, Code
 from pipeline.grading.gradebook.class_lines import Line, class_frame, wrong_springs
 from pipeline.grading.references.tolerance import exact
 from pipeline.grading.rubric import Rubric
@@ -39,6 +38,7 @@ from pipeline.report.numbers import count as counted
 from pipeline.report.render.html import render_html
 from pipeline.report.tables import cell, make_table
 from pipeline.report.words import clean
+from pipeline.schemas.grade import CODES, Code
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -17,7 +17,6 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.grading.grade import Grade
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.rows import Entry
 from pipeline.grading.intake.lms_names import Platform
@@ -27,6 +26,7 @@ from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.shared import told
 from pipeline.grading.words import OUTCOMES, points_text
 from pipeline.output import csv_text, own_folder, write_file
+from pipeline.schemas.grade import Grade
 
 _HOURS = 24.0
 

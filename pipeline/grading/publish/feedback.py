@@ -1,15 +1,13 @@
 """The feedback to one submission: their numbers beside ours, why, and where to look."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from html import unescape
 from itertools import count
 from numbers import Real
 from typing import Any
 
 from pipeline import __version__
-from pipeline.grading.grade import Criterion, Flag, Grade
-from pipeline.grading.gradebook.override import Override
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.shared import told
 from pipeline.grading.words import OUTCOMES, PLACES, TITLES, TONES, points_text
@@ -34,6 +32,7 @@ from pipeline.report.numbers import count as counted
 from pipeline.report.render.html import render_html
 from pipeline.report.tables import cell, make_table
 from pipeline.report.words import clean, name_span, rich
+from pipeline.schemas.grade import Criterion, Flag, Grade
 
 _TITLE = re.compile(r"<title>(.*?)</title>", re.DOTALL)
 _NAME = re.compile(r"(omega|zeta|K)(_\w)?")
@@ -45,7 +44,6 @@ def feedback_page(
     grade: Grade,
     *,
     rubric: Rubric,
-    overrides: Mapping[str, Override],
     figures: Sequence[tuple[str, str]],
     name: str,
 ) -> str:
@@ -53,12 +51,11 @@ def feedback_page(
 
     Parameters
     ----------
-    overrides : in force, by criterion.
     figures : file names and SVG.
     name : what the submission is called on the page.
     """
     numbers = count(1)
-    sections = [Section("summary", "Summary", tuple(_summary(grade, overrides)))]
+    sections = [Section("summary", "Summary", tuple(_summary(grade)))]
     if grade.flags:
         sections.append(Section("remarks", "What to look at", tuple(_remarks(grade.flags))))
     if grade.criteria:
@@ -80,7 +77,8 @@ def feedback_page(
 # -------------------------------------------------------------------------- summary
 
 
-def _summary(grade: Grade, overrides: Mapping[str, Override]) -> list[Block]:
+def _summary(grade: Grade) -> list[Block]:
+    overrides = grade.overrides
     points = f"{points_text(grade.points)} of {points_text(grade.out_of)}"
     by_hand = Tile(spans("Set by hand"), spans(counted_criteria(len(overrides))))
     if grade.status == "failed":

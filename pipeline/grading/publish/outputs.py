@@ -10,10 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from pipeline.errors import ConfigError
-from pipeline.grading.grade import Flag, Grade, grade_dict
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.class_lines import Line
-from pipeline.grading.gradebook.rows import Entry
 from pipeline.grading.publish.anonymous import KEY_FILE, STRANGER, anonymise, key_text, pseudonyms
 from pipeline.grading.publish.class_page import class_page
 from pipeline.grading.publish.feedback import feedback_page
@@ -22,7 +20,7 @@ from pipeline.grading.similarity.clusters import find_clusters, renamed
 from pipeline.grading.similarity.doubles import Double, find_doubles, with_recordings
 from pipeline.output import csv_text, own_folder, write_file
 from pipeline.resources import TEMPLATES
-from pipeline.results_json import plain_json
+from pipeline.schemas.grade import Flag, grade_text
 
 FEEDBACK = "feedback"
 _PAGE, _JSON, _CLASS = "feedback.html", "grade.json", "class.html"
@@ -57,9 +55,9 @@ def write_outputs(
             (entry.submission, flag) for flag in entry.grade.flags if flag.code == "shared_data"
         )
         grade = anonymise(entry.grade, names) if names is not None else entry.grade
-        lines.append(Line.of(grade, by_hand=sorted(entry.overrides)))
+        lines.append(Line.of(grade))
         gradings[entry.submission], authors[entry.submission] = entry.grading, entry.grade.authors
-        now_of[grade.submission] = _digest(look, entry.key, repr((grade, _by_hand(entry))))
+        now_of[grade.submission] = _digest(look, entry.key, repr(grade))
         own = own_folder(folder, _checked(grade.submission))
         there = (own / _PAGE).is_file() and (own / _JSON).is_file()
         if there and made_of.get(grade.submission) == now_of[grade.submission]:
@@ -70,12 +68,11 @@ def write_outputs(
         page = feedback_page(
             grade,
             rubric=rubric,
-            overrides=entry.overrides,
             figures=book.figures(entry),
             name=grade.submission,
         )
         write_file(own / _PAGE, page)
-        write_file(own / _JSON, _grade_text(grade, entry))
+        write_file(own / _JSON, grade_text(grade))
     if names is not None:
         lines.sort(key=lambda line: line.name)  # the order of the names would tell
     _remove_stale(folder, keep=set(now_of))
@@ -153,19 +150,6 @@ def _names(book: Gradebook, out: Path) -> dict[str, str]:
     out.mkdir(parents=True, exist_ok=True)
     write_file(out / KEY_FILE, key_text(names, authors))
     return names
-
-
-def _grade_text(grade: Grade, entry: Entry) -> str:
-    """Return `grade.json` with the points given by hand."""
-    plain = plain_json({**grade_dict(grade), "overrides": _by_hand(entry)})
-    return json.dumps(plain, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-
-
-def _by_hand(entry: Entry) -> list[dict[str, str | float | None]]:
-    return [
-        {"criterion": o.criterion, "points": o.points, "why": o.why}
-        for _, o in sorted(entry.overrides.items())
-    ]
 
 
 def _look(rubric: Rubric) -> str:

@@ -7,7 +7,7 @@ another's id to a copy would go unseen. So a TA is told, and no student accused.
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from pipeline.grading.outcome import Prints, person
+from pipeline.grading.gradings import Prints, person
 from pipeline.grading.similarity.shared import find_shared
 from pipeline.report.numbers import count, listing
 from pipeline.report.words import clean

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.fft import next_fast_len
 
-from pipeline.grading.grade import Flag
+from pipeline.grading.gradings import Prints, person
 from pipeline.grading.intake.lms_names import same_number
-from pipeline.grading.outcome import Prints, person
 from pipeline.grading.similarity.prints import PASSED, Print, unpack
+from pipeline.schemas.grade import Flag
 
 _WIDTH = 512  # samples around an anchor that are compared at first
 _BEFORE = 128  # of them before it

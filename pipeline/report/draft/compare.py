@@ -9,7 +9,8 @@ from pipeline.errors import ConfigError
 from pipeline.report.draft.changes import Change, CheckChange, DraftChanges
 from pipeline.report.numbers import count
 from pipeline.results import Analysis
-from pipeline.results_json import plain_json, results_dict
+from pipeline.results_json import results_dict
+from pipeline.schemas.base import plain_json
 from pipeline.schemas.results import Hardware, Parameter, Results
 
 _MOST_BYTES = 20_000_000  # of a results.json; real ones have a few ten thousand

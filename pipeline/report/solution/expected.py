@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from pipeline import __version__
 from pipeline.names import read_name
 from pipeline.plant.chain import Array, Chain
 from pipeline.report.document import Block, bullet_list, paragraph, spans
@@ -18,6 +17,9 @@ from pipeline.report.sections.page import Page
 from pipeline.report.tables import cell, make_table
 from pipeline.report.words import clean, name_span
 from pipeline.results import Analysis
+from pipeline.results_json import provenance
+from pipeline.schemas import solution as schema
+from pipeline.schemas.base import fields_of
 
 _WORDS = phrases("solution")
 SCHEMA = "cartlab-solution/1"
@@ -191,22 +193,12 @@ def solution_dict(analysis: Analysis) -> dict[str, Any]:
     model = chain and expected_model(chain, {p.name: p.tolerance for p in parameters})
     return {
         "schema": SCHEMA,
-        "submission": {
-            "title": analysis.title,
-            "carts": analysis.carts,
-            "springs": list(analysis.springs),
-            "units": {"position": analysis.position_unit, "input": analysis.input_unit},
-        },
-        "parameters": [
-            {
-                "name": p.name,
-                "unit": p.unit,
-                "value": p.value,
-                "std": p.std,
-                "tolerance": p.tolerance,
-            }
-            for p in parameters
-        ],
+        "submission": fields_of(
+            schema.SolutionSubmission,
+            analysis,
+            units={"position": analysis.position_unit, "input": analysis.input_unit},
+        ),
+        "parameters": [fields_of(schema.ExpectedParameter, p) for p in parameters],
         "state_space": model
         and {
             "A": model.A,
@@ -215,17 +207,11 @@ def solution_dict(analysis: Analysis) -> dict[str, Any]:
             "B_tolerance": model.B_tolerance[:, None],
         },
         "feedback": design
-        and {
-            "cart": design.cart,
-            "method": design.method,
-            "sample_time": design.sample_time,
-            "gains": design.gains,
-            "prefilter": design.prefilter,
-            "poles": [[pole.real, pole.imag] for pole in design.poles],
-            "overshoot_percent": design.overshoot_percent,
-            "settling_time": design.settling_time,
-            "peak_input": design.peak_input,
-            "margins": design.margins and vars(design.margins),
-        },
-        "provenance": {"version": __version__, "files": dict(sorted(analysis.files.items()))},
+        and fields_of(
+            schema.ReferenceFeedback,
+            design,
+            poles=[[pole.real, pole.imag] for pole in design.poles],
+            margins=design.margins and vars(design.margins),
+        ),
+        "provenance": provenance(analysis),
     }

@@ -1,6 +1,5 @@
 """The instructor's reference: the report, with the derivations and the numbers put in."""
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +13,7 @@ from pipeline.report.solution.design import design_blocks
 from pipeline.report.solution.expected import expected_blocks, solution_dict
 from pipeline.report.solution.model import motion_blocks, state_blocks, transfer_blocks
 from pipeline.results import Analysis
-from pipeline.results_json import plain_json
+from pipeline.schemas.base import json_text
 
 _WORKED: tuple[Part, ...] = (
     ("motion", "Equations of motion", motion_blocks),
@@ -53,5 +52,4 @@ def build_solution(
 
 def solution_text(analysis: Analysis) -> str:
     """Return `solution.json` as text, numbers at ten significant digits."""
-    plain = plain_json(solution_dict(analysis))
-    return json.dumps(plain, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    return json_text(solution_dict(analysis))

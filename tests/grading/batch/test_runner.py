@@ -17,12 +17,12 @@ from pipeline.grading.batch import worker_process
 from pipeline.grading.batch.runner import Limits, grade_batch, grades_of, run_here
 from pipeline.grading.batch.worker import Setup, Task, grade_task
 from pipeline.grading.batch.worker_process import Worker
-from pipeline.grading.grade import grade_text
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.intake.hand_ins import find_hand_ins
 from pipeline.grading.publish import feedback_figures
 from pipeline.grading.publish.outputs import write_outputs
 from pipeline.grading.rubric_file import load_rubric
+from pipeline.schemas.grade import grade_text
 from pipeline.synthesis import write_submission
 from tests.helpers.grades import n_graded
 from tests.helpers.waiting import PATIENCE, started, until

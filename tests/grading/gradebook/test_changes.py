@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.changes import points_changes, rubric_changes
-from pipeline.grading.outcome import Batch
+from pipeline.grading.gradings import Batch
 from pipeline.synthesis import write_submission
 from tests.helpers.grades import make_grade, make_outcome, n_graded, two_cart_rubric
 from tests.helpers.places import ROOT

@@ -16,12 +16,12 @@ from sqlalchemy import create_engine, text
 from sqlalchemy.exc import DBAPIError
 
 from pipeline.errors import ConfigError
-from pipeline.grading.grade import CODES
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.history import history_dict, history_text
 from pipeline.grading.gradebook.override import with_overrides
 from pipeline.grading.gradebook.schema import FILE, metadata
-from pipeline.grading.outcome import Batch
+from pipeline.grading.gradings import Batch
+from pipeline.schemas.grade import CODES
 from tests.helpers import postgres
 from tests.helpers.grades import (
     failed_grade,

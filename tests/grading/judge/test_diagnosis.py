@@ -7,7 +7,7 @@ from decimal import Decimal
 import numpy as np
 import pytest
 
-from pipeline.grading.grade import Flag
+from pipeline.schemas.grade import Flag
 from pipeline.submission import Reported, StateSpace
 from tests.helpers.grading_students import Student, student, typed
 from tests.helpers.textbook_student import by_eye, final_table, initial_table

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.grading.grade import CODES, Flag, Grade, grade_text
 from pipeline.grading.judge.checks import between
 from pipeline.grading.judge.run import grade_submission, under_rubric
 from pipeline.grading.mistakes.state_model import StateModel, compare_entries
 from pipeline.grading.references.springs import with_all_springs
 from pipeline.grading.rubric_file import load_rubric
+from pipeline.schemas.grade import CODES, Flag, Grade, grade_text
 from pipeline.submission import Input, InputOverride, StateSpace, load_submission
 from pipeline.synthesis import write_submission
 from pipeline.synthesis.hidden import prepare_bench, write_bench

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.grading.grade import Grade
 from pipeline.grading.judge.run import grade_submission
 from pipeline.grading.rubric_file import load_rubric
+from pipeline.schemas.grade import Grade
 from pipeline.submission import load_submission
 from pipeline.synthesis import write_submission
 from pipeline.workflow import analyse

@@ -11,7 +11,7 @@ import pytest
 
 from pipeline.errors import ConfigError
 from pipeline.grading.gradebook.book import Gradebook
-from pipeline.grading.outcome import Batch
+from pipeline.grading.gradings import Batch
 from pipeline.grading.publish.export import export
 from pipeline.grading.publish.students import students_of
 from tests.helpers.grades import (

@@ -14,11 +14,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import ConfigError
-from pipeline.grading.grade import CODES, Flag
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.class_lines import Line
 from pipeline.grading.gradebook.override import Override, read_points, with_overrides
-from pipeline.grading.outcome import Batch
+from pipeline.grading.gradings import Batch
 from pipeline.grading.publish.anonymous import KEY_FILE, anonymise, pseudonyms
 from pipeline.grading.publish.class_page import class_page
 from pipeline.grading.publish.export import results_text
@@ -26,6 +25,7 @@ from pipeline.grading.publish.feedback import feedback_page
 from pipeline.grading.publish.outputs import grades_csv, write_outputs
 from pipeline.grading.table import read_table
 from pipeline.grading.words import PLACES, TITLES
+from pipeline.schemas.grade import CODES, Flag
 from tests.helpers.grades import (
     failed_grade,
     hertz_flag,
@@ -249,7 +249,7 @@ def test_every_flag_has_a_name_and_a_place_to_look():
 def test_the_feedback_puts_their_numbers_beside_ours():
     """Both, the difference, the message, the help, and what lateness took."""
     grade = make_grade("team-1", share=0.5, days_late=1.5, deducted=2.0, flags=(hertz_flag(),))
-    html = feedback_page(grade, rubric=RUBRIC, overrides={}, figures=(), name="team-1")
+    html = feedback_page(grade, rubric=RUBRIC, figures=(), name="team-1")
 
     text = re.sub(r"<[^>]+>", "", html)
     assert "this looks like Hz where rad/s is asked." in text
@@ -261,7 +261,7 @@ def test_the_feedback_puts_their_numbers_beside_ours():
 def test_feedback_on_shared_data_names_nobody_and_does_not_praise():
     """All points or not, the page asks to talk; in whose submission it stands, it leaves open."""
     grade = make_grade("team-1", flags=(shared_flag("b-team"),))
-    html = feedback_page(grade, rubric=RUBRIC, overrides={}, figures=(), name="team-1")
+    html = feedback_page(grade, rubric=RUBRIC, figures=(), name="team-1")
 
     assert "also stands in another submission" in html
     assert "All points were earned." in html
@@ -271,7 +271,7 @@ def test_feedback_on_shared_data_names_nobody_and_does_not_praise():
 def test_a_submission_that_could_not_be_graded_hears_why():
     """The reason, and what to do."""
     grade = failed_grade("team-1", "no submission.toml in it")
-    html = feedback_page(grade, rubric=RUBRIC, overrides={}, figures=(), name="team-1")
+    html = feedback_page(grade, rubric=RUBRIC, figures=(), name="team-1")
     assert "No submission.toml in it." in html
     assert "Mend it and hand it in again" in html
 
@@ -291,16 +291,16 @@ def test_any_numbers_can_be_shown(values):
     """Infinite, missing, text or nested: a page comes of it, with its control characters gone."""
     grade = make_grade("team-1", share=0.5)
     found = dict(reversed(values.items()))
-    first = replace(grade.criteria[0], expected=values, found=found)
+    first = grade.criteria[0].model_copy(update={"expected": values, "found": found})
     grade = make_grade("team-1", criteria=(first, *grade.criteria[1:]))
-    html = feedback_page(grade, rubric=RUBRIC, overrides={}, figures=(), name="team-1")
+    html = feedback_page(grade, rubric=RUBRIC, figures=(), name="team-1")
     assert not re.search(r"[\x00-\x08\x0b\x0c\x0e-\x1f]", html)
 
 
 @pytest.mark.parametrize(("points", "percent"), [(19.95, "99"), (4.6, "23")])
 def test_only_all_points_are_100_percent(points, percent):
     """19.95 of 20 is 99 %, 4.6 of 20 is 23 %: decimals as typed, rounded down."""
-    page = class_page([Line.of(make_grade("a", points=points), by_hand=())], rubric=RUBRIC)
+    page = class_page([Line.of(make_grade("a", points=points))], rubric=RUBRIC)
     cells = re.sub(r"<[^>]+>", " ", page.split("All submissions.")[-1]).split()
     assert cells[cells.index(str(points)) + 1] == percent
 
@@ -309,8 +309,8 @@ def test_the_class_page_counts_what_there_is():
     """Mean and median of those graded, outcomes by criterion, mistakes by how many made them."""
     grades = [make_grade("a"), make_grade("b", share=0.5, flags=(hertz_flag(),)),
               make_grade("c", share=0.0, flags=(hertz_flag(), missing_flag()))]  # fmt: skip
-    lines = [Line.of(grade, by_hand=()) for grade in grades]
-    lines.append(Line.of(failed_grade("d", "broken"), by_hand=()))
+    lines = [Line.of(grade) for grade in grades]
+    lines.append(Line.of(failed_grade("d", "broken")))
     html = re.sub(r"<[^>]+>", " ", class_page(lines, rubric=RUBRIC))
     text = " ".join(html.split())
 
@@ -401,7 +401,7 @@ def test_points_by_hand_are_not_asked_for_again():
     given = Override(criterion=RUBRIC.criteria[0].id, points=1.0, why="x", by="y", at="")
     given = {given.criterion: given}
     by_hand = with_overrides(grade, given, rubric=RUBRIC)
-    page = feedback_page(by_hand, rubric=RUBRIC, overrides=given, figures=(), name="team-7")
+    page = feedback_page(by_hand, rubric=RUBRIC, figures=(), name="team-7")
     text = re.sub(r"<[^>]+>", "", page)
     assert "could not be graded automatically" in text
     assert "Its points were given by hand." in text
@@ -414,7 +414,7 @@ def test_points_by_hand_are_not_asked_for_again():
 @pytest.mark.parametrize("grades", [[], [failed_grade("a", "broken")]])
 def test_a_class_without_grades_has_a_page(grades):
     """Nobody handed in, or nothing could be graded."""
-    html = class_page([Line.of(grade, by_hand=()) for grade in grades], rubric=RUBRIC)
+    html = class_page([Line.of(grade) for grade in grades], rubric=RUBRIC)
     assert "Submissions" in html
 
 

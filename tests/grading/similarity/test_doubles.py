@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.grading.gradebook.book import Gradebook
-from pipeline.grading.outcome import Batch, Prints
+from pipeline.grading.gradings import Batch, Prints
 from pipeline.grading.publish.outputs import write_outputs
 from pipeline.grading.similarity.doubles import Double, find_doubles, with_recordings
 from pipeline.grading.similarity.prints import fingerprint

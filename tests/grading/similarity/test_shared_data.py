@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.grading.outcome import Prints
+from pipeline.grading.gradings import Prints
 from pipeline.grading.similarity.prints import fingerprint, unpack
 from pipeline.grading.similarity.shared import find_shared, shared_flag
 from pipeline.ingest.read import read_data

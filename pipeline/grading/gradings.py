@@ -1,25 +1,21 @@
-"""What the runner and the gradebook share: an outcome per submission, its prints, the batch."""
+"""What the runner and the gradebook share: a grading of a submission, its prints, the batch."""
 
-import json
 import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cache
 from typing import Literal
 
-from pydantic import TypeAdapter
-
-from pipeline.grading.grade import Flag, Grade
+from pipeline.schemas.grade import Flag
 
 
 @dataclass(frozen=True, kw_only=True)
-class Outcome:
+class Grading:
     """What one submission came to by itself, before it is compared with the others.
 
     Attributes
     ----------
     submission : its id, unique in the batch.
-    key : hash of all the outcome depends on: the files as handed in, rubric, code, name, lateness;
+    key : hash of all that it depends on: the files as handed in, rubric, code, name, lateness;
         behind a hyphen that of the files alone.
     status : `failed` where it could not be graded, for the one-line `reason`.
     settled : False where a limit or a crash ended it: another run tries again.
@@ -97,20 +93,3 @@ class Batch:
     kept: tuple[str, ...] = ()
     moved: Mapping[str, str] = field(default_factory=dict)
     taken_over: tuple[tuple[str, tuple[str, ...], tuple[str, ...]], ...] = ()
-
-
-def read_grade(text: str) -> Grade:
-    """Return the grade that a `grade.json` holds.
-
-    Raises
-    ------
-    ValueError : it is none.
-    """
-    document = json.loads(text)
-    document.pop("schema", None)
-    return _grades().validate_python(document)
-
-
-@cache
-def _grades() -> TypeAdapter[Grade]:
-    return TypeAdapter(Grade)
