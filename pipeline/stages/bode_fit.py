@@ -4,7 +4,8 @@ The stage-by-stage result becomes a physical chain, which all carts then fit joi
 logarithmic scale, to get near, then by maximum likelihood, each point by its standard error.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+import itertools
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -47,6 +48,7 @@ def fit_bode(
     springs: Sequence[bool],
     initial: Mapping[str, float] | None = None,
     decays: Mapping[int, Estimate] | None = None,
+    near: Chain | None = None,
 ) -> ChainFit:
     """Fit the chain of n carts to measured frequency responses; carts may be missing.
 
@@ -66,6 +68,7 @@ def fit_bode(
     springs : (n + 1,) which springs there are.
     initial : named parameters to start from, as far as known.
     decays : by cart, the damping ratio it has alone; used only where the responses put it at zero.
+    near : carts like these, fitted before: the one start, in place of all others.
 
     Returns
     -------
@@ -85,8 +88,12 @@ def fit_bode(
         )
     known = {name: value for name, value in (initial or {}).items() if value > 0}
     like = _stand_in(data, known, n=n, springs=springs)
-    staged, start = _staged_start(data, known, n=n, springs=springs, like=like)
-    best, tried = _fit_from_starts(P, data, first=start, like=like)
+    if near is None:
+        staged, first = _staged_start(data, known, n=n, springs=springs, like=like)
+        starts = itertools.chain([first], _random_starts(like, P.springs))
+    else:
+        staged, starts = None, (physical_start(near, springs=springs),)
+    best, tried = _fit_from_starts(P, data, starts)
     remark = ""
     if data.n_phases:
         # As few magnitudes as parameters say nothing about what the phases should be.
@@ -213,12 +220,12 @@ def _solve(P: Parametrisation, data: Points, theta: Array, scale: Scale) -> _Fit
 
 
 def _fit_from_starts(
-    P: Parametrisation, data: Points, *, first: Chain, like: Chain
+    P: Parametrisation, data: Points, starts: Iterable[Chain]
 ) -> tuple[_Fitted, int]:
-    """Fit from the first start, and from random ones while the data are not explained."""
+    """Fit from one start after the other while the data are not explained."""
     fits: list[_Fitted] = []
     failed: list[DataError] = []
-    for start in (first, *_random_starts(like, P.springs)):
+    for start in starts:
         try:
             near = _solve(P, data, P.pack(start), "log")
             fits.append(_solve(P, data, near.theta, "magnitude"))

@@ -15,7 +15,6 @@ from pipeline.grading.judge.laws import MOST_WIDENING, judge_laws
 from pipeline.grading.judge.pieces import asked_pieces
 from pipeline.grading.judge.work import ALL, NONE, Verdict, Work, mean_share
 from pipeline.grading.mistakes.impossible import not_positive
-from pipeline.grading.mistakes.state_model import compare_entries
 from pipeline.grading.references.reference import OFF_SCALE, Reference, off_scale
 from pipeline.grading.references.tolerance import NO_CREDIT, as_typed, credit, percent_off, rounding
 from pipeline.grading.rubric import is_damping, matching
@@ -203,8 +202,7 @@ def _state_space(criterion: asked.StateModel, work: Work) -> Verdict:
     space = work.reported.state_space
     if space is None or not (space.A and space.B):
         return Verdict(share=NONE, message="A and B are not both reported.")
-    entries = compare_entries(space, models=work.state_models, n=work.rubric.system.carts)
-    if not entries:
+    if not (entries := work.entries):
         return Verdict(
             share=None, message="Not checked: neither a table nor a fit to compare with."
         )

@@ -259,7 +259,7 @@ def _flags(work: Work) -> list[Flag]:
     flags, space = [], work.reported.state_space
     if space is not None and space.A:
         n = work.rubric.system.carts
-        flags += diagnose_state_space(space, models=work.state_models, n=n)
+        flags += diagnose_state_space(space, work.entries, models=work.state_models, n=n)
     if work.controller is not None:
         flags += diagnose_controller(work.controller)
     flags += diagnose_reduced(work.analysis)

@@ -3,12 +3,13 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
+from functools import cached_property
 from typing import Any
 
 from pipeline.grading.judge.pieces import missing_pieces
 from pipeline.grading.mistakes.controller import Controller
 from pipeline.grading.mistakes.explain import Label
-from pipeline.grading.mistakes.state_model import StateModel
+from pipeline.grading.mistakes.state_model import Entry, StateModel, compare_entries
 from pipeline.grading.references.reference import References
 from pipeline.grading.rubric import Rubric
 from pipeline.results import Analysis
@@ -41,6 +42,13 @@ class Work:
     def missing(self) -> list[str]:
         """What must be handed in and is not; a file that cannot be read is not."""
         return missing_pieces(self.submission, self.rubric, unreadable=self.analysis.unreadable)
+
+    @cached_property
+    def entries(self) -> list[Entry]:
+        """The entries of A and B beside what they may rightly be; none where they are not there."""
+        space = self.reported.state_space
+        n = self.rubric.system.carts
+        return compare_entries(space, models=self.state_models, n=n) if space and space.A else []
 
     @property
     def reported(self) -> Reported:

@@ -4,12 +4,11 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
-from fractions import Fraction
 from typing import Literal
 
 from pipeline.grading.mistakes.catalogue import Mistake
 from pipeline.grading.references.reference import Reference
-from pipeline.grading.references.tolerance import half_digit, percent_off
+from pipeline.grading.references.tolerance import Typed
 from pipeline.grading.rubric import is_damping
 from pipeline.names import read_name
 from pipeline.schemas.grade import Code
@@ -51,9 +50,9 @@ class Explanation:
     left: tuple[str, ...]
 
     @property
-    def codes(self) -> set[Code]:
+    def codes(self) -> frozenset[Code]:
         """The codes of all mistakes found."""
-        return {code for one in self.explained for code in one.mistake.codes}
+        return frozenset(code for one in self.explained for code in one.mistake.codes)
 
 
 def explain(
@@ -69,15 +68,15 @@ def explain(
 
     Where others make it about as likely, none is named.
     """
+    typed = {name: Typed.of(number) for name, number in table.items()}
+    ways = _by_way([_Tried.on(m, typed, label) for m in mistakes if not m.beside.intersection(off)])
     remaining, codes = list(off), frozenset[Code]()
-    possible = [m for m in mistakes if not m.beside.intersection(off)]
     found: list[Explained] = []
-    ways = _by_way(possible)
     while remaining:
         nothing = _Cover(codes=frozenset(), fits=())
-        covers = [_cover(way, table, remaining, label=label) for way in ways]
+        covers = [_cover(way, remaining) for way in ways]
         covers = [nothing, *(cover for cover in covers if cover.explained)]
-        scores = [_score(c, table, known, off=remaining, free=codes | believed) for c in covers]
+        scores = [_score(c, typed, known, off=remaining, free=codes | believed) for c in covers]
         score = {id(c): one for c, one in zip(covers, scores, strict=True)}
         best = max(covers, key=lambda c: (score[id(c)], -len(c.codes)))
         if best is nothing:
@@ -128,33 +127,76 @@ class _Cover:
         return frozenset(name for _, names in self.fits for name in names)
 
 
-def _by_way(mistakes: Sequence[Mistake]) -> list[list[Mistake]]:
+@dataclass(frozen=True, kw_only=True)
+class _Tried:
+    """A mistake held against a table: how far off what it predicts each number is, in percent."""
+
+    mistake: Mistake
+    label: Label
+    errors: Mapping[str, float]
+
+    @classmethod
+    def on(cls, mistake: Mistake, table: Mapping[str, Typed], label: Label) -> "_Tried":
+        errors = {
+            name: table[name].percent_off(predicted, sigmas=SIGMAS)
+            for name, predicted in mistake.predicted.items()
+            if name in table
+        }
+        return cls(mistake=mistake, label=label, errors=errors)
+
+    def explains(self, remaining: Sequence[str]) -> list[str]:
+        """Return which of the remaining numbers it reproduces, if it may be believed.
+
+        Half of them must be met; the others may be as far off as honest numbers are.
+        """
+        mistake = self.mistake
+        met = [name for name in self.errors if self.off_by(name) <= 1]
+        near = [name for name in self.errors if name in met or self._is_near(name)]
+        if len(met) < mistake.least or 2 * len(met) < len(near):
+            return []
+        if mistake.whole and len(near) < len(self.errors):
+            return []
+        wrong = [name for name in remaining if name in near]
+        # Of two carts swapped both numbers are wrong, not only near the other's.
+        return [] if "carts_swapped" in mistake.codes and len(wrong) < mistake.least else wrong
+
+    def off_by(self, name: str) -> float:
+        """Return how far a number is off, as share of what it may be."""
+        return self.errors[name] / (100 * self.mistake.tolerance)
+
+    def _is_near(self, name: str) -> bool:
+        """Whether a number beside others that it makes is off as honest numbers are off."""
+        by_eye = self.label == "initial" and read_name(name).is_by_eye
+        limit = _NEAR_BY_EYE if by_eye else _NEAR
+        return not is_damping(name) and self.errors[name] <= 100 * limit
+
+
+def _by_way(tried: Sequence[_Tried]) -> list[list[_Tried]]:
     """Return the mistakes that are one and the same way to be wrong, of whatever numbers."""
-    ways: dict[tuple[tuple[Code, ...], str], list[Mistake]] = {}
-    for mistake in mistakes:
-        ways.setdefault((mistake.codes, mistake.help), []).append(mistake)
+    ways: dict[tuple[tuple[Code, ...], str], list[_Tried]] = {}
+    for one in tried:
+        ways.setdefault((one.mistake.codes, one.mistake.help), []).append(one)
     return [*ways.values()]
 
 
-def _cover(
-    way: Sequence[Mistake], table: Table, remaining: Sequence[str], *, label: Label
-) -> _Cover:
+def _cover(way: Sequence[_Tried], remaining: Sequence[str]) -> _Cover:
     """Explain what one way to be wrong can, with mistakes that explain more numbers first."""
     fits: list[tuple[Mistake, list[str]]] = []
     open_ = list(remaining)
-    while tried := [(m, names) for m in way if (names := _explains(m, table, open_, label=label))]:
-        mistake, names = min(
-            tried, key=lambda fit: (-len(fit[1]), _distance(fit[0], table, fit[1]))
+    while tried := [(one, names) for one in way if (names := one.explains(open_))]:
+        best, names = min(
+            tried,
+            key=lambda fit: (-len(fit[1]), sum(map(fit[0].off_by, fit[1])) / len(fit[1])),
         )
-        fits.append((mistake, names))
+        fits.append((best.mistake, names))
         open_ = [name for name in open_ if name not in names]
-    used = frozenset(way[0].codes) if fits else frozenset[Code]()
+    used = frozenset(way[0].mistake.codes) if fits else frozenset[Code]()
     return _Cover(codes=used, fits=tuple(fits))
 
 
 def _score(
     cover: _Cover,
-    table: Table,
+    table: Mapping[str, Typed],
     known: Mapping[str, Reference],
     *,
     off: Collection[str],
@@ -173,19 +215,19 @@ def _score(
         if name in off and name not in cover.explained
         else _log_density(table[name], predicted[name], name)
         for name in known
-        if table[name] > 0
+        if table[name].value > 0
     )
     tries = max((mistake.tries for mistake, _ in cover.fits), default=1)
     return told - math.log(tries) - _KNOWN_SLIP * len(cover.codes - set(free))
 
 
-def _log_density(typed: Decimal, reference: Reference, name: str) -> float:
+def _log_density(typed: Typed, reference: Reference, name: str) -> float:
     """Return the logarithm of the density of ln(number), that of one anywhere at the least.
 
     Even between the bounds that rounding leaves, with Cauchy's tails outside them: some numbers
     are read far worse than most.
     """
-    half = float(half_digit(typed) / abs(Fraction(typed)))
+    half, value = typed.hidden, typed.value
     low, high = reference.low, reference.high
     anywhere = -math.log(_ANYWHERE) - _SLIP
     if low <= 0:
@@ -198,44 +240,8 @@ def _log_density(typed: Decimal, reference: Reference, name: str) -> float:
     elif read.is_by_eye:
         usual = _BY_EYE
     # What a mistake is made with was typed to as many digits before.
-    digits = 10.0 ** (1 - len(typed.as_tuple().digits)) / 4
+    digits = 10.0 ** (1 - typed.digits) / 4
     usual = math.hypot(usual, digits, reference.std / reference.value)
-    outside = max(math.log(low / float(typed)), math.log(float(typed) / high)) - half
+    outside = max(math.log(low / value), math.log(value / high)) - half
     room = math.log(high / low) + 2 * half + math.pi * usual
     return max(-math.log(room) - math.log1p((max(outside, 0.0) / usual) ** 2), anywhere)
-
-
-def _explains(
-    mistake: Mistake, table: Table, remaining: Sequence[str], *, label: Label
-) -> list[str]:
-    """Return which of the remaining numbers a mistake reproduces, if it may be believed.
-
-    Half of them must be met; the others may be as far off as honest numbers are.
-    """
-    asked = [name for name in mistake.predicted if name in table]
-    met = [name for name in asked if _off_by(mistake, table, name) <= 1]
-    near = [name for name in asked if name in met or _is_near(mistake, table, name, label=label)]
-    if len(met) < mistake.least or 2 * len(met) < len(near):
-        return []
-    if mistake.whole and len(near) < len(asked):
-        return []
-    wrong = [name for name in remaining if name in near]
-    # Of two carts swapped both numbers are wrong, not only near the other's.
-    return [] if "carts_swapped" in mistake.codes and len(wrong) < mistake.least else wrong
-
-
-def _off_by(mistake: Mistake, table: Table, name: str) -> float:
-    """Return how far a number is off what a mistake predicts, as share of what it may be."""
-    error = percent_off(table[name], mistake.predicted[name], sigmas=SIGMAS)
-    return float(error) / (100 * mistake.tolerance)
-
-
-def _is_near(mistake: Mistake, table: Table, name: str, *, label: Label) -> bool:
-    """Whether a number beside others that a mistake makes is off it as honest numbers are off."""
-    error = percent_off(table[name], mistake.predicted[name], sigmas=SIGMAS)
-    by_eye = label == "initial" and read_name(name).is_by_eye
-    return not is_damping(name) and float(error) <= 100 * (_NEAR_BY_EYE if by_eye else _NEAR)
-
-
-def _distance(mistake: Mistake, table: Table, names: Sequence[str]) -> float:
-    return sum(_off_by(mistake, table, name) for name in names) / len(names)

@@ -263,13 +263,14 @@ def _entry_error(typed: Decimal, right: float, kind: Kind, *, slack: float = 0.0
 # ------------------------------------------------------------------------- the flag
 
 
-def diagnose_state_space(space: StateSpace, *, models: Sequence[StateModel], n: int) -> list[Flag]:
+def diagnose_state_space(
+    space: StateSpace, entries: Sequence[Entry], *, models: Sequence[StateModel], n: int
+) -> list[Flag]:
     """Return a flag where entries are wrong, with the slip that explains them all, if any.
 
     A known slip that makes all of A and B is evidence even where a table is too vague for one
     entry alone to be.
     """
-    entries = compare_entries(space, models=models, n=n)
     suspects = [entry for entry in entries if entry.suspect]
     slip = _slip(space, models=models, n=n) if suspects else ""
     wrong = suspects if slip else [entry for entry in entries if entry.wrong]

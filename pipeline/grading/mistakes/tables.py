@@ -56,9 +56,12 @@ def diagnose_tables(reported: Reported, *, references: References, analysis: Ana
         label: _judge(label, reported, references=references, analysis=analysis, copied=copied)
         for label in tables
     }
+    alone = {label: one.explain() for label, one in judged.items()}
     # What one table alone leaves open the mistakes of the other may decide.
     found: dict[Label, Explanation] = {
-        label: one.explain(believed=frozenset(judged[_OTHER[label]].explain().codes))
+        label: one.explain(believed=alone[_OTHER[label]].codes)
+        if alone[_OTHER[label]].codes
+        else alone[label]
         for label, one in judged.items()
     }
     flags = [flag for one in judged.values() for flag in one.flags]

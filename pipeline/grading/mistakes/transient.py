@@ -99,9 +99,9 @@ def _refit(
             )
         )
     assert analysis.fit is not None
-    start = {name: e.value for name, e in analysis.fit.parameters.items()}
+    chain = analysis.fit.chain
     try:
-        fit = fit_bode(responses, n=analysis.carts, springs=analysis.springs, initial=start)
+        fit = fit_bode(responses, n=analysis.carts, springs=analysis.springs, near=chain)
     except DataError:
         return {}
     references = {}

@@ -1,11 +1,15 @@
 """How far off a number is, and what that earns: exact arithmetic, so that an edge is an edge."""
 
 import math
+from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
+from typing import TypeVar
 
 from pipeline.grading.references.reference import Reference
 from pipeline.grading.rubric import Late
+
+Number = TypeVar("Number", float, Fraction)
 
 _CENTS = 100  # points are taken to the hundredth
 NO_CREDIT = Fraction(10**6)  # percent; of a number that is zero or has the wrong sign
@@ -51,14 +55,55 @@ def percent_off(typed: Decimal, reference: Reference, *, sigmas: float) -> Fract
     slack = exact(sigmas) * Fraction(reference.std)
     low, high = Fraction(reference.low) - slack, Fraction(reference.high) + slack
     half = rounding(typed)
-    least, most = Fraction(typed) - half, Fraction(typed) + half
+    nothing, least, most = Fraction(0), Fraction(typed) - half, Fraction(typed) + half
+    return _apart(least, most, low, high, nothing=nothing, worst=NO_CREDIT)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Typed:
+    """A number of a table in floating point, to be held against many references in turn.
+
+    Attributes
+    ----------
+    excused : how far rounding may have moved it.
+    hidden : half a digit as share of it.
+    digits : that were typed.
+    """
+
+    value: float
+    excused: float
+    hidden: float
+    digits: int
+
+    @classmethod
+    def of(cls, typed: Decimal) -> "Typed":
+        """Return a number as its author wrote it."""
+        return cls(
+            value=float(typed),
+            excused=float(rounding(typed)),
+            hidden=float(half_digit(typed) / abs(Fraction(typed))) if typed else math.inf,
+            digits=len(typed.as_tuple().digits),
+        )
+
+    def percent_off(self, reference: Reference, *, sigmas: float) -> float:
+        """Return what `percent_off` does, but for its last digits: no edge of a credit is here."""
+        slack = sigmas * reference.std
+        low, high = reference.low - slack, reference.high + slack
+        least, most = self.value - self.excused, self.value + self.excused
+        return _apart(least, most, low, high, nothing=0.0, worst=float(NO_CREDIT))
+
+
+def _apart(
+    least: Number, most: Number, low: Number, high: Number, *, nothing: Number, worst: Number
+) -> Number:
+    """Return how far two intervals are apart, in percent."""
     if most < low:
         above, below = low, most
     elif least > high:
         above, below = least, high
     else:
-        return Fraction(0)
-    return min(100 * (above / below - 1), NO_CREDIT) if below > 0 else NO_CREDIT
+        return nothing
+    return min(100 * (above / below - 1), worst) if below > 0 else worst
 
 
 def credit(error: Fraction, *, full: float, none: float) -> Fraction:

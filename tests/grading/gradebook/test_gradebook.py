@@ -7,7 +7,6 @@ import sqlite3
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from itertools import count
 
@@ -275,7 +274,8 @@ def test_no_override_is_above_what_the_rubric_has_now(open_book):
     (model,) = [c for c in book.entry("team-1").grade.criteria if c.id == "state-model"]
     given = {"state-model": book.entry("team-1").overrides["state-model"]}
 
-    less = replace(make_grade("team-1"), criteria=(replace(model, points=0.0, out_of=1.0),))
+    changed = model.model_copy(update={"points": 0.0, "out_of": 1.0})
+    less = make_grade("team-1", criteria=(changed,))
 
     (line,) = with_overrides(less, given, rubric=RUBRIC).criteria
     assert (line.points, line.outcome) == (1.0, "pass")

@@ -4,7 +4,6 @@ import csv
 import io
 import json
 import re
-from dataclasses import replace
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -325,7 +324,8 @@ def shares(*found: tuple[str, str, str]) -> Flag:
     """Return the flag of (own recording, other submission, its recording)s."""
     keys = ("experiment", "submission", "other_experiment")
     recordings = [{**dict(zip(keys, one, strict=True)), "sigmas": 9.5} for one in found]
-    return replace(shared_flag("x"), evidence={"submissions": [], "recordings": recordings})
+    evidence = {"submissions": [], "recordings": recordings}
+    return shared_flag("x").model_copy(update={"evidence": evidence})
 
 
 def test_the_class_page_groups_who_shares_with_whom(tmp_path):
