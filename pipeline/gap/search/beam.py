@@ -2,15 +2,25 @@
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from itertools import count
 
 import numpy as np
 
 from pipeline.gap.fit.structure import Candidate
 from pipeline.gap.search.deadline import OutOfTime
 from pipeline.gap.search.grow import fit_whole, grow
-from pipeline.gap.search.hypothesis import BIC_DROP, Bench, Hypothesis, judge, worth_it
+from pipeline.gap.search.hypothesis import (
+    BIC_DROP,
+    Bench,
+    Hypothesis,
+    judge,
+    lowers_error,
+    worth_it,
+)
+from pipeline.plant.effects import find_effect
 
-_BEAM = (2,)  # hypotheses kept after the first step; then one
+_BEAM = (1, 2)  # hypotheses grown side by side: the linear one, the best two; then one
+_PATIENCE = 2  # steps in a row that lower no held-out error
 _DEPTH = 6  # effects
 _HOPELESS = 5.0  # a hypothesis with this many times the best one's chi-square is not grown
 _STEP = 0.81  # of the chi-square: a tenth of the error, which a further effect must take
@@ -22,22 +32,29 @@ def search(baseline: Hypothesis, bench: Bench, *, depth: int = _DEPTH) -> list[H
     """Return every hypothesis judged, the baseline first; past the time, those so far."""
     seen: dict[frozenset[tuple[str, int]], Hypothesis] = {baseline.key: baseline}
     with suppress(OutOfTime):
-        _grow_beam(baseline, bench, seen, depth=depth)
+        _grow_the_best(baseline, bench, seen, depth=depth)
     return list(seen.values())
 
 
-def _grow_beam(
+def _grow_the_best(
     baseline: Hypothesis,
     bench: Bench,
     seen: dict[frozenset[tuple[str, int]], Hypothesis],
     *,
     depth: int,
 ) -> None:
-    """Fill `seen`, the best hypothesis of each set of effects."""
-    beam = [baseline]
-    for level in range(depth):
+    """Fill `seen`, the best hypothesis of each set of effects.
+
+    Who leads is grown first. Where nothing that grows from it pays, the best of those that wait
+    has its turn.
+    """
+    waiting, best, idle = [baseline], baseline, 0
+    for level in count():
+        width = _BEAM[level] if level < len(_BEAM) else 1
+        parents = [h for h in waiting[:width] if h is waiting[0] or not h.key < waiting[0].key]
+        waiting = waiting[len(parents) :]
         children: list[Hypothesis] = []
-        for parent in beam:
+        for parent in parents:
             for child in grow(parent, bench):
                 if not (child.sound and np.isfinite(child.error)):
                     continue
@@ -46,26 +63,49 @@ def _grow_beam(
                     if child.bic < parent.bic - BIC_DROP:
                         children.append(child)
             if any(child.at_floor for child in children):
-                break
-        if not children:
-            break
-        unique = {child.key: child for child in sorted(children, key=lambda h: -h.bic)}
-        worthy = [child for child in unique.values() if not _needlessly_rich(child, unique)]
-        worthy.sort(key=lambda h: h.bic)
-        count = len(worthy[0].key)
-        bench.tell(f"{count} effect{'s' * (count > 1)}: " + _names(worthy[0]))
-        if worthy[0].at_floor:
-            break
-        before = min(h.fit.chi for h in beam)
-        within = _HOPELESS * worthy[0].fit.chi
-        beam = []
-        for child in worthy:
-            # What grows from a part grows from the whole that explains more too.
-            if child.fit.chi <= within and not any(child.key < h.key for h in beam):
-                beam += [child] if _leads_on(child, before) else []
-        beam = beam[: _BEAM[level] if level < len(_BEAM) else 1]
-        if not beam or max(h.size for h in beam) >= depth:
-            break
+                return
+        if children:
+            leader = min(children, key=lambda h: h.bic)
+            bench.tell(f"{len(leader.key)} effect{'s' * (len(leader.key) > 1)}: {_names(leader)}")
+        idle = 0 if any(lowers_error(child, best, bench) for child in children) else idle + 1
+        best = min([best, *children], key=lambda h: h.error)
+        before = min(parent.fit.chi for parent in parents)
+        waiting += [
+            child
+            for child in children
+            if child is seen[child.key]
+            and child.size < depth
+            and not _needlessly_rich(child, seen)
+            and _leads_on(child, before)
+        ]
+        waiting = _by_promise(waiting, seen, bench)
+        if idle == _PATIENCE or not waiting:
+            return
+
+
+def _by_promise(
+    waiting: Sequence[Hypothesis],
+    seen: Mapping[frozenset[tuple[str, int]], Hypothesis],
+    bench: Bench,
+) -> list[Hypothesis]:
+    """Return who is worth growing, the best first, one of each family of laws.
+
+    What grows from a part grows from the whole that explains more too, so parts come last; a whole
+    that does not, on runs it has not seen, leads astray.
+    """
+    leading: dict[frozenset[tuple[str, int]], Hypothesis] = {}
+    for h in sorted(waiting, key=lambda h: h.bic):
+        if not any(
+            part.key and part.key < h.key and not lowers_error(h, part, bench)
+            for part in seen.values()
+        ):
+            effects = h.fit.structure.effects
+            leading.setdefault(
+                frozenset((c.effect.family or c.key[0], c.place) for c in effects), h
+            )
+    within = _HOPELESS * min((h.fit.chi for h in leading.values()), default=0.0)
+    near = [h for h in leading.values() if h.fit.chi <= within]
+    return sorted(near, key=lambda h: any(h.key < whole.key for whole in near))
 
 
 def _leads_on(child: Hypothesis, before: float) -> bool:
@@ -104,11 +144,14 @@ def choose(found: Sequence[Hypothesis], baseline: Hypothesis, bench: Bench) -> H
 
 
 def prune(chosen: Hypothesis, bench: Bench) -> Hypothesis:
-    """Drop effects the others have made needless, as far as the time allows."""
+    """Drop effects, and richer laws, the others have made needless, as far as the time allows."""
     with suppress(OutOfTime):
         while len(chosen.key) > 1:
-            trials = [_without(chosen, c, bench) for c in chosen.fit.structure.effects]
+            effects = chosen.fit.structure.effects
+            trials = [_without(chosen, c, bench) for c in effects]
             as_good = [h for h in trials if h.sound and not worth_it(chosen, h, bench)]
+            plainer = [_plainer(chosen, c, bench) for c in effects if c.effect.grows_from]
+            as_good += [h for h in plainer if h.sound and h.bic < chosen.bic]
             if not as_good:
                 break
             chosen = min(as_good, key=lambda h: h.bic)
@@ -121,6 +164,24 @@ def _without(hypothesis: Hypothesis, effect: Candidate, bench: Bench) -> Hypothe
     theta = np.delete(hypothesis.fit.theta, np.r_[structure.span(index)])
     fit = fit_whole(structure.without(index), theta, bench)
     return judge(fit, bench, added=fit.structure.effects[-1:])
+
+
+def _plainer(hypothesis: Hypothesis, rich: Candidate, bench: Bench) -> Hypothesis:
+    """Return the hypothesis with the law in place of a richer one that grew from it."""
+    structure, theta = hypothesis.fit.structure, hypothesis.fit.theta
+    index = structure.effects.index(rich)
+    effect = find_effect(rich.effect.grows_from or rich.effect.key)
+    at = [rich.effect.names.index(name) for name in effect.names]
+    plain = Candidate(
+        effect=effect,
+        place=rich.place,
+        signs=tuple(rich.signs[i] for i in at),
+        scales=tuple(rich.scales[i] for i in at),
+    )
+    own = structure.span(index)
+    theta = np.concatenate([np.delete(theta, np.r_[own]), theta[own][at]])
+    fit = fit_whole(structure.without(index).with_effect(plain), theta, bench)
+    return judge(fit, bench, added=hypothesis.added)
 
 
 def steps_to(

@@ -23,8 +23,8 @@ _FULL_SCREEN = 3  # … with the best of a screen on whole runs
 _OUT_OF_SIGHT = 8.0  # a suspect that leaves this many times the best one's misfit is out
 _BESIDE_THE_FLOOR = 1.5  # … where that one leaves no more than noise
 _IN_THE_RUNNING = 3.0  # times the best sibling's misfit: what may still win when refined
-_TOGETHER = 0.9  # of the best single one's misfit, which a team must leave at most
-_NO_LESS = 1.03  # of the same: what a part of a team leaves that does as well alone
+_TOGETHER = 0.9  # of what a part of it leaves, which a team must leave at most
+_NO_LESS = 1.03  # of what a team leaves: a part of it that leaves less does as well alone
 _POLISHED = 0.1  # of the chi-square without it: a contact that is there explains more
 _NOISE_ALONE = 1.05  # chi-square that no richer law of friction lowers
 _HINT = 2.0  # what the criterion must fall by, by the screen's estimate, to be worth a refit
@@ -41,44 +41,46 @@ def grow(parent: Hypothesis, bench: Bench) -> Iterator[Hypothesis]:
     dry friction grows into its richer laws.
     """
     fits: list[tuple[tuple[Candidate, ...], Fit]] = []
+    plain: list[Hypothesis] = []
     for candidates, start in _starts(parent, bench):
         fits.append((candidates, fit_whole(start.structure, start.theta, bench)))
         if not _is_contact(candidates):
-            yield judge(fits[-1][1], bench, added=candidates)
+            plain.append(judge(fits[-1][1], bench, added=candidates))
+            yield plain[-1]
     for candidates, fit in fits[:]:
         for other, structure, theta in _lookalikes(candidates, fit, bench):
             fits.append(((other,), fit_whole(structure, theta, bench)))
     lowest = min((fit.cost for _, fit in fits), default=np.inf)
-    contacts: dict[tuple[str, int], Fit] = {}
+    contacts: set[tuple[str, int]] = set()
     for candidates, fit in sorted(fits, key=lambda pair: pair[1].cost):
         if _is_contact(candidates) and candidates[0].key not in contacts:
             if fit.cost < _IN_THE_RUNNING * lowest and fit.chi < _POLISHED * parent.fit.chi:
                 fit = polish(fit, bench.training, enough=AT_FLOOR, mapper=bench.mapper)
-            contacts[candidates[0].key] = fit
+            contacts.add(candidates[0].key)
             yield judge(fit, bench, added=candidates)
-    for candidates, fit in fits:
-        equals = min(f.cost for others, f in fits if len(others) == len(candidates))
-        running = _NOISE_ALONE * fit.n_points < fit.cost < _IN_THE_RUNNING * equals
-        if not running or _better_told(candidates, fit, fits):
+    closed = any(child.at_floor for child in plain)
+    for child in plain:
+        equals = [fit.cost for others, fit in fits if closed or len(others) == len(child.added)]
+        noise = _NOISE_ALONE * child.fit.n_points
+        running = noise < child.fit.cost < _IN_THE_RUNNING * min(equals)
+        if not running or any(_tells_better(other, child) for other in plain):
             continue
         for effect in bench.catalogue:
-            if any(c.effect.key == effect.grows_from for c in candidates):
-                yield _grown_friction(effect, candidates, fit, bench)
+            if any(c.effect.key == effect.grows_from for c in child.added):
+                yield _grown_friction(effect, child, bench)
 
 
-def _better_told(
-    candidates: Sequence[Candidate], fit: Fit, fits: Sequence[tuple[tuple[Candidate, ...], Fit]]
-) -> bool:
-    """Does a whole family explain more than this part of it, or a part no less than this team?"""
-    keys = {c.key for c in candidates}
-    for more, other in fits:
-        others = {c.key for c in more}
-        family = len({c.effect.key for c in more}) == 1
-        if family and keys < others and other.cost < _TOGETHER * fit.cost:
-            return True
-        if others < keys and other.cost < _NO_LESS * fit.cost:
-            return True
-    return False
+def _tells_better(other: Hypothesis, child: Hypothesis) -> bool:
+    """Do the same laws on more carts explain more, or a part of this team no less?
+
+    By what is left of runs not seen; and a part must do as well on those it is fitted to.
+    """
+    mine, others = {c.key for c in child.added}, {c.key for c in other.added}
+    family = {c.effect.key for c in other.added} == {c.effect.key for c in child.added}
+    if family and mine < others:
+        return other.error < _TOGETHER * child.error
+    as_well = other.error < _NO_LESS * child.error and other.fit.cost < _NO_LESS * child.fit.cost
+    return others < mine and as_well
 
 
 def _lookalikes(
@@ -151,6 +153,7 @@ def _starts(parent: Hypothesis, bench: Bench) -> list[tuple[tuple[Candidate, ...
             pair = _refit_team(loose, team, pieces, bench)
             if team.family or pair[1].cost < _TOGETHER * best:
                 chosen.append(pair)
+                best = min(best, pair[1].cost)
     suspects, _ = look(parent.fit, bench.training)
     suspects = [s for s in suspects if _promises(s.share, parent.fit)]
     for suspect in suspects[:_FULL_SCREEN]:
@@ -286,10 +289,9 @@ def fit_whole(structure: Structure, theta: Array, bench: Bench) -> Fit:
     return fit
 
 
-def _grown_friction(
-    effect: Effect, added: Sequence[Candidate], simple: Fit, bench: Bench
-) -> Hypothesis:
+def _grown_friction(effect: Effect, child: Hypothesis, bench: Bench) -> Hypothesis:
     """Fit a richer friction law in the places of the simpler one, just added, from its fit."""
+    added, simple = child.added, child.fit
     structure = simple.structure
     simpler = [c for c in added if c.effect.key == effect.grows_from]
     at = [structure.effects.index(c) for c in simpler]

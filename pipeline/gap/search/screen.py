@@ -149,10 +149,10 @@ def shown_places(effect: Effect, springs: Sequence[bool], runs: Sequence[Run]) -
 def find_teams(
     trials: Sequence[tuple[Candidate, tuple[float, ...]]], directions: Array, residual: Array
 ) -> list[Team]:
-    """Return the best pair of candidates, and the best effect that acts on all carts at once.
+    """Return the best effect that acts on all carts, pair of candidates, and effect beside either.
 
     Each pays little alone where the other is missing; their joint share is that of a least-squares
-    fit of both directions.
+    fit of all directions.
     """
     total = float(residual @ residual)
     gram, overlap = directions.T @ directions, directions.T @ residual
@@ -161,8 +161,9 @@ def find_teams(
         if candidate.effect.family:
             by_effect.setdefault(candidate.effect.key, []).append(at)
     families = [tuple(members) for members in by_effect.values() if len(members) > 1]
+    beside = [(*family, at) for family in families for at in set(range(len(trials))) - {*family}]
     best: list[Team] = []
-    for groups in (families, combinations(range(len(trials)), 2)):
+    for groups in (families, combinations(range(len(trials)), 2), beside):
         teams = []
         for group in groups:
             members = [trials[at] for at in group]
