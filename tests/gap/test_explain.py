@@ -158,6 +158,28 @@ def test_effects_that_only_together_explain_are_found_together():
     assert team.share == pytest.approx(1.0)
 
 
+def test_friction_on_all_carts_is_tried_beside_another_effect():
+    """Two frictions and a braking motor add up to the residual, and no two of them do."""
+    case = make_case(seed=44, n=2, rate=113.1)
+    structure = Structure(springs=case.springs)
+    chain = structure.chain(
+        structure.vector(Chain(m=np.array(case.m), c=np.array(case.c), k=np.array(case.k)))
+    )
+    runs = [make_run(record, n=2) for record in case.records]
+    trials = [
+        candidates_at(find_effect(key), place, runs=runs, chain=chain)[0]
+        for key, place in (("coulomb_friction", 1), ("drive_damping", 0), ("coulomb_friction", 2))
+    ]
+    residual = np.ones(3)
+
+    family, pair, three = find_teams(trials, np.eye(3), residual)
+
+    assert family.family
+    assert family.share == pytest.approx(pair.share) == pytest.approx(2 / 3)
+    assert {c.key for c in three.candidates} == {candidate.key for candidate, _ in trials}
+    assert three.share == pytest.approx(1.0)
+
+
 def test_what_no_run_shows_absorbs_nothing():
     """A held cart's mass and the share of two springs that act as one project nothing off."""
     m, c, k = np.array([3e-4]), np.array([6e-4]), 0.08

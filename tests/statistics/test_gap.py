@@ -105,12 +105,13 @@ def test_a_stop_and_a_stiffening_spring_are_told_apart(effect, hardness, part):
 
 @pytest.mark.slow
 @pytest.mark.sample
-def test_friction_on_all_carts_is_found_at_once():
+@pytest.mark.parametrize("n", [2, 3])
+def test_friction_on_all_carts_is_found_at_once(n):
     """What a real rig does together: friction on all carts, a braking motor, hands that let go.
 
-    Its errors fall to the noise, the two frictions come from one step, each with its own force.
+    Its errors fall to the noise, the frictions come from one step, each with its own force.
     """
-    case = make_rig(seed=1, n=2)
+    case = make_rig(seed=1, n=n)
 
     told: list[str] = []
     gap = explain(case, tell=told.append)

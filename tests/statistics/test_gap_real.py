@@ -83,6 +83,18 @@ def test_a_cart_held_in_all_runs_is_a_wall(real_data, tmp_path):
     assert gap.final < 0.027
 
 
+def test_all_runs_of_two_carts_have_friction_on_both(real_data, tmp_path):
+    """Cart 1 alone, cart 2 alone, both: friction on both carts brings unseen runs within 4 %."""
+    folder = write_two_cart_submission(tmp_path / "lab", real_data, steps=(1, 2, 3, 4, 5))
+    analysis = analyse(load_submission(folder), design=False)
+
+    gap = explain_gap(analysis.records, springs=analysis.springs, chain=analysis.chain)
+
+    assert gap.verdict in ("partial", "named")
+    assert {f.where.get("cart") for f in gap.effects if f.effect.key in DRY} == {1, 2}
+    assert gap.final < 0.04
+
+
 def test_silverbox_has_a_hardening_spring(real_data):
     """The benchmark's circuit: the cubic spring is named first and alone explains the gap."""
     data = loadmat(real_data / "silverbox" / "SNLS80mV.mat")

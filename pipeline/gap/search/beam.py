@@ -78,12 +78,12 @@ def _grow_the_best(
             and not _needlessly_rich(child, seen)
             and _leads_on(child, before)
         ]
-        waiting = _by_promise(waiting, seen, bench)
+        waiting = by_promise(waiting, seen, bench)
         if idle == _PATIENCE or not waiting:
             return
 
 
-def _by_promise(
+def by_promise(
     waiting: Sequence[Hypothesis],
     seen: Mapping[frozenset[tuple[str, int]], Hypothesis],
     bench: Bench,

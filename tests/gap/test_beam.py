@@ -1,0 +1,87 @@
+"""The order of a search, as a table of hypotheses; and what it leaves out at its end."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+from pipeline.gap.data.runs import make_run
+from pipeline.gap.data.split import split
+from pipeline.gap.fit.baseline import fit_baseline
+from pipeline.gap.search.beam import by_promise, prune
+from pipeline.gap.search.grow import fit_whole
+from pipeline.gap.search.hypothesis import Bench, judge
+from pipeline.gap.search.screen import candidates_at, extend
+from pipeline.plant.effects import CATALOGUE, find_effect
+from tests.truth.bench import Hidden
+from tests.truth.cases import make_case
+
+COULOMB, DAHL = ("coulomb_friction", 1), ("presliding_friction", 1)
+CUBIC, DELAY = ("cubic_spring", 1), ("input_delay", 0)
+BENCH: Any = SimpleNamespace(explains=lambda h: False)
+
+
+def hypothesis(*keys: tuple[str, int], error: float, bic: float, chi: float = 100.0) -> Any:
+    """Return what the order of a search depends on: no fit is made here."""
+    effects = [SimpleNamespace(key=key, effect=find_effect(key[0]), place=key[1]) for key in keys]
+    fit = SimpleNamespace(chi=chi, structure=SimpleNamespace(effects=effects))
+    return SimpleNamespace(key=frozenset(keys), error=error, bic=bic, fit=fit)
+
+
+def order(*waiting: Any) -> list[set[tuple[str, int]]]:
+    """Return the effects of those who are grown, in their order."""
+    return [set(h.key) for h in by_promise(waiting, {h.key: h for h in waiting}, BENCH)]
+
+
+def test_a_whole_that_explains_no_more_than_its_part_leads_astray():
+    """By the criterion alone the whole would be grown; on runs not seen its part does as well."""
+    part = hypothesis(DAHL, error=0.047, bic=-100)
+    useless = hypothesis(DAHL, CUBIC, error=0.046, bic=-200)
+    useful = hypothesis(DAHL, CUBIC, error=0.03, bic=-200)
+    other = hypothesis(DELAY, error=0.08, bic=-10)
+    assert order(part, useless, other) == [{DAHL}, {DELAY}]
+    assert order(part, useful, other) == [{DAHL, CUBIC}, {DELAY}, {DAHL}]
+
+
+def test_of_one_family_of_laws_the_best_is_grown():
+    """Friction that yields before it slides stands for friction; what is hopeless is left."""
+    plain = hypothesis(COULOMB, error=0.06, bic=-50)
+    rich = hypothesis(DAHL, error=0.04, bic=-100)
+    far = hypothesis(DELAY, error=0.1, bic=-20, chi=1000.0)
+    assert order(plain, rich, far) == [{DAHL}]
+
+
+def test_a_richer_law_that_explains_no_more_gives_way():
+    """Dry friction that yields over next to nothing is plain dry friction."""
+    hidden = [
+        Hidden(effect="coulomb_friction", place=1, parameters={"force": 0.0006}),
+        Hidden(effect="input_delay", parameters={"delay": 0.015}),
+    ]
+    case = make_case(seed=46, n=1, effects=hidden, rate=113.1)
+    runs = [make_run(record, n=1) for record in case.records]
+    teach, tell = split(runs)
+    held_out = [runs[i] for i in tell]
+    training = [runs[i] for i in teach]
+    fit, training = fit_baseline(training, springs=case.springs, start=None)
+    bench = Bench(
+        training=tuple(training),
+        held_out=tuple(replace(run, sigma=training[0].sigma) for run in held_out),
+        springs=case.springs,
+        catalogue=CATALOGUE,
+        repeatability=0.0,
+        mapper=map,
+        tell=print,
+    )
+    chain = fit.structure.chain(fit.theta)
+    for key, values in (("input_delay", (0.015,)), ("presliding_friction", (0.0006, 1e-4))):
+        effect = find_effect(key)
+        place = 0 if effect.place == "input" else 1
+        candidate, _ = candidates_at(effect, place, runs=training, chain=chain)[0]
+        structure, theta = extend(fit, candidate, values)
+        fit = replace(fit, structure=structure, theta=theta)
+    rich = judge(fit_whole(fit.structure, fit.theta, bench), bench)
+
+    pruned = prune(rich, bench)
+
+    assert rich.key == {DAHL, DELAY}
+    assert pruned.key == {COULOMB, DELAY}
+    assert pruned.error < 1.01 * rich.error
