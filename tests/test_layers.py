@@ -57,7 +57,7 @@ HOMES = {
     "typer": ("cli",),
     "rich": ("cli", "bench.watch"),
     "serial": ("bench.host",),
-    "tomlkit": ("bench.host", "bench.planning"),
+    "tomlkit": ("submission", "ingest", "bench.host"),
     "starlette": ("bench.watch",),
     "uvicorn": ("bench.watch",),
     "control": ("plant", "checks", "notebook"),

@@ -53,6 +53,23 @@ def inspect(
 
 
 @app.command()
+def fill(folder: Folder, as_json: AsJson = False) -> None:
+    """Find out what the files in DIR/data are and write their tables into submission.toml."""
+    from pipeline.ingest.fill import fill_submission, format_found
+
+    found = fill_submission(folder)
+    if as_json:
+        typer.echo(json.dumps([f.to_dict() for f in found], indent=1, ensure_ascii=False))
+    else:
+        typer.echo(format_found(found))
+    left = [f for f in found if f.state in ("unknown", "broken")]
+    say(f"wrote {folder / 'submission.toml'}: springs, units and what is marked unsure are yours")
+    if left:
+        say(f"cartlab: without a table: {', '.join(f.file for f in left)}")
+        raise typer.Exit(1)
+
+
+@app.command()
 def report(
     folder: Folder,
     out: Annotated[Path | None, typer.Option(help="Where to write; default: DIR/report.")] = None,

@@ -27,6 +27,7 @@ class ColumnInspection:
 
     name: str
     role: str | None
+    unit: str | None
     low: float
     high: float
     step: float | None
@@ -42,6 +43,7 @@ class Inspection:
     rate : Hz. None, as the other times, where the file has no time column.
     kind : the kind of experiment it looks like; `frequency` (Hz) of a sine dwell.
     problems : what to look at before using the file.
+    guessed : column numbers by role, where the file has no headings and the signals tell.
     """
 
     file: str
@@ -55,6 +57,13 @@ class Inspection:
     kind: Kind | None
     frequency: float | None
     problems: tuple[str, ...]
+    guessed: Mapping[str, int]
+
+    @property
+    def positions(self) -> dict[int, ColumnInspection]:
+        """The columns that are a cart's position, by cart."""
+        roles = {column.role: column for column in self.columns if column.role}
+        return {int(role[1:]): roles[role] for role in sorted(roles) if role[0] == "x"}
 
     def to_dict(self) -> dict:
         """Return the inspection as plain values for JSON."""
@@ -78,15 +87,19 @@ def inspect_file(path: Path) -> Inspection:
         columns, unused = {}, ()
         problems.append(str(error).removeprefix(f"{table.source}: "))
     bare = not columns and all(name.isdigit() for name in table.names)
+    guessed = suggest_columns(table) if bare else {}
     if bare:
-        line = suggest_columns(table)
+        columns, _ = assign_columns(table, explicit=guessed, free=(1,))
+        line = ", ".join(f"{role} = {number}" for role, number in guessed.items())
         problems.append(
             "the columns have no names: say in submission.toml which is what"
-            + (f", perhaps {line}" if line else "")
+            + (f", perhaps columns = {{ {line} }}" if guessed else "")
         )
     elif unused:
         problems.append(f"no role for {', '.join(unused)}: name them in `columns` to use them")
-    further = [] if bare else problems  # without names everything else is missing too
+    further = (
+        [] if bare and not guessed else problems
+    )  # without names everything else is missing too
     clock = _clock(table, columns, further) if "frequency" not in columns else None
     kind, frequency = _guess(table, columns, clock, further)
     roles = {column.index: role for role, column in columns.items()}
@@ -97,6 +110,7 @@ def inspect_file(path: Path) -> Inspection:
             ColumnInspection(
                 name=name,
                 role=roles.get(i),
+                unit=columns[roles[i]].unit if i in roles else None,
                 low=float(values.min()) + 0.0,  # never "-0"
                 high=float(values.max()) + 0.0,
                 step=encoder_step(values) or None if roles.get(i, " ")[0] == "x" else None,
@@ -111,6 +125,7 @@ def inspect_file(path: Path) -> Inspection:
         kind=kind,
         frequency=frequency,
         problems=tuple(problems),
+        guessed=guessed,
     )
 
 

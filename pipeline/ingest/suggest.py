@@ -1,4 +1,4 @@
-"""Guess which column is what where the file names none, as a line to check and to use."""
+"""Guess which column is what where the file names none."""
 
 import numpy as np
 
@@ -11,15 +11,15 @@ _QUICK = 1e-5  # s between samples; no bench records faster, a slow signal that 
 _MOST_CARTS = 4
 
 
-def suggest_columns(table: Table) -> str | None:
-    """Return a line for submission.toml, or None without a clock and encoders to be seen.
+def suggest_columns(table: Table) -> dict[str, int]:
+    """Return each role's column, counted from 1; {} without a clock and encoders to be seen.
 
     After the clock come the encoders, which hold whole numbers, the first perhaps a commanded
     position that only mirrors encoder 1; the input stands last, as in the exports of the ECP.
     """
     time = next((i for i, column in enumerate(table.values) if _looks_like_a_clock(column)), None)
     if time is None:
-        return None
+        return {}
     after = [i for i in range(time + 1, len(table.names)) if np.ptp(table.values[i]) > 0]
     given = {"time": time}
     if len(after) > 1:
@@ -28,9 +28,9 @@ def suggest_columns(table: Table) -> str | None:
     if len(encoders) > 1 and mirrors(*table.values[encoders[:2]]):
         encoders = encoders[1:]
     if not encoders or len(encoders) > _MOST_CARTS:
-        return None
+        return {}
     given |= {f"x{cart}": i for cart, i in enumerate(encoders, start=1)}
-    return f"columns = {{ {', '.join(f'{role} = {i + 1}' for role, i in given.items())} }}"
+    return {role: i + 1 for role, i in given.items()}
 
 
 def _looks_like_a_clock(values: Array) -> bool:

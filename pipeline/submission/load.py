@@ -2,7 +2,7 @@
 
 import re
 import stat
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from decimal import Decimal
 from itertools import islice
@@ -19,6 +19,7 @@ from pipeline.submission.complaints import (
     explain,
     nearest,
     quote,
+    without_tag,
 )
 from pipeline.submission.models import Experiment, Reported, StateFeedback, Submission
 from pipeline.submission.toml_file import BACKSLASH, parse_toml, read_text
@@ -53,13 +54,44 @@ def load_submission(path: Path) -> Submission:
         raise SubmissionError(f"{quote(str(path))}: no such folder")
     if (problem := outside(folder, toml.name)) is not None:
         raise SubmissionError(f"{where}: {problem}")
-    text = read_text(toml, where=where, limit=MAX_TOML_BYTES, error=SubmissionError)
+    return parse_submission(
+        read_text(toml, where=where, limit=MAX_TOML_BYTES, error=SubmissionError),
+        folder=folder,
+        where=where,
+    )
+
+
+class InvalidSubmission(SubmissionError):
+    """What stands in `submission.toml` is not what may stand there.
+
+    Attributes
+    ----------
+    problems : all that were found, each with its place; the text is the first.
+    """
+
+    def __init__(self, where: str, problems: Sequence[tuple[Location, str]]) -> None:
+        self.problems = tuple(problems)
+        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+        super().__init__(f"{where}: {problems[0][1]}{more}")
+
+
+def parse_submission(text: str, *, folder: Path, where: str = NAME) -> Submission:
+    """Check the text of a `submission.toml` that lies, or is to lie, in a folder.
+
+    Parameters
+    ----------
+    where : what to call the file.
+
+    Raises
+    ------
+    SubmissionError : no TOML; InvalidSubmission, with every problem, where it is.
+    """
     # Decimals stay so: no typed digit is lost.
     document = parse_toml(text, where=where, error=SubmissionError, parse_float=Decimal)
     submission = _validate(document, where=where)
-    _raise_first(
-        [f"{dotted(at, document)}: {what}" for at, what in _problems(submission, folder)], where
-    )
+    if found := list(_problems(submission, folder)):
+        worded = [(at, f"{dotted(at, document)}: {what}") for at, what in found]
+        raise InvalidSubmission(where, worded)
     everyone = tuple(range(1, submission.system.carts + 1))
     experiments = tuple(
         experiment.model_copy(
@@ -81,23 +113,22 @@ def load_submission(path: Path) -> Submission:
 def _validate(document: dict, *, where: str) -> Submission:
     for key in document:
         if key not in TOP_LEVEL:
-            raise SubmissionError(
-                f"{where}: {dotted([key], document)}: unknown key{nearest(key, TOP_LEVEL)}"
-            )
+            what = f"{dotted([key], document)}: unknown key{nearest(key, TOP_LEVEL)}"
+            raise InvalidSubmission(where, [((key,), what)])
     try:
         plain = {key: _plain(value, (key,)) for key, value in document.items()}
     except _Unusable as error:
         at, what = error.args
-        raise SubmissionError(f"{where}: {dotted(at, document)}: {what}") from None
+        raise InvalidSubmission(where, [(at, f"{dotted(at, document)}: {what}")]) from None
     except RecursionError:
         raise SubmissionError(f"{where}: lists or tables nest too deeply") from None
     try:
         return Submission.model_validate(plain, strict=True)
     except ValidationError as error:
         # A misspelt required key is both unknown and missing: the first says more.
-        first, *others = sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
-        _raise_first([explain(first, plain)], where, more=len(others))
-        raise  # never: there is at least one error
+        found = sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
+        worded = [(without_tag(e["loc"], plain), explain(e, plain)) for e in found]
+        raise InvalidSubmission(where, worded) from None
 
 
 class _Unusable(Exception):
@@ -123,13 +154,6 @@ def _plain(value: object, at: tuple[int | str, ...]) -> object:
     if at[0] == "reported":
         return Decimal(value)
     return float(value) if isinstance(value, Decimal) else value
-
-
-def _raise_first(problems: list[str], where: str, *, more: int = 0) -> None:
-    """Raise the first problem, with a count of the others and of those that were not worded."""
-    if problems:
-        others = len(problems) - 1 + more
-        raise SubmissionError(f"{where}: {problems[0]}{f' (and {others} more)' if others else ''}")
 
 
 def _notes(folder: Path) -> str | None:

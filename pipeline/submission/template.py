@@ -4,6 +4,7 @@ from pathlib import Path
 
 from pipeline.errors import ConfigError
 from pipeline.names import parameter_names
+from pipeline.output import write_file
 from pipeline.resources import TEMPLATES
 from pipeline.submission.load import NAME, spring_names
 
@@ -32,6 +33,14 @@ def new_submission(folder: Path, *, carts: int) -> None:
     folder = Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ConfigError(f"{folder}: is there already and not empty; name a new folder")
+    write_templates(folder, carts=carts)
+
+
+def write_templates(folder: Path, *, carts: int) -> None:
+    """Write what `new_submission` does into a folder where only recordings may be yet.
+
+    `submission.toml` and `notes.md` that are there stay as they are.
+    """
     import jinja2  # costs 50 ms, and only a new submission needs it
 
     source = (TEMPLATES / f"{NAME}.j2").read_text(encoding="utf-8")
@@ -50,5 +59,6 @@ def new_submission(folder: Path, *, carts: int) -> None:
         names=parameter_names(carts),
     )
     (folder / "data").mkdir(parents=True, exist_ok=True)
-    (folder / NAME).write_text(text, encoding="utf-8", newline="\n")
-    (folder / "notes.md").write_text(_NOTES, encoding="utf-8", newline="\n")
+    for name, content in ((NAME, text), ("notes.md", _NOTES)):
+        if not (folder / name).exists():
+            write_file(folder / name, content)

@@ -2,13 +2,14 @@
 
 import re
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from pipeline.errors import PipelineError
 from pipeline.submission.complaints import quote
 
+Value: TypeAlias = "str | bool | int | float | Sequence[Value] | Mapping[str, Value]"
 _MAX_KEY_DEPTH = 30  # tomllib's time grows with the square of a dotted key's depth
 _DOTTED_KEY = re.compile(r"[\w\"'-]+(?:[ \t]*\.[ \t]*[\w\"'-]+)*")
 _LONGEST_LINE, _SHOWN = 300, 60  # characters of a line that are looked at, and shown

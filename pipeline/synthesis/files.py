@@ -3,20 +3,17 @@
 import json
 import math
 from collections.abc import Mapping, Sequence
-from typing import TypeAlias
 
 import numpy as np
 
 from pipeline.plant.chain import Array
+from pipeline.submission.toml_file import Value
 from pipeline.synthesis.bench import Run
 from pipeline.synthesis.runs import INPUT_DECIMALS
 
 
 class Typed(str):
     """A number as a student typed it: its digits stand in the file as they are."""
-
-
-Value: TypeAlias = "str | bool | int | float | Sequence[Value] | Mapping[str, Value]"
 
 
 def csv_text(run: Run, *, u: Array, y: Array, time_decimals: int, count: float) -> str:

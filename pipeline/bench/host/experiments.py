@@ -1,17 +1,18 @@
 """Additions to submission.toml: an experiment, a scale, a new file; what stands there is kept."""
 
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 
 from pipeline.bench.planning.plan import Limits
 from pipeline.bench.protocol.messages import FULL_SCALE, Description
-from pipeline.errors import ConfigError, SubmissionError
+from pipeline.errors import ConfigError
 from pipeline.ingest.read import DUTY_COUNT
 from pipeline.output import new_folder, write_file
 from pipeline.submission import Submission, load_submission
+from pipeline.submission.edit import append_experiment, edit_submission
 from pipeline.submission.load import NAME, spring_names
-from pipeline.synthesis.files import Value, toml_section
+from pipeline.submission.toml_file import Value
+from pipeline.synthesis.files import toml_section
 
 _TO_ADD = """\
 # Who you are, one table for each of you:
@@ -30,31 +31,13 @@ _SAME = 1e-3  # scales that differ by less are the same number typed with fewer 
 
 
 def add_experiment(submission: Submission, entry: Mapping[str, Value]) -> Submission:
-    """Append an `[[experiments]]` table; text and comments that stand there are kept.
+    """Add an `[[experiments]]` table; text and comments that stand there are kept.
 
     Raises
     ------
     SubmissionError : the file cannot take it, or what comes of it would not be valid.
     """
-    path = submission.folder / NAME
-    text = path.read_bytes().decode("utf-8-sig")
-    newline = "\r\n" if "\r\n" in text else "\n"
-    addition = toml_section("[[experiments]]", entry).replace("\n", newline)
-    new = text.rstrip() + 2 * newline + addition
-    try:
-        tomllib.loads(new)
-    except tomllib.TOMLDecodeError as error:
-        raise SubmissionError(
-            f"{submission.folder.resolve().name}/{NAME}: an [[experiments]] table cannot be added "
-            f"at its end ({error}); write every experiment as a table of its own"
-        ) from None
-    before = path.read_bytes()
-    write_file(path, new)
-    try:
-        return load_submission(submission.folder)
-    except SubmissionError:
-        write_file(path, before)
-        raise
+    return edit_submission(submission.folder, lambda document: append_experiment(document, entry))
 
 
 def prepare_submission(folder: Path, bench: Description, *, stock: bool) -> Submission:

@@ -1,6 +1,5 @@
 """Take files recorded by other programs into a submission as they appear in a folder."""
 
-import re
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -13,21 +12,18 @@ from pipeline.bench.planning.plan_file import load_plan, plan_path
 from pipeline.bench.planning.plan_words import hold_words
 from pipeline.bench.watch.observer import Observer
 from pipeline.errors import ConfigError, SubmissionError
-from pipeline.ingest.formats.recognise import read_table
+from pipeline.ingest.fill import ENDINGS, experiment_entry, free_carts, free_id
 from pipeline.ingest.inspect import Inspection, inspect_file
-from pipeline.ingest.suggest import suggest_columns
 from pipeline.output import own_folder
 from pipeline.results import Kind
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.load import MAX_DATA_BYTES
-from pipeline.synthesis.files import Value
+from pipeline.submission.toml_file import Value
 
 LOOK_EVERY = 0.5  # s
 _COMPLETE = 2  # looks in a row at which size and time of a file were the same
 _CUT_SHORT = 20  # … at which a file that ends in mid-line is taken to stay so
-_ENDINGS = (".txt", ".csv", ".mat", ".m", ".log", ".dat", ".tsv", ".asc")
 _SAME_FREQUENCY = 0.05  # of it: a dwell recorded for the one the plan asks for
-_NO_NAME = re.compile(r"[^\w.-]+", re.ASCII)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,8 +119,8 @@ class Importer:
         """Tell whether this can be no data file, and say so."""
         if path.is_dir():
             why = "a folder"
-        elif path.suffix.casefold() not in _ENDINGS:
-            why = f"a data file ends in {', '.join(_ENDINGS)}"
+        elif path.suffix.casefold() not in ENDINGS:
+            why = f"a data file ends in {', '.join(ENDINGS)}"
         else:
             return not path.is_file()
         self._over.add(path)
@@ -175,13 +171,13 @@ class Importer:
             else:
                 self._observer.remark(f"{path.name}: not taken, {inspection.problems[0]}")
             return None
-        planned = self._match(inspection, path)
+        planned = self._match(inspection)
         kind = planned.kind if planned else inspection.kind
         if kind is None:
             why = "; ".join(inspection.problems)
             self._observer.remark(f"{path.name}: not taken, nothing tells what it is: {why}")
             return None
-        name = planned.id if planned else self._free_id(path.stem)
+        name = planned.id if planned else free_id(path.stem, self._done)
         data = own_folder(self._folder, "data")
         data.mkdir(exist_ok=True)
         target = data / f"{name}{path.suffix.casefold()}"
@@ -216,16 +212,11 @@ class Importer:
             for copy in copies
         )
 
-    def _match(self, inspection: Inspection, path: Path) -> Recording | None:
-        """Return the next recording of the plan if the file looks like it.
-
-        A table without headings, whose columns can be guessed, looks like anything.
-        """
+    def _match(self, inspection: Inspection) -> Recording | None:
+        """Return the next recording of the plan if the file looks like it."""
         recording = self._next
         if recording is None:
             return None
-        if inspection.kind is None:
-            return recording if _columns(path) else None
         if recording.kind == "sine":
             found = inspection.frequency
             near = found and abs(found / recording.frequency - 1) < _SAME_FREQUENCY
@@ -235,14 +226,6 @@ class Importer:
         return (
             recording if inspection.kind in alike.get(recording.kind, (recording.kind,)) else None
         )
-
-    def _free_id(self, stem: str) -> str:
-        base = _NO_NAME.sub("-", stem).strip("-.") or "record"
-        number, name = 1, base
-        while name in self._done:
-            number += 1
-            name = f"{base}-{number}"
-        return name
 
 
 def _entry(
@@ -254,31 +237,10 @@ def _entry(
     submission: Submission,
 ) -> dict[str, Value]:
     """Return the keys of the `[[experiments]]` table of an imported file."""
-    entry: dict[str, Value] = {"id": name, "kind": kind, "file": f"data/{target.name}"}
-    if planned is not None:
-        entry["carts"] = list(planned.carts)
-    elif carts := _measured(inspection, submission):
-        entry["carts"] = carts
+    n = submission.system.carts
+    carts = planned.carts if planned else free_carts(inspection)[0]
+    file = f"data/{target.name}"
+    entry = experiment_entry(inspection, name=name, kind=kind, file=file, carts=carts, n=n)
     if kind == "sine" and (hertz := planned.frequency if planned else inspection.frequency):
         entry["frequency"] = hertz if planned else float(f"{hertz:.4g}")
-    columns = _columns(target)
-    if columns:
-        entry["columns"] = columns
     return entry
-
-
-def _measured(inspection: Inspection, submission: Submission) -> list[int]:
-    """Return the one cart of a file that measures one, [] where all are there."""
-    roles = {column.role for column in inspection.columns if column.role}
-    carts = sorted(int(role[1:]) for role in roles if role[0] == "x" and role[1:].isdigit())
-    return carts if len(carts) == 1 < submission.system.carts else []
-
-
-def _columns(path: Path) -> dict[str, Value]:
-    """Return which column of a file without headings is what, as far as that can be guessed."""
-    table, _ = read_table(path.resolve().parent, path.resolve().name)
-    if not all(name.isdigit() for name in table.names):
-        return {}
-    line = suggest_columns(table)
-    pairs = re.findall(r"(\w+) = (\d+)", line or "")
-    return {role: int(number) for role, number in pairs}

@@ -1,0 +1,318 @@
+"""What the files of a submission are, written into its `submission.toml`.
+
+A table is added for every recording in `data/` that has none, and completed where it lacks what its
+file tells. What stands there is nobody's to change; what is not sure is said as a comment.
+"""
+
+import json
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal
+
+import tomlkit
+
+from pipeline.errors import ConfigError, SubmissionError
+from pipeline.ingest.inspect import Inspection, inspect_file
+from pipeline.results import Kind
+from pipeline.submission.edit import (
+    append_experiment,
+    comment_text,
+    edit_submission,
+    toml_item,
+)
+from pipeline.submission.load import NAME, outside
+from pipeline.submission.models import MOST_EXPERIMENTS
+from pipeline.submission.template import write_templates
+from pipeline.submission.toml_file import Value
+
+ENDINGS = (".txt", ".csv", ".mat", ".m", ".log", ".dat", ".tsv", ".asc")
+_MOST_CARTS = 4
+_HELD_STEPS = 2.0  # encoder steps over a whole record; a cart that is free moves more
+_HARDLY = 0.05  # of the furthest cart's motion; less may be a cart that a hand held
+_NO_NAME = re.compile(r"[^\w.-]+", re.ASCII)
+
+State = Literal["new", "completed", "there", "copy", "unknown", "broken"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Found:
+    """A data file and its place in `submission.toml`.
+
+    Attributes
+    ----------
+    file : below the submission's folder.
+    state : its table is new, completed or was there; or there is none, for it is a copy of another
+        file, nothing tells what it is, or it cannot be read.
+    experiment : the id of its table; "" without one.
+    carts : that were free, as far as the file tells; () all.
+    inspection : None where the file cannot be read.
+    remarks : what is wrong; unsure : what a person has to say.
+    """
+
+    file: str
+    state: State
+    experiment: str = ""
+    kind: Kind | None = None
+    carts: tuple[int, ...] = ()
+    inspection: Inspection | None = None
+    remarks: tuple[str, ...] = ()
+    unsure: tuple[str, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what was found as plain values for JSON."""
+        return asdict(self)
+
+
+def data_files(folder: Path) -> list[str]:
+    """Return the recordings in `data/`, "2" before "10", as they stand in `submission.toml`."""
+    names = [
+        path.relative_to(folder).as_posix()
+        for path in (folder / "data").rglob("*")
+        if path.suffix.casefold() in ENDINGS and not path.name.startswith((".", "~"))
+    ]
+    return sorted((n for n in names if outside(folder, n) is None), key=_natural)
+
+
+def look_at(folder: Path, file: str) -> Found:
+    """Return what a file of a submission is; `state` is "broken" or not settled yet ("unknown")."""
+    try:
+        inspection = inspect_file(folder / file)
+    except SubmissionError as error:
+        reason = str(error).removeprefix(str(folder / file)).lstrip(": ")
+        return Found(file=file, state="broken", remarks=(reason,))
+    carts, unsure = free_carts(inspection)
+    return Found(
+        file=file,
+        state="unknown",
+        kind=inspection.kind,
+        carts=carts,
+        inspection=inspection,
+        remarks=inspection.problems,
+        unsure=unsure,
+    )
+
+
+def free_carts(inspection: Inspection) -> tuple[tuple[int, ...], tuple[str, ...]]:
+    """Return the carts that a file shows to move, and what is not sure of it.
+
+    () stands for all: those of a table of ratios, and where none moves, which says nothing.
+    """
+    positions = inspection.positions
+    if inspection.kind == "bode":
+        return (), ()
+    step = max((column.step or 0.0 for column in positions.values()), default=0.0)
+    ranges = {cart: column.high - column.low for cart, column in positions.items()}
+    carts = tuple(cart for cart, travel in ranges.items() if travel > _HELD_STEPS * step)
+    little = [cart for cart in carts if ranges[cart] < _HARDLY * max(ranges.values())]
+    if inspection.kind == "sine" or not little:  # near a null, a free cart hardly moves
+        return carts, ()
+    others = [cart for cart in carts if cart not in little]
+    which = " and ".join(map(str, little))
+    return carts, (f"cart {which} hardly moves; if it was held: carts = {others}",)
+
+
+def experiment_entry(
+    inspection: Inspection, *, name: str, kind: Kind, file: str, carts: Sequence[int], n: int
+) -> dict[str, Value]:
+    """Return the keys of the `[[experiments]]` table of a file; `n` carts has the system."""
+    entry: dict[str, Value] = {"id": name, "kind": kind}
+    if carts and len(carts) < n:
+        entry["carts"] = [cart for cart in carts if cart <= n]
+    entry["file"] = file
+    if inspection.guessed:
+        entry["columns"] = dict(inspection.guessed)
+    return entry
+
+
+def free_id(stem: str, taken: Iterable[str]) -> str:
+    """Return a name for an experiment after that of its file, unlike those taken."""
+    base = _NO_NAME.sub("-", stem).strip("-.") or "record"
+    names, number, name = set(taken), 1, base
+    while name in names:
+        number += 1
+        name = f"{base}-{number}"
+    return name
+
+
+def fill_submission(folder: Path) -> tuple[Found, ...]:
+    """Write the tables of the files in `data/`; without a `submission.toml`, one is made.
+
+    Raises
+    ------
+    ConfigError : there is no such folder, or no recording in its `data/`.
+    SubmissionError : `submission.toml` is broken, or cannot be changed by a program.
+    """
+    if not folder.is_dir():
+        raise ConfigError(f"{folder}: no such folder; copy your recordings into {folder / 'data'}")
+    looked = [look_at(folder, file) for file in data_files(folder)]
+    if not looked:
+        raise ConfigError(
+            f"{folder / 'data'}: no recording in it; copy your files there (they end in "
+            f"{', '.join(ENDINGS)})"
+        )
+    new = not (folder / NAME).exists()
+    if new:
+        write_templates(folder, carts=_carts_seen(looked))
+    found: list[Found] = []
+
+    def change(document: tomlkit.TOMLDocument) -> None:
+        if new:
+            _state_units(document, looked)
+        filling = _Filling(document, folder)
+        found.extend(filling.add(one) for one in looked)
+
+    edit_submission(folder, change)
+    return tuple(found)
+
+
+class _Filling:
+    """A document to which the tables of files are added one after the other."""
+
+    def __init__(self, document: tomlkit.TOMLDocument, folder: Path) -> None:
+        self._document, self._folder = document, folder
+        system: Any = document.get("system", {})
+        self._n = system.get("carts", 1)
+
+    @property
+    def _tables(self) -> list[Any]:
+        return [table for table in self._document.get("experiments", ()) if "file" in table]
+
+    def add(self, found: Found) -> Found:
+        """Add the table of one file, or complete the one that is there; return what was done."""
+        if found.inspection is None:
+            return found
+        for table in self._tables:
+            if _plain(table["file"]) == found.file:
+                return self._complete(table, found, found.inspection)
+        if (same := self._same(found.file)) is not None:
+            return replace(found, state="copy", remarks=(*found.remarks, f"is a copy of {same}"))
+        if found.kind is None:
+            self._say_unknown(found)
+            return found
+        taken = [str(table.get("id", "")) for table in self._tables]
+        name = free_id(PurePosixPath(found.file).stem, taken)
+        entry = experiment_entry(
+            found.inspection,
+            name=name,
+            kind=found.kind,
+            file=found.file,
+            carts=found.carts,
+            n=self._n,
+        )
+        if len(self._tables) >= MOST_EXPERIMENTS:
+            full = f"not added: {MOST_EXPERIMENTS} experiments are the most"
+            return replace(found, remarks=(*found.remarks, full))
+        unsure = (*found.unsure, *_unsure(found, self._n))
+        append_experiment(self._document, entry, remarks=[f"unsure: {one}" for one in unsure])
+        return replace(found, state="new", experiment=name, unsure=unsure)
+
+    def _complete(self, table: Any, found: Found, inspection: Inspection) -> Found:
+        """Give a table the keys that it cannot do without and its file tells."""
+        before = len(table)
+        if "id" not in table:
+            taken = [str(one.get("id", "")) for one in self._tables]
+            table["id"] = free_id(PurePosixPath(found.file).stem, taken)
+        if "kind" not in table and found.kind is not None:
+            table["kind"] = found.kind
+        if "columns" not in table and inspection.guessed:
+            table["columns"] = toml_item(inspection.guessed)
+        return replace(
+            found,
+            state="completed" if len(table) > before else "there",
+            experiment=str(table["id"]),
+            kind=table.get("kind"),
+            carts=tuple(table.get("carts", ())),
+        )
+
+    def _same(self, file: str) -> str | None:
+        """Return another file of the submission that holds the very same."""
+        path = self._folder / file
+        for table in self._tables:
+            other = self._folder / _plain(table["file"])
+            if (
+                other.is_file()
+                and other.stat().st_size == path.stat().st_size
+                and other.read_bytes() == path.read_bytes()
+            ):
+                return _plain(table["file"])
+        return None
+
+    def _say_unknown(self, found: Found) -> None:
+        """Leave a table as a comment, to be filled in by who knows what the file is; once."""
+        line = f"file = {json.dumps(found.file, ensure_ascii=False)}"
+        if f"# {line}" in tomlkit.dumps(self._document).splitlines():
+            return
+        why = "; ".join(found.remarks) or "nothing tells what it is"
+        id_ = json.dumps(free_id(PurePosixPath(found.file).stem, ()))
+        kind = 'kind = ""    # decay, step, sine, sweep, closed_loop or bode?'
+        self._document.add(tomlkit.nl())
+        for text in (f"unsure: {why}", "[[experiments]]", f"id = {id_}", kind, line):
+            self._document.add(tomlkit.comment(comment_text(text)))
+
+
+def _plain(file: object) -> str:
+    return str(PurePosixPath(str(file).replace("\\", "/")))
+
+
+def _unsure(found: Found, n: int) -> Iterator[str]:
+    """Yield what a person knows and no file tells."""
+    assert found.inspection is not None
+    if found.inspection.guessed:
+        yield "the columns have no names, their numbers are guessed"
+    if found.kind == "closed_loop":
+        yield "what ran: controller = { type = … }" + (", controlled_cart = …" if n > 1 else "")
+    positions = found.inspection.positions
+    if n > 1 and list(positions) == [1] and not re.search(r"\d", positions[1].name):
+        yield "is it cart 1 that it measures? Else columns = { x2 = … }"
+
+
+def _natural(name: str) -> list[tuple[str, int]]:
+    return [(text, int(n or -1)) for text, n in re.findall(r"(\D*)(\d{0,9})", name.casefold())]
+
+
+def _carts_seen(looked: Sequence[Found]) -> int:
+    """Return the last cart that moves in any file; an exporter writes columns for more."""
+    carts = [
+        cart for one in looked if one.inspection for cart in one.carts or one.inspection.positions
+    ]
+    return max((cart for cart in carts if cart <= _MOST_CARTS), default=1)
+
+
+def _state_units(document: tomlkit.TOMLDocument, looked: Sequence[Found]) -> None:
+    """Write the units that headings state into a new document; counts it takes without a word."""
+    system: Any = document["system"]
+    for inspection in (one.inspection for one in looked if one.inspection):
+        for column in inspection.columns:
+            role = column.role or ""
+            key = "input" if role == "input" else "position" if role[:1] == "x" else ""
+            if key and column.unit and not column.unit.startswith("count"):
+                system[key]["unit"] = column.unit
+
+
+def format_found(found: Sequence[Found]) -> str:
+    """Return a table of one line a file, what is wrong or not sure below."""
+    rows = [
+        (one.file, one.state, one.kind or "?", _carts_words(one.carts), one.experiment or "-")
+        for one in found
+    ]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = [
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    ]
+    said: dict[str, list[str]] = {}
+    for one in found:
+        for remark in (*one.remarks, *(f"unsure: {unsure}" for unsure in one.unsure)):
+            said.setdefault(remark, []).append(one.file)
+    for remark, files in said.items():
+        which = files[0] if len(files) == 1 else f"{len(files)} files"
+        lines.append(f"! {which}: {remark}")
+    return "\n".join(lines)
+
+
+def _carts_words(carts: Sequence[int]) -> str:
+    if not carts:
+        return "all carts"
+    return f"cart{'s' if len(carts) > 1 else ''} {', '.join(map(str, carts))}"

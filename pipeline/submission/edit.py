@@ -1,0 +1,121 @@
+"""Change `submission.toml` in place: comments, order and digits that nobody touched stay."""
+
+import hashlib
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import tomlkit
+from tomlkit.exceptions import TOMLKitError
+from tomlkit.items import Array
+
+from pipeline.errors import SubmissionError
+from pipeline.output import write_file
+from pipeline.submission.load import MAX_TOML_BYTES, NAME, parse_submission
+from pipeline.submission.models import Submission
+from pipeline.submission.toml_file import Value, read_text
+
+_MANY_BLANKS = re.compile(r"\n{3,}(?=\[\[experiments\]\])")
+_LONGEST_LINE = 90  # characters of a comment
+
+
+class Outdated(SubmissionError):
+    """The file is another than the one that the change was made for; `text` is what it is now."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(f"{NAME}: was changed meanwhile, by another program or in another window")
+        self.text = text
+
+
+def submission_text(folder: Path) -> str:
+    """Return the text of a folder's `submission.toml`.
+
+    Raises
+    ------
+    SubmissionError : there is none that can be read.
+    """
+    where = f"{folder.resolve().name}/{NAME}"
+    return read_text(folder / NAME, where=where, limit=MAX_TOML_BYTES, error=SubmissionError)
+
+
+def text_digest(text: str) -> str:
+    """Return what tells one state of the file from another."""
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def edit_submission(
+    folder: Path, change: Callable[[tomlkit.TOMLDocument], None], *, seen: str = ""
+) -> Submission:
+    """Change the document of a submission; written is what is valid, whole or not at all.
+
+    Parameters
+    ----------
+    seen : digest of the text that the change was made for; "": whatever stands there.
+
+    Raises
+    ------
+    SubmissionError : what comes of it would not be valid (`InvalidSubmission`), or the file
+        cannot be changed so.
+    Outdated : the file is not the one `seen`.
+    """
+    text = submission_text(folder)
+    if seen and seen != text_digest(text):
+        raise Outdated(text)
+    where = f"{folder.resolve().name}/{NAME}"
+    newline = "\r\n" if "\r\n" in text else "\n"
+    try:
+        document = tomlkit.parse(text.replace("\r\n", "\n"))
+        change(document)
+        new = _MANY_BLANKS.sub("\n\n", tomlkit.dumps(document)).rstrip() + "\n"
+    except (TOMLKitError, RecursionError) as error:
+        raise SubmissionError(f"{where}: cannot be changed by a program ({error})") from None
+    submission = parse_submission(new, folder=folder, where=where)
+    write_file(folder / NAME, new.replace("\n", newline))
+    return submission
+
+
+def append_experiment(
+    document: tomlkit.TOMLDocument, entry: Mapping[str, Value], *, remarks: Sequence[str] = ()
+) -> None:
+    """Add an `[[experiments]]` table after the others, remarks as comments at its end."""
+    there: Any = document.get("experiments")
+    inline = isinstance(there, Array)
+    table: Any = tomlkit.inline_table() if inline else tomlkit.table()
+    for key, value in entry.items():
+        table.add(key, toml_item(value))
+    if inline:
+        there.append(table)
+        return
+    for remark in remarks:
+        table.add(tomlkit.comment(comment_text(remark)))
+    table.add(tomlkit.nl())
+    before = tomlkit.dumps(document) if there is None else there[-1].as_string()
+    table.trivia.indent = "" if not before or before.endswith("\n\n") else "\n"
+    if there is None:
+        there = tomlkit.aot()
+        there.append(table)
+        document.append("experiments", there)
+    else:
+        there.append(table)
+
+
+def comment_text(remark: str) -> str:
+    """Return a remark fit to stand behind a #, whatever a file's name brought into it."""
+    plain = "".join(c if c.isprintable() else " " for c in remark)
+    return plain if len(plain) <= _LONGEST_LINE else plain[: _LONGEST_LINE - 1] + "…"
+
+
+def toml_item(value: Value) -> Any:
+    """Return a plain value as an item of a document, tables within a line."""
+    if isinstance(value, Mapping):
+        table = tomlkit.inline_table()
+        for key, item in value.items():
+            table.append(key, toml_item(item))
+        return table
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        array = tomlkit.array()
+        for item in value:
+            array.append(toml_item(item))
+        return array
+    return tomlkit.item(value)

@@ -1,0 +1,213 @@
+"""`cartlab fill`: what the files in `data/` are, written into `submission.toml` in place."""
+
+import json
+import shutil
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from pipeline.cli import app
+from pipeline.errors import ConfigError, SubmissionError
+from pipeline.ingest.fill import data_files, fill_submission
+from pipeline.ingest.read import read_data
+from pipeline.resources import EXAMPLES
+from pipeline.submission import load_submission, new_submission
+from pipeline.submission.edit import Outdated, append_experiment, edit_submission, text_digest
+
+T = np.arange(1200) / 150.0
+RING = np.round(300 * np.exp(-0.5 * T) * np.cos(12 * T))
+STEP = np.where((T > 1) & (T < 4), 0.5, 0.0)
+SINE = 0.3 * np.sin(2 * np.pi * 4.0 * T)
+
+
+def put(folder: Path, name: str, **columns: np.ndarray) -> None:
+    """Write columns as a CSV file into `data/`."""
+    (folder / "data").mkdir(parents=True, exist_ok=True)
+    heads = [key.replace("__", " [") + ("]" if "__" in key else "") for key in columns]
+    rows = "".join(",".join(f"{v:.7g}" for v in r) + "\n" for r in zip(*columns.values()))  # noqa: B905
+    (folder / "data" / name).write_text(",".join(heads) + "\n" + rows, encoding="utf-8")
+
+
+def states(folder: Path) -> dict[str, tuple[str, str, str | None]]:
+    """Fill, and return state, id and kind by file."""
+    return {f.file: (f.state, f.experiment, f.kind) for f in fill_submission(folder)}
+
+
+def test_a_folder_of_files_becomes_a_submission(tmp_path):
+    """Carts, units, kinds and which carts moved come from the files; the rest is a comment."""
+    still = 0 * T
+    put(tmp_path, "run 10.csv", time=T, input=SINE, x1__cm=RING / 300, x2__cm=0.4 * RING / 300)
+    put(tmp_path, "run 2.csv", time=T, input=STEP, x1__cm=RING / 300, x2__cm=0.4 * RING / 300)
+    put(tmp_path, "pull.csv", time=T, input=still, x1__cm=RING / 300, x2__cm=still)
+    put(tmp_path, "loop.csv", time=T, input=RING / 999, reference=STEP, x1__cm=RING / 300)
+    assert data_files(tmp_path) == [f"data/{n}.csv" for n in ("loop", "pull", "run 2", "run 10")]
+    assert states(tmp_path) == {
+        "data/loop.csv": ("new", "loop", "closed_loop"),
+        "data/pull.csv": ("new", "pull", "decay"),
+        "data/run 2.csv": ("new", "run-2", "step"),
+        "data/run 10.csv": ("new", "run-10", "sine"),
+    }
+    submission = load_submission(tmp_path)
+    assert submission.system.carts == 2
+    assert submission.system.position.unit == "cm"
+    assert {e.id: e.carts for e in submission.experiments} == {
+        "loop": (1,), "pull": (1,), "run-2": (1, 2), "run-10": (1, 2),
+    }  # fmt: skip
+    text = (tmp_path / "submission.toml").read_text(encoding="utf-8")
+    assert "# unsure: what ran: controller" in text
+    assert "#[design]" in text  # of the commented file that `cartlab new` writes
+    assert len(read_data(submission).records) == 4
+
+
+def test_the_exporter_s_empty_columns_are_no_carts(tmp_path):
+    """An encoder that never moves in any file belongs to no cart."""
+    put(tmp_path, "a.csv", time=T, input=STEP, x1=RING, x2=0.5 * RING, x3=0 * T)
+    fill_submission(tmp_path)
+    assert load_submission(tmp_path).system.carts == 2
+
+
+def test_what_stands_there_is_kept_and_what_lacks_is_completed(tmp_path):
+    """Kinds, ids and comments of the person's stay; a second time nothing changes."""
+    put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
+    put(tmp_path, "b.csv", time=T, input=SINE, x1=RING)
+    put(tmp_path, "c.csv", time=T, input=0 * T, x1=RING)
+    text = (
+        "version = 1  # ours\n[system]\ncarts = 1\n\n"
+        '[[experiments]]\nid = "mine"  # my own\nkind = "sweep"\nfile = "data\\\\a.csv"\n'
+        '[[experiments]]\nfile = "data/b.csv"\n# for the report\n[reported.initial]\nK = 0.10\n'
+    )
+    (tmp_path / "submission.toml").write_bytes(text.replace("\n", "\r\n").encode())
+    assert states(tmp_path) == {
+        "data/a.csv": ("there", "mine", "sweep"),
+        "data/b.csv": ("completed", "b", "sine"),
+        "data/c.csv": ("new", "c", "decay"),
+    }
+    raw = (tmp_path / "submission.toml").read_bytes()
+    assert raw.count(b"\r\n") == raw.count(b"\n")
+    for line in text.splitlines():
+        assert line in raw.decode().splitlines()
+    assert {f.state for f in fill_submission(tmp_path)} == {"there"}
+    assert (tmp_path / "submission.toml").read_bytes() == raw
+
+
+def test_what_is_no_recording_gets_no_table(tmp_path):
+    """Copies, riddles and texts are said; a riddle stands as a comment, once."""
+    put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
+    put(tmp_path, "b.csv", time=T, input=STEP, x1=RING)
+    put(tmp_path, "riddle.csv", foo=RING, bar=STEP)
+    (tmp_path / "data" / "text.txt").write_text("zero the encoders\n")
+    for _ in range(2):
+        assert [v[0] for v in states(tmp_path).values()][1:] == ["copy", "unknown", "broken"]
+        text = (tmp_path / "submission.toml").read_text(encoding="utf-8")
+        assert text.count('# file = "data/riddle.csv"') == 1
+        assert [e.id for e in load_submission(tmp_path).experiments] == ["a"]
+
+
+def test_a_bare_matrix_gets_its_columns(tmp_path):
+    """Numbers that the signals tell are written, and said to be guessed."""
+    (tmp_path / "data").mkdir()
+    rows = [f"{t:.5f}\t{x:.0f}\t{u}" for t, x, u in zip(T, RING, STEP, strict=True)]
+    (tmp_path / "data" / "bare.txt").write_text("\n".join(rows) + "\n")
+    (found,) = fill_submission(tmp_path)
+    assert (found.state, found.kind) == ("new", "step")
+    (experiment,) = load_submission(tmp_path).experiments
+    assert experiment.columns == {"time": 1, "input": 3, "x1": 2}
+    assert any("guessed" in one for one in found.unsure)
+
+
+def test_links_out_of_the_folder_are_not_followed(tmp_path):
+    """A link to somebody else's file is no file of the submission."""
+    put(tmp_path / "theirs", "a.csv", time=T, input=STEP, x1=RING)
+    put(tmp_path / "mine", "b.csv", time=T, input=STEP, x1=RING)
+    (tmp_path / "mine" / "data" / "a.csv").symlink_to(tmp_path / "theirs" / "data" / "a.csv")
+    assert list(states(tmp_path / "mine")) == ["data/b.csv"]
+
+
+def test_nothing_to_fill_in_is_one_line(tmp_path):
+    """No folder, no file, a broken `submission.toml`: an error, and nothing is written."""
+    with pytest.raises(ConfigError, match="no such folder"):
+        fill_submission(tmp_path / "nowhere")
+    with pytest.raises(ConfigError, match="no recording in it"):
+        fill_submission(tmp_path)
+    put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
+    (tmp_path / "submission.toml").write_text("version = 1\n[system]\ncarts = 9\n")
+    with pytest.raises(SubmissionError, match=r"system\.carts: expected at most 4"):
+        fill_submission(tmp_path)
+    assert (tmp_path / "submission.toml").read_text() == "version = 1\n[system]\ncarts = 9\n"
+
+
+def test_the_command_says_what_it_did(tmp_path):
+    """A table or JSON on stdout; exit status 1 where a file is left without a table."""
+    put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
+    result = CliRunner().invoke(app, ["fill", str(tmp_path)], catch_exceptions=False)
+    assert result.exit_code == 0
+    assert result.stdout.split() == ["data/a.csv", "new", "step", "cart", "1", "a"]
+    put(tmp_path, "riddle.csv", foo=RING)
+    result = CliRunner().invoke(app, ["fill", str(tmp_path), "--json"], catch_exceptions=False)
+    assert result.exit_code == 1
+    assert [row["state"] for row in json.loads(result.stdout)] == ["there", "unknown"]
+
+
+@pytest.mark.parametrize(("name", "carts"), [("one-cart", 1), ("two-cart", 2), ("three-cart", 3)])
+def test_the_files_of_an_example_are_told_apart(name, carts, tmp_path):
+    """Without its tables, a worked example gets back kinds and free carts of all files."""
+    true = load_submission(EXAMPLES / name)
+    shutil.copytree(true.folder / "data", tmp_path / "bare" / "data")
+    found = {f.file: f for f in fill_submission(tmp_path / "bare")}
+    told = {f.file: (f.kind, f.carts) for f in found.values()}
+    assert told == {e.file: (e.kind, e.carts) for e in true.experiments}
+    assert load_submission(tmp_path / "bare").system.carts == carts
+
+
+# ------------------------------------------------------------------- changes in place
+
+_WORDS = st.text(st.characters(codec="utf-8", exclude_categories=["C", "Z"]), max_size=8)
+_COMMENTS = st.lists(_WORDS.map(lambda word: f"# {word}"), min_size=8, max_size=8)
+_TABLES = st.permutations(["system", "experiments", "reported.initial", "design"])
+
+
+@given(_COMMENTS, _TABLES, st.integers(0, 3), st.booleans())
+def test_whatever_stands_there_stays(tmp_path_factory, comments, tables, n, blank):
+    """Every comment, key and digit outlives an added table, in whatever order they stand."""
+    bodies = {
+        "system": "[system] {}\ncarts = 1\ninput = {{ unit = 'V' }} {}\n",
+        "experiments": "".join(
+            f"[[experiments]]\n{{}}\nid = 'e{i}'\nkind = 'step'\nfile = 'a.csv'\n" for i in range(n)
+        ),
+        "reported.initial": "[reported.initial]\n{}\nK = 0.10 {}\n",
+        "design": "{}\n[design]\nreference = 1e0\n",
+    }
+    folder = tmp_path_factory.mktemp("any")
+    parts = ["version = 1", *(bodies[table] for table in tables)]
+    text = ("\n\n" if blank else "\n").join(parts) + "\n"
+    for comment in comments:
+        text = text.replace("{}", comment, 1)
+    text = text.replace("{{", "{").replace("}}", "}")
+    (folder / "submission.toml").write_text(text, encoding="utf-8")
+    entry = {"id": "new", "kind": "bode", "file": "data/b.csv", "columns": {"frequency": 1}}
+
+    edit_submission(folder, lambda d: append_experiment(d, entry, remarks=["what\x00?\n[x]"]))
+
+    now = (folder / "submission.toml").read_text(encoding="utf-8")
+    before = tomllib.loads(text)
+    before.setdefault("experiments", []).append(entry)
+    assert tomllib.loads(now) == before
+    lines = now.splitlines()
+    assert [line for line in text.splitlines() if line.strip() and line not in lines] == []
+
+
+def test_an_outdated_change_is_refused(tmp_path):
+    """Whoever saw another text than stands there now changes nothing, and gets the text."""
+    new_submission(tmp_path / "team", carts=1)
+    toml = tmp_path / "team" / "submission.toml"
+    seen = text_digest(toml.read_text(encoding="utf-8"))
+    toml.write_text(toml.read_text(encoding="utf-8") + "# from outside\n", encoding="utf-8")
+    with pytest.raises(Outdated) as refused:
+        edit_submission(tmp_path / "team", lambda d: d.update(title="x"), seen=seen)
+    assert refused.value.text.endswith("# from outside\n")
+    assert "from outside" in toml.read_text(encoding="utf-8")
