@@ -12,7 +12,7 @@ from pipeline.gap.data.runs import Run
 from pipeline.gap.data.sides import prepare, take_sides
 from pipeline.gap.fit.baseline import fit_baseline, measure_noise
 from pipeline.gap.fit.levenberg_marquardt import Fit, covariance, fit_model
-from pipeline.gap.fit.restart import dry_force
+from pipeline.gap.fit.restart import holding_force
 from pipeline.gap.fit.structure import Candidate
 from pipeline.gap.search.beam import choose, prune, search, steps_to
 from pipeline.gap.search.deadline import Deadline, OutOfTime
@@ -207,9 +207,9 @@ def _with_offset(
     offset = find_offset(structure.chain(chosen.fit.theta), runs, own)
     if effect is None or offset is None:
         return path, None
-    cart, _, _ = structure.model(chosen.fit.theta).tables()
-    if abs(offset.force) < dry_force(cart)[offset.cart - 1]:
-        # Friction holds a cart as far from its equilibrium: no proof of a constant force.
+    holding = holding_force(structure.model(chosen.fit.theta).tables())
+    if abs(offset.force) < holding[offset.cart - 1]:
+        # What holds a cart as far from its equilibrium is there: no proof of a constant force.
         return path, None
     pinned, loose = (
         replace(

@@ -66,7 +66,8 @@ def rest_positions(model: AugmentedChain, *, free: Sequence[int] | None = None) 
     """
     cart, spring, drive = model.tables()
     n = model.chain.n
-    if not (np.any(cart[:, Cart.OFFSET]) and model.chain.is_tied):
+    pulled = np.any(cart[:, Cart.OFFSET]) or drive[Drive.COGGING] != 0.0
+    if not (pulled and model.chain.is_tied):
         return np.zeros(n)
     cart[:, DRY] = 0.0
     cart[:, Cart.GAIN] = 1.0
@@ -257,7 +258,8 @@ class SteppedBench:
         """Return the forces on all bodies but friction and the drive, as if they stood still."""
         s = self._state
         s[kernel.MID_X], s[kernel.MID_V], s[kernel.FORCE] = s[kernel.X], 0.0, s[kernel.FIX]
-        kernel._smooth_forces(self._cart, self._spring, self._n, s)
+        driven = max(self._motor, 0)
+        kernel._smooth_forces(self._cart, self._spring, self._drive, driven, self._n, s)
         return s[kernel.FORCE] - self._K @ s[kernel.X]
 
     def _close_contacts(self) -> None:

@@ -20,6 +20,7 @@ import numpy as np
 from pipeline.plant.compiled import (
     ACC,
     CHANGE,
+    COGGING,
     CONTACT_D,
     CONTACT_K,
     COULOMB,
@@ -56,6 +57,8 @@ from pipeline.plant.compiled import (
     MOTOR,
     OFFSET,
     PAST,
+    PHASE,
+    PITCH,
     ROWS,
     RUB,
     SIDE,
@@ -89,6 +92,7 @@ _LONGEST_LINEAR = 4.5e-3  # s; springs, dampers and dry friction are exact at an
 _CONTACT_REACH = 0.4  # omega h inside a contact
 _DAHL_STEP = 2.3e-3  # s; the presliding state is held over half of it
 _STRIBECK_STEP = 1.2e-3  # s; the drop of friction from its static force is over in few of them
+_COGGING_STEP = 1e-3  # s; a cart crosses a small part of the pitch in it
 _LONGEST_STEP = 2.5e-3  # s; nonlinear forces are held over it
 _MOST_EVENTS = 12  # in one substep; more would be chatter
 _BLOWN_UP = 1e9  # positions beyond this are a diverged model
@@ -125,12 +129,15 @@ def _assemble(cart, spring, drive, free, s, K, C):
 
 
 @jit
-def _smooth_forces(cart, spring, n, s):
+def _smooth_forces(cart, spring, drive, driven, n, s):
     """Add the forces that are neither linear nor dry, at the state in the middle of the step."""
     for i in range(n):
         s[FORCE, i] += cart[i, OFFSET]
         if cart[i, DRAG] != 0.0:
             s[FORCE, i] -= cart[i, DRAG] * s[MID_V, i] * abs(s[MID_V, i])
+    if drive[COGGING] != 0.0:
+        turn = 2.0 * np.pi * s[MID_X, driven] / drive[PITCH] + drive[PHASE]
+        s[FORCE, driven] += drive[COGGING] * np.sin(turn)
     for j in range(n + 1):
         if spring[j, CUBIC] != 0.0:
             f = spring[j, CUBIC] * stretch(s, MID_X, j, n) ** 3
@@ -271,7 +278,7 @@ def _advance(
             s[FORCE, i] = s[FIX, i]
             s[GRIP, i] = s[INV, i]
         if not smooth:
-            _smooth_forces(cart, spring, n, s)
+            _smooth_forces(cart, spring, drive, driven, n, s)
         s[FORCE, driven] += u
         s[FORCE, 0] -= drive_c * s[MID_V, 0]
         if dry:
@@ -359,7 +366,8 @@ def _advance(
                     switching = e
                     stopping = -1
         if lanes.size > 0:
-            carry(lanes, T, phi, work, s, K, C, N, n, cart, spring, scatter, drive_c, whole, step)
+            push = drive_c, driven, drive
+            carry(lanes, T, phi, work, s, K, C, N, n, cart, spring, scatter, push, whole, step)
         for i in range(N):
             s[X, i] += step * (
                 s[V, i]
@@ -438,7 +446,7 @@ def _simulate(
     N, motor, parent = _assemble(cart, spring, drive, free, s, K, C)
 
     dry = False
-    smooth = True
+    smooth = drive[COGGING] == 0.0
     presliding = False
     stribeck = False
     fastest = 0.0
@@ -468,6 +476,8 @@ def _simulate(
         longest = min(longest, _DAHL_STEP)
     if stribeck:
         longest = min(longest, _STRIBECK_STEP)
+    if drive[COGGING] != 0.0:
+        longest = min(longest, _COGGING_STEP)
     if motor >= 0:
         contact = max(contact, drive[CONTACT_K] * (s[INV, 0] + s[INV, motor]))
     longest /= refine
@@ -534,7 +544,7 @@ def _simulate(
         if shot == 0 and presliding:
             for i in range(N):
                 s[MID_X, i], s[MID_V, i], s[FORCE, i] = s[X, i], s[V, i], s[FIX, i]
-            _smooth_forces(cart, spring, n, s)
+            _smooth_forces(cart, spring, drive, driven, n, s)
             for i in range(n):
                 if cart[i, DAHL] > 0.0:
                     net = s[FORCE, i] + (u[0] if i == 0 else 0.0)
@@ -613,7 +623,7 @@ def simulate_batch(cart, spring, drive, x0, v0, scatter, free, t, knots, command
 
     Parameters
     ----------
-    cart, spring, drive : (b, n, 17), (b, n + 1, 5), (b, 9) tables, see `Cart`, `Spring`, `Drive`.
+    cart, spring, drive : (b, n, 17), (b, n + 1, 5), (b, 12) tables, see `Cart`, `Spring`, `Drive`.
     x0, v0 : (b, shots, n) positions and velocities of the carts at the start of each shot; or
         (b, shots, 2 n), where those of their hidden masses relative to them follow, which the
         first shot takes and the later ones carry over.

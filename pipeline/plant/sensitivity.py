@@ -18,6 +18,7 @@ from pipeline.plant.compiled import (
     ACC,
     BEFORE,
     CHANGE,
+    COGGING,
     CUBIC,
     D2,
     D3,
@@ -32,6 +33,8 @@ from pipeline.plant.compiled import (
     MID_V,
     MID_X,
     PAST,
+    PHASE,
+    PITCH,
     RUB,
     SIDE,
     STATIC,
@@ -80,10 +83,11 @@ def _add(T, row, factor, other):
 
 
 @jit
-def carry(lanes, T, phi, work, s, K, C, N, n, cart, spring, scatter, drive_c, whole, step):
+def carry(lanes, T, phi, work, s, K, C, N, n, cart, spring, scatter, push, whole, step):
     """Move the sensitivities on by `step`, before the state moves.
 
-    Forces were taken in the middle of the `whole` step.
+    Forces were taken in the middle of the `whole` step; `push` is the braking of the motor now,
+    which body it drives, and the table of the drive.
     """
     moved = 3 * N + 2
     changed = abs(step - phi[2 * N, 0]) > _SAME * step
@@ -104,7 +108,7 @@ def carry(lanes, T, phi, work, s, K, C, N, n, cart, spring, scatter, drive_c, wh
             continue
         force = _force(lanes[0, lane], lanes[1, lane], s, n, spring)
         T[3 * N + 1, lane // _BLOCK, lane % _BLOCK] = force
-    _kick(lanes, T, s, N, n, cart, spring, scatter, drive_c, whole, 0.5 * step)
+    _kick(lanes, T, s, N, n, cart, spring, scatter, push, whole, 0.5 * step)
     for row in range(2 * N):
         for block in range(T.shape[1]):
             a = b = c = d = 0.0
@@ -130,7 +134,7 @@ def carry(lanes, T, phi, work, s, K, C, N, n, cart, spring, scatter, drive_c, wh
         for block in range(T.shape[1]):
             for q in range(_BLOCK):
                 T[row, block, q] = T[moved + row, block, q]
-    _kick(lanes, T, s, N, n, cart, spring, scatter, drive_c, whole, 0.5 * step)
+    _kick(lanes, T, s, N, n, cart, spring, scatter, push, whole, 0.5 * step)
 
 
 @jit
@@ -177,7 +181,7 @@ def _force(kind, at, s, n, spring):
 
 
 @jit
-def _kick(lanes, T, s, N, n, cart, spring, scatter, drive_c, whole, span):
+def _kick(lanes, T, s, N, n, cart, spring, scatter, push, whole, span):
     """Give the lanes the impulse of `span` s of their forces and of the nonlinear slopes."""
     for lane in range(lanes.shape[1]):
         kind, at, block, q = lanes[0, lane], lanes[1, lane], lane // _BLOCK, lane % _BLOCK
@@ -188,6 +192,11 @@ def _kick(lanes, T, s, N, n, cart, spring, scatter, drive_c, whole, span):
             T[N + at, block, q] += s[GRIP, at] * pull
         if kind == BY_STIFFNESS and at > 0:
             T[N + at - 1, block, q] -= s[GRIP, at - 1] * pull
+    braking, driven, drive = push
+    if drive[COGGING] != 0.0:
+        per = 2.0 * np.pi / drive[PITCH]
+        k = span * drive[COGGING] * per * np.cos(per * s[MID_X, driven] + drive[PHASE])
+        _add(T, N + driven, s[GRIP, driven] * k, driven)
     for j in range(n + 1):
         if spring[j, CUBIC] != 0.0:
             k = 3.0 * span * spring[j, CUBIC] * stretch(s, MID_X, j, n) ** 2
@@ -197,7 +206,7 @@ def _kick(lanes, T, s, N, n, cart, spring, scatter, drive_c, whole, span):
                     if 0 <= near < n:
                         _add(T, N + body, s[GRIP, body] * k, near)
     for i in range(n):
-        c = 2.0 * cart[i, DRAG] * abs(s[MID_V, i]) + (drive_c if i == 0 else 0.0)
+        c = 2.0 * cart[i, DRAG] * abs(s[MID_V, i]) + (braking if i == 0 else 0.0)
         if cart[i, STATIC] != 0.0 and s[SIDE, i] != 0.0 and s[V, i] != 0.0:
             ratio = abs(s[MID_V, i]) / cart[i, STRIBECK]
             fall = 2.0 * ratio / cart[i, STRIBECK] * np.exp(-ratio * ratio)

@@ -54,6 +54,9 @@ class Drive(IntEnum):
     MOTOR_MASS = 6  # the share of cart 1's mass on the motor's side of the gap
     CONTACT_STIFFNESS = 7
     CONTACT_DAMPING = 8
+    COGGING = 9  # force that repeats with the motor's position, …
+    PITCH = 10  # … over this travel, …
+    PHASE = 11  # … from this phase where cart 1 is at zero
 
 
 # Dry friction: what holds a cart at rest, and differs from run to run by a factor of its own.
@@ -64,7 +67,7 @@ Tables = tuple[Array, Array, Array]
 
 
 def linear_tables(chain: Chain) -> Tables:
-    """Return cart (n, 17), spring (n + 1, 5) and drive (9,) tables of a chain without effects."""
+    """Return cart (n, 17), spring (n + 1, 5) and drive (12,) tables of a chain without effects."""
     cart = np.zeros((chain.n, len(Cart)))
     spring = np.zeros((chain.n + 1, len(Spring)))
     drive = np.zeros(len(Drive))
@@ -72,5 +75,5 @@ def linear_tables(chain: Chain) -> Tables:
     # Divisors and factors whose neutral value is not zero.
     cart[:, [Cart.STRIBECK, Cart.DISTANCE, Cart.GAIN]] = 1.0
     spring[:, Spring.STIFFNESS] = chain.k
-    drive[Drive.LIMIT] = NO_LIMIT
+    drive[Drive.LIMIT], drive[Drive.PITCH] = NO_LIMIT, 1.0
     return cart, spring, drive

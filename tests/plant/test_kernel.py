@@ -131,6 +131,7 @@ PARAMETERS = {
     "extra_mode": {"mass": 3e-5, "stiffness": 0.03, "damping": 5e-5},
     "end_stop": {"position": 0.8, "stiffness": 2.0},
     "backlash": {"gap": 0.05},
+    "cogging": {"force": 0.003, "pitch": 0.3, "phase": 1.0},
 }
 
 

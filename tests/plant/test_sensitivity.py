@@ -31,6 +31,7 @@ CASES = {
     "input_delay": {"delay": 0.011},
     "actuator_lag": {"time_constant": 0.015},
     "backlash": {"gap": 0.05},
+    "cogging": {"force": 0.003, "pitch": 0.3, "phase": 1.0},
     "end_stop": {"position": 0.45, "stiffness": 1.0},
     "extra_mode": {"mass": 3e-5, "stiffness": 0.006, "damping": 2e-5},
     "sensor_gain": {"gain": 1.1},

@@ -20,7 +20,7 @@ _CART = (
     "m c coulomb excess stribeck dahl delta mu drag offset stop stop_k stop_c gain hm hk hc"
 ).split()
 _SPRING = "k cubic change stretch coupling".split()
-_DRIVE = "dead limit delay lag braking gap motor contact contact_c".split()
+_DRIVE = "dead limit delay lag braking gap motor contact contact_c cog pitch phase".split()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,6 +115,8 @@ def _motion(cart, spring, drive, free, t, times, command, x0, v0, scatter, h):
             vm += h / drive[6] * (u - push)
         else:
             f[0] += u
+        if drive[9] != 0.0:
+            f[0] += drive[9] * np.sin(2.0 * np.pi * x[0] / drive[10] + drive[11])
         if drive[4] != 0.0 and command[on] != 0.0:
             f[0] -= drive[4] * w[0]
         for i in range(n):
@@ -244,6 +246,8 @@ def _hide(effect: Hidden, cart: np.ndarray, spring: np.ndarray, drive: np.ndarra
             drive[3] = p["time_constant"]
         case "drive_damping":
             drive[4] = p["coefficient"]
+        case "cogging":
+            drive[9:12] = p["force"], p["pitch"], p["phase"]
         case "backlash":
             motor = 0.15 * cart[0, 0]
             contact = 60.0 * float(spring[:2, 0].sum())

@@ -293,6 +293,12 @@ def _draw(name, n, m, c, k, stiffness, large, rate, linear, severity, rng) -> Hi
             return Hidden(effect=name, parameters={"time_constant": s * draw(0.01, 0.04)})
         case "backlash":
             return Hidden(effect=name, parameters={"gap": s * draw(0.03, 0.12)})
+        case "cogging":
+            # At most 0.6 of what would let the cart snap from tooth to tooth.
+            pitch = draw(0.2, 0.6)
+            force = s * draw(0.2, 0.6) * stiffness[0, 0] * pitch / (2 * np.pi)
+            parameters = {"force": force, "pitch": pitch, "phase": draw(-np.pi, np.pi)}
+            return Hidden(effect=name, parameters=parameters)
         case "end_stop":
             side = 1.0 if linear[0][i].max() > -linear[0][i].min() else -1.0
             parameters = {

@@ -149,7 +149,7 @@ def fit_locals(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
         )
 
     found = follow(own)
-    if any(fit.structure.dry) and found.chi > fit.chi:
+    if fit.structure.many_rests and found.chi > fit.chi:
         again = restart_runs(found, runs, mapper=mapper)
         found = follow(again.locals_)
     return found

@@ -8,19 +8,19 @@ from pipeline.gap.data.runs import Run
 from pipeline.gap.fit.levenberg_marquardt import Fit, Mapper, evaluate, fit_model
 from pipeline.gap.fit.linearise import Locals, residual_points
 from pipeline.plant.chain import Array
-from pipeline.plant.tables import Cart
+from pipeline.plant.tables import Cart, Drive, Tables
 
 _BAD_RUN, _BAD_SHARE = 1.5, 2.0  # chi-square, or share of the median run's, to start a run anew
 _RESTARTS = ((0.8, 1.0), (-0.8, 1.0), (1.6, 1.0), (-1.6, 1.0), (0.0, 0.94), (0.0, 1.06))
 
 
 def restart_runs(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
-    """Start the worst runs' own unknowns anew from elsewhere in the friction band.
+    """Start the worst runs' own unknowns anew from elsewhere in the band where carts may rest.
 
-    A cart rests anywhere inside the band, and is zeroed there, so a run's misfit has several
-    valleys in zero and friction. Shared parameters stay.
+    A cart rests anywhere inside the band of friction or cogging, and is zeroed there, so a run's
+    misfit has several valleys in zero and friction. Shared parameters stay.
     """
-    if not any(fit.structure.dry):
+    if not fit.structure.many_rests:
         return fit
     worst = fit.run_chi > max(_BAD_RUN, _BAD_SHARE * float(np.median(fit.run_chi)))
     band = _rest_band(fit)
@@ -68,16 +68,18 @@ def restart_runs(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
 
 
 def _rest_band(fit: Fit) -> Array:
-    """Return (n,) how far from equilibrium dry friction may leave each cart, about one sigma."""
+    """Return (n,) how far from its springs' equilibrium each cart may lie, about one sigma."""
     chain = fit.structure.chain(fit.theta)
-    cart = fit.structure.tables(fit.theta[None])[0][0]
-    force = dry_force(cart)
+    force = holding_force(fit.structure.model(fit.theta).tables())
     if not np.any(chain.k > 0):
         return np.zeros(chain.n)
     compliance = np.abs(np.linalg.pinv(chain.stiffness))
     return np.sqrt(((0.5 * compliance * force) ** 2).sum(axis=1))
 
 
-def dry_force(cart: Array) -> Array:
-    """Return (n,) the largest force at which dry friction still holds each cart, from its table."""
-    return cart[:, Cart.COULOMB] + cart[:, Cart.STATIC] + cart[:, Cart.DAHL]
+def holding_force(tables: Tables) -> Array:
+    """Return (n,) the largest force against which friction or cogging still holds each cart."""
+    cart, _, drive = tables
+    force = cart[:, Cart.COULOMB] + cart[:, Cart.STATIC] + cart[:, Cart.DAHL]
+    force[0] += drive[Drive.COGGING]
+    return force

@@ -75,6 +75,11 @@ class Structure:
         return tuple(i + 1 in places for i in range(self.n))
 
     @cached_property
+    def many_rests(self) -> bool:
+        """Whether some cart may lie still elsewhere than where its springs would let it."""
+        return any(c.effect.many_rests for c in self.effects)
+
+    @cached_property
     def has_contact(self) -> bool:
         """Whether bodies meet."""
         return any(c.effect.contact for c in self.effects)

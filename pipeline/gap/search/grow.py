@@ -259,7 +259,6 @@ def _best_start(
 def fit_whole(structure: Structure, theta: Array, bench: Bench) -> Fit:
     """Fit whole runs; friction first with one size for all runs, then run by run."""
     whole = bench.training
-    dry = any(structure.dry)
     contact = structure.has_contact
     fit = fit_model(
         structure,
@@ -270,7 +269,7 @@ def fit_whole(structure: Structure, theta: Array, bench: Bench) -> Fit:
         mapper=bench.mapper,
     )
     for attempt in range(_FRICTION_ROUNDS):
-        if not dry or fit.chi < AT_FLOOR:
+        if not structure.many_rests or fit.chi < AT_FLOOR:
             break
         if np.quantile(fit.run_chi, 0.25) < _NEARLY_RIGHT:
             fit = restart_runs(fit, whole, mapper=bench.mapper)

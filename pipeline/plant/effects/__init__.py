@@ -6,7 +6,7 @@ To add one: write an `Effect` in a file here and list it below.
 from difflib import get_close_matches
 
 from pipeline.errors import ConfigError
-from pipeline.plant.effects import actuator, friction, springs, structure
+from pipeline.plant.effects import actuator, cogging, friction, springs, structure
 from pipeline.plant.effects.base import AugmentedChain, Effect, Parameter, Term, make_term
 
 CATALOGUE: tuple[Effect, ...] = (
@@ -25,6 +25,7 @@ CATALOGUE: tuple[Effect, ...] = (
     actuator.DELAY,
     actuator.LAG,
     actuator.BACKLASH,
+    cogging.COGGING,
     structure.END_STOP,
     structure.SENSOR_GAIN,
     structure.EXTRA_MODE,

@@ -145,18 +145,24 @@ class Effect:
         return not all(p.reported for p in self.parameters)
 
     @cached_property
-    def _writes(self) -> frozenset[IntEnum]:
-        return frozenset(self.columns(dict.fromkeys(self.names, 1.0)))
-
-    @property
     def dry(self) -> bool:
         """Whether it is friction whose size differs from run to run."""
-        return not self._writes.isdisjoint(DRY)
+        return self._fills(*DRY)
 
-    @property
+    @cached_property
+    def many_rests(self) -> bool:
+        """Whether carts may lie still elsewhere than where their springs alone would let them."""
+        return self._fills(*DRY, Drive.COGGING)
+
+    @cached_property
     def hides_mass(self) -> bool:
         """Whether something moves that no sensor reads."""
-        return Cart.HIDDEN_MASS in self._writes
+        return self._fills(Cart.HIDDEN_MASS)
+
+    def _fills(self, *columns: IntEnum) -> bool:
+        own = self.columns(dict.fromkeys(self.names, 1.0))
+        # Columns of different tables are equal as numbers.
+        return any(column is mine for column in columns for mine in own)
 
     def named(self, values: Sequence[float]) -> dict[str, float]:
         """Return parameter values by their names."""

@@ -1,0 +1,51 @@
+"""A motor whose force repeats with its position: teeth of its rotor, or of pinion and rack."""
+
+from pipeline.plant.effects.base import Effect, Parameter
+from pipeline.plant.tables import Drive
+
+COGGING = Effect(
+    key="cogging",
+    title="Cogging of the motor",
+    sentence="The teeth of the motor (or of pinion and rack) pull cart 1 to and fro as it travels.",
+    place="input",
+    equation=r"f = F \sin(2\pi x_1/\lambda + \varphi)",
+    parameters=(
+        Parameter(
+            name="force",
+            symbol="F",
+            unit="input",
+            scale=lambda s: s.stiffness * s.position,
+            trials=(0.01,),
+            neutral=0.0,
+        ),
+        Parameter(
+            name="pitch",
+            symbol="λ",
+            unit="position",
+            scale=lambda s: s.position,
+            trials=(0.1, 0.2, 0.4),
+            lower=0.02,
+            upper=1.0,  # a longer one is a spring that is not straight
+        ),
+        Parameter(
+            name="phase",
+            symbol="φ",
+            unit="rad",
+            scale=lambda s: 1.0,
+            trials=(0.0, 1.571, 3.142, -1.571),
+            signed=True,
+        ),
+    ),
+    columns=lambda p: {
+        Drive.COGGING: p["force"],
+        Drive.PITCH: p["pitch"],
+        Drive.PHASE: p["phase"],
+    },
+    rugged=True,
+    fingerprint="The cart rests at some positions rather than at others, evenly apart; the "
+    "residual force is a wave over the position, alike in both directions.",
+    deciding_run="A slow ramp of the input, up and down: the cart moves in even steps, at the same "
+    "positions both ways, where dry friction shifts them.",
+    reference="D. C. Hanselman, Brushless Permanent Magnet Motor Design, 2nd ed., chapter 5",
+    axis="position",
+)
