@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.errors import DataError
 from pipeline.plant import kernel
@@ -126,12 +125,9 @@ class SteppedBench:
         self._cart, self._spring, self._drive = model.tables()
         self._n, self._rows = n, [cart - 1 for cart in free]
         self._free = np.isin(_all(n), free)
-        size = 2 * n + 1
-        self._state = np.zeros((kernel.ROWS, size))
-        self._K, self._C = np.zeros((size, size)), np.zeros((size, size))
-        self._N, self._motor, parents = kernel._assemble(
-            self._cart, self._spring, self._drive, self._free, self._state, self._K, self._C
-        )
+        bodies = kernel.assemble(self._cart, self._spring, self._drive, self._free)
+        self._N, self._motor, parents, self._state, self._K, self._C = bodies[:6]
+        self._switches, self._active = bodies.switches, bodies.active
         self._inverse_mass = self._state[kernel.INV].copy()
         self._state[kernel.X, :n] = np.where(self._free, x0, 0.0)
         for i in range(n, self._N):
@@ -139,8 +135,6 @@ class SteppedBench:
             self._state[kernel.X, i] = self._state[kernel.X, parent]
         self._no_sensitivities = make_sensitivities(kernel.NO_LANES, self._N)
         self._step, self._contact_step = self._step_lengths()
-        self._switches = self._possible_switches()
-        self._active = np.zeros(self._switches.size, dtype=np.bool_)
         self._close_contacts()
         self._bend_presliding()
         self._now = 0.0
@@ -289,11 +283,3 @@ class SteppedBench:
             both = float(inverse[0] + inverse[self._motor])
             contact = max(contact, self._drive[Drive.CONTACT_STIFFNESS] * both)
         return step, _CONTACT_REACH / np.sqrt(contact) if contact > 0.0 else step
-
-    def _possible_switches(self) -> NDArray[np.int64]:
-        """Return the kernel's numbers of the contacts and slack springs there are."""
-        n = self._n
-        stops = np.flatnonzero(self._cart[:, Cart.STOP_STIFFNESS])
-        slack = n + np.flatnonzero(self._spring[:, Spring.CHANGE])
-        gap = [2 * n + 1, 2 * n + 2] if self._motor >= 0 else []
-        return np.array([*stops, *slack, *gap], dtype=np.int64)

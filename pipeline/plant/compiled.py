@@ -33,7 +33,8 @@ _OPTIONS: dict[str, Any] = {
     "error_model": "numpy",
 }
 jit = njit(**_OPTIONS)
-inlined = njit(**_OPTIONS, inline="always")
+# In the machine's code, where it is fast; in that of Python it would be typed at every call anew.
+inlined = njit(**_OPTIONS, forceinline=True)
 
 
 @jit
@@ -50,11 +51,12 @@ def tie(M, j, n, value):
 
 @jit
 def pair(M, i, j, value):
-    """Add `value` between bodies i and j to a symmetric matrix."""
+    """Add `value` between bodies i and j, or i and a wall (-1), to a symmetric matrix."""
     M[i, i] += value
-    M[j, j] += value
-    M[i, j] -= value
-    M[j, i] -= value
+    if j >= 0:
+        M[j, j] += value
+        M[i, j] -= value
+        M[j, i] -= value
 
 
 @jit

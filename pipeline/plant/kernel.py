@@ -15,8 +15,13 @@ VIII.2; for the friction events B. Armstrong-Hélouvry, P. Dupont, C. Canudas de
 Automatica 30 (1994), section 4.
 """
 
-import numpy as np
+from math import ceil, exp, pi, sin, sqrt
+from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.plant.chain import Array
 from pipeline.plant.compiled import (
     ACC,
     CHANGE,
@@ -99,11 +104,9 @@ _BLOWN_UP = 1e9  # positions beyond this are a diverged model
 
 
 @jit
-def _assemble(cart, spring, drive, free, s, K, C):
-    """Fill the linear matrices; returns dof count, motor index or -1, parents of hidden masses."""
+def _assemble(cart, spring, drive, free, s, K, C, parent):
+    """Fill the linear matrices; returns how many bodies there are, and the motor's row or -1."""
     n = cart.shape[0]
-    K[:] = 0.0
-    C[:] = 0.0
     for i in range(n):
         s[INV, i] = 1.0 / cart[i, MASS] if free[i] else 0.0
         C[i, i] += cart[i, DAMPING]
@@ -117,7 +120,6 @@ def _assemble(cart, spring, drive, free, s, K, C):
         s[INV, N] = 1.0 / drive[MOTOR]
         s[INV, 0] = 1.0 / max(cart[0, MASS] - drive[MOTOR], 0.02 * cart[0, MASS])
         N += 1
-    parent = np.full(2 * n + 1, -1)
     for i in range(n):
         if cart[i, HID_M] > 0.0:
             s[INV, N] = 1.0 / cart[i, HID_M]
@@ -125,7 +127,7 @@ def _assemble(cart, spring, drive, free, s, K, C):
             pair(C, i, N, cart[i, HID_C])
             parent[N] = i
             N += 1
-    return N, motor, parent
+    return N, motor
 
 
 @jit
@@ -136,8 +138,8 @@ def _smooth_forces(cart, spring, drive, driven, n, s):
         if cart[i, DRAG] != 0.0:
             s[FORCE, i] -= cart[i, DRAG] * s[MID_V, i] * abs(s[MID_V, i])
     if drive[COGGING] != 0.0:
-        turn = 2.0 * np.pi * s[MID_X, driven] / drive[PITCH] + drive[PHASE]
-        s[FORCE, driven] += drive[COGGING] * np.sin(turn)
+        turn = 2.0 * pi * s[MID_X, driven] / drive[PITCH] + drive[PHASE]
+        s[FORCE, driven] += drive[COGGING] * sin(turn)
     for j in range(n + 1):
         if spring[j, CUBIC] != 0.0:
             f = spring[j, CUBIC] * stretch(s, MID_X, j, n) ** 3
@@ -151,23 +153,44 @@ def _smooth_forces(cart, spring, drive, driven, n, s):
 def _position(s, i, h):
     return s[X, i] + h * (
         s[V, i]
-        + h / 2.0 * (s[D2, i] + h / 3.0 * (s[D3, i] + h / 4.0 * (s[D4, i] + h / 5.0 * s[D5, i])))
+        + h
+        / 2.0
+        * (
+            s[D2, i]
+            + h
+            / 3.0
+            * (s[D3, i] + h / 4.0 * (s[D4, i] + h / 5.0 * (s[D5, i] + h / 6.0 * s[D6, i])))
+        )
     )
 
 
 @jit
-def _rate(s, i, h):
+def _velocity(s, i, h):
     return s[V, i] + h * (
-        s[D2, i] + h / 2.0 * (s[D3, i] + h / 3.0 * (s[D4, i] + h / 4.0 * s[D5, i]))
+        s[D2, i]
+        + h / 2.0 * (s[D3, i] + h / 3.0 * (s[D4, i] + h / 4.0 * (s[D5, i] + h / 5.0 * s[D6, i])))
     )
+
+
+@jit
+def _contact(which, cart, drive, n, motor):
+    """Return body, the other one or -1 (a wall), side, stiffness, damping and reach of a contact.
+
+    Contacts 0 to n - 1 are end stops, 2n + 1 and 2n + 2 the two sides of the gap.
+    """
+    if which < n:
+        side = 1.0 if cart[which, STOP] > 0.0 else -1.0
+        return which, -1, side, cart[which, STOP_K], cart[which, STOP_D], abs(cart[which, STOP])
+    side = 1.0 if which == 2 * n + 1 else -1.0
+    return motor, 0, side, drive[CONTACT_K], drive[CONTACT_D], 0.5 * drive[GAP]
 
 
 @jit
 def _guard(which, active, cart, spring, drive, n, motor, s, h):
     """Return how far past its switch a contact or slack is, h from now; positive: it switches.
 
-    Switches 0 to n - 1 are end stops, n to 2n springs, 2n + 1 and 2n + 2 the two sides of the
-    gap. A contact begins where the bodies meet and push, and ends where the push does.
+    Switches n to 2n are springs, the others contacts, which begin where the bodies meet and push,
+    and end where the push does.
     """
     if n <= which <= 2 * n:
         j = which - n
@@ -175,26 +198,20 @@ def _guard(which, active, cart, spring, drive, n, motor, s, h):
         side = 1.0 if spring[j, STRETCH] >= 0.0 else -1.0
         beyond = side * (reach - spring[j, STRETCH])
         return -beyond if active else beyond
-    if which < n:
-        side = 1.0 if cart[which, STOP] > 0.0 else -1.0
-        depth = cart[which, STOP_K] * side * (_position(s, which, h) - cart[which, STOP])
-        push = depth + cart[which, STOP_D] * side * _rate(s, which, h)
-    else:
-        side = 1.0 if which == 2 * n + 1 else -1.0
-        lead = _position(s, motor, h) - _position(s, 0, h)
-        depth = drive[CONTACT_K] * (side * lead - 0.5 * drive[GAP])
-        push = depth + drive[CONTACT_D] * side * (_rate(s, motor, h) - _rate(s, 0, h))
+    body, other, side, k, c, reach = _contact(which, cart, drive, n, motor)
+    x, v = _position(s, body, h), _velocity(s, body, h)
+    if other >= 0:
+        x -= _position(s, other, h)
+        v -= _velocity(s, other, h)
+    depth = k * (side * x - reach)
+    push = depth + c * side * v
     return -push if active else min(depth, push)
 
 
 @jit
 def _switch(which, sign, cart, spring, drive, n, motor, s, K, C):
     """Put a contact or slack into the linear matrices (sign 1) or take it out (sign -1)."""
-    if which < n:
-        K[which, which] += sign * cart[which, STOP_K]
-        C[which, which] += sign * cart[which, STOP_D]
-        s[FIX, which] += sign * cart[which, STOP_K] * cart[which, STOP]
-    elif which <= 2 * n:
+    if n <= which <= 2 * n:
         j = which - n
         k = sign * spring[j, CHANGE] * spring[j, STIFF]
         tie(K, j, n, k)
@@ -204,13 +221,12 @@ def _switch(which, sign, cart, spring, drive, n, motor, s, K, C):
         if j > 0:
             s[FIX, j - 1] -= k * spring[j, STRETCH]
     else:
-        side = 1.0 if which == 2 * n + 1 else -1.0
-        k = sign * drive[CONTACT_K]
-        half = 0.5 * drive[GAP] * side
-        pair(K, 0, motor, k)
-        pair(C, 0, motor, sign * drive[CONTACT_D])
-        s[FIX, 0] -= k * half
-        s[FIX, motor] += k * half
+        body, other, side, k, c, reach = _contact(which, cart, drive, n, motor)
+        pair(K, body, other, sign * k)
+        pair(C, body, other, sign * c)
+        s[FIX, body] += sign * k * side * reach
+        if other >= 0:
+            s[FIX, other] -= sign * k * side * reach
 
 
 @inlined
@@ -266,6 +282,7 @@ def _advance(
     driven = motor if motor >= 0 else 0
     left = h
     events = 0
+    none = N + switches.size  # no body's number, and no switch's
     while left > 1e-12:
         step = left
         for e in range(switches.size):
@@ -287,7 +304,7 @@ def _advance(
                 if cart[i, DAHL] > 0.0 and s[INV, i] > 0.0:
                     sign = 1.0 if s[MID_V, i] > 0.0 else -1.0
                     path = 0.5 * abs(s[MID_V, i]) * step / cart[i, DISTANCE]
-                    s[DECAY, i] = np.exp(-path)
+                    s[DECAY, i] = exp(-path)
                     held = sign + (s[Z, i] - sign) * s[DECAY, i]
                     s[RUB, i] -= cart[i, DAHL] * held
             for i in range(n):
@@ -310,35 +327,32 @@ def _advance(
                     speed = abs(s[MID_V, i])
                 if cart[i, STATIC] != 0.0:
                     ratio = speed / cart[i, STRIBECK]
-                    slide += cart[i, STATIC] * np.exp(-ratio * ratio)
+                    slide += cart[i, STATIC] * exp(-ratio * ratio)
                 s[RUB, i] -= slide * s[SIDE, i]
             for i in range(n):
                 s[FORCE, i] += scatter[i] * s[RUB, i]
         # The usual sizes as constants: the compiler then unrolls the loops.
         if N == 1:
-            _taylor(s, K, C, 1)
+            _taylor(s, K, C, np.int64(1))
         elif N == 2:
-            _taylor(s, K, C, 2)
+            _taylor(s, K, C, np.int64(2))
         elif N == 3:
-            _taylor(s, K, C, 3)
+            _taylor(s, K, C, np.int64(3))
         else:
             _taylor(s, K, C, N)
         whole = step
-        stopping = -1
-        switching = -1
+        stopping = switching = none
         if dry and events < _MOST_EVENTS:
             for i in range(n):
                 if s[SIDE, i] == 0.0:
                     continue
-                end = _velocity(s[V, i], s[D2, i], s[D3, i], s[D4, i], s[D5, i], s[D6, i], step)
+                end = _velocity(s, i, step)
                 if s[SIDE, i] * end < 0.0 and s[V, i] != 0.0:
                     # The root of the velocity: false position, made safe by its bracket.
                     low, high, v_low, v_high = 0.0, step, s[V, i], end
                     for _ in range(4):
                         guess = low + (high - low) * v_low / (v_low - v_high)
-                        value = _velocity(
-                            s[V, i], s[D2, i], s[D3, i], s[D4, i], s[D5, i], s[D6, i], guess
-                        )
+                        value = _velocity(s, i, guess)
                         if s[SIDE, i] * value > 0.0:
                             low, v_low = guess, value
                         else:
@@ -364,26 +378,12 @@ def _advance(
                             low, g_low, g_high = guess, min(value, -1e-300), 0.5 * g_high
                     step = high
                     switching = e
-                    stopping = -1
+                    stopping = none
         if lanes.size > 0:
             push = drive_c, driven, drive
             carry(lanes, T, phi, work, s, K, C, N, n, cart, spring, scatter, push, whole, step)
         for i in range(N):
-            s[X, i] += step * (
-                s[V, i]
-                + step
-                / 2.0
-                * (
-                    s[D2, i]
-                    + step
-                    / 3.0
-                    * (
-                        s[D3, i]
-                        + step / 4.0 * (s[D4, i] + step / 5.0 * (s[D5, i] + step / 6.0 * s[D6, i]))
-                    )
-                )
-            )
-            s[V, i] = _velocity(s[V, i], s[D2, i], s[D3, i], s[D4, i], s[D5, i], s[D6, i], step)
+            s[X, i], s[V, i] = _position(s, i, step), _velocity(s, i, step)
             s[ACC, i] = s[D2, i] + step * (s[D3, i] + 0.5 * step * s[D4, i])
         if dry:
             for i in range(n):
@@ -391,21 +391,20 @@ def _advance(
                     sign = 1.0 if s[MID_V, i] > 0.0 else -1.0
                     decay = s[DECAY, i] * s[DECAY, i]
                     if step < whole:
-                        decay = np.exp(-abs(s[MID_V, i]) * step / cart[i, DISTANCE])
+                        decay = exp(-abs(s[MID_V, i]) * step / cart[i, DISTANCE])
                     s[Z, i] = sign + (s[Z, i] - sign) * decay
                 if s[SIDE, i] != 0.0 and s[SIDE, i] * s[V, i] < 0.0:
                     s[V, i] = 0.0
-        if stopping >= 0:
+        if stopping != none:
             stop(T, s, N, stopping)
             s[V, stopping] = 0.0
             s[ACC, stopping] = 0.0
             events += 1
-        if switching >= 0:
+        if switching != none:
             which, ends = switches[switching], 1.0 if active[switching] else 0.0
-            if which < n:
-                meet(T, s, N, which, -1, cart[which, STOP_K], ends * cart[which, STOP_D])
-            elif which > 2 * n:
-                meet(T, s, N, motor, 0, drive[CONTACT_K], ends * drive[CONTACT_D])
+            if not n <= which <= 2 * n:
+                body, other, _, k, c, _ = _contact(which, cart, drive, n, motor)
+                meet(T, s, N, body, other, k, ends * c)
             active[switching] = not active[switching]
             sign = 1.0 if active[switching] else -1.0
             phi[2 * N, 0] = -1.0  # its matrix is no longer that of the carts
@@ -415,12 +414,7 @@ def _advance(
 
 
 @jit
-def _velocity(v, d2, d3, d4, d5, d6, h):
-    return v + h * (d2 + h / 2.0 * (d3 + h / 3.0 * (d4 + h / 4.0 * (d5 + h / 5.0 * d6))))
-
-
-@jit
-def _integral(time, knots, u, total, twice, at):
+def _integral(time, knots, held, at):
     """Integrate the held input up to `time`, once and twice; `at` is the interval found last."""
     last = knots.size - 1
     while at < last and knots[at + 1] <= time:
@@ -428,93 +422,93 @@ def _integral(time, knots, u, total, twice, at):
     while at > 0 and knots[at] > time:
         at -= 1
     since = time - knots[at]
-    once = total[at] + u[at] * since
-    return once, twice[at] + 0.5 * (total[at] + once) * since, at
+    once = held[1, at] + held[0, at] * since
+    return once, held[2, at] + 0.5 * (held[1, at] + once) * since, at
 
 
 @jit
 def _simulate(
-    cart, spring, drive, x0, v0, scatter, free, t, knots, command, starts, refine, of, y, dy
+    cart,
+    spring,
+    drive,
+    x0,
+    v0,
+    scatter,
+    free,
+    t,
+    knots,
+    command,
+    starts,
+    refine,
+    y,
+    dy,
+    N,
+    motor,
+    parent,
+    s,
+    K,
+    C,
+    switches,
+    active,
+    held,
+    lanes,
+    T,
+    phi,
+    work,
 ):
     """Fill y (n, samples) with the readings of one run; False where the model diverged.
 
-    And dy (lanes, n, samples) with their derivatives, `of` (2, lanes) tells by what.
+    And dy (lanes, n, samples) with their derivatives.
     """
     n = cart.shape[0]
-    size = 2 * n + 1
-    s, K, C = np.zeros((ROWS, size)), np.zeros((size, size)), np.zeros((size, size))
-    N, motor, parent = _assemble(cart, spring, drive, free, s, K, C)
-
-    dry = False
-    smooth = drive[COGGING] == 0.0
-    presliding = False
-    stribeck = False
-    fastest = 0.0
-    contact = 0.0
+    # Sums, of which flags are made: numba compiles a function anew for every constant flag.
+    rubbing = presliding = stribeck = fastest = contact = 0.0
+    rough = abs(drive[COGGING])
     for i in range(N):
         row = 0.0
         for j in range(N):
             row += abs(K[i, j])
         fastest = max(fastest, row * s[INV, i])
     for i in range(n):
-        dry = dry or cart[i, COULOMB] + cart[i, STATIC] + cart[i, LOAD] + cart[i, DAHL] > 0.0
-        presliding = presliding or cart[i, DAHL] > 0.0
-        stribeck = stribeck or cart[i, STATIC] > 0.0
-        smooth = smooth and cart[i, OFFSET] == 0.0 and cart[i, DRAG] == 0.0
+        presliding += cart[i, DAHL]
+        stribeck += cart[i, STATIC]
+        rubbing += cart[i, COULOMB] + cart[i, STATIC] + cart[i, LOAD] + cart[i, DAHL]
+        rough += abs(cart[i, OFFSET]) + abs(cart[i, DRAG])
         contact = max(contact, cart[i, STOP_K] * s[INV, i])
     for j in range(n + 1):
-        smooth = smooth and spring[j, CUBIC] == 0.0
+        rough += abs(spring[j, CUBIC])
         if spring[j, CHANGE] > 0.0:
             # A spring that hardens past its gap is the faster one.
             extra = spring[j, CHANGE] * spring[j, STIFF]
             heavier = max(s[INV, j] if j < n else 0.0, s[INV, j - 1] if j > 0 else 0.0)
             fastest += extra * heavier
+    dry, smooth = rubbing > 0.0, rough == 0.0
     longest = min(
-        _LONGEST_LINEAR if smooth else _LONGEST_STEP, _SERIES_REACH / np.sqrt(fastest + 1e-12)
+        _LONGEST_LINEAR if smooth else _LONGEST_STEP, _SERIES_REACH / sqrt(fastest + 1e-12)
     )
-    if presliding:
+    if presliding > 0.0:
         longest = min(longest, _DAHL_STEP)
-    if stribeck:
+    if stribeck > 0.0:
         longest = min(longest, _STRIBECK_STEP)
     if drive[COGGING] != 0.0:
         longest = min(longest, _COGGING_STEP)
     if motor >= 0:
         contact = max(contact, drive[CONTACT_K] * (s[INV, 0] + s[INV, motor]))
     longest /= refine
-    contact_step = _CONTACT_REACH / np.sqrt(contact) / refine if contact > 0.0 else longest
-    count = 0
-    switches = np.zeros(2 * n + 3, dtype=np.int64)
-    for i in range(n):
-        if cart[i, STOP_K] > 0.0:
-            switches[count] = i
-            count += 1
-    for j in range(n + 1):
-        if spring[j, CHANGE] != 0.0:
-            switches[count] = n + j
-            count += 1
-    if motor >= 0:
-        switches[count], switches[count + 1] = 2 * n + 1, 2 * n + 2
-        count += 2
-    switches = switches[:count]
-    active = np.zeros(count, dtype=np.bool_)
-
-    u = np.empty(command.size)
-    total = np.zeros(command.size)
-    twice = np.zeros(command.size)
+    contact_step = _CONTACT_REACH / sqrt(contact) / refine if contact > 0.0 else longest
     for i in range(command.size):
         value = command[i]
         if drive[DEAD] != 0.0:
-            size_past = abs(value) - drive[DEAD]
-            value = np.sign(value) * size_past if size_past > 0.0 else 0.0
-        u[i] = min(max(value, -drive[LIMIT]), drive[LIMIT])
+            past_zone = max(abs(value) - drive[DEAD], 0.0)
+            value = past_zone if value > 0.0 else -past_zone
+        held[0, i] = min(max(value, -drive[LIMIT]), drive[LIMIT])
         if i > 0:
-            held = knots[i] - knots[i - 1]
-            total[i] = total[i - 1] + u[i - 1] * held
-            twice[i] = twice[i - 1] + 0.5 * (total[i - 1] + total[i]) * held
-    lanes, T, phi, work = make_sensitivities(of, N)
-    lagged = u[0]
+            span = knots[i] - knots[i - 1]
+            held[1, i] = held[1, i - 1] + held[0, i - 1] * span
+            held[2, i] = held[2, i - 1] + 0.5 * (held[1, i - 1] + held[1, i]) * span
+    lagged = held[0, 0]
     driven = motor if motor >= 0 else 0
-    at = 0
+    at = knots.size - 1
     on = 0
 
     for shot in range(starts.size - 1):
@@ -540,40 +534,40 @@ def _simulate(
                 active[e] = not active[e]
                 sign = 1.0 if active[e] else -1.0
                 _switch(switches[e], sign, cart, spring, drive, n, motor, s, K, C)
-        past, past2, at = _integral(t[first] - drive[DELAY], knots, u, total, twice, at)
-        if shot == 0 and presliding:
+        past, past2, at = _integral(t[first] - drive[DELAY], knots, held, at)
+        if shot == 0 and presliding > 0.0:
             for i in range(N):
                 s[MID_X, i], s[MID_V, i], s[FORCE, i] = s[X, i], s[V, i], s[FIX, i]
             _smooth_forces(cart, spring, drive, driven, n, s)
             for i in range(n):
                 if cart[i, DAHL] > 0.0:
-                    net = s[FORCE, i] + (u[0] if i == 0 else 0.0)
+                    net = s[FORCE, i] + (held[0, 0] if i == 0 else 0.0)
                     for j in range(N):
                         net -= K[i, j] * s[X, j]
                     s[Z, i] = min(max(net / (scatter[i] * cart[i, DAHL]), -1.0), 1.0)
                     if abs(s[V, i]) > 0.0:
-                        s[Z, i] = np.sign(s[V, i])
+                        s[Z, i] = 1.0 if s[V, i] > 0.0 else -1.0
                     elif abs(s[Z, i]) < 1.0:
                         bend_presliding(lanes, T, s, K, cart, scatter, i, n, N)
         for sample in range(first, end):
             for i in range(n):
                 y[i, sample] = cart[i, GAIN] * s[X, i]
-                for lane in range(of.shape[1]):
+                for lane in range(dy.shape[0]):
                     dy[lane, i, sample] = cart[i, GAIN] * T[i, lane // 4, lane % 4]
             if sample == end - 1:
                 break
             interval = t[sample + 1] - t[sample]
-            count = int(np.ceil(interval / longest - 1e-9))
+            count = ceil(interval / longest - 1e-9)
             h = interval / count
             for sub in range(count):
                 now = t[sample] + sub * h
-                upto, upto2, at = _integral(now + h - drive[DELAY], knots, u, total, twice, at)
+                upto, upto2, at = _integral(now + h - drive[DELAY], knots, held, at)
                 mean = (upto - past) / h
                 # What comes early in the step moves the body further than its mean would.
                 early = upto2 - past2 - 0.5 * h * (past + upto)
                 past, past2 = upto, upto2
                 if drive[LAG] > 0.0:
-                    decay = np.exp(-h / drive[LAG])
+                    decay = exp(-h / drive[LAG])
                     target = mean
                     mean = target + (lagged - target) * drive[LAG] / h * (1.0 - decay)
                     before = lagged
@@ -613,6 +607,33 @@ def _simulate(
             if not abs(s[X, 0]) + abs(s[X, n - 1]) < _BLOWN_UP:
                 return False
     return True
+
+
+class Bodies(NamedTuple):
+    """Carts, motor and hidden masses before they move: tables of the simulator, and their size."""
+
+    N: int
+    motor: int  # its row, or -1
+    parent: NDArray[np.int64]  # the carts of hidden masses, or -1
+    state: Array
+    K: Array
+    C: Array
+    switches: NDArray[np.int64]  # the numbers of the contacts and slack springs there are
+    active: NDArray[np.bool_]
+
+
+def assemble(cart: Array, spring: Array, drive: Array, free: NDArray[np.bool_]) -> Bodies:
+    """Return the bodies of one bench at rest at zero, no contact closed."""
+    n = len(cart)
+    size = 2 * n + 1
+    s, K, C = np.zeros((ROWS, size)), np.zeros((size, size)), np.zeros((size, size))
+    parent = np.full(size, -1)
+    N, motor = _assemble(cart, spring, drive, free, s, K, C, parent)
+    switches = [i for i in range(n) if cart[i, STOP_K] > 0.0]
+    switches += [n + j for j in range(n + 1) if spring[j, CHANGE] != 0.0]
+    switches += [2 * n + 1, 2 * n + 2] if motor >= 0 else []
+    numbers = np.array(switches, dtype=np.int64)
+    return Bodies(N, motor, parent, s, K, C, numbers, np.zeros(numbers.size, dtype=np.bool_))
 
 
 NO_LANES = np.zeros((2, 0), dtype=np.int64)
@@ -655,48 +676,26 @@ def simulate_with_derivatives(
     -------
     (b, n, samples) readings, and (lanes, n, samples) derivatives of the first variant's.
     """
-    # numba compiles anew, for 20 s, for every mix of arrays that may or may not be written to.
+    # numba compiles anew, for ten seconds, for arrays that may not be written to, or for strides.
     floats = (cart, spring, drive, x0, v0, scatter, t, knots, command)
     cart, spring, drive, x0, v0, scatter, t, knots, command = (
         _plain(array, np.float64) for array in floats
     )
     free, starts, of = _plain(free, np.bool_), _plain(starts, np.int64), _plain(of, np.int64)
-    return _simulate_batch(
-        cart, spring, drive, x0, v0, scatter, free, t, knots, command, starts, float(refine), of
-    )
+    y = np.empty((len(cart), cart.shape[1], t.size))
+    dy = derivatives = np.empty((of.shape[1], *y.shape[1:]))
+    run = free, t, knots, command, starts, float(refine)
+    for b in range(len(cart)):
+        bench, start = (cart[b], spring[b], drive[b]), (x0[b], v0[b], scatter[b])
+        bodies = assemble(*bench, free)
+        held, lanes = np.zeros((3, command.size)), make_sensitivities(of, bodies.N)
+        if not _simulate(*bench, *start, *run, y[b], dy, *bodies, held, *lanes):
+            y[b] = np.nan
+        of, dy = NO_LANES, dy[:0]
+    return y, derivatives
 
 
 def _plain(array, dtype):
     """Return an array of the one kind the compiled function takes: whole, and writable."""
     fits = array.dtype == dtype and array.flags.carray
     return array if fits else np.array(array, dtype=dtype, order="C")
-
-
-@jit
-def _simulate_batch(
-    cart, spring, drive, x0, v0, scatter, free, t, knots, command, starts, refine, of
-):
-    n = cart.shape[1]
-    y = np.empty((cart.shape[0], n, t.size))
-    dy = np.empty((of.shape[1], n, t.size))
-    for b in range(cart.shape[0]):
-        if not _simulate(
-            cart[b],
-            spring[b],
-            drive[b],
-            x0[b],
-            v0[b],
-            scatter[b],
-            free,
-            t,
-            knots,
-            command,
-            starts,
-            refine,
-            of,
-            y[b],
-            dy,
-        ):
-            y[b] = np.nan
-        of = of[:, :0].copy()
-    return y, dy

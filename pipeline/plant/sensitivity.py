@@ -12,6 +12,8 @@ Impulses are right to second order in the step: 1e-3 of a derivative, which only
 Reference: I. A. Hiskens, M. A. Pai, IEEE Trans. Circuits and Systems I 47 (2000), 204-220.
 """
 
+from math import cos, exp, pi
+
 import numpy as np
 
 from pipeline.plant.compiled import (
@@ -56,7 +58,6 @@ _BLOCK = 4  # lanes that a processor takes at once: the last axis
 _SAME = 1e-9  # relative; steps as near as this share their matrix
 
 
-@jit
 def make_sensitivities(of, N):
     """Return the lanes `of` (2, lanes: by what, of which), in whole blocks, and room for them.
 
@@ -68,8 +69,7 @@ def make_sensitivities(of, N):
     wanted = of.shape[1]
     blocks = (wanted + _BLOCK - 1) // _BLOCK
     lanes = np.full((2, blocks * _BLOCK), _UNUSED)
-    for lane in range(wanted):
-        lanes[0, lane], lanes[1, lane] = of[0, lane], of[1, lane]
+    lanes[:, :wanted] = of
     T, phi = np.zeros((5 * N + 2, blocks, _BLOCK)), np.full((2 * N + 1, 2 * N), -1.0)
     return lanes, T, phi, np.empty((7, N))
 
@@ -125,7 +125,7 @@ def carry(lanes, T, phi, work, s, K, C, N, n, cart, spring, scatter, push, whole
     for i in range(n):
         if cart[i, DAHL] > 0.0:
             sign = 1.0 if s[MID_V, i] > 0.0 else -1.0
-            decay = np.exp(-abs(s[MID_V, i]) * step / cart[i, DISTANCE])
+            decay = exp(-abs(s[MID_V, i]) * step / cart[i, DISTANCE])
             slope = (1.0 - sign * s[Z, i]) * decay * step / cart[i, DISTANCE]
             _add(T, 2 * N + i, decay - 1.0, 2 * N + i)
             _add(T, 2 * N + i, 0.5 * slope, N + i)
@@ -194,8 +194,8 @@ def _kick(lanes, T, s, N, n, cart, spring, scatter, push, whole, span):
             T[N + at - 1, block, q] -= s[GRIP, at - 1] * pull
     braking, driven, drive = push
     if drive[COGGING] != 0.0:
-        per = 2.0 * np.pi / drive[PITCH]
-        k = span * drive[COGGING] * per * np.cos(per * s[MID_X, driven] + drive[PHASE])
+        per = 2.0 * pi / drive[PITCH]
+        k = span * drive[COGGING] * per * cos(per * s[MID_X, driven] + drive[PHASE])
         _add(T, N + driven, s[GRIP, driven] * k, driven)
     for j in range(n + 1):
         if spring[j, CUBIC] != 0.0:
@@ -209,7 +209,7 @@ def _kick(lanes, T, s, N, n, cart, spring, scatter, push, whole, span):
         c = 2.0 * cart[i, DRAG] * abs(s[MID_V, i]) + (braking if i == 0 else 0.0)
         if cart[i, STATIC] != 0.0 and s[SIDE, i] != 0.0 and s[V, i] != 0.0:
             ratio = abs(s[MID_V, i]) / cart[i, STRIBECK]
-            fall = 2.0 * ratio / cart[i, STRIBECK] * np.exp(-ratio * ratio)
+            fall = 2.0 * ratio / cart[i, STRIBECK] * exp(-ratio * ratio)
             c -= scatter[i] * cart[i, STATIC] * fall
         if cart[i, DAHL] > 0.0:
             force = scatter[i] * cart[i, DAHL] * s[DECAY, i]
