@@ -429,6 +429,7 @@ class HardwareCheck:
     input_scale : the factor on the logged input that explains the motion best (1 = as logged),
         its sign included; None where it was not looked for.
     t, measured, model : (n,).
+    effort : (n,) input that the modelled loop asks for; None with the measured input.
     contradicted : what was logged or stated of the run cannot be so; the note says how.
     """
 
@@ -448,6 +449,7 @@ class HardwareCheck:
     model: Array
     note: str = ""
     contradicted: bool = False
+    effort: Array | None = None
 
 
 # -------------------------------------------------------------------- together

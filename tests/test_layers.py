@@ -32,7 +32,7 @@ LEVELS = (
     ("gap",),
     ("exchange", "report.math"),
     ("report",),
-    ("report.figures", "report.equations"),
+    ("report.figures", "report.equations", "report.tables"),
     ("report.render",),
     ("report.sections",),
     ("report.gap", "report.effects"),

@@ -15,7 +15,7 @@ from pipeline.errors import DataError
 from pipeline.estimation.measured_run import MeasuredRun, measured_run
 from pipeline.plant import step_response
 from pipeline.plant.chain import Array, Chain
-from pipeline.plant.loop import Controller, Pid, StateFeedback, replay, simulate_loop
+from pipeline.plant.loop import Controller, LoopRun, Pid, StateFeedback, replay, simulate_loop
 from pipeline.results import HardwareCheck, Record
 
 _SERVO_PERIOD = 0.000884  # s; of the ECP controller, whose log keeps one sample in several
@@ -92,9 +92,13 @@ def check_hardware(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Simulated:
-    """Readings (f, n) of the free carts, the factor used on the input, and the one found."""
+    """Readings (f, n) of the free carts, the factor used on the input, and the one found.
+
+    `u` is the input (n,) that a simulated loop asks for.
+    """
 
     y: Array
+    u: Array | None = None
     note: str
     contradicted: bool = False
     factor: float = 1.0
@@ -173,7 +177,7 @@ def _close(
     """
     drive = opened.factor if opened else 1.0
     limit = min(np.inf if limit is None else limit, _plateau(run.record.u))
-    y, misfit = _run_loop(run, law, reference=reference, drive=drive, limit=limit)
+    loop, misfit = _run_loop(run, law, reference=reference, drive=drive, limit=limit)
     to_beat, note, times_stated = _WORTH_IT * misfit, "", 1.0
     for factor in _logged_per_stated(run, law, reference=reference, opened=opened):
         if misfit <= run.noise_floor:
@@ -181,20 +185,20 @@ def _close(
         times = _times(law, factor)
         scaled, less = _run_loop(run, times, reference=reference, drive=drive, limit=limit)
         if less < min(to_beat, misfit):
-            y, misfit, times_stated = scaled, less, factor
+            loop, misfit, times_stated = scaled, less, factor
             note = f"is {factor:.3g} times" if factor != -1.0 else "has the opposite sign of"
             note = f"the logged input {note} what the stated controller asks for"
-    if y is None:
+    if loop is None:
         raise DataError("the stated controller makes it unstable")
     # A bench may count its input the other way under feedback, by right.
     wrong = abs(times_stated) != 1.0 and misfit <= _WRONG
-    return _Simulated(y=y, note=note, contradicted=wrong)
+    return _Simulated(y=loop.x, u=loop.u, note=note, contradicted=wrong)
 
 
 def _run_loop(
     run: MeasuredRun, law: Controller, *, reference: Array, drive: float, limit: float
-) -> tuple[Array | None, float]:
-    """Return the readings (f, n) and their misfit; None and the largest where it is unstable.
+) -> tuple[LoopRun | None, float]:
+    """Return the run and its misfit; None and the largest where it is unstable.
 
     How fast the bench's controller samples and acts, and whether it predicts, is not logged: of
     the usual ways the one that comes nearest to the measurement is taken.
@@ -202,7 +206,7 @@ def _run_loop(
     best, least = None, _BLOWN_UP
     for law_as_run, sample_time, delay in _ways(run, law, drive=drive):
         with np.errstate(over="ignore", invalid="ignore"):
-            y = simulate_loop(
+            loop = simulate_loop(
                 run.chain,
                 law_as_run,
                 t=run.record.t,
@@ -214,10 +218,10 @@ def _run_loop(
                 rest=run.rest,
                 x0=run.x0,
                 free=run.free,
-            ).x
-            misfit = run.misfit(y)
+            )
+            misfit = run.misfit(loop.x)
         if misfit < least:
-            best, least = y, misfit
+            best, least = loop, misfit
         if least <= run.noise_floor:
             break
     return best, least
@@ -363,6 +367,7 @@ def _compare(
                 model=model,
                 note=note,
                 contradicted=simulated.contradicted,
+                effort=simulated.u,
             )
         )
         note = ""

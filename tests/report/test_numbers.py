@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from pipeline.plant.designed_loop import Margins
 from pipeline.report.numbers import listing, percent, significant, with_error
-from pipeline.report.tables import margin_rows
+from pipeline.report.tables.loops import margin_rows
 
 _SUPERSCRIPTS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻−", "0123456789--")
 

@@ -36,7 +36,7 @@ from pipeline.report.figures.svg import to_svg
 from pipeline.report.numbers import NOTHING, listing
 from pipeline.report.numbers import count as counted
 from pipeline.report.render.html import render_html
-from pipeline.report.tables import cell, make_table
+from pipeline.report.tables.cells import cell, make_table
 from pipeline.report.words import clean
 from pipeline.schemas.grade import CODES, Code
 

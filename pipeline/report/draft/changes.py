@@ -7,7 +7,7 @@ from math import hypot
 from pipeline.report.document import Block, Span, bullet_list, paragraph, spans
 from pipeline.report.numbers import count, percent, significant, unit_text, with_error
 from pipeline.report.sections.page import Page
-from pipeline.report.tables import cell, make_table
+from pipeline.report.tables.cells import cell, make_table
 from pipeline.report.words import clean, name_span, rich
 
 _WORTH_TELLING = 1.0  # standard errors; less is chance

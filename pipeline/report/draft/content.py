@@ -38,13 +38,8 @@ from pipeline.report.sections.notes import discussion_blocks
 from pipeline.report.sections.page import Page, remarks
 from pipeline.report.sections.questions import ask, open_questions, placed, split_notes
 from pipeline.report.sections.summary import summary
-from pipeline.report.tables import (
-    check_table,
-    file_table,
-    fitted_chain_table,
-    parameter_notes,
-    parameter_table,
-)
+from pipeline.report.tables.housekeeping import check_table, file_table
+from pipeline.report.tables.parameters import fitted_chain_table, parameter_notes, parameter_table
 from pipeline.report.words import clean, names_spans, rich, stage_name
 from pipeline.results import Analysis
 

@@ -1,26 +1,32 @@
 """Frequency response of one cart, measured and fitted (the paper's Figures 4, 6, 7, 9-11)."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MultipleLocator
 
 from pipeline.names import mode_suffixes
 from pipeline.plant.chain import Array, Chain
 from pipeline.report.figures.style import (
+    CART_COLOURS,
+    CART_LINES,
     MEASURED,
     MODEL,
     QUIET,
     legend_above,
     log_frequency_axis,
     panels,
+    plot_line,
 )
 from pipeline.report.figures.svg import tell
 from pipeline.report.numbers import subscript
 from pipeline.results import FrequencyResponse
 
 _LINE_POINTS = 300
+_SQUARE = 90.0  # degrees: phases are read against right angles
 _DB_PER_NEPER = 20 / np.log(10)
 _HIGHEST_PEAK = 100.0  # times the largest measured magnitude; without damping a peak has no end
 _WIDEST_BAR = 0.9  # of the magnitude: an error bar in decibels cannot reach down to zero
@@ -35,7 +41,7 @@ def bode_figure(
     """
     response = _positive(response)
     has_phase = response.phase is not None
-    heights = [1.4, *([0.65] if has_phase else []), *([0.55] if chain else [])]
+    heights = [1.3, *([0.8] if has_phase else []), *([0.5] if chain else [])]
     figure, axes = panels(*heights)
     log_frequency_axis(axes[0], response.omega)
     plot_magnitude(
@@ -47,6 +53,36 @@ def bode_figure(
     if chain:
         plot_residual(axes[-1], response, chain=chain)
     axes[-1].set_xlabel("ω [rad/s]")
+    return figure
+
+
+def overview_figure(
+    responses: Sequence[FrequencyResponse],
+    *,
+    chain: Chain | None,
+    position_unit: str,
+    input_unit: str,
+) -> Figure:
+    """Return the magnitudes of all carts in one panel: measured as points, the fit as lines."""
+    responses = [_positive(response) for response in responses]
+    figure, (ax,) = panels(1.75)
+    every = np.concatenate([response.omega for response in responses])
+    log_frequency_axis(ax, every)
+    for response in responses:
+        style, name = (response.cart - 1) % len(CART_LINES), f"cart {response.cart}"
+        colour, ls = CART_COLOURS[style], CART_LINES[style]
+        decibel = _decibel(response.magnitude)
+        (points,) = ax.plot(response.omega, decibel, "D", ms=3.2, mew=0.8, mfc="white", mec=colour)
+        tell(points, response.omega, decibel, name=f"{name}, measured")
+        if chain:
+            omega, line = _fitted(response, chain)
+            plot_line(ax, omega, line, name=f"{name}, fit", color=colour, ls=ls, in_legend=False)
+        ax.plot([], [], "D", ls=ls if chain else "", ms=3.2, mfc="white", color=colour, label=name)
+    if chain:
+        _mark_modes(ax, every, chain)
+    ax.set_ylabel(f"|X/U| [dB re 1 {position_unit}/{input_unit}]")
+    ax.set_xlabel("ω [rad/s]")
+    legend_above(ax)
     return figure
 
 
@@ -68,10 +104,7 @@ def plot_magnitude(
         label="measured",
     )
     if chain:
-        omega = _dense(response.omega, chain)
-        magnitude = np.abs(chain.frequency_response(omega)[response.cart - 1])
-        highest = float(response.magnitude.max()) * _HIGHEST_PEAK
-        ax.plot(omega, _decibel(np.minimum(magnitude, highest)), color=MODEL, label="fit")
+        ax.plot(*_fitted(response, chain), color=MODEL, label="fit")
         _mark_modes(ax, response.omega, chain)
     ax.set_ylabel(f"|X{subscript(response.cart)}/U| [dB re 1 {position_unit}/{input_unit}]")
 
@@ -92,6 +125,9 @@ def plot_phase(ax: Axes, response: FrequencyResponse, *, chain: Chain | None) ->
         None if response.phase_std is None else np.degrees(np.clip(response.phase_std, 0, np.pi))
     )
     _points(ax, response.omega, np.degrees(phase), error)
+    low, high = np.sort(ax.get_ylim())
+    ax.set_ylim(_SQUARE * np.floor(low / _SQUARE), _SQUARE * np.ceil(high / _SQUARE))
+    ax.yaxis.set_major_locator(MultipleLocator(_SQUARE if high - low > _SQUARE else _SQUARE / 2))
     ax.set_ylabel("phase [°]")
 
 
@@ -126,6 +162,14 @@ def _points(ax: Axes, x: Array, y: Array, error: Array | None, *, label: str = "
         label=label or None, zorder=3,
     )  # fmt: skip
     tell(drawn.lines[0], x, y, name="measured")
+
+
+def _fitted(response: FrequencyResponse, chain: Chain) -> tuple[Array, Array]:
+    """Return frequencies and the chain's magnitudes there in decibels."""
+    omega = _dense(response.omega, chain)
+    magnitude = np.abs(chain.frequency_response(omega)[response.cart - 1])
+    highest = float(response.magnitude.max()) * _HIGHEST_PEAK
+    return omega, _decibel(np.minimum(magnitude, highest))
 
 
 def _dense(omega: Array, chain: Chain) -> Array:

@@ -17,9 +17,9 @@ from pipeline.report.figures.style import (
     SHADE,
     legend_above,
     panels,
-    plot_left,
     plot_measured,
     plot_model,
+    plot_residuals,
     plot_second,
     position_label,
 )
@@ -48,7 +48,7 @@ def before_after_figure(trace: Trace, *, noise: float, position_unit: str) -> Fi
     above.set_ylabel(position_label(trace.cart, position_unit))
     legend_above(above)
     below.axhspan(-2 * noise, 2 * noise, color=SHADE, lw=0)
-    plot_left(
+    plot_residuals(
         below,
         trace.t,
         {
@@ -56,7 +56,7 @@ def before_after_figure(trace: Trace, *, noise: float, position_unit: str) -> Fi
             "linear model": trace.measured - trace.baseline,
         },
     )
-    below.set_ylabel(f"left [{position_unit}]")
+    below.set_ylabel(f"residual [{position_unit}]")
     below.set_xlabel("time [s]")
     return figure
 
@@ -212,8 +212,8 @@ def spectrum_figure(traces: Sequence[Trace], *, position_unit: str) -> Figure:
     figure, (ax,) = panels(1.9)
     ax.set_yscale("log")
     ax.plot(f[index], motion[index], color=MEASURED, lw=0.8, ls=":", label="measured motion")
-    ax.plot(f[index], before[index], color=SECOND, ls="--", lw=1.0, label="left, linear model")
-    ax.plot(f[index], after[index], color=MODEL, lw=1.0, label="left, with the effects")
+    ax.plot(f[index], before[index], color=SECOND, ls="--", lw=1.0, label="residual, linear model")
+    ax.plot(f[index], after[index], color=MODEL, lw=1.0, label="residual, with the effects")
     ax.set_ylabel(f"amplitude [{position_unit}]")
     ax.set_xlabel("frequency [Hz]")
     legend_above(ax)

@@ -7,6 +7,7 @@ figure reads in grey and for the colour-blind. Text stays text: it can be search
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from os.path import commonprefix
 from typing import Any
 
 import matplotlib
@@ -21,7 +22,7 @@ from pipeline.report.figures.svg import tell
 from pipeline.report.numbers import subscript
 from pipeline.report.words import clean
 
-WIDTH = 4.6  # inches: 8.5 pt text stays readable when a phone shows it at four fifths
+WIDTH = 5.2  # inches: as wide as a page of text, on a phone three quarters of it
 MEASURED = "#222222"
 MODEL = "#0072b2"  # blue and vermillion of Okabe and Ito, apart in grey too
 SECOND = "#d55e00"
@@ -41,8 +42,8 @@ _X_LABEL, _Y_LABEL = 0.31, 0.46  # from the axes to the middle of their titles
 _COLUMN_GAP, _TITLE_GAP = 0.5, 0.24
 LIFT = 0.22  # of a legend above the titles of panels
 _MOST_COLUMNS = 3
-_TITLE_LETTERS = 54  # side by side, over the whole width
-_DOT = 1.5  # points
+_TITLE_LETTERS = 60  # side by side, over the whole width
+_DOT = 2.2  # points
 _STROKE = 1e-4  # of the time span
 
 _STYLE: dict[Any, Any] = {
@@ -111,11 +112,18 @@ def small_multiples(
     )
     for spare in axes[len(titles) :]:
         figure.delaxes(spare)
-    longest = _TITLE_LETTERS // columns
-    for ax, title in zip(axes, map(clean, titles), strict=False):
-        short = title if len(title) <= longest else f"{title[: longest - 1]}…"
-        ax.set_title(short, loc="left", y=1.0)
+    for ax, title in zip(axes, _short(titles, most=_TITLE_LETTERS // columns), strict=False):
+        ax.set_title(title, loc="left", y=1.0)
     return figure, axes[: len(titles)]
+
+
+def _short(titles: Sequence[str], *, most: int) -> list[str]:
+    """Return titles of so many letters; long ones lose first what they all begin with."""
+    titles = [clean(title) for title in titles]
+    if len(titles) > 1 and max(map(len, titles)) > most:
+        same = len(commonprefix(titles))
+        titles = [f"…{title[same:]}" for title in titles] if same > 1 else titles
+    return [title if len(title) <= most else f"{title[: most - 1]}…" for title in titles]
 
 
 def _grid(
@@ -203,8 +211,20 @@ def thin(t: Array, y: Array) -> tuple[Array, Array]:
     return t[keep], y[keep]
 
 
-def plot_measured(ax: Axes, t: Array, y: Array, *, most: int = _MOST_POINTS) -> None:
-    """Draw a measured time series as points, of a long one `most` spread evenly."""
+def plot_measured(
+    ax: Axes,
+    t: Array,
+    y: Array,
+    *,
+    most: int = _MOST_POINTS,
+    name: str = "measured",
+    color: str = MEASURED,
+    in_legend: bool = True,
+) -> None:
+    """Draw a measured time series as points, of a long one `most` spread evenly.
+
+    They lie below the lines of models, which are thinner: both are seen where they agree.
+    """
     shown = np.linspace(0, t.size - 1, min(t.size, most)).astype(int)
     # Round-ended strokes too short to see as such: one path for all points takes a fifth of the
     # time and a third of the text that markers do. (Some readers drop strokes of no length at
@@ -213,11 +233,12 @@ def plot_measured(ax: Axes, t: Array, y: Array, *, most: int = _MOST_POINTS) -> 
     strokes = points.repeat(2, axis=0)
     strokes[1::2, 0] += _STROKE * (points[-1, 0] - points[0, 0])
     path = Path(strokes, np.tile([Path.MOVETO, Path.LINETO], shown.size))
-    dots = PathPatch(path, fill=False, color=MEASURED, lw=_DOT, capstyle="round", zorder=3)
-    tell(dots, t, y, name="measured")
+    dots = PathPatch(path, fill=False, color=color, lw=_DOT, capstyle="round", zorder=1.9)
+    tell(dots, t, y, name=name)
     ax.add_artist(dots)
     ax.update_datalim(points)
-    ax.plot([], [], ".", color=MEASURED, ms=3 * _DOT, mew=0, label="measured")  # for the legend
+    if in_legend:
+        ax.plot([], [], ".", color=color, ms=3 * _DOT, mew=0, label=name)
 
 
 def plot_line(
@@ -239,7 +260,7 @@ def plot_line(
 
 def plot_model(ax: Axes, t: Array, y: Array, *, label: str = "model") -> None:
     """Draw a model as a line."""
-    plot_line(ax, t, y, name=label)
+    plot_line(ax, t, y, name=label, lw=1.0)
 
 
 def plot_second(ax: Axes, t: Array, y: Array, *, label: str) -> None:
@@ -247,11 +268,11 @@ def plot_second(ax: Axes, t: Array, y: Array, *, label: str) -> None:
     plot_line(ax, t, y, name=label, color=SECOND, ls="--", lw=1.0)
 
 
-def plot_left(ax: Axes, t: Array, left: Mapping[str, Array]) -> None:
-    """Draw what one or two models, by their names, leave of a measurement, in their colours."""
+def plot_residuals(ax: Axes, t: Array, residuals: Mapping[str, Array]) -> None:
+    """Draw the residuals of one or two models, by their names, in the models' colours."""
     ax.axhline(0.0, color=QUIET, lw=0.6)
     looks = ((MODEL, "-"), (SECOND, "--"))
-    for (name, y), (colour, ls) in zip(left.items(), looks, strict=False):
+    for (name, y), (colour, ls) in zip(residuals.items(), looks, strict=False):
         plot_line(ax, t, y, name=name, color=colour, ls=ls, lw=0.8, in_legend=False)
 
 

@@ -40,7 +40,13 @@ def draw_ticks(ax: Axes, *, label_x: bool, label_y: bool = True) -> None:
         low, high = sorted((ax.get_xlim, ax.get_ylim)[direction]())
         scale = (ax.get_xscale, ax.get_yscale)[direction]()
         most = max(2, int(size / _SPACING[direction]))
-        ticks = log_ticks(low, high) if scale == "log" else linear_ticks(low, high, most=most)
+        if not axis.isDefault_majloc:  # the figure asked for its own: whole numbers, right angles
+            ticks = axis.get_majorticklocs()
+            ticks = ticks[(ticks >= low) & (ticks <= high)]
+        elif scale == "log":
+            ticks = log_ticks(low, high)
+        else:
+            ticks = linear_ticks(low, high, most=most)
         for set_locator in (axis.set_major_locator, axis.set_minor_locator):
             set_locator(NullLocator())
         _grid(ax, ticks, direction=direction)

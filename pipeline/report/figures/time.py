@@ -17,13 +17,14 @@ from pipeline.report.figures.style import (
     QUIET,
     SECOND,
     SHADE,
+    THIRD,
     keep_in_sight,
     legend_above,
     panels,
-    plot_left,
     plot_line,
     plot_measured,
     plot_model,
+    plot_residuals,
     plot_second,
     position_label,
     small_multiples,
@@ -42,6 +43,7 @@ from pipeline.results import (
 
 _CYCLES_SHOWN = 10  # of the steady part: single cycles can still be seen
 _SINE_POINTS = 300
+_STEP_POINTS = 400  # several panels a figure: enough to follow a swing
 _SETTLED_BAND = 0.02  # the 2 % of the settling time
 _ROOM = 1.12  # above the largest value
 _LOOPS = {"closed": "loop model", "open": "model on measured input"}
@@ -133,16 +135,21 @@ def step_figure(
 
 
 def plot_step(ax: Axes, gains: Sequence[StepGain], *, record: Record) -> None:
-    """Plot the positions of all carts of a step record, with the levels that were read off."""
+    """Plot the positions of all carts of a step record, with the levels that were read off.
+
+    A level is dashed over the window that it was read from, behind the points.
+    """
     for gain in gains:
-        _plot_cart(ax, record.t, record.position(gain.cart), cart=gain.cart)
+        style = (gain.cart - 1) % len(CART_LINES)
+        plot_measured(ax, record.t, record.position(gain.cart), most=_STEP_POINTS,
+                      name=f"x{subscript(gain.cart)}", color=CART_COLOURS[style])  # fmt: skip
         for edge in gain.edges:
             for window, level in (
                 (edge.window_before, edge.level_before),
                 (edge.window_after, edge.level_after),
             ):
-                ax.plot(window, (level, level), color=MEASURED, lw=2.2, solid_capstyle="butt")
-    ax.plot([], [], color=MEASURED, lw=2.2, label="level")
+                ax.plot(window, (level, level), color=MEASURED, ls="--", lw=0.8, zorder=1.5)
+    ax.plot([], [], color=MEASURED, ls="--", lw=0.8, label="level")
     for t in sorted({edge.t for gain in gains for edge in gain.edges}):
         ax.axvline(t, color=QUIET, lw=0.8, ls=":")
 
@@ -171,7 +178,7 @@ def sine_figure(points: Sequence[SinePoint], *, record: Record, position_unit: s
 
 
 def plot_sine(ax: Axes, point: SinePoint, *, record: Record) -> None:
-    """Plot one cart's motion, transient shaded, the steady amplitude as a band."""
+    """Plot one cart's motion, transient shaded, the steady amplitude as two lines."""
     end = point.steady_from + _CYCLES_SHOWN * 2 * np.pi / point.omega
     shown = record.t <= end
     t, y = record.t[shown], record.position(point.cart)[shown]
@@ -189,22 +196,44 @@ def plot_sine(ax: Axes, point: SinePoint, *, record: Record) -> None:
 # ------------------------------------------------------------------- feedback
 
 
-def hardware_figure(checks: Sequence[Sequence[HardwareCheck]], *, position_unit: str) -> Figure:
-    """Return one run: each cart, and below it what its models leave.
+def hardware_figure(
+    checks: Sequence[Sequence[HardwareCheck]],
+    *,
+    record: Record,
+    position_unit: str,
+    input_unit: str,
+) -> Figure:
+    """Return one run: each cart with its set point, below it the residuals, last the input.
 
     An entry holds the one or two models of a cart.
     """
-    figure, axes = panels(*[1.05, 0.45] * len(checks))
-    for above, below, group in zip(axes[::2], axes[1::2], checks, strict=True):
+    driven = record.u is not None
+    figure, axes = panels(*[0.95, 0.42] * len(checks), *([0.6] if driven else []))
+    for above, below, group in zip(axes[::2], axes[1::2], checks, strict=False):
+        if record.reference is not None:
+            above.step(record.t, record.reference, where="post", color=THIRD, lw=0.9, ls="-.",
+                       label="set point")  # fmt: skip
         plot_hardware(above, group)
         above.set_ylabel(position_label(group[0].cart, position_unit))
-        left = {_LOOPS[check.loop]: check.measured - check.model for check in group}
-        plot_left(below, group[0].t, left)
+        residuals = {_LOOPS[check.loop]: check.measured - check.model for check in group}
+        plot_residuals(below, group[0].t, residuals)
         keep_in_sight(below, group[0].measured - np.median(group[0].measured))
-        below.set_ylabel(f"left [{position_unit}]")
+        below.set_ylabel(f"residual [{position_unit}]")
+    if record.u is not None:
+        plot_effort(axes[-1], record, model=checks[0][0].effort)
+        axes[-1].set_ylabel(f"u [{input_unit}]")
     legend_above(axes[0])
     axes[-1].set_xlabel("time [s]")
     return figure
+
+
+def plot_effort(ax: Axes, record: Record, *, model: Array | None) -> None:
+    """Plot the input as logged, and what the modelled loop asks for."""
+    assert record.u is not None
+    plot_measured(ax, record.t, record.u, in_legend=False)
+    if model is not None:
+        plot_line(ax, record.t, model, name="loop model", lw=1.0, in_legend=False)
+        keep_in_sight(ax, record.u)
 
 
 def plot_hardware(ax: Axes, checks: Sequence[HardwareCheck]) -> None:

@@ -45,7 +45,8 @@ from pipeline.report.gap.words import (
 from pipeline.report.numbers import count, listing, percent
 from pipeline.report.render.write import write_document
 from pipeline.report.sections.page import Page, left_out, remarks
-from pipeline.report.tables import chain_table, file_table
+from pipeline.report.tables.housekeeping import file_table
+from pipeline.report.tables.parameters import chain_table
 from pipeline.report.words import clean
 from pipeline.results import Analysis
 

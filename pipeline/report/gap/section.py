@@ -37,7 +37,7 @@ from pipeline.report.gap.words import (
 )
 from pipeline.report.numbers import listing
 from pipeline.report.sections.page import Page
-from pipeline.report.tables import cell, make_table
+from pipeline.report.tables.cells import cell, make_table
 from pipeline.report.words import clean
 from pipeline.results import Analysis, HardwareCheck, Record
 from pipeline.submission.toml_file import read_text

@@ -6,7 +6,7 @@ from pipeline.gap.types import FoundEffect, Gap, GapWindow
 from pipeline.report.document import Cell, Table
 from pipeline.report.gap.words import WORDS, effect_name, phase, share
 from pipeline.report.numbers import percent, unit_text, with_error
-from pipeline.report.tables import cell, make_table
+from pipeline.report.tables.cells import cell, make_table
 from pipeline.report.words import clean
 
 

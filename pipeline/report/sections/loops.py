@@ -4,12 +4,11 @@ from pipeline.report.document import Block, paragraph
 from pipeline.report.figures.time import design_figure, hardware_figure
 from pipeline.report.numbers import count, percent, significant
 from pipeline.report.phrases import phrases
-from pipeline.report.sections.page import Page, left_out, remarks
-from pipeline.report.tables import feedback_table, hardware_table, pole_table
+from pipeline.report.sections.page import Page, remarks
+from pipeline.report.tables.loops import feedback_table, hardware_table, pole_table
 from pipeline.report.words import clean
 
 _WORDS = phrases("measurements")
-_MOST_RUNS = 4  # runs drawn; the table holds all
 _AS_LOGGED = 0.05  # a factor on the input this near one is not worth a word
 
 
@@ -52,21 +51,22 @@ def hardware_blocks(page: Page) -> list[Block]:
     table = hardware_table(checks, number=page.table_number(), position_unit=page.position)
     blocks: list[Block] = [table]
     runs = list(dict.fromkeys(check.experiment for check in checks))
-    for i, run in enumerate(runs[:_MOST_RUNS], start=1):
+    for i, run in enumerate(runs, start=1):
         own = [check for check in checks if check.experiment == run]
         carts = sorted({check.cart for check in own})
         figure = hardware_figure(
             [[check for check in own if check.cart == cart] for cart in carts],
+            record=page.records[run],
             position_unit=page.position,
+            input_unit=page.drive,
         )
         worst = max(own, key=lambda check: check.nrmse)
         said = {"run": run, "cart": str(worst.cart), "left": percent(100 * worst.nrmse)}
-        more = left_out(len(runs) - _MOST_RUNS) if i == _MOST_RUNS else ""
         blocks.append(
             page.picture(
                 f"hardware-{i}",
                 figure,
-                caption=_WORDS.text("hardware", more=more, **said),
+                caption=_WORDS.text("hardware", **said),
                 alt=_WORDS.text("hardware_alt", carts=count(len(carts), "cart"), **said),
             )
         )

@@ -9,7 +9,7 @@ from pipeline.report.figures.time import damping_figure, decay_figure, sine_figu
 from pipeline.report.numbers import count, listing, percent, significant, with_error
 from pipeline.report.phrases import phrases
 from pipeline.report.sections.page import Page, left_out
-from pipeline.report.tables import decay_table, step_table
+from pipeline.report.tables.records import decay_table, step_table
 from pipeline.report.words import clean
 from pipeline.results import FrequencyResponse, SinePoint
 

@@ -15,7 +15,8 @@ from pipeline.report.math.tree import Math, Term, matrix, parens, power, row, to
 from pipeline.report.numbers import complex_text, percent, significant
 from pipeline.report.phrases import phrases
 from pipeline.report.sections.page import Page
-from pipeline.report.tables import cell, make_table, margin_rows
+from pipeline.report.tables.cells import cell, make_table
+from pipeline.report.tables.loops import margin_rows
 from pipeline.results import FeedbackDesign
 
 _WORDS = phrases("solution")

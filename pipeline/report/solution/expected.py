@@ -14,7 +14,7 @@ from pipeline.report.equations.algebra import evaluate, work_out
 from pipeline.report.numbers import percent, significant, unit_text
 from pipeline.report.phrases import phrases
 from pipeline.report.sections.page import Page
-from pipeline.report.tables import cell, make_table
+from pipeline.report.tables.cells import cell, make_table
 from pipeline.report.words import clean, name_span
 from pipeline.results import Analysis
 from pipeline.results_json import provenance

@@ -18,7 +18,7 @@ from pipeline.report.figures.carts import free_body_figure
 from pipeline.report.math.tree import Math, Term, lines, matrix, row, total
 from pipeline.report.phrases import phrases
 from pipeline.report.sections.page import Page
-from pipeline.report.tables import fitted_chain_table
+from pipeline.report.tables.parameters import fitted_chain_table
 from pipeline.report.words import rich
 
 _WORDS = phrases("solution")

@@ -1,0 +1,1 @@
+"""The tables of a report, as data: numbers formatted, parameter names as mathematics."""

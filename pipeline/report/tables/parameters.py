@@ -1,0 +1,127 @@
+"""What was identified: initial and final estimates, the chain."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from pipeline.plant.chain import Chain
+from pipeline.report.document import Cell, Spans, Table, spans
+from pipeline.report.numbers import (
+    NOTHING,
+    percent,
+    significant,
+    unit_text,
+    with_error,
+)
+from pipeline.report.phrases import phrases
+from pipeline.report.tables.cells import cell, make_table
+from pipeline.report.words import SOURCES, clean, name_span, rich
+from pipeline.results import (
+    ChainFit,
+    Estimate,
+    ParameterRow,
+)
+
+_WORDS = phrases("report")
+
+
+def parameter_table(rows: Sequence[ParameterRow], *, number: int, carts: int) -> Table:
+    """Return initial and final estimates as the paper's Tables 1-3, with errors and a verdict."""
+    words = {1: "one", 2: "two", 3: "three", 4: "four"}
+    return make_table(
+        number,
+        _WORDS.text("parameter_table", carts=words.get(carts, carts)),
+        ("Parameter", "Unit", "Initial estimate", "from", "Final estimate", "Change", "Verdict"),
+        [_parameter_row(row) for row in rows],
+        "lldlddl",
+    )
+
+
+def _parameter_row(row: ParameterRow) -> list[Cell]:
+    source = SOURCES.get(row.initial.source, clean(row.initial.source)) if row.initial else ""
+    change = percent(row.change_percent, signed=True)
+    if row.change_sigmas is not None:
+        change += f" ({significant(row.change_sigmas, digits=2)} σ)"
+    return [
+        cell(name_span(row.name)),
+        cell(unit_text(clean(row.unit)) or "1"),
+        cell(_estimate(row.initial)),
+        cell(source, "quiet"),
+        cell(_estimate(row.final)),
+        cell(change),
+        _verdict(row.consistent),
+    ]
+
+
+def _estimate(estimate: Estimate | None) -> str:
+    if estimate is None:
+        return NOTHING
+    if estimate.source == "assumed":  # a guess has no more digits than were thought of
+        return significant(estimate.value, digits=2)
+    return with_error(estimate.value, estimate.std)
+
+
+def _verdict(consistent: bool | None) -> Cell:
+    if consistent is None:
+        return cell(NOTHING, "quiet")
+    return cell("agree", "good") if consistent else cell("differ", "bad")
+
+
+def parameter_notes(rows: Sequence[ParameterRow]) -> list[Spans]:
+    """Return the remarks on single parameters, equal remarks told once."""
+    by_note: dict[str, list[str]] = {}
+    for row in rows:
+        if row.note:
+            by_note.setdefault(row.note, []).append(row.name)
+    return [spans(rich(", ".join(names)), ": ", rich(clean(n))) for n, names in by_note.items()]
+
+
+def fitted_chain_table(fit: ChainFit, *, number: int, position_unit: str, input_unit: str) -> Table:
+    """Return masses, dampings and springs of a joint fit."""
+    std = dict(zip(fit.names, np.sqrt(np.diag(fit.covariance)), strict=True))
+    return chain_table(
+        fit.chain, std=std, number=number, position_unit=position_unit, input_unit=input_unit
+    )
+
+
+def chain_table(
+    chain: Chain, *, std: Mapping[str, float], number: int, position_unit: str, input_unit: str
+) -> Table:
+    """Return masses, dampings and springs, each with its standard error where it was fitted."""
+    kinds = (
+        ("m", "mass", chain.m, f"{input_unit} s²/{position_unit}"),
+        ("c", "damping", chain.c, f"{input_unit} s/{position_unit}"),
+        ("k", "spring", chain.k, f"{input_unit}/{position_unit}"),
+    )
+    rows = []
+    for letter, noun, values, unit in kinds:
+        for i, value in enumerate(values, start=1):
+            if chain.n == 1 and letter == "k" and i > 1:
+                continue  # only the sum of a lone cart's springs is known
+            name = f"{letter}_{i}" if chain.n > 1 else letter
+            error = std.get(f"{letter}_{i}")
+            absent = value == 0 and not error
+            rows.append(
+                [
+                    cell(name_span(name)),
+                    cell(_where(noun, i, chain.n)),
+                    cell("none" if absent else with_error(float(value), error)),
+                    cell(unit_text(clean(unit))),
+                ]
+            )
+    return make_table(
+        number,
+        _WORDS.text("chain_table"),
+        ("Symbol", "Meaning", "Value", "Unit"),
+        rows,
+        "lldl",
+    )
+
+
+def _where(noun: str, i: int, n: int) -> str:
+    if noun != "spring":
+        return f"{noun} of cart {i}" if n > 1 else noun
+    if n == 1:
+        return "springs, together"
+    left, right = ("wall" if i == 1 else str(i - 1)), ("wall" if i == n + 1 else str(i))
+    return f"spring {left}–{right}"
