@@ -10,7 +10,9 @@ The map goes on where a package has types of its own: `Ingested` (`ingest/read.p
 leave out and what explains it) and `Grade` (`grading/grade.py`). `results_json.py` writes it all.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from decimal import Decimal
 from typing import Literal
 
 from pipeline.plant.chain import Array, Chain, ComplexArray, frozen_array
@@ -484,7 +486,7 @@ class Analysis:
     to its reason, `unexplained` each driven recording in which the carts move to the share of its
     motion's power that the fitted carts leave. `rows` are the table; `chain` is None where no fit
     was possible (then `skipped` says why). `tables` are the students' own reduced tables, also
-    where dwells stand in their place.
+    where dwells stand in their place; `reported` their numbers, initial and final, as typed.
     """
 
     title: str
@@ -512,6 +514,7 @@ class Analysis:
     unexplained: dict[str, float] = field(default_factory=dict)
     discussion: str | None  # notes.md, without its comments
     left_out: tuple[LeftOut, ...] = ()
+    reported: Mapping[str, Mapping[str, Decimal]] = field(default_factory=dict)
 
     @property
     def chain(self) -> Chain | None:

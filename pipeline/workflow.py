@@ -124,6 +124,7 @@ def analyse(
         unexplained={name: one.share for name, one in found.fitted.fits.items()},
         discussion=submission.discussion,
         left_out=tuple(left_out),
+        reported=submission.typed,
     )
 
 

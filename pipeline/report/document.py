@@ -100,7 +100,8 @@ class Cell:
 class Table:
     """A numbered table; `align` has one of l, c, r or d (on the decimal mark) for each column.
 
-    A page lets its reader search and sort it where it is a `finder`.
+    A page lets its reader search and sort it where it is a `finder`; small print is for what is
+    there to be looked up.
     """
 
     number: int
@@ -109,6 +110,7 @@ class Table:
     rows: tuple[tuple[Cell, ...], ...]
     align: str
     finder: bool = False
+    small: bool = False
     kind: str = field(default="table", init=False)
 
 

@@ -27,18 +27,18 @@ def significant(value: float | None, *, digits: int = 4) -> str:
     return f"{_fixed(value / 10.0**exponent, digits - 1)} × 10{_superscript(exponent)}"
 
 
-def with_error(value: float, std: float | None) -> str:
-    """Return "value ± std", both to the decimal place of the second digit of the error."""
+def with_error(value: float, std: float | None, *, digits: int = 2) -> str:
+    """Return "value ± std", to the decimal place of the last of so many digits of the error."""
     if std is None or not math.isfinite(std) or std <= 0 or not math.isfinite(value):
         return significant(value)
     if std < _FINEST * abs(value):
         return significant(value, digits=_MOST_DIGITS)
     size = _exponent(max(abs(value), std), digits=2)
     if _is_plain(size):
-        decimals = 1 - _exponent(std, digits=2)
+        decimals = digits - 1 - _exponent(std, digits=digits)
         return f"{_fixed(value, decimals)} ± {_fixed(std, decimals)}"
     scale = 10.0**size
-    decimals = 1 - _exponent(std / scale, digits=2)
+    decimals = digits - 1 - _exponent(std / scale, digits=digits)
     inside = f"{_fixed(value / scale, decimals)} ± {_fixed(std / scale, decimals)}"
     return f"({inside}) × 10{_superscript(size)}"
 

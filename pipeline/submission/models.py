@@ -180,3 +180,9 @@ class Submission(_Model):
     reported: Reported | None = None
     folder: Path = Field(default=Path(), exclude=True)
     discussion: str | None = Field(default=None, exclude=True)
+
+    @property
+    def typed(self) -> dict[str, dict[str, Decimal]]:
+        """Return the students' own initial and final estimates, with the digits as typed."""
+        own = self.reported or Reported()
+        return {"initial": own.initial, "final": own.final}

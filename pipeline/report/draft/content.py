@@ -39,7 +39,12 @@ from pipeline.report.sections.page import Page, remarks
 from pipeline.report.sections.questions import ask, open_questions, placed, split_notes
 from pipeline.report.sections.summary import summary
 from pipeline.report.tables.housekeeping import check_table, file_table
-from pipeline.report.tables.parameters import fitted_chain_table, parameter_notes, parameter_table
+from pipeline.report.tables.parameters import (
+    fitted_chain_table,
+    parameter_notes,
+    parameter_table,
+    reported_table,
+)
 from pipeline.report.words import clean, names_spans, rich, stage_name
 from pipeline.results import Analysis
 
@@ -66,7 +71,7 @@ def build_document(
     asked = ask(analysis)
     answers, rest = split_notes(discussion_blocks(analysis.discussion or ""), asked)
     parts: Sequence[Part] = (
-        ("summary", "Summary", lambda page: [*summary(page.analysis), *gap_in_short(gap)]),
+        ("summary", "Summary", lambda page: [*summary(page), *gap_in_short(gap)]),
         ("changes", "Since the earlier draft", lambda page: change_blocks(page, changes)),
         *(worked or (("model", "The model", _model),)),
         ("parameters", "Initial and final estimates", _parameters),
@@ -141,6 +146,9 @@ def _parameters(page: Page) -> list[Block]:
         blocks.append(bullet_list(remarks))
     if staged := _staged_differences(page):
         blocks.append(staged)
+    if any(page.analysis.reported.values()):
+        table = reported_table(rows, page.analysis.reported, number=page.table_number())
+        blocks += [Heading(spans(_WORDS.text("reported"))), table]
     return blocks
 
 

@@ -26,6 +26,7 @@ from pipeline.report.numbers import subscript
 from pipeline.results import FrequencyResponse
 
 _LINE_POINTS = 300
+_MARGIN = 0.08  # of the phase's span, above and below
 _SQUARE = 90.0  # degrees: phases are read against right angles
 _DB_PER_NEPER = 20 / np.log(10)
 _HIGHEST_PEAK = 100.0  # times the largest measured magnitude; without damping a peak has no end
@@ -125,8 +126,9 @@ def plot_phase(ax: Axes, response: FrequencyResponse, *, chain: Chain | None) ->
         None if response.phase_std is None else np.degrees(np.clip(response.phase_std, 0, np.pi))
     )
     _points(ax, response.omega, np.degrees(phase), error)
-    low, high = np.sort(ax.get_ylim())
-    ax.set_ylim(_SQUARE * np.floor(low / _SQUARE), _SQUARE * np.ceil(high / _SQUARE))
+    low, high = ax.dataLim.intervaly
+    margin = _MARGIN * max(high - low, _SQUARE)
+    ax.set_ylim(low - margin, high + margin)
     ax.yaxis.set_major_locator(MultipleLocator(_SQUARE if high - low > _SQUARE else _SQUARE / 2))
     ax.set_ylabel("phase [°]")
 

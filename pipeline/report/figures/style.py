@@ -7,7 +7,7 @@ figure reads in grey and for the colour-blind. Text stays text: it can be search
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from os.path import commonprefix
+from itertools import takewhile
 from typing import Any
 
 import matplotlib
@@ -121,7 +121,8 @@ def _short(titles: Sequence[str], *, most: int) -> list[str]:
     """Return titles of so many letters; long ones lose first what they all begin with."""
     titles = [clean(title) for title in titles]
     if len(titles) > 1 and max(map(len, titles)) > most:
-        same = len(commonprefix(titles))
+        pairs = zip(min(titles), max(titles), strict=False)  # what these two share, all do
+        same = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
         titles = [f"…{title[same:]}" for title in titles] if same > 1 else titles
     return [title if len(title) <= most else f"{title[: most - 1]}…" for title in titles]
 

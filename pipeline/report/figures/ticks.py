@@ -6,7 +6,7 @@ matplotlib makes seven objects for every tick, which takes half the time of a fi
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
-from matplotlib.ticker import NullLocator
+from matplotlib.ticker import MaxNLocator, MultipleLocator, NullLocator
 from matplotlib.transforms import ScaledTranslation
 
 from pipeline.plant.chain import Array
@@ -14,6 +14,7 @@ from pipeline.plant.chain import Array
 # What a page that zooms draws anew or moves: grids, tick labels, letters that mark a place.
 TAGS = ("grid-x", "grid-y", "tick-x", "tick-y", "mark")
 GRID = "#e4e4e4"
+_OWN = (MultipleLocator, MaxNLocator)  # what a figure asks for: right angles, whole numbers
 _SIZE = 7.5  # points, of the labels
 _PAD = 3.5 / 72  # inches, between axis and label
 _SPACING = (0.45, 0.18)  # inches at least between ticks along x and along y
@@ -40,8 +41,9 @@ def draw_ticks(ax: Axes, *, label_x: bool, label_y: bool = True) -> None:
         low, high = sorted((ax.get_xlim, ax.get_ylim)[direction]())
         scale = (ax.get_xscale, ax.get_yscale)[direction]()
         most = max(2, int(size / _SPACING[direction]))
-        if not axis.isDefault_majloc:  # the figure asked for its own: whole numbers, right angles
-            ticks = axis.get_majorticklocs()
+        own = axis.get_major_locator()
+        if type(own) in _OWN:
+            ticks = np.asarray(own())
             ticks = ticks[(ticks >= low) & (ticks <= high)]
         elif scale == "log":
             ticks = log_ticks(low, high)

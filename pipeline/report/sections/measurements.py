@@ -3,13 +3,13 @@
 import numpy as np
 
 from pipeline.names import mode_suffixes, omega_names
-from pipeline.report.document import Block, paragraph
-from pipeline.report.figures.bode import bode_figure
+from pipeline.report.document import Block, Details, paragraph, spans
+from pipeline.report.figures.bode import bode_figure, overview_figure
 from pipeline.report.figures.time import damping_figure, decay_figure, sine_figure, step_figure
 from pipeline.report.numbers import count, listing, percent, significant, with_error
 from pipeline.report.phrases import phrases
 from pipeline.report.sections.page import Page, left_out
-from pipeline.report.tables.records import decay_table, step_table
+from pipeline.report.tables.records import decay_table, dwell_table, step_table
 from pipeline.report.words import clean
 from pipeline.results import FrequencyResponse, SinePoint
 
@@ -40,6 +40,18 @@ def response_blocks(page: Page) -> list[Block]:
     found = {response.source for response in page.analysis.frequency_responses}
     used = [_WORDS.text(f"source_{key}") for key in ("dwells", "table", "records") if key in found]
     return [paragraph(_WORDS.text("source", sources=listing(used))), *blocks]
+
+
+def overview_blocks(page: Page) -> list[Block]:
+    """Return one picture of what was identified: all carts, measured and fitted."""
+    shown = [r for r in page.analysis.frequency_responses if np.any(r.magnitude > 0)]
+    if not shown:
+        return []
+    chain, marks = page.analysis.chain, listing(omega_names(mode_suffixes(page.analysis.carts)))
+    figure = overview_figure(shown, chain=chain, position_unit=page.position, input_unit=page.drive)
+    key = "overview" if chain else "overview_points"
+    alt = _WORDS.text("overview_alt", carts=count(len(shown), "cart"))
+    return [page.picture("overview", figure, caption=_WORDS.text(key, marks=marks), alt=alt)]
 
 
 def _bode_caption(page: Page, response: FrequencyResponse) -> str:
@@ -156,7 +168,7 @@ def _line_styles(carts: int) -> str:
 
 
 def dwell_blocks(page: Page) -> list[Block]:
-    """Return one dwell, the transient told from the steady state."""
+    """Return one dwell, the transient told from the steady state, and the numbers of all."""
     points = [p for p in page.analysis.sine_points if p.experiment in page.records]
     if not points:
         return []
@@ -179,7 +191,16 @@ def dwell_blocks(page: Page) -> list[Block]:
             caption=_WORDS.text("sine", run=run, carts=carts, **said),
             alt=_WORDS.text("sine_alt", amplitudes=listing(amplitudes), **said),
         ),
+        _all_dwells(page),
     ]
+
+
+def _all_dwells(page: Page) -> Block:
+    points = sorted(page.analysis.sine_points, key=lambda p: (p.omega, p.experiment, p.cart))
+    units = (page.position, page.drive)
+    dwells = count(len({point.experiment for point in points}), "dwell")
+    table = dwell_table(points, number=page.table_number(), units=units)
+    return Details(spans(_WORDS.text("all_dwells", dwells=dwells)), (table,))
 
 
 def _instructive(point: SinePoint) -> tuple[bool, float]:

@@ -27,8 +27,10 @@ from pipeline.report.numbers import (
     with_error,
 )
 from pipeline.report.phrases import phrases
+from pipeline.report.sections.measurements import overview_blocks
+from pipeline.report.sections.page import Page
 from pipeline.report.words import clean, name_span, names_spans, plain_lines, rich, stage_name
-from pipeline.results import SIGN, Analysis, Check, HardwareCheck
+from pipeline.results import SIGN, Analysis, Check, Estimate, HardwareCheck
 
 _WORDS = phrases("summary")
 _KINDS = {  # what carts are identified from
@@ -45,14 +47,18 @@ _OF_DATA = (
     "setup.",
     "hardware.",
 )  # checks of recordings, not of what they say
+_CALIBRATION = 1e-3  # no teaching bench's encoder and motor are known better than this
+_COARSE = 1e-2  # from here on two digits of an error leave four of the value
 _CLOSE = 0.10  # a simulation within 10 % of the motion is a good linear model's
 
 
-def summary(analysis: Analysis) -> list[Block]:
+def summary(page: Page) -> list[Block]:
     """Say what was identified, what agrees, what does not, what is missing, what to do next.
 
-    What is well is a tile on a board; what is not has a sentence as well.
+    What is well is a tile on a board; what is not has a sentence as well. One picture shows all
+    carts.
     """
+    analysis = page.analysis
     blocks: list[Block] = [_identified(analysis)]
     blocks += [
         Tiles(tiles) for tiles in (_numbers_board(analysis), _verdict_board(analysis)) if tiles
@@ -60,6 +66,7 @@ def summary(analysis: Analysis) -> list[Block]:
     problems = [text for good, text in _findings(analysis) if not good]
     if problems:
         blocks.append(bullet_list(problems))
+    blocks += overview_blocks(page)
     return [*blocks, paragraph(Span(_WORDS.text("next"), "strong")), _next(analysis)]
 
 
@@ -112,14 +119,22 @@ def _identified(analysis: Analysis) -> Block:
 def _numbers_board(analysis: Analysis) -> tuple[Tile, ...]:
     """Return the gains and the resonances."""
     return tuple(
-        Tile(
-            label=spans(name_span(row.name)),
-            value=spans(with_error(row.final.value, row.final.std)),
-            note=spans(unit_text(clean(row.unit))),
-        )
+        _number_tile(row.name, row.final, unit=unit_text(clean(row.unit)))
         for row in analysis.rows
         if row.final and (analysis.carts == 1 or _is_told(read_name(row.name)))
     )
+
+
+def _number_tile(name: str, final: Estimate, *, unit: str) -> Tile:
+    """Return a number in four digits; a smaller error than any calibration's is only a note."""
+    share = (final.std or 0.0) / abs(final.value) if final.value else 1.0
+    if 0 < share < _CALIBRATION:
+        value = significant(final.value)
+        error = _WORDS.text("statistical", share=f"{significant(100 * share, digits=1)} %")
+        unit = f"{unit}, {error}" if unit else error
+    else:
+        value = with_error(final.value, final.std, digits=2 if share >= _COARSE else 1)
+    return Tile(label=spans(name_span(name)), value=spans(value), note=spans(unit))
 
 
 def _is_told(name: Name) -> bool:

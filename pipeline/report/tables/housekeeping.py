@@ -1,6 +1,7 @@
 """Checks and files."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from pipeline.report.document import Span, Table
 from pipeline.report.phrases import phrases
@@ -39,7 +40,7 @@ def check_table(checks: Sequence[Check], caption: str, *, number: int) -> Table:
 
 def file_table(analysis: Analysis, *, number: int) -> Table:
     """Return the data files with their SHA-256."""
-    return make_table(
+    table = make_table(
         number,
         _WORDS.text("file_table"),
         ("File", "SHA-256"),
@@ -49,3 +50,4 @@ def file_table(analysis: Analysis, *, number: int) -> Table:
         ],
         "ll",
     )
+    return replace(table, small=True)

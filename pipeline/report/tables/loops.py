@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.report.document import Table, spans
+from pipeline.report.document import Spans, Table, spans
 from pipeline.report.numbers import (
     NOTHING,
     complex_text,
@@ -39,6 +39,7 @@ def feedback_table(design: FeedbackDesign, *, number: int, units: tuple[str, str
             )
         )
     rows += [
+        *_weights(design),
         (spans("prefilter"), significant(design.prefilter), f"{drive}/{position}"),
         (spans("sample time"), significant(design.sample_time), "s"),
         (spans("overshoot"), percent(design.overshoot_percent), ""),
@@ -58,6 +59,17 @@ def feedback_table(design: FeedbackDesign, *, number: int, units: tuple[str, str
         [[cell(what), cell(value), cell(unit_text(unit))] for what, value, unit in rows],
         "ldl",
     )
+
+
+def _weights(design: FeedbackDesign) -> list[tuple[Spans, str, str]]:
+    """Return what the quadratic regulator weighs; nothing for placed poles."""
+    if design.Q is None:
+        return []
+    diagonal = ", ".join(significant(value, digits=3) for value in np.diag(design.Q))
+    return [
+        (spans("LQR weights of the state, Q (diagonal)"), diagonal, ""),
+        (spans("LQR weight of the input, R"), significant(design.R, digits=3), ""),
+    ]
 
 
 def margin_rows(margins: Margins | None) -> list[tuple[str, str, str, str]]:

@@ -1,9 +1,11 @@
 """What was identified: initial and final estimates, the chain."""
 
 from collections.abc import Mapping, Sequence
+from decimal import Decimal
 
 import numpy as np
 
+from pipeline.names import read_name
 from pipeline.plant.chain import Chain
 from pipeline.report.document import Cell, Spans, Table, spans
 from pipeline.report.numbers import (
@@ -21,8 +23,10 @@ from pipeline.results import (
     Estimate,
     ParameterRow,
 )
+from pipeline.stages.compare import SIGMA_LIMIT, change_limit
 
 _WORDS = phrases("report")
+_FEW = 1 / 3  # of the limit for initial and final: other ways through the same data differ so much
 
 
 def parameter_table(rows: Sequence[ParameterRow], *, number: int, carts: int) -> Table:
@@ -31,9 +35,18 @@ def parameter_table(rows: Sequence[ParameterRow], *, number: int, carts: int) ->
     return make_table(
         number,
         _WORDS.text("parameter_table", carts=words.get(carts, carts)),
-        ("Parameter", "Unit", "Initial estimate", "from", "Final estimate", "Change", "Verdict"),
+        (
+            "Parameter",
+            "Unit",
+            "Initial estimate",
+            "from",
+            "Final estimate",
+            "Change",
+            "Limit",
+            "Verdict",
+        ),
         [_parameter_row(row) for row in rows],
-        "lldlddl",
+        "lldlddrl",
     )
 
 
@@ -49,6 +62,7 @@ def _parameter_row(row: ParameterRow) -> list[Cell]:
         cell(source, "quiet"),
         cell(_estimate(row.final)),
         cell(change),
+        cell(NOTHING if row.consistent is None else f"{change_limit(row.name):.0f} %", "quiet"),
         _verdict(row.consistent),
     ]
 
@@ -65,6 +79,49 @@ def _verdict(consistent: bool | None) -> Cell:
     if consistent is None:
         return cell(NOTHING, "quiet")
     return cell("agree", "good") if consistent else cell("differ", "bad")
+
+
+def reported_table(
+    rows: Sequence[ParameterRow], reported: Mapping[str, Mapping[str, Decimal]], *, number: int
+) -> Table:
+    """Return the students' own numbers beside those of their data.
+
+    What is off beyond its rounding, three standard errors and a few percent says what to look at.
+    """
+    both = [
+        (row.name, column, unit_text(clean(row.unit)) or "1", found, reported[column][row.name])
+        for column in reported
+        for row in rows
+        if (found := getattr(row, column)) and row.name in reported[column]
+    ]
+    head = ("Parameter", "Estimate", "Yours", "From your data", "Unit", "Off", "Look at")
+    lines = [
+        [
+            cell(name_span(name)),
+            cell(column),
+            cell(f"{yours:f}".replace("-", "−")),
+            cell(_estimate(found)),
+            cell(unit),
+            *_off(name, yours, found),
+        ]
+        for name, column, unit, found, yours in both
+    ]
+    return make_table(number, _WORDS.text("reported_table"), head, lines, "llddldl")
+
+
+def _off(name: str, yours: Decimal, found: Estimate) -> tuple[Cell, Cell]:
+    """Return how far a number is off, and what to look at where that is too far."""
+    if not found.value or found.source == "assumed":
+        return cell(NOTHING, "quiet"), cell("")
+    off = float(yours) - found.value
+    share = percent(100 * off / abs(found.value), signed=True)
+    rounding = 0.5 * 10.0 ** int(yours.as_tuple().exponent)
+    few = _FEW * change_limit(name) / 100 * abs(found.value)
+    if abs(off) <= rounding + SIGMA_LIMIT * (found.std or 0.0) + few:
+        return cell(share), cell("")
+    read = read_name(name)
+    kind = "gain" if read.is_gain else "damping" if read.is_damping else "frequency"
+    return cell(share, "bad"), cell(_WORDS.text(f"look_{kind}"))
 
 
 def parameter_notes(rows: Sequence[ParameterRow]) -> list[Spans]:

@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from pipeline.report.document import Table, spans
 from pipeline.report.numbers import (
     significant,
@@ -12,6 +14,7 @@ from pipeline.report.tables.cells import cell, make_table
 from pipeline.report.words import clean, name_span
 from pipeline.results import (
     LogDecrement,
+    SinePoint,
     StepGain,
 )
 
@@ -78,3 +81,27 @@ def step_table(gains: Sequence[StepGain], *, number: int, units: tuple[str, str]
         rows,
         "lccdd",
     )
+
+
+def dwell_table(points: Sequence[SinePoint], *, number: int, units: tuple[str, str]) -> Table:
+    """Return frequency, amplitudes, ratio and phase of every dwell and cart; whether it settled."""
+    position, drive = (clean(unit) for unit in units)
+    rows = [
+        [
+            cell(clean(point.experiment)),
+            cell(significant(point.omega / (2 * np.pi))),
+            cell(str(point.cart)),
+            cell(significant(point.input_amplitude)),
+            cell(with_error(point.amplitude, point.amplitude_std)),
+            cell(with_error(point.gain, point.gain_std)),
+            cell(with_error(np.degrees(point.phase), np.degrees(point.phase_std))),
+            cell(significant(point.steady_from, digits=3)) if point.settled
+            else cell("not settled", "bad"),
+        ]
+        for point in points
+    ]  # fmt: skip
+    head = (
+        "Record", "f [Hz]", "Cart", f"|U| [{drive}]", f"|X| [{position}]",
+        f"|X|/|U| [{position}/{drive}]", "Phase [°]", "Steady from [s]",
+    )  # fmt: skip
+    return make_table(number, _WORDS.text("dwell_table"), head, rows, "ldcddddr")
