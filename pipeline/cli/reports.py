@@ -30,20 +30,39 @@ def new(
 
 @app.command()
 def inspect(
-    files: Annotated[list[Path], typer.Argument(metavar="FILE…", help="Data files.")],
+    files: Annotated[
+        list[Path], typer.Argument(metavar="FILE…|DIR", help="Data files, or folders of them.")
+    ],
     as_json: AsJson = False,
 ) -> None:
-    """Show what a data file holds: format, columns, rate, duration, kind, problems."""
-    from pipeline.ingest.inspect import format_inspection, inspect_file
+    """Show what data files hold: format, columns, rate, duration, kind, problems.
+
+    Of a folder (its data/, where it has one) a table with one line a file.
+    """
+    from pipeline.ingest.inspect import (
+        data_files_in,
+        format_inspection,
+        format_inspections,
+        inspect_file,
+    )
 
     inspections, unreadable = [], []
-    for file in files:  # one broken file does not hide the others
+    folders = [file for file in files if file.is_dir()]
+    listed = [file for file in files if file not in folders]
+    for folder in folders:
+        found = data_files_in(folder / "data" if (folder / "data").is_dir() else folder)
+        listed += found
+        if not found:
+            unreadable.append(f"{folder}: no data files in it")
+    for file in listed:  # one broken file does not hide the others
         try:
             inspections.append(inspect_file(file))
         except PipelineError as error:
             unreadable.append(str(error))
     if as_json:
         typer.echo(json.dumps([i.to_dict() for i in inspections], indent=1, ensure_ascii=False))
+    elif inspections and folders:
+        typer.echo(format_inspections(inspections))
     elif inspections:
         typer.echo("\n\n".join(format_inspection(i) for i in inspections))
     for message in unreadable:

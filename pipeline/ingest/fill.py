@@ -14,7 +14,8 @@ from typing import Any, Literal
 import tomlkit
 
 from pipeline.errors import ConfigError, SubmissionError
-from pipeline.ingest.inspect import Inspection, inspect_file
+from pipeline.ingest.formats.table import ENDINGS
+from pipeline.ingest.inspect import Inspection, data_files_in, inspect_file
 from pipeline.results import Kind
 from pipeline.submission.edit import (
     append_experiment,
@@ -27,7 +28,6 @@ from pipeline.submission.models import MOST_EXPERIMENTS
 from pipeline.submission.template import write_templates
 from pipeline.submission.toml_file import Value
 
-ENDINGS = (".txt", ".csv", ".mat", ".m", ".log", ".dat", ".tsv", ".asc")
 _MOST_CARTS = 4
 _HELD_STEPS = 2.0  # encoder steps over a whole record; a cart that is free moves more
 _HARDLY = 0.05  # of the furthest cart's motion; less may be a cart that a hand held
@@ -66,13 +66,13 @@ class Found:
 
 
 def data_files(folder: Path) -> list[str]:
-    """Return the recordings in `data/`, "2" before "10", as they stand in `submission.toml`."""
-    names = [
-        path.relative_to(folder).as_posix()
-        for path in (folder / "data").rglob("*")
-        if path.suffix.casefold() in ENDINGS and not path.name.startswith((".", "~"))
+    """Return the recordings in `data/`, as they stand in `submission.toml`."""
+    found = data_files_in(folder / "data")
+    return [
+        name
+        for path in found
+        if outside(folder, name := path.relative_to(folder).as_posix()) is None
     ]
-    return sorted((n for n in names if outside(folder, n) is None), key=_natural)
 
 
 def look_at(folder: Path, file: str) -> Found:
@@ -266,10 +266,6 @@ def _unsure(found: Found, n: int) -> Iterator[str]:
     positions = found.inspection.positions
     if n > 1 and list(positions) == [1] and not re.search(r"\d", positions[1].name):
         yield "is it cart 1 that it measures? Else columns = { x2 = … }"
-
-
-def _natural(name: str) -> list[tuple[str, int]]:
-    return [(text, int(n or -1)) for text, n in re.findall(r"(\D*)(\d{0,9})", name.casefold())]
 
 
 def _carts_seen(looked: Sequence[Found]) -> int:

@@ -1,6 +1,7 @@
 """What a data file holds, before anything is made of it."""
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from pipeline.ingest.channels import channel_problems, encoder_step, mirrors
 from pipeline.ingest.clock import SLOW, Clock, read_clock
 from pipeline.ingest.columns import Column, assign_columns, conversion, holds_counts
 from pipeline.ingest.formats.recognise import read_table
-from pipeline.ingest.formats.table import FORM_TITLES, Table
+from pipeline.ingest.formats.table import ENDINGS, FORM_TITLES, Table
 from pipeline.ingest.suggest import suggest_columns
 from pipeline.plant.chain import Array
 from pipeline.results import Kind
@@ -68,6 +69,23 @@ class Inspection:
     def to_dict(self) -> dict:
         """Return the inspection as plain values for JSON."""
         return asdict(self)
+
+
+def data_files_in(folder: Path) -> list[Path]:
+    """Return what may hold data in a folder and those below, "2" before "10"."""
+    found = [
+        path
+        for path in folder.rglob("*")
+        if path.suffix.casefold() in ENDINGS
+        and not path.name.startswith((".", "~"))
+        and path.is_file()
+    ]
+    return sorted(found, key=_natural)
+
+
+def _natural(path: Path) -> list[tuple[str, int]]:
+    parts = re.findall(r"(\D*)(\d{0,9})", path.as_posix().casefold())
+    return [(text, int(n or -1)) for text, n in parts]
 
 
 def inspect_file(path: Path) -> Inspection:
@@ -231,6 +249,30 @@ def line_frequency(t: Array, u: Array) -> float | None:
     return centre / float(t[-1] - t[0]) * (t.size - 1) / t.size
 
 
+def format_inspections(inspections: Sequence[Inspection]) -> str:
+    """Return a table of one line a file; what is wrong with it stands below."""
+    head = ("file", "format", "samples", "s", "Hz", "looks like", "columns")
+    rows = [head]
+    for one in inspections:
+        roles = " ".join(column.role or "-" for column in one.columns)
+        duration, rate = (
+            "" if number is None else f"{number:.4g}" for number in (one.duration, one.rate)
+        )
+        rows.append((one.file, one.format, str(one.samples), duration, rate, _looks(one), roles))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = []
+    for row, one in zip(rows, (None, *inspections), strict=True):
+        cells = zip(row, widths, strict=True)
+        lines.append("  ".join(f"{cell:<{width}}" for cell, width in cells).rstrip())
+        lines += [f"  ! {problem}" for problem in one.problems] if one else []
+    return "\n".join(lines)
+
+
+def _looks(inspection: Inspection) -> str:
+    at = "" if inspection.frequency is None else f" at {inspection.frequency:.4g} Hz"
+    return f"{inspection.kind or 'unknown'}{at}"
+
+
 def format_inspection(inspection: Inspection) -> str:
     """Return the inspection as plain text."""
     lines = [inspection.file, f"  format    {inspection.format}"]
@@ -241,10 +283,7 @@ def format_inspection(inspection: Inspection) -> str:
             f"jitter {1e3 * jitter:.3g} ms rms" if jitter > 1e-9 else "even"
         )
     lines.append(f"  samples   {samples}")
-    looks = inspection.kind or "unknown"
-    if inspection.frequency is not None:
-        looks += f" at {inspection.frequency:.4g} Hz"
-    lines.append(f"  looks like {looks}")
+    lines.append(f"  looks like {_looks(inspection)}")
     width = max(len(column.name) for column in inspection.columns)
     for column in inspection.columns:
         step = f", step {column.step:.4g}" if column.step else ""

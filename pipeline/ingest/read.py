@@ -182,7 +182,13 @@ class _Opened:
 
 def _open(table: Table, experiment: Experiment, system: System) -> _Opened:
     _refuse_cut(table)
-    columns, unused = assign_columns(table, explicit=experiment.columns, free=experiment.carts)
+    own = experiment.columns or {}
+    shared = {
+        role: column
+        for role, column in system.columns.items()
+        if table.has(column) and column not in own.values()
+    }
+    columns, unused = assign_columns(table, explicit=shared | own, free=experiment.carts)
     positions = sorted(
         (c for role, c in columns.items() if role[0] == "x" and c.cart <= system.carts),
         key=lambda column: column.cart,

@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Sequence
 
 _SUPERSCRIPT = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 _SUBSCRIPT = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
@@ -9,38 +10,50 @@ _PLAIN_RANGE = (1e-3, 1e5)  # sizes written without a power of ten
 _MOST_DIGITS = 8
 _FINEST = 1e-8  # an error this far below the value is that of exact data: its digits say nothing
 NOTHING = "–"
+_TIMES = " × 10"
 _WHOLE = re.compile(r"[^\w]*\d+(?=\D|$)")
 _EXPONENT = re.compile(r"(?<![\w.])(-?\d+(?:\.\d+)?)e([+-]\d+)\b")
 _HYPHEN = re.compile(r"(?<![\w.)\]])-(?=\d)")
 _SIGNED_ZERO = re.compile(r"[+−]0\.0 %")
 
 
-def significant(value: float | None, *, digits: int = 4) -> str:
+def significant(value: float | None, *, digits: int = 4, power: bool = False) -> str:
     """Return a number with `digits` significant digits; a dash where there is none."""
     if value is None or not math.isfinite(value):
         return NOTHING
     if value == 0:
         return "0"
     exponent = _exponent(value, digits=digits)
-    if _is_plain(exponent):
+    if _is_plain(exponent) and not power:
         return _fixed(value, digits - 1 - exponent)
-    return f"{_fixed(value / 10.0**exponent, digits - 1)} × 10{_superscript(exponent)}"
+    return f"{_fixed(value / 10.0**exponent, digits - 1)}{_TIMES}{_superscript(exponent)}"
 
 
-def with_error(value: float, std: float | None, *, digits: int = 2) -> str:
-    """Return "value ± std", to the decimal place of the last of so many digits of the error."""
+def with_errors(column: Sequence[tuple[float, float | None]]) -> list[str]:
+    """Return "value ± std" for each of a column: all with a power of ten where one needs it."""
+    texts = [with_error(value, std) for value, std in column]
+    if not any(_TIMES in text for text in texts):
+        return texts
+    return [with_error(value, std, power=True) for value, std in column]
+
+
+def with_error(value: float, std: float | None, *, digits: int = 2, power: bool = False) -> str:
+    """Return "value ± std", to the decimal place of the last of so many digits of the error.
+
+    With a power of ten where the size, or `power`, asks for it.
+    """
     if std is None or not math.isfinite(std) or std <= 0 or not math.isfinite(value):
-        return significant(value)
+        return significant(value, power=power)
     if std < _FINEST * abs(value):
-        return significant(value, digits=_MOST_DIGITS)
+        return significant(value, digits=_MOST_DIGITS, power=power)
     size = _exponent(max(abs(value), std), digits=2)
-    if _is_plain(size):
+    if _is_plain(size) and not power:
         decimals = digits - 1 - _exponent(std, digits=digits)
         return f"{_fixed(value, decimals)} ± {_fixed(std, decimals)}"
     scale = 10.0**size
     decimals = digits - 1 - _exponent(std / scale, digits=digits)
     inside = f"{_fixed(value / scale, decimals)} ± {_fixed(std / scale, decimals)}"
-    return f"({inside}) × 10{_superscript(size)}"
+    return f"({inside}){_TIMES}{_superscript(size)}"
 
 
 def complex_text(value: complex, *, digits: int) -> str:

@@ -2,7 +2,7 @@
 
 import re
 import stat
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from decimal import Decimal
 from itertools import islice
@@ -184,6 +184,8 @@ def _problems(submission: Submission, folder: Path) -> Iterator[tuple[Location, 
             ("system", "springs"),
             f"expected {n + 1} values ({', '.join(spring_names(n))}), found {len(springs)}",
         )
+    for key, what in _columns(submission.system.columns, n):
+        yield ("system", *key), what
     if submission.design is not None:
         yield from _in_range(("design", "cart"), submission.design.cart, n)
     seen: dict[str, int] = {}
@@ -253,8 +255,12 @@ def _experiment_problems(
             )
     elif controller is not None:
         yield from _in_range(("controller", "cart"), controller.cart, n)
+    yield from _columns(experiment.columns or {}, n)
+
+
+def _columns(columns: Mapping[str, str | int], n: int) -> Iterator[tuple[Location, str]]:
     roles = (*_SYSTEM_COLUMNS, *(f"x{i}" for i in range(1, n + 1)))
-    for role, column in (experiment.columns or {}).items():
+    for role, column in columns.items():
         if role not in roles:
             yield ("columns", role), f"unknown column{nearest(role, roles)}"
         if isinstance(column, int) and column < 1:

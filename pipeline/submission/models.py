@@ -51,12 +51,16 @@ class Position(_Model):
 
 
 class System(_Model):
-    """The carts and springs on the bench; springs not stated are all there."""
+    """The carts and springs on the bench; springs not stated are all there.
+
+    `columns` (role to heading or number) are those of every recording that has them.
+    """
 
     carts: Annotated[int, Field(ge=1, le=4)]
     springs: tuple[bool, ...]
     input: Input = Input()
     position: Position = Position()
+    columns: dict[str, str | int] = {}
 
     @model_validator(mode="before")
     @classmethod

@@ -9,7 +9,13 @@ import pytest
 import scipy.io
 
 from pipeline.errors import SubmissionError
-from pipeline.ingest.inspect import Inspection, format_inspection, inspect_file
+from pipeline.ingest.inspect import (
+    Inspection,
+    data_files_in,
+    format_inspection,
+    format_inspections,
+    inspect_file,
+)
 
 RATE = 200.0
 T = np.arange(2000) / RATE
@@ -163,3 +169,16 @@ def test_what_is_no_data_file_is_one_line(tmp_path):
     assert str(caught.value).startswith(f"{tmp_path / 'words.csv'} line 1: ")
     with pytest.raises(SubmissionError, match="is a folder"):
         inspect_file(tmp_path)
+
+
+def test_a_folder_is_a_table_of_one_line_a_file(tmp_path):
+    """Its `data` are looked into, what else lies there is not; problems stand below their file."""
+    (tmp_path / "data").mkdir()
+    inspect(tmp_path / "data", time=T, input=STEP, x1=X)
+    (tmp_path / "data" / "photo.jpg").write_bytes(b"no data")
+    files = data_files_in(tmp_path)
+    assert [file.name for file in files] == ["a.csv"]
+    head, line, *problems = format_inspections([inspect_file(file) for file in files]).splitlines()
+    assert head.split()[:2] == ["file", "format"]
+    assert line.endswith("time input x1")
+    assert all(problem.startswith("  ! ") for problem in problems)

@@ -17,7 +17,8 @@ from matplotlib.patches import Rectangle
 from matplotlib.text import Text
 
 from pipeline.plant.chain import Chain
-from pipeline.report.figures.bode import bode_figure
+from pipeline.report.figures.bode import bode_figure, overview_figure, plot_phase
+from pipeline.report.figures.grading import distribution_figure
 from pipeline.report.figures.style import (
     drawing,
     panels,
@@ -130,7 +131,9 @@ def test_an_unstable_model_does_not_hide_the_measurement():
     growth = np.append(np.exp(np.linspace(0, 700, check.t.size - 1)), np.inf)
     for model in (1e12 * check.model, growth):
         with drawing():
-            figure = hardware_figure([[replace(check, model=model)]], position_unit="cm")
+            figure = hardware_figure(
+                [[replace(check, model=model)]], record=None, position_unit="cm", input_unit="V"
+            )
             to_svg(figure, name="x", alt="")
         low, high = figure.axes[0].get_ylim()
         assert high - low <= 3.01 * np.ptp(check.measured)
@@ -269,7 +272,13 @@ def figures_of(carts: int) -> dict[str, Figure]:
             [p for p in analysis.sine_points if p.experiment == dwell], record=records[dwell],
             position_unit="count",
         ),
-        "hardware": hardware_figure(checks, position_unit="count"),
+        "hardware": hardware_figure(
+            checks, record=analysis.records[-1], position_unit="count", input_unit="V"
+        ),
+        "overview": overview_figure(
+            analysis.frequency_responses, chain=analysis.chain, position_unit="count",
+            input_unit="V",
+        ),
         "feedback": design_figure(analysis.feedback, position_unit="count", input_unit="V"),
     }  # fmt: skip
 
@@ -335,3 +344,38 @@ def test_repeats_stand_on_one_time_axis():
     assert len({round(ax.get_position().x0, 6) for ax in axes}) == 3
     assert [ax.get_title(loc="left") for ax in axes] == list("abcde")
     assert len(figure.axes) == 5
+
+
+def test_phases_are_read_against_right_angles():
+    """Ticks of a phase that turns by more than a right angle are multiples of 90 degrees."""
+    response = make_analysis(2).frequency_responses[1]
+    figure, (ax,) = panels(1.0)
+    with drawing():
+        plot_phase(ax, response, chain=make_analysis(2).chain)
+        to_svg(figure, name="x", alt="")
+    texts = [text.get_text() for text in ax.texts if text.get_gid() == "tick-y"]
+    assert {float(text.replace("−", "-")) % 90 for text in texts} == {0.0}
+    assert len(texts) >= 3
+
+
+@pytest.mark.parametrize("points", [[10.0], [1.0, 9.0, 9.5, 4.0], [3.0] * 40])
+def test_submissions_are_counted_in_whole_numbers(points):
+    """No axis of a histogram speaks of half a submission."""
+    with drawing():
+        figure = distribution_figure(points, out_of=10.0)
+        to_svg(figure, name="x", alt="")
+    (ax,) = figure.axes
+    texts = [text.get_text() for text in ax.texts if text.get_gid() == "tick-y"]
+    assert len(texts) >= 2
+    assert all(text.isdigit() for text in texts)
+
+
+def test_long_titles_lose_what_they_share():
+    """Of long names with one beginning the rest is shown, where the difference is."""
+    names = [f"DOF1_en1_input1_trial_of_monday_{i}" for i in range(6)]
+    with drawing():
+        _, axes = small_multiples(names, height=1.0, share_y=True)
+    assert [ax.get_title(loc="left") for ax in axes] == [f"…{i}" for i in range(6)]
+    with drawing():
+        _, axes = small_multiples(["step-1", "step-2"], height=1.0, share_y=True)
+    assert [ax.get_title(loc="left") for ax in axes] == ["step-1", "step-2"]

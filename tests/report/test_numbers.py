@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.plant.designed_loop import Margins
-from pipeline.report.numbers import listing, percent, significant, with_error
+from pipeline.report.numbers import listing, percent, significant, with_error, with_errors
 from pipeline.report.tables.loops import margin_rows
 
 _SUPERSCRIPTS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻−", "0123456789--")
@@ -108,3 +108,10 @@ def test_margins_say_lag_lead_and_no_limit():
     none = replace(lag, phase_deg=None, omega_phase=None)
     assert margin_rows(none)[1][1:] == ("–", "°", "no limit")
     assert margin_rows(None) == []
+
+
+def test_a_column_has_one_form():
+    """Where one number needs a power of ten all of the column have one."""
+    small, large = (3.12812e-4, 1.2e-6), (0.1274769, 3.9e-6)
+    assert with_errors([large]) == ["0.1274769 ± 0.0000039"]
+    assert with_errors([small, large]) == ["(3.128 ± 0.012) × 10⁻⁴", "(1.274769 ± 0.000039) × 10⁻¹"]

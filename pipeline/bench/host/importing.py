@@ -12,7 +12,8 @@ from pipeline.bench.planning.plan_file import load_plan, plan_path
 from pipeline.bench.planning.plan_words import hold_words
 from pipeline.bench.watch.observer import Observer
 from pipeline.errors import ConfigError, SubmissionError
-from pipeline.ingest.fill import ENDINGS, experiment_entry, free_carts, free_id
+from pipeline.ingest.fill import experiment_entry, free_carts, free_id
+from pipeline.ingest.formats.table import ENDINGS
 from pipeline.ingest.inspect import Inspection, inspect_file
 from pipeline.output import own_folder
 from pipeline.results import Kind

@@ -18,6 +18,7 @@ _LARGEST = 1e50  # of anything in a file, times and what is not used included
 # of them, as the stages form them, neither overflow nor vanish.
 _SMALLEST_MEASURED, _LARGEST_MEASURED = 1e-12, 1e12
 
+ENDINGS = (".txt", ".csv", ".mat", ".m", ".log", ".dat", ".tsv", ".asc")  # of data files
 FORM_TITLES: dict[Form, str] = {
     "ecp": 'ECP "Export Raw Data" text',
     "bench_log": "bench log, tab-separated",
@@ -77,6 +78,12 @@ class Table:
         close = get_close_matches(column, self.names, n=1)
         hint = f"did you mean {close[0]!r}?" if close else f"it has {self.headings()}"
         raise SubmissionError(f"{self.source}: there is no column {column[:60]!r}; {hint}")
+
+    def has(self, column: str | int) -> bool:
+        """Return whether there is such a column."""
+        if isinstance(column, int):
+            return 1 <= column <= len(self.names)
+        return _loosely(column) in map(_loosely, self.names)
 
     def headings(self) -> str:
         """Return the headings as one short line."""

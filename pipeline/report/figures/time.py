@@ -199,18 +199,19 @@ def plot_sine(ax: Axes, point: SinePoint, *, record: Record) -> None:
 def hardware_figure(
     checks: Sequence[Sequence[HardwareCheck]],
     *,
-    record: Record,
+    record: Record | None,
     position_unit: str,
     input_unit: str,
 ) -> Figure:
     """Return one run: each cart with its set point, below it the residuals, last the input.
 
-    An entry holds the one or two models of a cart.
+    An entry holds the one or two models of a cart; without the record there is neither set point
+    nor input.
     """
-    driven = record.u is not None
-    figure, axes = panels(*[0.95, 0.42] * len(checks), *([0.6] if driven else []))
+    driven = record is not None and record.u is not None
+    figure, axes = panels(*[0.9, 0.62] * len(checks), *([0.6] if driven else []))
     for above, below, group in zip(axes[::2], axes[1::2], checks, strict=False):
-        if record.reference is not None:
+        if record is not None and record.reference is not None:
             above.step(record.t, record.reference, where="post", color=THIRD, lw=0.9, ls="-.",
                        label="set point")  # fmt: skip
         plot_hardware(above, group)
@@ -219,7 +220,7 @@ def hardware_figure(
         plot_residuals(below, group[0].t, residuals)
         keep_in_sight(below, group[0].measured - np.median(group[0].measured))
         below.set_ylabel(f"residual [{position_unit}]")
-    if record.u is not None:
+    if driven:
         plot_effort(axes[-1], record, model=checks[0][0].effort)
         axes[-1].set_ylabel(f"u [{input_unit}]")
     legend_above(axes[0])

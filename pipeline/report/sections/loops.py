@@ -56,7 +56,7 @@ def hardware_blocks(page: Page) -> list[Block]:
         carts = sorted({check.cart for check in own})
         figure = hardware_figure(
             [[check for check in own if check.cart == cart] for cart in carts],
-            record=page.records[run],
+            record=page.records.get(run),
             position_unit=page.position,
             input_unit=page.drive,
         )

@@ -14,6 +14,7 @@ from pipeline.report.numbers import (
     significant,
     unit_text,
     with_error,
+    with_errors,
 )
 from pipeline.report.phrases import phrases
 from pipeline.report.tables.cells import cell, make_table
@@ -150,29 +151,24 @@ def chain_table(
         ("c", "damping", chain.c, f"{input_unit} s/{position_unit}"),
         ("k", "spring", chain.k, f"{input_unit}/{position_unit}"),
     )
-    rows = []
-    for letter, noun, values, unit in kinds:
-        for i, value in enumerate(values, start=1):
-            if chain.n == 1 and letter == "k" and i > 1:
-                continue  # only the sum of a lone cart's springs is known
-            name = f"{letter}_{i}" if chain.n > 1 else letter
-            error = std.get(f"{letter}_{i}")
-            absent = value == 0 and not error
-            rows.append(
-                [
-                    cell(name_span(name)),
-                    cell(_where(noun, i, chain.n)),
-                    cell("none" if absent else with_error(float(value), error)),
-                    cell(unit_text(clean(unit))),
-                ]
-            )
-    return make_table(
-        number,
-        _WORDS.text("chain_table"),
-        ("Symbol", "Meaning", "Value", "Unit"),
-        rows,
-        "lldl",
-    )
+    listed = [
+        (letter, noun, unit, i, float(value), std.get(f"{letter}_{i}"))
+        for letter, noun, values, unit in kinds
+        for i, value in enumerate(values, start=1)
+        if chain.n > 1 or letter != "k" or i == 1  # of a lone cart's springs the sum is known
+    ]
+    numbers = with_errors([(value, error) for *_, value, error in listed])
+    rows = [
+        [
+            cell(name_span(f"{letter}_{i}" if chain.n > 1 else letter)),
+            cell(_where(noun, i, chain.n)),
+            cell(text if value or error else "none"),
+            cell(unit_text(clean(unit))),
+        ]
+        for (letter, noun, unit, i, value, error), text in zip(listed, numbers, strict=True)
+    ]
+    head = ("Symbol", "Meaning", "Value", "Unit")
+    return make_table(number, _WORDS.text("chain_table"), head, rows, "lldl")
 
 
 def _where(noun: str, i: int, n: int) -> str:
