@@ -252,7 +252,7 @@ def line_frequency(t: Array, u: Array) -> float | None:
 def format_inspections(inspections: Sequence[Inspection]) -> str:
     """Return a table of one line a file; what is wrong with it stands below."""
     head = ("file", "format", "samples", "s", "Hz", "looks like", "columns")
-    rows = [head]
+    rows: list[tuple[str, ...]] = [head]
     for one in inspections:
         roles = " ".join(column.role or "-" for column in one.columns)
         duration, rate = (

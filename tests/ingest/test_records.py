@@ -252,6 +252,18 @@ def test_a_bare_matrix_is_read_by_column_numbers(tmp_path):
     assert "columns not used: 1" in record.notes
 
 
+def test_the_system_names_the_columns_of_all_its_recordings(tmp_path):
+    """Those that a file has; an experiment's own go before them."""
+    named = CM + '\ncolumns = { x1 = "first", x2 = "second", reference = "goal" }'
+    content = csv(time=T, input=U, first=X1, second=X2)
+    record = read(tmp_path, named, STEP, content).records[0]
+    assert_allclose(record.y, np.array([X1, X2]), rtol=1e-6)
+    own = STEP + '\ncolumns = { x1 = "second" }'
+    record = read(tmp_path, named, own, content).records[0]
+    assert record.carts == (1,)
+    assert_allclose(record.position(1), X2, rtol=1e-6)
+
+
 def test_a_sample_rate_stands_in_for_a_time_column(tmp_path):
     """Without a time column samples follow each other at the stated rate."""
     record = read(tmp_path, "", STEP + "\nsample_rate = 113.0", csv(u=U, x1=X1)).records[0]

@@ -27,6 +27,7 @@ def test_a_number_of_ones_own_that_is_off_says_what_to_look_at():
 def test_what_was_assumed_says_nothing_of_a_number():
     """A guess is no measurement to hold a student's number against."""
     row = make_analysis(1).rows[0]
+    assert row.initial
     assumed = replace(row, initial=replace(row.initial, source="assumed"))
     table = reported_table([assumed], {"initial": {row.name: Decimal("99999")}}, number=1)
     assert [plain(cell.text) for cell in table.rows[0]][-2:] == ["–", ""]
@@ -43,8 +44,8 @@ def test_agree_stands_beside_its_limit():
 
 def test_a_dwell_that_did_not_settle_is_said():
     """The table has every dwell and cart."""
-    first, *others = make_analysis(2).sine_points
-    points = [replace(first, settled=False), *others]
+    settled = [replace(point, settled=True) for point in make_analysis(2).sine_points]
+    points = [replace(settled[0], settled=False), *settled[1:]]
     table = dwell_table(points, number=1, units=("cm", "V"))
     assert len(table.rows) == len(points)
     assert [cell.tone for row in table.rows for cell in row if cell.tone] == ["bad"]

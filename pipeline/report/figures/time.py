@@ -208,7 +208,7 @@ def hardware_figure(
     An entry holds the one or two models of a cart; without the record there is neither set point
     nor input.
     """
-    driven = record is not None and record.u is not None
+    driven = record if record is not None and record.u is not None else None
     figure, axes = panels(*[0.9, 0.62] * len(checks), *([0.6] if driven else []))
     for above, below, group in zip(axes[::2], axes[1::2], checks, strict=False):
         if record is not None and record.reference is not None:
@@ -221,7 +221,7 @@ def hardware_figure(
         keep_in_sight(below, group[0].measured - np.median(group[0].measured))
         below.set_ylabel(f"residual [{position_unit}]")
     if driven:
-        plot_effort(axes[-1], record, model=checks[0][0].effort)
+        plot_effort(axes[-1], driven, model=checks[0][0].effort)
         axes[-1].set_ylabel(f"u [{input_unit}]")
     legend_above(axes[0])
     axes[-1].set_xlabel("time [s]")
