@@ -182,6 +182,3 @@ def test_a_folder_is_a_table_of_one_line_a_file(tmp_path):
     assert head.split()[:2] == ["file", "format"]
     assert line.endswith("time input x1")
     assert all(problem.startswith("  ! ") for problem in problems)
-<<<<<<< HEAD
-=======
->>>>>>> d33e6fe (inspect tells a folder in a table; columns for all recordings of a bench; tests of the report's new parts)
