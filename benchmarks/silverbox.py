@@ -16,7 +16,7 @@ from scipy.io import loadmat
 
 from pipeline.gap.data.runs import make_run
 from pipeline.gap.explain import explain_gap
-from pipeline.gap.fit.linearise import fresh_locals, simulate_run
+from pipeline.gap.fit.linearise import fresh_nuisance, simulate_run
 from pipeline.gap.fit.structure import Candidate, Structure
 from pipeline.gap.types import Gap
 from pipeline.results import Record
@@ -53,9 +53,9 @@ def test_error(gap: Gap, record: Record, *, skipped: int, zero: float) -> float:
             Candidate(effect=term.effect, place=term.place, signs=signs, scales=sizes)
         )
     theta = structure.vector(gap.model.chain, [term.values for term in gap.model.terms])
-    own = fresh_locals(run)
-    own.zero[:] = zero
-    model = simulate_run(structure, theta[None], run, own)[0, 0]
+    nuisance = fresh_nuisance(run)
+    nuisance.zero[:] = zero
+    model = simulate_run(structure, theta[None], run, nuisance)[0, 0]
     return float(np.sqrt(np.mean((run.y[0] - model)[skipped:] ** 2)))
 
 

@@ -149,7 +149,7 @@ def explain_gap(
 
 def _learnt_spread(fit: Fit) -> dict[int, float]:
     """Return the run-to-run spread of each cart's dry friction, where the runs asked for one."""
-    moved = np.any([own.scatter != 1.0 for own in fit.locals_], axis=0)
+    moved = np.any([nuisance.scatter != 1.0 for nuisance in fit.nuisance], axis=0)
     dry = fit.structure.dry
     return {i + 1: float(fit.spread[i]) for i in range(len(dry)) if dry[i] and moved[i]}
 
@@ -203,8 +203,8 @@ def _with_offset(
     structure = chosen.fit.structure
     effect = next((effect for effect in bench.catalogue if effect.only_rest), None)
     runs = [*bench.training, *bench.held_out]
-    own = [*chosen.fit.locals_, *chosen.held.locals_]
-    offset = find_offset(structure.chain(chosen.fit.theta), runs, own)
+    nuisance = [*chosen.fit.nuisance, *chosen.held.nuisance]
+    offset = find_offset(structure.chain(chosen.fit.theta), runs, nuisance)
     if effect is None or offset is None:
         return path, None
     holding = holding_force(structure.model(chosen.fit.theta).tables())

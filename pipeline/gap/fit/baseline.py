@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.gap.data.runs import Run, cut_shots, high_frequency_noise
 from pipeline.gap.fit.levenberg_marquardt import Fit, Mapper, fit_model
-from pipeline.gap.fit.linearise import Locals, fresh_locals, simulate_run
+from pipeline.gap.fit.linearise import Nuisance, fresh_nuisance, simulate_run
 from pipeline.gap.fit.restart import restart_runs
 from pipeline.gap.fit.structure import Structure
 from pipeline.plant.chain import Array, Chain
@@ -115,8 +115,8 @@ def measure_noise(fit: Fit, shots: Sequence[Run], runs: Sequence[Run]) -> list[R
     """Return the runs with the noise of each cart: encoder step or high-frequency residual."""
     found: dict[int, list[float]] = {}
     resting: dict[int, list[float]] = {}
-    for shot, own in zip(shots, fit.locals_, strict=True):
-        model = simulate_run(fit.structure, fit.theta[None], shot, own)[0]
+    for shot, nuisance in zip(shots, fit.nuisance, strict=True):
+        model = simulate_run(fit.structure, fit.theta[None], shot, nuisance)[0]
         for j, row in enumerate(shot.rows):
             for part in (slice(a, b) for a, b in pairwise(shot.shots)):
                 # An encoder at rest repeats itself: only a moving one shows its noise.
@@ -132,24 +132,24 @@ def measure_noise(fit: Fit, shots: Sequence[Run], runs: Sequence[Run]) -> list[R
     return out
 
 
-def fit_locals(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
+def fit_nuisance(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
     """Fit only what belongs to the runs: for runs the model has not seen."""
-    own: Sequence[Locals] = [fresh_locals(run) for run in runs]
+    nuisance: Sequence[Nuisance] = [fresh_nuisance(run) for run in runs]
 
-    def follow(own: Sequence[Locals]) -> Fit:
+    def follow(nuisance: Sequence[Nuisance]) -> Fit:
         return fit_model(
             fit.structure,
             fit.theta,
             runs,
-            locals_=own,
+            nuisance=nuisance,
             spread=fit.spread,
             shared=False,
             iterations=10,
             mapper=mapper,
         )
 
-    found = follow(own)
+    found = follow(nuisance)
     if fit.structure.many_rests and found.chi > fit.chi:
         again = restart_runs(found, runs, mapper=mapper)
-        found = follow(again.locals_)
+        found = follow(again.nuisance)
     return found

@@ -1,4 +1,4 @@
-"""Fit a model to all runs at once: Levenberg-Marquardt, with each run's own unknowns eliminated.
+"""Fit a model to all runs at once: Levenberg-Marquardt, the nuisance parameters eliminated.
 
 Reference: J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., section 10.3.
 """
@@ -11,10 +11,10 @@ import numpy as np
 from pipeline.gap.data.runs import Run
 from pipeline.gap.fit.linearise import (
     Linear,
-    Locals,
-    fresh_locals,
+    Nuisance,
+    fresh_nuisance,
     linearise,
-    move_locals,
+    move_nuisance,
     residual_points,
     run_cost,
     triangle,
@@ -27,11 +27,13 @@ Mapper = Callable[..., Iterable]
 _SCATTER_START = 0.05  # spread of friction from run to run, before anything is known
 _SCATTER_FLOOR, _SCATTER_TOP = 0.004, 0.2
 _SCATTER_PRIOR = (3.0, 0.04)  # weight in runs, and spread, of the prior on that spread
-_LOCAL_SCALES = (1.0, 0.3, 0.05)  # of a run's own step, where the whole one raises its cost
+_NUISANCE_SCALES = (1.0, 0.3, 0.05)  # of a run's own step, where the whole one raises its cost
 _SHOWN = 3e-4  # of a column: two that differ by less differ by their difference steps
 _DEAD = 1e-9  # of the strongest column: a weaker one is rounding
 _ANCHOR = 1e6  # standard errors per unit of log mass
-_DAMP, _RELAX, _STIFFEN = 1e-3, 6.0, 6.0
+_DAMP, _RELAX, _STIFFEN, _LEAST_DAMP = 1e-3, 6.0, 6.0, 1e-9
+_ATTEMPTS = 5  # at a shorter step, each six times as damped, before the fit has converged
+_RELEASES = 3  # of parameters at their bounds, which are rarely more than one
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -41,7 +43,7 @@ class Fit:
     Attributes
     ----------
     theta : the vector of `structure`; covariance (size, size) of it, or None before the end.
-    locals_ : one for each run, in their order.
+    nuisance : one for each run, in their order.
     cost : sum of squared residuals over their noise, prior terms included.
     chi_square : without the prior terms; n_points the residuals behind it.
     run_chi : (runs,) chi-square per residual of each run; run_prior its prior terms.
@@ -49,7 +51,7 @@ class Fit:
 
     structure: Structure
     theta: Array
-    locals_: tuple[Locals, ...]
+    nuisance: tuple[Nuisance, ...]
     cost: float
     chi_square: float
     n_points: float
@@ -69,7 +71,7 @@ def evaluate(
     structure: Structure,
     theta: Array,
     runs: Sequence[Run],
-    locals_: Sequence[Locals],
+    nuisance: Sequence[Nuisance],
     *,
     spread: Array,
     inflate: float = 1.0,
@@ -77,18 +79,18 @@ def evaluate(
 ) -> Fit:
     """Return the fit at given parameters and locals, without moving either."""
 
-    def cost(pair: tuple[Run, Locals]) -> tuple[float, float]:
+    def cost(pair: tuple[Run, Nuisance]) -> tuple[float, float]:
         return run_cost(structure, theta, *pair, spread=spread)
 
-    costs = np.array(list(mapper(cost, zip(runs, locals_, strict=True))))
-    return _fit_at(structure, theta, runs, locals_, costs, spread=spread, inflate=inflate)
+    costs = np.array(list(mapper(cost, zip(runs, nuisance, strict=True))))
+    return _fit_at(structure, theta, runs, nuisance, costs, spread=spread, inflate=inflate)
 
 
 def _fit_at(
     structure: Structure,
     theta: Array,
     runs: Sequence[Run],
-    locals_: Sequence[Locals],
+    nuisance: Sequence[Nuisance],
     costs: Array,
     *,
     spread: Array,
@@ -98,7 +100,7 @@ def _fit_at(
     return Fit(
         structure=structure,
         theta=theta,
-        locals_=tuple(locals_),
+        nuisance=tuple(nuisance),
         cost=float(costs[:, 0].sum() + inflate**2 * costs[:, 1].sum()),
         chi_square=float(costs[:, 0].sum()),
         n_points=float(points.sum()),
@@ -114,7 +116,7 @@ def fit_model(
     theta: Array,
     runs: Sequence[Run],
     *,
-    locals_: Sequence[Locals] | None = None,
+    nuisance: Sequence[Nuisance] | None = None,
     spread: Array | None = None,
     iterations: int = 12,
     shared: bool = True,
@@ -123,117 +125,155 @@ def fit_model(
     tolerance: float = 1e-3,
     mapper: Mapper = map,
 ) -> Fit:
-    """Fit the shared parameters and every run's own unknowns.
+    """Fit the shared parameters and every run's nuisance parameters.
 
     Parameters
     ----------
-    theta : (size,) start; without `shared` it stays, and only the runs' own unknowns move.
+    theta : (size,) start; without `shared` it stays, and only nuisance parameters move.
     spread : (n,) expected spread of the dry friction from run to run; learnt if `learn_spread`.
     tolerance : relative fall of the cost below which the fit has converged.
     """
     low, high = structure.bounds()
-    reach = structure.reach()
-    theta = np.clip(theta, low, high)
-    own = tuple(locals_) if locals_ is not None else tuple(fresh_locals(run) for run in runs)
-    spread = np.full(structure.n, _SCATTER_START) if spread is None else spread
-    moving = np.arange(theta.size if shared else 0)
+    best = evaluate(
+        structure,
+        np.clip(theta, low, high),
+        runs,
+        [fresh_nuisance(run) for run in runs] if nuisance is None else nuisance,
+        spread=np.full(structure.n, _SCATTER_START) if spread is None else spread,
+        mapper=mapper,
+    )
     damp = _DAMP
-    inflate = 1.0
-    best = evaluate(structure, theta, runs, own, spread=spread, inflate=inflate, mapper=mapper)
     for iteration in range(iterations):
-        inflate = max(1.0, np.sqrt(best.chi)) if np.isfinite(best.chi) else 1.0
+        inflate = _inflation(best)
         best = replace(best, cost=best.chi_square + inflate**2 * float(best.run_prior.sum()))
-
-        def share(pair: tuple[Run, Locals], at: Fit = best, inflate: float = inflate) -> Linear:
-            return linearise(
-                structure,
-                at.theta,
-                *pair,
-                inflate=inflate,
-                spread=at.spread,
-                scatter_free=scatter_free,
-                shared=shared,
-            )
-
-        linear = list(mapper(share, zip(runs, best.locals_, strict=True)))
-        stacked = np.concatenate([*(part.reduced for part in linear), _anchor(runs, moving.size)])
+        linear = _linearise_all(
+            best, runs, inflate=inflate, scatter_free=scatter_free, shared=shared, mapper=mapper
+        )
+        reduced = [part.reduced for part in linear]
+        stacked = np.concatenate([*reduced, _anchor(runs, reduced[0].shape[1] - 1)])
         if not np.all(np.isfinite(stacked)):
             break
-        J, r = stacked[:, :-1], stacked[:, -1]
-        # At a bound, with the step pointing outward, a parameter stays.
-        delta = np.zeros(theta.size)
-        active = moving
-        accepted: Fit | None = None
-        for _attempt in range(5):
-            delta[:] = 0.0
-            active = moving
-            for _ in range(3):
-                if active.size == 0:
-                    break
-                scale = np.linalg.norm(J[:, active], axis=0)
-                scale = np.maximum(scale, 1e-9 * max(1e-30, scale.max()))
-                A = np.concatenate([J[:, active], np.diag(np.sqrt(damp) * scale)])
-                step = np.linalg.lstsq(A, np.concatenate([r, np.zeros(active.size)]), rcond=None)[0]
-                out = (best.theta[active] + step <= low[active]) & (
-                    best.theta[active] <= low[active]
-                )
-                out |= (best.theta[active] + step >= high[active]) & (
-                    best.theta[active] >= high[active]
-                )
-                if not out.any():
-                    delta[active] = step
-                    break
-                active = active[~out]
-            # One long step must not carry the others with it: each is clipped by itself.
-            delta = np.clip(delta, -reach, reach)
-            delta = np.clip(best.theta + delta, low, high) - best.theta
-            there = best.theta + delta
-
-            def follow(
-                job: tuple[Linear, Run, Locals, float],
-                at: Fit = best,
-                delta: Array = delta,
-                there: Array = there,
-                inflate: float = inflate,
-            ) -> tuple[Locals, tuple[float, float]]:
-                """Move a run's own unknowns with the step, less far where that is no gain."""
-                part, run, own, before = job
-                tried = []
-                for scale in _LOCAL_SCALES:
-                    moved = move_locals(part, own, delta[moving], scale)
-                    cost = run_cost(structure, there, run, moved, spread=at.spread)
-                    tried.append((cost[0] + inflate**2 * cost[1], moved, cost))
-                    if tried[-1][0] <= before:
-                        break
-                _, moved, cost = min(tried, key=lambda t: t[0])
-                return moved, cost
-
-            before = best.run_chi * best.run_points + inflate**2 * best.run_prior
-            followed = list(mapper(follow, zip(linear, runs, best.locals_, before, strict=True)))
-            trial = _fit_at(
-                structure,
-                there,
-                runs,
-                [moved for moved, _ in followed],
-                np.array([cost for _, cost in followed]),
-                spread=best.spread,
-                inflate=inflate,
-            )
+        for _attempt in range(_ATTEMPTS):
+            delta = _step(stacked, best.theta, low, high, reach=structure.reach(), damp=damp)
+            trial = _follow(best, runs, linear, delta, inflate=inflate, mapper=mapper)
             if trial.cost < best.cost:
-                accepted = trial
                 break
-            damp *= _STIFFEN
-            damp = max(damp, 1e-3)
-        if accepted is None:
+            damp = max(damp * _STIFFEN, _DAMP)
+        else:
             break
-        fall = (best.cost - accepted.cost) / best.cost
-        best = accepted
-        damp = max(damp / _RELAX, 1e-9)
+        fall = (best.cost - trial.cost) / best.cost
+        best = trial
+        damp = max(damp / _RELAX, _LEAST_DAMP)
         if learn_spread and iteration >= 1:
             best = _learn_spread(best, runs, linear)
         if fall < tolerance:
             break
     return best
+
+
+def _inflation(fit: Fit) -> float:
+    """Return by how much the misfit of a model that is still wrong widens the noise."""
+    return max(1.0, float(np.sqrt(fit.chi))) if np.isfinite(fit.chi) else 1.0
+
+
+def _linearise_all(
+    fit: Fit,
+    runs: Sequence[Run],
+    *,
+    inflate: float,
+    scatter_free: bool = True,
+    shared: bool = True,
+    extras: Sequence[Array | None] | None = None,
+    mapper: Mapper,
+) -> list[Linear]:
+    """Return every run's share of a step from a fit."""
+
+    def share(job: tuple[Run, Nuisance, Array | None]) -> Linear:
+        run, nuisance, extra = job
+        return linearise(
+            fit.structure,
+            fit.theta,
+            run,
+            nuisance,
+            inflate=inflate,
+            spread=fit.spread,
+            scatter_free=scatter_free,
+            shared=shared,
+            extras=extra,
+        )
+
+    extras = [None] * len(runs) if extras is None else extras
+    return list(mapper(share, zip(runs, fit.nuisance, extras, strict=True)))
+
+
+def _step(
+    stacked: Array, theta: Array, low: Array, high: Array, *, reach: Array, damp: float
+) -> Array:
+    """Return the damped step of the shared parameters, inside their bounds and their reach.
+
+    `stacked` (rows, moving + 1) has the Jacobian and the residual; with nothing moving it is 0.
+    """
+    J, r = stacked[:, :-1], stacked[:, -1]
+    delta = np.zeros(theta.size)
+    active = np.arange(J.shape[1])
+    for _ in range(_RELEASES):
+        if active.size == 0:
+            break
+        scale = np.linalg.norm(J[:, active], axis=0)
+        scale = np.maximum(scale, _DEAD * max(1e-30, scale.max()))
+        A = np.concatenate([J[:, active], np.diag(np.sqrt(damp) * scale)])
+        step = np.linalg.lstsq(A, np.concatenate([r, np.zeros(active.size)]), rcond=None)[0]
+        # At a bound, with the step pointing outward, a parameter stays.
+        at = theta[active]
+        out = (at + step <= low[active]) & (at <= low[active])
+        out |= (at + step >= high[active]) & (at >= high[active])
+        if not out.any():
+            delta[active] = step
+            break
+        active = active[~out]
+    # One long step must not carry the others with it: each is clipped by itself.
+    delta = np.clip(delta, -reach, reach)
+    return np.clip(theta + delta, low, high) - theta
+
+
+def _follow(
+    fit: Fit,
+    runs: Sequence[Run],
+    linear: Sequence[Linear],
+    delta: Array,
+    *,
+    inflate: float,
+    mapper: Mapper,
+) -> Fit:
+    """Return the fit after a step, the nuisance parameters moved with it.
+
+    Less far in a run where that is no gain.
+    """
+    theta = fit.theta + delta
+
+    def move(job: tuple[Linear, Run, Nuisance, float]) -> tuple[Nuisance, tuple[float, float]]:
+        part, run, nuisance, before = job
+        tried = []
+        for scale in _NUISANCE_SCALES:
+            moved = move_nuisance(part, nuisance, delta[: part.reduced.shape[1] - 1], scale)
+            cost = run_cost(fit.structure, theta, run, moved, spread=fit.spread)
+            tried.append((cost[0] + inflate**2 * cost[1], moved, cost))
+            if tried[-1][0] <= before:
+                break
+        _, moved, cost = min(tried, key=lambda t: t[0])
+        return moved, cost
+
+    before = fit.run_chi * fit.run_points + inflate**2 * fit.run_prior
+    moved = list(mapper(move, zip(linear, runs, fit.nuisance, before, strict=True)))
+    return _fit_at(
+        fit.structure,
+        theta,
+        runs,
+        [nuisance for nuisance, _ in moved],
+        np.array([cost for _, cost in moved]),
+        spread=fit.spread,
+        inflate=inflate,
+    )
 
 
 def _anchor(runs: Sequence[Run], size: int) -> Array:
@@ -250,7 +290,7 @@ def _anchor(runs: Sequence[Run], size: int) -> Array:
 def _learn_spread(fit: Fit, runs: Sequence[Run], linear: Sequence[Linear]) -> Fit:
     """Learn how much the friction of each cart varies."""
     spread = fit.spread.copy()
-    factors = np.array([own.scatter for own in fit.locals_])
+    factors = np.array([nuisance.scatter for nuisance in fit.nuisance])
     noise = max(1.0, fit.chi)
     for i, dry in enumerate(fit.structure.dry):
         if not dry:
@@ -265,7 +305,7 @@ def _learn_spread(fit: Fit, runs: Sequence[Run], linear: Sequence[Linear]) -> Fi
         weight, prior = _SCATTER_PRIOR
         total = weight * prior**2
         for r, j in there:
-            column = linear[r].own[j, j]
+            column = linear[r].run_wide[j, j]
             variance = min(noise / column**2 if column else np.inf, spread[i] ** 2)
             total += (factors[r, i] - 1.0) ** 2 + variance
         spread[i] = np.clip(np.sqrt(total / (len(there) + weight)), _SCATTER_FLOOR, _SCATTER_TOP)
@@ -285,22 +325,7 @@ def project(
     -------
     (rows, k) what is left of them, and (rows,) what is left of the residual.
     """
-    inflate = max(1.0, np.sqrt(fit.chi))
-
-    def share(job: tuple[Run, Locals, Array]) -> Linear:
-        run, own, extra = job
-        return linearise(
-            fit.structure,
-            fit.theta,
-            run,
-            own,
-            inflate=inflate,
-            spread=fit.spread,
-            scatter_free=True,
-            extras=extra,
-        )
-
-    linear = list(mapper(share, zip(runs, fit.locals_, extras, strict=True)))
+    linear = _linearise_all(fit, runs, inflate=_inflation(fit), extras=extras, mapper=mapper)
     stacked = np.concatenate([part.reduced for part in linear])
     shared, wide = stacked[:, : fit.theta.size], stacked[:, fit.theta.size :]
     if not np.all(np.isfinite(shared)):
@@ -320,24 +345,15 @@ def covariance(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
 
     Where friction was fitted with one size for all runs, its spread is no part of the error.
     """
-    scatter_free = any(np.any(own.scatter != 1.0) for own in fit.locals_)
-
-    def share(pair: tuple[Run, Locals]) -> Linear:
-        return linearise(
-            fit.structure,
-            fit.theta,
-            *pair,
-            inflate=max(1.0, np.sqrt(fit.chi)),
-            spread=fit.spread,
-            scatter_free=scatter_free,
-        )
-
-    linear = list(mapper(share, zip(runs, fit.locals_, strict=True)))
+    scatter_free = any(np.any(nuisance.scatter != 1.0) for nuisance in fit.nuisance)
+    linear = _linearise_all(
+        fit, runs, inflate=_inflation(fit), scatter_free=scatter_free, mapper=mapper
+    )
     parts = [*(part.reduced for part in linear), _anchor(runs, fit.theta.size)]
     J = np.concatenate(parts)[:, :-1]
     if not np.all(np.isfinite(J)):
         return fit
     _, s, vt = np.linalg.svd(J, full_matrices=False)
-    s = np.maximum(s, 1e-9 * s[0])
+    s = np.maximum(s, _DEAD * s[0])
     cov = (vt.T / s**2) @ vt * max(1.0, fit.chi)
     return replace(fit, covariance=cov)

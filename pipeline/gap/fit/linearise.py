@@ -1,9 +1,9 @@
-"""One run: its own unknowns, its readings under a model, and its share of a step.
+"""One run: its nuisance parameters, its readings under a model, and its share of a step.
 
-A run's own unknowns are the carts' start (and restart) states, those of hidden masses where the
-carts already move, the encoders' zeros, and a factor on the dry friction of each cart, which varies
-from run to run. They enter the residual almost
-linearly, so a QR factorisation of each run leaves a small problem in the shared parameters.
+The nuisance parameters of a run are the carts' start (and restart) states, those of hidden masses
+where the carts already move, the encoders' zeros, and a factor on the dry friction of each cart,
+which varies from run to run. They enter the residual almost linearly, so a QR factorisation of
+each run leaves a small problem in the shared parameters (variable projection).
 
 Reference: G. H. Golub, V. Pereyra, Inverse Problems 19 (2003), R1 (separable least squares).
 """
@@ -30,10 +30,12 @@ _START_STEP = 1e-3  # for differences, of the swing or of the friction
 _TALL = 400  # rows of a matrix that are factorised at once
 _HOME = 0.1  # how firmly the priors hold starts that the data do not show …
 _HELD = 1e6  # … and a velocity that is known to be zero
+_FACTOR_STEP = 0.3  # of a friction factor, at a time: beyond, the friction is another one …
+_FACTORS = (0.3, 3.0)  # … and of no bench, whose factors are within some 20 % of one
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Locals:
+class Nuisance:
     """What belongs to one run: start states (shots, 2 n), zeros (n,), friction factors (n,).
 
     The start states are those of the carts, then those of their hidden masses relative to them.
@@ -45,12 +47,12 @@ class Locals:
     scatter: Array
 
 
-def fresh_locals(run: Run) -> Locals:
-    """Return a run's unknowns where they are expected."""
+def fresh_nuisance(run: Run) -> Nuisance:
+    """Return a run's nuisance parameters where they are expected."""
     n = run.zero.size
     free = np.array(run.free)
     hidden = np.zeros((len(run.shots) - 1, n))
-    return Locals(
+    return Nuisance(
         x0=np.hstack([np.where(free, run.shot_x - run.zero, 0.0), hidden]),
         v0=np.hstack([np.where(free, run.shot_v, 0.0), hidden]),
         zero=np.where(free, run.zero, 0.0),
@@ -58,17 +60,17 @@ def fresh_locals(run: Run) -> Locals:
     )
 
 
-def simulate_run(structure: Structure, thetas: Array, run: Run, own: Locals) -> Array:
+def simulate_run(structure: Structure, thetas: Array, run: Run, nuisance: Nuisance) -> Array:
     """Return (b, rows, samples) readings of one run for many vectors, zeros included."""
-    y, _ = simulate_variants(structure, thetas, run, own)
-    return y + own.zero[list(run.rows)][:, None]
+    y, _ = simulate_variants(structure, thetas, run, nuisance)
+    return y + nuisance.zero[list(run.rows)][:, None]
 
 
 def simulate_variants(
     structure: Structure,
     thetas: Array,
     run: Run,
-    own: Locals,
+    nuisance: Nuisance,
     *,
     lanes: Sequence[tuple[int, int]] = (),
 ) -> tuple[Array, Array]:
@@ -83,9 +85,9 @@ def simulate_variants(
         cart,
         spring,
         drive,
-        np.broadcast_to(own.x0, (b, *own.x0.shape[-2:])),
-        np.broadcast_to(own.v0, (b, *own.v0.shape[-2:])),
-        np.broadcast_to(own.scatter, (b, own.scatter.shape[-1])),
+        np.broadcast_to(nuisance.x0, (b, *nuisance.x0.shape[-2:])),
+        np.broadcast_to(nuisance.v0, (b, *nuisance.v0.shape[-2:])),
+        np.broadcast_to(nuisance.scatter, (b, nuisance.scatter.shape[-1])),
         np.array(run.free),
         run.t,
         run.knots,
@@ -107,14 +109,14 @@ class Linear:
     """One run's share of a step: what is left for the shared parameters, and the way back."""
 
     reduced: Array  # (rows, size + 1) of R: shared parameters and residual
-    own: Array  # R of the run-wide locals: [own | shared | residual]
-    shots: Array  # (shots, ., .) R of each shot: [shot locals | own | shared | residual]
+    run_wide: Array  # R of friction factors and zeros: [they | shared | residual]
+    shots: Array  # (shots, ., .) R of each shot: [starts | run-wide | shared | residual]
     layout: "Layout"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """Which local unknowns a run has: cart indices of each kind, n more for a hidden mass."""
+    """Which nuisance parameters a run has: cart indices of each, n more for a hidden mass."""
 
     x0: tuple[int, ...]
     v0: tuple[int, ...]
@@ -181,7 +183,7 @@ def linearise(
     structure: Structure,
     theta: Array,
     run: Run,
-    own: Locals,
+    nuisance: Nuisance,
     *,
     inflate: float,
     spread: Array,
@@ -189,43 +191,78 @@ def linearise(
     shared: bool = True,
     extras: Array | None = None,
 ) -> Linear:
-    """Return a run's residual and its derivatives, with its own unknowns eliminated.
+    """Return a run's residual and its Jacobian, with its nuisance parameters eliminated.
 
     `inflate` widens the noise to the misfit of a model that is still wrong, as far as priors are
-    concerned; without `shared` only the run's own unknowns move; `extras` (k, rows, samples of
+    concerned; without `shared` only the nuisance parameters move; `extras` (k, rows, samples of
     `run.thin`) are further columns to project.
     """
     run = run.thin
     layout = _layout(structure, run, scatter_free=scatter_free)
-    derive = _differences if structure.has_contact else _derivatives
-    model, by_own, by_shared = derive(structure, theta, run, own, layout, shared=shared)
-    residual = run.y - model - own.zero[list(run.rows)][:, None]
-    by_zero = np.zeros((len(layout.zero), *residual.shape))
-    by_zero[range(len(layout.zero)), [run.rows.index(i) for i in layout.zero]] = 1.0
-    columns = [by_own, by_zero, by_shared, *([] if extras is None else [extras]), residual[None]]
-    points = _by_shot(np.concatenate(columns) / run.sigma[:, None], run)
+    columns = _columns(structure, theta, run, nuisance, layout, shared=shared, extras=extras)
     prior = _start_prior(layout, run, _sizes(structure, theta, run), inflate=inflate)
     starts = prior.shape[1]
-    wide = np.zeros((*prior.shape[:2], points.shape[0]))
-    wide[:, :, :starts] = prior
-    R = triangle(np.concatenate([np.moveaxis(points, 0, -1), wide], axis=1))
-    rest = R[:, starts:, starts:].reshape(-1, R.shape[-1] - starts)
-    lanes = len(layout.scatter) + len(layout.zero)
-    expected = np.zeros((lanes, rest.shape[-1]))
-    for j, i in enumerate(layout.scatter):
-        expected[j, j] = inflate / spread[i]
-        expected[j, -1] = (1.0 - own.scatter[i]) * expected[j, j]
-    for j, i in enumerate(layout.zero, start=len(layout.scatter)):
-        expected[j, j] = inflate / run.zero_std[i]
-        expected[j, -1] = (run.zero[i] - own.zero[i]) * expected[j, j]
-    own_R = triangle(np.concatenate([rest, expected]))
+    shots = _eliminate_starts(_by_shot(columns / run.sigma[:, None], run), prior)
+    rest = shots[:, starts:, starts:].reshape(-1, shots.shape[-1] - starts)
+    expected = _run_prior(layout, run, nuisance, rest.shape[-1], spread=spread, inflate=inflate)
+    R, wide = triangle(np.concatenate([rest, expected])), len(expected)
     return Linear(
-        reduced=own_R[lanes:, lanes:], own=own_R[:lanes], shots=R[:, :starts], layout=layout
+        reduced=R[wide:, wide:], run_wide=R[:wide], shots=shots[:, :starts], layout=layout
     )
 
 
+def _columns(
+    structure: Structure,
+    theta: Array,
+    run: Run,
+    nuisance: Nuisance,
+    layout: Layout,
+    *,
+    shared: bool,
+    extras: Array | None,
+) -> Array:
+    """Return (., rows, samples) Jacobian by the starts, friction factors, zeros and shared …
+
+    … parameters, the further columns, and the residual last.
+    """
+    derive = _differences if structure.has_contact else _derivatives
+    model, by_nuisance, by_shared = derive(structure, theta, run, nuisance, layout, shared=shared)
+    residual = run.y - model - nuisance.zero[list(run.rows)][:, None]
+    by_zero = np.zeros((len(layout.zero), *residual.shape))
+    by_zero[range(len(layout.zero)), [run.rows.index(i) for i in layout.zero]] = 1.0
+    further = [] if extras is None else [extras]
+    return np.concatenate([by_nuisance, by_zero, by_shared, *further, residual[None]])
+
+
+def _eliminate_starts(points: Array, prior: Array) -> Array:
+    """Return R of each shot (columns, shots, points), with the prior (shots, starts, starts)."""
+    wide = np.zeros((*prior.shape[:2], points.shape[0]))
+    wide[:, :, : prior.shape[1]] = prior
+    return triangle(np.concatenate([np.moveaxis(points, 0, -1), wide], axis=1))
+
+
+def _run_prior(
+    layout: Layout, run: Run, nuisance: Nuisance, columns: int, *, spread: Array, inflate: float
+) -> Array:
+    """Return (run-wide parameters, columns) of the priors on friction factors and zeros."""
+    expected = np.zeros((len(layout.scatter) + len(layout.zero), columns))
+    for j, i in enumerate(layout.scatter):
+        expected[j, j] = inflate / spread[i]
+        expected[j, -1] = (1.0 - nuisance.scatter[i]) * expected[j, j]
+    for j, i in enumerate(layout.zero, start=len(layout.scatter)):
+        expected[j, j] = inflate / run.zero_std[i]
+        expected[j, -1] = (run.zero[i] - nuisance.zero[i]) * expected[j, j]
+    return expected
+
+
 def _derivatives(
-    structure: Structure, theta: Array, run: Run, own: Locals, layout: Layout, *, shared: bool
+    structure: Structure,
+    theta: Array,
+    run: Run,
+    nuisance: Nuisance,
+    layout: Layout,
+    *,
+    shared: bool,
 ) -> tuple[Array, Array, Array]:
     """Return the readings (rows, samples) and their derivatives (., rows, samples).
 
@@ -241,7 +278,7 @@ def _derivatives(
         steps = structure.steps()[structure.base_size :]
     thetas = np.repeat(theta[None], 1 + steps.size, axis=0)
     thetas[1:, theta.size - steps.size :] += np.diag(steps)
-    y, by = simulate_variants(structure, thetas, run, own, lanes=lanes)
+    y, by = simulate_variants(structure, thetas, run, nuisance, lanes=lanes)
     # By the logarithm of a number: by itself, times the number.
     by[local:] *= np.exp(theta[: len(lanes) - local])[:, None, None]
     by_effects = (y[1:] - y[0]) / steps[:, None, None]
@@ -249,7 +286,13 @@ def _derivatives(
 
 
 def _differences(
-    structure: Structure, theta: Array, run: Run, own: Locals, layout: Layout, *, shared: bool
+    structure: Structure,
+    theta: Array,
+    run: Run,
+    nuisance: Nuisance,
+    layout: Layout,
+    *,
+    shared: bool,
 ) -> tuple[Array, Array, Array]:
     """Return what `_derivatives` does, by differences alone.
 
@@ -262,7 +305,9 @@ def _differences(
     g_steps = np.full(len(layout.scatter), _START_STEP)
     divisors = np.concatenate([x_steps, v_steps, g_steps, steps])
     b, lane = 1 + divisors.size, 1
-    x0, v0, scatter = (np.repeat(a[None], b, axis=0) for a in (own.x0, own.v0, own.scatter))
+    x0, v0, scatter = (
+        np.repeat(a[None], b, axis=0) for a in (nuisance.x0, nuisance.v0, nuisance.scatter)
+    )
     for values, places, sizes in (
         (np.moveaxis(x0, 1, -1), layout.x0, x_steps),
         (np.moveaxis(v0, 1, -1), layout.v0, v_steps),
@@ -274,7 +319,9 @@ def _differences(
     thetas = np.repeat(theta[None], b, axis=0)
     if shared:
         thetas[lane:] += np.diag(steps)
-    y, _ = simulate_variants(structure, thetas, run, replace(own, x0=x0, v0=v0, scatter=scatter))
+    y, _ = simulate_variants(
+        structure, thetas, run, replace(nuisance, x0=x0, v0=v0, scatter=scatter)
+    )
     by = (y[1:] - y[0]) / divisors[:, None, None]
     return y[0], by[: lane - 1], by[lane - 1 :]
 
@@ -302,36 +349,35 @@ def _start_prior(layout: Layout, run: Run, sizes: tuple[Array, Array], *, inflat
     return prior
 
 
-def move_locals(linear: Linear, own: Locals, delta: Array, scale: float = 1.0) -> Locals:
-    """Return the locals that go with a step of the shared parameters."""
+def move_nuisance(linear: Linear, nuisance: Nuisance, delta: Array, scale: float = 1.0) -> Nuisance:
+    """Return the nuisance parameters that go with a step of the shared ones."""
     layout = linear.layout
-    lanes_o = linear.own.shape[0]
+    n_wide, n_starts = linear.run_wide.shape[0], linear.shots.shape[1]
     tail = np.concatenate([-delta, [1.0]])
     wide = np.zeros(0)
-    if lanes_o:
-        wide = np.linalg.solve(linear.own[:, :lanes_o], linear.own[:, lanes_o:] @ tail)
-    lanes_s = linear.shots.shape[1]
-    right = linear.shots[:, :, lanes_s:] @ np.concatenate([-wide, tail])
-    moved = np.linalg.solve(linear.shots[:, :, :lanes_s], right[..., None])[..., 0]
-    x0, v0 = own.x0.copy(), own.v0.copy()
-    zero, scatter = own.zero.copy(), own.scatter.copy()
-    x0[:, list(layout.x0)] += scale * moved[:, : len(layout.x0)]
+    if n_wide:
+        wide = np.linalg.solve(linear.run_wide[:, :n_wide], linear.run_wide[:, n_wide:] @ tail)
+    right = linear.shots[:, :, n_starts:] @ np.concatenate([-wide, tail])
+    starts = np.linalg.solve(linear.shots[:, :, :n_starts], right[..., None])[..., 0]
+    x0, v0 = nuisance.x0.copy(), nuisance.v0.copy()
+    zero, scatter = nuisance.zero.copy(), nuisance.scatter.copy()
+    x0[:, list(layout.x0)] += scale * starts[:, : len(layout.x0)]
     if layout.v0:
-        change = scale * moved[:, len(layout.x0) :]
+        change = scale * starts[:, len(layout.x0) :]
         if not layout.first_v0:
             change[0] = 0.0
         v0[:, list(layout.v0)] += change
-    g = len(layout.scatter)
-    scatter[list(layout.scatter)] += scale * np.clip(wide[:g], -0.3, 0.3)
-    zero[list(layout.zero)] += scale * wide[g:]
-    return Locals(x0=x0, v0=v0, zero=zero, scatter=np.clip(scatter, 0.3, 3.0))
+    factors = wide[: len(layout.scatter)]
+    scatter[list(layout.scatter)] += scale * np.clip(factors, -_FACTOR_STEP, _FACTOR_STEP)
+    zero[list(layout.zero)] += scale * wide[len(layout.scatter) :]
+    return Nuisance(x0=x0, v0=v0, zero=zero, scatter=np.clip(scatter, *_FACTORS))
 
 
 def run_cost(
     structure: Structure,
     theta: Array,
     run: Run,
-    own: Locals,
+    nuisance: Nuisance,
     *,
     spread: Array,
 ) -> tuple[float, float]:
@@ -339,13 +385,13 @@ def run_cost(
     if not structure.visible(theta):
         return np.inf, 0.0
     run = run.thin
-    model = simulate_run(structure, theta[None], run, own)[0]
+    model = simulate_run(structure, theta[None], run, nuisance)[0]
     residual = _by_shot((run.y - model) / run.sigma[:, None], run)
     chi = float((residual**2).sum())
     if not np.isfinite(chi):
         return np.inf, 0.0
     rows = list(run.rows)
-    prior = float((((own.zero - run.zero) / run.zero_std)[rows] ** 2).sum())
+    prior = float((((nuisance.zero - run.zero) / run.zero_std)[rows] ** 2).sum())
     dry = np.array(structure.dry) & np.array(run.free)
-    prior += float((((own.scatter - 1.0) / spread)[dry] ** 2).sum())
+    prior += float((((nuisance.scatter - 1.0) / spread)[dry] ** 2).sum())
     return chi, prior

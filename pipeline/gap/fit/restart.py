@@ -1,4 +1,4 @@
-"""Start the worst runs' own unknowns anew, from elsewhere in the friction band."""
+"""Start the worst runs' nuisance parameters anew, from elsewhere in the friction band."""
 
 from collections.abc import Sequence
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline.gap.data.runs import Run
 from pipeline.gap.fit.levenberg_marquardt import Fit, Mapper, evaluate, fit_model
-from pipeline.gap.fit.linearise import Locals, residual_points
+from pipeline.gap.fit.linearise import Nuisance, residual_points
 from pipeline.plant.chain import Array
 from pipeline.plant.tables import Cart, Drive, Tables
 
@@ -15,7 +15,7 @@ _RESTARTS = ((0.8, 1.0), (-0.8, 1.0), (1.6, 1.0), (-1.6, 1.0), (0.0, 0.94), (0.0
 
 
 def restart_runs(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
-    """Start the worst runs' own unknowns anew from elsewhere in the band where carts may rest.
+    """Start the worst runs' nuisance parameters anew, elsewhere in the band where carts may rest.
 
     A cart rests anywhere inside the band of friction or cogging, and is zeroed there, so a run's
     misfit has several valleys in zero and friction. Shared parameters stay.
@@ -26,17 +26,19 @@ def restart_runs(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
     band = _rest_band(fit)
     rest = np.array(fit.structure.dry)
 
-    def again(job: tuple[Run, Locals, bool, float]) -> Locals:
-        run, own, bad, chi = job
+    def again(job: tuple[Run, Nuisance, bool, float]) -> Nuisance:
+        run, nuisance, bad, chi = job
         if not bad:
-            return own
+            return nuisance
         free = np.array(run.free)
-        best, lowest = own, chi * residual_points(run)
+        best, lowest = nuisance, chi * residual_points(run)
         for shift, factor in _RESTARTS:
             move = np.where(free, shift * band, 0.0)
-            start = Locals(
-                x0=own.x0 - np.append(move, np.zeros(move.size)) if run.at_rest else own.x0,
-                v0=own.v0,
+            start = Nuisance(
+                x0=nuisance.x0 - np.append(move, np.zeros(move.size))
+                if run.at_rest
+                else nuisance.x0,
+                v0=nuisance.v0,
                 zero=np.where(free, run.zero, 0.0) + move,
                 scatter=np.where(rest & free, factor, 1.0),
             )
@@ -44,23 +46,23 @@ def restart_runs(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
                 fit.structure,
                 fit.theta,
                 [run],
-                locals_=[start],
+                nuisance=[start],
                 spread=fit.spread,
                 shared=False,
                 iterations=6,
             )
             if trial.chi_square < lowest:
-                best, lowest = trial.locals_[0], trial.chi_square
+                best, lowest = trial.nuisance[0], trial.chi_square
         return best
 
-    jobs = zip(runs, fit.locals_, worst, fit.run_chi, strict=True)
-    locals_ = tuple(mapper(again, jobs))
+    jobs = zip(runs, fit.nuisance, worst, fit.run_chi, strict=True)
+    nuisance = tuple(mapper(again, jobs))
     inflate = max(1.0, float(np.sqrt(fit.chi)))
     return evaluate(
         fit.structure,
         fit.theta,
         runs,
-        locals_,
+        nuisance,
         spread=fit.spread,
         inflate=inflate,
         mapper=mapper,

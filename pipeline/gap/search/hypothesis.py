@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.gap.data.runs import Run
-from pipeline.gap.fit.baseline import fit_locals
+from pipeline.gap.fit.baseline import fit_nuisance
 from pipeline.gap.fit.levenberg_marquardt import Fit, Mapper
 from pipeline.gap.fit.linearise import simulate_run
 from pipeline.gap.fit.structure import Candidate
@@ -103,10 +103,10 @@ class Bench:
 
 def judge(fit: Fit, bench: Bench, *, added: Sequence[Candidate] = ()) -> Hypothesis:
     """Return the hypothesis a fit stands for."""
-    held = fit_locals(fit, bench.held_out, mapper=bench.mapper)
+    held = fit_nuisance(fit, bench.held_out, mapper=bench.mapper)
     errors, sizes = [], []
-    for run, own in zip(bench.held_out, held.locals_, strict=True):
-        model = simulate_run(fit.structure, fit.theta[None], run, own)[0]
+    for run, nuisance in zip(bench.held_out, held.nuisance, strict=True):
+        model = simulate_run(fit.structure, fit.theta[None], run, nuisance)[0]
         errors.append(float(((run.y - model) ** 2).sum()))
         sizes.append(float((run.swing**2).sum() * run.t.size))
     effective = fit.n_points / THINNING

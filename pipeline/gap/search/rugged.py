@@ -75,7 +75,7 @@ def polish(fit: Fit, runs: Sequence[Run], *, enough: float, mapper: Mapper = map
                 fit.structure.without(index),
                 np.delete(fit.theta, np.r_[fit.structure.span(index)]),
                 runs,
-                fit.locals_,
+                fit.nuisance,
                 spread=fit.spread,
                 mapper=mapper,
             )
@@ -91,7 +91,7 @@ def polish(fit: Fit, runs: Sequence[Run], *, enough: float, mapper: Mapper = map
                         structure,
                         theta,
                         runs,
-                        locals_=fit.locals_,
+                        nuisance=fit.nuisance,
                         spread=fit.spread,
                         iterations=8,
                         tolerance=1e-4,

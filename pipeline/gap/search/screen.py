@@ -1,8 +1,8 @@
 """Rank every effect at every place, and effects together, by how much of the gap they explain.
 
 An output-error score test: each effect is simulated at a few trial sizes beside the fitted
-model; what the model could absorb (its parameters, every run's own unknowns) is projected off,
-and the best multiple of what is left is subtracted from the residual.
+model; what the model could absorb (its parameters, every run's nuisance parameters) is projected
+off, and the best multiple of what remains is subtracted from the residual.
 
 Reference: T. Söderström, P. Stoica, System Identification, section 11.5 (score tests).
 """
@@ -15,7 +15,7 @@ import numpy as np
 
 from pipeline.gap.data.runs import Run
 from pipeline.gap.fit.levenberg_marquardt import Fit, Mapper, project
-from pipeline.gap.fit.linearise import Locals, simulate_run
+from pipeline.gap.fit.linearise import Nuisance, simulate_run
 from pipeline.gap.fit.structure import Candidate, Structure, bench_scales
 from pipeline.plant.chain import Array, Chain
 from pipeline.plant.effects.base import Effect, Parameter
@@ -211,16 +211,16 @@ def added_signals(
     """
     vectors = [(fit.structure.with_effect(candidate), values) for candidate, values in trials]
 
-    def change(pair: tuple[Run, Locals]) -> Array:
-        run, own = pair[0].thin, pair[1]
-        base = simulate_run(fit.structure, fit.theta[None], run, own)[0]
+    def change(pair: tuple[Run, Nuisance]) -> Array:
+        run, nuisance = pair[0].thin, pair[1]
+        base = simulate_run(fit.structure, fit.theta[None], run, nuisance)[0]
         out = np.empty((len(trials), *base.shape))
         for at, (structure, values) in enumerate(vectors):
             theta = _extended(structure, fit.theta, values)
-            out[at] = simulate_run(structure, theta[None], run, own)[0] - base
+            out[at] = simulate_run(structure, theta[None], run, nuisance)[0] - base
         return np.where(np.isfinite(out), out, 0.0)
 
-    return list(mapper(change, zip(runs, fit.locals_, strict=True)))
+    return list(mapper(change, zip(runs, fit.nuisance, strict=True)))
 
 
 def _extended(structure: Structure, theta: Array, values: Sequence[float]) -> Array:

@@ -7,7 +7,7 @@ import numpy as np
 
 from pipeline.gap.data.runs import Run
 from pipeline.gap.fit.levenberg_marquardt import Fit
-from pipeline.gap.fit.linearise import Locals, simulate_run
+from pipeline.gap.fit.linearise import Nuisance, simulate_run
 from pipeline.gap.search.hypothesis import AT_FLOOR, Bench, Hypothesis
 from pipeline.gap.types import FoundEffect, NamedValue, RecordGap, Rival, Trace
 from pipeline.plant.chain import Array
@@ -139,23 +139,23 @@ def chain_std(fit: Fit) -> dict[str, float]:
     return {name: float(v * r) for (name, v), r in zip(values.items(), relative, strict=True)}
 
 
-def _sides_of(hypothesis: Hypothesis, bench: Bench) -> list[tuple[Run, Locals, bool]]:
-    """Return every run with its own unknowns, and whether it was held out."""
-    training = zip(bench.training, hypothesis.fit.locals_, strict=True)
-    held_out = zip(bench.held_out, hypothesis.held.locals_, strict=True)
-    return [(run, own, False) for run, own in training] + [
-        (run, own, True) for run, own in held_out
+def _sides_of(hypothesis: Hypothesis, bench: Bench) -> list[tuple[Run, Nuisance, bool]]:
+    """Return every run with its nuisance parameters, and whether it was held out."""
+    training = zip(bench.training, hypothesis.fit.nuisance, strict=True)
+    held_out = zip(bench.held_out, hypothesis.held.nuisance, strict=True)
+    return [(run, nuisance, False) for run, nuisance in training] + [
+        (run, nuisance, True) for run, nuisance in held_out
     ]
 
 
 def make_traces(before: Hypothesis, after: Hypothesis, bench: Bench) -> tuple[Trace, ...]:
     """Return every cart of every run beside the model before and after."""
     out = []
-    for (run, own_before, held), (_, own_after, _) in zip(
+    for (run, nuisance_before, held), (_, nuisance_after, _) in zip(
         _sides_of(before, bench), _sides_of(after, bench), strict=True
     ):
-        linear = simulate_run(before.fit.structure, before.fit.theta[None], run, own_before)[0]
-        final = simulate_run(after.fit.structure, after.fit.theta[None], run, own_after)[0]
+        linear = simulate_run(before.fit.structure, before.fit.theta[None], run, nuisance_before)[0]
+        final = simulate_run(after.fit.structure, after.fit.theta[None], run, nuisance_after)[0]
         u = run.record.u[-run.t.size :] if run.record.u is not None else np.zeros(run.t.size)
         out += [
             Trace(
@@ -167,7 +167,7 @@ def make_traces(before: Hypothesis, after: Hypothesis, bench: Bench) -> tuple[Tr
                 measured=run.y[j],
                 baseline=linear[j],
                 final=final[j],
-                zero=float(own_after.zero[row]),
+                zero=float(nuisance_after.zero[row]),
             )
             for j, row in enumerate(run.rows)
         ]

@@ -102,8 +102,8 @@ def _independent_points(hypothesis: Hypothesis, bench: Bench) -> float:
     """
     total = 0.0
     fit = hypothesis.fit
-    for run, own in zip(bench.training, fit.locals_, strict=True):
-        model = simulate_run(fit.structure, fit.theta[None], run, own)[0]
+    for run, nuisance in zip(bench.training, fit.nuisance, strict=True):
+        model = simulate_run(fit.structure, fit.theta[None], run, nuisance)[0]
         for row in run.y - model:
             power = np.abs(np.fft.rfft(row - row.mean(), 2 * row.size)) ** 2
             covariance = np.fft.irfft(power)[: row.size]

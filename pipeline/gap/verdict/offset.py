@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.gap.data.runs import Run
-from pipeline.gap.fit.linearise import Locals
+from pipeline.gap.fit.linearise import Nuisance
 from pipeline.plant.chain import Array, Chain
 
 _SURE = 6.0  # standard errors
@@ -27,7 +27,7 @@ class Offset:
     std: float
 
 
-def find_offset(chain: Chain, runs: Sequence[Run], locals_: Sequence[Locals]) -> Offset | None:
+def find_offset(chain: Chain, runs: Sequence[Run], nuisance: Sequence[Nuisance]) -> Offset | None:
     """Return the constant force that the fitted zeros ask for, or None."""
     if not np.any(chain.k > 0):
         return None
@@ -35,8 +35,8 @@ def find_offset(chain: Chain, runs: Sequence[Run], locals_: Sequence[Locals]) ->
         return None  # neither other springs nor a start where it was zeroed: a zero like any other
     best: tuple[float, Offset] | None = None
     total, step = 0.0, 0.0
-    for run, own in zip(runs, locals_, strict=True):
-        zeros = own.zero[list(run.rows)]
+    for run, one in zip(runs, nuisance, strict=True):
+        zeros = one.zero[list(run.rows)]
         total += float(zeros @ zeros)
         step = max(step, float((run.sigma * np.sqrt(12.0)).max()))
     count = sum(len(run.rows) for run in runs)
@@ -45,8 +45,8 @@ def find_offset(chain: Chain, runs: Sequence[Run], locals_: Sequence[Locals]) ->
     for cart in range(1, chain.n + 1):
         gains = [_compliance(chain, run, cart) for run in runs]
         pairs = [
-            (gain, own.zero[list(run.rows)])
-            for gain, run, own in zip(gains, runs, locals_, strict=True)
+            (gain, one.zero[list(run.rows)])
+            for gain, run, one in zip(gains, runs, nuisance, strict=True)
             if np.any(gain)
         ]
         forces = np.array([gain @ zero / (gain @ gain) for gain, zero in pairs])

@@ -20,8 +20,8 @@ def find_windows(fit: Fit, runs: Sequence[Run]) -> tuple[GapWindow, ...]:
     `share` is the window's part of that cart's squared misfit in that run.
     """
     found: list[tuple[float, GapWindow]] = []
-    for run, own in zip(runs, fit.locals_, strict=True):
-        model = simulate_run(fit.structure, fit.theta[None], run, own)[0]
+    for run, nuisance in zip(runs, fit.nuisance, strict=True):
+        model = simulate_run(fit.structure, fit.theta[None], run, nuisance)[0]
         for j, row in enumerate(run.rows):
             energy = ((run.y[j] - model[j]) / run.sigma[j]) ** 2
             total = float(energy.sum())
