@@ -1,5 +1,6 @@
 """The whole job on what is shipped."""
 
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated
 
@@ -15,17 +16,28 @@ from pipeline.cli.reports import gap, run_report
 def demo(
     out: Annotated[Path, typer.Option(help="Where to write.")] = Path("cartlab-demo"),
 ) -> None:
-    """Run the whole job: a shipped example, a bench that hides friction, a class of three."""
+    """Run the whole job: a shipped example, a class of three, a bench that hides friction."""
     from pipeline.output import check_folder
     from pipeline.resources import EXAMPLES
 
-    run_report(EXAMPLES / "three-cart", out=check_folder(out) / "report", pdf=True)
-    bench = out / "bench"
-    if not (bench / "submission.toml").exists():
-        simulate(out=bench, preset="throne-2dof", hide=["coulomb_friction"])
-    gap(bench, out=out / "gap")
+    out = check_folder(out)
+    # On a new machine the simulator is compiled beside what does without it.
+    compiling = get_context("spawn").Process(target=_compile, daemon=True)
+    compiling.start()
+    run_report(EXAMPLES / "three-cart", out=out / "report", pdf=True)
     for number in (1, 2, 3):
         team = out / "class" / f"team-{number}"
         if not (team / "submission.toml").exists():
             simulate(out=team, preset="throne-1dof", seed=number, reported=True)
     grade([out / "class"], rubric=Path("throne-1dof"), out=out / "grades")
+    bench = out / "bench"
+    compiling.join()
+    if not (bench / "submission.toml").exists():
+        simulate(out=bench, preset="throne-2dof", hide=["coulomb_friction"])
+    gap(bench, out=out / "gap")
+
+
+def _compile() -> None:
+    from pipeline.plant.augmented import compile_simulator
+
+    compile_simulator()

@@ -2,13 +2,9 @@
 
 from collections.abc import Callable
 
-import numpy as np
-
 from pipeline.gap.explain import explain_gap
 from pipeline.gap.types import Gap
-from pipeline.plant.augmented import simulate_augmented
-from pipeline.plant.chain import Chain
-from pipeline.plant.effects import AugmentedChain
+from pipeline.plant.augmented import compile_simulator
 from pipeline.results import Analysis
 
 
@@ -25,7 +21,7 @@ def investigate(
     DataError : no usable record.
     """
     progress("preparing the simulator; once on each machine it is compiled, which takes a while")
-    _compile()
+    compile_simulator()
     wrong = {one.experiment for one in analysis.left_out if one.is_wrong}
     return explain_gap(
         [record for record in analysis.records if record.id not in wrong],
@@ -36,9 +32,3 @@ def investigate(
         budget=budget,
         tell=progress,
     )
-
-
-def _compile() -> None:
-    """Run the simulator once, so that the wait for its compilation is announced."""
-    chain = Chain(m=np.ones(1), c=np.ones(1), k=np.array([1.0, 0.0]))
-    simulate_augmented(AugmentedChain(chain=chain), np.array([0.0, 0.01]), np.zeros(2))

@@ -12,7 +12,7 @@ import numpy as np
 
 from pipeline.errors import DataError
 from pipeline.plant import kernel
-from pipeline.plant.chain import Array
+from pipeline.plant.chain import Array, Chain
 from pipeline.plant.effects.base import AugmentedChain
 from pipeline.plant.sensitivity import make_sensitivities
 from pipeline.plant.tables import DRY, Cart, Drive, Spring, Tables
@@ -106,6 +106,12 @@ def _simulate(
 
 def _all(n: int) -> tuple[int, ...]:
     return tuple(range(1, n + 1))
+
+
+def compile_simulator() -> None:
+    """Run the simulator once, so that it is compiled: ten seconds, where nobody has yet."""
+    chain = Chain(m=np.ones(1), c=np.ones(1), k=np.array([1.0, 0.0]))
+    simulate_augmented(AugmentedChain(chain=chain), np.array([0.0, 0.01]), np.zeros(2))
 
 
 class SteppedBench:
