@@ -308,7 +308,7 @@ def test_a_figure_says_the_values_under_the_pointer(three, show):
     analysis = analyse(load_submission(EXAMPLES / "three-cart"))
     response = next(r for r in analysis.frequency_responses if r.cart == 3)
     page = show(page_of(three))
-    figure = page.locator("figure").first
+    figure = page.locator("#frequency-response figure").first
     figure.scroll_into_view_if_needed()
     box = figure.locator("svg use").nth(10).bounding_box()  # the legend's own comes last
 
@@ -402,7 +402,7 @@ def test_without_scripts_the_page_is_whole(three, show):
 
     assert page.locator("figure svg").count() == page.locator("figure").count() > 5
     assert page.locator("button").count() == 0
-    page.locator("summary").first.click()
+    page.locator("#checks summary").click()
     assert page.get_by_text("The fit converged").is_visible()
 
 
