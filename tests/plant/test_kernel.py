@@ -1,5 +1,8 @@
 """The compiled simulator against exact solutions, an event-driven one, and the fine-step truth."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -279,6 +282,34 @@ def test_a_hidden_mass_starts_where_it_is_told_to():
     assert_allclose(got[0], true, atol=1e-6 * np.abs(true).max())
 
 
+_NOTHING_LEFT = """
+import numpy as np
+from pipeline.plant import kernel, sensitivity
+from pipeline.plant.augmented import SteppedBench, compile_simulator
+from pipeline.plant.chain import PRESETS
+from pipeline.plant.effects import AugmentedChain
+from pipeline.plant.tables import linear_tables
+
+files = vars(kernel), vars(sensitivity)
+stats = [one.stats for file in files for one in file.values() if hasattr(one, "stats")]
+compile_simulator()
+before = [dict(one.cache_misses) for one in stats]
+
+chain = PRESETS["throne-2dof"]
+SteppedBench(AugmentedChain(chain=chain)).step(0.1, following=0.0, interval=0.004)
+t, still, moving = 0.004 * np.arange(10), np.zeros((1, 1, 2)), np.array([True, True])
+run = still, still, np.ones((1, 2)), moving, t, t, np.ones(10), np.array([0, 10]), 1.0
+by_mass = np.array([[sensitivity.BY_MASS], [0]])
+kernel.simulate_with_derivatives(*(table[None] for table in linear_tables(chain)), *run, by_mass)
+assert [dict(one.cache_misses) for one in stats] == before
+"""
+
+
+def test_once_compiled_nothing_is_left_to_compile():
+    """A bench that is stepped and derivatives run what `compile_simulator` compiled."""
+    subprocess.run([sys.executable, "-c", _NOTHING_LEFT], check=True)
+
+
 def test_arrays_of_any_kind_meet_the_same_simulator():
     """Views, whole numbers and what may not be written to cost no compilation of their own."""
     tables = linear_tables(PRESETS["throne-2dof"])
@@ -303,8 +334,8 @@ def test_arrays_of_any_kind_meet_the_same_simulator():
     )
     assert np.array_equal(fixed[0], whole)
     mine = [*vars(kernel).values(), *vars(sensitivity).values()]
-    compiled = {one: one.signatures for one in mine if hasattr(one, "signatures")}
-    assert [one for one, kinds in compiled.items() if len(kinds) > 1] == [kernel.stretch]
+    twice = [one for one in mine if len(getattr(one, "signatures", ())) > 1]
+    assert twice in ([], [kernel.stretch])  # which takes the row it reads as a constant
 
 
 @pytest.mark.parametrize("preset", list(PRESETS))
