@@ -70,7 +70,20 @@ def say(text: str) -> None:
 
 @contextmanager
 def progress_line() -> Iterator[Callable[[str], None]]:
-    """Show what is being done while it is done; silent where stderr is no terminal."""
+    """Show what is being done while it is done, and say so where Ctrl-C ends it.
+
+    Silent where stderr is no terminal.
+    """
+    try:
+        with _shown_line() as show:
+            yield show
+    except KeyboardInterrupt:
+        say("stopped; the same command begins anew")
+        raise
+
+
+@contextmanager
+def _shown_line() -> Iterator[Callable[[str], None]]:
     if not sys.stderr.isatty():
         yield lambda text: None
         return

@@ -152,7 +152,7 @@ def run_report(
     for line in (changes and changes_line(changes), open_line(analysis)):
         if line:
             say(line)
-    say(f"wrote {out / 'report.html'}" + (f" and {out / 'report.pdf'}" if pdf else ""))
+    say(_wrote(out, "report", pdf=pdf))
     return analysis
 
 
@@ -192,7 +192,7 @@ def solution(
         write_file(out / "solution.json", text := solution_text(analysis))
         render_solution(analysis, out, gap=gap, pdf=pdf, progress=progress)
     _say_unreadable(analysis)
-    say(f"wrote {out / 'solution.html'}" + (f" and {out / 'solution.pdf'}" if pdf else ""))
+    say(_wrote(out, "solution", pdf=pdf))
     if as_json:
         typer.echo(text, nl=False)
 
@@ -229,6 +229,11 @@ def gap(
         write_file(out / "gap.json", text := gap_text(found, analysis))
         render_gap(found, analysis, out, pdf=pdf, progress=progress)
     _say_unreadable(analysis)
-    say(f"{terminal_verdict(found)}\nwrote {out / 'gap.html'}")
+    say(terminal_verdict(found))
+    say(_wrote(out, "gap", pdf=pdf))
     if as_json:
         typer.echo(text, nl=False)
+
+
+def _wrote(out: Path, name: str, *, pdf: bool) -> str:
+    return f"wrote {out / f'{name}.html'}" + (f" and {out / f'{name}.pdf'}" if pdf else "")

@@ -1,6 +1,7 @@
 """Progress on a terminal; elsewhere only what a person has to know."""
 
 import os
+import signal
 import subprocess
 import sys
 
@@ -52,6 +53,26 @@ def test_a_terminal_sees_what_is_done_and_for_how_long(tmp_path):
     assert "report: " in seen
     assert "0:00:0" in seen
     assert seen.rstrip().endswith(f"wrote {tmp_path / 'report.html'} and {tmp_path / 'report.pdf'}")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo terminals")
+def test_ctrl_c_is_answered(tmp_path):
+    """Who stops a report at work is told so, and the exit status is that of Ctrl-C."""
+    import pty
+
+    ours, theirs = pty.openpty()
+    command = [sys.executable, "-m", "pipeline", "report", str(EXAMPLES / "three-cart")]
+    with subprocess.Popen([*command, "--out", str(tmp_path)], stderr=theirs) as running:
+        os.close(theirs)
+        seen = b""
+        while b"free decays" not in seen and (more := _read(ours)):
+            seen += more
+        running.send_signal(signal.SIGINT)
+        seen += b"".join(iter(lambda: _read(ours), b""))
+    os.close(ours)
+
+    assert running.returncode == 130
+    assert seen.decode().rstrip().endswith("stopped; the same command begins anew")
 
 
 def _read(terminal: int) -> bytes:
