@@ -52,11 +52,11 @@ def test_error(gap: Gap, record: Record, *, skipped: int, zero: float) -> float:
         structure = structure.with_effect(
             Candidate(effect=term.effect, place=term.place, signs=signs, scales=sizes)
         )
-    theta = structure.vector(gap.model.chain, [term.values for term in gap.model.terms])
+    model = structure.start(gap.model.chain, [term.values for term in gap.model.terms])
     nuisance = fresh_nuisance(run)
     nuisance.zero[:] = zero
-    model = simulate_run(structure, theta[None], run, nuisance)[0, 0]
-    return float(np.sqrt(np.mean((run.y[0] - model)[skipped:] ** 2)))
+    simulated = simulate_run(model, run, nuisance)[0]
+    return float(np.sqrt(np.mean((run.y[0] - simulated)[skipped:] ** 2)))
 
 
 def main() -> None:

@@ -94,7 +94,7 @@ def explain_gap(
                 break
             # Less is left than was taken for noise: the misfit of the linear model was in it.
             quiet = _quieter(bench, chosen)
-            fit = fit_model(fit.structure, fit.theta, quiet.training, mapper=pool.map)
+            fit = fit_model(fit, quiet.training, mapper=pool.map)
             again = _investigate(fit, quiet, deadline)
             if not deadline.cut:
                 bench, (chosen, found) = quiet, again
@@ -222,17 +222,8 @@ def _with_offset(
     candidate = Candidate(
         effect=effect, place=offset.cart, signs=(1.0,), scales=(abs(offset.force),)
     )
-    without = tuple(
-        judge(
-            fit_whole(h.fit.structure, h.fit.theta, pinned),
-            pinned,
-            added=h.added,
-        )
-        for h in path
-    )
-    grown = structure.with_effect(candidate)
-    theta = np.append(chosen.fit.theta, np.sign(offset.force))
-    fit = fit_whole(grown, theta, loose)
+    without = tuple(judge(fit_whole(h.fit, pinned), pinned, added=h.added) for h in path)
+    fit = fit_whole(chosen.fit.with_effect(candidate, (offset.force,)), loose)
     final = judge(fit, loose, added=(candidate,))
     if final.error > min(0.9 * without[-1].error, _AS_FREE * chosen.error):
         return path, None

@@ -10,7 +10,7 @@ from pipeline.gap.fit.baseline import fit_baseline
 from pipeline.gap.search.beam import by_promise, prune
 from pipeline.gap.search.grow import fit_whole
 from pipeline.gap.search.hypothesis import Bench, judge
-from pipeline.gap.search.screen import candidates_at, extend
+from pipeline.gap.search.screen import candidates_at
 from pipeline.plant.effects import CATALOGUE, find_effect
 from tests.truth.bench import Hidden
 from tests.truth.cases import make_case
@@ -72,13 +72,13 @@ def test_a_richer_law_that_explains_no_more_gives_way():
         tell=print,
     )
     chain = fit.structure.chain(fit.theta)
+    start = fit
     for key, values in (("input_delay", (0.015,)), ("presliding_friction", (0.0006, 1e-4))):
         effect = find_effect(key)
         place = 0 if effect.place == "input" else 1
         candidate, _ = candidates_at(effect, place, runs=training, chain=chain)[0]
-        structure, theta = extend(fit, candidate, values)
-        fit = replace(fit, structure=structure, theta=theta)
-    rich = judge(fit_whole(fit.structure, fit.theta, bench), bench)
+        start = start.with_effect(candidate, values)
+    rich = judge(fit_whole(start, bench), bench)
 
     pruned = prune(rich, bench)
 

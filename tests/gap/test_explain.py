@@ -141,9 +141,8 @@ def test_effects_that_only_together_explain_are_found_together():
     """Of three directions two, each of which explains little alone, add up to the residual."""
     case = make_case(seed=44, n=2, rate=113.1)
     structure = Structure(springs=case.springs)
-    chain = structure.chain(
-        structure.vector(Chain(m=np.array(case.m), c=np.array(case.c), k=np.array(case.k)))
-    )
+    true = Chain(m=np.array(case.m), c=np.array(case.c), k=np.array(case.k))
+    chain = structure.chain(structure.start(true).theta)
     runs = [make_run(record, n=2) for record in case.records]
     trials = [
         candidates_at(find_effect(key), 1, runs=runs, chain=chain)[0]
@@ -162,9 +161,8 @@ def test_friction_on_all_carts_is_tried_beside_another_effect():
     """Two frictions and a braking motor add up to the residual, and no two of them do."""
     case = make_case(seed=44, n=2, rate=113.1)
     structure = Structure(springs=case.springs)
-    chain = structure.chain(
-        structure.vector(Chain(m=np.array(case.m), c=np.array(case.c), k=np.array(case.k)))
-    )
+    true = Chain(m=np.array(case.m), c=np.array(case.c), k=np.array(case.k))
+    chain = structure.chain(structure.start(true).theta)
     runs = [make_run(record, n=2) for record in case.records]
     trials = [
         candidates_at(find_effect(key), place, runs=runs, chain=chain)[0]
@@ -202,7 +200,7 @@ def test_what_no_run_shows_absorbs_nothing():
     for record, chain, springs in chains:
         structure = Structure(springs=springs)
         run = make_run(record, n=len(springs) - 1)
-        fit = fit_model(structure, structure.vector(chain), [run], iterations=0)
+        fit = fit_model(structure.start(chain), [run], iterations=0)
         wave = np.sign(np.sin(7.0 * t))[None, None]
         directions, residual = project(fit, [run], [wave])
         left.append((float((directions**2).sum()), float((residual**2).sum())))

@@ -103,12 +103,17 @@ def fit_baseline(
     starts = [chain for chain in (start,) if chain is not None]
     starts.append(first_chain(runs, springs=springs))
     fits = [
-        fit_model(structure, structure.vector(chain), shots, iterations=15, mapper=mapper)
+        fit_model(
+            structure.start(chain),
+            shots,
+            iterations=15,
+            mapper=mapper,
+        )
         for chain in starts
     ]
     best = min(fits, key=lambda fit: fit.cost)
     noisy = measure_noise(best, shots, runs)
-    return fit_model(structure, best.theta, noisy, iterations=25, mapper=mapper), noisy
+    return fit_model(best, noisy, iterations=25, mapper=mapper), noisy
 
 
 def measure_noise(fit: Fit, shots: Sequence[Run], runs: Sequence[Run]) -> list[Run]:
@@ -116,7 +121,7 @@ def measure_noise(fit: Fit, shots: Sequence[Run], runs: Sequence[Run]) -> list[R
     found: dict[int, list[float]] = {}
     resting: dict[int, list[float]] = {}
     for shot, nuisance in zip(shots, fit.nuisance, strict=True):
-        model = simulate_run(fit.structure, fit.theta[None], shot, nuisance)[0]
+        model = simulate_run(fit, shot, nuisance)
         for j, row in enumerate(shot.rows):
             for part in (slice(a, b) for a, b in pairwise(shot.shots)):
                 # An encoder at rest repeats itself: only a moving one shows its noise.
@@ -138,8 +143,7 @@ def fit_nuisance(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
 
     def follow(nuisance: Sequence[Nuisance]) -> Fit:
         return fit_model(
-            fit.structure,
-            fit.theta,
+            fit,
             runs,
             nuisance=nuisance,
             spread=fit.spread,

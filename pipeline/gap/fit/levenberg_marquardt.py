@@ -19,7 +19,7 @@ from pipeline.gap.fit.linearise import (
     run_cost,
     triangle,
 )
-from pipeline.gap.fit.structure import Structure
+from pipeline.gap.fit.structure import Model
 from pipeline.plant.chain import Array
 
 Mapper = Callable[..., Iterable]
@@ -37,20 +37,18 @@ _RELEASES = 3  # of parameters at their bounds, which are rarely more than one
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Fit:
+class Fit(Model):
     """A fitted model.
 
     Attributes
     ----------
-    theta : the vector of `structure`; covariance (size, size) of it, or None before the end.
+    covariance : (size, size) of the vector, or None before the end.
     nuisance : one for each run, in their order.
     cost : sum of squared residuals over their noise, prior terms included.
     chi_square : without the prior terms; n_points the residuals behind it.
     run_chi : (runs,) chi-square per residual of each run; run_prior its prior terms.
     """
 
-    structure: Structure
-    theta: Array
     nuisance: tuple[Nuisance, ...]
     cost: float
     chi_square: float
@@ -68,8 +66,7 @@ class Fit:
 
 
 def evaluate(
-    structure: Structure,
-    theta: Array,
+    model: Model,
     runs: Sequence[Run],
     nuisance: Sequence[Nuisance],
     *,
@@ -77,18 +74,17 @@ def evaluate(
     inflate: float = 1.0,
     mapper: Mapper = map,
 ) -> Fit:
-    """Return the fit at given parameters and locals, without moving either."""
+    """Return the fit at given parameters, shared and nuisance, without moving either."""
 
     def cost(pair: tuple[Run, Nuisance]) -> tuple[float, float]:
-        return run_cost(structure, theta, *pair, spread=spread)
+        return run_cost(model, *pair, spread=spread)
 
     costs = np.array(list(mapper(cost, zip(runs, nuisance, strict=True))))
-    return _fit_at(structure, theta, runs, nuisance, costs, spread=spread, inflate=inflate)
+    return _fit_at(model, runs, nuisance, costs, spread=spread, inflate=inflate)
 
 
 def _fit_at(
-    structure: Structure,
-    theta: Array,
+    model: Model,
     runs: Sequence[Run],
     nuisance: Sequence[Nuisance],
     costs: Array,
@@ -98,8 +94,8 @@ def _fit_at(
 ) -> Fit:
     points = np.array([residual_points(run) for run in runs])
     return Fit(
-        structure=structure,
-        theta=theta,
+        structure=model.structure,
+        theta=model.theta,
         nuisance=tuple(nuisance),
         cost=float(costs[:, 0].sum() + inflate**2 * costs[:, 1].sum()),
         chi_square=float(costs[:, 0].sum()),
@@ -112,8 +108,7 @@ def _fit_at(
 
 
 def fit_model(
-    structure: Structure,
-    theta: Array,
+    start: Model,
     runs: Sequence[Run],
     *,
     nuisance: Sequence[Nuisance] | None = None,
@@ -129,14 +124,14 @@ def fit_model(
 
     Parameters
     ----------
-    theta : (size,) start; without `shared` it stays, and only nuisance parameters move.
+    start : where to begin; without `shared` it stays, and only nuisance parameters move.
     spread : (n,) expected spread of the dry friction from run to run; learnt if `learn_spread`.
     tolerance : relative fall of the cost below which the fit has converged.
     """
+    structure = start.structure
     low, high = structure.bounds()
     best = evaluate(
-        structure,
-        np.clip(theta, low, high),
+        Model(structure=structure, theta=np.clip(start.theta, low, high)),
         runs,
         [fresh_nuisance(run) for run in runs] if nuisance is None else nuisance,
         spread=np.full(structure.n, _SCATTER_START) if spread is None else spread,
@@ -191,8 +186,7 @@ def _linearise_all(
     def share(job: tuple[Run, Nuisance, Array | None]) -> Linear:
         run, nuisance, extra = job
         return linearise(
-            fit.structure,
-            fit.theta,
+            fit,
             run,
             nuisance,
             inflate=inflate,
@@ -249,14 +243,14 @@ def _follow(
 
     Less far in a run where that is no gain.
     """
-    theta = fit.theta + delta
+    model = Model(structure=fit.structure, theta=fit.theta + delta)
 
     def move(job: tuple[Linear, Run, Nuisance, float]) -> tuple[Nuisance, tuple[float, float]]:
         part, run, nuisance, before = job
         tried = []
         for scale in _NUISANCE_SCALES:
             moved = move_nuisance(part, nuisance, delta[: part.reduced.shape[1] - 1], scale)
-            cost = run_cost(fit.structure, theta, run, moved, spread=fit.spread)
+            cost = run_cost(model, run, moved, spread=fit.spread)
             tried.append((cost[0] + inflate**2 * cost[1], moved, cost))
             if tried[-1][0] <= before:
                 break
@@ -266,8 +260,7 @@ def _follow(
     before = fit.run_chi * fit.run_points + inflate**2 * fit.run_prior
     moved = list(mapper(move, zip(linear, runs, fit.nuisance, before, strict=True)))
     return _fit_at(
-        fit.structure,
-        theta,
+        model,
         runs,
         [nuisance for nuisance, _ in moved],
         np.array([cost for _, cost in moved]),

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.gap.data.runs import Run
-from pipeline.gap.fit.structure import Structure
+from pipeline.gap.fit.structure import Model, Structure
 from pipeline.plant.chain import Array
 from pipeline.plant.kernel import simulate_with_derivatives
 from pipeline.plant.sensitivity import (
@@ -60,13 +60,13 @@ def fresh_nuisance(run: Run) -> Nuisance:
     )
 
 
-def simulate_run(structure: Structure, thetas: Array, run: Run, nuisance: Nuisance) -> Array:
-    """Return (b, rows, samples) readings of one run for many vectors, zeros included."""
-    y, _ = simulate_variants(structure, thetas, run, nuisance)
-    return y + nuisance.zero[list(run.rows)][:, None]
+def simulate_run(model: Model, run: Run, nuisance: Nuisance) -> Array:
+    """Return the readings (rows, samples) of one run, zeros included."""
+    y, _ = _simulate_variants(model.structure, model.theta[None], run, nuisance)
+    return y[0] + nuisance.zero[list(run.rows)][:, None]
 
 
-def simulate_variants(
+def _simulate_variants(
     structure: Structure,
     thetas: Array,
     run: Run,
@@ -180,8 +180,7 @@ def _r(matrix: Array) -> Array:
 
 
 def linearise(
-    structure: Structure,
-    theta: Array,
+    model: Model,
     run: Run,
     nuisance: Nuisance,
     *,
@@ -198,9 +197,9 @@ def linearise(
     `run.thin`) are further columns to project.
     """
     run = run.thin
-    layout = _layout(structure, run, scatter_free=scatter_free)
-    columns = _columns(structure, theta, run, nuisance, layout, shared=shared, extras=extras)
-    prior = _start_prior(layout, run, _sizes(structure, theta, run), inflate=inflate)
+    layout = _layout(model.structure, run, scatter_free=scatter_free)
+    columns = _columns(model, run, nuisance, layout, shared=shared, extras=extras)
+    prior = _start_prior(layout, run, _sizes(model, run), inflate=inflate)
     starts = prior.shape[1]
     shots = _eliminate_starts(_by_shot(columns / run.sigma[:, None], run), prior)
     rest = shots[:, starts:, starts:].reshape(-1, shots.shape[-1] - starts)
@@ -212,8 +211,7 @@ def linearise(
 
 
 def _columns(
-    structure: Structure,
-    theta: Array,
+    model: Model,
     run: Run,
     nuisance: Nuisance,
     layout: Layout,
@@ -225,9 +223,9 @@ def _columns(
 
     … parameters, the further columns, and the residual last.
     """
-    derive = _differences if structure.has_contact else _derivatives
-    model, by_nuisance, by_shared = derive(structure, theta, run, nuisance, layout, shared=shared)
-    residual = run.y - model - nuisance.zero[list(run.rows)][:, None]
+    derive = _differences if model.structure.has_contact else _derivatives
+    y, by_nuisance, by_shared = derive(model, run, nuisance, layout, shared=shared)
+    residual = run.y - y - nuisance.zero[list(run.rows)][:, None]
     by_zero = np.zeros((len(layout.zero), *residual.shape))
     by_zero[range(len(layout.zero)), [run.rows.index(i) for i in layout.zero]] = 1.0
     further = [] if extras is None else [extras]
@@ -256,19 +254,14 @@ def _run_prior(
 
 
 def _derivatives(
-    structure: Structure,
-    theta: Array,
-    run: Run,
-    nuisance: Nuisance,
-    layout: Layout,
-    *,
-    shared: bool,
+    model: Model, run: Run, nuisance: Nuisance, layout: Layout, *, shared: bool
 ) -> tuple[Array, Array, Array]:
     """Return the readings (rows, samples) and their derivatives (., rows, samples).
 
     By the run's starts and friction factors, and by the shared parameters: of the chain they are
     carried beside the state, of the effects they are differences.
     """
+    structure, theta = model.structure, model.theta
     lanes = [(BY_POSITION, i) for i in layout.x0] + [(BY_VELOCITY, i) for i in layout.v0]
     lanes += [(BY_FRICTION, i) for i in layout.scatter]
     local, steps = len(lanes), np.zeros(0)
@@ -278,7 +271,7 @@ def _derivatives(
         steps = structure.steps()[structure.base_size :]
     thetas = np.repeat(theta[None], 1 + steps.size, axis=0)
     thetas[1:, theta.size - steps.size :] += np.diag(steps)
-    y, by = simulate_variants(structure, thetas, run, nuisance, lanes=lanes)
+    y, by = _simulate_variants(structure, thetas, run, nuisance, lanes=lanes)
     # By the logarithm of a number: by itself, times the number.
     by[local:] *= np.exp(theta[: len(lanes) - local])[:, None, None]
     by_effects = (y[1:] - y[0]) / steps[:, None, None]
@@ -286,19 +279,14 @@ def _derivatives(
 
 
 def _differences(
-    structure: Structure,
-    theta: Array,
-    run: Run,
-    nuisance: Nuisance,
-    layout: Layout,
-    *,
-    shared: bool,
+    model: Model, run: Run, nuisance: Nuisance, layout: Layout, *, shared: bool
 ) -> tuple[Array, Array, Array]:
     """Return what `_derivatives` does, by differences alone.
 
     Behind a contact the misfit is full of narrow valleys: a finite step looks across them.
     """
-    position, velocity = _sizes(structure, theta, run)
+    structure, theta = model.structure, model.theta
+    position, velocity = _sizes(model, run)
     steps = structure.steps() if shared else np.zeros(0)
     x_steps = _START_STEP * position[list(layout.x0)]
     v_steps = _START_STEP * velocity[list(layout.v0)]
@@ -319,19 +307,20 @@ def _differences(
     thetas = np.repeat(theta[None], b, axis=0)
     if shared:
         thetas[lane:] += np.diag(steps)
-    y, _ = simulate_variants(
+    y, _ = _simulate_variants(
         structure, thetas, run, replace(nuisance, x0=x0, v0=v0, scatter=scatter)
     )
     by = (y[1:] - y[0]) / divisors[:, None, None]
     return y[0], by[: lane - 1], by[lane - 1 :]
 
 
-def _sizes(structure: Structure, theta: Array, run: Run) -> tuple[Array, Array]:
+def _sizes(model: Model, run: Run) -> tuple[Array, Array]:
     """Return the usual positions and velocities (2 n,) of the carts and what hides on them."""
     size = np.maximum(run.swing, 1e-9)
-    position = np.full(structure.n, size.max())
+    chain = model.structure.chain(model.theta)
+    position = np.full(chain.n, size.max())
     position[list(run.rows)] = size
-    rate = np.sqrt(np.diag(structure.chain(theta).stiffness) / np.exp(theta[: structure.n]))
+    rate = np.sqrt(np.diag(chain.stiffness) / chain.m)
     return np.tile(position, 2), np.tile(position * np.maximum(rate, 1.0), 2)
 
 
@@ -373,20 +362,13 @@ def move_nuisance(linear: Linear, nuisance: Nuisance, delta: Array, scale: float
     return Nuisance(x0=x0, v0=v0, zero=zero, scatter=np.clip(scatter, *_FACTORS))
 
 
-def run_cost(
-    structure: Structure,
-    theta: Array,
-    run: Run,
-    nuisance: Nuisance,
-    *,
-    spread: Array,
-) -> tuple[float, float]:
+def run_cost(model: Model, run: Run, nuisance: Nuisance, *, spread: Array) -> tuple[float, float]:
     """Return chi-square of a run, and its prior terms."""
-    if not structure.visible(theta):
+    structure = model.structure
+    if not structure.visible(model.theta):
         return np.inf, 0.0
     run = run.thin
-    model = simulate_run(structure, theta[None], run, nuisance)[0]
-    residual = _by_shot((run.y - model) / run.sigma[:, None], run)
+    residual = _by_shot((run.y - simulate_run(model, run, nuisance)) / run.sigma[:, None], run)
     chi = float((residual**2).sum())
     if not np.isfinite(chi):
         return np.inf, 0.0

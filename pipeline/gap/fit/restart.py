@@ -43,8 +43,7 @@ def restart_runs(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
                 scatter=np.where(rest & free, factor, 1.0),
             )
             trial = fit_model(
-                fit.structure,
-                fit.theta,
+                fit,
                 [run],
                 nuisance=[start],
                 spread=fit.spread,
@@ -59,8 +58,7 @@ def restart_runs(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
     nuisance = tuple(mapper(again, jobs))
     inflate = max(1.0, float(np.sqrt(fit.chi)))
     return evaluate(
-        fit.structure,
-        fit.theta,
+        fit,
         runs,
         nuisance,
         spread=fit.spread,

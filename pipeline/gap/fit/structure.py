@@ -35,6 +35,24 @@ class Candidate:
         """Effect and place."""
         return self.effect.key, self.place
 
+    def values(self, coordinates: Array) -> list[float]:
+        """Return the parameter values at a piece of the vector."""
+        return [
+            float(x) * scale if p.signed else sign * float(np.exp(x))
+            for p, x, sign, scale in zip(
+                self.effect.parameters, coordinates, self.signs, self.scales, strict=True
+            )
+        ]
+
+    def coordinates(self, values: Sequence[float]) -> Array:
+        """Return the piece of the vector that holds parameter values."""
+        return np.array(
+            [
+                v / scale if p.signed else np.log(max(abs(v), _SMALLEST * scale))
+                for p, v, scale in zip(self.effect.parameters, values, self.scales, strict=True)
+            ]
+        )
+
     def has_signs_of(self, values: Sequence[float]) -> bool:
         """Whether values are on the sides that the candidate keeps."""
         sided = zip(self.effect.parameters, self.signs, values, strict=True)
@@ -121,7 +139,7 @@ class Structure:
                 Term(
                     effect=candidate.effect,
                     place=candidate.place,
-                    values=tuple(float(v) for v in _values(candidate, coordinates)),
+                    values=tuple(candidate.values(coordinates)),
                 )
             )
         return AugmentedChain(chain=self.chain(theta), terms=tuple(terms))
@@ -135,17 +153,17 @@ class Structure:
             np.array([tables[2] for tables in stacked]),
         )
 
-    def vector(self, chain: Chain, values: Sequence[Sequence[float]] = ()) -> Array:
-        """Return the vector of a chain and effect parameter values."""
+    def start(self, chain: Chain, values: Sequence[Sequence[float]] = ()) -> "Model":
+        """Return the model of a chain and the effects' parameter values."""
         tiny = 1e-3 * np.sqrt(chain.m * np.maximum(np.diag(chain.stiffness), 1e-12 * chain.m))
         parts = [np.log(chain.m), np.log(np.maximum(chain.c, tiny))]
         k = chain.k[list(self.rows)] if self.n > 1 else chain.k.sum(keepdims=True)[: len(self.rows)]
         parts.append(np.log(np.maximum(k, 1e-4 * chain.k.max())))
         parts += [
-            _coordinates(candidate, value)
+            candidate.coordinates(value)
             for candidate, value in zip(self.effects, values, strict=True)
         ]
-        return np.concatenate(parts)
+        return Model(structure=self, theta=np.concatenate(parts))
 
     def visible(self, theta: Array) -> bool:
         """Do the hidden masses, if any, swing slowly enough to be told from the carts?"""
@@ -193,7 +211,7 @@ class Structure:
         """Return d(parameter)/d(coordinate) of the effects; the chain stays in logs."""
         out = [np.ones(self.base_size)]
         for index, c in enumerate(self.effects):
-            values = _values(c, theta[self.span(index)])
+            values = c.values(theta[self.span(index)])
             out.append(
                 np.array(
                     [
@@ -207,24 +225,32 @@ class Structure:
         return np.concatenate(out)
 
 
-def _values(candidate: Candidate, coordinates: Array) -> list[float]:
-    return [
-        float(x) * scale if p.signed else sign * float(np.exp(x))
-        for p, x, sign, scale in zip(
-            candidate.effect.parameters, coordinates, candidate.signs, candidate.scales, strict=True
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Model:
+    """A structure with its vector `theta` (size,): where a fit starts, or ends."""
+
+    structure: Structure
+    theta: Array
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        """The effects with their values, in the structure's order."""
+        return self.structure.model(self.theta).terms
+
+    def with_effect(self, candidate: Candidate, values: Sequence[float]) -> "Model":
+        """Return the model with one more effect, at the values of its parameters."""
+        return Model(
+            structure=self.structure.with_effect(candidate),
+            theta=np.concatenate([self.theta, candidate.coordinates(values)]),
         )
-    ]
 
-
-def _coordinates(candidate: Candidate, values: Sequence[float]) -> Array:
-    return np.array(
-        [
-            v / scale if p.signed else np.log(max(abs(v), _SMALLEST * scale))
-            for p, v, scale in zip(
-                candidate.effect.parameters, values, candidate.scales, strict=True
-            )
-        ]
-    )
+    def without(self, *indices: int) -> "Model":
+        """Return the model without some of its effects, the rest as it is."""
+        spans = [np.r_[self.structure.span(index)] for index in indices]
+        return Model(
+            structure=self.structure.without(*indices),
+            theta=np.delete(self.theta, np.concatenate(spans)),
+        )
 
 
 # ----------------------------------------------------------------- the sizes on this bench

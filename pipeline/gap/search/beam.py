@@ -159,17 +159,14 @@ def prune(chosen: Hypothesis, bench: Bench) -> Hypothesis:
 
 
 def _without(hypothesis: Hypothesis, effect: Candidate, bench: Bench) -> Hypothesis:
-    structure = hypothesis.fit.structure
-    index = structure.effects.index(effect)
-    theta = np.delete(hypothesis.fit.theta, np.r_[structure.span(index)])
-    fit = fit_whole(structure.without(index), theta, bench)
+    index = hypothesis.fit.structure.effects.index(effect)
+    fit = fit_whole(hypothesis.fit.without(index), bench)
     return judge(fit, bench, added=fit.structure.effects[-1:])
 
 
 def _plainer(hypothesis: Hypothesis, rich: Candidate, bench: Bench) -> Hypothesis:
     """Return the hypothesis with the law in place of a richer one that grew from it."""
-    structure, theta = hypothesis.fit.structure, hypothesis.fit.theta
-    index = structure.effects.index(rich)
+    index = hypothesis.fit.structure.effects.index(rich)
     effect = find_effect(rich.effect.grows_from or rich.effect.key)
     at = [rich.effect.names.index(name) for name in effect.names]
     plain = Candidate(
@@ -178,9 +175,8 @@ def _plainer(hypothesis: Hypothesis, rich: Candidate, bench: Bench) -> Hypothesi
         signs=tuple(rich.signs[i] for i in at),
         scales=tuple(rich.scales[i] for i in at),
     )
-    own = structure.span(index)
-    theta = np.concatenate([np.delete(theta, np.r_[own]), theta[own][at]])
-    fit = fit_whole(structure.without(index).with_effect(plain), theta, bench)
+    values = [hypothesis.fit.terms[index].values[i] for i in at]
+    fit = fit_whole(hypothesis.fit.without(index).with_effect(plain, values), bench)
     return judge(fit, bench, added=hypothesis.added)
 
 

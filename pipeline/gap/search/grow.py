@@ -1,7 +1,6 @@
 """Grow a hypothesis: screen the catalogue, refit the suspects, fit the best to whole runs."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -10,11 +9,10 @@ from pipeline.gap.data.runs import Run, cut_shots
 from pipeline.gap.fit.baseline import SHOT_LENGTH
 from pipeline.gap.fit.levenberg_marquardt import Fit, fit_model
 from pipeline.gap.fit.restart import restart_runs
-from pipeline.gap.fit.structure import Candidate, Structure
+from pipeline.gap.fit.structure import Candidate, Model
 from pipeline.gap.search.hypothesis import AT_FLOOR, THINNING, Bench, Hypothesis, judge
 from pipeline.gap.search.rugged import polish, zoom
-from pipeline.gap.search.screen import Suspect, Team, candidates_at, extend, screen
-from pipeline.plant.chain import Array
+from pipeline.gap.search.screen import Suspect, Team, candidates_at, screen
 from pipeline.plant.effects.base import Effect
 
 _SHORT_LIST = 9  # suspects refitted on pieces
@@ -43,13 +41,13 @@ def grow(parent: Hypothesis, bench: Bench) -> Iterator[Hypothesis]:
     fits: list[tuple[tuple[Candidate, ...], Fit]] = []
     plain: list[Hypothesis] = []
     for candidates, start in _starts(parent, bench):
-        fits.append((candidates, fit_whole(start.structure, start.theta, bench)))
+        fits.append((candidates, fit_whole(start, bench)))
         if not _is_contact(candidates):
             plain.append(judge(fits[-1][1], bench, added=candidates))
             yield plain[-1]
     for candidates, fit in fits[:]:
-        for other, structure, theta in _lookalikes(candidates, fit, bench):
-            fits.append(((other,), fit_whole(structure, theta, bench)))
+        for other, start in _lookalikes(candidates, fit, bench):
+            fits.append(((other,), fit_whole(start, bench)))
     lowest = min((fit.cost for _, fit in fits), default=np.inf)
     contacts: set[tuple[str, int]] = set()
     for candidates, fit in sorted(fits, key=lambda pair: pair[1].cost):
@@ -85,27 +83,24 @@ def _tells_better(other: Hypothesis, child: Hypothesis) -> bool:
 
 def _lookalikes(
     added: Sequence[Candidate], fit: Fit, bench: Bench
-) -> Iterator[tuple[Candidate, Structure, Array]]:
+) -> Iterator[tuple[Candidate, Model]]:
     """Yield what the values of an effect, just added by itself, hint at in its stead."""
     if len(added) > 1:
         return
     index, chain = len(fit.structure.effects) - 1, fit.structure.chain(fit.theta)
-    term = fit.structure.model(fit.theta).terms[index]
+    term = fit.terms[index]
     hint = term.effect.lookalike(term.effect.named(term.values), term.place, chain)
     if hint is None or hint.effect not in bench.catalogue:
         return
-    structure = fit.structure.without(index)
-    if (hint.effect.key, hint.place) in (c.key for c in structure.effects):
+    base = fit.without(index)
+    if (hint.effect.key, hint.place) in (c.key for c in base.structure.effects):
         return
-    base = replace(
-        fit, structure=structure, theta=np.delete(fit.theta, np.r_[fit.structure.span(index)])
-    )
     for candidate, usual in candidates_at(
         hint.effect, hint.place, runs=bench.training, chain=chain
     ):
         values = hint.effect.named(usual) | hint.values
         if candidate.has_signs_of(tuple(values.values())):
-            yield candidate, *extend(base, candidate, tuple(values.values()))
+            yield candidate, base.with_effect(candidate, tuple(values.values()))
             return
 
 
@@ -128,8 +123,7 @@ def _starts(parent: Hypothesis, bench: Bench) -> list[tuple[tuple[Candidate, ...
     )
     pieces = [cut_shots(run, length=SHOT_LENGTH) for run in bench.training]
     loose = fit_model(
-        parent.fit.structure,
-        parent.fit.theta,
+        parent.fit,
         pieces,
         iterations=4,
         scatter_free=False,
@@ -203,24 +197,22 @@ def _short_refit(
     several = _needs_starts(suspect.candidate)
     if _is_rugged(suspect.candidate.effect) and suspect.share > _ZOOM_SHARE * top:
         suspect = zoom(start, pieces, suspect, mapper=bench.mapper)
-    starts = [extend(start, suspect.candidate, values) for values in suspect.starts]
+    starts = [start.with_effect(suspect.candidate, values) for values in suspect.starts]
     starts = starts[:3] if several else [_best_start(starts, pieces, bench)]
     fits = [
         fit_model(
-            structure,
-            theta,
+            one,
             pieces,
             iterations=3 if several else 5,
             scatter_free=False,
             mapper=bench.mapper,
         )
-        for structure, theta in starts
+        for one in starts
     ]
     best = min(fits, key=lambda fit: fit.cost)
     if several:
         best = fit_model(
-            best.structure,
-            best.theta,
+            best,
             pieces,
             nuisance=best.nuisance,
             iterations=6,
@@ -236,35 +228,39 @@ def _refit_team(
     """Refit the members of a team together on pieces."""
     starts = []
     for values in team.starts:
-        grown = start
-        for candidate, own in zip(team.candidates, values, strict=True):
-            structure, theta = extend(grown, candidate, own)
-            grown = replace(start, structure=structure, theta=theta)
-        starts.append((grown.structure, grown.theta))
-    structure, theta = _best_start(starts, pieces, bench)
-    fit = fit_model(structure, theta, pieces, iterations=5, scatter_free=False, mapper=bench.mapper)
+        grown: Model = start
+        for candidate, of_one in zip(team.candidates, values, strict=True):
+            grown = grown.with_effect(candidate, of_one)
+        starts.append(grown)
+    best = _best_start(starts, pieces, bench)
+    fit = fit_model(
+        best,
+        pieces,
+        iterations=5,
+        scatter_free=False,
+        mapper=bench.mapper,
+    )
     return team.candidates, fit
 
 
-def _best_start(
-    starts: Sequence[tuple[Structure, Array]], pieces: Sequence[Run], bench: Bench
-) -> tuple[Structure, Array]:
+def _best_start(starts: Sequence[Model], pieces: Sequence[Run], bench: Bench) -> Model:
     """Return the start that leaves least: the screen's is a trial's multiple, not simulated."""
-    return min(
-        starts,
-        key=lambda start: fit_model(*start, pieces, iterations=0, mapper=bench.mapper).cost,
-    )
+
+    def cost(start: Model) -> float:
+        fit = fit_model(start, pieces, iterations=0, mapper=bench.mapper)
+        return fit.cost
+
+    return min(starts, key=cost)
 
 
-def fit_whole(structure: Structure, theta: Array, bench: Bench) -> Fit:
+def fit_whole(start: Model, bench: Bench) -> Fit:
     """Fit whole runs; friction first with one size for all runs, then run by run."""
     whole = bench.training
-    contact = structure.has_contact
+    structure = start.structure
     fit = fit_model(
-        structure,
-        theta,
+        start,
         whole,
-        iterations=25 if contact else 12,
+        iterations=25 if structure.has_contact else 12,
         scatter_free=False,
         mapper=bench.mapper,
     )
@@ -276,8 +272,7 @@ def fit_whole(structure: Structure, theta: Array, bench: Bench) -> Fit:
         elif attempt:
             break
         fit = fit_model(
-            structure,
-            fit.theta,
+            fit,
             whole,
             nuisance=fit.nuisance,
             spread=fit.spread,
@@ -294,11 +289,8 @@ def _grown_friction(effect: Effect, child: Hypothesis, bench: Bench) -> Hypothes
     structure = simple.structure
     simpler = [c for c in added if c.effect.key == effect.grows_from]
     at = [structure.effects.index(c) for c in simpler]
-    terms = structure.model(simple.theta).terms
-    known = [effect.grown(terms[i].effect.named(terms[i].values)) for i in at]
+    known = [effect.grown(t.effect.named(t.values)) for t in (simple.terms[i] for i in at)]
     chain = structure.chain(simple.theta)
-    spans = np.r_[tuple(structure.span(index) for index in at)]
-    base = replace(simple, structure=structure.without(*at), theta=np.delete(simple.theta, spans))
     trials = [candidates_at(effect, c.place, runs=bench.training, chain=chain) for c in simpler]
     fits = []
     tried = set()
@@ -310,14 +302,12 @@ def _grown_friction(effect: Effect, child: Hypothesis, bench: Bench) -> Hypothes
         if starts in tried:
             continue
         tried.add(starts)
-        start = base
+        start = simple.without(*at)
         for (candidate, _), values in zip(trial, starts, strict=True):
-            grown, theta = extend(start, candidate, values)
-            start = replace(base, structure=grown, theta=theta)
+            start = start.with_effect(candidate, values)
         fits.append(
             fit_model(
-                start.structure,
-                start.theta,
+                start,
                 bench.training,
                 iterations=4,
                 scatter_free=False,
@@ -325,5 +315,5 @@ def _grown_friction(effect: Effect, child: Hypothesis, bench: Bench) -> Hypothes
             )
         )
     best = min(fits, key=lambda fit: fit.cost)
-    fit = fit_whole(best.structure, best.theta, bench)
+    fit = fit_whole(best, bench)
     return judge(fit, bench, added=best.structure.effects[-len(added) :])

@@ -106,7 +106,7 @@ def judge(fit: Fit, bench: Bench, *, added: Sequence[Candidate] = ()) -> Hypothe
     held = fit_nuisance(fit, bench.held_out, mapper=bench.mapper)
     errors, sizes = [], []
     for run, nuisance in zip(bench.held_out, held.nuisance, strict=True):
-        model = simulate_run(fit.structure, fit.theta[None], run, nuisance)[0]
+        model = simulate_run(fit, run, nuisance)
         errors.append(float(((run.y - model) ** 2).sum()))
         sizes.append(float((run.swing**2).sum() * run.t.size))
     effective = fit.n_points / THINNING

@@ -12,7 +12,7 @@ import numpy as np
 
 from pipeline.gap.data.runs import Run
 from pipeline.gap.fit.levenberg_marquardt import Fit, Mapper, evaluate, fit_model, project
-from pipeline.gap.search.screen import Suspect, added_signals, extend
+from pipeline.gap.search.screen import Suspect, added_signals
 from pipeline.plant.chain import Array
 
 _ELITE, _SCATTERED = 5, 32
@@ -71,25 +71,24 @@ def polish(fit: Fit, runs: Sequence[Run], *, enough: float, mapper: Mapper = map
         for at, widths in enumerate(_CYCLE):
             if fit.chi < enough:
                 return fit
+            base = fit.without(index)
             bare = evaluate(
-                fit.structure.without(index),
-                np.delete(fit.theta, np.r_[fit.structure.span(index)]),
+                base,
                 runs,
                 fit.nuisance,
                 spread=fit.spread,
                 mapper=mapper,
             )
-            values = fit.structure.model(fit.theta).terms[index].values
+            values = fit.terms[index].values
             here = Suspect(candidate=candidate, share=1.0, starts=(values,))
             seed = 1 + cycle * len(_CYCLE) + at
             there = zoom(bare, runs, here, widths=widths, seed=seed, mapper=mapper)
             trials = []
             for start in there.starts[:_REFITTED]:
-                structure, theta = extend(bare, candidate, start)
+                model = bare.with_effect(candidate, start)
                 trials.append(
                     fit_model(
-                        structure,
-                        theta,
+                        model,
                         runs,
                         nuisance=fit.nuisance,
                         spread=fit.spread,

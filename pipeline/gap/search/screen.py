@@ -16,7 +16,7 @@ import numpy as np
 from pipeline.gap.data.runs import Run
 from pipeline.gap.fit.levenberg_marquardt import Fit, Mapper, project
 from pipeline.gap.fit.linearise import Nuisance, simulate_run
-from pipeline.gap.fit.structure import Candidate, Structure, bench_scales
+from pipeline.gap.fit.structure import Candidate, bench_scales
 from pipeline.plant.chain import Array, Chain
 from pipeline.plant.effects.base import Effect, Parameter
 
@@ -209,31 +209,14 @@ def added_signals(
 
     A trial is a candidate with the values of its parameters; a diverged one changes nothing.
     """
-    vectors = [(fit.structure.with_effect(candidate), values) for candidate, values in trials]
+    models = [fit.with_effect(candidate, values) for candidate, values in trials]
 
     def change(pair: tuple[Run, Nuisance]) -> Array:
         run, nuisance = pair[0].thin, pair[1]
-        base = simulate_run(fit.structure, fit.theta[None], run, nuisance)[0]
+        base = simulate_run(fit, run, nuisance)
         out = np.empty((len(trials), *base.shape))
-        for at, (structure, values) in enumerate(vectors):
-            theta = _extended(structure, fit.theta, values)
-            out[at] = simulate_run(structure, theta[None], run, nuisance)[0] - base
+        for at, model in enumerate(models):
+            out[at] = simulate_run(model, run, nuisance) - base
         return np.where(np.isfinite(out), out, 0.0)
 
     return list(mapper(change, zip(runs, fit.nuisance, strict=True)))
-
-
-def _extended(structure: Structure, theta: Array, values: Sequence[float]) -> Array:
-    """Return theta with the coordinates of one further effect."""
-    candidate = structure.effects[-1]
-    coordinates = [
-        v / scale if p.signed else np.log(max(abs(v), 1e-7 * scale))
-        for p, v, scale in zip(candidate.effect.parameters, values, candidate.scales, strict=True)
-    ]
-    return np.concatenate([theta, coordinates])
-
-
-def extend(fit: Fit, candidate: Candidate, values: Sequence[float]) -> tuple[Structure, Array]:
-    """Return structure and start vector of a fit with an effect added."""
-    structure = fit.structure.with_effect(candidate)
-    return structure, _extended(structure, fit.theta, values)

@@ -154,8 +154,8 @@ def make_traces(before: Hypothesis, after: Hypothesis, bench: Bench) -> tuple[Tr
     for (run, nuisance_before, held), (_, nuisance_after, _) in zip(
         _sides_of(before, bench), _sides_of(after, bench), strict=True
     ):
-        linear = simulate_run(before.fit.structure, before.fit.theta[None], run, nuisance_before)[0]
-        final = simulate_run(after.fit.structure, after.fit.theta[None], run, nuisance_after)[0]
+        linear = simulate_run(before.fit, run, nuisance_before)
+        final = simulate_run(after.fit, run, nuisance_after)
         u = run.record.u[-run.t.size :] if run.record.u is not None else np.zeros(run.t.size)
         out += [
             Trace(

@@ -103,7 +103,7 @@ def _independent_points(hypothesis: Hypothesis, bench: Bench) -> float:
     total = 0.0
     fit = hypothesis.fit
     for run, nuisance in zip(bench.training, fit.nuisance, strict=True):
-        model = simulate_run(fit.structure, fit.theta[None], run, nuisance)[0]
+        model = simulate_run(fit, run, nuisance)
         for row in run.y - model:
             power = np.abs(np.fft.rfft(row - row.mean(), 2 * row.size)) ** 2
             covariance = np.fft.irfft(power)[: row.size]
@@ -150,7 +150,7 @@ def _same_law(
     if effect.same_as != other[0]:
         return False
     places = [candidate.key for candidate in chosen.fit.structure.effects]
-    term = chosen.fit.structure.model(chosen.fit.theta).terms[places.index(mine)]
+    term = chosen.fit.terms[places.index(mine)]
     return abs(term.values[0]) < effect.same_below * sample_time
 
 

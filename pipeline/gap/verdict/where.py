@@ -21,7 +21,7 @@ def find_windows(fit: Fit, runs: Sequence[Run]) -> tuple[GapWindow, ...]:
     """
     found: list[tuple[float, GapWindow]] = []
     for run, nuisance in zip(runs, fit.nuisance, strict=True):
-        model = simulate_run(fit.structure, fit.theta[None], run, nuisance)[0]
+        model = simulate_run(fit, run, nuisance)
         for j, row in enumerate(run.rows):
             energy = ((run.y[j] - model[j]) / run.sigma[j]) ** 2
             total = float(energy.sum())
