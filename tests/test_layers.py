@@ -25,7 +25,7 @@ LEVELS = (
     ("identify.soundness",),
     ("identify",),
     ("workflow", "synthesis", "results_json"),
-    ("gap.types", "gap.data"),
+    ("gap.types", "gap.limits", "gap.data"),
     ("gap.fit",),
     ("gap.search",),
     ("gap.verdict",),

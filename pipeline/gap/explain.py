@@ -14,6 +14,7 @@ from pipeline.gap.fit.baseline import fit_baseline, measure_noise
 from pipeline.gap.fit.levenberg_marquardt import Fit, covariance, fit_model
 from pipeline.gap.fit.restart import holding_force
 from pipeline.gap.fit.structure import Candidate
+from pipeline.gap.limits import AS_REPEATS, OFFSET_AS_FREE, OFFSET_GAIN, TOO_GOOD
 from pipeline.gap.search.beam import choose, prune, search, steps_to
 from pipeline.gap.search.deadline import Deadline, OutOfTime
 from pipeline.gap.search.grow import fit_whole
@@ -27,7 +28,7 @@ from pipeline.gap.verdict.account import (
     make_traces,
     repeatability,
 )
-from pipeline.gap.verdict.decision import AS_REPEATS, choose_experiment, reach_verdict
+from pipeline.gap.verdict.decision import choose_experiment, reach_verdict
 from pipeline.gap.verdict.offset import find_offset
 from pipeline.gap.verdict.where import find_windows
 from pipeline.plant.chain import Chain
@@ -35,8 +36,7 @@ from pipeline.plant.effects import CATALOGUE
 from pipeline.plant.effects.base import Effect, Term
 from pipeline.results import Record
 
-_AS_FREE = 1.1  # times the error with free zeros: what a force that is there leaves with fixed ones
-_NOISE_ROUNDS, _TOO_GOOD = 2, 0.7  # chi-square per point no fit to true noise falls to
+_NOISE_ROUNDS = 2  # of measuring the noise anew
 
 
 def explain_gap(
@@ -90,7 +90,7 @@ def explain_gap(
         )
         chosen, found = _investigate(fit, bench, deadline)
         for _ in range(_NOISE_ROUNDS):
-            if chosen.fit.chi > _TOO_GOOD or deadline.cut:
+            if chosen.fit.chi > TOO_GOOD or deadline.cut:
                 break
             # Less is left than was taken for noise: the misfit of the linear model was in it.
             quiet = _quieter(bench, chosen)
@@ -225,7 +225,7 @@ def _with_offset(
     without = tuple(judge(fit_whole(h.fit, pinned), pinned, added=h.added) for h in path)
     fit = fit_whole(chosen.fit.with_effect(candidate, (offset.force,)), loose)
     final = judge(fit, loose, added=(candidate,))
-    if final.error > min(0.9 * without[-1].error, _AS_FREE * chosen.error):
+    if final.error > min(OFFSET_GAIN * without[-1].error, OFFSET_AS_FREE * chosen.error):
         return path, None
     return (*without, final), loose
 

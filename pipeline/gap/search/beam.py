@@ -7,16 +7,10 @@ from itertools import count
 import numpy as np
 
 from pipeline.gap.fit.structure import Candidate
+from pipeline.gap.limits import BIC_DROP
 from pipeline.gap.search.deadline import OutOfTime
 from pipeline.gap.search.grow import fit_whole, grow
-from pipeline.gap.search.hypothesis import (
-    BIC_DROP,
-    Bench,
-    Hypothesis,
-    judge,
-    lowers_error,
-    worth_it,
-)
+from pipeline.gap.search.hypothesis import Bench, Hypothesis, judge, lowers_error, worth_it
 from pipeline.plant.effects import find_effect
 
 _BEAM = (1, 2)  # hypotheses grown side by side: the linear one, the best two; then one

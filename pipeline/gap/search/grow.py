@@ -10,7 +10,8 @@ from pipeline.gap.fit.baseline import SHOT_LENGTH
 from pipeline.gap.fit.levenberg_marquardt import Fit, fit_model
 from pipeline.gap.fit.restart import restart_runs
 from pipeline.gap.fit.structure import Candidate, Model
-from pipeline.gap.search.hypothesis import AT_FLOOR, THINNING, Bench, Hypothesis, judge
+from pipeline.gap.limits import AT_FLOOR, THINNING
+from pipeline.gap.search.hypothesis import Bench, Hypothesis, judge
 from pipeline.gap.search.rugged import polish, zoom
 from pipeline.gap.search.screen import Suspect, Team, candidates_at, screen
 from pipeline.plant.effects.base import Effect

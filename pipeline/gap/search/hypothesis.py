@@ -10,19 +10,23 @@ from pipeline.gap.fit.baseline import fit_nuisance
 from pipeline.gap.fit.levenberg_marquardt import Fit, Mapper
 from pipeline.gap.fit.linearise import simulate_run
 from pipeline.gap.fit.structure import Candidate
+from pipeline.gap.limits import (
+    AT_FLOOR,
+    BIC_DROP,
+    CONTACT_GAIN,
+    ENOUGH_NOISE,
+    ENOUGH_REPEATS,
+    HELD_OUT_GAIN,
+    PARTIAL_CONTACT,
+    PARTIAL_GAIN,
+    RUN_GAIN,
+    RUN_SHARE,
+    SAME_LAW,
+    THINNING,
+)
 from pipeline.plant.effects import find_effect
 from pipeline.plant.effects.base import Effect
 
-AT_FLOOR = 1.15  # chi-square per point below this is noise
-THINNING = 10.0  # neighbouring residuals are not independent: N / 10 count
-BIC_DROP = 20.0  # by which the criterion must fall for one more effect
-_SAME_LAW = 6.0  # … and for one that another cart already has
-_ENOUGH_NOISE, _ENOUGH_REPEATS = 2.0, 1.5  # times the floor, or what repeats differ by
-_HELD_OUT_GAIN = 0.95  # an effect must lower the held-out error by this factor …
-_PARTIAL_GAIN = 0.9  # … by this one where too much for a name is left …
-_PARTIAL_CONTACT = 0.55  # (a contact, with its many parameters, stands in for much)
-_CONTACT_GAIN = 0.5  # what a contact leaves is its contact law: no effect to mop it up
-_RUN_GAIN, _RUN_SHARE = 0.97, 0.6  # … and by 3 % in 60 % of the runs
 _BOUND_MARGIN = 0.01  # in logarithms, or in scales
 
 
@@ -97,7 +101,7 @@ class Bench:
 
     def explains(self, hypothesis: Hypothesis) -> bool:
         """Tell whether so little is left that the gap has its name."""
-        enough = max(_ENOUGH_NOISE * self.floor, _ENOUGH_REPEATS * self.repeatability)
+        enough = max(ENOUGH_NOISE * self.floor, ENOUGH_REPEATS * self.repeatability)
         return hypothesis.error <= enough
 
 
@@ -126,7 +130,7 @@ def lowers_error(child: Hypothesis, parent: Hypothesis, bench: Bench) -> bool:
     """Is the held-out error lower, and by enough where too much for a name is left?"""
     added = child.key - parent.key
     contact = any(find_effect(key).contact for key, _ in added)
-    gain = _PARTIAL_CONTACT if contact else _PARTIAL_GAIN
+    gain = PARTIAL_CONTACT if contact else PARTIAL_GAIN
     return child.error < (1.0 if bench.explains(child) else gain) * parent.error
 
 
@@ -134,11 +138,11 @@ def worth_it(child: Hypothesis, parent: Hypothesis, bench: Bench) -> bool:
     """Does a further effect help on runs the model has not seen?"""
     if not lowers_error(child, parent, bench):
         return False
-    gain = _CONTACT_GAIN if parent.has_contact else _HELD_OUT_GAIN
-    drop = BIC_DROP if child.size != parent.size else _SAME_LAW
+    gain = CONTACT_GAIN if parent.has_contact else HELD_OUT_GAIN
+    drop = BIC_DROP if child.size != parent.size else SAME_LAW
     if child.bic > parent.bic - drop or child.held.chi > gain**2 * parent.held.chi:
         return False
-    better = child.held.run_chi < _RUN_GAIN**2 * parent.held.run_chi
+    better = child.held.run_chi < RUN_GAIN**2 * parent.held.run_chi
     # A run with nothing but noise left cannot become better.
     open_runs = parent.held.run_chi > AT_FLOOR
-    return bool(np.mean(better[open_runs] if open_runs.any() else better) >= _RUN_SHARE)
+    return bool(np.mean(better[open_runs] if open_runs.any() else better) >= RUN_SHARE)

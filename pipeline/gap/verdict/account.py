@@ -8,7 +8,8 @@ import numpy as np
 from pipeline.gap.data.runs import Run
 from pipeline.gap.fit.levenberg_marquardt import Fit
 from pipeline.gap.fit.linearise import Nuisance, simulate_run
-from pipeline.gap.search.hypothesis import AT_FLOOR, Bench, Hypothesis
+from pipeline.gap.limits import AT_FLOOR
+from pipeline.gap.search.hypothesis import Bench, Hypothesis
 from pipeline.gap.types import FoundEffect, NamedValue, RecordGap, Rival, Trace
 from pipeline.plant.chain import Array
 from pipeline.plant.effects import find_effect

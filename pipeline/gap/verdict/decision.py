@@ -5,15 +5,21 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.gap.fit.linearise import simulate_run
+from pipeline.gap.limits import (
+    AS_REPEATS,
+    CLOSE_BIC,
+    CLOSE_ERROR,
+    CLOSE_GAIN,
+    MOSTLY,
+    NEAR_FLOOR,
+    NOTHING,
+    THINNING,
+)
 from pipeline.gap.search.beam import steps_to
-from pipeline.gap.search.hypothesis import THINNING, Bench, Hypothesis, lowers_error
+from pipeline.gap.search.hypothesis import Bench, Hypothesis, lowers_error
 from pipeline.gap.types import GapWindow, Verdict
 from pipeline.plant.effects import find_effect
 
-_CLOSE_ERROR, _CLOSE_GAIN, _CLOSE_BIC = 1.15, 0.10, 40.0
-_MOSTLY = 0.5  # of the error: who leaves more has not explained most of it
-_NEAR_FLOOR = 1.5  # times the noise: beyond, what is left is not noise alone
-_NOTHING = 1.05  # times the noise: too little to speak of
 _REPEAT = "Repeat each run, so that what differs from run to run is known."
 # What shows more of what is left, by what the cart does there.
 _SHOWS = {
@@ -30,7 +36,6 @@ _SHOWS = {
 }
 _SHOWS["large displacement, negative side"] = _SHOWS["large displacement, positive side"]
 _SHOWS["input off"] = _SHOWS["fast motion"]
-AS_REPEATS = 1.1  # an error below this many times what repeats differ by is theirs
 
 
 def reach_verdict(
@@ -48,7 +53,7 @@ def reach_verdict(
     """
     baseline, chosen = steps[0], steps[-1]
     if not chosen.key:
-        least = max(_NOTHING * bench.floor, AS_REPEATS * bench.repeatability)
+        least = max(NOTHING * bench.floor, AS_REPEATS * bench.repeatability)
         nothing = baseline.at_floor or baseline.error < least
         return ("none" if nothing else "unexplained"), steps, []
     explained = bench.explains(chosen)
@@ -58,14 +63,14 @@ def reach_verdict(
         for rival in found
         if len(rival.key) == len(chosen.key)
         and rival.key != chosen.key
-        and rival.error < _CLOSE_ERROR * chosen.error
-        and _evidence(chosen, rival, bench) < min(_CLOSE_GAIN * gain, _CLOSE_BIC)
+        and rival.error < CLOSE_ERROR * chosen.error
+        and _evidence(chosen, rival, bench) < min(CLOSE_GAIN * gain, CLOSE_BIC)
         and not _same_thing(rival, chosen, sample_time=sample_time)
         and (explained or not _same_kind(rival, chosen))
     ]
     if not explained:
         without = _needless(chosen, [*found, *steps], bench)
-        disputed = bool(close) and chosen.error > _MOSTLY * baseline.error
+        disputed = bool(close) and chosen.error > MOSTLY * baseline.error
         if without is not None or disputed:
             back = steps[:-1] if without is None else steps_to(without, [*found, *steps], bench)
             return reach_verdict(back, found, bench=bench, sample_time=sample_time)
@@ -88,7 +93,7 @@ def _evidence(chosen: Hypothesis, rival: Hypothesis, bench: Bench) -> float:
     independent than the criterion counts, and much of the difference may be chance.
     """
     difference = rival.bic - chosen.bic
-    if chosen.fit.chi < _NEAR_FLOOR**2:
+    if chosen.fit.chi < NEAR_FLOOR**2:
         return difference
     counted = chosen.fit.n_points / THINNING
     return difference * min(1.0, _independent_points(chosen, bench) / counted)

@@ -11,11 +11,8 @@ import numpy as np
 
 from pipeline.gap.data.runs import Run
 from pipeline.gap.fit.linearise import Nuisance
+from pipeline.gap.limits import OFFSET_SHARE, OFFSET_STEPS, OFFSET_SURE
 from pipeline.plant.chain import Array, Chain
-
-_SURE = 6.0  # standard errors
-_EXPLAINED = 0.8  # of the zeros' sum of squares
-_COUNTS = 1.5  # encoder steps the zeros must be away from the file's, root-mean-square
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +37,7 @@ def find_offset(chain: Chain, runs: Sequence[Run], nuisance: Sequence[Nuisance])
         total += float(zeros @ zeros)
         step = max(step, float((run.sigma * np.sqrt(12.0)).max()))
     count = sum(len(run.rows) for run in runs)
-    if np.sqrt(total / count) < _COUNTS * step:
+    if np.sqrt(total / count) < OFFSET_STEPS * step:
         return None
     for cart in range(1, chain.n + 1):
         gains = [_compliance(chain, run, cart) for run in runs]
@@ -58,8 +55,8 @@ def find_offset(chain: Chain, runs: Sequence[Run], nuisance: Sequence[Nuisance])
         )
         smallest = step / np.sqrt(12.0) / max(float(np.abs(g).max()) for g, _ in pairs)
         std = max(float(forces.std(ddof=1)), smallest) / np.sqrt(forces.size)
-        sure = abs(float(forces.mean())) > _SURE * std
-        if sure and left < (1.0 - _EXPLAINED) * total and (best is None or left < best[0]):
+        sure = abs(float(forces.mean())) > OFFSET_SURE * std
+        if sure and left < (1.0 - OFFSET_SHARE) * total and (best is None or left < best[0]):
             best = (left, Offset(cart=cart, force=float(forces.mean()), std=std))
     return best[1] if best else None
 
