@@ -17,8 +17,9 @@ from scipy.io import loadmat
 from pipeline.gap.data.runs import make_run
 from pipeline.gap.explain import explain_gap
 from pipeline.gap.fit.linearise import fresh_nuisance, simulate_run
-from pipeline.gap.fit.structure import Candidate, Structure
+from pipeline.gap.fit.structure import Candidate, Model, Structure
 from pipeline.gap.types import Gap
+from pipeline.plant.effects.base import AugmentedChain
 from pipeline.results import Record
 
 INTERVAL = 2**14 / 1e7  # s
@@ -42,17 +43,22 @@ def cut(u: np.ndarray, y: np.ndarray, name: str, first: int, end: int) -> Record
     )
 
 
-def test_error(gap: Gap, record: Record, *, skipped: int, zero: float) -> float:
-    """Return the root-mean-square error (V) of the model on a record it has not seen."""
-    run = make_run(record, n=1)
-    structure = Structure(springs=(True, False))
-    for term in gap.model.terms:
+def start_at(model: AugmentedChain, *, springs: tuple[bool, ...]) -> Model:
+    """Return a model as the fits have it: its structure and its vector."""
+    structure = Structure(springs=springs)
+    for term in model.terms:
         signs = tuple(float(np.sign(v) or 1.0) for v in term.values)
         sizes = tuple(abs(v) for v in term.values)
         structure = structure.with_effect(
             Candidate(effect=term.effect, place=term.place, signs=signs, scales=sizes)
         )
-    model = structure.start(gap.model.chain, [term.values for term in gap.model.terms])
+    return structure.start(model.chain, [term.values for term in model.terms])
+
+
+def test_error(gap: Gap, record: Record, *, skipped: int, zero: float) -> float:
+    """Return the root-mean-square error (V) of the model on a record it has not seen."""
+    run = make_run(record, n=1)
+    model = start_at(gap.model, springs=(True, False))
     nuisance = fresh_nuisance(run)
     nuisance.zero[:] = zero
     simulated = simulate_run(model, run, nuisance)[0]

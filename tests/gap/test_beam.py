@@ -39,7 +39,7 @@ def test_a_whole_that_explains_no_more_than_its_part_leads_astray():
     useful = hypothesis(DAHL, CUBIC, error=0.03, bic=-200)
     other = hypothesis(DELAY, error=0.08, bic=-10)
     assert order(part, useless, other) == [{DAHL}, {DELAY}]
-    assert order(part, useful, other) == [{DAHL, CUBIC}, {DELAY}, {DAHL}]
+    assert order(part, useful, other) == [{DAHL, CUBIC}, {DAHL}, {DELAY}]
 
 
 def test_of_one_family_of_laws_the_best_is_grown():

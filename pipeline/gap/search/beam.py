@@ -1,8 +1,7 @@
-"""Search the catalogue: keep a few hypotheses, grow them, choose, prune."""
+"""Search the catalogue: grow the most promising hypothesis, choose, prune."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from itertools import count
 
 import numpy as np
 
@@ -13,8 +12,7 @@ from pipeline.gap.search.grow import fit_whole, grow
 from pipeline.gap.search.hypothesis import Bench, Hypothesis, judge, lowers_error, worth_it
 from pipeline.plant.effects import find_effect
 
-_BEAM = (1, 2)  # hypotheses grown side by side: the linear one, the best two; then one
-_PATIENCE = 2  # steps in a row that lower no held-out error
+_PATIENCE = 2  # hypotheses grown in a row from which none comes with a lower held-out error
 _DEPTH = 6  # effects
 _HOPELESS = 5.0  # a hypothesis with this many times the best one's chi-square is not grown
 _STEP = 0.81  # of the chi-square: a tenth of the error, which a further effect must take
@@ -39,42 +37,38 @@ def _grow_the_best(
 ) -> None:
     """Fill `seen`, the best hypothesis of each set of effects.
 
-    Who leads is grown first. Where nothing that grows from it pays, the best of those that wait
-    has its turn.
+    Who leads is grown first. Where nothing that grows from it pays, it was the wrong way, and the
+    best of those that wait has its turn.
     """
     waiting, best, idle = [baseline], baseline, 0
-    for level in count():
-        width = _BEAM[level] if level < len(_BEAM) else 1
-        parents = [h for h in waiting[:width] if h is waiting[0] or not h.key < waiting[0].key]
-        waiting = waiting[len(parents) :]
+    while waiting and idle < _PATIENCE:
+        parent, *waiting = waiting
         children: list[Hypothesis] = []
-        for parent in parents:
-            for child in grow(parent, bench):
-                if not (child.sound and np.isfinite(child.error)):
-                    continue
-                if child.key not in seen or child.bic < seen[child.key].bic:
-                    seen[child.key] = child
-                    if child.bic < parent.bic - BIC_DROP:
-                        children.append(child)
-            if any(child.at_floor for child in children):
-                return
+        for child in grow(parent, bench):
+            if not (child.sound and np.isfinite(child.error)):
+                continue
+            if child.key not in seen or child.bic < seen[child.key].bic:
+                seen[child.key] = child
+                if child.bic < parent.bic - BIC_DROP:
+                    children.append(child)
+        if any(child.at_floor for child in children):
+            break
         if children:
             leader = min(children, key=lambda h: h.bic)
             bench.tell(f"{len(leader.key)} effect{'s' * (len(leader.key) > 1)}: {_names(leader)}")
-        idle = 0 if any(lowers_error(child, best, bench) for child in children) else idle + 1
+        # One of two effects may do little by itself.
+        pays = parent is baseline or any(lowers_error(child, best, bench) for child in children)
+        idle = 0 if pays else idle + 1
         best = min([best, *children], key=lambda h: h.error)
-        before = min(parent.fit.chi for parent in parents)
         waiting += [
             child
             for child in children
             if child is seen[child.key]
             and child.size < depth
             and not _needlessly_rich(child, seen)
-            and _leads_on(child, before)
+            and _leads_on(child, parent.fit.chi)
         ]
         waiting = by_promise(waiting, seen, bench)
-        if idle == _PATIENCE or not waiting:
-            return
 
 
 def by_promise(
@@ -82,24 +76,20 @@ def by_promise(
     seen: Mapping[frozenset[tuple[str, int]], Hypothesis],
     bench: Bench,
 ) -> list[Hypothesis]:
-    """Return who is worth growing, the best first, one of each family of laws.
+    """Return who is worth growing, the best first: of one family of laws at its places only one.
 
-    What grows from a part grows from the whole that explains more too, so parts come last; a whole
-    that does not, on runs it has not seen, leads astray.
+    A whole that explains no more than its part, on runs it has not seen, leads astray.
     """
     leading: dict[frozenset[tuple[str, int]], Hypothesis] = {}
     for h in sorted(waiting, key=lambda h: h.bic):
-        if not any(
-            part.key and part.key < h.key and not lowers_error(h, part, bench)
-            for part in seen.values()
-        ):
+        parts = (part for part in seen.values() if part.key and part.key < h.key)
+        if all(lowers_error(h, part, bench) for part in parts):
             effects = h.fit.structure.effects
             leading.setdefault(
                 frozenset((c.effect.family or c.key[0], c.place) for c in effects), h
             )
     within = _HOPELESS * min((h.fit.chi for h in leading.values()), default=0.0)
-    near = [h for h in leading.values() if h.fit.chi <= within]
-    return sorted(near, key=lambda h: any(h.key < whole.key for whole in near))
+    return [h for h in leading.values() if h.fit.chi <= within]
 
 
 def _leads_on(child: Hypothesis, before: float) -> bool:

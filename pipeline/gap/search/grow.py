@@ -72,14 +72,17 @@ def grow(parent: Hypothesis, bench: Bench) -> Iterator[Hypothesis]:
 def _tells_better(other: Hypothesis, child: Hypothesis) -> bool:
     """Do the same laws on more carts explain more, or a part of this team no less?
 
-    By what is left of runs not seen; and a part must do as well on those it is fitted to.
+    Of runs not seen and of those fitted: where the two disagree, neither stands for the other.
     """
     mine, others = {c.key for c in child.added}, {c.key for c in other.added}
-    family = {c.effect.key for c in other.added} == {c.effect.key for c in child.added}
-    if family and mine < others:
-        return other.error < _TOGETHER * child.error
-    as_well = other.error < _NO_LESS * child.error and other.fit.cost < _NO_LESS * child.fit.cost
-    return others < mine and as_well
+    same_laws = {c.effect.key for c in other.added} == {c.effect.key for c in child.added}
+    if same_laws and mine < others:
+        within = _TOGETHER
+    elif others < mine:
+        within = _NO_LESS
+    else:
+        return False
+    return other.error < within * child.error and other.fit.cost < within * child.fit.cost
 
 
 def _lookalikes(

@@ -1,0 +1,318 @@
+"""Write `benchmarks/gap.md`: what the gap workflow gets right, how fast, and real rigs in pictures.
+
+    python benchmarks/gap_page.py RESULTS.jsonl… [--silverbox OUTPUT] [--rig FOLDER]
+
+The results are those of `gap_confusion.py --report`, the output that of `silverbox.py`; FOLDER holds
+the recordings of an ECP 210. Without one of them its part of the page stays as it is.
+"""
+
+import argparse
+import json
+import os
+import re
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
+
+import numpy as np
+from scipy.stats import beta
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks.silverbox import start_at
+from pipeline.gap.data.sides import prepare
+from pipeline.gap.explain import explain_gap
+from pipeline.gap.fit.baseline import fit_baseline
+from pipeline.gap.search.grow import fit_whole
+from pipeline.gap.search.hypothesis import Bench, Hypothesis, judge
+from pipeline.gap.types import Gap, Trace
+from pipeline.gap.verdict.account import make_traces
+from pipeline.output import write_file
+from pipeline.plant.effects import CATALOGUE
+from pipeline.plant.effects.base import AugmentedChain
+from pipeline.report.figures.gap import before_after_figure
+from pipeline.report.figures.style import drawing
+from pipeline.report.figures.svg import plain_svg, to_svg
+from pipeline.results import Record
+
+PAGE = Path(__file__).with_name("gap.md")
+FIGURES = Path(__file__).with_name("figures")
+SUITES = {
+    "clean": "nothing",
+    "singles": "one effect, full size",
+    "small": "one effect, 0.3 of it",
+    "pairs": "two effects",
+}
+RIGHT = ("exact", "equivalent", "ambiguous, right first")
+_THINNED = 2  # samples a point of a picture
+
+
+# ----------------------------------------------------------------------------- tables
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table in Markdown."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+
+
+def summary_of(rows: Sequence[dict]) -> str:
+    """Return the suites: how many are right, how much is left, how long they took."""
+    out = []
+    for suite, words in SUITES.items():
+        cases = [row for row in rows if row["suite"] == suite]
+        if not cases:
+            continue
+        right = sum(_is_right(row) for row in cases)
+        left = np.array([row["final"] for row in cases])
+        cpu = np.array([row["cpu"] for row in cases])
+        out.append(
+            [
+                words,
+                str(len(cases)),
+                f"{right} ({_bounds(right, len(cases))})",
+                f"{np.median(left):.2f}, {np.quantile(left, 0.9):.2f}",
+                f"{np.mean(left <= 2.0):.1%}",
+                f"{np.median(cpu):.1f}, {np.quantile(cpu, 0.9):.1f}, {cpu.max():.1f}",
+            ]
+        )
+    head = ["hidden", "cases", "right (95 % bounds)", "gap left, in noises: median, 90 %"]
+    return table([*head, "at most 2 noises left", "s of one core: median, 90 %, most"], out)
+
+
+def _is_right(row: dict) -> bool:
+    return row["verdict"] == "none" if not row["truth"] else row["outcome"] in RIGHT
+
+
+def _bounds(right: int, of: int) -> str:
+    """Return the bounds of a rate (C. J. Clopper, E. S. Pearson, Biometrika 26, 1934, 404-413)."""
+    low = beta.ppf(0.025, right, of - right + 1) if right else 0.0
+    high = beta.ppf(0.975, right + 1, of - right) if right < of else 1.0
+    return f"{100 * low:.1f} to {100 * high:.1f} %"
+
+
+def confusion_of(rows: Sequence[dict]) -> str:
+    """Return what was said of each single effect, and of which of two something was missed."""
+    out = []
+    singles = [row for row in rows if row["suite"] in ("singles", "small")]
+    for key in sorted({row["truth"][0][0] for row in singles}):
+        cases = [row for row in singles if row["truth"][0][0] == key]
+        other = Counter(_said(row) for row in cases if row["outcome"] != "exact")
+        times = [_times([row for row in cases if row["n"] == n]) for n in (1, 2, 3)]
+        exact = sum(row["outcome"] == "exact" for row in cases)
+        words = "; ".join(f"{n} × {text}" for text, n in other.items())
+        out.append([_named(key), str(len(cases)), str(exact), words, *times])
+    head = ["hidden", "cases", "named exactly", "else", "s of one core, 1 cart: median (most)"]
+    return table([*head, "2 carts", "3 carts"], out)
+
+
+def _said(row: dict) -> str:
+    found = " + ".join(_named(key) + (f" {place}" if place else "") for key, place in row["found"])
+    return f"{row['outcome']}: {found or 'nothing'} ({row['final']:.2f} noises left)"
+
+
+def _named(key: str) -> str:
+    return key.replace("_", " ")
+
+
+def _times(rows: Sequence[dict]) -> str:
+    cpu = [row["cpu"] for row in rows]
+    return f"{np.median(cpu):.1f} ({max(cpu):.1f})" if cpu else ""
+
+
+def pairs_of(rows: Sequence[dict]) -> str:
+    """Return the pairs that were not named exactly."""
+    pairs = [row for row in rows if row["suite"] == "pairs"]
+    out = [
+        [" + ".join(_named(key) for key, _ in row["truth"]), str(row["n"]), _said(row)]
+        for row in pairs
+        if row["outcome"] != "exact"
+    ]
+    times = [_times([row for row in pairs if row["n"] == n]) for n in (1, 2, 3)]
+    text = f"One, two, three carts take {', '.join(times)} s of one core, median (most).\n"
+    return text + ("\n" + table(["two effects", "carts", "said"], out) if out else "")
+
+
+def sureness_of(rows: Sequence[dict]) -> str:
+    """Return how often the truth lies within the errors stated."""
+    z = np.array(
+        [v for row in rows if row["outcome"] == "exact" for v in row["z"] if v is not None]
+    )
+    return (
+        f"Of {z.size} parameters of effects named, {np.mean(np.abs(z) < 2):.0%} lie within two of the "
+        f"standard errors stated and {np.mean(np.abs(z) < 3):.0%} within three.\n"
+    )
+
+
+def silverbox_of(output: str) -> str:
+    """Return the official test errors, from what `silverbox.py` printed."""
+    errors = re.findall(r"^(multisine|arrow|no extrapolation): ([\d.]+) mV", output, re.MULTILINE)
+    named = re.findall(r"^  (\w+): ([\d.]+%) -> ([\d.]+%)", output, re.MULTILINE)
+    rows = [[_named(key), before, after] for key, before, after in named]
+    return (
+        table(["test part", "error"], [[name, f"{value} mV"] for name, value in errors])
+        + "\n"
+        + table(["effect", "error of the motion before", "after"], rows)
+    )
+
+
+# ------------------------------------------------------------------------- real rigs
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rig:
+    """Recordings of a real rig, and what is free to move in them."""
+
+    name: str
+    words: str
+    records: tuple[Record, ...]
+    springs: tuple[bool, ...]
+
+
+def rigs_in(folder: Path) -> Iterator[Rig]:
+    """Yield one cart at a time, and both."""
+    from pipeline.submission import load_submission
+    from pipeline.workflow import analyse
+    from tests.helpers.ucsd import write_two_cart_submission
+    from tests.statistics.test_gap_real import ecp_record
+
+    singles = (
+        ("cart-1", "cart 1 alone: five steps", "DOF1_en1_input1", "step"),
+        ("cart-2", "cart 2 alone: five decays, let go by hand", "DOF1_en2_manual2", "decay"),
+    )
+    for name, words, file, kind in singles:
+        records = tuple(
+            ecp_record(folder / f"{file}_test{i}.csv", column=3, kind=kind) for i in range(1, 6)
+        )
+        yield Rig(name=name, words=words, records=records, springs=(True, False))
+    with tempfile.TemporaryDirectory() as copy:
+        lab = write_two_cart_submission(Path(copy) / "lab", folder.parent, steps=(1, 2, 3, 4, 5))
+        analysis = analyse(load_submission(lab), design=False)
+    parts = (
+        ("held", "cart 1 in a bench of two, cart 2 held: five steps", "alone-1"),
+        ("both", "both carts: five steps", "both"),
+        ("all", "all fifteen runs at once: cart 1, cart 2 by hand, both", ""),
+    )
+    for name, words, start in parts:
+        records = tuple(
+            r for r in analysis.records if r.id.startswith(start) and r.kind != "closed_loop"
+        )
+        yield Rig(name=name, words=words, records=records, springs=analysis.springs)
+
+
+def explain_rig(rig: Rig, tell: Callable[[str], None]) -> str:
+    """Return the account of one rig, and draw a picture of each step."""
+    cpu = time.process_time()
+    gap = explain_gap(rig.records, springs=rig.springs, position_unit="count", workers=1)
+    cpu = time.process_time() - cpu
+    tell(f"{rig.name}: {gap.verdict} {gap.baseline:.2%} -> {gap.final:.2%} in {cpu:.1f} s")
+    repeats = f", repeats differ by {gap.repeatability:.2%}" if gap.repeatability else ""
+    lines = [
+        f"### {rig.words[0].upper()}{rig.words[1:]}\n",
+        f"Verdict **{gap.verdict}**: {gap.baseline:.2%} of the motion on runs not seen with the linear "
+        f"model, {gap.final:.2%} with the effects (noise {gap.noise_floor:.2%}{repeats}); {cpu:.0f} s of "
+        "one core.\n",
+    ]
+    steps = _steps(gap, rig)
+    for number, (found, (bench, before, after)) in enumerate(
+        zip(gap.effects, steps, strict=True), start=1
+    ):
+        place = next(iter(found.where.items()), None)
+        where = f", {place[0]} {place[1]}" if place else ""
+        values = ", ".join(
+            f"{name.replace('_', ' ')} {value.value:.3g} {value.unit}"
+            for name, value in found.parameters.items()
+        )
+        trace = _where_it_helps(before, after, bench)
+        file = f"{rig.name}-{number}.svg"
+        _draw(trace, bench, file)
+        lines += [
+            f"{number}. **{_named(found.effect.key)}{where}** ({values}): "
+            f"{found.nrmse_before:.2%} → {found.nrmse_after:.2%}\n",
+            f"   ![Run {trace.experiment}, cart {trace.cart}: measured, the linear model, the model with "
+            f"{number} effect{'s' * (number > 1)}, and what each leaves](figures/{file})\n",
+        ]
+    return "\n".join(lines)
+
+
+def _steps(gap: Gap, rig: Rig) -> Iterator[tuple[Bench, Hypothesis, Hypothesis]]:
+    """Yield the linear model and that with one effect, two, …, each fitted to the training runs."""
+    runs = {run.id: run for run in prepare(rig.records, springs=rig.springs, notes=[])}
+    training = [runs[name] for name in gap.training]
+    linear, training = fit_baseline(training, springs=rig.springs, start=gap.linear.chain)
+    sigma = {row: s for run in training for row, s in zip(run.rows, run.sigma, strict=True)}
+    held_out = [runs[name] for name in gap.held_out]
+    bench = Bench(
+        training=tuple(training),
+        held_out=tuple(
+            replace(run, sigma=np.array([sigma[row] for row in run.rows])) for run in held_out
+        ),
+        springs=rig.springs,
+        catalogue=CATALOGUE,
+        repeatability=gap.repeatability or 0.0,
+        mapper=map,
+        tell=print,
+    )
+    before = judge(linear, bench)
+    for count in range(1, len(gap.effects) + 1):
+        model = AugmentedChain(chain=gap.model.chain, terms=gap.model.terms[:count])
+        yield bench, before, judge(fit_whole(start_at(model, springs=rig.springs), bench), bench)
+
+
+def _where_it_helps(before: Hypothesis, after: Hypothesis, bench: Bench) -> Trace:
+    """Return the cart and run, of those held out, of which the effects explain most."""
+
+    def gained(trace: Trace) -> float:
+        left = [((trace.measured - model) ** 2).sum() for model in (trace.baseline, trace.final)]
+        return float((left[0] - left[1]) / np.var(trace.measured))
+
+    return max((t for t in make_traces(before, after, bench) if t.held_out), key=gained)
+
+
+def _draw(trace: Trace, bench: Bench, file: str) -> None:
+    part = slice(None, None, _THINNED)
+    thin = {key: getattr(trace, key)[part] for key in ("t", "u", "measured", "baseline", "final")}
+    run = next(run for run in bench.held_out if run.id == trace.experiment)
+    noise = float(run.sigma[run.rows.index(trace.cart - 1)])
+    with drawing():
+        figure = before_after_figure(replace(trace, **thin), noise=noise, position_unit="count")
+        svg = to_svg(figure, name=file, alt=f"{trace.experiment}, cart {trace.cart}")
+    FIGURES.mkdir(exist_ok=True)
+    write_file(FIGURES / file, plain_svg(svg))
+
+
+# --------------------------------------------------------------------------- the page
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Write the page of the gap workflow's benchmarks.")
+    parser.add_argument("results", nargs="*", type=Path)
+    parser.add_argument("--silverbox", type=Path)
+    parser.add_argument("--rig", type=Path)
+    options = parser.parse_args()
+    parts: dict[str, str] = {}
+    if options.results:
+        rows = [json.loads(line) for path in options.results for line in path.open()]
+        parts["rates"] = summary_of(rows) + "\n" + sureness_of(rows)
+        parts["confusion"] = confusion_of(rows)
+        parts["pairs"] = pairs_of(rows)
+    if options.silverbox:
+        parts["silverbox"] = silverbox_of(options.silverbox.read_text(encoding="utf-8"))
+    if options.rig:
+        parts["rigs"] = "\n".join(explain_rig(rig, print) for rig in rigs_in(options.rig))
+    page = PAGE.read_text(encoding="utf-8")
+    for name, text in parts.items():
+        begin, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->\n"
+        head, rest = page.split(begin)
+        page = head + begin + "\n" + text + "\n" + end + rest.split(end)[1]
+    write_file(PAGE, page)
+
+
+if __name__ == "__main__":
+    main()
