@@ -41,8 +41,10 @@ def _grow_the_best(
     best of those that wait has its turn.
     """
     waiting, best, idle = [baseline], baseline, 0
+    done: set[frozenset[tuple[str, int]]] = set()
     while waiting and idle < _PATIENCE:
         parent, *waiting = waiting
+        done.add(parent.key)
         children: list[Hypothesis] = []
         for child in grow(parent, bench):
             if not (child.sound and np.isfinite(child.error)):
@@ -64,6 +66,7 @@ def _grow_the_best(
             child
             for child in children
             if child is seen[child.key]
+            and child.key not in done
             and child.size < depth
             and not _needlessly_rich(child, seen)
             and _leads_on(child, parent.fit.chi)
