@@ -122,31 +122,20 @@ def run_report(
     tables: bool = False,
 ) -> "Analysis":
     """Write the report of a submission and say in a few lines what it found."""
-    from pipeline.output import check_folder, clear_files, own_folder, write_file
+    from pipeline.output import check_folder, own_folder
     from pipeline.report.draft.changes import changes_line
-    from pipeline.report.draft.write import render_report
-    from pipeline.report.gap.section import with_gap
+    from pipeline.report.draft.make import make_report
     from pipeline.report.sections.questions import open_line
     from pipeline.report.sections.summary import terminal_summary
-    from pipeline.results_json import results_text
     from pipeline.submission import load_submission
-    from pipeline.workflow import analyse
 
     submission = load_submission(folder)
     out = check_folder(out) if out else own_folder(submission.folder, "report")
     compared = _comparison(compare)
     with progress_line() as progress:
-        analysis, gap = with_gap(analyse(submission, progress=progress), submission.folder)
-        changes = compared(analysis)
-        out.mkdir(parents=True, exist_ok=True)
-        write_file(out / "results.json", results_text(analysis))
-        clear_files(out, "results.mat")  # of an earlier report
-        clear_files(own_folder(out, "tables"), "*.csv")
-        if tables:
-            from pipeline.exchange.saved import save_tables  # loads pandas
-
-            save_tables(analysis, out)
-        render_report(analysis, out, gap=gap, changes=changes, pdf=pdf, progress=progress)
+        analysis, changes = make_report(
+            submission, out, compared=compared, pdf=pdf, tables=tables, progress=progress
+        )
     say(terminal_summary(analysis))
     _say_unreadable(analysis)
     for line in (changes and changes_line(changes), open_line(analysis)):

@@ -326,7 +326,7 @@ def test_nobody_is_faster_than_who_has_the_secret(page, monkeypatch):
 
 def test_a_stranger_is_turned_out_in_time_and_a_reader_is_not(folder, monkeypatch):
     """An idle connection ends by itself; one that has shown the secret goes on."""
-    monkeypatch.setattr("pipeline.bench.watch.web._TO_SHOW_IT", 0.2)
+    monkeypatch.setattr("pipeline.web.strangers._TO_SHOW_IT", 0.2)
     with LivePage(folder) as page, ExitStack() as opened:
         stream = news(page, opened)
         assert stream.readline() == b"event: state\n"

@@ -22,6 +22,7 @@ from pipeline.grading.intake.files import Changed, open_submission
 from pipeline.grading.judge.run import Graded, grade_submission
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.prints import fingerprint
+from pipeline.processes import limit_memory
 from pipeline.schemas.grade import Grade, grade_text
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.complaints import quote
@@ -205,7 +206,7 @@ def main() -> None:
     tasks = sys.stdin.buffer
     setup = Setup(**json.loads(tasks.readline()))
     rubric = Rubric.model_validate_json(setup.rubric)
-    _limit_memory(setup.memory_limit)
+    limit_memory(setup.memory_limit)
     answers.write(b"ready\n")
     answers.flush()
     for line in tasks:
@@ -220,18 +221,6 @@ def main() -> None:
         answers.flush()
         if not outcome.settled:
             return  # after a fault a fresh process is surer
-
-
-def _limit_memory(more: int) -> None:
-    """Let the address space grow by so many bytes; elsewhere the parent watches alone."""
-    if sys.platform != "linux":
-        return
-    import resource
-
-    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
-    limit = pages * resource.getpagesize() + more
-    _, hard = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(resource.RLIMIT_AS, (limit, hard))
 
 
 if __name__ == "__main__":

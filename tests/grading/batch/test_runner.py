@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.grading.batch import worker_process
 from pipeline.grading.batch.runner import Limits, grade_batch, grades_of, run_here
 from pipeline.grading.batch.worker import Setup, Task, grade_task
 from pipeline.grading.batch.worker_process import Worker
@@ -22,6 +21,7 @@ from pipeline.grading.intake.hand_ins import find_hand_ins
 from pipeline.grading.publish import feedback_figures
 from pipeline.grading.publish.outputs import write_outputs
 from pipeline.grading.rubric_file import load_rubric
+from pipeline.processes import LineProcess
 from pipeline.schemas.grade import grade_text
 from pipeline.synthesis import write_submission
 from tests.helpers.grades import n_graded
@@ -129,15 +129,15 @@ def setup(tmp_path):
 @pytest.fixture
 def kill_next(monkeypatch):
     """Return what has the next process that is sent a line killed as it gets it."""
-    send, doomed = worker_process._send, []
+    send, doomed = LineProcess.send, []
 
     def send_and_kill(process, line):
         send(process, line)
         if doomed:
             doomed.pop()
-            process.kill()
+            process._process.kill()
 
-    monkeypatch.setattr(worker_process, "_send", send_and_kill)
+    monkeypatch.setattr(LineProcess, "send", send_and_kill)
     return lambda: doomed.append(True)
 
 
