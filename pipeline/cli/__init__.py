@@ -3,6 +3,8 @@
 # isort: off
 # In this order `cartlab --help` lists the commands: as a lab needs them.
 from pipeline.cli.common import app, main
-from pipeline.cli import reports, models, plan, acquire, emulate, grading, demo
+from pipeline.cli import reports, models, plan, acquire, emulate, grading, desk, demo
 
-__all__ = ["acquire", "app", "demo", "emulate", "grading", "main", "models", "plan", "reports"]
+__all__ = [
+    "acquire", "app", "demo", "desk", "emulate", "grading", "main", "models", "plan", "reports",
+]  # fmt: skip

@@ -12,7 +12,7 @@ from tomlkit.items import Array
 
 from pipeline.errors import SubmissionError
 from pipeline.output import write_file
-from pipeline.submission.load import MAX_TOML_BYTES, NAME, parse_submission
+from pipeline.submission.load import MAX_TOML_BYTES, NAME, outside, parse_submission
 from pipeline.submission.models import Submission
 from pipeline.submission.toml_file import Value, read_text
 
@@ -36,6 +36,8 @@ def submission_text(folder: Path) -> str:
     SubmissionError : there is none that can be read.
     """
     where = f"{folder.resolve().name}/{NAME}"
+    if (problem := outside(folder, NAME)) is not None:
+        raise SubmissionError(f"{where}: {problem}")
     return read_text(folder / NAME, where=where, limit=MAX_TOML_BYTES, error=SubmissionError)
 
 

@@ -32,7 +32,7 @@ _LARGEST = Decimal("1e30")  # beyond any physical number in any unit, yet safe t
 _MOST_DIGITS = 1_000
 _MOST_SHOWN = 30_000  # characters of the notes: fifteen pages
 _MOST_LOOKED_AT = 1_000  # files and folders, for the one that may be meant
-_COMMENT = re.compile(r"<!--.*?(?:-->|\Z)", re.DOTALL)  # one left open runs to the end
+COMMENT = re.compile(r"<!--.*?(?:-->|\Z)", re.DOTALL)  # one left open runs to the end
 _SYSTEM_COLUMNS = ("time", "input", "reference", "frequency")
 
 
@@ -164,7 +164,7 @@ def _notes(folder: Path) -> str | None:
     if (problem := outside(folder, "notes.md")) is not None:
         raise SubmissionError(f"{where}: {problem}")
     typed = read_text(path, where=where, limit=MAX_NOTES_BYTES, error=SubmissionError)
-    text = _COMMENT.sub("", typed)
+    text = COMMENT.sub("", typed)
     if len(text) > _MOST_SHOWN:
         shown = text[: text.rfind("\n", 0, _MOST_SHOWN) + 1] or text[:_MOST_SHOWN]
         length = f"{len(shown):,} of {len(text):,} characters"

@@ -1,7 +1,6 @@
 """A document as one self-contained HTML file: nothing loaded from anywhere, one script of ours."""
 
 import base64
-import hashlib
 import math
 import re
 from collections.abc import Sequence
@@ -14,6 +13,7 @@ from pipeline.report.document import Block, Document, Picture, Table, Tiles, fla
 from pipeline.report.figures.style import MEASURED, MODEL, QUIET, SECOND, SHADE, THIRD
 from pipeline.report.figures.ticks import GRID
 from pipeline.report.math.tree import Term, to_mathml
+from pipeline.report.render.scripts import ALWAYS, EXPLORE, FINDER, script, script_hash
 from pipeline.resources import TEMPLATES
 
 # The style sheet says what each colour is in light and in dark.
@@ -28,15 +28,15 @@ _WIDE = "±×%"  # wider than a digit
 
 def render_html(document: Document) -> str:
     """Return the page; every text is escaped, only our own SVG, MathML and script are not."""
-    script = "".join(_script(name) for name in _scripts(document))
+    text = script(*_scripts(document))
     return (
         _environment()
         .get_template("report.html.j2")
         .render(
             document=document,
             math_font=_math_font(),
-            script=Markup(script),
-            script_hash=Markup(_hash(script)),
+            script=Markup(text),
+            script_hash=Markup(script_hash(text)),
         )
     )
 
@@ -49,17 +49,12 @@ def render_fragment(blocks: Sequence[Block]) -> str:
 def _scripts(document: Document) -> list[str]:
     """Return the scripts that a page has something for."""
     blocks = [block for section in document.sections for block in flat(section.blocks)]
-    names = ["page.js"]
+    names = [ALWAYS]
     if any(isinstance(block, Picture) for block in blocks):
-        names.append("explore.js")
+        names.append(EXPLORE)
     if any(isinstance(block, Table) and block.finder for block in blocks):
-        names.append("finder.js")
+        names.append(FINDER)
     return names
-
-
-@cache
-def _script(name: str) -> str:
-    return (TEMPLATES / name).read_text(encoding="utf-8")
 
 
 @cache
@@ -109,11 +104,6 @@ def _board(board: Tiles) -> str:
 
 def _digits_wide(text: str) -> float:
     return sum(0.5 if c in _NARROW else 1.5 if c in _WIDE else 1.0 for c in text)
-
-
-def _hash(script: str) -> str:
-    """Return the hash by which the page's policy knows its one script."""
-    return f"sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}"
 
 
 @cache

@@ -4,7 +4,6 @@ A question stands where its figures are. It is answered in `notes.md` under a he
 with the question's id; what stands under no such heading is the discussion.
 """
 
-import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -23,6 +22,7 @@ from pipeline.report.document import (
 )
 from pipeline.report.numbers import count, listing, percent, significant
 from pipeline.report.phrases import phrases
+from pipeline.report.sections.answers import named
 from pipeline.report.sections.notes import discussion_blocks, even_headings
 from pipeline.report.words import SOURCES, clean, rich
 from pipeline.results import Analysis, HardwareCheck, ParameterRow
@@ -34,9 +34,6 @@ _LISTED = 4  # runs; of more the first
 _FAR = 0.10  # of the motion: a difference between bench and model worth a question
 _LEVEL = 0.03  # of the level
 _OVERSHOOT = 5.0  # percent of the step
-
-_LEAD = re.compile(r"(?:question|q|answer|a)?[\s:.#]*([\w.-]+)", re.IGNORECASE)
-_SPELT = str.maketrans({"ω": "omega", "ζ": "zeta", " ": " "})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -253,7 +250,7 @@ def split_notes(
     level = 0
     for block in blocks:
         if isinstance(block, Heading):
-            id_ = ids.get(_named(block))
+            id_ = ids.get(named(plain(block.text)))
             if id_ is not None:
                 current, level = answers.setdefault(id_, []), block.level
                 continue
@@ -263,13 +260,6 @@ def split_notes(
     return {id_: even_headings(found) for id_, found in answers.items() if found}, even_headings(
         rest
     )
-
-
-def _named(heading: Heading) -> str:
-    """Return the id that a heading begins with, however it is spelt."""
-    text = plain(heading.text).translate(_SPELT).strip()
-    match = _LEAD.match(text)
-    return match[1].rstrip(".:").lower() if match else ""
 
 
 def placed(

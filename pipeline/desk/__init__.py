@@ -1,0 +1,1 @@
+"""The desk: one local web page for student, TA, instructor and bench."""

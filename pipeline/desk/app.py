@@ -1,0 +1,181 @@
+"""The desk as an application: every address in one table, and the server that answers there."""
+
+import asyncio
+import socket
+from collections.abc import AsyncIterator, Awaitable, Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.datastructures import FormData
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import Response, StreamingResponse
+from starlette.routing import Route
+
+from pipeline.desk.doors import Guard, ProxyDoor, SecretDoor
+from pipeline.desk.home import open_grades, open_place, show_home
+from pipeline.desk.pages import served_file, static_file
+from pipeline.desk.state import Ask, Desk, plain_error
+from pipeline.desk.student import room as student
+from pipeline.desk.users import User, read_users
+from pipeline.errors import ConfigError, PipelineError
+from pipeline.grading.intake.unpack import HAND_IN
+from pipeline.web.server import Served
+from pipeline.web.strangers import Strangers, announced
+
+Handler = Callable[[Ask], Response]
+_MOST_FIELDS = 5_000
+_FRAME = 0.2  # s between looks for news
+_ALIVE = 5.0  # s between signs of life where there is none
+
+# Address, method, who answers. What changes anything is a POST of a form that needs no script.
+ROUTES: tuple[tuple[str, str, Handler], ...] = (
+    ("/", "GET", show_home),
+    ("/open", "POST", open_place),
+    ("/static/{name}", "GET", lambda ask: static_file(ask.request.path_params["name"])),
+    ("/student/{n:int}/", "GET", student.show),
+    ("/student/{n:int}/files", "POST", student.upload),
+    ("/student/{n:int}/fill", "POST", student.fill),
+    ("/student/{n:int}/save", "POST", student.save),
+    ("/student/{n:int}/experiments/{index:int}", "POST", student.save_experiment),
+    ("/student/{n:int}/make-report", "POST", student.start_report),
+    ("/student/{n:int}/stop", "POST", student.stop),
+    ("/student/{n:int}/report", "GET", student.report),
+    ("/student/{n:int}/report/{name:path}", "GET", student.report_file),
+    ("/student/{n:int}/answer", "POST", student.answer),
+    ("/student/{n:int}/hand-in.zip", "GET", student.packed),
+    ("/grades/{n:int}/", "GET", open_grades),
+    ("/grades/{n:int}/{name:path}", "GET",
+     lambda ask: served_file(ask.grades(), ask.request.path_params["name"])),
+)  # fmt: skip
+EVENTS = "/student/{n:int}/events"
+
+
+class DeskServer:
+    """The desk, served; a context.
+
+    Parameters
+    ----------
+    folders : to begin with, of the person at this computer.
+    port : to serve at; 0: a free one.
+    host, users : of a lab server: the address to listen at, and the file that says who may what.
+
+    Attributes
+    ----------
+    url : to open; the secret in it, if any, opens once.
+    """
+
+    def __init__(
+        self,
+        *,
+        folders: list[Path],
+        port: int = 0,
+        host: str = "127.0.0.1",
+        users: Path | None = None,
+    ) -> None:
+        listed = read_users(users) if users else None
+        try:
+            listener = socket.create_server((host, port))
+        except OSError as error:
+            raise ConfigError(
+                f"port {port} of {host} is not free for the desk ({error.strerror}): name another "
+                "with --port"
+            ) from None
+        port = listener.getsockname()[1]
+        if listed:
+            door: SecretDoor | ProxyDoor = ProxyDoor(*listed)
+            self.url = f"http://{host}:{port}/"
+        else:
+            door = SecretDoor(User(name="", role="owner", folders=folders), port=port)
+            self.url = f"http://127.0.0.1:{port}/{door.secret}/"
+        self._desk = Desk()
+        strangers = Strangers()
+        guard = Guard(
+            app=application(self._desk), door=door, uploads=HAND_IN.total, strangers=strangers
+        )
+        self._served = Served(guard, listener, protocol=announced(strangers, shows=door.shows))
+
+    def __enter__(self) -> Self:
+        if not self._served.start():
+            raise ConfigError("the desk could not be served")
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._served.stop()
+        self._desk.close()
+
+
+def application(desk: Desk) -> Starlette:
+    """Return what answers, where a guard has said who asks (`scope["user"]`)."""
+    routes = [
+        Route(path, _endpoint(desk, handler), methods=[method]) for path, method, handler in ROUTES
+    ]
+    return Starlette(
+        routes=[*routes, Route(EVENTS, _events(desk))],
+        exception_handlers={HTTPException: _missing(desk)},
+    )
+
+
+def _endpoint(desk: Desk, handler: Handler) -> Callable[[Request], Awaitable[Response]]:
+    """Return what reads the form, answers in a thread, and tells a person what went wrong."""
+
+    async def answer(request: Request) -> Response:
+        form = FormData()
+        if request.method == "POST":
+            form = await request.form(max_files=HAND_IN.members, max_fields=_MOST_FIELDS)
+        ask = Ask(desk=desk, user=request.scope["user"], request=request, form=form)
+        try:
+            return await run_in_threadpool(handler, ask)
+        except PipelineError as error:
+            return plain_error(ask, str(error), status=422)
+        except OSError as error:
+            where = f"{error.filename}: " if error.filename else ""
+            return plain_error(ask, f"{where}{error.strerror or error}", status=500)
+        finally:
+            await form.close()
+
+    return answer
+
+
+def _missing(desk: Desk) -> Callable[[Request, Exception], Response]:
+    def answer(request: Request, error: Exception) -> Response:
+        assert isinstance(error, HTTPException)
+        ask = Ask(desk=desk, user=request.scope["user"], request=request, form=FormData())
+        return plain_error(ask, str(error.detail), status=error.status_code)
+
+    return answer
+
+
+def _events(desk: Desk) -> Callable[[Request], Awaitable[Response]]:
+    """Return what tells the stages of the work in a folder as they change, and its end."""
+
+    async def answer(request: Request) -> Response:
+        ask = Ask(desk=desk, user=request.scope["user"], request=request, form=FormData())
+        return StreamingResponse(_news(desk, ask.folder()), media_type="text/event-stream")
+
+    return answer
+
+
+async def _news(desk: Desk, place: Path) -> AsyncIterator[str]:
+    """Send a line for every stage; one a person has not read is not kept for them."""
+    seen, quiet = -1, 0.0
+    while (job := desk.jobs.of(place)) is not None:
+        if job.news != seen:
+            seen, quiet = job.news, 0.0
+            yield f"event: {'end' if job.over else 'stage'}\ndata: {' '.join(job.said.split())}\n\n"
+        elif quiet > _ALIVE:
+            quiet = 0.0
+            yield ": still here\n\n"
+        if job.over:
+            return
+        await asyncio.sleep(_FRAME)
+        quiet += _FRAME
+    yield "event: end\ndata: \n\n"

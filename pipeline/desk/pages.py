@@ -1,0 +1,51 @@
+"""Files that are shown as they lie in a folder, each under the strictest policy that shows it."""
+
+from pathlib import Path, PurePosixPath
+
+from starlette.exceptions import HTTPException
+from starlette.responses import FileResponse, Response
+
+from pipeline.report.render.scripts import every_hash
+from pipeline.resources import TEMPLATES
+from pipeline.submission.load import outside
+
+# A page of a folder is a stranger's here: of an origin of its own, so that it sees no cookie and
+# asks nothing of the desk; it runs the scripts that the report brings, and no others.
+_REPORT = (
+    "sandbox allow-scripts; default-src 'none'; style-src 'unsafe-inline'; script-src {hashes}; "
+    "img-src data:; font-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'self'"
+)
+_INERT = "sandbox; default-src 'none'; style-src 'unsafe-inline'; frame-ancestors 'none'"
+_KINDS = {
+    ".html": "text/html",
+    ".pdf": "application/pdf",
+    ".svg": "image/svg+xml",
+    ".json": "application/json",
+}
+_OWN_KINDS = {".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
+_STATIC = {
+    "report.css": "report.css",
+    "desk.css": "desk/desk.css",
+    "desk.js": "desk/desk.js",
+    "htmx.js": "desk/htmx.min.js",
+    "icon.svg": "desk/icon.svg",
+}
+
+
+def served_file(folder: Path, name: str) -> Response:
+    """Return a file that lies in a folder, not one that a link there leads to elsewhere."""
+    kind = _KINDS.get(PurePosixPath(name).suffix)
+    if kind is None or outside(folder, name) is not None:
+        raise HTTPException(404, "there is no such file")
+    hashes = " ".join(f"'{one}'" for one in every_hash())
+    policy = _REPORT.format(hashes=hashes) if kind == "text/html" else _INERT
+    headers = {} if kind == "application/pdf" else {"Content-Security-Policy": policy}
+    return FileResponse(folder / name, media_type=kind, headers=headers)
+
+
+def static_file(name: str) -> Response:
+    """Return a style sheet or script of the desk."""
+    if name not in _STATIC:
+        raise HTTPException(404, "there is no such file")
+    kind = _OWN_KINDS[PurePosixPath(name).suffix]
+    return Response((TEMPLATES / _STATIC[name]).read_bytes(), media_type=kind)

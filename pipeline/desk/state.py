@@ -1,0 +1,150 @@
+"""What every page of the desk is made with: who asks, for which place, and what is under way."""
+
+import secrets
+from collections import OrderedDict
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from starlette.datastructures import FormData
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, RedirectResponse, Response
+
+from pipeline import __version__
+from pipeline.desk.jobs import Failed, Hand, Jobs
+from pipeline.desk.users import User
+from pipeline.resources import TEMPLATES
+
+_MOST_LOOKS = 5_000  # files of which is kept what they are
+
+Stamp = tuple[int, int]
+
+
+@dataclass(kw_only=True)
+class Desk:
+    """What outlives a request."""
+
+    jobs: Jobs = field(default_factory=Jobs)
+    hand: Hand = field(default_factory=Hand)
+    said: dict[tuple[str, Path], list[str]] = field(default_factory=dict)
+    _looks: OrderedDict[Path, tuple[Stamp, dict[str, Any]]] = field(default_factory=OrderedDict)
+
+    def looks(self, folder: Path) -> dict[str, dict[str, Any]]:
+        """Return what the data files of a submission are, by name; each is looked at once."""
+        found = {}
+        for file in self.hand.do("files", folder=str(folder)):
+            path = folder / file
+            info = path.stat()
+            stamp = info.st_mtime_ns, info.st_size
+            kept = self._looks.get(path)
+            if kept is None or kept[0] != stamp:
+                kept = self._looks[path] = stamp, self._look(folder, file)
+                while len(self._looks) > _MOST_LOOKS:
+                    self._looks.popitem(last=False)
+            found[file] = kept[1]
+        return found
+
+    def _look(self, folder: Path, file: str) -> dict[str, Any]:
+        try:
+            return self.hand.do("look", folder=str(folder), files=[file])[file]
+        except Failed as error:  # what the file did to the process, it did to this row only
+            nothing = {"kind": None, "carts": [], "format": "", "unsure": [], "lines": []}
+            return {"file": file, "state": "broken", "remarks": [str(error)], **nothing}
+
+    def close(self) -> None:
+        """End all work."""
+        self.jobs.close()
+        self.hand.close()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ask:
+    """One request: of whom, for what."""
+
+    desk: Desk
+    user: User
+    request: Request
+    form: FormData
+
+    def folder(self) -> Path:
+        """Return the submission that the address is about; of others' there is no address."""
+        return self._place(self.user.folders)
+
+    def grades(self) -> Path:
+        """Return the output of a grading that the address is about."""
+        return self._place(self.user.gradebooks)
+
+    def _place(self, places: list[Path]) -> Path:
+        number = self.request.path_params["n"]
+        if number >= len(places):
+            raise HTTPException(404, "there is nothing here that is yours to see")
+        return places[number]
+
+    def text(self, name: str) -> str:
+        """Return a field of the form as text, "" where it is not there."""
+        value = self.form.get(name)
+        return value.replace("\r\n", "\n").strip() if isinstance(value, str) else ""
+
+    def page(self, template: str, *, status: int = 200, **context: Any) -> Response:
+        """Return a page."""
+        text = (
+            _environment()
+            .get_template(f"{template}.html.j2")
+            .render(
+                user=self.user,
+                path=self.request.url.path,
+                rooms=rooms(self.user),
+                version=__version__,
+                **context,
+            )
+        )
+        return HTMLResponse(text, status_code=status)
+
+    def back(self, to: str, *said: str) -> Response:
+        """Return to a page, which says this once."""
+        if said:
+            key = self.user.name, self.folder()
+            self.desk.said.setdefault(key, []).extend(said)
+        return RedirectResponse(to, status_code=303)
+
+    def told(self) -> list[str]:
+        """Return what is to be said on this page, once."""
+        return self.desk.said.pop((self.user.name, self.folder()), [])
+
+
+def rooms(user: User) -> list[tuple[str, str]]:
+    """Return the address and the name of every room that somebody may enter."""
+    found = [("/", "Desk")]
+    found += [(f"/student/{n}/", _name(p)) for n, p in enumerate(user.folders)]
+    found += [(f"/grades/{n}/", _name(p)) for n, p in enumerate(user.gradebooks)]
+    return found
+
+
+def _name(place: Path) -> str:
+    return place.name or str(place)
+
+
+@cache
+def _environment() -> Environment:
+    environment = Environment(
+        loader=FileSystemLoader(TEMPLATES / "desk"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    # Whatever is cached of an earlier version of a style sheet or script is not asked for again.
+    environment.globals["fresh"] = secrets.token_hex(4)
+    return environment
+
+
+def plain_error(ask: Ask, text: str, *, status: int) -> Response:
+    """Return a page that says what is wrong."""
+    return ask.page("wrong", status=status, title="That did not work", text=text)
+
+
+Fields = Mapping[str, Any]

@@ -1,0 +1,37 @@
+"""The zip that is handed in: what the submission names, and nothing else."""
+
+import io
+import zipfile
+from pathlib import Path
+
+from pipeline.submission import load_submission
+from pipeline.submission.load import NAME, outside
+
+_FIXED_TIME = (1980, 1, 1, 0, 0, 0)  # same files, same bytes
+_BESIDE = ("notes.md", "report/report.pdf")
+
+
+def hand_in(folder: Path) -> bytes:
+    """Return the zip of a submission.
+
+    Raises
+    ------
+    SubmissionError : it is not valid, or a file that it names is not there.
+    """
+    submission = load_submission(folder)
+    names = dict.fromkeys([NAME, *(experiment.file for experiment in submission.experiments)])
+    beside = [name for name in _BESIDE if outside(folder, name) is None]
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in (*names, *beside):
+            info = zipfile.ZipInfo(name, _FIXED_TIME)
+            archive.writestr(info, (folder / name).read_bytes(), zipfile.ZIP_DEFLATED)
+    return buffer.getvalue()
+
+
+def missing(folder: Path) -> list[str]:
+    """Return what keeps a submission from being handed in, each in a line."""
+    submission = load_submission(folder)
+    files = dict.fromkeys(experiment.file for experiment in submission.experiments)
+    found = [problem for file in files if (problem := outside(folder, file)) is not None]
+    return found or ([] if files else ["there is no experiment in it yet"])

@@ -1,0 +1,299 @@
+"""The student's room: files, form, report, questions, the zip. The folder on disk is the truth."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import tomlkit
+from starlette.datastructures import UploadFile
+from starlette.responses import Response
+
+from pipeline.desk.jobs import Failed
+from pipeline.desk.pages import served_file
+from pipeline.desk.state import Ask
+from pipeline.desk.student.files import take_upload
+from pipeline.desk.student.form import (
+    Field,
+    apply,
+    experiment_fields,
+    field_text,
+    groups,
+    read_document,
+    remove_experiment,
+    typed,
+    with_errors,
+)
+from pipeline.desk.student.handin import hand_in, missing
+from pipeline.desk.student.yours import compare_claims, read_json
+from pipeline.errors import SubmissionError
+from pipeline.output import write_file
+from pipeline.report.numbers import count
+from pipeline.report.sections.answers import with_answer, written_answer
+from pipeline.submission.edit import Outdated, edit_submission, submission_text, text_digest
+from pipeline.submission.load import MAX_NOTES_BYTES, NAME, outside, parse_submission
+from pipeline.submission.toml_file import read_text
+
+_ASKED = "report/questions.json"
+_NOTES = "notes.md"
+
+
+def show(ask: Ask) -> Response:
+    """Show the room as the folder is now."""
+    return _room(ask)
+
+
+def upload(ask: Ask) -> Response:
+    """Take files, and write down what they are."""
+    folder, said = ask.folder(), []
+    for item in ask.form.getlist("files"):
+        if isinstance(item, UploadFile) and item.filename:
+            said += take_upload(item.filename, item.file, folder, hand=ask.desk.hand)
+    return ask.back(_here(ask), *said, *_filled(ask, folder))
+
+
+def fill(ask: Ask) -> Response:
+    """Write the tables of files that have none."""
+    return ask.back(_here(ask), *_filled(ask, ask.folder()))
+
+
+def save(ask: Ask) -> Response:
+    """Write the form into the file."""
+    document = read_document(submission_text(ask.folder()))
+    fields = [field for group in groups(document) for field in group.fields]
+    return _save(ask, fields)
+
+
+def save_experiment(ask: Ask) -> Response:
+    """Write one row of the table of files into its table, or take the table away."""
+    folder, index = ask.folder(), ask.request.path_params["index"]
+    if ask.text("remove"):
+        return _edited(ask, lambda document: remove_experiment(document, index), changed=[])
+    return _save(ask, experiment_fields(read_document(submission_text(folder)), index))
+
+
+def start_report(ask: Ask) -> Response:
+    """Have the report made."""
+    folder = ask.folder()
+    ask.desk.jobs.start("report", title="The report", place=folder, folder=str(folder))
+    return ask.back(_here(ask) + "#report")
+
+
+def stop(ask: Ask) -> Response:
+    """Stop what is under way in the folder."""
+    if job := ask.desk.jobs.of(ask.folder()):
+        job.stop.set()
+    return ask.back(_here(ask) + "#report")
+
+
+def report(ask: Ask) -> Response:
+    """Show the report with its questions, and claims beside what the data say."""
+    folder = ask.folder()
+    told, notes = _told(folder), _notes(folder)
+    return ask.page(
+        "report",
+        title=f"Report of {folder.name}",
+        told=told,
+        questions=[
+            {**one, "answer": written_answer(notes, one["id"])} for one in told["questions"]
+        ],
+        seen=text_digest(notes),
+        yours=compare_claims(folder),
+        there=outside(folder, "report/report.html") is None,
+        said=ask.told(),
+        here=_here(ask),
+    )
+
+
+def answer(ask: Ask) -> Response:
+    """Write the answer to a question into `notes.md`."""
+    folder, id_, typed_text = ask.folder(), ask.text("id"), ask.text("answer")
+    notes = _notes(folder)
+    if ask.text("seen") != text_digest(notes):
+        yours = [Field(path=id_, label=f"Answer to {id_}", value=typed_text)]
+        return _outdated(ask, _NOTES, notes, yours)
+    if id_ not in [one["id"] for one in _told(folder)["questions"]]:
+        raise SubmissionError(f"the report asks nothing called {id_!r}")
+    write_file(folder / _NOTES, with_answer(notes, id_, typed_text))
+    return ask.back(f"{_here(ask)}report#question-{id_}", "Written into notes.md.")
+
+
+def report_file(ask: Ask) -> Response:
+    """Return a file of the report, which runs no script but the report's own."""
+    return served_file(ask.folder(), f"report/{ask.request.path_params['name']}")
+
+
+def packed(ask: Ask) -> Response:
+    """Return the zip."""
+    name = "".join(c if c.isalnum() or c in "-_." else "-" for c in ask.folder().name) or "lab"
+    headers = {"Content-Disposition": f'attachment; filename="{name}.zip"'}
+    return Response(hand_in(ask.folder()), media_type="application/zip", headers=headers)
+
+
+# ------------------------------------------------------------------------------- parts
+
+
+def _here(ask: Ask) -> str:
+    return f"/student/{ask.request.path_params['n']}/"
+
+
+def _filled(ask: Ask, folder: Path) -> list[str]:
+    """Have the tables of new files written; return what is to be said."""
+    try:
+        rows = ask.desk.hand.do("fill", folder=str(folder))
+    except Failed as error:
+        return [str(error)]
+    new = [row["file"] for row in rows if row["state"] in ("new", "completed")]
+    return [f"{count(len(new), 'file')} written into {NAME}."] if new else []
+
+
+def _room(
+    ask: Ask,
+    *,
+    status: int = 200,
+    changed: Sequence[Field] = (),
+    error: SubmissionError | None = None,
+) -> Response:
+    """Show the room; with what was typed in place of what stands in the file, where it is wrong."""
+    folder = ask.folder()
+    text = submission_text(folder) if (folder / NAME).exists() else ""
+    document = read_document(text)
+    if error is None and text:
+        error = _wrong(text, folder)
+    rows = _rows(ask, folder, document)
+    form = groups(document)
+    every = [f for group in form for f in group.fields] + [f for r in rows for f in r["fields"]]
+    shown, left = with_errors(every, changed, error)
+    by_path = {field.path: field for field in shown}
+    job = ask.desk.jobs.of(folder)
+    return ask.page(
+        "student",
+        status=status,
+        title=folder.name,
+        folder=folder,
+        rows=[{**row, "fields": [by_path[f.path] for f in row["fields"]]} for row in rows],
+        groups=[group.filled(by_path) for group in form] if document else [],
+        seen=text_digest(text),
+        wrong=left,
+        keeps=_keeps(folder) if text and error is None else [],
+        sound=bool(text) and error is None,
+        job=job,
+        report=_report_state(folder),
+        told=_told(folder),
+        said=ask.told(),
+        here=_here(ask),
+    )
+
+
+def _wrong(text: str, folder: Path) -> SubmissionError | None:
+    """Return what is wrong with the file as it stands."""
+    try:
+        parse_submission(text, folder=folder)
+    except SubmissionError as error:
+        return error
+    return None
+
+
+def _keeps(folder: Path) -> list[str]:
+    try:
+        return missing(folder)
+    except SubmissionError as error:
+        return [str(error)]
+
+
+def _rows(ask: Ask, folder: Path, document: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return a row for every data file, and for every table whose file is not there."""
+    tables = document.get("experiments", [])
+    listed = [t for t in tables if isinstance(t, dict)] if isinstance(tables, list) else []
+    places: dict[str, list[int]] = {}
+    for index, table in enumerate(listed):
+        places.setdefault(str(table.get("file", "")).replace("\\", "/"), []).append(index)
+    rows = []
+    for file, look in ask.desk.looks(folder).items():
+        for index in places.pop(file, [None]):
+            rows.append(_row(document, file, look, index, listed))
+    gone = {"remarks": ["there is no such file"], "unsure": [], "lines": [], "format": ""}
+    for file, indices in places.items():
+        rows += [_row(document, file, gone, index, listed) for index in indices]
+    return rows
+
+
+def _row(
+    document: Mapping[str, Any],
+    file: str,
+    look: Mapping[str, Any],
+    index: int | None,
+    listed: Sequence[Mapping[str, Any]],
+) -> dict[str, Any]:
+    return {
+        "file": file,
+        "look": look,
+        "index": index,
+        "id": "" if index is None else str(listed[index].get("id", "")),
+        "fields": () if index is None else experiment_fields(document, index),
+    }
+
+
+def _save(ask: Ask, fields: Sequence[Field]) -> Response:
+    changed = typed(fields, ask.form, ask.form.getlist)
+    return _edited(ask, lambda document: apply(document, changed), changed=changed)
+
+
+def _edited(
+    ask: Ask, change: Callable[[tomlkit.TOMLDocument], None], *, changed: Sequence[Field]
+) -> Response:
+    """Change the file; what would not be valid is shown as typed, what is outdated is refused."""
+    try:
+        edit_submission(ask.folder(), change, seen=ask.text("seen") or "nothing")
+    except Outdated as error:
+        return _outdated(ask, NAME, error.text, changed)
+    except SubmissionError as error:
+        return _room(ask, status=422, changed=changed, error=error)
+    return ask.back(_here(ask), "Saved.")
+
+
+def _outdated(ask: Ask, name: str, text: str, changed: Sequence[Field]) -> Response:
+    """Show both versions: the file as it is now, and what was typed."""
+    now = read_document(text) if name == NAME else {}
+    return ask.page(
+        "outdated",
+        status=409,
+        title=f"{name} was changed meanwhile",
+        name=name,
+        text=text,
+        changed=[(field, field_text(now, field)) for field in changed],
+        here=_here(ask),
+    )
+
+
+def _notes(folder: Path) -> str:
+    if not (folder / _NOTES).exists():
+        return ""
+    if problem := outside(folder, _NOTES):
+        raise SubmissionError(problem)
+    where = f"{folder.name}/{_NOTES}"
+    return read_text(folder / _NOTES, where=where, limit=MAX_NOTES_BYTES, error=SubmissionError)
+
+
+def _told(folder: Path) -> dict[str, Any]:
+    """Return what the last report said and asked."""
+    told = read_json(folder, _ASKED)
+    questions = [
+        {"id": str(one["id"]), "text": str(one["text"])}
+        for one in told.get("questions", ())
+        if isinstance(one, dict) and {"id", "text"} <= one.keys()
+    ]
+    return {
+        "questions": questions,
+        "changes": str(told.get("changes", "")),
+        "failed": [str(one) for one in told.get("failed", ())],
+    }
+
+
+def _report_state(folder: Path) -> str:
+    """Return "none", "current", or "older" than what it is made of."""
+    if outside(folder, "report/report.html") is not None:
+        return "none"
+    made = (folder / "report" / "report.html").stat().st_mtime_ns
+    sources = [folder / NAME, folder / _NOTES, *(folder / "data").rglob("*")]
+    newer = any(path.stat().st_mtime_ns > made for path in sources if path.is_file())
+    return "older" if newer else "current"

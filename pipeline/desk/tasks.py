@@ -1,0 +1,135 @@
+"""What the desk's worker does, by name: JSON in, JSON out."""
+
+import json
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import ConfigError, SubmissionError
+from pipeline.ingest.columns import assign_columns
+from pipeline.ingest.fill import Found, data_files, fill_submission, look_at
+from pipeline.ingest.formats.recognise import read_table
+from pipeline.lock import alone_in
+from pipeline.output import own_folder, write_file
+from pipeline.plant.chain import Array
+from pipeline.results import Analysis
+from pipeline.submission import load_submission
+from pipeline.submission.load import leaves
+
+Progress = Callable[[str], None]
+ASKED = "questions.json"  # beside the report: what it asks, and what it said in one line
+
+_ACROSS, _HIGH = 120, 32  # of a thumbnail
+
+
+def look(folder: str, files: Sequence[str], *, progress: Progress) -> dict[str, Any]:
+    """Return what some data files are, by name, with a thumbnail of each."""
+    return {file: _row(Path(folder), file) for file in files}
+
+
+def files(folder: str, *, progress: Progress) -> list[str]:
+    """Return the data files that there are."""
+    return data_files(Path(folder))
+
+
+def fill(folder: str, *, progress: Progress) -> list[dict[str, Any]]:
+    """Write the tables of the files in `data/`."""
+    return [_plain(found) for found in fill_submission(Path(folder))]
+
+
+def report(folder: str, *, progress: Progress) -> dict[str, Any]:
+    """Write the report into the submission's own folder, compared with the one that was there."""
+    from pipeline.report.draft.changes import changes_line
+    from pipeline.report.draft.compare import compare_drafts, read_results
+    from pipeline.report.draft.make import make_report
+    from pipeline.report.sections.questions import ask
+
+    submission = load_submission(Path(folder))
+    out = own_folder(submission.folder, "report")
+
+    def compared(analysis: Analysis) -> Any:
+        try:
+            return compare_drafts(read_results(out / "results.json"), analysis)
+        except ConfigError:  # none, or of another bench
+            return None
+
+    with alone_in(out):
+        analysis, changes = make_report(submission, out, compared=compared, progress=progress)
+        asked = [{"id": question.id, "text": question.text} for question in ask(analysis)]
+        told = {
+            "questions": asked,
+            "changes": changes_line(changes) if changes else "",
+            "failed": [check.message for check in analysis.checks if check.outcome == "fail"],
+            "unreadable": dict(analysis.unreadable),
+        }
+        write_file(out / ASKED, json.dumps(told, ensure_ascii=False))
+    return told
+
+
+def unpack(archive: str, into: str, *, progress: Progress) -> list[str]:
+    """Unpack what was uploaded, by the limits of a hand-in; return the files."""
+    from pipeline.grading.intake.unpack import HAND_IN, unpack
+
+    target = Path(into)
+    shutil.rmtree(target, ignore_errors=True)
+    if refused := unpack(Path(archive), target, limits=HAND_IN):
+        raise SubmissionError(next(iter(refused.values())))
+    return sorted(p.relative_to(target).as_posix() for p in target.rglob("*") if p.is_file())
+
+
+TASKS: Mapping[str, Callable[..., Any]] = {
+    "look": look,
+    "files": files,
+    "fill": fill,
+    "report": report,
+    "unpack": unpack,
+}
+
+
+def _row(folder: Path, file: str) -> dict[str, Any]:
+    if leaves(folder, file):
+        raise SubmissionError(f"{file}: leaves the folder")
+    found = look_at(folder, file)
+    return {**_plain(found), "lines": thumbnail(folder, found)}
+
+
+def _plain(found: Found) -> dict[str, Any]:
+    inspection = found.inspection
+    return {
+        "file": found.file,
+        "state": found.state,
+        "experiment": found.experiment,
+        "kind": found.kind,
+        "carts": list(found.carts),
+        "remarks": list(found.remarks),
+        "unsure": list(found.unsure),
+        "format": inspection.format if inspection else "",
+        "samples": inspection.samples if inspection else 0,
+        "duration": inspection.duration if inspection else None,
+    }
+
+
+def thumbnail(folder: Path, found: Found) -> list[str]:
+    """Return the positions of a record as the points of SVG lines, one a cart."""
+    if found.inspection is None or found.kind == "bode":
+        return []
+    table, _ = read_table(folder, found.file)
+    columns, _ = assign_columns(table, explicit=found.inspection.guessed or None, free=(1,))
+    roles = sorted(role for role in columns if role[0] == "x")
+    rows = [table.values[columns[role].index] for role in roles]
+    low = min((float(row.min()) for row in rows), default=0.0)
+    high = max((float(row.max()) for row in rows), default=0.0)
+    if not np.isfinite(high - low) or high == low:
+        return []
+    return [_points((row - low) / (high - low)) for row in rows]
+
+
+def _points(row: Array) -> str:
+    """Return a row between 0 and 1 as points: least and most of every stretch, in turn."""
+    stretches = np.array_split(row, min(row.size, _ACROSS))
+    heights = [(s.max(), s.min())[i % 2] for i, s in enumerate(stretches)]
+    step = _ACROSS / max(len(heights) - 1, 1)
+    return " ".join(f"{i * step:.1f},{_HIGH * (1 - h):.1f}" for i, h in enumerate(heights))

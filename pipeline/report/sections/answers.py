@@ -1,0 +1,74 @@
+"""Answers in `notes.md`: each under a heading that begins with its question's id."""
+
+import re
+from itertools import pairwise
+
+from markdown_it import MarkdownIt
+
+from pipeline.errors import SubmissionError
+from pipeline.submission.load import COMMENT
+
+_LEAD = re.compile(r"(?:question|q|answer|a)?[\s:.#]*([\w.-]+)", re.IGNORECASE)
+_LEVEL = 2  # of a heading that is added
+_SPELT = str.maketrans({"ω": "omega", "ζ": "zeta", " ": " "})
+
+
+def named(heading: str) -> str:
+    """Return the id that a heading begins with, however it is spelt."""
+    match = _LEAD.match(heading.translate(_SPELT).strip())
+    return match[1].rstrip(".:").lower() if match else ""
+
+
+def written_answer(notes: str, id_: str) -> str:
+    """Return the answer to a question as it was typed, "" where there is none."""
+    lines = _lines(notes)
+    found = _span(notes, id_)
+    return "".join(lines[found[2] : found[3]]).strip() if found else ""
+
+
+def with_answer(notes: str, id_: str, answer: str) -> str:
+    """Return the notes with another answer to a question; all else stays as it is.
+
+    Raises
+    ------
+    SubmissionError : a heading in it would end the answer.
+    """
+    text = answer.replace("\r\n", "\n").strip()
+    lines = _lines(notes)
+    level, heading, start, end = _span(notes, id_) or (_LEVEL, len(lines), None, len(lines))
+    if any(at <= level for at, *_ in _headings(text)):
+        least = "#" * (level + 1)
+        raise SubmissionError(f"a heading in an answer begins with {least}, or it would end there")
+    if not text:
+        return "".join([*lines[:heading], *lines[end:]])
+    if start is None:
+        return f"{notes.rstrip()}\n\n{'#' * level} {id_}\n\n{text}\n".lstrip()
+    rest = ["\n", *lines[end:]] if lines[end:] else []
+    return "".join([*lines[:start], f"\n{text}\n", *rest])
+
+
+def _lines(text: str) -> list[str]:
+    """Return the lines as Markdown counts them, each with its end."""
+    return re.findall(r"[^\n]*\n|[^\n]+", text)
+
+
+def _span(notes: str, id_: str) -> tuple[int, int, int, int] | None:
+    """Return the level and line of the heading, and where its answer begins and ends."""
+    headings = _headings(notes)
+    for i, (level, start, end, text) in enumerate(headings):
+        if named(text) == id_.lower():
+            after = (line for at, line, _, _ in headings[i + 1 :] if at <= level)
+            return level, start, end, next(after, len(_lines(notes)))
+    return None
+
+
+def _headings(markdown: str) -> list[tuple[int, int, int, str]]:
+    """Return level, first line, line after and text of the headings; those in comments are none."""
+    text = COMMENT.sub(lambda found: re.sub(r"[^\n]", " ", found[0]), markdown)
+    tokens = MarkdownIt("commonmark", {"html": False}).parse(text)
+    found = []
+    for heading, inline in pairwise(tokens):
+        if heading.type == "heading_open" and heading.level == 0 and heading.map:
+            words = "".join(one.content for one in inline.children or ())
+            found.append((int(heading.tag[1:]), *heading.map, words))
+    return found

@@ -1,0 +1,76 @@
+"""Answers are found and written in `notes.md` by their question's id; the rest stays."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.errors import SubmissionError
+from pipeline.report.sections.answers import with_answer, written_answer
+from pipeline.report.sections.notes import discussion_blocks
+from pipeline.report.sections.questions import Asked, split_notes
+
+NOTES = """\
+<!-- keep
+## zeta_b
+me -->
+# Discussion
+
+All is well.
+
+## Question **friction-2**: why?
+
+Because.
+
+### In detail
+
+```
+# no heading
+```
+
+## Outlook
+
+More.
+"""
+
+
+def test_an_answer_is_what_stands_under_its_heading():
+    """Deeper headings and code are part of it; comments hold no answers."""
+    assert written_answer(NOTES, "friction-2").startswith("Because.\n\n### In detail")
+    assert written_answer(NOTES, "friction-2").endswith("# no heading\n```")
+    assert written_answer(NOTES, "zeta_b") == ""
+
+
+def test_an_answer_is_replaced_added_and_taken_away():
+    """All other lines stay as they are."""
+    new = with_answer(NOTES, "friction-2", "Dry bearings.\r\n")
+    assert written_answer(new, "friction-2") == "Dry bearings."
+    assert new.splitlines()[:9] == NOTES.splitlines()[:9]
+    assert new.endswith("Dry bearings.\n\n## Outlook\n\nMore.\n")
+    assert "friction" not in with_answer(new, "friction-2", "")
+    assert with_answer("", "level", "So.") == "## level\n\nSo.\n"
+    assert with_answer(NOTES, "level", "") == NOTES
+
+
+def test_a_heading_that_would_end_the_answer_is_refused():
+    """What the report would not show as the answer is not written as one."""
+    with pytest.raises(SubmissionError, match="begins with ###"):
+        with_answer(NOTES, "level", "So.\n\n# Aha\n\nMore.")
+    assert "### Aha" in with_answer(NOTES, "level", "So.\n\n### Aha\n\nMore.")
+
+
+WORDS = st.text(st.characters(codec="utf-8", exclude_categories=["C"]), max_size=30)
+
+
+@given(st.lists(WORDS, max_size=6), WORDS.filter(str.strip), st.integers(0, 6))
+def test_what_is_written_is_what_the_report_shows(lines, answer, at):
+    """Whatever stands around it, an answer without headings comes back from the notes."""
+    notes = "\n\n".join([*lines[:at], "## zeta_b", *lines[at:]])
+    try:
+        new = with_answer(notes, "level", answer)
+    except SubmissionError:
+        return
+    if "<!--" in notes or any(line.strip().startswith(("```", "~~~")) for line in lines):
+        return  # a comment or code that is open runs to the end
+    asked = [Asked(id="level", section="x", text="")]
+    assert bool(split_notes(discussion_blocks(new), asked)[0]) == bool(discussion_blocks(answer))
+    assert written_answer(new, "level") == answer.strip()
