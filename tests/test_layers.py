@@ -60,7 +60,7 @@ HOMES = {
     "typer": ("cli",),
     "rich": ("cli", "bench.watch"),
     "serial": ("bench.host",),
-    "tomlkit": ("submission", "ingest", "bench.host"),
+    "tomlkit": ("submission", "ingest", "bench.host", "desk.student"),
     "starlette": ("web", "bench.watch", "desk"),
     "uvicorn": ("web",),
     "control": ("plant", "checks", "notebook"),

@@ -33,3 +33,7 @@ htmx.onLoad(() => {
     });
   }
 });
+document.addEventListener("htmx:sendError", () => {
+  const said = document.querySelector("[role=status]");
+  said.textContent = "No answer: the desk was ended, or this was more than it takes at once.";
+});

@@ -1,0 +1,242 @@
+"""Who gets in: by the secret that opens once, or through the proxy, and nobody else."""
+
+import re
+import socket
+import time
+from contextlib import ExitStack
+from urllib.parse import urlsplit
+
+import psutil
+import pytest
+
+from pipeline.desk.app import ROUTES, DeskServer
+from pipeline.desk.doors import MOST_FORM
+from pipeline.desk.users import read_users
+from pipeline.errors import ConfigError
+from tests.helpers.desks import Visitor, a_submission
+from tests.helpers.waiting import PATIENCE, until
+
+PATHS = [re.sub(r"\{\w+:int\}", "0", re.sub(r"\{name(:path)?\}", "x.json", p)) for p, *_ in ROUTES]
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory):
+    """A desk with one submission."""
+    folder = a_submission(tmp_path_factory.mktemp("desk") / "team")
+    with DeskServer(folders=[folder]) as server:
+        yield server
+
+
+@pytest.fixture(scope="module")
+def visitor(server):
+    """Who opened the printed address."""
+    return Visitor.of(server.url)
+
+
+def test_the_secret_opens_once_and_leaves_the_address(server, visitor):
+    """Then a cookie does that no script reads and no other site sends; the address is used up."""
+    assert visitor.get("/").status == 200
+    assert Visitor(port=visitor.port).get(urlsplit(server.url).path).status == 403
+    again = visitor.get(urlsplit(server.url).path)
+    assert (again.status, again.headers["location"]) == (303, "/")
+    cookie = again.headers["set-cookie"].lower()
+    assert "httponly" in cookie
+    assert "samesite=strict" in cookie
+    assert again.headers["referrer-policy"] == "no-referrer"
+    secret = urlsplit(server.url).path.strip("/")
+    assert secret not in visitor.headers["Cookie"]
+    assert len(secret) >= 32
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_nobody_gets_in_without_the_cookie(visitor, path):
+    """No address answers a stranger; a cookie of one's own is none."""
+    for cookie in ("", f"cartlab-{visitor.port}=guess", "cartlab=x"):
+        stranger = Visitor(port=visitor.port, headers={"Cookie": cookie})
+        assert stranger.get(path).status == 403
+        assert stranger.post(path).status == 403
+
+
+def test_other_pages_cannot_ask(visitor):
+    """A foreign name, an origin that is none of ours, a browser's word that it is another page."""
+    port = visitor.port
+    for wrong in (
+        {"Host": f"evil.example:{port}"}, {"Host": "127.0.0.1"}, {"Origin": "http://evil.example"},
+        {"Origin": "null"}, {"Origin": f"http://127.0.0.1:{port + 1}"},
+        {"Sec_Fetch_Site": "cross-site"}, {"Sec_Fetch_Site": "same-site"},
+    ):  # fmt: skip
+        assert visitor.get("/", **wrong).status == 403, wrong
+        form = visitor.send("/open", b"folder=/", kind="application/x-www-form-urlencoded", **wrong)
+        assert form.status == 403, wrong
+    silent = visitor.ask("POST", "/open", b"", {"Content-Type": "text/plain"})
+    assert silent.status == 403  # a form says where it is from
+    assert visitor.get("/", Host=f"localhost:{port}").status == 200
+
+
+@pytest.mark.parametrize("path", ["/", "/nowhere", "/static/desk.js", "/student/7/"])
+def test_every_answer_has_its_policy(visitor, path):
+    """Scripts and styles are the desk's own files, and nobody may frame it."""
+    for who in (visitor, Visitor(port=visitor.port)):
+        policy = who.get(path).headers["content-security-policy"]
+        assert "unsafe" not in policy
+        assert "default-src 'none'" in policy
+        assert "frame-ancestors 'none'" in policy
+        assert who.get(path).headers["x-content-type-options"] == "nosniff"
+
+
+@pytest.mark.parametrize(
+    "length", [f"Content-Length: {MOST_FORM + 1}", "Transfer-Encoding: chunked"]
+)
+def test_nobody_sends_more_than_is_read(visitor, length):
+    """By what a request says of itself, or by what comes; the desk goes on."""
+    host = f"127.0.0.1:{visitor.port}"
+    head = (
+        f"POST /open HTTP/1.1\r\nHost: {host}\r\nOrigin: http://{host}\r\n{length}\r\n"
+        f"Cookie: {visitor.headers['Cookie']}\r\n"
+        "Content-Type: application/x-www-form-urlencoded\r\n\r\n"
+    )
+    with socket.create_connection(("127.0.0.1", visitor.port), timeout=PATIENCE) as line:
+        line.sendall(head.encode())
+        if "chunked" in length:
+            for _ in range(MOST_FORM // 100_000 + 1):
+                line.sendall(b"186A0\r\n&a=" + b"x" * 99_997 + b"\r\n")
+        assert line.recv(12) == b"HTTP/1.1 413"
+    assert visitor.get("/").status == 200
+
+
+def test_strangers_are_few_and_leave(visitor, monkeypatch):
+    """Of 300 idle connections some are held, and not for long; who has the cookie is served."""
+
+    def held() -> int:
+        mine = psutil.Process().net_connections("tcp")
+        here = (c.laddr[1:] == (visitor.port,) and c.status == "ESTABLISHED" for c in mine)
+        return sum(here)
+
+    monkeypatch.setattr("pipeline.web.strangers._TO_SHOW_IT", 0.5)
+    with ExitStack() as opened:
+        for number in range(300):
+            stranger = socket.create_connection(("127.0.0.1", visitor.port), timeout=PATIENCE)
+            opened.enter_context(stranger)
+            if number % 30 == 0:
+                until(lambda: held() <= 140)
+        assert visitor.get("/").status == 200
+        until(lambda: held() <= 3)
+
+
+def test_a_port_that_is_taken_is_one_line(server):
+    """The command ends with it."""
+    with pytest.raises(ConfigError, match="is not free for the desk"):
+        DeskServer(folders=[], port=urlsplit(server.url).port or 0)
+
+
+# ------------------------------------------------------------------------- a lab server
+
+USERS = """
+[proxy]
+address = "127.0.0.1"
+header = "X-Remote-User"
+site = "https://lab.example.edu"
+[[users]]
+name = "s1"
+role = "student"
+folders = ["one"]
+[[users]]
+name = "s2"
+role = "student"
+folders = ["two", "three"]
+[[users]]
+name = "t"
+role = "ta"
+gradebooks = ["grades"]
+"""
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory):
+    """A desk for three, who come through a proxy; who asks, by name."""
+    root = tmp_path_factory.mktemp("lab")
+    for name in ("one", "two", "three", "four"):
+        a_submission(root / name)
+    (root / "grades").mkdir()
+    (root / "grades" / "class.html").write_text("<p>the class</p>", encoding="utf-8")
+    (root / "users.toml").write_text(USERS, encoding="utf-8")
+    with DeskServer(folders=[], users=root / "users.toml") as server:
+        port = urlsplit(server.url).port or 0
+
+        def who(name: str, **given: str) -> Visitor:
+            headers = {"X-Remote-User": name} if name else {}
+            return Visitor(port=port, host="lab.example.edu", headers=headers, **given)
+
+        yield who
+
+
+def test_everybody_sees_their_own(lab):
+    """A student's address of the same form is another folder; beyond their own there is none."""
+    assert "one" in lab("s1").get("/student/0/").text
+    assert "two" in lab("s2").get("/student/0/").text
+    assert lab("s1").get("/student/1/").status == 404
+    assert lab("s2").get("/student/1/").status == 200
+    for path in ("/student/-1/", "/student/00000001/", "/student/1/report", "/student/../two/",
+                 "/student/%2e%2e/", "/student/1/hand-in.zip", "/grades/0/"):  # fmt: skip
+        assert lab("s1").get(path).status == 404, path
+    assert lab("s1").post("/student/1/save", title="mine", seen="").status == 404
+    assert lab("s1").upload("/student/1/files", [("a.csv", b"x")]).status == 404
+    assert lab("s1").get("/").headers["location"] == "/student/0/"
+
+
+def test_a_ta_sees_the_gradebooks_they_are_listed_for(lab):
+    """And no student's room."""
+    assert lab("t").get("/grades/0/class.html").body == b"<p>the class</p>"
+    assert lab("t").get("/grades/1/").status == 404
+    assert lab("t").get("/student/0/").status == 404
+
+
+def test_nobody_names_a_folder_of_the_server(lab, tmp_path):
+    """Only the person at this computer opens folders by name."""
+    for name in ("s1", "t"):
+        assert lab(name).post("/open", folder=str(tmp_path)).status == 403
+
+
+def test_forged_names_are_refused(lab):
+    """None, one that is not listed, two at once, and one from another address than the proxy's."""
+    assert lab("").get("/").status == 403
+    assert lab("root").get("/").status == 403
+    assert lab("s1", source="127.0.0.2").get("/student/0/").status == 403
+    double = "GET /student/0/ HTTP/1.1\r\nHost: lab.example.edu\r\n"
+    double += "X-Remote-User: s1\r\nX-Remote-User: s2\r\n\r\n"
+    with socket.create_connection(("127.0.0.1", lab("").port), timeout=PATIENCE) as line:
+        line.sendall(double.encode())
+        assert line.recv(12) == b"HTTP/1.1 403"
+    assert lab("s1").get("/", X_Forwarded_For="127.0.0.2").status == 303
+    assert lab("s1").get("/", Host="127.0.0.1").status == 403
+    port = lab("").port
+    assert Visitor(port=port, headers={"X-Remote-User": "s1"}).get("/").status == 403
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("", "proxy: is required"),
+        (USERS.replace("ta", "boss", 1), "role"),
+        (USERS.replace('"s2"', '"s1"'), "there twice"),
+        (USERS.replace("folders", "folder", 1), "did you mean 'folders'"),
+        (USERS.replace("https://lab.example.edu", "lab"), "site"),
+    ],
+)
+def test_a_wrong_list_is_one_line(text, why, tmp_path):
+    """What is wrong with the file of users is said, and nothing is served."""
+    (tmp_path / "users.toml").write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError, match=why):
+        read_users(tmp_path / "users.toml")
+
+
+def test_a_stranger_s_clock_runs(server):
+    """A connection that shows nothing ends by itself."""
+    began = time.monotonic()
+    with socket.create_connection(("127.0.0.1", urlsplit(server.url).port or 0)) as line:
+        line.settimeout(PATIENCE)
+        try:
+            assert line.recv(1) == b""
+        except ConnectionResetError:
+            pass
+    assert time.monotonic() - began >= 1

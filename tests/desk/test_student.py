@@ -1,0 +1,360 @@
+"""The student's room over plain forms: files, table, form, report, answers, zip, and no harm."""
+
+import io
+import json
+import re
+import time
+import zipfile
+from html import unescape
+from pathlib import Path
+
+import psutil
+import pytest
+
+from pipeline.desk.app import DeskServer
+from pipeline.desk.jobs import Failed, Hand
+from pipeline.desk.student import files as uploads
+from pipeline.desk.student.files import take_upload
+from pipeline.errors import SubmissionError
+from pipeline.grading.intake.hand_ins import find_hand_ins
+from pipeline.submission import load_submission
+from pipeline.submission.load import NAME
+from tests.helpers.desks import Visitor, a_submission, some_files
+from tests.helpers.waiting import until
+
+HERE = "/student/0/"
+
+
+@pytest.fixture
+def room(tmp_path):
+    """Return who opened the desk on an empty folder, and the folder."""
+    folder = tmp_path / "team"
+    folder.mkdir()
+    with DeskServer(folders=[folder]) as server:
+        yield Visitor.of(server.url), folder
+
+
+@pytest.fixture
+def filled(tmp_path):
+    """Return who opened the desk on a submission, and the folder."""
+    folder = a_submission(tmp_path / "team")
+    with DeskServer(folders=[folder]) as server:
+        yield Visitor.of(server.url), folder
+
+
+@pytest.fixture(scope="module")
+def hand():
+    """A process for short tasks."""
+    hand = Hand()
+    yield hand
+    hand.close()
+
+
+def wrongs(page: str) -> list[str]:
+    """Return what a page says is wrong."""
+    return [unescape(w) for w in re.findall(r'class="wrong"[^>]*>([^<]*)<', page)]
+
+
+def test_from_an_empty_folder_to_the_zip(room):
+    """Without any script: files become a submission, it a report, answers notes, all a hand-in."""
+    visitor, folder = room
+    assert "Begin with your files" in visitor.get(HERE).text
+    assert visitor.upload(HERE + "files", some_files()).headers["location"] == HERE
+    page = visitor.get(HERE)
+    assert page.text.count("<polyline") >= len(some_files())
+    assert {e.file for e in load_submission(folder).experiments} == {
+        f"data/{name}" for name, _ in some_files()
+    }
+    given = {"title": "One <cart>", "system.position.unit": "cm", "reported.final.K": "28.90",
+             "system.springs.shown": "1", "system.springs": "0"}  # fmt: skip
+    saved = visitor.post(HERE + "save", seen=page.value("seen"), **given)
+    assert (saved.status, saved.headers["location"]) == (303, HERE)
+    submission = load_submission(folder)
+    assert (submission.title, submission.system.springs) == ("One <cart>", (True, False))
+    assert submission.reported is not None
+    assert str(submission.reported.final["K"]) == "28.90"  # digits as typed
+    assert "# Not sure what a data file holds?" in (folder / NAME).read_text(encoding="utf-8")
+
+    assert visitor.post(HERE + "make-report").status == 303
+    until(lambda: "Read the report" in visitor.get(HERE).text)
+    page = visitor.get(HERE + "report").text
+    assert '<td class="r">28.90</td>' in page  # yours, beside what the data say
+    report = visitor.get(HERE + "report/report.html")
+    assert report.headers["content-security-policy"].startswith("sandbox allow-scripts;")
+    assert "One &lt;cart&gt;" in report.text
+    assert visitor.get(HERE + "report/report.pdf").body.startswith(b"%PDF")
+
+    told = folder / "report" / "questions.json"
+    asked = json.loads(told.read_text(encoding="utf-8"))
+    asked["questions"].append({"id": "zeta", "text": "Why?"})
+    told.write_text(json.dumps(asked), encoding="utf-8")
+    seen = visitor.get(HERE + "report").value("seen")
+    answered = visitor.post(HERE + "answer", id="zeta", answer="So.\r\nAnd so.", seen=seen)
+    assert answered.status == 303
+    assert (folder / "notes.md").read_text(encoding="utf-8").endswith("## zeta\n\nSo.\nAnd so.\n")
+    assert "And so.</textarea>" in visitor.get(HERE + "report").text
+
+    packed = visitor.get(HERE + "hand-in.zip")
+    names = set(zipfile.ZipFile(io.BytesIO(packed.body)).namelist())
+    files = {f"data/{name}" for name, _ in some_files()}
+    assert names == files | {NAME, "notes.md", "report/report.pdf"}
+    archive = folder.parent / "one.zip"
+    archive.write_bytes(packed.body)
+    (found,) = find_hand_ins([archive], scratch=folder.parent / "scratch")
+    assert found.problem == ""
+
+
+def test_what_is_wrong_stands_beside_its_field(filled):
+    """As the file's own check words it; what was typed stays in the form, the file as it was."""
+    visitor, folder = filled
+    before = (folder / NAME).read_bytes()
+    seen = visitor.get(HERE).value("seen")
+    typed = {"design.cart": "7", "reported.initial.K": "25,6", "system.input.per_count": "-1"}
+    page = visitor.post(HERE + "save", seen=seen, **typed)
+    assert page.status == 422
+    text = page.text
+    assert 'id="reported-initial-K-wrong"' in text
+    assert "expected a number, found '25,6'" in wrongs(text)
+    assert "expected more than 0.0, found -1" in wrongs(text)
+    assert page.value("reported.initial.K") == "25,6"
+    assert (folder / NAME).read_bytes() == before
+    typed = {"design.cart": "7"}
+    page = visitor.post(HERE + "save", seen=seen, **typed)
+    assert wrongs(page.text) == ["there is no cart 7, the system has only cart 1"]
+
+
+def test_a_row_is_corrected_in_place(filled):
+    """Kind, carts, window of one file; and its table is taken out, the file stays."""
+    visitor, folder = filled
+    page = visitor.get(HERE)
+    index = next(i for i, e in enumerate(load_submission(folder).experiments) if e.kind == "step")
+    path = f"experiments.{index}"
+    row = {f"{path}.kind": "sweep", f"{path}.window": "0.5; 2", f"{path}.note": "bumped"}
+    where = f"{HERE}experiments/{index}"
+    assert visitor.post(where, seen=page.value("seen"), **row).status == 303
+    experiment = load_submission(folder).experiments[index]
+    assert (experiment.kind, experiment.window, experiment.note) == ("sweep", (0.5, 2.0), "bumped")
+    seen = visitor.get(HERE).value("seen")
+    assert visitor.post(where, seen=seen, remove="1").status == 303
+    assert experiment.id not in [e.id for e in load_submission(folder).experiments]
+    assert (folder / experiment.file).is_file()
+    assert "not in submission.toml" in visitor.get(HERE).text
+
+
+def test_edits_from_outside_show_and_are_not_written_over(filled):
+    """A form of an older state is refused with both versions; so is an answer."""
+    visitor, folder = filled
+    seen = visitor.get(HERE).value("seen")
+    text = (folder / NAME).read_text(encoding="utf-8")
+    title = re.sub(r"(?m)^title = .*$", 'title = "From outside"  # ours', text)
+    (folder / NAME).write_text(title, encoding="utf-8")
+    assert visitor.get(HERE).value("title") == "From outside"
+    for path, field in (("save", {"title": "Mine"}), ("experiments/0", {"remove": "1"})):
+        page = visitor.post(HERE + path, seen=seen, **field)
+        assert page.status == 409
+        assert "From outside" in page.text
+        assert (folder / NAME).read_text(encoding="utf-8") == title
+    assert "Mine" in visitor.post(HERE + "save", seen=seen, title="Mine").text
+    assert visitor.post(HERE + "save", title="Mine").status == 409  # seen nothing
+    (folder / "notes.md").write_text("Other words.\n", encoding="utf-8")
+    page = visitor.post(HERE + "answer", id="zeta", answer="Mine", seen=seen)
+    assert (page.status, "Other words." in page.text, "Mine" in page.text) == (409, True, True)
+    assert (folder / "notes.md").read_text(encoding="utf-8") == "Other words.\n"
+
+
+@pytest.mark.parametrize("text", ["version = \n", "\xff", "version = 1\n[system]\ncarts = 9\n"])
+def test_a_broken_file_is_shown_as_such(filled, text):
+    """The room opens all the same, says what is wrong, and makes no report."""
+    visitor, folder = filled
+    (folder / NAME).write_bytes(text.encode("latin-1"))
+    page = visitor.get(HERE)
+    assert wrongs(page.text) or page.status == 422
+    assert "Make the report" not in page.text
+    assert visitor.get(HERE + "hand-in.zip").status == 422
+
+
+# ----------------------------------------------------------------------------- uploads
+
+NAMES = {
+    "../../escape.csv": "escape.csv", "..\\..\\escape.csv": "escape.csv", "C:\\a.csv": "a.csv",
+    "/etc/a.csv": "a.csv", "con.csv": "data-con.csv", "a:b.csv": "a-b.csv", ".hidden.csv": None,
+    "a\x00b.csv": "a-b.csv", "a\nb.csv": "a-b.csv", "x" * 300 + ".csv": "x" * 116 + ".csv",
+    "<script>.csv": "-script-.csv", "'; --.csv": "'; --.csv",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_file_goes_nowhere_but_into_data(name, tmp_path, hand):
+    """Whatever it is called."""
+    (tmp_path / "team").mkdir()
+    take_upload(name, io.BytesIO(b"time,x1\n0,1\n"), tmp_path / "team", hand=hand)
+    found = [path.relative_to(tmp_path / "team") for path in tmp_path.rglob("*.csv")]
+    if NAMES[name]:
+        assert found == [Path("data") / str(NAMES[name])]
+    else:
+        assert [path.parent for path in found] == [Path("data")]
+
+
+def test_nothing_is_written_over(tmp_path, hand):
+    """The same file again is none; another of its name gets another name; links stay links."""
+    for raw in (b"one", b"one", b"two", b"two"):
+        take_upload("a.csv", io.BytesIO(raw), tmp_path, hand=hand)
+    assert {p.name: p.read_bytes() for p in (tmp_path / "data").iterdir()} == {
+        "a.csv": b"one", "a-2.csv": b"two",
+    }  # fmt: skip
+    secret = tmp_path / "secret"
+    secret.write_bytes(b"secret")
+    (tmp_path / "data" / "b.csv").symlink_to(secret)
+    take_upload("b.csv", io.BytesIO(b"mine"), tmp_path, hand=hand)
+    assert secret.read_bytes() == b"secret"
+    assert (tmp_path / "data" / "b-2.csv").read_bytes() == b"mine"
+
+
+def test_a_linked_data_folder_is_refused(tmp_path, hand):
+    """What a link points at may be anybody's."""
+    (tmp_path / "theirs").mkdir()
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "data").symlink_to(tmp_path / "theirs")
+    try:
+        said = take_upload("a.csv", io.BytesIO(b"x"), tmp_path / "mine", hand=hand)
+    except Exception as error:
+        said = [str(error)]
+    assert "link" in said[0]
+    assert list((tmp_path / "theirs").iterdir()) == []
+
+
+def test_an_archive_is_taken_by_the_limits_of_a_hand_in(tmp_path, hand):
+    """Recordings of a zip are taken; a bomb, a link and a way out are refused with their reason."""
+
+    def zipped(*members: tuple[str, bytes]) -> io.BytesIO:
+        buffer = io.BytesIO()
+        with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+            for name, raw in members:
+                archive.writestr(name, raw)
+        return io.BytesIO(buffer.getvalue())
+
+    good = zipped(("team/data/a.csv", b"x"), ("team/plot.py", b"import os"), ("__MACOSX/a", b"y"))
+    (said,) = take_upload("a.zip", good, tmp_path, hand=hand)
+    assert "plot.py" in said
+    assert [path.name for path in (tmp_path / "data").iterdir()] == ["a.csv"]
+    for wrong in (
+        zipped(("big.csv", bytes(30_000_000))), zipped(("../out.csv", b"x")), io.BytesIO(b"PK"),
+    ):  # fmt: skip
+        (said,) = take_upload("b.zip", wrong, tmp_path, hand=hand)
+        assert "not taken" in said
+    assert [path.name for path in tmp_path.rglob("*.csv")] == ["a.csv"]
+
+
+def test_a_folder_has_room_for_a_hand_in(tmp_path, hand, monkeypatch):
+    """Then nothing more is taken."""
+    monkeypatch.setattr(uploads, "MAX_DATA_BYTES", 10)
+    (said,) = take_upload("a.csv", io.BytesIO(b"x" * 11), tmp_path, hand=hand)
+    assert "larger than 10 bytes" in said
+    limits = uploads.HAND_IN.__class__(members=2, total=15)
+    monkeypatch.setattr(uploads, "HAND_IN", limits)
+    assert take_upload("a.csv", io.BytesIO(b"x" * 10), tmp_path, hand=hand) == []
+    (said,) = take_upload("b.csv", io.BytesIO(b"y" * 6), tmp_path, hand=hand)
+    assert "at most 2 files and 15 bytes" in said
+
+
+def test_names_and_texts_of_files_are_never_markup(room):
+    """What a file or its heading is called is shown as text."""
+    visitor, folder = room
+    evil = "<img src=x onerror=alert(1)>"
+    (folder / "data").mkdir()
+    (folder / "data" / f"{evil}.csv").write_text(f"{evil},x1\n" + "1,2\n" * 20, encoding="utf-8")
+    visitor.post(HERE + "fill")
+    page = visitor.get(HERE).text
+    assert "<img" not in page
+    assert "&lt;img" in page
+
+
+def test_other_files_of_the_folder_are_not_served(filled):
+    """The report's files are, where no link leads out."""
+    visitor, folder = filled
+    (folder / "report").mkdir(exist_ok=True)
+    (folder / "report" / "x.json").write_text("{}", encoding="utf-8")
+    (folder / "report" / "y.json").symlink_to("/etc/hostname")
+    assert visitor.get(HERE + "report/x.json").body == b"{}"
+    for name in ("y.json", "../submission.toml", "%2e%2e/submission.toml", "../notes.md", ".lock",
+                 "..%2fsubmission.toml", "//etc/hostname", "nothing.html"):  # fmt: skip
+        assert visitor.get(HERE + "report/" + name).status == 404, name
+
+
+def test_a_report_page_that_is_not_ours_runs_nothing(filled):
+    """Its scripts are not those of the report, which alone the policy lets run."""
+    visitor, folder = filled
+    (folder / "report").mkdir(exist_ok=True)
+    (folder / "report" / "report.html").write_text("<script>alert(1)</script>", encoding="utf-8")
+    policy = visitor.get(HERE + "report/report.html").headers["content-security-policy"]
+    scripts = next(part for part in policy.split(";") if "script-src" in part)
+    assert scripts.split()[1:] == re.findall(r"'sha256-[^']+'", scripts)
+
+
+# -------------------------------------------------------------------------------- jobs
+
+
+def test_a_job_tells_its_stages_survives_a_reload_and_is_stopped(filled):
+    """The page of any later moment shows it; stopped, nothing of it is written."""
+    visitor, folder = filled
+    before = {p.pid for p in psutil.Process().children()}
+    assert visitor.post(HERE + "make-report").status == 303
+    assert visitor.post(HERE + "make-report").status == 303  # the same one
+    assert "data-events" in visitor.get(HERE).text
+    until(lambda: {p.pid for p in psutil.Process().children()} - before)
+    assert visitor.post(HERE + "stop").status == 303
+    until(lambda: "stopped" in " ".join(wrongs(visitor.get(HERE).text)))
+    assert not (folder / "report" / "report.html").exists()
+    news = visitor.get(HERE + "events")
+    assert news.headers["content-type"].startswith("text/event-stream")
+    assert news.text.startswith("event: end\n")
+    assert visitor.post(HERE + "make-report").status == 303
+    stages = re.findall(r"event: stage\ndata: (.*)", visitor.get(HERE + "events").text)
+    assert len(set(stages)) > 3
+    assert "Read the report" in visitor.get(HERE).text
+
+
+def test_a_file_that_ends_the_process_costs_its_own_row(room, monkeypatch):
+    """The others are shown; the next task has another process."""
+    visitor, folder = room
+    visitor.upload(HERE + "files", some_files(most=2))
+    monkeypatch.setattr("pipeline.desk.jobs._SHORT", 0.0)
+    (folder / "data" / "late.csv").write_bytes(some_files()[0][1])
+    time.sleep(0.01)
+    with pytest.raises(Failed):
+        Hand().do("look", folder=str(folder), files=["data/late.csv"])
+    monkeypatch.undo()
+    assert "late.csv" in visitor.get(HERE).text
+
+
+def test_who_serves_is_gone_and_so_is_the_work(tmp_path):
+    """A worker whose desk was killed ends by itself."""
+    hand = Hand()
+    hand.do("files", folder=str(tmp_path))
+    process = hand._process
+    assert process is not None
+    (child,) = [p for p in psutil.Process().children() if p.pid == process._process.pid]
+    assert process._process.stdin is not None
+    process._process.stdin.close()
+    until(lambda: not child.is_running() or child.status() == psutil.STATUS_ZOMBIE)
+    hand.close()
+
+
+def test_a_task_says_why_it_came_to_nothing(tmp_path, hand):
+    """In the words of the command; the process goes on."""
+    with pytest.raises(Failed, match="no recording in it"):
+        hand.do("fill", folder=str(tmp_path))
+    with pytest.raises(Failed, match="leaves"):
+        hand.do("look", folder=str(tmp_path), files=["../x.csv"])
+    assert hand.do("files", folder=str(tmp_path)) == []
+
+
+def test_saving_what_is_not_valid_changes_nothing(tmp_path):
+    """Whatever way it comes in."""
+    from pipeline.submission.edit import edit_submission
+
+    folder = a_submission(tmp_path / "team")
+    before = (folder / NAME).read_bytes()
+    with pytest.raises(SubmissionError):
+        edit_submission(folder, lambda document: document.pop("system"))
+    assert (folder / NAME).read_bytes() == before

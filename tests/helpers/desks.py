@@ -1,0 +1,110 @@
+"""A desk that is served, and somebody who asks it as a browser without scripts does."""
+
+import http.client
+import re
+import shutil
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from html import unescape
+from pathlib import Path
+from urllib.parse import urlencode, urlsplit
+
+from pipeline.resources import EXAMPLES
+from tests.helpers.waiting import PATIENCE
+
+BOUNDARY = "----cartlab"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Answer:
+    """What came back."""
+
+    status: int
+    headers: Mapping[str, str]
+    body: bytes
+
+    @property
+    def text(self) -> str:
+        """The page."""
+        return self.body.decode()
+
+    def value(self, name: str) -> str:
+        """Return the value of a field of the page."""
+        found = re.search(rf'name="{re.escape(name)}"[^>]*? value="([^"]*)"', self.text)
+        found = found or re.search(rf'value="([^"]*)"[^>]*? name="{re.escape(name)}"', self.text)
+        assert found, name
+        return unescape(found[1])
+
+
+@dataclass(kw_only=True)
+class Visitor:
+    """Who asks: with a cookie or the headers of a proxy, from an address of this computer."""
+
+    port: int
+    headers: dict[str, str] = field(default_factory=dict)
+    source: str = "127.0.0.1"
+    host: str = ""
+
+    @classmethod
+    def of(cls, url: str) -> "Visitor":
+        """Return who opened the address that was printed."""
+        parts = urlsplit(url)
+        visitor = cls(port=parts.port or 0)
+        answer = visitor.get(parts.path)
+        assert (answer.status, answer.headers["location"]) == (303, "/")
+        visitor.headers["Cookie"] = answer.headers["set-cookie"].split(";")[0]
+        return visitor
+
+    def get(self, path: str, **headers: str) -> Answer:
+        """Ask for a page."""
+        return self.ask("GET", path, None, headers)
+
+    def post(self, path: str, **fields: str) -> Answer:
+        """Send a form."""
+        return self.send(path, urlencode(fields).encode(), kind="application/x-www-form-urlencoded")
+
+    def upload(self, path: str, files: Iterable[tuple[str, bytes]]) -> Answer:
+        """Send files."""
+        body = b"".join(
+            f'--{BOUNDARY}\r\nContent-Disposition: form-data; name="files"; '
+            f'filename="{name}"\r\n\r\n'.encode()
+            + raw
+            + b"\r\n"
+            for name, raw in files
+        )
+        whole = body + f"--{BOUNDARY}--\r\n".encode()
+        return self.send(path, whole, kind=f"multipart/form-data; boundary={BOUNDARY}")
+
+    def send(self, path: str, body: bytes, *, kind: str, **headers: str) -> Answer:
+        """Send something."""
+        host = self.host or f"127.0.0.1:{self.port}"
+        scheme = "https" if self.host else "http"
+        own = {"Content-Type": kind, "Origin": f"{scheme}://{host}"}
+        return self.ask("POST", path, body, own | headers)
+
+    def ask(self, method: str, path: str, body: bytes | None, headers: dict[str, str]) -> Answer:
+        """Ask anything."""
+        connection = http.client.HTTPConnection(
+            "127.0.0.1", self.port, timeout=PATIENCE, source_address=(self.source, 0)
+        )
+        named = {name.replace("_", "-"): value for name, value in headers.items()}
+        host = {"Host": self.host} if self.host else {}
+        try:
+            connection.request(method, path, body, host | self.headers | named)
+            answer = connection.getresponse()
+            found = {name.lower(): value for name, value in answer.getheaders()}
+            return Answer(status=answer.status, headers=found, body=answer.read())
+        finally:
+            connection.close()
+
+
+def some_files(folder: str = "one-cart", *, most: int = 99) -> list[tuple[str, bytes]]:
+    """Return the recordings of a worked example."""
+    paths = sorted((EXAMPLES / folder / "data").iterdir())
+    return [(path.name, path.read_bytes()) for path in paths[:most]]
+
+
+def a_submission(folder: Path, example: str = "one-cart") -> Path:
+    """Return a copy of a worked example."""
+    shutil.copytree(EXAMPLES / example, folder, ignore=shutil.ignore_patterns("report"))
+    return folder
