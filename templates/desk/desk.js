@@ -8,7 +8,7 @@ htmx.onLoad(() => {
     const end = () => {
       news.close();
       if (shown.isConnected)
-        htmx.ajax("GET", location.pathname, { target: "#main", select: "#main", swap: "outerHTML show:none" });
+        htmx.ajax("GET", location.pathname, { target: "#main", select: "#main > *", swap: "innerHTML show:none" });
     };
     news.addEventListener("stage", (event) => {
       if (!shown.isConnected) return news.close();

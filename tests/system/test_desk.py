@@ -1,0 +1,173 @@
+"""The desk in a real browser: from an empty folder to the zip, by day, by night, on a phone."""
+
+import re
+import signal
+import subprocess
+import sys
+import urllib.request
+import zipfile
+from pathlib import Path
+from urllib.error import HTTPError
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import expect
+
+from pipeline.desk.app import DeskServer
+from pipeline.submission import load_submission
+from pipeline.submission.load import NAME
+from tests.helpers.desks import a_submission
+from tests.helpers.places import ROOT
+from tests.helpers.waiting import PATIENCE, started, until
+from tests.system.test_report_pages import PHONE, WIDE
+
+FILES = sorted((ROOT / "submissions" / "one-cart" / "data").iterdir())
+
+
+@pytest.fixture
+def show(browser):
+    """Open a desk in a window of its own; errors and requests to elsewhere fail the test."""
+    contexts, errors = [], []
+
+    def opened(url: str, *, size=WIDE, **options):
+        context = browser.new_context(
+            viewport={"width": size[0], "height": size[1]}, reduced_motion="reduce", **options
+        )
+        context.set_default_timeout(1e3 * PATIENCE)
+        contexts.append(context)
+        window = context.new_page()
+        window.on("pageerror", lambda error: errors.append(str(error)))
+        window.on("console", lambda m: errors.append(m.text) if m.type == "error" else None)
+        home = re.match(r"http://[^/]+/", url)
+        assert home is not None
+        own = (home[0], "blob:", "data:")
+        window.on("request", lambda r: None if r.url.startswith(own) else errors.append(r.url))
+        window.goto(url)
+        assert window.url == home[0]  # without the secret
+        return window
+
+    yield opened
+    for context in contexts:
+        context.close()
+    refused = "the server responded with a status of 422"  # said beside the field
+    assert [error for error in errors if refused not in error] == []
+
+
+def violations(window) -> list:
+    """Return what axe finds, by day and by night."""
+    found = []
+    for scheme in ("light", "dark"):
+        window.emulate_media(color_scheme=scheme)
+        for one in Axe().run(window).response["violations"]:
+            found.append((scheme, one["id"], [node["target"] for node in one["nodes"]][:3]))
+    return found
+
+
+def test_a_student_goes_from_an_empty_folder_to_the_zip(show, tmp_path):
+    """Files dropped, a mistake mended, the form, the report, an answer, the zip."""
+    folder = tmp_path / "team"
+    with DeskServer(folders=[]) as server:
+        window = show(server.url)
+        window.get_by_label("Folder on this computer").fill(str(folder))
+        window.get_by_role("button", name="Open").click()
+        expect(window.get_by_role("heading", level=1)).to_have_text("team")
+
+        window.locator("#drop").set_input_files(FILES)
+        expect(window.locator("table.files tbody tr")).to_have_count(len(FILES))
+        assert len(load_submission(folder).experiments) == len(FILES)
+
+        window.get_by_label("Title of the report").fill("One <b>cart</b>")
+        window.get_by_label("Unit of positions").fill("cm")
+        window.get_by_text("The controller you are asked for").click()
+        window.get_by_label("Cart whose position").fill("2")
+        save = window.locator("#details").get_by_role("button", name="Save")
+        save.click()
+        expect(window.locator("#design-cart-wrong")).to_contain_text("there is no cart 2")
+        expect(window.get_by_label("Title of the report")).to_have_value("One <b>cart</b>")
+        window.get_by_label("Cart whose position").fill("1")
+        save.click()
+        expect(window.get_by_text("Saved.")).to_be_visible()
+        step = next(e for e in load_submission(folder).experiments if e.kind == "step")
+        row = window.get_by_role("row").filter(has_text=Path(step.file).name)
+        row.get_by_text(step.id, exact=True).click()
+        row.get_by_label("Note").fill("the cart was bumped")
+        row.get_by_role("button", name="Save").click()
+        until(lambda: "bumped" in (folder / NAME).read_text(encoding="utf-8"))
+        window.get_by_role("button", name="Make the report").click()
+        expect(window.locator("[data-events]")).to_contain_text("The report")
+        window.reload()
+        window.get_by_role("link", name="Read the report").click()
+        report = window.frame_locator("iframe")
+        expect(report.get_by_role("heading", level=1)).to_have_text("One <b>cart</b>")
+        expect(report.locator("figure .tools").first).to_be_attached()  # its own script runs
+        question = window.locator("form.question").first
+        if question.count():
+            question.get_by_role("textbox").fill("Because.")
+            question.get_by_role("button").click()
+            expect(window.get_by_text("Written into notes.md.")).to_be_visible()
+            assert "Because." in (folder / "notes.md").read_text(encoding="utf-8")
+        window.get_by_role("link", name="Back to the files").click()
+        with window.expect_download() as download:
+            window.get_by_role("link", name="Hand in: the zip").click()
+        with zipfile.ZipFile(download.value.path()) as archive:
+            assert {NAME, "notes.md", "report/report.pdf"} <= set(archive.namelist())
+    submission = load_submission(folder)
+    assert submission.title == "One <b>cart</b>"
+    assert "bumped" in next(e for e in submission.experiments if e.id == step.id).note
+
+
+@pytest.mark.parametrize("size", [WIDE, PHONE], ids=["wide", "phone"])
+def test_everybody_can_use_it(show, tmp_path, size):
+    """Axe finds nothing by day and by night; nothing is wider than the screen; keys do."""
+    folder = a_submission(tmp_path / "team", "two-cart")
+    with DeskServer(folders=[folder]) as server:
+        window = show(server.url, size=size)
+        assert violations(window) == []
+        window.get_by_role("link", name="team").first.click()
+        expect(window.locator("table.files")).to_be_visible()
+        window.get_by_label("Position of one encoder count").fill("0")
+        window.get_by_label("Position of one encoder count").press("Enter")
+        expect(window.locator("#system-position-per_count-wrong")).to_be_visible()
+        for details in window.locator("#details details:not([open]) > summary").all():
+            details.press("Enter")
+        assert violations(window) == []
+        assert window.evaluate("document.documentElement.scrollWidth") <= size[0]
+        window.goto(f"{window.url.split('/student')[0]}/student/0/report")
+        assert violations(window) == []
+        assert window.evaluate("document.documentElement.scrollWidth") <= size[0]
+        window.keyboard.press("Tab")
+        expect(window.get_by_role("link", name="Skip to the content")).to_be_focused()
+
+
+def test_without_scripts_it_works_too(show, tmp_path):
+    """Every change is a plain form."""
+    folder = a_submission(tmp_path / "team")
+    with DeskServer(folders=[folder]) as server:
+        window = show(server.url, java_script_enabled=False)
+        window.get_by_role("link", name="team").first.click()
+        window.get_by_label("Title of the report").fill("Plain")
+        window.locator("#details").get_by_role("button", name="Save").click()
+        expect(window.get_by_text("Saved.")).to_be_visible()
+        window.locator("#drop").set_input_files([FILES[0]])
+        window.get_by_role("button", name="Take", exact=True).click()
+        expect(window.get_by_text("is there already")).to_be_visible()
+    assert load_submission(folder).title == "Plain"
+
+
+def test_the_command_says_its_address_and_ends_with_a_signal(tmp_path):
+    """One line on stderr when ready, one where the port is taken; a signal ends it, status 0."""
+    command = [sys.executable, "-m", "pipeline", "desk", str(tmp_path / "team"), "--no-browser"]
+    with started(command, stderr=subprocess.PIPE, encoding="utf-8") as desk:
+        assert desk.stderr is not None
+        ready = re.fullmatch(r"ready: (http://127\.0\.0\.1:(\d+)/\S+/)\n", desk.stderr.readline())
+        assert ready is not None
+        with pytest.raises(HTTPError, match="403"):  # led on without its cookie
+            urllib.request.urlopen(ready[1], timeout=PATIENCE)
+        taken = subprocess.run(
+            [*command, "--port", ready[2]], stderr=subprocess.PIPE, encoding="utf-8", check=False
+        )
+        assert taken.returncode == 2
+        assert len(taken.stderr.splitlines()) == 1
+        desk.send_signal(signal.SIGINT if sys.platform == "win32" else signal.SIGTERM)
+        assert desk.wait(PATIENCE) == 0
+        assert desk.stderr.read() == ""
