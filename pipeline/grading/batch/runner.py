@@ -21,6 +21,7 @@ from pipeline.grading.intake.files import digest
 from pipeline.grading.intake.hand_ins import HandIn
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.shared import find_shared, same_recordings, same_team, shared_flag
+from pipeline.grading.words import WORDS
 from pipeline.output import write_file
 from pipeline.schemas.grade import Flag, Grade, read_grade
 
@@ -172,10 +173,10 @@ def _work(
 
 
 def code_version() -> str:
-    """Return what changes whenever a grade may: a hash of the code and what it computes with."""
+    """Return what changes whenever a grade may: a hash of the code, its words, what it computes with."""
     root = Path(pipeline.__file__).parent
     versions = [pipeline.__version__, *(f"{name} {version(name)}" for name in _COMPUTE_WITH)]
-    total = hashlib.sha256(" ".join(versions).encode())
+    total = hashlib.sha256(" ".join(versions).encode() + WORDS.path.read_bytes())
     for path in sorted(root.rglob("*.py")):
         total.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
     return total.hexdigest()

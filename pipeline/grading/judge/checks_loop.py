@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline.grading import rubric as asked
 from pipeline.grading.judge.work import NONE, Verdict, Work, mean_share
-from pipeline.grading.mistakes.controller import Controller, same_gains
+from pipeline.grading.mistakes.controller import Controller, does, same_gains
 from pipeline.grading.references.reference import OFF_SCALE, Reference, off_scale
 from pipeline.grading.references.tolerance import as_typed, credit, exact, percent_off, rounding
 from pipeline.plant.chain import Array
@@ -29,7 +29,7 @@ def judge_gains(criterion: asked.Gains, work: Work) -> Verdict:
         return loop
     controller, gains = loop
     goal = controller.goal
-    best, found = NONE, {}
+    best, found, told = NONE, {}, ""
     for numbers in controller.numbers(gains):
         share = NONE
         if numbers.stable and numbers.settling_time is not None:
@@ -44,7 +44,7 @@ def judge_gains(criterion: asked.Gains, work: Work) -> Verdict:
                 ),
             )
         if not found or share > best:
-            best = share
+            best, told = share, does(numbers)
             found = {
                 "stable": numbers.stable,
                 "overshoot_percent": numbers.overshoot if np.isfinite(numbers.overshoot) else None,
@@ -53,16 +53,9 @@ def judge_gains(criterion: asked.Gains, work: Work) -> Verdict:
             }
     if not found:
         return Verdict(share=NONE, message="These gains cannot be simulated.")
-    overshoot, settling = found["overshoot_percent"], found["settling_time"]
-    does = (
-        "the loop is unstable"
-        if not found["stable"]
-        else f"overshoot {round(overshoot, 2):.3g} %, "
-        + (f"settling in {settling:.3g} s" if settling is not None else "no settling in sight")
-    )
     return Verdict(
         share=best,
-        message=f"On your carts: {does}; the goal is {goal.overshoot_percent:g} % and "
+        message=f"On your carts: {told}; the goal is {goal.overshoot_percent:g} % and "
         f"{goal.settling_time:g} s.",
         expected={
             "overshoot_percent": goal.overshoot_percent,

@@ -8,10 +8,12 @@ from decimal import Decimal
 import numpy as np
 
 from pipeline.errors import DataError
+from pipeline.grading.mistakes import limits
 from pipeline.grading.mistakes.loop_numbers import LoopNumbers, loop_numbers
 from pipeline.grading.mistakes.state_model import own_chain
 from pipeline.grading.references.reference import is_explained
 from pipeline.grading.references.tolerance import as_typed, rounding
+from pipeline.grading.words import WORDS
 from pipeline.names import read_name
 from pipeline.plant.chain import Array, Chain
 from pipeline.plant.robustness import MASS_SPRING_ERROR, level_error_percent, static_levels
@@ -19,15 +21,6 @@ from pipeline.results import Analysis
 from pipeline.schemas.grade import Flag
 from pipeline.submission import Design, StateFeedback, Submission
 from pipeline.workflow import reference_design
-
-# Where a controller is wrong rather than a matter of taste or of the model's error.
-_OVERSHOOT = 20.0  # percentage points above the goal
-_SETTLING = 2.0  # times the goal
-_CLAIM_OVERSHOOT, _CLAIM_SETTLING = 12.0, 1.6  # percentage points, times
-_OTHER_GAINS = 2.5  # times: claims so far off are of other gains, whatever the prefilter
-_PREFILTER, _PREFILTER_BLURRED = 0.10, 0.20  # relative
-_SIGMAS = 2.0  # of the fitted static gains, which a prefilter may be off by
-_SAME_GAINS = 0.02  # relative to the largest of its kind: typed again with fewer digits
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -73,40 +66,42 @@ class Controller:
     def reaches_goal(self, gains: Array) -> bool:
         """Whether gains do what is asked for on one of the models."""
         return any(
-            numbers.stable
-            and numbers.overshoot <= self.goal.overshoot_percent
-            and numbers.settling_time is not None
-            and numbers.settling_time <= self.goal.settling_time
-            for numbers in self.numbers(gains)
+            self.meets(numbers, overshoot=0.0, settling=1.0) for numbers in self.numbers(gains)
         )
 
-    def meets(self, numbers: LoopNumbers) -> bool:
-        """Whether a loop comes near enough to the goal not to be called wrong."""
+    def meets(
+        self,
+        numbers: LoopNumbers,
+        *,
+        overshoot: float = limits.OVERSHOOT,
+        settling: float = limits.SETTLING,
+    ) -> bool:
+        """Whether a loop comes near enough to the goal, by default not to be called wrong."""
         return (
             numbers.stable
-            and numbers.overshoot <= self.goal.overshoot_percent + _OVERSHOOT
+            and numbers.overshoot <= self.goal.overshoot_percent + overshoot
             and numbers.settling_time is not None
-            and numbers.settling_time <= _SETTLING * self.goal.settling_time
+            and numbers.settling_time <= settling * self.goal.settling_time
         )
 
     def is_claimed(self, numbers: LoopNumbers) -> bool:
         """Whether a loop does about what was reported of it."""
         if self.overshoot is not None and not (
-            abs(numbers.overshoot - float(self.overshoot)) <= _CLAIM_OVERSHOOT
+            abs(numbers.overshoot - float(self.overshoot)) <= limits.CLAIM_OVERSHOOT
         ):
             return False
         if self.settling is None or self.settling <= 0:
             return True
         settles = numbers.settling_time
         ratio = None if settles is None else settles / float(self.settling)
-        return ratio is not None and 1 / _CLAIM_SETTLING <= ratio <= _CLAIM_SETTLING
+        return ratio is not None and 1 / limits.CLAIM_SETTLING <= ratio <= limits.CLAIM_SETTLING
 
     def is_of_other_gains(self, numbers: LoopNumbers) -> bool:
         """Whether a loop settles so much sooner or later than reported that it is not meant."""
         if self.settling is None or self.settling <= 0 or numbers.settling_time is None:
             return False
         ratio = numbers.settling_time / float(self.settling)
-        return max(ratio, 1 / ratio) > _OTHER_GAINS
+        return max(ratio, 1 / ratio) > limits.OTHER_GAINS
 
     def prefilter_fits(self, numbers: LoopNumbers, *, sharp: bool = False) -> bool:
         """Whether the reported prefilter is one over the static gain of this loop.
@@ -116,7 +111,7 @@ class Controller:
         if self.prefilter is None:
             return True
         off = abs(float(self.prefilter) - numbers.prefilter) - float(rounding(self.prefilter))
-        allowed = _PREFILTER_BLURRED if self.blurred and not sharp else _PREFILTER
+        allowed = limits.PREFILTER_BLURRED if self.blurred and not sharp else limits.PREFILTER
         return off <= (allowed + self.doubt) * abs(numbers.prefilter)
 
 
@@ -172,7 +167,7 @@ def _doubt(controller: Controller, submission: Submission, analysis: Analysis) -
         return 0.0
     share = float(level_error_percent(chain, gains, cart=cart)) / 100 / MASS_SPRING_ERROR
     fitted = [
-        _SIGMAS * row.final.std / abs(row.final.value)
+        limits.PREFILTER_SIGMAS * row.final.std / abs(row.final.value)
         for row in analysis.rows
         if read_name(row.name).is_gain and row.final and row.final.std and row.final.value
     ]
@@ -194,7 +189,7 @@ def _by_rounding(typed: Mapping[str, Decimal], gains: Array, *, cart: int) -> fl
     half = {name: float(rounding(value)) for name, value in typed.items()}
     moved = [level({**values, name: values[name] + half[name]}) for name in values]
     relative = np.nan_to_num(np.array(moved) / level(values) - 1)
-    return _SIGMAS / np.sqrt(3) * float(np.linalg.norm(relative))
+    return limits.PREFILTER_SIGMAS / np.sqrt(3) * float(np.linalg.norm(relative))
 
 
 def _reachable(goal: Design, submission: Submission, analysis: Analysis) -> Design:
@@ -262,7 +257,7 @@ def same_gains(a: Array, b: Array) -> bool:
     scale = np.empty_like(a)
     for part in (0, 1):
         scale[part::2] = max(float(np.abs(a[part::2]).max()), float(np.abs(b[part::2]).max()))
-    return bool(np.all(np.abs(a - b) <= _SAME_GAINS * np.maximum(scale, 1e-300)))
+    return bool(np.all(np.abs(a - b) <= limits.SAME_GAINS * np.maximum(scale, 1e-300)))
 
 
 def _slip(controller: Controller) -> tuple[str, Array | None]:
@@ -289,63 +284,60 @@ def _slip(controller: Controller) -> tuple[str, Array | None]:
 def _undone(gains: Array) -> Iterator[tuple[str, Array]]:
     """Yield (the slip in words, the gains without it); none that changes nothing."""
     n = gains.size // 2
-    found = [("all signs are reversed: u = prefilter·r − G·x takes the gains with a minus", -gains)]
+    pairs = gains.reshape(n, 2)
+    found = [(WORDS.text("all_signs"), -gains)]
     if n > 1:
-        ordered = np.empty_like(gains)
-        ordered[0::2], ordered[1::2] = gains[:n], gains[n:]
-        found.append(
-            ("the gains are listed positions first; the order is (x1, v1, x2, v2, …)", ordered)
-        )
-        pairs = gains.reshape(n, 2)
-        found += [
-            (
-                "the gains belong to other carts; cart 1 is the one at the motor",
-                np.ravel(pairs[p, :]),
-            )
-            for p in map(list, itertools.permutations(range(n)))
-            if p != sorted(p)
-        ]
-    exchanged = gains.copy()
-    exchanged[0::2], exchanged[1::2] = gains[1::2], gains[0::2]
-    found.append(("position and velocity gains are exchanged", exchanged))
-    for i in range(gains.size):
+        found.append((WORDS.text("gains_positions_first"), gains.reshape(2, n).T.ravel()))
+        others = list(itertools.permutations(range(n)))[1:]
+        found += [(WORDS.text("gains_of_others"), pairs[list(p)].ravel()) for p in others]
+    found.append((WORDS.text("gains_exchanged"), pairs[:, ::-1].ravel()))
+    for i, gain in enumerate(gains):
         flipped = gains.copy()
-        flipped[i] = -flipped[i]
-        found.append((f"the sign of gain {i + 1} is reversed", flipped))
+        flipped[i] = -gain
+        found.append((WORDS.text("sign_of_gain", number=i + 1), flipped))
     for text, meant in found:
         if not same_gains(meant, gains):
             yield text, meant
+
+
+def does(numbers: LoopNumbers) -> str:
+    """Return what a loop does, in words."""
+    if not numbers.stable:
+        return WORDS.text("unstable")
+    seconds = numbers.settling_time
+    return WORDS.text(
+        "does",
+        overshoot=f"{round(numbers.overshoot, 2):.3g}",
+        settling=WORDS.text("settles", seconds=f"{seconds:.3g}")
+        if seconds is not None
+        else WORDS.text("never_settles"),
+    )
 
 
 def _gains_flag(
     controller: Controller, numbers: LoopNumbers, *, slip: str, other_ran: bool
 ) -> Flag:
     goal = controller.goal
-    settles = numbers.settling_time
-    does = (
-        f"overshoot {round(numbers.overshoot, 2):.3g} %, settling "
-        + (f"in {settles:.3g} s" if settles is not None else "not in sight")
-        if numbers.stable
-        else "the loop is unstable"
-    )
     why = slip or (
-        "they are not the gains that ran on the bench"
+        WORDS.text("not_those_that_ran")
         if other_ran
-        else f"you report {controller.settling} s"
+        else WORDS.text("settling_reported", settling=controller.settling)
         if controller.meets(numbers)
-        else f"the goal was {goal.overshoot_percent:g} % and {goal.settling_time:g} s"
+        else WORDS.text(
+            "goal", overshoot=f"{goal.overshoot_percent:g}", settling=f"{goal.settling_time:g}"
+        )
     )
     assert controller.gains is not None
     return Flag(
         code="wrong_gains",
         parameters=("gains",),
-        message=f"with these gains on your carts: {does}; {why}.",
+        message=WORDS.text("gains", does=does(numbers), why=why),
         evidence={
             "reported": controller.gains.tolist(),
             "ran": None if controller.ran is None else controller.ran.tolist(),
             "stable": numbers.stable,
             "overshoot_percent": numbers.overshoot if np.isfinite(numbers.overshoot) else None,
-            "settling_time": settles,
+            "settling_time": numbers.settling_time,
             "slip": slip,
         },
     )
@@ -356,7 +348,9 @@ def _prefilter_slip(controller: Controller, right: float) -> str:
     typed = controller.prefilter
     assert typed is not None
     for text, value in _prefilter_slips(controller, right):
-        if abs(float(typed) - value) <= 0.5 * _PREFILTER * abs(value) + float(rounding(typed)):
+        if abs(float(typed) - value) <= 0.5 * limits.PREFILTER * abs(value) + float(
+            rounding(typed)
+        ):
             return text
     return ""
 
@@ -364,13 +358,15 @@ def _prefilter_slip(controller: Controller, right: float) -> str:
 def _prefilter_flag(controller: Controller, numbers: LoopNumbers, *, slip: str) -> Flag:
     typed, right = controller.prefilter, numbers.prefilter
     assert typed is not None
-    hint = (
-        slip or "it is one over the static gain of the loop, from r to the cart that is controlled"
-    )
     return Flag(
         code="wrong_prefilter",
         parameters=("prefilter",),
-        message=f"prefilter: these gains need {right:.4g}, you report {as_typed(typed)}: {hint}.",
+        message=WORDS.text(
+            "prefilter",
+            recomputed=f"{right:.4g}",
+            reported=as_typed(typed),
+            why=slip or WORDS.text("prefilter_is"),
+        ),
         evidence={
             "parameter": "prefilter",
             "reported": float(typed),
@@ -382,11 +378,10 @@ def _prefilter_flag(controller: Controller, numbers: LoopNumbers, *, slip: str) 
 
 def _prefilter_slips(controller: Controller, right: float) -> Iterator[tuple[str, float]]:
     chain, goal = controller.models[0], controller.goal
-    yield "this is the loop's static gain itself, so take its reciprocal", 1 / right
-    yield "its sign is reversed", -right
+    yield WORDS.text("prefilter_reciprocal"), 1 / right
+    yield WORDS.text("prefilter_sign"), -right
     if chain.is_tied:
-        static = 1 / float(chain.static_gains()[goal.cart - 1])
-        yield "this is 1/K of the cart without feedback; the gains add their share", static
+        yield WORDS.text("prefilter_open"), 1 / float(chain.static_gains()[goal.cart - 1])
     for cart in range(1, chain.n + 1):
         if cart != goal.cart and controller.gains is not None:
             other = loop_numbers(
@@ -397,9 +392,7 @@ def _prefilter_slips(controller: Controller, right: float) -> Iterator[tuple[str
                 sample_time=goal.sample_time,
             )
             if other is not None:
-                yield (
-                    f"this one is for cart {cart}, and cart {goal.cart} is controlled",
-                    (other.prefilter),
-                )
+                said = WORDS.text("prefilter_of_other", cart=cart, goal=goal.cart)
+                yield said, other.prefilter
     if right != 1.0:
-        yield "no prefilter was designed", 1.0
+        yield WORDS.text("prefilter_none"), 1.0

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from decimal import Decimal
 from typing import Literal
 
+from pipeline.grading.mistakes import limits
 from pipeline.grading.mistakes.catalogue import Mistake
 from pipeline.grading.references.reference import Reference
 from pipeline.grading.references.tolerance import Typed
@@ -13,17 +14,7 @@ from pipeline.grading.rubric import is_damping
 from pipeline.names import read_name
 from pipeline.schemas.grade import Code
 
-SIGMAS = 3.0  # standard errors of the recordings' own number that are no mistake
-_NEAR = 0.1  # relative: as far off is an honest first estimate, with a mistake in it or without
-_NEAR_BY_EYE = 0.3  # … of a resonance or null that is read off a plot
-
-# How far honest numbers lie outside their bounds: half of the logarithms of them by less (Cauchy).
-_GAIN, _FREQUENCY, _BY_EYE, _DAMPING = 0.01, 0.004, 0.06, 0.2
-# A number that is off, and nothing explains it, lies anywhere within so many e-folds. One in twenty
-# is; a known mistake is made in one table of ten.
-_ANYWHERE = 3.0
-_SLIP, _KNOWN_SLIP = math.log(20), math.log(10)
-_MARGIN = 2.0  # e-folds: of two explanations the other is out where it is so much less likely
+_SLIP, _KNOWN_SLIP = math.log(limits.ONE_IN_OFF), math.log(limits.ONE_IN_KNOWN)
 # With little damping a step peaks at twice its level, which is also what peak to peak gives: of a
 # first estimate it is then true that the step peaks there, whatever was done.
 _TRUE_ANYWAY: Code = "peak_for_steady_state"
@@ -86,7 +77,7 @@ def explain(
             for c in covers
             if not best.codes <= c.codes
             and best.explained & c.explained
-            and score[id(c)] > score[id(best)] - _MARGIN
+            and score[id(c)] > score[id(best)] - limits.MARGIN
         ]
         rival = None
         shared = frozenset.intersection(best.codes, *(c.codes for c in rivals))
@@ -138,7 +129,7 @@ class _Tried:
     @classmethod
     def on(cls, mistake: Mistake, table: Mapping[str, Typed], label: Label) -> "_Tried":
         errors = {
-            name: table[name].percent_off(predicted, sigmas=SIGMAS)
+            name: table[name].percent_off(predicted, sigmas=limits.SIGMAS)
             for name, predicted in mistake.predicted.items()
             if name in table
         }
@@ -167,15 +158,15 @@ class _Tried:
     def _is_near(self, name: str) -> bool:
         """Whether a number beside others that it makes is off as honest numbers are off."""
         by_eye = self.label == "initial" and read_name(name).is_by_eye
-        limit = _NEAR_BY_EYE if by_eye else _NEAR
+        limit = limits.NEAR_BY_EYE if by_eye else limits.NEAR
         return not is_damping(name) and self.errors[name] <= 100 * limit
 
 
 def _by_way(tried: Sequence[_Tried]) -> list[list[_Tried]]:
     """Return the mistakes that are one and the same way to be wrong, of whatever numbers."""
-    ways: dict[tuple[tuple[Code, ...], str], list[_Tried]] = {}
+    ways: dict[tuple, list[_Tried]] = {}
     for one in tried:
-        ways.setdefault((one.mistake.codes, one.mistake.help), []).append(one)
+        ways.setdefault((one.mistake.said, one.mistake.periods), []).append(one)
     return [*ways.values()]
 
 
@@ -209,7 +200,7 @@ def _score(
         predicted |= {n: mistake.predicted[n] for n in touched}
     # What is off is no honest number; a mistake of the whole table may make any of it.
     wide = any(m.table_wide for m, _ in cover.fits)
-    unexplained = -math.log(_ANYWHERE) - (0.0 if wide else _SLIP)
+    unexplained = -math.log(limits.ANYWHERE) - (0.0 if wide else _SLIP)
     told = sum(
         unexplained
         if name in off and name not in cover.explained
@@ -229,16 +220,16 @@ def _log_density(typed: Typed, reference: Reference, name: str) -> float:
     """
     half, value = typed.hidden, typed.value
     low, high = reference.low, reference.high
-    anywhere = -math.log(_ANYWHERE) - _SLIP
+    anywhere = -math.log(limits.ANYWHERE) - _SLIP
     if low <= 0:
         return anywhere
-    read, usual = read_name(name), _FREQUENCY
+    read, usual = read_name(name), limits.USUAL_FREQUENCY
     if read.is_gain:
-        usual = _GAIN
+        usual = limits.USUAL_GAIN
     elif read.is_damping:
-        usual = _DAMPING
+        usual = limits.USUAL_DAMPING
     elif read.is_by_eye:
-        usual = _BY_EYE
+        usual = limits.USUAL_BY_EYE
     # What a mistake is made with was typed to as many digits before.
     digits = 10.0 ** (1 - typed.digits) / 4
     usual = math.hypot(usual, digits, reference.std / reference.value)

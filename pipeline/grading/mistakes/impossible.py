@@ -4,15 +4,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from decimal import Decimal
 
+from pipeline.grading.mistakes import limits
 from pipeline.grading.references.tolerance import as_typed, rounding
+from pipeline.grading.words import WORDS
 from pipeline.names import read_name
 from pipeline.plant.laws import HEAVY_DAMPING, orders
 from pipeline.schemas.grade import Flag
-
-# How far an order may be broken: fitted numbers are good to some percent, and first estimates of
-# resonances and nulls are read off a plot.
-_FINAL_SLACK = 1.1
-_INITIAL_SLACK = 1.2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,8 +44,15 @@ class BrokenOrder:
         return Flag(
             code="physically_impossible",
             parameters=self.names,
-            message=f"{self.lesser} = {as_typed(low)} cannot be above {self.greater} = "
-            f"{as_typed(high)} ({label} estimates): {self.reason}.",
+            message=WORDS.text(
+                "broken_order",
+                lesser=self.lesser,
+                low=as_typed(low),
+                greater=self.greater,
+                high=as_typed(high),
+                table=label,
+                reason=self.reason,
+            ),
             evidence={
                 "table": label,
                 "reported": {self.lesser: float(low), self.greater: float(high)},
@@ -64,7 +68,7 @@ def not_positive(table: Mapping[str, Decimal]) -> list[str]:
 
 def broken_orders(table: Mapping[str, Decimal], *, initial: bool) -> list[BrokenOrder]:
     """Return the orders that a table breaks by more than rounding and honest error."""
-    slack = _INITIAL_SLACK if initial else _FINAL_SLACK
+    slack = limits.ORDER_INITIAL if initial else limits.ORDER_FINAL
     heavy = any(v > HEAVY_DAMPING for n, v in table.items() if read_name(n).is_ratio)
     broken = []
     for lesser, greater, reason in orders(list(table)):

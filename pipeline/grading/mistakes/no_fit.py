@@ -4,22 +4,12 @@ from decimal import Decimal
 from fractions import Fraction
 from math import exp
 
+from pipeline.grading.mistakes import limits
 from pipeline.grading.references.reference import Reference, References
 from pipeline.grading.references.tolerance import half_digit, is_vague, percent_off, rounding
 from pipeline.grading.rubric import is_damping
 from pipeline.names import read_name
 from pipeline.submission import Reported
-
-# How far an initial and a final estimate of one number usually lie apart, relative: where the
-# recordings leave no doubt, and where they do.
-_APART, _APART_BLURRED = 0.003, 0.01
-_APART_DAMPING, _APART_DAMPING_BLURRED = 0.03, 0.15
-_SHARP, _SHARP_DAMPING = 1.01, 1.05  # high over low of a reference without doubt
-_SLIP = 0.2  # relative: a number measured further off is wrong by a slip, maybe in both tables
-_SURPRISE = 3.0  # at most so much (e-folds) does the wrong number tell, as some fit badly
-_NORMAL, _SIGMAS = 3.5, 3.0  # one over the density of a normal difference at zero
-_CHANCE = 3e-3  # of a table that a fit gave agreeing so by coincidence
-_SHARE = 0.75  # of the numbers in both tables
 
 
 def copied_final(reported: Reported, *, references: References) -> list[str]:
@@ -31,17 +21,17 @@ def copied_final(reported: Reported, *, references: References) -> list[str]:
     """
     both = [name for name in reported.final if name in reported.initial]
     same = [n for n in both if _same(reported, n)]
-    if not both or len(same) < _SHARE * len(both):
+    if not both or len(same) < limits.COPIED * len(both):
         return []
     if 2 * sum(is_vague(reported.final[name]) for name in same) > len(same):
         return []
     fitted = [name for name in both if read_name(name).is_by_eye]
-    if len([name for name in fitted if name in same]) < _SHARE * len(fitted):
+    if len([name for name in fitted if name in same]) < limits.COPIED * len(fitted):
         return []
     chance = 1.0
     for name in same:
         chance *= _coincidence(reported.final[name], references.final.get(name), name)
-    return same if chance < _CHANCE else []
+    return same if chance < limits.COINCIDENCE else []
 
 
 def _coincidence(typed: Decimal, reference: Reference | None, name: str) -> float:
@@ -54,19 +44,19 @@ def _coincidence(typed: Decimal, reference: Reference | None, name: str) -> floa
         return 1.0
     damping = is_damping(name)
     half = half_digit(typed) / abs(Fraction(typed))
-    apart, surprise = _APART_DAMPING_BLURRED if damping else _APART_BLURRED, 0.0
+    apart, surprise = limits.APART_DAMPING_BLURRED if damping else limits.APART_BLURRED, 0.0
     if reference is not None and reference.low > 0:
         # A single digit stands for more than what grading excuses of it.
         hidden = half - rounding(typed) / abs(Fraction(typed))
-        off = max(float(percent_off(typed, reference, sigmas=_SIGMAS) / 100 - hidden), 0.0)
-        if reference.high <= reference.low * (_SHARP_DAMPING if damping else _SHARP):
-            apart = _APART_DAMPING if damping else _APART
+        off = max(float(percent_off(typed, reference, sigmas=limits.SIGMAS) / 100 - hidden), 0.0)
+        if reference.within(limits.NO_DOUBT_DAMPING if damping else limits.NO_DOUBT):
+            apart = limits.APART_DAMPING if damping else limits.APART
             if off == 0:
                 return 1.0
         measured = not damping and not read_name(name).is_by_eye
-        if not measured or off <= _SLIP:
-            surprise = min(0.5 * (off / apart) ** 2, _SURPRISE)
-    again = 1.0 if is_vague(typed) else min(1.0, 2 * float(half) / (apart * _NORMAL))
+        if not measured or off <= limits.SLIPPED:
+            surprise = min(0.5 * (off / apart) ** 2, limits.SURPRISE)
+    again = 1.0 if is_vague(typed) else min(1.0, 2 * float(half) / (apart * limits.NORMAL))
     return again * exp(-surprise)
 
 

@@ -5,13 +5,12 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from pipeline.checks.recordings import SCALES, why_other_frequency
+from pipeline.grading.mistakes import limits
 from pipeline.grading.references.reference import is_explained
 from pipeline.ingest.channels import saturation
 from pipeline.ingest.inspect import line_frequency
 from pipeline.results import Analysis, Record
 from pipeline.schemas.grade import Flag
-
-_FREQUENCY = 0.08  # relative: a stated frequency further from that of the input is another run's
 
 
 def bad_runs(analysis: Analysis) -> dict[str, str]:
@@ -64,6 +63,6 @@ def _problems(record: Record, *, sticky: bool) -> Iterator[str]:
     if record.kind == "sine" and record.omega is not None and np.ptp(u) > 0:
         hertz, stated = line_frequency(record.t, u), record.omega / (2 * np.pi)
         resolution = 1.0 / float(record.t[-1] - record.t[0])
-        if hertz is not None and abs(hertz - stated) > max(_FREQUENCY * stated, resolution):
+        if hertz is not None and abs(hertz - stated) > max(limits.OTHER_RUN * stated, resolution):
             why = why_other_frequency(stated / hertz) or "is it the file of another experiment?"
             yield f"the input has {hertz:.3g} Hz, {stated:.3g} Hz is stated: {why}"

@@ -4,24 +4,19 @@ A table stands in for dwells, so a slip in it goes unseen into every number that
 Where the dwells are handed in too they tell; else the steps and decays do, by the fit's numbers.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.grading.mistakes import limits
 from pipeline.grading.mistakes.transient import early_readings
 from pipeline.grading.references.reference import is_explained
+from pipeline.grading.words import WORDS
 from pipeline.plant.chain import Array
 from pipeline.results import Analysis, SinePoint
 from pipeline.schemas.grade import Code, Flag
 
-_SAME_FREQUENCY = 0.02  # relative: a row of the table is of this dwell
-_MET = 0.06  # relative: a ratio read off the right way, or by one slip
-_MOST = 0.8  # of the rows must be met by a slip
-_FEW = 0.6  # of the rows met as they stand: the table is right but for odd rows
-_FEWEST = 4  # rows; fewer single nothing out
-_LEAST_COUNTS = 20.0  # encoder steps: smaller amplitudes are not read well
-_OFF = 1.3  # factor, median over the rows: a table wrong by an unknown slip
 _TURN = 2 * np.pi
 
 
@@ -45,21 +40,17 @@ def diagnose_reduced(analysis: Analysis) -> list[Flag]:
     if not analysis.sine_points:
         return _against_time_records(analysis)
     rows = _rows(analysis, stretch=1.0)
-    if rows is not None and _share(rows.reported, rows.measured) >= _FEW:
+    if rows is not None and _share(rows.reported, rows.measured) >= limits.ENOUGH_ROWS:
         return []
-    found = []
-    for code, text, predicted, seen in _slips(analysis, rows):
-        share = _share(seen.reported, predicted)
-        if share >= _MOST:
-            found.append((share, code, text, seen))
-    if found:
-        _, code, text, seen = max(found, key=lambda one: one[0])
-        return [_flag(code, text, seen)]
+    slips = [(_share(slip.rows.reported, slip.predicted), slip) for slip in _slips(analysis, rows)]
+    share, best = max(slips, key=lambda one: one[0], default=(0.0, None))
+    if best is not None and share >= limits.MOST_ROWS:
+        return [_flag(best.code, best.said, best.rows)]
     if rows is None:
         return []
     ratio = float(np.median(np.abs(np.log(rows.reported / rows.measured))))
-    text = "the table is not what your own dwells give; reduce them again"
-    return [_flag("data_problem", text, rows)] if ratio > np.log(_OFF) else []
+    off = ratio > np.log(limits.TABLE_OFF)
+    return [_flag("data_problem", "reduced_off", rows)] if off else []
 
 
 def _rows(analysis: Analysis, *, stretch: float) -> _Rows | None:
@@ -71,11 +62,11 @@ def _rows(analysis: Analysis, *, stretch: float) -> _Rows | None:
             p for p in analysis.sine_points if p.cart == table.cart and _is_clear(p, analysis)
         ]
         for omega, ratio in zip(table.omega * stretch, table.magnitude, strict=True):
-            near = [p for p in points if abs(p.omega / omega - 1) <= _SAME_FREQUENCY]
+            near = [p for p in points if abs(p.omega / omega - 1) <= limits.SAME_FREQUENCY]
             if near:
                 best = min(near, key=lambda p: abs(p.omega - omega))
                 matched.append((table.cart, float(ratio), best))
-    if len(matched) < _FEWEST:
+    if len(matched) < limits.FEWEST_ROWS:
         return None
     return _Rows(
         cart=np.array([cart for cart, _, _ in matched]),
@@ -96,51 +87,56 @@ def _rows(analysis: Analysis, *, stretch: float) -> _Rows | None:
 
 def _is_clear(point: SinePoint, analysis: Analysis) -> bool:
     steps = [r.encoder_step(point.cart) for r in analysis.records if r.id == point.experiment]
-    return point.settled and point.amplitude > _LEAST_COUNTS * max(steps, default=0.0)
+    return point.settled and point.amplitude > limits.LEAST_COUNTS * max(steps, default=0.0)
 
 
 def _share(reported: Array, predicted: Array) -> float:
     """Return the share of the rows that are what is predicted."""
     with np.errstate(all="ignore"):
-        return float(np.mean(np.abs(np.log(reported / predicted)) <= _MET))
+        return float(np.mean(np.abs(np.log(reported / predicted)) <= limits.RATIO))
 
 
-def _slips(analysis: Analysis, rows: _Rows | None) -> Iterator[tuple[Code, str, Array, _Rows]]:
-    """Yield (code, in words, what it makes of the rows, the rows)."""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Slip:
+    """A slip, the sentence that says it, and what it makes of the rows."""
+
+    code: Code
+    said: str
+    predicted: Array
+    rows: _Rows
+
+
+def _slips(analysis: Analysis, rows: _Rows | None) -> Iterator[_Slip]:
+    """Yield all that may have gone wrong with the whole table."""
     # A column headed in Hz that holds rad/s, and the other way round.
-    for stretch, text in (
-        (1 / _TURN, "its frequencies are in rad/s; the column is for Hz"),
-        (_TURN, "its frequencies were divided by 2π once too often"),
-    ):
+    for stretch, said in ((1 / _TURN, "reduced_radians"), (_TURN, "reduced_hertz")):
         moved = _rows(analysis, stretch=stretch)
         if moved is not None:
-            yield "hz_for_rad_s", text, moved.measured, moved
+            yield _Slip(code="hz_for_rad_s", said=said, predicted=moved.measured, rows=moved)
     if rows is None:
         return
-    peak = "its ratios are {} those of your own dwells: the amplitudes of input and position are "
-    peak += "both half of the distance from peak to peak"
-    yield "peak_to_peak", peak.format("twice"), 2 * rows.measured, rows
-    yield "peak_to_peak", peak.format("half of"), rows.measured / 2, rows
     counts = [r.encoder_step(int(c)) for r in analysis.records for c in r.carts]
     count = float(np.median(counts)) if counts else 0.0
-    if count not in (0.0, 1.0):
-        text = "its ratios are in encoder counts: multiply by the length of a count"
-        yield "counts_for_length", text, rows.measured / count, rows
     decibel = 20 * np.log10(rows.measured)
-    text = "its ratios look like decibels: say so in the heading, as in 'x1 [dB]'"
-    yield "data_problem", text, np.where(decibel > 0, decibel, np.nan), rows
-    gains = {(p.cart, round(p.omega, 6)): p.gain for p in analysis.sine_points}
+    found: list[tuple[Code, str, Array]] = [
+        ("peak_to_peak", "reduced_twice", 2 * rows.measured),
+        ("peak_to_peak", "reduced_half", rows.measured / 2),
+        ("data_problem", "reduced_decibels", np.where(decibel > 0, decibel, np.nan)),
+    ]
+    if count not in (0.0, 1.0):
+        found.insert(2, ("counts_for_length", "reduced_counts", rows.measured / count))
     if analysis.carts == 2:
-        other = _other_cart(analysis, rows, gains)
-        yield "carts_swapped", "its columns belong to the other cart each", other, rows
+        found.append(("carts_swapped", "reduced_swapped", _other_cart(analysis, rows)))
     for early in rows.early:
-        if _share(early, rows.measured) < _FEW:
-            text = "its ratios are those of the first swings: wait for the steady state"
-            yield "transient_used", text, early, rows
+        if _share(early, rows.measured) < limits.ENOUGH_ROWS:
+            found.append(("transient_used", "reduced_early", early))
+    for code, said, predicted in found:
+        yield _Slip(code=code, said=said, predicted=predicted, rows=rows)
 
 
-def _other_cart(analysis: Analysis, rows: _Rows, gains: Mapping[tuple[int, float], float]) -> Array:
+def _other_cart(analysis: Analysis, rows: _Rows) -> Array:
     """Return what the dwell of each row says of the other of two carts; NaN where nothing."""
+    gains = {(p.cart, round(p.omega, 6)): p.gain for p in analysis.sine_points}
     omega = {p.gain: round(p.omega, 6) for p in analysis.sine_points}
     return np.array(
         [
@@ -150,14 +146,19 @@ def _other_cart(analysis: Analysis, rows: _Rows, gains: Mapping[tuple[int, float
     )
 
 
-def _flag(code: Code, text: str, rows: _Rows) -> Flag:
+def _flag(code: Code, said: str, rows: _Rows) -> Flag:
     worst = int(np.argmax(np.abs(np.log(rows.reported / rows.measured))))
     carts = sorted(set(rows.cart.tolist()))
     return Flag(
         code=code,
         parameters=tuple(f"bode.x{cart}" for cart in carts),
-        message=f"the reduced table: {text} (cart {rows.cart[worst]}: {rows.reported[worst]:.4g}, "
-        f"your dwell gives {rows.measured[worst]:.4g}).",
+        message=WORDS.text(
+            "reduced",
+            slip=WORDS.text(said),
+            cart=rows.cart[worst],
+            reported=f"{rows.reported[worst]:.4g}",
+            recomputed=f"{rows.measured[worst]:.4g}",
+        ),
         evidence={
             "cart": int(rows.cart[worst]),
             "reported": float(rows.reported[worst]),
@@ -186,14 +187,13 @@ def _against_time_records(analysis: Analysis) -> list[Flag]:
     )
     for code, symbol, factor, words in slips:
         values = np.array(ratios[symbol])
-        if values.size and np.all(np.abs(np.log(values / factor)) <= _MET):
+        if values.size and np.all(np.abs(np.log(values / factor)) <= limits.RATIO):
             what = "gains" if symbol == "K" else "frequencies"
             return [
                 Flag(
                     code=code,
                     parameters=tuple(f"bode.x{table.cart}" for table in analysis.tables),
-                    message=f"the reduced table: fitted, its {what} are {words} those of your "
-                    "steps and decays; look again at how amplitudes and frequencies were read.",
+                    message=WORDS.text("reduced_fitted", what=what, factor=words),
                     evidence={"ratio": float(values[0])},
                 )
             ]

@@ -8,9 +8,11 @@ from typing import Literal
 
 import numpy as np
 
+from pipeline.grading.mistakes import limits
 from pipeline.grading.references.reference import Reference
 from pipeline.grading.references.tolerance import percent_off
 from pipeline.grading.rubric import is_damping
+from pipeline.grading.words import WORDS
 from pipeline.names import parameter_names
 from pipeline.plant.chain import Array, Chain, recover_from_parameters
 from pipeline.schemas.grade import Flag
@@ -18,19 +20,9 @@ from pipeline.submission import StateSpace
 
 Kind = Literal["exact", "stiffness", "damping"]
 
-# From here on an entry is wrong rather than imprecise: percent. Couplings are differences of
-# large numbers, dampings are what friction adds to.
-_WRONG = {"exact": 0.0, "stiffness": 20.0, "damping": 100.0}
-# A 0 or 1 of A is met within what a computer adds to it: 1.2e-17 is zero.
-_EXACT = 1e-6
-# Standard errors of an honest table's numbers, relative, and how many of them its A and B may lie
-# off: two routes from the table to one coupling part by as much.
-_HONEST, _HONEST_DAMPING = 0.01, 0.1
-_SIGMAS = 2.0
 _NAMED = 3  # carts whose chain the named parameters give back
 _MODES = ("omega_a", "omega_b", "omega_c")
 _NULLS = ("omega_x", "omega_y")
-_EXPLAINED = {"exact": 0.0, "stiffness": 12.0, "damping": 60.0}  # what a named slip must meet
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -58,12 +50,12 @@ class Entry:
     @property
     def wrong(self) -> bool:
         """Whether it is wrong rather than imprecise."""
-        return self.error > _WRONG[self.kind]
+        return self.error > limits.WRONG[self.kind]
 
     @property
     def suspect(self) -> bool:
         """Whether it would be wrong if the models were exact."""
-        return self.bare > _WRONG[self.kind]
+        return self.bare > limits.WRONG[self.kind]
 
 
 def compare_entries(space: StateSpace, *, models: Sequence[StateModel], n: int) -> list[Entry]:
@@ -143,7 +135,9 @@ def _put_dampings(
             continue
         middle, half = (told.high + told.low) / 2, (told.high - told.low) / 2
         right[at, at] = -2 * middle * values[omega]
-        slack[at, at] = 2 * (half + _SIGMAS * _HONEST_DAMPING * middle) * values[omega]
+        slack[at, at] = (
+            2 * (half + limits.HONEST_SIGMAS * limits.HONEST_DAMPING * middle) * values[omega]
+        )
 
 
 def _own_names(i: int, n: int) -> tuple[str, str]:
@@ -206,13 +200,13 @@ def _spread(
     variance = np.zeros_like(right)
     for name, value in values.items():
         error = np.hypot(
-            _HONEST_DAMPING if is_damping(name) else _HONEST,
+            limits.HONEST_DAMPING if is_damping(name) else limits.HONEST,
             rounding.get(name, 0.0) / np.sqrt(3.0),
         )
         moved = make({**values, name: value * (1 + error)}, n)
         if moved is not None:
             variance += (moved - right) ** 2
-    return _SIGMAS * np.sqrt(variance)
+    return limits.HONEST_SIGMAS * np.sqrt(variance)
 
 
 def own_chain(values: Mapping[str, float], *, n: int) -> Chain | None:
@@ -250,9 +244,9 @@ def _matrix(space: StateSpace, n: int) -> dict[tuple[int, int], Decimal]:
 
 def _entry_error(typed: Decimal, right: float, kind: Kind, *, slack: float = 0.0) -> Fraction:
     if kind == "exact":
-        return Fraction(0) if abs(float(typed) - right) <= _EXACT else Fraction(10**6)
+        return Fraction(0) if abs(float(typed) - right) <= limits.EXACT else Fraction(10**6)
     if right == 0:
-        return Fraction(0) if abs(typed) <= _EXACT else Fraction(10**6)
+        return Fraction(0) if abs(typed) <= limits.EXACT else Fraction(10**6)
     size = abs(right)
     reference = Reference(
         value=size, low=max(size - slack, 0.0), high=size + slack, std=0.0, source=""
@@ -278,12 +272,13 @@ def diagnose_state_space(
         return []
     worst = max(wrong, key=lambda entry: entry.error)
     names = ", ".join(entry.name for entry in wrong[:4]) + (" …" if len(wrong) > 4 else "")
-    what = slip or "derive the row again from the equation of motion of its cart"
     return [
         Flag(
             code="wrong_state_space",
             parameters=tuple(entry.name for entry in wrong),
-            message=f"{names}: {what}.",
+            message=WORDS.text(
+                "state_space", entries=names, what=slip or WORDS.text("derive_again")
+            ),
             evidence={
                 "parameter": worst.name,
                 "reported": float(worst.typed),
@@ -297,17 +292,20 @@ def diagnose_state_space(
 def _slip(space: StateSpace, *, models: Sequence[StateModel], n: int) -> str:
     """Return the first known slip that turns the right [A B] into the one reported, or ""."""
     typed, kinds = _matrix(space, n), _kinds(n)
+    A = {at: number for at, number in typed.items() if at[1] < 2 * n}
+    B = {at: number for at, number in typed.items() if at[1] == 2 * n}
     for model in (one.right for one in models if np.all(np.isfinite(one.right))):
-        for text, slipped, moved in _slips(model, n):
-            of_states: list[list[Kind]] = [
-                [kinds[i][_column(moved, j)] for j in range(2 * n + 1)] for i in moved
-            ]
+        for text, order in _reordered(n):
+            columns = [*order, 2 * n]
+            slipped = model[np.ix_(order, columns)]
+            of_states = [[kinds[i][j] for j in columns] for i in order]
             # Who orders the states anew in A may have left B as it was.
             if _met(typed, slipped, of_states) or (
-                moved != sorted(moved)
-                and _met({at: x for at, x in typed.items() if at[1] < 2 * n}, slipped, of_states)
-                and _met({at: x for at, x in typed.items() if at[1] == 2 * n}, model, kinds)
+                _met(A, slipped, of_states) and _met(B, model, kinds)
             ):
+                return text
+        for text, slipped in _changed(model, n):
+            if _met(typed, slipped, kinds):
                 return text
     return ""
 
@@ -317,86 +315,55 @@ def _met(
 ) -> bool:
     """Whether all typed entries are those of a slipped [A B]."""
     return all(
-        _entry_error(number, float(slipped[i, j]), kinds[i][j]) <= _EXPLAINED[kinds[i][j]]
+        _entry_error(number, float(slipped[i, j]), kinds[i][j]) <= limits.EXPLAINED[kinds[i][j]]
         for (i, j), number in typed.items()
     )
 
 
-def _column(moved: list[int], column: int) -> int:
-    return moved[column] if column < len(moved) else column
+def _reordered(n: int) -> Iterator[tuple[str, list[int]]]:
+    """Yield (in words, which state stands where)."""
+    if n > 1:
+        yield WORDS.text("positions_first"), [*range(0, 2 * n, 2), *range(1, 2 * n, 2)]
+        back = [2 * i + part for i in reversed(range(n)) for part in (0, 1)]
+        yield WORDS.text("reverse_order"), back
 
 
-def _slips(model: Array, n: int) -> Iterator[tuple[str, Array, list[int]]]:
-    """Yield (in words, the [A B] it gives, which state stands where)."""
-    same = list(range(2 * n))
-
-    def reordered(order: list[int]) -> Array:
-        return np.hstack([model[np.ix_(order, order)], model[order, -1:]])
-
-    first = [*range(0, 2 * n, 2), *range(1, 2 * n, 2)]
-    yield (
-        "the states are in another order than (x1, v1, x2, v2, …): all positions come first",
-        reordered(first),
-        first,
-    )
-    back = [2 * i + part for i in reversed(range(n)) for part in (0, 1)]
-    yield "the carts are in reverse order: cart 1 is the one at the motor", reordered(back), back
-    transposed = model.copy()
-    transposed[:, :-1] = model[:, :-1].T
-    yield "A looks transposed", transposed, same
-    yield from _entry_slips(model, n)
-
-
-def _entry_slips(model: Array, n: int) -> Iterator[tuple[str, Array, list[int]]]:
-    same = list(range(2 * n))
+def _changed(model: Array, n: int) -> Iterator[tuple[str, Array]]:
+    """Yield (in words, the [A B] it gives)."""
     own = [(2 * i + 1, 2 * i) for i in range(n)]
     dampings = [(2 * i + 1, 2 * i + 1) for i in range(n)]
-    couplings = [(2 * i + 1, 2 * j) for i in range(n) for j in (i - 1, i + 1) if 0 <= j < n]
+    pairs = [((2 * i + 1, 2 * i + 2), (2 * i + 3, 2 * i)) for i in range(n - 1)]
+    couplings = sorted(at for pair in pairs for at in pair)
 
-    def changed(where: list[tuple[int, int]], factor: object) -> Array:
+    def put(values: Mapping[tuple[int, int], float]) -> Array:
         slipped = model.copy()
-        for at in where:
-            slipped[at] = model[at] * factor if isinstance(factor, float) else slipped[at]
+        for at, value in values.items():
+            slipped[at] = value
         return slipped
 
-    signs = {
-        "the stiffness": own,
-        "the damping": dampings,
-        "the coupling": couplings,
-    }
-    for words, where in signs.items():
-        if where:
-            yield f"the sign of {words} terms is reversed", changed(where, -1.0), same
-            for at in where:
-                text = f"the sign of A({at[0] + 1}, {at[1] + 1}) is reversed"
-                yield text, changed([at], -1.0), same
-    yield "the damping terms miss the 2 of 2ζω", changed(dampings, 0.5), same
-    root = model.copy()
-    for at in own:
-        root[at] = -np.sqrt(abs(model[at]))
-    yield "the stiffness terms hold ω where ω² belongs", root, same
-    hertz = model.copy()
-    for at in own:
-        hertz[at] = model[at] / (2 * np.pi) ** 2
-    yield "the stiffness terms are made of Hz instead of rad/s", hertz, same
-    if couplings:
-        yield "the couplings between the carts are missing", changed(couplings, 0.0), same
-        exchanged = model.copy()
-        for i in range(n - 1):
-            a, b = (2 * i + 1, 2 * i + 2), (2 * i + 3, 2 * i)
-            exchanged[a], exchanged[b] = model[b], model[a]
-        text = "the couplings k/m of neighbours are exchanged: divide by the mass of the row's cart"
-        yield text, exchanged, same
-        for i in range(n - 1):
-            a, b = (2 * i + 1, 2 * i + 2), (2 * i + 3, 2 * i)
-            one = model.copy()
-            one[a], one[b] = model[b], model[a]
-            yield f"the couplings of carts {i + 1} and {i + 2} are exchanged", one, same
-    for row in range(1, 2 * n, 2):
-        if row != 1:
-            moved = model.copy()
-            moved[row, -1], moved[1, -1] = model[1, -1], 0.0
-            yield "the input acts on cart 1, so B belongs in row 2", moved, same
-    inverse = model.copy()
-    inverse[1, -1] = 1 / model[1, -1]
-    yield "B holds the mass where its reciprocal belongs", inverse, same
+    def times(factor: float, places: Sequence[tuple[int, int]]) -> Array:
+        return put({at: factor * model[at] for at in places})
+
+    def exchanged(of: Sequence[tuple[tuple[int, int], tuple[int, int]]]) -> Array:
+        return put({a: model[b] for one, other in of for a, b in ((one, other), (other, one))})
+
+    transposed = model.copy()
+    transposed[:, :-1] = model[:, :-1].T
+    yield WORDS.text("transposed"), transposed
+    for terms, places in (("stiffness", own), ("damping", dampings), ("coupling", couplings)):
+        if places:
+            yield WORDS.text("sign_of_terms", terms=terms), times(-1.0, places)
+        for at in places:
+            entry = f"A({at[0] + 1}, {at[1] + 1})"
+            yield WORDS.text("sign_of_entry", entry=entry), times(-1.0, [at])
+    yield WORDS.text("half_damping"), times(0.5, dampings)
+    yield WORDS.text("root_stiffness"), put({at: -np.sqrt(abs(model[at])) for at in own})
+    yield WORDS.text("hertz_stiffness"), times((2 * np.pi) ** -2, own)
+    if pairs:
+        yield WORDS.text("no_couplings"), times(0.0, couplings)
+        yield WORDS.text("couplings_exchanged"), exchanged(pairs)
+    for cart, pair in enumerate(pairs, start=1):
+        yield WORDS.text("pair_exchanged", cart=cart, next=cart + 1), exchanged([pair])
+    for row in range(3, 2 * n, 2):
+        yield WORDS.text("input_row"), put({(row, -1): model[1, -1], (1, -1): 0.0})
+    yield WORDS.text("input_mass"), put({(1, -1): 1 / model[1, -1]})

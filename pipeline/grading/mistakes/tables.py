@@ -4,30 +4,22 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 
+from pipeline.grading.mistakes import limits
 from pipeline.grading.mistakes.catalogue import Mistake, known_mistakes
-from pipeline.grading.mistakes.explain import SIGMAS, Explained, Explanation, Label, Table, explain
+from pipeline.grading.mistakes.explain import Explained, Explanation, Label, Table, explain
 from pipeline.grading.mistakes.impossible import BrokenOrder, broken_orders, not_positive
 from pipeline.grading.mistakes.no_fit import copied_final
 from pipeline.grading.mistakes.transient import transient_fits
 from pipeline.grading.references.reference import Reference, References
 from pipeline.grading.references.tolerance import as_typed, percent_off
 from pipeline.grading.rubric import is_damping
+from pipeline.grading.words import WORDS
 from pipeline.names import read_name
 from pipeline.results import Analysis
 from pipeline.schemas.grade import CODES, Code, Flag
 from pipeline.submission import Reported
 
-# From here on a number is worth a remark. Two careful teams on one bench differ by some percent in
-# gains and frequencies, the paper's own tables by up to 14 % (29 % at a null read off by eye);
-# dampings differ by half and more.
-_OFF_FINAL = 7.0
-_OFF_INITIAL = 10.0
-_OFF_BY_EYE = 30.0  # resonances and nulls before any fit
-_OFF_DAMPING = 80.0
-_SUSPECT_DAMPING = 40.0  # enough to look for a known mistake, not for a remark of its own
-_OFF_EACH_OTHER = 25.0
-_CONFIRMED = Decimal("0.05")  # relative: the other table says the same
-_TOLD: dict[Label, str] = {"initial": "first estimate", "final": "final estimate"}
+_TOLD: dict[Label, str] = {"initial": "first_estimate", "final": "final_estimate"}
 _OTHER: dict[Label, Label] = {"initial": "final", "final": "initial"}
 
 # What comes of reading a decay or a step; in a final table only where it was taken over.
@@ -156,11 +148,11 @@ def _judge(
     impossible = not_positive(table)
     taken = {*impossible, *(copied if label == "final" else ())}
     errors = {
-        name: float(percent_off(typed, known[name], sigmas=SIGMAS))
+        name: float(percent_off(typed, known[name], sigmas=limits.SIGMAS))
         for name, typed in table.items()
         if name in known and name not in taken
     }
-    suspect = [n for n, e in errors.items() if e > min(limit(n, label), _SUSPECT_DAMPING)]
+    suspect = [n for n, e in errors.items() if e > min(limit(n, label), limits.SUSPECT_DAMPING)]
     if (
         label == "initial"
     ):  # friction may leave room for what the student's own, right, fit does not
@@ -206,7 +198,7 @@ def _unordered(
 def _agrees(final: Decimal, references: References, name: str) -> bool:
     """Whether a final number is what the recordings say."""
     known = references.final.get(name)
-    return known is not None and percent_off(final, known, sigmas=SIGMAS) == 0
+    return known is not None and percent_off(final, known, sigmas=limits.SIGMAS) == 0
 
 
 def _is_of_gains(mistake: Mistake) -> bool:
@@ -214,7 +206,7 @@ def _is_of_gains(mistake: Mistake) -> bool:
 
 
 def _near(a: Decimal, b: Decimal) -> bool:
-    return abs(a - b) <= _CONFIRMED * abs(b)
+    return abs(a - b) <= Decimal(str(limits.CONFIRMED)) * abs(b)
 
 
 def _may_be_final(mistake: Mistake, reported: Reported) -> bool:
@@ -240,10 +232,10 @@ def _corrected(
 def limit(name: str, table: str) -> float:
     """Return from how many percent on a reported number is worth a remark."""
     if is_damping(name):
-        return _OFF_DAMPING
+        return limits.OFF_DAMPING
     if table == "final":
-        return _OFF_FINAL
-    return _OFF_BY_EYE if read_name(name).is_by_eye else _OFF_INITIAL
+        return limits.OFF_FINAL
+    return limits.OFF_BY_EYE if read_name(name).is_by_eye else limits.OFF_INITIAL
 
 
 # ------------------------------------------------------------------------ flags
@@ -277,19 +269,16 @@ def _specific_flags(
         evidence |= {"mistake_gives": predicted.value}
         if len(first.mistake.codes) > 1:
             evidence["together_with"] = [c for c in first.mistake.codes if c != code]
-        said = {"reported": as_typed(typed), "recomputed": f"{reference.value:.4g}", "name": name}
-        message = f"{name} ({_TOLD[first.table]}): {first.mistake.help.format(**said)}."
+        message = WORDS.text(
+            "mistake",
+            name=name,
+            table=WORDS.text(_TOLD[first.table]),
+            help=first.mistake.help(typed, reference),
+        )
         if first.rival and code not in first.rival.codes:
             evidence["or_else"] = [c for c in first.rival.codes if c not in first.mistake.codes]
-            message += f" Or {first.rival.help.format(**said)}."
-        flags.append(
-            Flag(
-                code=code,
-                parameters=tuple(names),
-                message=message,
-                evidence=evidence,
-            )
-        )
+            message += WORDS.text("or_else", help=first.rival.help(typed, reference))
+        flags.append(Flag(code=code, parameters=tuple(names), message=message, evidence=evidence))
     return flags
 
 
@@ -297,24 +286,27 @@ def _off_flag(
     table: Table, names: Sequence[str], known: Mapping[str, Reference], label: str
 ) -> Flag:
     def error(name: str) -> float:
-        return float(percent_off(table[name], known[name], sigmas=SIGMAS)) / limit(name, label)
+        return float(percent_off(table[name], known[name], sigmas=limits.SIGMAS)) / limit(
+            name, label
+        )
 
     worst = max(names, key=error)
     reference, typed = known[worst], table[worst]
     ratio = float(typed) / reference.value if reference.value else 0.0
-    look = {
-        "K": "look at the levels before and after the step, and at the lowest frequencies",
-        "o": "look again at the peaks of the decay, or of the Bode plot",
-        "z": "look again at how fast the peaks fall, or how high the resonance is",
-    }.get(worst[0], "look again at how it was read")
+    look = {"K": "look_gain", "o": "look_frequency", "z": "look_damping"}.get(worst[0], "look")
     if any(abs(ratio / 10.0**power - 1) < 0.05 for power in (-3, -2, -1, 1, 2, 3)):
-        look = "it is off by a power of ten, so check the units and the decimal point"
+        look = "look_power"
     code: Code = "initial_off" if label == "initial" else "final_off"
     return Flag(
         code=code,
         parameters=tuple(names),
-        message=f"{worst}: your recordings give {reference.said}, you report "
-        f"{as_typed(typed)}: {look}.",
+        message=WORDS.text(
+            "off",
+            name=worst,
+            recomputed=reference.said,
+            reported=as_typed(typed),
+            look=WORDS.text(look),
+        ),
         evidence=_evidence(worst, typed, reference, label),
     )
 
@@ -323,12 +315,16 @@ def _impossible_flag(
     table: Table, names: Sequence[str], known: Mapping[str, Reference], label: Label
 ) -> Flag:
     name = names[0]
-    hint = "is a sign wrong?" if table[name] else "type as many digits as show how large it is."
     return Flag(
         code="physically_impossible",
         parameters=tuple(names),
-        message=f"{name} = {as_typed(table[name])} ({_TOLD[label]}): gains, frequencies and "
-        f"dampings of carts on springs are positive; {hint}",
+        message=WORDS.text(
+            "not_positive",
+            name=name,
+            reported=as_typed(table[name]),
+            table=WORDS.text(_TOLD[label]),
+            hint=WORDS.text("hint_sign" if table[name] else "hint_digits"),
+        ),
         evidence=_evidence(name, table[name], known.get(name), label),
     )
 
@@ -342,8 +338,7 @@ def _copied_flag(reported: Reported, copied: Sequence[str], references: Referenc
     return Flag(
         code="no_fit_done",
         parameters=tuple(copied),
-        message="the final estimates are the initial ones, digit for digit: fit the transfer "
-        f"functions to the measured Bode points; {worst} for one then changes.",
+        message=WORDS.text("copied", name=worst),
         evidence=_evidence(worst, reported.final[worst], references.final.get(worst), "final"),
     )
 
@@ -375,9 +370,9 @@ def _disagreements(
             value=float(final), low=min(bounds), high=max(bounds), std=0.0, source="final"
         )
         error = float(percent_off(initial, allowed, sigmas=0.0))
-        worth = 2 * _OFF_DAMPING if is_damping(name) else _OFF_EACH_OTHER
-        by_eye = limit(name, "initial") == _OFF_BY_EYE
-        if error > (worth + _OFF_BY_EYE if by_eye else worth):
+        worth = 2 * limits.OFF_DAMPING if is_damping(name) else limits.OFF_EACH_OTHER
+        by_eye = limit(name, "initial") == limits.OFF_BY_EYE
+        if error > (worth + limits.OFF_BY_EYE if by_eye else worth):
             apart.append((error / worth, name))
     return sorted(apart, reverse=True)
 
@@ -388,8 +383,9 @@ def _disagreement_flag(reported: Reported, apart: Sequence[tuple[float, str]]) -
     return Flag(
         code="initial_final_disagree",
         parameters=tuple(name for _, name in apart),
-        message=f"{worst}: your first estimate is {as_typed(initial)}, the final one "
-        f"{as_typed(final)}: one of the two is worth another look.",
+        message=WORDS.text(
+            "disagree", name=worst, initial=as_typed(initial), final=as_typed(final)
+        ),
         evidence={
             "parameter": worst,
             "initial": float(initial),

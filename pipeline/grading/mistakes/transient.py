@@ -6,17 +6,13 @@ from decimal import Decimal
 import numpy as np
 
 from pipeline.errors import DataError
+from pipeline.grading.mistakes import limits
 from pipeline.grading.mistakes.catalogue import Mistake
 from pipeline.grading.references.reference import Reference
 from pipeline.grading.rubric import is_damping
 from pipeline.plant.chain import Array
 from pipeline.results import Analysis, FrequencyResponse, Record
 from pipeline.stages.bode_fit import fit_bode
-
-_TOLERANCE = 0.06  # the fit of a student weighs the points its own way
-_DAMPING = 0.2
-_MET = 0.65  # of the numbers: a wrong response has no exact fit, so not every one is met
-_NEW, _NEW_DAMPING = 0.12, 0.5  # of a number: moved by less, the right one would be met as well
 
 Reading = Callable[[Record, Array], float]
 
@@ -42,10 +38,9 @@ def transient_fits(
                 Mistake(
                     codes=("transient_used",),
                     predicted=moved,
-                    tolerance=_TOLERANCE,
-                    help="{reported} is what a fit to amplitudes of the first swings gives; after "
-                    "the transient the same recordings give {recomputed}",
-                    least=max(2, round(_MET * len(asked))),
+                    tolerance=limits.EARLY,
+                    said=("early",),
+                    least=max(2, round(limits.EARLY_MET * len(asked))),
                     table_wide=True,
                 )
             )
@@ -53,7 +48,9 @@ def transient_fits(
 
 
 def _is_new(name: str, ratio: float) -> bool:
-    return abs(np.log(ratio)) > np.log1p(_NEW_DAMPING if is_damping(name) else _NEW)
+    return abs(np.log(ratio)) > np.log1p(
+        limits.EARLY_NEW_DAMPING if is_damping(name) else limits.EARLY_NEW
+    )
 
 
 def early_readings() -> Iterator[Reading]:
@@ -108,7 +105,7 @@ def _refit(
     for name, estimate in fit.parameters.items():
         if estimate.value <= 0:
             continue
-        slack = _DAMPING if is_damping(name) else 0.0
+        slack = limits.DAMPING if is_damping(name) else 0.0
         reference = Reference.at(estimate.value, source="transient")
         references[name] = reference.widened(1 + slack)
     return references

@@ -15,7 +15,7 @@ from pipeline.grading.references.tolerance import exact
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.clusters import Cluster
 from pipeline.grading.similarity.doubles import Double
-from pipeline.grading.words import TITLES, points_text
+from pipeline.grading.words import WORDS, points_text
 from pipeline.report.document import (
     Block,
     Cell,
@@ -198,7 +198,7 @@ def _mistakes(lines: Sequence[Line], tables: count) -> list[Block]:
         named = [_link(name) for name in having.loc[having == code].index]
         rows.append(
             [
-                cell(spans(f"{TITLES[code]} (", Span(code, "code"), ")")),
+                cell(spans(f"{WORDS.text(f'title_{code}')} (", Span(code, "code"), ")")),
                 cell(str(counts[code])),
                 cell(f"{100 * counts[code] / len(lines):.0f} %"),
                 cell(spans(*_listed(named))),

@@ -24,7 +24,7 @@ from pipeline.grading.publish.roster import POINTS_POSSIBLE, Roster
 from pipeline.grading.publish.students import Student, students_of
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.shared import told
-from pipeline.grading.words import OUTCOMES, points_text
+from pipeline.grading.words import WORDS, points_text
 from pipeline.output import csv_text, own_folder, write_file
 from pipeline.schemas.grade import Grade
 
@@ -238,7 +238,7 @@ def results_text(grade: Grade, *, by_hand: bool = False) -> str:
                 "status": "passed" if c.outcome == "pass" else "failed",
                 "name": c.title or c.id,
                 "number": str(i),
-                "output": f"{OUTCOMES[c.outcome]}: {c.message}",
+                "output": f"{WORDS.text(f'outcome_{c.outcome}')}: {c.message}",
                 "tags": [c.id],
                 "visibility": "visible",
             }

@@ -10,7 +10,7 @@ from typing import Any
 from pipeline import __version__
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.shared import told
-from pipeline.grading.words import OUTCOMES, PLACES, TITLES, TONES, points_text
+from pipeline.grading.words import WORDS, points_text
 from pipeline.report.document import (
     Block,
     Details,
@@ -22,6 +22,7 @@ from pipeline.report.document import (
     Table,
     Tile,
     Tiles,
+    Tone,
     bullet_list,
     paragraph,
     spans,
@@ -32,10 +33,11 @@ from pipeline.report.numbers import count as counted
 from pipeline.report.render.html import render_html
 from pipeline.report.tables.cells import cell, make_table
 from pipeline.report.words import clean, name_span, rich
-from pipeline.schemas.grade import Criterion, Flag, Grade
+from pipeline.schemas.grade import Criterion, Flag, Grade, Outcome
 
 _TITLE = re.compile(r"<title>(.*?)</title>", re.DOTALL)
 _NAME = re.compile(r"(omega|zeta|K)(_\w)?")
+_TONES: dict[Outcome, Tone] = {"pass": "good", "partial": "", "fail": "bad", "skip": "quiet"}
 _MOST_ROWS = 60  # of one criterion
 _LONGEST_TEXT = 200  # letters of a value that is no number
 
@@ -171,9 +173,9 @@ def _remarks(flags: Sequence[Flag]) -> list[Block]:
     blocks: list[Block] = []
     for flag in flags:
         blocks += [
-            Heading(rich(_capital(TITLES[flag.code]))),
+            Heading(rich(_capital(WORDS.text(f"title_{flag.code}")))),
             paragraph(rich(_sentence(told(flag)))),
-            paragraph(Span("Where to look: ", "strong"), rich(PLACES[flag.code])),
+            paragraph(Span("Where to look: ", "strong"), rich(WORDS.text(f"place_{flag.code}"))),
         ]
     return blocks
 
@@ -196,7 +198,7 @@ def _criteria(grade: Grade, rubric: Rubric, numbers: count) -> list[Block]:
             [
                 cell(clean(c.title or c.id)),
                 cell(f"{points_text(c.points)} of {points_text(c.out_of)}"),
-                cell(OUTCOMES[c.outcome], TONES[c.outcome]),
+                cell(WORDS.text(f"outcome_{c.outcome}"), _TONES[c.outcome]),
             ]
             for c in grade.criteria
         ],
@@ -211,7 +213,10 @@ def _criteria(grade: Grade, rubric: Rubric, numbers: count) -> list[Block]:
         if criterion.outcome == "pass":
             blocks.append(Details(spans(f"{title}: passed"), tuple(inside)))
         else:
-            blocks += [Heading(spans(f"{title}: {OUTCOMES[criterion.outcome]}")), *inside]
+            blocks += [
+                Heading(spans(f"{title}: {WORDS.text(f'outcome_{criterion.outcome}')}")),
+                *inside,
+            ]
     return blocks
 
 

@@ -53,9 +53,13 @@ class Reference:
     @property
     def said(self) -> str:
         """What the recordings give, in words: a number, or from where to where it may lie."""
-        if self.low > 0 and self.high <= _SAME * self.low:
+        if self.low > 0 and self.within(_SAME):
             return f"{self.value:.4g}"
         return f"{self.low:.3g} to {self.high:.3g}"
+
+    def within(self, factor: float) -> bool:
+        """Whether its bounds are no further apart than a factor."""
+        return self.high <= self.low * factor
 
     def including(self, value: float) -> "Reference":
         """Return the reference with a value between its bounds."""

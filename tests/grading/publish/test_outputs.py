@@ -23,7 +23,7 @@ from pipeline.grading.publish.export import results_text
 from pipeline.grading.publish.feedback import feedback_page
 from pipeline.grading.publish.outputs import grades_csv, write_outputs
 from pipeline.grading.table import read_table
-from pipeline.grading.words import PLACES, TITLES
+from pipeline.grading.words import WORDS
 from pipeline.schemas.grade import CODES, Flag
 from tests.helpers.grades import (
     failed_grade,
@@ -242,7 +242,10 @@ def test_names_that_stand_in_are_all_different():
 
 def test_every_flag_has_a_name_and_a_place_to_look():
     """In words, for all codes there are."""
-    assert list(TITLES) == list(PLACES) == list(CODES)
+    for said in ("title", "place"):
+        assert [k for k in WORDS.by_key if k.startswith(f"{said}_")] == [
+            f"{said}_{c}" for c in CODES
+        ]
 
 
 def test_the_feedback_puts_their_numbers_beside_ours():
