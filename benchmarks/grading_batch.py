@@ -30,7 +30,7 @@ import psutil
 from pipeline.grading.batch.batch_run import grade_class
 from pipeline.grading.batch.runner import Limits, grade_batch, run_here
 from pipeline.grading.gradebook.book import Gradebook
-from pipeline.grading.gradings import Prints
+from pipeline.grading.gradings import Member
 from pipeline.grading.intake.hand_ins import find_hand_ins
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.grading.similarity.prints import fingerprint
@@ -240,8 +240,8 @@ def shared(base: Path, *, teams: int) -> None:
         records.append(read_data(load_submission(folder)).records)
         shutil.rmtree(folder)
 
-    def prints(name: str, of: tuple[Record, ...]) -> Prints:
-        return Prints(submission=name, authors=(name,), fingerprints=fingerprint(of))
+    def prints(name: str, of: tuple[Record, ...]) -> Member:
+        return Member(submission=name, authors=(name,), fingerprints=fingerprint(of))
 
     honest = [prints(str(i), of) for i, of in enumerate(records)]
     start = time.process_time()

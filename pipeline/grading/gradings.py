@@ -1,8 +1,9 @@
-"""What the runner and the gradebook share: a grading of a submission, its prints, the batch."""
+"""What the runner and the gradebook share: gradings, the members of a class, the batch."""
 
 import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal
 
 from pipeline.schemas.grade import Flag
@@ -41,17 +42,43 @@ class Grading:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Prints:
-    """The fingerprints of one stored outcome and whose recordings they are of.
+class Member:
+    """A submission of a class: whose it is, and the fingerprints of its recordings.
 
-    `of_class` where it is of the assignment that is being graded, `owner` as of an outcome.
+    `key`, `owner` and `reason` are those of its grading, `grading` is its number in the gradebook;
+    `of_class` where it is of the assignment that is being graded.
     """
 
     submission: str
     authors: tuple[str, ...]
-    fingerprints: bytes
     owner: str = ""
+    key: str = ""
+    fingerprints: bytes = field(default=b"", repr=False)
+    reason: str = ""
+    grading: int = 0
     of_class: bool = False
+
+    @classmethod
+    def of(cls, grading: Grading) -> "Member":
+        """Return what a batch itself needs of a grading: all else stays in the book."""
+        return cls(
+            submission=grading.submission,
+            authors=grading.authors,
+            owner=grading.owner,
+            key=grading.key,
+            fingerprints=grading.fingerprints,
+            reason=grading.reason if grading.status == "failed" else "",
+        )
+
+    @cached_property
+    def people(self) -> set[str]:
+        """The authors, however they typed their ids."""
+        return set(map(person, self.authors))
+
+    @property
+    def content(self) -> str:
+        """The part of its key that is of the files alone, "" where it has none."""
+        return self.key.partition("-")[2]
 
 
 def person(author: str) -> str:
@@ -59,29 +86,13 @@ def person(author: str) -> str:
     return " ".join(unicodedata.normalize("NFKC", author).split()).casefold()
 
 
-def content(key: str) -> str:
-    """Return the part of an outcome's key that is of the files alone, "" where it has none."""
-    return key.partition("-")[2]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Listed:
-    """A line of the class list so far, and the outcome it stands for: its key and number."""
-
-    submission: str
-    authors: tuple[str, ...]
-    owner: str
-    key: str
-    grading: int
-
-
 @dataclass(frozen=True, kw_only=True)
 class Batch:
-    """A batch that ran to its end; the outcomes themselves stay in the gradebook.
+    """A batch that ran to its end; the gradings themselves stay in the gradebook.
 
     Attributes
     ----------
-    keys : of the outcomes, in the order of the submissions' ids.
+    keys : of the gradings, in the order of the submissions' ids.
     shared : by submission, the flag for recordings that stand in another submission too.
     failed : (submission, reason) of those that could not be graded.
     kept, moved, taken_over : what became of the class list before, see `so_far.SoFar`.

@@ -12,11 +12,11 @@ from pathlib import Path
 from pydantic import TypeAdapter
 
 import pipeline
-from pipeline.grading.batch.so_far import Row, class_so_far
+from pipeline.grading.batch.so_far import class_so_far
 from pipeline.grading.batch.worker import Setup, Task, failed
 from pipeline.grading.batch.worker_process import Worker
 from pipeline.grading.gradebook.book import Gradebook
-from pipeline.grading.gradings import Batch, Grading, Prints
+from pipeline.grading.gradings import Batch, Grading, Member
 from pipeline.grading.intake.files import digest
 from pipeline.grading.intake.hand_ins import HandIn
 from pipeline.grading.rubric import Rubric
@@ -77,7 +77,7 @@ def grade_batch(
     """
     limits = limits or Limits()
     code, text = code_version(), rubric.model_dump_json()
-    rows: dict[str, Row] = {}
+    rows: dict[str, Member] = {}
     new = []
     for hand_in in hand_ins:
         task = _task(hand_in, basis=(code, text, figures))
@@ -88,7 +88,7 @@ def grade_batch(
         if outcome is None or not outcome.settled:
             new.append(task)
         else:
-            rows[task.id] = Row.of(outcome)
+            rows[task.id] = Member.of(outcome)
     total = len(hand_ins)
     progress(len(rows), total, "")
     if new:
@@ -101,7 +101,7 @@ def grade_batch(
         )
         for outcome in execute(new, setup, rubric.out_of):
             book.put(outcome)
-            rows[outcome.submission] = Row.of(outcome)
+            rows[outcome.submission] = Member.of(outcome)
             progress(len(rows), total, outcome.submission)
     progress(total, total, "comparing the recordings")
     before = class_so_far(rows, book)
@@ -116,7 +116,7 @@ def grade_batch(
             memory=memory,
             examples=examples,
         ),
-        failed=tuple((row.prints.submission, row.reason) for row in in_order if row.reason),
+        failed=tuple((row.submission, row.reason) for row in in_order if row.reason),
         kept=tuple(before.kept),
         moved=before.moved,
         taken_over=before.taken_over,
@@ -173,7 +173,7 @@ def _work(
 
 
 def code_version() -> str:
-    """Return what changes whenever a grade may: a hash of the code, its words, what it computes with."""
+    """Return what changes whenever a grade may: a hash of code, words and what it computes with."""
     root = Path(pipeline.__file__).parent
     versions = [pipeline.__version__, *(f"{name} {version(name)}" for name in _COMPUTE_WITH)]
     total = hashlib.sha256(" ".join(versions).encode() + WORDS.path.read_bytes())
@@ -199,7 +199,7 @@ def _task(hand_in: HandIn, *, basis: tuple[str, str, bool]) -> Task:
 
 
 def _shared(
-    rows: Sequence[Row],
+    rows: Sequence[Member],
     book: Gradebook,
     *,
     basis: Sequence[str],
@@ -207,7 +207,7 @@ def _shared(
     examples: Callable[[], Iterable[bytes]],
 ) -> dict[str, Flag]:
     """Return the flags for recordings that stand in two submissions of this or earlier batches."""
-    batch = [row.prints for row in rows if row.prints.fingerprints]
+    batch = [row for row in rows if row.fingerprints]
     names = {prints.submission: prints for prints in batch}
     here = {(prints.authors, prints.fingerprints) for prints in batch}  # under another name, too
     earlier = [
@@ -230,7 +230,7 @@ def _shared(
     return flags
 
 
-def _is_before(earlier: Prints, now: Prints | None) -> bool:
+def _is_before(earlier: Member, now: Member | None) -> bool:
     """Tell what a team handed in before, or this very batch graded otherwise: that is no news.
 
     Where only the ids of its authors were mended, the recordings tell.
@@ -240,7 +240,7 @@ def _is_before(earlier: Prints, now: Prints | None) -> bool:
     return same_team(earlier, now) or (earlier.of_class and same_recordings(earlier, now))
 
 
-def _digest(head: Sequence[str], *groups: Sequence[Prints]) -> str:
+def _digest(head: Sequence[str], *groups: Sequence[Member]) -> str:
     """Return a hash of everything that a comparison of recordings depends on."""
     total = hashlib.sha256(json.dumps(head).encode())
     for group in groups:
@@ -267,7 +267,7 @@ def _remembered(memory: Path, compared: str) -> dict[str, Flag] | None:
 def grades_of(batch: Batch, book: Gradebook) -> Iterator[tuple[Grading, Grade]]:
     """Yield every outcome with its grade, shared data flagged; one at a time in memory."""
     for key in batch.keys:
-        outcome = book.known(key)
+        outcome = book.known(key, figures=False)
         if outcome is None:
             raise KeyError(key)
         grade = read_grade(outcome.grade)

@@ -26,8 +26,8 @@ from pipeline.grading.gradebook.lists import (
     points_of,
 )
 from pipeline.grading.gradebook.override import Override
-from pipeline.grading.gradebook.prints import pages, read_listed, read_prints, read_prints_of
 from pipeline.grading.gradebook.rows import (
+    GRADING,
     Entry,
     add_row,
     carry_overrides,
@@ -36,21 +36,23 @@ from pipeline.grading.gradebook.rows import (
     known_grading,
     last_named,
     newest_of,
-    put_figures,
+    pages,
     read_figures,
     read_flag,
+    read_members,
+    read_prints,
     read_rubric,
-    storable,
 )
 from pipeline.grading.gradebook.schema import (
     Database,
     batches,
     entries,
+    figures,
     gradings,
     overrides,
     submissions,
 )
-from pipeline.grading.gradings import Batch, Grading, Listed, Prints
+from pipeline.grading.gradings import Batch, Grading, Member
 from pipeline.grading.rubric import Rubric
 from pipeline.schemas.grade import read_grade
 
@@ -99,59 +101,48 @@ class Gradebook:
     # ------------------------------------------------------------------ while grading
 
     def known(self, key: str, *, figures: bool = True) -> Grading | None:
-        """Return the newest outcome of this key, None where there is none; or without figures."""
+        """Return the newest grading of this key, None where there is none; or without figures."""
         with self._database.reading() as connection:
-            return known_grading(
-                connection, key, assignment=self._assignment or "", figures=figures
-            )
+            return known_grading(connection, key, assignment=self._assignment or "", drawn=figures)
 
-    def put(self, outcome: Grading) -> None:
-        """Add an outcome: durable on return, and nothing of it there before.
+    def put(self, grading: Grading) -> None:
+        """Add a grading: durable on return, and nothing of it there before.
 
         Raises
         ------
         ValueError : its grade is none.
         """
-        grade = read_grade(outcome.grade)
+        grade = read_grade(grading.grade)
         with self._database.writing() as connection:
-            number = self._submission(connection, outcome.submission)
-            row = {
-                "submission_id": number,
-                "at": self._at(),
-                "key": outcome.key,
-                "status": outcome.status,
-                "reason": storable(outcome.reason),
-                "settled": outcome.settled,
-                "points": grade.points,
-                "out_of": grade.out_of,
-                "days_late": outcome.days_late,
-                "deducted": grade.deducted,
-                "authors": json.dumps(outcome.authors),
-                "owner": storable(outcome.owner),
-                "detail": storable(outcome.detail),
-                "grade": storable(outcome.grade),
-                "fingerprints": outcome.fingerprints,
-            }
-            grading = add_row(connection, gradings, row)
-            put_figures(connection, grading, outcome.figures)
+            number = add_row(
+                connection,
+                gradings,
+                {
+                    **{name: getattr(grading, name) for name in GRADING},
+                    "submission_id": self._submission(connection, grading.submission),
+                    "at": self._at(),
+                    "points": grade.points,
+                    "out_of": grade.out_of,
+                    "deducted": grade.deducted,
+                },
+            )
+            for position, (name, svg) in enumerate(grading.figures):
+                drawn = {"grading_id": number, "position": position, "name": name, "svg": svg}
+                add_row(connection, figures, drawn)
 
-    def prints(self) -> Iterator[Prints]:
-        """Return all fingerprints that differ, of every submission under its authors.
+    def prints(self, numbers: Sequence[int] | None = None) -> Iterator[Member]:
+        """Return all fingerprints that differ, or those of some gradings, see `Entry.grading`.
 
         Those of a first version count too: what was replaced may have been passed on before.
         """
-        return read_prints(self._database, assignment=self._assignment or "")
+        return read_prints(self._database, numbers, assignment=self._assignment or "")
 
-    def listed(self) -> Iterator[Listed]:
-        """Return the class list so far; nothing where no batch ran to its end yet."""
+    def listed(self) -> Iterator[Member]:
+        """Return the class list so far, without fingerprints; nothing where no batch ended yet."""
         with self._database.reading() as connection:
             last = self._newest(connection)
             lines = [] if last is None else lines_of(connection, last)
-        return read_listed(self._database, [line["grading_id"] for line in lines])
-
-    def prints_of(self, numbers: Sequence[int]) -> list[Prints]:
-        """Return the fingerprints of gradings, see `Entry.grading`."""
-        return read_prints_of(self._database, numbers)
+        return read_members(self._database, [line["grading_id"] for line in lines])
 
     def names(self) -> list[str]:
         """Return the submissions of the class list so far."""
@@ -316,7 +307,7 @@ class Gradebook:
         ConfigError : there is no such submission or criterion, the points are none that it can
             have, or who and why are not said.
         """
-        why, by = storable(why).strip(), storable(by).strip()
+        why, by = why.strip(), by.strip()
         if not why or not by:
             raise ConfigError("an override needs a reason (--why) and a name (--by)")
         with self._database.writing() as connection:
@@ -327,17 +318,15 @@ class Gradebook:
                 raise ConfigError(f"{criterion}: the rubric has no such criterion; {hint}")
             if points is not None and not 0 <= points <= out_of[criterion]:
                 raise ConfigError(f"{criterion}: has 0 to {out_of[criterion]:g} points")
-            authors = last_named(connection, row.submission_id)
             given = Override(
                 criterion=criterion,
                 points=points,
                 why=why,
                 by=by,
                 at=self._at(),
-                authors=tuple(json.loads(authors)),
+                authors=last_named(connection, row.submission_id),
             )
-            values = {**asdict(given), "authors": authors, "submission_id": row.submission_id}
-            add_row(connection, overrides, values)
+            add_row(connection, overrides, {**asdict(given), "submission_id": row.submission_id})
         return given
 
     # ----------------------------------------------------------------------- in parts
@@ -347,7 +336,7 @@ class Gradebook:
 
     def _submission(self, connection: Connection, name: str) -> int:
         """Return the number of a submission, new or not."""
-        values = {"assignment": self._assignment or "", "name": storable(name)}
+        values = {"assignment": self._assignment or "", "name": name}
         mine = select(submissions.c.id).filter_by(**values)
         number = connection.scalar(mine)
         return add_row(connection, submissions, values) if number is None else number

@@ -111,7 +111,7 @@ def _other_name(
 ) -> str:
     """Return what a submission of one class list is called in another where only its people are."""
 
-    def listed(batch: int | None) -> dict[int, tuple[str, str]]:
+    def listed(batch: int | None) -> dict[int, tuple[str, tuple[str, ...]]]:
         rows = select(submissions.c.id, submissions.c.name, gradings.c.authors)
         rows = rows.select_from(entries.join(submissions).join(gradings))
         rows = rows.where(entries.c.batch_id == batch)
@@ -119,7 +119,7 @@ def _other_name(
 
     here, there = listed(of), listed(among)
     people = here[submission][1]
-    found = [name for i, (name, by) in there.items() if i not in here and by == people != "[]"]
+    found = [name for i, (name, by) in there.items() if i not in here and by == people != ()]
     return found[0] if len(found) == 1 else ""
 
 

@@ -1,6 +1,6 @@
 """The class lists of a gradebook: who is on one, and by which rubric they were graded."""
 
-import json
+from collections.abc import Sequence
 from difflib import get_close_matches
 
 from pydantic import ValidationError
@@ -66,9 +66,9 @@ def by_other_rubrics(connection: Connection, batch: Row) -> list[str]:
     return sorted(row.name for row in rows if row.rubric in others)
 
 
-def is_of(authors: str, team: str) -> bool:
-    """Tell whether somebody is among authors, a list in JSON."""
-    return person(team) in map(person, json.loads(authors))
+def is_of(authors: Sequence[str], team: str) -> bool:
+    """Tell whether somebody is among authors, however they typed the id."""
+    return person(team) in map(person, authors)
 
 
 def nearest(word: str, words: list[str]) -> str:

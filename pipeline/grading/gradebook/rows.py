@@ -1,9 +1,8 @@
 """Rows of a gradebook as what they stand for."""
 
-import json
-import zlib
-from collections.abc import Mapping
-from dataclasses import dataclass
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
 
 from pydantic import ValidationError
 from sqlalchemy import Connection, Row, Select, Table, insert, select
@@ -11,15 +10,29 @@ from sqlalchemy import Connection, Row, Select, Table, insert, select
 from pipeline.errors import ConfigError
 from pipeline.grading.gradebook.override import Override, with_overrides
 from pipeline.grading.gradebook.schema import (
+    Database,
     entries,
     figures,
     gradings,
     overrides,
     submissions,
 )
-from pipeline.grading.gradings import Grading
+from pipeline.grading.gradings import Grading, Member
 from pipeline.grading.rubric import Rubric
 from pipeline.schemas.grade import Flag, Grade, read_grade
+
+_PAGE = 100  # rows read at a time: memory stays flat, and a writer need not wait long
+# What a grading has in columns of its name.
+GRADING = [f.name for f in fields(Grading) if f.name in gradings.c]
+_OVERRIDE = [overrides.c[f.name] for f in fields(Override)]
+_OF_GRADING = select(submissions.c.name.label("submission"), *(gradings.c[x] for x in GRADING))
+_MEMBER = (
+    submissions.c.name.label("submission"),
+    gradings.c.authors,
+    gradings.c.owner,
+    gradings.c.key,
+    gradings.c.id.label("grading"),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,50 +65,76 @@ def add_row(connection: Connection, table: Table, values: dict) -> int:
     return key[0]
 
 
-def put_figures(connection: Connection, grading: int, drawn: tuple[tuple[str, str], ...]) -> None:
-    """Add the figures of a grading."""
-    pictures = [
-        {"grading_id": grading, "position": i, "name": storable(name),
-         "svg": zlib.compress(svg.encode())}
-        for i, (name, svg) in enumerate(drawn)
-    ]  # fmt: skip
-    if pictures:
-        connection.execute(insert(figures), pictures)
+def pages(numbers: Sequence[int]) -> Iterator[Sequence[int]]:
+    """Return numbers of rows as many at a time as are read at once."""
+    return (numbers[i : i + _PAGE] for i in range(0, len(numbers), _PAGE))
+
+
+def _newest(chosen: Select, key: str, *, assignment: str) -> Select:
+    """Return the query for the newest grading of a key: assignments may have one rubric's text."""
+    mine = chosen.where(gradings.c.key == key, submissions.c.assignment == assignment)
+    return mine.order_by(gradings.c.id.desc()).limit(1)
+
+
+# ------------------------------------------------------------------------ gradings
+
+
+def known_grading(
+    connection: Connection, key: str, *, assignment: str, drawn: bool
+) -> Grading | None:
+    """Return the newest grading of a key, perhaps with figures; None where there is none."""
+    newest = _newest(_OF_GRADING.join(submissions), key, assignment=assignment)
+    row = connection.execute(newest.add_columns(gradings.c.id)).mappings().one_or_none()
+    if row is None:
+        return None
+    own = {name: value for name, value in row.items() if name != "id"}
+    return Grading(**own, figures=read_figures(connection, row["id"]) if drawn else ())
 
 
 def read_figures(connection: Connection, grading: int) -> tuple[tuple[str, str], ...]:
     """Return the figures of a grading: file names and SVG."""
     mine = select(figures.c.name, figures.c.svg).where(figures.c.grading_id == grading)
-    rows = connection.execute(mine.order_by(figures.c.position))
-    return tuple((name, zlib.decompress(svg).decode()) for name, svg in rows)
+    return tuple((name, svg) for name, svg in connection.execute(mine.order_by(figures.c.position)))
 
 
-def known_grading(
-    connection: Connection, key: str, *, assignment: str, figures: bool
-) -> Grading | None:
-    """Return the newest outcome of a key, None where there is none; or without its figures."""
-    newest = select(gradings, submissions.c.name).join(submissions)
-    newest = newest.where(gradings.c.key == key, submissions.c.assignment == assignment)
-    row = connection.execute(newest.order_by(gradings.c.id.desc()).limit(1)).one_or_none()
-    if row is None:
-        return None
-    return Grading(
-        submission=row.name,
-        authors=tuple(json.loads(row.authors)),
-        key=row.key,
-        status=row.status,
-        reason=row.reason,
-        settled=row.settled,
-        days_late=row.days_late,
-        grade=row.grade,
-        fingerprints=row.fingerprints,
-        figures=read_figures(connection, row.id) if figures else (),
-        owner=row.owner,
-        detail=row.detail,
-    )
+def read_members(database: Database, numbers: Sequence[int]) -> Iterator[Member]:
+    """Yield the gradings of these numbers as members of the class, without fingerprints."""
+    lines = select(*_MEMBER).join(submissions).order_by(gradings.c.id)
+    for page in pages(numbers):
+        with database.reading() as connection:
+            rows = connection.execute(lines.where(gradings.c.id.in_(page))).mappings().all()
+        yield from (Member(**row, of_class=True) for row in rows)
 
 
-_COLUMNS = (
+def read_prints(
+    database: Database, numbers: Sequence[int] | None = None, *, assignment: str
+) -> Iterator[Member]:
+    """Yield whose fingerprints there are, of all gradings or those of these numbers.
+
+    Each that differs, of every submission under its authors.
+    """
+    chosen = select(*_MEMBER, gradings.c.fingerprints, submissions.c.assignment)
+    chosen = chosen.join(submissions).order_by(gradings.c.id)
+    if numbers is None:
+        chosen = chosen.where(gradings.c.fingerprints != b"")
+        with database.reading() as connection:
+            numbers = sorted(connection.scalars(select(gradings.c.id)))
+    seen = set()
+    for page in pages(numbers):
+        with database.reading() as connection:
+            rows = connection.execute(chosen.where(gradings.c.id.in_(page))).mappings().all()
+        for row in map(dict, rows):
+            of = row.pop("assignment")
+            one = Member(**row, of_class=of == assignment)
+            own = of, one.submission, one.authors, hashlib.sha256(one.fingerprints).digest()
+            if own not in seen:
+                seen.add(own)
+                yield one
+
+
+# ---------------------------------------------------------------------- class lists
+
+_ENTRY = (
     gradings.c.id,
     gradings.c.submission_id,
     gradings.c.key,
@@ -107,15 +146,14 @@ _COLUMNS = (
 
 
 def newest_of(connection: Connection, key: str, *, assignment: str) -> Row:
-    """Return the newest grading of a key; two assignments may have rubrics of one text.
+    """Return the newest grading of a key.
 
     Raises
     ------
     KeyError : there is none.
     """
-    newest = select(*_COLUMNS).join(submissions)
-    newest = newest.where(gradings.c.key == key, submissions.c.assignment == assignment)
-    row = connection.execute(newest.order_by(gradings.c.id.desc()).limit(1)).one_or_none()
+    newest = _newest(select(*_ENTRY).join(submissions), key, assignment=assignment)
+    row = connection.execute(newest).one_or_none()
     if row is None:
         raise KeyError(key)
     return row
@@ -126,28 +164,17 @@ def class_list(*, detail: bool = True) -> Select:
     joined = entries.join(gradings, entries.c.grading_id == gradings.c.id).join(
         submissions, entries.c.submission_id == submissions.c.id
     )
-    columns = _COLUMNS if detail else (submissions.c.name, gradings.c.authors)
+    columns = _ENTRY if detail else (submissions.c.name, gradings.c.authors)
     chosen = select(*columns, entries.c.position, entries.c.shared)
     return chosen.select_from(joined).order_by(entries.c.position)
 
 
 def final_entry(connection: Connection, row: Row, *, shared: Flag | None, rubric: Rubric) -> Entry:
     """Return the grade as it counts: shared data flagged, points given by hand."""
-    authors = tuple(json.loads(row.authors))
-    given = {}
-    mine = select(overrides).where(overrides.c.submission_id == row.submission_id)
-    for o in connection.execute(mine.order_by(overrides.c.id)):
-        override = Override(
-            criterion=o.criterion,
-            points=o.points,
-            why=o.why,
-            by=o.by,
-            at=o.at,
-            authors=tuple(json.loads(o.authors)),
-        )
-        if override.concerns(authors):
-            given[o.criterion] = override
-    given = {key: override for key, override in given.items() if override.points is not None}
+    mine = select(*_OVERRIDE).where(overrides.c.submission_id == row.submission_id)
+    ever = (Override(**o) for o in connection.execute(mine.order_by(overrides.c.id)).mappings())
+    newest = {override.criterion: override for override in ever if override.concerns(row.authors)}
+    given = {key: override for key, override in newest.items() if override.points is not None}
     first = select(gradings.c.key).where(gradings.c.submission_id == row.submission_id)
     grade = read_grade(row.grade)
     grade = grade.with_flags(shared) if shared else grade
@@ -162,12 +189,12 @@ def final_entry(connection: Connection, row: Row, *, shared: Flag | None, rubric
     )
 
 
-def last_named(connection: Connection, submission: int) -> str:
-    """Return the authors that a submission named last, as JSON: a broken one names nobody."""
+def last_named(connection: Connection, submission: int) -> tuple[str, ...]:
+    """Return the authors that a submission named last: a broken one names nobody."""
     named = select(gradings.c.authors).where(
-        gradings.c.submission_id == submission, gradings.c.authors != "[]"
+        gradings.c.submission_id == submission, gradings.c.authors != ()
     )
-    return connection.scalar(named.order_by(gradings.c.id.desc()).limit(1)) or "[]"
+    return connection.scalar(named.order_by(gradings.c.id.desc()).limit(1)) or ()
 
 
 def carry_overrides(connection: Connection, moved: Mapping[str, str], *, assignment: str) -> None:
@@ -175,7 +202,6 @@ def carry_overrides(connection: Connection, moved: Mapping[str, str], *, assignm
 
     All that is not there yet, so that it stays right when the name changes back.
     """
-    columns = [column for column in overrides.c if column.name not in ("id", "submission_id")]
     named = select(submissions.c.name, submissions.c.id).where(
         submissions.c.assignment == assignment,
         submissions.c.name.in_([*moved, *moved.values()]),
@@ -183,8 +209,9 @@ def carry_overrides(connection: Connection, moved: Mapping[str, str], *, assignm
     numbers = {row.name: row.id for row in connection.execute(named)}
     given = {}
     for name, number in numbers.items():
-        mine = select(*columns).where(overrides.c.submission_id == number).order_by(overrides.c.id)
-        given[name] = [dict(row) for row in connection.execute(mine).mappings()]
+        mine = select(*_OVERRIDE).where(overrides.c.submission_id == number)
+        rows = connection.execute(mine.order_by(overrides.c.id)).mappings()
+        given[name] = [dict(row) for row in rows]
     for old, new in moved.items():
         for values in given[old]:
             if values not in given[new]:
@@ -209,8 +236,3 @@ def read_rubric(batch: Row) -> Rubric:
         raise ConfigError(
             "the gradebook's rubric is of another version of cartlab: run cartlab grade again"
         ) from None
-
-
-def storable(text: str) -> str:
-    """Return text that every database takes: no NUL, no half of a character."""
-    return text.replace("\0", "�").encode("utf-8", "replace").decode() if text else text

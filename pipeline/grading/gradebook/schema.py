@@ -4,6 +4,8 @@ Every table is append-only: what once was graded, overridden or listed stays, an
 has triggers (SQLite, PostgreSQL) it refuses to change or delete a row. The newest is what counts.
 """
 
+import json
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,6 +26,7 @@ from sqlalchemy import (
     String,
     Table,
     Text,
+    TypeDecorator,
     UniqueConstraint,
     create_engine,
     event,
@@ -42,6 +45,45 @@ _SUFFIXES = (".sqlite", ".sqlite3", ".db")  # of files; anything else is a folde
 _VERSION = "1"
 _CREATING = 0x6361_7274  # a number for PostgreSQL's lock that nobody else has
 _PATIENCE = 60.0  # s, for a lock that another process holds; a commit takes milliseconds
+
+
+class Words(TypeDecorator):
+    """Text that every database takes: no NUL, no half of a character."""
+
+    impl, cache_ok = Text, True
+
+    def process_bind_param(self, value, dialect):
+        """Return what is kept."""
+        return value.replace("\0", "�").encode("utf-8", "replace").decode() if value else value
+
+
+class Names(TypeDecorator):
+    """A list of texts, kept as JSON."""
+
+    impl, cache_ok = Text, True
+
+    def process_bind_param(self, value, dialect):
+        """Return what is kept."""
+        return json.dumps(value)
+
+    def process_result_value(self, value, dialect):
+        """Return what was meant."""
+        return tuple(json.loads(value))
+
+
+class Deflated(TypeDecorator):
+    """Long text, kept small."""
+
+    impl, cache_ok = LargeBinary, True
+
+    def process_bind_param(self, value, dialect):
+        """Return what is kept."""
+        return zlib.compress(value.encode())
+
+    def process_result_value(self, value, dialect):
+        """Return what was meant."""
+        return zlib.decompress(value).decode()
+
 
 metadata = MetaData()
 
@@ -70,16 +112,16 @@ gradings = Table(
     Column("at", Text, nullable=False),
     Column("key", String(255), nullable=False),
     Column("status", Text, nullable=False),
-    Column("reason", Text, nullable=False),
+    Column("reason", Words, nullable=False),
     Column("settled", Boolean, nullable=False),
     Column("points", Float, nullable=False),
     Column("out_of", Float, nullable=False),
     Column("days_late", Float, nullable=False),
     Column("deducted", Float, nullable=False),
-    Column("authors", Text, nullable=False),
-    Column("owner", Text, nullable=False),
-    Column("detail", Text, nullable=False),
-    Column("grade", Text, nullable=False),
+    Column("authors", Names, nullable=False),
+    Column("owner", Words, nullable=False),
+    Column("detail", Words, nullable=False),
+    Column("grade", Words, nullable=False),
     Column("fingerprints", LargeBinary, nullable=False),
     Index("gradings_by_key", "key"),
     Index("gradings_by_submission", "submission_id"),
@@ -90,8 +132,8 @@ figures = Table(
     metadata,
     Column("grading_id", ForeignKey("gradings.id"), primary_key=True),
     Column("position", Integer, primary_key=True),
-    Column("name", Text, nullable=False),
-    Column("svg", LargeBinary, nullable=False),  # deflated
+    Column("name", Words, nullable=False),
+    Column("svg", Deflated, nullable=False),
 )
 
 # A batch that ran to its end, and its class list: for each submission the grading that counts,
@@ -127,9 +169,9 @@ overrides = Table(
     Column("at", Text, nullable=False),
     Column("criterion", Text, nullable=False),
     Column("points", Float),
-    Column("why", Text, nullable=False),
-    Column("by", Text, nullable=False),
-    Column("authors", Text, nullable=False),
+    Column("why", Words, nullable=False),
+    Column("by", Words, nullable=False),
+    Column("authors", Names, nullable=False),
     Index("overrides_by_submission", "submission_id"),
 )
 

@@ -298,7 +298,7 @@ def _slip(space: StateSpace, *, models: Sequence[StateModel], n: int) -> str:
         for text, order in _reordered(n):
             columns = [*order, 2 * n]
             slipped = model[np.ix_(order, columns)]
-            of_states = [[kinds[i][j] for j in columns] for i in order]
+            of_states: list[list[Kind]] = [[kinds[i][j] for j in columns] for i in order]
             # Who orders the states anew in A may have left B as it was.
             if _met(typed, slipped, of_states) or (
                 _met(A, slipped, of_states) and _met(B, model, kinds)

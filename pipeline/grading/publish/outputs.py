@@ -101,7 +101,7 @@ def _doubles(
     """Return who stands in several submissions, nameless where `names` stand in for those."""
     found = find_doubles(authors)
     concerned = dict.fromkeys(name for double in found for name in double.submissions)
-    found = with_recordings(found, book.prints_of([gradings[name] for name in concerned]))
+    found = with_recordings(found, book.prints([gradings[name] for name in concerned]))
     if names is None:
         return found
     return sorted(

@@ -7,7 +7,7 @@ another's id to a copy would go unseen. So a TA is told, and no student accused.
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from pipeline.grading.gradings import Prints, person
+from pipeline.grading.gradings import Member, person
 from pipeline.grading.similarity.shared import find_shared
 from pipeline.report.numbers import count, listing
 from pipeline.report.words import clean
@@ -53,7 +53,7 @@ def find_doubles(authors: Mapping[str, Sequence[str]]) -> list[Double]:
     ]
 
 
-def with_recordings(doubles: Iterable[Double], prints: Iterable[Prints]) -> list[Double]:
+def with_recordings(doubles: Iterable[Double], prints: Iterable[Member]) -> list[Double]:
     """Return them with what their submissions share; recordings handed out with the task count."""
     shared = find_shared([replace(one, authors=(one.submission,)) for one in prints])
     return [

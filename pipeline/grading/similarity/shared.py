@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.fft import next_fast_len
 
-from pipeline.grading.gradings import Prints, person
+from pipeline.grading.gradings import Member
 from pipeline.grading.intake.lms_names import same_number
 from pipeline.grading.similarity.prints import PASSED, Print, unpack
 from pipeline.schemas.grade import Flag
@@ -68,9 +68,9 @@ class _Entry:
 
 
 def find_shared(
-    batch: Sequence[Prints],
+    batch: Sequence[Member],
     *,
-    earlier: Iterable[Prints] = (),
+    earlier: Iterable[Member] = (),
     examples: Iterable[bytes] = (),
 ) -> dict[str, tuple[SharedRecord, ...]]:
     """Return, by submission of the batch, its recordings that stand in another submission.
@@ -127,8 +127,8 @@ def find_shared(
     }
 
 
-def _handed_out(packed: bytes) -> Prints:
-    return Prints(submission="", authors=(), fingerprints=packed)
+def _handed_out(packed: bytes) -> Member:
+    return Member(submission="", authors=(), fingerprints=packed)
 
 
 def shared_flag(records: Sequence[SharedRecord]) -> Flag:
@@ -172,7 +172,7 @@ def told(flag: Flag) -> str:
     return shared_message(flag.parameters, ["another submission"])
 
 
-def same_team(a: Prints, b: Prints) -> bool:
+def same_team(a: Member, b: Member) -> bool:
     """Tell whether two submissions are of one team.
 
     That is with an author in common, or handed in under one number of a platform; without
@@ -180,12 +180,12 @@ def same_team(a: Prints, b: Prints) -> bool:
     """
     if same_number(a.owner, b.owner):
         return True
-    if a.authors and b.authors:
-        return not set(map(person, a.authors)).isdisjoint(map(person, b.authors))
+    if a.people and b.people:
+        return not a.people.isdisjoint(b.people)
     return a.submission == b.submission
 
 
-def same_recordings(a: Prints, b: Prints) -> bool:
+def same_recordings(a: Member, b: Member) -> bool:
     """Tell whether one of two submissions has all recordings of the other, untouched."""
     of_a, of_b = ({one.residual.tobytes() for one in unpack(p.fingerprints)} for p in (a, b))
     return of_a <= of_b or of_b <= of_a
@@ -212,7 +212,7 @@ def _decisive(found: Sequence[_Match]) -> list[_Match]:
 
 
 def _matches(
-    entries: Sequence[_Entry], *, first_batch: int, everyone: int, owners: Sequence[Prints]
+    entries: Sequence[_Entry], *, first_batch: int, everyone: int, owners: Sequence[Member]
 ) -> Iterator[tuple[_Entry, _Entry, float]]:
     """Yield pairs of recordings of different teams that share their noise, with the sigmas.
 

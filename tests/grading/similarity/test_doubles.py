@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.grading.gradebook.book import Gradebook
-from pipeline.grading.gradings import Batch, Prints
+from pipeline.grading.gradings import Batch, Member
 from pipeline.grading.publish.outputs import write_outputs
 from pipeline.grading.similarity.doubles import Double, find_doubles, with_recordings
 from pipeline.grading.similarity.prints import fingerprint
@@ -66,7 +66,7 @@ def test_without_names_nobody_is_named(recordings, tmp_path):
 def test_recordings_are_counted_not_pairs_of_submissions(recordings):
     """Four submissions with one set of recordings have that many in common, not six times it."""
     prints = [
-        Prints(submission=f"t{i}", authors=("s1",), fingerprints=recordings[0]) for i in range(4)
+        Member(submission=f"t{i}", authors=("s1",), fingerprints=recordings[0]) for i in range(4)
     ]
     counted = []
     for some in (prints[:2], prints):

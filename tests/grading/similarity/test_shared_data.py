@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.grading.gradings import Prints
+from pipeline.grading.gradings import Member
 from pipeline.grading.similarity.prints import fingerprint, unpack
 from pipeline.grading.similarity.shared import find_shared, shared_flag
 from pipeline.ingest.read import read_data
@@ -25,7 +25,7 @@ def teams(tmp_path_factory):
 
 
 def prints(name, records, authors=None):
-    return Prints(
+    return Member(
         submission=name, authors=authors or (f"s-{name}",), fingerprints=fingerprint(records)
     )
 
