@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from pipeline.checks.carts import check_carts
+from pipeline.checks.channels import check_channels
 from pipeline.checks.estimates import check_decays, check_rows, check_steps
 from pipeline.checks.loops import check_loops, design_margins, verify_design
 from pipeline.checks.recordings import (
@@ -78,6 +79,7 @@ def analyse(
         *check_left_out(left_out, records=data.records),
         *check_setup(data.records),
         *check_dwells(data.records, found.sines),
+        *check_channels(found.responses, fit, records=sound),
         *found.repeats.checks,
         *check_rows(rows),
         *check_decays(found.decays, position_unit=position),

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from pipeline.checks.channels import LATE_CHANNEL
 from pipeline.checks.recordings import SCALES, why_other_frequency
 from pipeline.grading.mistakes import limits
 from pipeline.grading.references.reference import is_explained
@@ -22,12 +23,13 @@ def bad_runs(analysis: Analysis) -> dict[str, str]:
         for check in analysis.checks
         if check.id.partition(".")[0] in ("setup", *SCALES) and check.outcome == "fail"
     }
+    late = [c.message for c in analysis.checks if c.id.partition(".")[0] == LATE_CHANNEL]
     sticky = not is_explained(analysis)
     for record in analysis.records:
         if record.id in setups:
             found[record.id] = setups[record.id]
             continue
-        for problem in _problems(record, sticky=sticky):
+        for problem in (*_problems(record, sticky=sticky), *(late if record.omega else ())):
             found.setdefault(record.id, problem)
     return found
 
