@@ -16,6 +16,7 @@ from pipeline.synthesis.hidden import prepare_bench
 from pipeline.workflow import analyse
 
 SAMPLE = 0.00884  # s
+LATE = 5  # samples
 
 
 def hand_in(folder: Path, *, hide: tuple[str, ...] = (), late: int = 0) -> Path:
@@ -33,9 +34,9 @@ def hand_in(folder: Path, *, hide: tuple[str, ...] = (), late: int = 0) -> Path:
     return folder
 
 
-def test_a_late_channel_is_told_with_its_delay(tmp_path, samples=5):
+def test_a_late_channel_is_told_with_its_delay(tmp_path):
     """In the report's checks, to within a fifth of a sample, and by the grade of the data."""
-    submission = load_submission(hand_in(tmp_path / "team", late=samples))
+    submission = load_submission(hand_in(tmp_path / "team", late=LATE))
     graded = grade_submission(
         submission, rubric=load_rubric(RUBRICS / "throne-2dof.toml"), name="team"
     )
@@ -43,7 +44,7 @@ def test_a_late_channel_is_told_with_its_delay(tmp_path, samples=5):
     (check,) = [c for c in graded.analysis.checks if c.id.startswith(LATE_CHANNEL)]
     assert check.outcome == "fail"
     assert check.id == f"{LATE_CHANNEL}.cart-2"
-    np.testing.assert_allclose(check.value, samples * SAMPLE, atol=0.2 * SAMPLE)
+    np.testing.assert_allclose(check.value, LATE * SAMPLE, atol=0.2 * SAMPLE)
     (flag,) = [flag for flag in graded.grade.flags if flag.code == "data_problem"]
     assert all(name.startswith("sine") for name in flag.parameters)
 
