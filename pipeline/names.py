@@ -124,3 +124,9 @@ def listed(ids: Sequence[str], *, most: int = 4) -> str:
     if len(ids) <= most:
         return ", ".join(ids)
     return f"{ids[0]}, {ids[1]} … {ids[-1]} ({len(ids)} runs)"
+
+
+def first_few(names: Sequence[str], most: int) -> str:
+    """Return names with commas between them, those beyond the first few as a number."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more

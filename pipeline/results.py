@@ -7,7 +7,8 @@ sigma; `None` means it could not be had.
 The map goes on where a package has types of its own: `Ingested` (`ingest/read.py`, what was read),
 `Identified` and `Fitted` (`identify/`, what the stages make of the records, up to the fit),
 `Repeats` (`identify/soundness/repeated_numbers.py`), `Gap` (`gap/types.py`, what the linear carts
-leave out and what explains it) and `Grade` (`grading/grade.py`). `results_json.py` writes it all.
+leave out and what explains it), `Grade` (`schemas/grade.py`, what a submission earned and why) and
+`Grading` (`grading/gradings.py`, what becomes of it in a class). `results_json.py` writes it all.
 """
 
 from collections.abc import Mapping

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
@@ -19,17 +19,9 @@ from pipeline.submission.toml_file import parse_toml, read_text
 
 _MAX_BYTES = 1_000_000
 _CHECKS: dict[str, type[BaseModel]] = {
-    "required": rubric.RequiredPieces,
-    "data": rubric.DataQuality,
-    "initial": rubric.Parameters,
-    "final": rubric.Parameters,
-    "initial_final": rubric.InitialFinal,
-    "laws": rubric.Laws,
-    "state_space": rubric.StateModel,
-    "gains": rubric.Gains,
-    "claims": rubric.Claims,
-    "prefilter": rubric.Prefilter,
-    "hardware": rubric.Hardware,
+    check: model
+    for model in get_args(get_args(rubric.Criterion)[0])
+    for check in get_args(model.model_fields["check"].annotation)
 }
 _TABLES: dict[str, type[BaseModel]] = {
     "system": submission.System,

@@ -193,7 +193,6 @@ def _executor(*, jobs: int, cluster: str | None) -> Executor:
 
 
 def _examples_digest(rubric: Rubric, *, folder: Path) -> str:
-    """Return a hash of all that `_handed_out` reads."""
     own = (folder / example for example in rubric.examples)
     return " ".join(digest([path]) for path in (*own, EXAMPLES))
 

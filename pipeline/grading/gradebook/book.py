@@ -335,14 +335,12 @@ class Gradebook:
         return self._now().astimezone(UTC).isoformat(timespec="microseconds")
 
     def _submission(self, connection: Connection, name: str) -> int:
-        """Return the number of a submission, new or not."""
         values = {"assignment": self._assignment or "", "name": name}
         mine = select(submissions.c.id).filter_by(**values)
         number = connection.scalar(mine)
         return add_row(connection, submissions, values) if number is None else number
 
     def _last(self, connection: Connection) -> Row:
-        """Return the last batch that ran to its end."""
         newest = select(batches).order_by(batches.c.id.desc()).limit(1)
         if self._assignment is not None:
             newest = newest.where(batches.c.assignment == self._assignment)

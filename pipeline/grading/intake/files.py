@@ -17,6 +17,7 @@ from pathlib import Path, PurePosixPath
 from pipeline.errors import SubmissionError
 from pipeline.grading.intake.lms_names import parse_name
 from pipeline.grading.intake.unpack import HAND_IN, STRANGE_ARCHIVES, Limits, is_debris, unpack
+from pipeline.names import first_few
 from pipeline.submission.complaints import quote
 from pipeline.submission.load import MAX_DATA_BYTES, NAME
 
@@ -176,8 +177,7 @@ def _nothing_in(into: Path) -> str:
     files = [path for path in sorted(into.rglob("*")) if path.is_file()]
     if not files:
         return f"no {NAME} in it: it is empty"
-    named = ", ".join(quote(path.name) for path in files[:3])
-    more = f" and {len(files) - 3} more" if len(files) > 3 else ""
+    named = first_few([quote(path.name) for path in files], 3)
     strange = [path.name for path in files if path.suffix.lower() in STRANGE_ARCHIVES]
     hint = f"; {quote(strange[0])} cannot be opened, pack a zip file" if strange else ""
-    return f"no {NAME} in it, only {named}{more}{hint}"
+    return f"no {NAME} in it, only {named}{hint}"

@@ -5,7 +5,7 @@ import re
 import unicodedata
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path, PurePosixPath
 
 from pipeline.errors import ConfigError, SubmissionError
@@ -71,16 +71,10 @@ def _silent(text: str) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Found:
-    """A hand-in before its id is settled: its name, and that of the folder around it."""
+class _Found(HandIn):
+    """A hand-in whose id is not settled: that is its name yet, `parent` the folder around it."""
 
-    name: str
     parent: str
-    sources: tuple[Path, ...]
-    owner: str = ""
-    handed_in: str = ""
-    days_late: float = 0.0
-    problem: str = ""
 
 
 def find_hand_ins(
@@ -155,7 +149,7 @@ def _with_refused(
         else:
             problems.setdefault(owner, why)
     return [
-        *(_Found(name=x, parent=folder.name, sources=(), problem=why) for x, why in lost.items()),
+        *(_Found(id=x, parent=folder.name, sources=(), problem=why) for x, why in lost.items()),
         *(replace(one, problem=problems.get(i, one.problem)) for i, one in enumerate(found)),
     ]
 
@@ -183,12 +177,12 @@ def _in_folder(folder: Path, *, walk: _Walk, top: bool = True, depth: int = 0) -
         return _looked_into(folder, walk=walk, top=top, depth=depth)
     except OSError as error:
         problem = f"cannot be read ({error.strerror or error})"
-        return [_Found(name=folder.name, parent=folder.parent.name, sources=(), problem=problem)]
+        return [_Found(id=folder.name, parent=folder.parent.name, sources=(), problem=problem)]
 
 
 def _looked_into(folder: Path, *, walk: _Walk, top: bool, depth: int) -> list[_Found]:
     if _is_submission(folder) or depth > DEEPEST:
-        return [_Found(name=folder.name, parent=folder.parent.name, sources=(folder,))]
+        return [_Found(id=folder.name, parent=folder.parent.name, sources=(folder,))]
     entries = [
         entry
         for entry in sorted(folder.iterdir())
@@ -254,19 +248,19 @@ def _single(entry: Path) -> _Found:
     """Return a folder or archive that is one hand-in."""
     if entry.is_symlink():
         return _Found(
-            name=entry.stem,
+            id=entry.stem,
             parent=entry.parent.name,
             sources=(),
             problem=f"{quote(entry.name)} is a link; hand in the files themselves",
         )
     if entry.is_dir():
-        return _Found(name=entry.name, parent=entry.parent.name, sources=(entry,))
+        return _Found(id=entry.name, parent=entry.parent.name, sources=(entry,))
     return _archive(entry)
 
 
 def _archive(path: Path) -> _Found:
     name, own = _folder_inside(path), path.stem.removesuffix(".tar")
-    return _Found(name=name or own, parent=own if name else path.parent.name, sources=(path,))
+    return _Found(id=name or own, parent=own if name else path.parent.name, sources=(path,))
 
 
 def _folder_inside(archive: Path) -> str:
@@ -296,7 +290,7 @@ def _from_platform(folder: Path, uploads: dict[Path, Upload], *, top: bool) -> l
         shown = sent.names if sent and sent.names else owner
         found.append(
             _Found(
-                name=inside or shown,
+                id=inside or shown,
                 parent=shown if inside and not own else folder.name,
                 sources=sources,
                 owner=owner_text(shown, platform, user),
@@ -328,8 +322,8 @@ def _name_inside(sources: Sequence[Path]) -> str:
 
 def _with_ids(found: Sequence[_Found], *, known: Iterable[str] = ()) -> list[HandIn]:
     """Give every hand-in its folder's name; where two are the same, the parent's before it."""
-    names = [_fit(one.name) for one in found]
-    longer = [_fit(f"{one.parent}-{one.name}") for one in found]
+    names = [_fit(one.id) for one in found]
+    longer = [_fit(f"{one.parent}-{one.id}") for one in found]
     often, before = Counter(name.casefold() for name in names), set(known)
     names = [
         long if often[name.casefold()] > 1 or (long in before and name not in before) else name
@@ -343,16 +337,8 @@ def _with_ids(found: Sequence[_Found], *, known: Iterable[str] = ()) -> list[Han
             number += 1
             unique = f"{name}-{number}"
         taken.add(unique.casefold())
-        hand_ins.append(
-            HandIn(
-                id=unique,
-                sources=one.sources,
-                owner=one.owner,
-                handed_in=one.handed_in,
-                days_late=one.days_late,
-                problem=one.problem,
-            )
-        )
+        own = {field.name: getattr(one, field.name) for field in fields(HandIn)}
+        hand_ins.append(HandIn(**{**own, "id": unique}))
     return hand_ins
 
 

@@ -1,6 +1,6 @@
 """The checks of a rubric: each gives a share of the points, and says why."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from decimal import Decimal
 from fractions import Fraction
 
@@ -18,6 +18,7 @@ from pipeline.grading.mistakes.impossible import not_positive
 from pipeline.grading.references.reference import OFF_SCALE, Reference, off_scale
 from pipeline.grading.references.tolerance import NO_CREDIT, as_typed, credit, percent_off, rounding
 from pipeline.grading.rubric import is_damping, matching
+from pipeline.names import first_few
 
 _NAMED = 4  # so many are named in a message
 
@@ -47,11 +48,6 @@ def judge(criterion: asked.Criterion, work: Work) -> Verdict:
             return judge_hardware(criterion, work)
 
 
-def _listed(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    return ", ".join(names[:_NAMED]) + more
-
-
 # ------------------------------------------------------------------- pieces and data
 
 
@@ -59,13 +55,13 @@ def _required(work: Work) -> Verdict:
     pieces, missing = asked_pieces(work.rubric), work.missing
     if not pieces:
         return Verdict(share=ALL, message="Nothing in particular was asked for.")
-    unread = _listed(list(work.analysis.unreadable))
+    unread = first_few(list(work.analysis.unreadable), _NAMED)
     here = "All that was asked for is here" + (
         f", without {unread}, not readable" if unread else ""
     )
     return Verdict(
         share=ALL - Fraction(len(missing), len(pieces)),
-        message=f"Missing: {_listed(missing)}." if missing else f"{here}.",
+        message=f"Missing: {first_few(missing, _NAMED)}." if missing else f"{here}.",
         expected={"pieces": pieces},
         found={"missing": missing},
     )
@@ -118,7 +114,11 @@ def _parameters(criterion: asked.Parameters, work: Work) -> Verdict:
             wrong.add(name)
             there = f", your recordings give {known[name].said}" if name in known else ""
             off.append(f"{name}: you report {as_typed(table[name])}{there}")
-    left = f" Not judged: {_listed(guessed)}." if guessed and criterion.check == "final" else ""
+    left = (
+        f" Not judged: {first_few(guessed, _NAMED)}."
+        if guessed and criterion.check == "final"
+        else ""
+    )
     message = f"{'; '.join(off[:_NAMED])}." if off else "As your own recordings say."
     return Verdict(
         share=mean_share(shares),

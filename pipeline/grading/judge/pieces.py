@@ -3,6 +3,7 @@
 from collections.abc import Collection
 
 from pipeline.grading.rubric import RequiredRuns, Rubric, matching
+from pipeline.names import first_few
 from pipeline.schemas.grade import Flag
 from pipeline.submission import Experiment, Submission
 
@@ -26,11 +27,10 @@ def missing_pieces(
 
 def missing_flag(missing: list[str]) -> Flag:
     """Return the flag for what is missing."""
-    shown = ", ".join(missing[:6]) + (f" and {len(missing) - 6} more" if len(missing) > 6 else "")
     return Flag(
         code="missing",
         parameters=tuple(missing),
-        message=f"not handed in: {shown}.",
+        message=f"not handed in: {first_few(missing, 6)}.",
         evidence={"missing": missing},
     )
 

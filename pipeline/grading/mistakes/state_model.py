@@ -226,7 +226,6 @@ def own_chain(values: Mapping[str, float], *, n: int) -> Chain | None:
 
 
 def _kinds(n: int) -> list[list[Kind]]:
-    """Return the kind of every entry of [A B]."""
     kinds: list[list[Kind]] = [["exact"] * (2 * n + 1) for _ in range(2 * n)]
     for i in range(n):
         for j in (i - 1, i, i + 1):

@@ -16,6 +16,7 @@ from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.clusters import Cluster
 from pipeline.grading.similarity.doubles import Double
 from pipeline.grading.words import WORDS, points_text
+from pipeline.names import first_few
 from pipeline.report.document import (
     Block,
     Cell,
@@ -140,7 +141,6 @@ def _points(points: "pd.Series", rubric: Rubric, pictures: count) -> list[Block]
 def _criteria(
     graded: "pd.DataFrame", rubric: Rubric, tables: count, pictures: count
 ) -> list[Block]:
-    """Return how hard each criterion was."""
     import pandas as pd
 
     if graded.empty:
@@ -219,16 +219,12 @@ def _shared(lines: Sequence[Line], clusters: Sequence[Cluster], tables: count) -
     for number, cluster in enumerate(clusters, start=1):
         for submissions, recordings in cluster.by_submissions().items():
             links = [_link(name) if name in here else Span(clean(name)) for name in submissions]
-            more = len(recordings) - _NAMED
             rows.append(
                 [
                     cell(str(number)),
                     cell(spans(*_listed(links))),
                     cell(str(len(recordings))),
-                    cell(
-                        clean(", ".join(recordings[:_NAMED]))
-                        + (f" and {more} more" if more > 0 else "")
-                    ),
+                    cell(clean(first_few(recordings, _NAMED))),
                 ]
             )
     head = ("Cluster", "Submissions", "Recordings", "Which")

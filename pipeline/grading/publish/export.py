@@ -201,7 +201,6 @@ def _gradescope(students: Sequence[Student], rubric: Rubric) -> str:
 
 
 def _clock(days: float) -> str:
-    """Return days as H:M:S."""
     seconds = round(days * _HOURS * 3600)
     return f"{seconds // 3600:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}"
 

@@ -148,7 +148,6 @@ class Roster:
         return students.str.contains(POINTS_POSSIBLE, regex=False)
 
     def _title(self, title: str) -> str:
-        """Return a column's title as the table has it."""
         for name in self.table.columns:
             found = _TITLE.fullmatch(str(name))
             if name == title or (found and found[1] == title):

@@ -17,6 +17,7 @@ from scipy.fft import next_fast_len
 from pipeline.grading.gradings import Member
 from pipeline.grading.intake.lms_names import same_number
 from pipeline.grading.similarity.prints import PASSED, Print, unpack
+from pipeline.names import first_few
 from pipeline.schemas.grade import Flag
 
 _WIDTH = 512  # samples around an anchor that are compared at first
@@ -156,10 +157,9 @@ def shared_flag(records: Sequence[SharedRecord]) -> Flag:
 
 def shared_message(experiments: Sequence[str], others: Iterable[str]) -> str:
     """Return the sentence for recordings that stand in other submissions."""
-    more = f" and {len(experiments) - 4} more" if len(experiments) > 4 else ""
     stand = "stands" if len(experiments) == 1 else "stand"
     return (
-        f"{', '.join(experiments[:4])}{more} also {stand} in {', '.join(others)}: the noise of the "
+        f"{first_few(experiments, 4)} also {stand} in {', '.join(others)}: the noise of the "
         "recordings is the same. That does not say whose they are; if they were shared for a "
         "reason, say so."
     )

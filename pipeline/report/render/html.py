@@ -46,6 +46,11 @@ def render_fragment(blocks: Sequence[Block]) -> str:
     return _environment().get_template("fragment.html.j2").render(blocks=blocks)
 
 
+def render_text(template: str, **values: object) -> str:
+    """Return a text of ours, nothing in it escaped."""
+    return _environment().overlay(autoescape=False).get_template(template).render(**values)
+
+
 def _scripts(document: Document) -> list[str]:
     """Return the scripts that a page has something for."""
     blocks = [block for section in document.sections for block in flat(section.blocks)]

@@ -373,7 +373,7 @@ def test_any_name_becomes_a_folders(tmp_path_factory, names):
     """Ids are different, printable, not too long, and lie where they should."""
     from pipeline.grading.intake.hand_ins import _Found, _with_ids
 
-    found = [_Found(name=name, parent="p", sources=()) for name in names]
+    found = [_Found(id=name, parent="p", sources=()) for name in names]
     ids = [hand_in.id for hand_in in _with_ids(found)]
     assert len({i.casefold() for i in ids}) == len(names)
     for i in ids:
