@@ -61,10 +61,10 @@ class Mistake:
         values = {"reported": as_typed(typed), "recomputed": recomputed}
         return "".join(WORDS.text(key, counted=counted, there=there, **values) for key in self.said)
 
-    def and_(self, code: Code, said: str, predicted: dict[str, Reference], **other) -> "Mistake":
+    def together_with(self, code: Code, said: str, predicted: dict[str, Reference]) -> "Mistake":
         """Return this mistake with another one made on top of it."""
-        both = (*self.codes, code), (*self.said, said)
-        return replace(self, codes=both[0], said=both[1], predicted=predicted, **other)
+        codes, sentences = (*self.codes, code), (*self.said, said)
+        return replace(self, codes=codes, said=sentences, predicted=predicted)
 
 
 def known_mistakes(references: Numbers, analysis: Analysis) -> list[Mistake]:
@@ -188,10 +188,12 @@ def _miscount_and(miscount: Mistake, omegas: Numbers, zetas: Numbers) -> Iterato
     omega = {n: r for n, r in miscount.predicted.items() if n in omegas}
     zeta = {n: r for n, r in miscount.predicted.items() if n in zetas}
     if omega:
-        yield miscount.and_("hz_for_rad_s", "and_hertz", {**_times(omega, 1 / _TURN), **zeta})
+        slow = {**_times(omega, 1 / _TURN), **zeta}
+        yield miscount.together_with("hz_for_rad_s", "and_hertz", slow)
     if omega and zeta:
         damped = {**omega, **_times(zeta, _LOG10)}
-        yield miscount.and_("log10_for_ln", "and_log10", damped, least=2)
+        both = miscount.together_with("log10_for_ln", "and_log10", damped)
+        yield replace(both, least=2)
 
 
 # -------------------------------------------------------------------------- gains
@@ -271,13 +273,9 @@ def _in_counts(mistakes: Sequence[Mistake]) -> Iterator[Mistake]:
         if mistake.codes in (("peak_to_peak",), ("peak_for_steady_state",)):
             in_counts = counted[0].predicted
             per_length = {n: 2 * r.value / twice.predicted[n].value for n, r in in_counts.items()}
-            yield mistake.and_(
-                "counts_for_length",
-                "and_counts",
-                {n: r.times(per_length[n]) for n, r in mistake.predicted.items()},
-                tolerance=limits.READ,
-                tries=1,
-            )
+            scaled = {n: r.times(per_length[n]) for n, r in mistake.predicted.items()}
+            both = mistake.together_with("counts_for_length", "and_counts", scaled)
+            yield replace(both, tolerance=limits.READ, tries=1)
 
 
 def _is_off(extreme: Reference, gain: Reference) -> bool:
@@ -322,6 +320,5 @@ def _swapped(mistakes: Sequence[Mistake], references: Numbers) -> Iterator[Mista
             continue
         for source in _permutations(list(references)):
             swapped = {name: mistake.predicted[other] for name, other in source.items()}
-            yield mistake.and_(
-                "carts_swapped", "and_swapped", swapped, whole=True, least=2, tries=1
-            )
+            both = mistake.together_with("carts_swapped", "and_swapped", swapped)
+            yield replace(both, whole=True, least=2, tries=1)
