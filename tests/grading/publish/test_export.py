@@ -45,7 +45,7 @@ def write(tmp_path: Path, *outcomes, platform, roster: str = "", overrides=(), *
 def test_a_grade_is_better_than_none(tmp_path):
     """Who stands in a hand-in that could not be graded and in one without points has those."""
     unread = failed_grade("a", "too slow")
-    unread = replace(unread, authors=("bob",))
+    unread = unread.model_copy(update={"authors": ("bob",)})
     nothing = make_grade("b", share=0.0, authors=("bob",))
     outcomes = make_outcome(unread), make_outcome(nothing)
     with Gradebook(tmp_path, assignment="lab", create=True) as book:
