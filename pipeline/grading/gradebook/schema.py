@@ -9,6 +9,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from sqlalchemy import (
     DDL,
@@ -52,7 +53,7 @@ class Words(TypeDecorator):
 
     impl, cache_ok = Text, True
 
-    def process_bind_param(self, value, dialect):
+    def process_bind_param(self, value: Any, dialect: object) -> Any:
         """Return what is kept."""
         return value.replace("\0", "�").encode("utf-8", "replace").decode() if value else value
 
@@ -62,11 +63,11 @@ class Names(TypeDecorator):
 
     impl, cache_ok = Text, True
 
-    def process_bind_param(self, value, dialect):
+    def process_bind_param(self, value: Any, dialect: object) -> Any:
         """Return what is kept."""
         return json.dumps(value)
 
-    def process_result_value(self, value, dialect):
+    def process_result_value(self, value: Any, dialect: object) -> Any:
         """Return what was meant."""
         return tuple(json.loads(value))
 
@@ -76,11 +77,11 @@ class Deflated(TypeDecorator):
 
     impl, cache_ok = LargeBinary, True
 
-    def process_bind_param(self, value, dialect):
+    def process_bind_param(self, value: Any, dialect: object) -> Any:
         """Return what is kept."""
         return zlib.compress(value.encode())
 
-    def process_result_value(self, value, dialect):
+    def process_result_value(self, value: Any, dialect: object) -> Any:
         """Return what was meant."""
         return zlib.decompress(value).decode()
 
