@@ -310,7 +310,9 @@ def main() -> None:
     if options.silverbox:
         parts["silverbox"] = silverbox_of(options.silverbox.read_text(encoding="utf-8"))
     if options.rig:
-        parts["rigs"] = "\n".join(explain_rig(rig, print) for rig in rigs_in(options.rig))
+        rigs = list(rigs_in(options.rig))
+        explain_gap(rigs[0].records, springs=rigs[0].springs, budget=0.0)  # compiles the simulator
+        parts["rigs"] = "\n".join(explain_rig(rig, print) for rig in rigs)
     page = PAGE.read_text(encoding="utf-8")
     for name, text in parts.items():
         begin, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->\n"
