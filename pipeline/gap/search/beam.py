@@ -91,7 +91,7 @@ def by_promise(
             leading.setdefault(
                 frozenset((c.effect.family or c.key[0], c.place) for c in effects), h
             )
-    within = _HOPELESS * min((h.fit.chi for h in leading.values()), default=0.0)
+    within = _HOPELESS * min(h.fit.chi for h in seen.values())
     return [h for h in leading.values() if h.fit.chi <= within]
 
 
