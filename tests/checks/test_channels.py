@@ -43,6 +43,7 @@ def test_a_late_channel_is_told_with_its_delay(tmp_path):
     assert graded.analysis is not None
     (check,) = [c for c in graded.analysis.checks if c.id.startswith(LATE_CHANNEL)]
     assert check.outcome == "fail"
+    assert check.value is not None
     assert check.id == f"{LATE_CHANNEL}.cart-2"
     np.testing.assert_allclose(check.value, LATE * SAMPLE, atol=0.2 * SAMPLE)
     (flag,) = [flag for flag in graded.grade.flags if flag.code == "data_problem"]
