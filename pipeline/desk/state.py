@@ -2,7 +2,7 @@
 
 import secrets
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -21,7 +21,7 @@ from pipeline.resources import TEMPLATES
 
 _MOST_LOOKS = 5_000  # files of which is kept what they are
 
-Stamp = tuple[int, int]
+Stamp = tuple[int, int, dict[str, str | int]]  # time, size, columns as stated
 
 
 @dataclass(kw_only=True)
@@ -33,24 +33,31 @@ class Desk:
     said: dict[tuple[str, Path], list[str]] = field(default_factory=dict)
     _looks: OrderedDict[Path, tuple[Stamp, dict[str, Any]]] = field(default_factory=OrderedDict)
 
-    def looks(self, folder: Path) -> dict[str, dict[str, Any]]:
-        """Return what the data files of a submission are, by name; each is looked at once."""
+    def looks(
+        self, folder: Path, stated: Callable[[str], dict[str, str | int]]
+    ) -> dict[str, dict[str, Any]]:
+        """Return what the data files of a submission are, by name; each is looked at once.
+
+        Parameters
+        ----------
+        stated : which column of a file is what.
+        """
         found = {}
         for file in self.hand.do("files", folder=str(folder)):
-            path = folder / file
+            path, columns = folder / file, stated(file)
             info = path.stat()
-            stamp = info.st_mtime_ns, info.st_size
+            stamp = info.st_mtime_ns, info.st_size, columns
             kept = self._looks.get(path)
             if kept is None or kept[0] != stamp:
-                kept = self._looks[path] = stamp, self._look(folder, file)
+                kept = self._looks[path] = stamp, self._look(folder, file, columns)
                 while len(self._looks) > _MOST_LOOKS:
                     self._looks.popitem(last=False)
             found[file] = kept[1]
         return found
 
-    def _look(self, folder: Path, file: str) -> dict[str, Any]:
+    def _look(self, folder: Path, file: str, columns: dict[str, str | int]) -> dict[str, Any]:
         try:
-            return self.hand.do("look", folder=str(folder), files=[file])[file]
+            return self.hand.do("look", folder=str(folder), file=file, columns=columns)
         except Failed as error:  # what the file did to the process, it did to this row only
             nothing = {"kind": None, "carts": [], "format": "", "unsure": [], "lines": []}
             return {"file": file, "state": "broken", "remarks": [str(error)], **nothing}
@@ -145,6 +152,3 @@ def _environment() -> Environment:
 def plain_error(ask: Ask, text: str, *, status: int) -> Response:
     """Return a page that says what is wrong."""
     return ask.page("wrong", status=status, title="That did not work", text=text)
-
-
-Fields = Mapping[str, Any]

@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +25,14 @@ ASKED = "questions.json"  # beside the report: what it asks, and what it said in
 _ACROSS, _HIGH = 120, 32  # of a thumbnail
 
 
-def look(folder: str, files: Sequence[str], *, progress: Progress) -> dict[str, Any]:
-    """Return what some data files are, by name, with a thumbnail of each."""
-    return {file: _row(Path(folder), file) for file in files}
+def look(
+    folder: str, file: str, columns: dict[str, str | int], *, progress: Progress
+) -> dict[str, Any]:
+    """Return what a data file is, with a thumbnail; `columns` as `submission.toml` states them."""
+    if leaves(Path(folder), file):
+        raise SubmissionError(f"{file}: leaves the folder")
+    found = look_at(Path(folder), file, columns=columns)
+    return {**_plain(found), "lines": thumbnail(Path(folder), found, columns=columns)}
 
 
 def files(folder: str, *, progress: Progress) -> list[str]:
@@ -89,13 +94,6 @@ TASKS: Mapping[str, Callable[..., Any]] = {
 }
 
 
-def _row(folder: Path, file: str) -> dict[str, Any]:
-    if leaves(folder, file):
-        raise SubmissionError(f"{file}: leaves the folder")
-    found = look_at(folder, file)
-    return {**_plain(found), "lines": thumbnail(folder, found)}
-
-
 def _plain(found: Found) -> dict[str, Any]:
     inspection = found.inspection
     return {
@@ -112,14 +110,16 @@ def _plain(found: Found) -> dict[str, Any]:
     }
 
 
-def thumbnail(folder: Path, found: Found) -> list[str]:
+def thumbnail(folder: Path, found: Found, *, columns: Mapping[str, str | int]) -> list[str]:
     """Return the positions of a record as the points of SVG lines, one a cart."""
     if found.inspection is None or found.kind == "bode":
         return []
     table, _ = read_table(folder, found.file)
-    columns, _ = assign_columns(table, explicit=found.inspection.guessed or None, free=(1,))
-    roles = sorted(role for role in columns if role[0] == "x")
-    rows = [table.values[columns[role].index] for role in roles]
+    stated = {role: column for role, column in columns.items() if table.has(column)}
+    explicit = stated or found.inspection.guessed
+    assigned, _ = assign_columns(table, explicit=explicit, free=(1,))
+    roles = sorted(role for role in assigned if role[0] == "x")
+    rows = [table.values[assigned[role].index] for role in roles]
     low = min((float(row.min()) for row in rows), default=0.0)
     high = max((float(row.max()) for row in rows), default=0.0)
     if not np.isfinite(high - low) or high == low:

@@ -6,7 +6,7 @@ file tells. What stands there is nobody's to change; what is not sure is said as
 
 import json
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
@@ -21,12 +21,13 @@ from pipeline.submission.edit import (
     append_experiment,
     comment_text,
     edit_submission,
+    submission_text,
     toml_item,
 )
-from pipeline.submission.load import NAME, outside
+from pipeline.submission.load import NAME, outside, posix, stated_columns
 from pipeline.submission.models import MOST_EXPERIMENTS
 from pipeline.submission.template import write_templates
-from pipeline.submission.toml_file import Value
+from pipeline.submission.toml_file import Value, parse_toml
 
 _MOST_CARTS = 4
 _HELD_STEPS = 2.0  # encoder steps over a whole record; a cart that is free moves more
@@ -75,10 +76,15 @@ def data_files(folder: Path) -> list[str]:
     ]
 
 
-def look_at(folder: Path, file: str) -> Found:
-    """Return what a file of a submission is; `state` is "broken" or not settled yet ("unknown")."""
+def look_at(folder: Path, file: str, *, columns: Mapping[str, str | int] = {}) -> Found:
+    """Return what a file of a submission is; `state` is "broken" or not settled yet ("unknown").
+
+    Parameters
+    ----------
+    columns : which is what, as far as `submission.toml` says.
+    """
     try:
-        inspection = inspect_file(folder / file)
+        inspection = inspect_file(folder / file, columns=columns)
     except SubmissionError as error:
         reason = str(error).removeprefix(str(folder / file)).lstrip(": ")
         return Found(file=file, state="broken", remarks=(reason,))
@@ -146,13 +152,17 @@ def fill_submission(folder: Path) -> tuple[Found, ...]:
     """
     if not folder.is_dir():
         raise ConfigError(f"{folder}: no such folder; copy your recordings into {folder / 'data'}")
-    looked = [look_at(folder, file) for file in data_files(folder)]
+    new = not (folder / NAME).exists()
+    text = "" if new else submission_text(folder)
+    document = parse_toml(text, where=f"{folder.resolve().name}/{NAME}", error=SubmissionError)
+    looked = [
+        look_at(folder, file, columns=stated_columns(document, file)) for file in data_files(folder)
+    ]
     if not looked:
         raise ConfigError(
             f"{folder / 'data'}: no recording in it; copy your files there (they end in "
             f"{', '.join(ENDINGS)})"
         )
-    new = not (folder / NAME).exists()
     if new:
         write_templates(folder, carts=_carts_seen(looked))
     found: list[Found] = []
@@ -184,7 +194,7 @@ class _Filling:
         if found.inspection is None:
             return found
         for table in self._tables:
-            if _plain(table["file"]) == found.file:
+            if posix(str(table["file"])) == found.file:
                 return self._complete(table, found, found.inspection)
         if (same := self._same(found.file)) is not None:
             return replace(found, state="copy", remarks=(*found.remarks, f"is a copy of {same}"))
@@ -230,13 +240,13 @@ class _Filling:
         """Return another file of the submission that holds the very same."""
         path = self._folder / file
         for table in self._tables:
-            other = self._folder / _plain(table["file"])
+            other = self._folder / posix(str(table["file"]))
             if (
                 other.is_file()
                 and other.stat().st_size == path.stat().st_size
                 and other.read_bytes() == path.read_bytes()
             ):
-                return _plain(table["file"])
+                return posix(str(table["file"]))
         return None
 
     def _say_unknown(self, found: Found) -> None:
@@ -250,10 +260,6 @@ class _Filling:
         self._document.add(tomlkit.nl())
         for text in (f"unsure: {why}", "[[experiments]]", f"id = {id_}", kind, line):
             self._document.add(tomlkit.comment(comment_text(text)))
-
-
-def _plain(file: object) -> str:
-    return str(PurePosixPath(str(file).replace("\\", "/")))
 
 
 def _unsure(found: Found, n: int) -> Iterator[str]:

@@ -88,8 +88,12 @@ def _natural(path: Path) -> list[tuple[str, int]]:
     return [(text, int(n or -1)) for text, n in parts]
 
 
-def inspect_file(path: Path) -> Inspection:
+def inspect_file(path: Path, *, columns: Mapping[str, str | int] = {}) -> Inspection:
     """Look into one data file; what would stop a report is listed as a problem where it can be.
+
+    Parameters
+    ----------
+    columns : which is what, as far as that is stated; a column that is not there states nothing.
 
     Raises
     ------
@@ -99,15 +103,16 @@ def inspect_file(path: Path) -> Inspection:
     table, _ = read_table(real.parent, real.name, shown=str(path))
     problems = [f"{table.cut}: the file was cut short"] if table.cut else []
     problems += table.notes
+    stated = {role: column for role, column in columns.items() if table.has(column)}
     try:
-        columns, unused = assign_columns(table, explicit=None, free=(1,))
+        assigned, unused = assign_columns(table, explicit=stated, free=(1,))
     except SubmissionError as error:
-        columns, unused = {}, ()
+        assigned, unused = {}, ()
         problems.append(str(error).removeprefix(f"{table.source}: "))
-    bare = not columns and all(name.isdigit() for name in table.names)
+    bare = not assigned and all(name.isdigit() for name in table.names)
     guessed = suggest_columns(table) if bare else {}
     if bare:
-        columns, _ = assign_columns(table, explicit=guessed, free=(1,))
+        assigned, _ = assign_columns(table, explicit=guessed, free=(1,))
         line = ", ".join(f"{role} = {number}" for role, number in guessed.items())
         problems.append(
             "the columns have no names: say in submission.toml which is what"
@@ -115,12 +120,11 @@ def inspect_file(path: Path) -> Inspection:
         )
     elif unused:
         problems.append(f"no role for {', '.join(unused)}: name them in `columns` to use them")
-    further = (
-        [] if bare and not guessed else problems
-    )  # without names everything else is missing too
-    clock = _clock(table, columns, further) if "frequency" not in columns else None
-    kind, frequency = _guess(table, columns, clock, further)
-    roles = {column.index: role for role, column in columns.items()}
+    # Without names everything else is missing too.
+    further = [] if bare and not guessed else problems
+    clock = _clock(table, assigned, further) if "frequency" not in assigned else None
+    kind, frequency = _guess(table, assigned, clock, further)
+    roles = {column.index: role for role, column in assigned.items()}
     return Inspection(
         file=str(path),
         format=FORM_TITLES[table.form],
@@ -128,7 +132,7 @@ def inspect_file(path: Path) -> Inspection:
             ColumnInspection(
                 name=name,
                 role=roles.get(i),
-                unit=columns[roles[i]].unit if i in roles else None,
+                unit=assigned[roles[i]].unit if i in roles else None,
                 low=float(values.min()) + 0.0,  # never "-0"
                 high=float(values.max()) + 0.0,
                 step=encoder_step(values) or None if roles.get(i, " ")[0] == "x" else None,

@@ -97,7 +97,7 @@ def parse_submission(text: str, *, folder: Path, where: str = NAME) -> Submissio
         experiment.model_copy(
             update={
                 "carts": tuple(sorted(experiment.carts)) or everyone,
-                "file": _posix(experiment.file),
+                "file": posix(experiment.file),
             }
         )
         for experiment in submission.experiments
@@ -294,9 +294,23 @@ def _reported_problems(submission: Submission) -> Iterator[tuple[Location, str]]
 # ------------------------------------------------------------------------- files
 
 
-def _posix(name: str) -> str:
+def posix(name: str) -> str:
     """Return a file name with forward slashes, as a student on any system may have typed it."""
     return str(PurePosixPath(name.replace("\\", "/")))
+
+
+def stated_columns(document: Mapping[str, object], file: str) -> dict[str, str | int]:
+    """Return which column of a file is what by a `submission.toml`, valid or not yet."""
+    tables = document.get("experiments")
+    listed = tables if isinstance(tables, list) else []
+    own = (t for t in listed if isinstance(t, dict) and posix(str(t.get("file", ""))) == file)
+    stated: dict[str, str | int] = {}
+    for table in (document.get("system"), *own):
+        columns = table.get("columns") if isinstance(table, dict) else None
+        for role, column in columns.items() if isinstance(columns, dict) else ():
+            if isinstance(column, str | int):
+                stated[str(role)] = column
+    return stated
 
 
 def leaves(folder: Path, name: str) -> str | None:
@@ -305,7 +319,7 @@ def leaves(folder: Path, name: str) -> str | None:
     if not name.strip() or not name.isprintable():
         hint = "" if name.isprintable() else f"; {BACKSLASH}"
         return f"expected a file name, found {shown}{hint}"
-    windows, relative = PureWindowsPath(name), Path(_posix(name))
+    windows, relative = PureWindowsPath(name), Path(posix(name))
     if windows.drive or windows.root or relative.is_absolute() or ".." in windows.parts:
         return f"{shown} leaves the submission folder"
     with suppress(OSError, RuntimeError):  # `outside` tells what cannot be followed
@@ -323,9 +337,9 @@ def outside(folder: Path, name: str, *, taken: Collection[str] = ()) -> str | No
         return problem
     shown = quote(name)
     try:
-        info = (folder / _posix(name)).resolve().stat()
+        info = (folder / posix(name)).resolve().stat()
     except FileNotFoundError:
-        return f"there is no file {shown}{_near_file(folder, _posix(name), taken)}"
+        return f"there is no file {shown}{_near_file(folder, posix(name), taken)}"
     except (OSError, RuntimeError) as error:  # a loop of links is a RuntimeError before 3.13
         return f"{shown} cannot be read ({getattr(error, 'strerror', None) or 'a loop of links'})"
     if stat.S_ISDIR(info.st_mode):

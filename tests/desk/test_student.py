@@ -322,7 +322,7 @@ def test_a_file_that_ends_the_process_costs_its_own_row(room, monkeypatch):
     (folder / "data" / "late.csv").write_bytes(some_files()[0][1])
     time.sleep(0.01)
     with pytest.raises(Failed):
-        Hand().do("look", folder=str(folder), files=["data/late.csv"])
+        Hand().do("look", folder=str(folder), file="data/late.csv", columns={})
     monkeypatch.undo()
     assert "late.csv" in visitor.get(HERE).text
 
@@ -345,7 +345,7 @@ def test_a_task_says_why_it_came_to_nothing(tmp_path, hand):
     with pytest.raises(Failed, match="no recording in it"):
         hand.do("fill", folder=str(tmp_path))
     with pytest.raises(Failed, match="leaves"):
-        hand.do("look", folder=str(tmp_path), files=["../x.csv"])
+        hand.do("look", folder=str(tmp_path), file="../x.csv", columns={})
     assert hand.do("files", folder=str(tmp_path)) == []
 
 

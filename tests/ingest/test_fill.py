@@ -211,3 +211,22 @@ def test_an_outdated_change_is_refused(tmp_path):
         edit_submission(tmp_path / "team", lambda d: d.update(title="x"), seen=seen)
     assert refused.value.text.endswith("# from outside\n")
     assert "from outside" in toml.read_text(encoding="utf-8")
+
+
+def test_columns_that_are_stated_tell_what_a_file_is(tmp_path):
+    """Under `[system]` for all files that have them, in an experiment's table for its own."""
+    put(tmp_path, "a.csv", clock=T, volts=STEP, sled=RING)
+    put(tmp_path, "b.csv", time=T, input=SINE, x1=RING)
+    put(tmp_path, "c.csv", clock=T, volts=STEP, other=RING)
+    (tmp_path / "submission.toml").write_text(
+        "version = 1\n[system]\ncarts = 1\n"
+        'columns = { time = "clock", input = "volts", x1 = "sled" }\n'
+        '[[experiments]]\nfile = "data/c.csv"\ncolumns = { x1 = "other" }\n',
+        encoding="utf-8",
+    )
+    assert states(tmp_path) == {
+        "data/a.csv": ("new", "a", "step"),
+        "data/b.csv": ("new", "b", "sine"),
+        "data/c.csv": ("completed", "c", "step"),
+    }
+    assert len(read_data(load_submission(tmp_path)).records) == 3

@@ -14,7 +14,7 @@ from typing import Any
 import tomlkit
 
 from pipeline.errors import SubmissionError
-from pipeline.names import parameter_names
+from pipeline.names import parameter_names, read_name
 from pipeline.resources import TEMPLATES
 from pipeline.submission.edit import toml_item
 from pipeline.submission.load import InvalidSubmission, spring_names
@@ -86,10 +86,18 @@ def groups(document: Mapping[str, Any]) -> list[Group]:
         optional = entry.get("optional", False)
         found.append(Group(title=entry["title"], fields=tuple(fields), optional=optional))
     rigid = carts == 1 and _at(document, "system.springs") == [False, False]
-    names = parameter_names(carts, rigid=rigid)
+    units = {
+        key: str(_at(document, f"system.{key}.unit") or unit)
+        for key, unit in (("position", "count"), ("input", "V"))
+    }
     claims = tuple(
-        Field(path=f"reported.{which}.{name}", label=f"{name} {which}", kind="number")
-        for name in names
+        Field(
+            path=f"reported.{which}.{name}",
+            label=f"{name} {which}",
+            help=read_name(name).unit(**units),
+            kind="number",
+        )
+        for name in parameter_names(carts, rigid=rigid)
         for which in ("initial", "final")
     )
     found.insert(3, Group(title="Your numbers", fields=claims, optional=True))
@@ -103,7 +111,9 @@ def field_text(document: Mapping[str, Any], field: Field) -> str:
 
 def experiment_fields(document: Mapping[str, Any], index: int) -> tuple[Field, ...]:
     """Return the fields of one experiment, filled in from its table."""
-    entries = _catalogue()["experiment"]
+    entries = [*_catalogue()["experiment"]]
+    if _at(document, f"experiments.{index}.kind") == "closed_loop":
+        entries += _catalogue()["loop"]
     fields = [_field(one, f"experiments.{index}.{one['path']}") for one in entries]
     return _filled(fields, document, _carts(document))
 
@@ -222,6 +232,8 @@ def _text(field: Field, value: Any) -> str:
             ", ".join(filter(None, (str(p.get("id", "")), str(p.get("name", ""))))) for p in people
         )
         return "\n".join(lines)
+    if field.kind == "columns" and isinstance(value, dict):
+        return "\n".join(f"{role} = {column}" for role, column in value.items())
     if field.kind == "rows" and isinstance(value, list):
         return "\n".join(_row(row) for row in value)
     return _row(value)
@@ -240,6 +252,14 @@ def _item(field: Field) -> Any:
             return toml_item([word == "true" for word in field.value.split()])
         case "numbers":
             return _numbers(field.value)
+        case "columns":
+            pairs = (line.partition("=")[::2] for line in field.value.splitlines())
+            return toml_item(
+                {
+                    role.strip(): int(column) if column.strip().isdecimal() else column.strip()
+                    for role, column in pairs
+                }
+            )
         case "rows":
             rows = tomlkit.array()
             for line in field.value.splitlines():

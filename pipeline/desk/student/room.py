@@ -31,7 +31,14 @@ from pipeline.output import write_file
 from pipeline.report.numbers import count
 from pipeline.report.sections.answers import with_answer, written_answer
 from pipeline.submission.edit import Outdated, edit_submission, submission_text, text_digest
-from pipeline.submission.load import MAX_NOTES_BYTES, NAME, outside, parse_submission
+from pipeline.submission.load import (
+    MAX_NOTES_BYTES,
+    NAME,
+    outside,
+    parse_submission,
+    posix,
+    stated_columns,
+)
 from pipeline.submission.toml_file import read_text
 
 _ASKED = "report/questions.json"
@@ -207,9 +214,10 @@ def _rows(ask: Ask, folder: Path, document: Mapping[str, Any]) -> list[dict[str,
     listed = [t for t in tables if isinstance(t, dict)] if isinstance(tables, list) else []
     places: dict[str, list[int]] = {}
     for index, table in enumerate(listed):
-        places.setdefault(str(table.get("file", "")).replace("\\", "/"), []).append(index)
+        places.setdefault(posix(str(table.get("file", ""))), []).append(index)
     rows = []
-    for file, look in ask.desk.looks(folder).items():
+    looks = ask.desk.looks(folder, lambda file: stated_columns(document, file))
+    for file, look in looks.items():
         for index in places.pop(file, [None]):
             rows.append(_row(document, file, look, index, listed))
     gone = {"remarks": ["there is no such file"], "unsure": [], "lines": [], "format": ""}

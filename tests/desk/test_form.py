@@ -1,0 +1,129 @@
+"""The form of `submission.toml`: what is typed comes back, and nothing else in the file changes."""
+
+import tomllib
+from decimal import Decimal
+
+import pytest
+import tomlkit
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.desk.student.form import (
+    Field,
+    apply,
+    experiment_fields,
+    groups,
+    read_document,
+    typed,
+    with_errors,
+)
+from pipeline.errors import SubmissionError
+from pipeline.resources import EXAMPLES
+from pipeline.submission import new_submission
+from pipeline.submission.load import parse_submission
+
+WHOLE = (EXAMPLES / "two-cart" / "submission.toml").read_text(encoding="utf-8")
+
+
+def fields(text: str) -> dict[str, Field]:
+    """Return every field of a file's form, by path."""
+    document = read_document(text)
+    loop = [i for i, e in enumerate(document.get("experiments", [])) if e["kind"] == "closed_loop"]
+    of_loop = experiment_fields(document, loop[0]) if loop else ()
+    every = [field for group in groups(document) for field in group.fields]
+    return {field.path: field for field in (*every, *of_loop)}
+
+
+def changed(text: str, **values: str) -> str:
+    """Return a file in which these fields were typed."""
+    document = tomlkit.parse(text)
+    apply(document, typed(fields(text).values(), values, lambda path: []))
+    return tomlkit.dumps(document)
+
+
+def test_a_form_that_nobody_touched_changes_nothing():
+    """What is shown, sent back as it is, is no change."""
+    form = {path: field.value for path, field in fields(WHOLE).items()}
+    flags = {"system.springs.shown": "1"}
+    on = [str(i) for i, flag in enumerate(fields(WHOLE)["system.springs"].on) if flag]
+    assert typed(fields(WHOLE).values(), form | flags, lambda path: on) == []
+
+
+NUMBER = st.from_regex(r"-?(0|[1-9][0-9]{0,5})(\.[0-9]{1,8})?", fullmatch=True)
+
+
+@given(NUMBER, NUMBER, st.text(st.characters(exclude_categories=["C", "Z"]), max_size=20))
+def test_what_was_typed_stands_in_the_file(initial, final, title):
+    """Digits as typed, wherever the table has to be made; every other line is as it was."""
+    values = {"title": title, "reported.initial.K_1": initial, "reported.final.K_1": final}
+    new = changed(WHOLE, **values)
+    after = tomllib.loads(new, parse_float=Decimal)
+    assert after["reported"]["initial"]["K_1"] == Decimal(initial)
+    assert after["reported"]["final"]["K_1"] == Decimal(final)
+    assert f"K_1 = {final}" in new.splitlines()
+    assert after["title"] == title
+    lines = new.splitlines()
+    lost = [line for line in WHOLE.splitlines() if line.strip() and line not in lines]
+    assert all(line.startswith(("title", "K_1")) for line in lost)
+
+
+def test_every_kind_of_field_goes_there_and_back():
+    """People, springs, units, columns, matrices, a controller: typed, read again, still valid."""
+    given = {
+        "authors": "s1, Ann\ns2", "system.position.per_count": "0.00227",
+        "system.columns": "x1 = Encoder 1 Pos\ntime = 2", "design.method": "poles",
+        "reported.state_space.A": "0 1 0 0\n-1, -2, 3.50, 0\n0 0 0 1\n1 0 -2 -3",
+        "reported.feedback.gains": "[1, 2, 3.0, 4]",
+    }  # fmt: skip
+    loop = next(path for path in fields(WHOLE) if path.endswith("controller.type"))
+    given |= {loop: "pid", loop.replace("type", "kp"): "0.05"}
+    new = changed(WHOLE, **given)
+    for path, value in given.items():
+        assert fields(new)[path].value.replace(",", "").split() == (
+            value.strip("[]").replace(",", "").split()
+        ), path
+    with pytest.raises(SubmissionError, match="gains"):  # those of the state feedback are there
+        parse_submission(new, folder=EXAMPLES / "two-cart")
+    gone = changed(new, **{loop.replace("type", key): "" for key in ("gains", "prefilter")})
+    submission = parse_submission(gone, folder=EXAMPLES / "two-cart")
+    assert submission.reported is not None
+    assert submission.reported.state_space is not None
+    assert str(submission.reported.state_space.A[1][2]) == "3.50"
+    assert submission.system.columns == {"x1": "Encoder 1 Pos", "time": 2}
+    assert [author.name for author in submission.authors] == ["Ann", ""]
+    empty = changed(gone, **dict.fromkeys(given, ""))
+    assert "A" not in tomllib.loads(empty)["reported"]["state_space"]
+    assert "columns" not in tomllib.loads(empty)["system"]
+
+
+def test_comments_outlive_every_change(tmp_path):
+    """The commented file that `cartlab new` writes keeps them all."""
+    new_submission(tmp_path / "team", carts=2)
+    text = (tmp_path / "team" / "submission.toml").read_text(encoding="utf-8")
+    values = {"title": "x", "system.position.unit": "cm", "system.position.per_count": "0.1",
+              "design.cart": "2", "reported.initial.K_1": "1.50", "authors": "s1"}  # fmt: skip
+    new = changed(changed(text, **values), **dict.fromkeys(values, ""))
+    comments = [line[line.index("#") :] for line in text.splitlines() if "#" in line]
+    assert [comment for comment in comments if comment not in new] == []
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "wrong"),
+    [
+        ("system.input.per_count", "-1", "more than 0"), ("reported.final.K_1", "1e999", "between"),
+        ("reported.final.K_1", ".5", "a number"), ("design.settling_time", "0", "more than 0"),
+        ("system.columns", "foo = 1", "unknown column"), ("design.reference", "nan", "a number"),
+        ("reported.feedback.gains", "1, 2", "expected 4 gains"), ("title", "x" * 300, "200"),
+        ("reported.state_space.A", "1 2\n3 4", "4 rows"), ("authors", "x" * 300, "200"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_said_at_its_field(path, value, wrong):
+    """In the words of the file's own check, and nowhere else."""
+    now = [Field(path=path, label="", kind=fields(WHOLE)[path].kind, value=value)]
+    document = tomlkit.parse(WHOLE)
+    apply(document, now)
+    with pytest.raises(SubmissionError) as error:
+        parse_submission(tomlkit.dumps(document), folder=EXAMPLES / "two-cart")
+    shown, left = with_errors(tuple(fields(WHOLE).values()), now, error.value)
+    assert {field.path: wrong in field.wrong for field in shown if field.wrong} == {path: True}
+    assert left == []

@@ -1,0 +1,72 @@
+"""Hostile uploads: whatever they hold, they reach nothing beside their folder and run nothing."""
+
+import os
+import re
+
+import pytest
+
+from pipeline.desk.app import DeskServer
+from tests.helpers.desks import Visitor
+from tests.helpers.hostile import SECRET, write_hostile
+from tests.helpers.places import ROOT
+
+_OURS = re.compile(r"data/[^/]+|submission\.toml|notes\.md|\.lock")
+
+
+def visit(tmp_path, *, every: int, drawn: int, seed: int) -> int:
+    """Upload every hostile hand-in into a room of its own, look at it; return how many."""
+    school, rooms = tmp_path / "school", tmp_path / "rooms"
+    school.mkdir()
+    good = {
+        path.relative_to(ROOT / "submissions" / "one-cart").as_posix(): path.read_bytes()
+        for path in sorted((ROOT / "submissions" / "one-cart").rglob("*"))
+        if path.is_file()
+    }
+    entries = write_hostile(school, good, seed=seed, every=every, drawn=drawn)
+    outside = {p for p in tmp_path.rglob("*") if not p.is_relative_to(school)}
+    folders = [rooms / str(i) for i in range(len(entries))]
+    for folder in folders:
+        folder.mkdir(parents=True)
+    with DeskServer(folders=folders) as server:
+        visitor = Visitor.of(server.url)
+        for number, entry in enumerate(entries):
+            here, path = f"/student/{number}/", school / entry
+            files = [path] if path.is_file() else []
+            if path.is_dir() and not path.is_symlink():
+                files = [p for p in sorted(path.rglob("*")) if _is_plain(p)]
+            sent = [(_quoted(f.name), f.read_bytes()) for f in files if _is_plain(f)]
+            assert visitor.upload(here + "files", sent).status in (303, 400, 413, 422), entry
+            for page in (visitor.get(here), visitor.get(here + "report")):
+                assert page.status in (200, 422), entry
+                assert SECRET not in page.text
+                assert not re.search(
+                    r"<(?!/?script src=\"/static/)script|<img|onerror=\S*\(1\)>", page.text
+                )
+    for i, folder in enumerate(folders):
+        found = [p.relative_to(folder).as_posix() for p in folder.rglob("*") if not p.is_dir()]
+        assert all(_OURS.fullmatch(name) for name in found), entries[i]
+        assert not any(p.is_symlink() for p in folder.rglob("*"))
+    now = {p for p in tmp_path.rglob("*") if not p.is_relative_to(school)}
+    assert all(p.is_relative_to(rooms) for p in now - outside)
+    return len(entries)
+
+
+def _is_plain(path) -> bool:
+    return path.is_file() and not path.is_symlink() and os.access(path, os.R_OK)
+
+
+def _quoted(name: str) -> str:
+    """Return a name as browsers send it in a form."""
+    plain = name.encode("utf-8", "replace").decode()
+    return plain.replace('"', "%22").replace("\r", "%0D").replace("\n", "%0A")
+
+
+def test_hostile_uploads_reach_nothing(tmp_path):
+    """Archives and folders of the hostile class, of the spoilt submissions some."""
+    assert visit(tmp_path, every=12, drawn=6, seed=1) >= 50
+
+
+@pytest.mark.slow
+def test_two_hundred_hostile_uploads_reach_nothing(tmp_path):
+    """All of them, and as many drawn."""
+    assert visit(tmp_path, every=1, drawn=100, seed=2) >= 200
