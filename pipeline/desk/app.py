@@ -120,7 +120,7 @@ def application(desk: Desk) -> Starlette:
     ]
     return Starlette(
         routes=[*routes, Route(EVENTS, _events(desk))],
-        exception_handlers={HTTPException: _missing(desk)},
+        exception_handlers={HTTPException: _wrong(desk), Exception: _wrong(desk)},
     )
 
 
@@ -145,11 +145,15 @@ def _endpoint(desk: Desk, handler: Handler) -> Callable[[Request], Awaitable[Res
     return answer
 
 
-def _missing(desk: Desk) -> Callable[[Request, Exception], Response]:
+def _wrong(desk: Desk) -> Callable[[Request, Exception], Response]:
+    """Return what tells of an address that is none, and of a fault of our own."""
+
     def answer(request: Request, error: Exception) -> Response:
-        assert isinstance(error, HTTPException)
         ask = Ask(desk=desk, user=request.scope["user"], request=request, form=FormData())
-        return plain_error(ask, str(error.detail), status=error.status_code)
+        if isinstance(error, HTTPException):
+            return plain_error(ask, str(error.detail), status=error.status_code)
+        what = f"the desk itself failed ({type(error).__name__}: {error}); please report it"
+        return plain_error(ask, what, status=500)
 
     return answer
 

@@ -20,7 +20,9 @@ from pipeline.desk.users import User
 from pipeline.resources import TEMPLATES
 
 _MOST_LOOKS = 5_000  # files of which is kept what they are
-
+NOTHING_KNOWN: dict[str, Any] = {
+    "kind": None, "format": "", "duration": None, "remarks": [], "unsure": [], "lines": [],
+}  # fmt: skip
 Stamp = tuple[int, int, dict[str, str | int]]  # time, size, columns as stated
 
 
@@ -59,8 +61,7 @@ class Desk:
         try:
             return self.hand.do("look", folder=str(folder), file=file, columns=columns)
         except Failed as error:  # what the file did to the process, it did to this row only
-            nothing = {"kind": None, "carts": [], "format": "", "unsure": [], "lines": []}
-            return {"file": file, "state": "broken", "remarks": [str(error)], **nothing}
+            return {**NOTHING_KNOWN, "remarks": [str(error)]}
 
     def close(self) -> None:
         """End all work."""

@@ -99,13 +99,10 @@ def _plain(found: Found) -> dict[str, Any]:
     return {
         "file": found.file,
         "state": found.state,
-        "experiment": found.experiment,
         "kind": found.kind,
-        "carts": list(found.carts),
         "remarks": list(found.remarks),
         "unsure": list(found.unsure),
         "format": inspection.format if inspection else "",
-        "samples": inspection.samples if inspection else 0,
         "duration": inspection.duration if inspection else None,
     }
 

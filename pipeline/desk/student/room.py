@@ -12,7 +12,7 @@ from starlette.responses import Response
 
 from pipeline.desk.jobs import Failed
 from pipeline.desk.pages import served_file
-from pipeline.desk.state import Ask
+from pipeline.desk.state import NOTHING_KNOWN, Ask
 from pipeline.desk.student.files import take_upload
 from pipeline.desk.student.form import (
     Field,
@@ -220,7 +220,7 @@ def _rows(ask: Ask, folder: Path, document: Mapping[str, Any]) -> list[dict[str,
     for file, look in looks.items():
         for index in places.pop(file, [None]):
             rows.append(_row(document, file, look, index, listed))
-    gone = {"remarks": ["there is no such file"], "unsure": [], "lines": [], "format": ""}
+    gone = {**NOTHING_KNOWN, "remarks": ["there is no such file"]}
     for file, indices in places.items():
         rows += [_row(document, file, gone, index, listed) for index in indices]
     return rows
@@ -233,12 +233,15 @@ def _row(
     index: int | None,
     listed: Sequence[Mapping[str, Any]],
 ) -> dict[str, Any]:
+    fields = () if index is None else experiment_fields(document, index)
+    if any(field.path.endswith("controller.type") and not field.value for field in fields):
+        look = {**look, "unsure": [*look["unsure"], "say what controller ran, below its kind"]}
     return {
         "file": file,
         "look": look,
         "index": index,
         "id": "" if index is None else str(listed[index].get("id", "")),
-        "fields": () if index is None else experiment_fields(document, index),
+        "fields": fields,
     }
 
 
