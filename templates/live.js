@@ -18,7 +18,7 @@
   };
   const short = (value) => (value === undefined ? '–' : value.toPrecision(3).replace('-', '−'));
 
-  let state = { phase: 'waiting', plan: [], remarks: [], units: {}, carts: 0, seconds: 0, seconds_left: 0 };
+  let state = { phase: 'waiting', waits: 'Waiting for the bench to answer.', turn: 0, offered: [], plan: [], remarks: [], units: {}, carts: 0, seconds: 0, seconds_left: 0 };
   let since = performance.now(); // when the phase began
   let run = 0;
   let points = []; // [t, input, target, x1, …] of this run
@@ -26,12 +26,6 @@
 
   // ------------------------------------------------------------------ words and lists
 
-  const STATUS = {
-    waiting: () => (state.instruction ? 'Waiting for you.' : 'Waiting for the bench.'),
-    settling: () => `The carts come to rest before ${state.now}.`,
-    recording: () => `Recording ${state.now}.`,
-    over: () => 'The session is over.',
-  };
   const tell = (text, lost = false) => {
     if ($('status').textContent !== text) $('status').textContent = text;
     $('status').classList.toggle('lost', lost);
@@ -44,14 +38,20 @@
     state = fresh;
     document.title = `${state.now ?? 'At the bench'} – cartlab`;
     $('title').textContent = state.title || 'cartlab';
-    tell(STATUS[state.phase]());
+    tell(state.waits);
     for (const [id, unit] of [['positions', state.units.position], ['inputs', state.units.input]])
       $(id).closest('figure').querySelector('.unit').textContent = unit ? `in ${unit}` : '';
+    // Asked whether to record again, the answer is one of the buttons that are offered.
+    const again = state.offered.includes('repeat');
+    for (const button of document.querySelectorAll('[data-wish]'))
+      if (button.id !== 'stop') button.disabled = !state.offered.includes(button.dataset.wish);
+    $('stop').disabled = state.phase === 'over';
+    $('confirm').hidden = again;
     if (asked) {
       $('ask').hidden = !state.instruction;
       $('instruction').textContent = state.instruction?.text ?? '';
       $('confirm').disabled = false;
-      if (state.instruction) $('confirm').focus({ preventScroll: true });
+      if (state.instruction) $(again ? 'repeat' : 'confirm').focus({ preventScroll: true });
     }
     if (relisted) listPlan();
     if (rekeyed) listKeys();
@@ -224,15 +224,23 @@
     redraw();
   });
   news.addEventListener('error', () => tell('The connection is lost; trying again …', true));
-  news.addEventListener('open', () => tell(STATUS[state.phase]()));
+  news.addEventListener('open', () => tell(state.waits));
+  const press = async (wish, number) => {
+    try {
+      await fetch('press', { method: 'POST', body: new URLSearchParams({ wish, number }) });
+    } catch {
+      tell(`No answer: ${wish} was not heard. Use Ctrl-C in the terminal, or the switch.`, true);
+    }
+  };
   $('confirm').addEventListener('click', async () => {
     $('confirm').disabled = true;
-    const body = JSON.stringify({ number: state.instruction?.number });
-    try {
-      await fetch('confirm', { method: 'POST', headers: { 'Content-Type': 'application/json' }, body });
-    } catch {
-      $('confirm').disabled = false;
-    }
+    await press('done', state.instruction?.number);
+    $('confirm').disabled = false;
+  });
+  for (const button of document.querySelectorAll('[data-wish]'))
+    button.addEventListener('click', () => press(button.dataset.wish, state.turn));
+  document.addEventListener('keydown', (event) => {
+    if (event.key === 'Escape' && state.phase !== 'over') press('stop', state.turn);
   });
   new ResizeObserver(redraw).observe($('positions'));
   matchMedia('(prefers-color-scheme: dark)').addEventListener('change', redraw);

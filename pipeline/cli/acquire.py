@@ -11,6 +11,7 @@ from pipeline.cli.common import INTERRUPTED, Folder, app
 from pipeline.errors import ConfigError
 
 if TYPE_CHECKING:
+    from pipeline.bench.watch.buttons import Buttons
     from pipeline.bench.watch.observer import Observer
     from pipeline.bench.watch.terminal import Terminal
 
@@ -53,8 +54,10 @@ def acquire(
         if source is not None:
             _import(folder, source, terminal, once=once)
         elif port is not None:
-            with _watching(folder, terminal, web=web, yes=yes) as observers:
-                _record(folder, port, terminal, observers=observers, only=only or ())
+            with _watching(folder, terminal, web=web, yes=yes) as (observers, buttons):
+                _record(
+                    folder, port, terminal, observers=observers, buttons=buttons, only=only or ()
+                )
 
 
 @contextmanager
@@ -73,16 +76,16 @@ def _saying_where(folder: Path) -> Iterator[None]:
 @contextmanager
 def _watching(
     folder: Path, terminal: "Terminal", *, web: bool, yes: bool
-) -> Iterator[list["Observer"]]:
-    """Yield who watches, the first of whom has the person confirm."""
+) -> Iterator[tuple[list["Observer"], "Buttons | None"]]:
+    """Yield who watches, the first of whom has the person confirm, and the page's buttons."""
     if not web:
-        yield [terminal]
+        yield [terminal], None
         return
     from pipeline.bench.watch.web import LivePage
 
     with LivePage(folder) as page:
         terminal.remark(f"watch{'' if yes else ', and confirm,'} at {page.url}")
-        yield [terminal, page] if yes else [page, terminal]
+        yield [terminal, page] if yes else [page, terminal], page.buttons
 
 
 def _record(
@@ -91,12 +94,13 @@ def _record(
     terminal: "Terminal",
     *,
     observers: Sequence["Observer"],
+    buttons: "Buttons | None",
     only: Collection[str],
 ) -> None:
     from pipeline.bench.host.acquire import acquire as carry_out
 
     try:
-        outcomes = carry_out(folder, port=port, observers=observers, only=only)
+        outcomes = carry_out(folder, port=port, observers=observers, only=only, buttons=buttons)
     except KeyboardInterrupt:
         terminal.remark("stopped; the same command goes on where this ended")
         raise typer.Exit(INTERRUPTED) from None

@@ -219,18 +219,26 @@ def test_requests_of_other_pages_are_refused(page):
     assert ask(page, Origin="null")[0].status == 403
     assert ask(page, Origin=good, Host=f"localhost:{port}")[0].status == 403
     assert ask(page, Sec_Fetch_Site="cross-site")[0].status == 403
-    assert ask(page, "confirm", "POST", '{"number": 1}')[0].status == 403
-    assert ask(page, "confirm", "POST", '{"number": 1}', Origin=good)[0].status == 409
+    assert ask(page, "press", "POST", "wish=done&number=1")[0].status == 403
+    assert ask(page, "press", "POST", "wish=done&number=1", Origin=good)[0].status == 409
 
 
 @pytest.mark.parametrize(
     ("body", "status"),
-    [("", 400), ("[1]", 400), ('{"n": 1}', 400), ('{"number": "1"}', 409), ("1" * 500, 413)],
+    [
+        ("", 400),
+        ("[1]", 400),
+        ("wish=done", 400),
+        ("wish=done&number=x", 400),
+        ("wish=done&number=1", 409),
+        ("wish=burn&number=1", 409),
+        ("1" * 500, 413),
+    ],
 )
 def test_nonsense_confirms_nothing(page, body, status):
     """Broken, strange or long answers are refused and the page goes on."""
     origin = page.url[: page.url.index("/", 8)]
-    assert ask(page, "confirm", "POST", body, Origin=origin)[0].status == status
+    assert ask(page, "press", "POST", body, Origin=origin)[0].status == status
     assert ask(page)[0].status == 200
 
 
@@ -241,7 +249,7 @@ def test_the_secret_is_new_each_time_and_written_nowhere(folder, caplog, capfd):
     for _ in range(2):
         with LivePage(folder) as page:
             ask(page)
-            ask(page, "confirm", "POST", "", Origin="http://evil.example")
+            ask(page, "press", "POST", "", Origin="http://evil.example")
             secrets.add(urlsplit(page.url).path.strip("/"))
     assert len(secrets) == 2
     assert all(len(secret) >= 32 for secret in secrets)
@@ -466,6 +474,30 @@ def test_an_instruction_is_confirmed_with_its_button(page, show, how):
         window.keyboard.press(how)
     assert done.wait(PATIENCE)
     expect(window.locator("#ask")).to_be_hidden()
+
+
+def test_the_buttons_are_those_that_would_be_heeded(page, show):
+    """Skip, Keep and Repeat count in a run, once; Stop always, also as Esc from anywhere."""
+    window = show()
+    skip = window.get_by_role("button", name="Skip")
+    expect(skip).to_be_disabled()
+    page.buttons.begin()
+    page.buttons.offer("skip", "keep", "repeat")
+    record(page)
+    window.get_by_role("button", name="Keep this partial run").click()
+    until(lambda: page.buttons.pressed == "keep")
+    expect(skip).to_be_disabled()
+
+    page.buttons.begin()
+    page.buttons.offer("repeat", "skip")
+    asked = threading.Thread(target=page.confirm, args=("Record sine-01 again",))
+    asked.start()
+    expect(window.get_by_role("button", name="Repeat")).to_be_focused()
+    expect(window.locator("#confirm")).to_be_hidden()
+    window.keyboard.press("Escape")
+    asked.join()
+    assert page.buttons.pressed == "stop"
+    expect(window.locator("#status")).to_have_text("Stopping.")
 
 
 def test_every_page_open_sees_the_same(page, show):

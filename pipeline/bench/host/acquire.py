@@ -1,7 +1,7 @@
 """Carry out the plan of a submission on a bench, from where it was left."""
 
 from collections.abc import Callable, Collection, Generator, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pipeline.bench.host.experiments import (
@@ -16,13 +16,14 @@ from pipeline.bench.host.raw import read_raw
 from pipeline.bench.host.record import data_file, save_record
 from pipeline.bench.host.serial_line import SerialLine, open_line
 from pipeline.bench.host.session import STOPPED, Session
-from pipeline.bench.host.signals import signals_held, stopping_on_signals
+from pipeline.bench.host.signals import Stopped, signals_held, stopping_on_signals
 from pipeline.bench.planning.gains import Scales, bench_gains, bench_scales, controller_table
 from pipeline.bench.planning.orders import Order, make_order
 from pipeline.bench.planning.plan import Plan, Recording
 from pipeline.bench.planning.plan_file import load_plan, plan_path, save_plan
 from pipeline.bench.planning.propose import extend_plan, propose_plan
 from pipeline.bench.protocol.messages import PidGains, StateGains
+from pipeline.bench.watch.buttons import Buttons, Wish
 from pipeline.bench.watch.observer import Observer, Observers, Outcome
 from pipeline.errors import ConfigError, DataError, HardwareError, PipelineError
 from pipeline.lock import alone_in
@@ -37,7 +38,12 @@ _USUAL_BAUD = 115_200
 
 
 def acquire(
-    folder: Path, *, port: str, observers: Sequence[Observer], only: Collection[str] = ()
+    folder: Path,
+    *,
+    port: str,
+    observers: Sequence[Observer],
+    only: Collection[str] = (),
+    buttons: Buttons | None = None,
 ) -> tuple[Outcome, ...]:
     """Record what the plan asks for and is not there yet; return how each run ended.
 
@@ -50,26 +56,41 @@ def acquire(
     observers : who watches; the first has a person confirm what hands must do.
     only : the ids to record, the others left; () for the whole plan, which then grows by what
         the data recorded allow.
+    buttons : what somebody wants done with the run at hand.
 
     Raises
     ------
+    Stopped : a signal or a button ended the session; the same call goes on where it was.
     HardwareError : there is no bench.
     ConfigError : another session writes there; or the plan as a whole or the submission does not
         fit the bench; of one recording that does not, its outcome says why, and the others go on.
     """
     with stopping_on_signals(), alone_in(folder):
-        work = _Acquisition(folder, port=port, observer=Observers(observers), only=only)
+        work = _Acquisition(
+            folder,
+            port=port,
+            observer=Observers(observers),
+            only=only,
+            buttons=buttons or Buttons(),
+        )
         return tuple(work.outcomes())
 
 
 class _Acquisition:
     def __init__(
-        self, folder: Path, *, port: str, observer: Observer, only: Collection[str]
+        self,
+        folder: Path,
+        *,
+        port: str,
+        observer: Observer,
+        only: Collection[str],
+        buttons: Buttons,
     ) -> None:
         self._folder = folder
         self._port = port
         self._observer = observer
         self._only = frozenset(only)
+        self._buttons = buttons
         self._failed: dict[str, int] = {}  # tries of each recording that has not come off yet
 
     def outcomes(self) -> Iterator[Outcome]:
@@ -106,10 +127,16 @@ class _Acquisition:
             self._observer.remark(f"{file} is what a session left that was cut off")
         plan = self._plan(submission, line)
         session = Session(
-            line, carts=submission.system.carts, limits=plan.limits, observer=self._observer
+            line,
+            carts=submission.system.carts,
+            limits=plan.limits,
+            observer=self._observer,
+            buttons=self._buttons,
         )
         self._observer.planned(plan, _done(submission))
         while True:
+            self._buttons.begin()
+            self._heed_stop()
             recording = self._next(plan, submission)
             if recording is None:
                 longer = plan if self._only else self._extended(plan, submission, line)
@@ -118,33 +145,77 @@ class _Acquisition:
                 plan = longer
                 self._observer.planned(plan, _done(submission))
                 continue
-            outcome, submission = self._record(recording, plan, submission, session, line)
-            yield outcome
-            if outcome.partial:
-                self._offer_again(outcome)
+            run = self._record(recording, plan, submission, session, line)
+            yield run.outcome
+            if run.outcome.partial:
+                if self._wish(run) == "keep":
+                    yield self._keep(run)
                 if _is_lost(line):
                     return True
+            submission = load_submission(self._folder)
 
-    def _offer_again(self, outcome: Outcome) -> None:
-        name = outcome.recording.id
-        if outcome.partial.startswith(STOPPED):  # the same again would do the same harm
+    def _heed_stop(self) -> None:
+        if self._buttons.pressed == "stop":
+            raise Stopped("by hand")
+
+    def _wish(self, run: "_Run") -> Wish:
+        """Return what becomes of a run that ended early: a limit decides, a button, an answer."""
+        name, partial = run.outcome.recording.id, run.outcome.partial
+        limit = partial.startswith(STOPPED)
+        if run.file and (limit or self._buttons.pressed != "keep"):
+            self._observer.remark(f"{run.file} is partial ({partial}); it is not in {NAME}")
+        if limit:  # the same again would do the same harm
             self._failed[name] = _TRIES
             less = (
                 "divide its amplitude in plan.toml by four"
-                if outcome.recording.amplitude
+                if run.outcome.recording.amplitude
                 else "pull the cart out less far"
             )
             self._observer.remark(
                 f"{name} is not tried again now; if a limit was passed, {less}, or raise the limit "
                 "in plan.toml if the bench has the room"
             )
-            return
+            return "skip"
+        wish = self._buttons.pressed or self._answer(run)
+        self._heed_stop()
+        if wish == "skip" or (wish == "keep" and not run.file):
+            self._failed[name] = _TRIES
+            return "skip"
+        return wish
+
+    def _answer(self, run: "_Run") -> Wish:
+        """Ask whether to record it again; a fault that struck too often is not asked about."""
+        name = run.outcome.recording.id
         self._failed[name] = self._failed.get(name, 0) + 1
-        if self._failed[name] < _TRIES:
-            try:
-                self._observer.confirm(f"Record {name} again")
-            except ConfigError:  # nobody there to decide: the rest of the plan goes on
-                self._failed[name] = _TRIES
+        if self._failed[name] >= _TRIES:
+            return "skip"
+        offered: list[Wish] = ["repeat", "keep", "skip"] if run.file else ["repeat", "skip"]
+        self._buttons.offer(*offered)
+        try:
+            self._observer.confirm(f"Record {name} again")
+        except ConfigError:  # nobody there to decide: the rest of the plan goes on
+            return "skip"
+        return self._buttons.pressed or "repeat"
+
+    def _keep(self, run: "_Run") -> Outcome:
+        """Note a run that ended early as an experiment, which says how it ended."""
+        remark = f"partial, kept by hand: {run.outcome.partial}"
+        outcome = replace(run.outcome, partial="", remarks=(*run.outcome.remarks, remark))
+        with signals_held():
+            self._note(replace(run, outcome=outcome))
+            (self._folder / run.file).unlink()  # the same lines as those that were noted
+        self._observer.finished(outcome)
+        return outcome
+
+    def _note(self, run: "_Run") -> None:
+        """Make the data file of a run, and its table."""
+        submission = load_submission(self._folder)
+        file = save_record(run.path, folder=self._folder, carts=submission.system.carts)
+        outcome = run.outcome
+        entry = _experiment(
+            outcome.recording, file=file, controller=run.controller, remarks=outcome.remarks
+        )
+        add_experiment(submission, entry)
 
     def _plan(self, submission: Submission, line: SerialLine) -> Plan:
         if plan_path(submission).exists():
@@ -188,14 +259,14 @@ class _Acquisition:
         submission: Submission,
         session: Session,
         line: SerialLine,
-    ) -> tuple[Outcome, Submission]:
-        """Record one experiment and note it; return how it went and the submission as it is now."""
+    ) -> "_Run":
+        """Record one experiment and note it."""
+        path = _raw_path(self._folder, recording)
         try:
             order, table = _order(recording, plan, submission, line)
         except PipelineError as error:  # this bench cannot, or must not, do it: nothing is sent
             self._failed[recording.id] = _TRIES
-            return self._refused(recording, str(error)), submission
-        path = _raw_path(self._folder, recording)
+            return self._refused(recording, path, str(error))
         try:
             restless = session.prepare(recording)
             with signals_held() as let_in:  # what is complete is noted before the program ends
@@ -204,17 +275,17 @@ class _Acquisition:
                 # Late lines have their stamps: no reader of the data need know.
                 if (spoilt := str(replace(outcome.anomalies, late=0))) != "none":
                     remarks.append(spoilt)
-                outcome = replace(outcome, remarks=tuple(remarks))
+                run = _Run(
+                    outcome=replace(outcome, remarks=tuple(remarks)), path=path, controller=table
+                )
                 if outcome.partial:
-                    self._keep_partial(path, submission, outcome.partial)
+                    run = replace(run, file=self._saved_partial(path, submission))
                 else:
-                    file = save_record(path, folder=self._folder, carts=submission.system.carts)
-                    entry = _experiment(recording, file=file, controller=table, remarks=remarks)
-                    submission = add_experiment(load_submission(self._folder), entry)
-                self._observer.finished(outcome)
+                    self._note(run)
+                self._observer.finished(run.outcome)
         except HardwareError as error:
-            return self._refused(recording, str(error)), submission
-        return outcome, submission
+            return self._refused(recording, path, str(error))
+        return run
 
     def _run(
         self,
@@ -227,26 +298,46 @@ class _Acquisition:
         try:
             return session.record(order, path, let_in=let_in)
         except KeyboardInterrupt:
-            self._keep_partial(path, submission, "stopped by hand")
+            if file := self._saved_partial(path, submission):
+                self._observer.remark(f"{file} is partial (stopped by hand); it is not in {NAME}")
             raise
 
-    def _refused(self, recording: Recording, why: str) -> Outcome:
+    def _refused(self, recording: Recording, path: Path, why: str) -> "_Run":
         """Tell of a recording that did not begin."""
         outcome = Outcome(recording=recording, lines=0, partial=why)
         self._observer.finished(outcome)
-        return outcome
+        return _Run(outcome=outcome, path=path)
 
-    def _keep_partial(self, path: Path, submission: Submission, why: str) -> None:
-        """Save what came of a run that ended early, where no report takes it for a whole one."""
+    def _saved_partial(self, path: Path, submission: Submission) -> str:
+        """Save what came of a run that ended early, where no report takes it for a whole one.
+
+        Return the name of the file, "" where nothing came.
+        """
         if not path.exists():
-            return
+            return ""
         try:
-            file = save_record(
+            return save_record(
                 path, folder=self._folder, carts=submission.system.carts, partial=True
             )
-        except DataError:  # nothing came
-            return
-        self._observer.remark(f"{file} is partial ({why}); it is not in {NAME}")
+        except DataError:
+            return ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Run:
+    """One try of a recording.
+
+    Attributes
+    ----------
+    path : of its raw file, which is there if it began.
+    file : of what came of it, where it ended early; "": nothing came.
+    controller : of a closed loop, as submission.toml tells of it.
+    """
+
+    outcome: Outcome
+    path: Path
+    file: str = ""
+    controller: dict[str, Value] | None = None
 
 
 def _recovered(folder: Path, *, carts: int) -> list[str]:

@@ -7,13 +7,14 @@ hangs, the heartbeat ends and the bench cuts its motor itself.
 
 import gc
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 
 from pipeline.bench.host.raw import RawHeader, RawWriter
 from pipeline.bench.host.serial_line import FIRST_LINE, LUMP, SerialLine
+from pipeline.bench.host.signals import Stopped
 from pipeline.bench.host.stream import Stream
 from pipeline.bench.planning.orders import Order
 from pipeline.bench.planning.plan import Limits, Recording
@@ -30,6 +31,7 @@ from pipeline.bench.protocol.messages import (
     encode,
 )
 from pipeline.bench.protocol.stamps import OTHER
+from pipeline.bench.watch.buttons import Buttons, Wish
 from pipeline.bench.watch.observer import Observer, Outcome
 from pipeline.errors import HardwareError
 
@@ -37,6 +39,12 @@ _NOTHING_MOVED = (
     "no cart that is free moved: is it held, is its encoder plugged in, is the motor on?"
 )
 STOPPED = "stopped: "  # begins why a run was ended that was not safe to go on with
+# Why a run ended that somebody ended with a button.
+BY_HAND: Mapping[Wish, str] = {
+    "skip": "skipped by hand",
+    "keep": "ended by hand",
+    "repeat": "ended by hand, to be repeated",
+}
 
 _LOOK = 0.003  # s between looks at the port
 _FORWARD = 0.05  # s between batches handed to the observers
@@ -71,10 +79,20 @@ class Session:
     ----------
     carts : of the submission; a bench that describes itself may have more, whose travel is
         watched as well.
+    buttons : looked at before anything moves and at every look at the port.
     """
 
-    def __init__(self, line: SerialLine, *, carts: int, limits: Limits, observer: Observer) -> None:
+    def __init__(
+        self,
+        line: SerialLine,
+        *,
+        carts: int,
+        limits: Limits,
+        observer: Observer,
+        buttons: Buttons | None = None,
+    ) -> None:
         self._line = line
+        self._buttons = buttons or Buttons()
         self._carts = carts
         self._limits = limits
         self._observer = observer
@@ -87,6 +105,7 @@ class Session:
 
     def prepare(self, recording: Recording) -> str:
         """Have the carts held or freed and at rest; return what is to be said of it, or ""."""
+        self._buttons.offer("skip")
         held = tuple(cart for cart in range(1, self._carts + 1) if cart not in recording.carts)
         if self._line.knows("h"):
             self._line.send(Hands(held=held))
@@ -140,6 +159,7 @@ class Session:
         with RawWriter(path, header) as raw:
             try:
                 self._start(order.commands)
+                self._buttons.offer("skip", "keep", "repeat")
                 self._observer.started(order.recording)
                 partial = self._listen(
                     stream,
@@ -224,7 +244,21 @@ class Session:
         self._beat = float("-inf")  # a reset disarms the watchdog
         self._is_zeroed = True
 
+    def _by_hand(self) -> str:
+        """Return why somebody wants this run to end, or "".
+
+        Raises
+        ------
+        Stopped : the whole session is to end.
+        """
+        wish = self._buttons.pressed
+        if wish == "stop":
+            raise Stopped("by hand")
+        return BY_HAND[wish] if wish else ""
+
     def _start(self, commands: Sequence[Command]) -> None:
+        if why := self._by_hand():
+            raise HardwareError(why)
         self._line.clear()  # nothing of an earlier run belongs to this one
         self._heartbeat()
         self._latest_beat = 0.0
@@ -302,6 +336,8 @@ class Session:
                     unread = now if unread is None else unread
                     if now - unread > _UNREADABLE:
                         return f"{STOPPED}what the bench sends cannot be read: nothing is watched"
+            if why := self._by_hand():  # after the limits: what they say is never unsaid
+                return why
             quiet = now - last
             if stream.latest >= end - 2 * self._period and quiet > _AFTER_END:
                 return ""

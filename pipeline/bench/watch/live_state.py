@@ -10,6 +10,7 @@ from typing import Any, Literal
 from pipeline.bench.planning.plan import Plan, Recording
 from pipeline.bench.planning.plan_words import session_time, what_words
 from pipeline.bench.protocol.messages import Reading
+from pipeline.bench.watch.buttons import Buttons, Wish
 from pipeline.bench.watch.observer import Anomalies, Outcome
 from pipeline.errors import ConfigError
 from pipeline.submission import Input, Position, Submission, load_submission
@@ -42,10 +43,15 @@ class LiveState:
     Parameters
     ----------
     folder : of the submission, whose units are shown; it is there once a plan is told.
+
+    Attributes
+    ----------
+    buttons : what is pressed on the page, for the acquisition to heed.
     """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
+        self.buttons = Buttons()
         self._lock = threading.Lock()
         self._answered = threading.Condition(self._lock)
         self._submission: Submission | None = None
@@ -75,7 +81,7 @@ class LiveState:
             self._version += 1
 
     def confirm(self, instruction: str) -> None:
-        """Show what a person must do, and wait for the button.
+        """Show what a person must do, and wait until it is done or another button is pressed.
 
         Raises
         ------
@@ -85,9 +91,13 @@ class LiveState:
             self._asked += 1
             self._instruction = self._asked, instruction
             self._version += 1
-            while self._instruction is not None and self._phase != "over":
+            while (
+                self._instruction is not None and self._phase != "over" and not self.buttons.pressed
+            ):
                 self._answered.wait(_ASK)
-            if self._instruction is not None:
+            unanswered, self._instruction = self._instruction is not None, None
+            self._version += 1
+            if unanswered and not self.buttons.pressed:
                 raise ConfigError(f"nobody confirmed: {instruction}")
 
     def settling(self, recording: Recording, seconds: float) -> None:
@@ -170,6 +180,14 @@ class LiveState:
             self._answered.notify_all()
             return True
 
+    def press(self, wish: Wish, *, turn: int) -> bool:
+        """Press a button; return whether it will be heeded."""
+        heeded = self.buttons.press(wish, turn=turn)
+        with self._lock:
+            self._version += 1
+            self._answered.notify_all()
+        return heeded
+
     def end(self) -> None:
         """Tell that nothing comes any more."""
         self._change("over", None)
@@ -201,6 +219,9 @@ class LiveState:
                 },
                 "phase": self._phase,
                 "instruction": {"number": asked[0], "text": asked[1]} if asked else None,
+                "waits": self._waits(),
+                "turn": self.buttons.turn,
+                "offered": [] if self.buttons.pressed else list(self.buttons.offered),
                 "now": self._now and self._now.id,
                 "closed": self._now is not None and self._now.kind == "closed_loop",
                 "duration": self._now.duration if self._now else 0.0,
@@ -210,6 +231,22 @@ class LiveState:
                 "plan": [self._entry(recording) for recording in recordings],
                 "remarks": list(self._remarks),
             }
+
+    def _waits(self) -> str:
+        """Return in one sentence what the program is about, or waiting for."""
+        if self._phase == "over":
+            return "The session is over."
+        if self.buttons.pressed == "stop":
+            return "Stopping."
+        if self._instruction:
+            return "Waiting for you."
+        if self._phase == "settling" and self._now:
+            return f"Waiting for the carts to come to rest before {self._now.id}."
+        if self._phase == "recording" and self._now:
+            return f"Recording {self._now.id}."
+        if self._plan is None:
+            return "Waiting for the bench to answer."
+        return "Waiting for the bench to be ready for the next recording."
 
     def _entry(self, recording: Recording) -> dict[str, str]:
         name = recording.id

@@ -16,6 +16,7 @@ from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
 from typing import Self
+from urllib.parse import parse_qsl
 
 from starlette.applications import Starlette
 from starlette.datastructures import Headers
@@ -24,6 +25,7 @@ from starlette.responses import PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
+from pipeline.bench.watch.buttons import WISHES
 from pipeline.bench.watch.live_state import LiveState
 from pipeline.errors import HardwareError
 from pipeline.resources import TEMPLATES
@@ -43,6 +45,7 @@ _FILES = {
     "report.css": ("report.css", "text/css"),
     "live.css": ("live.css", "text/css"),
 }
+_VIEW = "<!-- the view -->"
 
 
 class LivePage(LiveState):
@@ -71,7 +74,7 @@ class LivePage(LiveState):
         routes = [
             Route("/", self._file),
             Route("/events", self._events),
-            Route("/confirm", self._confirm, methods=["POST"]),
+            Route("/press", self._press, methods=["POST"]),
             Route("/{name}", self._file),
         ]
         app = _Guard(Starlette(routes=routes), token=token, sites=own_names(port))
@@ -107,17 +110,23 @@ class LivePage(LiveState):
         if name not in _FILES:
             return PlainTextResponse("not found", status_code=404)
         file, kind = _FILES[name]
-        return Response((TEMPLATES / file).read_bytes(), media_type=kind)
+        text = (TEMPLATES / file).read_text(encoding="utf-8").replace(_VIEW, live_view())
+        return Response(text, media_type=kind)
 
-    async def _confirm(self, request: Request) -> Response:
+    async def _press(self, request: Request) -> Response:
+        """Take a button: `done` of an instruction, or what is wanted of a turn, by its number."""
         if int(request.headers.get("content-length", _LARGEST_ANSWER + 1)) > _LARGEST_ANSWER:
             return PlainTextResponse("too long", status_code=413)
         try:
-            number = json.loads(await request.body())["number"]
-        except (ValueError, TypeError, KeyError):
+            pressed = dict(parse_qsl((await request.body()).decode("ascii"), strict_parsing=True))
+            wish, number = pressed["wish"], int(pressed["number"])
+        except (ValueError, KeyError):
             return PlainTextResponse("not understood", status_code=400)
-        done = isinstance(number, int) and self.answer(number)
-        return Response(status_code=204 if done else 409)
+        if wish == "done":
+            heeded = self.answer(number)
+        else:
+            heeded = wish in WISHES and self.press(wish, turn=number)
+        return Response(status_code=204 if heeded else 409)
 
     async def _events(self, request: Request) -> Response:
         if self._pages >= _MOST_PAGES:
@@ -146,6 +155,11 @@ class LivePage(LiveState):
                 await asyncio.sleep(_FRAME)
         finally:
             self._pages -= 1
+
+
+def live_view() -> str:
+    """Return what a page shows of a session, with its buttons, for live.js to fill."""
+    return (TEMPLATES / "live-view.html").read_text(encoding="utf-8")
 
 
 def _event(kind: str, data: Mapping[str, object]) -> str:
