@@ -15,6 +15,7 @@ from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
 
+from pipeline.desk.bench import room as bench
 from pipeline.desk.doors import Guard, ProxyDoor, SecretDoor
 from pipeline.desk.home import open_grades, open_place, show_home
 from pipeline.desk.pages import served_file, static_file
@@ -47,6 +48,11 @@ ROUTES: tuple[tuple[str, str, Handler], ...] = (
     ("/student/{n:int}/report/{name:path}", "GET", student.report_file),
     ("/student/{n:int}/answer", "POST", student.answer),
     ("/student/{n:int}/hand-in.zip", "GET", student.packed),
+    ("/bench/{n:int}/", "GET", bench.show),
+    ("/bench/{n:int}/plan", "POST", bench.plan),
+    ("/bench/{n:int}/acquire", "POST", bench.start),
+    ("/bench/{n:int}/press", "POST", bench.press),
+    ("/bench/{n:int}/events", "GET", bench.events),
     ("/grades/{n:int}/", "GET", open_grades),
     ("/grades/{n:int}/{name:path}", "GET",
      lambda ask: served_file(ask.grades(), ask.request.path_params["name"])),

@@ -27,6 +27,8 @@ _STATIC = {
     "report.css": "report.css",
     "desk.css": "desk/desk.css",
     "desk.js": "desk/desk.js",
+    "live.css": "live.css",
+    "live.js": "live.js",
     "htmx.js": "desk/htmx.min.js",
     "icon.svg": "desk/icon.svg",
 }

@@ -15,6 +15,7 @@ from starlette.requests import Request
 from starlette.responses import HTMLResponse, RedirectResponse, Response
 
 from pipeline import __version__
+from pipeline.desk.benches import Sessions
 from pipeline.desk.jobs import Failed, Hand, Jobs
 from pipeline.desk.users import User
 from pipeline.resources import TEMPLATES
@@ -32,6 +33,7 @@ class Desk:
 
     jobs: Jobs = field(default_factory=Jobs)
     hand: Hand = field(default_factory=Hand)
+    benches: Sessions = field(default_factory=Sessions)
     said: dict[tuple[str, Path], list[str]] = field(default_factory=dict)
     _looks: OrderedDict[Path, tuple[Stamp, dict[str, Any]]] = field(default_factory=OrderedDict)
 
@@ -64,7 +66,8 @@ class Desk:
             return {**NOTHING_KNOWN, "remarks": [str(error)]}
 
     def close(self) -> None:
-        """End all work."""
+        """End all work; benches are told to stop first."""
+        self.benches.close()
         self.jobs.close()
         self.hand.close()
 
@@ -128,6 +131,8 @@ def rooms(user: User) -> list[tuple[str, str]]:
     """Return the address and the name of every room that somebody may enter."""
     found = [("/", "Desk")]
     found += [(f"/student/{n}/", _name(p)) for n, p in enumerate(user.folders)]
+    if user.owns:
+        found += [(f"/bench/{n}/", f"{_name(p)}: bench") for n, p in enumerate(user.folders)]
     found += [(f"/grades/{n}/", _name(p)) for n, p in enumerate(user.gradebooks)]
     return found
 

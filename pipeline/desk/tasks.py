@@ -85,12 +85,21 @@ def unpack(archive: str, into: str, *, progress: Progress) -> list[str]:
     return sorted(p.relative_to(target).as_posix() for p in target.rglob("*") if p.is_file())
 
 
+def plan(folder: str, stock: bool, *, progress: Progress) -> list[str]:
+    """Write plan.toml, or add to it what the data allow."""
+    from pipeline.bench.planning.make import make_plan
+
+    made = make_plan(load_submission(Path(folder)), stock=stock, progress=progress)
+    return [made.said, made.trouble]
+
+
 TASKS: Mapping[str, Callable[..., Any]] = {
     "look": look,
     "files": files,
     "fill": fill,
     "report": report,
     "unpack": unpack,
+    "plan": plan,
 }
 
 

@@ -1,0 +1,118 @@
+"""Acquisitions that the desk has begun: each a process of its own, its live page behind ours."""
+
+import json
+import queue
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import closing, suppress
+from dataclasses import dataclass, field
+from http.client import HTTPConnection, HTTPException, HTTPResponse
+from pathlib import Path
+from urllib.parse import urlencode, urlsplit
+
+from pipeline.processes import LineProcess
+
+_PROCESS = "pipeline.desk.bench.process"
+_TO_STOP = 20.0  # s for the bench to be told and what came to be saved, on a busy machine
+_ANSWERS = 10.0  # s; the live page says that it is there every five
+_LUMP = 65_536  # bytes
+
+
+@dataclass(kw_only=True, eq=False)
+class Session:
+    """One acquisition.
+
+    Attributes
+    ----------
+    url : of its live page, known to nobody else; "" until it is served.
+    said : how it ended; "" while it goes on.
+    """
+
+    port: str
+    process: LineProcess
+    url: str = ""
+    said: str = ""
+    ended: threading.Event = field(default_factory=threading.Event)
+
+    def press(self, wish: str, number: str) -> int:
+        """Pass a button on to the process, which decides; return its status, 409 for no use."""
+        body = urlencode({"wish": wish, "number": number})
+        with suppress(OSError, HTTPException):
+            connection, answer = self._ask("POST", "press", body)
+            with closing(connection):
+                return answer.status
+        if wish == "stop":  # the page does not answer: the process does
+            self.stop()
+            return 204
+        return 409
+
+    def stop(self) -> None:
+        """Have it end: the bench is told first."""
+        with suppress(OSError, ValueError):  # it has ended, its pipe is closed
+            self.process.send(b"stop\n")
+
+    def events(self) -> Iterator[bytes]:
+        """Yield the news of its live page as they come."""
+        with suppress(OSError, HTTPException):
+            connection, answer = self._ask("GET", "events")
+            with closing(connection):
+                while lump := answer.read1(_LUMP):
+                    yield lump
+
+    def _ask(
+        self, method: str, what: str, body: str | None = None
+    ) -> tuple[HTTPConnection, HTTPResponse]:
+        url = urlsplit(self.url)
+        connection = HTTPConnection(url.hostname or "", url.port, timeout=_ANSWERS)
+        headers = {"Origin": f"http://{url.netloc}"}
+        connection.request(method, f"{url.path}{what}", body, headers)
+        return connection, connection.getresponse()
+
+    def listen(self) -> None:
+        """Take down what the process says until it ends."""
+        while True:
+            with suppress(queue.Empty):
+                line = self.process.line(timeout=_ANSWERS)
+                if not line:
+                    break
+                told = json.loads(line)
+                self.url, self.said = told.get("url", self.url), told.get("over", "")
+        self.said = self.said or f"the process ended ({self.process.ending()})"
+        self.process.close()
+        self.ended.set()
+
+
+class Sessions:
+    """The last acquisition in each folder."""
+
+    def __init__(self) -> None:
+        self._sessions: dict[Path, Session] = {}
+        self._lock = threading.Lock()
+
+    def of(self, folder: Path) -> Session | None:
+        """Return the last one in a folder."""
+        return self._sessions.get(folder)
+
+    def start(self, folder: Path, *, port: str, only: Sequence[str]) -> Session:
+        """Begin one; where one is under way, that is what is returned."""
+        with self._lock:
+            before = self._sessions.get(folder)
+            if before and not before.ended.is_set():
+                return before
+            session = Session(port=port, process=LineProcess(_PROCESS))
+            self._sessions[folder] = session
+        given = {"folder": str(folder), "port": port, "only": list(only)}
+        with suppress(OSError):
+            session.process.send(json.dumps(given).encode() + b"\n")
+        threading.Thread(target=session.listen, daemon=True).start()
+        return session
+
+    def close(self) -> None:
+        """Have all of them end, and wait until their benches have been told."""
+        for session in self._sessions.values():
+            session.stop()
+        end = time.monotonic() + _TO_STOP
+        for session in self._sessions.values():
+            if not session.ended.wait(max(0.0, end - time.monotonic())):
+                session.process.close()
