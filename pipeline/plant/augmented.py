@@ -13,15 +13,15 @@ import numpy as np
 from pipeline.errors import DataError
 from pipeline.plant import kernel
 from pipeline.plant.chain import Array, Chain
+from pipeline.plant.contacts import guard, switch
 from pipeline.plant.effects.base import AugmentedChain
 from pipeline.plant.sensitivity import make_sensitivities
+from pipeline.plant.step import advance, smooth_forces
 from pipeline.plant.tables import DRY, Cart, Drive, Spring, Tables
 
 _REFINE = 4.0  # divides the kernel's step: this is what others are judged by
 _LONGEST_STEP = 5e-4  # s, of the stepped bench
-_SERIES_REACH = 0.2  # omega h, as in the kernel
 _DAMPED_REACH = 1.0  # c h / m: a light hidden mass may be damped faster than it swings
-_CONTACT_REACH = 0.4  # omega h inside a contact, as in the kernel
 _TO_REST = 40.0  # periods of the slowest motion, heavily damped: nothing is left of the start
 _IN_HAND = 1e-30  # inverse mass of a carried cart: no force moves it, yet its friction is felt
 _RUN_AWAY = "with these effects the carts run away: a spring softens too much, or a force is huge"
@@ -209,7 +209,7 @@ class SteppedBench:
     # ------------------------------------------------------------------ inside
 
     def _advance(self, force: float, *, braking: float, h: float) -> None:
-        kernel._advance(
+        advance(
             self._cart,
             self._spring,
             self._drive,
@@ -259,16 +259,16 @@ class SteppedBench:
         s = self._state
         s[kernel.MID_X], s[kernel.MID_V], s[kernel.FORCE] = s[kernel.X], 0.0, s[kernel.FIX]
         driven = max(self._motor, 0)
-        kernel._smooth_forces(self._cart, self._spring, self._drive, driven, self._n, s)
+        smooth_forces(self._cart, self._spring, self._drive, driven, self._n, s)
         return s[kernel.FORCE] - self._K @ s[kernel.X]
 
     def _close_contacts(self) -> None:
         """Put the contacts that are closed from the start into the matrices."""
         kinds = (self._cart, self._spring, self._drive, self._n, self._motor, self._state)
         for e, which in enumerate(self._switches):
-            if kernel._guard(which, False, *kinds, 0.0) > 0.0:
+            if guard(which, False, *kinds, 0.0) > 0.0:
                 self._active[e] = True
-                kernel._switch(which, 1.0, *kinds, self._K, self._C)
+                switch(which, 1.0, *kinds, self._K, self._C)
 
     def _bend_presliding(self) -> None:
         """Bend the presliding friction as far as it holds what acts on the carts at rest."""
@@ -282,10 +282,10 @@ class SteppedBench:
         change = 1.0 + max(float(self._spring[:, Spring.CHANGE].max()), 0.0)
         fastest = float(np.max(np.abs(self._K[:N, :N]).sum(1) * inverse)) * change
         damped = float(np.max(np.abs(self._C[:N, :N]).sum(1) * inverse))
-        step = min(_LONGEST_STEP, _SERIES_REACH / np.sqrt(max(fastest, 1e-12)))
+        step = min(_LONGEST_STEP, kernel._SERIES_REACH / np.sqrt(max(fastest, 1e-12)))
         step = min(step, _DAMPED_REACH / max(damped, 1e-12))
         contact = float(np.max(self._cart[:, Cart.STOP_STIFFNESS] * inverse[: self._n]))
         if self._motor >= 0:
             both = float(inverse[0] + inverse[self._motor])
             contact = max(contact, self._drive[Drive.CONTACT_STIFFNESS] * both)
-        return step, _CONTACT_REACH / np.sqrt(contact) if contact > 0.0 else step
+        return step, kernel._CONTACT_REACH / np.sqrt(contact) if contact > 0.0 else step

@@ -2,7 +2,7 @@
 
 The compiled functions index flat tables: numba cannot see dataclasses. It looks only at a
 function's own file to see whether what it has stored is out of date: who changes one of these
-files (`kernel`, `sensitivity` and this) removes `pipeline/plant/__pycache__`.
+files (`kernel`, `step`, `contacts`, `sensitivity` and this) removes `pipeline/plant/__pycache__`.
 """
 
 from typing import Any

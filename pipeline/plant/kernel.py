@@ -15,7 +15,7 @@ VIII.2; for the friction events B. Armstrong-Hélouvry, P. Dupont, C. Canudas de
 Automatica 30 (1994), section 4.
 """
 
-from math import ceil, exp, pi, sin, sqrt
+from math import ceil, exp, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -26,29 +26,20 @@ from pipeline.plant.compiled import (
     ACC,
     CHANGE,
     COGGING,
-    CONTACT_D,
     CONTACT_K,
     COULOMB,
     COUPLING,
     CUBIC,
-    D2,
-    D3,
-    D4,
-    D5,
-    D6,
     DAHL,
     DAMPING,
     DEAD,
-    DECAY,
     DELAY,
-    DISTANCE,
     DRAG,
     DRIVE_C,
     FIX,
     FORCE,
     GAIN,
     GAP,
-    GRIP,
     HID_C,
     HID_K,
     HID_M,
@@ -61,35 +52,29 @@ from pipeline.plant.compiled import (
     MID_X,
     MOTOR,
     OFFSET,
-    PAST,
-    PHASE,
-    PITCH,
     ROWS,
-    RUB,
-    SIDE,
     STATIC,
     STIFF,
-    STOP,
-    STOP_D,
     STOP_K,
-    STRETCH,
-    STRIBECK,
     V,
     X,
     Z,
-    inlined,
     jit,
     pair,
-    stretch,
     tie,
+)
+from pipeline.plant.contacts import (
+    guard,
+    switch,
 )
 from pipeline.plant.sensitivity import (
     bend_presliding,
-    carry,
     make_sensitivities,
-    meet,
     restart,
-    stop,
+)
+from pipeline.plant.step import (
+    advance,
+    smooth_forces,
 )
 
 _SERIES_REACH = 0.2  # omega h: the series' sixth order then leaves 1e-8 after seconds
@@ -99,7 +84,6 @@ _DAHL_STEP = 2.3e-3  # s; the presliding state is held over half of it
 _STRIBECK_STEP = 1.2e-3  # s; the drop of friction from its static force is over in few of them
 _COGGING_STEP = 1e-3  # s; a cart crosses a small part of the pitch in it
 _LONGEST_STEP = 2.5e-3  # s; nonlinear forces are held over it
-_MOST_EVENTS = 12  # in one substep; more would be chatter
 _BLOWN_UP = 1e9  # positions beyond this are a diverged model
 
 
@@ -128,289 +112,6 @@ def _assemble(cart, spring, drive, free, s, K, C, parent):
             parent[N] = i
             N += 1
     return N, motor
-
-
-@jit
-def _smooth_forces(cart, spring, drive, driven, n, s):
-    """Add the forces that are neither linear nor dry, at the state in the middle of the step."""
-    for i in range(n):
-        s[FORCE, i] += cart[i, OFFSET]
-        if cart[i, DRAG] != 0.0:
-            s[FORCE, i] -= cart[i, DRAG] * s[MID_V, i] * abs(s[MID_V, i])
-    if drive[COGGING] != 0.0:
-        turn = 2.0 * pi * s[MID_X, driven] / drive[PITCH] + drive[PHASE]
-        s[FORCE, driven] += drive[COGGING] * sin(turn)
-    for j in range(n + 1):
-        if spring[j, CUBIC] != 0.0:
-            f = spring[j, CUBIC] * stretch(s, MID_X, j, n) ** 3
-            if j < n:
-                s[FORCE, j] -= f
-            if j > 0:
-                s[FORCE, j - 1] += f
-
-
-@jit
-def _position(s, i, h):
-    return s[X, i] + h * (
-        s[V, i]
-        + h
-        / 2.0
-        * (
-            s[D2, i]
-            + h
-            / 3.0
-            * (s[D3, i] + h / 4.0 * (s[D4, i] + h / 5.0 * (s[D5, i] + h / 6.0 * s[D6, i])))
-        )
-    )
-
-
-@jit
-def _velocity(s, i, h):
-    return s[V, i] + h * (
-        s[D2, i]
-        + h / 2.0 * (s[D3, i] + h / 3.0 * (s[D4, i] + h / 4.0 * (s[D5, i] + h / 5.0 * s[D6, i])))
-    )
-
-
-@jit
-def _contact(which, cart, drive, n, motor):
-    """Return body, the other one or -1 (a wall), side, stiffness, damping and reach of a contact.
-
-    Contacts 0 to n - 1 are end stops, 2n + 1 and 2n + 2 the two sides of the gap.
-    """
-    if which < n:
-        side = 1.0 if cart[which, STOP] > 0.0 else -1.0
-        return which, -1, side, cart[which, STOP_K], cart[which, STOP_D], abs(cart[which, STOP])
-    side = 1.0 if which == 2 * n + 1 else -1.0
-    return motor, 0, side, drive[CONTACT_K], drive[CONTACT_D], 0.5 * drive[GAP]
-
-
-@jit
-def _guard(which, active, cart, spring, drive, n, motor, s, h):
-    """Return how far past its switch a contact or slack is, h from now; positive: it switches.
-
-    Switches n to 2n are springs, the others contacts, which begin where the bodies meet and push,
-    and end where the push does.
-    """
-    if n <= which <= 2 * n:
-        j = which - n
-        reach = (_position(s, j, h) if j < n else 0.0) - (_position(s, j - 1, h) if j > 0 else 0.0)
-        side = 1.0 if spring[j, STRETCH] >= 0.0 else -1.0
-        beyond = side * (reach - spring[j, STRETCH])
-        return -beyond if active else beyond
-    body, other, side, k, c, reach = _contact(which, cart, drive, n, motor)
-    x, v = _position(s, body, h), _velocity(s, body, h)
-    if other >= 0:
-        x -= _position(s, other, h)
-        v -= _velocity(s, other, h)
-    depth = k * (side * x - reach)
-    push = depth + c * side * v
-    return -push if active else min(depth, push)
-
-
-@jit
-def _switch(which, sign, cart, spring, drive, n, motor, s, K, C):
-    """Put a contact or slack into the linear matrices (sign 1) or take it out (sign -1)."""
-    if n <= which <= 2 * n:
-        j = which - n
-        k = sign * spring[j, CHANGE] * spring[j, STIFF]
-        tie(K, j, n, k)
-        s[PAST, j] += sign
-        if j < n:
-            s[FIX, j] += k * spring[j, STRETCH]
-        if j > 0:
-            s[FIX, j - 1] -= k * spring[j, STRETCH]
-    else:
-        body, other, side, k, c, reach = _contact(which, cart, drive, n, motor)
-        pair(K, body, other, sign * k)
-        pair(C, body, other, sign * c)
-        s[FIX, body] += sign * k * side * reach
-        if other >= 0:
-            s[FIX, other] -= sign * k * side * reach
-
-
-@inlined
-def _taylor(s, K, C, N):
-    """Fill D2 to D6, the Taylor coefficients of the linear flow under a constant force."""
-    for i in range(N):
-        f = s[FORCE, i]
-        for j in range(N):
-            f -= K[i, j] * s[X, j] + C[i, j] * s[V, j]
-        s[D2, i] = s[GRIP, i] * f
-    for i in range(N):
-        f = 0.0
-        for j in range(N):
-            f -= K[i, j] * s[V, j] + C[i, j] * s[D2, j]
-        s[D3, i] = s[GRIP, i] * f
-    for row in (D2, D3, D4):
-        for i in range(N):
-            f = 0.0
-            for j in range(N):
-                f -= K[i, j] * s[row, j] + C[i, j] * s[row + 1, j]
-            s[row + 2, i] = s[GRIP, i] * f
-
-
-@inlined
-def _advance(
-    cart,
-    spring,
-    drive,
-    n,
-    N,
-    motor,
-    s,
-    K,
-    C,
-    scatter,
-    u,
-    drive_c,
-    h,
-    dry,
-    smooth,
-    switches,
-    active,
-    contact_step,
-    lanes,
-    T,
-    phi,
-    work,
-):
-    """Advance x, v and the presliding state z by h, from friction event to friction event.
-
-    Sensitivities go along, see `make_sensitivities`.
-    """
-    driven = motor if motor >= 0 else 0
-    left = h
-    events = 0
-    none = N + switches.size  # no body's number, and no switch's
-    while left > 1e-12:
-        step = left
-        for e in range(switches.size):
-            # Inside a stiff contact the series needs shorter steps.
-            if active[e] and not n <= switches[e] <= 2 * n:
-                step = min(step, contact_step)
-        for i in range(N):
-            s[MID_X, i] = s[X, i] + 0.5 * step * (s[V, i] + 0.25 * step * s[ACC, i])
-            s[MID_V, i] = s[V, i] + 0.5 * step * s[ACC, i]
-            s[FORCE, i] = s[FIX, i]
-            s[GRIP, i] = s[INV, i]
-        if not smooth:
-            _smooth_forces(cart, spring, drive, driven, n, s)
-        s[FORCE, driven] += u
-        s[FORCE, 0] -= drive_c * s[MID_V, 0]
-        if dry:
-            for i in range(n):
-                s[RUB, i] = 0.0
-                if cart[i, DAHL] > 0.0 and s[INV, i] > 0.0:
-                    sign = 1.0 if s[MID_V, i] > 0.0 else -1.0
-                    path = 0.5 * abs(s[MID_V, i]) * step / cart[i, DISTANCE]
-                    s[DECAY, i] = exp(-path)
-                    held = sign + (s[Z, i] - sign) * s[DECAY, i]
-                    s[RUB, i] -= cart[i, DAHL] * held
-            for i in range(n):
-                # side: the direction the cart slides in, 0 where nothing dry acts on it.
-                s[SIDE, i] = 0.0
-                slide = cart[i, COULOMB] + cart[i, LOAD] * abs(u)
-                if slide + cart[i, STATIC] <= 0.0 or s[INV, i] == 0.0:
-                    continue
-                if s[V, i] == 0.0:
-                    net = s[FORCE, i] + scatter[i] * s[RUB, i]
-                    for j in range(N):
-                        net -= K[i, j] * s[X, j] + C[i, j] * s[V, j]
-                    if abs(net) <= scatter[i] * (slide + cart[i, STATIC]):
-                        s[GRIP, i] = 0.0
-                        continue
-                    s[SIDE, i] = 1.0 if net > 0.0 else -1.0
-                    speed = 0.5 * step * (abs(net) - scatter[i] * slide) * s[INV, i]
-                else:
-                    s[SIDE, i] = 1.0 if s[V, i] > 0.0 else -1.0
-                    speed = abs(s[MID_V, i])
-                if cart[i, STATIC] != 0.0:
-                    ratio = speed / cart[i, STRIBECK]
-                    slide += cart[i, STATIC] * exp(-ratio * ratio)
-                s[RUB, i] -= slide * s[SIDE, i]
-            for i in range(n):
-                s[FORCE, i] += scatter[i] * s[RUB, i]
-        # The usual sizes as constants: the compiler then unrolls the loops.
-        if N == 1:
-            _taylor(s, K, C, np.int64(1))
-        elif N == 2:
-            _taylor(s, K, C, np.int64(2))
-        elif N == 3:
-            _taylor(s, K, C, np.int64(3))
-        else:
-            _taylor(s, K, C, N)
-        whole = step
-        stopping = switching = none
-        if dry and events < _MOST_EVENTS:
-            for i in range(n):
-                if s[SIDE, i] == 0.0:
-                    continue
-                end = _velocity(s, i, step)
-                if s[SIDE, i] * end < 0.0 and s[V, i] != 0.0:
-                    # The root of the velocity: false position, made safe by its bracket.
-                    low, high, v_low, v_high = 0.0, step, s[V, i], end
-                    for _ in range(4):
-                        guess = low + (high - low) * v_low / (v_low - v_high)
-                        value = _velocity(s, i, guess)
-                        if s[SIDE, i] * value > 0.0:
-                            low, v_low = guess, value
-                        else:
-                            high, v_high = guess, value
-                    step = low + (high - low) * v_low / (v_low - v_high)
-                    stopping = i
-        if events < _MOST_EVENTS:
-            for e in range(switches.size):
-                end = _guard(switches[e], active[e], cart, spring, drive, n, motor, s, step)
-                if end > 0.0:
-                    low, high = 0.0, step
-                    g_low = _guard(switches[e], active[e], cart, spring, drive, n, motor, s, 0.0)
-                    g_low, g_high = min(g_low, -1e-300), end
-                    # The root by the Illinois method, taken on its far side.
-                    for _ in range(8):
-                        guess = low + (high - low) * g_low / (g_low - g_high)
-                        value = _guard(
-                            switches[e], active[e], cart, spring, drive, n, motor, s, guess
-                        )
-                        if value > 0.0:
-                            high, g_high, g_low = guess, value, 0.5 * g_low
-                        else:
-                            low, g_low, g_high = guess, min(value, -1e-300), 0.5 * g_high
-                    step = high
-                    switching = e
-                    stopping = none
-        if lanes.size > 0:
-            push = drive_c, driven, drive
-            carry(lanes, T, phi, work, s, K, C, N, n, cart, spring, scatter, push, whole, step)
-        for i in range(N):
-            s[X, i], s[V, i] = _position(s, i, step), _velocity(s, i, step)
-            s[ACC, i] = s[D2, i] + step * (s[D3, i] + 0.5 * step * s[D4, i])
-        if dry:
-            for i in range(n):
-                if cart[i, DAHL] > 0.0:
-                    sign = 1.0 if s[MID_V, i] > 0.0 else -1.0
-                    decay = s[DECAY, i] * s[DECAY, i]
-                    if step < whole:
-                        decay = exp(-abs(s[MID_V, i]) * step / cart[i, DISTANCE])
-                    s[Z, i] = sign + (s[Z, i] - sign) * decay
-                if s[SIDE, i] != 0.0 and s[SIDE, i] * s[V, i] < 0.0:
-                    s[V, i] = 0.0
-        if stopping != none:
-            stop(T, s, N, stopping)
-            s[V, stopping] = 0.0
-            s[ACC, stopping] = 0.0
-            events += 1
-        if switching != none:
-            which, ends = switches[switching], 1.0 if active[switching] else 0.0
-            if not n <= which <= 2 * n:
-                body, other, _, k, c, _ = _contact(which, cart, drive, n, motor)
-                meet(T, s, N, body, other, k, ends * c)
-            active[switching] = not active[switching]
-            sign = 1.0 if active[switching] else -1.0
-            phi[2 * N, 0] = -1.0  # its matrix is no longer that of the carts
-            _switch(which, sign, cart, spring, drive, n, motor, s, K, C)
-            events += 1
-        left -= step
 
 
 @jit
@@ -530,15 +231,15 @@ def _simulate(
                     s[V, j] += v0[shot, n + parent[j]]
         for e in range(switches.size):
             # The state is new: a contact may be open or closed from the start.
-            if _guard(switches[e], active[e], cart, spring, drive, n, motor, s, 0.0) > 0.0:
+            if guard(switches[e], active[e], cart, spring, drive, n, motor, s, 0.0) > 0.0:
                 active[e] = not active[e]
                 sign = 1.0 if active[e] else -1.0
-                _switch(switches[e], sign, cart, spring, drive, n, motor, s, K, C)
+                switch(switches[e], sign, cart, spring, drive, n, motor, s, K, C)
         past, past2, at = _integral(t[first] - drive[DELAY], knots, held, at)
         if shot == 0 and presliding > 0.0:
             for i in range(N):
                 s[MID_X, i], s[MID_V, i], s[FORCE, i] = s[X, i], s[V, i], s[FIX, i]
-            _smooth_forces(cart, spring, drive, driven, n, s)
+            smooth_forces(cart, spring, drive, driven, n, s)
             for i in range(n):
                 if cart[i, DAHL] > 0.0:
                     net = s[FORCE, i] + (held[0, 0] if i == 0 else 0.0)
@@ -578,7 +279,7 @@ def _simulate(
                     while on < knots.size - 1 and knots[on + 1] <= now + 0.5 * h:
                         on += 1
                     drive_c = drive[DRIVE_C] if command[on] != 0.0 else 0.0
-                _advance(
+                advance(
                     cart,
                     spring,
                     drive,

@@ -1,0 +1,107 @@
+"""What switches inside a step: end stops, springs past a stretch, the two sides of a gap."""
+
+from pipeline.plant.compiled import (
+    CHANGE,
+    CONTACT_D,
+    CONTACT_K,
+    D2,
+    D3,
+    D4,
+    D5,
+    D6,
+    FIX,
+    GAP,
+    PAST,
+    STIFF,
+    STOP,
+    STOP_D,
+    STOP_K,
+    STRETCH,
+    V,
+    X,
+    jit,
+    pair,
+    tie,
+)
+
+
+@jit
+def position(s, i, h):
+    """Return where a body is, h from now, by its Taylor series."""
+    return s[X, i] + h * (
+        s[V, i]
+        + h
+        / 2.0
+        * (
+            s[D2, i]
+            + h
+            / 3.0
+            * (s[D3, i] + h / 4.0 * (s[D4, i] + h / 5.0 * (s[D5, i] + h / 6.0 * s[D6, i])))
+        )
+    )
+
+
+@jit
+def velocity(s, i, h):
+    """Return how fast a body is, h from now, by its Taylor series."""
+    return s[V, i] + h * (
+        s[D2, i]
+        + h / 2.0 * (s[D3, i] + h / 3.0 * (s[D4, i] + h / 4.0 * (s[D5, i] + h / 5.0 * s[D6, i])))
+    )
+
+
+@jit
+def contact(which, cart, drive, n, motor):
+    """Return body, the other one or -1 (a wall), side, stiffness, damping and reach of a contact.
+
+    Contacts 0 to n - 1 are end stops, 2n + 1 and 2n + 2 the two sides of the gap.
+    """
+    if which < n:
+        side = 1.0 if cart[which, STOP] > 0.0 else -1.0
+        return which, -1, side, cart[which, STOP_K], cart[which, STOP_D], abs(cart[which, STOP])
+    side = 1.0 if which == 2 * n + 1 else -1.0
+    return motor, 0, side, drive[CONTACT_K], drive[CONTACT_D], 0.5 * drive[GAP]
+
+
+@jit
+def guard(which, active, cart, spring, drive, n, motor, s, h):
+    """Return how far past its switch a contact or slack is, h from now; positive: it switches.
+
+    Switches n to 2n are springs, the others contacts, which begin where the bodies meet and push,
+    and end where the push does.
+    """
+    if n <= which <= 2 * n:
+        j = which - n
+        reach = (position(s, j, h) if j < n else 0.0) - (position(s, j - 1, h) if j > 0 else 0.0)
+        side = 1.0 if spring[j, STRETCH] >= 0.0 else -1.0
+        beyond = side * (reach - spring[j, STRETCH])
+        return -beyond if active else beyond
+    body, other, side, k, c, reach = contact(which, cart, drive, n, motor)
+    x, v = position(s, body, h), velocity(s, body, h)
+    if other >= 0:
+        x -= position(s, other, h)
+        v -= velocity(s, other, h)
+    depth = k * (side * x - reach)
+    push = depth + c * side * v
+    return -push if active else min(depth, push)
+
+
+@jit
+def switch(which, sign, cart, spring, drive, n, motor, s, K, C):
+    """Put a contact or slack into the linear matrices (sign 1) or take it out (sign -1)."""
+    if n <= which <= 2 * n:
+        j = which - n
+        k = sign * spring[j, CHANGE] * spring[j, STIFF]
+        tie(K, j, n, k)
+        s[PAST, j] += sign
+        if j < n:
+            s[FIX, j] += k * spring[j, STRETCH]
+        if j > 0:
+            s[FIX, j - 1] -= k * spring[j, STRETCH]
+    else:
+        body, other, side, k, c, reach = contact(which, cart, drive, n, motor)
+        pair(K, body, other, sign * k)
+        pair(C, body, other, sign * c)
+        s[FIX, body] += sign * k * side * reach
+        if other >= 0:
+            s[FIX, other] -= sign * k * side * reach

@@ -1,0 +1,279 @@
+"""One step of the simulator: forces, the series of the linear flow, the events inside it."""
+
+from math import exp, pi, sin
+
+import numpy as np
+
+from pipeline.plant.compiled import (
+    ACC,
+    COGGING,
+    COULOMB,
+    CUBIC,
+    D2,
+    D3,
+    D4,
+    DAHL,
+    DECAY,
+    DISTANCE,
+    DRAG,
+    FIX,
+    FORCE,
+    GRIP,
+    INV,
+    LOAD,
+    MID_V,
+    MID_X,
+    OFFSET,
+    PHASE,
+    PITCH,
+    RUB,
+    SIDE,
+    STATIC,
+    STRIBECK,
+    V,
+    X,
+    Z,
+    inlined,
+    jit,
+    stretch,
+)
+from pipeline.plant.contacts import (
+    contact,
+    guard,
+    position,
+    switch,
+    velocity,
+)
+from pipeline.plant.sensitivity import (
+    carry,
+    meet,
+    stop,
+)
+
+_MOST_EVENTS = 12  # in one substep; more would be chatter
+
+
+@jit
+def smooth_forces(cart, spring, drive, driven, n, s):
+    """Add the forces that are neither linear nor dry, at the state in the middle of the step."""
+    for i in range(n):
+        s[FORCE, i] += cart[i, OFFSET]
+        if cart[i, DRAG] != 0.0:
+            s[FORCE, i] -= cart[i, DRAG] * s[MID_V, i] * abs(s[MID_V, i])
+    if drive[COGGING] != 0.0:
+        turn = 2.0 * pi * s[MID_X, driven] / drive[PITCH] + drive[PHASE]
+        s[FORCE, driven] += drive[COGGING] * sin(turn)
+    for j in range(n + 1):
+        if spring[j, CUBIC] != 0.0:
+            f = spring[j, CUBIC] * stretch(s, MID_X, j, n) ** 3
+            if j < n:
+                s[FORCE, j] -= f
+            if j > 0:
+                s[FORCE, j - 1] += f
+
+
+@inlined
+def rub(cart, s, K, C, scatter, u, n, N, step):
+    """Add dry friction to the forces; a cart that it holds gets no inverse mass."""
+    for i in range(n):
+        s[RUB, i] = 0.0
+        if cart[i, DAHL] > 0.0 and s[INV, i] > 0.0:
+            sign = 1.0 if s[MID_V, i] > 0.0 else -1.0
+            path = 0.5 * abs(s[MID_V, i]) * step / cart[i, DISTANCE]
+            s[DECAY, i] = exp(-path)
+            held = sign + (s[Z, i] - sign) * s[DECAY, i]
+            s[RUB, i] -= cart[i, DAHL] * held
+    for i in range(n):
+        # side: the direction the cart slides in, 0 where nothing dry acts on it.
+        s[SIDE, i] = 0.0
+        slide = cart[i, COULOMB] + cart[i, LOAD] * abs(u)
+        if slide + cart[i, STATIC] <= 0.0 or s[INV, i] == 0.0:
+            continue
+        if s[V, i] == 0.0:
+            net = s[FORCE, i] + scatter[i] * s[RUB, i]
+            for j in range(N):
+                net -= K[i, j] * s[X, j] + C[i, j] * s[V, j]
+            if abs(net) <= scatter[i] * (slide + cart[i, STATIC]):
+                s[GRIP, i] = 0.0
+                continue
+            s[SIDE, i] = 1.0 if net > 0.0 else -1.0
+            speed = 0.5 * step * (abs(net) - scatter[i] * slide) * s[INV, i]
+        else:
+            s[SIDE, i] = 1.0 if s[V, i] > 0.0 else -1.0
+            speed = abs(s[MID_V, i])
+        if cart[i, STATIC] != 0.0:
+            ratio = speed / cart[i, STRIBECK]
+            slide += cart[i, STATIC] * exp(-ratio * ratio)
+        s[RUB, i] -= slide * s[SIDE, i]
+    for i in range(n):
+        s[FORCE, i] += scatter[i] * s[RUB, i]
+
+
+@inlined
+def taylor(s, K, C, N):
+    """Fill D2 to D6, the Taylor coefficients of the linear flow under a constant force."""
+    for i in range(N):
+        f = s[FORCE, i]
+        for j in range(N):
+            f -= K[i, j] * s[X, j] + C[i, j] * s[V, j]
+        s[D2, i] = s[GRIP, i] * f
+    for i in range(N):
+        f = 0.0
+        for j in range(N):
+            f -= K[i, j] * s[V, j] + C[i, j] * s[D2, j]
+        s[D3, i] = s[GRIP, i] * f
+    for row in (D2, D3, D4):
+        for i in range(N):
+            f = 0.0
+            for j in range(N):
+                f -= K[i, j] * s[row, j] + C[i, j] * s[row + 1, j]
+            s[row + 2, i] = s[GRIP, i] * f
+
+
+@inlined
+def first_stop(s, n, step, none):
+    """Return when, within the step, the first sliding cart stops, and which: or `none`."""
+    stopping = none
+    for i in range(n):
+        if s[SIDE, i] == 0.0:
+            continue
+        end = velocity(s, i, step)
+        if s[SIDE, i] * end < 0.0 and s[V, i] != 0.0:
+            # The root of the velocity: false position, made safe by its bracket.
+            low, high, v_low, v_high = 0.0, step, s[V, i], end
+            for _ in range(4):
+                guess = low + (high - low) * v_low / (v_low - v_high)
+                value = velocity(s, i, guess)
+                if s[SIDE, i] * value > 0.0:
+                    low, v_low = guess, value
+                else:
+                    high, v_high = guess, value
+            step = low + (high - low) * v_low / (v_low - v_high)
+            stopping = i
+    return step, stopping
+
+
+@inlined
+def first_switch(switches, active, cart, spring, drive, n, motor, s, step, none):
+    """Return when, within the step, the first contact or slack switches, and which: or `none`."""
+    switching = none
+    for e in range(switches.size):
+        end = guard(switches[e], active[e], cart, spring, drive, n, motor, s, step)
+        if end > 0.0:
+            low, high = 0.0, step
+            g_low = guard(switches[e], active[e], cart, spring, drive, n, motor, s, 0.0)
+            g_low, g_high = min(g_low, -1e-300), end
+            # The root by the Illinois method, taken on its far side.
+            for _ in range(8):
+                guess = low + (high - low) * g_low / (g_low - g_high)
+                value = guard(switches[e], active[e], cart, spring, drive, n, motor, s, guess)
+                if value > 0.0:
+                    high, g_high, g_low = guess, value, 0.5 * g_low
+                else:
+                    low, g_low, g_high = guess, min(value, -1e-300), 0.5 * g_high
+            step = high
+            switching = e
+    return step, switching
+
+
+@inlined
+def advance(
+    cart,
+    spring,
+    drive,
+    n,
+    N,
+    motor,
+    s,
+    K,
+    C,
+    scatter,
+    u,
+    drive_c,
+    h,
+    dry,
+    smooth,
+    switches,
+    active,
+    contact_step,
+    lanes,
+    T,
+    phi,
+    work,
+):
+    """Advance x, v and the presliding state z by h, from friction event to friction event.
+
+    Sensitivities go along, see `make_sensitivities`.
+    """
+    driven = motor if motor >= 0 else 0
+    left = h
+    events = 0
+    none = N + switches.size  # no body's number, and no switch's
+    while left > 1e-12:
+        step = left
+        for e in range(switches.size):
+            # Inside a stiff contact the series needs shorter steps.
+            if active[e] and not n <= switches[e] <= 2 * n:
+                step = min(step, contact_step)
+        for i in range(N):
+            s[MID_X, i] = s[X, i] + 0.5 * step * (s[V, i] + 0.25 * step * s[ACC, i])
+            s[MID_V, i] = s[V, i] + 0.5 * step * s[ACC, i]
+            s[FORCE, i] = s[FIX, i]
+            s[GRIP, i] = s[INV, i]
+        if not smooth:
+            smooth_forces(cart, spring, drive, driven, n, s)
+        s[FORCE, driven] += u
+        s[FORCE, 0] -= drive_c * s[MID_V, 0]
+        if dry:
+            rub(cart, s, K, C, scatter, u, n, N, step)
+        # The usual sizes as constants: the compiler then unrolls the loops.
+        if N == 1:
+            taylor(s, K, C, np.int64(1))
+        elif N == 2:
+            taylor(s, K, C, np.int64(2))
+        elif N == 3:
+            taylor(s, K, C, np.int64(3))
+        else:
+            taylor(s, K, C, N)
+        whole = step
+        stopping = switching = none
+        if dry and events < _MOST_EVENTS:
+            step, stopping = first_stop(s, n, step, none)
+        if events < _MOST_EVENTS:
+            step, switching = first_switch(
+                switches, active, cart, spring, drive, n, motor, s, step, none
+            )
+            if switching != none:
+                stopping = none
+        if lanes.size > 0:
+            push = drive_c, driven, drive
+            carry(lanes, T, phi, work, s, K, C, N, n, cart, spring, scatter, push, whole, step)
+        for i in range(N):
+            s[X, i], s[V, i] = position(s, i, step), velocity(s, i, step)
+            s[ACC, i] = s[D2, i] + step * (s[D3, i] + 0.5 * step * s[D4, i])
+        if dry:
+            for i in range(n):
+                if cart[i, DAHL] > 0.0:
+                    sign = 1.0 if s[MID_V, i] > 0.0 else -1.0
+                    decay = s[DECAY, i] * s[DECAY, i]
+                    if step < whole:
+                        decay = exp(-abs(s[MID_V, i]) * step / cart[i, DISTANCE])
+                    s[Z, i] = sign + (s[Z, i] - sign) * decay
+                if s[SIDE, i] != 0.0 and s[SIDE, i] * s[V, i] < 0.0:
+                    s[V, i] = 0.0
+        if stopping != none:
+            stop(T, s, N, stopping)
+            s[V, stopping] = 0.0
+            s[ACC, stopping] = 0.0
+            events += 1
+        if switching != none:
+            which, ends = switches[switching], 1.0 if active[switching] else 0.0
+            if not n <= which <= 2 * n:
+                body, other, _, k, c, _ = contact(which, cart, drive, n, motor)
+                meet(T, s, N, body, other, k, ends * c)
+            active[switching] = not active[switching]
+            sign = 1.0 if active[switching] else -1.0
+            phi[2 * N, 0] = -1.0  # its matrix is no longer that of the carts
+            switch(which, sign, cart, spring, drive, n, motor, s, K, C)
+            events += 1
+        left -= step
