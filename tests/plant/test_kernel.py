@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pipeline.plant import kernel, sensitivity
+from pipeline.plant import compiled, contacts, kernel, sensitivity, step
 from pipeline.plant.chain import PRESETS, Array, Chain
 from pipeline.plant.effects import AugmentedChain, find_effect, make_term
 from pipeline.plant.kernel import simulate_batch
@@ -284,13 +284,13 @@ def test_a_hidden_mass_starts_where_it_is_told_to():
 
 _NOTHING_LEFT = """
 import numpy as np
-from pipeline.plant import kernel, sensitivity
+from pipeline.plant import contacts, kernel, sensitivity, step
 from pipeline.plant.augmented import SteppedBench, compile_simulator
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.effects import AugmentedChain
 from pipeline.plant.tables import linear_tables
 
-files = vars(kernel), vars(sensitivity)
+files = [vars(module) for module in (contacts, kernel, sensitivity, step)]
 stats = [one.stats for file in files for one in file.values() if hasattr(one, "stats")]
 compile_simulator()
 before = [dict(one.cache_misses) for one in stats]
@@ -333,9 +333,10 @@ def test_arrays_of_any_kind_meet_the_same_simulator():
         1,
     )
     assert np.array_equal(fixed[0], whole)
-    mine = [*vars(kernel).values(), *vars(sensitivity).values()]
-    twice = [one for one in mine if len(getattr(one, "signatures", ())) > 1]
-    assert twice in ([], [kernel.stretch])  # which takes the row it reads as a constant
+    modules = (compiled, contacts, kernel, sensitivity, step)
+    mine = {id(one): one for module in modules for one in vars(module).values()}
+    twice = [one for one in mine.values() if len(getattr(one, "signatures", ())) > 1]
+    assert twice in ([], [compiled.stretch])  # which takes the row it reads as a constant
 
 
 @pytest.mark.parametrize("preset", list(PRESETS))
