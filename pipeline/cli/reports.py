@@ -167,19 +167,14 @@ def solution(
     as_json: AsJson = False,
 ) -> None:
     """Write the instructor's reference: derivations, numbers put in, what to expect."""
-    from pipeline.output import check_folder, own_folder, write_file
-    from pipeline.report.gap.section import with_gap
-    from pipeline.report.solution.write import render_solution, solution_text
+    from pipeline.output import check_folder, own_folder
+    from pipeline.report.solution.make import make_solution
     from pipeline.submission import load_submission
-    from pipeline.workflow import analyse
 
     submission = load_submission(folder)
     out = check_folder(out) if out else own_folder(submission.folder, "solution")
     with progress_line() as progress:
-        analysis, gap = with_gap(analyse(submission, progress=progress), submission.folder)
-        out.mkdir(parents=True, exist_ok=True)
-        write_file(out / "solution.json", text := solution_text(analysis))
-        render_solution(analysis, out, gap=gap, pdf=pdf, progress=progress)
+        analysis, text = make_solution(submission, out, pdf=pdf, progress=progress)
     _say_unreadable(analysis)
     say(_wrote(out, "solution", pdf=pdf))
     if as_json:

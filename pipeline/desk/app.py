@@ -18,6 +18,9 @@ from starlette.routing import Route
 from pipeline.desk.bench import room as bench
 from pipeline.desk.doors import Guard, ProxyDoor, SecretDoor
 from pipeline.desk.home import open_grades, open_place, show_home
+from pipeline.desk.instructor import room as instructor
+from pipeline.desk.instructor import rubrics
+from pipeline.desk.instructor.room import owned
 from pipeline.desk.pages import served_file, static_file
 from pipeline.desk.state import Ask, Desk, plain_error
 from pipeline.desk.student import room as student
@@ -53,6 +56,18 @@ ROUTES: tuple[tuple[str, str, Handler], ...] = (
     ("/bench/{n:int}/acquire", "POST", bench.start),
     ("/bench/{n:int}/press", "POST", bench.press),
     ("/bench/{n:int}/events", "GET", bench.events),
+    ("/exercises/", "GET", owned(instructor.show)),
+    ("/exercises/picture.svg", "GET", owned(instructor.picture)),
+    ("/exercises/make", "POST", owned(instructor.make)),
+    ("/exercises/made", "GET", owned(instructor.made)),
+    ("/exercises/stop", "POST", owned(instructor.stop)),
+    ("/effects/", "GET", owned(instructor.catalogue)),
+    ("/rubric/", "GET", owned(rubrics.show)),
+    ("/rubric/check", "POST", owned(rubrics.check)),
+    ("/rubric/save", "POST", owned(rubrics.save)),
+    ("/solution/{n:int}/", "GET", owned(instructor.show_solution)),
+    ("/solution/{n:int}/make", "POST", owned(instructor.make_solution)),
+    ("/solution/{n:int}/{name:path}", "GET", owned(instructor.solution_file)),
     ("/grades/{n:int}/", "GET", open_grades),
     ("/grades/{n:int}/{name:path}", "GET",
      lambda ask: served_file(ask.grades(), ask.request.path_params["name"])),

@@ -132,6 +132,7 @@ def rooms(user: User) -> list[tuple[str, str]]:
     found = [("/", "Desk")]
     found += [(f"/student/{n}/", _name(p)) for n, p in enumerate(user.folders)]
     if user.owns:
+        found += [("/exercises/", "Exercises"), ("/rubric/", "Rubric"), ("/effects/", "Effects")]
         found += [(f"/bench/{n}/", f"{_name(p)}: bench") for n, p in enumerate(user.folders)]
     found += [(f"/grades/{n}/", _name(p)) for n, p in enumerate(user.gradebooks)]
     return found

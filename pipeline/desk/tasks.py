@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.desk.exercises import effect_svg, exercise, simulate, solution
 from pipeline.errors import ConfigError, SubmissionError
 from pipeline.ingest.columns import assign_columns
 from pipeline.ingest.fill import Found, data_files, fill_submission, look_at
@@ -100,6 +101,10 @@ TASKS: Mapping[str, Callable[..., Any]] = {
     "report": report,
     "unpack": unpack,
     "plan": plan,
+    "exercise": exercise,
+    "effect_svg": effect_svg,
+    "simulate": simulate,
+    "solution": solution,
 }
 
 

@@ -50,8 +50,27 @@ def load_rubric(path: Path) -> Rubric:
     if not path.exists():
         shipped = nearest(path.stem, sorted(p.stem for p in RUBRICS.glob("*.toml")))
         raise ConfigError(f"{path}: there is no such rubric{shipped}")
-    text = read_text(path, where=path.name, limit=_MAX_BYTES, error=ConfigError)
-    document = parse_toml(text, where=path.name, error=ConfigError)
+    return parse_rubric(rubric_source(path), where=path.name)
+
+
+def rubric_source(path: Path) -> str:
+    """Return the text of a rubric.
+
+    Raises
+    ------
+    ConfigError : it cannot be read.
+    """
+    return read_text(path, where=path.name, limit=_MAX_BYTES, error=ConfigError)
+
+
+def parse_rubric(text: str, *, where: str) -> Rubric:
+    """Check the text of a rubric; `where` is what to call the file.
+
+    Raises
+    ------
+    ConfigError : one line for every mistake, with file, line, key and what was expected.
+    """
+    document = parse_toml(text, where=where, error=ConfigError)
     problems = _validate(document)
     if isinstance(problems, Rubric):
         found, problems = problems, list(_contradictions(problems))
@@ -59,7 +78,7 @@ def load_rubric(path: Path) -> Rubric:
             return found
         problems = [(at, f"{dotted(at, document)}: {what}") for at, what in problems]
     lines = [(_line_of(text, at), what) for at, what in problems]
-    raise ConfigError("\n".join(f"{path.name} line {line}: {what}" for line, what in sorted(lines)))
+    raise ConfigError("\n".join(f"{where} line {line}: {what}" for line, what in sorted(lines)))
 
 
 def _validate(document: dict) -> Rubric | list[tuple[Location, str]]:

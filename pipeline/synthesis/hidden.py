@@ -131,9 +131,10 @@ def _named_effect(text: str, bench: HiddenBench) -> tuple[Term, frozenset[str]]:
             raise ConfigError(f"{where}: write {name}=VALUE")
         given[name] = _number(value, where=f"{where}: {name}")
     place = _place(effect, bench.chain, given.pop(effect.place, None), where=where)
+    scales, _ = _session_scales(effect, bench.chain, place=place, travel=bench.travel)
     for parameter in effect.parameters:
         if parameter.name in given:
-            _refuse_impossible(parameter, given[parameter.name], where=where)
+            _refuse_impossible(parameter, given[parameter.name], scales, where=where)
     values = default_values(effect, bench.chain, place=place, travel=bench.travel) | given
     _refuse_weak_hold(effect, values, where=where)
     return _term(effect, place, values), frozenset(given)
@@ -186,12 +187,13 @@ def _is_hard_to_tell(term: Term, chain: Chain) -> bool:
     return term.place not in term.effect.places(tuple(bool(k > 0) for k in chain.k))
 
 
-def _refuse_impossible(parameter: Parameter, value: float, *, where: str) -> None:
+def _refuse_impossible(parameter: Parameter, value: float, scales: Scales, *, where: str) -> None:
     """Refuse a size the law has no meaning for."""
     if parameter.signed or parameter.side:
         return
-    if value < parameter.lower or (value == 0.0 and parameter.neutral != 0.0):
-        least = "positive" if parameter.neutral != 0.0 else f"at least {parameter.lower:g}"
+    lower = parameter.lower * parameter.scale(scales)
+    if value < lower or (value == 0.0 and parameter.neutral != 0.0):
+        least = f"at least {lower:.3g}" if lower or parameter.neutral == 0.0 else "positive"
         raise ConfigError(f"{where}: {parameter.name} must be {least}")
 
 

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from pipeline import __version__
-from pipeline.plant.chain import PRESETS
+from pipeline.plant.chain import PRESETS, Chain
 from pipeline.plant.effects import Effect, Term
 from pipeline.report.document import (
     Block,
@@ -93,13 +93,14 @@ def _entry(effect: Effect, *, number: int) -> list[Block]:
     return [
         paragraph(effect.sentence),
         formula(from_tex(effect.equation)),
-        _picture(term, number=number),
+        effect_picture(term, chain, bench=_BENCH, number=number),
         bullet_list(spans(Span(lead, "strong"), text) for lead, text in facts if text),
         Code(_command(term)),
     ]
 
 
-def _picture(term: Term, *, number: int) -> Picture:
+def effect_picture(term: Term, chain: Chain, *, bench: str, number: int) -> Picture:
+    """Return an effect's fingerprint on a bench, and a run with and without it."""
     effect = term.effect
     place = f" on {effect.place} {term.place}" if term.place else ""
     alt = _WORDS.text(
@@ -113,11 +114,11 @@ def _picture(term: Term, *, number: int) -> Picture:
         "effect",
         title=effect.title,
         place=place,
-        bench=_BENCH,
+        bench=bench,
         sizes=_sizes(term),
         seen=fingerprint_words(effect),
     )
-    figure = effect_figure(term, PRESETS[_BENCH])
+    figure = effect_figure(term, chain)
     svg = to_svg(figure, name=effect.key, alt=alt)
     return Picture(
         number=number, name=effect.key, caption=spans(caption), alt=alt, svg=svg, width=WIDTH

@@ -1,0 +1,1 @@
+"""The instructor's room: exercises, solutions, rubrics, the catalogue of effects."""

@@ -1,0 +1,188 @@
+"""The instructor's room over plain forms: exercises, their pictures, solutions, rubrics."""
+
+import json
+import re
+from collections.abc import Iterator
+from html import unescape
+from pathlib import Path
+from urllib.parse import urlencode
+
+import pytest
+from typer.testing import CliRunner
+
+from pipeline.cli import app
+from pipeline.desk.app import DeskServer
+from pipeline.desk.exercises import exercise
+from pipeline.grading.rubric_file import load_rubric
+from pipeline.plant.chain import PRESETS
+from pipeline.plant.effects import CATALOGUE
+from pipeline.resources import RUBRICS
+from tests.helpers.desks import Visitor, a_submission
+from tests.helpers.waiting import until
+
+FRICTION = {"effect": "coulomb_friction", "coulomb_friction.place": "2"}
+
+
+@pytest.fixture
+def visitor() -> Iterator[Visitor]:
+    """Somebody at a desk of their own."""
+    with DeskServer(folders=[]) as server:
+        yield Visitor.of(server.url)
+
+
+def shown(visitor: Visitor, **sent: str) -> str:
+    """Return the page of exercises with a form filled in."""
+    answer = visitor.get(f"/exercises/?{urlencode(sent)}")
+    assert answer.status == 200
+    return unescape(answer.text)
+
+
+def wait_for(visitor: Visitor, address: str) -> str:
+    """Return the page of long work once that is over."""
+    until(lambda: 'http-equiv="refresh"' not in visitor.get(address).text)
+    return visitor.get(address).text
+
+
+# ------------------------------------------------------------------------------- exercises
+
+
+def test_every_effect_has_its_sizes_and_slides_about_them():
+    """On each preset: what the form says is a `--hide` that `simulate` takes."""
+    for preset, chain in PRESETS.items():
+        for effect in CATALOGUE:
+            if chain.n < effect.fewest_carts or (effect.between_carts and chain.n < 2):
+                continue
+            found = exercise(
+                {"preset": preset},
+                [{"key": effect.key, "place": "", "sizes": {}}],
+                progress=print,
+            )
+            assert (found["wrong"], len(found["told"])) == ("", 1)
+            assert all(p["slide"] == "0" for p in found["effects"][0]["parameters"])
+
+
+def test_a_slider_counts_when_moved_and_a_number_when_typed():
+    """A tenth of the usual by the slider; a typed one moves the slider; else the bench's usual."""
+
+    def force(preset: str, **size: str) -> dict[str, str]:
+        chosen = [{"key": "coulomb_friction", "place": "1", "sizes": {"force": size}}]
+        found = exercise({"preset": preset}, chosen, progress=print)
+        return found["effects"][0]["parameters"][0]
+
+    usual = force("throne-2dof")["value"]
+    before = {"value": usual, "usual": usual, "was": "0"}
+    assert float(force("throne-2dof", **before, slide="-1")["value"]) == pytest.approx(
+        float(usual) / 10, rel=0.01
+    )
+    typed = force("throne-2dof", **(before | {"value": "0.004"}), slide="0")
+    assert typed["value"] == "0.004"
+    assert 10 ** float(typed["slide"]) == pytest.approx(0.004 / float(usual), rel=0.02)
+    other = force("throne-1dof", **before, slide="0")["value"]
+    assert other == force("throne-1dof")["value"] != usual
+
+
+def test_a_class_is_what_simulate_writes(visitor, tmp_path):
+    """Three folders, seeds counting up: the bytes of the command; what is hidden is in none."""
+    page = shown(visitor, preset="throne-2dof", **FRICTION)
+    (told,) = re.findall(r"<li>(coulomb_friction on cart 2.*?)</li>", page)
+    force = re.search(r'name="coulomb_friction.force.value"[^>]* value="([^"]+)"', page)
+    assert force is not None
+    out = tmp_path / "class"
+    answer = visitor.post(
+        "/exercises/make", preset="throne-2dof", out=str(out), folders="3", seed="5", **FRICTION
+    )
+    assert answer.status == 303
+    wait_for(visitor, answer.headers["location"])
+    assert [folder.name for folder in sorted(out.iterdir())] == ["1", "2", "3"]
+    command = ["simulate", "--preset", "throne-2dof", "--seed", "6", "--out", str(tmp_path / "b")]
+    hide = f"coulomb_friction:cart=2,force={force[1]}"
+    assert CliRunner().invoke(app, [*command, "--hide", hide]).exit_code == 0
+    for path in (tmp_path / "b").rglob("*.*"):
+        made = (out / "2" / path.relative_to(tmp_path / "b")).read_bytes()
+        assert made == path.read_bytes()
+        assert b"friction" not in made
+    assert force[1] in told
+    again = visitor.post("/exercises/make", out=str(out), folders="1", seed="0")
+    assert again.status == 422  # it is not empty
+
+
+def test_an_own_chain_and_what_is_wrong_with_it(visitor):
+    """Its numbers make a bench; what is wrong is said in their words, and nothing is drawn."""
+    chain = {"preset": "", "m": "2e-4 3e-4", "c": "5e-4, 5e-4", "k": "0 0.1 0.05"}
+    page = shown(visitor, **chain, effect="input_delay")
+    assert "input_delay: delay" in page
+    assert "own chain: m needs numbers" in shown(visitor, **(chain | {"m": "2e-4 heavy"}))
+    assert "own chain: chain: m must be positive" in shown(visitor, **(chain | {"m": "0 1e-4"}))
+    wrong = FRICTION | {"coulomb_friction.force.value": "-1"}
+    assert "force must be at least 0" in shown(visitor, preset="throne-2dof", **wrong)
+    assert visitor.post("/exercises/make", **wrong, out="x", folders="1", seed="0").status == 422
+
+
+def test_a_picture_is_inert(visitor):
+    """The drawing of an effect is an SVG that may run nothing; a forged one is refused."""
+    (address,) = re.findall(r'src="(/exercises/picture[^"]+)"', shown(visitor, **FRICTION))
+    drawn = visitor.get(address)
+    assert drawn.headers["content-type"] == "image/svg+xml"
+    assert "script" not in drawn.headers["content-security-policy"]
+    assert "sandbox" in drawn.headers["content-security-policy"]
+    assert drawn.body.startswith(b"<svg ")
+    forged = urlencode({"preset": "throne-2dof", "hide": "coulomb_friction:force=<script>"})
+    assert visitor.get(f"/exercises/picture.svg?{forged}").status == 422
+
+
+def test_a_solution_is_what_the_command_writes(tmp_path):
+    """Made in the folder, shown in its page, with the expected values for programs."""
+    folder = a_submission(tmp_path / "reference")
+    with DeskServer(folders=[folder]) as server:
+        visitor = Visitor.of(server.url)
+        assert visitor.get("/solution/0/solution.html").status == 404
+        assert visitor.post("/solution/0/make").status == 303
+        assert "Make it anew" in wait_for(visitor, "/solution/0/")
+        assert visitor.get("/solution/0/solution.html").status == 200
+        values = json.loads(visitor.get("/solution/0/solution.json").body)
+    assert values["schema"] == "cartlab-solution/1"
+
+
+# ------------------------------------------------------------------------------- rubrics
+
+
+def test_a_rubric_is_saved_only_when_valid(visitor, tmp_path):
+    """A new one begins with a shipped one; a mistake stands beside its line, and is not written."""
+    path = tmp_path / "rubric.toml"
+    page = visitor.get(f"/rubric/?{urlencode({'file': path, 'start': 'throne-2dof'})}")
+    text = (RUBRICS / "throne-2dof.toml").read_text(encoding="utf-8")
+    assert unescape(page.text).count(text.strip()) == 1
+    line = next(i for i, one in enumerate(text.split("\n"), 1) if one.startswith("title"))
+    spoilt = text.replace("title", "titel", 1)
+    answer = visitor.post("/rubric/save", file=str(path), text=spoilt, seen=page.value("seen"))
+    assert answer.status == 422
+    assert f'<th scope="row">{line}</th><td><code>titel' in answer.text
+    assert not path.exists()
+    crlf = text.replace("\n", "\r\n")  # as browsers send it
+    saved = visitor.post("/rubric/save", file=str(path), text=crlf, seen=page.value("seen"))
+    assert saved.status == 303
+    assert path.read_text(encoding="utf-8").rstrip() == text.rstrip()
+    assert load_rubric(path) == load_rubric(Path("throne-2dof"))
+
+
+def test_a_rubric_that_was_changed_meanwhile_is_not_written_over(visitor, tmp_path):
+    """Both versions are shown; what is on disk stays."""
+    path = tmp_path / "rubric.toml"
+    text = (RUBRICS / "throne-1dof.toml").read_text(encoding="utf-8")
+    path.write_text(text, encoding="utf-8")
+    seen = visitor.get(f"/rubric/?{urlencode({'file': path})}").value("seen")
+    path.write_text(f"# by another\n{text}", encoding="utf-8")
+    mine = f"# mine\n{text}"
+    answer = visitor.post("/rubric/save", file=str(path), text=mine, seen=seen)
+    assert answer.status == 409
+    assert "# by another" in answer.text
+    assert "# mine" in answer.text
+    assert path.read_text(encoding="utf-8").startswith("# by another")
+    new = visitor.post("/rubric/save", file=str(path), text=mine, seen="new")
+    assert new.status == 409  # begun as a new file, which is there now
+
+
+@pytest.mark.parametrize("file", ["", "rubric.txt", "/nowhere/at/all/rubric.toml", "a\x00.toml"])
+def test_a_rubric_lies_where_it_can(visitor, file):
+    """A name that is none is one clear sentence."""
+    assert visitor.post("/rubric/save", file=file, text="x", seen="new").status == 422
