@@ -47,7 +47,7 @@ LEVELS = (
     ("grading.publish",),
     ("grading.batch",),
     ("desk",),
-    ("desk.student", "desk.bench", "desk.instructor"),
+    ("desk.student", "desk.bench", "desk.grades", "desk.instructor"),
     ("desk.app",),
     ("cli", "notebook"),
     ("__main__",),

@@ -5,7 +5,7 @@ import socket
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -17,11 +17,14 @@ from starlette.routing import Route
 
 from pipeline.desk.bench import room as bench
 from pipeline.desk.doors import Guard, ProxyDoor, SecretDoor
-from pipeline.desk.home import open_grades, open_place, show_home
+from pipeline.desk.grades import room as grades
+from pipeline.desk.grades import team
+from pipeline.desk.grades import work as whole
+from pipeline.desk.home import open_place, show_home
 from pipeline.desk.instructor import room as instructor
 from pipeline.desk.instructor import rubrics
 from pipeline.desk.instructor.room import owned
-from pipeline.desk.pages import served_file, static_file
+from pipeline.desk.pages import static_file
 from pipeline.desk.state import Ask, Desk, plain_error
 from pipeline.desk.student import room as student
 from pipeline.desk.users import User, read_users
@@ -68,11 +71,22 @@ ROUTES: tuple[tuple[str, str, Handler], ...] = (
     ("/solution/{n:int}/", "GET", owned(instructor.show_solution)),
     ("/solution/{n:int}/make", "POST", owned(instructor.make_solution)),
     ("/solution/{n:int}/{name:path}", "GET", owned(instructor.solution_file)),
-    ("/grades/{n:int}/", "GET", open_grades),
-    ("/grades/{n:int}/{name:path}", "GET",
-     lambda ask: served_file(ask.grades(), ask.request.path_params["name"])),
+    ("/grades/{n:int}/", "GET", grades.show),
+    ("/grades/{n:int}/news", "GET", grades.news),
+    ("/grades/{n:int}/distribution.svg", "GET", grades.distribution),
+    ("/grades/{n:int}/class.html", "GET", grades.at_a_glance),
+    ("/grades/{n:int}/feedback/{name:path}/feedback.html", "GET", grades.feedback),
+    ("/grades/{n:int}/team", "GET", team.show),
+    ("/grades/{n:int}/team", "POST", team.act),
+    ("/grades/{n:int}/figure", "GET", team.figure),
+    ("/grades/{n:int}/sign", "POST", team.sign),
+    ("/grades/{n:int}/import", "POST", whole.take_table),
+    ("/grades/{n:int}/export", "POST", whole.export_class),
+    ("/grades/{n:int}/publish", "POST", whole.publish),
+    ("/grades/{n:int}/regrade", "POST", whole.regrade),
+    ("/grades/{n:int}/stop", "POST", whole.stop),
 )  # fmt: skip
-EVENTS = "/student/{n:int}/events"
+EVENTS = {"/student/{n:int}/events": Ask.folder, "/grades/{n:int}/events": Ask.grades}
 
 
 class DeskServer:
@@ -140,7 +154,7 @@ def application(desk: Desk) -> Starlette:
         Route(path, _endpoint(desk, handler), methods=[method]) for path, method, handler in ROUTES
     ]
     return Starlette(
-        routes=[*routes, Route(EVENTS, _events(desk))],
+        routes=[*routes, *(Route(path, _events(desk, place)) for path, place in EVENTS.items())],
         exception_handlers={HTTPException: _wrong(desk), Exception: _wrong(desk)},
     )
 
@@ -179,12 +193,12 @@ def _wrong(desk: Desk) -> Callable[[Request, Exception], Response]:
     return answer
 
 
-def _events(desk: Desk) -> Callable[[Request], Awaitable[Response]]:
+def _events(desk: Desk, place: Callable[[Ask], Any]) -> Callable[[Request], Awaitable[Response]]:
     """Return what tells the stages of the work in a folder as they change, and its end."""
 
     async def answer(request: Request) -> Response:
         ask = Ask(desk=desk, user=request.scope["user"], request=request, form=FormData())
-        return StreamingResponse(_news(desk, ask.folder()), media_type="text/event-stream")
+        return StreamingResponse(_news(desk, place(ask)), media_type="text/event-stream")
 
     return answer
 

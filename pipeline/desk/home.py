@@ -5,10 +5,9 @@ from pathlib import Path
 from starlette.exceptions import HTTPException
 from starlette.responses import RedirectResponse, Response
 
-from pipeline.desk.state import Ask
+from pipeline.desk.state import Ask, Found
 from pipeline.errors import ConfigError
-
-_GRADEBOOK, _CLASS = "gradebook.sqlite", "class.html"
+from pipeline.grading.gradebook.schema import FILE
 
 
 def show_home(ask: Ask) -> Response:
@@ -21,16 +20,21 @@ def show_home(ask: Ask) -> Response:
 
 
 def open_place(ask: Ask) -> Response:
-    """Open a folder of this computer: a submission, there or not yet, or a grading's output."""
+    """Open a folder of this computer, a submission or a grading's output, or a database."""
     if not ask.user.owns:
         raise HTTPException(403, "folders of this computer are opened by its owner only")
     typed = ask.text("folder")
     if not typed or not typed.isprintable():
         raise ConfigError("name a folder")
+    if "://" in typed:
+        ask.desk.books.book(typed)
+        return _entered(typed, ask.user.gradebooks, room="grades")
     folder = Path(typed).expanduser().resolve()
+    if folder.name == FILE and folder.is_file():
+        folder = folder.parent
     if folder.exists() and not folder.is_dir():
         raise ConfigError(f"{folder}: is a file; name the folder that it lies in")
-    if (folder / _GRADEBOOK).is_file():
+    if (folder / FILE).is_file():
         return _entered(folder, ask.user.gradebooks, room="grades")
     if not folder.parent.is_dir():
         raise ConfigError(f"{folder}: there is no folder {folder.parent} to make it in")
@@ -38,14 +42,7 @@ def open_place(ask: Ask) -> Response:
     return _entered(folder, ask.user.folders, room="student")
 
 
-def open_grades(ask: Ask) -> Response:
-    """Show the class page of a grading."""
-    folder = ask.grades()
-    there = (folder / _CLASS).is_file()
-    return ask.page("grades", title=folder.name, there=there)
-
-
-def _entered(folder: Path, places: list[Path], *, room: str) -> Response:
+def _entered(folder: Found, places: list[Found], *, room: str) -> Response:
     if folder not in places:
         places.append(folder)
     return RedirectResponse(f"/{room}/{places.index(folder)}/", status_code=303)

@@ -29,6 +29,7 @@ _STATIC = {
     "desk.js": "desk/desk.js",
     "live.css": "live.css",
     "live.js": "live.js",
+    "grades.js": "desk/grades.js",
     "htmx.js": "desk/htmx.min.js",
     "icon.svg": "desk/icon.svg",
 }

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from starlette.datastructures import FormData
@@ -16,8 +16,9 @@ from starlette.responses import HTMLResponse, RedirectResponse, Response
 
 from pipeline import __version__
 from pipeline.desk.benches import Sessions
+from pipeline.desk.books import Books
 from pipeline.desk.jobs import Failed, Hand, Jobs
-from pipeline.desk.users import User
+from pipeline.desk.users import Place, User, place_name
 from pipeline.resources import TEMPLATES
 
 _MOST_LOOKS = 5_000  # files of which is kept what they are
@@ -25,6 +26,7 @@ NOTHING_KNOWN: dict[str, Any] = {
     "kind": None, "format": "", "duration": None, "remarks": [], "unsure": [], "lines": [],
 }  # fmt: skip
 Stamp = tuple[int, int, dict[str, str | int]]  # time, size, columns as stated
+Found = TypeVar("Found", Path, Place)
 
 
 @dataclass(kw_only=True)
@@ -34,7 +36,8 @@ class Desk:
     jobs: Jobs = field(default_factory=Jobs)
     hand: Hand = field(default_factory=Hand)
     benches: Sessions = field(default_factory=Sessions)
-    said: dict[tuple[str, Path], list[str]] = field(default_factory=dict)
+    books: Books = field(default_factory=Books)
+    said: dict[tuple[str, str], list[str]] = field(default_factory=dict)
     _looks: OrderedDict[Path, tuple[Stamp, dict[str, Any]]] = field(default_factory=OrderedDict)
 
     def looks(
@@ -69,6 +72,7 @@ class Desk:
         """End all work; benches are told to stop first."""
         self.benches.close()
         self.jobs.close()
+        self.books.close()
         self.hand.close()
 
 
@@ -85,15 +89,19 @@ class Ask:
         """Return the submission that the address is about; of others' there is no address."""
         return self._place(self.user.folders)
 
-    def grades(self) -> Path:
-        """Return the output of a grading that the address is about."""
+    def grades(self) -> Place:
+        """Return the gradebook that the address is about: the folder it is in, or a database."""
         return self._place(self.user.gradebooks)
 
-    def _place(self, places: list[Path]) -> Path:
+    def _place(self, places: list[Found]) -> Found:
         number = self.request.path_params["n"]
         if number >= len(places):
             raise HTTPException(404, "there is nothing here that is yours to see")
         return places[number]
+
+    def _room(self) -> tuple[str, str]:
+        """Return whose room the address is in, and which."""
+        return self.user.name, "/".join(self.request.url.path.split("/")[:3])
 
     def text(self, name: str) -> str:
         """Return a field of the form as text, "" where it is not there."""
@@ -118,28 +126,23 @@ class Ask:
     def back(self, to: str, *said: str) -> Response:
         """Return to a page, which says this once."""
         if said:
-            key = self.user.name, self.folder()
-            self.desk.said.setdefault(key, []).extend(said)
+            self.desk.said.setdefault(self._room(), []).extend(said)
         return RedirectResponse(to, status_code=303)
 
     def told(self) -> list[str]:
         """Return what is to be said on this page, once."""
-        return self.desk.said.pop((self.user.name, self.folder()), [])
+        return self.desk.said.pop(self._room(), [])
 
 
 def rooms(user: User) -> list[tuple[str, str]]:
     """Return the address and the name of every room that somebody may enter."""
     found = [("/", "Desk")]
-    found += [(f"/student/{n}/", _name(p)) for n, p in enumerate(user.folders)]
+    found += [(f"/student/{n}/", place_name(p)) for n, p in enumerate(user.folders)]
     if user.owns:
         found += [("/exercises/", "Exercises"), ("/rubric/", "Rubric"), ("/effects/", "Effects")]
-        found += [(f"/bench/{n}/", f"{_name(p)}: bench") for n, p in enumerate(user.folders)]
-    found += [(f"/grades/{n}/", _name(p)) for n, p in enumerate(user.gradebooks)]
+        found += [(f"/bench/{n}/", f"{place_name(p)}: bench") for n, p in enumerate(user.folders)]
+    found += [(f"/grades/{n}/", place_name(p)) for n, p in enumerate(user.gradebooks)]
     return found
-
-
-def _name(place: Path) -> str:
-    return place.name or str(place)
 
 
 @cache

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
+from urllib.parse import urlsplit
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -10,6 +11,7 @@ from pipeline.errors import ConfigError
 from pipeline.submission.complaints import explain
 from pipeline.submission.toml_file import parse_toml, read_text
 
+Place = Path | str  # a folder, or the address of a database
 Role = Literal["owner", "student", "ta", "instructor"]
 _MOST_BYTES = 1_000_000
 
@@ -22,13 +24,13 @@ class User:
     ----------
     folders : the submissions that they see, addressed by their place in this list: of another's
         there is no address. An owner's list grows as they open folders.
-    gradebooks : likewise, the outputs of gradings.
+    gradebooks : likewise, the outputs of gradings, or addresses of databases.
     """
 
     name: str
     role: Role
     folders: list[Path] = field(default_factory=list)
-    gradebooks: list[Path] = field(default_factory=list)
+    gradebooks: list[Place] = field(default_factory=list)
 
     @property
     def owns(self) -> bool:
@@ -90,7 +92,15 @@ def read_users(path: Path) -> tuple[Proxy, dict[str, User]]:
             name=user.name,
             role=user.role,
             folders=[root / folder for folder in user.folders],
-            gradebooks=[root / folder for folder in user.gradebooks],
+            gradebooks=[one if "://" in one else root / one for one in user.gradebooks],
         )
         for user in found.users
     }
+
+
+def place_name(place: Place) -> str:
+    """Return what to call a place: of a database its name, never who opens it with which word."""
+    if isinstance(place, str):
+        parts = urlsplit(place)
+        return parts.path.strip("/") or parts.hostname or parts.scheme
+    return place.name or str(place)

@@ -14,6 +14,7 @@ from pipeline.desk.doors import MOST_FORM
 from pipeline.desk.users import read_users
 from pipeline.errors import ConfigError
 from tests.helpers.desks import Visitor, a_submission
+from tests.helpers.grades import write_class
 from tests.helpers.waiting import PATIENCE, until
 
 PATHS = [re.sub(r"\{\w+:int\}", "0", re.sub(r"\{name(:path)?\}", "x.json", p)) for p, *_ in ROUTES]
@@ -157,8 +158,7 @@ def lab(tmp_path_factory):
     root = tmp_path_factory.mktemp("lab")
     for name in ("one", "two", "three", "four"):
         a_submission(root / name)
-    (root / "grades").mkdir()
-    (root / "grades" / "class.html").write_text("<p>the class</p>", encoding="utf-8")
+    write_class(root / "grades")
     (root / "users.toml").write_text(USERS, encoding="utf-8")
     with DeskServer(folders=[], users=root / "users.toml") as server:
         port = urlsplit(server.url).port or 0
@@ -186,7 +186,7 @@ def test_everybody_sees_their_own(lab):
 
 def test_a_ta_sees_the_gradebooks_they_are_listed_for(lab):
     """And no student's room."""
-    assert lab("t").get("/grades/0/class.html").body == b"<p>the class</p>"
+    assert "team-07" in lab("t").get("/grades/0/").text
     assert lab("t").get("/grades/1/").status == 404
     assert lab("t").get("/student/0/").status == 404
 

@@ -118,6 +118,14 @@ def make_outcome(grade: Grade, *, key: str = "", **changes: Any) -> Grading:
 def write_class(folder: Path, *, anonymous: bool = False) -> Path:
     """Write the pages of a class of all sorts into a folder, figures and hostile names included."""
     folder.mkdir(exist_ok=True)
+    fill_book(folder, anonymous=anonymous)
+    with Gradebook(folder) as book:
+        write_outputs(book, folder)
+    return folder
+
+
+def fill_book(place: str | Path, *, anonymous: bool = False) -> None:
+    """Make a gradebook with a class of all sorts, figures and hostile names included."""
     rubric = two_cart_rubric().model_copy(update={"anonymous": anonymous})
     names = [f"team-{n:02d}" for n in range(1, 13)]
     names += ["Ünal 学生 & co", "a-name-without-end-" * 5, "=cmd'C'!A0"]
@@ -132,14 +140,12 @@ def write_class(folder: Path, *, anonymous: bool = False) -> Path:
     broken = failed_grade("broken", "submission.toml line 3: <b>cart</b> is no key")
     outcomes.append(make_outcome(broken))
     shared = {"team-02": shared_flag("team-03"), "team-03": shared_flag("team-02")}
-    with Gradebook(folder, assignment="lab", create=True) as book:
+    with Gradebook(place, assignment="lab", create=True) as book:
         for outcome in outcomes:
             book.put(outcome)
         keys = tuple(o.key for o in sorted(outcomes, key=lambda o: o.submission))
         book.finish(Batch(keys=keys, shared=shared), rubric=rubric)
         book.override("team-02", "laws", 1.0, why="right, <i>as told</i>", by="Ada")
-        write_outputs(book, folder)
-    return folder
 
 
 def _figure(name: str) -> tuple[tuple[str, str], ...]:
@@ -156,7 +162,7 @@ def _figure(name: str) -> tuple[tuple[str, str], ...]:
         figure = reported_bode_figure(
             measured, chain=chain, reported=transfer_functions(values), units=("cm", "V")
         )
-        svg = to_svg(figure, name="response-1", alt=f"Response of cart 1 of {name}.")
+        svg = to_svg(figure, name="response-1", alt="Response of cart 1.")
     return (("response-1.svg", svg),)
 
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 from sqlalchemy import Connection, Row, select
 
@@ -37,6 +37,7 @@ from pipeline.grading.gradebook.rows import (
     last_named,
     newest_of,
     pages,
+    put_brief,
     read_figures,
     read_flag,
     read_members,
@@ -92,7 +93,7 @@ class Gradebook:
         """Let go of the database."""
         self._database.close()
 
-    def __enter__(self) -> "Gradebook":
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -126,6 +127,7 @@ class Gradebook:
                     "deducted": grade.deducted,
                 },
             )
+            put_brief(connection, number, grade)
             for position, (name, svg) in enumerate(grading.figures):
                 drawn = {"grading_id": number, "position": position, "name": name, "svg": svg}
                 add_row(connection, figures, drawn)
@@ -263,8 +265,8 @@ class Gradebook:
         with self._database.reading() as connection:
             return read_figures(connection, entry.grading)
 
-    def history(self, team: str) -> tuple[str, list[Event]]:
-        """Return the submission's id and all that ever happened to it.
+    def history(self, team: str, *, named: bool = True) -> tuple[str, list[Event]]:
+        """Return the submission's id and all that ever happened to it, see `read_events`.
 
         Raises
         ------
@@ -272,7 +274,7 @@ class Gradebook:
         """
         with self._database.reading() as connection:
             row = self._find_ever(connection, team)
-            return row.name, read_events(connection, row.submission_id)
+            return row.name, read_events(connection, row.submission_id, named=named)
 
     def remove(self, teams: Sequence[str]) -> list[str]:
         """Take submissions off the class list and return their names.
@@ -307,29 +309,45 @@ class Gradebook:
         ConfigError : there is no such submission or criterion, the points are none that it can
             have, or who and why are not said.
         """
+        with self._database.writing() as connection:
+            last, row = self._find(connection, team)
+            return self._give(
+                connection, row, criterion, points, why=why, by=by, rubric=read_rubric(last)
+            )
+
+    # ----------------------------------------------------------------------- in parts
+
+    def _give(
+        self,
+        connection: Connection,
+        row: Row,
+        criterion: str,
+        points: float | None,
+        *,
+        why: str,
+        by: str,
+        rubric: Rubric,
+    ) -> Override:
+        """Add an override of the submission of a line."""
         why, by = why.strip(), by.strip()
         if not why or not by:
             raise ConfigError("an override needs a reason (--why) and a name (--by)")
-        with self._database.writing() as connection:
-            last, row = self._find(connection, team)
-            out_of = {c.id: c.points for c in read_rubric(last).criteria}
-            if criterion not in out_of:
-                hint = nearest(criterion, list(out_of))
-                raise ConfigError(f"{criterion}: the rubric has no such criterion; {hint}")
-            if points is not None and not 0 <= points <= out_of[criterion]:
-                raise ConfigError(f"{criterion}: has 0 to {out_of[criterion]:g} points")
-            given = Override(
-                criterion=criterion,
-                points=points,
-                why=why,
-                by=by,
-                at=self._at(),
-                authors=last_named(connection, row.submission_id),
-            )
-            add_row(connection, overrides, {**asdict(given), "submission_id": row.submission_id})
+        out_of = {c.id: c.points for c in rubric.criteria}
+        if criterion not in out_of:
+            hint = nearest(criterion, list(out_of))
+            raise ConfigError(f"{criterion}: the rubric has no such criterion; {hint}")
+        if points is not None and not 0 <= points <= out_of[criterion]:
+            raise ConfigError(f"{criterion}: has 0 to {out_of[criterion]:g} points")
+        given = Override(
+            criterion=criterion,
+            points=points,
+            why=why,
+            by=by,
+            at=self._at(),
+            authors=last_named(connection, row.submission_id),
+        )
+        add_row(connection, overrides, {**asdict(given), "submission_id": row.submission_id})
         return given
-
-    # ----------------------------------------------------------------------- in parts
 
     def _at(self) -> str:
         return self._now().astimezone(UTC).isoformat(timespec="microseconds")

@@ -17,6 +17,8 @@ from pipeline.grading.gradebook.schema import (
 )
 from pipeline.schemas.grade import read_grade
 
+FAILED = "could not be graded: "  # before the reason, in the text of an event
+
 
 @dataclass(frozen=True, kw_only=True)
 class Event:
@@ -42,12 +44,12 @@ class Event:
     by: str = ""
 
 
-def read_events(connection: Connection, submission: int) -> list[Event]:
-    """Return the events of one submission, oldest first."""
+def read_events(connection: Connection, submission: int, *, named: bool = True) -> list[Event]:
+    """Return the events of one submission, oldest first; `named` tells what else it was called."""
     found = [
         *_graded(connection, submission),
         *_overridden(connection, submission),
-        *_listed(connection, submission),
+        *_listed(connection, submission, named=named),
     ]
     return sorted(found, key=lambda event: event.at)
 
@@ -55,7 +57,7 @@ def read_events(connection: Connection, submission: int) -> list[Event]:
 def _graded(connection: Connection, submission: int) -> Iterator[Event]:
     mine = select(gradings).where(gradings.c.submission_id == submission)
     for row in connection.execute(mine.order_by(gradings.c.id)):
-        text = f"could not be graded: {row.reason}"
+        text = FAILED + row.reason
         if row.status != "failed":
             text = ", ".join(flag.code for flag in read_grade(row.grade).flags)
         yield Event(at=row.at, what="graded", points=row.points, out_of=row.out_of, text=text)
@@ -74,7 +76,7 @@ def _overridden(connection: Connection, submission: int) -> Iterator[Event]:
         )
 
 
-def _listed(connection: Connection, submission: int) -> Iterator[Event]:
+def _listed(connection: Connection, submission: int, *, named: bool) -> Iterator[Event]:
     """Yield the class lists in which something was new, and those it is no longer in."""
     own = and_(entries.c.batch_id == batches.c.id, entries.c.submission_id == submission)
     of_batch = batches.c.id, batches.c.at, batches.c.rubric
@@ -90,7 +92,8 @@ def _listed(connection: Connection, submission: int) -> Iterator[Event]:
         if points is None:
             if before is not None:
                 now = _other_name(connection, submission, of=previous, among=batch)
-                text = "off the class list" + (f": goes on as {now}" if now else "")
+                goes_on = f"goes on as {now}" if named else "goes on under another name"
+                text = "off the class list" + (f": {goes_on}" if now else "")
                 yield Event(at=at, what="removed", points=None, text=text)
             before = None
             continue
@@ -98,7 +101,7 @@ def _listed(connection: Connection, submission: int) -> Iterator[Event]:
         if before is None and (
             then := _other_name(connection, submission, of=batch, among=previous)
         ):
-            said.append(f"was {then} before")
+            said.append(f"was {then} before" if named else "had another name before")
         if judged_by and rubric != judged_by:
             said += [f"rubric: {change}" for change in rubric_changes(judged_by, rubric)]
         if ((points, out_of, shared), rubric) != (before, judged_by):
@@ -135,15 +138,17 @@ def history_dict(submission: str, events: Sequence[Event]) -> dict[str, Any]:
 def history_text(submission: str, events: Sequence[Event]) -> str:
     """Return a history as lines to read."""
     return "\n".join(
-        [submission, *(f"{_to_the_second(event.at)}  {_words(event)}" for event in events)]
+        [submission, *(f"{to_the_second(event.at)}  {event_words(event)}" for event in events)]
     )
 
 
-def _to_the_second(at: str) -> str:
+def to_the_second(at: str) -> str:
+    """Return a time as people read it."""
     return datetime.fromisoformat(at).strftime("%Y-%m-%d %H:%M:%S UTC")
 
 
-def _words(event: Event) -> str:
+def event_words(event: Event) -> str:
+    """Return what an event was, with points, who and why."""
     if event.what == "override":
         points = "automatic points again" if event.points is None else f"{event.points:g} by hand"
         return f"override  {event.criterion}: {points}, by {event.by}: {event.text}"

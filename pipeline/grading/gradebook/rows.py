@@ -1,7 +1,7 @@
 """Rows of a gradebook as what they stand for."""
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 
 from pydantic import ValidationError
@@ -11,6 +11,7 @@ from pipeline.errors import ConfigError
 from pipeline.grading.gradebook.override import Override, with_overrides
 from pipeline.grading.gradebook.schema import (
     Database,
+    briefs,
     entries,
     figures,
     gradings,
@@ -24,7 +25,7 @@ from pipeline.schemas.grade import Flag, Grade, read_grade
 _PAGE = 100  # rows read at a time: memory stays flat, and a writer need not wait long
 # What a grading has in columns of its name.
 GRADING = [f.name for f in fields(Grading) if f.name in gradings.c]
-_OVERRIDE = [overrides.c[f.name] for f in fields(Override)]
+OVERRIDE = [overrides.c[f.name] for f in fields(Override)]
 _OF_GRADING = select(submissions.c.name.label("submission"), *(gradings.c[x] for x in GRADING))
 _MEMBER = (
     submissions.c.name.label("submission"),
@@ -89,6 +90,21 @@ def known_grading(
         return None
     own = {name: value for name, value in row.items() if name != "id"}
     return Grading(**own, figures=read_figures(connection, row["id"]) if drawn else ())
+
+
+def put_brief(connection: Connection, grading: int, grade: Grade) -> None:
+    """Add what the table of a class shows of a grading: all but the evidence."""
+    bare = {"message": "", "expected": {}, "found": {}}
+    plain = {"message": "", "evidence": {}}
+    brief = grade.model_copy(
+        update={
+            "criteria": tuple(c.model_copy(update=bare) for c in grade.criteria),
+            "flags": tuple(flag.model_copy(update=plain) for flag in grade.flags),
+            "notes": (),
+        }
+    )
+    text = brief.model_dump_json(by_alias=True)
+    connection.execute(insert(briefs).values(grading_id=grading, grade=text))
 
 
 def read_figures(connection: Connection, grading: int) -> tuple[tuple[str, str], ...]:
@@ -171,11 +187,24 @@ def class_list(*, detail: bool = True) -> Select:
 
 def final_entry(connection: Connection, row: Row, *, shared: Flag | None, rubric: Rubric) -> Entry:
     """Return the grade as it counts: shared data flagged, points given by hand."""
-    mine = select(*_OVERRIDE).where(overrides.c.submission_id == row.submission_id)
-    ever = (Override(**o) for o in connection.execute(mine.order_by(overrides.c.id)).mappings())
+    mine = select(*OVERRIDE).where(overrides.c.submission_id == row.submission_id)
+    rows = connection.execute(mine.order_by(overrides.c.id)).mappings()
+    first = select(gradings.c.key).where(gradings.c.submission_id == row.submission_id)
+    return as_it_counts(
+        row,
+        [Override(**o) for o in rows],
+        shared=shared,
+        rubric=rubric,
+        first_key=connection.scalar(first.order_by(gradings.c.id).limit(1)) or "",
+    )
+
+
+def as_it_counts(
+    row: Row, ever: Iterable[Override], *, shared: Flag | None, rubric: Rubric, first_key: str
+) -> Entry:
+    """Return a line with all overrides that there ever were of its submission."""
     newest = {override.criterion: override for override in ever if override.concerns(row.authors)}
     given = {key: override for key, override in newest.items() if override.points is not None}
-    first = select(gradings.c.key).where(gradings.c.submission_id == row.submission_id)
     grade = read_grade(row.grade)
     grade = grade.with_flags(shared) if shared else grade
     return Entry(
@@ -185,7 +214,7 @@ def final_entry(connection: Connection, row: Row, *, shared: Flag | None, rubric
         owner=row.owner,
         key=row.key,
         grading=row.id,
-        first_key=connection.scalar(first.order_by(gradings.c.id).limit(1)) or "",
+        first_key=first_key,
     )
 
 
@@ -209,7 +238,7 @@ def carry_overrides(connection: Connection, moved: Mapping[str, str], *, assignm
     numbers = {row.name: row.id for row in connection.execute(named)}
     given = {}
     for name, number in numbers.items():
-        mine = select(*_OVERRIDE).where(overrides.c.submission_id == number)
+        mine = select(*OVERRIDE).where(overrides.c.submission_id == number)
         rows = connection.execute(mine.order_by(overrides.c.id)).mappings()
         given[name] = [dict(row) for row in rows]
     for old, new in moved.items():

@@ -44,7 +44,7 @@ from pipeline.errors import ConfigError
 FILE = "gradebook.sqlite"
 _SUFFIXES = (".sqlite", ".sqlite3", ".db")  # of files; anything else is a folder
 _VERSION = "1"
-_CREATING = 0x6361_7274  # a number for PostgreSQL's lock that nobody else has
+_TURN = 0x6361_7274  # a number for PostgreSQL's lock that nobody else has
 _PATIENCE = 60.0  # s, for a lock that another process holds; a commit takes milliseconds
 
 
@@ -176,6 +176,27 @@ overrides = Table(
     Index("overrides_by_submission", "submission_id"),
 )
 
+# A grade without its evidence, of which the table of a class is made. Gradebooks that are older
+# than this table get it, and what is in it, when they are opened by several at once.
+briefs = Table(
+    "briefs",
+    metadata,
+    Column("grading_id", ForeignKey("gradings.id"), primary_key=True),
+    Column("grade", Words, nullable=False),
+)
+
+# Who looked at a grading; the newest counts, so that a mark can be taken back.
+looks = Table(
+    "looks",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("grading_id", ForeignKey("gradings.id"), nullable=False),
+    Column("at", Text, nullable=False),
+    Column("by", Words, nullable=False),
+    Column("seen", Boolean, nullable=False),
+    Index("looks_by_grading", "grading_id"),
+)
+
 _REFUSE = "a gradebook is only added to"
 event.listen(
     metadata,
@@ -248,6 +269,21 @@ class Database:
         with self._translated(), self._writer.begin() as connection:
             yield connection
 
+    @contextmanager
+    def changing(self) -> Iterator[Connection]:
+        """Write with nobody else who does: what is read here is so until this ends."""
+        with self.writing() as connection:
+            _take_turns(connection)
+            yield connection
+
+    def complete(self) -> None:
+        """Make the tables that came after this gradebook was made."""
+        with self.reading() as connection:
+            whole = _is_whole(connection)
+        if not whole:
+            with self.writing() as connection:
+                _create(connection)
+
     def close(self) -> None:
         """Let go of the connections."""
         self._engine.dispose()
@@ -263,10 +299,18 @@ class Database:
 
 def _create(connection: Connection) -> None:
     """Make the tables that are not there; two runs that begin at once make them one by one."""
-    if connection.dialect.name == "postgresql":  # SQLite's write lock is held already
-        connection.execute(select(func.pg_advisory_xact_lock(_CREATING)))
-    if not metadata.tables.keys() <= set(inspect(connection).get_table_names()):
+    _take_turns(connection)
+    if not _is_whole(connection):
         metadata.create_all(connection)
+
+
+def _take_turns(connection: Connection) -> None:
+    if connection.dialect.name == "postgresql":  # SQLite's write lock is held already
+        connection.execute(select(func.pg_advisory_xact_lock(_TURN)))
+
+
+def _is_whole(connection: Connection) -> bool:
+    return metadata.tables.keys() <= set(inspect(connection).get_table_names())
 
 
 def _engine(place: str | Path, *, create: bool) -> Engine:

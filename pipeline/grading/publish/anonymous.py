@@ -8,7 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from pipeline.grading.gradebook.book import Gradebook
-from pipeline.grading.gradebook.history import Event
+from pipeline.grading.gradebook.class_lines import Line
+from pipeline.grading.gradebook.history import FAILED, Event
 from pipeline.grading.similarity.shared import shared_message
 from pipeline.output import csv_text
 from pipeline.schemas.grade import Flag, Grade
@@ -51,17 +52,29 @@ def anonymise(grade: Grade, names: Mapping[str, str]) -> Grade:
     call their runs and files stays.
     """
     own = names[grade.submission]
-    name = re.escape(grade.submission)
-    path = re.compile(rf"^{name}(?=:)|(?<![^\s'\"(]){name}(?=[/\\])")
     hidden = {
         "submission": own,
         "authors": (),
-        "reason": path.sub(own, _ARCHIVE.sub("the archive: ", grade.reason)),
+        "reason": _hidden_reason(grade.reason, grade.submission, own),
         "flags": tuple(
             _hidden(flag, names) if flag.code == "shared_data" else flag for flag in grade.flags
         ),
     }
     return grade.model_copy(update=hidden)
+
+
+def anonymous_line(line: Line, names: Mapping[str, str]) -> Line:
+    """Return the line of an anonymised grade."""
+    own = names[line.name]
+    return replace(line, name=own, authors=(), reason=_hidden_reason(line.reason, line.name, own))
+
+
+def _hidden_reason(reason: str, submission: str, own: str) -> str:
+    if not reason:
+        return ""
+    name = re.escape(submission)
+    path = re.compile(rf"^{name}(?=:)|(?<![^\s'\"(]){name}(?=[/\\])")
+    return path.sub(own, _ARCHIVE.sub("the archive: ", reason))
 
 
 def _hidden(flag: Flag, names: Mapping[str, str]) -> Flag:
@@ -101,9 +114,16 @@ def history_of(book: Gradebook, team: str) -> tuple[str, list[Event]]:
     ConfigError : there is no such submission, or several.
     """
     name = meant(book, team)
-    submission, events = book.history(name)
-    return (submission, events) if name == team else (team, _renamed(events, name, team))
+    submission, events = book.history(name, named=not is_pseudonym(team))
+    return (submission, events) if name == team else (team, renamed_events(events, name, team))
 
 
-def _renamed(events: Sequence[Event], name: str, shown: str) -> list[Event]:
-    return [replace(event, text=event.text.replace(name, shown)) for event in events]
+def renamed_events(events: Sequence[Event], name: str, shown: str) -> list[Event]:
+    """Return a history in which a submission is called otherwise."""
+    return [replace(event, text=_renamed(event.text, name, shown)) for event in events]
+
+
+def _renamed(text: str, name: str, shown: str) -> str:
+    if text.startswith(FAILED):
+        text = FAILED + _hidden_reason(text.removeprefix(FAILED), name, shown)
+    return text.replace(name, shown)

@@ -37,7 +37,7 @@ from pipeline.schemas.grade import Criterion, Flag, Grade, Outcome
 
 _TITLE = re.compile(r"<title>(.*?)</title>", re.DOTALL)
 _NAME = re.compile(r"(omega|zeta|K)(_\w)?")
-_TONES: dict[Outcome, Tone] = {"pass": "good", "partial": "", "fail": "bad", "skip": "quiet"}
+TONES: dict[Outcome, Tone] = {"pass": "good", "partial": "", "fail": "bad", "skip": "quiet"}
 _MOST_ROWS = 60  # of one criterion
 _LONGEST_TEXT = 200  # letters of a value that is no number
 
@@ -92,7 +92,7 @@ def _summary(grade: Grade) -> list[Block]:
             Tiles((tile, by_hand) if overrides else (tile,)),
             paragraph(
                 Span(f"This submission could not be graded{how}. ", "strong"),
-                f"{_sentence(grade.reason)} {then}",
+                f"{sentence(grade.reason)} {then}",
             ),
             *_notes(grade),
         ]
@@ -143,7 +143,7 @@ def _lost(grade: Grade) -> list[Block]:
             spans(
                 Span(clean(c.title or c.id), "strong"),
                 f" ({points_text(c.points)} of {points_text(c.out_of)}): ",
-                rich(_sentence(c.message)),
+                rich(sentence(c.message)),
             )
             for c in lost
         ),
@@ -153,11 +153,11 @@ def _lost(grade: Grade) -> list[Block]:
 def _notes(grade: Grade) -> list[Block]:
     if not grade.notes:
         return []
-    notes = bullet_list(rich(_sentence(note)) for note in grade.notes)
+    notes = bullet_list(rich(sentence(note)) for note in grade.notes)
     return [paragraph("To know, without points lost for it:"), notes]
 
 
-def _sentence(text: str) -> str:
+def sentence(text: str) -> str:
     """Return a message as a sentence: a capital where it starts with a word, and a full stop."""
     text = clean(text).strip()
     word = text.split(" ", 1)[0]
@@ -174,7 +174,7 @@ def _remarks(flags: Sequence[Flag]) -> list[Block]:
     for flag in flags:
         blocks += [
             Heading(rich(_capital(WORDS.text(f"title_{flag.code}")))),
-            paragraph(rich(_sentence(told(flag)))),
+            paragraph(rich(sentence(told(flag)))),
             paragraph(Span("Where to look: ", "strong"), rich(WORDS.text(f"place_{flag.code}"))),
         ]
     return blocks
@@ -198,7 +198,7 @@ def _criteria(grade: Grade, rubric: Rubric, numbers: count) -> list[Block]:
             [
                 cell(clean(c.title or c.id)),
                 cell(f"{points_text(c.points)} of {points_text(c.out_of)}"),
-                cell(WORDS.text(f"outcome_{c.outcome}"), _TONES[c.outcome]),
+                cell(WORDS.text(f"outcome_{c.outcome}"), TONES[c.outcome]),
             ]
             for c in grade.criteria
         ],
@@ -207,8 +207,8 @@ def _criteria(grade: Grade, rubric: Rubric, numbers: count) -> list[Block]:
     blocks: list[Block] = [overview]
     for criterion in grade.criteria:
         title = _capital(clean(criterion.title or criterion.id))
-        said = paragraph(rich(_sentence(criterion.message)))
-        table = _numbers(criterion, check=checks.get(criterion.id, ""), numbers=numbers)
+        said = paragraph(rich(sentence(criterion.message)))
+        table = numbers_table(criterion, check=checks.get(criterion.id, ""), numbers=numbers)
         inside: list[Block] = [said, *([table] if table else [])]
         if criterion.outcome == "pass":
             blocks.append(Details(spans(f"{title}: passed"), tuple(inside)))
@@ -220,7 +220,7 @@ def _criteria(grade: Grade, rubric: Rubric, numbers: count) -> list[Block]:
     return blocks
 
 
-def _numbers(criterion: Criterion, *, check: str, numbers: count) -> Table | None:
+def numbers_table(criterion: Criterion, *, check: str, numbers: count) -> Table | None:
     """Return the numbers of a criterion side by side, None where it has none."""
     names = [
         name
@@ -285,8 +285,7 @@ def _off(found: Any, expected: Any) -> str:
 
 
 def _picture(number: int, file: str, svg: str) -> Picture:
-    title = _TITLE.search(svg)
-    alt = unescape(title[1]) if title else "A figure of your recordings."
+    alt = alternative(svg)
     return Picture(
         number=number,
         name=file.removesuffix(".svg"),
@@ -295,3 +294,9 @@ def _picture(number: int, file: str, svg: str) -> Picture:
         svg=svg,
         width=WIDTH,
     )
+
+
+def alternative(svg: str) -> str:
+    """Return what a figure says of itself in words."""
+    title = _TITLE.search(svg)
+    return unescape(title[1]) if title else "A figure of your recordings."

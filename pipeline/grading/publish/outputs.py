@@ -77,7 +77,7 @@ def write_outputs(
         lines.sort(key=lambda line: line.name)  # the order of the names would tell
     _remove_stale(folder, keep=set(now_of))
     write_file(out / "grades.csv", grades_csv(lines, rubric=rubric))
-    doubles = _doubles(book, authors, gradings=gradings, names=names)
+    doubles = doubles_of(book, authors, gradings=gradings, names=names)
     clusters = find_clusters(shared)
     if names is not None:
         clusters = renamed(clusters, names, other=STRANGER)
@@ -91,7 +91,7 @@ def write_outputs(
     return doubles
 
 
-def _doubles(
+def doubles_of(
     book: Gradebook,
     authors: Mapping[str, Sequence[str]],
     *,

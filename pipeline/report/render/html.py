@@ -4,6 +4,7 @@ import base64
 import math
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -51,6 +52,22 @@ def render_text(template: str, **values: object) -> str:
     return _environment().overlay(autoescape=False).get_template(template).render(**values)
 
 
+def render_blocks(blocks: Sequence[Block]) -> Markup:
+    """Return blocks for a page that has the report's style sheet, and allows no style in itself."""
+    plain = [
+        replace(block, align=block.align.replace("d", "r")) if isinstance(block, Table) else block
+        for block in blocks
+    ]
+    return Markup(_environment().get_template("blocks.html.j2").module.render_all(plain))  # type: ignore[attr-defined]
+
+
+def render_drawing(svg: str) -> str:
+    """Return a drawing as a file of its own, in the colours of the page by day and by night."""
+    css = (TEMPLATES / "report.css").read_text(encoding="utf-8")
+    colours = css[: css.index("* {")] + "text { fill: var(--f-ink); }"
+    return _coloured(svg).replace("</title>", f"</title><style>{colours}</style>", 1)
+
+
 def _scripts(document: Document) -> list[str]:
     """Return the scripts that a page has something for."""
     blocks = [block for section in document.sections for block in flat(section.blocks)]
@@ -87,10 +104,14 @@ def _svg(picture: Picture) -> Markup:
     """
     named = f'<svg aria-label="{escape(picture.alt)}" '
     svg = _TITLE.sub("", picture.svg, count=1).replace("<svg ", named, 1)
+    return Markup(_coloured(svg))
+
+
+def _coloured(svg: str) -> str:
     svg = svg.replace("#ffffff", "var(--paper)")
     for colour, role in _ROLES.items():
         svg = svg.replace(colour, f"var(--f-{role})")
-    return Markup(svg)
+    return svg
 
 
 def _tails(table: Table) -> list[str]:

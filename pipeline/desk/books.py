@@ -1,0 +1,139 @@
+"""The gradebooks that are open at this desk, and each class as it was read last."""
+
+import getpass
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import ConfigError
+from pipeline.grading.gradebook.class_lines import Line
+from pipeline.grading.gradebook.open_book import ClassNow, Listing, OpenBook, State
+from pipeline.grading.publish.anonymous import anonymous_line, pseudonyms
+from pipeline.grading.rubric import Rubric
+
+
+@dataclass(frozen=True, kw_only=True)
+class Team:
+    """A line of the class as a page shows it.
+
+    Attributes
+    ----------
+    submission : its name in the gradebook, which an anonymous page does not show.
+    seen : who looked at it, or "".
+    """
+
+    line: Line
+    submission: str
+    listing: Listing
+    seen: str
+
+
+@dataclass(frozen=True)
+class Class:
+    """A class as pages show it: under other names where it is anonymous, and in their order."""
+
+    now: ClassNow
+    state: State
+
+    @property
+    def rubric(self) -> Rubric:
+        """By which it is graded."""
+        return self.now.rubric
+
+    @cached_property
+    def names(self) -> Mapping[str, str] | None:
+        """What stands in for the name of each submission, None where names are shown."""
+        if not self.rubric.anonymous:
+            return None
+        return pseudonyms({one.line.name: one.first_key for one in self.now.listings})
+
+    @cached_property
+    def teams(self) -> Mapping[str, Team]:
+        """All of it, by the names that are shown."""
+        lines = [
+            one.line if self.names is None else anonymous_line(one.line, self.names)
+            for one in self.now.listings
+        ]
+        teams = [
+            Team(
+                line=line,
+                submission=one.line.name,
+                listing=one,
+                seen=self.now.seen.get(one.grading, ""),
+            )
+            for line, one in zip(lines, self.now.listings, strict=True)
+        ]
+        if self.names is not None:  # the order of the names would tell
+            teams.sort(key=lambda team: team.line.name)
+        return {team.line.name: team for team in teams}
+
+    @cached_property
+    def lost(self) -> Mapping[str, frozenset[str]]:
+        """Who has not all points of a criterion; one that was never judged has none."""
+        return {
+            asked.id: frozenset(
+                name
+                for name, team in self.teams.items()
+                if team.line.criteria.get(asked.id, ("", 0.0))[1] < asked.points
+            )
+            for asked in self.rubric.criteria
+        }
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError):  # KeyError until Python 3.12: a system that does not know them
+        return ""
+
+
+class Books:
+    """Every gradebook is opened once, and a class read when something in it is another."""
+
+    def __init__(self) -> None:
+        self.signed = _user()  # who changes points, where no proxy says it
+        self.asked: dict[Path | str, dict[str, str]] = {}  # what was graded again last, from where
+        self._books: dict[Path | str, OpenBook] = {}
+        self._classes: dict[Path | str, Class] = {}
+        self._drawn: dict[tuple[Path | str, str], tuple[State, Any]] = {}
+        self._lock, self._drawing = threading.Lock(), threading.Lock()
+
+    def book(self, place: Path | str) -> OpenBook:
+        """Return an open gradebook.
+
+        Raises
+        ------
+        ConfigError : there is none.
+        """
+        with self._lock:
+            if isinstance(place, Path) and not place.is_dir():
+                raise ConfigError(f"{place.name}: there is no such folder any more")
+            if place not in self._books:
+                self._books[place] = OpenBook(place)
+            return self._books[place]
+
+    def of(self, place: Path | str) -> Class:
+        """Return the class as it is now."""
+        book = self.book(place)
+        state, known = book.state(), self._classes.get(place)
+        if known is None or known.state != state:
+            known = Class(book.class_now(known.now if known else None), state)
+            self._classes[place] = known
+        return known
+
+    def drawn(self, place: Path | str, what: str, draw: Callable[[Class], Any]) -> Any:
+        """Return what is drawn of a class, again only where that is another; one at a time."""
+        shown = self.of(place)
+        with self._drawing:
+            known = self._drawn.get((place, what))
+            if known is None or known[0] != shown.state:
+                known = self._drawn[place, what] = shown.state, draw(shown)
+            return known[1]
+
+    def close(self) -> None:
+        """Let go of all."""
+        for book in self._books.values():
+            book.close()

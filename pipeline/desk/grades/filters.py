@@ -1,0 +1,116 @@
+"""Which teams of a class are shown, and in which order: all in the address of the page."""
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from urllib.parse import urlencode
+
+from pipeline.desk.books import Class, Team
+from pipeline.grading.words import WORDS
+from pipeline.schemas.grade import CODES
+
+_STATES: Mapping[str, tuple[str, Callable[[Team], bool]]] = {
+    "failed": ("could not be graded", lambda team: team.line.status == "failed"),
+    "late": ("late", lambda team: team.line.days_late > 0),
+    "hand": ("changed by hand", lambda team: bool(team.line.by_hand)),
+    "remark": ("with a remark", lambda team: bool(team.line.codes)),
+}
+_SEEN = {"no": "not yet looked at", "yes": "looked at"}
+_ORDERS = {"name": "name", "points": "points, least first", "late": "days late, most first"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Filter:
+    """What a page asks for; empty is everything.
+
+    Attributes
+    ----------
+    flag : a code that they have.
+    lost : a criterion of which they have not all points.
+    state : one of `_STATES`.
+    seen : "no", "yes".
+    q : letters of a name.
+    """
+
+    flag: str = ""
+    lost: str = ""
+    state: str = ""
+    seen: str = ""
+    q: str = ""
+    order: str = ""
+
+    @classmethod
+    def read(cls, asked: Mapping[str, str]) -> "Filter":
+        """Return what an address asks for."""
+        return cls(**{name: asked.get(name, "").strip() for name in cls.__dataclass_fields__})
+
+    @property
+    def query(self) -> str:
+        """The address's end that asks for it."""
+        return urlencode({name: value for name, value in asdict(self).items() if value})
+
+    def chosen(self, shown: Class) -> list[Team]:
+        """Return the teams that it is about, in its order."""
+        return [team for team in self.ordered(shown) if self._takes(team, shown)]
+
+    def beside(self, shown: Class, name: str) -> tuple[str, str]:
+        """Return who is before and after a team among the chosen, or ""; it may be none of them."""
+        before, after, passed = "", "", False
+        for team in self.ordered(shown):
+            if team.line.name == name:
+                passed = True
+            elif self._takes(team, shown):
+                if passed:
+                    after = team.line.name
+                    break
+                before = team.line.name
+        return before, after
+
+    def ordered(self, shown: Class) -> Sequence[Team]:
+        """Return the whole class in its order."""
+        teams = list(shown.teams.values())
+        if self.order == "points":
+            teams.sort(key=lambda team: team.line.points)
+        elif self.order == "late":
+            teams.sort(key=lambda team: -team.line.days_late)
+        return teams
+
+    def _takes(self, team: Team, shown: Class) -> bool:
+        line = team.line
+        if self.flag and self.flag not in line.codes:
+            return False
+        if self.seen in _SEEN and bool(team.seen) != (self.seen == "yes"):
+            return False
+        if self.state in _STATES and not _STATES[self.state][1](team):
+            return False
+        if self.lost and line.name not in shown.lost.get(self.lost, ()):
+            return False
+        wanted = self.q.casefold()
+        return not wanted or any(wanted in text.casefold() for text in (line.name, *line.authors))
+
+    def fields(self, shown: Class) -> list[dict]:
+        """Return the choices of a form, each with how many there are."""
+        teams = list(shown.teams.values())
+        flags = Counter(code for team in teams for code in team.line.codes)
+        common = sorted(flags, key=lambda code: (-flags[code], CODES.index(code)))
+        seen = sum(bool(team.seen) for team in teams)
+        numbers = {"no": len(teams) - seen, "yes": seen}
+        lost = {key: len(names) for key, names in shown.lost.items()}
+        titles = {c.id: c.title or c.id for c in shown.rubric.criteria}
+        by_state = {key: sum(map(test, teams)) for key, (_, test) in _STATES.items()}
+        remarks = {c: f"{WORDS.text(f'title_{c}')} ({flags[c]})" for c in common}
+        return [
+            _choice("flag", "Remark", remarks, self.flag),
+            _choice("lost", "Points lost in", {c: f"{titles[c]} ({n})" for c, n in lost.items()},
+                    self.lost),
+            _choice("state", "State", {k: f"{_STATES[k][0]} ({n})" for k, n in by_state.items()},
+                    self.state),
+            _choice("seen", "Looked at", {k: f"{_SEEN[k]} ({n})" for k, n in numbers.items()},
+                    self.seen),
+            _choice("order", "Order", _ORDERS, self.order or "name", whole=False),
+        ]  # fmt: skip
+
+
+def _choice(name: str, label: str, choices: Mapping, chosen: str, *, whole: bool = True) -> dict:
+    every = {"": "all"} if whole else {}
+    return {"name": name, "label": label, "choices": {**every, **choices}, "chosen": chosen}

@@ -1,0 +1,371 @@
+"""A gradebook that several people look at and change at the same time."""
+
+import json
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import Connection, Row, Select, func, insert, select
+
+from pipeline.errors import ConfigError
+from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.class_lines import Line
+from pipeline.grading.gradebook.history import Event, read_events
+from pipeline.grading.gradebook.override import Override
+from pipeline.grading.gradebook.override_table import Wish
+from pipeline.grading.gradebook.rows import (
+    OVERRIDE,
+    Entry,
+    as_it_counts,
+    class_list,
+    final_entry,
+    pages,
+    put_brief,
+    read_flag,
+    read_rubric,
+)
+from pipeline.grading.gradebook.schema import (
+    batches,
+    briefs,
+    entries,
+    gradings,
+    looks,
+    overrides,
+    submissions,
+)
+from pipeline.grading.rubric import Rubric
+from pipeline.schemas.grade import Flag, read_grade
+
+State = tuple[int, int, int]
+
+
+class Conflict(ConfigError):
+    """A change rests on what is no longer so; `now` is what somebody else gave, if anything."""
+
+    def __init__(self, text: str, *, now: Override | None) -> None:
+        super().__init__(text)
+        self.now = now
+
+
+@dataclass(frozen=True, kw_only=True)
+class Listing:
+    """A line of the class list as it counts.
+
+    Attributes
+    ----------
+    shared : the flag for recordings that stand in other submissions too.
+    first_key : of what was first handed in under this name.
+    made_of : what the line was worked out from.
+    """
+
+    line: Line
+    grading: int
+    shared: Flag | None
+    first_key: str
+    made_of: tuple[Any, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClassNow:
+    """The class list as it counts.
+
+    Attributes
+    ----------
+    seen : who marked a grading as looked at, by its number.
+    """
+
+    rubric: Rubric
+    listings: tuple[Listing, ...]
+    seen: Mapping[int, str]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TeamNow:
+    """All of one submission, at one moment.
+
+    Attributes
+    ----------
+    versions : by criterion what its points rest on; to be sent along with a change of them.
+    changed : criteria that were ever given points by hand.
+    seen : who marked it as looked at, or "".
+    """
+
+    rubric: Rubric
+    entry: Entry
+    versions: Mapping[str, str]
+    changed: frozenset[str]
+    seen: str
+    events: Sequence[Event]
+
+
+class OpenBook(Gradebook):
+    """A gradebook of which several processes show the newest, and change no more than they saw.
+
+    One of an earlier cartlab gets the tables that it has not; earlier ones go on reading it.
+    """
+
+    def __init__(self, place: str | Path, *, assignment: str | None = None) -> None:
+        super().__init__(place, assignment=assignment)
+        self._database.complete()
+        self._fill_briefs()
+
+    def state(self) -> State:
+        """Return numbers that change whenever something else is to be shown."""
+        with self._database.reading() as connection:
+            last = self._last(connection).id
+            newest = (connection.scalar(select(func.max(t.c.id))) or 0 for t in (overrides, looks))
+            return (last, *newest)  # type: ignore[return-value]
+
+    def class_now(self, before: ClassNow | None = None) -> ClassNow:
+        """Return the class; of what it was before, lines that rest on the same stay."""
+        with self._database.reading() as connection:
+            last = self._last(connection)
+            rubric = read_rubric(last)
+            of_class = select(entries.c.submission_id).where(entries.c.batch_id == last.id)
+            of_lists = select(entries.c.grading_id).where(entries.c.batch_id == last.id)
+            rows = connection.execute(_brief_list().where(entries.c.batch_id == last.id)).all()
+            given: dict[int, dict[int, Override]] = defaultdict(dict)
+            mine = _overrides().where(overrides.c.submission_id.in_(of_class))
+            for row in connection.execute(mine):
+                given[row.submission_id][row.id] = _read_override(row)
+            firsts = select(func.min(gradings.c.id)).where(gradings.c.submission_id.in_(of_class))
+            firsts = firsts.group_by(gradings.c.submission_id)
+            keys = select(gradings.c.submission_id, gradings.c.key)
+            first_key = {
+                row.submission_id: row.key
+                for row in connection.execute(keys.where(gradings.c.id.in_(firsts)))
+            }
+            looked = select(looks).where(looks.c.grading_id.in_(of_lists)).order_by(looks.c.id)
+            marks = {row.grading_id: row for row in connection.execute(looked)}
+        known = before.listings if before and before.rubric == rubric else ()
+        made = {listing.made_of: listing for listing in known}
+        listings = []
+        for row in rows:
+            own = given.get(row.submission_id, {})
+            made_of = (row.id, row.shared, *own)
+            listing = made.get(made_of)
+            if listing is None:
+                first = first_key[row.submission_id]
+                listing = _listing(
+                    row, [*own.values()], rubric=rubric, first_key=first, made_of=made_of
+                )
+            listings.append(listing)
+        return ClassNow(
+            rubric=rubric,
+            listings=tuple(listings),
+            seen={number: row.by for number, row in marks.items() if row.seen},
+        )
+
+    def team(self, name: str) -> TeamNow:
+        """Return all of a submission.
+
+        Raises
+        ------
+        ConfigError : there is none of this name.
+        """
+        with self._database.reading() as connection:
+            last, row = self._find(connection, name)
+            rubric = read_rubric(last)
+            newest = _newest_overrides(connection, row.submission_id)
+            marks = select(looks).where(looks.c.grading_id == row.id)
+            mark = connection.execute(marks.order_by(looks.c.id.desc()).limit(1)).one_or_none()
+            return TeamNow(
+                rubric=rubric,
+                entry=final_entry(connection, row, shared=read_flag(row.shared), rubric=rubric),
+                versions={c.id: _version(row, newest.get(c.id)) for c in rubric.criteria},
+                changed=frozenset(newest),
+                seen=mark.by if mark is not None and mark.seen else "",
+                events=read_events(connection, row.submission_id, named=not rubric.anonymous),
+            )
+
+    def change(
+        self,
+        team: str,
+        criterion: str,
+        points: float | None,
+        *,
+        why: str,
+        by: str,
+        seen: str,
+    ) -> Override:
+        """Give points by hand as `override` does, where nobody else did since.
+
+        Parameters
+        ----------
+        seen : what the change rests on, from `TeamNow.versions`.
+
+        Raises
+        ------
+        Conflict : somebody else changed them, or the submission was graded anew.
+        """
+        with self._database.changing() as connection:
+            last, row = self._find(connection, team)
+            _check_seen(connection, row, criterion, seen)
+            return self._give(
+                connection, row, criterion, points, why=why, by=by, rubric=read_rubric(last)
+            )
+
+    def undo(self, team: str, criterion: str, *, by: str, seen: str) -> Override:
+        """Give a criterion what it had before its last change; twice: what it had after.
+
+        Raises
+        ------
+        Conflict : see `change`.
+        """
+        with self._database.changing() as connection:
+            last, row = self._find(connection, team)
+            _check_seen(connection, row, criterion, seen)
+            own = overrides.c.submission_id == row.submission_id, overrides.c.criterion == criterion
+            rows = connection.execute(_overrides().where(*own)).all()
+            if not rows:
+                raise ConfigError(f"{criterion}: nothing was changed by hand")
+            before = rows[-2] if len(rows) > 1 and rows[-2].points is not None else None
+            return self._give(
+                connection,
+                row,
+                criterion,
+                before.points if before else None,
+                why=before.why if before else "taken back",
+                by=by,
+                rubric=read_rubric(last),
+            )
+
+    def change_all(self, wishes: Sequence[Wish], *, by: str) -> int:
+        """Give points by hand, all of them or, where one cannot be, none; say how many were new.
+
+        Raises
+        ------
+        ConfigError : with the line of the table.
+        """
+        new = 0
+        with self._database.changing() as connection:
+            last = self._last(connection)
+            rubric = read_rubric(last)
+            of_batch = class_list(detail=False).add_columns(submissions.c.id.label("submission_id"))
+            lines = connection.execute(of_batch.where(entries.c.batch_id == last.id)).all()
+            named = {row.name: row for row in lines}
+            for wish in wishes:
+                row = named.get(wish.submission)
+                if row is None:
+                    raise ConfigError(f"line {wish.line}: no such submission is in the class")
+                newest = _newest_overrides(connection, row.submission_id).get(wish.criterion)
+                if newest is not None and (newest.points, newest.why) == (wish.points, wish.why):
+                    continue
+                try:
+                    self._give(
+                        connection, row, wish.criterion, wish.points, why=wish.why, by=by,
+                        rubric=rubric,
+                    )  # fmt: skip
+                except ConfigError as error:
+                    raise ConfigError(f"line {wish.line}: {error}") from None
+                new += 1
+        return new
+
+    def mark(self, team: str, *, by: str, seen: bool) -> None:
+        """Say that somebody looked at a submission as it is graded now, or did not."""
+        with self._database.writing() as connection:
+            _, row = self._find(connection, team)
+            values = {"grading_id": row.id, "at": self._at(), "by": by, "seen": seen}
+            connection.execute(insert(looks).values(values))
+
+    def changes_since(self, number: int) -> list[tuple[str, Override]]:
+        """Return the submission and content of each override after one of a number."""
+        with self._database.reading() as connection:
+            mine = _overrides().where(
+                overrides.c.id > number,
+                submissions.c.assignment == self._last(connection).assignment,
+            )
+            rows = connection.execute(mine).all()
+        return [(row.name, _read_override(row)) for row in rows]
+
+    def reasons(self) -> dict[str, list[str]]:
+        """Return the reasons that overrides were given for, by criterion, the commonest first."""
+        with self._database.reading() as connection:
+            mine = (
+                select(overrides.c.criterion, overrides.c.why)
+                .join(submissions)
+                .where(
+                    submissions.c.assignment == self._last(connection).assignment,
+                    overrides.c.points.is_not(None),
+                )
+                .group_by(overrides.c.criterion, overrides.c.why)
+                .order_by(func.count().desc(), overrides.c.why)
+            )
+            found: dict[str, list[str]] = defaultdict(list)
+            for criterion, why in connection.execute(mine):
+                found[criterion].append(why)
+        return dict(found)
+
+    def _fill_briefs(self) -> None:
+        """Add what gradings of an earlier cartlab lack."""
+        lacking = select(gradings.c.id).outerjoin(briefs).where(briefs.c.grading_id.is_(None))
+        lacking = lacking.where(gradings.c.id.in_(self._listed_now()))
+        with self._database.reading() as connection:
+            numbers = sorted(connection.scalars(lacking))
+        for page in pages(numbers):
+            with self._database.changing() as connection:
+                whole = select(gradings.c.id, gradings.c.grade).where(gradings.c.id.in_(page))
+                still = whole.where(gradings.c.id.in_(lacking))
+                for row in connection.execute(still).all():
+                    put_brief(connection, row.id, read_grade(row.grade))
+
+    def _listed_now(self) -> Select:
+        mine = select(func.max(batches.c.id)).group_by(batches.c.assignment)
+        return select(entries.c.grading_id).where(entries.c.batch_id.in_(mine))
+
+
+def _listing(
+    row: Row, given: Sequence[Override], *, rubric: Rubric, first_key: str, made_of: tuple[Any, ...]
+) -> Listing:
+    shared = read_flag(row.shared)
+    if given:
+        entry = as_it_counts(row, given, shared=shared, rubric=rubric, first_key=first_key)
+        line = Line.of(entry.grade)
+    else:
+        line = Line.of_plain(json.loads(row.grade), shared=shared is not None)
+    return Listing(line=line, grading=row.id, shared=shared, first_key=first_key, made_of=made_of)
+
+
+def _brief_list() -> Select:
+    """Return the query for the lines of class lists, with briefs as their grades."""
+    columns = gradings.c.id, gradings.c.submission_id, gradings.c.key, gradings.c.authors
+    chosen = select(
+        *columns, gradings.c.owner, briefs.c.grade, submissions.c.name, entries.c.shared
+    )
+    joined = (
+        entries.join(gradings, entries.c.grading_id == gradings.c.id)
+        .join(briefs, briefs.c.grading_id == gradings.c.id)
+        .join(submissions, entries.c.submission_id == submissions.c.id)
+    )
+    return chosen.select_from(joined).order_by(entries.c.position)
+
+
+def _overrides() -> Select:
+    """Return the query for all that was given by hand, in order."""
+    columns = overrides.c.id, overrides.c.submission_id, submissions.c.name
+    return select(*columns, *OVERRIDE).join(submissions).order_by(overrides.c.id)
+
+
+def _read_override(row: Row) -> Override:
+    """Return what a row of that says."""
+    return Override(**{column.name: row._mapping[column.name] for column in OVERRIDE})
+
+
+def _newest_overrides(connection: Connection, submission: int) -> dict[str, Row]:
+    rows = connection.execute(_overrides().where(overrides.c.submission_id == submission))
+    return {row.criterion: row for row in rows}
+
+
+def _version(row: Row, newest: Row | None) -> str:
+    return f"{row.id}.{newest.id if newest is not None else 0}"
+
+
+def _check_seen(connection: Connection, row: Row, criterion: str, seen: str) -> None:
+    newest = _newest_overrides(connection, row.submission_id).get(criterion)
+    if seen != _version(row, newest):
+        raise Conflict(
+            f"{criterion}: was changed, or graded anew, after this page was shown",
+            now=_read_override(newest) if newest is not None else None,
+        )

@@ -1,0 +1,476 @@
+"""The TA's room over plain forms: the class, a team, what several change at once, in and out."""
+
+import io
+import re
+import sqlite3
+import zipfile
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from html import unescape
+from itertools import chain
+from threading import Barrier
+from urllib.parse import quote, urlencode, urlsplit
+
+import pytest
+
+from pipeline.desk.app import DeskServer
+from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.open_book import OpenBook
+from pipeline.grading.gradebook.schema import FILE
+from pipeline.grading.publish.export import export
+from tests.helpers.desks import BOUNDARY, Answer, Visitor, a_submission
+from tests.helpers.grades import fill_book, make_grade, make_outcome, two_cart_rubric, write_class
+from tests.helpers.waiting import until
+
+ROOM = "/grades/0/"
+
+
+@pytest.fixture
+def grades(tmp_path):
+    """The output of a grading."""
+    return write_class(tmp_path / "grades")
+
+
+@pytest.fixture
+def ta(grades):
+    """Who opened it at this computer."""
+    with DeskServer(folders=[]) as server:
+        visitor = Visitor.of(server.url)
+        assert visitor.post("/open", folder=str(grades)).headers["location"] == ROOM
+        visitor.post(ROOM + "sign", by="Ada", of="team-01")
+        yield visitor
+
+
+def names(answer: Answer) -> list[str]:
+    """Return the submissions of a page of the class."""
+    assert answer.status == 200, answer.text
+    return [unescape(n) for n in re.findall(r'<th scope="row"><a [^>]*>(.*?)</a>', answer.text)]
+
+
+def at(team: str, **more: str) -> str:
+    """Return the address of a team."""
+    return f"{ROOM}team?{urlencode({'of': team, **more})}"
+
+
+def version(answer: Answer, criterion: str) -> str:
+    """Return what a change of a criterion on this page rests on."""
+    found = re.search(rf'value="{criterion}"><input type="hidden" name="seen" value="(.*?)"',
+                      answer.text)  # fmt: skip
+    assert found
+    return found[1]
+
+
+def change(who: Visitor, team: str, criterion: str = "laws", seen: str = "", **fields: str):
+    """Send the form of a criterion."""
+    seen = seen or version(who.get(at(team)), criterion)
+    return who.post(at(team), do="change", criterion=criterion, seen=seen, **fields)
+
+
+def upload(who: Visitor, path: str, name: str, content: str, **fields: str) -> Answer:
+    """Send a form with a file in it."""
+    parts = [f'name="{key}"\r\n\r\n{value}' for key, value in fields.items()]
+    parts.append(f'name="{name}"; filename="t.csv"\r\n\r\n{content}')
+    lines = [f"--{BOUNDARY}\r\nContent-Disposition: form-data; {part}\r\n" for part in parts]
+    body = "".join([*lines, f"--{BOUNDARY}--\r\n"]).encode()
+    return who.send(path, body, kind=f"multipart/form-data; boundary={BOUNDARY}")
+
+
+# ---------------------------------------------------------------------------- the class
+
+
+def test_the_class_is_filtered_by_what_a_team_has(ta, grades):
+    """Each filter against the gradebook itself; together they narrow."""
+    with Gradebook(grades) as book:
+        entries = {entry.submission: entry for entry in book.entries()}
+    ta.post(at("team-03"), do="accept")
+
+    def those(test) -> set[str]:
+        return {name for name, entry in entries.items() if test(entry)}
+
+    codes = {name: [f.code for f in entry.grade.flags] for name, entry in entries.items()}
+    lost = those(lambda e: any(c.id == "laws" and c.points < c.out_of for c in e.grade.criteria))
+    for query, expected in {
+        "": set(entries),
+        "flag=hz_for_rad_s": {name for name, own in codes.items() if "hz_for_rad_s" in own},
+        "flag=shared_data": {"team-02", "team-03"},
+        "state=failed": {"broken"},
+        "state=late": those(lambda e: e.grade.days_late > 0),
+        "state=hand": {"team-02"},
+        "seen=yes": {"team-03"},
+        "seen=no": set(entries) - {"team-03"},
+        "lost=laws": lost | {"broken"},
+        "lost=laws&flag=shared_data&seen=no": {"team-02"} & lost,
+        "q=S4": {"team-05"},
+        "q=ünal": {"Ünal 学生 & co"},
+        "flag=nothing": set(),
+    }.items():
+        assert set(names(ta.get(f"{ROOM}?{quote(query, safe='=&')}"))) == expected, query
+    by_points = names(ta.get(ROOM + "?order=points"))
+    assert [entries[n].grade.points for n in by_points] == sorted(
+        entry.grade.points for entry in entries.values()
+    )
+
+
+def test_a_large_class_comes_a_page_at_a_time(tmp_path):
+    """Every team stands on one page."""
+    with Gradebook(tmp_path, assignment="lab", create=True) as book:
+        outcomes = [make_outcome(make_grade(f"t{n:03d}")) for n in range(120)]
+        for outcome in outcomes:
+            book.put(outcome)
+        book.finish(_batch(outcomes), rubric=two_cart_rubric())
+    with DeskServer(folders=[]) as server:
+        who = Visitor.of(server.url)
+        who.post("/open", folder=str(tmp_path))
+        shown = [names(who.get(f"{ROOM}?page={page}")) for page in ("1", "2", "3")]
+        assert [len(page) for page in shown] == [50, 50, 20]
+        assert list(chain(*shown)) == [outcome.submission for outcome in outcomes]
+        for odd in ("0", "-1", "9" * 40, "x", "4"):
+            assert names(who.get(f"{ROOM}?page={odd}"))
+
+
+def _batch(outcomes):
+    from pipeline.grading.gradings import Batch
+
+    return Batch(keys=tuple(outcome.key for outcome in outcomes), shared={})
+
+
+def test_what_is_drawn_is_of_the_class_as_it_is_now(ta, grades):
+    """The histogram, the class page, a team's feedback: of the gradebook, not of the folder."""
+    before = ta.get(ROOM + "class.html").text
+    picture = ta.get(ROOM + "distribution.svg")
+    assert picture.headers["content-type"].startswith("image/svg+xml")
+    assert "sandbox" in picture.headers["content-security-policy"]
+    assert change(ta, "team-09", points="0", why="not theirs").status == 303
+    assert ta.get(ROOM + "class.html").text != before
+    address = quote("feedback/team-09/feedback.html")
+    assert "not theirs" in ta.get(ROOM + address).text
+    assert "not theirs" not in (grades / "feedback/team-09/feedback.html").read_text("utf-8")
+    ta.post(ROOM + "publish")
+    until(lambda: "Writing: done" in ta.get(ROOM).text)
+    assert "not theirs" in (grades / "feedback/team-09/feedback.html").read_text("utf-8")
+
+
+# ------------------------------------------------------------------------------- a team
+
+
+def test_a_team_has_its_numbers_beside_ours(ta):
+    """Reported and recomputed, the remark's evidence, the figure; hostile text is text."""
+    page = ta.get(at("team-01")).text
+    assert "3.12" in page
+    assert "19.6" in page
+    figure = re.search(r'<img class="drawing" src="(.*?)"', page)
+    assert figure
+    drawn = ta.get(unescape(figure[1]))
+    assert drawn.status == 200
+    assert drawn.text.startswith("<svg")
+    assert "<script" not in ta.get(at("team-05")).text.split("<main")[1]
+    assert "&lt;script&gt;" in ta.get(at("team-05")).text
+    assert "&lt;b&gt;cart" in ta.get(at("broken")).text
+    assert ta.get(at("team-99")).status == 404
+    assert ta.get(f"{ROOM}figure?of=team-01&figure=../x").status == 404
+
+
+def test_points_are_changed_as_the_command_does(ta, grades):
+    """With a reason and a name, to be undone; the history tells all of it."""
+    assert change(ta, "team-01", points="0,5", why="a clear plot").status == 303
+    with Gradebook(grades) as book:
+        given = book.entry("team-01").overrides["laws"]
+        assert (given.points, given.why, given.by) == (0.5, "a clear plot", "Ada")
+    page = ta.get(at("team-01"))
+    assert "a clear plot" in page.text
+    for expected in ({}, {"laws": 0.5}):  # undone, and that undone
+        seen = version(ta.get(at("team-01")), "laws")
+        ta.post(at("team-01"), do="undo", criterion="laws", seen=seen)
+        with Gradebook(grades) as book:
+            overrides = book.entry("team-01").overrides
+            assert {key: one.points for key, one in overrides.items()} == expected
+            assert len(book.history("team-01")[1]) >= 4
+    assert change(ta, "team-01", points="auto", why="as graded").status == 303
+    with Gradebook(grades) as book:
+        assert not book.entry("team-01").overrides
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [{"points": "1", "why": " "}, {"points": "99", "why": "x"}, {"points": "-1", "why": "x"},
+     {"points": "nan", "why": "x"}, {"points": "many", "why": "x"}],
+)  # fmt: skip
+def test_what_cannot_be_is_said_beside_the_field(ta, grades, fields):
+    """Nothing is written, and what was typed stays."""
+    answer = change(ta, "team-01", **fields)
+    assert answer.status == 422
+    assert f'value="{fields["points"]}"' in answer.text
+    assert 'id="wrong-laws"' in answer.text
+    with Gradebook(grades) as book:
+        assert not book.entry("team-01").overrides
+
+
+def test_forged_forms_change_nothing(ta, grades):
+    """Another button, another criterion, no version."""
+    seen = version(ta.get(at("team-01")), "laws")
+    for form in ({"do": "drop"}, {"do": "change", "criterion": "x", "seen": seen, "points": "1"},
+                 {"do": "change", "criterion": "laws", "points": "1", "why": "x"},
+                 {"do": "undo", "criterion": "laws", "seen": seen}):  # fmt: skip
+        assert ta.post(at("team-01"), **form).status in (400, 409, 422), form
+    with Gradebook(grades) as book:
+        assert not book.entry("team-01").overrides
+
+
+def test_accept_goes_on_to_the_next_of_the_filter(ta):
+    """Through all that are not looked at yet, then back to the class; a mark can be taken back."""
+    query = {"flag": "hz_for_rad_s", "seen": "no"}
+    expected = names(ta.get(f"{ROOM}?{urlencode(query)}"))
+    address, visited = at(expected[0], **query), []
+    while "team?" in address:
+        page = ta.get(address)
+        assert page.status == 200
+        visited.append(re.findall(r"<h1>(.*?)</h1>", page.text)[0])
+        address = ta.post(address, do="accept").headers["location"]
+    assert [unescape(name) for name in visited] == expected
+    assert address == f"{ROOM}?{urlencode(query)}"
+    assert names(ta.get(address)) == []
+    ta.post(at(expected[0], **query), do="unsee")
+    assert names(ta.get(address)) == expected[:1]
+
+
+def test_reasons_are_there_to_be_used_again(ta):
+    """Of the same criterion, the commonest first."""
+    for team, why in (("team-05", "b"), ("team-06", "a"), ("team-07", "b")):
+        change(ta, team, points="1", why=why)
+    page = ta.get(at("team-08")).text
+    offered = re.search(r'<datalist id="reasons-laws">(.*?)</datalist>', page)
+    assert offered
+    assert re.findall('value="(.*?)"', offered[1])[:2] == ["b", "a"]
+
+
+# ------------------------------------------------------------------------- several at once
+
+
+@pytest.fixture(scope="module")
+def database():
+    """A PostgreSQL server with a class in it."""
+    from tests.helpers import postgres
+
+    if why := postgres.missing():
+        pytest.skip(why)
+    with postgres.running() as url:
+        fill_book(url)
+        yield url
+
+
+USERS = """
+[proxy]
+address = "127.0.0.1"
+header = "X-Remote-User"
+site = "https://lab.example.edu"
+"""
+
+
+@pytest.fixture
+def two_desks(database, tmp_path):
+    """Two desks of a lab on one database, and who asks the first and the second."""
+    users = "".join(
+        f'[[users]]\nname = "{name}"\nrole = "{role}"\ngradebooks = ["{database}"]\n'
+        for name, role in (("Ada", "ta"), ("Bob", "ta"), ("Eve", "student"))
+    )
+    (tmp_path / "users.toml").write_text(USERS + users, encoding="utf-8")
+    with (
+        DeskServer(folders=[], users=tmp_path / "users.toml") as one,
+        DeskServer(folders=[], users=tmp_path / "users.toml") as other,
+    ):
+
+        def who(name: str, server: DeskServer) -> Visitor:
+            port = urlsplit(server.url).port or 0
+            return Visitor(port=port, host="lab.example.edu", headers={"X-Remote-User": name})
+
+        yield who("Ada", one), who("Bob", other), who("Eve", one)
+
+
+def test_two_change_the_same_and_one_is_told(two_desks, database):
+    """The second sees both versions, and the news; nothing of theirs was written."""
+    ada, bob, eve = two_desks
+    seen = version(bob.get(at("team-04")), "laws")
+    since = re.search(r"since=(\d+)", bob.get(at("team-04")).text)
+    assert since
+    assert change(ada, "team-04", points="1", why="ada's reason", by="Mallory").status == 303
+    answer = change(bob, "team-04", seen=seen, points="2", why="bob's reason")
+    assert answer.status == 409
+    for text in ("ada&#39;s reason", "bob&#39;s reason", "Ada", "Bob"):
+        assert text in answer.text
+    news = bob.get(f"{ROOM}news?since={since[1]}&told={since[1]}&of=team-04")
+    assert "ada&#39;s reason" in news.text
+    assert "hx-reswap" not in news.headers
+    told = re.search(r"told=(\d+)", news.text)
+    assert told
+    again = bob.get(f"{ROOM}news?since={since[1]}&told={told[1]}&of=team-04")
+    assert again.headers["hx-reswap"] == "none"
+    with Gradebook(database) as book:
+        given = book.entry("team-04").overrides["laws"]
+        assert (given.points, given.by) == (1.0, "Ada")  # whom the proxy named
+    assert eve.get(ROOM).status == 404  # a student has no class, whatever a list says
+    assert eve.post(at("team-04"), do="accept").status == 404
+    assert database not in ada.get(ROOM).text
+
+
+def test_of_changes_at_one_moment_one_counts(two_desks, database):
+    """Twenty rounds of two that rest on the same page: one is taken, one refused."""
+    ada, bob, _ = two_desks
+    for number in range(20):
+        seen = version(ada.get(at("team-06")), "pieces")
+        ready = Barrier(2)
+
+        def give(who, why, *, seen=seen, ready=ready):
+            ready.wait()
+            return change(who, "team-06", "pieces", seen=seen, points="0.5", why=why).status
+
+        with ThreadPoolExecutor(2) as pool:
+            one = pool.submit(give, ada, f"a{number}")
+            other = pool.submit(give, bob, f"b{number}")
+            assert sorted([one.result(), other.result()]) == [303, 409]
+    with OpenBook(database) as book:
+        assert len([o for _, o in book.changes_since(0) if o.criterion == "pieces"]) == 20
+
+
+# ------------------------------------------------------------------------------ in and out
+
+
+def test_a_table_is_taken_over_whole_or_not_at_all(ta, grades):
+    """A wrong line is named and nothing written; the same table again adds nothing."""
+    head = "submission,criterion,points,why\n"
+    good = 'team-01,laws,1,"clear, at last"\nÜnal 学生 & co,pieces,0.5,late\n'
+    for wrong in ("team-99,laws,1,x\n", "team-01,nothing,1,x\n", "team-01,laws,77,x\n",
+                  "team-01,laws,?,x\n", "team-01,laws,1,\n"):  # fmt: skip
+        answer = upload(ta, ROOM + "import", "table", head + good + wrong)
+        assert answer.status == 422
+        assert "line 4" in answer.text
+        with Gradebook(grades) as book:
+            assert not book.entry("team-01").overrides
+    assert upload(ta, ROOM + "import", "table", "a,b\n1,2\n").status == 422
+    assert upload(ta, ROOM + "import", "table", head + good).status == 303
+    assert "2 changes taken over" in ta.get(ROOM).text
+    upload(ta, ROOM + "import", "table", head + good)
+    assert "0 changes taken over, 2 were so before" in ta.get(ROOM).text
+    with Gradebook(grades) as book:
+        assert book.entry("team-01").overrides["laws"].why == "clear, at last"
+        assert book.entry("Ünal 学生 & co").overrides["pieces"].by == "Ada"
+
+
+@pytest.mark.parametrize("platform", ["canvas", "moodle", "gradescope"])
+def test_the_export_is_that_of_the_command(ta, grades, tmp_path, platform):
+    """Byte by byte; several files and remarks come as a zip."""
+    with Gradebook(grades) as book:
+        done = export(book, platform, tmp_path / "out", title="Lab 3")
+    answer = ta.post(ROOM + "export", lms=platform, title="Lab 3")
+    assert answer.status == 200
+    assert "attachment" in answer.headers["content-disposition"]
+    expected = {f.relative_to(tmp_path / "out").as_posix(): f.read_bytes() for f in done.files}
+    if done.remarks:
+        expected["remarks.txt"] = ("\n".join(done.remarks) + "\n").encode()
+    if len(expected) == 1:
+        assert answer.body == expected[f"{platform}.csv"]
+    else:
+        with zipfile.ZipFile(io.BytesIO(answer.body)) as archive:
+            assert {name: archive.read(name) for name in archive.namelist()} == expected
+
+
+def test_a_roster_that_is_none_is_refused(ta):
+    """As by the command."""
+    assert upload(ta, ROOM + "export", "roster", "a,b\n1,2\n", lms="canvas").status == 422
+    assert ta.post(ROOM + "export", lms="blackboard").status == 400
+
+
+def test_a_class_is_graded_again_from_the_desk(tmp_path):
+    """What is as it was is not; points by hand stay; who is no owner names no folder."""
+    team = a_submission(tmp_path / "class" / "team-05", "one-cart")
+    grades = tmp_path / "grades"
+    grades.mkdir()
+    with Gradebook(grades, assignment="throne-1dof", create=True) as book:
+        outcome = make_outcome(make_grade("team-04"), fingerprints=b"")
+        book.put(outcome)
+        book.finish(_batch([outcome]), rubric=two_cart_rubric())
+    with DeskServer(folders=[]) as server:
+        who = Visitor.of(server.url)
+        who.post("/open", folder=str(grades))
+        assert who.post(ROOM + "regrade", paths="", rubric="x").status == 422
+        who.post(ROOM + "regrade", paths=str(team), rubric="throne-1dof", lateness="")
+        until(lambda: "data-events" not in who.get(ROOM).text)
+        page = who.get(ROOM)
+        assert "Grading: done" in page.text, re.findall("class=.wrong.*", page.text)
+        assert names(page) == ["team-04", "team-05"]
+        assert (grades / "feedback/team-05/feedback.html").is_file()
+
+
+# ------------------------------------------------------------------------------- anonymous
+
+
+def test_an_anonymous_class_names_nobody_anywhere(tmp_path):
+    """Every page that a link leads to, every address, every refusal; a table goes by its names."""
+    grades = write_class(tmp_path / "g", anonymous=True)
+    with Gradebook(grades) as book:
+        entries = list(book.entries())
+    real = {entry.submission for entry in entries} - {"broken"}
+    real |= {author for entry in entries for author in entry.grade.authors if len(author) > 3}
+    with DeskServer(folders=[]) as server:
+        who = Visitor.of(server.url)
+        who.post("/open", folder=str(grades))
+        shown = names(who.get(ROOM))
+        assert len(shown) == len(entries)
+        assert shown == sorted(shown)
+        change(who, shown[0], points="1", why="well")
+        tried = ("news?since=0&told=0", "feedback/team-02/feedback.html",
+                 "feedback/team-02/grade.json", "anonymous-key.csv")  # fmt: skip
+        seen, waiting = set(), [ROOM, at("team-02"), at("nobody"), *(ROOM + one for one in tried)]
+        while waiting:
+            address = waiting.pop()
+            seen.add(address)
+            body = who.get(address).text
+            for name in real:
+                assert name not in unescape(body), (address, name)
+            for link in re.findall(r'(?:href|src|action|hx-get)="([^"]+)"', body):
+                link = unescape(link).split("#")[0]
+                if "feedback/" in link and not link.startswith("/"):
+                    link = ROOM + link
+                if link.startswith(ROOM) and link not in seen and "?page" not in link:
+                    waiting.append(link)
+        assert len(seen) > 2 * len(shown)
+        head = "submission,criterion,points,why\n"
+        for wrong in ("team-02,laws,1,x\n", "team-0,laws,1,x\n"):
+            answer = upload(who, ROOM + "import", "table", head + wrong)
+            assert answer.status == 422
+            assert "team-03" not in answer.text
+        table = f"{head}{shown[1]},laws,1,x\n"
+        assert upload(who, ROOM + "import", "table", table).status == 303
+
+
+# ---------------------------------------------------------------------------- older books
+
+
+def test_an_older_gradebook_gets_what_it_lacks(grades):
+    """Once; what was in it is as it was, and an open one of before goes on."""
+    with Gradebook(grades) as book:
+        before = [(e.submission, e.grade) for e in book.entries()]
+        with closing(sqlite3.connect(grades / FILE)) as raw:
+            raw.executescript("DROP TABLE briefs; DROP TABLE looks")
+        with OpenBook(grades) as opened, OpenBook(grades) as again:
+            listings = opened.class_now().listings
+            assert [(n.line.name, n.line.points) for n in listings] == [
+                (name, grade.points) for name, grade in before
+            ]
+            assert again.class_now() == opened.class_now()
+            opened.mark("team-01", by="Ada", seen=True)
+            assert set(again.class_now().seen.values()) == {"Ada"}
+        assert [(e.submission, e.grade) for e in book.entries()] == before
+
+
+def test_the_lines_of_a_class_are_those_of_its_grades(grades):
+    """Read from briefs without validation, and again from what is known: the same."""
+    from pipeline.grading.gradebook.class_lines import Line
+
+    with OpenBook(grades) as book:
+        first = book.class_now()
+        assert [one.line for one in first.listings] == [Line.of(e.grade) for e in book.entries()]
+        book.override("team-03", "laws", 0.25, why="x", by="y")
+        second = book.class_now(first)
+        assert [one.line for one in second.listings] == [Line.of(e.grade) for e in book.entries()]
+        same = [a is b for a, b in zip(first.listings, second.listings, strict=True)]
+        assert same.count(False) == 1
