@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.desk.class_tasks import publish, regrade
 from pipeline.desk.exercises import effect_svg, exercise, simulate, solution
-from pipeline.desk.grades.tasks import publish, regrade
 from pipeline.errors import ConfigError, SubmissionError
 from pipeline.ingest.columns import assign_columns
 from pipeline.ingest.fill import Found, data_files, fill_submission, look_at

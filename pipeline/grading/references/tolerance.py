@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
+from functools import lru_cache
 from typing import TypeVar
 
 from pipeline.grading.references.reference import Reference
@@ -41,6 +42,7 @@ def is_vague(typed: Decimal) -> bool:
     return half_digit(typed) > _MOST_ROUNDING * abs(Fraction(typed))
 
 
+@lru_cache(1024)  # a rubric has few numbers, and a class asks for each again and again
 def exact(value: float) -> Fraction:
     """Return a number of a rubric as its author typed it: 0.1 is a tenth."""
     return Fraction(repr(value))
