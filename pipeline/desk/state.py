@@ -154,6 +154,7 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["called"] = place_name
     # Whatever is cached of an earlier version of a style sheet or script is not asked for again.
     environment.globals["fresh"] = secrets.token_hex(4)
     return environment
