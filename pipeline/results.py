@@ -433,6 +433,7 @@ class HardwareCheck:
         its sign included; None where it was not looked for.
     t, measured, model : (n,).
     effort : (n,) input that the modelled loop asks for; None with the measured input.
+    set_point : (n,) where the loop is told to bring this cart; None where it is another that is.
     contradicted : what was logged or stated of the run cannot be so; the note says how.
     """
 
@@ -453,6 +454,7 @@ class HardwareCheck:
     note: str = ""
     contradicted: bool = False
     effort: Array | None = None
+    set_point: Array | None = None
 
 
 # -------------------------------------------------------------------- together

@@ -37,6 +37,7 @@ from pipeline.plant.effects.base import Effect, Term
 from pipeline.results import Record
 
 _NOISE_ROUNDS = 2  # of measuring the noise anew
+_PINNED, _LOOSE = 1e-4, 0.5  # noises an encoder's zero may be off: not at all; by its rounding
 
 
 def explain_gap(
@@ -116,7 +117,14 @@ def explain_gap(
             f"the search ended after the {budget:g} s allowed: this is the best answer so far, and "
             "another run may come further (--budget SECONDS allows more)"
         )
-    effects = list_effects(path, final, found, position_unit=position_unit, input_unit=input_unit)
+    driven = any(np.any(run.command) for run in bench.training)
+    effects = list_effects(
+        path,
+        final,
+        found,
+        position_unit=position_unit,
+        input_unit=input_unit if driven else f"{position_unit}/s^2",  # the first mass is one
+    )
     traces = make_traces(path[0], chosen, bench)
     model = chosen.fit.structure.model(chosen.fit.theta)
     enough = verdict in ("none", "named")
@@ -217,7 +225,7 @@ def _with_offset(
             training=tuple(_pin(run, width=width) for run in bench.training),
             held_out=tuple(_pin(run, width=width) for run in bench.held_out),
         )
-        for width in (1e-4, 0.5)
+        for width in (_PINNED, _LOOSE)
     )
     candidate = Candidate(
         effect=effect, place=offset.cart, signs=(1.0,), scales=(abs(offset.force),)

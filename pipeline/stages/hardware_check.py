@@ -76,7 +76,7 @@ def check_hardware(
         raise DataError(
             f"{record.id}: the hardware check needs a loop or an input to simulate: {found}"
         )
-    checks = []
+    checks: list[HardwareCheck] = []
     if closed is not None:
         closed = replace(closed, scale=opened.scale if opened else None)
         if opened and (note := _not_as_stated(run, closed, opened)):
@@ -87,7 +87,13 @@ def check_hardware(
     if opened is not None:
         note = "; ".join(filter(None, (trouble, opened.note)))
         checks += _compare(run, replace(opened, note=note), loop="open")
-    return tuple(checks)
+    steered = _steered_cart(controller, controlled_cart)
+    return tuple(
+        replace(check, set_point=record.reference)
+        if check.cart == steered and not check.contradicted
+        else check
+        for check in checks
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -143,19 +149,25 @@ def _plant_law(
     A PID acts on the error in the file's own counts, which `position_scale` made positions of.
     """
     if isinstance(controller, submission.Pid):
-        steered = controller.cart
-        if "cart" not in controller.model_fields_set and cart is not None:
-            steered = cart
         return Pid(
             kp=controller.kp,
             ki=controller.ki,
             kd=controller.kd,
             scale=controller.scale / position_scale,
-            cart=steered,
+            cart=_steered_cart(controller, cart) or 1,
         )
     if controller is None or not controller.gains:
         return None
     return StateFeedback(gains=np.array(controller.gains), prefilter=controller.prefilter)
+
+
+def _steered_cart(controller: submission.Controller | None, stated: int | None) -> int | None:
+    """Return the cart that the loop brings to the set point; None where nothing says which."""
+    if isinstance(controller, submission.Pid) and (
+        stated is None or "cart" in controller.model_fields_set
+    ):
+        return controller.cart
+    return stated
 
 
 def _close(

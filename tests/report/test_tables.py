@@ -33,6 +33,18 @@ def test_what_was_assumed_says_nothing_of_a_number():
     assert [plain(cell.text) for cell in table.rows[0]][-2:] == ["–", ""]
 
 
+def test_nothing_found_and_no_known_slip_say_nothing():
+    """A number without an estimate stands beside a dash; a wrong mass gets no hint of another."""
+    row = make_analysis(1).rows[0]
+    mine = {row.name: Decimal("3.0")}
+    table = reported_table([replace(row, final=None)], {"final": mine}, number=1)
+    assert [plain(cell.text) for cell in table.rows[0]][3:] == ["–", row.unit, "–", ""]
+    mass = replace(row, name="mass", unit="V s^2/cm")
+    table = reported_table([mass], {"final": {"mass": Decimal("99999")}}, number=1)
+    assert table.rows[0][-2].tone == "bad"
+    assert plain(table.rows[0][-1].text) == ""
+
+
 def test_agree_stands_beside_its_limit():
     """A gain within 15 %, a damping ratio within 50 %."""
     rows = [row for row in make_analysis(1).rows if row.consistent is not None]

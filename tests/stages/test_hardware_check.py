@@ -311,6 +311,19 @@ def test_a_pid_is_closed_around_the_controlled_cart_unless_it_names_one():
         assert of(checks, "closed")[2].nrmse < 2 * noise_floor(y[1])
 
 
+def test_only_the_cart_that_is_steered_has_the_set_point():
+    """The others have nowhere to be; where nothing says which it is, none has."""
+    y, u = bench(TWO, Pid(kp=0.008, kd=0.0008, cart=2))
+    run = record(y, u=u, reference=STEPS)
+    unnamed = submission.Pid(type="pid", kp=0.008, kd=0.0008)
+    for stated in (2, None):
+        checks = check_hardware(run, TWO, controller=unnamed, controlled_cart=stated)
+        told = {check.cart for check in checks if check.set_point is not None}
+        assert told == {stated or unnamed.cart}
+    checks = check_hardware(run, TWO, controller=None)
+    assert all(check.set_point is None for check in checks)
+
+
 def test_a_pid_acts_on_the_files_own_counts():
     """Gains stated per count close the same loop as gains per cm, whatever unit ingest made."""
     law = Pid(kp=0.008, kd=0.0008, cart=2)

@@ -205,15 +205,14 @@ def hardware_figure(
 ) -> Figure:
     """Return one run: each cart with its set point, below it the residuals, last the input.
 
-    An entry holds the one or two models of a cart; without the record there is neither set point
-    nor input.
+    An entry holds the one or two models of a cart; without the record there is no input.
     """
     driven = record if record is not None and record.u is not None else None
     figure, axes = panels(*[0.9, 0.62] * len(checks), *([0.6] if driven else []))
     for above, below, group in zip(axes[::2], axes[1::2], checks, strict=False):
-        if record is not None and record.reference is not None:
-            above.step(record.t, record.reference, where="post", color=THIRD, lw=0.9, ls="-.",
-                       label="set point")  # fmt: skip
+        if (set_point := group[0].set_point) is not None:
+            above.step(group[0].t, set_point, where="post", color=THIRD, lw=0.9, ls="-.")
+            axes[0].plot([], [], color=THIRD, lw=0.9, ls="-.", label="set point")
         plot_hardware(above, group)
         above.set_ylabel(position_label(group[0].cart, position_unit))
         residuals = {_LOOPS[check.loop]: check.measured - check.model for check in group}

@@ -90,10 +90,10 @@ def reported_table(
     What is off beyond its rounding, three standard errors and a few percent says what to look at.
     """
     both = [
-        (row.name, column, unit_text(clean(row.unit)) or "1", found, reported[column][row.name])
-        for column in reported
+        (row.name, column, unit_text(clean(row.unit)) or "1", getattr(row, column), yours)
+        for column, own in reported.items()
         for row in rows
-        if (found := getattr(row, column)) and row.name in reported[column]
+        if (yours := own.get(row.name)) is not None
     ]
     head = ("Parameter", "Estimate", "Yours", "From your data", "Unit", "Off", "Look at")
     lines = [
@@ -110,9 +110,9 @@ def reported_table(
     return make_table(number, _WORDS.text("reported_table"), head, lines, "llddldl")
 
 
-def _off(name: str, yours: Decimal, found: Estimate) -> tuple[Cell, Cell]:
+def _off(name: str, yours: Decimal, found: Estimate | None) -> tuple[Cell, Cell]:
     """Return how far a number is off, and what to look at where that is too far."""
-    if not found.value or found.source == "assumed":
+    if found is None or not found.value or found.source == "assumed":
         return cell(NOTHING, "quiet"), cell("")
     off = float(yours) - found.value
     share = percent(100 * off / abs(found.value), signed=True)
@@ -121,8 +121,9 @@ def _off(name: str, yours: Decimal, found: Estimate) -> tuple[Cell, Cell]:
     if abs(off) <= rounding + SIGMA_LIMIT * (found.std or 0.0) + few:
         return cell(share), cell("")
     read = read_name(name)
-    kind = "gain" if read.is_gain else "damping" if read.is_damping else "frequency"
-    return cell(share, "bad"), cell(_WORDS.text(f"look_{kind}"))
+    kinds = {"gain": read.is_gain, "damping": read.is_ratio, "frequency": read.is_frequency}
+    look = next((_WORDS.text(f"look_{kind}") for kind, is_it in kinds.items() if is_it), "")
+    return cell(share, "bad"), cell(look)
 
 
 def parameter_notes(rows: Sequence[ParameterRow]) -> list[Spans]:
