@@ -24,8 +24,10 @@ def check_channels(
     """
     dwells = [r for r in responses if r.source == "dwells" and r.phase is not None]
     samples = [record.sample_time for record in records if record.kind == "sine"]
-    checks = []
-    for other in dwells[1:] if fit and samples else ():
+    checks: list[Check] = []
+    if fit is None or not samples:
+        return checks
+    for other in dwells[1:]:
         omega, late = _lateness(dwells[0], other, fit=fit)
         if omega.size < _FEWEST:
             continue

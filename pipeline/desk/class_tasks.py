@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from pipeline.desk.typed import typed_path
 from pipeline.errors import ConfigError
 
 Progress = Callable[[str], None]
@@ -36,7 +37,7 @@ def regrade(
 
     try:
         grade_class(
-            [Path(path).expanduser() for path in paths],
+            [typed_path(path, wanted="name the submissions") for path in paths],
             rubric_file=Path(rubric),
             out=Path(folder),
             jobs=os.cpu_count() or 1,

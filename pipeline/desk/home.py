@@ -6,6 +6,7 @@ from starlette.exceptions import HTTPException
 from starlette.responses import RedirectResponse, Response
 
 from pipeline.desk.state import Ask, Found
+from pipeline.desk.typed import typed_path
 from pipeline.errors import ConfigError
 from pipeline.grading.gradebook.schema import FILE
 
@@ -24,12 +25,10 @@ def open_place(ask: Ask) -> Response:
     if not ask.user.owns:
         raise HTTPException(403, "folders of this computer are opened by its owner only")
     typed = ask.text("folder")
-    if not typed or not typed.isprintable():
-        raise ConfigError("name a folder")
     if "://" in typed:
         ask.desk.books.book(typed)
         return _entered(typed, ask.user.gradebooks, room="grades")
-    folder = Path(typed).expanduser().resolve()
+    folder = typed_path(typed, wanted="name a folder")
     if folder.name == FILE and folder.is_file():
         folder = folder.parent
     if folder.exists() and not folder.is_dir():

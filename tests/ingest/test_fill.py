@@ -141,6 +141,26 @@ def test_nothing_to_fill_in_is_one_line(tmp_path):
     assert (tmp_path / "submission.toml").read_text() == "version = 1\n[system]\ncarts = 9\n"
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "where"),
+    [
+        ("carts = 1", 'carts = "2"', "system.carts"),
+        ("[system]", "system = 3\n[other]", "system"),
+        ("version = 1", "version = 1\nexperiments = [1]", "experiments[1]"),
+        ("version = 1", "version = 1\nexperiments = 3", "experiments"),
+    ],
+)
+def test_what_is_no_table_is_one_line(old, new, where, tmp_path):
+    """Where a table or a number was to be filled from, the file's own check says what stands."""
+    put(tmp_path, "pull.csv", time=T, input=0 * T, x1=RING, x2=0.4 * RING)
+    typed = "version = 1\n[system]\ncarts = 1\n".replace(old, new).replace("[other]\ncarts = 1", "")
+    (tmp_path / "submission.toml").write_text(typed, encoding="utf-8")
+    done = CliRunner().invoke(app, ["fill", str(tmp_path)])
+    assert isinstance(done.exception, SubmissionError)  # which the command ends on, status 2
+    assert f"submission.toml: {where}: expected" in str(done.exception)
+    assert (tmp_path / "submission.toml").read_text(encoding="utf-8") == typed
+
+
 def test_the_command_says_what_it_did(tmp_path):
     """A table or JSON on stdout; exit status 1 where a file is left without a table."""
     put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)

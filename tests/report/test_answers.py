@@ -58,6 +58,20 @@ def test_a_heading_that_would_end_the_answer_is_refused():
     assert "### Aha" in with_answer(NOTES, "level", "So.\n\n### Aha\n\nMore.")
 
 
+OPEN = ["```\ncode", "~~~", "So <!-- why", "```\n<!-- x\n```", "So.\n\n### outlook\n\nMine."]
+
+
+@pytest.mark.parametrize("text", OPEN)
+def test_an_answer_that_would_swallow_another_is_refused(text):
+    """Code and comments that are left open run on; closed, they are part of the answer."""
+    with pytest.raises(SubmissionError, match="close every"):
+        with_answer(NOTES, "friction-2", text)
+    for closed in ("```\n# code\n```", "So <!-- why --> it is.", "### In detail\n\nMore."):
+        assert written_answer(with_answer(NOTES, "friction-2", closed), "friction-2") == closed
+    with pytest.raises(SubmissionError, match="close every"):  # it would stand in the open code
+        with_answer("## zeta_b\n\n```\ncode", "level", "So.")
+
+
 WORDS = st.text(st.characters(codec="utf-8", exclude_categories=["C"]), max_size=30)
 
 
@@ -69,8 +83,6 @@ def test_what_is_written_is_what_the_report_shows(lines, answer, at):
         new = with_answer(notes, "level", answer)
     except SubmissionError:
         return
-    if "<!--" in notes or any(line.strip().startswith(("```", "~~~")) for line in lines):
-        return  # a comment or code that is open runs to the end
     asked = [Asked(id="level", section="x", text="")]
     assert bool(split_notes(discussion_blocks(new), asked)[0]) == bool(discussion_blocks(answer))
     assert written_answer(new, "level") == answer.strip()

@@ -12,6 +12,7 @@ from starlette.responses import RedirectResponse, Response
 from pipeline.desk.exercises import MOST_FOLDERS, SLIDE
 from pipeline.desk.pages import served_file
 from pipeline.desk.state import Ask
+from pipeline.desk.typed import typed_path, whole_number
 from pipeline.errors import ConfigError
 from pipeline.output import new_folder
 from pipeline.plant.chain import PRESETS
@@ -84,8 +85,8 @@ def make(ask: Ask) -> Response:
         bench=bench,
         hide=[one["hide"] for one in found["effects"]],
         out=str(out),
-        folders=_count(ask, "folders", least=1, most=MOST_FOLDERS),
-        seed=_count(ask, "seed", least=0, most=2**31),
+        folders=whole_number(ask.text("folders"), name="folders", least=1, most=MOST_FOLDERS),
+        seed=whole_number(ask.text("seed"), name="seed", least=0, most=2**31),
         reported=bool(ask.text("reported")),
     )
     return RedirectResponse(f"/exercises/made?{urlencode({'out': out})}", status_code=303)
@@ -184,15 +185,4 @@ def _picture_url(bench: Mapping[str, str], hide: str) -> str:
 
 
 def _place(typed: str) -> Path:
-    if not typed or not typed.isprintable():
-        raise ConfigError("name a folder for the exercise, not there yet or empty")
-    return Path(typed).expanduser().resolve()
-
-
-def _count(ask: Ask, name: str, *, least: int, most: int) -> int:
-    typed = ask.text(name)
-    if not (typed.isascii() and typed.isdecimal()) or not least <= int(typed[:12]) <= most:
-        raise ConfigError(
-            f"{name}: expected a whole number from {least} to {most}, found {typed!r}"
-        )
-    return int(typed)
+    return typed_path(typed, wanted="name a folder for the exercise, not there yet or empty")

@@ -2,10 +2,12 @@
 
 import re
 from pathlib import Path
+from urllib.parse import urlencode
 
 from starlette.responses import RedirectResponse, Response
 
 from pipeline.desk.state import Ask
+from pipeline.desk.typed import typed_path
 from pipeline.errors import ConfigError
 from pipeline.grading.rubric_file import parse_rubric, rubric_source
 from pipeline.grading.rubric_text import rubric_text
@@ -44,7 +46,8 @@ def save(ask: Ask) -> Response:
     if _problems(text):
         return _page(ask, path, text, seen=seen, status=422)
     write_file(path, text)
-    return RedirectResponse(f"/rubric/?file={path}&saved=1", status_code=303)
+    query = urlencode({"file": path, "saved": 1})
+    return RedirectResponse(f"/rubric/?{query}", status_code=303)
 
 
 def _page(
@@ -85,9 +88,7 @@ def _typed(ask: Ask) -> str:
 
 
 def _path(typed: str) -> Path:
-    if not typed or not typed.isprintable():
-        raise ConfigError("name the file of the rubric, such as rubric.toml")
-    path = Path(typed).expanduser().resolve()
+    path = typed_path(typed, wanted="name the file of the rubric, such as rubric.toml")
     if path.suffix != ".toml":
         raise ConfigError(f"{path}: a rubric is a .toml file")
     if not path.parent.is_dir():

@@ -23,13 +23,18 @@ def bad_runs(analysis: Analysis) -> dict[str, str]:
         for check in analysis.checks
         if check.id.partition(".")[0] in ("setup", *SCALES) and check.outcome == "fail"
     }
-    late = [c.message for c in analysis.checks if c.id.partition(".")[0] == LATE_CHANNEL]
+    late = {
+        int(check.id.rpartition("-")[2]): check.message
+        for check in analysis.checks
+        if check.id.partition(".")[0] == LATE_CHANNEL
+    }
     sticky = not is_explained(analysis)
     for record in analysis.records:
         if record.id in setups:
             found[record.id] = setups[record.id]
             continue
-        for problem in (*_problems(record, sticky=sticky), *(late if record.omega else ())):
+        here = [late[cart] for cart in late if record.omega and cart in record.free]
+        for problem in (*_problems(record, sticky=sticky), *here):
             found.setdefault(record.id, problem)
     return found
 
