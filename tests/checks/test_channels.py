@@ -1,6 +1,7 @@
 """A channel that is logged later than the others is told; carts with friction are not."""
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 
 from pipeline.checks.channels import LATE_CHANNEL
 from pipeline.grading.judge.run import grade_submission
+from pipeline.grading.mistakes.recordings import bad_runs
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.resources import RUBRICS
 from pipeline.submission import load_submission
@@ -48,6 +50,11 @@ def test_a_late_channel_is_told_with_its_delay(tmp_path):
     np.testing.assert_allclose(check.value, LATE * SAMPLE, atol=0.2 * SAMPLE)
     (flag,) = [flag for flag in graded.grade.flags if flag.code == "data_problem"]
     assert all(name.startswith("sine") for name in flag.parameters)
+    dwells = [record for record in graded.analysis.records if record.omega]
+    held = replace(dwells[0], free=(1,))
+    others = [held if record is dwells[0] else record for record in graded.analysis.records]
+    bad = bad_runs(replace(graded.analysis, records=tuple(others)))
+    assert {one.id for one in dwells} - set(bad) == {held.id}  # its cart 2 does not move
 
 
 @pytest.mark.parametrize(

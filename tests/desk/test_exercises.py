@@ -182,7 +182,37 @@ def test_a_rubric_that_was_changed_meanwhile_is_not_written_over(visitor, tmp_pa
     assert new.status == 409  # begun as a new file, which is there now
 
 
-@pytest.mark.parametrize("file", ["", "rubric.txt", "/nowhere/at/all/rubric.toml", "a\x00.toml"])
+@pytest.mark.parametrize(
+    "file", ["", "rubric.txt", "/nowhere/at/all/rubric.toml", "a\x00.toml", "~nosuch/r.toml"]
+)
 def test_a_rubric_lies_where_it_can(visitor, file):
     """A name that is none is one clear sentence."""
     assert visitor.post("/rubric/save", file=file, text="x", seen="new").status == 422
+
+
+def test_a_rubric_is_found_again_whatever_its_folder_is_called(visitor, tmp_path):
+    """A name with the signs of an address: the page after saving is of the same file."""
+    folder = tmp_path / "R+D & co #2 100%"
+    folder.mkdir()
+    path, text = folder / "rubric.toml", (RUBRICS / "throne-1dof.toml").read_text(encoding="utf-8")
+    saved = visitor.post("/rubric/save", file=str(path), text=text, seen="new")
+    page = visitor.get(saved.headers["location"])
+    assert page.value("file") == str(path)
+
+
+@pytest.mark.parametrize("folders", ["00000000000199999", "0" * 11 + "1" * 5000, "0", "-1", "²"])
+def test_a_number_of_folders_is_read_whole(visitor, tmp_path, folders):
+    """Not its first digits; nothing is begun for more than there may be."""
+    out = tmp_path / "class"
+    sent = {"preset": "throne-1dof", "out": str(out), "seed": "0", "folders": folders}
+    assert visitor.post("/exercises/make", **sent).status == 422
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("typed", ["~nosuch/x", "", "a\x00b"])
+def test_a_place_that_is_none_is_said(visitor, typed):
+    """Whichever form it is typed into; `~` of nobody is no fault of the desk's own."""
+    sent = {"preset": "throne-1dof", "folders": "1", "seed": "0"}
+    assert visitor.post("/open", folder=typed).status == 422
+    assert visitor.post("/exercises/make", out=typed, **sent).status == 422
+    assert visitor.get(f"/exercises/made?{urlencode({'out': typed})}").status == 422

@@ -1,0 +1,39 @@
+"""What people type into a form, as what it says: a place on this computer, a whole number."""
+
+from pathlib import Path
+
+from pipeline.errors import ConfigError
+
+
+def typed_path(typed: str, *, wanted: str) -> Path:
+    """Return a path that was typed, from the root.
+
+    Parameters
+    ----------
+    wanted : what to do where nothing was typed, in the words of the form.
+
+    Raises
+    ------
+    ConfigError : it is no path, or `~` of nobody whom this computer knows.
+    """
+    if not typed or not typed.isprintable():
+        raise ConfigError(wanted)
+    try:
+        return Path(typed).expanduser().resolve()
+    except RuntimeError:
+        raise ConfigError(f"{typed}: this computer knows nobody of that name") from None
+
+
+def whole_number(typed: str, *, name: str, least: int, most: int) -> int:
+    """Return a whole number that was typed.
+
+    Raises
+    ------
+    ConfigError : it is none, or outside of `least` to `most`.
+    """
+    number = typed if typed.isascii() and typed.isdecimal() else ""
+    # However many digits it has, no more are read than the largest has.
+    if number and len(number) <= len(str(most)) and least <= int(number) <= most:
+        return int(number)
+    found = f"{typed[:20]}…" if len(typed) > 20 else typed
+    raise ConfigError(f"{name}: expected a whole number from {least} to {most}, found {found!r}")
