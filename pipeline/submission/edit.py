@@ -72,6 +72,9 @@ def edit_submission(
         new = _MANY_BLANKS.sub("\n\n", tomlkit.dumps(document)).rstrip() + "\n"
     except (TOMLKitError, RecursionError) as error:
         raise SubmissionError(f"{where}: cannot be changed by a program ({error})") from None
+    except (TypeError, AttributeError, LookupError):
+        parse_submission(text, folder=folder, where=where)  # no table where one was to be changed?
+        raise
     submission = parse_submission(new, folder=folder, where=where)
     write_file(folder / NAME, new.replace("\n", newline))
     return submission

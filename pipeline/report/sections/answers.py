@@ -31,7 +31,8 @@ def with_answer(notes: str, id_: str, answer: str) -> str:
 
     Raises
     ------
-    SubmissionError : a heading in it would end the answer.
+    SubmissionError : a heading in it would end the answer, or what it leaves open would swallow
+        another.
     """
     text = answer.replace("\r\n", "\n").strip()
     lines = _lines(notes)
@@ -42,9 +43,18 @@ def with_answer(notes: str, id_: str, answer: str) -> str:
     if not text:
         return "".join([*lines[:heading], *lines[end:]])
     if start is None:
-        return f"{notes.rstrip()}\n\n{'#' * level} {id_}\n\n{text}\n".lstrip()
-    rest = ["\n", *lines[end:]] if lines[end:] else []
-    return "".join([*lines[:start], f"\n{text}\n", *rest])
+        new = f"{notes.rstrip()}\n\n{'#' * level} {id_}\n\n{text}\n".lstrip()
+    else:
+        rest = ["\n", *lines[end:]] if lines[end:] else []
+        new = "".join([*lines[:start], f"\n{text}\n", *rest])
+    others = {name: body for name, (at, body) in _bodies(notes).items() if not heading <= at < end}
+    now = {name: body for name, (_, body) in _bodies(new).items()}
+    if written_answer(new, id_) != text or any(now.get(name) != others[name] for name in others):
+        raise SubmissionError(
+            "this would run into other answers: close every block of code (```) and every comment "
+            "(<!-- -->), here and in notes.md, and let no heading begin with another question's id"
+        )
+    return new
 
 
 def _lines(text: str) -> list[str]:
@@ -60,6 +70,16 @@ def _span(notes: str, id_: str) -> tuple[int, int, int, int] | None:
             after = (line for at, line, _, _ in headings[i + 1 :] if at <= level)
             return level, start, end, next(after, len(_lines(notes)))
     return None
+
+
+def _bodies(notes: str) -> dict[str, tuple[int, str]]:
+    """Return the line of every id's heading, and what stands below it up to the next of any."""
+    lines, headings = _lines(notes), _headings(notes)
+    found: dict[str, tuple[int, str]] = {}
+    for i, (_, at, start, text) in enumerate(headings):
+        end = headings[i + 1][1] if headings[i + 1 :] else len(lines)
+        found.setdefault(named(text), (at, "".join(lines[start:end]).strip()))
+    return found
 
 
 def _headings(markdown: str) -> list[tuple[int, int, int, str]]:
