@@ -227,7 +227,8 @@
   news.addEventListener('open', () => tell(state.waits));
   const press = async (wish, number) => {
     try {
-      await fetch('press', { method: 'POST', body: new URLSearchParams({ wish, number }) });
+      const answer = await fetch('press', { method: 'POST', body: new URLSearchParams({ wish, number }) });
+      if (answer.status >= 500) throw new Error(answer.statusText);
     } catch {
       tell(`No answer: ${wish} was not heard. Use Ctrl-C in the terminal, or the switch.`, true);
     }

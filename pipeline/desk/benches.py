@@ -36,7 +36,7 @@ class Session:
     ended: threading.Event = field(default_factory=threading.Event)
 
     def press(self, wish: str, number: str) -> int:
-        """Pass a button on to the process, which decides; return its status, 409 for no use."""
+        """Pass a button on to the process, which decides; return its status, 503 for no answer."""
         body = urlencode({"wish": wish, "number": number})
         with suppress(OSError, HTTPException):
             connection, answer = self._ask("POST", "press", body)
@@ -45,7 +45,7 @@ class Session:
         if wish == "stop":  # the page does not answer: the process does
             self.stop()
             return 204
-        return 409
+        return 503
 
     def stop(self) -> None:
         """Have it end: the bench is told first."""

@@ -1,0 +1,111 @@
+"""The rooms of the bench and of the instructor in a real browser, from nothing to their end."""
+
+import re
+
+from playwright.sync_api import expect
+
+from pipeline.desk.app import DeskServer
+from pipeline.grading.rubric_file import load_rubric
+from pipeline.submission import load_submission
+from tests.helpers.acquisitions import sine, write_work
+from tests.helpers.waiting import until
+from tests.system import test_desk
+from tests.system.test_report_pages import PHONE, WIDE
+
+show = test_desk.show
+
+
+def fits(window) -> bool:
+    """Tell whether nothing is wider than the screen, and axe finds nothing by day and by night."""
+    assert test_desk.violations(window) == []
+    width = window.evaluate("document.documentElement.scrollWidth")
+    return width <= window.viewport_size["width"]
+
+
+def test_a_session_is_begun_watched_and_decided_on(show, tmp_path, real):
+    """Keep takes the run that is going on, the next one is recorded; then Esc ends another."""
+    work = write_work(
+        tmp_path / "team",
+        [sine("long", seconds=300), sine("next", seconds=1), sine("last", seconds=300)],
+    )
+    with DeskServer(folders=[work]) as server:
+        window = show(server.url, size=PHONE)
+        window.get_by_role("link", name="team: bench").click()
+        assert fits(window)
+        window.get_by_label("Port of the bench").fill(real.address)
+        for name in ("long", "next", "last"):
+            window.get_by_label(name, exact=True).check()
+        window.get_by_role("button", name="Acquire").click()
+
+        status, stop = window.locator("#status"), window.get_by_role("button", name="Stop")
+        expect(status).to_have_text("Recording long.")
+        expect(stop).to_be_in_viewport()
+        expect(window.locator("#plots .keys").first).to_contain_text(re.compile(r"cart 1 [−\d]"))
+        assert fits(window)
+        window.locator("#told").scroll_into_view_if_needed()
+        expect(stop).to_be_in_viewport()  # always in reach
+        window.get_by_role("button", name="Keep this partial run").click()
+        expect(window.locator("#plan .done b")).to_have_text(["long", "next"])
+        expect(status).to_have_text("Recording last.")
+        window.reload()
+        expect(status).to_have_text("Recording last.")
+        window.keyboard.press("Escape")
+        expect(status).to_have_text("The session is over.")
+        until(lambda: (work / "data" / "last.partial.txt").exists())
+        window.get_by_role("link", name="The plan as it is now").click()
+        expect(window.get_by_text("Stopped. Begin again")).to_be_visible()
+    assert [e.id for e in load_submission(work).experiments] == ["long", "next"]
+
+
+def test_an_exercise_is_made_of_what_is_seen(show, tmp_path):
+    """An effect is ticked, its slider moved, its picture redrawn; the exercise opens."""
+    out = tmp_path / "exercise"
+    with DeskServer(folders=[]) as server:
+        window = show(server.url, size=WIDE)
+        window.get_by_role("link", name="Exercises").click()
+        window.locator('input[value="coulomb_friction"]').check()
+        drawn = window.locator("#hidden img")
+        expect(drawn).to_have_js_property("complete", True)
+        until(lambda: drawn.evaluate("image => image.naturalWidth") > 100)
+        before = drawn.get_attribute("src")
+        slider = window.get_by_label("force, from a tenth")
+        slider.fill("0.5")
+        until(lambda: window.locator("#hidden img").get_attribute("src") != before)
+        expect(window.locator("#hidden li")).to_contain_text("coulomb_friction on cart 1")
+        assert fits(window)
+        window.get_by_label("Folder").fill(str(out))
+        window.get_by_role("button", name="Make").click()
+        window.get_by_role("button", name="Open exercise").click()
+        expect(window.get_by_role("heading", level=1)).to_have_text("exercise")
+    assert len(load_submission(out).experiments) > 10
+
+
+def test_a_rubric_is_edited_with_its_mistakes_beside_it(show, tmp_path):
+    """What is wrong shows as it is typed, and goes; what is right is saved."""
+    path = tmp_path / "rubric.toml"
+    with DeskServer(folders=[]) as server:
+        window = show(server.url)
+        window.goto(f"{window.url}rubric/")
+        window.get_by_label("Another rubric").fill(str(path))
+        window.get_by_label("A new one begins with").select_option("throne-1dof")
+        window.get_by_role("button", name="Open").click()
+        text = window.locator("#text")
+        good = text.input_value()
+        text.fill(good.replace("points", "pionts", 1))
+        wrong = window.locator("#problems td.wrong").filter(has_text="unknown key; did you mean")
+        expect(wrong.first).to_be_visible()
+        assert fits(window)
+        window.get_by_role("button", name="Save").click()
+        expect(wrong.first).to_be_visible()
+        assert not path.exists()
+        window.locator("#text").fill(good)
+        expect(window.locator("#problems")).to_contain_text("Valid")
+        window.get_by_role("button", name="Save").click()
+        expect(window.get_by_text("Saved.")).to_be_visible()
+        assert load_rubric(path)
+        window.set_viewport_size({"width": 400, "height": 800})
+        window.get_by_role("link", name="Effects").click()
+        window.locator("#coulomb_friction summary").click()
+        drawn = window.locator("#coulomb_friction img")
+        until(lambda: drawn.evaluate("image => image.naturalWidth") > 100)
+        assert fits(window)
