@@ -15,7 +15,10 @@ from pipeline.errors import ConfigError
 @app.command()
 def desk(
     folder: Annotated[
-        Path | None, typer.Argument(metavar="[FOLDER]", help="A submission, there or to be made.")
+        Path | None,
+        typer.Argument(
+            metavar="[FOLDER]", help="A submission, there or to be made; a grading's output."
+        ),
     ] = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="To serve at; 0: a free one.")] = 0,
     browser: Annotated[
@@ -35,10 +38,7 @@ def desk(
         raise ConfigError("--host and --users go together: who listens to others asks who they are")
     if folder is not None and users is not None:
         raise ConfigError("with --users, the file says which folders there are")
-    folders = [folder.resolve()] if folder else []
-    for one in folders:
-        one.mkdir(parents=True, exist_ok=True)
-    with DeskServer(folders=folders, port=port, host=host or "127.0.0.1", users=users) as server:
+    with DeskServer(folder=folder, port=port, host=host or "127.0.0.1", users=users) as server:
         stop = threading.Event()
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: stop.set())

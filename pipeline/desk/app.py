@@ -20,7 +20,7 @@ from pipeline.desk.doors import Guard, ProxyDoor, SecretDoor
 from pipeline.desk.grades import room as grades
 from pipeline.desk.grades import team
 from pipeline.desk.grades import work as whole
-from pipeline.desk.home import open_place, show_home
+from pipeline.desk.home import enter, open_place, show_home
 from pipeline.desk.instructor import room as instructor
 from pipeline.desk.instructor import rubrics
 from pipeline.desk.instructor.room import owned
@@ -94,7 +94,7 @@ class DeskServer:
 
     Parameters
     ----------
-    folders : to begin with, of the person at this computer.
+    folder : to begin with, of the person at this computer.
     port : to serve at; 0: a free one.
     host, users : of a lab server: the address to listen at, and the file that says who may what.
 
@@ -106,7 +106,7 @@ class DeskServer:
     def __init__(
         self,
         *,
-        folders: list[Path],
+        folder: Path | None = None,
         port: int = 0,
         host: str = "127.0.0.1",
         users: Path | None = None,
@@ -124,7 +124,9 @@ class DeskServer:
             door: SecretDoor | ProxyDoor = ProxyDoor(*listed)
             self.url = f"http://{host}:{port}/"
         else:
-            door = SecretDoor(User(name="", role="owner", folders=folders), port=port)
+            owner = User(name="", role="owner")
+            start = enter(owner, folder) if folder else "/"
+            door = SecretDoor(owner, port=port, start=start)
             self.url = f"http://127.0.0.1:{port}/{door.secret}/"
         self._desk = Desk()
         strangers = Strangers()

@@ -32,10 +32,11 @@ class SecretDoor:
     address is without a secret that a history or a picture of the screen could keep.
     """
 
-    def __init__(self, user: User, *, port: int) -> None:
+    def __init__(self, user: User, *, port: int, start: str) -> None:
         self.sites = own_names(port)
         self.secret = secrets.token_urlsafe(24)
         self._user, self._session, self._opened = user, secrets.token_urlsafe(24), False
+        self._start = start
         self._cookie = f"cartlab-{port}"  # cookies do not tell ports apart
         self._sent = re.compile(rf"\b{self._cookie}=([\w-]+)".encode())
 
@@ -58,7 +59,9 @@ class SecretDoor:
         if self._opened and not known:
             return _refused("this address was opened already; start `cartlab desk` again")
         self._opened = True
-        answer = RedirectResponse("/", status_code=303, headers={"Referrer-Policy": "no-referrer"})
+        answer = RedirectResponse(
+            self._start, status_code=303, headers={"Referrer-Policy": "no-referrer"}
+        )
         answer.set_cookie(self._cookie, self._session, httponly=True, samesite="strict")
         return answer
 

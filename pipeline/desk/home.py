@@ -7,6 +7,7 @@ from starlette.responses import RedirectResponse, Response
 
 from pipeline.desk.state import Ask, Found
 from pipeline.desk.typed import typed_path
+from pipeline.desk.users import User
 from pipeline.errors import ConfigError
 from pipeline.grading.gradebook.schema import FILE
 
@@ -21,27 +22,38 @@ def show_home(ask: Ask) -> Response:
 
 
 def open_place(ask: Ask) -> Response:
-    """Open a folder of this computer, a submission or a grading's output, or a database."""
+    """Open what somebody named: a folder of this computer, or a database."""
+    typed = ask.text("folder")
     if not ask.user.owns:
         raise HTTPException(403, "folders of this computer are opened by its owner only")
-    typed = ask.text("folder")
     if "://" in typed:
         ask.desk.books.book(typed)
-        return _entered(typed, ask.user.gradebooks, room="grades")
-    folder = typed_path(typed, wanted="name a folder")
+        return RedirectResponse(_entered(typed, ask.user.gradebooks, "grades"), status_code=303)
+    address = enter(ask.user, typed_path(typed, wanted="name a folder"))
+    return RedirectResponse(address, status_code=303)
+
+
+def enter(user: User, folder: Path) -> str:
+    """Open a folder: a submission, there or not yet, or a grading's output; return its address.
+
+    Raises
+    ------
+    ConfigError : it is no folder, and none can be made there.
+    """
+    folder = folder.expanduser().resolve()
     if folder.name == FILE and folder.is_file():
         folder = folder.parent
     if folder.exists() and not folder.is_dir():
         raise ConfigError(f"{folder}: is a file; name the folder that it lies in")
     if (folder / FILE).is_file():
-        return _entered(folder, ask.user.gradebooks, room="grades")
+        return _entered(folder, user.gradebooks, "grades")
     if not folder.parent.is_dir():
         raise ConfigError(f"{folder}: there is no folder {folder.parent} to make it in")
     folder.mkdir(exist_ok=True)
-    return _entered(folder, ask.user.folders, room="student")
+    return _entered(folder, user.folders, "student")
 
 
-def _entered(folder: Found, places: list[Found], *, room: str) -> Response:
-    if folder not in places:
-        places.append(folder)
-    return RedirectResponse(f"/{room}/{places.index(folder)}/", status_code=303)
+def _entered(place: Found, places: list[Found], room: str) -> str:
+    if place not in places:
+        places.append(place)
+    return f"/{room}/{places.index(place)}/"

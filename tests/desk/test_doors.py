@@ -24,7 +24,7 @@ PATHS = [re.sub(r"\{\w+:int\}", "0", re.sub(r"\{name(:path)?\}", "x.json", p)) f
 def server(tmp_path_factory):
     """A desk with one submission."""
     folder = a_submission(tmp_path_factory.mktemp("desk") / "team")
-    with DeskServer(folders=[folder]) as server:
+    with DeskServer(folder=folder) as server:
         yield server
 
 
@@ -39,7 +39,7 @@ def test_the_secret_opens_once_and_leaves_the_address(server, visitor):
     assert visitor.get("/").status == 200
     assert Visitor(port=visitor.port).get(urlsplit(server.url).path).status == 403
     again = visitor.get(urlsplit(server.url).path)
-    assert (again.status, again.headers["location"]) == (303, "/")
+    assert (again.status, again.headers["location"]) == (303, "/student/0/")
     cookie = again.headers["set-cookie"].lower()
     assert "httponly" in cookie
     assert "samesite=strict" in cookie
@@ -127,7 +127,7 @@ def test_strangers_are_few_and_leave(visitor, monkeypatch):
 def test_a_port_that_is_taken_is_one_line(server):
     """The command ends with it."""
     with pytest.raises(ConfigError, match="is not free for the desk"):
-        DeskServer(folders=[], port=urlsplit(server.url).port or 0)
+        DeskServer(port=urlsplit(server.url).port or 0)
 
 
 # ------------------------------------------------------------------------- a lab server
@@ -160,7 +160,7 @@ def lab(tmp_path_factory):
         a_submission(root / name)
     write_class(root / "grades")
     (root / "users.toml").write_text(USERS, encoding="utf-8")
-    with DeskServer(folders=[], users=root / "users.toml") as server:
+    with DeskServer(users=root / "users.toml") as server:
         port = urlsplit(server.url).port or 0
 
         def who(name: str, **given: str) -> Visitor:

@@ -28,8 +28,10 @@ def visit(tmp_path, *, every: int, drawn: int, seed: int) -> int:
     folders = [rooms / str(i) for i in range(len(entries))]
     for folder in folders:
         folder.mkdir(parents=True)
-    with DeskServer(folders=folders) as server:
+    with DeskServer() as server:
         visitor = Visitor.of(server.url)
+        for folder in folders:
+            assert visitor.post("/open", folder=str(folder)).status == 303
         for number, entry in enumerate(entries):
             here, path = f"/student/{number}/", school / entry
             files = [path] if path.is_file() else []

@@ -1,10 +1,16 @@
 """The student's room over plain forms: files, table, form, report, answers, zip, and no harm."""
 
+import http.client
 import io
 import json
+import random
 import re
+import subprocess
+import sys
+import threading
 import time
 import zipfile
+from contextlib import suppress
 from html import unescape
 from pathlib import Path
 
@@ -20,7 +26,7 @@ from pipeline.grading.intake.hand_ins import find_hand_ins
 from pipeline.submission import load_submission
 from pipeline.submission.load import NAME
 from tests.helpers.desks import Visitor, a_submission, some_files
-from tests.helpers.waiting import until
+from tests.helpers.waiting import started, until
 
 HERE = "/student/0/"
 
@@ -30,7 +36,7 @@ def room(tmp_path):
     """Return who opened the desk on an empty folder, and the folder."""
     folder = tmp_path / "team"
     folder.mkdir()
-    with DeskServer(folders=[folder]) as server:
+    with DeskServer(folder=folder) as server:
         yield Visitor.of(server.url), folder
 
 
@@ -38,7 +44,7 @@ def room(tmp_path):
 def filled(tmp_path):
     """Return who opened the desk on a submission, and the folder."""
     folder = a_submission(tmp_path / "team")
-    with DeskServer(folders=[folder]) as server:
+    with DeskServer(folder=folder) as server:
         yield Visitor.of(server.url), folder
 
 
@@ -160,6 +166,48 @@ def test_edits_from_outside_show_and_are_not_written_over(filled):
     page = visitor.post(HERE + "answer", id="zeta", answer="Mine", seen=seen)
     assert (page.status, "Other words." in page.text, "Mine" in page.text) == (409, True, True)
     assert (folder / "notes.md").read_text(encoding="utf-8") == "Other words.\n"
+
+
+def test_of_two_at_once_one_is_told_of_the_other(filled):
+    """Eight windows save what they were shown: one does, and it is its title that stands there."""
+    visitor, folder = filled
+    seen = visitor.get(HERE).value("seen")
+    answers: dict[str, int] = {}
+
+    def save(title: str) -> None:
+        answers[title] = visitor.post(HERE + "save", seen=seen, title=title).status
+
+    threads = [threading.Thread(target=save, args=(f"window {i}",)) for i in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(answers.values()) == [303] + 7 * [409]
+    assert answers[load_submission(folder).title] == 303
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_what_was_confirmed_outlives_a_kill(tmp_path):
+    """The server is killed at random moments while a title is saved again and again."""
+    folder = a_submission(tmp_path / "team")
+    draw = random.Random(1)
+    command = [sys.executable, "-m", "pipeline", "desk", folder, "--no-browser"]
+    for _ in range(5):
+        with started(command, stderr=subprocess.PIPE, encoding="utf-8") as desk:
+            assert desk.stderr is not None
+            visitor = Visitor.of(desk.stderr.readline().split()[1])
+            seen, confirmed = visitor.get(HERE).value("seen"), load_submission(folder).title
+            threading.Timer(draw.uniform(0.0, 2.0), desk.kill).start()
+            number = 0
+            with suppress(OSError, http.client.HTTPException):
+                for number in range(10_000):
+                    visitor.post(HERE + "save", seen=seen, title=f"title {number}")
+                    confirmed = f"title {number}"
+                    seen = visitor.get(HERE).value("seen")
+        sent = f"title {number}"  # perhaps written, not confirmed
+        assert load_submission(folder).title in (confirmed, sent)
+        assert load_submission(folder).experiments
 
 
 @pytest.mark.parametrize("text", ["version = \n", "\xff", "version = 1\n[system]\ncarts = 9\n"])

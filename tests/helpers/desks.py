@@ -51,7 +51,7 @@ class Visitor:
         parts = urlsplit(url)
         visitor = cls(port=parts.port or 0)
         answer = visitor.get(parts.path)
-        assert (answer.status, answer.headers["location"]) == (303, "/")
+        assert (answer.status, parts.path in answer.headers["location"]) == (303, False)
         visitor.headers["Cookie"] = answer.headers["set-cookie"].split(";")[0]
         return visitor
 

@@ -80,9 +80,7 @@ def groups(document: Mapping[str, Any]) -> list[Group]:
     carts = _carts(document)
     found = []
     for entry in _catalogue()["groups"]:
-        fields = [
-            Field(**{**one, "choices": tuple(one.get("choices", ()))}) for one in entry["fields"]
-        ]
+        fields = [_field(one, one["path"]) for one in entry["fields"]]
         optional = entry.get("optional", False)
         found.append(Group(title=entry["title"], fields=tuple(fields), optional=optional))
     rigid = carts == 1 and _at(document, "system.springs") == [False, False]

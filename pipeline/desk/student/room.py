@@ -114,14 +114,15 @@ def report(ask: Ask) -> Response:
 
 def answer(ask: Ask) -> Response:
     """Write the answer to a question into `notes.md`."""
-    folder, id_, typed_text = ask.folder(), ask.text("id"), ask.text("answer")
-    notes = _notes(folder)
-    if ask.text("seen") != text_digest(notes):
-        yours = [Field(path=id_, label=f"Answer to {id_}", value=typed_text)]
-        return _outdated(ask, _NOTES, notes, yours)
-    if id_ not in [one["id"] for one in _told(folder)["questions"]]:
-        raise SubmissionError(f"the report asks nothing called {id_!r}")
-    write_file(folder / _NOTES, with_answer(notes, id_, typed_text))
+    folder, id_, words = ask.folder(), ask.text("id"), ask.text("answer")
+    with ask.desk.alone(folder):
+        notes = _notes(folder)
+        if ask.text("seen") != text_digest(notes):
+            yours = [Field(path=id_, label=f"Answer to {id_}", value=words)]
+            return _outdated(ask, _NOTES, notes, yours)
+        if id_ not in [one["id"] for one in _told(folder)["questions"]]:
+            raise SubmissionError(f"the report asks nothing called {id_!r}")
+        write_file(folder / _NOTES, with_answer(notes, id_, words))
     return ask.back(f"{_here(ask)}report#question-{id_}", "Written into notes.md.")
 
 
@@ -147,7 +148,8 @@ def _here(ask: Ask) -> str:
 def _filled(ask: Ask, folder: Path) -> list[str]:
     """Have the tables of new files written; return what is to be said."""
     try:
-        rows = ask.desk.hand.do("fill", folder=str(folder))
+        with ask.desk.alone(folder):
+            rows = ask.desk.hand.do("fill", folder=str(folder))
     except Failed as error:
         return [str(error)]
     new = [row["file"] for row in rows if row["state"] in ("new", "completed")]
@@ -254,8 +256,10 @@ def _edited(
     ask: Ask, change: Callable[[tomlkit.TOMLDocument], None], *, changed: Sequence[Field]
 ) -> Response:
     """Change the file; what would not be valid is shown as typed, what is outdated is refused."""
+    folder = ask.folder()
     try:
-        edit_submission(ask.folder(), change, seen=ask.text("seen") or "nothing")
+        with ask.desk.alone(folder):
+            edit_submission(folder, change, seen=ask.text("seen") or "nothing")
     except Outdated as error:
         return _outdated(ask, NAME, error.text, changed)
     except SubmissionError as error:
