@@ -17,6 +17,7 @@ from pipeline.submission.models import Submission
 from pipeline.submission.toml_file import Value, read_text
 
 _MANY_BLANKS = re.compile(r"\n{3,}(?=\[\[experiments\]\])")
+_MOST_EDITED = 200_000  # characters; tomlkit takes seconds for the worst of them
 _LONGEST_LINE = 90  # characters of a comment
 
 
@@ -65,6 +66,10 @@ def edit_submission(
     if seen and seen != text_digest(text):
         raise Outdated(text)
     where = f"{folder.resolve().name}/{NAME}"
+    if len(text) > _MOST_EDITED:
+        raise SubmissionError(
+            f"{where}: {len(text):,} characters; a program changes files of up to {_MOST_EDITED:,}"
+        )
     newline = "\r\n" if "\r\n" in text else "\n"
     try:
         document = tomlkit.parse(text.replace("\r\n", "\n"))

@@ -19,9 +19,8 @@ def visit(tmp_path, *, every: int, drawn: int, seed: int) -> int:
     school, rooms = tmp_path / "school", tmp_path / "rooms"
     school.mkdir()
     good = {
-        path.relative_to(ROOT / "submissions" / "one-cart").as_posix(): path.read_bytes()
-        for path in sorted((ROOT / "submissions" / "one-cart").rglob("*"))
-        if path.is_file()
+        name: (ROOT / "submissions" / "one-cart" / name).read_bytes()
+        for name in ("submission.toml", "notes.md", "data/step-1.csv", "data/decay-1a.csv")
     }
     entries = write_hostile(school, good, seed=seed, every=every, drawn=drawn)
     outside = {p for p in tmp_path.rglob("*") if not p.is_relative_to(school)}

@@ -43,7 +43,7 @@ def room(tmp_path):
 @pytest.fixture
 def filled(tmp_path):
     """Return who opened the desk on a submission, and the folder."""
-    folder = a_submission(tmp_path / "team")
+    folder = a_submission(tmp_path / "Gruppe ж 7")
     with DeskServer(folder=folder) as server:
         yield Visitor.of(server.url), folder
 
@@ -318,8 +318,10 @@ def test_names_and_texts_of_files_are_never_markup(room):
 
 
 def test_other_files_of_the_folder_are_not_served(filled):
-    """The report's files are, where no link leads out."""
+    """The report's files are, where no link leads out; and the zip, by a name that headers know."""
     visitor, folder = filled
+    zipped = visitor.get(HERE + "hand-in.zip").headers["content-disposition"]
+    assert zipped == 'attachment; filename="Gruppe---7.zip"'
     (folder / "report").mkdir(exist_ok=True)
     (folder / "report" / "x.json").write_text("{}", encoding="utf-8")
     (folder / "report" / "y.json").symlink_to("/etc/hostname")

@@ -1,6 +1,7 @@
 """The student's room: files, form, report, questions, the zip. The folder on disk is the truth."""
 
 import json
+import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -39,6 +40,7 @@ from pipeline.submission.load import (
     posix,
     stated_columns,
 )
+from pipeline.submission.models import MOST_EXPERIMENTS
 from pipeline.submission.toml_file import read_text
 
 _ASKED = "report/questions.json"
@@ -133,7 +135,7 @@ def report_file(ask: Ask) -> Response:
 
 def packed(ask: Ask) -> Response:
     """Return the zip."""
-    name = "".join(c if c.isalnum() or c in "-_." else "-" for c in ask.folder().name) or "lab"
+    name = re.sub(r"[^A-Za-z0-9_.-]", "-", ask.folder().name)  # headers know no others
     headers = {"Content-Disposition": f'attachment; filename="{name}.zip"'}
     return Response(hand_in(ask.folder()), media_type="application/zip", headers=headers)
 
@@ -212,13 +214,15 @@ def _keeps(folder: Path) -> list[str]:
 
 def _rows(ask: Ask, folder: Path, document: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return a row for every data file, and for every table whose file is not there."""
-    tables = document.get("experiments", [])
+    tables = document.get("experiments")
     listed = [t for t in tables if isinstance(t, dict)] if isinstance(tables, list) else []
+    listed = listed[:MOST_EXPERIMENTS]  # further ones are what is wrong with the file
     places: dict[str, list[int]] = {}
     for index, table in enumerate(listed):
         places.setdefault(posix(str(table.get("file", ""))), []).append(index)
     rows = []
-    looks = ask.desk.looks(folder, lambda file: stated_columns(document, file))
+    known = {**document, "experiments": listed}
+    looks = ask.desk.looks(folder, lambda file: stated_columns(known, file))
     for file, look in looks.items():
         for index in places.pop(file, [None]):
             rows.append(_row(document, file, look, index, listed))
