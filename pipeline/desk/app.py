@@ -112,6 +112,8 @@ class DeskServer:
         users: Path | None = None,
     ) -> None:
         listed = read_users(users) if users else None
+        owner = User(name="", role="owner")
+        start = enter(owner, folder) if folder else "/"
         try:
             listener = socket.create_server((host, port))
         except OSError as error:
@@ -124,8 +126,6 @@ class DeskServer:
             door: SecretDoor | ProxyDoor = ProxyDoor(*listed)
             self.url = f"http://{host}:{port}/"
         else:
-            owner = User(name="", role="owner")
-            start = enter(owner, folder) if folder else "/"
             door = SecretDoor(owner, port=port, start=start)
             self.url = f"http://127.0.0.1:{port}/{door.secret}/"
         self._desk = Desk()

@@ -31,6 +31,7 @@ MAX_DATA_BYTES = 100_000_000  # over half an hour at 1 kHz
 _LARGEST = Decimal("1e30")  # beyond any physical number in any unit, yet safe to multiply
 _MOST_DIGITS = 1_000
 _MOST_SHOWN = 30_000  # characters of the notes: fifteen pages
+_MOST_WORDED = 20  # problems; to find what a misspelt key may mean takes a while
 _MOST_LOOKED_AT = 1_000  # files and folders, for the one that may be meant
 COMMENT = re.compile(r"<!--.*?(?:-->|\Z)", re.DOTALL)  # one left open runs to the end
 _SYSTEM_COLUMNS = ("time", "input", "reference", "frequency")
@@ -66,13 +67,15 @@ class InvalidSubmission(SubmissionError):
 
     Attributes
     ----------
-    problems : all that were found, each with its place; the text is the first.
+    problems : the first that were found, each with its place; the text is the very first.
     """
 
-    def __init__(self, where: str, problems: Sequence[tuple[Location, str]]) -> None:
+    def __init__(
+        self, where: str, problems: Sequence[tuple[Location, str]], *, more: int = 0
+    ) -> None:
         self.problems = tuple(problems)
-        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-        super().__init__(f"{where}: {problems[0][1]}{more}")
+        others = len(problems) - 1 + more
+        super().__init__(f"{where}: {problems[0][1]}{f' (and {others} more)' if others else ''}")
 
 
 def parse_submission(text: str, *, folder: Path, where: str = NAME) -> Submission:
@@ -127,8 +130,9 @@ def _validate(document: dict, *, where: str) -> Submission:
     except ValidationError as error:
         # A misspelt required key is both unknown and missing: the first says more.
         found = sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
-        worded = [(without_tag(e["loc"], plain), explain(e, plain)) for e in found]
-        raise InvalidSubmission(where, worded) from None
+        first = found[:_MOST_WORDED]
+        worded = [(without_tag(e["loc"], plain), explain(e, plain)) for e in first]
+        raise InvalidSubmission(where, worded, more=len(found) - len(first)) from None
 
 
 class _Unusable(Exception):

@@ -33,7 +33,7 @@ def begun(visitor: Visitor, work: Path, port: str, *only: str) -> None:
 def test_a_plan_is_proposed_and_a_session_recorded_and_stopped(tmp_path, real):
     """Ticked recordings are made; the news come through; a Stop without scripts ends it."""
     work = write_work(tmp_path / "team", [sine("short", seconds=1), sine("long", seconds=300)])
-    with DeskServer(folders=[work]) as server:
+    with DeskServer(folder=work) as server:
         visitor = Visitor.of(server.url)
         page = visitor.get("/bench/0/")
         assert 'value="long" aria-label="long"' in page.text
@@ -90,7 +90,7 @@ def test_a_plan_is_made_and_what_is_wrong_is_said(tmp_path):
     work.mkdir()
     text = 'version = 1\n[system]\ncarts = 1\nposition = { unit = "cm" }\n'
     (work / "submission.toml").write_text(text, encoding="utf-8")
-    with DeskServer(folders=[work]) as server:
+    with DeskServer(folder=work) as server:
         visitor = Visitor.of(server.url)
         assert visitor.post("/bench/0/plan").status == 303
         until((work / "plan.toml").exists)

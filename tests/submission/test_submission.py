@@ -1,6 +1,7 @@
 """`submission.toml` becomes a validated model, digits as typed, defaults filled in."""
 
 import re
+import time
 from decimal import Decimal
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -247,3 +248,14 @@ gains = [1, 0, 1, 0]
     (tmp_path / "submission.toml").write_text(text, encoding="utf-8")
     with pytest.raises(SubmissionError, match=r"system\.carts: carts = 3, but .* are for 2"):
         load_submission(tmp_path)
+
+
+def test_a_hundred_thousand_mistakes_are_told_at_once(tmp_path):
+    """The first is worded, the others counted: what each may have meant would take minutes."""
+    keys = "".join(f"k{i} = 1\n" for i in range(60_000))
+    text = f"version = 1\n[system]\ncarts = 1\n{keys}"
+    (tmp_path / "submission.toml").write_text(text, encoding="utf-8")
+    began = time.process_time()
+    with pytest.raises(SubmissionError, match=r"unknown key.*\(and 59999 more\)"):
+        load_submission(tmp_path)
+    assert time.process_time() - began < 20  # takes one; all of them took a hundred

@@ -21,7 +21,6 @@ from pipeline.submission.load import InvalidSubmission, spring_names
 
 _NUMBER = re.compile(r"[-+]?(0|[1-9]\d*)(\.\d+)?([eE][-+]?\d+)?")
 _INLINE = ("input", "position", "controller", "columns")  # tables that stand in one line
-_MOST_SHOWN = 100  # problems
 _BLANK = ("title", "section")  # keys that stay where nothing is said, and their comments
 _KEPT = ("system", "experiments")  # tables that stay where nothing is left in them
 
@@ -146,7 +145,7 @@ def with_errors(
     now = {field.path: field for field in changed}
     shown = [now.get(field.path, field) for field in fields]
     left: list[str] = []
-    problems = error.problems[:_MOST_SHOWN] if isinstance(error, InvalidSubmission) else ()
+    problems = error.problems if isinstance(error, InvalidSubmission) else ()
     if error is not None and not problems:
         left.append(str(error))
     for location, what in problems:

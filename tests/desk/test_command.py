@@ -1,0 +1,53 @@
+"""What `cartlab desk` cannot do is one line; what it opens by itself."""
+
+import pytest
+
+from pipeline.desk.app import DeskServer
+from tests.helpers.commandline import cartlab_here
+from tests.helpers.desks import Visitor, a_submission
+
+USERS = '[proxy]\naddress = "127.0.0.1"\nheader = "X-Name"\nsite = "http://lab"\n'
+
+
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        (["--host", "127.0.0.1"], "go together"),
+        (["--users", "users.toml"], "go together"),
+        (["team", "--host", "127.0.0.1", "--users", "users.toml"], "the file says"),
+        (["--host", "127.0.0.1", "--users", "nowhere.toml"], "nowhere.toml"),
+        (["--host", "127.0.0.1", "--users", "users.toml"], "users: is required"),
+        (["users.toml"], "is a file"),
+        (["nowhere/team"], "there is no folder"),
+    ],
+)
+def test_what_it_cannot_do_is_one_line(options, why, tmp_path):
+    """Exit status 2; nothing is served or made."""
+    (tmp_path / "users.toml").write_text(USERS, encoding="utf-8")
+    done = cartlab_here("desk", "--no-browser", *options, cwd=tmp_path)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert why in done.stderr.lower()
+    assert [path.name for path in tmp_path.iterdir()] == ["users.toml"]
+
+
+def test_the_output_of_a_grading_is_shown_as_such(tmp_path):
+    """Beside a submission that is opened by name; the class page runs its own scripts only."""
+    grades = tmp_path / "grades"
+    grades.mkdir()
+    (grades / "gradebook.sqlite").write_bytes(b"")
+    (grades / "class.html").write_text("<p>the class</p>", encoding="utf-8")
+    with DeskServer(folder=grades) as server:
+        visitor = Visitor.of(server.url)
+        assert "class.html" in visitor.get("/grades/0/").text
+        page = visitor.get("/grades/0/class.html")
+        assert page.body == b"<p>the class</p>"
+        assert page.headers["content-security-policy"].startswith("sandbox")
+        assert visitor.get("/grades/0/gradebook.sqlite").status == 404
+        team = a_submission(tmp_path / "team")
+        assert visitor.post("/open", folder=str(team)).headers["location"] == "/student/0/"
+        assert visitor.post("/open", folder=str(team)).headers["location"] == "/student/0/"
+        assert visitor.post("/open", folder=str(tmp_path / "a" / "b")).status == 422
+        home = visitor.get("/").text
+        assert "/grades/0/" in home
+        assert "/student/0/" in home
