@@ -26,7 +26,7 @@ FRICTION = {"effect": "coulomb_friction", "coulomb_friction.place": "2"}
 @pytest.fixture
 def visitor() -> Iterator[Visitor]:
     """Somebody at a desk of their own."""
-    with DeskServer(folders=[]) as server:
+    with DeskServer() as server:
         yield Visitor.of(server.url)
 
 
@@ -133,7 +133,7 @@ def test_a_picture_is_inert(visitor):
 def test_a_solution_is_what_the_command_writes(tmp_path):
     """Made in the folder, shown in its page, with the expected values for programs."""
     folder = a_submission(tmp_path / "reference")
-    with DeskServer(folders=[folder]) as server:
+    with DeskServer(folder=folder) as server:
         visitor = Visitor.of(server.url)
         assert visitor.get("/solution/0/solution.html").status == 404
         assert visitor.post("/solution/0/make").status == 303
