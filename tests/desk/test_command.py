@@ -31,22 +31,19 @@ def test_what_it_cannot_do_is_one_line(options, why, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["users.toml"]
 
 
-def test_the_output_of_a_grading_is_shown_as_such(tmp_path):
-    """Beside a submission that is opened by name; the class page runs its own scripts only."""
+def test_what_is_opened_is_known_by_what_lies_in_it(tmp_path):
+    """A grading's output by its gradebook, by the folder or the file; all else is a submission."""
     grades = tmp_path / "grades"
     grades.mkdir()
     (grades / "gradebook.sqlite").write_bytes(b"")
-    (grades / "class.html").write_text("<p>the class</p>", encoding="utf-8")
     with DeskServer(folder=grades) as server:
         visitor = Visitor.of(server.url)
-        assert "class.html" in visitor.get("/grades/0/").text
-        page = visitor.get("/grades/0/class.html")
-        assert page.body == b"<p>the class</p>"
-        assert page.headers["content-security-policy"].startswith("sandbox")
-        assert visitor.get("/grades/0/gradebook.sqlite").status == 404
         team = a_submission(tmp_path / "team")
-        assert visitor.post("/open", folder=str(team)).headers["location"] == "/student/0/"
-        assert visitor.post("/open", folder=str(team)).headers["location"] == "/student/0/"
+        for folder, room in (
+            (grades / "gradebook.sqlite", "grades"), (team, "student"), (team, "student"),
+        ):  # fmt: skip
+            opened = visitor.post("/open", folder=str(folder))
+            assert (opened.status, opened.headers["location"]) == (303, f"/{room}/0/")
         assert visitor.post("/open", folder=str(tmp_path / "a" / "b")).status == 422
         home = visitor.get("/").text
         assert "/grades/0/" in home

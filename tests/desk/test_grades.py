@@ -34,7 +34,7 @@ def grades(tmp_path):
 @pytest.fixture
 def ta(grades):
     """Who opened it at this computer."""
-    with DeskServer(folders=[]) as server:
+    with DeskServer() as server:
         visitor = Visitor.of(server.url)
         assert visitor.post("/open", folder=str(grades)).headers["location"] == ROOM
         visitor.post(ROOM + "sign", by="Ada", of="team-01")
@@ -118,7 +118,7 @@ def test_a_large_class_comes_a_page_at_a_time(tmp_path):
         for outcome in outcomes:
             book.put(outcome)
         book.finish(_batch(outcomes), rubric=two_cart_rubric())
-    with DeskServer(folders=[]) as server:
+    with DeskServer() as server:
         who = Visitor.of(server.url)
         who.post("/open", folder=str(tmp_path))
         shown = [names(who.get(f"{ROOM}?page={page}")) for page in ("1", "2", "3")]
@@ -275,8 +275,8 @@ def two_desks(database, tmp_path):
     )
     (tmp_path / "users.toml").write_text(USERS + users, encoding="utf-8")
     with (
-        DeskServer(folders=[], users=tmp_path / "users.toml") as one,
-        DeskServer(folders=[], users=tmp_path / "users.toml") as other,
+        DeskServer(users=tmp_path / "users.toml") as one,
+        DeskServer(users=tmp_path / "users.toml") as other,
     ):
 
         def who(name: str, server: DeskServer) -> Visitor:
@@ -388,7 +388,7 @@ def test_a_class_is_graded_again_from_the_desk(tmp_path):
         outcome = make_outcome(make_grade("team-04"), fingerprints=b"")
         book.put(outcome)
         book.finish(_batch([outcome]), rubric=two_cart_rubric())
-    with DeskServer(folders=[]) as server:
+    with DeskServer() as server:
         who = Visitor.of(server.url)
         who.post("/open", folder=str(grades))
         assert who.post(ROOM + "regrade", paths="", rubric="x").status == 422
@@ -410,7 +410,7 @@ def test_an_anonymous_class_names_nobody_anywhere(tmp_path):
         entries = list(book.entries())
     real = {entry.submission for entry in entries} - {"broken"}
     real |= {author for entry in entries for author in entry.grade.authors if len(author) > 3}
-    with DeskServer(folders=[]) as server:
+    with DeskServer() as server:
         who = Visitor.of(server.url)
         who.post("/open", folder=str(grades))
         shown = names(who.get(ROOM))
