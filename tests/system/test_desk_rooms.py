@@ -28,7 +28,7 @@ def test_a_session_is_begun_watched_and_decided_on(show, tmp_path, real):
         tmp_path / "team",
         [sine("long", seconds=300), sine("next", seconds=1), sine("last", seconds=300)],
     )
-    with DeskServer(folders=[work]) as server:
+    with DeskServer(folder=work) as server:
         window = show(server.url, size=PHONE)
         window.get_by_role("link", name="team: bench").click()
         assert fits(window)
@@ -60,7 +60,7 @@ def test_a_session_is_begun_watched_and_decided_on(show, tmp_path, real):
 def test_an_exercise_is_made_of_what_is_seen(show, tmp_path):
     """An effect is ticked, its slider moved, its picture redrawn; the exercise opens."""
     out = tmp_path / "exercise"
-    with DeskServer(folders=[]) as server:
+    with DeskServer() as server:
         window = show(server.url, size=WIDE)
         window.get_by_role("link", name="Exercises").click()
         window.locator('input[value="coulomb_friction"]').check()
@@ -83,7 +83,7 @@ def test_an_exercise_is_made_of_what_is_seen(show, tmp_path):
 def test_a_rubric_is_edited_with_its_mistakes_beside_it(show, tmp_path):
     """What is wrong shows as it is typed, and goes; what is right is saved."""
     path = tmp_path / "rubric.toml"
-    with DeskServer(folders=[]) as server:
+    with DeskServer() as server:
         window = show(server.url)
         window.goto(f"{window.url}rubric/")
         window.get_by_label("Another rubric").fill(str(path))
