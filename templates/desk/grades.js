@@ -14,7 +14,8 @@ if (keys) {
     const wanted = document.querySelector(`[data-key="${CSS.escape(event.key)}"]`);
     if (!wanted) return;
     event.preventDefault();
-    if (wanted.matches("input")) wanted.select();
-    else wanted.click();
+    if (!wanted.matches("input")) return wanted.click();
+    wanted.focus();
+    wanted.select();
   });
 }
