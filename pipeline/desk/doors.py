@@ -4,6 +4,7 @@ import re
 import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from ipaddress import ip_address
 
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
@@ -31,6 +32,8 @@ class SecretDoor:
     The secret opens once; then a cookie that no script reads and no other site sends does, and the
     address is without a secret that a history or a picture of the screen could keep.
     """
+
+    arrivals = False  # the cookie does not come along
 
     def __init__(self, user: User, *, port: int, start: str) -> None:
         self.sites = own_names(port)
@@ -69,6 +72,8 @@ class SecretDoor:
 class ProxyDoor:
     """For a lab server: the proxy in front says who somebody is, and nobody else is heard."""
 
+    arrivals = True  # from the page of a login, or of a course
+
     def __init__(self, proxy: Proxy, users: Mapping[str, User]) -> None:
         self.sites = frozenset([proxy.site])
         self._proxy, self._users = proxy, users
@@ -79,7 +84,10 @@ class ProxyDoor:
 
     def enter(self, scope: Scope, headers: Headers) -> User | Response:
         """Return who asks, or the answer to who may not."""
-        if scope["client"][0] != self._proxy.address:
+        sent = headers.getlist(self._proxy.secret_header)
+        # Whoever is logged in where the proxy runs has its address, and not its secret.
+        known = len(sent) == 1 and _same(sent[0].encode("latin-1"), self._proxy.secret)
+        if not known or ip_address(scope["client"][0]) != ip_address(self._proxy.address):
             return _refused("ask by the address of the laboratory")
         names = headers.getlist(self._proxy.header)
         if len(names) != 1 or names[0] not in self._users:
@@ -107,7 +115,10 @@ class Guard:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request, or refuse it."""
         headers, send = Headers(scope=scope), guarded(send, _PAGE)
-        if why := refusal(headers, method=scope["method"], sites=self.door.sites):
+        why = refusal(
+            headers, method=scope["method"], sites=self.door.sites, arrivals=self.door.arrivals
+        )
+        if why:
             await _refused(why)(scope, receive, send)
             return
         found = self.door.enter(scope, headers)

@@ -146,8 +146,9 @@ def rooms(user: User) -> list[tuple[str, str]]:
     """Return the address and the name of every room that somebody may enter."""
     found = [("/", "Desk")]
     found += [(f"/student/{n}/", place_name(p)) for n, p in enumerate(user.folders)]
-    if user.owns:
-        found += [("/exercises/", "Exercises"), ("/rubric/", "Rubric"), ("/effects/", "Effects")]
+    whole = {"exercises": "Exercises", "rubric": "Rubric", "effects": "Effects"}
+    found += [(f"/{room}/", name) for room, name in whole.items() if user.may(room)]
+    if user.may("bench"):
         found += [(f"/bench/{n}/", f"{place_name(p)}: bench") for n, p in enumerate(user.folders)]
     found += [(f"/grades/{n}/", place_name(p)) for n, p in enumerate(user.gradebooks)]
     return found

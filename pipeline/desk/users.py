@@ -1,11 +1,15 @@
 """Who may see what: everything for the person at this computer, else what a file says."""
 
+import os
+import stat
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Annotated, Literal
 from urllib.parse import urlsplit
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
 from pipeline.errors import ConfigError
 from pipeline.submission.complaints import explain
@@ -14,6 +18,17 @@ from pipeline.submission.toml_file import parse_toml, read_text
 Place = Path | str  # a folder, or the address of a database
 Role = Literal["owner", "student", "ta", "instructor"]
 _MOST_BYTES = 1_000_000
+
+# The rooms that a role may enter, by the first part of their address. Rooms that write wherever
+# one says, read any file or open a port of this computer are for who started the desk.
+_ALL = frozenset({"", "static"})
+_ROOMS: dict[Role, frozenset[str]] = {
+    "student": _ALL | {"student"},
+    "ta": _ALL | {"grades"},
+    "instructor": _ALL | {"student", "grades", "solution", "effects"},
+    "owner": _ALL
+    | {"open", "student", "grades", "solution", "effects", "exercises", "rubric", "bench"},
+}
 
 
 @dataclass(kw_only=True)
@@ -32,6 +47,10 @@ class User:
     folders: list[Path] = field(default_factory=list)
     gradebooks: list[Place] = field(default_factory=list)
 
+    def may(self, room: str) -> bool:
+        """Whether they may enter a room; which of its places, their lists say."""
+        return room in _ROOMS[self.role]
+
     @property
     def owns(self) -> bool:
         """Whether they may open whatever this computer lets them."""
@@ -42,12 +61,20 @@ class _Model(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+_HEADER = r"^[A-Za-z0-9-]+$"
+
+
 class Proxy(_Model):
     """The reverse proxy in front, which knows who somebody is."""
 
     address: Annotated[str, Field(min_length=1)]  # of the proxy: nobody else may connect
-    header: Annotated[str, Field(pattern=r"^[A-Za-z0-9-]+$")]  # in which it says the name
-    site: Annotated[str, Field(pattern=r"^https?://[^/\s]+$")]  # that browsers ask for
+    header: Annotated[str, Field(pattern=_HEADER)]  # in which it says the name
+    secret_header: Annotated[str, Field(pattern=_HEADER)]  # in which it says the secret
+    secret: Annotated[str, Field(pattern=r"^[!-~]{24,200}$")]  # known to it and the desk only
+    # That browsers ask for, who write it in small letters.
+    site: Annotated[
+        str, StringConstraints(to_lower=True), Field(pattern=r"^(?i:https?)://[^/\s]+$")
+    ]
 
 
 class Listed(_Model):
@@ -83,10 +110,14 @@ def read_users(path: Path) -> tuple[Proxy, dict[str, User]]:
             error.errors()[0], document, tables=tables, top_level=tuple(Users.model_fields)
         )
         raise ConfigError(f"{path}: {first}") from None
-    names = [user.name for user in found.users]
-    if twice := next((name for name in names if names.count(name) > 1), None):
-        raise ConfigError(f"{path}: users: {twice!r} is there twice")
     root = path.resolve().parent
+    if wrong := next(_wrong(found, root), None):
+        raise ConfigError(f"{path}: {wrong}")
+    if os.name == "posix" and path.stat().st_mode & stat.S_IROTH:
+        raise ConfigError(
+            f"{path}: everybody on this computer may read it, and the proxy's secret with it: "
+            "chmod o-r"
+        )
     return found.proxy, {
         user.name: User(
             name=user.name,
@@ -96,6 +127,28 @@ def read_users(path: Path) -> tuple[Proxy, dict[str, User]]:
         )
         for user in found.users
     }
+
+
+def _wrong(found: Users, root: Path) -> Iterator[str]:
+    """Yield what cannot be meant."""
+    proxy, names = found.proxy, [user.name for user in found.users]
+    try:
+        ip_address(proxy.address)
+    except ValueError:
+        yield f"proxy.address: expected an address such as 127.0.0.1, found {proxy.address!r}"
+    if proxy.header.lower() == proxy.secret_header.lower():
+        yield "proxy.secret_header: expected another header than that of the name"
+    for user in found.users:
+        where = f"users: {user.name!r}"
+        if names.count(user.name) > 1:
+            yield f"{where} is there twice"
+        for room, places in (("student", user.folders), ("grades", user.gradebooks)):
+            if places and room not in _ROOMS[user.role]:
+                key = "folders" if room == "student" else "gradebooks"
+                yield f"{where}: a {user.role} sees no {key}; take them away, or give another role"
+        for place in (*user.folders, *user.gradebooks):
+            if "://" not in place and not (root / place).is_dir():
+                yield f"{where}: there is no folder {root / place}"
 
 
 def place_name(place: Place) -> str:

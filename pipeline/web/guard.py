@@ -24,7 +24,9 @@ def own_names(port: int) -> frozenset[str]:
     return frozenset(f"http://{host}:{port}" for host in ("127.0.0.1", "localhost"))
 
 
-def refusal(headers: Headers, *, method: str, sites: Collection[str]) -> str:
+def refusal(
+    headers: Headers, *, method: str, sites: Collection[str], arrivals: bool = False
+) -> str:
     """Return why a request is not one of our own pages' or of a person; "" where it is.
 
     Names that lead here from elsewhere have another Host; other pages have another Origin, and
@@ -33,6 +35,8 @@ def refusal(headers: Headers, *, method: str, sites: Collection[str]) -> str:
     Parameters
     ----------
     sites : scheme, name and port of the addresses that lead here.
+    arrivals : whether people may come from another page, by a link or led on by a login: a whole
+        page may then be asked for, which writes nothing and which no other page can read.
     """
     host, origin = headers.get("host", ""), headers.get("origin")
     site = next((site for site in sites if site.partition("://")[2] == host), "")
@@ -40,9 +44,12 @@ def refusal(headers: Headers, *, method: str, sites: Collection[str]) -> str:
         return "ask by the address that cartlab printed"
     if origin != site and (origin is not None or method != "GET"):
         return "another page's request"
-    if headers.get("sec-fetch-site", "none") not in ("same-origin", "none"):
-        return "another page's request"
-    return ""
+    if headers.get("sec-fetch-site", "none") in ("same-origin", "none"):
+        return ""
+    asked = headers.get("sec-fetch-mode"), headers.get("sec-fetch-dest")
+    if arrivals and method == "GET" and asked == ("navigate", "document"):
+        return ""
+    return "another page's request"
 
 
 def guarded(send: Send, headers: Mapping[str, str]) -> Send:

@@ -7,6 +7,7 @@ from tests.helpers.commandline import cartlab_here
 from tests.helpers.desks import Visitor, a_submission
 
 USERS = '[proxy]\naddress = "127.0.0.1"\nheader = "X-Name"\nsite = "http://lab"\n'
+USERS += f'secret_header = "X-Secret"\nsecret = "{"s" * 24}"\n'
 
 
 @pytest.mark.parametrize(
@@ -24,6 +25,7 @@ USERS = '[proxy]\naddress = "127.0.0.1"\nheader = "X-Name"\nsite = "http://lab"\
 def test_what_it_cannot_do_is_one_line(options, why, tmp_path):
     """Exit status 2; nothing is served or made."""
     (tmp_path / "users.toml").write_text(USERS, encoding="utf-8")
+    (tmp_path / "users.toml").chmod(0o600)
     done = cartlab_here("desk", "--no-browser", *options, cwd=tmp_path)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1

@@ -2,6 +2,7 @@
 
 import re
 import socket
+import sys
 import time
 from contextlib import ExitStack
 from urllib.parse import urlsplit
@@ -13,7 +14,7 @@ from pipeline.desk.app import ROUTES, DeskServer
 from pipeline.desk.doors import MOST_FORM
 from pipeline.desk.users import read_users
 from pipeline.errors import ConfigError
-from tests.helpers.desks import Visitor, a_submission
+from tests.helpers.desks import PROXY, Visitor, a_submission, through_proxy, write_users
 from tests.helpers.grades import write_class
 from tests.helpers.waiting import PATIENCE, until
 
@@ -133,10 +134,6 @@ def test_a_port_that_is_taken_is_one_line(server):
 # ------------------------------------------------------------------------- a lab server
 
 USERS = """
-[proxy]
-address = "127.0.0.1"
-header = "X-Remote-User"
-site = "https://lab.example.edu"
 [[users]]
 name = "s1"
 role = "student"
@@ -149,25 +146,29 @@ folders = ["two", "three"]
 name = "t"
 role = "ta"
 gradebooks = ["grades"]
+[[users]]
+name = "i"
+role = "instructor"
+folders = ["one"]
+gradebooks = ["grades"]
 """
 
 
 @pytest.fixture(scope="module")
-def lab(tmp_path_factory):
-    """A desk for three, who come through a proxy; who asks, by name."""
-    root = tmp_path_factory.mktemp("lab")
+def root(tmp_path_factory):
+    """The folders of a lab server."""
+    return tmp_path_factory.mktemp("lab")
+
+
+@pytest.fixture(scope="module")
+def lab(root):
+    """A desk for four, who come through a proxy; who asks, by name."""
     for name in ("one", "two", "three", "four"):
         a_submission(root / name)
     write_class(root / "grades")
-    (root / "users.toml").write_text(USERS, encoding="utf-8")
-    with DeskServer(users=root / "users.toml") as server:
+    with DeskServer(users=write_users(root, USERS)) as server:
         port = urlsplit(server.url).port or 0
-
-        def who(name: str, **given: str) -> Visitor:
-            headers = {"X-Remote-User": name} if name else {}
-            return Visitor(port=port, host="lab.example.edu", headers=headers, **given)
-
-        yield who
+        yield lambda name, **given: through_proxy(port, name, **given)
 
 
 def test_everybody_sees_their_own(lab):
@@ -177,7 +178,7 @@ def test_everybody_sees_their_own(lab):
     assert lab("s1").get("/student/1/").status == 404
     assert lab("s2").get("/student/1/").status == 200
     for path in ("/student/-1/", "/student/00000001/", "/student/1/report", "/student/../two/",
-                 "/student/%2e%2e/", "/student/1/hand-in.zip", "/grades/0/"):  # fmt: skip
+                 "/student/%2e%2e/", "/student/1/hand-in.zip"):  # fmt: skip
         assert lab("s1").get(path).status == 404, path
     assert lab("s1").post("/student/1/save", title="mine", seen="").status == 404
     assert lab("s1").upload("/student/1/files", [("a.csv", b"x")]).status == 404
@@ -188,7 +189,51 @@ def test_a_ta_sees_the_gradebooks_they_are_listed_for(lab):
     """And no student's room."""
     assert "team-07" in lab("t").get("/grades/0/").text
     assert lab("t").get("/grades/1/").status == 404
-    assert lab("t").get("/student/0/").status == 404
+
+
+# Of each room, by the first part of an address, who of a lab server is let in.
+ENTER = {"": "s t i", "static": "s t i", "student": "s i", "grades": "t i", "solution": "i",
+         "effects": "i", "open": "", "exercises": "", "rubric": "", "bench": ""}  # fmt: skip
+
+
+@pytest.mark.parametrize("path", [*PATHS, "/student/0/events", "/grades/0/events"])
+def test_each_role_has_its_rooms(lab, path):
+    """Every address: none of a room that is not one's own, whatever is sent there."""
+    for role, name in {"s": "s1", "t": "t", "i": "i"}.items():
+        let_in = role in ENTER[path.split("/")[1]].split()
+        if not let_in:
+            answers = {lab(name).get(path).status, lab(name).post(path).status}
+            assert 403 in answers <= {403, 405}, name
+        elif path.endswith("/"):
+            assert lab(name).get(path).status in (200, 303, 405), name
+
+
+def test_people_come_from_the_page_of_a_login(lab):
+    """A whole page may be asked for from elsewhere, and no part of one, and no form."""
+    led = {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "navigate"}
+    page = led | {"Sec_Fetch_Dest": "document"}
+    assert lab("s1").get("/student/0/", **page).status == 200
+    for other in (led | {"Sec_Fetch_Dest": "iframe"}, page | {"Sec_Fetch_Mode": "no-cors"}, led):
+        assert lab("s1").get("/student/0/", **other).status == 403
+    kind = "application/x-www-form-urlencoded"
+    assert lab("s1").send("/student/0/fill", b"", kind=kind, **page).status == 403
+
+
+def test_a_page_that_is_asked_for_writes_nothing(lab, root):
+    """Whoever may ask for it, from wherever: every file is afterwards as it was."""
+
+    def files() -> dict:
+        return {
+            path: path.read_bytes()
+            for path in root.rglob("*")
+            if path.is_file() and not path.name.startswith("gradebook.sqlite-")
+        }
+
+    before = files()
+    for path in (p for p, (_, method, _) in zip(PATHS, ROUTES, strict=True) if method == "GET"):
+        for name in ("s1", "t", "i"):
+            lab(name).get(path)
+    assert files() == before
 
 
 def test_nobody_names_a_folder_of_the_server(lab, tmp_path):
@@ -202,7 +247,13 @@ def test_forged_names_are_refused(lab):
     assert lab("").get("/").status == 403
     assert lab("root").get("/").status == 403
     assert lab("s1", source="127.0.0.2").get("/student/0/").status == 403
+    guessed = lab("s1")
+    for secret in ("", "the-proxy-and-the-desk-know-i", "wrong"):
+        assert guessed.get("/student/0/", X_Proxy_Secret=secret).status == 403
+    del guessed.headers["X-Proxy-Secret"]  # who is logged in beside the proxy
+    assert guessed.get("/student/0/").status == 403
     double = "GET /student/0/ HTTP/1.1\r\nHost: lab.example.edu\r\n"
+    double += "X-Proxy-Secret: the-proxy-and-the-desk-know-it\r\n"
     double += "X-Remote-User: s1\r\nX-Remote-User: s2\r\n\r\n"
     with socket.create_connection(("127.0.0.1", lab("").port), timeout=PATIENCE) as line:
         line.sendall(double.encode())
@@ -217,17 +268,37 @@ def test_forged_names_are_refused(lab):
     ("text", "why"),
     [
         ("", "proxy: is required"),
-        (USERS.replace("ta", "boss", 1), "role"),
-        (USERS.replace('"s2"', '"s1"'), "there twice"),
-        (USERS.replace("folders", "folder", 1), "did you mean 'folders'"),
-        (USERS.replace("https://lab.example.edu", "lab"), "site"),
+        ((PROXY + USERS).replace('"ta"', '"boss"', 1), "role"),
+        ((PROXY + USERS).replace('secret = "the', 'secrets = "the'), "secret"),
+        ((PROXY + USERS).replace("the-proxy-and-the-desk-know-it", "short"), "secret"),
+        ((PROXY + USERS).replace("X-Proxy-Secret", "x-remote-user"), "another header"),
+        ((PROXY + USERS).replace("127.0.0.1", "proxy.lab"), "proxy.address"),
+        ((PROXY + USERS).replace('"student"', '"ta"', 1), "a ta sees no folders"),
+        ((PROXY + USERS).replace('"ta"', '"student"'), "a student sees no gradebooks"),
+        ((PROXY + USERS).replace('"two"', '"twoo"'), "there is no folder"),
+        ((PROXY + USERS).replace('"s2"', '"s1"'), "there twice"),
+        ((PROXY + USERS).replace("folders", "folder", 1), "did you mean 'folders'"),
+        ((PROXY + USERS).replace("https://Lab.example.edu", "lab"), "site"),
     ],
 )
 def test_a_wrong_list_is_one_line(text, why, tmp_path):
     """What is wrong with the file of users is said, and nothing is served."""
+    for name in ("one", "two", "three", "grades"):
+        (tmp_path / name).mkdir()
     (tmp_path / "users.toml").write_text(text, encoding="utf-8")
+    (tmp_path / "users.toml").chmod(0o600)
     with pytest.raises(ConfigError, match=why):
         read_users(tmp_path / "users.toml")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has other rights")
+def test_a_secret_that_everybody_may_read_is_none(tmp_path):
+    """The file of users is for the desk alone; one that is so is read."""
+    path = write_users(tmp_path, '[[users]]\nname = "s1"\nrole = "student"\n')
+    assert read_users(path)[0].site == "https://lab.example.edu"
+    path.chmod(0o644)
+    with pytest.raises(ConfigError, match="chmod o-r"):
+        read_users(path)
 
 
 def test_a_stranger_s_clock_runs(server):

@@ -18,7 +18,7 @@ from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.open_book import OpenBook
 from pipeline.grading.gradebook.schema import FILE
 from pipeline.grading.publish.export import export
-from tests.helpers.desks import BOUNDARY, Answer, Visitor, a_submission
+from tests.helpers.desks import BOUNDARY, Answer, Visitor, a_submission, through_proxy, write_users
 from tests.helpers.grades import fill_book, make_grade, make_outcome, two_cart_rubric, write_class
 from tests.helpers.waiting import until
 
@@ -258,30 +258,18 @@ def database():
         yield url
 
 
-USERS = """
-[proxy]
-address = "127.0.0.1"
-header = "X-Remote-User"
-site = "https://lab.example.edu"
-"""
-
-
 @pytest.fixture
 def two_desks(database, tmp_path):
     """Two desks of a lab on one database, and who asks the first and the second."""
     users = "".join(
         f'[[users]]\nname = "{name}"\nrole = "{role}"\ngradebooks = ["{database}"]\n'
-        for name, role in (("Ada", "ta"), ("Bob", "ta"), ("Eve", "student"))
+        for name, role in (("Ada", "ta"), ("Bob", "ta"))
     )
-    (tmp_path / "users.toml").write_text(USERS + users, encoding="utf-8")
-    with (
-        DeskServer(users=tmp_path / "users.toml") as one,
-        DeskServer(users=tmp_path / "users.toml") as other,
-    ):
+    path = write_users(tmp_path, users + '[[users]]\nname = "Eve"\nrole = "student"\n')
+    with DeskServer(users=path) as one, DeskServer(users=path) as other:
 
         def who(name: str, server: DeskServer) -> Visitor:
-            port = urlsplit(server.url).port or 0
-            return Visitor(port=port, host="lab.example.edu", headers={"X-Remote-User": name})
+            return through_proxy(urlsplit(server.url).port or 0, name)
 
         yield who("Ada", one), who("Bob", other), who("Eve", one)
 

@@ -13,6 +13,14 @@ from pipeline.resources import EXAMPLES
 from tests.helpers.waiting import PATIENCE
 
 BOUNDARY = "----cartlab"
+PROXY = """
+[proxy]
+address = "127.0.0.1"
+header = "X-Remote-User"
+secret_header = "X-Proxy-Secret"
+secret = "the-proxy-and-the-desk-know-it"
+site = "https://Lab.example.edu"
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,6 +104,22 @@ class Visitor:
             return Answer(status=answer.status, headers=found, body=answer.read())
         finally:
             connection.close()
+
+
+def through_proxy(port: int, name: str, **given: str) -> Visitor:
+    """Return who comes through the proxy of a lab server, which names them; "" for no name."""
+    headers = {"X-Proxy-Secret": "the-proxy-and-the-desk-know-it"}
+    if name:
+        headers["X-Remote-User"] = name
+    return Visitor(port=port, host="lab.example.edu", headers=headers, **given)
+
+
+def write_users(folder: Path, text: str) -> Path:
+    """Write the file of users of a lab server, for the desk's eyes only."""
+    path = folder / "users.toml"
+    path.write_text(PROXY + text, encoding="utf-8")
+    path.chmod(0o600)
+    return path
 
 
 def some_files(folder: str = "one-cart", *, most: int = 99) -> list[tuple[str, bytes]]:

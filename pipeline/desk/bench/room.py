@@ -20,7 +20,7 @@ from pipeline.submission.load import NAME
 
 def show(ask: Ask) -> Response:
     """Show the plan and the form, or the session that is under way."""
-    folder = _folder(ask)
+    folder = ask.folder()
     session = ask.desk.benches.of(folder)
     return ask.page(
         "bench",
@@ -38,7 +38,7 @@ def show(ask: Ask) -> Response:
 
 def plan(ask: Ask) -> Response:
     """Have a plan made, or added to."""
-    folder = _folder(ask)
+    folder = ask.folder()
     stock = bool(ask.text("stock"))
     ask.desk.jobs.start("plan", title="The plan", place=folder, folder=str(folder), stock=stock)
     return ask.back(_here(ask))
@@ -46,7 +46,7 @@ def plan(ask: Ask) -> Response:
 
 def start(ask: Ask) -> Response:
     """Begin to acquire what is ticked; all of the plan where nothing is."""
-    folder, port = _folder(ask), ask.text("port")
+    folder, port = ask.folder(), ask.text("port")
     if not port:
         raise ConfigError("name the port of the bench, such as COM3, /dev/ttyACM0 or socket://…")
     only = [value for value in ask.form.getlist("only") if isinstance(value, str)]
@@ -65,18 +65,12 @@ def events(ask: Ask) -> Response:
     return StreamingResponse(_running(ask).events(), media_type="text/event-stream")
 
 
-def _folder(ask: Ask) -> Path:
-    if not ask.user.owns:
-        raise HTTPException(403, "the bench is at the computer of this desk's owner")
-    return ask.folder()
-
-
 def _here(ask: Ask) -> str:
     return f"/bench/{ask.request.path_params['n']}/"
 
 
 def _running(ask: Ask) -> Session:
-    session = ask.desk.benches.of(_folder(ask))
+    session = ask.desk.benches.of(ask.folder())
     if session is None or session.ended.is_set() or not session.url:
         raise HTTPException(404, "no session is under way")
     return session

@@ -41,8 +41,6 @@ def here(ask: Ask) -> str:
 def a_class(ask: Ask) -> Class:
     """Return the class that the address is about."""
     place = ask.grades()
-    if ask.user.role == "student":
-        raise HTTPException(404, "there is nothing here that is yours to see")
     return ask.desk.books.of(place)
 
 

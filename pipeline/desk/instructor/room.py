@@ -1,6 +1,6 @@
 """The instructor's room: exercises with what is hidden in them, solutions, the catalogue."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
@@ -26,17 +26,6 @@ _PICTURE = "default-src 'none'; style-src 'unsafe-inline'; sandbox"
 _BENCH = ("preset", "m", "c", "k")
 _SIZE = ("value", "usual", "slide", "was")
 _SHOWN_ON = "throne-2dof"  # the smallest with a spring between two carts
-
-
-def owned(handler: Callable[[Ask], Response]) -> Callable[[Ask], Response]:
-    """Return what answers the owner of this computer only: exercises are written where they say."""
-
-    def answer(ask: Ask) -> Response:
-        if not ask.user.owns:
-            raise HTTPException(403, "this room is for the owner of this desk")
-        return handler(ask)
-
-    return answer
 
 
 def show(ask: Ask) -> Response:
