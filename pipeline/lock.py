@@ -1,4 +1,4 @@
-"""One cartlab at a time writes into a folder."""
+"""One cartlab at a time writes into a folder: a run keeps others out, a change waits its turn."""
 
 import os
 import sqlite3
@@ -7,7 +7,9 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from pipeline.errors import ConfigError
-from pipeline.output import LOCK
+from pipeline.output import LOCK, TURN
+
+_PATIENCE = 30.0  # s for a turn, which takes less than one
 
 # Where a database keeps its user's number, by SQLite's file format; the lock keeps its process
 # there, to be read by whoever the lock keeps out.
@@ -36,10 +38,27 @@ def alone_in(out: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _locked(lock: Path) -> Iterator[None]:
+def turn_in(folder: Path) -> Iterator[None]:
+    """Wait until nobody else reads a file of a folder to write it again.
+
+    It is a lock of its own: a session on a bench has the folder to itself for an hour, and changes
+    its `submission.toml` all the while.
+
+    Raises
+    ------
+    ConfigError : another has had its turn for half a minute, or nothing can be written there.
+    """
+    with _locked(folder / TURN, patience=_PATIENCE):
+        yield
+
+
+@contextmanager
+def _locked(lock: Path, *, patience: float = 0.0) -> Iterator[None]:
+    if lock.is_symlink():
+        raise ConfigError(f"{lock}: is a link; remove it")
     with ExitStack() as stack:
         try:
-            connection = sqlite3.connect(lock, timeout=0, isolation_level=None)
+            connection = sqlite3.connect(lock, timeout=patience, isolation_level=None)
             stack.callback(connection.close)
             connection.execute("PRAGMA journal_mode = MEMORY")  # no further file
             connection.execute("PRAGMA locking_mode = EXCLUSIVE")  # a commit keeps the lock

@@ -4,13 +4,14 @@ Tables are written so that a spreadsheet runs nothing that a student wrote.
 """
 
 import re
+import secrets
 from collections.abc import Iterable, Sequence
 from numbers import Real
 from pathlib import Path
 
 from pipeline.errors import ConfigError
 
-LOCK = ".lock"  # of `pipeline.lock`
+LOCK, TURN = ".lock", ".turn"  # of `pipeline.lock`
 # What looks like the start of a formula and is none: a number, and the dash for nothing.
 _PLAIN = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?|-", re.ASCII)
 # What starts a formula, wide and small forms too, at the start of a cell or behind a semicolon,
@@ -31,13 +32,13 @@ def check_folder(out: Path) -> Path:
 
 
 def new_folder(out: Path) -> Path:
-    """Return the folder, not yet there or empty but for a lock.
+    """Return the folder, not yet there or empty but for locks.
 
     Raises
     ------
     ConfigError : there is something in it, which a new submission would be mixed with.
     """
-    if check_folder(out).is_dir() and any(path.name != LOCK for path in out.iterdir()):
+    if check_folder(out).is_dir() and any(path.name not in (LOCK, TURN) for path in out.iterdir()):
         raise ConfigError(f"{out}: is not empty; name a new folder with --out")
     return out
 
@@ -58,11 +59,14 @@ def own_folder(parent: Path, name: str) -> Path:
 def write_file(path: Path, content: str | bytes) -> None:
     """Write a file whole or not at all; a link in its place is replaced, not followed."""
     raw = content.encode() if isinstance(content, str) else content
-    part = path.with_name(f".{path.name}.part")
-    part.unlink(missing_ok=True)  # left by a run that was stopped
-    with part.open("xb") as file:
-        file.write(raw)
-    part.replace(path)
+    part = path.with_name(f".{secrets.token_hex(8)}.part")  # of this write alone
+    try:
+        with part.open("xb") as file:
+            file.write(raw)
+        part.replace(path)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
 
 
 def clear_files(folder: Path, pattern: str) -> None:

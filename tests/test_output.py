@@ -4,6 +4,7 @@ import csv
 import io
 import re
 import unicodedata
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -26,10 +27,21 @@ def test_a_file_is_replaced_whole(tmp_path):
     """New content takes the place of the old, with nothing left beside it."""
     path = tmp_path / "results.json"
     write_file(path, "old")
-    (tmp_path / ".results.json.part").write_text("left by a run that was stopped")
     write_file(path, "ω\n")
     assert path.read_bytes() == "ω\n".encode()
     assert [p.name for p in tmp_path.iterdir()] == ["results.json"]
+
+
+def test_a_file_that_many_write_at_once_is_one_of_theirs(tmp_path):
+    """Whole, whoever came last; what cannot be written leaves nothing."""
+    path, texts = tmp_path / "notes.md", [str(i) * 300_000 for i in range(8)]
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda text: write_file(path, text), 5 * texts))
+    assert path.read_text() in texts
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(OSError, match="folder"):
+        write_file(tmp_path / "folder", "x")
+    assert {p.name for p in tmp_path.iterdir()} == {"notes.md", "folder"}
 
 
 def test_a_link_is_replaced_not_followed(tmp_path):

@@ -1,8 +1,7 @@
 """What every page of the desk is made with: who asks, for which place, and what is under way."""
 
 import secrets
-import threading
-from collections import OrderedDict, defaultdict
+from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
@@ -39,14 +38,7 @@ class Desk:
     benches: Sessions = field(default_factory=Sessions)
     books: Books = field(default_factory=Books)
     said: dict[tuple[str, str], list[str]] = field(default_factory=dict)
-    _locks: defaultdict[Path, threading.Lock] = field(
-        default_factory=lambda: defaultdict(threading.Lock)
-    )
     _looks: OrderedDict[Path, tuple[Stamp, dict[str, Any]]] = field(default_factory=OrderedDict)
-
-    def alone(self, folder: Path) -> threading.Lock:
-        """Return what holds for whoever reads a file of a folder to write it again."""
-        return self._locks[folder]
 
     def looks(
         self, folder: Path, stated: Callable[[str], dict[str, str | int]]

@@ -11,6 +11,7 @@ from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import Array
 
 from pipeline.errors import SubmissionError
+from pipeline.lock import turn_in
 from pipeline.output import write_file
 from pipeline.submission.load import MAX_TOML_BYTES, NAME, outside, parse_submission
 from pipeline.submission.models import Submission
@@ -62,27 +63,31 @@ def edit_submission(
         cannot be changed so.
     Outdated : the file is not the one `seen`.
     """
-    text = submission_text(folder)
-    if seen and seen != text_digest(text):
-        raise Outdated(text)
-    where = f"{folder.resolve().name}/{NAME}"
-    if len(text) > _MOST_EDITED:
-        raise SubmissionError(
-            f"{where}: {len(text):,} characters; a program changes files of up to {_MOST_EDITED:,}"
-        )
-    newline = "\r\n" if "\r\n" in text else "\n"
-    try:
-        document = tomlkit.parse(text.replace("\r\n", "\n"))
-        change(document)
-        new = _MANY_BLANKS.sub("\n\n", tomlkit.dumps(document)).rstrip() + "\n"
-    except (TOMLKitError, RecursionError) as error:
-        raise SubmissionError(f"{where}: cannot be changed by a program ({error})") from None
-    except (TypeError, AttributeError, LookupError):
-        parse_submission(text, folder=folder, where=where)  # no table where one was to be changed?
-        raise
-    submission = parse_submission(new, folder=folder, where=where)
-    write_file(folder / NAME, new.replace("\n", newline))
-    return submission
+    with turn_in(folder):
+        text = submission_text(folder)
+        if seen and seen != text_digest(text):
+            raise Outdated(text)
+        where = f"{folder.resolve().name}/{NAME}"
+        if len(text) > _MOST_EDITED:
+            raise SubmissionError(
+                f"{where}: {len(text):,} characters; a program changes files of up to "
+                f"{_MOST_EDITED:,}"
+            )
+        newline = "\r\n" if "\r\n" in text else "\n"
+        try:
+            document = tomlkit.parse(text.replace("\r\n", "\n"))
+            change(document)
+            new = _MANY_BLANKS.sub("\n\n", tomlkit.dumps(document)).rstrip() + "\n"
+        except (TOMLKitError, RecursionError) as error:
+            raise SubmissionError(f"{where}: cannot be changed by a program ({error})") from None
+        except (TypeError, AttributeError, LookupError):
+            parse_submission(text, folder=folder, where=where)  # no table where one was?
+            raise
+        if len(new.encode()) > MAX_TOML_BYTES:
+            raise SubmissionError(f"{where}: would have more than {MAX_TOML_BYTES:,} bytes")
+        submission = parse_submission(new, folder=folder, where=where)
+        write_file(folder / NAME, new.replace("\n", newline))
+        return submission
 
 
 def append_experiment(

@@ -112,15 +112,26 @@ def read_text(path: Path, *, where: str, limit: int, error: type[PipelineError])
     """
     try:
         if (size := path.stat().st_size) > limit:
-            raise error(f"{where}: {size:,} bytes, the limit is {limit:,}")
+            raise error(_too_large(where, size, limit))
         raw = path.read_bytes()
     except OSError as wrong:
         raise error(f"{where}: cannot be read ({wrong.strerror})") from None
+    return decoded(raw, where=where, limit=limit, error=error)
+
+
+def decoded(raw: bytes, *, where: str, limit: int, error: type[PipelineError]) -> str:
+    """Return what `read_text` does of a file that holds `raw`."""
+    if len(raw) > limit:
+        raise error(_too_large(where, len(raw), limit))
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError as wrong:
         line = raw[: wrong.start].count(b"\n") + 1
         raise error(f"{where} line {line}: not UTF-8 text; save it as UTF-8") from None
+
+
+def _too_large(where: str, size: int, limit: int) -> str:
+    return f"{where}: {size:,} bytes, the limit is {limit:,}"
 
 
 def parse_toml(

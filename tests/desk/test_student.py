@@ -10,9 +10,11 @@ import sys
 import threading
 import time
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from html import unescape
 from pathlib import Path
+from urllib.parse import unquote
 
 import psutil
 import pytest
@@ -24,9 +26,10 @@ from pipeline.desk.student.files import take_upload
 from pipeline.errors import SubmissionError
 from pipeline.grading.intake.hand_ins import find_hand_ins
 from pipeline.submission import load_submission
+from pipeline.submission.edit import edit_submission
 from pipeline.submission.load import NAME
 from tests.helpers.desks import Visitor, a_submission, some_files
-from tests.helpers.waiting import started, until
+from tests.helpers.waiting import PATIENCE, started, until
 
 HERE = "/student/0/"
 
@@ -59,6 +62,16 @@ def hand():
 def wrongs(page: str) -> list[str]:
     """Return what a page says is wrong."""
     return [unescape(w) for w in re.findall(r'class="wrong"[^>]*>([^<]*)<', page)]
+
+
+def ask_for(folder: Path, *ids: str) -> tuple[str, ...]:
+    """Leave a report that asks questions."""
+    (folder / "report").mkdir()
+    (folder / "report" / "report.html").write_text("<p>the report</p>", encoding="utf-8")
+    asked = [{"id": id_, "text": "Why?"} for id_ in ids]
+    told = json.dumps({"questions": asked, "failed": [], "changes": ""})
+    (folder / "report" / "questions.json").write_text(told, encoding="utf-8")
+    return ids
 
 
 def test_from_an_empty_folder_to_the_zip(room):
@@ -186,6 +199,88 @@ def test_of_two_at_once_one_is_told_of_the_other(filled):
     assert answers[load_submission(folder).title] == 303
 
 
+_SAVES = """
+import sys
+from pathlib import Path
+from pipeline.submission.edit import Outdated, edit_submission, submission_text, text_digest
+folder, title = Path(sys.argv[1]), sys.argv[2]
+def change(document):
+    print("changing", flush=True)
+    sys.stdin.readline()
+    document["title"] = title
+edit_submission(folder, change, seen=text_digest(submission_text(folder)))
+"""
+
+
+def test_another_process_waits_its_turn(filled):
+    """The command in a terminal and the desk: who comes second is told of the first."""
+    visitor, folder = filled
+    seen = visitor.get(HERE).value("seen")
+    command = [sys.executable, "-c", _SAVES, str(folder), "terminal"]
+    with started(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None
+        assert other.stdin is not None
+        assert other.stdout.readline().strip() == b"changing"
+        with ThreadPoolExecutor(1) as pool:
+            saved = pool.submit(visitor.post, HERE + "save", seen=seen, title="desk")
+            time.sleep(0.5)
+            assert not saved.done()
+            other.stdin.write(b"\n")
+            other.stdin.flush()
+            assert other.wait(PATIENCE) == 0
+            assert saved.result().status == 409
+    assert load_submission(folder).title == "terminal"
+
+
+def test_of_two_answers_at_once_none_is_lost(filled):
+    """Either both stand in the notes, or one is told of the other."""
+    visitor, folder = filled
+    asked = ask_for(folder, *(f"zeta_{i}" for i in range(6)))
+    seen = visitor.get(HERE + "report").value("seen")
+    with ThreadPoolExecutor(6) as pool:
+        sent = {
+            id_: pool.submit(visitor.post, HERE + "answer", id=id_, answer=f"of {id_}", seen=seen)
+            for id_ in asked
+        }
+    notes = (folder / "notes.md").read_text(encoding="utf-8")
+    confirmed = {id_ for id_ in asked if sent[id_].result().status == 303}
+    assert confirmed == {id_ for id_ in asked if f"of {id_}" in notes}
+    assert len(confirmed) == 1
+
+
+def test_an_answer_that_is_refused_stays_on_the_page(filled):
+    """With what is wrong; the notes are as they were, whatever it leaves open or how long."""
+    visitor, folder = filled
+    ask_for(folder, "zeta")
+    (folder / "notes.md").write_text("## level\n\nMine.\n", encoding="utf-8")
+    seen = visitor.get(HERE + "report").value("seen")
+    for words in ("Because.\n```", "# Aha", "x" * 1_000_001):
+        page = visitor.post(HERE + "answer", id="zeta", answer=words, seen=seen)
+        assert page.status == 422
+        assert len(wrongs(page.text)) == 2  # above all, and at the answer
+        assert f"{words}</textarea>" in page.text
+    assert words[:99] in visitor.post(HERE + "answer", id="gone", answer=words, seen=seen).text
+    assert (folder / "notes.md").read_text(encoding="utf-8") == "## level\n\nMine.\n"
+    (folder / "notes.md").write_bytes(b"\xff")
+    page = visitor.post(HERE + "answer", id="zeta", answer="So.", seen=seen)
+    assert (page.status, "So.</textarea>" in page.text) == (422, True)
+
+
+def test_lines_of_a_note_stay_lines(filled):
+    """Whatever else of its row is changed; blanks around it are no change."""
+    visitor, folder = filled
+    note = "one\n\ntwo\n"
+    edit_submission(folder, lambda d: d["experiments"][0].update(note=note))
+    page = visitor.get(HERE)
+    (shown,) = re.findall(
+        r'<textarea[^>]* name="experiments.0.note"[^>]*>([^<]*)</textarea>', page.text
+    )
+    row = {"experiments.0.note": shown.replace("\n", "\r\n"), "experiments.0.window": "0.5; 2"}
+    assert visitor.post(HERE + "experiments/0", seen=page.value("seen"), **row).status == 303
+    experiment = load_submission(folder).experiments[0]
+    assert (experiment.note, experiment.window) == (note, (0.5, 2.0))
+
+
 @pytest.mark.slow
 @pytest.mark.sample
 def test_what_was_confirmed_outlives_a_kill(tmp_path):
@@ -216,9 +311,36 @@ def test_a_broken_file_is_shown_as_such(filled, text):
     visitor, folder = filled
     (folder / NAME).write_bytes(text.encode("latin-1"))
     page = visitor.get(HERE)
-    assert wrongs(page.text) or page.status == 422
+    assert (page.status, bool(wrongs(page.text))) == (200, True)
     assert "Make the report" not in page.text
     assert visitor.get(HERE + "hand-in.zip").status == 422
+
+
+@pytest.mark.parametrize("broken", [b"version = \n", b"\xff", b"#" * 1_000_001])
+def test_a_text_that_cannot_be_read_is_not_taken_and_gives_way(broken, filled):
+    """An uploaded one is checked before it is stored; over one on disk a sound one goes."""
+    visitor, folder = filled
+    sound = (folder / NAME).read_bytes()
+    (folder / NAME).unlink()
+    visitor.upload(HERE + "files", [(NAME, broken)])
+    assert "not taken" in visitor.get(HERE).text
+    (folder / NAME).write_bytes(broken)  # by an editor
+    visitor.upload(HERE + "files", [(NAME, sound)])
+    assert load_submission(folder).experiments
+    visitor.upload(HERE + "files", [(NAME, b"version = 1\n")])
+    assert "there is one already" in unescape(visitor.get(HERE).text)
+    assert (folder / NAME).read_bytes().startswith(sound[:200])
+
+
+@pytest.mark.parametrize("broken", [b"\xff", b"x" * 1_000_001])
+def test_notes_that_cannot_be_read_are_not_taken_and_give_way(broken, tmp_path, hand):
+    """By the limit of what is read."""
+    for name in ("notes.md", "there/notes.md"):
+        (said,) = take_upload(name, io.BytesIO(broken), tmp_path, hand=hand)
+        assert "not taken" in said
+    (tmp_path / "notes.md").write_bytes(broken)
+    assert take_upload("notes.md", io.BytesIO(b"So."), tmp_path, hand=hand) == []
+    assert (tmp_path / "notes.md").read_bytes() == b"So."
 
 
 # ----------------------------------------------------------------------------- uploads
@@ -256,6 +378,18 @@ def test_nothing_is_written_over(tmp_path, hand):
     take_upload("b.csv", io.BytesIO(b"mine"), tmp_path, hand=hand)
     assert secret.read_bytes() == b"secret"
     assert (tmp_path / "data" / "b-2.csv").read_bytes() == b"mine"
+
+
+def test_files_of_one_name_at_once_are_all_kept(tmp_path, hand):
+    """Each under a name of its own."""
+    raws = [str(i).encode() * 200_000 for i in range(8)]
+
+    def take(raw: bytes) -> list[str]:
+        return take_upload("a.csv", io.BytesIO(raw), tmp_path, hand=hand)
+
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(take, raws))
+    assert sorted(p.read_bytes() for p in (tmp_path / "data").iterdir()) == raws
 
 
 def test_a_linked_data_folder_is_refused(tmp_path, hand):
@@ -321,7 +455,9 @@ def test_other_files_of_the_folder_are_not_served(filled):
     """The report's files are, where no link leads out; and the zip, by a name that headers know."""
     visitor, folder = filled
     zipped = visitor.get(HERE + "hand-in.zip").headers["content-disposition"]
-    assert zipped == 'attachment; filename="Gruppe---7.zip"'
+    plain, _, whole = zipped.partition("; filename*=UTF-8''")
+    assert plain == 'attachment; filename="Gruppe---7.zip"'
+    assert unquote(whole) == "Gruppe ж 7.zip"
     (folder / "report").mkdir(exist_ok=True)
     (folder / "report" / "x.json").write_text("{}", encoding="utf-8")
     (folder / "report" / "y.json").symlink_to("/etc/hostname")
@@ -401,8 +537,6 @@ def test_a_task_says_why_it_came_to_nothing(tmp_path, hand):
 
 def test_saving_what_is_not_valid_changes_nothing(tmp_path):
     """Whatever way it comes in."""
-    from pipeline.submission.edit import edit_submission
-
     folder = a_submission(tmp_path / "team")
     before = (folder / NAME).read_bytes()
     with pytest.raises(SubmissionError):

@@ -70,6 +70,8 @@ def test_an_answer_that_would_swallow_another_is_refused(text):
         assert written_answer(with_answer(NOTES, "friction-2", closed), "friction-2") == closed
     with pytest.raises(SubmissionError, match="close every"):  # it would stand in the open code
         with_answer("## zeta_b\n\n```\ncode", "level", "So.")
+    with pytest.raises(SubmissionError, match="close every"):  # the next one would
+        with_answer(NOTES, "level", "So.\n```")
 
 
 WORDS = st.text(st.characters(codec="utf-8", exclude_categories=["C"]), max_size=30)

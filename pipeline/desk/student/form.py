@@ -133,7 +133,7 @@ def typed(fields: Iterable[Field], form: Mapping[str, Any], values: Any) -> list
         else:
             text = str(form.get(field.path, "")).replace("\r\n", "\n").strip()
             shown = field.path in form
-        if shown and text != field.value:
+        if shown and text != field.value.strip():
             changed.append(replace(field, value=text))
     return changed
 

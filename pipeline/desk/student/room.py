@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import tomlkit
 from starlette.datastructures import UploadFile
@@ -28,6 +29,7 @@ from pipeline.desk.student.form import (
 )
 from pipeline.desk.student.handin import hand_in, missing
 from pipeline.errors import SubmissionError
+from pipeline.lock import turn_in
 from pipeline.output import write_file
 from pipeline.report.numbers import count
 from pipeline.report.sections.answers import with_answer, written_answer
@@ -98,33 +100,26 @@ def stop(ask: Ask) -> Response:
 
 def report(ask: Ask) -> Response:
     """Show the report with its questions, and claims beside what the data say."""
-    folder = ask.folder()
-    told, notes = _told(folder), _notes(folder)
-    return ask.page(
-        "report",
-        title=f"Report of {folder.name}",
-        told=told,
-        questions=[
-            {**one, "answer": written_answer(notes, one["id"])} for one in told["questions"]
-        ],
-        seen=text_digest(notes),
-        there=outside(folder, "report/report.html") is None,
-        said=ask.told(),
-        here=_here(ask),
-    )
+    return _asked(ask)
 
 
 def answer(ask: Ask) -> Response:
-    """Write the answer to a question into `notes.md`."""
+    """Write the answer to a question into `notes.md`; what cannot be is shown as typed."""
     folder, id_, words = ask.folder(), ask.text("id"), ask.text("answer")
-    with ask.desk.alone(folder):
-        notes = _notes(folder)
-        if ask.text("seen") != text_digest(notes):
-            yours = [Field(path=id_, label=f"Answer to {id_}", value=words)]
-            return _outdated(ask, _NOTES, notes, yours)
-        if id_ not in [one["id"] for one in _told(folder)["questions"]]:
-            raise SubmissionError(f"the report asks nothing called {id_!r}")
-        write_file(folder / _NOTES, with_answer(notes, id_, words))
+    try:
+        with turn_in(folder):
+            notes = _notes(folder)
+            if ask.text("seen") != text_digest(notes):
+                yours = [Field(path=id_, label=f"Answer to {id_}", value=words)]
+                return _outdated(ask, _NOTES, notes, yours)
+            if id_ not in [one["id"] for one in _told(folder)["questions"]]:
+                raise SubmissionError(f"the report asks nothing called {id_!r}")
+            new = with_answer(notes, id_, words)
+            if len(new.encode()) > MAX_NOTES_BYTES:
+                raise SubmissionError(f"{_NOTES} would have more than {MAX_NOTES_BYTES:,} bytes")
+            write_file(folder / _NOTES, new)
+    except SubmissionError as error:
+        return _asked(ask, status=422, refused={id_: (words, str(error))})
     return ask.back(f"{_here(ask)}report#question-{id_}", "Written into notes.md.")
 
 
@@ -135,8 +130,10 @@ def report_file(ask: Ask) -> Response:
 
 def packed(ask: Ask) -> Response:
     """Return the zip."""
-    name = re.sub(r"[^A-Za-z0-9_.-]", "-", ask.folder().name)  # headers know no others
-    headers = {"Content-Disposition": f'attachment; filename="{name}.zip"'}
+    name = f"{ask.folder().name}.zip"
+    plain = re.sub(r"[^A-Za-z0-9_.-]", "-", name)  # other letters by RFC 5987, beside this
+    disposition = f"attachment; filename=\"{plain}\"; filename*=UTF-8''{quote(name, safe='')}"
+    headers = {"Content-Disposition": disposition}
     return Response(hand_in(ask.folder()), media_type="application/zip", headers=headers)
 
 
@@ -150,12 +147,43 @@ def _here(ask: Ask) -> str:
 def _filled(ask: Ask, folder: Path) -> list[str]:
     """Have the tables of new files written; return what is to be said."""
     try:
-        with ask.desk.alone(folder):
-            rows = ask.desk.hand.do("fill", folder=str(folder))
+        rows = ask.desk.hand.do("fill", folder=str(folder))
     except Failed as error:
         return [str(error)]
     new = [row["file"] for row in rows if row["state"] in ("new", "completed")]
     return [f"{count(len(new), 'file')} written into {NAME}."] if new else []
+
+
+def _asked(ask: Ask, *, status: int = 200, refused: Mapping[str, tuple[str, str]] = {}) -> Response:
+    """Show the report.
+
+    Parameters
+    ----------
+    refused : by question, an answer as it was typed, and why it was not written.
+    """
+    folder, told = ask.folder(), _told(ask.folder())
+    problems, notes = [why for _, why in refused.values()], ""
+    try:
+        notes = _notes(folder)
+    except SubmissionError as error:
+        problems = [str(error)]
+    questions, known = [], [one["id"] for one in told["questions"]]
+    others = [{"id": id_, "text": f"Answer to {id_}"} for id_ in refused if id_ not in known]
+    for one in [*told["questions"], *others]:
+        words, why = refused.get(one["id"]) or (written_answer(notes, one["id"]), "")
+        questions.append({**one, "answer": words, "wrong": why})
+    return ask.page(
+        "report",
+        status=status,
+        title=f"Report of {folder.name}",
+        told=told,
+        questions=questions,
+        problems=problems,
+        seen=text_digest(notes),
+        there=outside(folder, "report/report.html") is None,
+        said=ask.told(),
+        here=_here(ask),
+    )
 
 
 def _room(
@@ -166,8 +194,11 @@ def _room(
     error: SubmissionError | None = None,
 ) -> Response:
     """Show the room; with what was typed in place of what stands in the file, where it is wrong."""
-    folder = ask.folder()
-    text = submission_text(folder) if (folder / NAME).exists() else ""
+    folder, text = ask.folder(), ""
+    try:
+        text = submission_text(folder) if (folder / NAME).exists() else ""
+    except SubmissionError as unreadable:
+        error = unreadable
     document = read_document(text)
     if error is None and text:
         error = _wrong(text, folder)
@@ -262,8 +293,7 @@ def _edited(
     """Change the file; what would not be valid is shown as typed, what is outdated is refused."""
     folder = ask.folder()
     try:
-        with ask.desk.alone(folder):
-            edit_submission(folder, change, seen=ask.text("seen") or "nothing")
+        edit_submission(folder, change, seen=ask.text("seen") or "nothing")
     except Outdated as error:
         return _outdated(ask, NAME, error.text, changed)
     except SubmissionError as error:
@@ -281,7 +311,7 @@ def _outdated(ask: Ask, name: str, text: str, changed: Sequence[Field]) -> Respo
         name=name,
         text=text,
         changed=[(field, field_text(now, field)) for field in changed],
-        here=_here(ask),
+        back=_here(ask) + ("report" if name == _NOTES else ""),
     )
 
 

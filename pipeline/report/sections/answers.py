@@ -11,6 +11,10 @@ from pipeline.submission.load import COMMENT
 _LEAD = re.compile(r"(?:question|q|answer|a)?[\s:.#]*([\w.-]+)", re.IGNORECASE)
 _LEVEL = 2  # of a heading that is added
 _SPELT = str.maketrans({"ω": "omega", "ζ": "zeta", " ": " "})
+_OPEN = (
+    "this would run into other answers: close every block of code (```) and every comment "
+    "(<!-- -->), here and in notes.md, and let no heading begin with another question's id"
+)
 
 
 def named(heading: str) -> str:
@@ -40,6 +44,8 @@ def with_answer(notes: str, id_: str, answer: str) -> str:
     if any(at <= level for at, *_ in _headings(text)):
         least = "#" * (level + 1)
         raise SubmissionError(f"a heading in an answer begins with {least}, or it would end there")
+    if len(_headings(f"{text}\n\n# end")) != len(_headings(text)) + 1:
+        raise SubmissionError(_OPEN)
     if not text:
         return "".join([*lines[:heading], *lines[end:]])
     if start is None:
@@ -50,10 +56,7 @@ def with_answer(notes: str, id_: str, answer: str) -> str:
     others = {name: body for name, (at, body) in _bodies(notes).items() if not heading <= at < end}
     now = {name: body for name, (_, body) in _bodies(new).items()}
     if written_answer(new, id_) != text or any(now.get(name) != others[name] for name in others):
-        raise SubmissionError(
-            "this would run into other answers: close every block of code (```) and every comment "
-            "(<!-- -->), here and in notes.md, and let no heading begin with another question's id"
-        )
+        raise SubmissionError(_OPEN)
     return new
 
 
