@@ -85,6 +85,8 @@ ROUTES: tuple[tuple[str, str, Handler], ...] = (
     ("/grades/{n:int}/regrade", "POST", whole.regrade),
     ("/grades/{n:int}/stop", "POST", whole.stop),
 )  # fmt: skip
+# A Stop does not wait for one of the threads in which all others are answered.
+STOPS = frozenset([student.stop, bench.press, instructor.stop, whole.stop])
 EVENTS = {"/student/{n:int}/events": Ask.folder, "/grades/{n:int}/events": Ask.grades}
 
 
@@ -183,7 +185,8 @@ def _endpoint(
             form = await request.form(max_files=HAND_IN.members, max_fields=_MOST_FIELDS)
         ask = Ask(desk=desk, user=request.scope["user"], request=request, form=form)
         try:
-            return await run_in_threadpool(handler, ask)
+            run = asyncio.to_thread if handler in STOPS else run_in_threadpool
+            return await run(handler, ask)
         except PipelineError as error:
             return plain_error(ask, str(error), status=422)
         except OSError as error:

@@ -5,7 +5,8 @@ import os
 import queue
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -18,12 +19,19 @@ _WORKER = "pipeline.desk.worker"
 _GLANCE = 0.1  # s between looks at the clock, the memory and who wants it stopped
 _LONGEST = 1800.0  # s of a job
 _SHORT = 180.0  # s of a short task, the start of its process on a busy machine included
+_HANDS = 3  # processes for short tasks, of 150 MB each
+_WAITING = 8  # requests about one folder; each keeps one of the server's 40 threads
+_LAST_WORDS = 300  # characters of what a process said before it died
 
 State = Literal["waiting", "running", "done", "failed", "stopped"]
 
 
 class Failed(PipelineError):
     """A task came to nothing; the text says why."""
+
+
+class Busy(PipelineError):
+    """A task was not begun, since others are under way; the text says which."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -33,6 +41,7 @@ class Job:
     Attributes
     ----------
     place : the folder that it works in.
+    asked : the task, and what it was given.
     said : what it is about now, or what became of it.
     news : goes up whenever that changes.
     """
@@ -40,6 +49,7 @@ class Job:
     id: str
     title: str
     place: Path
+    asked: tuple[str, dict[str, Any]]
     state: State = "waiting"
     said: str = "waiting for its turn"
     news: int = 0
@@ -66,14 +76,26 @@ class Jobs:
         self._number = 0
 
     def start(self, task: str, *, title: str, place: Path, **given: Any) -> Job:
-        """Begin a task; where work in its folder is under way, that is what is returned."""
+        """Begin a task; one that is under way with the same is not begun again.
+
+        Raises
+        ------
+        Busy : something else is under way in the folder.
+        """
+        asked = task, given
         with self._lock:
             before = self._jobs.get(place)
             if before and not before.over:
+                if before.asked != asked:
+                    raise Busy(
+                        f"{before.title} is under way in this folder ({before.said}): wait for its "
+                        "end or stop it first"
+                    )
                 return before
             self._number += 1
-            job = self._jobs[place] = Job(id=str(self._number), title=title, place=place)
-        threading.Thread(target=self._run, args=(job, task, given), daemon=True).start()
+            id_ = str(self._number)
+            job = self._jobs[place] = Job(id=id_, title=title, place=place, asked=asked)
+        threading.Thread(target=self._run, args=(job,), daemon=True).start()
         return job
 
     def of(self, place: Path) -> Job | None:
@@ -87,17 +109,17 @@ class Jobs:
         while any(not job.over for job in self._jobs.values()):
             time.sleep(_GLANCE)
 
-    def _run(self, job: Job, task: str, given: dict[str, Any]) -> None:
+    def _run(self, job: Job) -> None:
         while not self._turns.acquire(timeout=_GLANCE):
             if job.stop.is_set():
                 return job.tell("stopped", "stopped before it began")
         job.tell("running", "starting")
-        process = LineProcess(_WORKER)
+        process = None
         try:
+            process = LineProcess(_WORKER)
             _work(
                 process,
-                task,
-                given,
+                *job.asked,
                 limit=_LONGEST,
                 stop=job.stop,
                 tell=lambda stage: job.tell("running", stage),
@@ -105,17 +127,28 @@ class Jobs:
             job.tell("done", "done")
         except Failed as error:
             job.tell("stopped" if job.stop.is_set() else "failed", str(error))
+        except OSError as error:
+            job.tell("failed", f"no process could be started for it ({error.strerror or error})")
         finally:
-            process.close()
+            if process is not None:
+                process.close()
             self._turns.release()
 
 
 class Hand:
-    """A process for short tasks, one after the other: it looks at files and fills in tables."""
+    """Processes for short tasks, which look at files and fill in tables.
+
+    The tasks of a folder are done one after the other: who has a slow file waits for it, and with
+    them who looks at the same folder.
+    """
 
     def __init__(self) -> None:
-        self._lock, self._never = threading.Lock(), threading.Event()
-        self._process: LineProcess | None = None
+        self._free: queue.LifoQueue[LineProcess | None] = queue.LifoQueue()
+        for _ in range(_HANDS):
+            self._free.put(None)
+        self._closed = threading.Event()
+        self._lock = threading.Lock()
+        self._folders: dict[str, tuple[threading.Semaphore, threading.Lock]] = {}
 
     def do(self, task: str, **given: Any) -> Any:
         """Return the answer of a task.
@@ -123,18 +156,43 @@ class Hand:
         Raises
         ------
         Failed : with the reason; what a file does to the process, the next task does not feel.
+        Busy : too many wait for the folder already.
         """
+        with self._turn(given.get("folder")):
+            process = self._free.get()
+            try:
+                if self._closed.is_set():
+                    raise Failed("the desk is ending")
+                if process is None or not process.runs:
+                    process = LineProcess(_WORKER)
+                return _work(process, task, given, limit=_SHORT, stop=self._closed, tell=str)
+            finally:
+                self._free.put(process)
+
+    @contextmanager
+    def _turn(self, folder: str | None) -> Iterator[None]:
+        if folder is None:
+            yield
+            return
         with self._lock:
-            process = self._process
-            if process is None or not process.runs:
-                process = self._process = LineProcess(_WORKER)
-            return _work(process, task, given, limit=_SHORT, stop=self._never, tell=str)
+            new = threading.Semaphore(_WAITING), threading.Lock()
+            waiting, one = self._folders.setdefault(folder, new)
+        if not waiting.acquire(blocking=False):
+            raise Busy("a file of this folder is still being looked at; try again in a minute")
+        try:
+            with one:
+                yield
+        finally:
+            waiting.release()
 
     def close(self) -> None:
-        """End the process."""
-        with self._lock:
-            if self._process is not None:
-                self._process.close()
+        """End the processes, and what they are about."""
+        self._closed.set()
+        processes = [self._free.get() for _ in range(_HANDS)]
+        for process in processes:
+            if process is not None:
+                process.close()
+            self._free.put(None)
 
 
 def _work(
@@ -162,7 +220,8 @@ def _work(
                     raise _ended(process, "needed more memory than allowed") from None
                 continue
             if not line:
-                raise _ended(process, f"the process ended ({process.ending()})")
+                words = process.said().strip().rpartition("\n")[2][-_LAST_WORDS:]
+                raise _ended(process, f"the process ended ({process.ending()}) {words}".rstrip())
             answer = json.loads(line)
             if "stage" in answer:
                 tell(answer["stage"])

@@ -517,7 +517,8 @@ def test_who_serves_is_gone_and_so_is_the_work(tmp_path):
     """A worker whose desk was killed ends by itself."""
     hand = Hand()
     hand.do("files", folder=str(tmp_path))
-    process = hand._process
+    process = hand._free.get()
+    hand._free.put(process)
     assert process is not None
     (child,) = [p for p in psutil.Process().children() if p.pid == process._process.pid]
     assert process._process.stdin is not None
