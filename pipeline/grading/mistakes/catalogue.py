@@ -17,6 +17,7 @@ from pipeline.grading.words import WORDS
 from pipeline.names import read_name
 from pipeline.results import Analysis
 from pipeline.schemas.grade import Code
+from pipeline.submission import Reported
 
 _TURN = 2 * math.pi
 _LOG10 = math.log10(math.e)
@@ -67,7 +68,19 @@ class Mistake:
         return replace(self, codes=codes, said=sentences, predicted=predicted)
 
 
-def known_mistakes(references: Numbers, analysis: Analysis) -> list[Mistake]:
+def _may_be_log10(name: str, reference: Reference, reported: Reported) -> bool:
+    """Tell whether a damping can show it: a blurred one only against the team's own final value.
+
+    A decay with friction has any ratio to a reference so wide; a final value that agrees with the
+    initial one was not made by taking the wrong logarithm of the decay.
+    """
+    if reference.high <= limits.BLURRED_DAMPING * reference.low:
+        return True
+    initial, final = reported.initial.get(name), reported.final.get(name)
+    return initial is None or final is None or final > limits.OWN_FINAL * initial
+
+
+def known_mistakes(references: Numbers, analysis: Analysis, reported: Reported) -> list[Mistake]:
     """Return every mistake that can be tried on a table, single ones before combined ones."""
     read = {name: read_name(name) for name in references}
     sure = {n: r for n, r in references.items() if 0 < r.high <= limits.VAGUE * r.low}
@@ -81,11 +94,12 @@ def known_mistakes(references: Numbers, analysis: Analysis) -> list[Mistake]:
     omegas = {n: r for n, r in sure.items() if read[n].is_frequency}
     own_omegas = {n: r for n, r in omegas.items() if not read[n].is_by_eye}
     own_zetas = {n: r for n, r in every_zeta.items() if n in sure}
+    told = {n: r for n, r in every_zeta.items() if _may_be_log10(n, r, reported)}
     hertz, scales = list(_hertz(omegas, every_omega)), list(_gain_mistakes(gains, analysis))
     log10 = Mistake(
         codes=("log10_for_ln",),
         said=("log10",),
-        predicted=_times(every_zeta, _LOG10),  # vague ones as well
+        predicted=_times(every_zeta, _LOG10) if told else {},  # vague ones as well
         tolerance=limits.LOG10_DAMPING,
         whole=True,
     )

@@ -5,6 +5,8 @@ teams, the planted code for nine mistakes of ten and more (`tests/statistics/tes
 `benchmarks/grading.py`). Shares are relative, "high over low" is of a reference's bounds.
 """
 
+from decimal import Decimal
+
 # ------------------------------------------------ from where on a number is worth a remark, percent
 
 # Two careful teams on one bench differ by some percent in gains and frequencies, the paper's own
@@ -36,6 +38,7 @@ TURN_OFF = 0.06  # another extremum of the step as near to a gain as this says n
 
 VAGUE = 3.0  # high over low: what any mistake would meet tells of none
 BLURRED_DAMPING = 1.3  # … such a damping tells no story of a period miscounted
+OWN_FINAL = Decimal("1.5")  # … and no logarithm to base 10 nearer than so to its own final value
 SHARP = 1.05  # … a reference that friction does not blur
 
 # ------------------------------------------- which of several mistakes is believed: likelihoods

@@ -159,7 +159,7 @@ def _judge(
         apart = _disagreements(reported, references, blurred=False)
         apart = [name for _, name in apart if read_name(name).is_gain]
         suspect += [n for n in apart if n in errors and _agrees(reported.final[n], references, n)]
-    mistakes = known_mistakes({n: r for n, r in known.items() if n in table}, analysis)
+    mistakes = known_mistakes({n: r for n, r in known.items() if n in table}, analysis, reported)
     if label == "final":
         mistakes = [m for m in mistakes if _may_be_final(m, reported)]
         if len(suspect) >= min(2, analysis.carts):

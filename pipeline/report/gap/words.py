@@ -27,7 +27,8 @@ _NEGLIGIBLE = 1e-3  # of a value: an error this small stands in the table alone
 
 def verdict_title(gap: Gap) -> str:
     """Return the verdict in a few words."""
-    return WORDS.text(f"title_{gap.verdict}")
+    undecided = gap.verdict == "unexplained" and not gap.complete
+    return WORDS.text("title_undecided" if undecided else f"title_{gap.verdict}")
 
 
 def error_board(gap: Gap) -> Tiles:
@@ -125,10 +126,11 @@ def _explanation(effect: Effect, where: Mapping[str, int], error: float, sizes: 
 def _unexplained(gap: Gap) -> Block:
     said = {"noise": _noise(gap), "suspicion": _suspicion(gap), **_shares(gap)}
     if not gap.effects:
-        return paragraph(WORDS.spans("unexplained", **said))
+        return paragraph(WORDS.spans("unexplained" if gap.complete else "undecided", **said))
     suspects = listing([effect_name(found.effect, found.where) for found in gap.effects])
     are = "suspect is" if len(gap.effects) == 1 else "suspects, together, are"
-    return paragraph(WORDS.spans("suspected", are=are, suspects=suspects, **said))
+    key = "suspected" if gap.complete else "suspected_so_far"
+    return paragraph(WORDS.spans(key, are=are, suspects=suspects, **said))
 
 
 def _suspicion(gap: Gap) -> str:
