@@ -295,8 +295,8 @@ def test_two_change_the_same_and_one_is_told(two_desks, database):
     with Gradebook(database) as book:
         given = book.entry("team-04").overrides["laws"]
         assert (given.points, given.by) == (1.0, "Ada")  # whom the proxy named
-    assert eve.get(ROOM).status == 404  # a student has no class, whatever a list says
-    assert eve.post(at("team-04"), do="accept").status == 404
+    assert eve.get(ROOM).status == 403  # a student has no class, whatever a list says
+    assert eve.post(at("team-04"), do="accept").status == 403
     assert database not in ada.get(ROOM).text
 
 

@@ -11,7 +11,7 @@ from tests.helpers.hostile import SECRET, write_hostile
 from tests.helpers.places import ROOT
 
 _MARKUP = re.compile(r"<script(?! src=\"/static/)|<img|<iframe(?! class)")
-_OURS = re.compile(r"data/[^/]+|submission\.toml|notes\.md|\.lock")
+_OURS = re.compile(r"\.turn|data/[^/]+|submission\.toml|notes\.md|\.lock")
 
 
 def visit(tmp_path, *, every: int, drawn: int, seed: int) -> int:
