@@ -65,7 +65,7 @@ def main() -> None:
         folder = Path(scratch) / "grades"
         folder.mkdir()
         write_book(folder, told.teams, anonymous=told.anonymous)
-        with DeskServer(folders=[]) as server:
+        with DeskServer() as server:
             visitor = Visitor.of(server.url)
             assert visitor.post("/open", folder=str(folder)).status == 303
             pages = {
