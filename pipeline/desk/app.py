@@ -119,8 +119,8 @@ class DeskServer:
             listener = socket.create_server((host, port))
         except OSError as error:
             raise ConfigError(
-                f"port {port} of {host} is not free for the desk ({error.strerror}): name another "
-                "with --port"
+                f"the desk cannot listen at port {port} of {host} ({error.strerror}): name another "
+                "with --port, or an IPv4 address of this computer with --host"
             ) from None
         port = listener.getsockname()[1]
         if listed:

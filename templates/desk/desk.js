@@ -1,4 +1,5 @@
-// What the desk needs besides htmx: stages of long work as they come, and a place for dropped files.
+// What the desk needs besides htmx: stages of long work as they come, a place for dropped files, and
+// that what is typed stays until it is saved.
 "use strict";
 htmx.onLoad(() => {
   const shown = document.querySelector("[data-events]");
@@ -36,4 +37,41 @@ htmx.onLoad(() => {
 document.addEventListener("htmx:sendError", () => {
   const said = document.querySelector("[role=status]");
   said.textContent = "No answer: the desk was ended, or this was more than it takes at once.";
+});
+
+// An answer replaces all of #main. Of each page, by its heading, is kept what was typed and not sent with the request; it goes
+// back when the page comes back. A row is known by its experiment, whose number may have changed.
+const unsaved = new Map(), sent = new WeakMap();
+let before = "";
+const heading = () => document.querySelector("h1").textContent;
+const switched = (one) => one.type === "checkbox" || one.type === "radio";
+const state = (one) => (switched(one) ? one.checked : one.value);
+const shown = (one) => {
+  if (switched(one)) return one.defaultChecked;
+  if (one.tagName !== "SELECT") return one.defaultValue;
+  return ([...one.options].find((option) => option.defaultSelected) ?? one.options[0])?.value;
+};
+const key = (one) =>
+  [one.form?.dataset.row ?? one.form?.id, one.name.replace(/^experiments\.\d+/, ""), switched(one) && one.value].join("\n");
+const typed = (within) => [...within.querySelectorAll("input:not([type=hidden], [type=file]), select, textarea")].filter((one) => one.name);
+document.addEventListener("htmx:beforeSend", (event) => {
+  const form = event.detail.elt.closest("form");
+  if (form) sent.set(event.detail.xhr, new Map(typed(form).map((one) => [one, state(one)])));
+});
+document.addEventListener("htmx:beforeSwap", (event) => {
+  if (event.detail.target.id !== "main") return;
+  const went = sent.get(event.detail.xhr) ?? new Map();
+  const kept = typed(event.detail.target).filter((one) => state(one) !== (went.has(one) ? went.get(one) : shown(one)));
+  before = heading();
+  unsaved.set(before, new Map(kept.map((one) => [key(one), state(one)])));
+});
+document.addEventListener("htmx:afterSwap", (event) => {
+  if (event.detail.target.id !== "main") return;
+  const kept = unsaved.get(heading()) ?? new Map();
+  for (const one of typed(event.detail.target)) {
+    if (!kept.has(key(one))) continue;
+    one[switched(one) ? "checked" : "value"] = kept.get(key(one));
+    for (let around = one.closest("details"); around; around = around.parentElement.closest("details")) around.open = true;
+  }
+  if (heading() !== before) scrollTo(0, 0); // another page altogether
 });

@@ -127,7 +127,7 @@ def test_strangers_are_few_and_leave(visitor, monkeypatch):
 
 def test_a_port_that_is_taken_is_one_line(server):
     """The command ends with it."""
-    with pytest.raises(ConfigError, match="is not free for the desk"):
+    with pytest.raises(ConfigError, match="the desk cannot listen at port"):
         DeskServer(port=urlsplit(server.url).port or 0)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import psutil
 
-PATIENCE = 300.0  # s after which what is awaited is taken never to come
+PATIENCE = 120.0  # s after which what is awaited is taken never to come
 
 
 def until(happened: Callable[[], object], what: str = "it") -> None:

@@ -95,7 +95,8 @@ def test_a_rubric_is_edited_with_its_mistakes_beside_it(show, tmp_path):
         wrong = window.locator("#problems td.wrong").filter(has_text="unknown key; did you mean")
         expect(wrong.first).to_be_visible()
         assert fits(window)
-        window.get_by_role("button", name="Save").click()
+        with window.expect_navigation():
+            window.get_by_role("button", name="Save").click()
         expect(wrong.first).to_be_visible()
         assert not path.exists()
         window.locator("#text").fill(good)
