@@ -22,7 +22,7 @@ from pipeline.bench.planning.plan import Limits
 from pipeline.bench.protocol.messages import Reading
 from pipeline.bench.watch.observer import Anomalies
 from pipeline.errors import ConfigError
-from pipeline.plant.chain import PRESETS
+from pipeline.plant.linear.presets import PRESETS
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
 from tests.helpers.acquisitions import Notes, host, sine, write_work

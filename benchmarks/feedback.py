@@ -11,9 +11,10 @@ import time
 
 import numpy as np
 
-from pipeline.plant.chain import PRESETS, Chain
-from pipeline.plant.loop import StateFeedback, loop_matrix, simulate_loop
-from pipeline.plant.step_response import overshoot_percent, settling_time
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.linear.step_response import overshoot_percent, settling_time
+from pipeline.plant.loop.sampled_loop import StateFeedback, loop_matrix, simulate_loop
 from pipeline.results import FeedbackDesign
 from pipeline.stages.state_feedback import Method, design_feedback
 

@@ -18,9 +18,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.estimation.chain.parametrisation import Parametrisation, named_estimates
-from pipeline.plant.chain import PRESETS, Array, Chain
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.linear.presets import PRESETS
 from pipeline.results import ChainFit, FrequencyResponse
 from pipeline.stages.bode_fit import fit_bode
 

@@ -19,7 +19,7 @@ from pipeline.gap.explain import explain_gap
 from pipeline.gap.fit.linearise import fresh_nuisance, simulate_run
 from pipeline.gap.fit.structure import Candidate, Model, Structure
 from pipeline.gap.types import Gap
-from pipeline.plant.effects.base import AugmentedChain
+from pipeline.plant.nonlinear.effects.base import AugmentedChain
 from pipeline.results import Record
 
 INTERVAL = 2**14 / 1e7  # s

@@ -11,7 +11,7 @@ import time
 
 import numpy as np
 
-from pipeline.plant.chain import PRESETS
+from pipeline.plant.linear.presets import PRESETS
 from pipeline.stages.time_fit import fit_records
 from tests.helpers.time_records import random_chain, step_record
 

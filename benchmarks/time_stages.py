@@ -11,8 +11,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pipeline.plant.chain import PRESETS, Array
-from pipeline.plant.simulate import simulate_linear
+from pipeline.arrays import Array
+from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.linear.simulate import simulate_linear
 from pipeline.results import Kind, Record
 from pipeline.stages.log_decrement import fit_log_decrement
 from pipeline.stages.sine import fit_sine

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 from pipeline.errors import ConfigError, DataError
 from pipeline.exchange import frames
-from pipeline.plant.chain import Chain
-from pipeline.plant.designed_loop import closed_loop
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.loop.margins import closed_loop
 from pipeline.report.document import Block, Document, Heading, spans
 from pipeline.report.draft.content import build_document
 from pipeline.report.gap.section import with_gap

@@ -16,9 +16,10 @@ from dataclasses import dataclass, field
 from decimal import Decimal
 from typing import Literal
 
-from pipeline.plant.chain import Array, Chain, ComplexArray, frozen_array
-from pipeline.plant.designed_loop import Margins
-from pipeline.plant.loop import StateFeedback
+from pipeline.arrays import Array, ComplexArray, frozen_array
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.loop.margins import Margins
+from pipeline.plant.loop.sampled_loop import StateFeedback
 
 Kind = Literal["decay", "step", "sine", "sweep", "closed_loop", "bode"]
 Hold = Literal["zero_order", "band_limited"]

@@ -3,7 +3,7 @@
 from typing import Any
 
 from pipeline import __version__
-from pipeline.plant.chain import Chain
+from pipeline.plant.linear.chain import Chain
 from pipeline.results import Analysis, HardwareCheck, LogDecrement, ParameterRow
 from pipeline.schemas import results as schema
 from pipeline.schemas.base import fields_of, json_text

@@ -12,10 +12,13 @@ PIPELINE = ROOT / "pipeline"
 
 # From the ground up, rooms and the rooms within them; a module imports from its own room or below.
 LEVELS = (
-    ("__init__", "errors", "names", "resources"),
+    ("__init__", "arrays", "errors", "names", "resources"),
     ("output", "schemas"),
     ("lock", "processes", "web"),
-    ("plant",),
+    ("plant.linear",),
+    ("plant.loop", "plant.nonlinear.tables"),
+    ("plant.nonlinear.effects", "plant.nonlinear.simulator"),
+    ("plant", "plant.nonlinear"),
     ("results", "submission"),
     ("ingest.formats",),
     ("ingest", "estimation"),
@@ -63,7 +66,7 @@ HOMES = {
     "tomlkit": ("submission", "ingest", "bench.host", "desk.student"),
     "starlette": ("web", "bench.watch", "desk"),
     "uvicorn": ("web",),
-    "control": ("plant", "checks", "notebook"),
+    "control": ("plant.linear", "plant.loop", "checks", "notebook"),
     "sqlalchemy": ("grading.gradebook",),
     "pandas": ("exchange", "grading", "notebook"),
 }

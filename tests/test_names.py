@@ -3,8 +3,8 @@
 import pytest
 
 from pipeline.names import gain_name, own_omega, own_zeta, parameter_names, read_name
-from pipeline.plant.chain import PRESETS
-from pipeline.plant.laws import brackets, orders
+from pipeline.plant.linear.laws import brackets, orders
+from pipeline.plant.linear.presets import PRESETS
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4])

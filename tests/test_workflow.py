@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from pipeline.estimation.chain.follow import follow
-from pipeline.plant.chain import PRESETS
+from pipeline.plant.linear.presets import PRESETS
 from pipeline.resources import EXAMPLES
 from pipeline.results_json import results_text
 from pipeline.submission import load_submission

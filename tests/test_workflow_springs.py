@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.plant.chain import Array, Chain
-from pipeline.plant.simulate import simulate_linear
+from pipeline.arrays import Array
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.linear.simulate import simulate_linear
 from pipeline.results import Analysis
 from pipeline.results_json import results_text
 from pipeline.submission import load_submission

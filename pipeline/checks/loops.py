@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from pipeline.arrays import Array
 from pipeline.errors import DataError
-from pipeline.plant.chain import Array, Chain
-from pipeline.plant.designed_loop import Margins, closed_loop, stability_margins
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.loop.margins import Margins, closed_loop, stability_margins
 from pipeline.results import Check, FeedbackDesign, HardwareCheck, Outcome
 
 if TYPE_CHECKING:

@@ -38,6 +38,6 @@ def demo(
 
 
 def _compile() -> None:
-    from pipeline.plant.augmented import compile_simulator
+    from pipeline.plant.nonlinear.augmented import compile_simulator
 
     compile_simulator()

@@ -45,7 +45,7 @@ def effects(
     as_json: AsJson = False,
 ) -> None:
     """List what a bench may do beyond the linear chain: law, fingerprint, what decides."""
-    from pipeline.plant.effects import CATALOGUE, find_effect
+    from pipeline.plant.nonlinear.effects import CATALOGUE, find_effect
     from pipeline.report.effects.words import catalogue_data, catalogue_text
 
     chosen = [find_effect(name)] if name else CATALOGUE

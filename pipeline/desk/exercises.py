@@ -13,7 +13,7 @@ from typing import Any
 
 from pipeline.errors import ConfigError
 from pipeline.output import new_folder, own_folder
-from pipeline.plant.effects import Parameter, find_effect
+from pipeline.plant.nonlinear.effects import Parameter, find_effect
 from pipeline.submission import load_submission
 from pipeline.synthesis.hidden import HiddenBench, default_values, prepare_bench, usual_term
 

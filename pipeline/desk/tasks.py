@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.desk.class_tasks import publish, regrade
 from pipeline.desk.exercises import effect_svg, exercise, simulate, solution
 from pipeline.errors import ConfigError, SubmissionError
@@ -16,7 +17,6 @@ from pipeline.ingest.fill import Found, data_files, fill_submission, look_at
 from pipeline.ingest.formats.recognise import read_table
 from pipeline.lock import alone_in
 from pipeline.output import own_folder, write_file
-from pipeline.plant.chain import Array
 from pipeline.results import Analysis
 from pipeline.submission import load_submission
 from pipeline.submission.load import leaves

@@ -11,7 +11,7 @@ from functools import cache
 
 import numpy as np
 
-from pipeline.plant.chain import Array
+from pipeline.arrays import Array
 
 _MIN_LAGS = 8  # lags of the residual's correlation that are always looked at
 _LAGS_SHARE = 1 / 3  # of the samples; a rest after a step is correlated as long as it lasts

@@ -5,7 +5,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from pipeline.plant.chain import Array
+from pipeline.arrays import Array
 
 T = TypeVar("T")
 

@@ -5,10 +5,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.estimation.noise import local_noise
-from pipeline.plant.chain import Array, Chain
-from pipeline.plant.simulate import simulate_linear
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.linear.simulate import simulate_linear
 from pipeline.results import Record
 
 _STILL = 0.02  # of its range that a signal may vary while nothing happens

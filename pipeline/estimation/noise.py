@@ -4,7 +4,7 @@ from math import comb
 
 import numpy as np
 
-from pipeline.plant.chain import Array
+from pipeline.arrays import Array
 
 _NEIGHBOURS = (-3, -2, -1, 1, 2, 3)  # a quintic through these follows any motion we sample
 _MEDIAN_TO_SIGMA = 1.4826  # median absolute value to standard deviation, normal noise

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.estimation.noise import difference_noise
-from pipeline.plant.chain import Array
 
 _FLAT_INPUT = 0.02  # of the input's range: smaller changes are noise of the logged input
 

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from pipeline.arrays import Array, ComplexArray
 from pipeline.estimation.noise import difference_gain
-from pipeline.plant.chain import Array, ComplexArray
 from pipeline.results import Record
 
 _LEAST_INPUT_SHARE = 0.01  # of its strongest line; below, the input does not excite the plant

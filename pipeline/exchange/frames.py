@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.plant.chain import Array
+from pipeline.arrays import Array
 from pipeline.results import Analysis, Record
 from pipeline.results_json import results_dict
 from pipeline.schemas.base import Document

@@ -3,7 +3,7 @@
 from typing import Any
 
 from pipeline.gap.types import FoundEffect, Gap, GapWindow, NamedValue, Rival
-from pipeline.plant.chain import Chain
+from pipeline.plant.linear.chain import Chain
 from pipeline.schemas import gap as schema
 from pipeline.schemas.base import fields_of
 

@@ -31,9 +31,9 @@ from pipeline.gap.verdict.account import (
 from pipeline.gap.verdict.decision import choose_experiment, reach_verdict
 from pipeline.gap.verdict.offset import find_offset
 from pipeline.gap.verdict.where import find_windows
-from pipeline.plant.chain import Chain
-from pipeline.plant.effects import CATALOGUE
-from pipeline.plant.effects.base import Effect, Term
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.nonlinear.effects import CATALOGUE
+from pipeline.plant.nonlinear.effects.base import Effect, Term
 from pipeline.results import Record
 
 _NOISE_ROUNDS = 2  # of measuring the noise anew

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from pipeline.gap.explain import explain_gap
 from pipeline.gap.types import Gap
-from pipeline.plant.augmented import compile_simulator
+from pipeline.plant.nonlinear.augmented import compile_simulator
 from pipeline.results import Analysis
 
 

@@ -9,8 +9,8 @@ from pydantic import ValidationError
 from pipeline.errors import ConfigError
 from pipeline.gap.document import gap_json
 from pipeline.gap.types import FoundEffect, Gap, GapWindow, NamedValue, RecordGap, Rival
-from pipeline.plant.chain import Chain
-from pipeline.plant.effects import AugmentedChain, Term, find_effect
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.nonlinear.effects import AugmentedChain, Term, find_effect
 from pipeline.results import Analysis
 from pipeline.results_json import chain_entry, provenance
 from pipeline.schemas.base import fields_of, json_text

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from pipeline.plant.chain import Array
-from pipeline.plant.effects.base import AugmentedChain, Effect
+from pipeline.arrays import Array
+from pipeline.plant.nonlinear.effects.base import AugmentedChain, Effect
 
 Verdict = Literal["named", "partial", "none", "ambiguous", "unexplained"]
 

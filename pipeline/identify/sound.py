@@ -14,7 +14,7 @@ from pipeline.identify.soundness.faults import find_faults, find_impossible_gain
 from pipeline.identify.soundness.other_kind import find_other_kinds
 from pipeline.identify.soundness.repeats import find_outlier_repeats
 from pipeline.ingest.read import Ingested
-from pipeline.plant.chain import Chain
+from pipeline.plant.linear.chain import Chain
 from pipeline.results import LeftOut
 from pipeline.stages.bode_fit import fit_bode
 from pipeline.submission import System

@@ -4,10 +4,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
 from pipeline.ingest.columns import Column, conversion
 from pipeline.ingest.formats.table import Table, refuse_extreme
-from pipeline.plant.chain import Array
 from pipeline.results import FrequencyResponse
 
 DEFAULT_SPREAD = 0.01  # of a ratio read off two plots, where no repeats show the true spread

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from pipeline.plant.chain import Array
+from pipeline.arrays import Array
 
 _MOST_LEVELS = 20_000  # an encoder on a lab cart has a few thousand counts over its travel
 _ON_GRID = 0.15  # of a step, rms: farther off, the values are not multiples of one step

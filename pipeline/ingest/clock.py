@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.plant.chain import Array
+from pipeline.arrays import Array
 
 SLOW = 0.5  # s between samples; no bench records so slowly, a file in ms or in samples looks so
 _FINEST_DECIMAL = 9  # a file that prints time beyond the nanosecond has not rounded it

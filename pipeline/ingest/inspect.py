@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
 from pipeline.ingest.channels import channel_problems, encoder_step, mirrors
 from pipeline.ingest.clock import SLOW, Clock, read_clock
@@ -14,7 +15,6 @@ from pipeline.ingest.columns import Column, assign_columns, conversion, holds_co
 from pipeline.ingest.formats.recognise import read_table
 from pipeline.ingest.formats.table import ENDINGS, FORM_TITLES, Table
 from pipeline.ingest.suggest import suggest_columns
-from pipeline.plant.chain import Array
 from pipeline.results import Kind
 
 _UNEVEN = 0.01  # of the sample interval, rms

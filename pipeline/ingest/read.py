@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
 from pipeline.ingest.bode import Points, frequency_responses, read_points
 from pipeline.ingest.channels import channel_problems, encoder_step, mirrors
@@ -15,7 +16,6 @@ from pipeline.ingest.formats.recognise import read_table
 from pipeline.ingest.formats.table import Table, refuse_extreme
 from pipeline.ingest.signs import Signs, with_signs
 from pipeline.ingest.times import FEWEST_SAMPLES, clock_notes, time_stamps
-from pipeline.plant.chain import Array
 from pipeline.results import FrequencyResponse, Record
 from pipeline.submission import Experiment, Submission, System
 

@@ -2,10 +2,10 @@
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.ingest.channels import mirrors
 from pipeline.ingest.clock import SLOW, read_clock
 from pipeline.ingest.formats.table import Table
-from pipeline.plant.chain import Array
 
 _QUICK = 1e-5  # s between samples; no bench records faster, a slow signal that only rises does
 _MOST_CARTS = 4

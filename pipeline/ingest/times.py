@@ -2,11 +2,11 @@
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
 from pipeline.ingest.clock import SLOW, Clock
 from pipeline.ingest.columns import Column, conversion
 from pipeline.ingest.formats.table import Table
-from pipeline.plant.chain import Array
 
 FEWEST_SAMPLES = 8
 _RATE_DIFFERS = 0.01  # of the rate: a stated one that is farther off is worth a word

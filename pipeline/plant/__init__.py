@@ -1,1 +1,1 @@
-"""The carts: linear chain, exact simulation, feedback loop."""
+"""The carts: linear, under feedback, and with what the linear model leaves out."""

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import least_squares
 
+from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.estimation.chain.bode_points import Points, Scale, response_at, weighted_residuals
 from pipeline.estimation.chain.parametrisation import (
@@ -22,7 +23,8 @@ from pipeline.estimation.chain.parametrisation import (
 from pipeline.estimation.chain.staged_fit import LogMagnitude, StagedFit, fit_stage_by_stage
 from pipeline.estimation.last_point import LastPoint
 from pipeline.names import own_zeta, read_name
-from pipeline.plant.chain import Array, Chain, recover_chain
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.linear.recovery import recover_chain
 from pipeline.results import EXPLAINED, ChainFit, Estimate, FrequencyResponse
 
 _STARTS = 8  # random ones, tried where the first does not explain the data

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pipeline.arrays import Array, ComplexArray
 from pipeline.errors import DataError
 from pipeline.estimation.chain.parametrisation import ASSUMED_ZETA
 from pipeline.estimation.record_transforms import transfer_ratio, visible_band
@@ -18,7 +19,6 @@ from pipeline.names import (
     own_omega,
     parameter_names,
 )
-from pipeline.plant.chain import Array, ComplexArray
 from pipeline.results import Estimate, FrequencyResponse, Record, SinePoint
 
 # Two dwells are repeats where their frequencies differ by less than this: a fitted frequency is

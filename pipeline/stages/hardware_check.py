@@ -11,11 +11,19 @@ from typing import Literal
 import numpy as np
 
 from pipeline import submission
+from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.estimation.measured_run import MeasuredRun, measured_run
-from pipeline.plant import step_response
-from pipeline.plant.chain import Array, Chain
-from pipeline.plant.loop import Controller, LoopRun, Pid, StateFeedback, replay, simulate_loop
+from pipeline.plant.linear import step_response
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.loop.sampled_loop import (
+    Controller,
+    LoopRun,
+    Pid,
+    StateFeedback,
+    replay,
+    simulate_loop,
+)
 from pipeline.results import HardwareCheck, Record
 
 _SERVO_PERIOD = 0.000884  # s; of the ECP controller, whose log keeps one sample in several

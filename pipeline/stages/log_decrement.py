@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.estimation.decay.free_decay import FreeDecay, find_decay, fit_decay
 from pipeline.estimation.noise import grain
-from pipeline.plant.chain import Array
 from pipeline.results import LogDecrement, Record
 
 _PEAKS_FOR_REGRESSION = 4  # two amplitudes

@@ -5,10 +5,10 @@ from functools import cached_property
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.estimation.colour import colour
 from pipeline.estimation.noise import grain, noise_beyond_rounding, rounding_left
-from pipeline.plant.chain import Array
 from pipeline.results import Record, SinePoint
 
 _MIN_SAMPLES = 12  # five unknowns, and something left to judge the fit by

@@ -1,7 +1,7 @@
 """Design state feedback with a prefilter, so that one cart follows a step.
 
 The design is sampled and its model holds the computer's one-sample delay: the gains multiply the
-state predicted for the moment the effort begins to act (`pipeline.plant.loop`), so the loop has
+state predicted for the moment the effort begins to act (`plant.loop.sampled_loop`), so the loop has
 the poles of Phi - Gamma G and one at z = 0 for the delay, with 2n gains.
 
 "lqr" weighs energy against the input, alpha times the potential and beta times the kinetic, and
@@ -17,13 +17,14 @@ from typing import Literal
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from pipeline.arrays import Array, ComplexArray
 from pipeline.errors import DataError
-from pipeline.plant import step_response
-from pipeline.plant.chain import Array, Chain, ComplexArray, quadratic_factors
-from pipeline.plant.feedback import lqr_gains, place_poles
-from pipeline.plant.loop import StateFeedback, check_ticks, discretise, simulate_loop
-from pipeline.plant.robustness import DAMPING_ERROR, MASS_SPRING_ERROR, level_error_percent
-from pipeline.plant.sampled import RADIANS_PER_SAMPLE, SampledPlant, energy_weights
+from pipeline.plant.linear import step_response
+from pipeline.plant.linear.chain import Chain, quadratic_factors
+from pipeline.plant.loop.gains import lqr_gains, place_poles
+from pipeline.plant.loop.robustness import DAMPING_ERROR, MASS_SPRING_ERROR, level_error_percent
+from pipeline.plant.loop.sampled_loop import StateFeedback, check_ticks, discretise, simulate_loop
+from pipeline.plant.loop.sampled_plant import RADIANS_PER_SAMPLE, SampledPlant, energy_weights
 from pipeline.results import FeedbackDesign
 
 Method = Literal["poles", "lqr"]

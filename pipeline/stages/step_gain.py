@@ -6,12 +6,12 @@ from itertools import pairwise
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.estimation.colour import colour
 from pipeline.estimation.decay.ringing import find_poles, fit_ringing
 from pipeline.estimation.noise import grain, noise_beyond_rounding, rounding_left
 from pipeline.estimation.peaks import extrema, plateaus
-from pipeline.plant.chain import Array
 from pipeline.results import Record, StepEdge, StepGain
 
 _MIN_SAMPLES = 12

@@ -14,6 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.estimation.chain.parametrisation import (
     Parametrisation,
@@ -24,7 +25,7 @@ from pipeline.estimation.chain.time_search import Attempt, condense, descend, lo
 from pipeline.estimation.chain.time_window import Window, open_window
 from pipeline.estimation.colour import long_run_variance, score_covariance
 from pipeline.names import read_name
-from pipeline.plant.chain import Array, Chain
+from pipeline.plant.linear.chain import Chain
 from pipeline.results import ChainFit, Estimate, Record
 
 _NEGLIGIBLE = 0.05  # of its standard error: such a damping or wall spring is held at zero

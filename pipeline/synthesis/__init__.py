@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.errors import ConfigError
-from pipeline.plant.chain import PRESETS, Chain
-from pipeline.plant.effects import Term
-from pipeline.plant.loop import StateFeedback
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.loop.sampled_loop import StateFeedback
+from pipeline.plant.nonlinear.effects import Term
 from pipeline.results import FeedbackDesign
 from pipeline.stages.state_feedback import design_feedback
 from pipeline.submission import Design

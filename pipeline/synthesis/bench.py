@@ -5,11 +5,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.plant.chain import Array, Chain
-from pipeline.plant.effects import AugmentedChain, Term
-from pipeline.plant.loop import StateFeedback, simulate_loop
-from pipeline.plant.simulate import propagate, simulate_linear
-from pipeline.plant.tables import Cart
+from pipeline.arrays import Array
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.linear.simulate import propagate, simulate_linear
+from pipeline.plant.loop.sampled_loop import StateFeedback, simulate_loop
+from pipeline.plant.nonlinear.effects import AugmentedChain, Term
+from pipeline.plant.nonlinear.tables import Cart
 from pipeline.results import Kind
 
 # A hand trembles by hundredths of a millimetre at these rates; it is not a clamp.
@@ -135,7 +136,7 @@ class Bench:
         return Motion(u=run.u, x=x)
 
     def _move_with_effects(self, run: Run) -> Motion:
-        from pipeline.plant.augmented import SteppedBench, simulate_augmented
+        from pipeline.plant.nonlinear.augmented import SteppedBench, simulate_augmented
 
         model = AugmentedChain(chain=self.chain, terms=self.effects)
         if run.controller is not None and run.reference is not None:
@@ -199,7 +200,7 @@ def _release_with_effects(model: AugmentedChain, run: Run, hand: Hand) -> Array:
     The hand pulls the cart out before the recorder starts, so friction and hidden masses are
     where that leaves them; it then follows its tremor, and lets go as in the linear chain.
     """
-    from pipeline.plant.augmented import SteppedBench
+    from pipeline.plant.nonlinear.augmented import SteppedBench
 
     hand = before_stop(hand, model)
     bench, t, cart = SteppedBench(model, free=run.free), run.t, hand.cart

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.plant.chain import Chain
+from pipeline.plant.linear.chain import Chain
 from pipeline.results import FeedbackDesign
 from pipeline.synthesis.files import Typed, Value
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from pipeline.plant.chain import Array
+from pipeline.arrays import Array
 from pipeline.submission.toml_file import Value
 from pipeline.synthesis.bench import Run
 from pipeline.synthesis.runs import INPUT_DECIMALS

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import ConfigError
-from pipeline.plant.chain import Chain
-from pipeline.plant.effects import Effect, Parameter, Term, find_effect
-from pipeline.plant.effects.base import Scales, chain_scales
-from pipeline.plant.simulate import simulate_linear
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.linear.simulate import simulate_linear
+from pipeline.plant.nonlinear.effects import Effect, Parameter, Term, find_effect
+from pipeline.plant.nonlinear.effects.base import Scales, chain_scales
 from pipeline.submission.complaints import nearest, quote
 from pipeline.submission.toml_file import read_text
 from pipeline.synthesis import COUNT, SAMPLE_TIME, preset_chain, write_submission

@@ -4,8 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.plant.chain import Array, Chain, quadratic_factors
-from pipeline.plant.dwells import (
+from pipeline.arrays import Array
+from pipeline.plant.linear.chain import Chain, quadratic_factors
+from pipeline.plant.linear.dwells import (
     SETTLED,
     SETTLED_DWELL,
     dwell_frequencies,
@@ -13,8 +14,8 @@ from pipeline.plant.dwells import (
     settling_wait,
     steady_time,
 )
-from pipeline.plant.loop import StateFeedback
-from pipeline.plant.simulate import simulate_linear
+from pipeline.plant.linear.simulate import simulate_linear
+from pipeline.plant.loop.sampled_loop import StateFeedback
 from pipeline.synthesis.bench import Hand, Run
 
 INPUT_DECIMALS = 5  # the input is set in steps of 10 µV, so the log holds what was applied

@@ -31,7 +31,7 @@ from pipeline.bench.watch.terminal import Terminal, sparkline
 from pipeline.cli import app
 from pipeline.errors import ConfigError, HardwareError
 from pipeline.ingest.read import read_data
-from pipeline.plant.chain import PRESETS
+from pipeline.plant.linear.presets import PRESETS
 from pipeline.submission import StateFeedback, System, load_submission
 from pipeline.workflow import analyse
 from tests.helpers.acquisitions import LIMITS, Notes, host, sine, until_bytes, write_work

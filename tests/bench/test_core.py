@@ -17,8 +17,8 @@ from pipeline.bench.protocol.messages import (
     parse_reading,
 )
 from pipeline.bench.protocol.waves import target_at
-from pipeline.plant.chain import Chain
-from pipeline.plant.loop import Pid, StateFeedback, simulate_loop
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.loop.sampled_loop import Pid, StateFeedback, simulate_loop
 
 PERIOD = 1e-3
 # Two carts in counts and duty counts: some 10 counts a duty count, 2 and 5 Hz.

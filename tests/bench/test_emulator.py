@@ -26,7 +26,7 @@ from pipeline.bench.protocol.messages import (
     parse_reading,
 )
 from pipeline.errors import ConfigError
-from pipeline.plant.chain import PRESETS
+from pipeline.plant.linear.presets import PRESETS
 from pipeline.results import Record
 from pipeline.stages.log_decrement import fit_log_decrement
 from pipeline.synthesis.hidden import prepare_bench

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from pipeline.arrays import Array
 from pipeline.bench.emulator.core import ReferenceCore
 from pipeline.bench.planning.gains import (
     Scales,
@@ -17,8 +18,8 @@ from pipeline.bench.planning.gains import (
 from pipeline.bench.planning.plan import Limits, PidLoop, Recording, StateLoop
 from pipeline.bench.protocol.messages import Description, Start, StateGains, Wave, encode
 from pipeline.errors import DataError
-from pipeline.plant.chain import Array, Chain
-from pipeline.plant.loop import Pid, StateFeedback, discretise, simulate_loop
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.loop.sampled_loop import Pid, StateFeedback, discretise, simulate_loop
 from pipeline.resources import EXAMPLES
 from pipeline.results import Analysis, FeedbackDesign
 from pipeline.submission import Submission, load_submission

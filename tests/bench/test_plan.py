@@ -15,9 +15,10 @@ from pipeline.bench.protocol.messages import FULL_SCALE, Description, Start, Wav
 from pipeline.bench.protocol.waves import target_at
 from pipeline.cli import main
 from pipeline.errors import ConfigError, DataError
-from pipeline.plant.chain import PRESETS, quadratic_factors
-from pipeline.plant.dwells import SETTLED_DWELL, settling_wait
-from pipeline.plant.simulate import simulate_linear
+from pipeline.plant.linear.chain import quadratic_factors
+from pipeline.plant.linear.dwells import SETTLED_DWELL, settling_wait
+from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.linear.simulate import simulate_linear
 from pipeline.resources import EXAMPLES
 from pipeline.submission import (
     Design,

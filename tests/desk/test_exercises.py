@@ -14,8 +14,8 @@ from pipeline.cli import app
 from pipeline.desk.app import DeskServer
 from pipeline.desk.exercises import exercise
 from pipeline.grading.rubric_file import load_rubric
-from pipeline.plant.chain import PRESETS
-from pipeline.plant.effects import CATALOGUE
+from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.nonlinear.effects import CATALOGUE
 from pipeline.resources import RUBRICS
 from tests.helpers.desks import Visitor, a_submission
 from tests.helpers.waiting import until

@@ -13,7 +13,8 @@ from pipeline.estimation.chain.parametrisation import (
     named_estimates,
     physical_start,
 )
-from pipeline.plant.chain import PRESETS, Chain
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.linear.presets import PRESETS
 
 
 @st.composite

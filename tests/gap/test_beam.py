@@ -11,7 +11,7 @@ from pipeline.gap.search.beam import by_promise, prune
 from pipeline.gap.search.grow import fit_whole
 from pipeline.gap.search.hypothesis import Bench, judge
 from pipeline.gap.search.screen import candidates_at
-from pipeline.plant.effects import CATALOGUE, find_effect
+from pipeline.plant.nonlinear.effects import CATALOGUE, find_effect
 from tests.truth.bench import Hidden
 from tests.truth.cases import make_case
 

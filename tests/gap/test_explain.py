@@ -15,8 +15,8 @@ from pipeline.gap.fit.structure import Structure
 from pipeline.gap.search.screen import candidates_at, find_teams
 from pipeline.gap.types import Gap
 from pipeline.gap.verdict.account import repeatability
-from pipeline.plant.chain import Chain
-from pipeline.plant.effects import CATALOGUE, find_effect
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.nonlinear.effects import CATALOGUE, find_effect
 from pipeline.results import Record
 from tests.truth.bench import Hidden, simulate_truth
 from tests.truth.cases import COUNT, make_case

@@ -9,8 +9,8 @@ import pytest
 from pipeline.gap.data.runs import make_run
 from pipeline.gap.fit.structure import Structure
 from pipeline.gap.search.screen import candidates_at, shown_places
-from pipeline.plant.chain import PRESETS
-from pipeline.plant.effects import CATALOGUE, find_effect
+from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.nonlinear.effects import CATALOGUE, find_effect
 from tests.truth.cases import make_case
 
 

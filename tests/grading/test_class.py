@@ -13,7 +13,7 @@ from pipeline.grading.judge.run import grade_submission
 from pipeline.grading.mistakes.state_model import own_chain
 from pipeline.grading.publish.class_page import class_page
 from pipeline.grading.rubric_file import load_rubric
-from pipeline.plant.chain import Chain
+from pipeline.plant.linear.chain import Chain
 from pipeline.schemas.grade import Grade
 from pipeline.submission import load_submission
 from pipeline.synthesis.hidden import prepare_bench, write_bench

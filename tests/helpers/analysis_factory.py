@@ -7,9 +7,11 @@ from functools import cache
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.names import read_name
-from pipeline.plant.chain import PRESETS, Array, Chain
-from pipeline.plant.simulate import simulate_linear
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.linear.simulate import simulate_linear
 from pipeline.results import (
     Analysis,
     ChainFit,

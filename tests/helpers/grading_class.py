@@ -13,14 +13,15 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.grading.judge.run import under_rubric
 from pipeline.grading.mistakes.state_model import own_chain
 from pipeline.grading.references.springs import with_all_springs
 from pipeline.grading.rubric import Rubric, is_damping
 from pipeline.grading.rubric_file import load_rubric
-from pipeline.plant.chain import Array, Chain
-from pipeline.plant.effects import Term, find_effect
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.nonlinear.effects import Term, find_effect
 from pipeline.stages.state_feedback import design_feedback
 from pipeline.submission import Design, Feedback, Reported, StateSpace, Submission, load_submission
 from pipeline.synthesis import preset_chain, write_submission

@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.errors import DataError
-from pipeline.plant.chain import Array
 from pipeline.results import FrequencyResponse
 from pipeline.stages.bode_fit import fit_bode
 from pipeline.submission import Feedback, Reported

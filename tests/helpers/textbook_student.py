@@ -11,7 +11,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.signal import find_peaks
 
-from pipeline.plant.chain import Array
+from pipeline.arrays import Array
 from pipeline.results import Record
 
 MODES = "abcdefgh"

@@ -7,7 +7,8 @@ import pytest
 
 from pipeline.identify.soundness.repeats import find_outlier_repeats
 from pipeline.ingest.read import read_data
-from pipeline.plant.chain import PRESETS, Chain
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.linear.presets import PRESETS
 from pipeline.submission import load_submission
 from tests.helpers.time_records import decay_record, step_record
 from tests.helpers.ucsd import write_two_cart_submission

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.arrays import Array
 from pipeline.checks.recordings import check_signs
 from pipeline.ingest.drive import find_signs
 from pipeline.ingest.read import read_data
-from pipeline.plant.chain import PRESETS, Array
-from pipeline.plant.simulate import simulate_linear
+from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.linear.simulate import simulate_linear
 from pipeline.report.sections.questions import ask
 from pipeline.results import Record
 from pipeline.submission import load_submission

@@ -11,14 +11,9 @@ from numpy.testing import assert_allclose
 
 from pipeline.errors import DataError
 from pipeline.names import read_name
-from pipeline.plant.chain import (
-    PRESETS,
-    Chain,
-    parameter_names,
-    quadratic_factors,
-    recover_chain,
-    recover_from_parameters,
-)
+from pipeline.plant.linear.chain import Chain, parameter_names, quadratic_factors
+from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.linear.recovery import recover_chain, recover_from_parameters
 
 # The paper's final estimates: Tables 1 and 2 are kept by the presets, Table 3 by no real chain.
 TABLE_1 = {"K": 28.9, "omega_n": 13.2, "zeta": 0.10}

@@ -6,10 +6,18 @@ import numpy as np
 import pytest
 
 from pipeline.errors import ConfigError
-from pipeline.plant.augmented import simulate_augmented
-from pipeline.plant.chain import PRESETS, Chain
-from pipeline.plant.effects import CATALOGUE, AugmentedChain, Effect, Term, find_effect, make_term
-from pipeline.plant.effects.base import chain_scales
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.nonlinear.augmented import simulate_augmented
+from pipeline.plant.nonlinear.effects import (
+    CATALOGUE,
+    AugmentedChain,
+    Effect,
+    Term,
+    find_effect,
+    make_term,
+)
+from pipeline.plant.nonlinear.effects.base import chain_scales
 
 KEYS = {
     "coulomb_friction": ("cart", {"force"}),

@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pipeline.plant import compiled, contacts, kernel, sensitivity, step
-from pipeline.plant.chain import PRESETS, Array, Chain
-from pipeline.plant.effects import AugmentedChain, find_effect, make_term
-from pipeline.plant.kernel import simulate_batch
-from pipeline.plant.simulate import simulate_linear
-from pipeline.plant.tables import Cart, Tables, linear_tables
+from pipeline.arrays import Array
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.linear.simulate import simulate_linear
+from pipeline.plant.nonlinear.effects import AugmentedChain, find_effect, make_term
+from pipeline.plant.nonlinear.simulator import contacts, kernel, sensitivity, state, step
+from pipeline.plant.nonlinear.simulator.kernel import simulate_batch
+from pipeline.plant.nonlinear.tables import Cart, Tables, linear_tables
 from tests.truth.bench import Hidden, simulate_truth
 
 COUNT = 0.00227  # cm, the encoder step
@@ -284,11 +286,11 @@ def test_a_hidden_mass_starts_where_it_is_told_to():
 
 _NOTHING_LEFT = """
 import numpy as np
-from pipeline.plant import contacts, kernel, sensitivity, step
-from pipeline.plant.augmented import SteppedBench, compile_simulator
-from pipeline.plant.chain import PRESETS
-from pipeline.plant.effects import AugmentedChain
-from pipeline.plant.tables import linear_tables
+from pipeline.plant.nonlinear.simulator import contacts, kernel, sensitivity, step
+from pipeline.plant.nonlinear.augmented import SteppedBench, compile_simulator
+from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.nonlinear.effects import AugmentedChain
+from pipeline.plant.nonlinear.tables import linear_tables
 
 files = [vars(module) for module in (contacts, kernel, sensitivity, step)]
 stats = [one.stats for file in files for one in file.values() if hasattr(one, "stats")]
@@ -333,10 +335,10 @@ def test_arrays_of_any_kind_meet_the_same_simulator():
         1,
     )
     assert np.array_equal(fixed[0], whole)
-    modules = (compiled, contacts, kernel, sensitivity, step)
+    modules = (contacts, kernel, sensitivity, state, step)
     mine = {id(one): one for module in modules for one in vars(module).values()}
     twice = [one for one in mine.values() if len(getattr(one, "signatures", ())) > 1]
-    assert twice in ([], [compiled.stretch])  # which takes the row it reads as a constant
+    assert twice in ([], [state.stretch])  # which takes the row it reads as a constant
 
 
 @pytest.mark.parametrize("preset", list(PRESETS))

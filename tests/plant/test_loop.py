@@ -4,9 +4,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from pipeline.arrays import Array
 from pipeline.errors import DataError
-from pipeline.plant.chain import PRESETS, Array, Chain
-from pipeline.plant.loop import (
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.linear.simulate import simulate_linear
+from pipeline.plant.loop.sampled_loop import (
     Pid,
     StateFeedback,
     discretise,
@@ -14,7 +17,6 @@ from pipeline.plant.loop import (
     replay,
     simulate_loop,
 )
-from pipeline.plant.simulate import simulate_linear
 
 T = 0.00884  # s
 TWO = PRESETS["throne-2dof"]

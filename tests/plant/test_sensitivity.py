@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from pipeline.plant.chain import PRESETS
-from pipeline.plant.effects import AugmentedChain, find_effect, make_term
-from pipeline.plant.kernel import simulate_with_derivatives
-from pipeline.plant.sensitivity import (
+from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.nonlinear.effects import AugmentedChain, find_effect, make_term
+from pipeline.plant.nonlinear.simulator.kernel import simulate_with_derivatives
+from pipeline.plant.nonlinear.simulator.sensitivity import (
     BY_DAMPING,
     BY_FRICTION,
     BY_MASS,
@@ -14,7 +14,7 @@ from pipeline.plant.sensitivity import (
     BY_STIFFNESS,
     BY_VELOCITY,
 )
-from pipeline.plant.tables import Cart, Spring
+from pipeline.plant.nonlinear.tables import Cart, Spring
 
 CASES = {
     "nothing": {},

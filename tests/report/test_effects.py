@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from pipeline.plant.effects import CATALOGUE, find_effect
+from pipeline.plant.nonlinear.effects import CATALOGUE, find_effect
 from pipeline.report.effects.page import build_gallery, render_effects
 from pipeline.report.effects.words import catalogue_data, catalogue_text
 from tests.helpers.commandline import cartlab_here

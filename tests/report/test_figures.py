@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.text import Text
 
-from pipeline.plant.chain import Chain
+from pipeline.plant.linear.chain import Chain
 from pipeline.report.figures.bode import bode_figure, overview_figure, plot_phase
 from pipeline.report.figures.grading import distribution_figure
 from pipeline.report.figures.style import (

@@ -23,10 +23,10 @@ from pipeline.gap.types import (
     Verdict,
 )
 from pipeline.gap.verdict.residual_force import residual_forces
-from pipeline.plant.augmented import simulate_augmented
-from pipeline.plant.chain import PRESETS
-from pipeline.plant.effects import CATALOGUE, AugmentedChain, Term, find_effect, make_term
-from pipeline.plant.effects.base import chain_scales
+from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.nonlinear.augmented import simulate_augmented
+from pipeline.plant.nonlinear.effects import CATALOGUE, AugmentedChain, Term, find_effect, make_term
+from pipeline.plant.nonlinear.effects.base import chain_scales
 from pipeline.report.document import Formula
 from pipeline.report.draft.content import build_document
 from pipeline.report.equations.effects import augmented_equations, law

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.plant.designed_loop import Margins
+from pipeline.plant.loop.margins import Margins
 from pipeline.report.numbers import listing, percent, significant, with_error, with_errors
 from pipeline.report.tables.loops import margin_rows
 

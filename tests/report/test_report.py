@@ -11,7 +11,7 @@ import numpy as np
 import pypdf
 import pytest
 
-from pipeline.plant.chain import Chain
+from pipeline.plant.linear.chain import Chain
 from pipeline.report.draft.write import render_report
 from pipeline.report.render.pdf import missing_characters
 from pipeline.report.sections.summary import terminal_summary

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from sympy.parsing.sympy_parser import parse_expr
 
-from pipeline.plant.chain import PRESETS, Chain
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.linear.presets import PRESETS
 from pipeline.report.document import Formula
 from pipeline.report.equations import derivation
 from pipeline.report.equations.algebra import evaluate, shown, shown_with, value_term, work_out

@@ -10,8 +10,10 @@ from numpy.testing import assert_allclose
 from scipy.stats import binom
 
 from benchmarks.identification import PAPER_STARTS, measure, quality
+from pipeline.arrays import Array
 from pipeline.errors import DataError
-from pipeline.plant.chain import PRESETS, Array, Chain
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.linear.presets import PRESETS
 from pipeline.results import Estimate, FrequencyResponse
 from pipeline.stages.bode_fit import fit_bode
 

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from pipeline.checks.carts import check_carts
 from pipeline.checks.estimates import check_rows
-from pipeline.plant.chain import PRESETS, Chain
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.linear.presets import PRESETS
 from pipeline.results import ChainFit, Estimate
 from pipeline.stages.compare import (
     DAMPING_LIMIT,

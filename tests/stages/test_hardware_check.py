@@ -11,11 +11,13 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from pipeline import submission
+from pipeline.arrays import Array
 from pipeline.checks.loops import check_loops
 from pipeline.errors import DataError
-from pipeline.plant.chain import PRESETS, Array, Chain
-from pipeline.plant.loop import Controller, Pid, StateFeedback, simulate_loop
-from pipeline.plant.simulate import simulate_linear
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.linear.simulate import simulate_linear
+from pipeline.plant.loop.sampled_loop import Controller, Pid, StateFeedback, simulate_loop
 from pipeline.results import FeedbackDesign, HardwareCheck, Kind, Record
 from pipeline.stages.hardware_check import check_hardware
 from pipeline.stages.state_feedback import design_feedback

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.identification import converged_share, quality
-from pipeline.plant.chain import PRESETS
+from pipeline.plant.linear.presets import PRESETS
 
 
 @pytest.mark.slow

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.plant.chain import PRESETS
+from pipeline.plant.linear.presets import PRESETS
 from pipeline.stages.time_fit import fit_records
 from tests.helpers.time_records import random_chain, step_record
 from tests.stages.test_time_fit import errors

@@ -8,15 +8,11 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from pipeline.errors import ConfigError, DataError
-from pipeline.plant.chain import (
-    PRESETS,
-    Chain,
-    parameter_names,
-    quadratic_factors,
-    recover_from_parameters,
-)
-from pipeline.plant.dwells import dwell_frequencies
-from pipeline.plant.simulate import simulate_linear
+from pipeline.plant.linear.chain import Chain, parameter_names, quadratic_factors
+from pipeline.plant.linear.dwells import dwell_frequencies
+from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.linear.recovery import recover_from_parameters
+from pipeline.plant.linear.simulate import simulate_linear
 from pipeline.resources import EXAMPLES
 from pipeline.submission import load_submission
 from pipeline.synthesis import COUNT, SAMPLE_TIME, write_submission

@@ -13,10 +13,10 @@ from pipeline.errors import ConfigError, DataError
 from pipeline.gap.document import gap_json
 from pipeline.gap.types import Gap
 from pipeline.ingest.read import read_data
-from pipeline.plant.augmented import SteppedBench, rest_positions, simulate_augmented
-from pipeline.plant.chain import PRESETS
-from pipeline.plant.effects import CATALOGUE, AugmentedChain, Term, find_effect
-from pipeline.plant.loop import StateFeedback
+from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.loop.sampled_loop import StateFeedback
+from pipeline.plant.nonlinear.augmented import SteppedBench, rest_positions, simulate_augmented
+from pipeline.plant.nonlinear.effects import CATALOGUE, AugmentedChain, Term, find_effect
 from pipeline.submission import load_submission
 from pipeline.synthesis import COUNT, SAMPLE_TIME, write_submission
 from pipeline.synthesis.bench import Bench, Hand, Run

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from pipeline.arrays import Array
 from pipeline.errors import PipelineError
-from pipeline.plant.chain import Array
 from pipeline.resources import EXAMPLES
 from pipeline.results_json import results_text
 from pipeline.submission import Experiment, Submission, load_submission

@@ -15,7 +15,7 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from pypdf import PdfReader
 
-from pipeline.plant.effects import CATALOGUE
+from pipeline.plant.nonlinear.effects import CATALOGUE
 from pipeline.report.draft.write import render_report
 from pipeline.report.effects.page import render_effects
 from pipeline.report.gap.page import render_gap

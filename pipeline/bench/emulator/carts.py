@@ -5,10 +5,10 @@ from collections.abc import Generator
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.bench.protocol.messages import FULL_SCALE, Hands
-from pipeline.plant.augmented import SteppedBench
-from pipeline.plant.chain import Array
-from pipeline.plant.effects import AugmentedChain
+from pipeline.plant.nonlinear.augmented import SteppedBench
+from pipeline.plant.nonlinear.effects import AugmentedChain
 from pipeline.synthesis.bench import Hand, before_stop
 from pipeline.synthesis.hidden import HiddenBench
 

@@ -24,7 +24,7 @@ from pipeline.bench.protocol.messages import (
     format_reading,
 )
 from pipeline.bench.protocol.waves import nearest_count, target_at
-from pipeline.plant.loop import VELOCITY_CORRECTION
+from pipeline.plant.loop.sampled_loop import VELOCITY_CORRECTION
 
 
 class Core(Protocol):
@@ -158,7 +158,7 @@ class _OpenLoop:
 
 
 class _Pid:
-    """As `pipeline.plant.loop` has it, acting at once."""
+    """As `pipeline.plant.loop.sampled_loop` has it, acting at once."""
 
     def __init__(self, gains: PidGains, *, row: int, period: float) -> None:
         self._gains, self._row, self._period = gains, row, period
@@ -173,7 +173,7 @@ class _Pid:
 
 
 class _StateFeedback:
-    """As `pipeline.plant.loop` has it without a model, acting one tick later."""
+    """As `pipeline.plant.loop.sampled_loop` has it without a model, acting one tick later."""
 
     def __init__(self, gains: StateGains, *, period: float) -> None:
         self._gains, self._period = gains, period

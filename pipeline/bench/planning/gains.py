@@ -1,9 +1,9 @@
 """The controller of a recording in the bench's own numbers, once it is known to do no harm there.
 
 The bench computes in duty counts and encoder counts, once a period, by the laws of
-`pipeline.plant.loop`: state feedback with velocities at constant velocity and one period of delay,
-PID without delay. A design has a sample time of its own and predicts with a model, so the loop is
-simulated as the bench will run it before any gain is sent.
+`plant.loop.sampled_loop`: state feedback with velocities at constant velocity and one period of
+delay, PID without delay. A design has a sample time of its own and predicts with a model, so the
+loop is simulated as the bench will run it before any gain is sent.
 """
 
 from dataclasses import dataclass
@@ -12,14 +12,21 @@ from typing import Any, Self, TypeAlias
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.bench.planning.plan import Limits, PidLoop, Recording, StateLoop
 from pipeline.bench.protocol.messages import FULL_SCALE, Description, PidGains, StateGains
 from pipeline.errors import DataError
 from pipeline.identify.remarks import is_reversed
-from pipeline.plant import step_response
-from pipeline.plant.chain import Array, Chain
-from pipeline.plant.loop import Controller, Pid, StateFeedback, discretise, simulate_loop
-from pipeline.plant.robustness import stays_stable
+from pipeline.plant.linear import step_response
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.loop.robustness import stays_stable
+from pipeline.plant.loop.sampled_loop import (
+    Controller,
+    Pid,
+    StateFeedback,
+    discretise,
+    simulate_loop,
+)
 from pipeline.results import Analysis, FeedbackDesign
 from pipeline.submission import Design, Submission
 

@@ -15,8 +15,8 @@ from pipeline.bench.planning.plan import Limits, Plan, Recording, StateLoop
 from pipeline.bench.protocol.messages import CHIRP_SPAN, FULL_SCALE, Description
 from pipeline.errors import DataError
 from pipeline.ingest.read import DUTY_COUNT
-from pipeline.plant.chain import Chain
-from pipeline.plant.dwells import (
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.linear.dwells import (
     SETTLED,
     SETTLED_DWELL,
     dwell_frequencies,

@@ -15,8 +15,8 @@ from pipeline.desk.state import Ask
 from pipeline.desk.typed import typed_path, whole_number
 from pipeline.errors import ConfigError
 from pipeline.output import new_folder
-from pipeline.plant.chain import PRESETS
-from pipeline.plant.effects import CATALOGUE
+from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.nonlinear.effects import CATALOGUE
 from pipeline.report.effects.words import catalogue_data
 from pipeline.report.math.tex import from_tex
 from pipeline.report.math.tree import to_text

@@ -7,9 +7,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.arrays import Array, ComplexArray
 from pipeline.errors import DataError
 from pipeline.estimation.chain.parametrisation import Parametrisation
-from pipeline.plant.chain import Array, ComplexArray
 from pipeline.results import Estimate, FrequencyResponse
 
 Scale = Literal["log", "magnitude", "polar"]

@@ -11,12 +11,13 @@ from itertools import combinations
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.estimation.chain.modal_response import Modes, find_modes
 from pipeline.estimation.chain.parametrisation import Parametrisation
 from pipeline.estimation.chain.time_window import Window, compare, open_window
 from pipeline.estimation.mistakes import FASTEST, LENGTH_SCALES, TIME_FACTORS
-from pipeline.plant.chain import Array, Chain
+from pipeline.plant.linear.chain import Chain
 from pipeline.results import Record
 
 _SAME_SCALE = 0.1  # relative

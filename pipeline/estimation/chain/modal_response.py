@@ -10,8 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pipeline.arrays import Array, ComplexArray
 from pipeline.estimation.chain.parametrisation import Parametrisation
-from pipeline.plant.chain import Array, Chain, ComplexArray
+from pipeline.plant.linear.chain import Chain
 
 # Below this |lambda dt| the derivative of expm1(z)/z is taken from its series: rounding would leave
 # it 1e-16/|z|, the series errs by z²/8.

@@ -12,9 +12,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.names import read_name
-from pipeline.plant.chain import Array, Chain
+from pipeline.plant.linear.chain import Chain
 from pipeline.results import Estimate
 
 # Damping ratios to begin with, where none is measured:

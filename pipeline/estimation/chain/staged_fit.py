@@ -12,8 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
+from pipeline.arrays import Array
 from pipeline.names import NULLS, gain_name, mode_suffixes, mode_zeta, own_omega, own_zeta
-from pipeline.plant.chain import Array, Chain, quadratic_factors, recover_chain
+from pipeline.plant.linear.chain import Chain, quadratic_factors
+from pipeline.plant.linear.recovery import recover_chain
 
 _EVALUATIONS = 100  # a stage that gets there takes about ten
 _RUNAWAY = 7.0  # of a logarithm, a factor 1000: a stage that got there has lost its way

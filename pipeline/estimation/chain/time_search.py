@@ -7,13 +7,14 @@ from functools import cached_property
 import numpy as np
 from scipy.optimize import least_squares
 
+from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.estimation.chain.modal_response import find_modes
 from pipeline.estimation.chain.parametrisation import Parametrisation
 from pipeline.estimation.chain.time_start import WIDTHS, even_chains, regress_chain
 from pipeline.estimation.chain.time_window import Misfit, Window, compare
 from pipeline.estimation.last_point import LastPoint
-from pipeline.plant.chain import Array, Chain
+from pipeline.plant.linear.chain import Chain
 from pipeline.results import EXPLAINED
 
 # A chain that leaves more than this share of the motion's power unexplained is not the one

@@ -14,9 +14,10 @@ from itertools import pairwise
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.estimation.chain.parametrisation import even_chain, physical_start
 from pipeline.estimation.chain.time_window import Window
-from pipeline.plant.chain import Array, Chain
+from pipeline.plant.linear.chain import Chain
 
 WIDTHS = (0.15, 0.3, 0.6, 1.2)  # s; a bump should span about one period of the carts
 _HOP = 0.25  # of the width, from one bump to the next: they overlap, so closer adds little

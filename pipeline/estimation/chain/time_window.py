@@ -4,11 +4,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pipeline.arrays import Array, ComplexArray
 from pipeline.errors import DataError
 from pipeline.estimation.chain.modal_response import Modes, drive_modes
 from pipeline.estimation.noise import local_noise
-from pipeline.plant.chain import Array, ComplexArray
-from pipeline.plant.simulate import OVERSAMPLING, interpolate_band_limited
+from pipeline.plant.linear.simulate import OVERSAMPLING, interpolate_band_limited
 from pipeline.results import Kind, Record
 
 # A free decay is used from where its largest swing has fallen by half: whatever released the

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.arrays import Array
 from pipeline.estimation.colour import colour
 from pipeline.estimation.decay.ringing import Ringing
 from pipeline.estimation.decay.separable import fit_separable
-from pipeline.plant.chain import Array
 from pipeline.results import FrictionTest
 
 THRESHOLD = 10.8  # F(1, many) above this once in a thousand decays without friction

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.estimation.decay.dry_friction import FrictionFit, fit_friction
 from pipeline.estimation.decay.ringing import Ringing, fit_ringing
 from pipeline.estimation.peaks import extrema, plateaus
-from pipeline.plant.chain import Array
 from pipeline.results import Record
 
 # Swings are counted in grains: encoder steps, or as much noise as would round as coarsely.

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.arrays import Array, ComplexArray
 from pipeline.estimation.colour import colour
 from pipeline.estimation.decay.separable import fit_separable
-from pipeline.plant.chain import Array, ComplexArray
 
 _PENCIL_SAMPLES = 300  # the matrix pencil only starts the fit; more samples would only cost time
 _OSCILLATES = 1e-3  # imaginary part over size: below, a pole is real but for rounding

@@ -10,8 +10,8 @@ from typing import Protocol
 import numpy as np
 from scipy.optimize import least_squares
 
+from pipeline.arrays import Array
 from pipeline.estimation.last_point import LastPoint
-from pipeline.plant.chain import Array
 
 
 class Model(Protocol):

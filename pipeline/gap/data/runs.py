@@ -6,9 +6,9 @@ from itertools import pairwise
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.estimation.noise import difference_noise
-from pipeline.plant.chain import Array
-from pipeline.plant.simulate import interpolate_band_limited
+from pipeline.plant.linear.simulate import interpolate_band_limited
 from pipeline.results import Record
 
 _REST_TIME = 0.02  # s without motion: the run starts at rest

@@ -6,12 +6,13 @@ from itertools import pairwise
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.gap.data.runs import Run, cut_shots, high_frequency_noise
 from pipeline.gap.fit.levenberg_marquardt import Fit, Mapper, fit_model
 from pipeline.gap.fit.linearise import Nuisance, fresh_nuisance, simulate_run
 from pipeline.gap.fit.restart import restart_runs
 from pipeline.gap.fit.structure import Structure
-from pipeline.plant.chain import Array, Chain
+from pipeline.plant.linear.chain import Chain
 
 SHOT_LENGTH = 0.6  # s; a wrong structure does little harm over it
 _WINDOW, _HOP = 0.3, 0.05  # s, of the modulating functions, at the usual pace

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.gap.data.runs import Run
 from pipeline.gap.fit.linearise import (
     Linear,
@@ -20,7 +21,6 @@ from pipeline.gap.fit.linearise import (
     triangle,
 )
 from pipeline.gap.fit.structure import Model
-from pipeline.plant.chain import Array
 
 Mapper = Callable[..., Iterable]
 

@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.gap.data.runs import Run
 from pipeline.gap.fit.structure import Model, Structure
-from pipeline.plant.chain import Array
-from pipeline.plant.kernel import simulate_with_derivatives
-from pipeline.plant.sensitivity import (
+from pipeline.plant.nonlinear.simulator.kernel import simulate_with_derivatives
+from pipeline.plant.nonlinear.simulator.sensitivity import (
     BY_DAMPING,
     BY_FRICTION,
     BY_MASS,
@@ -77,7 +77,7 @@ def _simulate_variants(
     """Return (b, rows, samples) readings of one run for many vectors, zeros left out.
 
     And the derivatives (lanes, rows, samples) of the first, by what `lanes` tell: a kind of
-    `pipeline.plant.sensitivity` and a cart or spring, from 0.
+    `pipeline.plant.nonlinear.simulator.sensitivity` and a cart or spring, from 0.
     """
     cart, spring, drive = structure.tables(thetas)
     b = len(thetas)

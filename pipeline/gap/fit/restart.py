@@ -4,11 +4,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.gap.data.runs import Run
 from pipeline.gap.fit.levenberg_marquardt import Fit, Mapper, evaluate, fit_model
 from pipeline.gap.fit.linearise import Nuisance, residual_points
-from pipeline.plant.chain import Array
-from pipeline.plant.tables import Cart, Drive, Tables
+from pipeline.plant.nonlinear.tables import Cart, Drive, Tables
 
 _BAD_RUN, _BAD_SHARE = 1.5, 2.0  # chi-square, or share of the median run's, to start a run anew
 _RESTARTS = ((0.8, 1.0), (-0.8, 1.0), (1.6, 1.0), (-1.6, 1.0), (0.0, 0.94), (0.0, 1.06))

@@ -6,10 +6,11 @@ from functools import cached_property
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.gap.data.runs import Run
-from pipeline.plant.chain import Array, Chain
-from pipeline.plant.effects.base import AugmentedChain, Effect, Scales, Term, chain_scales
-from pipeline.plant.tables import Cart, Tables
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.nonlinear.effects.base import AugmentedChain, Effect, Scales, Term, chain_scales
+from pipeline.plant.nonlinear.tables import Cart, Tables
 
 _SMALLEST = 1e-7  # of a parameter's scale; below, an effect is not there
 _LARGEST = 1e4

@@ -10,7 +10,7 @@ from pipeline.gap.limits import BIC_DROP
 from pipeline.gap.search.deadline import OutOfTime
 from pipeline.gap.search.grow import fit_whole, grow
 from pipeline.gap.search.hypothesis import Bench, Hypothesis, judge, lowers_error, worth_it
-from pipeline.plant.effects import find_effect
+from pipeline.plant.nonlinear.effects import find_effect
 
 _PATIENCE = 2  # hypotheses grown in a row from which none comes with a lower held-out error
 _DEPTH = 6  # effects

@@ -14,7 +14,7 @@ from pipeline.gap.limits import AT_FLOOR, THINNING
 from pipeline.gap.search.hypothesis import Bench, Hypothesis, judge
 from pipeline.gap.search.rugged import polish, zoom
 from pipeline.gap.search.screen import Suspect, Team, candidates_at, screen
-from pipeline.plant.effects.base import Effect
+from pipeline.plant.nonlinear.effects.base import Effect
 
 _SHORT_LIST = 9  # suspects refitted on pieces
 _FULL_LIST = 5  # of which the best are refitted on whole runs …

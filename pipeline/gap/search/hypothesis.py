@@ -24,8 +24,8 @@ from pipeline.gap.limits import (
     SAME_LAW,
     THINNING,
 )
-from pipeline.plant.effects import find_effect
-from pipeline.plant.effects.base import Effect
+from pipeline.plant.nonlinear.effects import find_effect
+from pipeline.plant.nonlinear.effects.base import Effect
 
 _BOUND_MARGIN = 0.01  # in logarithms, or in scales
 

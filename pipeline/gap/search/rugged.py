@@ -10,10 +10,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.gap.data.runs import Run
 from pipeline.gap.fit.levenberg_marquardt import Fit, Mapper, evaluate, fit_model, project
 from pipeline.gap.search.screen import Suspect, added_signals
-from pipeline.plant.chain import Array
 
 _ELITE, _SCATTERED = 5, 32
 _WIDE = (0.6, 0.35, 0.2, 0.1)  # spread of the trials, in logarithms or scales

@@ -13,12 +13,13 @@ from itertools import combinations, product
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.gap.data.runs import Run
 from pipeline.gap.fit.levenberg_marquardt import Fit, Mapper, project
 from pipeline.gap.fit.linearise import Nuisance, simulate_run
 from pipeline.gap.fit.structure import Candidate, bench_scales
-from pipeline.plant.chain import Array, Chain
-from pipeline.plant.effects.base import Effect, Parameter
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.nonlinear.effects.base import Effect, Parameter
 
 _MOST = 3.0  # a multiple beyond this is no longer what was simulated
 _LEAST = 0.1  # … and one below starts a fit where it has no slope

@@ -5,15 +5,15 @@ from itertools import pairwise
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.gap.data.runs import Run
 from pipeline.gap.fit.levenberg_marquardt import Fit
 from pipeline.gap.fit.linearise import Nuisance, simulate_run
 from pipeline.gap.limits import AT_FLOOR
 from pipeline.gap.search.hypothesis import Bench, Hypothesis
 from pipeline.gap.types import FoundEffect, NamedValue, RecordGap, Rival, Trace
-from pipeline.plant.chain import Array
-from pipeline.plant.effects import find_effect
-from pipeline.plant.effects.base import Term
+from pipeline.plant.nonlinear.effects import find_effect
+from pipeline.plant.nonlinear.effects.base import Term
 
 _MOST_RIVALS = 4  # listed
 _SAME_LENGTH, _SAME_LEVEL = 0.9, 0.01  # share of the samples, and of the largest input: a repeat

@@ -18,7 +18,7 @@ from pipeline.gap.limits import (
 from pipeline.gap.search.beam import steps_to
 from pipeline.gap.search.hypothesis import Bench, Hypothesis, lowers_error
 from pipeline.gap.types import GapWindow, Verdict
-from pipeline.plant.effects import find_effect
+from pipeline.plant.nonlinear.effects import find_effect
 
 _REPEAT = "Repeat each run, so that what differs from run to run is known."
 # What shows more of what is left, by what the cart does there.

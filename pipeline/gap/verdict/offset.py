@@ -9,10 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.gap.data.runs import Run
 from pipeline.gap.fit.linearise import Nuisance
 from pipeline.gap.limits import OFFSET_SHARE, OFFSET_STEPS, OFFSET_SURE
-from pipeline.plant.chain import Array, Chain
+from pipeline.plant.linear.chain import Chain
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,11 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.gap.data.runs import high_frequency_noise
 from pipeline.gap.types import Gap, Trace
-from pipeline.plant.chain import Array, Chain
-from pipeline.plant.effects.base import AugmentedChain
-from pipeline.plant.tables import Drive
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.nonlinear.effects.base import AugmentedChain
+from pipeline.plant.nonlinear.tables import Drive
 
 _WINDOWS = (0.05, 0.07, 0.1, 0.15, 0.2, 0.3)  # s; half of one weighs anything
 _FEWEST = 9  # samples in a window

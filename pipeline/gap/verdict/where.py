@@ -4,11 +4,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.gap.data.runs import Run
 from pipeline.gap.fit.levenberg_marquardt import Fit
 from pipeline.gap.fit.linearise import simulate_run
 from pipeline.gap.types import GapWindow
-from pipeline.plant.chain import Array
 
 _WINDOW = 0.15  # of the run
 _MOST = 8  # windows shown

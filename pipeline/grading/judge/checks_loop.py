@@ -4,12 +4,12 @@ from fractions import Fraction
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.grading import rubric as asked
 from pipeline.grading.judge.work import NONE, Verdict, Work, mean_share
 from pipeline.grading.mistakes.controller import Controller, does, same_gains
 from pipeline.grading.references.reference import OFF_SCALE, Reference, off_scale
 from pipeline.grading.references.tolerance import as_typed, credit, exact, percent_off, rounding
-from pipeline.plant.chain import Array
 
 
 def _loop(work: Work) -> tuple[Controller, Array] | Verdict:

@@ -12,11 +12,12 @@ from fractions import Fraction
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.grading.references.tolerance import rounding
 from pipeline.grading.rubric import is_damping
 from pipeline.names import parameter_names
-from pipeline.plant.chain import Array, recover_from_parameters
-from pipeline.plant.laws import orders
+from pipeline.plant.linear.laws import orders
+from pipeline.plant.linear.recovery import recover_from_parameters
 
 MOST_WIDENING = 4  # tolerances; a law that then still fails is simply broken
 _PER_TOLERANCE = 2  # steps in which the box is widened by one

@@ -7,6 +7,7 @@ from decimal import Decimal
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.grading.mistakes import limits
 from pipeline.grading.mistakes.loop_numbers import LoopNumbers, loop_numbers
@@ -15,8 +16,8 @@ from pipeline.grading.references.reference import is_explained
 from pipeline.grading.references.tolerance import as_typed, rounding
 from pipeline.grading.words import WORDS
 from pipeline.names import read_name
-from pipeline.plant.chain import Array, Chain
-from pipeline.plant.robustness import MASS_SPRING_ERROR, level_error_percent, static_levels
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.loop.robustness import MASS_SPRING_ERROR, level_error_percent, static_levels
 from pipeline.results import Analysis
 from pipeline.schemas.grade import Flag
 from pipeline.submission import Design, StateFeedback, Submission

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.plant import step_response
-from pipeline.plant.chain import Array, Chain, ComplexArray
-from pipeline.plant.loop import discretise
+from pipeline.arrays import Array, ComplexArray
+from pipeline.plant.linear import step_response
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.loop.sampled_loop import discretise
 
 _SAMPLE_TIME = 0.00884  # s, of the ECP controller, where none is stated
 _HORIZON = 6.0  # times the settling time asked for

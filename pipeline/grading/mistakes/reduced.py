@@ -9,11 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.grading.mistakes import limits
 from pipeline.grading.mistakes.transient import early_readings
 from pipeline.grading.references.reference import is_explained
 from pipeline.grading.words import WORDS
-from pipeline.plant.chain import Array
 from pipeline.results import Analysis, SinePoint
 from pipeline.schemas.grade import Code, Flag
 

@@ -8,13 +8,15 @@ from typing import Literal
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.grading.mistakes import limits
 from pipeline.grading.references.reference import Reference
 from pipeline.grading.references.tolerance import percent_off
 from pipeline.grading.rubric import is_damping
 from pipeline.grading.words import WORDS
 from pipeline.names import parameter_names
-from pipeline.plant.chain import Array, Chain, recover_from_parameters
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.linear.recovery import recover_from_parameters
 from pipeline.schemas.grade import Flag
 from pipeline.submission import StateSpace
 

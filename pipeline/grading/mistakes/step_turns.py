@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.grading.references.reference import Reference
 from pipeline.names import read_name
-from pipeline.plant.chain import Array
 from pipeline.results import Analysis, Record, StepGain
 
 _TURNS = 3  # the peak, the trough after it, the second peak

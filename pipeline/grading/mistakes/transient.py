@@ -5,12 +5,12 @@ from decimal import Decimal
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.grading.mistakes import limits
 from pipeline.grading.mistakes.catalogue import Mistake
 from pipeline.grading.references.reference import Reference
 from pipeline.grading.rubric import is_damping
-from pipeline.plant.chain import Array
 from pipeline.results import Analysis, FrequencyResponse, Record
 from pipeline.stages.bode_fit import fit_bode
 

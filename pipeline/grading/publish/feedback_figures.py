@@ -2,7 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 
-from pipeline.plant.chain import Array, transfer_functions
+from pipeline.arrays import Array
+from pipeline.plant.linear.recovery import transfer_functions
 from pipeline.report.figures.grading import reported_bode_figure
 from pipeline.report.figures.style import drawing
 from pipeline.report.figures.svg import to_svg

@@ -9,7 +9,7 @@ from pipeline.checks.recordings import POSITION_SCALE, SCALES
 from pipeline.estimation.chain.follow import FOLLOWED
 from pipeline.grading.rubric import is_damping
 from pipeline.names import read_name
-from pipeline.plant.chain import Chain
+from pipeline.plant.linear.chain import Chain
 from pipeline.results import Analysis, Estimate, ParameterRow, StepEdge
 from pipeline.stages.compare import (
     GAIN_AND_FREQUENCY_LIMIT,

@@ -14,7 +14,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from pipeline.plant.chain import Array
+from pipeline.arrays import Array
 from pipeline.results import Record
 
 # The filter passes what is faster than 0.4 of the Nyquist frequency: a bench logged at 113 Hz

@@ -21,8 +21,8 @@ from pipeline.estimation.chain.follow import (
     near,
 )
 from pipeline.estimation.mistakes import FASTEST, TIME_FACTORS
-from pipeline.plant.chain import Chain
-from pipeline.plant.simulate import simulate_linear
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.linear.simulate import simulate_linear
 from pipeline.results import LeftOut, Record, StepGain
 
 _ACROSS = 0.5  # of the input's range: a reading that stays while the input changes so far

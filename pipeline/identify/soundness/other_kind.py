@@ -4,8 +4,8 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.ingest.inspect import is_stepped, line_frequency
-from pipeline.plant.chain import Array
 from pipeline.results import LeftOut, Record
 
 _CUT, _SAME = 0.5, 0.02  # of the usual length, which a program gives to all

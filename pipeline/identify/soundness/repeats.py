@@ -5,7 +5,7 @@ from itertools import combinations
 
 import numpy as np
 
-from pipeline.plant.chain import Array
+from pipeline.arrays import Array
 from pipeline.results import LeftOut, Record
 
 # Inputs count as the same where they differ by less than this share (root-mean-square): an edge

@@ -8,8 +8,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
-from pipeline.plant.chain import Array
 
 Form = Literal["ecp", "bench_log", "bench_mat", "matrix", "variables", "csv"]
 

@@ -8,9 +8,9 @@ from operator import methodcaller
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
 from pipeline.ingest.formats.table import Form, Table, refuse_unusable
-from pipeline.plant.chain import Array
 
 _MAX_COLUMNS = 64
 _SNIFFED_ROWS = 40

@@ -7,9 +7,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from pipeline.plant.augmented import rest_positions, simulate_augmented
-from pipeline.plant.chain import Array, Chain
-from pipeline.plant.effects import AugmentedChain, Effect, Term
+from pipeline.arrays import Array
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.nonlinear.augmented import rest_positions, simulate_augmented
+from pipeline.plant.nonlinear.effects import AugmentedChain, Effect, Term
 from pipeline.report.effects.words import INPUT, POSITION
 from pipeline.report.figures.style import (
     MODEL,

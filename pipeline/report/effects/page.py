@@ -4,8 +4,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from pipeline import __version__
-from pipeline.plant.chain import PRESETS, Chain
-from pipeline.plant.effects import Effect, Term
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.nonlinear.effects import Effect, Term
 from pipeline.report.document import (
     Block,
     Code,

@@ -4,7 +4,7 @@ import textwrap
 from collections.abc import Sequence
 from typing import Any
 
-from pipeline.plant.effects import Effect, Parameter
+from pipeline.plant.nonlinear.effects import Effect, Parameter
 from pipeline.report.math.tex import from_tex
 from pipeline.report.math.tree import to_text
 from pipeline.report.numbers import unit_text

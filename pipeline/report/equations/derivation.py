@@ -12,7 +12,7 @@ paper's numerator of cart 1. Coefficients are d_0, d_1, …; n_0, …; r_0, ….
 from collections.abc import Sequence
 from itertools import product
 
-from pipeline.plant.chain import Chain
+from pipeline.plant.linear.chain import Chain
 from pipeline.report.equations.algebra import Equation, work_out
 
 MOST_CARTS = 4  # letters for the polynomials of more are not made

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from pipeline.plant.effects.base import Term as EffectTerm
+from pipeline.plant.nonlinear.effects.base import Term as EffectTerm
 from pipeline.report.document import Formula
 from pipeline.report.equations.model import equations_of_motion, formula
 from pipeline.report.math.tex import from_tex

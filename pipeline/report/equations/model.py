@@ -7,7 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.plant.chain import Array, Chain, ComplexArray, quadratic_factors
+from pipeline.arrays import Array, ComplexArray
+from pipeline.plant.linear.chain import Chain, quadratic_factors
 from pipeline.report.document import Formula
 from pipeline.report.math.tree import (
     Math,

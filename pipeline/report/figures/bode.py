@@ -8,8 +8,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
+from pipeline.arrays import Array
 from pipeline.names import mode_suffixes
-from pipeline.plant.chain import Array, Chain
+from pipeline.plant.linear.chain import Chain
 from pipeline.report.figures.style import (
     CART_COLOURS,
     CART_LINES,

@@ -6,9 +6,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from pipeline.arrays import Array
 from pipeline.gap.types import FoundEffect, RecordGap, Trace
 from pipeline.gap.verdict.residual_force import ResidualForce
-from pipeline.plant.chain import Array
 from pipeline.report.figures.style import (
     MEASURED,
     MODEL,

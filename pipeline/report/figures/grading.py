@@ -6,7 +6,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from pipeline.plant.chain import Array, Chain
+from pipeline.arrays import Array
+from pipeline.plant.linear.chain import Chain
 from pipeline.report.figures.bode import bode_figure
 from pipeline.report.figures.style import MEASURED, MODEL, SECOND, legend_above, panels
 from pipeline.report.figures.svg import tell

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 
-from pipeline.plant.chain import Array
+from pipeline.arrays import Array
 from pipeline.report.figures.svg import tell
 from pipeline.report.numbers import subscript
 from pipeline.report.words import clean

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-from pipeline.plant.chain import Array
+from pipeline.arrays import Array
 from pipeline.report.figures.ticks import TAGS, draw_ticks
 
 _POINTS = 72.0  # units of the drawing in an inch

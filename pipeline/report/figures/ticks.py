@@ -9,7 +9,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, MultipleLocator, NullLocator
 from matplotlib.transforms import ScaledTranslation
 
-from pipeline.plant.chain import Array
+from pipeline.arrays import Array
 
 # What a page that zooms draws anew or moves: grids, tick labels, letters that mark a place.
 TAGS = ("grid-x", "grid-y", "tick-x", "tick-y", "mark")

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from pipeline.plant.chain import Array
+from pipeline.arrays import Array
 from pipeline.report.figures.style import (
     CART_COLOURS,
     CART_LINES,

@@ -8,12 +8,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from pipeline.arrays import Array
 from pipeline.errors import ConfigError, DataError
 from pipeline.estimation.measured_run import measured_run
 from pipeline.gap.stored import read_gap
 from pipeline.gap.types import Gap
-from pipeline.plant.chain import Array
-from pipeline.plant.effects import AugmentedChain
+from pipeline.plant.nonlinear.effects import AugmentedChain
 from pipeline.report.document import Block, paragraph
 from pipeline.report.equations.effects import augmented_equations, law
 from pipeline.report.figures.style import (
@@ -170,7 +170,7 @@ def _replay(
 ) -> list[_Replay]:
     """Simulate a run with the measured input; [] where the carts run away or nothing drives."""
     # Compiled code: the linear report never needs it.
-    from pipeline.plant.augmented import rest_positions, simulate_augmented
+    from pipeline.plant.nonlinear.augmented import rest_positions, simulate_augmented
 
     if record.u is None:
         return []

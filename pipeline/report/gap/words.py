@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from pipeline.gap.types import FoundEffect, Gap, NamedValue, Rival
-from pipeline.plant.effects.base import Effect
+from pipeline.plant.nonlinear.effects.base import Effect
 from pipeline.report.document import (
     Block,
     Spans,

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import solve_discrete_are
 
-from pipeline.plant.chain import Array, Chain, ComplexArray
-from pipeline.plant.loop import discretise
+from pipeline.arrays import Array, ComplexArray
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.loop.sampled_loop import discretise
 from pipeline.report.document import Block, Code, bullet_list, paragraph, spans
 from pipeline.report.equations.algebra import value_term
 from pipeline.report.equations.model import formula, matlab_matrix, number_matrix

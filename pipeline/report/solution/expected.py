@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.names import read_name
-from pipeline.plant.chain import Array, Chain
+from pipeline.plant.linear.chain import Chain
 from pipeline.report.document import Block, bullet_list, paragraph, spans
 from pipeline.report.equations import derivation
 from pipeline.report.equations.algebra import evaluate, work_out

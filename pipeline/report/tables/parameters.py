@@ -6,7 +6,7 @@ from decimal import Decimal
 import numpy as np
 
 from pipeline.names import read_name
-from pipeline.plant.chain import Chain
+from pipeline.plant.linear.chain import Chain
 from pipeline.report.document import Cell, Spans, Table, spans
 from pipeline.report.numbers import (
     NOTHING,

@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.arrays import Array
 from pipeline.estimation.chain.follow import find_misread, follow
 from pipeline.grading.judge.run import grade_submission
 from pipeline.grading.mistakes.recordings import bad_runs
 from pipeline.grading.rubric_file import load_rubric
-from pipeline.plant.chain import PRESETS, Array
+from pipeline.plant.linear.presets import PRESETS
 from pipeline.results import Analysis
 from pipeline.submission import load_submission
 from pipeline.synthesis import write_submission

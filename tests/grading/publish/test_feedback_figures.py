@@ -5,7 +5,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from pipeline.grading.publish.feedback_figures import draw_figures
-from pipeline.plant.chain import PRESETS, transfer_functions
+from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.linear.recovery import transfer_functions
 from pipeline.report.figures.grading import reported_magnitude
 from tests.helpers.grading_students import student
 

@@ -1,28 +1,10 @@
 """What switches inside a step: end stops, springs past a stretch, the two sides of a gap."""
 
-from pipeline.plant.compiled import (
-    CHANGE,
-    CONTACT_D,
-    CONTACT_K,
-    D2,
-    D3,
-    D4,
-    D5,
-    D6,
-    FIX,
-    GAP,
-    PAST,
-    STIFF,
-    STOP,
-    STOP_D,
-    STOP_K,
-    STRETCH,
-    V,
-    X,
-    jit,
-    pair,
-    tie,
-)
+# isort: off
+from pipeline.plant.nonlinear.simulator.state import (
+    CHANGE, CONTACT_D, CONTACT_K, D2, D3, D4, D5, D6, FIX, GAP, PAST, STIFF, STOP, STOP_D, STOP_K,
+    STRETCH, V, X, jit, pair, tie,
+)  # fmt: skip
 
 
 @jit

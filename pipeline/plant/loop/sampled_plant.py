@@ -4,9 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.plant.chain import Array, Chain
-from pipeline.plant.loop import StateFeedback, discretise
-from pipeline.plant.robustness import stays_stable
+from pipeline.arrays import Array
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.loop.robustness import stays_stable
+from pipeline.plant.loop.sampled_loop import StateFeedback, discretise
 
 RADIANS_PER_SAMPLE = 0.5  # of the fastest mode, at most: 12 samples a period
 _SAMPLE_TIME = 0.00884  # s; the laboratory's controller

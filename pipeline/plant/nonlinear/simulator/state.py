@@ -1,15 +1,15 @@
 """What the compiled functions share: columns, rows and lanes as plain integers, and the compiler.
 
 The compiled functions index flat tables: numba cannot see dataclasses. It looks only at a
-function's own file to see whether what it has stored is out of date: who changes one of these
-files (`kernel`, `step`, `contacts`, `sensitivity` and this) removes `pipeline/plant/__pycache__`.
+function's own file to see whether what it has stored is out of date: who changes a file of this
+folder removes its `__pycache__`.
 """
 
 from typing import Any
 
 from numba import njit
 
-# The columns of `pipeline.plant.tables` as plain integers, which compile to constants.
+# The columns of `pipeline.plant.nonlinear.tables` as plain integers, which compile to constants.
 MASS, DAMPING, COULOMB, STATIC, STRIBECK, DAHL, DISTANCE, LOAD = (int(i) for i in range(8))
 DRAG, OFFSET, STOP, STOP_K, STOP_D, GAIN, HID_M, HID_K, HID_C = (int(i) for i in range(8, 17))
 STIFF, CUBIC, CHANGE, STRETCH, COUPLING = (int(i) for i in range(5))

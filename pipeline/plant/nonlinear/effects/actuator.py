@@ -1,7 +1,7 @@
 """What happens to the input on its way to cart 1."""
 
-from pipeline.plant.effects.base import Effect, Parameter
-from pipeline.plant.tables import Drive
+from pipeline.plant.nonlinear.effects.base import Effect, Parameter
+from pipeline.plant.nonlinear.tables import Drive
 
 # Sample times: a delay and a lag of one size T are late by the same mean time, and differ first by
 # T²/2 in the second moment, an eighth of a sample squared.

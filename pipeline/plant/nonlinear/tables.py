@@ -7,7 +7,8 @@ from enum import IntEnum
 
 import numpy as np
 
-from pipeline.plant.chain import Array, Chain
+from pipeline.arrays import Array
+from pipeline.plant.linear.chain import Chain
 
 
 class Cart(IntEnum):

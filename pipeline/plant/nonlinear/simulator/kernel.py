@@ -7,7 +7,7 @@ root of its velocity polynomial, and from rest it either sticks (and then truly 
 slides on. No tanh, no threshold velocity.
 
 What is simulated is told by three tables, one row a cart, a spring, and one for the drive; an
-effect fills columns of them (`pipeline.plant.effects`), and the neutral values of all columns
+effect fills columns of them (`plant.nonlinear.effects`), and the neutral values of all columns
 give the linear chain back.
 
 Reference: E. Hairer, C. Lubich, G. Wanner, "Geometric Numerical Integration", 2nd ed., sec.
@@ -21,61 +21,21 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.plant.chain import Array
-from pipeline.plant.compiled import (
-    ACC,
-    CHANGE,
-    COGGING,
-    CONTACT_K,
-    COULOMB,
-    COUPLING,
-    CUBIC,
-    DAHL,
-    DAMPING,
-    DEAD,
-    DELAY,
-    DRAG,
-    DRIVE_C,
-    FIX,
-    FORCE,
-    GAIN,
-    GAP,
-    HID_C,
-    HID_K,
-    HID_M,
-    INV,
-    LAG,
-    LIMIT,
-    LOAD,
-    MASS,
-    MID_V,
-    MID_X,
-    MOTOR,
-    OFFSET,
-    ROWS,
-    STATIC,
-    STIFF,
-    STOP_K,
-    V,
-    X,
-    Z,
-    jit,
-    pair,
-    tie,
-)
-from pipeline.plant.contacts import (
-    guard,
-    switch,
-)
-from pipeline.plant.sensitivity import (
+from pipeline.arrays import Array
+from pipeline.plant.nonlinear.simulator.contacts import guard, switch
+from pipeline.plant.nonlinear.simulator.sensitivity import (
     bend_presliding,
     make_sensitivities,
     restart,
 )
-from pipeline.plant.step import (
-    advance,
-    smooth_forces,
-)
+from pipeline.plant.nonlinear.simulator.step import advance, smooth_forces
+
+# isort: off
+from pipeline.plant.nonlinear.simulator.state import (
+    ACC, CHANGE, COGGING, CONTACT_K, COULOMB, COUPLING, CUBIC, DAHL, DAMPING, DEAD, DELAY, DRAG,
+    DRIVE_C, FIX, FORCE, GAIN, GAP, HID_C, HID_K, HID_M, INV, LAG, LIMIT, LOAD, MASS, MID_V,
+    MID_X, MOTOR, OFFSET, ROWS, STATIC, STIFF, STOP_K, V, X, Z, jit, pair, tie,
+)  # fmt: skip
 
 _SERIES_REACH = 0.2  # omega h: the series' sixth order then leaves 1e-8 after seconds
 _LONGEST_LINEAR = 4.5e-3  # s; springs, dampers and dry friction are exact at any step
@@ -371,7 +331,7 @@ def simulate_with_derivatives(
 
     Parameters
     ----------
-    of : (2, lanes) by what: a kind of `pipeline.plant.sensitivity`, and a cart or spring, from 0.
+    of : (2, lanes) by what: a kind of `sensitivity`, and a cart or spring, from 0.
 
     Returns
     -------

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.linalg import expm
 
-from pipeline.plant.chain import Array, Chain
+from pipeline.arrays import Array
+from pipeline.plant.linear.chain import Chain
 
 OVERSAMPLING = 8  # points between samples for a band-limited input
 _LANCZOS_WIDTH = 12  # samples on each side of the interpolation kernel

@@ -1,7 +1,7 @@
 """A motor whose force repeats with its position: teeth of its rotor, or of pinion and rack."""
 
-from pipeline.plant.effects.base import Effect, Parameter
-from pipeline.plant.tables import Drive
+from pipeline.plant.nonlinear.effects.base import Effect, Parameter
+from pipeline.plant.nonlinear.tables import Drive
 
 COGGING = Effect(
     key="cogging",

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.errors import DataError
-from pipeline.plant.chain import Array, Chain, quadratic_factors
-from pipeline.plant.simulate import simulate_linear
+from pipeline.plant.linear.chain import Chain, quadratic_factors
+from pipeline.plant.linear.simulate import simulate_linear
 
 SETTLED = 7.0  # time constants: a transient of 1 cm is down to half a count
 SETTLED_DWELL = 9.0  # … to a tenth of one: at a resonance it hides in the amplitude

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.linalg import hessenberg
 
-from pipeline.plant.chain import Array, ComplexArray
+from pipeline.arrays import Array, ComplexArray
 
 
 def lqr_gains(phi: Array, gamma: Array, weights: Array) -> Array:

@@ -9,31 +9,19 @@ Reference: R. D. Throne, "Frequency Domain System Identification of One, Two, an
 of Freedom Systems in an Introductory Controls Class", Proc. ASEE Annual Conference, 2005.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.arrays import Array, ComplexArray, frozen_array
 from pipeline.errors import DataError
-from pipeline.names import MODES, NULLS, parameter_names
+from pipeline.names import parameter_names
 
 if TYPE_CHECKING:
     import control  # half a second: imported where it is used
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-
-
-def frozen_array(values: object, *, name: str, shape: tuple[int, ...] | None = None) -> Array:
-    """Return a read-only float64 copy, its shape checked."""
-    array = np.array(values, dtype=np.float64)
-    if shape is not None and array.shape != shape:
-        raise ValueError(f"{name}: expected shape {shape}, found {array.shape}")
-    array.flags.writeable = False
-    return array
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -258,151 +246,3 @@ def quadratic_factors(roots: ComplexArray) -> tuple[Array, Array]:
     with np.errstate(divide="ignore", invalid="ignore"):
         zeta = np.where(omega_sorted > 0, np.array(minus_real)[order] / omega_sorted, np.inf)
     return omega_sorted, zeta
-
-
-# ------------------------------------------------------------------ the map back
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Recovered:
-    """The chain that a set of transfer functions implies; arrays may go on with more axes.
-
-    Attributes
-    ----------
-    m, c : (n,), k : (n + 1,), as in `Chain`, but as found: a measured table may well imply a
-        negative spring, which `Chain` users must see and not have hidden.
-    damping_terms, stiffness_terms : (n,) 2 zeta_i omega_i and omega_i² of each cart alone.
-    couplings : (n - 1,) k² over both masses, of the springs between the carts.
-    routes : the redundancies R1, R2, …: two routes to one number.
-    """
-
-    m: Array
-    c: Array
-    k: Array
-    damping_terms: Array
-    stiffness_terms: Array
-    couplings: Array
-    routes: dict[str, tuple[Array, Array]]
-
-    @property
-    def residuals(self) -> dict[str, float]:
-        """The redundancies of a single chain, each as relative difference."""
-        return {name: _relative_difference(*map(float, two)) for name, two in self.routes.items()}
-
-    def chain(self) -> Chain:
-        """Return the chain, as found (stiffnesses may be negative)."""
-        return Chain(m=self.m, c=self.c, k=self.k)
-
-
-def recover_chain(gains: Array, tails: Sequence[Array]) -> Recovered:
-    """Recover masses, dampings and springs from static gains and the polynomials T_1 … T_n.
-
-    `gains` is (n,); `tails` are monic, in falling powers, T_i of degree 2 (n - i + 1). Further axes
-    hold further chains. Uses the best-conditioned route for every number (the s¹ coefficients only
-    serve as checks: rounding grows some 15 times along them) and returns what is left over.
-    """
-    n, others = len(gains), tails[0].shape[1:]
-    T = [*tails, np.ones((1, *others))]
-    g, square, left = np.zeros((3, n, *others))  # left: k_i / m_i
-    kappa = np.zeros((n, *others))  # kappa[i] couples carts i and i + 1 (counted from 1)
-    routes: list[tuple[Array, Array]] = []
-    for i in range(n - 1, -1, -1):  # from the far end, where the transfer function has no zeros
-        whole, rest = T[i], T[i + 1]
-        g[i] = whole[1] - (rest[1] if len(rest) > 1 else 0.0)
-        square[i] = whole[2] - (rest[2] + g[i] * rest[1] if len(rest) > 1 else 0.0)
-        if i < n - 1:
-            beyond = T[i + 2]
-            kappa[i + 1] = (square[i] * rest[-1] - whole[-1]) / beyond[-1]
-            rebuilt = _product([np.stack([np.ones(others), g[i], square[i]]), rest])
-            rebuilt[-len(beyond) :] -= kappa[i + 1] * beyond
-            # The coefficients that no step above has used are the redundancies.
-            routes += [(rebuilt[j], whole[j]) for j in range(3, len(whole) - 1)]
-        if i > 0:
-            left[i] = gains[i] / gains[i - 1] * whole[-1] / rest[-1]
-    m, k = np.zeros((n, *others)), np.zeros((n + 1, *others))
-    m[0] = T[1][-1] / (gains[0] * T[0][-1])
-    for i in range(1, n):
-        k[i] = m[i - 1] * kappa[i] / left[i]
-        m[i] = k[i] / left[i]
-    k[0] = m[0] * square[0] - k[1]  # k[1] is still zero for a single cart
-    if n > 1:
-        k[n] = m[-1] * square[-1] - k[n - 1]
-    routes += [((k[i] + k[i + 1]) / m[i], square[i]) for i in range(1, n - 1)]
-    return Recovered(
-        m=m,
-        c=g * m,
-        k=k,
-        damping_terms=g,
-        stiffness_terms=square,
-        couplings=kappa[1:],
-        routes={f"R{j}": route for j, route in enumerate(routes, start=1)},
-    )
-
-
-def _relative_difference(a: float, b: float) -> float:
-    scale = max(abs(a), abs(b))
-    return 0.0 if scale == 0 else abs(a - b) / scale
-
-
-def transfer_functions(values: Mapping[str, float | Array]) -> tuple[Array, Sequence[Array]]:
-    """Return the static gains (n,) and T_1 … T_n that named parameters of 1 to 3 carts stand for.
-
-    `values` uses the names of `Chain.parameters`; the recomputed ones (omega_1, …) are not read,
-    except the last cart's, which is the zero of the cart before it.
-    """
-    if "omega_n" in values:
-        return np.array([values["K"]]), [_quadratic(values, "n", zeta="zeta")]
-    n = 3 if "K_3" in values else 2
-    factors = [MODES[:n], *([NULLS] if n == 3 else []), str(n)]
-    tails = [_product([_quadratic(values, suffix) for suffix in group]) for group in factors]
-    return np.array([values[f"K_{i}"] for i in range(1, n + 1)]), tails
-
-
-def _product(polynomials: Sequence[Array]) -> Array:
-    """Return the product of polynomials, coefficients along the first axis."""
-    result: Array = polynomials[0]
-    for other in polynomials[1:]:
-        if result.ndim == 1:
-            result = np.convolve(result, other)
-            continue
-        total = np.zeros((len(result) + len(other) - 1, *result.shape[1:]))
-        for i, coefficient in enumerate(result):
-            total[i : i + len(other)] += coefficient * other
-        result = total
-    return result
-
-
-def _quadratic(values: Mapping[str, float | Array], suffix: str, zeta: str | None = None) -> Array:
-    omega = np.asarray(values[f"omega_{suffix}"])
-    return np.stack([np.ones_like(omega), 2 * values[zeta or f"zeta_{suffix}"] * omega, omega**2])
-
-
-def recover_from_parameters(values: Mapping[str, float | Array]) -> Recovered:
-    """Recover the chain from named parameters (1 to 3 carts), with the redundancies left over.
-
-    Two carts have 8 transfer-function parameters for 7 physical ones (R1); three have 15 for 10
-    (R1 to R5). A table that a real chain made leaves them at zero.
-    """
-    return recover_chain(*transfer_functions(values))
-
-
-# --------------------------------------------------------------------- presets
-
-# In V, cm, s, from the paper's tables, with no spring to the near wall (the constrained optimum
-# for both): throne-1dof is Table 1 exactly, throne-2dof rounds to all eight independent final
-# values of Table 2, throne-3dof is the nearest real chain to Table 3.
-PRESETS: Mapping[str, Chain] = {
-    "throne-1dof": Chain(
-        m=np.array([1.98587e-4]), c=np.array([5.24270e-4]), k=np.array([0.0346021, 0.0])
-    ),
-    "throne-2dof": Chain(
-        m=np.array([3.128204e-4, 1.737182e-4]),
-        c=np.array([6.663748e-4, 4.408337e-4]),
-        k=np.array([0.0, 0.1274783, 0.06085252]),
-    ),
-    "throne-3dof": Chain(
-        m=np.array([3.2732e-4, 2.516715e-4, 1.960671e-4]),
-        c=np.array([1.520765e-3, 4.32763e-4, 3.40361e-4]),
-        k=np.array([0.0, 0.1234592, 0.06648407, 0.06275727]),
-    ),
-}

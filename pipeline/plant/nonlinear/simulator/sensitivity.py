@@ -16,39 +16,12 @@ from math import cos, exp, pi
 
 import numpy as np
 
-from pipeline.plant.compiled import (
-    ACC,
-    BEFORE,
-    CHANGE,
-    COGGING,
-    CUBIC,
-    D2,
-    D3,
-    DAHL,
-    DECAY,
-    DISTANCE,
-    DRAG,
-    GRIP,
-    HALF_A,
-    HALF_V,
-    HALF_X,
-    MID_V,
-    MID_X,
-    PAST,
-    PHASE,
-    PITCH,
-    RUB,
-    SIDE,
-    STATIC,
-    STRETCH,
-    STRIBECK,
-    TURNED,
-    V,
-    X,
-    Z,
-    jit,
-    stretch,
-)
+# isort: off
+from pipeline.plant.nonlinear.simulator.state import (
+    ACC, BEFORE, CHANGE, COGGING, CUBIC, D2, D3, DAHL, DECAY, DISTANCE, DRAG, GRIP, HALF_A,
+    HALF_V, HALF_X, MID_V, MID_X, PAST, PHASE, PITCH, RUB, SIDE, STATIC, STRETCH, STRIBECK,
+    TURNED, V, X, Z, jit, stretch,
+)  # fmt: skip
 
 # What a lane is the derivative with respect to: the table's own number, of a cart or a spring; the
 # factor on a cart's dry friction; or its start (from n on, that of the hidden mass on it).

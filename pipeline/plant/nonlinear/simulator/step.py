@@ -4,51 +4,15 @@ from math import exp, pi, sin
 
 import numpy as np
 
-from pipeline.plant.compiled import (
-    ACC,
-    COGGING,
-    COULOMB,
-    CUBIC,
-    D2,
-    D3,
-    D4,
-    DAHL,
-    DECAY,
-    DISTANCE,
-    DRAG,
-    FIX,
-    FORCE,
-    GRIP,
-    INV,
-    LOAD,
-    MID_V,
-    MID_X,
-    OFFSET,
-    PHASE,
-    PITCH,
-    RUB,
-    SIDE,
-    STATIC,
-    STRIBECK,
-    V,
-    X,
-    Z,
-    inlined,
-    jit,
+from pipeline.plant.nonlinear.simulator.contacts import contact, guard, position, switch, velocity
+from pipeline.plant.nonlinear.simulator.sensitivity import carry, meet, stop
+
+# isort: off
+from pipeline.plant.nonlinear.simulator.state import (
+    ACC, COGGING, COULOMB, CUBIC, D2, D3, D4, DAHL, DECAY, DISTANCE, DRAG, FIX, FORCE, GRIP, INV,
+    LOAD, MID_V, MID_X, OFFSET, PHASE, PITCH, RUB, SIDE, STATIC, STRIBECK, V, X, Z, inlined, jit,
     stretch,
-)
-from pipeline.plant.contacts import (
-    contact,
-    guard,
-    position,
-    switch,
-    velocity,
-)
-from pipeline.plant.sensitivity import (
-    carry,
-    meet,
-    stop,
-)
+)  # fmt: skip
 
 _MOST_EVENTS = 12  # in one substep; more would be chatter
 

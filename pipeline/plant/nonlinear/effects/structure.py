@@ -1,7 +1,7 @@
 """Things on the bench that the chain leaves out: end stops, hidden masses, a sensor's scale."""
 
-from pipeline.plant.effects.base import Effect, Parameter
-from pipeline.plant.tables import Cart
+from pipeline.plant.nonlinear.effects.base import Effect, Parameter
+from pipeline.plant.nonlinear.tables import Cart
 
 END_STOP = Effect(
     key="end_stop",

@@ -9,9 +9,10 @@ from typing import Literal
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.errors import ConfigError
-from pipeline.plant.chain import Array, Chain
-from pipeline.plant.tables import DRY, Cart, Drive, Tables, linear_tables
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.nonlinear.tables import DRY, Cart, Drive, Tables, linear_tables
 
 Place = Literal["cart", "spring", "input"]
 Axis = Literal["velocity", "position", "stretch", "input", "time", "frequency"]

@@ -3,8 +3,9 @@
 import numpy as np
 from scipy.linalg import hadamard
 
-from pipeline.plant.chain import Array, Chain
-from pipeline.plant.loop import StateFeedback, loop_matrix
+from pipeline.arrays import Array
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.loop.sampled_loop import StateFeedback, loop_matrix
 
 MASS_SPRING_ERROR = 0.03  # by which an identified mass or spring may well be off
 DAMPING_ERROR = 0.30

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.plant.chain import Array
+from pipeline.arrays import Array
 
 SETTLING_BAND = 0.02  # of the change in level: the 2 % criterion
 

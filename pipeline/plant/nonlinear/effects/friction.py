@@ -1,7 +1,7 @@
 """Dry friction, drag and offset: forces on a cart that depend on how it moves."""
 
-from pipeline.plant.effects.base import Effect, Parameter, Scales
-from pipeline.plant.tables import Cart
+from pipeline.plant.nonlinear.effects.base import Effect, Parameter, Scales
+from pipeline.plant.nonlinear.tables import Cart
 
 _BREAKAWAY = 1.5  # times the sliding force: a start in the middle of what dry surfaces show
 _LEAST_SLIDING = 0.01  # of the force at rest

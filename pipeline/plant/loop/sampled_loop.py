@@ -30,8 +30,9 @@ from typing import Protocol
 import numpy as np
 from scipy.linalg import expm
 
+from pipeline.arrays import Array, frozen_array
 from pipeline.errors import DataError
-from pipeline.plant.chain import Array, Chain, frozen_array
+from pipeline.plant.linear.chain import Chain
 
 # Share of the prediction error at a tick that is put down to the velocity. A half keeps three
 # quarters of the encoder's rounding noise out of v and forgets a wrong start in a few ticks.

@@ -6,8 +6,8 @@ To add one: write an `Effect` in a file here and list it below.
 from difflib import get_close_matches
 
 from pipeline.errors import ConfigError
-from pipeline.plant.effects import actuator, cogging, friction, springs, structure
-from pipeline.plant.effects.base import AugmentedChain, Effect, Parameter, Term, make_term
+from pipeline.plant.nonlinear.effects import actuator, cogging, friction, springs, structure
+from pipeline.plant.nonlinear.effects.base import AugmentedChain, Effect, Parameter, Term, make_term
 
 CATALOGUE: tuple[Effect, ...] = (
     friction.COULOMB,

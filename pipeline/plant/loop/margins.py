@@ -1,7 +1,7 @@
 """The designed loop as systems of python-control, and how far it is from the edge.
 
-The loop is that of `pipeline.plant.loop`: gains on the state predicted for the moment the effort
-begins to act, the observer's prediction, one sample of delay.
+The loop is that of `sampled_loop`: gains on the state predicted for the moment the effort begins
+to act, the observer's prediction, one sample of delay.
 """
 
 from dataclasses import dataclass
@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.arrays import Array, ComplexArray
 from pipeline.errors import DataError
-from pipeline.plant.chain import Array, Chain, ComplexArray
-from pipeline.plant.loop import StateFeedback, broken_loop, discretise
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.loop.sampled_loop import StateFeedback, broken_loop, discretise
 
 if TYPE_CHECKING:
     import control  # half a second: imported where it is used

@@ -10,14 +10,15 @@ from itertools import pairwise
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.errors import DataError
-from pipeline.plant import kernel
-from pipeline.plant.chain import Array, Chain
-from pipeline.plant.contacts import guard, switch
-from pipeline.plant.effects.base import AugmentedChain
-from pipeline.plant.sensitivity import make_sensitivities
-from pipeline.plant.step import advance, smooth_forces
-from pipeline.plant.tables import DRY, Cart, Drive, Spring, Tables
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.nonlinear.effects.base import AugmentedChain
+from pipeline.plant.nonlinear.simulator import kernel
+from pipeline.plant.nonlinear.simulator.contacts import guard, switch
+from pipeline.plant.nonlinear.simulator.sensitivity import make_sensitivities
+from pipeline.plant.nonlinear.simulator.step import advance, smooth_forces
+from pipeline.plant.nonlinear.tables import DRY, Cart, Drive, Spring, Tables
 
 _REFINE = 4.0  # divides the kernel's step: this is what others are judged by
 _LONGEST_STEP = 5e-4  # s, of the stepped bench

@@ -2,10 +2,10 @@
 
 from collections.abc import Mapping
 
-from pipeline.plant.chain import Chain
-from pipeline.plant.effects.base import Effect, Lookalike, Parameter
-from pipeline.plant.effects.structure import END_STOP
-from pipeline.plant.tables import Spring
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.nonlinear.effects.base import Effect, Lookalike, Parameter
+from pipeline.plant.nonlinear.effects.structure import END_STOP
+from pipeline.plant.nonlinear.tables import Spring
 
 _HARD = 4.0  # times its stiffness: a spring that much stiffer past a stretch may be a contact
 

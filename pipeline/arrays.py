@@ -1,0 +1,16 @@
+"""Arrays: real and complex ones by type, and read-only copies."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+
+def frozen_array(values: object, *, name: str, shape: tuple[int, ...] | None = None) -> Array:
+    """Return a read-only float64 copy, its shape checked."""
+    array = np.array(values, dtype=np.float64)
+    if shape is not None and array.shape != shape:
+        raise ValueError(f"{name}: expected shape {shape}, found {array.shape}")
+    array.flags.writeable = False
+    return array

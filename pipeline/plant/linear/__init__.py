@@ -1,0 +1,1 @@
+"""The chain of carts: its equations, the maps to and from named parameters, exact simulation."""

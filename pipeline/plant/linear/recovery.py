@@ -1,0 +1,137 @@
+"""The map back: from gains and polynomials, or named parameters, to masses, dampings, springs.
+
+Reference: R. D. Throne, "Frequency Domain System Identification of One, Two, and Three Degree
+of Freedom Systems in an Introductory Controls Class", Proc. ASEE Annual Conference, 2005.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.arrays import Array
+from pipeline.names import MODES, NULLS
+from pipeline.plant.linear.chain import Chain
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Recovered:
+    """The chain that a set of transfer functions implies; arrays may go on with more axes.
+
+    Attributes
+    ----------
+    m, c : (n,), k : (n + 1,), as in `Chain`, but as found: a measured table may well imply a
+        negative spring, which `Chain` users must see and not have hidden.
+    damping_terms, stiffness_terms : (n,) 2 zeta_i omega_i and omega_i² of each cart alone.
+    couplings : (n - 1,) k² over both masses, of the springs between the carts.
+    routes : the redundancies R1, R2, …: two routes to one number.
+    """
+
+    m: Array
+    c: Array
+    k: Array
+    damping_terms: Array
+    stiffness_terms: Array
+    couplings: Array
+    routes: dict[str, tuple[Array, Array]]
+
+    @property
+    def residuals(self) -> dict[str, float]:
+        """The redundancies of a single chain, each as relative difference."""
+        return {name: _relative_difference(*map(float, two)) for name, two in self.routes.items()}
+
+    def chain(self) -> Chain:
+        """Return the chain, as found (stiffnesses may be negative)."""
+        return Chain(m=self.m, c=self.c, k=self.k)
+
+
+def recover_chain(gains: Array, tails: Sequence[Array]) -> Recovered:
+    """Recover masses, dampings and springs from static gains and the polynomials T_1 … T_n.
+
+    `gains` is (n,); `tails` are monic, in falling powers, T_i of degree 2 (n - i + 1). Further axes
+    hold further chains. Uses the best-conditioned route for every number (the s¹ coefficients only
+    serve as checks: rounding grows some 15 times along them) and returns what is left over.
+    """
+    n, others = len(gains), tails[0].shape[1:]
+    T = [*tails, np.ones((1, *others))]
+    g, square, left = np.zeros((3, n, *others))  # left: k_i / m_i
+    kappa = np.zeros((n, *others))  # kappa[i] couples carts i and i + 1 (counted from 1)
+    routes: list[tuple[Array, Array]] = []
+    for i in range(n - 1, -1, -1):  # from the far end, where the transfer function has no zeros
+        whole, rest = T[i], T[i + 1]
+        g[i] = whole[1] - (rest[1] if len(rest) > 1 else 0.0)
+        square[i] = whole[2] - (rest[2] + g[i] * rest[1] if len(rest) > 1 else 0.0)
+        if i < n - 1:
+            beyond = T[i + 2]
+            kappa[i + 1] = (square[i] * rest[-1] - whole[-1]) / beyond[-1]
+            rebuilt = _product([np.stack([np.ones(others), g[i], square[i]]), rest])
+            rebuilt[-len(beyond) :] -= kappa[i + 1] * beyond
+            # The coefficients that no step above has used are the redundancies.
+            routes += [(rebuilt[j], whole[j]) for j in range(3, len(whole) - 1)]
+        if i > 0:
+            left[i] = gains[i] / gains[i - 1] * whole[-1] / rest[-1]
+    m, k = np.zeros((n, *others)), np.zeros((n + 1, *others))
+    m[0] = T[1][-1] / (gains[0] * T[0][-1])
+    for i in range(1, n):
+        k[i] = m[i - 1] * kappa[i] / left[i]
+        m[i] = k[i] / left[i]
+    k[0] = m[0] * square[0] - k[1]  # k[1] is still zero for a single cart
+    if n > 1:
+        k[n] = m[-1] * square[-1] - k[n - 1]
+    routes += [((k[i] + k[i + 1]) / m[i], square[i]) for i in range(1, n - 1)]
+    return Recovered(
+        m=m,
+        c=g * m,
+        k=k,
+        damping_terms=g,
+        stiffness_terms=square,
+        couplings=kappa[1:],
+        routes={f"R{j}": route for j, route in enumerate(routes, start=1)},
+    )
+
+
+def _relative_difference(a: float, b: float) -> float:
+    scale = max(abs(a), abs(b))
+    return 0.0 if scale == 0 else abs(a - b) / scale
+
+
+def transfer_functions(values: Mapping[str, float | Array]) -> tuple[Array, Sequence[Array]]:
+    """Return the static gains (n,) and T_1 … T_n that named parameters of 1 to 3 carts stand for.
+
+    `values` uses the names of `Chain.parameters`; the recomputed ones (omega_1, …) are not read,
+    except the last cart's, which is the zero of the cart before it.
+    """
+    if "omega_n" in values:
+        return np.array([values["K"]]), [_quadratic(values, "n", zeta="zeta")]
+    n = 3 if "K_3" in values else 2
+    factors = [MODES[:n], *([NULLS] if n == 3 else []), str(n)]
+    tails = [_product([_quadratic(values, suffix) for suffix in group]) for group in factors]
+    return np.array([values[f"K_{i}"] for i in range(1, n + 1)]), tails
+
+
+def _product(polynomials: Sequence[Array]) -> Array:
+    """Return the product of polynomials, coefficients along the first axis."""
+    result: Array = polynomials[0]
+    for other in polynomials[1:]:
+        if result.ndim == 1:
+            result = np.convolve(result, other)
+            continue
+        total = np.zeros((len(result) + len(other) - 1, *result.shape[1:]))
+        for i, coefficient in enumerate(result):
+            total[i : i + len(other)] += coefficient * other
+        result = total
+    return result
+
+
+def _quadratic(values: Mapping[str, float | Array], suffix: str, zeta: str | None = None) -> Array:
+    omega = np.asarray(values[f"omega_{suffix}"])
+    return np.stack([np.ones_like(omega), 2 * values[zeta or f"zeta_{suffix}"] * omega, omega**2])
+
+
+def recover_from_parameters(values: Mapping[str, float | Array]) -> Recovered:
+    """Recover the chain from named parameters (1 to 3 carts), with the redundancies left over.
+
+    Two carts have 8 transfer-function parameters for 7 physical ones (R1); three have 15 for 10
+    (R1 to R5). A table that a real chain made leaves them at zero.
+    """
+    return recover_chain(*transfer_functions(values))

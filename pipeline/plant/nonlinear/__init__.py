@@ -1,0 +1,1 @@
+"""The chain with effects: catalogue, tables, simulation."""

@@ -1,0 +1,1 @@
+"""The compiled simulator, and derivatives carried beside the state."""
