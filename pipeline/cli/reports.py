@@ -68,7 +68,7 @@ def inspect(
     for message in unreadable:
         say(f"cartlab: {message}")
     if unreadable:
-        raise typer.Exit(2)
+        raise typer.Exit(1 if inspections else 2)
 
 
 @app.command()

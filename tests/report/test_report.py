@@ -2,6 +2,7 @@
 
 import base64
 import hashlib
+import io
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -12,9 +13,13 @@ import pypdf
 import pytest
 
 from pipeline.plant.linear.chain import Chain
+from pipeline.report.document import Document, Picture, Section, plain
 from pipeline.report.draft.write import render_report
-from pipeline.report.render.pdf import missing_characters
+from pipeline.report.render.pdf import missing_characters, render_pdf
+from pipeline.report.sections.measurements import decay_blocks
+from pipeline.report.sections.page import Page as Shown
 from pipeline.report.sections.summary import terminal_summary
+from pipeline.report.tables.housekeeping import file_table
 from pipeline.results import (
     SIGN,
     Analysis,
@@ -112,6 +117,35 @@ def test_every_part_is_there(carts, folders):
     assert bode == [str(i) for i in range(carts, 0, -1)]  # last cart first, as the paper
     assert "Émilie du Châtelet (s1025)" in page.text
     assert "Émilie du Châtelet (s1025)" in pdf
+
+
+def test_print_keeps_figures_and_questions_where_the_page_has_them(folders):
+    """No figure stands before the heading it belongs to, or after the next one."""
+    html = (folders[3] / "report.html").read_text(encoding="utf-8")
+    _, pdf = read(folders[3])
+    marks = re.findall(r"<h2[^>]*>([^<]+)</h2>|<b>(Figure \d+)\.|<b>(Question\.)", html)
+
+    at, places = 0, []
+    for mark in marks:
+        (text,) = filter(None, mark)
+        places.append(text)
+        at = pdf.index(text, at)
+    assert len([place for place in places if place.startswith("Figure")]) > 8
+
+
+def test_no_page_ends_the_print_with_one_row_of_hashes(folders):
+    """A long list of files is cut into parts of like length, each on one page."""
+    # One more than a page has room for:
+    files = {f"data/run-{i:03d}.csv": f"{i:064x}" for i in range(97)}
+    analysis = replace(make_analysis(1), files=files)
+    table = file_table(analysis, number=1)
+    document = Document("A", "", (), (Section("p", "Provenance", (table,)),), "")
+
+    pages = pypdf.PdfReader(io.BytesIO(render_pdf(document))).pages
+
+    rows = [len(re.findall(r"run-\d{3}", page.extract_text())) for page in pages]
+    assert sum(rows) == 97
+    assert min(rows) > 20
 
 
 def test_the_page_stands_alone(folders):
@@ -395,10 +429,27 @@ def test_a_poor_result_is_called_so(tmp_path):
     text = terminal_summary(replace(analysis, fit=fit, rows=rows, hardware=hardware))
     assert "The fit did not converge: k_1 at its bound" in text
     assert "more than the stated noise is left" in text
+    assert "±" in terminal_summary(analysis)  # which rests on noise alone being left
+    assert "±" not in text
     assert "K_1 (+23.4 %)" in text
     assert "1 of 2 checks failed" in text
     assert "Record sine-04 again and longer" in text
     assert "Find what the linear model leaves out" in text
+
+
+def test_a_cart_that_a_step_set_swinging_was_not_let_go():
+    """Where no decay was recorded, the ring-down of a step of the cart alone stands for one."""
+    analysis = make_analysis(1)
+    ringing = {decay.experiment for decay in analysis.log_decrements}
+    records = tuple(replace(r, kind="step") if r.id in ringing else r for r in analysis.records)
+
+    let_go, stepped = (
+        "".join(plain(b.caption) for b in decay_blocks(Shown.of(one)) if isinstance(b, Picture))
+        for one in (analysis, replace(analysis, records=records))
+    )
+
+    assert "let go" in let_go
+    assert "let go" not in stepped
 
 
 def test_what_was_not_used_is_not_said_to_be():

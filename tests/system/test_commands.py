@@ -179,3 +179,18 @@ def test_simulate_makes_a_submission_that_report_takes(tmp_path):
     assert not (folder / "report" / "report.pdf").exists()
     again = cartlab_here("simulate", "--preset", "throne-1dof", "--out", folder)
     assert (again.returncode, "is not empty" in again.stderr) == (2, True)
+
+
+def test_one_broken_file_does_not_make_a_folder_unreadable(tmp_path):
+    """The table of the others is made, so the status is that of a check that failed; else 2."""
+    broken = tmp_path / "broken.csv"
+    broken.write_text("time,x1\n0,oops\n1,2\n", encoding="utf-8")
+    alone = cartlab_here("inspect", tmp_path)
+    shutil.copyfile(EXAMPLES / "two-cart" / "data" / "sine-01.csv", tmp_path / "sound.csv")
+
+    done = cartlab_here("inspect", tmp_path)
+
+    assert (alone.returncode, alone.stdout) == (2, "")
+    assert done.returncode == 1
+    assert "sound.csv" in done.stdout
+    assert "broken.csv line 2" in done.stderr

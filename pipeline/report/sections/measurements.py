@@ -118,6 +118,7 @@ def decay_blocks(page: Page) -> list[Block]:
         caption = _WORDS.text(
             "decay",
             run=clean(first.experiment),
+            freed=_WORDS.text("let_go" if records[0].kind == "decay" else "stepped"),
             sticking=_WORDS.text("decay_sticking") if sticks else "",
             more=left_out(len(own) - len(drawn)),
             **said,

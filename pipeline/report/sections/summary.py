@@ -49,6 +49,7 @@ _OF_DATA = (
 )  # checks of recordings, not of what they say
 _CALIBRATION = 1e-3  # no teaching bench's encoder and motor are known better than this
 _COARSE = 1e-2  # from here on two digits of an error leave four of the value
+_UNSURE_DIGITS = 3  # of a number whose standard error says too little: the model misses something
 _CLOSE = 0.10  # a simulation within 10 % of the motion is a good linear model's
 
 
@@ -119,16 +120,25 @@ def _identified(analysis: Analysis) -> Block:
 def _numbers_board(analysis: Analysis) -> tuple[Tile, ...]:
     """Return the gains and the resonances."""
     return tuple(
-        _number_tile(row.name, row.final, unit=unit_text(clean(row.unit)))
+        _number_tile(
+            row.name, row.final, unit=unit_text(clean(row.unit)), is_sure=_is_explained(analysis)
+        )
         for row in analysis.rows
         if row.final and (analysis.carts == 1 or _is_told(read_name(row.name)))
     )
 
 
-def _number_tile(name: str, final: Estimate, *, unit: str) -> Tile:
+def _is_explained(analysis: Analysis) -> bool:
+    """Tell whether the standard errors hold: they rest on noise alone being left."""
+    return analysis.fit is not None and analysis.fit.explains_data
+
+
+def _number_tile(name: str, final: Estimate, *, unit: str, is_sure: bool) -> Tile:
     """Return a number in four digits; a smaller error than any calibration's is only a note."""
     share = (final.std or 0.0) / abs(final.value) if final.value else 1.0
-    if 0 < share < _CALIBRATION:
+    if not is_sure:
+        value = significant(final.value, digits=_UNSURE_DIGITS)
+    elif 0 < share < _CALIBRATION:
         value = significant(final.value)
         error = _WORDS.text("statistical", share=f"{significant(100 * share, digits=1)} %")
         unit = f"{unit}, {error}" if unit else error
