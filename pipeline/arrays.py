@@ -14,3 +14,11 @@ def frozen_array(values: object, *, name: str, shape: tuple[int, ...] | None = N
         raise ValueError(f"{name}: expected shape {shape}, found {array.shape}")
     array.flags.writeable = False
     return array
+
+
+def freeze(instance: object, *names: str) -> None:
+    """Replace the named array fields by read-only copies."""
+    for name in names:
+        value = getattr(instance, name)
+        if value is not None:
+            object.__setattr__(instance, name, frozen_array(value, name=name))

@@ -19,7 +19,7 @@ LEVELS = (
     ("plant.loop", "plant.nonlinear.tables"),
     ("plant.nonlinear.effects", "plant.nonlinear.simulator"),
     ("plant", "plant.nonlinear"),
-    ("results", "submission"),
+    ("results", "results_of_runs", "submission"),
     ("ingest.formats",),
     ("ingest", "estimation"),
     ("estimation.decay", "estimation.chain"),

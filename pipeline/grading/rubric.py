@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
 
 from pipeline.names import parameter_names
-from pipeline.results import Kind
+from pipeline.results_of_runs import Kind
 from pipeline.submission import Design, System
 
 Points = Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)]

@@ -16,7 +16,7 @@ import tomlkit
 from pipeline.errors import ConfigError, SubmissionError
 from pipeline.ingest.formats.table import ENDINGS
 from pipeline.ingest.inspect import Inspection, data_files_in, inspect_file
-from pipeline.results import Kind
+from pipeline.results_of_runs import Kind
 from pipeline.submission.edit import (
     append_experiment,
     comment_text,

@@ -15,7 +15,7 @@ from pipeline.ingest.columns import Column, assign_columns, conversion, holds_co
 from pipeline.ingest.formats.recognise import read_table
 from pipeline.ingest.formats.table import ENDINGS, FORM_TITLES, Table
 from pipeline.ingest.suggest import suggest_columns
-from pipeline.results import Kind
+from pipeline.results_of_runs import Kind
 
 _UNEVEN = 0.01  # of the sample interval, rms
 _EDGE, _MOST_EDGES, _FLAT = 0.2, 20, 0.03  # of the input's range: an edge; between edges, its rms

@@ -12,7 +12,8 @@ from pipeline.estimation.colour import colour
 from pipeline.estimation.decay.ringing import find_poles, fit_ringing
 from pipeline.estimation.noise import grain, noise_beyond_rounding, rounding_left
 from pipeline.estimation.peaks import extrema, plateaus
-from pipeline.results import Record, StepEdge, StepGain
+from pipeline.results import Record, StepGain
+from pipeline.results_of_runs import StepEdge
 
 _MIN_SAMPLES = 12
 _CREEP = 0.005  # of the input's range: two halves of a constant stretch differ by no more

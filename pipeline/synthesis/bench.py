@@ -11,7 +11,7 @@ from pipeline.plant.linear.simulate import propagate, simulate_linear
 from pipeline.plant.loop.sampled_loop import StateFeedback, simulate_loop
 from pipeline.plant.nonlinear.effects import AugmentedChain, Term
 from pipeline.plant.nonlinear.tables import Cart
-from pipeline.results import Kind
+from pipeline.results_of_runs import Kind
 
 # A hand trembles by hundredths of a millimetre at these rates; it is not a clamp.
 _TREMOR_HZ = np.array([1.3, 4.1, 8.7])

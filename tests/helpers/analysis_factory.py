@@ -19,16 +19,15 @@ from pipeline.results import (
     Estimate,
     FeedbackDesign,
     FrequencyResponse,
-    FrictionTest,
     HardwareCheck,
     LogDecrement,
     ParameterRow,
     Record,
     SinePoint,
     Skipped,
-    StepEdge,
     StepGain,
 )
+from pipeline.results_of_runs import FrictionTest, StepEdge
 
 NOTES = "## What we saw\n\nThe *dampings* differ, as `zeta_a` shows:\n\n- friction\n- play\n"
 _SAMPLE_TIME = 0.00884  # s, the ECP controller's

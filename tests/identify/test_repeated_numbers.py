@@ -3,7 +3,8 @@
 from dataclasses import replace
 
 from pipeline.identify.soundness.repeated_numbers import Repeats, compare_repeats
-from pipeline.results import Estimate, LogDecrement, StepEdge, StepGain
+from pipeline.results import Estimate, LogDecrement, StepGain
+from pipeline.results_of_runs import StepEdge
 from tests.helpers.analysis_factory import make_analysis
 
 SWING = make_analysis(1).log_decrements[0]

@@ -18,7 +18,8 @@ from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.plant.linear.simulate import simulate_linear
 from pipeline.plant.loop.sampled_loop import Controller, Pid, StateFeedback, simulate_loop
-from pipeline.results import FeedbackDesign, HardwareCheck, Kind, Record
+from pipeline.results import FeedbackDesign, HardwareCheck, Record
+from pipeline.results_of_runs import Kind
 from pipeline.stages.hardware_check import check_hardware
 from pipeline.stages.state_feedback import design_feedback
 

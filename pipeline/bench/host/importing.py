@@ -16,7 +16,7 @@ from pipeline.ingest.fill import experiment_entry, free_carts, free_id
 from pipeline.ingest.formats.table import ENDINGS
 from pipeline.ingest.inspect import Inspection, inspect_file
 from pipeline.output import own_folder
-from pipeline.results import Kind
+from pipeline.results_of_runs import Kind
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.load import MAX_DATA_BYTES
 from pipeline.submission.toml_file import Value

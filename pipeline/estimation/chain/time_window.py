@@ -9,7 +9,8 @@ from pipeline.errors import DataError
 from pipeline.estimation.chain.modal_response import Modes, drive_modes
 from pipeline.estimation.noise import local_noise
 from pipeline.plant.linear.simulate import OVERSAMPLING, interpolate_band_limited
-from pipeline.results import Kind, Record
+from pipeline.results import Record
+from pipeline.results_of_runs import Kind
 
 # A free decay is used from where its largest swing has fallen by half: whatever released the
 # cart has let go of it by then.

@@ -16,7 +16,7 @@ from pipeline.arrays import Array
 from pipeline.estimation.colour import colour
 from pipeline.estimation.decay.ringing import Ringing
 from pipeline.estimation.decay.separable import fit_separable
-from pipeline.results import FrictionTest
+from pipeline.results_of_runs import FrictionTest
 
 THRESHOLD = 10.8  # F(1, many) above this once in a thousand decays without friction
 _UNKNOWNS = 7

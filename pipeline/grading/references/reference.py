@@ -10,7 +10,8 @@ from pipeline.estimation.chain.follow import FOLLOWED
 from pipeline.grading.rubric import is_damping
 from pipeline.names import read_name
 from pipeline.plant.linear.chain import Chain
-from pipeline.results import Analysis, Estimate, ParameterRow, StepEdge
+from pipeline.results import Analysis, Estimate, ParameterRow
+from pipeline.results_of_runs import StepEdge
 from pipeline.stages.compare import (
     GAIN_AND_FREQUENCY_LIMIT,
 )
