@@ -2,6 +2,7 @@
 
 import ast
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -13,13 +14,13 @@ PIPELINE = ROOT / "pipeline"
 # From the ground up, rooms and the rooms within them; a module imports from its own room or below.
 LEVELS = (
     ("__init__", "arrays", "errors", "names", "resources"),
-    ("output", "schemas"),
+    ("output", "results_of_runs", "schemas"),
     ("lock", "processes", "web"),
     ("plant.linear",),
     ("plant.loop", "plant.nonlinear.tables"),
     ("plant.nonlinear.effects", "plant.nonlinear.simulator"),
     ("plant", "plant.nonlinear"),
-    ("results", "results_of_runs", "submission"),
+    ("results", "submission"),
     ("ingest.formats",),
     ("ingest", "estimation"),
     ("estimation.decay", "estimation.chain"),
@@ -82,6 +83,7 @@ def _room(parts: Sequence[str]) -> str:
     return next(path for path in paths if path in ROOMS)
 
 
+@cache
 def _imports(path: Path) -> list[str]:
     found = []
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

@@ -4,7 +4,7 @@ from collections.abc import Container, Iterable, Mapping, Sequence
 
 import numpy as np
 
-from pipeline.estimation.mistakes import TIME_UNITS
+from pipeline.estimation.units_and_clocks import TIME_UNITS
 from pipeline.ingest.columns import conversion
 from pipeline.ingest.signs import FEW_NAMES, Signs
 from pipeline.names import listed

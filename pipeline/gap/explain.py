@@ -18,7 +18,7 @@ from pipeline.gap.limits import AS_REPEATS, OFFSET_AS_FREE, OFFSET_GAIN, TOO_GOO
 from pipeline.gap.search.beam import choose, prune, search, steps_to
 from pipeline.gap.search.deadline import Deadline, OutOfTime
 from pipeline.gap.search.grow import fit_whole
-from pipeline.gap.search.hypothesis import Bench, Hypothesis, judge
+from pipeline.gap.search.hypothesis import Hypothesis, Study, judge
 from pipeline.gap.types import FoundEffect, Gap
 from pipeline.gap.verdict.account import (
     chain_std,
@@ -80,7 +80,7 @@ def explain_gap(
         fit, training = fit_baseline(training, springs=springs, start=chain, mapper=pool.map)
         sigma = {row: s for run in training for row, s in zip(run.rows, run.sigma, strict=True)}
         held_out = [_with_noise(run, sigma) for run in held_out]
-        bench = Bench(
+        study = Study(
             training=tuple(training),
             held_out=tuple(held_out),
             springs=tuple(springs),
@@ -89,35 +89,35 @@ def explain_gap(
             mapper=pool.map,
             tell=tell,
         )
-        chosen, found = _investigate(fit, bench, deadline)
+        chosen, found = _investigate(fit, study, deadline)
         for _ in range(_NOISE_ROUNDS):
             if chosen.fit.chi > TOO_GOOD or deadline.cut:
                 break
             # Less is left than was taken for noise: the misfit of the linear model was in it.
-            quiet = _quieter(bench, chosen)
+            quiet = _quieter(study, chosen)
             fit = fit_model(fit, quiet.training, mapper=pool.map)
             again = _investigate(fit, quiet, deadline)
             if not deadline.cut:
-                bench, (chosen, found) = quiet, again
-        path = steps_to(chosen, found, bench)
+                study, (chosen, found) = quiet, again
+        path = steps_to(chosen, found, study)
         with suppress(OutOfTime):
-            path, judged_by = _with_offset(path, replace(bench, mapper=deadline.map))
+            path, judged_by = _with_offset(path, replace(study, mapper=deadline.map))
             if judged_by is not None:
                 # The others were judged with the encoders' zeros free.
-                bench, found = judged_by, list(path)
-        sample_time = max(run.record.sample_time for run in bench.training)
-        verdict, path, close = reach_verdict(path, found, bench=bench, sample_time=sample_time)
+                study, found = judged_by, list(path)
+        sample_time = max(run.record.sample_time for run in study.training)
+        verdict, path, close = reach_verdict(path, found, study=study, sample_time=sample_time)
         chosen = path[-1]
-        final = covariance(chosen.fit, bench.training, mapper=pool.map)
-    if verdict not in ("none", "unexplained") and not bench.explains(chosen):
-        times = chosen.error / bench.floor
+        final = covariance(chosen.fit, study.training, mapper=pool.map)
+    if verdict not in ("none", "unexplained") and not study.explains(chosen):
+        times = chosen.error / study.floor
         notes.append(f"{times:.1f} times the noise is left: something remains")
     if deadline.cut:
         notes.append(
             f"the search ended after the {budget:g} s allowed: this is the best answer so far, and "
             "another run may come further (--budget SECONDS allows more)"
         )
-    driven = any(np.any(run.command) for run in bench.training)
+    driven = any(np.any(run.command) for run in study.training)
     effects = list_effects(
         path,
         final,
@@ -125,26 +125,26 @@ def explain_gap(
         position_unit=position_unit,
         input_unit=input_unit if driven else f"{position_unit}/s^2",  # the first mass is one
     )
-    traces = make_traces(path[0], chosen, bench)
+    traces = make_traces(path[0], chosen, study)
     model = chosen.fit.structure.model(chosen.fit.theta)
     enough = verdict in ("none", "named")
-    left = () if enough else find_windows(chosen.fit, bench.training)
+    left = () if enough else find_windows(chosen.fit, study.training)
     return Gap(
         verdict=verdict,
         effects=effects,
         baseline=path[0].error,
         final=chosen.error,
-        noise_floor=bench.floor,
-        repeatability=bench.repeatability or None,
-        by_record=compare_by_record(traces, bench),
-        where=find_windows(path[0].fit, bench.training) if verdict != "none" else (),
+        noise_floor=study.floor,
+        repeatability=study.repeatability or None,
+        by_record=compare_by_record(traces, study),
+        where=find_windows(path[0].fit, study.training) if verdict != "none" else (),
         next_experiment=choose_experiment(
-            verdict, chosen, close, left, repeated=bench.repeatability > 0
+            verdict, chosen, close, left, repeated=study.repeatability > 0
         ),
         linear=path[0].fit.structure.model(path[0].fit.theta),
         model=replace(model, terms=_in_order(model.terms, effects)),
-        training=tuple(run.id for run in bench.training),
-        held_out=tuple(run.id for run in bench.held_out),
+        training=tuple(run.id for run in study.training),
+        held_out=tuple(run.id for run in study.held_out),
         traces=traces,
         chain_std=chain_std(final),
         spread=_learnt_spread(chosen.fit),
@@ -171,12 +171,12 @@ def _in_order(terms: Sequence[Term], effects: Sequence[FoundEffect]) -> tuple[Te
 # ------------------------------------------------------------------------ the noise
 
 
-def _quieter(bench: Bench, best: Hypothesis) -> Bench:
-    """Return the bench with the noise that the best model leaves."""
-    training = measure_noise(best.fit, bench.training, bench.training)
+def _quieter(study: Study, best: Hypothesis) -> Study:
+    """Return the study with the noise that the best model leaves."""
+    training = measure_noise(best.fit, study.training, study.training)
     sigma = {row: s for run in training for row, s in zip(run.rows, run.sigma, strict=True)}
-    held_out = tuple(_with_noise(run, sigma) for run in bench.held_out)
-    return replace(bench, training=tuple(training), held_out=held_out)
+    held_out = tuple(_with_noise(run, sigma) for run in study.held_out)
+    return replace(study, training=tuple(training), held_out=held_out)
 
 
 def _with_noise(run: Run, sigma: dict[int, float]) -> Run:
@@ -188,29 +188,29 @@ def _with_noise(run: Run, sigma: dict[int, float]) -> Run:
 # -------------------------------------------------------------------- the hypotheses
 
 
-def _investigate(fit: Fit, bench: Bench, deadline: Deadline) -> tuple[Hypothesis, list[Hypothesis]]:
+def _investigate(fit: Fit, study: Study, deadline: Deadline) -> tuple[Hypothesis, list[Hypothesis]]:
     """Return the hypothesis chosen and all that were judged in time, the linear one first."""
-    baseline = judge(fit, bench)
-    if baseline.at_floor or baseline.error < AS_REPEATS * bench.repeatability:
+    baseline = judge(fit, study)
+    if baseline.at_floor or baseline.error < AS_REPEATS * study.repeatability:
         return baseline, [baseline]
-    bench.tell(f"linear model: error {baseline.error:.1%} of the motion on held-out runs")
-    timed = replace(bench, mapper=deadline.map)
+    study.tell(f"linear model: error {baseline.error:.1%} of the motion on held-out runs")
+    timed = replace(study, mapper=deadline.map)
     found = search(baseline, timed)
-    return prune(choose(found, baseline, bench), timed), found
+    return prune(choose(found, baseline, study), timed), found
 
 
 def _with_offset(
-    path: tuple[Hypothesis, ...], bench: Bench
-) -> tuple[tuple[Hypothesis, ...], Bench | None]:
+    path: tuple[Hypothesis, ...], study: Study
+) -> tuple[tuple[Hypothesis, ...], Study | None]:
     """Return the path with a constant force at its end, where the rest points ask for one.
 
     With the force in the model the encoders' zeros are those of the file, within half a noise:
-    then the bench by which all is judged is returned with it.
+    then the study by which all is judged is returned with it.
     """
     chosen = path[-1]
     structure = chosen.fit.structure
-    effect = next((effect for effect in bench.catalogue if effect.only_rest), None)
-    runs = [*bench.training, *bench.held_out]
+    effect = next((effect for effect in study.catalogue if effect.only_rest), None)
+    runs = [*study.training, *study.held_out]
     nuisance = [*chosen.fit.nuisance, *chosen.held.nuisance]
     offset = find_offset(structure.chain(chosen.fit.theta), runs, nuisance)
     if effect is None or offset is None:
@@ -221,9 +221,9 @@ def _with_offset(
         return path, None
     pinned, loose = (
         replace(
-            bench,
-            training=tuple(_pin(run, width=width) for run in bench.training),
-            held_out=tuple(_pin(run, width=width) for run in bench.held_out),
+            study,
+            training=tuple(_pin(run, width=width) for run in study.training),
+            held_out=tuple(_pin(run, width=width) for run in study.held_out),
         )
         for width in (_PINNED, _LOOSE)
     )

@@ -134,12 +134,7 @@ def _stand_in(
 
 
 def _staged_start(
-    data: Points,
-    known: Mapping[str, float],
-    *,
-    n: int,
-    springs: Sequence[bool],
-    like: Chain,
+    data: Points, known: Mapping[str, float], *, n: int, springs: Sequence[bool], like: Chain
 ) -> tuple[StagedFit | None, Chain]:
     """Fit stage by stage and return the chain it implies, made possible where it is not."""
     if not any(springs):

@@ -70,13 +70,7 @@ def check_hardware(
     closed, trouble = None, ""
     if law is not None and record.reference is not None:
         try:
-            closed = _close(
-                run,
-                law,
-                reference=record.reference,
-                opened=opened,
-                limit=input_limit,
-            )
+            closed = _close(run, law, reference=record.reference, opened=opened, limit=input_limit)
         except DataError as error:
             trouble = f"the loop is not simulated: {error}"
     if opened is None and closed is None:

@@ -51,11 +51,11 @@ def fit_log_decrement(record: Record, *, cart: int) -> LogDecrement:
     fit, window = decay.fit, slice(decay.first, decay.stop)
     pole = complex(fit.poles[0])
     omega_n, zeta = abs(pole), -pole.real / abs(pole)
-    left = fit.rms / float(np.ptp(y[window]))
-    if not (0 < zeta < 1 and pole.imag > 0 and left < _NO_DECAY):
+    unexplained = fit.rms / float(np.ptp(y[window]))
+    if not (0 < zeta < 1 and pole.imag > 0 and unexplained < _NO_DECAY):
         raise DataError(
             f"{record.id}: log decrement needs a decaying oscillation of cart {cart}, found "
-            f"zeta = {zeta:.3g} with {100 * left:.0f} % of the motion unexplained"
+            f"zeta = {zeta:.3g} with {100 * unexplained:.0f} % of the motion unexplained"
         )
     of_pole = fit.covariance[2:, 2:]  # of (decay rate, damped frequency)
     per_zeta = np.array([pole.imag**2, pole.real * pole.imag]) / omega_n**3

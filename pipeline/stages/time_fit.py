@@ -203,11 +203,7 @@ def _released(attempt: Attempt) -> Attempt:
 
 
 def _result(
-    attempt: Attempt,
-    *,
-    explained: bool,
-    n_starts: int,
-    remarks: Sequence[str],
+    attempt: Attempt, *, explained: bool, n_starts: int, remarks: Sequence[str]
 ) -> ChainFit:
     """Collect the fit's outcome, its residuals counted in the stated errors."""
     parametrisation, chain = attempt.parametrisation, attempt.chain

@@ -9,7 +9,7 @@ from pipeline.gap.data.split import split
 from pipeline.gap.fit.baseline import fit_baseline
 from pipeline.gap.search.beam import by_promise, prune
 from pipeline.gap.search.grow import fit_whole
-from pipeline.gap.search.hypothesis import Bench, judge
+from pipeline.gap.search.hypothesis import Study, judge
 from pipeline.gap.search.screen import candidates_at
 from pipeline.plant.nonlinear.effects import CATALOGUE, find_effect
 from tests.truth.bench import Hidden
@@ -17,7 +17,7 @@ from tests.truth.cases import make_case
 
 COULOMB, DAHL = ("coulomb_friction", 1), ("presliding_friction", 1)
 CUBIC, DELAY = ("cubic_spring", 1), ("input_delay", 0)
-BENCH: Any = SimpleNamespace(explains=lambda h: False)
+STUDY: Any = SimpleNamespace(explains=lambda h: False)
 
 
 def hypothesis(*keys: tuple[str, int], error: float, bic: float, chi: float = 100.0) -> Any:
@@ -29,7 +29,7 @@ def hypothesis(*keys: tuple[str, int], error: float, bic: float, chi: float = 10
 
 def order(*waiting: Any) -> list[set[tuple[str, int]]]:
     """Return the effects of those who are grown, in their order."""
-    return [set(h.key) for h in by_promise(waiting, {h.key: h for h in waiting}, BENCH)]
+    return [set(h.key) for h in by_promise(waiting, {h.key: h for h in waiting}, STUDY)]
 
 
 def test_a_whole_that_explains_no_more_than_its_part_leads_astray():
@@ -62,7 +62,7 @@ def test_a_richer_law_that_explains_no_more_gives_way():
     held_out = [runs[i] for i in tell]
     training = [runs[i] for i in teach]
     fit, training = fit_baseline(training, springs=case.springs, start=None)
-    bench = Bench(
+    study = Study(
         training=tuple(training),
         held_out=tuple(replace(run, sigma=training[0].sigma) for run in held_out),
         springs=case.springs,
@@ -78,9 +78,9 @@ def test_a_richer_law_that_explains_no_more_gives_way():
         place = 0 if effect.place == "input" else 1
         candidate, _ = candidates_at(effect, place, runs=training, chain=chain)[0]
         start = start.with_effect(candidate, values)
-    rich = judge(fit_whole(start, bench), bench)
+    rich = judge(fit_whole(start, study), study)
 
-    pruned = prune(rich, bench)
+    pruned = prune(rich, study)
 
     assert rich.key == {DAHL, DELAY}
     assert pruned.key == {COULOMB, DELAY}

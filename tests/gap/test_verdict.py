@@ -31,7 +31,7 @@ def hypothesis(*keys: tuple[str, int], error: float, bic: float) -> Any:
     )
 
 
-BENCH: Any = SimpleNamespace(
+STUDY: Any = SimpleNamespace(
     floor=FLOOR, repeatability=0.0, training=(), explains=lambda h: h.error <= 2 * FLOOR
 )
 LINEAR = hypothesis(error=0.3, bic=0.0)
@@ -40,7 +40,7 @@ LINEAR = hypothesis(error=0.3, bic=0.0)
 def verdict_on(*steps: Any, others: tuple[Any, ...] = ()) -> tuple[str, set[Any], list[Any]]:
     """Return the verdict, the effects that stand, and the rivals."""
     path = (LINEAR, *steps)
-    verdict, stand, close = reach_verdict(path, [*path, *others], bench=BENCH, sample_time=0.01)
+    verdict, stand, close = reach_verdict(path, [*path, *others], study=STUDY, sample_time=0.01)
     assert [len(h.key) for h in stand] == list(range(len(stand)))  # one effect a step
     return verdict, set(stand[-1].key), close
 

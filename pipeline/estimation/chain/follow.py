@@ -16,7 +16,7 @@ from pipeline.errors import DataError
 from pipeline.estimation.chain.modal_response import Modes, find_modes
 from pipeline.estimation.chain.parametrisation import Parametrisation
 from pipeline.estimation.chain.time_window import Window, compare, open_window
-from pipeline.estimation.mistakes import FASTEST, LENGTH_SCALES, TIME_FACTORS
+from pipeline.estimation.units_and_clocks import FASTEST, LENGTH_SCALES, TIME_FACTORS
 from pipeline.plant.linear.chain import Chain
 from pipeline.results import Record
 
@@ -222,8 +222,8 @@ def _hold_against(record: Record, chain: Chain, modes: _ModesOf) -> Followed | N
     except DataError:  # nothing moves, or the motor does not reach the last cart
         return None
     power = np.var(window.y, axis=1)
-    left = np.mean(residual**2, axis=1) - window.stated_sigma**2  # beyond encoder and noise
-    lost = np.maximum(left, 0.0) / power
+    excess = np.mean(residual**2, axis=1) - window.stated_sigma**2  # beyond encoder and noise
+    lost = np.maximum(excess, 0.0) / power
     reach = np.sqrt(power) / np.maximum(np.std(window.y + residual, axis=1), window.stated_sigma)
     return Followed(
         lost=dict(zip(window.carts, lost.tolist(), strict=True)),

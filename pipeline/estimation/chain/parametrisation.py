@@ -240,9 +240,9 @@ def even_chain(values: Mapping[str, float], *, n: int, springs: Sequence[bool]) 
         )
     present = [any(springs), False] if n == 1 else list(springs)
     unit = Chain(m=np.ones(n), c=np.zeros(n), k=np.array(present, dtype=float))
-    own = np.sort(np.abs(unit.poles))[::2]  # each resonance stands twice, with its conjugate
+    modes = np.sort(np.abs(unit.poles))[::2]  # each resonance stands twice, with its conjugate
     stretch = np.exp(
-        np.mean(np.log(np.sort(omegas))) - np.mean(np.log(own[own > 0][: len(omegas)]))
+        np.mean(np.log(np.sort(omegas))) - np.mean(np.log(modes[modes > 0][: len(omegas)]))
     )
     k = unit.static_gains()[0] / gain
     even = Chain(m=unit.m * k / stretch**2, c=unit.c, k=unit.k * k)

@@ -186,10 +186,7 @@ def compare(window: Window, modes: Modes) -> Misfit:
         x0 = found[p:]
         z0, d_z0 = modes.entry @ x0, modes.d_entry @ x0
         signals += [free_motion, free_motion * window.t]
-        d_weights += [
-            d_shapes * z0 + shapes * d_z0[:, None],
-            shapes * z0 * modes.d_poles[:, None],
-        ]
+        d_weights += [d_shapes * z0 + shapes * d_z0[:, None], shapes * z0 * modes.d_poles[:, None]]
     n_p = modes.d_poles.shape[0]
     if signals:
         jacobian = _real_part(np.concatenate(d_weights, axis=2), np.concatenate(signals))

@@ -99,8 +99,7 @@ def fit_friction(
         zeta_std=float(np.sqrt(per_pole @ covariance[1:3, 1:3] @ per_pole)),
     )
     return FrictionFit(
-        test=test,
-        model=lambda at: _Swings.at(at, best.p, direction=direction).columns @ linear,
+        test=test, model=lambda at: _Swings.at(at, best.p, direction=direction).columns @ linear
     )
 
 

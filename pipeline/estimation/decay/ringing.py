@@ -68,14 +68,16 @@ def fit_ringing(t: Array, y: Array, *, poles: ComplexArray, drift: bool) -> Ring
         start=np.append(np.maximum(-poles.real / scale, _ALWAYS_DECAYS), poles.imag / scale),
         max_evaluations=_MAX_EVALUATIONS,
     )
-    linear, left, waves = fit.linear, fit.residual, _Waves.at(tau, fit.p, level=level)
+    linear, residual, waves = fit.linear, fit.residual, _Waves.at(tau, fit.p, level=level)
     X = waves.columns
     full = np.column_stack([X[:, :k], waves.derivatives(linear) / scale, X[:, k:]])
     kept = [0, 1] if drift else [0]
     kept += list(range(k, k + 2 * n_modes))
     inverse = np.linalg.pinv(np.linalg.qr(full, mode="r"))[kept]
     angle = float(np.median(fit.p[n_modes:])) * float(tau[-1] / (t.size - 1))
-    variance = float(left @ left) / max(t.size - full.shape[1], 1) * colour(left, angle=angle)
+    variance = (
+        float(residual @ residual) / max(t.size - full.shape[1], 1) * colour(residual, angle=angle)
+    )
     covariance = variance * (inverse @ inverse.T)
     if not drift:
         covariance = np.insert(np.insert(covariance, 1, 0.0, axis=0), 1, 0.0, axis=1)
@@ -86,7 +88,7 @@ def fit_ringing(t: Array, y: Array, *, poles: ComplexArray, drift: bool) -> Ring
         poles=scale * (-fit.p[:n_modes] + 1j * fit.p[n_modes:]),
         amplitudes=linear[k : k + n_modes] - 1j * linear[k + n_modes :],
         covariance=covariance,
-        rms=float(np.sqrt(np.mean(left**2))),
+        rms=float(np.sqrt(np.mean(residual**2))),
         converged=fit.converged,
     )
 

@@ -41,14 +41,14 @@ def split(runs: Sequence[Run]) -> tuple[list[int], list[int]]:
                 clusters.append([i])
         for cluster in clusters:
             held += cluster[1::2]
-        left = [cluster[0] for cluster in clusters]
-        if len(left) >= 3:
+        sizes_apart = [cluster[0] for cluster in clusters]
+        if len(sizes_apart) >= 3:
             # In order of signed size: the extremes of both signs teach.
-            held.append(left[len(left) // 2])
-        elif len(left) == 2 and kind == "decay" and len(members) == 2:
-            held.append(min(left, key=lambda i: abs(sizes[i])))
-        elif len(left) == 2:
-            pairs.append(left)
+            held.append(sizes_apart[len(sizes_apart) // 2])
+        elif len(sizes_apart) == 2 and kind == "decay" and len(members) == 2:
+            held.append(min(sizes_apart, key=lambda i: abs(sizes[i])))
+        elif len(sizes_apart) == 2:
+            pairs.append(sizes_apart)
     if not held:
         held = [min(pair, key=lambda i: abs(_size(runs[i]))) for pair in pairs[:1]]
     return [i for i in range(len(runs)) if i not in held], sorted(held)

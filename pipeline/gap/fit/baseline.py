@@ -104,13 +104,7 @@ def fit_baseline(
     starts = [chain for chain in (start,) if chain is not None]
     starts.append(first_chain(runs, springs=springs))
     fits = [
-        fit_model(
-            structure.start(chain),
-            shots,
-            iterations=15,
-            mapper=mapper,
-        )
-        for chain in starts
+        fit_model(structure.start(chain), shots, iterations=15, mapper=mapper) for chain in starts
     ]
     best = min(fits, key=lambda fit: fit.cost)
     noisy = measure_noise(best, shots, runs)

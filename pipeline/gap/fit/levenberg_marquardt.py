@@ -329,8 +329,8 @@ def project(
     shared = shared / np.maximum(scale, _DEAD * scale.max())
     basis, power, _ = np.linalg.svd(shared, full_matrices=False)
     basis = basis[:, power > _SHOWN]
-    left = triangle(wide - basis @ (basis.T @ wide))
-    return left[:, :-1], left[:, -1]
+    projected = triangle(wide - basis @ (basis.T @ wide))
+    return projected[:, :-1], projected[:, -1]
 
 
 def covariance(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:

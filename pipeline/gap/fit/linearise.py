@@ -31,7 +31,7 @@ _TALL = 400  # rows of a matrix that are factorised at once
 _HOME = 0.1  # how firmly the priors hold starts that the data do not show …
 _HELD = 1e6  # … and a velocity that is known to be zero
 _FACTOR_STEP = 0.3  # of a friction factor, at a time: beyond, the friction is another one …
-_FACTORS = (0.3, 3.0)  # … and of no bench, whose factors are within some 20 % of one
+_FACTORS = (0.3, 3.0)  # … and of no study, whose factors are within some 20 % of one
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -170,8 +170,8 @@ def triangle(matrix: Array) -> Array:
     if parts > 1:
         even = rows // parts * parts
         tall = matrix[..., :even, :].reshape(*stack, parts, even // parts, columns)
-        left = _r(tall).reshape(*stack, -1, columns)
-        matrix = np.concatenate([left, matrix[..., even:, :]], axis=-2)
+        triangles = _r(tall).reshape(*stack, -1, columns)
+        matrix = np.concatenate([triangles, matrix[..., even:, :]], axis=-2)
     return _r(matrix)
 
 

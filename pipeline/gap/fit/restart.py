@@ -43,12 +43,7 @@ def restart_runs(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
                 scatter=np.where(rest & free, factor, 1.0),
             )
             trial = fit_model(
-                fit,
-                [run],
-                nuisance=[start],
-                spread=fit.spread,
-                shared=False,
-                iterations=6,
+                fit, [run], nuisance=[start], spread=fit.spread, shared=False, iterations=6
             )
             if trial.chi_square < lowest:
                 best, lowest = trial.nuisance[0], trial.chi_square
@@ -57,14 +52,7 @@ def restart_runs(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
     jobs = zip(runs, fit.nuisance, worst, fit.run_chi, strict=True)
     nuisance = tuple(mapper(again, jobs))
     inflate = max(1.0, float(np.sqrt(fit.chi)))
-    return evaluate(
-        fit,
-        runs,
-        nuisance,
-        spread=fit.spread,
-        inflate=inflate,
-        mapper=mapper,
-    )
+    return evaluate(fit, runs, nuisance, spread=fit.spread, inflate=inflate, mapper=mapper)
 
 
 def _rest_band(fit: Fit) -> Array:

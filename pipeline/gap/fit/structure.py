@@ -172,9 +172,11 @@ class Structure:
         hidden = cart[:, Cart.HIDDEN_MASS] > 0.0
         if not hidden.any():
             return True
-        own = np.diag(self.chain(theta).stiffness) / cart[:, Cart.MASS]
+        of_cart = np.diag(self.chain(theta).stiffness) / cart[:, Cart.MASS]
         rate = cart[hidden, Cart.HIDDEN_STIFFNESS] / cart[hidden, Cart.HIDDEN_MASS]
-        return bool(np.all((own[hidden] == 0.0) | (rate < _FASTEST_HIDDEN**2 * own[hidden])))
+        return bool(
+            np.all((of_cart[hidden] == 0.0) | (rate < _FASTEST_HIDDEN**2 * of_cart[hidden]))
+        )
 
     def bounds(self) -> tuple[Array, Array]:
         """Return the lower and upper bounds of the vector."""

@@ -9,7 +9,7 @@ from pipeline.gap.fit.structure import Candidate
 from pipeline.gap.limits import BIC_DROP
 from pipeline.gap.search.deadline import OutOfTime
 from pipeline.gap.search.grow import fit_whole, grow
-from pipeline.gap.search.hypothesis import Bench, Hypothesis, judge, lowers_error, worth_it
+from pipeline.gap.search.hypothesis import Hypothesis, Study, judge, lowers_error, worth_it
 from pipeline.plant.nonlinear.effects import find_effect
 
 _PATIENCE = 2  # hypotheses grown in a row from which none comes with a lower held-out error
@@ -20,17 +20,17 @@ _CONTACT_STEP = 0.3  # a contact that is there takes more, and without it others
 _CONTACT_LAW = 10.0  # … chi-square that a contact of another law leaves: nothing to explain
 
 
-def search(baseline: Hypothesis, bench: Bench, *, depth: int = _DEPTH) -> list[Hypothesis]:
+def search(baseline: Hypothesis, study: Study, *, depth: int = _DEPTH) -> list[Hypothesis]:
     """Return every hypothesis judged, the baseline first; past the time, those so far."""
     seen: dict[frozenset[tuple[str, int]], Hypothesis] = {baseline.key: baseline}
     with suppress(OutOfTime):
-        _grow_the_best(baseline, bench, seen, depth=depth)
+        _grow_the_best(baseline, study, seen, depth=depth)
     return list(seen.values())
 
 
 def _grow_the_best(
     baseline: Hypothesis,
-    bench: Bench,
+    study: Study,
     seen: dict[frozenset[tuple[str, int]], Hypothesis],
     *,
     depth: int,
@@ -46,7 +46,7 @@ def _grow_the_best(
         parent, *waiting = waiting
         done.add(parent.key)
         children: list[Hypothesis] = []
-        for child in grow(parent, bench):
+        for child in grow(parent, study):
             if not (child.sound and np.isfinite(child.error)):
                 continue
             if child.key not in seen or child.bic < seen[child.key].bic:
@@ -57,9 +57,9 @@ def _grow_the_best(
             break
         if children:
             leader = min(children, key=lambda h: h.bic)
-            bench.tell(f"{len(leader.key)} effect{'s' * (len(leader.key) > 1)}: {_names(leader)}")
+            study.tell(f"{len(leader.key)} effect{'s' * (len(leader.key) > 1)}: {_names(leader)}")
         # One of two effects may do little by itself.
-        pays = parent is baseline or any(lowers_error(child, best, bench) for child in children)
+        pays = parent is baseline or any(lowers_error(child, best, study) for child in children)
         idle = 0 if pays else idle + 1
         best = min([best, *children], key=lambda h: h.error)
         waiting += [
@@ -71,13 +71,13 @@ def _grow_the_best(
             and not _needlessly_rich(child, seen)
             and _leads_on(child, parent.fit.chi)
         ]
-        waiting = by_promise(waiting, seen, bench)
+        waiting = by_promise(waiting, seen, study)
 
 
 def by_promise(
     waiting: Sequence[Hypothesis],
     seen: Mapping[frozenset[tuple[str, int]], Hypothesis],
-    bench: Bench,
+    study: Study,
 ) -> list[Hypothesis]:
     """Return who is worth growing, the best first: of one family of laws at its places only one.
 
@@ -86,7 +86,7 @@ def by_promise(
     leading: dict[frozenset[tuple[str, int]], Hypothesis] = {}
     for h in sorted(waiting, key=lambda h: h.bic):
         parts = (part for part in seen.values() if part.key and part.key < h.key)
-        if all(lowers_error(h, part, bench) for part in parts):
+        if all(lowers_error(h, part, study) for part in parts):
             effects = h.fit.structure.effects
             leading.setdefault(
                 frozenset((c.effect.family or c.key[0], c.place) for c in effects), h
@@ -119,25 +119,25 @@ def _names(hypothesis: Hypothesis) -> str:
     return " + ".join(c.label for c in hypothesis.fit.structure.effects)
 
 
-def choose(found: Sequence[Hypothesis], baseline: Hypothesis, bench: Bench) -> Hypothesis:
+def choose(found: Sequence[Hypothesis], baseline: Hypothesis, study: Study) -> Hypothesis:
     """Return the best hypothesis whose every effect is worth it, the smaller where in doubt."""
     best = baseline
     for size in range(1, _DEPTH + 1):
         level = [h for h in found if h.size == size]
-        level = [h for h in level if worth_it(h, best, bench)]
+        level = [h for h in level if worth_it(h, best, study)]
         if level:
             best = min(level, key=lambda h: h.bic)
     return best
 
 
-def prune(chosen: Hypothesis, bench: Bench) -> Hypothesis:
+def prune(chosen: Hypothesis, study: Study) -> Hypothesis:
     """Drop effects, and richer laws, the others have made needless, as far as the time allows."""
     with suppress(OutOfTime):
         while len(chosen.key) > 1:
             effects = chosen.fit.structure.effects
-            trials = [_without(chosen, c, bench) for c in effects]
-            as_good = [h for h in trials if h.sound and not worth_it(chosen, h, bench)]
-            plainer = [_plainer(chosen, c, bench) for c in effects if c.effect.grows_from]
+            trials = [_without(chosen, c, study) for c in effects]
+            as_good = [h for h in trials if h.sound and not worth_it(chosen, h, study)]
+            plainer = [_plainer(chosen, c, study) for c in effects if c.effect.grows_from]
             as_good += [h for h in plainer if h.sound and h.bic < chosen.bic]
             if not as_good:
                 break
@@ -145,13 +145,13 @@ def prune(chosen: Hypothesis, bench: Bench) -> Hypothesis:
     return chosen
 
 
-def _without(hypothesis: Hypothesis, effect: Candidate, bench: Bench) -> Hypothesis:
+def _without(hypothesis: Hypothesis, effect: Candidate, study: Study) -> Hypothesis:
     index = hypothesis.fit.structure.effects.index(effect)
-    fit = fit_whole(hypothesis.fit.without(index), bench)
-    return judge(fit, bench, added=fit.structure.effects[-1:])
+    fit = fit_whole(hypothesis.fit.without(index), study)
+    return judge(fit, study, added=fit.structure.effects[-1:])
 
 
-def _plainer(hypothesis: Hypothesis, rich: Candidate, bench: Bench) -> Hypothesis:
+def _plainer(hypothesis: Hypothesis, rich: Candidate, study: Study) -> Hypothesis:
     """Return the hypothesis with the law in place of a richer one that grew from it."""
     index = hypothesis.fit.structure.effects.index(rich)
     effect = find_effect(rich.effect.grows_from or rich.effect.key)
@@ -163,18 +163,18 @@ def _plainer(hypothesis: Hypothesis, rich: Candidate, bench: Bench) -> Hypothesi
         scales=tuple(rich.scales[i] for i in at),
     )
     values = [hypothesis.fit.terms[index].values[i] for i in at]
-    fit = fit_whole(hypothesis.fit.without(index).with_effect(plain, values), bench)
-    return judge(fit, bench, added=hypothesis.added)
+    fit = fit_whole(hypothesis.fit.without(index).with_effect(plain, values), study)
+    return judge(fit, study, added=hypothesis.added)
 
 
 def steps_to(
-    chosen: Hypothesis, found: Sequence[Hypothesis], bench: Bench
+    chosen: Hypothesis, found: Sequence[Hypothesis], study: Study
 ) -> tuple[Hypothesis, ...]:
     """Return the linear model, one effect, … chosen: what helps most by itself comes first."""
     steps = [chosen]
     while effects := steps[0].fit.structure.effects:
         key = steps[0].key
         smaller = [h for h in found if h.key < key and len(h.key) == len(key) - 1]
-        smaller = smaller or [_without(steps[0], effects[-1], bench)]
+        smaller = smaller or [_without(steps[0], effects[-1], study)]
         steps.insert(0, min(smaller, key=lambda h: h.error))
     return tuple(steps)

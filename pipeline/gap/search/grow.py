@@ -11,7 +11,7 @@ from pipeline.gap.fit.levenberg_marquardt import Fit, fit_model
 from pipeline.gap.fit.restart import restart_runs
 from pipeline.gap.fit.structure import Candidate, Model
 from pipeline.gap.limits import AT_FLOOR, THINNING
-from pipeline.gap.search.hypothesis import Bench, Hypothesis, judge
+from pipeline.gap.search.hypothesis import Hypothesis, Study, judge
 from pipeline.gap.search.rugged import polish, zoom
 from pipeline.gap.search.screen import Suspect, Team, candidates_at, screen
 from pipeline.plant.nonlinear.effects.base import Effect
@@ -33,7 +33,7 @@ _ZOOM_SHARE = 0.15  # of the first suspect's, below which one start must do
 _LEADING = 0.4  # of the first suspect's share, for what is dear to refit
 
 
-def grow(parent: Hypothesis, bench: Bench) -> Iterator[Hypothesis]:
+def grow(parent: Hypothesis, study: Study) -> Iterator[Hypothesis]:
     """Yield the children of a hypothesis, fully refitted: an effect more, or a team of them.
 
     What is dear is done last, and only for those who can still win: contacts are polished, and
@@ -41,22 +41,22 @@ def grow(parent: Hypothesis, bench: Bench) -> Iterator[Hypothesis]:
     """
     fits: list[tuple[tuple[Candidate, ...], Fit]] = []
     plain: list[Hypothesis] = []
-    for candidates, start in _starts(parent, bench):
-        fits.append((candidates, fit_whole(start, bench)))
+    for candidates, start in _starts(parent, study):
+        fits.append((candidates, fit_whole(start, study)))
         if not _is_contact(candidates):
-            plain.append(judge(fits[-1][1], bench, added=candidates))
+            plain.append(judge(fits[-1][1], study, added=candidates))
             yield plain[-1]
     for candidates, fit in fits[:]:
-        for other, start in _lookalikes(candidates, fit, bench):
-            fits.append(((other,), fit_whole(start, bench)))
+        for other, start in _lookalikes(candidates, fit, study):
+            fits.append(((other,), fit_whole(start, study)))
     lowest = min((fit.cost for _, fit in fits), default=np.inf)
     contacts: set[tuple[str, int]] = set()
     for candidates, fit in sorted(fits, key=lambda pair: pair[1].cost):
         if _is_contact(candidates) and candidates[0].key not in contacts:
             if fit.cost < _IN_THE_RUNNING * lowest and fit.chi < _POLISHED * parent.fit.chi:
-                fit = polish(fit, bench.training, enough=AT_FLOOR, mapper=bench.mapper)
+                fit = polish(fit, study.training, enough=AT_FLOOR, mapper=study.mapper)
             contacts.add(candidates[0].key)
-            yield judge(fit, bench, added=candidates)
+            yield judge(fit, study, added=candidates)
     closed = any(child.at_floor for child in plain)
     for child in plain:
         equals = [fit.cost for others, fit in fits if closed or len(others) == len(child.added)]
@@ -64,9 +64,9 @@ def grow(parent: Hypothesis, bench: Bench) -> Iterator[Hypothesis]:
         running = noise < child.fit.cost < _IN_THE_RUNNING * min(equals)
         if not running or any(_tells_better(other, child) for other in plain):
             continue
-        for effect in bench.catalogue:
+        for effect in study.catalogue:
             if any(c.effect.key == effect.grows_from for c in child.added):
-                yield _grown_friction(effect, child, bench)
+                yield _grown_friction(effect, child, study)
 
 
 def _tells_better(other: Hypothesis, child: Hypothesis) -> bool:
@@ -86,7 +86,7 @@ def _tells_better(other: Hypothesis, child: Hypothesis) -> bool:
 
 
 def _lookalikes(
-    added: Sequence[Candidate], fit: Fit, bench: Bench
+    added: Sequence[Candidate], fit: Fit, study: Study
 ) -> Iterator[tuple[Candidate, Model]]:
     """Yield what the values of an effect, just added by itself, hint at in its stead."""
     if len(added) > 1:
@@ -94,13 +94,13 @@ def _lookalikes(
     index, chain = len(fit.structure.effects) - 1, fit.structure.chain(fit.theta)
     term = fit.terms[index]
     hint = term.effect.lookalike(term.effect.named(term.values), term.place, chain)
-    if hint is None or hint.effect not in bench.catalogue:
+    if hint is None or hint.effect not in study.catalogue:
         return
     base = fit.without(index)
     if (hint.effect.key, hint.place) in (c.key for c in base.structure.effects):
         return
     for candidate, usual in candidates_at(
-        hint.effect, hint.place, runs=bench.training, chain=chain
+        hint.effect, hint.place, runs=study.training, chain=chain
     ):
         values = hint.effect.named(usual) | hint.values
         if candidate.has_signs_of(tuple(values.values())):
@@ -112,7 +112,7 @@ def _is_contact(candidates: Sequence[Candidate]) -> bool:
     return any(candidate.effect.contact for candidate in candidates)
 
 
-def _starts(parent: Hypothesis, bench: Bench) -> list[tuple[tuple[Candidate, ...], Fit]]:
+def _starts(parent: Hypothesis, study: Study) -> list[tuple[tuple[Candidate, ...], Fit]]:
     """Return the suspects worth a full refit, each with a fit to start from.
 
     Pieces forgive a wrong structure, so most suspects come from them; whole runs show what adds
@@ -120,23 +120,17 @@ def _starts(parent: Hypothesis, bench: Bench) -> list[tuple[tuple[Candidate, ...
     """
     look = partial(
         screen,
-        whole=bench.training,
-        springs=bench.springs,
-        catalogue=bench.catalogue,
-        mapper=bench.mapper,
+        whole=study.training,
+        springs=study.springs,
+        catalogue=study.catalogue,
+        mapper=study.mapper,
     )
-    pieces = [cut_shots(run, length=SHOT_LENGTH) for run in bench.training]
-    loose = fit_model(
-        parent.fit,
-        pieces,
-        iterations=4,
-        scatter_free=False,
-        mapper=bench.mapper,
-    )
+    pieces = [cut_shots(run, length=SHOT_LENGTH) for run in study.training]
+    loose = fit_model(parent.fit, pieces, iterations=4, scatter_free=False, mapper=study.mapper)
     suspects, teams = look(loose, pieces)
     suspects = [s for s in suspects if _promises(s.share, loose)]
     short = [
-        _short_refit(loose, s, pieces, bench, top=suspects[0].share) for s in _short_list(suspects)
+        _short_refit(loose, s, pieces, study, top=suspects[0].share) for s in _short_list(suspects)
     ]
     short.sort(key=lambda pair: pair[1].cost)
     closed = bool(short) and short[0][1].chi < AT_FLOOR
@@ -148,19 +142,19 @@ def _starts(parent: Hypothesis, bench: Bench) -> list[tuple[tuple[Candidate, ...
     best = short[0][1].cost if short else np.inf
     for team in teams:
         if _promises(team.share, loose) and not _is_contact(team.candidates):
-            pair = _refit_team(loose, team, pieces, bench)
+            pair = _refit_team(loose, team, pieces, study)
             if team.family or pair[1].cost < _TOGETHER * best:
                 chosen.append(pair)
                 best = min(best, pair[1].cost)
-    suspects, _ = look(parent.fit, bench.training)
+    suspects, _ = look(parent.fit, study.training)
     suspects = [s for s in suspects if _promises(s.share, parent.fit)]
     for suspect in suspects[:_FULL_SCREEN]:
         key, top = suspect.candidate.key, suspects[0].share
         if _needs_starts(suspect.candidate) and suspect.share > _LEADING * top:
-            chosen.append(_short_refit(parent.fit, suspect, bench.training, bench, top=top))
+            chosen.append(_short_refit(parent.fit, suspect, study.training, study, top=top))
         elif (key,) not in (tuple(c.key for c in candidates) for candidates, _ in chosen):
             pair = next((p for p in short if p[0][0].key == key), None)
-            pair = pair or _short_refit(loose, suspect, pieces, bench, top=0.0)
+            pair = pair or _short_refit(loose, suspect, pieces, study, top=0.0)
             if pair[1].cost < within:
                 chosen.append(pair)
     return chosen
@@ -192,7 +186,7 @@ def _is_rugged(effect: Effect) -> bool:
 
 
 def _short_refit(
-    start: Fit, suspect: Suspect, pieces: Sequence[Run], bench: Bench, *, top: float
+    start: Fit, suspect: Suspect, pieces: Sequence[Run], study: Study, *, top: float
 ) -> tuple[tuple[Candidate, ...], Fit]:
     """Refit a suspect on pieces; where the landscape is rugged, from several starts.
 
@@ -200,16 +194,12 @@ def _short_refit(
     """
     several = _needs_starts(suspect.candidate)
     if _is_rugged(suspect.candidate.effect) and suspect.share > _ZOOM_SHARE * top:
-        suspect = zoom(start, pieces, suspect, mapper=bench.mapper)
+        suspect = zoom(start, pieces, suspect, mapper=study.mapper)
     starts = [start.with_effect(suspect.candidate, values) for values in suspect.starts]
-    starts = starts[:3] if several else [_best_start(starts, pieces, bench)]
+    starts = starts[:3] if several else [_best_start(starts, pieces, study)]
     fits = [
         fit_model(
-            one,
-            pieces,
-            iterations=3 if several else 5,
-            scatter_free=False,
-            mapper=bench.mapper,
+            one, pieces, iterations=3 if several else 5, scatter_free=False, mapper=study.mapper
         )
         for one in starts
     ]
@@ -221,13 +211,13 @@ def _short_refit(
             nuisance=best.nuisance,
             iterations=6,
             scatter_free=False,
-            mapper=bench.mapper,
+            mapper=study.mapper,
         )
     return (suspect.candidate,), best
 
 
 def _refit_team(
-    start: Fit, team: Team, pieces: Sequence[Run], bench: Bench
+    start: Fit, team: Team, pieces: Sequence[Run], study: Study
 ) -> tuple[tuple[Candidate, ...], Fit]:
     """Refit the members of a team together on pieces."""
     starts = []
@@ -236,43 +226,37 @@ def _refit_team(
         for candidate, of_one in zip(team.candidates, values, strict=True):
             grown = grown.with_effect(candidate, of_one)
         starts.append(grown)
-    best = _best_start(starts, pieces, bench)
-    fit = fit_model(
-        best,
-        pieces,
-        iterations=5,
-        scatter_free=False,
-        mapper=bench.mapper,
-    )
+    best = _best_start(starts, pieces, study)
+    fit = fit_model(best, pieces, iterations=5, scatter_free=False, mapper=study.mapper)
     return team.candidates, fit
 
 
-def _best_start(starts: Sequence[Model], pieces: Sequence[Run], bench: Bench) -> Model:
+def _best_start(starts: Sequence[Model], pieces: Sequence[Run], study: Study) -> Model:
     """Return the start that leaves least: the screen's is a trial's multiple, not simulated."""
 
     def cost(start: Model) -> float:
-        fit = fit_model(start, pieces, iterations=0, mapper=bench.mapper)
+        fit = fit_model(start, pieces, iterations=0, mapper=study.mapper)
         return fit.cost
 
     return min(starts, key=cost)
 
 
-def fit_whole(start: Model, bench: Bench) -> Fit:
+def fit_whole(start: Model, study: Study) -> Fit:
     """Fit whole runs; friction first with one size for all runs, then run by run."""
-    whole = bench.training
+    whole = study.training
     structure = start.structure
     fit = fit_model(
         start,
         whole,
         iterations=25 if structure.has_contact else 12,
         scatter_free=False,
-        mapper=bench.mapper,
+        mapper=study.mapper,
     )
     for attempt in range(_FRICTION_ROUNDS):
         if not structure.many_rests or fit.chi < AT_FLOOR:
             break
         if np.quantile(fit.run_chi, 0.25) < _NEARLY_RIGHT:
-            fit = restart_runs(fit, whole, mapper=bench.mapper)
+            fit = restart_runs(fit, whole, mapper=study.mapper)
         elif attempt:
             break
         fit = fit_model(
@@ -282,12 +266,12 @@ def fit_whole(start: Model, bench: Bench) -> Fit:
             spread=fit.spread,
             iterations=12,
             learn_spread=True,
-            mapper=bench.mapper,
+            mapper=study.mapper,
         )
     return fit
 
 
-def _grown_friction(effect: Effect, child: Hypothesis, bench: Bench) -> Hypothesis:
+def _grown_friction(effect: Effect, child: Hypothesis, study: Study) -> Hypothesis:
     """Fit a richer friction law in the places of the simpler one, just added, from its fit."""
     added, simple = child.added, child.fit
     structure = simple.structure
@@ -295,7 +279,7 @@ def _grown_friction(effect: Effect, child: Hypothesis, bench: Bench) -> Hypothes
     at = [structure.effects.index(c) for c in simpler]
     known = [effect.grown(t.effect.named(t.values)) for t in (simple.terms[i] for i in at)]
     chain = structure.chain(simple.theta)
-    trials = [candidates_at(effect, c.place, runs=bench.training, chain=chain) for c in simpler]
+    trials = [candidates_at(effect, c.place, runs=study.training, chain=chain) for c in simpler]
     fits = []
     tried = set()
     for trial in zip(*trials, strict=True):
@@ -310,14 +294,8 @@ def _grown_friction(effect: Effect, child: Hypothesis, bench: Bench) -> Hypothes
         for (candidate, _), values in zip(trial, starts, strict=True):
             start = start.with_effect(candidate, values)
         fits.append(
-            fit_model(
-                start,
-                bench.training,
-                iterations=4,
-                scatter_free=False,
-                mapper=bench.mapper,
-            )
+            fit_model(start, study.training, iterations=4, scatter_free=False, mapper=study.mapper)
         )
     best = min(fits, key=lambda fit: fit.cost)
-    fit = fit_whole(best, bench)
-    return judge(fit, bench, added=best.structure.effects[-len(added) :])
+    fit = fit_whole(best, study)
+    return judge(fit, study, added=best.structure.effects[-len(added) :])

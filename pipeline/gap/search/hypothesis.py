@@ -78,7 +78,7 @@ class Hypothesis:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Bench:
+class Study:
     """What every step of the search needs: runs, springs, catalogue, and who maps over runs.
 
     `repeatability` is the relative error between runs with the same input, 0 without any.
@@ -105,11 +105,11 @@ class Bench:
         return hypothesis.error <= enough
 
 
-def judge(fit: Fit, bench: Bench, *, added: Sequence[Candidate] = ()) -> Hypothesis:
+def judge(fit: Fit, study: Study, *, added: Sequence[Candidate] = ()) -> Hypothesis:
     """Return the hypothesis a fit stands for."""
-    held = fit_nuisance(fit, bench.held_out, mapper=bench.mapper)
+    held = fit_nuisance(fit, study.held_out, mapper=study.mapper)
     errors, sizes = [], []
-    for run, nuisance in zip(bench.held_out, held.nuisance, strict=True):
+    for run, nuisance in zip(study.held_out, held.nuisance, strict=True):
         model = simulate_run(fit, run, nuisance)
         errors.append(float(((run.y - model) ** 2).sum()))
         sizes.append(float((run.swing**2).sum() * run.t.size))
@@ -126,17 +126,17 @@ def judge(fit: Fit, bench: Bench, *, added: Sequence[Candidate] = ()) -> Hypothe
     )
 
 
-def lowers_error(child: Hypothesis, parent: Hypothesis, bench: Bench) -> bool:
+def lowers_error(child: Hypothesis, parent: Hypothesis, study: Study) -> bool:
     """Is the held-out error lower, and by enough where too much for a name is left?"""
     added = child.key - parent.key
     contact = any(find_effect(key).contact for key, _ in added)
     gain = PARTIAL_CONTACT if contact else PARTIAL_GAIN
-    return child.error < (1.0 if bench.explains(child) else gain) * parent.error
+    return child.error < (1.0 if study.explains(child) else gain) * parent.error
 
 
-def worth_it(child: Hypothesis, parent: Hypothesis, bench: Bench) -> bool:
+def worth_it(child: Hypothesis, parent: Hypothesis, study: Study) -> bool:
     """Does a further effect help on runs the model has not seen?"""
-    if not lowers_error(child, parent, bench):
+    if not lowers_error(child, parent, study):
         return False
     gain = CONTACT_GAIN if parent.has_contact else HELD_OUT_GAIN
     drop = BIC_DROP if child.size != parent.size else SAME_LAW

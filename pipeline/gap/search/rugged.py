@@ -49,8 +49,8 @@ def zoom(
             trials.append(np.where(signed, value + step * scales, value * np.exp(step)))
         signals = added_signals(fit, runs, [(candidate, tuple(v)) for v in trials], mapper=mapper)
         directions, residual = project(fit, runs, signals, mapper=mapper)
-        left = ((residual[:, None] - directions) ** 2).sum(axis=0)
-        best += [(float(cost), value) for cost, value in zip(left, trials, strict=True)]
+        costs = ((residual[:, None] - directions) ** 2).sum(axis=0)
+        best += [(float(cost), value) for cost, value in zip(costs, trials, strict=True)]
         best.sort(key=lambda pair: pair[0])
         elite = [value for _, value in best[:_ELITE]]
     starts = tuple(tuple(float(v) for v in value) for value in elite)
@@ -72,13 +72,7 @@ def polish(fit: Fit, runs: Sequence[Run], *, enough: float, mapper: Mapper = map
             if fit.chi < enough:
                 return fit
             base = fit.without(index)
-            bare = evaluate(
-                base,
-                runs,
-                fit.nuisance,
-                spread=fit.spread,
-                mapper=mapper,
-            )
+            bare = evaluate(base, runs, fit.nuisance, spread=fit.spread, mapper=mapper)
             values = fit.terms[index].values
             here = Suspect(candidate=candidate, share=1.0, starts=(values,))
             seed = 1 + cycle * len(_CYCLE) + at

@@ -10,7 +10,7 @@ from pipeline.gap.data.runs import Run
 from pipeline.gap.fit.levenberg_marquardt import Fit
 from pipeline.gap.fit.linearise import Nuisance, simulate_run
 from pipeline.gap.limits import AT_FLOOR
-from pipeline.gap.search.hypothesis import Bench, Hypothesis
+from pipeline.gap.search.hypothesis import Hypothesis, Study
 from pipeline.gap.types import FoundEffect, NamedValue, RecordGap, Rival, Trace
 from pipeline.plant.nonlinear.effects import find_effect
 from pipeline.plant.nonlinear.effects.base import Term
@@ -36,8 +36,8 @@ def list_effects(
     lowest = min(h.bic for h in same_size.values())
     weight = {key: float(np.exp(-0.5 * (h.bic - lowest))) for key, h in same_size.items()}
     total = sum(weight.values())
-    slopes = structure.physical_derivative(final.theta)
-    std = np.sqrt(np.diag(final.covariance)) * slopes if final.covariance is not None else None
+    to_physical = structure.physical_derivative(final.theta)
+    std = np.sqrt(np.diag(final.covariance)) * to_physical if final.covariance is not None else None
     places = [candidate.key for candidate in structure.effects]
     out = []
     for before, after in pairwise(path):
@@ -140,20 +140,20 @@ def chain_std(fit: Fit) -> dict[str, float]:
     return {name: float(v * r) for (name, v), r in zip(values.items(), relative, strict=True)}
 
 
-def _sides_of(hypothesis: Hypothesis, bench: Bench) -> list[tuple[Run, Nuisance, bool]]:
+def _sides_of(hypothesis: Hypothesis, study: Study) -> list[tuple[Run, Nuisance, bool]]:
     """Return every run with its nuisance parameters, and whether it was held out."""
-    training = zip(bench.training, hypothesis.fit.nuisance, strict=True)
-    held_out = zip(bench.held_out, hypothesis.held.nuisance, strict=True)
+    training = zip(study.training, hypothesis.fit.nuisance, strict=True)
+    held_out = zip(study.held_out, hypothesis.held.nuisance, strict=True)
     return [(run, nuisance, False) for run, nuisance in training] + [
         (run, nuisance, True) for run, nuisance in held_out
     ]
 
 
-def make_traces(before: Hypothesis, after: Hypothesis, bench: Bench) -> tuple[Trace, ...]:
+def make_traces(before: Hypothesis, after: Hypothesis, study: Study) -> tuple[Trace, ...]:
     """Return every cart of every run beside the model before and after."""
     out = []
     for (run, nuisance_before, held), (_, nuisance_after, _) in zip(
-        _sides_of(before, bench), _sides_of(after, bench), strict=True
+        _sides_of(before, study), _sides_of(after, study), strict=True
     ):
         linear = simulate_run(before.fit, run, nuisance_before)
         final = simulate_run(after.fit, run, nuisance_after)
@@ -175,10 +175,10 @@ def make_traces(before: Hypothesis, after: Hypothesis, bench: Bench) -> tuple[Tr
     return tuple(out)
 
 
-def compare_by_record(traces: Sequence[Trace], bench: Bench) -> tuple[RecordGap, ...]:
+def compare_by_record(traces: Sequence[Trace], study: Study) -> tuple[RecordGap, ...]:
     """Return the relative error of every cart in every run, before and after, as traced."""
     out = []
-    order = (*bench.training, *bench.held_out)
+    order = (*study.training, *study.held_out)
     rows = [(run, j) for run in order for j in range(len(run.rows))]
     for trace, (run, j) in zip(traces, rows, strict=True):
         size = max(float(run.swing[j]), 1e-12)

@@ -16,7 +16,7 @@ from pipeline.gap.limits import (
     THINNING,
 )
 from pipeline.gap.search.beam import steps_to
-from pipeline.gap.search.hypothesis import Bench, Hypothesis, lowers_error
+from pipeline.gap.search.hypothesis import Hypothesis, Study, lowers_error
 from pipeline.gap.types import GapWindow, Verdict
 from pipeline.plant.nonlinear.effects import find_effect
 
@@ -39,11 +39,7 @@ _SHOWS["input off"] = _SHOWS["fast motion"]
 
 
 def reach_verdict(
-    steps: tuple[Hypothesis, ...],
-    found: Sequence[Hypothesis],
-    *,
-    bench: Bench,
-    sample_time: float,
+    steps: tuple[Hypothesis, ...], found: Sequence[Hypothesis], *, study: Study, sample_time: float
 ) -> tuple[Verdict, tuple[Hypothesis, ...], list[Hypothesis]]:
     """Return the verdict, the steps that stand, and under `ambiguous` the rivals.
 
@@ -53,10 +49,10 @@ def reach_verdict(
     """
     baseline, chosen = steps[0], steps[-1]
     if not chosen.key:
-        least = max(NOTHING * bench.floor, AS_REPEATS * bench.repeatability)
+        least = max(NOTHING * study.floor, AS_REPEATS * study.repeatability)
         nothing = baseline.at_floor or baseline.error < least
         return ("none" if nothing else "unexplained"), steps, []
-    explained = bench.explains(chosen)
+    explained = study.explains(chosen)
     gain = baseline.bic - chosen.bic
     close = [
         rival
@@ -64,29 +60,29 @@ def reach_verdict(
         if len(rival.key) == len(chosen.key)
         and rival.key != chosen.key
         and rival.error < CLOSE_ERROR * chosen.error
-        and _evidence(chosen, rival, bench) < min(CLOSE_GAIN * gain, CLOSE_BIC)
+        and _evidence(chosen, rival, study) < min(CLOSE_GAIN * gain, CLOSE_BIC)
         and not _same_thing(rival, chosen, sample_time=sample_time)
         and (explained or not _same_kind(rival, chosen))
     ]
     if not explained:
-        without = _needless(chosen, [*found, *steps], bench)
+        without = _needless(chosen, [*found, *steps], study)
         disputed = bool(close) and chosen.error > MOSTLY * baseline.error
         if without is not None or disputed:
-            back = steps[:-1] if without is None else steps_to(without, [*found, *steps], bench)
-            return reach_verdict(back, found, bench=bench, sample_time=sample_time)
+            back = steps[:-1] if without is None else steps_to(without, [*found, *steps], study)
+            return reach_verdict(back, found, study=study, sample_time=sample_time)
     if close:
         return "ambiguous", steps, close
     return ("named" if explained else "partial"), steps, []
 
 
-def _needless(chosen: Hypothesis, found: Sequence[Hypothesis], bench: Bench) -> Hypothesis | None:
+def _needless(chosen: Hypothesis, found: Sequence[Hypothesis], study: Study) -> Hypothesis | None:
     """Return the best hypothesis without one of the effects, if that effect does not pay."""
     smaller = [h for h in found if h.key < chosen.key and len(h.key) == len(chosen.key) - 1]
-    as_good = [h for h in smaller if not lowers_error(chosen, h, bench)]
+    as_good = [h for h in smaller if not lowers_error(chosen, h, study)]
     return min(as_good, key=lambda h: h.error, default=None)
 
 
-def _evidence(chosen: Hypothesis, rival: Hypothesis, bench: Bench) -> float:
+def _evidence(chosen: Hypothesis, rival: Hypothesis, study: Study) -> float:
     """Return by how much the chosen is the likelier, in units of the criterion.
 
     What a model leaves that is not noise swings with the carts: far fewer of its points are
@@ -96,10 +92,10 @@ def _evidence(chosen: Hypothesis, rival: Hypothesis, bench: Bench) -> float:
     if chosen.fit.chi < NEAR_FLOOR**2:
         return difference
     counted = chosen.fit.n_points / THINNING
-    return difference * min(1.0, _independent_points(chosen, bench) / counted)
+    return difference * min(1.0, _independent_points(chosen, study) / counted)
 
 
-def _independent_points(hypothesis: Hypothesis, bench: Bench) -> float:
+def _independent_points(hypothesis: Hypothesis, study: Study) -> float:
     """Return how many residuals would tell as much, were they independent.
 
     Reference: M. S. Bartlett, Journal of the Royal Statistical Society 98 (1935), 536-543: a
@@ -107,7 +103,7 @@ def _independent_points(hypothesis: Hypothesis, bench: Bench) -> float:
     """
     total = 0.0
     fit = hypothesis.fit
-    for run, nuisance in zip(bench.training, fit.nuisance, strict=True):
+    for run, nuisance in zip(study.training, fit.nuisance, strict=True):
         model = simulate_run(fit, run, nuisance)
         for row in run.y - model:
             power = np.abs(np.fft.rfft(row - row.mean(), 2 * row.size)) ** 2

@@ -50,15 +50,19 @@ def find_offset(chain: Chain, runs: Sequence[Run], nuisance: Sequence[Nuisance])
         forces = np.array([gain @ zero / (gain @ gain) for gain, zero in pairs])
         if forces.size < 3:
             continue
-        left = total - sum(
+        unexplained = total - sum(
             float(zero @ zero - (zero - gain * forces.mean()) @ (zero - gain * forces.mean()))
             for gain, zero in pairs
         )
         smallest = step / np.sqrt(12.0) / max(float(np.abs(g).max()) for g, _ in pairs)
         std = max(float(forces.std(ddof=1)), smallest) / np.sqrt(forces.size)
         sure = abs(float(forces.mean())) > OFFSET_SURE * std
-        if sure and left < (1.0 - OFFSET_SHARE) * total and (best is None or left < best[0]):
-            best = (left, Offset(cart=cart, force=float(forces.mean()), std=std))
+        if (
+            sure
+            and unexplained < (1.0 - OFFSET_SHARE) * total
+            and (best is None or unexplained < best[0])
+        ):
+            best = (unexplained, Offset(cart=cart, force=float(forces.mean()), std=std))
     return best[1] if best else None
 
 

@@ -75,15 +75,15 @@ def residual_forces(gap: Gap, *, free: Mapping[str, Sequence[int]]) -> tuple[Res
 
 
 def _one(carts: Mapping[int, Trace], cart: int, model: AugmentedChain) -> ResidualForce | None:
-    own = carts[cart]
-    t = own.t
-    around = [carts.get(cart - 1), own, carts.get(cart + 1)]
+    trace = carts[cart]
+    t = trace.t
+    around = [carts.get(cart - 1), trace, carts.get(cart + 1)]
     zero = np.zeros(t.size)
     measured = np.array([zero if c is None else c.measured - c.zero for c in around])
     simulated = np.array([zero if c is None else c.final - c.zero for c in around])
-    u = own.u if cart == 1 else zero
+    u = trace.u if cart == 1 else zero
     inputs = np.array([u, _arriving(u, model)])
-    noise = high_frequency_noise(own.measured - own.final)
+    noise = high_frequency_noise(trace.measured - trace.final)
     best = None
     for length in _WINDOWS:
         if (windows := _cut(t, length=length)) is None:
@@ -96,9 +96,9 @@ def _one(carts: Mapping[int, Trace], cart: int, model: AugmentedChain) -> Residu
     if best is None:
         return None
     return ResidualForce(
-        experiment=own.experiment,
+        experiment=trace.experiment,
         cart=cart,
-        held_out=own.held_out,
+        held_out=trace.held_out,
         t=best.t,
         measured=best.force,
         model=best.model,
@@ -176,11 +176,11 @@ def _average(
     m, c = chain.m[i], chain.c[i]
     before, after = chain.k[i], chain.k[i + 1]
 
-    own = m * w2 - c * w1 + (before + after) * w
+    force_weight = m * w2 - c * w1 + (before + after) * w
 
     def force(x: Array) -> Array:
         springs = (w * (before * x[0] + after * x[2])[windows]).sum(1)
-        return (own * x[1][windows]).sum(1) - springs - pushes[1]
+        return (force_weight * x[1][windows]).sum(1) - springs - pushes[1]
 
     return _Means(
         t=(w * local).sum(1),
@@ -189,7 +189,7 @@ def _average(
         inputs=pushes,
         position=np.array([(w * x[windows]).sum(1) for x in measured]),
         velocity=np.array([-(w1 * x[windows]).sum(1) for x in measured]),
-        noise=noise * float(np.sqrt(np.median((own**2).sum(1)))),
+        noise=noise * float(np.sqrt(np.median((force_weight**2).sum(1)))),
     )
 
 

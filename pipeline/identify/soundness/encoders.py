@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.estimation.chain.follow import measured
-from pipeline.estimation.mistakes import LENGTH_SCALES
+from pipeline.estimation.units_and_clocks import LENGTH_SCALES
 from pipeline.ingest.channels import stuck_spans
 from pipeline.results import LeftOut, Record
 

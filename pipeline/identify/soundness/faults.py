@@ -20,7 +20,7 @@ from pipeline.estimation.chain.follow import (
     most_follow,
     near,
 )
-from pipeline.estimation.mistakes import FASTEST, TIME_FACTORS
+from pipeline.estimation.units_and_clocks import FASTEST, TIME_FACTORS
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.simulate import simulate_linear
 from pipeline.results import LeftOut, Record, StepGain

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.estimation.mistakes import TIME_FACTORS
+from pipeline.estimation.units_and_clocks import TIME_FACTORS
 from pipeline.names import gain_name, own_omega, own_zeta, read_name
 from pipeline.results import Check, Estimate, LeftOut, LogDecrement, StepGain
 

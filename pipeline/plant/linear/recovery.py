@@ -54,7 +54,7 @@ def recover_chain(gains: Array, tails: Sequence[Array]) -> Recovered:
     """
     n, others = len(gains), tails[0].shape[1:]
     T = [*tails, np.ones((1, *others))]
-    g, square, left = np.zeros((3, n, *others))  # left: k_i / m_i
+    g, square, ratio = np.zeros((3, n, *others))  # ratio: k_i / m_i
     kappa = np.zeros((n, *others))  # kappa[i] couples carts i and i + 1 (counted from 1)
     routes: list[tuple[Array, Array]] = []
     for i in range(n - 1, -1, -1):  # from the far end, where the transfer function has no zeros
@@ -69,12 +69,12 @@ def recover_chain(gains: Array, tails: Sequence[Array]) -> Recovered:
             # The coefficients that no step above has used are the redundancies.
             routes += [(rebuilt[j], whole[j]) for j in range(3, len(whole) - 1)]
         if i > 0:
-            left[i] = gains[i] / gains[i - 1] * whole[-1] / rest[-1]
+            ratio[i] = gains[i] / gains[i - 1] * whole[-1] / rest[-1]
     m, k = np.zeros((n, *others)), np.zeros((n + 1, *others))
     m[0] = T[1][-1] / (gains[0] * T[0][-1])
     for i in range(1, n):
-        k[i] = m[i - 1] * kappa[i] / left[i]
-        m[i] = k[i] / left[i]
+        k[i] = m[i - 1] * kappa[i] / ratio[i]
+        m[i] = k[i] / ratio[i]
     k[0] = m[0] * square[0] - k[1]  # k[1] is still zero for a single cart
     if n > 1:
         k[n] = m[-1] * square[-1] - k[n - 1]

@@ -15,9 +15,9 @@ DRIVE_DAMPING = Effect(
     equation=r"f = -c\, v_1 \text{ while } u \ne 0",
     parameters=(
         Parameter(
-            name="coefficient",
-            symbol="c",
-            unit="input s/position",
+            "coefficient",
+            "c",
+            "input s/position",
             scale=lambda s: s.damping,
             trials=(0.2,),
             signed=True,
@@ -40,12 +40,7 @@ DEAD_ZONE = Effect(
     equation=r"u \to \operatorname{sign} u \cdot \max(|u| - w, 0)",
     parameters=(
         Parameter(
-            name="width",
-            symbol="w",
-            unit="input",
-            scale=lambda s: s.input,
-            trials=(0.02, 0.08, 0.25),
-            neutral=0.0,
+            "width", "w", "input", scale=lambda s: s.input, trials=(0.02, 0.08, 0.25), neutral=0.0
         ),
     ),
     columns=lambda p: {Drive.DEAD_ZONE: p["width"]},
@@ -63,13 +58,7 @@ SATURATION = Effect(
     place="input",
     equation=r"u \to \operatorname{clip}(u, -L, L)",
     parameters=(
-        Parameter(
-            name="limit",
-            symbol="L",
-            unit="input",
-            scale=lambda s: s.input,
-            trials=(0.97, 0.85, 0.65, 0.45),
-        ),
+        Parameter("limit", "L", "input", scale=lambda s: s.input, trials=(0.97, 0.85, 0.65, 0.45)),
     ),
     columns=lambda p: {Drive.LIMIT: p["limit"]},
     fingerprint="Large inputs move the cart less than in proportion.",
@@ -86,9 +75,9 @@ DELAY = Effect(
     equation=r"u(t) \to u(t - T)",
     parameters=(
         Parameter(
-            name="delay",
-            symbol="T",
-            unit="s",
+            "delay",
+            "T",
+            "s",
             scale=lambda s: s.sample_time,
             trials=(0.3, 1.5),
             signed=True,
@@ -113,9 +102,9 @@ LAG = Effect(
     equation=r"\tau \dot u + u = u_\text{command}",
     parameters=(
         Parameter(
-            name="time_constant",
-            symbol="τ",
-            unit="s",
+            "time_constant",
+            "τ",
+            "s",
             scale=lambda s: s.sample_time,
             trials=(0.3, 1.5, 5.0),
             neutral=0.0,
@@ -139,17 +128,12 @@ BACKLASH = Effect(
     equation=r"f_1 = k_c (|d| - g/2) \operatorname{sign} d, \quad d = x_m - x_1, \ |d| > g/2",
     parameters=(
         Parameter(
-            name="gap",
-            symbol="g",
-            unit="position",
-            scale=lambda s: s.position,
-            trials=(0.02, 0.08),
-            neutral=0.0,
+            "gap", "g", "position", scale=lambda s: s.position, trials=(0.02, 0.08), neutral=0.0
         ),
         Parameter(
-            name="motor_mass",
-            symbol="m_m",
-            unit="input s^2/position",
+            "motor_mass",
+            "m_m",
+            "input s^2/position",
             scale=lambda s: s.mass,
             trials=(0.1, 0.3),
             lower=0.02,
@@ -157,9 +141,9 @@ BACKLASH = Effect(
             reported=False,
         ),
         Parameter(
-            name="contact_stiffness",
-            symbol="k_c",
-            unit="input/position",
+            "contact_stiffness",
+            "k_c",
+            "input/position",
             scale=lambda s: s.stiffness,
             trials=(30.0,),
             lower=3.0,
@@ -167,9 +151,9 @@ BACKLASH = Effect(
             reported=False,
         ),
         Parameter(
-            name="contact_damping",
-            symbol="c_c",
-            unit="input s/position",
+            "contact_damping",
+            "c_c",
+            "input s/position",
             # A third of critical for the motor's share of the mass on the usual contact.
             scale=lambda s: (s.stiffness * s.mass) ** 0.5,
             trials=(1.0,),

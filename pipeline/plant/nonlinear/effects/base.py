@@ -1,7 +1,7 @@
 """What an effect is: a hypothesis about the bench, with an equation, a fingerprint and a test."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from enum import IntEnum
 from functools import cached_property
 from itertools import product
@@ -38,7 +38,7 @@ class Scales:
     stiffness: float
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Parameter:
     """One number of an effect.
 
@@ -56,6 +56,7 @@ class Parameter:
     name: str
     symbol: str
     unit: str
+    _: KW_ONLY
     scale: Callable[[Scales], float]
     trials: tuple[float, ...] = ()
     signed: bool = False
@@ -161,9 +162,9 @@ class Effect:
         return self._fills(Cart.HIDDEN_MASS)
 
     def _fills(self, *columns: IntEnum) -> bool:
-        own = self.columns(dict.fromkeys(self.names, 1.0))
+        filled = self.columns(dict.fromkeys(self.names, 1.0))
         # Columns of different tables are equal as numbers.
-        return any(column is mine for column in columns for mine in own)
+        return any(column is mine for column in columns for mine in filled)
 
     def named(self, values: Sequence[float]) -> dict[str, float]:
         """Return parameter values by their names."""

@@ -12,12 +12,7 @@ def _spring_force(s: Scales) -> float:
 
 
 _FORCE = Parameter(
-    name="force",
-    symbol="F",
-    unit="input",
-    scale=_spring_force,
-    trials=(0.003, 0.012, 0.04),
-    neutral=0.0,
+    "force", "F", "input", scale=_spring_force, trials=(0.003, 0.012, 0.04), neutral=0.0
 )
 
 COULOMB = Effect(
@@ -45,20 +40,8 @@ STICTION = Effect(
     r"\quad |f| \le S \text{ at rest}",
     parameters=(
         _FORCE,
-        Parameter(
-            name="static_force",
-            symbol="S",
-            unit="input",
-            scale=_spring_force,
-            trials=(0.02, 0.06),
-        ),
-        Parameter(
-            name="velocity",
-            symbol="w",
-            unit="position/s",
-            scale=lambda s: s.velocity,
-            trials=(0.02, 0.1),
-        ),
+        Parameter("static_force", "S", "input", scale=_spring_force, trials=(0.02, 0.06)),
+        Parameter("velocity", "w", "position/s", scale=lambda s: s.velocity, trials=(0.02, 0.1)),
     ),
     columns=lambda p: {
         Cart.COULOMB: p["force"],
@@ -87,11 +70,7 @@ PRESLIDING = Effect(
     parameters=(
         _FORCE,
         Parameter(
-            name="distance",
-            symbol="δ",
-            unit="position",
-            scale=lambda s: s.position,
-            trials=(0.005, 0.02, 0.06),
+            "distance", "δ", "position", scale=lambda s: s.position, trials=(0.005, 0.02, 0.06)
         ),
     ),
     columns=lambda p: {Cart.DAHL: p["force"], Cart.DISTANCE: p["distance"]},
@@ -113,12 +92,7 @@ LOAD = Effect(
     equation=r"f = -\mu |u| \operatorname{sign} v",
     parameters=(
         Parameter(
-            name="coefficient",
-            symbol="μ",
-            unit="",
-            scale=lambda s: 1.0,
-            trials=(0.01, 0.03, 0.1),
-            neutral=0.0,
+            "coefficient", "μ", "", scale=lambda s: 1.0, trials=(0.01, 0.03, 0.1), neutral=0.0
         ),
     ),
     columns=lambda p: {Cart.LOAD: p["coefficient"]},
@@ -138,9 +112,9 @@ DRAG = Effect(
     equation=r"f = -q\, v |v|",
     parameters=(
         Parameter(
-            name="coefficient",
-            symbol="q",
-            unit="input s^2/position^2",
+            "coefficient",
+            "q",
+            "input s^2/position^2",
             scale=lambda s: s.damping / s.velocity,
             trials=(0.2, 1.0),
             neutral=0.0,
@@ -161,13 +135,7 @@ OFFSET = Effect(
     equation=r"f = F",
     parameters=(
         Parameter(
-            name="force",
-            symbol="F",
-            unit="input",
-            scale=_spring_force,
-            trials=(0.03,),
-            signed=True,
-            neutral=0.0,
+            "force", "F", "input", scale=_spring_force, trials=(0.03,), signed=True, neutral=0.0
         ),
     ),
     columns=lambda p: {Cart.OFFSET: p["force"]},

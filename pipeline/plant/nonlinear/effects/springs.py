@@ -35,9 +35,9 @@ CUBIC = Effect(
     equation=r"f = k d + a d^3",
     parameters=(
         Parameter(
-            name="coefficient",
-            symbol="a",
-            unit="input/position^3",
+            "coefficient",
+            "a",
+            "input/position^3",
             scale=lambda s: s.stiffness / s.position**2,
             trials=(0.03, 0.2),
             signed=True,
@@ -62,9 +62,9 @@ SLACK = Effect(
     equation=r"f = k d + r k (d - s) \text{ past } s",
     parameters=(
         Parameter(
-            name="stiffness_change",
-            symbol="r",
-            unit="",
+            "stiffness_change",
+            "r",
+            "",
             scale=lambda s: 1.0,
             trials=(0.3,),
             signed=True,
@@ -72,9 +72,9 @@ SLACK = Effect(
             upper=50.0,
         ),
         Parameter(
-            name="stretch",
-            symbol="s",
-            unit="position",
+            "stretch",
+            "s",
+            "position",
             scale=lambda s: s.position,
             trials=(0.1, 0.35, 0.65),
             side=True,
@@ -98,9 +98,9 @@ COUPLING = Effect(
     equation=r"f = c\, \dot d",
     parameters=(
         Parameter(
-            name="coefficient",
-            symbol="c",
-            unit="input s/position",
+            "coefficient",
+            "c",
+            "input s/position",
             scale=lambda s: s.damping,
             trials=(0.3,),
             neutral=0.0,

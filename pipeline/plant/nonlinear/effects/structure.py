@@ -11,17 +11,17 @@ END_STOP = Effect(
     equation=r"f = -k\,(x - p) \text{ past } p, \text{ never pulling}",
     parameters=(
         Parameter(
-            name="position",
-            symbol="p",
-            unit="position",
+            "position",
+            "p",
+            "position",
             scale=lambda s: s.position,
             trials=(0.6, 0.8, 0.93),
             side=True,
         ),
         Parameter(
-            name="stiffness",
-            symbol="k",
-            unit="input/position",
+            "stiffness",
+            "k",
+            "input/position",
             scale=lambda s: s.stiffness,
             trials=(20.0,),
             lower=4.0,  # what is softer is a spring that changes
@@ -29,9 +29,9 @@ END_STOP = Effect(
             neutral=0.0,
         ),
         Parameter(
-            name="damping",
-            symbol="c",
-            unit="input s/position",
+            "damping",
+            "c",
+            "input s/position",
             scale=lambda s: (s.stiffness * s.mass) ** 0.5,
             trials=(0.5,),
             reported=False,
@@ -54,16 +54,7 @@ SENSOR_GAIN = Effect(
     sentence="One encoder reads more (or less) than the others for the same motion.",
     place="cart",
     equation=r"y = g x",
-    parameters=(
-        Parameter(
-            name="gain",
-            symbol="g",
-            unit="",
-            scale=lambda s: 1.0,
-            trials=(1.03, 0.97),
-            neutral=1.0,
-        ),
-    ),
+    parameters=(Parameter("gain", "g", "", scale=lambda s: 1.0, trials=(1.03, 0.97), neutral=1.0),),
     columns=lambda p: {Cart.GAIN: p["gain"]},
     fingerprint="The carts' amplitudes are in a ratio that no chain of springs gives.",
     deciding_run="Move the carts by a ruler and read the encoders.",
@@ -82,26 +73,17 @@ EXTRA_MODE = Effect(
     equation=r"f = k (x_h - x) + c (v_h - v), \quad m \dot v_h = -f",
     parameters=(
         Parameter(
-            name="mass",
-            symbol="m",
-            unit="input s^2/position",
+            "mass",
+            "m",
+            "input s^2/position",
             scale=lambda s: s.mass,
             lower=1e-3,
             upper=3.0,
             neutral=0.0,
         ),
+        Parameter("stiffness", "k", "input/position", scale=lambda s: s.stiffness, upper=300.0),
         Parameter(
-            name="stiffness",
-            symbol="k",
-            unit="input/position",
-            scale=lambda s: s.stiffness,
-            upper=300.0,
-        ),
-        Parameter(
-            name="damping",
-            symbol="c",
-            unit="input s/position",
-            scale=lambda s: (s.stiffness * s.mass) ** 0.5,
+            "damping", "c", "input s/position", scale=lambda s: (s.stiffness * s.mass) ** 0.5
         ),
     ),
     # Light and heavy, from slower to faster than the cart itself, with 3 % of critical damping.

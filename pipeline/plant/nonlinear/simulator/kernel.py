@@ -89,34 +89,9 @@ def _integral(time, knots, held, at):
 
 @jit
 def _simulate(
-    cart,
-    spring,
-    drive,
-    x0,
-    v0,
-    scatter,
-    free,
-    t,
-    knots,
-    command,
-    starts,
-    refine,
-    y,
-    dy,
-    N,
-    motor,
-    parent,
-    s,
-    K,
-    C,
-    switches,
-    active,
-    held,
-    lanes,
-    T,
-    phi,
-    work,
-):
+    cart, spring, drive, x0, v0, scatter, free, t, knots, command, starts, refine, y, dy, N, motor,
+    parent, s, K, C, switches, active, held, lanes, T, phi, work,
+):  # fmt: skip
     """Fill y (n, samples) with the readings of one run; False where the model diverged.
 
     And dy (lanes, n, samples) with their derivatives.
@@ -240,29 +215,9 @@ def _simulate(
                         on += 1
                     drive_c = drive[DRIVE_C] if command[on] != 0.0 else 0.0
                 advance(
-                    cart,
-                    spring,
-                    drive,
-                    n,
-                    N,
-                    motor,
-                    s,
-                    K,
-                    C,
-                    scatter,
-                    mean,
-                    drive_c,
-                    h,
-                    dry,
-                    smooth,
-                    switches,
-                    active,
-                    contact_step,
-                    lanes,
-                    T,
-                    phi,
-                    work,
-                )
+                    cart, spring, drive, n, N, motor, s, K, C, scatter, mean, drive_c, h, dry,
+                    smooth, switches, active, contact_step, lanes, T, phi, work,
+                )  # fmt: skip
                 if not dry or s[V, driven] != 0.0:
                     s[X, driven] += early * s[INV, driven]
             if not abs(s[X, 0]) + abs(s[X, n - 1]) < _BLOWN_UP:

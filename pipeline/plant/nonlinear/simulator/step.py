@@ -142,29 +142,9 @@ def first_switch(switches, active, cart, spring, drive, n, motor, s, step, none)
 
 @inlined
 def advance(
-    cart,
-    spring,
-    drive,
-    n,
-    N,
-    motor,
-    s,
-    K,
-    C,
-    scatter,
-    u,
-    drive_c,
-    h,
-    dry,
-    smooth,
-    switches,
-    active,
-    contact_step,
-    lanes,
-    T,
-    phi,
-    work,
-):
+    cart, spring, drive, n, N, motor, s, K, C, scatter, u, drive_c, h, dry, smooth, switches,
+    active, contact_step, lanes, T, phi, work,
+):  # fmt: skip
     """Advance x, v and the presliding state z by h, from friction event to friction event.
 
     Sensitivities go along, see `make_sensitivities`.
