@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from pipeline.cli.common import app
+from pipeline.cli.common import app, say
 from pipeline.cli.grading import grade
 from pipeline.cli.models import simulate
 from pipeline.cli.reports import gap, run_report
@@ -19,17 +19,19 @@ def demo(
     """Run the whole job: a shipped example, a class of three, a bench that hides friction."""
     from pipeline.output import check_folder
     from pipeline.resources import EXAMPLES
+    from pipeline.synthesis.classroom import PLANTED, PRESET, write_class
 
     out = check_folder(out)
     # On a new machine the simulator is compiled beside what does without it.
     compiling = get_context("spawn").Process(target=_compile, daemon=True)
     compiling.start()
     run_report(EXAMPLES / "three-cart", out=out / "report", pdf=True)
-    for number in (1, 2, 3):
-        team = out / "class" / f"team-{number}"
-        if not (team / "submission.toml").exists():
-            simulate(out=team, preset="throne-1dof", seed=number, reported=True)
-    grade([out / "class"], rubric=Path("throne-1dof"), out=out / "grades")
+    teams = out / "class"
+    if not teams.exists():
+        write_class(teams)
+        for mistake in PLANTED:
+            say(f"planted: {mistake}")
+    grade([teams], rubric=Path(PRESET), out=out / "grades")
     bench = out / "bench"
     compiling.join()
     if not (bench / "submission.toml").exists():
