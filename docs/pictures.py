@@ -1,8 +1,12 @@
-"""Make the tutorials' pictures anew: figures of a bench simulated as the tutorials do it."""
+"""Make the tutorials' and the gallery's pictures anew; the gallery's pages need Chromium."""
 
+import shutil
 import tempfile
 from pathlib import Path
 
+from playwright.sync_api import ViewportSize, sync_playwright
+
+from pipeline.cli.demo import demo
 from pipeline.output import write_file
 from pipeline.report.draft.content import build_document
 from pipeline.report.figures.svg import plain_svg
@@ -17,20 +21,55 @@ FIGURES = {
     "decay-cart-2": "decay.svg",
     "free-bodies": "free-bodies.svg",
 }
+# Of what `cartlab demo` writes: figures as they are, and pages as a browser shows them.
+DEMO_FIGURES = {
+    "report/figures/overview.svg": "overview.svg",
+    "report/figures/bode-cart-2.svg": "three-carts-bode.svg",
+    "report/figures/hardware-1.svg": "hardware.svg",
+    "gap/figures/before-after-1.svg": "before-after.svg",
+    "gap/figures/effect-1.svg": "effect.svg",
+}
+DEMO_PAGES = {
+    "report/report.html": "report-page.png",
+    "grades/class.html#mistakes": "class-page.png",
+    "grades/feedback/team-2/feedback.html": "feedback-page.png",
+    "gap/gap.html": "gap-page.png",
+}
+WINDOW: ViewportSize = {"width": 1000, "height": 760}
 
 
 def main() -> None:
     """Write every picture."""
     with tempfile.TemporaryDirectory() as folder:
-        hide = ["coulomb_friction:cart=2,force=0.002"]
-        bench = prepare_bench(preset="throne-2dof", model=None, hide=hide)
-        out = Path(folder) / "bench-4"
-        write_bench(out, bench, seed=7, reported=False)
-        analysis = analyse(load_submission(out))
+        tutorials(Path(folder) / "bench-4")
+        demo(Path(folder) / "demo")
+        gallery(Path(folder) / "demo")
+
+
+def tutorials(out: Path) -> None:
+    """Draw figures of a bench simulated as the tutorials do it."""
+    bench = prepare_bench(
+        preset="throne-2dof", model=None, hide=["coulomb_friction:cart=2,force=0.002"]
+    )
+    write_bench(out, bench, seed=7, reported=False)
+    analysis = analyse(load_submission(out))
     for document in (build_document(analysis, progress=None), build_solution(analysis)):
         for picture in document.pictures():
             if picture.name in FIGURES:
                 write_file(IMAGES / FIGURES[picture.name], plain_svg(picture.svg))
+
+
+def gallery(made: Path) -> None:
+    """Copy the demo's figures and photograph its pages."""
+    for figure, name in DEMO_FIGURES.items():
+        shutil.copyfile(made / figure, IMAGES / name)
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"))
+        page = browser.new_page(viewport=WINDOW)
+        for file, name in DEMO_PAGES.items():
+            page.goto(f"{made.as_uri()}/{file}")
+            page.screenshot(path=IMAGES / name)
+        browser.close()
 
 
 if __name__ == "__main__":

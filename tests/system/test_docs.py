@@ -12,7 +12,7 @@ from typer.main import get_command
 from pipeline.cli import app, main
 from tests.helpers.places import ROOT
 
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 _BLOCK = re.compile(r"^```sh\n(.*?)^```", re.DOTALL | re.MULTILINE)
 _LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 COMMANDS = get_command(app).commands  # pyright: ignore[reportAttributeAccessIssue]
@@ -109,5 +109,5 @@ def test_every_picture_is_shown_somewhere():
         for page in PAGES
         for target in _LINK.findall(page.read_text(encoding="utf-8"))
     }
-    for picture in (ROOT / "docs" / "images").iterdir():
+    for picture in (ROOT / "docs" / "images").rglob("*.*"):
         assert picture.resolve() in shown, picture.name

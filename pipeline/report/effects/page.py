@@ -31,7 +31,7 @@ from pipeline.report.tables.cells import cell, make_table
 from pipeline.synthesis.hidden import usual_term
 
 _WORDS = phrases("report")
-_BENCH = "throne-2dof"  # the smallest with a spring between two carts
+BENCH = "throne-2dof"  # the smallest with a spring between two carts
 
 
 def render_effects(
@@ -83,7 +83,7 @@ def _overview(effects: Sequence[Effect]) -> list[Block]:
 
 
 def _entry(effect: Effect, *, number: int) -> list[Block]:
-    chain = PRESETS[_BENCH]
+    chain = PRESETS[BENCH]
     term = usual_term(effect, chain)
     facts = [
         ("Fingerprint: ", effect.fingerprint),
@@ -94,9 +94,9 @@ def _entry(effect: Effect, *, number: int) -> list[Block]:
     return [
         paragraph(effect.sentence),
         formula(from_tex(effect.equation)),
-        effect_picture(term, chain, bench=_BENCH, number=number),
+        effect_picture(term, chain, bench=BENCH, number=number),
         bullet_list(spans(Span(lead, "strong"), text) for lead, text in facts if text),
-        Code(_command(term)),
+        Code(hiding_command(term)),
     ]
 
 
@@ -135,10 +135,10 @@ def _sizes(term: Term) -> str:
     )
 
 
-def _command(term: Term) -> str:
+def hiding_command(term: Term) -> str:
     """Return the command that hides this effect, as in the picture."""
     place = [f"{term.effect.place}={term.place}"] if term.place else []
     pairs = zip(term.effect.parameters, term.values, strict=True)
     sizes = [f"{p.name}={value:.3g}" for p, value in pairs if p.reported]
     hide = f"{term.effect.key}:{','.join(place + sizes)}"
-    return f"cartlab simulate --preset {_BENCH} --hide {hide} --out bench"
+    return f"cartlab simulate --preset {BENCH} --hide {hide} --out bench"

@@ -1,0 +1,62 @@
+"""Write the catalogue of effects as a page of these documents: `effects.md`, a picture for each."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from pipeline.output import write_file
+from pipeline.plant.chain import PRESETS
+from pipeline.plant.effects import CATALOGUE, Effect
+from pipeline.report.effects.page import BENCH, effect_picture, hiding_command
+from pipeline.report.effects.words import parameter_text
+from pipeline.report.figures.style import drawing
+from pipeline.report.figures.svg import plain_svg
+from pipeline.report.phrases import phrases
+from pipeline.synthesis.hidden import usual_term
+
+DOCS = Path(__file__).parent
+IMAGES = Path("images", "effects")
+
+
+def main() -> None:
+    """Write the page and every picture."""
+    (DOCS / IMAGES).mkdir(parents=True, exist_ok=True)
+    write_file(DOCS / "effects.md", effects_page())
+    with drawing():
+        for effect in CATALOGUE:
+            term = usual_term(effect, PRESETS[BENCH])
+            picture = effect_picture(term, PRESETS[BENCH], bench=BENCH, number=1)
+            write_file(DOCS / IMAGES / f"{effect.key}.svg", plain_svg(picture.svg))
+
+
+def effects_page() -> str:
+    """Return the page in Markdown, all its words from the catalogue."""
+    head = [
+        "# The effects",
+        "<!-- written by docs/effects_page.py from the catalogue in pipeline/plant/effects -->",
+        phrases("report").text("effects"),
+        "[`cartlab gap`](gap.md) looks for them, [`cartlab simulate`](commands.md) hides them.",
+    ]
+    return "\n\n".join([*head, *(part for e in CATALOGUE for part in _entry(e))]) + "\n"
+
+
+def _entry(effect: Effect) -> Iterator[str]:
+    term = usual_term(effect, PRESETS[BENCH])
+    yield f"## {effect.title}"
+    yield f"`{effect.key}`: {effect.sentence}"
+    yield f"```math\n{effect.equation}\n```"
+    picture = (IMAGES / f"{effect.key}.svg").as_posix()
+    yield f"![{effect.title}: its fingerprint, and a run with and without it]({picture})"
+    facts = {
+        "Where": effect.place,
+        "Parameters": ", ".join(parameter_text(p) for p in effect.parameters if p.reported),
+        "Fingerprint": effect.fingerprint,
+        "The run that decides": effect.deciding_run,
+        "Easily taken for": effect.equivalent,
+        "Read": effect.reference,
+        "Try it": f"`{hiding_command(term)}`",
+    }
+    yield "\n".join(f"- **{name}**: {fact}" for name, fact in facts.items() if fact)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,46 @@
+"""The site: it loads nothing from outside, and its catalogue of effects is the program's."""
+
+import pytest
+
+from docs.effects_page import IMAGES, effects_page
+from pipeline.plant.effects import CATALOGUE
+from tests.helpers.places import ROOT
+
+
+def test_the_page_of_effects_is_the_catalogue():
+    """What `docs/effects_page.py` writes is what stands there, and each effect has its picture."""
+    page = (ROOT / "docs" / "effects.md").read_text(encoding="utf-8")
+    assert page == effects_page(), "run python docs/effects_page.py"
+    pictures = {path.stem for path in (ROOT / "docs" / IMAGES).iterdir()}
+    assert pictures == {effect.key for effect in CATALOGUE}
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("a.html", '<script async src="https://cdn.example.org/a.js"></script>'),
+        ("a.html", "<link rel=stylesheet href=//fonts.example.org/css>"),
+        ("a.html", '<p><img alt="" src="http://example.org/a.png"></p>'),
+        ("a.css", '@import "https://example.org/a.css";'),
+        ("a.css", "a { background: url(https://example.org/a.png) }"),
+        ("a.svg", '<svg><image xlink:href="https://example.org/a.png"/></svg>'),
+    ],
+)
+def test_what_a_browser_would_fetch_elsewhere_is_found(name, text, tmp_path):
+    """Scripts, styles, pictures and fonts of another host end the build."""
+    website = pytest.importorskip("docs.website", reason="the site needs cartlab[docs]")
+    (tmp_path / name).write_text(text, encoding="utf-8")
+    (found,) = website.fetched_from_outside(tmp_path)
+    assert found.startswith(f"{name}: ")
+    assert "example.org" in found
+
+
+def test_links_and_local_files_are_no_loads(tmp_path):
+    """A link to another site, a namespace and a file beside the page are nobody's business."""
+    website = pytest.importorskip("docs.website", reason="the site needs cartlab[docs]")
+    (tmp_path / "a.html").write_text(
+        '<a href="https://example.org">there</a> <img src="../a.png"> <script src="a.js"></script>'
+        '<svg xmlns="http://www.w3.org/2000/svg"></svg>',
+        encoding="utf-8",
+    )
+    assert list(website.fetched_from_outside(tmp_path)) == []
