@@ -4,8 +4,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from pipeline.output import write_file
-from pipeline.plant.chain import PRESETS
-from pipeline.plant.effects import CATALOGUE, Effect
+from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.nonlinear.effects import CATALOGUE, Effect
 from pipeline.report.effects.page import BENCH, effect_picture, hiding_command
 from pipeline.report.effects.words import parameter_text
 from pipeline.report.figures.style import drawing
@@ -32,7 +32,7 @@ def effects_page() -> str:
     """Return the page in Markdown, all its words from the catalogue."""
     head = [
         "# The effects",
-        "<!-- written by docs/effects_page.py from the catalogue in pipeline/plant/effects -->",
+        "<!-- written by docs/effects_page.py -->",
         phrases("report").text("effects"),
         "[`cartlab gap`](gap.md) looks for them, [`cartlab simulate`](commands.md) hides them.",
     ]
