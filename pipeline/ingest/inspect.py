@@ -188,10 +188,7 @@ def _clock(table: Table, columns: Mapping[str, Column], problems: list[str]) -> 
 
 
 def _guess(
-    table: Table,
-    columns: Mapping[str, Column],
-    clock: Clock | None,
-    problems: list[str],
+    table: Table, columns: Mapping[str, Column], clock: Clock | None, problems: list[str]
 ) -> tuple[Kind | None, float | None]:
     """Return the kind of experiment the signals look like, and the frequency of a dwell."""
     if "frequency" in columns:

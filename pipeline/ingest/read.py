@@ -136,11 +136,7 @@ def _copies(tables: Mapping[str, tuple[Table, str]]) -> list[str]:
 
 
 def _read_bode(
-    table: Table,
-    experiment: Experiment,
-    system: System,
-    points: Points,
-    warnings: list[str],
+    table: Table, experiment: Experiment, system: System, points: Points, warnings: list[str]
 ) -> None:
     """Add the rows of a Bode table to `points`."""
     if len(experiment.carts) < system.carts:

@@ -77,7 +77,7 @@ def _say_signs(
     if not any(found.get(name) for name in searched):
         return [
             "the data do not tell the sign of the input: it is taken as "
-            f"{signs[searched[0]]:+d}; state it if it is not",
+            f"{signs[searched[0]]:+d}; state it if it is not"
         ]
     usual = 1 if sum(signs[name] for name in searched) >= 0 else -1
     text = f"sign of the input found from the data: {usual:+d}"

@@ -160,12 +160,7 @@ def sweep(chain: Chain, session: Session) -> Run:
 
 
 def closed_loop(
-    chain: Chain,
-    session: Session,
-    *,
-    cart: int,
-    reference: float,
-    controller: StateFeedback,
+    chain: Chain, session: Session, *, cart: int, reference: float, controller: StateFeedback
 ) -> Run:
     """Step the set point of one cart under state feedback."""
     t = session.clock(_REST + 4.0)

@@ -99,10 +99,7 @@ def test_a_plan_becomes_a_submission(tmp_path, fast):
     work = write_work(tmp_path / "work", [decay("decay-1"), step, sine("dwell", seconds=8), loop])
     notes = Notes()
     outcomes = acquire(
-        work,
-        port=fast.address,
-        observers=[notes],
-        only=["decay-1", "step", "dwell", "control"],
+        work, port=fast.address, observers=[notes], only=["decay-1", "step", "dwell", "control"]
     )
     whole = [outcome.recording.id for outcome in outcomes if not outcome.partial]
     assert whole == ["decay-1", "step", "dwell", "control"]

@@ -53,10 +53,7 @@ class OddBench(threading.Thread):
     """
 
     def __init__(
-        self,
-        lines: Callable[[list[Reading]], Iterator[Reading]],
-        *,
-        late: Sequence[Reading] = (),
+        self, lines: Callable[[list[Reading]], Iterator[Reading]], *, late: Sequence[Reading] = ()
     ) -> None:
         super().__init__(daemon=True)
         self._lines = lines

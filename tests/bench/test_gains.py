@@ -89,10 +89,7 @@ def on_the_bench(chain: Chain | None, gains, *, encoder: int) -> tuple[Array, Ar
     core, period = ReferenceCore(BENCH), BENCH.period
     core.receive(encode(gains))
     step = Start(
-        wave=Wave.SQUARE,
-        encoder=encoder,
-        frequency=0.5 / SECONDS,
-        amplitude=round(1.0 / COUNT),
+        wave=Wave.SQUARE, encoder=encoder, frequency=0.5 / SECONDS, amplitude=round(1.0 / COUNT)
     )
     core.receive(encode(step))
     phi, gamma = discretise(chain, period)

@@ -208,8 +208,7 @@ def test_every_cart_of_the_bench_is_watched(tmp_path, real):
         # At their second resonance, near 6 Hz, the second cart moves twice as far as the first.
         dwell = sine("dwell", seconds=8, frequency=6.0)
         order = make_order(
-            dwell.model_copy(update={"carts": (1,), "amplitude": 0.02}),
-            **{**ask, "limits": near},
+            dwell.model_copy(update={"carts": (1,), "amplitude": 0.02}), **{**ask, "limits": near}
         )
         outcome = session.record(order, tmp_path / "dwell-1.raw")
     assert outcome.partial.startswith("stopped: cart 2 was ")

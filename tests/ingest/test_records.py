@@ -164,8 +164,7 @@ def bench_log(effort: np.ndarray) -> str:
 
 
 @pytest.mark.parametrize(
-    ("system", "scale"),
-    [("", DUTY_COUNT), ('input = { unit = "V", per_count = 0.002 }', 0.002)],
+    ("system", "scale"), [("", DUTY_COUNT), ('input = { unit = "V", per_count = 0.002 }', 0.002)]
 )
 def test_duty_counts_become_input_units(system, scale, tmp_path):
     """A bench log's effort counts 4096 to 5 V unless the submission says otherwise."""

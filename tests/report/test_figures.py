@@ -169,10 +169,7 @@ def test_a_dwell_shades_the_transient():
         assert span.x1 == pytest.approx(4.0)
 
 
-@given(
-    st.integers(10, 3000),
-    st.integers(0, 2**32 - 1),
-)
+@given(st.integers(10, 3000), st.integers(0, 2**32 - 1))
 def test_thinning_keeps_the_envelope(n, seed):
     """The largest and smallest value stay, times ascend, and few points are left."""
     rng = np.random.default_rng(seed)

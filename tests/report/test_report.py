@@ -20,15 +20,7 @@ from pipeline.report.sections.measurements import decay_blocks
 from pipeline.report.sections.page import Page as Shown
 from pipeline.report.sections.summary import terminal_summary
 from pipeline.report.tables.housekeeping import file_table
-from pipeline.results import (
-    SIGN,
-    Analysis,
-    Check,
-    Estimate,
-    LeftOut,
-    ParameterRow,
-    Skipped,
-)
+from pipeline.results import SIGN, Analysis, Check, Estimate, LeftOut, ParameterRow, Skipped
 from tests.helpers.analysis_factory import make_analysis
 
 VOID = {"meta", "link", "br", "img", "hr", "input"}

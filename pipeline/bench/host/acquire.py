@@ -406,11 +406,7 @@ def _order(
         analysis = analyse(submission)
         scales = bench_scales(submission, bench=bench, analysis=analysis)
         gains = bench_gains(
-            recording,
-            submission=submission,
-            analysis=analysis,
-            bench=bench,
-            limits=plan.limits,
+            recording, submission=submission, analysis=analysis, bench=bench, limits=plan.limits
         )
         cart = recording.controller.cart
         table = dict(controller_table(gains, cart=cart, scales=scales, carts=system.carts))
@@ -421,11 +417,7 @@ def _order(
 
 
 def _experiment(
-    recording: Recording,
-    *,
-    file: str,
-    controller: dict[str, Value] | None,
-    remarks: Sequence[str],
+    recording: Recording, *, file: str, controller: dict[str, Value] | None, remarks: Sequence[str]
 ) -> dict[str, Value]:
     """Return the keys of the `[[experiments]]` table of a recording."""
     entry: dict[str, Value] = {

@@ -162,10 +162,7 @@ class Session:
                 self._buttons.offer("skip", "keep", "repeat")
                 self._observer.started(order.recording)
                 partial = self._listen(
-                    stream,
-                    seconds=order.recording.duration,
-                    arrived=raw.write,
-                    check=check,
+                    stream, seconds=order.recording.duration, arrived=raw.write, check=check
                 )
             except HardwareError as error:
                 partial = str(error)
@@ -363,13 +360,7 @@ class _Watch:
     """
 
     def __init__(
-        self,
-        order: Order,
-        *,
-        carts: int,
-        period: float | None,
-        stream: Stream,
-        observer: Observer,
+        self, order: Order, *, carts: int, period: float | None, stream: Stream, observer: Observer
     ) -> None:
         self._order = order
         self._carts = carts

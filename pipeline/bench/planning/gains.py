@@ -225,12 +225,7 @@ class _Trial:
         )
 
     def refuse_state(
-        self,
-        law: StateFeedback,
-        *,
-        cart: int,
-        goal: Design | None,
-        design: FeedbackDesign | None,
+        self, law: StateFeedback, *, cart: int, goal: Design | None, design: FeedbackDesign | None
     ) -> None:
         """Raise DataError where the loop is unstable, passes a limit or misses its goal."""
         name, reference = self.recording.id, self.recording.amplitude

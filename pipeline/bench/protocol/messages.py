@@ -125,10 +125,7 @@ class Signal(StrEnum):
 Command: TypeAlias = Start | PidGains | StateGains | ChirpEnd | Hands | Signal
 
 # A bench that knows no `s` is stopped by a run that does nothing, then reset.
-STOCK_STOP: tuple[Command, ...] = (
-    Start(wave=Wave.DELTA, frequency=1.0, amplitude=0),
-    Signal.RESET,
-)
+STOCK_STOP: tuple[Command, ...] = (Start(wave=Wave.DELTA, frequency=1.0, amplitude=0), Signal.RESET)
 
 
 def encode(command: Command) -> bytes:

@@ -12,14 +12,7 @@ from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.augmented import rest_positions, simulate_augmented
 from pipeline.plant.nonlinear.effects import AugmentedChain, Effect, Term
 from pipeline.report.effects.words import INPUT, POSITION
-from pipeline.report.figures.style import (
-    MODEL,
-    QUIET,
-    SECOND,
-    legend_above,
-    panels,
-    position_label,
-)
+from pipeline.report.figures.style import MODEL, QUIET, SECOND, legend_above, panels, position_label
 from pipeline.report.numbers import subscript
 
 _RATE = 1000.0  # Hz: differences of the positions are then velocities and accelerations

@@ -188,10 +188,7 @@ def _coefficient(modes: str, order: int) -> str:
 
 def carts_alone(n: int) -> list[Equation]:
     """Return each cart's own damping and frequency, from the last to the first, and kappa."""
-    equations = [
-        Equation(f"g_{n}", f"2*zeta_{n}*omega_{n}"),
-        Equation(f"w_{n}", f"omega_{n}**2"),
-    ]
+    equations = [Equation(f"g_{n}", f"2*zeta_{n}*omega_{n}"), Equation(f"w_{n}", f"omega_{n}**2")]
     for i in range(n - 1, 0, -1):
         whole, rest = _named(i, n), _named(i + 1, n)
         beyond = "" if i + 2 > n else f"/{_constant(i + 2, n)}"

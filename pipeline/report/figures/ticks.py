@@ -19,11 +19,7 @@ _SIZE = 7.5  # points, of the labels
 _PAD = 3.5 / 72  # inches, between axis and label
 _SPACING = (0.45, 0.18)  # inches at least between ticks along x and along y
 _STEPS = (1.0, 2.0, 5.0, 10.0)
-_LOG_FACTORS = (
-    (200.0, (1.0,)),
-    (7.0, (1.0, 2.0, 5.0)),
-    (0.0, (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0)),
-)
+_LOG_FACTORS = ((200.0, (1.0,)), (7.0, (1.0, 2.0, 5.0)), (0.0, (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0)))
 _FEW = 6  # on a logarithmic axis too short for 1, 2, 5
 _ROUNDING = 1e-9  # of a step
 _PLAIN = 4  # decimals, or digits before the point, beyond which powers of ten are clearer

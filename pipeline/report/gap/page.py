@@ -82,11 +82,7 @@ def build_gap_document(
         name = effect_name(found.effect, found.where)
         title = f"Suspect: {name}" if gap.verdict == "unexplained" else name
         parts.append(
-            (
-                f"effect-{i + 1}",
-                capital(title),
-                lambda i=i: _effect(page, gap, i, forces=forces),
-            )
+            (f"effect-{i + 1}", capital(title), lambda i=i: _effect(page, gap, i, forces=forces))
         )
     parts += [
         ("runs", "Measured against simulated", lambda: _runs(page, gap, worst[1:])),
@@ -285,10 +281,7 @@ def _method(gap: Gap) -> list[Block]:
 def _provenance(page: Page, gap: Gap) -> list[Block]:
     files = file_table(page.analysis, number=page.table_number())
     made = WORDS.spans("made" if gap.complete else "made_so_far", version=__version__)
-    return [
-        paragraph(made),
-        Details(spans(count(len(page.analysis.files), "data file")), (files,)),
-    ]
+    return [paragraph(made), Details(spans(count(len(page.analysis.files), "data file")), (files,))]
 
 
 def _worst_first(gap: Gap) -> list[Trace]:

@@ -14,10 +14,7 @@ def error_table(gap: Gap, *, number: int) -> Table:
     """Return the error on held-out runs, step by step, against noise and repeatability."""
     rows = [[cell("linear model"), cell(share(gap.baseline))]]
     rows += [
-        [
-            cell(f"with {effect_name(found.effect, found.where)}"),
-            cell(share(found.nrmse_after)),
-        ]
+        [cell(f"with {effect_name(found.effect, found.where)}"), cell(share(found.nrmse_after))]
         for found in gap.effects
     ]
     rows.append([cell("noise alone", "quiet"), cell(share(gap.noise_floor), "quiet")])
@@ -25,13 +22,7 @@ def error_table(gap: Gap, *, number: int) -> Table:
         rows.append(
             [cell("repeats of one run differ by", "quiet"), cell(share(gap.repeatability), "quiet")]
         )
-    return make_table(
-        number,
-        WORDS.text("error_table"),
-        ("Model", "Error"),
-        rows,
-        "ld",
-    )
+    return make_table(number, WORDS.text("error_table"), ("Model", "Error"), rows, "ld")
 
 
 def window_table(windows: Sequence[GapWindow], *, model: str, number: int) -> Table:

@@ -5,16 +5,7 @@ from dataclasses import replace
 
 from pipeline.gap.types import FoundEffect, Gap, NamedValue, Rival
 from pipeline.plant.nonlinear.effects.base import Effect
-from pipeline.report.document import (
-    Block,
-    Spans,
-    Tile,
-    Tiles,
-    Tone,
-    bullet_list,
-    paragraph,
-    spans,
-)
+from pipeline.report.document import Block, Spans, Tile, Tiles, Tone, bullet_list, paragraph, spans
 from pipeline.report.numbers import count, listing, significant, unit_text, with_error
 from pipeline.report.phrases import phrases
 from pipeline.report.words import clean, plain_lines

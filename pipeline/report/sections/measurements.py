@@ -154,9 +154,7 @@ def step_blocks(page: Page) -> list[Block]:
             position_unit=page.position,
         )
         caption = _WORDS.text(
-            "steps",
-            styles=_line_styles(page.analysis.carts),
-            more=left_out(len(runs) - len(drawn)),
+            "steps", styles=_line_styles(page.analysis.carts), more=left_out(len(runs) - len(drawn))
         )
         alt = _WORDS.text("steps_alt", records=count(len(drawn), "record"))
         blocks.append(page.picture("steps", figure, caption=caption, alt=alt))

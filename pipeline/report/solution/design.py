@@ -242,11 +242,7 @@ def _matlab(design: FeedbackDesign) -> str:
     gains = (
         [f"G = place(Phi, Gamma, exp(T*[{listed}]));"]
         if design.Q is None
-        else [
-            matlab_matrix("Q", design.Q),
-            f"R = {design.R:.10g};",
-            "G = dlqr(Phi, Gamma, Q, R);",
-        ]
+        else [matlab_matrix("Q", design.Q), f"R = {design.R:.10g};", "G = dlqr(Phi, Gamma, Q, R);"]
     )
     lines = [
         f"T = {design.sample_time:.10g};  sampled = c2d(ss(A, B, eye({design.gains.size}), 0), T);",

@@ -164,11 +164,7 @@ def _state_table(model: ExpectedModel, *, number: int) -> Block:
         if tolerance > 0
     ]
     return make_table(
-        number,
-        _WORDS.text("state_table"),
-        ("Entry", "Expected", "± accepted"),
-        rows,
-        "lrr",
+        number, _WORDS.text("state_table"), ("Entry", "Expected", "± accepted"), rows, "lrr"
     )
 
 

@@ -77,10 +77,7 @@ def transfer_blocks(page: Page) -> list[Block]:
         _written(derivation.static_gains(n)),
     ]
     if symbolic:
-        blocks += [
-            paragraph(_WORDS.text("paper_form")),
-            symbolic,
-        ]
+        blocks += [paragraph(_WORDS.text("paper_form")), symbolic]
     return blocks
 
 
@@ -99,10 +96,7 @@ def state_blocks(page: Page) -> list[Block]:
         fit, number=page.table_number(), position_unit=page.position, input_unit=page.drive
     )
     if not chain.is_tied or n > derivation.MOST_CARTS:
-        return [
-            paragraph(_WORDS.text("no_wall")),
-            table,
-        ]
+        return [paragraph(_WORDS.text("no_wall")), table]
     values = derivation.work_state_model(chain)
     values = work_out(derivation.physical(springs), values)
     blocks: list[Block] = [
@@ -110,10 +104,7 @@ def state_blocks(page: Page) -> list[Block]:
     ]
     if unnamed := derivation.unnamed(chain):
         known: list[Math] = [row(shown(k), "=", value_term(v)) for k, v in unnamed.items()]
-        blocks += [
-            paragraph(_WORDS.text("unnamed")),
-            _together(known),
-        ]
+        blocks += [paragraph(_WORDS.text("unnamed")), _together(known)]
     for title, words, equations in _steps(n):
         blocks += [Heading(spans(title)), *([rich_paragraph(words)] if words else [])]
         blocks += worked(equations, values)
@@ -132,16 +123,8 @@ def _steps(n: int) -> Iterable[tuple[str, str, Sequence[Equation]]]:
     """Yield title, explanation and equations of each step from the table to the entries."""
     if n > 1:
         what = "Δ(s) and N(s)" if n == 3 else "Δ(s)"
-        yield (
-            f"Coefficients of {what}",
-            _WORDS.text("coefficients"),
-            derivation.coefficients(n),
-        )
-        yield (
-            "Each cart alone",
-            _WORDS.text("alone_from_last"),
-            derivation.carts_alone(n),
-        )
+        yield (f"Coefficients of {what}", _WORDS.text("coefficients"), derivation.coefficients(n))
+        yield ("Each cart alone", _WORDS.text("alone_from_last"), derivation.carts_alone(n))
     yield (
         "Couplings and input" if n > 1 else "The input",
         _WORDS.text("couplings") if n > 1 else "",

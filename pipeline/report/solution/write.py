@@ -38,10 +38,7 @@ def render_solution(
 
 
 def build_solution(
-    analysis: Analysis,
-    *,
-    gap: Gap | None = None,
-    progress: Callable[[str], None] | None = None,
+    analysis: Analysis, *, gap: Gap | None = None, progress: Callable[[str], None] | None = None
 ) -> Document:
     """Return the report with the worked sections in the place of the short ones on the model."""
     document = build_document(analysis, gap=gap, worked=_WORKED, progress=progress)

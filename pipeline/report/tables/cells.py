@@ -4,9 +4,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 from pipeline.report.document import Cell, Span, Spans, Table, plain, spans
-from pipeline.report.numbers import (
-    at_decimal,
-)
+from pipeline.report.numbers import at_decimal
 
 
 def cell(text: str | Spans | Span, tone: str = "") -> Cell:

@@ -7,10 +7,7 @@ from pipeline.report.document import Span, Table
 from pipeline.report.phrases import phrases
 from pipeline.report.tables.cells import cell, make_table
 from pipeline.report.words import clean, rich
-from pipeline.results import (
-    Analysis,
-    Check,
-)
+from pipeline.results import Analysis, Check
 
 _WORDS = phrases("report")
 

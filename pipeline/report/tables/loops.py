@@ -5,21 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.report.document import Spans, Table, spans
-from pipeline.report.numbers import (
-    NOTHING,
-    complex_text,
-    percent,
-    significant,
-    unit_text,
-)
+from pipeline.report.numbers import NOTHING, complex_text, percent, significant, unit_text
 from pipeline.report.phrases import phrases
 from pipeline.report.tables.cells import cell, make_table
 from pipeline.report.words import clean
-from pipeline.results import (
-    FeedbackDesign,
-    HardwareCheck,
-    Margins,
-)
+from pipeline.results import FeedbackDesign, HardwareCheck, Margins
 
 _WORDS = phrases("report")
 

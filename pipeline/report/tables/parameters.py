@@ -19,11 +19,7 @@ from pipeline.report.numbers import (
 from pipeline.report.phrases import phrases
 from pipeline.report.tables.cells import cell, make_table
 from pipeline.report.words import SOURCES, clean, name_span, rich
-from pipeline.results import (
-    ChainFit,
-    Estimate,
-    ParameterRow,
-)
+from pipeline.results import ChainFit, Estimate, ParameterRow
 from pipeline.stages.compare import SIGMA_LIMIT, change_limit
 
 _WORDS = phrases("report")

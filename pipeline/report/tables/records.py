@@ -5,18 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.report.document import Table, spans
-from pipeline.report.numbers import (
-    significant,
-    with_error,
-)
+from pipeline.report.numbers import significant, with_error
 from pipeline.report.phrases import phrases
 from pipeline.report.tables.cells import cell, make_table
 from pipeline.report.words import clean, name_span
-from pipeline.results import (
-    LogDecrement,
-    SinePoint,
-    StepGain,
-)
+from pipeline.results import LogDecrement, SinePoint, StepGain
 
 _WORDS = phrases("report")
 
