@@ -36,7 +36,7 @@ LEVELS = (
     ("gap",),
     ("exchange", "report.math"),
     ("report",),
-    ("report.figures", "report.equations", "report.tables"),
+    ("report.figures", "report.equations"),
     ("report.render",),
     ("report.sections",),
     ("report.gap", "report.effects"),

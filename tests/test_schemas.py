@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.errors import ConfigError
 from pipeline.gap.stored import gap_text
-from pipeline.report.solution.write import solution_text
+from pipeline.report.solution.expected import solution_text
 from pipeline.resources import EXAMPLES
 from pipeline.results_json import results_text
 from pipeline.schemas.base import DIALECT

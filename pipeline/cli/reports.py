@@ -124,7 +124,7 @@ def run_report(
     """Write the report of a submission and say in a few lines what it found."""
     from pipeline.output import check_folder, own_folder
     from pipeline.report.draft.changes import changes_line
-    from pipeline.report.draft.make import make_report
+    from pipeline.report.draft.write import make_report
     from pipeline.report.sections.questions import open_line
     from pipeline.report.sections.summary import terminal_summary
     from pipeline.submission import load_submission
@@ -154,7 +154,7 @@ def _comparison(earlier: Path | None) -> "Callable[[Analysis], DraftChanges | No
     """Return what compares an analysis with an earlier draft, which is read at once."""
     if earlier is None:
         return lambda analysis: None
-    from pipeline.report.draft.compare import compare_drafts, read_results
+    from pipeline.report.draft.changes import compare_drafts, read_results
 
     return partial(compare_drafts, read_results(earlier))
 
@@ -168,7 +168,7 @@ def solution(
 ) -> None:
     """Write the instructor's reference: derivations, numbers put in, what to expect."""
     from pipeline.output import check_folder, own_folder
-    from pipeline.report.solution.make import make_solution
+    from pipeline.report.solution.write import make_solution
     from pipeline.submission import load_submission
 
     submission = load_submission(folder)

@@ -77,7 +77,7 @@ def simulate(
 
 def solution(folder: str, *, progress: Progress) -> None:
     """Write the reference of a submission into its own folder."""
-    from pipeline.report.solution.make import make_solution
+    from pipeline.report.solution.write import make_solution
 
     submission = load_submission(Path(folder))
     make_solution(submission, own_folder(submission.folder, "solution"), progress=progress)

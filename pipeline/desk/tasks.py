@@ -49,9 +49,8 @@ def fill(folder: str, *, progress: Progress) -> list[dict[str, Any]]:
 
 def report(folder: str, *, progress: Progress) -> dict[str, Any]:
     """Write the report into the submission's own folder, compared with the one that was there."""
-    from pipeline.report.draft.changes import changes_line
-    from pipeline.report.draft.compare import compare_drafts, read_results
-    from pipeline.report.draft.make import make_report
+    from pipeline.report.draft.changes import changes_line, compare_drafts, read_results
+    from pipeline.report.draft.write import make_report
     from pipeline.report.sections.questions import ask
 
     submission = load_submission(Path(folder))

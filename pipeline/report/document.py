@@ -4,11 +4,12 @@ Content is decided once (`content.py`), so the two renderings cannot disagree, a
 data: neither renderer ever takes a string for markup. `as_json` is what the PDF template reads.
 """
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field, fields, is_dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, Literal
 
 from pipeline.report.math.tree import Math, Term
+from pipeline.report.numbers import at_decimal
 
 _LONG = 16  # letters of a value for which a tile is wide
 _WIDE_TILES, _MOST_TILES = 3, 5  # side by side
@@ -250,6 +251,33 @@ def paragraph(*parts: str | Span | Spans) -> Paragraph:
 def bullet_list(items: Iterable[Spans]) -> Items:
     """Return a list of one-paragraph items."""
     return Items(tuple((Paragraph(item),) for item in items))
+
+
+def cell(text: str | Spans | Span, tone: Tone = "") -> Cell:
+    """Return a table cell."""
+    return Cell(spans(text), tone)
+
+
+def make_table(
+    number: int,
+    caption: str | Spans,
+    head: Iterable[str | Spans],
+    rows: Iterable[Sequence[Cell | str | Spans]],
+    align: str,
+) -> Table:
+    """Return a table; cells may be given by their texts, `align` is one letter a column."""
+
+    def cut(content: Cell | str | Spans, how: str) -> Cell:
+        made = content if isinstance(content, Cell) else cell(content)
+        return replace(made, parts=at_decimal(plain(made.text))) if how == "d" else made
+
+    return Table(
+        number=number,
+        caption=spans(caption),
+        head=tuple(cell(text) for text in head),
+        rows=tuple(tuple(cut(*pair) for pair in zip(row, align, strict=True)) for row in rows),
+        align=align,
+    )
 
 
 def as_json(value: Any) -> Any:

@@ -7,8 +7,7 @@ import pytest
 
 from pipeline.errors import ConfigError
 from pipeline.report.document import Table, plain
-from pipeline.report.draft.changes import changes_line
-from pipeline.report.draft.compare import compare_drafts, read_results
+from pipeline.report.draft.changes import changes_line, compare_drafts, read_results
 from pipeline.report.draft.content import build_document
 from pipeline.resources import EXAMPLES
 from pipeline.results import Analysis, Estimate

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from pipeline.plant.loop.margins import Margins
 from pipeline.report.numbers import listing, percent, significant, with_error, with_errors
-from pipeline.report.tables.loops import margin_rows
+from pipeline.report.sections.loops import margin_rows
 
 _SUPERSCRIPTS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻−", "0123456789--")
 

@@ -16,10 +16,10 @@ from pipeline.plant.linear.chain import Chain
 from pipeline.report.document import Document, Picture, Section, plain
 from pipeline.report.draft.write import render_report
 from pipeline.report.render.pdf import missing_characters, render_pdf
+from pipeline.report.sections.housekeeping import file_table
 from pipeline.report.sections.measurements import decay_blocks
 from pipeline.report.sections.page import Page as Shown
 from pipeline.report.sections.summary import terminal_summary
-from pipeline.report.tables.housekeeping import file_table
 from pipeline.results import SIGN, Analysis, Check, Estimate, LeftOut, ParameterRow, Skipped
 from tests.helpers.analysis_factory import make_analysis
 
@@ -130,7 +130,7 @@ def test_no_page_ends_the_print_with_one_row_of_hashes(folders):
     # One more than a page has room for:
     files = {f"data/run-{i:03d}.csv": f"{i:064x}" for i in range(97)}
     analysis = replace(make_analysis(1), files=files)
-    table = file_table(analysis, number=1)
+    table = file_table(Shown.of(analysis))
     document = Document("A", "", (), (Section("p", "Provenance", (table,)),), "")
 
     pages = pypdf.PdfReader(io.BytesIO(render_pdf(document))).pages

@@ -21,8 +21,8 @@ from pipeline.report.equations.algebra import evaluate, shown, shown_with, value
 from pipeline.report.equations.derivation import work_state_model
 from pipeline.report.math.tree import to_text
 from pipeline.report.solution.design import work_design
-from pipeline.report.solution.expected import expected_model, expected_parameters
-from pipeline.report.solution.write import build_solution, solution_text
+from pipeline.report.solution.expected import expected_model, expected_parameters, solution_text
+from pipeline.report.solution.write import build_solution
 from pipeline.stages.state_feedback import design_feedback
 from tests.helpers.analysis_factory import make_analysis
 from tests.plant.test_chain import chains

@@ -4,9 +4,15 @@ from dataclasses import replace
 from decimal import Decimal
 
 from pipeline.report.document import plain
-from pipeline.report.tables.parameters import parameter_table, reported_table
-from pipeline.report.tables.records import dwell_table
+from pipeline.report.sections.measurements import dwell_table
+from pipeline.report.sections.page import Page
+from pipeline.report.sections.parameters import parameter_table, reported_table
 from tests.helpers.analysis_factory import make_analysis
+
+
+def page(rows, reported=None) -> Page:
+    """Return a page of one cart with other rows, and with what is claimed."""
+    return Page.of(replace(make_analysis(1), rows=tuple(rows), reported=reported or {}))
 
 
 def test_a_number_of_ones_own_that_is_off_says_what_to_look_at():
@@ -15,7 +21,7 @@ def test_a_number_of_ones_own_that_is_off_says_what_to_look_at():
     true = {row.name: row.final.value for row in rows if row.final}
     mine = {"K": f"{true['K']:.3g}", "omega_n": f"{true['omega_n'] / 6.2832:.3g}"}
     table = reported_table(
-        rows, {"initial": {}, "final": {k: Decimal(v) for k, v in mine.items()}}, number=1
+        page(rows, {"initial": {}, "final": {k: Decimal(v) for k, v in mine.items()}})
     )
     gain, frequency = ([plain(cell.text) for cell in row] for row in table.rows)
     assert gain[2] == mine["K"]
@@ -29,7 +35,7 @@ def test_what_was_assumed_says_nothing_of_a_number():
     row = make_analysis(1).rows[0]
     assert row.initial
     assumed = replace(row, initial=replace(row.initial, source="assumed"))
-    table = reported_table([assumed], {"initial": {row.name: Decimal("99999")}}, number=1)
+    table = reported_table(page([assumed], {"initial": {row.name: Decimal("99999")}}))
     assert [plain(cell.text) for cell in table.rows[0]][-2:] == ["–", ""]
 
 
@@ -37,10 +43,10 @@ def test_nothing_found_and_no_known_slip_say_nothing():
     """A number without an estimate stands beside a dash; a wrong mass gets no hint of another."""
     row = make_analysis(1).rows[0]
     mine = {row.name: Decimal("3.0")}
-    table = reported_table([replace(row, final=None)], {"final": mine}, number=1)
+    table = reported_table(page([replace(row, final=None)], {"final": mine}))
     assert [plain(cell.text) for cell in table.rows[0]][3:] == ["–", row.unit, "–", ""]
     mass = replace(row, name="mass", unit="V s^2/cm")
-    table = reported_table([mass], {"final": {"mass": Decimal("99999")}}, number=1)
+    table = reported_table(page([mass], {"final": {"mass": Decimal("99999")}}))
     assert table.rows[0][-2].tone == "bad"
     assert plain(table.rows[0][-1].text) == ""
 
@@ -48,7 +54,7 @@ def test_nothing_found_and_no_known_slip_say_nothing():
 def test_agree_stands_beside_its_limit():
     """A gain within 15 %, a damping ratio within 50 %."""
     rows = [row for row in make_analysis(1).rows if row.consistent is not None]
-    table = parameter_table(rows, number=1, carts=1)
+    table = parameter_table(page(rows))
     limits = {plain(row[0].text): plain(row[6].text) for row in table.rows}
     assert limits["ω_n"] == "15 %"
     assert limits["ζ"] == "50 %"
@@ -56,8 +62,9 @@ def test_agree_stands_beside_its_limit():
 
 def test_a_dwell_that_did_not_settle_is_said():
     """The table has every dwell and cart."""
-    settled = [replace(point, settled=True) for point in make_analysis(2).sine_points]
-    points = [replace(settled[0], settled=False), *settled[1:]]
-    table = dwell_table(points, number=1, units=("cm", "V"))
+    analysis = make_analysis(2)
+    settled = [replace(point, settled=True) for point in analysis.sine_points]
+    points = (replace(settled[0], settled=False), *settled[1:])
+    table = dwell_table(Page.of(replace(analysis, sine_points=points)))
     assert len(table.rows) == len(points)
     assert [cell.tone for row in table.rows for cell in row if cell.tone] == ["bad"]

@@ -20,7 +20,7 @@ from pipeline.grading.publish.roster import Roster
 from pipeline.grading.publish.students import Student
 from pipeline.grading.publish.survey import read_survey, survey_dict, survey_text
 from pipeline.grading.rubric_file import load_rubric
-from pipeline.report.draft.compare import compare_drafts, read_results
+from pipeline.report.draft.changes import compare_drafts, read_results
 from pipeline.report.gap.words import terminal_verdict
 from pipeline.resources import RUBRICS
 from pipeline.results_json import results_text

@@ -28,6 +28,8 @@ from pipeline.report.document import (
     Tile,
     Tiles,
     bullet_list,
+    cell,
+    make_table,
     paragraph,
     spans,
 )
@@ -37,7 +39,6 @@ from pipeline.report.figures.svg import to_svg
 from pipeline.report.numbers import NOTHING, listing
 from pipeline.report.numbers import count as counted
 from pipeline.report.render.html import render_html
-from pipeline.report.tables.cells import cell, make_table
 from pipeline.report.words import clean
 from pipeline.schemas.grade import CODES, Code
 

@@ -24,6 +24,8 @@ from pipeline.report.document import (
     Tiles,
     Tone,
     bullet_list,
+    cell,
+    make_table,
     paragraph,
     spans,
 )
@@ -31,7 +33,6 @@ from pipeline.report.figures.style import WIDTH
 from pipeline.report.numbers import NOTHING, percent, significant, typeset
 from pipeline.report.numbers import count as counted
 from pipeline.report.render.html import render_html
-from pipeline.report.tables.cells import cell, make_table
 from pipeline.report.words import clean, name_span, rich
 from pipeline.schemas.grade import Criterion, Flag, Grade, Outcome
 

@@ -15,6 +15,8 @@ from pipeline.report.document import (
     Section,
     Span,
     bullet_list,
+    cell,
+    make_table,
     paragraph,
     spans,
 )
@@ -27,7 +29,6 @@ from pipeline.report.math.tex import from_tex
 from pipeline.report.numbers import significant
 from pipeline.report.phrases import phrases
 from pipeline.report.render.write import write_document
-from pipeline.report.tables.cells import cell, make_table
 from pipeline.synthesis.hidden import usual_term
 
 _WORDS = phrases("report")

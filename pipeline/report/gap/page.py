@@ -8,12 +8,9 @@ from pipeline.gap.types import FoundEffect, Gap, RecordGap, Trace
 from pipeline.gap.verdict.residual_force import ResidualForce, residual_forces
 from pipeline.report.document import (
     Block,
-    Details,
     Document,
-    Section,
     bullet_list,
     paragraph,
-    spans,
 )
 from pipeline.report.equations.effects import augmented_equations, law
 from pipeline.report.figures.gap import (
@@ -23,7 +20,6 @@ from pipeline.report.figures.gap import (
     spectrum_figure,
     timing_figure,
 )
-from pipeline.report.figures.style import drawing
 from pipeline.report.gap.tables import (
     effect_parameter_table,
     error_table,
@@ -39,14 +35,15 @@ from pipeline.report.gap.words import (
     next_block,
     place_name,
     share,
+    shares,
     verdict_blocks,
     verdict_title,
 )
 from pipeline.report.numbers import count, listing, percent
 from pipeline.report.render.write import write_document
-from pipeline.report.sections.page import Page, left_out, remarks
-from pipeline.report.tables.housekeeping import file_table
-from pipeline.report.tables.parameters import chain_table
+from pipeline.report.sections.housekeeping import provenance_blocks
+from pipeline.report.sections.page import Page, Part, left_out, remarks
+from pipeline.report.sections.parameters import chain_table
 from pipeline.report.words import clean
 from pipeline.results import Analysis
 
@@ -74,33 +71,31 @@ def build_gap_document(
     page = Page.of(analysis)
     worst = _worst_first(gap)
     forces = residual_forces(gap, free={record.id: record.free for record in analysis.records})
-    parts: list[tuple[str, str, Callable[[], list[Block]]]] = [
-        ("summary", verdict_title(gap), lambda: _summary(page, gap, worst[:1])),
-        ("where", "Where the linear model fails", lambda: _where(page, gap)),
+    parts: list[Part] = [
+        ("summary", verdict_title(gap), lambda page: _summary(page, gap, worst[:1])),
+        ("where", "Where the linear model fails", lambda page: _where(page, gap)),
     ]
     for i, found in enumerate(gap.effects):
         name = effect_name(found.effect, found.where)
         title = f"Suspect: {name}" if gap.verdict == "unexplained" else name
         parts.append(
-            (f"effect-{i + 1}", capital(title), lambda i=i: _effect(page, gap, i, forces=forces))
+            (
+                f"effect-{i + 1}",
+                capital(title),
+                lambda page, i=i: _effect(page, gap, i, forces=forces),
+            )
         )
+    made = WORDS.text("made" if gap.complete else "made_so_far", version=__version__)
     parts += [
-        ("runs", "Measured against simulated", lambda: _runs(page, gap, worst[1:])),
-        ("apart", "What would tell the explanations apart", lambda: _apart(gap)),
-        ("model", "The model with its effects", lambda: _model(page, gap)),
-        ("method", "How this was found", lambda: _method(gap)),
-        ("warnings", "Warnings", lambda: remarks(list(analysis.warnings))),
-        ("provenance", "Provenance", lambda: _provenance(page, gap)),
+        ("runs", "Measured against simulated", lambda page: _runs(page, gap, worst[1:])),
+        ("apart", "What would tell the explanations apart", lambda page: _apart(gap)),
+        ("model", "The model with its effects", lambda page: _model(page, gap)),
+        ("method", "How this was found", lambda page: _method(gap)),
+        ("warnings", "Warnings", lambda page: remarks(analysis.warnings)),
+        ("provenance", "Provenance", lambda page: provenance_blocks(page, made)),
     ]
-    sections = []
-    with drawing():
-        for id_, title, blocks_of in parts:
-            if progress:
-                progress(f"gap report: {title.lower()}")
-            if blocks := blocks_of():
-                sections.append(Section(id=id_, title=title, blocks=tuple(blocks)))
     return page.document(
-        sections,
+        page.sections(parts, doing="gap report", progress=progress),
         about="What the linear model leaves out",
         untitled=f"The gap of {count(analysis.carts, 'cart')}",
     )
@@ -110,7 +105,7 @@ def build_gap_document(
 
 
 def _summary(page: Page, gap: Gap, worst: Sequence[Trace]) -> list[Block]:
-    blocks = [*verdict_blocks(gap), error_board(gap), error_table(gap, number=page.table_number())]
+    blocks = [*verdict_blocks(gap), error_board(gap), error_table(page, gap)]
     blocks += [_before_after(page, gap, trace, number=1) for trace in worst]
     return blocks + next_block(gap)
 
@@ -126,20 +121,15 @@ def _where(page: Page, gap: Gap) -> list[Block]:
         runs=count(len(shown), "run"),
         run=top.experiment,
         cart=top.cart,
-        **_shares(top),
+        **shares(top),
     )
     caption = WORDS.text("by_record", more=more)
     blocks: list[Block] = [
         page.picture("by-record", by_record_figure(shown), caption=caption, alt=alt)
     ]
     if gap.where:
-        blocks.append(window_table(gap.where, model="linear_model", number=page.table_number()))
+        blocks.append(window_table(page, gap.where, model="linear_model"))
     return blocks
-
-
-def _shares(row: RecordGap) -> dict[str, str]:
-    errors = {"baseline": row.baseline, "final": row.final, "noise_floor": row.noise_floor}
-    return {name: share(error) for name, error in errors.items()}
 
 
 def _before_after(page: Page, gap: Gap, trace: Trace, *, number: int) -> Block:
@@ -152,7 +142,7 @@ def _before_after(page: Page, gap: Gap, trace: Trace, *, number: int) -> Block:
         "cart": str(trace.cart),
         "run": trace.experiment,
         "held": WORDS.text("held_out" if trace.held_out else "used"),
-        "errors": WORDS.text("run_errors", **_shares(row)) if row else "",
+        "errors": WORDS.text("run_errors", **shares(row)) if row else "",
     }
     return page.picture(
         f"before-after-{number}",
@@ -173,10 +163,10 @@ def _effect(page: Page, gap: Gap, index: int, *, forces: Sequence[ResidualForce]
         paragraph(WORDS.spans("step", sentence=effect.sentence, before=before, after=after)),
         law(gap.model.terms, index),
         *_evidence(page, gap, found, forces=forces, number=index + 1),
-        effect_parameter_table(found, number=page.table_number()),
+        effect_parameter_table(page, found),
     ]
     if found.rivals:
-        blocks.append(rival_table(found, gap, number=page.table_number()))
+        blocks.append(rival_table(page, found, gap))
     facts = {
         "fingerprint": effect.fingerprint,
         "decides": effect.deciding_run,
@@ -220,8 +210,7 @@ def _runs(page: Page, gap: Gap, worst: Sequence[Trace]) -> list[Block]:
         for i, trace in enumerate(worst[:_MORE_TRACES], start=2)
     ]
     if gap.left and gap.effects:
-        number = page.table_number()
-        blocks.append(window_table(gap.left, model="model_with_effects", number=number))
+        blocks.append(window_table(page, gap.left, model="model_with_effects"))
     return blocks
 
 
@@ -252,13 +241,7 @@ def _model(page: Page, gap: Gap) -> list[Block]:
         name, place = effect_name(term.effect, term.where), place_name(term.where)
         where = WORDS.spans(f"where_{term.effect.place}", name=capital(name), place=place)
         blocks += [paragraph(where), law(terms, index)]
-    table = chain_table(
-        gap.model.chain,
-        std=gap.chain_std,
-        number=page.table_number(),
-        position_unit=page.position,
-        input_unit=page.drive,
-    )
+    table = chain_table(page, gap.model.chain, std=gap.chain_std)
     scatter = [
         WORDS.text("scatter", cart=cart, spread=percent(100 * spread))
         for cart, spread in sorted(gap.spread.items())
@@ -278,23 +261,17 @@ def _method(gap: Gap) -> list[Block]:
     return [paragraph(WORDS.spans("method")), runs, *remarks(list(gap.notes))]
 
 
-def _provenance(page: Page, gap: Gap) -> list[Block]:
-    files = file_table(page.analysis, number=page.table_number())
-    made = WORDS.spans("made" if gap.complete else "made_so_far", version=__version__)
-    return [paragraph(made), Details(spans(count(len(page.analysis.files), "data file")), (files,))]
-
-
 def _worst_first(gap: Gap) -> list[Trace]:
     """Return the held-out runs, that of the largest error before first; one a run."""
-    found: dict[str, Trace] = {}
 
     def size(trace: Trace) -> float:
         row = _row(gap, trace)
-        return -(row.baseline if row else 0.0)
+        return row.baseline if row else 0.0
 
-    for trace in sorted((t for t in gap.traces if t.held_out), key=size):
-        found.setdefault(trace.experiment, trace)
-    return list(found.values())
+    # In ascending order, so that of each run the cart with the largest error stays.
+    held_out = sorted((trace for trace in gap.traces if trace.held_out), key=size)
+    worst = {trace.experiment: trace for trace in held_out}
+    return sorted(worst.values(), key=size, reverse=True)
 
 
 def _row(gap: Gap, trace: Trace) -> RecordGap | None:

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pipeline.arrays import Array
@@ -32,12 +31,12 @@ from pipeline.report.gap.words import (
     error_board,
     next_block,
     share,
+    shares,
     verdict_blocks,
     verdict_title,
 )
 from pipeline.report.numbers import listing
 from pipeline.report.sections.page import Page
-from pipeline.report.tables.cells import cell, make_table
 from pipeline.report.words import clean
 from pipeline.results import Analysis, HardwareCheck, Record
 from pipeline.submission.toml_file import read_text
@@ -87,9 +86,7 @@ def gap_in_short(gap: Gap | None) -> list[Block]:
     said = WORDS.spans(
         "in_short",
         verdict=f"{verdict_title(gap)}{names}",
-        baseline=share(gap.baseline),
-        final=share(gap.final),
-        noise_floor=share(gap.noise_floor),
+        **shares(gap),
     )
     return [paragraph(said)]
 
@@ -98,7 +95,7 @@ def gap_blocks(page: Page, gap: Gap | None) -> list[Block]:
     """Return the verdict, its errors, and the equations with the effects."""
     if gap is None:
         return []
-    blocks = [*verdict_blocks(gap), error_board(gap), error_table(gap, number=page.table_number())]
+    blocks = [*verdict_blocks(gap), error_board(gap), error_table(page, gap)]
     terms = gap.model.terms
     if terms:
         blocks.append(augmented_equations(page.analysis.springs, terms))
@@ -132,24 +129,13 @@ def augmented_hardware_blocks(page: Page, gap: Gap | None) -> list[Block]:
     every = [replay for found in replays.values() for replay in found]
     if not every:
         return []
-    blocks: list[Block] = [
-        paragraph(WORDS.spans("replay")),
-        make_table(
-            page.table_number(),
-            WORDS.text("replay_table"),
-            ("Record", "Cart", "Linear model", "With the effects"),
-            [
-                [
-                    cell(clean(replay.check.experiment)),
-                    cell(str(replay.check.cart)),
-                    cell(share(replay.check.nrmse)),
-                    cell(share(replay.nrmse)),
-                ]
-                for replay in every
-            ],
-            "lcdd",
-        ),
+    rows = [
+        (clean(one.check.experiment), str(one.check.cart), share(one.check.nrmse), share(one.nrmse))
+        for one in every
     ]
+    head = ("Record", "Cart", "Linear model", "With the effects")
+    table = page.table(WORDS.text("replay_table"), head, rows, "lcdd")
+    blocks: list[Block] = [paragraph(WORDS.spans("replay")), table]
     drawn = [(run, found) for run, found in replays.items() if found][:_MOST_RUNS]
     for i, (run, found) in enumerate(drawn, start=1):
         worst = max(found, key=lambda replay: replay.nrmse)
@@ -204,16 +190,12 @@ def _replay(
 def _replay_figure(replays: Sequence[_Replay], *, position_unit: str) -> Figure:
     figure, axes = panels(*[1.05] * len(replays))
     for ax, replay in zip(axes, replays, strict=True):
-        _plot_replay(ax, replay)
-        ax.set_ylabel(position_label(replay.check.cart, position_unit))
+        check = replay.check
+        plot_measured(ax, check.t, check.measured)
+        plot_second(ax, check.t, check.model, label="linear model")
+        plot_model(ax, check.t, replay.model, label="with the effects")
+        keep_in_sight(ax, check.measured)
+        ax.set_ylabel(position_label(check.cart, position_unit))
     legend_above(axes[0])
     axes[-1].set_xlabel("time [s]")
     return figure
-
-
-def _plot_replay(ax: Axes, replay: _Replay) -> None:
-    check = replay.check
-    plot_measured(ax, check.t, check.measured)
-    plot_second(ax, check.t, check.model, label="linear model")
-    plot_model(ax, check.t, replay.model, label="with the effects")
-    keep_in_sight(ax, check.measured)

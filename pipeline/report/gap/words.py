@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 
-from pipeline.gap.types import FoundEffect, Gap, NamedValue, Rival
+from pipeline.gap.types import FoundEffect, Gap, NamedValue, RecordGap, Rival
 from pipeline.plant.nonlinear.effects.base import Effect
 from pipeline.report.document import Block, Spans, Tile, Tiles, Tone, bullet_list, paragraph, spans
 from pipeline.report.numbers import count, listing, significant, unit_text, with_error
@@ -46,7 +46,7 @@ def verdict_blocks(gap: Gap) -> list[Block]:
     so_far = [] if gap.complete else [paragraph(WORDS.spans("so_far"))]
     match gap.verdict:
         case "none":
-            said: list[Block] = [paragraph(WORDS.spans("none", **_shares(gap)))]
+            said: list[Block] = [paragraph(WORDS.spans("none", **shares(gap)))]
         case "named" | "partial":
             said = [_named(gap)]
         case "ambiguous":
@@ -115,7 +115,7 @@ def _explanation(effect: Effect, where: Mapping[str, int], error: float, sizes: 
 
 
 def _unexplained(gap: Gap) -> Block:
-    said = {"noise": _noise(gap), "suspicion": _suspicion(gap), **_shares(gap)}
+    said = {"noise": _noise(gap), "suspicion": _suspicion(gap), **shares(gap)}
     if not gap.effects:
         return paragraph(WORDS.spans("unexplained" if gap.complete else "undecided", **said))
     suspects = listing([effect_name(found.effect, found.where) for found in gap.effects])
@@ -135,12 +135,10 @@ def _suspicion(gap: Gap) -> str:
     return f" {also}: {listing(named)}."
 
 
-def _shares(gap: Gap) -> dict[str, str]:
-    return {
-        "baseline": share(gap.baseline),
-        "final": share(gap.final),
-        "noise_floor": share(gap.noise_floor),
-    }
+def shares(gap: Gap | RecordGap) -> dict[str, str]:
+    """Return the errors before and after, and the noise, of all runs or of one."""
+    errors = {"baseline": gap.baseline, "final": gap.final, "noise_floor": gap.noise_floor}
+    return {name: share(error) for name, error in errors.items()}
 
 
 def _noise(gap: Gap) -> str:
@@ -151,7 +149,7 @@ def _noise(gap: Gap) -> str:
 
 
 def _errors(gap: Gap) -> str:
-    errors = WORDS.text("errors", noise=_noise(gap), **_shares(gap))
+    errors = WORDS.text("errors", noise=_noise(gap), **shares(gap))
     if not gap.left:
         return errors
     least = max(gap.noise_floor, gap.repeatability or 0.0)

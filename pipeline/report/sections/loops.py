@@ -1,14 +1,18 @@
 """Sections on control: the designed feedback, and model against measurement."""
 
-from pipeline.report.document import Block, paragraph
+import numpy as np
+
+from pipeline.arrays import ComplexArray
+from pipeline.report.document import Block, Table, paragraph
 from pipeline.report.figures.time import design_figure, hardware_figure
-from pipeline.report.numbers import count, percent, significant
+from pipeline.report.numbers import NOTHING, complex_text, count, percent, significant, unit_text
 from pipeline.report.phrases import phrases
 from pipeline.report.sections.page import Page, remarks
-from pipeline.report.tables.loops import feedback_table, hardware_table, pole_table
 from pipeline.report.words import clean
+from pipeline.results import FeedbackDesign, HardwareCheck, Margins
 
 _WORDS = phrases("measurements")
+_TABLES = phrases("report")
 _AS_LOGGED = 0.05  # a factor on the input this near one is not worth a word
 
 
@@ -32,8 +36,8 @@ def feedback_blocks(page: Page) -> list[Block]:
     method = _WORDS.text(f"method_{design.method}")
     return [
         paragraph(_WORDS.text("feedback", method=method, message=clean(design.message))),
-        feedback_table(design, number=page.table_number(), units=(page.position, page.drive)),
-        pole_table(design, number=page.table_number()),
+        _feedback_table(page, design),
+        _pole_table(page, design),
         page.picture(
             "feedback",
             design_figure(design, position_unit=page.position, input_unit=page.drive),
@@ -43,36 +47,142 @@ def feedback_blocks(page: Page) -> list[Block]:
     ]
 
 
+def _feedback_table(page: Page, design: FeedbackDesign) -> Table:
+    """Return gains, prefilter and what the simulated step does."""
+    position, drive = page.position, page.drive
+    rows = []
+    for i, value in enumerate(design.gains):
+        of, unit = ("velocity", f"{drive} s") if i % 2 else ("position", drive)
+        name = f"gain on the {of} of cart {i // 2 + 1}"
+        rows.append((name, significant(value), f"{unit}/{position}"))
+    if design.Q is not None:
+        diagonal = ", ".join(significant(value, digits=3) for value in np.diag(design.Q))
+        rows += [
+            ("LQR weights of the state, Q (diagonal)", diagonal, ""),
+            ("LQR weight of the input, R", significant(design.R, digits=3), ""),
+        ]
+    rows += [
+        ("prefilter", significant(design.prefilter), f"{drive}/{position}"),
+        ("sample time", significant(design.sample_time), "s"),
+        ("overshoot", percent(design.overshoot_percent), ""),
+        ("settling time, 2 %", significant(design.settling_time, digits=3), "s"),
+        ("largest input", significant(design.peak_input, digits=3), drive),
+    ]
+    rows += [
+        (name, value, f"{unit} {at}".strip())
+        for name, value, unit, at in margin_rows(design.margins)
+    ]
+    goal = significant(design.reference)
+    return page.table(
+        _TABLES.text("feedback_table", cart=design.cart, goal=goal, unit=position),
+        ("Quantity", "Value", "Unit"),
+        [(what, value, unit_text(unit)) for what, value, unit in rows],
+        "ldl",
+    )
+
+
+def margin_rows(margins: Margins | None) -> list[tuple[str, str, str, str]]:
+    """Return name, number, unit and place of each margin; none where they are unknown."""
+    if margins is None:
+        return []
+    gain, phase = margins.gain, margins.phase_deg
+    turn = "" if phase is None else "of lead " if phase < 0 else "of lag "
+    degrees = significant(phase and abs(phase), digits=3)
+    return [
+        ("gain margin", significant(gain, digits=3), "", _at(margins.omega_gain)),
+        ("phase margin", degrees, "°", turn + _at(margins.omega_phase)),
+        ("modulus margin", significant(margins.modulus, digits=3), "", ""),
+    ]
+
+
+def _at(omega: float | None) -> str:
+    return "no limit" if omega is None else f"at {significant(omega, digits=3)} rad/s"
+
+
+def _pole_table(page: Page, design: FeedbackDesign) -> Table:
+    """Return the closed-loop poles, beside the requested ones where some were."""
+    poles = _ascending(design.poles)
+    head = ["Pole [rad/s]", "Frequency [rad/s]", "Damping ratio"]
+    rows = [
+        [
+            complex_text(pole, digits=3),
+            significant(abs(pole), digits=3),
+            significant(-pole.real / abs(pole), digits=3) if pole != 0 else NOTHING,
+        ]
+        for pole in poles
+    ]
+    if design.requested_poles is not None:
+        # A delay adds poles that nobody asked for.
+        requested = [complex_text(pole, digits=3) for pole in _ascending(design.requested_poles)]
+        requested += [NOTHING] * (poles.size - len(requested))
+        head = ["Requested [rad/s]", *head]
+        rows = [[asked, *row] for asked, row in zip(requested, rows, strict=True)]
+    return page.table("Poles of the closed loop.", head, rows, "r" * len(head))
+
+
+def _ascending(poles: ComplexArray) -> ComplexArray:
+    return poles[np.lexsort((poles.imag, np.abs(poles)))]
+
+
 def hardware_blocks(page: Page) -> list[Block]:
     """Return model against measurement of every run, cart by cart."""
     checks = page.analysis.hardware
     if not checks:
         return []
-    table = hardware_table(checks, number=page.table_number(), position_unit=page.position)
-    blocks: list[Block] = [table]
+    blocks: list[Block] = [_hardware_table(page)]
     runs = list(dict.fromkeys(check.experiment for check in checks))
     for i, run in enumerate(runs, start=1):
-        own = [check for check in checks if check.experiment == run]
-        carts = sorted({check.cart for check in own})
+        of_run = [check for check in checks if check.experiment == run]
+        carts = sorted({check.cart for check in of_run})
         figure = hardware_figure(
-            [[check for check in own if check.cart == cart] for cart in carts],
+            [[check for check in of_run if check.cart == cart] for cart in carts],
             record=page.records.get(run),
             position_unit=page.position,
             input_unit=page.drive,
         )
-        worst = max(own, key=lambda check: check.nrmse)
+        worst = max(of_run, key=lambda check: check.nrmse)
         said = {"run": run, "cart": str(worst.cart), "left": percent(100 * worst.nrmse)}
-        blocks.append(
-            page.picture(
-                f"hardware-{i}",
-                figure,
-                caption=_WORDS.text("hardware", **said),
-                alt=_WORDS.text("hardware_alt", carts=count(len(carts), "cart"), **said),
-            )
-        )
+        caption = _WORDS.text("hardware", **said)
+        alt = _WORDS.text("hardware_alt", carts=count(len(carts), "cart"), **said)
+        blocks.append(page.picture(f"hardware-{i}", figure, caption=caption, alt=alt))
     scales = [
         _WORDS.text("input_scale", run=c.experiment, scale=significant(c.input_scale, digits=3))
         for c in checks
         if c.input_scale is not None and abs(c.input_scale - 1) > _AS_LOGGED
     ]
     return [*blocks, *remarks(list(dict.fromkeys(scales)))]
+
+
+def _hardware_table(page: Page) -> Table:
+    rows = [
+        (
+            clean(check.experiment),
+            str(check.cart),
+            "loop" if check.loop == "closed" else "measured input",
+            percent(100 * check.nrmse),
+            _overshoots(check),
+            _pair(check.settling_model, check.settling_measured),
+            _pair(check.steady_state_model, check.steady_state_measured),
+        )
+        for check in page.analysis.hardware
+    ]
+    return page.table(
+        _TABLES.text("hardware_table"),
+        ("Record", "Cart", "Simulated", "Difference", "Overshoot [%]", "Settling [s]",
+         f"Steady state [{page.position}]"),
+        rows,
+        "lcldrrr",
+    )  # fmt: skip
+
+
+def _overshoots(check: HardwareCheck) -> str:
+    pair = (check.overshoot_model, check.overshoot_measured)
+    if pair == (None, None):
+        return NOTHING
+    return " / ".join(percent(value).removesuffix(" %") for value in pair)
+
+
+def _pair(model: float | None, measured: float | None) -> str:
+    if model is None and measured is None:
+        return NOTHING
+    return f"{significant(model, digits=3)} / {significant(measured, digits=3)}"

@@ -3,17 +3,17 @@
 import numpy as np
 
 from pipeline.names import mode_suffixes, omega_names
-from pipeline.report.document import Block, Details, paragraph, spans
+from pipeline.report.document import Block, Details, Table, cell, paragraph, spans
 from pipeline.report.figures.bode import bode_figure, overview_figure
 from pipeline.report.figures.time import damping_figure, decay_figure, sine_figure, step_figure
 from pipeline.report.numbers import count, listing, percent, significant, with_error
 from pipeline.report.phrases import phrases
 from pipeline.report.sections.page import Page, left_out
-from pipeline.report.tables.records import decay_table, dwell_table, step_table
-from pipeline.report.words import clean
+from pipeline.report.words import clean, name_span
 from pipeline.results import FrequencyResponse, SinePoint
 
 _WORDS = phrases("measurements")
+_TABLES = phrases("report")
 _MOST_PANELS = 6  # repeats drawn in one figure; the tables hold all
 _PAPER_DWELL = 2 * np.pi * 4.0  # rad/s: the 4 Hz of the paper's Figures 12-14
 _ORDINALS = {1: "first", 2: "second", 3: "third", 4: "fourth"}
@@ -103,12 +103,10 @@ def decay_blocks(page: Page) -> list[Block]:
     decays = page.analysis.log_decrements
     if not decays:
         return []
-    blocks: list[Block] = [
-        decay_table(decays, number=page.table_number(), position_unit=page.position)
-    ]
+    blocks: list[Block] = [_decay_table(page)]
     for cart in sorted({decay.cart for decay in decays}):
-        own = [decay for decay in decays if decay.cart == cart and decay.experiment in page.records]
-        drawn = own[:_MOST_PANELS]
+        of_cart = [d for d in decays if d.cart == cart and d.experiment in page.records]
+        drawn = of_cart[:_MOST_PANELS]
         if not drawn:
             continue
         records = [page.records[decay.experiment] for decay in drawn]
@@ -120,7 +118,7 @@ def decay_blocks(page: Page) -> list[Block]:
             run=clean(first.experiment),
             freed=_WORDS.text("let_go" if records[0].kind == "decay" else "stepped"),
             sticking=_WORDS.text("decay_sticking") if sticks else "",
-            more=left_out(len(own) - len(drawn)),
+            more=left_out(len(of_cart) - len(drawn)),
             **said,
         )
         alt = _WORDS.text(
@@ -139,13 +137,44 @@ def decay_blocks(page: Page) -> list[Block]:
     return blocks
 
 
+def _decay_table(page: Page) -> Table:
+    """Return frequency and damping of every decay, by both methods, with the friction test."""
+    rows = []
+    for decay in page.analysis.log_decrements:
+        friction = decay.friction
+        if friction is None:
+            verdict = cell("not tested", "quiet")
+        elif friction.present:
+            verdict = cell(with_error(friction.drop, friction.drop_std), "bad")
+        else:
+            verdict = cell("none seen", "good")
+        rows.append(
+            (
+                clean(decay.experiment),
+                str(decay.cart),
+                with_error(decay.omega_n, decay.omega_n_std),
+                with_error(decay.zeta, decay.zeta_std),
+                with_error(decay.zeta_peaks, decay.zeta_peaks_std),
+                str(decay.peak_t.size),
+                verdict,
+            )
+        )
+    zeta = name_span("zeta")
+    return page.table(
+        _TABLES.text("decay_table"),
+        ("Record", "Cart", spans(name_span("omega_n"), " [rad/s]"), spans(zeta, " of the fit"),
+         spans(zeta, " of the extrema"), "Extrema", f"Dry friction d [{page.position}]"),
+        rows,
+        "lcdddcr",
+    )  # fmt: skip
+
+
 def step_blocks(page: Page) -> list[Block]:
     """Return the static gains and the step responses they were read from."""
     gains = page.analysis.step_gains
     if not gains:
         return []
-    units = (page.position, page.drive)
-    blocks: list[Block] = [step_table(gains, number=page.table_number(), units=units)]
+    blocks: list[Block] = [_step_table(page)]
     runs = list(dict.fromkeys(g.experiment for g in gains if g.experiment in page.records))
     if drawn := runs[:_MOST_PANELS]:
         figure = step_figure(
@@ -161,6 +190,21 @@ def step_blocks(page: Page) -> list[Block]:
     return blocks
 
 
+def _step_table(page: Page) -> Table:
+    """Return the static gain of every step record and cart."""
+    rows = []
+    for gain in page.analysis.step_gains:
+        value = with_error(gain.gain, gain.gain_std)
+        if gain.interval is not None:
+            value = " to ".join(significant(v, digits=3) for v in gain.interval)
+        edges, shift = str(len(gain.edges)), significant(gain.rest_shift, digits=2)
+        rows.append((clean(gain.experiment), str(gain.cart), edges, value, shift))
+    unit, moved = f"K [{page.position}/{page.drive}]", f"Rest moved by [{page.position}]"
+    return page.table(
+        _TABLES.text("step_table"), ("Record", "Cart", "Edges", unit, moved), rows, "lccdd"
+    )
+
+
 def _line_styles(carts: int) -> str:
     styles = zip(range(1, carts + 1), ("solid", "dashed", "dash-dotted", "dotted"), strict=False)
     return ", ".join(f"cart {cart} {style}" for cart, style in styles).capitalize()
@@ -172,15 +216,15 @@ def dwell_blocks(page: Page) -> list[Block]:
     if not points:
         return []
     chosen = min(points, key=_instructive)
-    own = sorted((p for p in points if p.experiment == chosen.experiment), key=lambda p: p.cart)
-    figure = sine_figure(own, record=page.records[chosen.experiment], position_unit=page.position)
-    ratios = [f"cart {p.cart}: {with_error(p.gain, p.gain_std)}" for p in own]
-    amplitudes = [f"{significant(p.amplitude, digits=3)} {page.position}" for p in own]
+    shown = sorted((p for p in points if p.experiment == chosen.experiment), key=lambda p: p.cart)
+    figure = sine_figure(shown, record=page.records[chosen.experiment], position_unit=page.position)
+    ratios = [f"cart {p.cart}: {with_error(p.gain, p.gain_std)}" for p in shown]
+    amplitudes = [f"{significant(p.amplitude, digits=3)} {page.position}" for p in shown]
     said = {
         "hertz": significant(chosen.omega / (2 * np.pi), digits=3),
         "seconds": significant(chosen.steady_from, digits=3),
     }
-    carts, run = "every cart" if len(own) > 1 else "the cart", clean(chosen.experiment)
+    carts, run = "every cart" if len(shown) > 1 else "the cart", clean(chosen.experiment)
     unit = f"{page.position}/{page.drive}"
     return [
         paragraph(_WORDS.text("dwell", unit=unit, ratios="; ".join(ratios), **said)),
@@ -195,11 +239,34 @@ def dwell_blocks(page: Page) -> list[Block]:
 
 
 def _all_dwells(page: Page) -> Block:
-    points = sorted(page.analysis.sine_points, key=lambda p: (p.omega, p.experiment, p.cart))
-    units = (page.position, page.drive)
-    dwells = count(len({point.experiment for point in points}), "dwell")
-    table = dwell_table(points, number=page.table_number(), units=units)
-    return Details(spans(_WORDS.text("all_dwells", dwells=dwells)), (table,))
+    dwells = count(len({point.experiment for point in page.analysis.sine_points}), "dwell")
+    return Details(spans(_WORDS.text("all_dwells", dwells=dwells)), (dwell_table(page),))
+
+
+def dwell_table(page: Page) -> Table:
+    """Return frequency, amplitudes, ratio and phase of every dwell and cart; whether it settled."""
+    position, drive = page.position, page.drive
+    rows = [
+        (
+            clean(point.experiment),
+            significant(point.omega / (2 * np.pi)),
+            str(point.cart),
+            significant(point.input_amplitude),
+            with_error(point.amplitude, point.amplitude_std),
+            with_error(point.gain, point.gain_std),
+            with_error(np.degrees(point.phase), np.degrees(point.phase_std)),
+            significant(point.steady_from, digits=3) if point.settled
+            else cell("not settled", "bad"),
+        )
+        for point in sorted(
+            page.analysis.sine_points, key=lambda p: (p.omega, p.experiment, p.cart)
+        )
+    ]  # fmt: skip
+    head = (
+        "Record", "f [Hz]", "Cart", f"|U| [{drive}]", f"|X| [{position}]",
+        f"|X|/|U| [{position}/{drive}]", "Phase [°]", "Steady from [s]",
+    )  # fmt: skip
+    return page.table(_TABLES.text("dwell_table"), head, rows, "ldcddddr")
 
 
 def _instructive(point: SinePoint) -> tuple[bool, float]:

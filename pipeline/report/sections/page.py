@@ -1,14 +1,24 @@
 """What all sections of a report share: the analysis, running numbers, figures as blocks."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import count as counter
 
 from matplotlib.figure import Figure
 
 from pipeline import __version__
-from pipeline.report.document import Block, Document, Picture, Section, bullet_list
-from pipeline.report.figures.style import WIDTH
+from pipeline.report.document import (
+    Block,
+    Cell,
+    Document,
+    Picture,
+    Section,
+    Spans,
+    Table,
+    bullet_list,
+    make_table,
+)
+from pipeline.report.figures.style import WIDTH, drawing
 from pipeline.report.figures.svg import to_svg
 from pipeline.report.numbers import count
 from pipeline.report.words import clean, rich
@@ -49,9 +59,28 @@ class Page:
             footer=f"cartlab {__version__}",
         )
 
-    def table_number(self) -> int:
-        """Return the next table's number."""
-        return next(self._tables)
+    def sections(
+        self, parts: Iterable["Part"], *, doing: str, progress: Callable[[str], None] | None
+    ) -> list[Section]:
+        """Return the sections that have something to show, each said to `progress` beforehand."""
+        found = []
+        with drawing():
+            for id_, title, blocks_of in parts:
+                if progress:
+                    progress(f"{doing}: {title.lower()}")
+                if blocks := blocks_of(self):
+                    found.append(Section(id=id_, title=title, blocks=tuple(blocks)))
+        return found
+
+    def table(
+        self,
+        caption: str | Spans,
+        head: Iterable[str | Spans],
+        rows: Iterable[Sequence[Cell | str | Spans]],
+        align: str,
+    ) -> Table:
+        """Return a table, see `make_table`, under the next table number."""
+        return make_table(next(self._tables), caption, head, rows, align)
 
     def picture(self, name: str, figure: Figure, *, caption: str, alt: str) -> Picture:
         """Return a figure as SVG, under the next figure number."""
@@ -64,6 +93,9 @@ class Page:
             svg=to_svg(figure, name=name, alt=alt),
             width=WIDTH,
         )
+
+
+Part = tuple[str, str, Callable[[Page], list[Block]]]  # anchor, title, blocks
 
 
 def remarks(notes: Sequence[str]) -> list[Block]:

@@ -8,16 +8,15 @@ from scipy.linalg import solve_discrete_are
 from pipeline.arrays import Array, ComplexArray
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.loop.sampled_loop import discretise
-from pipeline.report.document import Block, Code, bullet_list, paragraph, spans
+from pipeline.report.document import Block, Code, bullet_list, cell, paragraph, spans
 from pipeline.report.equations.algebra import value_term
 from pipeline.report.equations.model import formula, matlab_matrix, number_matrix
 from pipeline.report.math.tex import from_tex
 from pipeline.report.math.tree import Math, Term, matrix, parens, power, row, total
 from pipeline.report.numbers import complex_text, percent, significant
 from pipeline.report.phrases import phrases
+from pipeline.report.sections.loops import margin_rows
 from pipeline.report.sections.page import Page
-from pipeline.report.tables.cells import cell, make_table
-from pipeline.report.tables.loops import margin_rows
 from pipeline.results import FeedbackDesign
 
 _WORDS = phrases("solution")
@@ -129,7 +128,7 @@ def design_blocks(page: Page) -> list[Block]:
                 value_term(worked.prefilter),
             )
         ),
-        _pole_table(design, worked, number=page.table_number()),
+        _pole_table(page, design, worked),
         paragraph("The same in Matlab:"),
         Code(_matlab(design)),
         paragraph(
@@ -257,11 +256,10 @@ def _overshoot(zeta: float) -> float:
     return 100 * float(np.exp(-np.pi * zeta / np.sqrt(1 - zeta**2))) if zeta < 1 else 0.0
 
 
-def _pole_table(design: FeedbackDesign, worked: WorkedDesign, *, number: int) -> Block:
+def _pole_table(page: Page, design: FeedbackDesign, worked: WorkedDesign) -> Block:
     order = np.lexsort((worked.z.imag, -np.abs(worked.z)))
     s = np.log(worked.z[order]) / design.sample_time
-    return make_table(
-        number,
+    return page.table(
         _WORDS.text("worked_poles"),
         ("z", "|z|", "s [rad/s]", "Frequency [rad/s]", "Damping ratio"),
         [

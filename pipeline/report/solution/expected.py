@@ -2,25 +2,23 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.names import read_name
 from pipeline.plant.linear.chain import Chain
-from pipeline.report.document import Block, bullet_list, paragraph, spans
+from pipeline.report.document import Block, bullet_list, cell, paragraph, spans
 from pipeline.report.equations import derivation
 from pipeline.report.equations.algebra import evaluate, work_out
 from pipeline.report.numbers import percent, significant, unit_text
 from pipeline.report.phrases import phrases
 from pipeline.report.sections.page import Page
-from pipeline.report.tables.cells import cell, make_table
 from pipeline.report.words import clean, name_span
 from pipeline.results import Analysis
 from pipeline.results_json import provenance
 from pipeline.schemas import solution as schema
-from pipeline.schemas.base import fields_of
+from pipeline.schemas.base import fields_of, json_text
 
 _WORDS = phrases("solution")
 SCHEMA = "cartlab-solution/1"
@@ -121,8 +119,7 @@ def expected_blocks(page: Page) -> list[Block]:
                 sigmas=f"{SIGMAS:g}",
             )
         ),
-        make_table(
-            page.table_number(),
+        page.table(
             _WORDS.text("expected_table"),
             ("Parameter", "Unit", "Expected", "± accepted", "from", "to", "In Hz: a slip"),
             [
@@ -147,11 +144,11 @@ def expected_blocks(page: Page) -> list[Block]:
     ]
     if analysis.chain.is_tied and analysis.chain.n <= derivation.MOST_CARTS:
         model = expected_model(analysis.chain, {p.name: p.tolerance for p in parameters})
-        blocks += [_state_table(model, number=page.table_number())]
+        blocks += [_state_table(page, model)]
     return [*blocks, paragraph("How to judge a hand-in:"), _advice(analysis)]
 
 
-def _state_table(model: ExpectedModel, *, number: int) -> Block:
+def _state_table(page: Page, model: ExpectedModel) -> Block:
     rows = []
     for i, line in enumerate(model.A):
         for j, value in enumerate(line):
@@ -163,9 +160,7 @@ def _state_table(model: ExpectedModel, *, number: int) -> Block:
         for i, (value, tolerance) in enumerate(zip(model.B, model.B_tolerance, strict=True))
         if tolerance > 0
     ]
-    return make_table(
-        number, _WORDS.text("state_table"), ("Entry", "Expected", "± accepted"), rows, "lrr"
-    )
+    return page.table(_WORDS.text("state_table"), ("Entry", "Expected", "± accepted"), rows, "lrr")
 
 
 def _state_row(name: str, value: float, tolerance: float) -> list:
@@ -183,12 +178,12 @@ def _advice(analysis: Analysis) -> Block:
     return bullet_list(spans(text) for text in advice)
 
 
-def solution_dict(analysis: Analysis) -> dict[str, Any]:
-    """Return the reference as plain data: what `solution.json` holds."""
+def solution_text(analysis: Analysis) -> str:
+    """Return `solution.json` as text, numbers at ten significant digits."""
     parameters = expected_parameters(analysis)
     chain, design = analysis.chain, analysis.feedback
     model = chain and expected_model(chain, {p.name: p.tolerance for p in parameters})
-    return {
+    content = {
         "schema": SCHEMA,
         "submission": fields_of(
             schema.SolutionSubmission,
@@ -212,3 +207,4 @@ def solution_dict(analysis: Analysis) -> dict[str, Any]:
         ),
         "provenance": provenance(analysis),
     }
+    return json_text(content)

@@ -18,7 +18,7 @@ from pipeline.report.figures.carts import free_body_figure
 from pipeline.report.math.tree import Math, Term, lines, matrix, row, total
 from pipeline.report.phrases import phrases
 from pipeline.report.sections.page import Page
-from pipeline.report.tables.parameters import fitted_chain_table
+from pipeline.report.sections.parameters import fitted_chain_table
 from pipeline.report.words import rich
 
 _WORDS = phrases("solution")
@@ -92,9 +92,7 @@ def state_blocks(page: Page) -> list[Block]:
         return []
     chain = fit.chain
     n = chain.n
-    table = fitted_chain_table(
-        fit, number=page.table_number(), position_unit=page.position, input_unit=page.drive
-    )
+    table = fitted_chain_table(page, fit)
     if not chain.is_tied or n > derivation.MOST_CARTS:
         return [paragraph(_WORDS.text("no_wall")), table]
     values = derivation.work_state_model(chain)

@@ -5,15 +5,18 @@ from dataclasses import replace
 from pathlib import Path
 
 from pipeline.gap.types import Gap
+from pipeline.output import write_file
 from pipeline.report.document import Document
 from pipeline.report.draft.content import Part, build_document
+from pipeline.report.gap.section import with_gap
 from pipeline.report.numbers import count
 from pipeline.report.render.write import write_document
 from pipeline.report.solution.design import design_blocks
-from pipeline.report.solution.expected import expected_blocks, solution_dict
+from pipeline.report.solution.expected import expected_blocks, solution_text
 from pipeline.report.solution.model import motion_blocks, state_blocks, transfer_blocks
 from pipeline.results import Analysis
-from pipeline.schemas.base import json_text
+from pipeline.submission import Submission
+from pipeline.workflow import analyse
 
 _WORKED: tuple[Part, ...] = (
     ("motion", "Equations of motion", motion_blocks),
@@ -22,6 +25,17 @@ _WORKED: tuple[Part, ...] = (
     ("worked-design", "The controller, worked", design_blocks),
     ("expected", "What to expect of a hand-in", expected_blocks),
 )
+
+
+def make_solution(
+    submission: Submission, out: Path, *, pdf: bool = True, progress: Callable[[str], None]
+) -> tuple[Analysis, str]:
+    """Analyse a submission, write its reference; return the analysis and solution.json."""
+    analysis, gap = with_gap(analyse(submission, progress=progress), submission.folder)
+    out.mkdir(parents=True, exist_ok=True)
+    write_file(out / "solution.json", text := solution_text(analysis))
+    render_solution(analysis, out, gap=gap, pdf=pdf, progress=progress)
+    return analysis, text
 
 
 def render_solution(
@@ -45,8 +59,3 @@ def build_solution(
     return replace(
         document, subtitle=f"Worked reference for instructors · {count(analysis.carts, 'cart')}"
     )
-
-
-def solution_text(analysis: Analysis) -> str:
-    """Return `solution.json` as text, numbers at ten significant digits."""
-    return json_text(solution_dict(analysis))

@@ -1,4 +1,4 @@
-"""What was identified: initial and final estimates, the chain."""
+"""What was identified: initial and final estimates, the students' own numbers, the chain."""
 
 from collections.abc import Mapping, Sequence
 from decimal import Decimal
@@ -7,7 +7,17 @@ import numpy as np
 
 from pipeline.names import read_name
 from pipeline.plant.linear.chain import Chain
-from pipeline.report.document import Cell, Spans, Table, spans
+from pipeline.report.document import (
+    Block,
+    Cell,
+    Heading,
+    Spans,
+    Table,
+    bullet_list,
+    cell,
+    paragraph,
+    spans,
+)
 from pipeline.report.numbers import (
     NOTHING,
     percent,
@@ -17,34 +27,41 @@ from pipeline.report.numbers import (
     with_errors,
 )
 from pipeline.report.phrases import phrases
-from pipeline.report.tables.cells import cell, make_table
-from pipeline.report.words import SOURCES, clean, name_span, rich
-from pipeline.results import ChainFit, Estimate, ParameterRow
+from pipeline.report.sections.page import Page
+from pipeline.report.words import SOURCES, clean, name_span, names_spans, rich
+from pipeline.results import Analysis, ChainFit, Estimate, ParameterRow
 from pipeline.stages.compare import SIGMA_LIMIT, change_limit
 
 _WORDS = phrases("report")
+_NO_CHANGE = 0.05  # percent: nothing to speak of
 _FEW = 1 / 3  # of the limit for initial and final: other ways through the same data differ so much
 
 
-def parameter_table(rows: Sequence[ParameterRow], *, number: int, carts: int) -> Table:
+def parameter_blocks(page: Page) -> list[Block]:
+    """Return the estimates, remarks on them, and what the students claim."""
+    rows, reported = page.analysis.rows, page.analysis.reported
+    if not rows:
+        return []
+    blocks: list[Block] = [paragraph(_WORDS.text("parameters")), parameter_table(page)]
+    if remarks := _parameter_notes(rows):
+        blocks.append(bullet_list(remarks))
+    if staged := _staged_differences(page.analysis):
+        blocks.append(staged)
+    if any(reported.values()):
+        blocks += [Heading(spans(_WORDS.text("reported"))), reported_table(page)]
+    return blocks
+
+
+def parameter_table(page: Page) -> Table:
     """Return initial and final estimates as the paper's Tables 1-3, with errors and a verdict."""
-    words = {1: "one", 2: "two", 3: "three", 4: "four"}
-    return make_table(
-        number,
+    words, carts = {1: "one", 2: "two", 3: "three", 4: "four"}, page.analysis.carts
+    return page.table(
         _WORDS.text("parameter_table", carts=words.get(carts, carts)),
-        (
-            "Parameter",
-            "Unit",
-            "Initial estimate",
-            "from",
-            "Final estimate",
-            "Change",
-            "Limit",
-            "Verdict",
-        ),
-        [_parameter_row(row) for row in rows],
+        ("Parameter", "Unit", "Initial estimate", "from", "Final estimate", "Change", "Limit",
+         "Verdict"),
+        [_parameter_row(row) for row in page.analysis.rows],
         "lldlddrl",
-    )
+    )  # fmt: skip
 
 
 def _parameter_row(row: ParameterRow) -> list[Cell]:
@@ -52,16 +69,21 @@ def _parameter_row(row: ParameterRow) -> list[Cell]:
     change = percent(row.change_percent, signed=True)
     if row.change_sigmas is not None:
         change += f" ({significant(row.change_sigmas, digits=2)} σ)"
+    judged = row.consistent is not None
     return [
         cell(name_span(row.name)),
-        cell(unit_text(clean(row.unit)) or "1"),
+        cell(_unit(row)),
         cell(_estimate(row.initial)),
         cell(source, "quiet"),
         cell(_estimate(row.final)),
         cell(change),
-        cell(NOTHING if row.consistent is None else f"{change_limit(row.name):.0f} %", "quiet"),
+        cell(f"{change_limit(row.name):.0f} %" if judged else NOTHING, "quiet"),
         _verdict(row.consistent),
     ]
+
+
+def _unit(row: ParameterRow) -> str:
+    return unit_text(clean(row.unit)) or "1"
 
 
 def _estimate(estimate: Estimate | None) -> str:
@@ -78,32 +100,26 @@ def _verdict(consistent: bool | None) -> Cell:
     return cell("agree", "good") if consistent else cell("differ", "bad")
 
 
-def reported_table(
-    rows: Sequence[ParameterRow], reported: Mapping[str, Mapping[str, Decimal]], *, number: int
-) -> Table:
+def reported_table(page: Page) -> Table:
     """Return the students' own numbers beside those of their data.
 
     What is off beyond its rounding, three standard errors and a few percent says what to look at.
     """
-    both = [
-        (row.name, column, unit_text(clean(row.unit)) or "1", getattr(row, column), yours)
-        for column, own in reported.items()
-        for row in rows
-        if (yours := own.get(row.name)) is not None
-    ]
-    head = ("Parameter", "Estimate", "Yours", "From your data", "Unit", "Off", "Look at")
     lines = [
         [
-            cell(name_span(name)),
+            cell(name_span(row.name)),
             cell(column),
             cell(f"{yours:f}".replace("-", "−")),
-            cell(_estimate(found)),
-            cell(unit),
-            *_off(name, yours, found),
+            cell(_estimate(getattr(row, column))),
+            cell(_unit(row)),
+            *_off(row.name, yours, getattr(row, column)),
         ]
-        for name, column, unit, found, yours in both
+        for column, claimed in page.analysis.reported.items()
+        for row in page.analysis.rows
+        if (yours := claimed.get(row.name)) is not None
     ]
-    return make_table(number, _WORDS.text("reported_table"), head, lines, "llddldl")
+    head = ("Parameter", "Estimate", "Yours", "From your data", "Unit", "Off", "Look at")
+    return page.table(_WORDS.text("reported_table"), head, lines, "llddldl")
 
 
 def _off(name: str, yours: Decimal, found: Estimate | None) -> tuple[Cell, Cell]:
@@ -122,7 +138,7 @@ def _off(name: str, yours: Decimal, found: Estimate | None) -> tuple[Cell, Cell]
     return cell(share, "bad"), cell(look)
 
 
-def parameter_notes(rows: Sequence[ParameterRow]) -> list[Spans]:
+def _parameter_notes(rows: Sequence[ParameterRow]) -> list[Spans]:
     """Return the remarks on single parameters, equal remarks told once."""
     by_note: dict[str, list[str]] = {}
     for row in rows:
@@ -131,22 +147,41 @@ def parameter_notes(rows: Sequence[ParameterRow]) -> list[Spans]:
     return [spans(rich(", ".join(names)), ": ", rich(clean(n))) for n, names in by_note.items()]
 
 
-def fitted_chain_table(fit: ChainFit, *, number: int, position_unit: str, input_unit: str) -> Table:
-    """Return masses, dampings and springs of a joint fit."""
-    std = dict(zip(fit.names, np.sqrt(np.diag(fit.covariance)), strict=True))
-    return chain_table(
-        fit.chain, std=std, number=number, position_unit=position_unit, input_unit=input_unit
+def _staged_differences(analysis: Analysis) -> Block | None:
+    """Say where the fit cart by cart ended up elsewhere than the joint fit."""
+    fit = analysis.fit
+    if fit is None or fit.chain.n == 1:
+        return None
+    changes = {
+        name: abs(100 * (value / fit.parameters[name].value - 1))
+        for name, value in fit.staged.items()
+        if name in fit.parameters and fit.parameters[name].value
+    }
+    if not changes:
+        return None
+    worst = max(changes, key=changes.__getitem__)
+    if changes[worst] < _NO_CHANGE:
+        return paragraph(_WORDS.text("staged_same"))
+    return paragraph(
+        _WORDS.text("staged_differs", share=percent(changes[worst])),
+        names_spans([worst]),
+        _WORDS.text("joint_reported"),
     )
 
 
-def chain_table(
-    chain: Chain, *, std: Mapping[str, float], number: int, position_unit: str, input_unit: str
-) -> Table:
+def fitted_chain_table(page: Page, fit: ChainFit) -> Table:
+    """Return masses, dampings and springs of a joint fit."""
+    std = dict(zip(fit.names, np.sqrt(np.diag(fit.covariance)), strict=True))
+    return chain_table(page, fit.chain, std=std)
+
+
+def chain_table(page: Page, chain: Chain, *, std: Mapping[str, float]) -> Table:
     """Return masses, dampings and springs, each with its standard error where it was fitted."""
+    drive, position = page.drive, page.position
     kinds = (
-        ("m", "mass", chain.m, f"{input_unit} s²/{position_unit}"),
-        ("c", "damping", chain.c, f"{input_unit} s/{position_unit}"),
-        ("k", "spring", chain.k, f"{input_unit}/{position_unit}"),
+        ("m", "mass", chain.m, f"{drive} s²/{position}"),
+        ("c", "damping", chain.c, f"{drive} s/{position}"),
+        ("k", "spring", chain.k, f"{drive}/{position}"),
     )
     listed = [
         (letter, noun, unit, i, float(value), std.get(f"{letter}_{i}"))
@@ -156,16 +191,17 @@ def chain_table(
     ]
     numbers = with_errors([(value, error) for *_, value, error in listed])
     rows = [
-        [
-            cell(name_span(f"{letter}_{i}" if chain.n > 1 else letter)),
-            cell(_where(noun, i, chain.n)),
-            cell(text if value or error else "none"),
-            cell(unit_text(clean(unit))),
-        ]
+        (
+            (name_span(f"{letter}_{i}" if chain.n > 1 else letter),),
+            _where(noun, i, chain.n),
+            text if value or error else "none",
+            unit_text(unit),
+        )
         for (letter, noun, unit, i, value, error), text in zip(listed, numbers, strict=True)
     ]
-    head = ("Symbol", "Meaning", "Value", "Unit")
-    return make_table(number, _WORDS.text("chain_table"), head, rows, "lldl")
+    return page.table(
+        _WORDS.text("chain_table"), ("Symbol", "Meaning", "Value", "Unit"), rows, "lldl"
+    )
 
 
 def _where(noun: str, i: int, n: int) -> str:
