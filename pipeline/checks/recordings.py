@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline.estimation.units_and_clocks import TIME_UNITS
 from pipeline.ingest.columns import conversion
-from pipeline.ingest.signs import FEW_NAMES, Signs
+from pipeline.ingest.input_sign import FEW_NAMES, Signs
 from pipeline.names import listed
 from pipeline.results import SIGN, Check, LeftOut, Record, SinePoint
 from pipeline.submission import System

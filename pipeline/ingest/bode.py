@@ -6,12 +6,10 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
+from pipeline.ingest import limits
 from pipeline.ingest.columns import Column, conversion
 from pipeline.ingest.formats.table import Table, refuse_extreme
 from pipeline.results import FrequencyResponse
-
-DEFAULT_SPREAD = 0.01  # of a ratio read off two plots, where no repeats show the true spread
-_ENOUGH_REPEATS = 3  # degrees of freedom below which the spread of repeats says little
 
 Points = dict[int, list[tuple[float, float]]]
 
@@ -77,7 +75,7 @@ def frequency_responses(points: Points) -> tuple[tuple[FrequencyResponse, ...], 
     """Return one response a cart, repeats averaged, and where its standard errors come from.
 
     Rows at one frequency are repeats: their pooled relative spread is the standard error of all
-    points. Without enough of them it is `DEFAULT_SPREAD`.
+    points. Without enough of them it is `limits.RATIO_SPREAD`.
     """
     squares, freedom = 0.0, 0
     averaged: dict[int, tuple[Array, Array, Array]] = {}
@@ -89,10 +87,12 @@ def frequency_responses(points: Points) -> tuple[tuple[FrequencyResponse, ...], 
         squares += float(((logs - means[which]) ** 2).sum())
         freedom += logs.size - omega.size
         averaged[cart] = (omega, np.exp(means), repeats)
-    spread = np.sqrt(squares / freedom) if freedom >= _ENOUGH_REPEATS and squares > 0 else None
-    relative = DEFAULT_SPREAD if spread is None else float(spread)
+    spread = (
+        np.sqrt(squares / freedom) if freedom >= limits.ENOUGH_REPEATS and squares > 0 else None
+    )
+    relative = limits.RATIO_SPREAD if spread is None else float(spread)
     source = (
-        f"standard errors of the amplitude ratios are taken as {DEFAULT_SPREAD:.0%}: "
+        f"standard errors of the amplitude ratios are taken as {limits.RATIO_SPREAD:.0%}: "
         "the table has no repeats to tell"
         if spread is None
         else f"standard errors of the amplitude ratios are {relative:.2%}, from {freedom} repeats"

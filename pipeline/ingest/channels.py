@@ -5,16 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from pipeline.arrays import Array
-
-_MOST_LEVELS = 20_000  # an encoder on a lab cart has a few thousand counts over its travel
-_ON_GRID = 0.15  # of a step, rms: farther off, the values are not multiples of one step
-_MIRRORED = 0.8  # of the samples in motion
-_ABRUPT = 5.0  # encoder steps a sample; no cart stops from that speed between two samples
-_JUMP = 1.5  # times the fastest other move between two samples: no cart starts so from rest
-_STUCK_SAMPLES = 10
-_CLIPPED_SAMPLES = 3
-_CLIPPED_SHARE = 5  # times as often as the next level; the rounded crest of a sine: 1.4 times
-_FEW_LEVELS = 20  # a stepped input is at its extremes by design
+from pipeline.ingest import limits
 
 
 def encoder_step(x: Array) -> float:
@@ -28,18 +19,18 @@ def encoder_step(x: Array) -> float:
     if levels.size < 3:
         return 0.0
     distances = np.diff(levels)
-    distances = distances[distances > span / _MOST_LEVELS / 2]
+    distances = distances[distances > span / limits.MOST_LEVELS / 2]
     if distances.size < 2:
         return 0.0
     smallest = distances.min()
     step = float(np.median(distances[distances < 1.5 * smallest]))
     counts = np.cumsum(np.round(distances / step))
     at = np.cumsum(distances)
-    if counts[-1] > _MOST_LEVELS:
+    if counts[-1] > limits.MOST_LEVELS:
         return 0.0
     step = float(counts @ at / (counts @ counts))
     off_grid = distances / step - np.round(distances / step)
-    return step if np.sqrt(np.mean(off_grid**2)) < _ON_GRID else 0.0
+    return step if np.sqrt(np.mean(off_grid**2)) < limits.ON_GRID else 0.0
 
 
 def mirrors(reference: Array, x1: Array) -> bool:
@@ -53,7 +44,7 @@ def mirrors(reference: Array, x1: Array) -> bool:
         return False
     before, now, copy = x1[moving - 1], x1[moving], reference[moving]
     between = (copy >= np.minimum(before, now) - 1.0) & (copy <= np.maximum(before, now) + 1.0)
-    return bool(np.mean(between) > _MIRRORED)
+    return bool(np.mean(between) > limits.MIRRORED)
 
 
 def stuck_spans(x: Array) -> list[tuple[int, int]]:
@@ -67,14 +58,14 @@ def stuck_spans(x: Array) -> list[tuple[int, int]]:
     still = [
         (first, last)
         for first, last in _runs(moves == 0.0)
-        if last - first + 1 >= _STUCK_SAMPLES and first > 0
+        if last - first + 1 >= limits.STUCK_SAMPLES and first > 0
     ]
     moving = moves[moves > 0]
     if not still or moving.size < 3:
         return []
-    abrupt = _ABRUPT * (encoder_step(x) or float(np.median(moving)))
+    abrupt = limits.ABRUPT * (encoder_step(x) or float(np.median(moving)))
     after = [last for _, last in still if last < moves.size]
-    jump = max(abrupt, _JUMP * float(np.delete(moves, after).max(initial=0.0)))
+    jump = max(abrupt, limits.JUMP * float(np.delete(moves, after).max(initial=0.0)))
 
     def is_stuck(first: int, last: int) -> bool:
         on = moves[last : last + 2]  # it may move on between two samples
@@ -99,11 +90,11 @@ def saturation(u: Array) -> float | None:
     a controller that creeps up to its last value do not.
     """
     levels, counts = np.unique(u, return_counts=True)
-    if levels.size <= _FEW_LEVELS:
+    if levels.size <= limits.FEW_LEVELS:
         return None
     for top, following in ((-1, -2), (0, 1)):
         limit, gap = levels[top], abs(levels[top] - levels[following])
-        if limit == 0.0 or counts[top] < _CLIPPED_SHARE * counts[following]:
+        if limit == 0.0 or counts[top] < limits.CLIPPED_SHARE * counts[following]:
             continue
         for first, last in _runs((u[:-1] == limit) & (u[1:] == limit)):
             entry = abs(limit - u[first - 1]) if first > 0 else np.inf
@@ -111,7 +102,10 @@ def saturation(u: Array) -> float | None:
             m = last - first + 1
             # m samples of a crest, a parabola, lie within one level where it falls by so many to
             # the next; rounding adds one.
-            if m >= _CLIPPED_SAMPLES and min(entry, leave) > max(3, 4 * m / (m - 1) ** 2 + 1) * gap:
+            if (
+                m >= limits.CLIPPED_SAMPLES
+                and min(entry, leave) > max(3, 4 * m / (m - 1) ** 2 + 1) * gap
+            ):
                 return abs(float(limit))
     return None
 

@@ -11,21 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.arrays import Array
+from pipeline.errors import SubmissionError
+from pipeline.ingest import limits
+from pipeline.ingest.columns import Column, conversion
+from pipeline.ingest.formats.table import Table
 
-SLOW = 0.5  # s between samples; no bench records so slowly, a file in ms or in samples looks so
 _FINEST_DECIMAL = 9  # a file that prints time beyond the nanosecond has not rounded it
 _ON_STEP = 0.02  # of a step; a value farther off is no multiple
-_WORTH_STRAIGHTENING = 2e-3  # rounding below this share of the sample interval does no harm
-_ROUNDING_BAND = 0.65  # of the rounding step: half of it, and what the fit of a short piece errs
-_ROUNDING_REACH, _IN_BAND = 1.5, 0.99  # a rare stamp may be a step off: a late tick, a beat
-_WHOLE_STEP = 0.9  # of the rounding step off the line: more is a stamp that did not advance
-_SHORTEST_PIECE = 32  # samples; a fit of fewer leaves the band by chance
-_MOSTLY = 0.8  # share of samples on straight pieces below which the clock itself is uneven
-_BANDS = (1.0, 1.02, 1.05, 1.1, 1.2, 2 * _ROUNDING_BAND)  # rounding steps all stamps lie within;
-# one where nothing but the rounding moves them, more where the clock's ticks are late at times
+# Rounding steps all stamps lie within; one where nothing but the rounding moves them, more where
+# the clock's ticks are late at times.
+_BANDS = (1.0, 1.02, 1.05, 1.1, 1.2, 2 * limits.ROUNDING_BAND)
 _HAIR = 1e-6  # of a rounding step: what doubles err
 _NO_ROOM = 10 * _HAIR  # a strip this sure of its slope is held by stamps that flicker, not by time
-_GAP = 4.0  # a gap is an interval of so many usual ones
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -64,7 +61,74 @@ class Clock:
         """Root-mean-square deviation of the intervals (gaps aside) from their median, s."""
         steps = np.diff(self.t)
         usual = np.median(steps)
-        return float(np.sqrt(np.mean((steps[steps < _GAP * usual] - usual) ** 2)))
+        return float(np.sqrt(np.mean((steps[steps < limits.GAP * usual] - usual) ** 2)))
+
+
+def time_stamps(table: Table, column: Column | None, *, sample_rate: float | None) -> Array:
+    """Return the sample times (n,) in s as they stand in the file, or from the stated rate.
+
+    Raises
+    ------
+    SubmissionError : too few samples; no time column and no rate (Hz), or one in no unit of time.
+    """
+    n = table.values.shape[1]
+    if n < limits.FEWEST_SAMPLES:
+        raise SubmissionError(
+            f"{table.source}: expected at least {limits.FEWEST_SAMPLES} samples, found {n}"
+        )
+    if column is None:
+        if sample_rate is None:
+            raise SubmissionError(
+                f"{table.source}: no time column; it has {table.headings()}; name it in "
+                "`columns`, or state `sample_rate` in Hz"
+            )
+        return np.arange(n) / sample_rate
+    factor = conversion(column.unit, "s")
+    if factor is None:
+        raise SubmissionError(
+            f"{table.source}: {column.name!r} is in {column.unit}, which is no unit of time"
+        )
+    return table.values[column.index] * factor
+
+
+def clock_notes(
+    table: Table, column: Column, clock: Clock, *, sample_rate: float | None
+) -> list[str]:
+    """Return what is to be said of the clock behind a time column.
+
+    Raises
+    ------
+    SubmissionError : time stands still or goes back; names the line.
+    """
+    if clock.stopped is not None:
+        i = clock.stopped
+        before, after = clock.t[i - 1], clock.t[i]
+        what = "stands still" if after == before else "goes back"
+        hint = "; two records pasted together?" if after < before else ""
+        raise SubmissionError(
+            f"{table.source} {table.place(i)}: time {what}, from {before:g} s to {after:g} s{hint}"
+        )
+    notes = []
+    if clock.mean_interval > limits.SLOW:
+        notes.append(
+            f"samples are {clock.mean_interval:.4g} s apart: is {column.name!r} in other units?"
+        )
+    if clock.pieces:
+        even = "" if clock.pieces == 1 else f", in {clock.pieces} pieces"
+        notes.append(
+            f"time stamps rounded to {clock.rounding:g} s were straightened: "
+            f"one sample every {1e3 * (clock.period or clock.mean_interval):.6g} ms{even}"
+        )
+    for i in clock.gaps[:3]:
+        notes.append(f"time is missing between {clock.t[i - 1]:.4g} s and {clock.t[i]:.4g} s")
+    if len(clock.gaps) > 3:
+        notes.append(f"and {len(clock.gaps) - 3} more gaps in time")
+    if sample_rate is not None and abs(sample_rate * clock.mean_interval - 1) > limits.RATE_DIFFERS:
+        notes.append(
+            f"sample_rate = {sample_rate:g} Hz is not used: the time column says "
+            f"{1 / clock.mean_interval:.5g} Hz"
+        )
+    return notes
 
 
 def read_clock(stamps: Array) -> Clock:
@@ -94,7 +158,7 @@ def _checked(t: Array, rounding: float, *, pieces: int, period: float | None) ->
     steps = np.diff(t)
     stopped = int(np.argmax(steps <= 0)) + 1 if (steps <= 0).any() else None
     usual = np.median(steps)
-    gaps = np.flatnonzero(steps > _GAP * usual + 1.5 * rounding) + 1 if usual > 0 else ()
+    gaps = np.flatnonzero(steps > limits.GAP * usual + 1.5 * rounding) + 1 if usual > 0 else ()
     return Clock(
         t=t,
         rounding=rounding,
@@ -163,7 +227,7 @@ def _rounded(stamps: Array) -> _Rounded:
     record = _Rounded(stamps=stamps, rounding=rounding, stretches=(), even=False)
     mean = (stamps[-1] - stamps[0]) / (stamps.size - 1)
     steps = np.diff(stamps)
-    if (steps < 0).any() or mean <= 0 or rounding <= _WORTH_STRAIGHTENING * mean:
+    if (steps < 0).any() or mean <= 0 or rounding <= limits.WORTH_STRAIGHTENING * mean:
         return record
     if np.ptp(steps) <= 1e-6 * mean:
         return replace(record, stretches=((0, stamps.size),), even=True)
@@ -178,23 +242,23 @@ def _stretches(stamps: Array, rounding: float) -> tuple[tuple[int, int], ...]:
         start, end = waiting.pop()
         if _usual(stamps[start:end], rounding).any():
             found.append((start, end))
-        elif end - start >= 2 * _SHORTEST_PIECE:
+        elif end - start >= 2 * limits.SHORTEST_PIECE:
             middle = (start + end) // 2
             waiting += [(start, middle), (middle, end)]
     explained = sum(end - start for start, end in found)
-    return tuple(sorted(found)) if explained >= _MOSTLY * stamps.size else ()
+    return tuple(sorted(found)) if explained >= limits.MOSTLY * stamps.size else ()
 
 
 def _usual(stamps: Array, rounding: float) -> NDArray[np.bool_]:
     """Return which stamps (n,) lie within the rounding of one line: all but a few late, or none."""
     off = np.abs(_line(stamps) - stamps) / rounding
-    near = off <= _ROUNDING_BAND
-    if off.max() <= _ROUNDING_REACH and near.mean() >= _IN_BAND:
+    near = off <= limits.ROUNDING_BAND
+    if off.max() <= limits.ROUNDING_REACH and near.mean() >= limits.IN_BAND:
         return near
     # A least-squares line leans where few stamps jump; a strip of the rounding's width does not.
     every = np.ones(stamps.size, dtype=np.bool_)
     low, high = _slopes(stamps, every, width=_BANDS[-1] * rounding)
-    return every & (low <= high and off.max() < _WHOLE_STEP)
+    return every & (low <= high and off.max() < limits.WHOLE_STEP)
 
 
 def _line(stamps: Array, *, slope: float | None = None) -> Array:

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import tomlkit
 
 from pipeline.errors import ConfigError, SubmissionError
+from pipeline.ingest import limits
 from pipeline.ingest.formats.table import ENDINGS
 from pipeline.ingest.inspect import Inspection, data_files_in, inspect_file
 from pipeline.results_of_runs import Kind
@@ -30,8 +31,6 @@ from pipeline.submission.template import write_templates
 from pipeline.submission.toml_file import Value, parse_toml
 
 _MOST_CARTS = 4
-_HELD_STEPS = 2.0  # encoder steps over a whole record; a cart that is free moves more
-_HARDLY = 0.05  # of the furthest cart's motion; less may be a cart that a hand held
 _NO_NAME = re.compile(r"[^\w.-]+", re.ASCII)
 
 State = Literal["new", "completed", "there", "copy", "unknown", "broken"]
@@ -110,8 +109,8 @@ def free_carts(inspection: Inspection) -> tuple[tuple[int, ...], tuple[str, ...]
         return (), ()
     step = max((column.step or 0.0 for column in positions.values()), default=0.0)
     ranges = {cart: column.high - column.low for cart, column in positions.items()}
-    carts = tuple(cart for cart, travel in ranges.items() if travel > _HELD_STEPS * step)
-    little = [cart for cart in carts if ranges[cart] < _HARDLY * max(ranges.values())]
+    carts = tuple(cart for cart, travel in ranges.items() if travel > limits.HELD_STEPS * step)
+    little = [cart for cart in carts if ranges[cart] < limits.HARDLY * max(ranges.values())]
     if inspection.kind == "sine" or not little:  # near a null, a free cart hardly moves
         return carts, ()
     others = [cart for cart in carts if cart not in little]

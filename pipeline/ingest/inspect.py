@@ -9,17 +9,15 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
+from pipeline.ingest import limits
 from pipeline.ingest.channels import channel_problems, encoder_step, mirrors
-from pipeline.ingest.clock import SLOW, Clock, read_clock
+from pipeline.ingest.clock import Clock, clock_notes, read_clock
 from pipeline.ingest.columns import Column, assign_columns, conversion, holds_counts
 from pipeline.ingest.formats.recognise import read_table
 from pipeline.ingest.formats.table import ENDINGS, FORM_TITLES, Table
-from pipeline.ingest.suggest import suggest_columns
 from pipeline.results_of_runs import Kind
 
-_UNEVEN = 0.01  # of the sample interval, rms
-_EDGE, _MOST_EDGES, _FLAT = 0.2, 20, 0.03  # of the input's range: an edge; between edges, its rms
-_ONE_LINE = 0.9  # share of the input's power in one spectral line
+_MOST_CARTS = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,7 +108,7 @@ def inspect_file(path: Path, *, columns: Mapping[str, str | int] = {}) -> Inspec
         assigned, unused = {}, ()
         problems.append(str(error).removeprefix(f"{table.source}: "))
     bare = not assigned and all(name.isdigit() for name in table.names)
-    guessed = suggest_columns(table) if bare else {}
+    guessed = _suggest_columns(table) if bare else {}
     if bare:
         assigned, _ = assign_columns(table, explicit=guessed, free=(1,))
         line = ", ".join(f"{role} = {number}" for role, number in guessed.items())
@@ -151,6 +149,36 @@ def inspect_file(path: Path, *, columns: Mapping[str, str | int] = {}) -> Inspec
     )
 
 
+def _suggest_columns(table: Table) -> dict[str, int]:
+    """Return each role's column, counted from 1; {} without a clock and encoders to be seen.
+
+    After the clock come the encoders, which hold whole numbers, the first perhaps a commanded
+    position that only mirrors encoder 1; the input stands last, as in the exports of the ECP.
+    """
+    time = next((i for i, column in enumerate(table.values) if _looks_like_a_clock(column)), None)
+    if time is None:
+        return {}
+    after = [i for i in range(time + 1, len(table.names)) if np.ptp(table.values[i]) > 0]
+    given = {"time": time}
+    if len(after) > 1:
+        given["input"] = after.pop()
+    encoders = [i for i in after if table.whole[i]]
+    if len(encoders) > 1 and mirrors(*table.values[encoders[:2]]):
+        encoders = encoders[1:]
+    if not encoders or len(encoders) > _MOST_CARTS:
+        return {}
+    given |= {f"x{cart}": i for cart, i in enumerate(encoders, start=1)}
+    return {role: i + 1 for role, i in given.items()}
+
+
+def _looks_like_a_clock(values: Array) -> bool:
+    if values.size < 3 or values[-1] <= values[0] or (np.diff(values) < 0).any():
+        return False
+    clock = read_clock(values)
+    regular = bool(clock.jitter < clock.mean_interval)
+    return clock.stopped is None and limits.QUICK < clock.mean_interval < limits.SLOW and regular
+
+
 def _clock(table: Table, columns: Mapping[str, Column], problems: list[str]) -> Clock | None:
     """Return the clock, or None where there is none that runs; what is wrong goes to problems."""
     column, n = columns.get("time"), table.values.shape[1]
@@ -159,30 +187,15 @@ def _clock(table: Table, columns: Mapping[str, Column], problems: list[str]) -> 
         problems.append("no time column: state `sample_rate`" if n >= 3 else f"only {n} samples")
         return None
     clock = read_clock(table.values[column.index] * factor)
-    if clock.stopped is not None:
-        back = clock.t[clock.stopped] < clock.t[clock.stopped - 1]
-        problems.append(
-            f"{table.place(clock.stopped)}: time "
-            + ("goes back: two records pasted together?" if back else "stands still")
-        )
+    try:
+        problems += clock_notes(table, column, clock, sample_rate=None)
+    except SubmissionError as error:
+        problems.append(str(error).removeprefix(f"{table.source} "))
         return None
-    if clock.pieces:
-        problems.append(
-            f"time stamps are rounded to {clock.rounding:g} s; a clock of one sample every "
-            f"{1e3 * clock.mean_interval:.6g} ms explains them and is used"
-        )
-    elif clock.jitter > _UNEVEN * clock.mean_interval:
+    if not clock.pieces and clock.jitter > limits.UNEVEN * clock.mean_interval:
         problems.append(
             f"the sample interval varies by {clock.jitter / clock.mean_interval:.1%} (rms); "
             "times are used as they are"
-        )
-    problems += [
-        f"time is missing between {clock.t[i - 1]:.4g} s and {clock.t[i]:.4g} s"
-        for i in clock.gaps[:5]
-    ]
-    if clock.mean_interval > SLOW:
-        problems.append(
-            f"samples are {clock.mean_interval:.4g} s apart: is {column.name!r} in other units?"
         )
     return clock
 
@@ -229,12 +242,12 @@ def _follows(u: Array, reference: Array) -> bool:
 
 def is_stepped(u: Array) -> bool:
     """Is the input flat between a few edges?"""
-    edges = np.flatnonzero(np.abs(np.diff(u)) > _EDGE * np.ptp(u)) + 1
-    if edges.size > _MOST_EDGES:
+    edges = np.flatnonzero(np.abs(np.diff(u)) > limits.EDGE * np.ptp(u)) + 1
+    if edges.size > limits.MOST_EDGES:
         return False
     pieces = np.split(u, edges)
     spread = np.sqrt(sum(((piece - np.median(piece)) ** 2).sum() for piece in pieces) / u.size)
-    return bool(spread < _FLAT * np.ptp(u))
+    return bool(spread < limits.FLAT * np.ptp(u))
 
 
 def line_frequency(t: Array, u: Array) -> float | None:
@@ -244,7 +257,7 @@ def line_frequency(t: Array, u: Array) -> float | None:
     power = np.abs(np.fft.rfft((signal - signal.mean()) * np.hanning(t.size))) ** 2
     peak = int(np.argmax(power))
     line = slice(max(peak - 2, 0), peak + 3)
-    if power[line].sum() < _ONE_LINE * power.sum():
+    if power[line].sum() < limits.ONE_LINE * power.sum():
         return None
     centre = float(np.arange(power.size)[line] @ power[line] / power[line].sum())
     return centre / float(t[-1] - t[0]) * (t.size - 1) / t.size

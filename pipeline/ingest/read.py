@@ -8,20 +8,18 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
+from pipeline.ingest import limits
 from pipeline.ingest.bode import Points, frequency_responses, read_points
 from pipeline.ingest.channels import channel_problems, encoder_step, mirrors
-from pipeline.ingest.clock import Clock, read_clocks
+from pipeline.ingest.clock import Clock, clock_notes, read_clocks, time_stamps
 from pipeline.ingest.columns import Column, assign_columns, conversion, holds_counts
 from pipeline.ingest.formats.recognise import read_table
 from pipeline.ingest.formats.table import Table, refuse_extreme
-from pipeline.ingest.signs import Signs, with_signs
-from pipeline.ingest.times import FEWEST_SAMPLES, clock_notes, time_stamps
+from pipeline.ingest.input_sign import Signs, with_signs
 from pipeline.results import FrequencyResponse, Record
 from pipeline.submission import Experiment, Submission, System
 
 DUTY_COUNT = 5 / 4096  # V; the UCSD bench's amplifier gives 5 V for 4096 counts
-_FEW_COUNTS = 10  # a motor does not move at so few; whole numbers up to it are volts, typed in
-_WINDOW_SLACK = 0.01  # of the record's length: "to the end" is often typed rounded up
 _NEED_INPUT = ("step", "sine", "sweep")
 
 
@@ -121,7 +119,7 @@ def _unused_scale(records: Sequence[Record], system: System) -> list[str]:
         return []
     return [
         f"system.input.per_count = {per_count:g} is not used: no input holds counts (whole "
-        f"numbers beyond ±{_FEW_COUNTS:g}); every input is taken to be in {system.input.unit}"
+        f"numbers beyond ±{limits.FEW_COUNTS:g}); every input is taken to be in {system.input.unit}"
     ]
 
 
@@ -269,7 +267,7 @@ def _window(clock: Clock, experiment: Experiment) -> slice:
         return slice(None)
     start, end = experiment.window
     first, last = float(clock.t[0]), float(clock.t[-1])
-    slack = max(_WINDOW_SLACK * (last - first), 2 * clock.mean_interval)
+    slack = max(limits.WINDOW_SLACK * (last - first), 2 * clock.mean_interval)
     if start < first - slack or end > last + slack:
         raise SubmissionError(
             f"submission.toml: window = [{start:g}, {end:g}] lies outside the data of "
@@ -277,10 +275,10 @@ def _window(clock: Clock, experiment: Experiment) -> slice:
         )
     half = 0.5 * clock.rounding if clock.pieces else 1e-9
     inside = np.flatnonzero((clock.t >= start - half) & (clock.t <= end + half))
-    if inside.size < FEWEST_SAMPLES:
+    if inside.size < limits.FEWEST_SAMPLES:
         raise SubmissionError(
             f"submission.toml: window = [{start:g}, {end:g}] holds {inside.size} samples of "
-            f"{experiment.file}, {FEWEST_SAMPLES} are needed"
+            f"{experiment.file}, {limits.FEWEST_SAMPLES} are needed"
         )
     return slice(int(inside[0]), int(inside[-1]) + 1)
 
@@ -359,7 +357,7 @@ def _input(
 
 def _beyond_volts(values: Array) -> bool:
     """Tell counts from volts typed in: whole numbers, perhaps written "512.0", and large ones."""
-    return bool(np.all(values == np.round(values)) and np.abs(values).max() > _FEW_COUNTS)
+    return bool(np.all(values == np.round(values)) and np.abs(values).max() > limits.FEW_COUNTS)
 
 
 def _reference(

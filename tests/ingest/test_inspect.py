@@ -87,7 +87,7 @@ PROBLEMS = {
         "the input is clipped at 1.5",
     ),
     "gap": ({"time": T + (T > 5), "x1": X}, "time is missing between 5 s and 6.005 s"),
-    "rounding": ({"time": np.round(T * 1.013, 3), "x1": X}, "time stamps are rounded to 0.001 s"),
+    "rounding": ({"time": np.round(T * 1.013, 3), "x1": X}, "time stamps rounded to 0.001 s"),
     "uneven": ({"time": uneven, "x1": X}, "the sample interval varies by 2"),
     "pasted": ({"time": np.r_[T, T], "x1": np.r_[X, X]}, "line 2002: time goes back"),
     "still": ({"time": np.r_[T, T[-1]], "x1": np.r_[X, 0]}, "line 2002: time stands still"),

@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.arrays import Array
 from pipeline.checks.recordings import check_signs
-from pipeline.ingest.drive import find_signs
+from pipeline.ingest.input_sign import find_signs
 from pipeline.ingest.read import read_data
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.plant.linear.simulate import simulate_linear

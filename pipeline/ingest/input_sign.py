@@ -1,4 +1,6 @@
-"""Which way the motor pushes: the input held against the force that cart 1's motion asks for.
+"""The sign of the input: stated, found from the data, or as in the other records.
+
+Which way the motor pushes shows in the input, held against the force that cart 1's motion asks for:
 
     s u = m x_1'' + c x_1' + k x_1 + k' (x_1 - x_2),   m, c, k, k' ≥ 0,   s = ±1
 
@@ -13,27 +15,105 @@ method, Computers & Chemical Engineering 17, 1993.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.optimize import nnls
 
 from pipeline.arrays import Array
+from pipeline.ingest import limits
+from pipeline.names import listed
 from pipeline.results import Record
+from pipeline.submission import Submission
 
 _BUMP = np.polynomial.Polynomial.fromroots([0.0] * 4 + [1.0] * 4)  # t⁴ (1 - t)⁴
 _NARROWEST = 8  # samples under a bump
 _BUMPS = 6  # side by side in a record, at least
 _OVERLAP = 6  # steps in which a bump slides on by its width
 _MOST_PLACES = 400  # of the bump in a record
-# Of the input's power: how much more the other sign must leave unexplained to be ruled out. Far
-# above what an encoder's steps do; a cart's damping is worth more at every frequency that moves it.
-_LEAST, _LEAST_SHARE = 1e-3, 0.1
-# Of the cosine between an input and the force that the bench's equation gives. A lag (at most 90°)
-# and any likely delay stay above zero; a log that counts the other way is near -1.
-_TELLS, _CONTRARY = 0.3, -0.7
+FEW_NAMES = 6  # more are not listed one by one
 _ROUNDS = 5  # of turning contrary records and fitting again
+
+
+@dataclass(frozen=True, kw_only=True)
+class Signs:
+    """By record, the sign that is stated, and the one that its data tell: 0 where they do not."""
+
+    stated: Mapping[str, int]
+    found: Mapping[str, int]
+
+
+def with_signs(
+    records: list[Record], submission: Submission
+) -> tuple[list[Record], list[str], Signs]:
+    """Return the records with signed inputs, what is to be said of signs found, and those stated.
+
+    Where a record does not tell, it takes the sign of most others of its sort (under feedback or
+    not: a controller's log may count the other way), else of most others. A record whose own sign
+    is another than that of the system has the one that its data tell, else its own.
+    """
+    stated: dict[str, int] = {}
+    disputed: set[str] = set()
+    for experiment in submission.experiments:
+        own = experiment.input.sign if experiment.input is not None else None
+        if (sign := own or submission.system.input.sign) is not None:
+            stated[experiment.id] = sign
+        if own and submission.system.input.sign == -own and experiment.kind != "closed_loop":
+            disputed.add(experiment.id)
+    driven = [r for r in records if r.u is not None and np.ptp(r.u) > 0]
+    found = find_signs(driven, stated=stated)
+
+    def usual(record: Record) -> int:
+        alike = [r for r in driven if (r.kind == "closed_loop") == (record.kind == "closed_loop")]
+        votes = [
+            sum(stated.get(r.id) or found.get(r.id, 0) for r in group) for group in (alike, driven)
+        ]
+        return next((1 if vote > 0 else -1 for vote in votes if vote), 1)
+
+    told = {**found, **{n: s for n, s in stated.items() if n not in disputed or not found.get(n)}}
+    signs = {r.id: told.get(r.id) or usual(r) for r in records}
+    others = [r.id for r in driven if r.kind != "closed_loop"] or [r.id for r in driven]
+    bench = 1 if sum(signs[name] for name in others) >= 0 else -1
+    signed = [
+        replace(
+            record,
+            u=record.u if signs[record.id] == 1 else 0.0 - record.u,
+            input_scale=signs[record.id] * record.input_scale,
+            turned=record.id not in stated and found.get(record.id) == -bench,
+        )
+        if record.u is not None
+        else record
+        for record in records
+    ]
+    says = _say_signs([r.id for r in driven], stated=stated, found=found, signs=signs)
+    return signed, says, Signs(stated=stated, found=found)
+
+
+def _say_signs(
+    driven: list[str], *, stated: dict[str, int], found: dict[str, int], signs: dict[str, int]
+) -> list[str]:
+    """Return what was found, and what was only taken."""
+    searched = [name for name in driven if name not in stated]
+    if not searched:
+        return []
+    if not any(found.get(name) for name in searched):
+        return [
+            "the data do not tell the sign of the input: it is taken as "
+            f"{signs[searched[0]]:+d}; state it if it is not"
+        ]
+    usual = 1 if sum(signs[name] for name in searched) >= 0 else -1
+    text = f"sign of the input found from the data: {usual:+d}"
+    if others := [name for name in searched if signs[name] != usual]:
+        text += f", but {-usual:+d} in {listed(others, most=FEW_NAMES)}"
+    if unsure := [name for name in searched if not found.get(name)]:
+        text += (
+            f"; taken from the others where the data do not tell: {listed(unsure, most=FEW_NAMES)}"
+        )
+    return [text]
+
+
+# ------------------------------------------------------------- what the data tell
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -97,10 +177,14 @@ def _settle(
         if sign == 0:
             return {}
         cosines = {name: sign * said[name] * _cosine(w, weights) for name, w in weighed.items()}
-        contrary = {n for n, w in weighed.items() if w.decisive and cosines[n] < _CONTRARY}
+        contrary = {
+            n for n, w in weighed.items() if w.decisive and cosines[n] < limits.SIGN_CONTRARY
+        }
         if contrary == turned:
             return {
-                name: sign * signs[name] if name in turned or cosines[name] > _TELLS else 0
+                name: sign * signs[name]
+                if name in turned or cosines[name] > limits.SIGN_TELLS
+                else 0
                 for name in weighed
             }
         turned = contrary
@@ -122,7 +206,7 @@ def _bench(weighed: Sequence[_Weighed], signs: Sequence[int]) -> tuple[int, Arra
         drive = np.concatenate([s * w.drive[shift] for s, w in zip(signs, weighed, strict=True)])
         (ahead, left), (back, right) = (_explain(motion / size, s * drive) for s in (1, -1))
         share = np.array([left, right]) ** 2 / len(weighed)  # each record's input has the norm one
-        sure = abs(share[0] - share[1]) > _LEAST + _LEAST_SHARE * share.min()
+        sure = abs(share[0] - share[1]) > limits.SIGN_LEAST + limits.SIGN_SHARE * share.min()
         found.add((1 if share[0] < share[1] else -1) if sure else 0)
         if shift == 1:
             weights = (ahead if share[0] < share[1] else back) / size
