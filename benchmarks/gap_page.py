@@ -30,7 +30,7 @@ from pipeline.gap.data.sides import prepare
 from pipeline.gap.explain import explain_gap
 from pipeline.gap.fit.baseline import fit_baseline
 from pipeline.gap.search.grow import fit_whole
-from pipeline.gap.search.hypothesis import Bench, Hypothesis, judge
+from pipeline.gap.search.hypothesis import Hypothesis, Study, judge
 from pipeline.gap.types import Gap, Trace
 from pipeline.gap.verdict.account import make_traces
 from pipeline.output import write_file
@@ -223,7 +223,7 @@ def explain_rig(rig: Rig, tell: Callable[[str], None]) -> str:
         *(f"{note[0].upper()}{note[1:]}.\n" for note in gap.notes),
     ]
     steps = _steps(gap, rig)
-    for number, (found, (bench, before, after)) in enumerate(
+    for number, (found, (study, before, after)) in enumerate(
         zip(gap.effects, steps, strict=True), start=1
     ):
         place = next(iter(found.where.items()), None)
@@ -232,9 +232,9 @@ def explain_rig(rig: Rig, tell: Callable[[str], None]) -> str:
             f"{name.replace('_', ' ')} {value.value:.3g} {value.unit}".rstrip()
             for name, value in found.parameters.items()
         )
-        trace = _where_it_helps(before, after, bench)
+        trace = _where_it_helps(before, after, study)
         file = f"{rig.name}-{number}.svg"
-        _draw(trace, bench, file)
+        _draw(trace, study, file)
         lines += [
             f"{number}. **{_named(found.effect.key)}{where}** ({values}): "
             f"{found.nrmse_before:.2%} → {found.nrmse_after:.2%}\n",
@@ -244,14 +244,14 @@ def explain_rig(rig: Rig, tell: Callable[[str], None]) -> str:
     return "\n".join(lines)
 
 
-def _steps(gap: Gap, rig: Rig) -> Iterator[tuple[Bench, Hypothesis, Hypothesis]]:
+def _steps(gap: Gap, rig: Rig) -> Iterator[tuple[Study, Hypothesis, Hypothesis]]:
     """Yield the linear model and that with one effect, two, …, each fitted to the training runs."""
     runs = {run.id: run for run in prepare(rig.records, springs=rig.springs, notes=[])}
     training = [runs[name] for name in gap.training]
     linear, training = fit_baseline(training, springs=rig.springs, start=gap.linear.chain)
     sigma = {row: s for run in training for row, s in zip(run.rows, run.sigma, strict=True)}
     held_out = [runs[name] for name in gap.held_out]
-    bench = Bench(
+    study = Study(
         training=tuple(training),
         held_out=tuple(
             replace(run, sigma=np.array([sigma[row] for row in run.rows])) for run in held_out
@@ -262,26 +262,26 @@ def _steps(gap: Gap, rig: Rig) -> Iterator[tuple[Bench, Hypothesis, Hypothesis]]
         mapper=map,
         tell=print,
     )
-    before = judge(linear, bench)
+    before = judge(linear, study)
     for count in range(1, len(gap.effects) + 1):
         model = AugmentedChain(chain=gap.model.chain, terms=gap.model.terms[:count])
-        yield bench, before, judge(fit_whole(start_at(model, springs=rig.springs), bench), bench)
+        yield study, before, judge(fit_whole(start_at(model, springs=rig.springs), study), study)
 
 
-def _where_it_helps(before: Hypothesis, after: Hypothesis, bench: Bench) -> Trace:
+def _where_it_helps(before: Hypothesis, after: Hypothesis, study: Study) -> Trace:
     """Return the cart and run, of those held out, of which the effects explain most."""
 
     def gained(trace: Trace) -> float:
         left = [((trace.measured - model) ** 2).sum() for model in (trace.baseline, trace.final)]
         return float((left[0] - left[1]) / np.var(trace.measured))
 
-    return max((t for t in make_traces(before, after, bench) if t.held_out), key=gained)
+    return max((t for t in make_traces(before, after, study) if t.held_out), key=gained)
 
 
-def _draw(trace: Trace, bench: Bench, file: str) -> None:
+def _draw(trace: Trace, study: Study, file: str) -> None:
     part = slice(None, None, _THINNED)
     thin = {key: getattr(trace, key)[part] for key in ("t", "u", "measured", "baseline", "final")}
-    run = next(run for run in bench.held_out if run.id == trace.experiment)
+    run = next(run for run in study.held_out if run.id == trace.experiment)
     noise = float(run.sigma[run.rows.index(trace.cart - 1)])
     with drawing():
         figure = before_after_figure(replace(trace, **thin), noise=noise, position_unit="count")

@@ -6,8 +6,9 @@ from itertools import pairwise
 import numpy as np
 
 from pipeline.names import gain_name, read_name
+from pipeline.plant.limits import HEAVY_DAMPING
 from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.laws import HEAVY_DAMPING, brackets
+from pipeline.plant.linear.laws import brackets
 from pipeline.plant.linear.recovery import recover_from_parameters
 from pipeline.results import EXPLAINED, ChainFit, Check
 

@@ -6,16 +6,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pipeline.estimation.chain.follow import Followed, find_misread, follow, most_follow, near
+from pipeline.identify.limits import CONTRARY
 from pipeline.identify.log import Log
 from pipeline.names import own_zeta
 from pipeline.results import ChainFit, Estimate, FrequencyResponse, LeftOut, Record
 from pipeline.stages.bode_fit import fit_bode
-from pipeline.stages.sine import FEW_COUNTS
+from pipeline.stages.limits import FEW_COUNTS
 from pipeline.stages.time_fit import fit_records
-
-# The share of their motion that stays unexplained where most records of a kind contradict a fit to
-# others: a length in inches instead of centimetres leaves 0.37.
-_CONTRARY = 0.3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -150,7 +147,7 @@ def _contrary_kinds(records: Sequence[Record], fitted: Fitted) -> set[str]:
     chain, by_id = fitted.fit.chain, {record.id: record for record in records}
 
     def contrary(name: str) -> bool:
-        return all(fit.share > _CONTRARY for fit in near(by_id[name], chain))
+        return all(fit.share > CONTRARY for fit in near(by_id[name], chain))
 
     return {
         kind

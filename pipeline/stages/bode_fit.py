@@ -26,6 +26,7 @@ from pipeline.names import own_zeta, read_name
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.recovery import recover_chain
 from pipeline.results import EXPLAINED, ChainFit, Estimate, FrequencyResponse
+from pipeline.stages.limits import DECAY_AGREES, EXCESS_SIGMAS, PHASE_AGREES, VANISHING
 
 _STARTS = 8  # random ones, tried where the first does not explain the data
 _START_SPREAD = 0.5  # of ln m and ln k of a random start: half to double, mostly
@@ -33,14 +34,9 @@ _START_ZETAS = (0.02, 0.3)
 _SEED = 2005  # of the random starts; any, but the same every time
 _NEAR, _PRECISION = 1e-3, 1e-8  # change of the cost to stop at: on the way there, and at the end
 _EVALUATIONS = 100  # a fit that gets there takes about ten
-_PHASE_AGREES = 3.0  # times as far off as the magnitudes are: a delay or a wrong sign is further
-_VANISHING = 1e-4  # of its usual size: a damping or far spring that the data put at zero
-_DECAY_AGREES = 9.0  # chi² that each decay may add: by chance three standard errors off
 _RANK = 1e-8  # smallest singular value over the largest, columns in natural sizes
 _SHARES, _SHARE_PRECISION = (1e-6, 10.0), 0.01  # where a missing relative error may lie; ratio
 _WIDENINGS = 3  # fits in turn with the error they call for: it settles to a per cent
-# chi² exceeds its mean by more than this many of its standard deviations once in a thousand.
-_EXCESS_SIGMAS = 3.1
 
 
 def fit_bode(
@@ -99,7 +95,7 @@ def fit_bode(
     remark = ""
     if data.n_phases:
         # As few magnitudes as parameters say nothing about what the phases should be.
-        limit = _PHASE_AGREES * max(1.0, best.chi_square_per_dof**0.5)
+        limit = PHASE_AGREES * max(1.0, best.chi_square_per_dof**0.5)
         if best.dof <= 0 or _phase_misfit(best, data) <= limit:
             best = _solve(P, data, best.theta, "polar")
         else:
@@ -239,7 +235,7 @@ def _fit_from_starts(
 def _widen(fitted: _Fitted, data: Points) -> tuple[_Fitted, float]:
     """Fit again with the relative error that makes the misfit what the errors allow; 0 if it is."""
     excess = fitted.chi_square_per_dof - 1
-    if data.from_table or excess <= _EXCESS_SIGMAS * np.sqrt(2 / fitted.dof):
+    if data.from_table or excess <= EXCESS_SIGMAS * np.sqrt(2 / fitted.dof):
         return fitted, 0.0
     share = 0.0
     for _ in range(_WIDENINGS):
@@ -280,7 +276,7 @@ def _hold_vanished(
     vanished = [
         name
         for name, value, size in zip(P.names, P.physical(chain), sizes, strict=True)
-        if value < (0.0 if name == "k_1" else _VANISHING * size)
+        if value < (0.0 if name == "k_1" else VANISHING * size)
     ]
     if not vanished:
         return fitted, data
@@ -294,7 +290,7 @@ def _hold_vanished(
         held = P.holding_at_zero(*(name for name in vanished if name not in names))
         along = replace(data, decays=told)
         both = _solve(held, along, held.pack(replace(chain, c=c)), fitted.scale)
-        if both.chi_square < fitted.chi_square + _DECAY_AGREES * len(told):
+        if both.chi_square < fitted.chi_square + DECAY_AGREES * len(told):
             return _hold_vanished(both, along, {})
     held = P.holding_at_zero(*vanished)
     return _hold_vanished(_solve(held, data, held.pack(chain), fitted.scale), data, {})

@@ -10,12 +10,8 @@ import numpy as np
 
 from pipeline.names import read_name
 from pipeline.results import Estimate, ParameterRow
+from pipeline.stages.limits import DAMPING_LIMIT, GAIN_AND_FREQUENCY_LIMIT, SIGMA_LIMIT
 
-# The paper's own tables: gains and frequencies change by up to 14 % between the two estimates
-# (one null, read off by eye, by 29 %), damping ratios by half and more.
-GAIN_AND_FREQUENCY_LIMIT = 15.0  # percent
-DAMPING_LIMIT = 50.0  # percent
-SIGMA_LIMIT = 3.0  # combined standard errors: below, a difference may be chance
 _UNDECIDED = "the two estimates are too uncertain to agree or to disagree"
 AT_BOUND = (
     "the fit ends at its bound, zero: its data are too few to tell, so there is no final value"

@@ -10,24 +10,27 @@ from pipeline.errors import DataError
 from pipeline.estimation.colour import colour
 from pipeline.estimation.noise import grain, noise_beyond_rounding, rounding_left
 from pipeline.results import Record, SinePoint
+from pipeline.stages.limits import (
+    FEW_COUNTS,
+    FREQUENCY_RELATIVE,
+    FREQUENCY_SIGMAS,
+    NO_SINE,
+    OFF_SINE,
+    STEADY_SPREAD,
+)
 
 _MIN_SAMPLES = 12  # five unknowns, and something left to judge the fit by
 _WINDOW_CYCLES, _WINDOW_TIME = 3.0, 0.6  # a sliding window: the longer of the two; cycles, s
 _HOP_CYCLES, _HOP_TIME = 1.0, 0.2
 _LAST_WINDOWS = 4
-_SPREAD = 0.005  # of the amplitude: the last windows agree to this, or to their noise
-_OFF_SINE = 0.01  # of the amplitude: a residual below this is a good sine
 _BACK_SIGMAS = 4.0  # a stretch whose mean square residual is further up is not steady
 _MARGIN = 3  # the share of the steady part given up to what is left of the transient
 _DRIFT_SIGMAS = 3.0  # the steady part's two halves differ by no more
 _DROP = 6  # the share of it that goes at once where they do
 _PASSES = 3  # of carrying the sine back; each doubles or so what it stands on
 _DRIVEN = 0.5  # of the input's amplitude: the dwell runs from its first to its last such sample
-_FREQUENCY_SIGMAS, _FREQUENCY_RELATIVE = 5.0, 2e-4  # a stated frequency further off is not believed
-FEW_COUNTS = 20  # an amplitude below this is known to a few percent only
 _FLOOR_ROUNDING = 0.111  # of the encoder step, times sqrt(step / amplitude): see `_rounding_std`
 _PEAK_LINES = 4  # of the padded spectrum: a sine's frequency is no further from its peak
-_NO_SINE = 0.5  # of the input's amplitude: a residual above this is another signal
 _GAP = 3.0  # sample intervals; longer ones are gaps in the log
 _ITERATIONS = 20
 _PHASE_CONVERGED = 1e-9  # rad at the ends of the record
@@ -146,7 +149,7 @@ class Dwell:
         steady = self._steady_part(y, floor=floor)
         t = self._t[steady.start :]
         position, drive = self._fit(y, steady.start), self._fit(self._u, steady.start)
-        if drive.rms >= _NO_SINE * abs(drive.z):
+        if drive.rms >= NO_SINE * abs(drive.z):
             raise DataError(
                 f"{record.id}: a sine dwell needs an input of one frequency, found an amplitude of "
                 f"{abs(drive.z):.3g} at {omega / (2 * np.pi):.4g} Hz and {drive.rms:.3g} (rms) "
@@ -222,7 +225,7 @@ class Dwell:
         z = np.array([fit.z for fit in fits])
         latest, _ = last[-1]
         spread = float(np.max(np.abs(z - z.mean())))
-        agree = spread <= max(_SPREAD * abs(z.mean()), floor)
+        agree = spread <= max(STEADY_SPREAD * abs(z.mean()), floor)
         if len(last) < 2 or not (agree or spread <= 3 * max(fit.std for fit in fits)):
             return _Steady(start=latest, settled=False, left=spread)
         start = self._carry_back(y, latest, floor=floor, stretches=len(windows))
@@ -358,7 +361,7 @@ def _frequency(t: Array, u: Array, *, stated: float | None) -> tuple[float, str]
         fitted = peak
     if stated is None:
         return fitted, ""
-    if abs(fitted - stated) <= max(_FREQUENCY_SIGMAS * std, _FREQUENCY_RELATIVE * stated):
+    if abs(fitted - stated) <= max(FREQUENCY_SIGMAS * std, FREQUENCY_RELATIVE * stated):
         return stated, ""
     return fitted, (
         f"the input oscillates at {fitted / (2 * np.pi):.4g} Hz, not at the "
@@ -394,6 +397,6 @@ def _note_small(amplitude: float, *, step: float) -> str:
 
 
 def _note_off_sine(fit: _Sine, *, floor: float) -> str:
-    if fit.rms <= max(2 * floor, _OFF_SINE * abs(fit.z)):
+    if fit.rms <= max(2 * floor, OFF_SINE * abs(fit.z)):
         return ""
     return f"{100 * fit.rms / abs(fit.z):.1f} % of the motion is not a sine of this frequency"

@@ -19,13 +19,15 @@ from scipy.optimize import linear_sum_assignment
 
 from pipeline.arrays import Array, ComplexArray
 from pipeline.errors import DataError
+from pipeline.plant.limits import DAMPING_ERROR, MASS_SPRING_ERROR
 from pipeline.plant.linear import step_response
 from pipeline.plant.linear.chain import Chain, quadratic_factors
 from pipeline.plant.loop.gains import lqr_gains, place_poles
-from pipeline.plant.loop.robustness import DAMPING_ERROR, MASS_SPRING_ERROR, level_error_percent
+from pipeline.plant.loop.robustness import level_error_percent
 from pipeline.plant.loop.sampled_loop import StateFeedback, check_ticks, discretise, simulate_loop
 from pipeline.plant.loop.sampled_plant import RADIANS_PER_SAMPLE, SampledPlant, energy_weights
 from pipeline.results import FeedbackDesign
+from pipeline.stages.limits import LEVEL_ERROR, LEVEL_WARNING
 
 Method = Literal["poles", "lqr"]
 
@@ -47,8 +49,6 @@ _FURTHER_ZETA = (0.0, 0.1, 0.2, 0.35, 0.5, 0.7)  # at least; a pair keeps its ow
 _FURTHER_SPEED = (1.0, 1.25)  # of the plant's own frequency
 
 _SCREENED = 8  # candidates, in order, tried for a loop that is stable whatever the model's errors
-_LEVEL_ERROR = 10.0  # percent of the step that such errors may move the level, if it can be had
-_LEVEL_WARNING = 5.0  # percent, worth a word
 
 
 def design_feedback(
@@ -241,7 +241,7 @@ def _choose(plant: SampledPlant, candidates: _Candidates, goal: _Goal) -> tuple[
     within = candidates.peak <= goal.limit
     if not within.any():  # a step of this size is out of reach: design for a smaller one
         within = np.full_like(within, True)
-    for level_error, (settling, overshoot) in product((_LEVEL_ERROR, np.inf), _AIMS):
+    for level_error, (settling, overshoot) in product((LEVEL_ERROR, np.inf), _AIMS):
         good = within & (candidates.level_error <= level_error)
         good &= candidates.settling <= settling * goal.settling
         good &= candidates.overshoot <= max(overshoot * goal.overshoot, _UNSEEN)
@@ -341,7 +341,7 @@ def _message(plant: SampledPlant, goal: _Goal, design: FeedbackDesign) -> str:
             f"or dampings {100 * DAMPING_ERROR:g} % off"
         )
     error = float(level_error_percent(plant.chain, design.gains, cart=plant.cart))
-    if error > _LEVEL_WARNING:
+    if error > LEVEL_WARNING:
         said.append(
             f"these gains cancel much of the plant's own stiffness: errors of "
             f"{100 * MASS_SPRING_ERROR:g} % in the springs move the level by up to {error:.0f} %"

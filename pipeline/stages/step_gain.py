@@ -14,22 +14,24 @@ from pipeline.estimation.noise import grain, noise_beyond_rounding, rounding_lef
 from pipeline.estimation.peaks import extrema, plateaus
 from pipeline.results import Record, StepGain
 from pipeline.results_of_runs import StepEdge
+from pipeline.stages.limits import (
+    DRIFT_AGREES,
+    DRIFT_SIGMAS,
+    EXTRAPOLATES,
+    MOVED,
+    STEADY_SHARE,
+    STICKS_SIGMAS,
+)
 
 _MIN_SAMPLES = 12
 _CREEP = 0.005  # of the input's range: two halves of a constant stretch differ by no more
-_STEADY_SHARE = 0.6  # of the record: with less of it at constant input this is no step run
 # Motion is counted in grains: encoder steps, or as much noise as would round as coarsely.
 _FLAT = 3.0  # a window that spans no more is level
-_MOVED = 6.0  # a cart that moved less has not moved
 _PROMINENCE = 6.0
 _ARITHMETIC = 1e-3  # the scatter of a level without noise or rounding
 _NEARLY_FLAT = 0.02  # of the motion, where a window is not level to the noise
-_GOOD_FIT = 0.02  # of the motion: what an extrapolating fit may leave
-_GOOD_LEVEL = 0.02  # of the motion: the standard error it may have
 _STARTS_AT_REST = 0.1  # of the motion, per radian of the ringing: an initial velocity below this
-_DRIFT_SIGMAS, _DRIFT_AGREES = 5.0, 0.3
 _DRIFT_PASSES = 4
-_STICKS_SIGMAS = 4.0
 _SAME_INPUT = 0.02  # of the input's range
 
 
@@ -97,17 +99,17 @@ def fit_step_gain(record: Record, *, cart: int) -> StepGain:
             f"{record.id}: step gain needs a step on whose two sides cart {cart} settles, found "
             f"{len(found) - 1} edges, none with both"
         )
-    moving = [edge for edge in edges if abs(edge.level_after - edge.level_before) > _MOVED * size]
+    moving = [edge for edge in edges if abs(edge.level_after - edge.level_before) > MOVED * size]
     if not moving:
         raise DataError(
-            f"{record.id}: step gain needs cart {cart} to move by more than {_MOVED:.0f} encoder "
+            f"{record.id}: step gain needs cart {cart} to move by more than {MOVED:.0f} encoder "
             "steps, found less"
         )
     gain, gain_std = _combine(moving)
     shift, shift_std = _rest_shift(found)
     spread = [abs(edge.gain - gain) / edge.gain_std for edge in moving]
-    sticks = len(moving) < len(edges) or max(spread) > _STICKS_SIGMAS
-    sticks = sticks or (shift is not None and abs(shift) > _STICKS_SIGMAS * shift_std)
+    sticks = len(moving) < len(edges) or max(spread) > STICKS_SIGMAS
+    sticks = sticks or (shift is not None and abs(shift) > STICKS_SIGMAS * shift_std)
     notes += _notes(found, moving, edges, shift=shift if sticks else None)
     return StepGain(
         experiment=record.id,
@@ -140,7 +142,7 @@ def _constant_parts(record: Record) -> list[tuple[int, int, float]]:
     ]
     share = sum(b - a for a, b in long) / u.size
     parts = [(a, b, float(np.mean(u[a:b]))) for a, b in long]
-    if share < _STEADY_SHARE or not any(value for _, _, value in parts):
+    if share < STEADY_SHARE or not any(value for _, _, value in parts):
         raise DataError(
             f"{record.id}: step gain needs an input that steps and then stays, found it constant "
             f"and not zero for {100 * share if any(p[2] for p in parts) else 0:.0f} % of the record"
@@ -232,13 +234,13 @@ def _extrapolated(t: Array, y: Array, *, n_modes: int, floor: float) -> _Level |
             continue
         fit = fit_ringing(t, y, poles=poles, drift=False)
         std = float(np.sqrt(fit.covariance[0, 0]))
-        left = max(2 * floor, _GOOD_FIT * motion)
+        left = max(2 * floor, EXTRAPOLATES * motion)
         if (
             fit.converged
             and bool(np.all(fit.poles.real < 0))
             and float(np.min(fit.poles.imag)) * (t[-1] - t[0]) >= np.pi  # half a period is seen
             and fit.rms <= left
-            and std <= _GOOD_LEVEL * motion
+            and std <= EXTRAPOLATES * motion
         ):
             return _Level(first=0, stop=y.size, value=fit.level, std=std, extrapolated=True)
     return None
@@ -249,7 +251,7 @@ def _with_unseen_start(
 ) -> tuple[list[_Plateau], list[str]]:
     """Put a rest before a record that starts with the input on and the cart just setting off."""
     head = found[0]
-    if head.u == 0 or not head.level or abs(head.level.value - y[0]) <= _MOVED * size:
+    if head.u == 0 or not head.level or abs(head.level.value - y[0]) <= MOVED * size:
         return found, []
     radian = _pace(t[: head.stop], y[: head.stop], size=size) / (2 * np.pi)
     n = max(5, int(np.searchsorted(t, t[0] + radian / 2)))
@@ -279,8 +281,8 @@ def _drift(t: Array, y: Array, levels: Sequence[_Level], *, size: float) -> floa
         return 0.0
     weight = 1 / np.square(errors)
     drift = float(np.average(slopes, weights=weight))
-    seen = abs(drift) > _DRIFT_SIGMAS / np.sqrt(weight.sum())
-    alike = np.abs(np.array(slopes) - drift) <= _DRIFT_AGREES * abs(drift) + 3 * np.array(errors)
+    seen = abs(drift) > DRIFT_SIGMAS / np.sqrt(weight.sum())
+    alike = np.abs(np.array(slopes) - drift) <= DRIFT_AGREES * abs(drift) + 3 * np.array(errors)
     return drift if seen and bool(np.all(alike)) else 0.0
 
 

@@ -27,9 +27,8 @@ from pipeline.estimation.colour import long_run_variance, score_covariance
 from pipeline.names import read_name
 from pipeline.plant.linear.chain import Chain
 from pipeline.results import ChainFit, Estimate, Record
+from pipeline.stages.limits import NEGLIGIBLE, REST_SIGMAS
 
-_NEGLIGIBLE = 0.05  # of its standard error: such a damping or wall spring is held at zero
-_REST_SIGMAS = 5.0  # how far beyond chance a free start must improve the fit to be kept
 _STRUCTURE_VALUES = 20  # independent values of the chain's own error in a record
 _DETERMINED = 1e-9  # smallest singular value of the scaled Jacobian over its largest
 _NO_DAMPING = 1e-6  # of the critical one: as good as none, and its logarithm has derivatives
@@ -127,7 +126,7 @@ def _starts_at_rest(attempt: Attempt, index: int) -> bool:
     structure = (np.sum(misfit.residual**2) - misfit.residual.size) / _STRUCTURE_VALUES
     chance = max(long_run_variance(misfit.residual), structure)
     freed = misfit.n_nuisance - held.n_nuisance
-    return bool(gain <= chance * (freed + _REST_SIGMAS * np.sqrt(2 * freed)))
+    return bool(gain <= chance * (freed + REST_SIGMAS * np.sqrt(2 * freed)))
 
 
 def _covariance(attempt: Attempt) -> Array:
@@ -175,9 +174,7 @@ def _negligible(attempt: Attempt, covariance: Array) -> tuple[str, ...]:
     parametrisation, chain = attempt.parametrisation, attempt.chain
     share = parametrisation.physical(chain) / np.sqrt(np.diag(covariance))
     gone = [
-        name
-        for name, value in zip(parametrisation.names, share, strict=True)
-        if value < _NEGLIGIBLE
+        name for name, value in zip(parametrisation.names, share, strict=True) if value < NEGLIGIBLE
     ]
     walls = tuple(name for name in gone if name in ("k_1", f"k_{chain.n + 1}"))
     is_held = chain.k[0] > 0 or chain.k[-1] > 0

@@ -12,11 +12,8 @@ from pipeline.checks.estimates import check_rows
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.results import ChainFit, Estimate
-from pipeline.stages.compare import (
-    DAMPING_LIMIT,
-    GAIN_AND_FREQUENCY_LIMIT,
-    compare,
-)
+from pipeline.stages.compare import compare
+from pipeline.stages.limits import DAMPING_LIMIT, GAIN_AND_FREQUENCY_LIMIT
 
 
 def _estimate(value, std=None, source="step"):

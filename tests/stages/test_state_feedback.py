@@ -10,11 +10,12 @@ from scipy.optimize import linear_sum_assignment
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
+from pipeline.plant.limits import MASS_SPRING_ERROR
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.plant.linear.step_response import overshoot_percent, settling_time
 from pipeline.plant.loop.gains import lqr_gains, place_poles
-from pipeline.plant.loop.robustness import MASS_SPRING_ERROR, level_error_percent, stays_stable
+from pipeline.plant.loop.robustness import level_error_percent, stays_stable
 from pipeline.plant.loop.sampled_loop import StateFeedback, discretise, loop_matrix, simulate_loop
 from pipeline.results import FeedbackDesign
 from pipeline.stages.state_feedback import Method, design_feedback

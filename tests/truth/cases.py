@@ -38,6 +38,7 @@ EFFECTS = (
     "end_stop",
     "sensor_gain",
     "extra_mode",
+    "cogging",
 )
 
 

@@ -16,23 +16,21 @@ from pipeline.errors import DataError
 from pipeline.estimation.chain.modal_response import Modes, find_modes
 from pipeline.estimation.chain.parametrisation import Parametrisation
 from pipeline.estimation.chain.time_window import Window, compare, open_window
+from pipeline.estimation.limits import (
+    BETTER,
+    DETUNED,
+    DOUBTFUL,
+    FOLLOWED,
+    FRICTION_PER_ROOT,
+    LEAST_SHARE,
+    SAME_SCALE,
+    SEEN_STEPS,
+    TURNED,
+    UNMISTAKABLE,
+)
 from pipeline.estimation.units_and_clocks import FASTEST, LENGTH_SCALES, TIME_FACTORS
 from pipeline.plant.linear.chain import Chain
 from pipeline.results import Record
-
-_SAME_SCALE = 0.1  # relative
-_SEEN_STEPS = 5.0  # encoder steps of motion: rounding changes a smaller one by any factor
-# Shares of a record's power (about its mean) that the chain leaves unexplained.
-FOLLOWED = 0.1
-_DOUBTFUL, _BETTER = 0.005, 10.0  # as recorded at least this, read otherwise so many times less
-_UNMISTAKABLE = 10.0  # an amplifier at its limit makes less of the input by a factor of 2 or 3
-_TURNED = (
-    0.02  # at most this is left of a record that counts the other way; a long delay leaves more
-)
-_DETUNED = np.linspace(0.85, 1.15, 13)
-# Simulated carts with dry friction F under a force of amplitude A leave at least (F / 5A)² where
-# they move at all, which is doubled here; encoder and noise hide shares below the least.
-_FRICTION, _LEAST = 10.0, 1e-4
 
 _ModesOf = Callable[[tuple[int, ...]], Modes]
 
@@ -107,12 +105,12 @@ def near(record: Record, chain: Chain) -> list[Followed]:
     one of them that is all of the motion.
     """
     modes = _modes(chain)
-    detuned = [replace(record, t=factor * record.t) for factor in _DETUNED]
+    detuned = [replace(record, t=factor * record.t) for factor in DETUNED]
     return [fit for other in detuned if (fit := _hold_against(other, chain, modes))]
 
 
 def find_misread(
-    record: Record, chain: Chain, fit: Followed, *, better: float = _BETTER
+    record: Record, chain: Chain, fit: Followed, *, better: float = BETTER
 ) -> Misread | None:
     """Return how a record must be read to follow the chain, so many times better than as it is.
 
@@ -121,14 +119,14 @@ def find_misread(
     fit : how it follows as it is.
     """
     found, least = None, min(fit.share / better, FOLLOWED)
-    if better > 1 and fit.share < _DOUBTFUL:
+    if better > 1 and fit.share < DOUBTFUL:
         return None
     # As the bench counts its input: a record's own sign was found by what it holds.
     record = replace(record, u=0.0 - record.u) if record.turned and record.u is not None else record
     modes = _modes(chain)
     for misread, other in _readings(record, modes):
         held = _hold_against(other, chain, modes)
-        if held and held.share <= (min(least, _TURNED) if misread.legal else least):
+        if held and held.share <= (min(least, TURNED) if misread.legal else least):
             found, least = misread, held.share
     return found
 
@@ -149,7 +147,7 @@ def _readings(record: Record, modes: _ModesOf) -> Iterator[tuple[Misread, Record
         window = open_window(record)
     except DataError:
         return
-    if np.any(np.ptp(window.y, axis=1) < _SEEN_STEPS * np.sqrt(12) * window.stated_sigma):
+    if np.any(np.ptp(window.y, axis=1) < SEEN_STEPS * np.sqrt(12) * window.stated_sigma):
         return
     if (said := _say(window.carts, _weights(window, modes(window.free)))) is not None:
         misread, factors = said
@@ -178,9 +176,9 @@ def _say(carts: Sequence[int], weights: Array) -> tuple[Misread, Array] | None:
     A unit is that of the whole file: one cart near its null moves by any factor too little.
     """
     sign, size = np.sign(weights), np.abs(weights)
-    scales = [scale for scale in LENGTH_SCALES if scale >= _UNMISTAKABLE]
+    scales = [scale for scale in LENGTH_SCALES if scale >= UNMISTAKABLE]
     for scale in (*scales, *(1 / scale for scale in scales)):
-        if np.all(np.abs(size * scale - 1) < _SAME_SCALE) and len(set(sign)) == 1:
+        if np.all(np.abs(size * scale - 1) < SAME_SCALE) and len(set(sign)) == 1:
             words = (
                 "its positions or its input look to be in another unit: they move "
                 f"{scale:.3g} times as far as its input moves the carts"
@@ -230,7 +228,7 @@ def _hold_against(record: Record, chain: Chain, modes: _ModesOf) -> Followed | N
         missed=dict(zip(window.carts, residual, strict=True)),
         reach=dict(zip(window.carts, reach.tolist(), strict=True)),
         friction={
-            cart: float(_FRICTION * np.sqrt(max(share, _LEAST)) * np.ptp(force) / 2)
+            cart: float(FRICTION_PER_ROOT * np.sqrt(max(share, LEAST_SHARE)) * np.ptp(force) / 2)
             for cart, share in zip(window.carts, lost, strict=True)
             if share <= FOLLOWED and (force := force_on(record, chain, cart=cart)) is not None
         },

@@ -14,12 +14,10 @@ from pipeline.estimation.chain.parametrisation import Parametrisation
 from pipeline.estimation.chain.time_start import WIDTHS, even_chains, regress_chain
 from pipeline.estimation.chain.time_window import Misfit, Window, compare
 from pipeline.estimation.last_point import LastPoint
+from pipeline.estimation.limits import FOLLOWED
 from pipeline.plant.linear.chain import Chain
 from pipeline.results import EXPLAINED
 
-# A chain that leaves more than this share of the motion's power unexplained is not the one
-# (carts with dry friction leave some 2 %), unless the rest is noise.
-_LOST = 0.1
 # A damping or spring that is not there sends its logarithm towards minus infinity: e^-15 of a
 # start is nothing, and no step may overflow.
 _LOG_REACH = 15.0
@@ -85,7 +83,7 @@ class Attempt:
     @property
     def follows(self) -> bool:
         """True where the chain explains the motion, down to its noise or nearly all of it."""
-        return self.lost < _LOST or self.cost < EXPLAINED * self.dof
+        return self.lost < FOLLOWED or self.cost < EXPLAINED * self.dof
 
 
 def look(windows: Sequence[Window], parametrisation: Parametrisation, theta: Array) -> Attempt:

@@ -16,9 +16,9 @@ from pipeline.arrays import Array
 from pipeline.estimation.colour import colour
 from pipeline.estimation.decay.ringing import Ringing
 from pipeline.estimation.decay.separable import fit_separable
+from pipeline.estimation.limits import FRICTION_F
 from pipeline.results_of_runs import FrictionTest
 
-THRESHOLD = 10.8  # F(1, many) above this once in a thousand decays without friction
 _UNKNOWNS = 7
 _MAX_EVALUATIONS = 200  # a decay takes some 30, derivatives included
 _MOST_LOSS = 50.0  # of an exponent on the way to the fit: beyond, numbers run over
@@ -91,8 +91,8 @@ def fit_friction(
     drop, statistic = float(linear[3]), max(gained / variance, 0.0)
     test = FrictionTest(
         f_statistic=statistic,
-        threshold=THRESHOLD,
-        present=statistic > THRESHOLD and drop > floor,
+        threshold=FRICTION_F,
+        present=statistic > FRICTION_F and drop > floor,
         drop=drop,
         drop_std=float(np.sqrt(covariance[6, 6])),
         zeta=decay / omega_n,

@@ -9,6 +9,7 @@ from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.estimation.decay.dry_friction import FrictionFit, fit_friction
 from pipeline.estimation.decay.ringing import Ringing, fit_ringing
+from pipeline.estimation.limits import ADEQUATE
 from pipeline.estimation.peaks import extrema, plateaus
 from pipeline.results import Record
 
@@ -26,7 +27,6 @@ _MIN_SAMPLES = 12
 _BACK_SIGMAS = 4.0
 _BACK_SHARES = (0.05, 0.0, 0.0)
 _REAL_SHARE = 0.15
-_ADEQUATE = 1.5  # residual over noise: up to here the model says all there is to say
 _RELEASE_MARGIN = 1 / 40  # of a period, in which the fingers leave the cart
 
 
@@ -167,7 +167,7 @@ def fit_decay(t: Array, y: Array, *, stretch: Stretch, run: list[int], floor: fl
     enough = max(stop - _MIN_SAMPLES, stretch.first)
     latest = min(run[min(_BASE_SKIPS, max(len(run) - _BASE_NEEDS, 0))], enough)
     decay = fit_from(latest)
-    if decay.rms(t, y) > _ADEQUATE * floor:
+    if decay.rms(t, y) > ADEQUATE * floor:
         # How a real cart breaks away is no part of the model: from its first passage on.
         decay = fit_from(min(run[0], enough))
         passage = int(np.searchsorted(t, t[run[0]] - interval / 2))
@@ -215,7 +215,7 @@ def _fit(
     t, y = t[:stop], y[:stop]
     fit = fit_ringing(t[first:], y[first:], poles=np.array([pole]), drift=True)
     friction = None
-    if last or fit.rms > _ADEQUATE * floor:
+    if last or fit.rms > ADEQUATE * floor:
         friction = fit_friction(
             t[first:],
             y[first:],

@@ -8,7 +8,8 @@ from pipeline.grading.mistakes import limits
 from pipeline.grading.references.tolerance import as_typed, rounding
 from pipeline.grading.words import WORDS
 from pipeline.names import read_name
-from pipeline.plant.linear.laws import HEAVY_DAMPING, orders
+from pipeline.plant.limits import HEAVY_DAMPING
+from pipeline.plant.linear.laws import orders
 from pipeline.schemas.grade import Flag
 
 

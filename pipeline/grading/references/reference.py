@@ -6,15 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.checks.recordings import POSITION_SCALE, SCALES
-from pipeline.estimation.chain.follow import FOLLOWED
+from pipeline.estimation.limits import FOLLOWED
 from pipeline.grading.rubric import is_damping
 from pipeline.names import read_name
 from pipeline.plant.linear.chain import Chain
 from pipeline.results import Analysis, Estimate, ParameterRow
 from pipeline.results_of_runs import StepEdge
-from pipeline.stages.compare import (
-    GAIN_AND_FREQUENCY_LIMIT,
-)
+from pipeline.stages.limits import GAIN_AND_FREQUENCY_LIMIT
 
 # A fitted frequency or gain that far from the measured one: the fit has gone astray; factors.
 _ASTRAY, _ASTRAY_GAIN = 1.3, 1.6

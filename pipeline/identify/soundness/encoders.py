@@ -6,13 +6,9 @@ import numpy as np
 
 from pipeline.estimation.chain.follow import measured
 from pipeline.estimation.units_and_clocks import LENGTH_SCALES
+from pipeline.identify.limits import FASTEST_MOVES, SAME, STUCK_JUMP, STUCK_SPEED, WITNESSES
 from pipeline.ingest.channels import stuck_spans
 from pipeline.results import LeftOut, Record
-
-_SAME = 0.02  # relative: as far as the step is seen alike in two recordings
-_WITNESSES = 2  # kinds of experiment that have the usual step; of two alone either may be wrong
-_FASTEST = 0.98  # quantile of the moves from sample to sample: the odd jump does not count
-_AT_SPEED, _AWAY = 0.6, 1.5  # of the fastest
 
 
 def find_other_units(records: Sequence[Record], *, decays: bool = False) -> dict[str, LeftOut]:
@@ -32,7 +28,7 @@ def find_other_units(records: Sequence[Record], *, decays: bool = False) -> dict
             if (seen := [s for r in records if r.kind == kind and (s := steps.get(r.id, 0.0))])
         ]
         usual = max(by_kind, key=lambda step: sum(_alike(step, s) for s in by_kind), default=0.0)
-        if sum(_alike(step, usual) for step in by_kind) < _WITNESSES:
+        if sum(_alike(step, usual) for step in by_kind) < WITNESSES:
             continue
         scales = [s for scale in LENGTH_SCALES for s in (scale, 1 / scale)]
         for record in [r for r in records if r.id in steps and (r.kind == "decay") is decays]:
@@ -50,7 +46,7 @@ def find_other_units(records: Sequence[Record], *, decays: bool = False) -> dict
 
 
 def _alike(step: float, other: float) -> bool:
-    return abs(step - other) <= _SAME * other
+    return abs(step - other) <= SAME * other
 
 
 def _is_decimal(step: float) -> bool:
@@ -69,10 +65,10 @@ def find_stuck(records: Sequence[Record]) -> dict[str, LeftOut]:
         for cart in measured(record):
             y = record.position(cart)
             moves = np.abs(np.diff(y))
-            fastest = float(np.quantile(moves, _FASTEST))
+            fastest = float(np.quantile(moves, FASTEST_MOVES))
             for first, last in stuck_spans(y):
-                away = last < moves.size and moves[last] >= _AWAY * fastest
-                if away or moves[first - 1] >= _AT_SPEED * fastest:
+                away = last < moves.size and moves[last] >= STUCK_JUMP * fastest
+                if away or moves[first - 1] >= STUCK_SPEED * fastest:
                     reason = (
                         f"the encoder of cart {cart} stands still at speed from "
                         f"{record.t[first]:.4g} s to {record.t[last]:.4g} s: it stuck"

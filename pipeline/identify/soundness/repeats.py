@@ -6,20 +6,11 @@ from itertools import combinations
 import numpy as np
 
 from pipeline.arrays import Array
+from pipeline.identify.limits import MATERIAL, SAME_DURATION, SAME_INPUT, SPREADS, SPREADS_OF_MANY
 from pipeline.results import LeftOut, Record
 
-# Inputs count as the same where they differ by less than this share (root-mean-square): an edge
-# logged one sample early differs by 8 %, the next usual amplitude by 33 %.
-_SAME_INPUT = 0.2
-_SAME_DURATION = 0.8  # shorter over longer
-_MATERIAL = 0.05  # of the response; a smaller difference changes nothing anybody would act on
 _AMPLIFICATION = 2.0  # of a relative difference of the inputs by a lightly damped chain
 _START_SAMPLES = 3  # their median is the start: too few to move, enough to outvote a spike
-# How many spreads of the others a repeat must stand off. Where all repeats differ by chance
-# (along one shape, normally distributed) this flags 5 % of the sets, and far fewer where they
-# differ in several ways; three repeats leave one difference to judge by, hence the caution.
-_SPREADS = {3: 30.0, 4: 8.0}
-_SPREADS_OF_MANY = 5.0
 
 
 def find_outlier_repeats(records: Sequence[Record], *, unit: str) -> dict[str, LeftOut]:
@@ -75,11 +66,11 @@ def _is_repeat(first: Record, other: Record) -> bool:
     spans = np.ptp(first.t), np.ptp(other.t)
     if (first.kind, first.free, first.carts) != (other.kind, other.free, other.carts):
         return False
-    if min(spans) < _SAME_DURATION * max(spans):
+    if min(spans) < SAME_DURATION * max(spans):
         return False
     t = _common_times(first, other)
     u = np.concatenate([_at(t, record, _excitation(record)) for record in (first, other)])
-    return bool(_rms(u[0] - u[1]) <= _SAME_INPUT * _rms(u))
+    return bool(_rms(u[0] - u[1]) <= SAME_INPUT * _rms(u))
 
 
 def _common_times(*records: Record) -> Array:
@@ -109,14 +100,14 @@ def _differences(group: Sequence[Record]) -> tuple[Array, Array]:
     y = y - np.median(y[:, :, :_START_SAMPLES], axis=2, keepdims=True)
     by_input = np.sqrt(np.mean((u[:, None] - u) ** 2, axis=2)) / _rms(u)
     differences = np.sqrt(np.mean((y[:, None] - y) ** 2, axis=(2, 3)))
-    return differences, (_MATERIAL + _AMPLIFICATION * by_input) * _rms(y)
+    return differences, (MATERIAL + _AMPLIFICATION * by_input) * _rms(y)
 
 
 def _farthest(
     differences: Array, left: Sequence[int], *, expected: Array
 ) -> tuple[int, float, float] | None:
     """Return index, distance and spread of the others of the repeat that stands off, if any."""
-    threshold = _SPREADS.get(len(left), _SPREADS_OF_MANY)
+    threshold = SPREADS.get(len(left), SPREADS_OF_MANY)
     candidates = []
     for index in left:
         others = [i for i in left if i != index]

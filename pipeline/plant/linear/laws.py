@@ -10,8 +10,6 @@ from typing import NamedTuple
 
 from pipeline.names import MODES, NULLS, omega_names, read_name
 
-HEAVY_DAMPING = 0.3  # of a damping ratio: above it the orders of frequencies may bend
-
 _GAINS = "a cart further from the motor is moved less by a constant input"
 _MODES = "the resonances are listed in rising order"
 _ALONE = (

@@ -3,8 +3,7 @@
 import numpy as np
 
 from pipeline.arrays import Array
-
-SETTLING_BAND = 0.02  # of the change in level: the 2 % criterion
+from pipeline.plant.limits import SETTLING_BAND
 
 
 def overshoot_percent(y: Array, *, before: Array | float, level: Array | float) -> Array:

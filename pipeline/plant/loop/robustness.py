@@ -4,11 +4,9 @@ import numpy as np
 from scipy.linalg import hadamard
 
 from pipeline.arrays import Array
+from pipeline.plant.limits import DAMPING_ERROR, MASS_SPRING_ERROR
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.loop.sampled_loop import StateFeedback, loop_matrix
-
-MASS_SPRING_ERROR = 0.03  # by which an identified mass or spring may well be off
-DAMPING_ERROR = 0.30
 
 
 def stays_stable(chain: Chain, controller: StateFeedback, *, sample_time: float) -> bool:

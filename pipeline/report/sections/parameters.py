@@ -30,7 +30,8 @@ from pipeline.report.phrases import phrases
 from pipeline.report.sections.page import Page
 from pipeline.report.words import SOURCES, clean, name_span, names_spans, rich
 from pipeline.results import Analysis, ChainFit, Estimate, ParameterRow
-from pipeline.stages.compare import SIGMA_LIMIT, change_limit
+from pipeline.stages.compare import change_limit
+from pipeline.stages.limits import SIGMA_LIMIT
 
 _WORDS = phrases("report")
 _NO_CHANGE = 0.05  # percent: nothing to speak of

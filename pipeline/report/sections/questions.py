@@ -26,7 +26,7 @@ from pipeline.report.sections.answers import named
 from pipeline.report.sections.notes import discussion_blocks, even_headings
 from pipeline.report.words import SOURCES, clean, rich
 from pipeline.results import Analysis, HardwareCheck, ParameterRow
-from pipeline.stages.compare import DAMPING_LIMIT
+from pipeline.stages.limits import DAMPING_LIMIT
 
 _WORDS = phrases("questions")
 _MOST = 6  # a report with more would be a questionnaire

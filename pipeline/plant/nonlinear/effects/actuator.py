@@ -1,11 +1,8 @@
 """What happens to the input on its way to cart 1."""
 
+from pipeline.plant.limits import MUCH_SHORTER
 from pipeline.plant.nonlinear.effects.base import Effect, Parameter
 from pipeline.plant.nonlinear.tables import Drive
-
-# Sample times: a delay and a lag of one size T are late by the same mean time, and differ first by
-# T²/2 in the second moment, an eighth of a sample squared.
-_MUCH_SHORTER = 0.5
 
 DRIVE_DAMPING = Effect(
     key="drive_damping",
@@ -91,7 +88,7 @@ DELAY = Effect(
     axis="time",
     equivalent="A lag much shorter than the sample time.",
     same_as="actuator_lag",
-    same_below=_MUCH_SHORTER,
+    same_below=MUCH_SHORTER,
 )
 
 LAG = Effect(
@@ -117,7 +114,7 @@ LAG = Effect(
     axis="frequency",
     equivalent="A delay, where the time constant is much shorter than the sample time.",
     same_as="input_delay",
-    same_below=_MUCH_SHORTER,
+    same_below=MUCH_SHORTER,
 )
 
 BACKLASH = Effect(

@@ -1,10 +1,10 @@
 """Dry friction, drag and offset: forces on a cart that depend on how it moves."""
 
+from pipeline.plant.limits import LEAST_SLIDING
 from pipeline.plant.nonlinear.effects.base import Effect, Parameter, Scales
 from pipeline.plant.nonlinear.tables import Cart
 
 _BREAKAWAY = 1.5  # times the sliding force: a start in the middle of what dry surfaces show
-_LEAST_SLIDING = 0.01  # of the force at rest
 
 
 def _spring_force(s: Scales) -> float:
@@ -58,7 +58,7 @@ STICTION = Effect(
     grows_from="coulomb_friction",
     grown=lambda p: {"force": p["force"], "static_force": _BREAKAWAY * p["force"]},
     # Without a drop it is Coulomb's law; without sliding friction no dry surface behaves like it.
-    genuine=lambda p: _LEAST_SLIDING * p["static_force"] < p["force"] < p["static_force"],
+    genuine=lambda p: LEAST_SLIDING * p["static_force"] < p["force"] < p["static_force"],
 )
 
 PRESLIDING = Effect(

@@ -2,12 +2,11 @@
 
 from collections.abc import Mapping
 
+from pipeline.plant.limits import HARD
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.effects.base import Effect, Lookalike, Parameter
 from pipeline.plant.nonlinear.effects.structure import END_STOP
 from pipeline.plant.nonlinear.tables import Spring
-
-_HARD = 4.0  # times its stiffness: a spring that much stiffer past a stretch may be a contact
 
 
 def _stop(p: Mapping[str, float], spring: int, chain: Chain) -> Lookalike | None:
@@ -16,7 +15,7 @@ def _stop(p: Mapping[str, float], spring: int, chain: Chain) -> Lookalike | None
     ends = [
         (cart, side) for cart, side in ((spring, 1.0), (spring - 1, -1.0)) if 0 < cart <= chain.n
     ]
-    if p["stiffness_change"] < _HARD or len(ends) > 1:
+    if p["stiffness_change"] < HARD or len(ends) > 1:
         return None
     ((cart, side),) = ends
     stiffness = p["stiffness_change"] * float(chain.k[spring - 1])
