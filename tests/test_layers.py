@@ -46,7 +46,7 @@ LEVELS = (
     ("bench.planning", "bench.emulator"),
     ("bench.watch",),
     ("bench.host", "grading.intake", "grading.references"),
-    ("grading.mistakes", "grading.similarity"),
+    ("bench.design", "grading.mistakes", "grading.similarity"),
     ("grading.judge", "grading.gradebook"),
     ("grading.publish",),
     ("grading.batch",),

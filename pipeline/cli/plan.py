@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from pipeline.cli.common import AsJson, Folder, app, progress_line, say
+from pipeline.errors import ConfigError
 
 
 @app.command()
@@ -14,20 +15,44 @@ def plan(
     stock: Annotated[
         bool, typer.Option("--stock", help="The bench knows the stock commands only: no chirp.")
     ] = False,
+    number: Annotated[
+        int | None,
+        typer.Option("--next", min=1, max=20, help="Choose so many by what they will tell."),
+    ] = None,
+    goal: Annotated[
+        str | None,
+        typer.Option(
+            "--for",
+            help="With --next: what is to be known better: a parameter (zeta_2), `design` (the "
+            "predicted overshoot), `worst`, `mean` or `volume`.",
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Propose the experiments to record: write plan.toml, or add to it what the data allow."""
+    from pipeline.bench.design.goal import WORST
+    from pipeline.bench.design.next_plan import plan_next
     from pipeline.bench.planning.make import make_plan
     from pipeline.bench.planning.plan_words import plan_data, plan_table
     from pipeline.submission import load_submission
 
+    if goal and number is None:
+        raise ConfigError("--for says what the next experiments are for: it goes with --next N")
     submission = load_submission(folder)
     with progress_line() as progress:
-        made = make_plan(submission, stock=stock, progress=progress)
+        if number is None:
+            made = make_plan(submission, stock=stock, progress=progress)
+            words, further = [made.trouble, made.said], {}
+        else:
+            made = plan_next(
+                submission, n=number, goal=goal or WORST, stock=stock, progress=progress
+            )
+            words = [f"{made.path}: {len(made.recordings)} recordings added", made.said]
+            further = {"next": {"for": made.words, "errors": made.errors}}
     if as_json:
-        typer.echo(json.dumps(plan_data(made.plan, submission), indent=1, ensure_ascii=False))
+        data = plan_data(made.plan, submission) | further
+        typer.echo(json.dumps(data, indent=1, ensure_ascii=False))
     else:
         typer.echo(plan_table(made.plan, submission))
-    if made.trouble:
-        say(made.trouble)
-    say(made.said)
+    for sentence in filter(None, words):
+        say(sentence)

@@ -88,7 +88,7 @@ def test_hosts_talk_to_a_pseudo_terminal_one_after_the_other():
             with host(bench) as line:
                 line.write(encode(Signal.QUERY))
                 described = parse_description(line.readline())
-                assert (described.carts, described.commands) == (2, frozenset("cfhks"))
+                assert (described.carts, described.commands) == (2, frozenset("cfhkms"))
                 began = time.monotonic()
                 readings = stream(
                     bench, line, Start(wave=Wave.SQUARE, frequency=1.0, amplitude=300, cycles=2)

@@ -16,6 +16,7 @@ from pipeline.bench.protocol.messages import (
     Signal,
     Start,
     StateGains,
+    Tone,
     Wave,
     encode,
     format_description,
@@ -42,10 +43,16 @@ commands = st.one_of(
     st.builds(PidGains, kp=numbers, ki=numbers, kd=numbers),
     st.builds(StateGains, gains=st.tuples(*[numbers] * 4), prefilter=numbers),
     st.builds(ChirpEnd, frequency=frequencies),
+    st.builds(
+        Tone,
+        harmonic=st.integers(0, 10_000),
+        share=st.floats(-1, 1).map(lambda x: float(f"{x:.9g}")),
+        phase=st.floats(-10, 10).map(lambda x: float(f"{x:.9g}")),
+    ),
     st.builds(Hands, held=st.sampled_from([(), (1,), (2,), (1, 2)]), released=st.integers(0, 2)),
     st.sampled_from(Signal),
 )
-noise = st.one_of(st.binary(max_size=3), st.text("dfghkcqsotz;?19.-", max_size=4).map(str.encode))
+noise = st.one_of(st.binary(max_size=3), st.text("dfghkmcqsotz;?19.-", max_size=4).map(str.encode))
 
 
 def read(data: bytes, **options) -> list[Command]:
@@ -174,7 +181,7 @@ descriptions = st.builds(
     carts=st.integers(1, 3),
     period=st.floats(1e-4, 1.0),
     baud=st.integers(300, 10**7),
-    commands=st.frozensets(st.sampled_from("cfhks")),
+    commands=st.frozensets(st.sampled_from("cfhkms")),
     input_unit=st.sampled_from(["V", "N", "count"]),
     input_per_count=st.floats(1e-9, 1e9),
     position_unit=st.sampled_from(["cm", "mm", "m", "in", "count"]),

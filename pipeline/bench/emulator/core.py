@@ -9,6 +9,7 @@ from typing import Protocol
 
 from pipeline.bench.protocol.messages import (
     FULL_SCALE,
+    MOST_TONES,
     WATCHDOG,
     ChirpEnd,
     Command,
@@ -20,6 +21,7 @@ from pipeline.bench.protocol.messages import (
     Signal,
     Start,
     StateGains,
+    Tone,
     format_description,
     format_reading,
 )
@@ -97,7 +99,7 @@ class ReferenceCore:
             self._run = None
             return 0
         y = tuple(count - zero for count, zero in zip(counts, self._zero, strict=True))
-        target = target_at(run.start, 1e-3 * ms, chirp_end=run.chirp_end)
+        target = target_at(run.start, 1e-3 * ms, chirp_end=run.chirp_end, tones=run.tones)
         duty = run.law.duty(target, y)
         self._sent += format_reading(Reading(counts=y, target=target, duty=duty, ms=ms))
         return duty
@@ -106,6 +108,7 @@ class ReferenceCore:
         self._run: _Run | None = None
         self._gains: PidGains | StateGains = PidGains(kp=0.0, ki=0.0, kd=0.0)
         self._chirp_end: float | None = None
+        self._tones: tuple[Tone, ...] = ()
         self._zero: tuple[int, ...] | None = None  # None: the next counts are zero
         self._heard: int | None = None  # ms of wall time of the last heartbeat; None: disarmed
 
@@ -113,12 +116,18 @@ class ReferenceCore:
         match command:
             case Start():
                 self._run = _Run(
-                    start=command, since=stamp, chirp_end=self._chirp_end, law=self._loop(command)
+                    start=command,
+                    since=stamp,
+                    chirp_end=self._chirp_end,
+                    tones=self._tones,
+                    law=self._loop(command),
                 )
             case PidGains() | StateGains():
                 self._gains = command
             case ChirpEnd(frequency=frequency):
                 self._chirp_end = frequency
+            case Tone(harmonic=harmonic):
+                self._tones = (*self._tones, command)[-MOST_TONES:] if harmonic else ()
             case Signal.RESET:
                 self._reset()
             case Signal.STOP:
@@ -149,6 +158,7 @@ class _Run:
     start: Start
     since: int  # ms of the bench's clock when it began
     chirp_end: float | None
+    tones: tuple[Tone, ...]
     law: _Law
 
 

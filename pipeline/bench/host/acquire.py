@@ -212,7 +212,7 @@ class _Acquisition:
         submission = load_submission(self._folder)
         file = save_record(run.path, folder=self._folder, carts=submission.system.carts)
         outcome = run.outcome
-        entry = _experiment(
+        entry = experiment_entry(
             outcome.recording, file=file, controller=run.controller, remarks=outcome.remarks
         )
         add_experiment(submission, entry)
@@ -416,7 +416,7 @@ def _order(
     return order, table
 
 
-def _experiment(
+def experiment_entry(
     recording: Recording, *, file: str, controller: dict[str, Value] | None, remarks: Sequence[str]
 ) -> dict[str, Value]:
     """Return the keys of the `[[experiments]]` table of a recording."""

@@ -13,6 +13,7 @@ from pipeline.bench.protocol.messages import (
     Reading,
     Start,
     StateGains,
+    Tone,
     Wave,
 )
 from pipeline.bench.protocol.waves import target_at
@@ -47,9 +48,10 @@ class Order:
         start = self.commands[-1]
         assert isinstance(start, Start)
         end = next((c.frequency for c in self.commands if isinstance(c, ChirpEnd)), None)
+        tones = tuple(c for c in self.commands if isinstance(c, Tone) and c.harmonic)
 
         def target(ms: float) -> int:
-            return target_at(start, max(0.0, 1e-3 * ms), chirp_end=end)
+            return target_at(start, max(0.0, 1e-3 * ms), chirp_end=end, tones=tones)
 
         if abs(reading.target - target(reading.ms)) <= 1:
             return False
@@ -124,6 +126,9 @@ def make_order(
         _check_known("c", "chirp", recording, bench)
         if recording.frequency_end is not None:
             commands.append(ChirpEnd(frequency=recording.frequency_end))
+    if recording.wave == "multisine":
+        _check_known("m", "multisine", recording, bench)
+        commands += [Tone(harmonic=0), *recording.sines]
     commands.append(
         Start(
             wave=Wave[recording.wave.upper()],

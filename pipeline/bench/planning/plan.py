@@ -8,6 +8,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from pipeline.bench.protocol.messages import Tone
+
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
@@ -59,29 +61,45 @@ class Recording(_Model):
     amplitude : input units, in closed loop position units; 0: a decay that a hand starts.
     frequency : Hz, of the wave; a chirp starts there.
     frequency_end : Hz, where a chirp ends.
+    tones : of a multisine, of each sine the harmonic of `frequency`, its share of the amplitude
+        and its phase in rad.
     cycles : periods; the run takes cycles/frequency seconds.
     release : the cart that is pulled out and let go by hand; None: no hand.
     controller : closes the loop.
     settle : s of rest beforehand.
+    aim : what it was chosen for by its information, "zeta_2"; "": by habit, or by a person.
     """
 
     id: str
     kind: Literal["decay", "step", "sine", "sweep", "closed_loop"]
     carts: tuple[int, ...]
-    wave: Literal["delta", "square", "sine", "triangle", "sawtooth", "chirp"]
+    wave: Literal["delta", "square", "sine", "triangle", "sawtooth", "chirp", "multisine"]
     amplitude: Finite
     frequency: Positive
     frequency_end: Positive | None = None
+    tones: tuple[tuple[Annotated[int, Field(ge=1)], Finite, Finite], ...] = ()
     cycles: Annotated[int, Field(ge=1)] = 1
     release: int | None = None
     controller: Annotated[PidLoop | StateLoop, Field(discriminator="type")] | None = None
     settle: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 3.0
     note: str = ""
+    aim: str = ""
 
     @property
     def duration(self) -> float:
         """How long the run takes, s."""
         return self.cycles / self.frequency
+
+    @property
+    def sines(self) -> tuple[Tone, ...]:
+        """The tones of a multisine, as a bench is told them."""
+        return tuple(Tone(harmonic=h, share=share, phase=p) for h, share, p in self.tones)
+
+    @property
+    def highest_frequency(self) -> float:
+        """The highest at which it moves the carts on purpose, Hz."""
+        last = self.frequency_end or self.frequency
+        return max(self.frequency * max((h for h, *_ in self.tones), default=1), last)
 
 
 class Plan(_Model):

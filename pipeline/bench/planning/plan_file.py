@@ -5,10 +5,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pydantic import ValidationError
 
 from pipeline.bench.planning.plan import Limits, PidLoop, Plan, Recording, StateLoop
-from pipeline.bench.protocol.messages import FREQUENCIES
+from pipeline.bench.protocol.messages import FREQUENCIES, MOST_TONES
 from pipeline.errors import ConfigError
 from pipeline.output import write_file
 from pipeline.submission import Submission, System
@@ -19,6 +20,8 @@ from pipeline.synthesis.files import toml_section
 NAME = "plan.toml"
 LONGEST_RUN = 600.0  # s; what a simulation of it and its file can well take
 
+_PER_HARMONIC = 16  # points of a period of the highest
+_ROUNDED = 1.01  # a peak may be so far over one, between the points that were looked at
 _MAX_BYTES = 1_000_000
 _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,60}")  # data files are named after it
 _TABLES = {
@@ -35,7 +38,8 @@ _HEAD = """\
 # carts          free to move; the others are held
 # release        the cart that is pulled out and let go by hand
 # wave           "square" is off for half a period, then on; "chirp" sweeps from frequency to
-#                frequency_end; "sine", "triangle", "sawtooth"; "delta" is a short pulse
+#                frequency_end; "multisine" is the sum of its tones; "sine", "triangle", "sawtooth";
+#                "delta" is a short pulse
 # amplitude      {input}; of a closed loop {position}; 0 where a hand starts a decay
 # frequency      Hz, of the wave; the run takes cycles/frequency seconds
 # settle         s of rest beforehand
@@ -175,7 +179,19 @@ def _recording_problems(
         yield "frequency_end", "belongs to a chirp"
     if wave == "chirp" and recording.frequency_end in (None, recording.frequency):
         yield "frequency_end", "a chirp needs another frequency to end at than it starts at"
+    if (wave == "multisine") != bool(recording.tones) or len(recording.tones) > MOST_TONES:
+        found = len(recording.tones)
+        yield "tones", f"expected 1 to {MOST_TONES} for a multisine, else none, found {found}"
+    elif recording.tones and _peak(recording) > _ROUNDED:
+        yield "tones", f"their sum reaches {_peak(recording):.3g} times `amplitude`, at most 1 does"
     yield from _loop_problems(recording, n)
+
+
+def _peak(recording: Recording) -> float:
+    """Return how high a multisine of amplitude one goes."""
+    h, share, phase = (column[:, None] for column in np.array(recording.tones).T)
+    turns = np.linspace(0.0, 1.0, _PER_HARMONIC * int(h.max()), endpoint=False)
+    return float(np.max(np.abs((share * np.sin(2 * np.pi * h * turns + phase)).sum(axis=0))))
 
 
 def _time_problems(recording: Recording) -> Iterator[tuple[str, str]]:

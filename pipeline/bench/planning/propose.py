@@ -76,7 +76,7 @@ def propose_plan(submission: Submission, *, bench: Description | None = None) ->
         proposed += _first_steps(system, limits)
     if not kinds & {"sweep", "sine", "bode"}:
         proposed.append(_sweep(system, limits, chirps=bench is None or "c" in bench.commands))
-    recordings = _renamed(proposed, taken=[e.id for e in recorded])
+    recordings = renamed(proposed, taken=[e.id for e in recorded])
     plan = Plan(limits=limits, recordings=recordings)
     return plan.model_copy(update={"baud": bench.baud}) if bench else plan
 
@@ -93,7 +93,7 @@ def extend_plan(plan: Plan, submission: Submission, *, bench: Description | None
     """
     stages: list[Callable[[Analysis], list[Recording]]] = []
     if _wants_dwells(plan, submission):
-        stages.append(lambda analysis: _driven(_chain(analysis), plan.limits))
+        stages.append(lambda analysis: _driven(identified_chain(analysis), plan.limits))
     if _wants_loop(plan, submission):
         stages.append(lambda analysis: [_loop(analysis, submission, plan.limits, bench)])
     if not stages:
@@ -102,7 +102,7 @@ def extend_plan(plan: Plan, submission: Submission, *, bench: Description | None
     proposed = [recording for stage in stages for recording in stage(analysis)]
     taken = [entry.id for entry in (*plan.recordings, *submission.experiments)]
     return plan.model_copy(
-        update={"recordings": (*plan.recordings, *_renamed(proposed, taken=taken))}
+        update={"recordings": (*plan.recordings, *renamed(proposed, taken=taken))}
     )
 
 
@@ -110,6 +110,8 @@ def _wants_dwells(plan: Plan, submission: Submission) -> bool:
     """Whether there are none yet, and a sweep (or all that was planned) is recorded."""
     n, recorded = submission.system.carts, submission.experiments
     kinds = {e.kind for e in recorded if len(e.carts) == n}
+    if any(r.aim for r in plan.recordings):  # somebody knows what to record; dwells replace it
+        return False
     if kinds & {"sine", "bode"} or any(r.kind == "sine" for r in plan.recordings):
         return False
     ids = {e.id for e in recorded}
@@ -130,7 +132,7 @@ def _wants_loop(plan: Plan, submission: Submission) -> bool:
     )
 
 
-def _renamed(proposed: Sequence[Recording], *, taken: Sequence[str]) -> tuple[Recording, ...]:
+def renamed(proposed: Sequence[Recording], *, taken: Sequence[str]) -> tuple[Recording, ...]:
     """Return the recordings, each with an id of its own: "step-3" where there is a "step-2"."""
     used, renamed = set(taken), []
     for recording in proposed:
@@ -160,7 +162,7 @@ def _limits(system: System, design: Design | None, bench: Description | None) ->
     travel = _ABOUT_1_CM.get(system.position.unit, asked or 1.0) / AIM
     if design:
         travel = max(travel, asked / FURTHEST)
-    return Limits(input=min(most, stated or most), travel=_rounded(travel))
+    return Limits(input=min(most, stated or most), travel=rounded(travel))
 
 
 def _decays(cart: int, system: System) -> list[Recording]:
@@ -200,8 +202,8 @@ def _steps(
             kind="step",
             carts=tuple(range(1, carts + 1)),
             wave="square",
-            amplitude=_rounded_down(amplitude),
-            frequency=_rounded_down(0.5 / edge),
+            amplitude=rounded_down(amplitude),
+            frequency=rounded_down(0.5 / edge),
             cycles=_EDGES // 2,
             settle=settle,
         )
@@ -217,7 +219,7 @@ def _sweep(system: System, limits: Limits, *, chirps: bool) -> Recording:
         kind="sweep",
         carts=tuple(range(1, system.carts + 1)),
         wave="chirp" if chirps else "square",
-        amplitude=_rounded_down(_FIRST_SWEEP * limits.input),
+        amplitude=rounded_down(_FIRST_SWEEP * limits.input),
         frequency=frequency,
         frequency_end=CHIRP_SPAN * frequency if chirps else None,
         cycles=round(_SWEEP_TIME * frequency),
@@ -228,7 +230,7 @@ def _sweep(system: System, limits: Limits, *, chirps: bool) -> Recording:
 # ------------------------------------------------------------ from the quick model
 
 
-def _chain(analysis: Analysis) -> Chain:
+def identified_chain(analysis: Analysis) -> Chain:
     """Return the identified carts.
 
     Raises
@@ -254,7 +256,7 @@ def _reason(analysis: Analysis, *stages: str) -> str:
 def _driven(chain: Chain, limits: Limits) -> list[Recording]:
     """Return steps and dwells that move the carts as far as they are meant to go."""
     aim, furthest = AIM * limits.travel, FURTHEST * limits.travel
-    settle = _rounded(settling_wait(chain, time_constants=SETTLED))
+    settle = rounded(settling_wait(chain, time_constants=SETTLED))
     size = min(_STEP * aim / float(np.max(np.abs(chain.static_gains()))), limits.input)
     recordings = _steps([size, -size], carts=chain.n, edge=settle, settle=settle)
     wait = settling_wait(chain, time_constants=SETTLED_DWELL)
@@ -269,7 +271,7 @@ def _driven(chain: Chain, limits: Limits) -> list[Recording]:
                 kind="sine",
                 carts=tuple(range(1, chain.n + 1)),
                 wave="sine",
-                amplitude=_rounded_down(amplitude),
+                amplitude=rounded_down(amplitude),
                 frequency=hertz,
                 cycles=cycles,
                 settle=settle,
@@ -300,11 +302,11 @@ def _loop(
         kind="closed_loop",
         carts=tuple(range(1, submission.system.carts + 1)),
         wave="square",
-        amplitude=_rounded_down(size) if size < abs(task.reference) else task.reference,
-        frequency=_rounded_down(0.5 / edge),
+        amplitude=rounded_down(size) if size < abs(task.reference) else task.reference,
+        frequency=rounded_down(0.5 / edge),
         cycles=_EDGES // 2,
         controller=StateLoop(cart=feedback.cart),
-        settle=_rounded(settling_wait(_chain(analysis), time_constants=SETTLED)),
+        settle=rounded(settling_wait(identified_chain(analysis), time_constants=SETTLED)),
     )
     if bench is None or "f" in bench.commands:
         return recording
@@ -314,12 +316,12 @@ def _loop(
     return recording.model_copy(update={"controller": pid})
 
 
-def _rounded(value: float) -> float:
+def rounded(value: float) -> float:
     """Return the number as one types it: two digits."""
     return float(f"{value:.2g}")
 
 
-def _rounded_down(value: float) -> float:
+def rounded_down(value: float) -> float:
     """Return the number in two digits, no further from zero than it is."""
     size = 10.0 ** (floor(log10(abs(value))) - 1)
     return float(f"{floor(abs(value) / size * (1 + 1e-12)) * size:.2g}") * (1 if value > 0 else -1)

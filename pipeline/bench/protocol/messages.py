@@ -21,13 +21,16 @@ PULSE = 0.05  # s a delta wave is on
 NOMINAL_PERIOD = 1e-3  # s from line to line
 CHIRP_SPAN = 20.0  # a chirp ends at so many times the frequency it starts at, unless told
 FREQUENCIES = (1e-3, 1e3)  # Hz, of a wave; a command with any other is dropped
-EXTENSIONS = frozenset("cfhks")  # the commands, `?` aside, that the stock bench does not know
+EXTENSIONS = frozenset("cfhkms")  # the commands, `?` aside, that the stock bench does not know
 
 # What firmware can hold in 32 bits, and no bench needs more.
 _LONGEST_FIELD = 32  # characters
 _LARGEST_NUMBER = 1e9
 _LARGEST_AMPLITUDE = 1_000_000
 _MOST_CYCLES = 1_000_000
+MOST_TONES = 64  # of a multisine
+_HIGHEST_HARMONIC = 10_000
+_MOST_PHASE = 10.0  # rad, more than a turn
 _LONGEST_COUNT = 10  # digits of a field of a line
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
@@ -40,7 +43,8 @@ class Wave(StrEnum):
 
     delta is a short pulse as the period begins; square is zero for half a period, then the
     amplitude; sine, triangle and sawtooth start at zero and swing to both sides; chirp sweeps
-    once, logarithmically, over the whole run. `pipeline.bench.protocol.waves` has the formulas.
+    once, logarithmically, over the whole run; multisine is the sum of the tones told.
+    `pipeline.bench.protocol.waves` has the formulas.
     """
 
     DELTA = "d"
@@ -49,6 +53,7 @@ class Wave(StrEnum):
     TRIANGLE = "t"
     SAWTOOTH = "w"
     CHIRP = "c"
+    MULTISINE = "m"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,6 +105,22 @@ class ChirpEnd:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Tone:
+    """`m`: one sine of the multisines that follow; of harmonic 0: forget those told so far.
+
+    Attributes
+    ----------
+    harmonic : of the wave's frequency.
+    share : its amplitude, of the wave's.
+    phase : rad, at the start.
+    """
+
+    harmonic: int
+    share: float = 0.0
+    phase: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
 class Hands:
     """`h`: a virtual bench's hands hold some carts and, in the next run, let one go.
 
@@ -122,7 +143,7 @@ class Signal(StrEnum):
     QUERY = "?"
 
 
-Command: TypeAlias = Start | PidGains | StateGains | ChirpEnd | Hands | Signal
+Command: TypeAlias = Start | PidGains | StateGains | ChirpEnd | Tone | Hands | Signal
 
 # A bench that knows no `s` is stopped by a run that does nothing, then reset.
 STOCK_STOP: tuple[Command, ...] = (Start(wave=Wave.DELTA, frequency=1.0, amplitude=0), Signal.RESET)
@@ -141,6 +162,8 @@ def encode(command: Command) -> bytes:
             fields = ["f", *map(_number, (*gains, prefilter))]
         case ChirpEnd(frequency=frequency):
             fields = ["c", _number(frequency)]
+        case Tone(harmonic=harmonic, share=share, phase=phase):
+            fields = ["m", str(harmonic), _number(share), _number(phase)]
         case Hands(held=held, released=released):
             fields = ["h", str(sum(1 << (cart - 1) for cart in held)), str(released)]
         case Signal():
@@ -237,7 +260,7 @@ def _whole_within(lowest: int, highest: int) -> _Reader:
 
 def _field_kinds(encoders: int, extensions: Collection[str]) -> Mapping[str, tuple[_Reader, ...]]:
     """Return what follows each letter."""
-    waves = "".join(wave for wave in Wave if wave != Wave.CHIRP or "c" in extensions)
+    waves = "".join(w for w in Wave if w not in (Wave.CHIRP, Wave.MULTISINE) or w in extensions)
     frequency = _number_within(*FREQUENCIES)
     gain = _number_within(-_LARGEST_NUMBER, _LARGEST_NUMBER)
     amplitude = _whole_within(-_LARGEST_AMPLITUDE, _LARGEST_AMPLITUDE)
@@ -250,6 +273,11 @@ def _field_kinds(encoders: int, extensions: Collection[str]) -> Mapping[str, tup
     further: dict[str, tuple[_Reader, ...]] = {
         "f": (gain,) * (2 * encoders + 1),
         "c": (frequency,),
+        "m": (
+            _whole_within(0, _HIGHEST_HARMONIC),
+            _number_within(-1.0, 1.0),
+            _number_within(-_MOST_PHASE, _MOST_PHASE),
+        ),
         "h": (_whole_within(0, 2**encoders - 1), _whole_within(0, encoders)),
         "s": (),
         "k": (),
@@ -274,6 +302,8 @@ def _command(letter: str, values: list[Any]) -> Command:
             return StateGains(gains=tuple(gains), prefilter=prefilter)
         case "c", [frequency]:
             return ChirpEnd(frequency=frequency)
+        case "m", [harmonic, share, phase]:
+            return Tone(harmonic=harmonic, share=share, phase=phase)
         case "h", [mask, released]:
             held = tuple(c + 1 for c in range(mask.bit_length()) if mask >> c & 1)
             return Hands(held=held, released=released)
@@ -324,7 +354,8 @@ class Description:
     carts : how many of them are carts.
     period : s from line to line, as it should be.
     baud : of the line.
-    commands : the letters beyond the stock ones that it knows, with `c` for the chirp too.
+    commands : the letters beyond the stock ones that it knows, with `c` for the chirp and `m` for
+        the multisine too.
     input_unit, input_per_count : the input in its unit is duty counts times this.
     position_unit, position_per_count : likewise of the encoders.
     """

@@ -1,18 +1,22 @@
 """The target of a run over time: what a bench follows, and what a plan can know beforehand."""
 
 import math
+from collections.abc import Sequence
 
-from pipeline.bench.protocol.messages import CHIRP_SPAN, PULSE, Start, Wave
+from pipeline.bench.protocol.messages import CHIRP_SPAN, PULSE, Start, Tone, Wave
 
 
-def target_at(start: Start, t: float, *, chirp_end: float | None = None) -> int:
+def target_at(
+    start: Start, t: float, *, chirp_end: float | None = None, tones: Sequence[Tone] = ()
+) -> int:
     """Return the target `t` s after the start: duty counts in open loop, else encoder counts.
 
     Parameters
     ----------
     chirp_end : Hz, where a chirp ends; None: at `CHIRP_SPAN` times the frequency it starts at.
+    tones : of a multisine.
     """
-    return nearest_count(start.amplitude * _shape(start, t, chirp_end))
+    return nearest_count(start.amplitude * shape_at(start, t, chirp_end=chirp_end, tones=tones))
 
 
 def nearest_count(value: float) -> int:
@@ -20,8 +24,10 @@ def nearest_count(value: float) -> int:
     return math.floor(value + 0.5)
 
 
-def _shape(start: Start, t: float, chirp_end: float | None) -> float:
-    """Return the wave at unit amplitude."""
+def shape_at(
+    start: Start, t: float, *, chirp_end: float | None = None, tones: Sequence[Tone] = ()
+) -> float:
+    """Return the wave at unit amplitude; see `target_at`."""
     turns = t * start.frequency
     phase = turns - math.floor(turns)
     match start.wave:
@@ -37,6 +43,11 @@ def _shape(start: Start, t: float, chirp_end: float | None) -> float:
             return 2.0 * phase - (2.0 if phase >= 0.5 else 0.0)
         case Wave.CHIRP:
             return math.sin(2 * math.pi * _chirp_turns(start, t, chirp_end))
+        case Wave.MULTISINE:
+            return sum(
+                tone.share * math.sin(2 * math.pi * tone.harmonic * phase + tone.phase)
+                for tone in tones
+            )
 
 
 def _chirp_turns(start: Start, t: float, chirp_end: float | None) -> float:

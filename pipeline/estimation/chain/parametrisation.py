@@ -171,7 +171,7 @@ def named_estimates(
     DataError : several carts that no spring ties to a wall have no static gains.
     """
     values = chain.parameters()
-    J = _parameter_jacobian(chain, names)
+    J = parameter_jacobian(chain, names)
     variance = np.einsum("ij,jk,ik->i", J, covariance, J)
     return {
         name: Estimate(value=0.0, std=None, source=source, at_bound=True)
@@ -181,7 +181,7 @@ def named_estimates(
     }
 
 
-def _parameter_jacobian(chain: Chain, names: Sequence[str]) -> Array:
+def parameter_jacobian(chain: Chain, names: Sequence[str]) -> Array:
     """Return the derivative (n_named, n_p) of `Chain.parameters` by the physical parameters."""
     base = np.array(list(chain.parameters().values()))
     columns = []

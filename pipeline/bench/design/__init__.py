@@ -1,0 +1,1 @@
+"""The next experiment: how much one would tell, which tell most, and what to make of them."""

@@ -1,0 +1,96 @@
+"""The experiments that are weighed against one another, each as large as the travel allows."""
+
+from collections.abc import Collection, Iterator
+from math import ceil
+
+import numpy as np
+
+from pipeline.bench.design.goal import Goal
+from pipeline.bench.design.information import Knowledge
+from pipeline.bench.design.multisine import optimal_tones
+from pipeline.bench.planning.plan import Limits, Recording
+from pipeline.bench.planning.propose import FURTHEST, rounded, rounded_down
+from pipeline.errors import DataError
+from pipeline.plant.dwells import SETTLED, SETTLED_DWELL, dwell_frequencies, settling_wait
+
+_TIME = 20.0  # s of a broadband record, or …
+_SLOW = 20  # … so many periods of the slowest mode
+_PERIODS = 2  # of a multisine in it
+_EDGES = 6  # frequencies between which chirps run
+_BAND = (0.4, 1.6)  # times the first and the last resonance
+_SQUARES = 8  # frequencies of square waves
+_SLOWEST = 0.1  # times the first resonance: of a square wave
+_DWELLS = 40  # frequencies at which to dwell
+
+
+def propose_candidates(
+    known: Knowledge, *, limits: Limits, commands: Collection[str], goal: Goal
+) -> list[Recording]:
+    """Return what could be recorded next, with all carts free.
+
+    Dwells where the carts are identified from dwells; else chirps, square waves and multisines, as
+    far as the bench knows their `commands`.
+
+    Raises
+    ------
+    DataError : none has an input that the limits allow.
+    """
+    made = _dwells(known) if known.dwells else _broadband(known, limits, commands, goal)
+    settle = rounded(settling_wait(known.chain, time_constants=SETTLED))
+    carts = tuple(range(1, known.chain.n + 1))
+    candidates = []
+    for recording in made:
+        whole = recording.model_copy(update={"carts": carts, "settle": settle})
+        size = known.at_its_limits(whole, limits=limits, share=FURTHEST)
+        if size > 0:
+            candidates.append(whole.model_copy(update={"amplitude": rounded_down(size)}))
+    if not candidates:
+        raise DataError("no next experiment: the limits of plan.toml allow none")
+    return candidates
+
+
+def _dwells(known: Knowledge) -> Iterator[Recording]:
+    """Dwells that are measured for as long as one waits for their steady state."""
+    wait = settling_wait(known.chain, time_constants=SETTLED_DWELL)
+    for hertz in dwell_frequencies(known.chain, n=_DWELLS):
+        cycles = ceil(2 * wait * hertz)
+        yield _free("sine-01", "sine", "sine", frequency=hertz, cycles=cycles)
+
+
+def _broadband(
+    known: Knowledge, limits: Limits, commands: Collection[str], goal: Goal
+) -> Iterator[Recording]:
+    resonances = np.sort(np.abs(known.chain.poles)) / (2 * np.pi)
+    seconds = float(rounded(max(_TIME, _SLOW / resonances[0])))
+    for hertz in np.geomspace(_SLOWEST * resonances[0], resonances[-1], _SQUARES):
+        f = rounded(float(hertz))
+        yield _free("square-1", "sweep", "square", frequency=f, cycles=ceil(seconds * f))
+    if "c" in commands:
+        edges = [
+            rounded(float(f))
+            for f in np.geomspace(_BAND[0] * resonances[0], _BAND[1] * resonances[-1], _EDGES)
+        ]
+        for low, high in ((a, b) for a in edges for b in edges if a < b):
+            cycles = ceil(seconds * low)
+            yield _free("sweep-1", "sweep", "chirp", frequency=low, end=high, cycles=cycles)
+    if "m" in commands:
+        base = rounded(_PERIODS / seconds)
+        travel = FURTHEST * limits.travel
+        tones = optimal_tones(known, base=base, seconds=seconds, travel=travel, goal=goal)
+        yield _free(
+            "multisine-1", "sweep", "multisine", frequency=base, cycles=_PERIODS, tones=tones
+        )
+
+
+def _free(name, kind, wave, *, frequency, cycles, end=None, tones=()) -> Recording:
+    return Recording(
+        id=name,
+        kind=kind,
+        carts=(1,),
+        wave=wave,
+        amplitude=1.0,
+        frequency=frequency,
+        frequency_end=end,
+        cycles=cycles,
+        tones=tones,
+    )

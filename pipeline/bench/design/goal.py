@@ -1,0 +1,111 @@
+"""What a next experiment is to make better: one number of the parameters' covariance."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from pipeline.bench.design.information import Knowledge
+from pipeline.errors import ConfigError, DataError
+from pipeline.plant.chain import Array, Chain
+from pipeline.plant.loop import simulate_loop
+from pipeline.results import FeedbackDesign
+from pipeline.submission.complaints import nearest
+
+DESIGN, WORST, MEAN, VOLUME = "design", "worst", "mean", "volume"
+_STEP = 1e-4  # relative change of a parameter, of which the loop's overshoot is a difference
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Goal:
+    """A standard error to make small: one, the largest of several, or their mean.
+
+    Attributes
+    ----------
+    name : as `--for` takes it.
+    words : what the number is of, "zeta_2".
+    rows : (k, n_p) derivatives of what is of interest by the relative parameters, as shares, of
+        the overshoot as shares of the step. One row: c-optimal.
+    mean : of several errors the "largest" (E-optimal in named parameters), the "root mean square"
+        (A-optimal) or the "volume" of the confidence region, as its mean radius (D-optimal).
+    """
+
+    name: str
+    words: str
+    rows: Array
+    mean: Literal["largest", "root mean square", "volume"] = "largest"
+
+    def of(self, told: Array) -> Array:
+        """Return the error (…,) that H and S (…, 2, n_p, n_p) leave; inf where they leave all."""
+        H, S = told[..., 0, :, :], told[..., 1, :, :]
+        if self.mean == "volume":
+            (sign, of_h), (_, of_s) = np.linalg.slogdet(H), np.linalg.slogdet(S)
+            log = np.where(sign > 0, of_s - 2 * of_h, np.inf)
+            return np.exp(log / (2 * H.shape[-1]))
+        variance = self._variances(H, S)
+        squares = variance.mean(-1) if self.mean == "root mean square" else variance.max(-1)
+        return np.sqrt(squares)
+
+    def _variances(self, H: Array, S: Array) -> Array:
+        try:
+            half = self.rows @ np.linalg.inv(H)
+        except np.linalg.LinAlgError:
+            return np.full((*H.shape[:-2], len(self.rows)), np.inf)
+        return np.einsum("...kp,...pq,...kq->...k", half, S, half)
+
+    def worst(self, told: Array) -> int:
+        """Return which of the rows is known worst."""
+        return int(np.argmax(self._variances(*told)))
+
+
+def find_goal(name: str, known: Knowledge, *, feedback: FeedbackDesign | None) -> Goal:
+    """Return the goal of a name: a parameter's, "design", "worst", "mean" or "volume".
+
+    Raises
+    ------
+    ConfigError : there is no such goal.
+    DataError : "design" without one.
+    """
+    values, rows = known.chain.parameters(), known.by_parameters()
+    if name == WORST:
+        return Goal(name=name, words="the worst relative error", rows=rows)
+    if name == MEAN:
+        return Goal(name=name, words="the mean relative error", rows=rows, mean="root mean square")
+    if name == VOLUME:
+        return Goal(name=name, words="the mean error of m, c and k", rows=rows, mean="volume")
+    if name == DESIGN:
+        if feedback is None:
+            raise DataError("--for design: no controller is designed: add a [design] table first")
+        row = _by_overshoot(known, feedback)
+        return Goal(name=name, words="the predicted overshoot", rows=row)
+    if name not in values:
+        hint = nearest(name, [*values, DESIGN, WORST, MEAN, VOLUME])
+        raise ConfigError(f"--for {name}: there is no such parameter or goal{hint}")
+    at = list(values).index(name)
+    return Goal(name=name, words=name, rows=rows[at : at + 1])
+
+
+def _by_overshoot(known: Knowledge, feedback: FeedbackDesign) -> Array:
+    """Return the derivative (1, n_p) of the loop's peak by the parameters, as share of the step.
+
+    The controller stays what it is and the carts turn out to be others.
+    """
+    P, chain = known.parametrisation, known.chain
+    controller = feedback.controller(chain)
+    t = feedback.t
+
+    def peak(chain: Chain) -> float:
+        loop = simulate_loop(
+            chain,
+            controller,
+            t=t,
+            reference=np.full(t.size, feedback.reference),
+            sample_time=feedback.sample_time,
+        )
+        return float(np.max(loop.x[feedback.cart - 1] * np.sign(feedback.reference)))
+
+    value, columns = P.physical(chain), []
+    for change in _STEP * known.size * np.eye(value.size):
+        up, down = (peak(P.chain(value + sign * change)) for sign in (1, -1))
+        columns.append((up - down) / (2 * _STEP * abs(feedback.reference)))
+    return np.array([columns])

@@ -1,0 +1,136 @@
+"""`cartlab plan --next`: the experiments that bring most, and what each will bring."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.bench.design.candidates import propose_candidates
+from pipeline.bench.design.exchange import choose
+from pipeline.bench.design.goal import WORST, Goal, find_goal
+from pipeline.bench.design.information import Knowledge
+from pipeline.bench.host.raw import FOLDER as RAW
+from pipeline.bench.host.raw import read_raw
+from pipeline.bench.planning.plan import Plan, Recording
+from pipeline.bench.planning.plan_file import load_plan, plan_path, save_plan
+from pipeline.bench.planning.plan_words import session_time, time_words
+from pipeline.bench.planning.propose import propose_plan, renamed
+from pipeline.errors import DataError
+from pipeline.results import Analysis
+from pipeline.submission import Submission
+from pipeline.workflow import analyse
+
+_USUAL = frozenset("c")  # what a bench is taken to know of which nothing is recorded
+
+
+@dataclass(frozen=True, kw_only=True)
+class NextPlan:
+    """The experiments chosen, and the error expected after each.
+
+    Attributes
+    ----------
+    errors : (n + 1,) of what `words` names, relative: now, and after each more.
+    """
+
+    words: str
+    plan: Plan
+    path: Path | None
+    recordings: tuple[Recording, ...]
+    errors: tuple[float, ...]
+
+    @property
+    def said(self) -> str:
+        """What they bring, in one sentence."""
+        many = len(self.recordings)
+        after = f"these {many} recordings" if many > 1 else "this recording"
+        return (
+            f"{self.words}: ± {_percent(self.errors[0])} now, ± {_percent(self.errors[-1])} after "
+            f"{after} ({time_words(session_time(self.recordings))})"
+        )
+
+
+def plan_next(
+    submission: Submission,
+    *,
+    n: int,
+    goal: str = WORST,
+    stock: bool = False,
+    progress: Callable[[str], None],
+) -> NextPlan:
+    """Choose the `n` next experiments of a submission and add them to its plan.toml.
+
+    Raises
+    ------
+    DataError : the data recorded do not identify the carts, so nothing can be weighed.
+    ConfigError : there is no such goal.
+    """
+    old = load_plan(submission) if plan_path(submission).exists() else propose_plan(submission)
+    progress("asking the data what they tell")
+    analysis = analyse(submission)
+    progress("weighing the next experiments")
+    commands = frozenset() if stock else known_commands(submission.folder)
+    found = choose_next(analysis, old, n=n, goal=goal, commands=commands)
+    taken = [entry.id for entry in (*old.recordings, *submission.experiments)]
+    recordings = renamed(found.recordings, taken=taken)
+    plan = old.model_copy(update={"recordings": (*old.recordings, *recordings)})
+    return NextPlan(
+        words=found.words,
+        plan=plan,
+        path=save_plan(plan, submission),
+        recordings=recordings,
+        errors=found.errors,
+    )
+
+
+def choose_next(
+    analysis: Analysis, plan: Plan, *, n: int, goal: str, commands: frozenset[str]
+) -> NextPlan:
+    """Choose the `n` next experiments, each with the error expected once it is there.
+
+    Raises
+    ------
+    DataError, ConfigError : see `plan_next`.
+    """
+    known = Knowledge.of(analysis)
+    wanted = find_goal(goal, known, feedback=analysis.feedback)
+    candidates = propose_candidates(known, limits=plan.limits, commands=commands, goal=wanted)
+    told = np.array([known.of_recording(candidate) for candidate in candidates])
+    chosen = choose(told, known.told, n=n, goal=wanted)
+    sums = np.concatenate([known.told[None], told[list(chosen)]]).cumsum(axis=0)
+    errors = wanted.of(sums)
+    if not errors[-1] < errors[0]:
+        raise DataError(f"no experiment that the limits allow makes {wanted.words} better")
+    words = _words(wanted, known)
+    recordings = tuple(
+        candidates[one].model_copy(
+            update={
+                "aim": wanted.name,
+                "note": f"{words}: ± {_percent(before)} before, ± {_percent(after)} expected",
+            }
+        )
+        for one, before, after in zip(chosen, errors, errors[1:], strict=False)
+    )
+    return NextPlan(
+        words=words, plan=plan, path=None, recordings=recordings, errors=tuple(errors.tolist())
+    )
+
+
+def _words(goal: Goal, known: Knowledge) -> str:
+    if goal.name != WORST:
+        return goal.words
+    return f"{goal.words} ({list(known.chain.parameters())[goal.worst(known.told)]})"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2g} %"
+
+
+def known_commands(folder: Path) -> frozenset[str]:
+    """Return the extensions of the bench that the latest recording was made on."""
+    for path in sorted((folder / RAW).glob("*.raw"), key=lambda p: p.stat().st_mtime)[::-1]:
+        try:
+            return read_raw(path).header.bench.commands
+        except DataError:
+            continue
+    return _USUAL

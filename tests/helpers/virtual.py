@@ -1,0 +1,120 @@
+"""Recordings carried out on a virtual bench without a line or a clock: as fast as it computes."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from pipeline.bench.emulator.carts import TRUE_PERIOD, VirtualCarts, input_per_count
+from pipeline.bench.emulator.core import ReferenceCore
+from pipeline.bench.host.acquire import experiment_entry
+from pipeline.bench.host.experiments import add_experiment
+from pipeline.bench.host.record import data_file, log_text
+from pipeline.bench.planning.gains import Scales
+from pipeline.bench.planning.orders import make_order
+from pipeline.bench.planning.plan import Limits, Recording
+from pipeline.bench.protocol.messages import (
+    EXTENSIONS,
+    Description,
+    Hands,
+    Reading,
+    Start,
+    encode,
+    parse_reading,
+)
+from pipeline.output import write_file
+from pipeline.submission import Submission, load_submission
+from pipeline.submission.load import NAME
+from pipeline.synthesis.hidden import HiddenBench
+
+_PULL_OUT = 1700  # ticks a hand takes
+
+
+class VirtualBench:
+    """A bench at whose line somebody sits who never waits: ticks are run one after the other."""
+
+    def __init__(self, bench: HiddenBench, *, seed: int) -> None:
+        self.carts = VirtualCarts(bench, seed=seed)
+        self.description = Description(
+            name=bench.name,
+            encoders=self.carts.encoders,
+            carts=bench.chain.n,
+            commands=EXTENSIONS,
+            input_unit=bench.input_unit,
+            input_per_count=self.carts.input_per_count,
+            position_unit=bench.position_unit,
+            position_per_count=bench.count,
+        )
+        self.scales = Scales(input=input_per_count(bench), position=bench.count)
+        self._core, self._ticks = ReferenceCore(self.description), 0
+        self.seconds = 0.0  # of the bench's clock, all told
+
+    def _tick(self) -> list[Reading]:
+        duty = self._core.tick(
+            self.carts.counts(), stamp=int(1e3 * self._ticks * TRUE_PERIOD), now=0
+        )
+        self.carts.move(duty)
+        self._ticks += 1
+        return [r for line in self._core.take().splitlines() if (r := parse_reading(line))]
+
+    def _wait(self, seconds: float) -> None:
+        for _ in range(round(seconds / TRUE_PERIOD)):
+            self._tick()
+        self.seconds += seconds
+
+    def carry_out(
+        self, recording: Recording, *, submission: Submission, limits: Limits
+    ) -> list[Reading]:
+        """Return the lines of one recording; what passes a limit fails the assertion."""
+        n = submission.system.carts
+        order = make_order(
+            recording,
+            limits=limits,
+            scales=self.scales,
+            system=submission.system,
+            bench=self.description,
+        )
+        held = tuple(cart for cart in range(1, n + 1) if cart not in recording.carts)
+        self.carts.take_in_hand(Hands(held=held))
+        self._wait(recording.settle)
+        if recording.release:
+            self.carts.take_in_hand(Hands(held=held, released=recording.release))
+            self._wait(_PULL_OUT * TRUE_PERIOD)
+        for command in order.commands:
+            self._core.receive(encode(command))
+            if isinstance(command, Start):
+                self.carts.start()
+        lines = []
+        for _ in range(round(recording.duration / TRUE_PERIOD) + 2):
+            lines += self._tick()
+        self.seconds += recording.duration
+        for line in lines:
+            assert not (why := order.passed(line, carts=n)), f"{recording.id}: {why}"
+        return lines
+
+    def record(self, folder: Path, recordings: Sequence[Recording], *, limits: Limits) -> None:
+        """Carry out recordings into a submission, as `acquire` does."""
+        submission = load_submission(folder)
+        for recording in recordings:
+            lines = self.carry_out(recording, submission=submission, limits=limits)
+            text = log_text(lines, carts=submission.system.carts, reference=False)
+            (folder / "data").mkdir(exist_ok=True)
+            write_file(folder / data_file(recording), text)
+            entry = experiment_entry(
+                recording, file=data_file(recording), controller=None, remarks=()
+            )
+            submission = add_experiment(submission, entry)
+
+
+def new_folder(folder: Path, bench: VirtualBench, *, springs: Sequence[bool]) -> Path:
+    """Write a submission without records for a bench."""
+    described = bench.description
+    folder.mkdir(parents=True)
+    there = ", ".join("true" if one else "false" for one in springs)
+    (folder / NAME).write_text(
+        f"version = 1\n\n[system]\ncarts = {described.carts}\nsprings = [{there}]\n"
+        f'input = {{ unit = "{described.input_unit}", sign = 1, '
+        f"per_count = {described.input_per_count!r} }}\n"
+        f'position = {{ unit = "{described.position_unit}", '
+        f"per_count = {described.position_per_count!r} }}\n",
+        encoding="utf-8",
+    )
+    return folder
