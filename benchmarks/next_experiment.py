@@ -28,8 +28,9 @@ from pipeline.bench.design.next_plan import choose_next
 from pipeline.bench.planning.plan import Plan, Recording
 from pipeline.bench.planning.propose import FURTHEST, propose_plan, renamed, rounded, rounded_down
 from pipeline.output import write_file
-from pipeline.plant.chain import PRESETS, Array, Chain
-from pipeline.plant.dwells import SETTLED, SETTLED_DWELL, settling_wait, steady_time
+from pipeline.plant.linear.chain import Array, Chain
+from pipeline.plant.linear.dwells import SETTLED, SETTLED_DWELL, settling_wait, steady_time
+from pipeline.plant.linear.presets import PRESETS
 from pipeline.report.figures.style import drawing
 from pipeline.report.figures.svg import plain_svg, to_svg
 from pipeline.results import Analysis

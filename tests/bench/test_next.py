@@ -30,9 +30,9 @@ from pipeline.bench.protocol.messages import (
 )
 from pipeline.bench.protocol.waves import target_at
 from pipeline.errors import ConfigError
-from pipeline.plant.chain import PRESETS
-from pipeline.plant.loop import simulate_loop
-from pipeline.plant.simulate import simulate_linear
+from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.linear.simulate import simulate_linear
+from pipeline.plant.loop.sampled_loop import simulate_loop
 from pipeline.resources import EXAMPLES
 from pipeline.submission import load_submission
 from pipeline.synthesis.hidden import prepare_bench

@@ -11,7 +11,7 @@ from pipeline.bench.design.multisine import optimal_tones
 from pipeline.bench.planning.plan import Limits, Recording
 from pipeline.bench.planning.propose import FURTHEST, rounded, rounded_down
 from pipeline.errors import DataError
-from pipeline.plant.dwells import SETTLED, SETTLED_DWELL, dwell_frequencies, settling_wait
+from pipeline.plant.linear.dwells import SETTLED, SETTLED_DWELL, dwell_frequencies, settling_wait
 
 _TIME = 20.0  # s of a broadband record, or …
 _SLOW = 20  # … so many periods of the slowest mode

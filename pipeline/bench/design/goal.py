@@ -7,8 +7,8 @@ import numpy as np
 
 from pipeline.bench.design.information import Knowledge
 from pipeline.errors import ConfigError, DataError
-from pipeline.plant.chain import Array, Chain
-from pipeline.plant.loop import simulate_loop
+from pipeline.plant.linear.chain import Array, Chain
+from pipeline.plant.loop.sampled_loop import simulate_loop
 from pipeline.results import FeedbackDesign
 from pipeline.submission.complaints import nearest
 

@@ -33,9 +33,9 @@ from pipeline.estimation.chain.time_search import look
 from pipeline.estimation.chain.time_window import Window, open_window
 from pipeline.estimation.colour import score_covariance
 from pipeline.estimation.noise import noise_beyond_rounding
-from pipeline.plant.chain import Array, Chain
-from pipeline.plant.dwells import SETTLED_DWELL, settling_wait
-from pipeline.plant.simulate import simulate_linear
+from pipeline.plant.linear.chain import Array, Chain
+from pipeline.plant.linear.dwells import SETTLED_DWELL, settling_wait
+from pipeline.plant.linear.simulate import simulate_linear
 from pipeline.results import Analysis, ChainFit, FrequencyResponse, Record, SinePoint
 
 _NO_DAMPING = 1e-6  # of the critical one: what a fit held at zero, whose logarithm has a slope

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pipeline.bench.design.exchange import choose
 from pipeline.bench.design.goal import Goal
 from pipeline.bench.design.information import Knowledge
-from pipeline.plant.chain import Array, ComplexArray
+from pipeline.plant.linear.chain import Array, ComplexArray
 
 Tones = tuple[tuple[int, float, float], ...]
 Lines = NDArray[np.int64]  # harmonics
