@@ -6,11 +6,13 @@ from difflib import get_close_matches
 
 from pydantic_core import ErrorDetails
 
+from pipeline.names import first_few
 from pipeline.submission import models
 
 Location = Sequence[int | str]
 
 _LONGEST_QUOTE = 60  # characters of a found value worth showing
+_MOST_KNOWN = 40  # of what would do
 
 # The tables of the format, by their dotted path without the numbers.
 _TABLES: dict[str, type[models.BaseModel]] = {
@@ -73,7 +75,7 @@ def nearest(name: object, candidates: Sequence[str]) -> str:
     close = get_close_matches(str(name)[:_LONGEST_QUOTE], candidates, n=1, cutoff=0.5)
     if close:
         return f"; did you mean {close[0]!r}?"
-    return f"; known: {', '.join(candidates)}" if candidates else ""
+    return f"; known: {first_few(candidates, _MOST_KNOWN)}" if candidates else ""
 
 
 def dotted(location: Location, document: object) -> str:

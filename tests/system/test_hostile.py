@@ -165,7 +165,7 @@ def test_nothing_is_written_elsewhere_and_nobody_is_called(graded):
     assert not Path("/tmp/escaped").exists()
     out = base / "out-school"
     assert sorted(path.name for path in out.iterdir()) == [
-        ".compared.json", ".lock", "class.html", "feedback", "gradebook.sqlite", "grades.csv",
+        ".lock", "class.html", "feedback", "gradebook.sqlite", "grades.csv",
     ]  # fmt: skip
     assert not list(base.glob("escaped*"))
 

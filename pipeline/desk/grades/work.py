@@ -14,7 +14,7 @@ from pipeline.desk.grades.room import a_class, here
 from pipeline.desk.grades.team import signed
 from pipeline.desk.state import Ask
 from pipeline.errors import ConfigError
-from pipeline.grading.gradebook.override_table import Wish, read_wishes
+from pipeline.grading.gradebook.override import Wish, read_wishes
 from pipeline.grading.intake.lms_names import Platform
 from pipeline.grading.publish.export import export
 from pipeline.report.numbers import count

@@ -14,13 +14,11 @@ from pipeline.grading.batch.runner import (
     Limits,
     Progress,
     grade_batch,
-    grades_of,
     run_here,
 )
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.class_lines import wrong_springs
 from pipeline.grading.gradings import Batch
-from pipeline.grading.intake.files import digest
 from pipeline.grading.intake.hand_ins import find_hand_ins
 from pipeline.grading.intake.late_table import LateTable, settle_lateness
 from pipeline.grading.publish.outputs import write_outputs
@@ -37,7 +35,6 @@ from pipeline.submission.complaints import quote
 from pipeline.submission.load import NAME
 
 _SCRATCH = re.compile(r"\.scratch(-\d+)?")
-_MEMORY = ".compared.json"  # may be removed at any time
 _NAMED = 8  # submissions in a remark
 
 
@@ -96,8 +93,6 @@ def grade_class(
         # The rubric's file says which assignment it is: its title may be mended on the way.
         with Gradebook(gradebook or out, assignment=rubric_file.stem, create=True) as book:
             hidden = rubric.anonymous or anonymous
-            if hidden:  # it would tell who shares with whom
-                (out / _MEMORY).unlink(missing_ok=True)
             batch = grade_batch(
                 hand_ins,
                 rubric=rubric,
@@ -107,8 +102,6 @@ def grade_class(
                 limits=limits,
                 figures=figures,
                 examples=lambda: list(_handed_out(rubric, folder=rubric_file.parent)),
-                examples_digest=_examples_digest(rubric, folder=rubric_file.parent),
-                memory=None if hidden else out / _MEMORY,
                 progress=progress,
             )
             changes = book.finish(batch, rubric=rubric.model_copy(update={"anonymous": hidden}))
@@ -148,8 +141,8 @@ def _refuse_another_class(out: Path, *, assignment: str) -> None:
 
 def _told(batch: Batch, book: Gradebook) -> Iterator[str]:
     """Yield whether the rubric's springs are the benches', and what became of the class before."""
-    graded = (grade for _, grade in grades_of(batch, book) if grade.status == "graded")
-    if asked := wrong_springs(grade.springs for grade in graded):
+    grades = (entry.grade for entry in book.entries())
+    if asked := wrong_springs(grade.springs for grade in grades if grade.status == "graded"):
         yield asked
     hidden = book.rubric.anonymous
     for before, now in batch.moved.items():
@@ -177,7 +170,7 @@ def _names_so_far(place: Path | str, *, assignment: str) -> list[str]:
     """Return the submissions of the class list so far; making no gradebook."""
     try:
         with Gradebook(place, assignment=assignment) as book:
-            return book.names()
+            return [member.submission for member in book.listed()]
     except ConfigError:
         return []
 
@@ -190,11 +183,6 @@ def _executor(*, jobs: int, cluster: str | None) -> Executor:
     except ModuleNotFoundError as error:
         raise ConfigError(f"--cluster needs {error.name}: pip install 'cartlab[cluster]'") from None
     return run_on(cluster)
-
-
-def _examples_digest(rubric: Rubric, *, folder: Path) -> str:
-    own = (folder / example for example in rubric.examples)
-    return " ".join(digest([path]) for path in (*own, EXAMPLES))
 
 
 def _handed_out(rubric: Rubric, *, folder: Path) -> Iterator[bytes]:

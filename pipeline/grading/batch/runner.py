@@ -9,8 +9,6 @@ from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 
-from pydantic import TypeAdapter
-
 import pipeline
 from pipeline.grading.batch.so_far import class_so_far
 from pipeline.grading.batch.worker import Setup, Task, failed
@@ -22,8 +20,7 @@ from pipeline.grading.intake.hand_ins import HandIn
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.shared import find_shared, same_recordings, same_team, shared_flag
 from pipeline.grading.words import WORDS
-from pipeline.output import write_file
-from pipeline.schemas.grade import Flag, Grade, read_grade
+from pipeline.schemas.grade import Flag
 
 TIME_LIMIT = 120.0  # s for each hand-in
 MEMORY_LIMIT = 1_000_000_000  # bytes
@@ -55,8 +52,6 @@ def grade_batch(
     limits: Limits | None = None,
     figures: bool = False,
     examples: Callable[[], Iterable[bytes]] = tuple,
-    examples_digest: str = "",
-    memory: Path | None = None,
     progress: Progress = _silent,
 ) -> Batch:
     """Grade what the gradebook does not know yet; every outcome is in it as soon as it is had.
@@ -71,8 +66,7 @@ def grade_batch(
     execute : what runs the tasks: `run_here(jobs=…)` or `cluster.run_on(address)`.
     figures : draw those of the feedback, too.
     examples : packed fingerprints of recordings that were handed out with the task; asked for
-        only where recordings are shared. `examples_digest` changes whenever they do.
-    memory : a file that remembers which recordings were compared last, and with what result.
+        only where recordings are shared.
     progress : called with how many are done, of how many, and what was done last.
     """
     limits = limits or Limits()
@@ -109,13 +103,7 @@ def grade_batch(
     in_order = [rows[name] for name in sorted(rows)]
     return Batch(
         keys=tuple(row.key for row in in_order),
-        shared=_shared(
-            in_order,
-            book,
-            basis=(code, text, examples_digest),
-            memory=memory,
-            examples=examples,
-        ),
+        shared=_shared(in_order, book, examples=examples),
         failed=tuple((row.submission, row.reason) for row in in_order if row.reason),
         kept=tuple(before.kept),
         moved=before.moved,
@@ -199,12 +187,7 @@ def _task(hand_in: HandIn, *, basis: tuple[str, str, bool]) -> Task:
 
 
 def _shared(
-    rows: Sequence[Member],
-    book: Gradebook,
-    *,
-    basis: Sequence[str],
-    memory: Path | None,
-    examples: Callable[[], Iterable[bytes]],
+    rows: Sequence[Member], book: Gradebook, *, examples: Callable[[], Iterable[bytes]]
 ) -> dict[str, Flag]:
     """Return the flags for recordings that stand in two submissions of this or earlier batches."""
     batch = [row for row in rows if row.fingerprints]
@@ -217,17 +200,10 @@ def _shared(
         and (prints.authors, prints.fingerprints) not in here
         and not _is_before(prints, names.get(prints.submission))
     ]
-    compared = _digest(basis, batch, earlier)
-    if memory is not None and (flags := _remembered(memory, compared)) is not None:
-        return flags
     found = find_shared(batch, earlier=earlier)
     if found and (handed_out := tuple(examples())):
         found = find_shared(batch, earlier=earlier, examples=handed_out)
-    flags = {submission: shared_flag(records) for submission, records in found.items()}
-    if memory is not None:
-        plain = {name: flag.model_dump() for name, flag in flags.items()}
-        write_file(memory, json.dumps({"compared": compared, "flags": plain}))
-    return flags
+    return {submission: shared_flag(records) for submission, records in found.items()}
 
 
 def _is_before(earlier: Member, now: Member | None) -> bool:
@@ -238,38 +214,3 @@ def _is_before(earlier: Member, now: Member | None) -> bool:
     if now is None:
         return False
     return same_team(earlier, now) or (earlier.of_class and same_recordings(earlier, now))
-
-
-def _digest(head: Sequence[str], *groups: Sequence[Member]) -> str:
-    """Return a hash of everything that a comparison of recordings depends on."""
-    total = hashlib.sha256(json.dumps(head).encode())
-    for group in groups:
-        total.update(b"group")
-        for prints in group:
-            own = hashlib.sha256(prints.fingerprints).hexdigest()
-            total.update(
-                json.dumps([prints.submission, prints.authors, prints.owner, own]).encode()
-            )
-    return total.hexdigest()
-
-
-def _remembered(memory: Path, compared: str) -> dict[str, Flag] | None:
-    """Return the flags of the last comparison if it was this one."""
-    try:
-        document = json.loads(memory.read_text(encoding="utf-8"))
-        if document["compared"] != compared:
-            return None
-        return TypeAdapter(dict[str, Flag]).validate_python(document["flags"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-
-
-def grades_of(batch: Batch, book: Gradebook) -> Iterator[tuple[Grading, Grade]]:
-    """Yield every outcome with its grade, shared data flagged; one at a time in memory."""
-    for key in batch.keys:
-        outcome = book.known(key, figures=False)
-        if outcome is None:
-            raise KeyError(key)
-        grade = read_grade(outcome.grade)
-        flag = batch.shared.get(outcome.submission)
-        yield outcome, grade.with_flags(flag) if flag else grade

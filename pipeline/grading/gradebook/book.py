@@ -17,26 +17,22 @@ from pipeline.errors import ConfigError
 from pipeline.grading.gradebook.changes import kept_by_hand, points_changes, rubric_changes
 from pipeline.grading.gradebook.class_lines import Line, class_frame
 from pipeline.grading.gradebook.history import Event, read_events
-from pipeline.grading.gradebook.lists import (
-    add_list,
-    by_other_rubrics,
-    is_of,
-    lines_of,
-    nearest,
-    points_of,
-)
 from pipeline.grading.gradebook.override import Override
 from pipeline.grading.gradebook.rows import (
     GRADING,
     Entry,
+    add_list,
     add_row,
+    by_other_rubrics,
     carry_overrides,
     class_list,
     final_entry,
     known_grading,
     last_named,
+    lines_of,
     newest_of,
     pages,
+    points_of,
     put_brief,
     read_figures,
     read_flag,
@@ -53,9 +49,10 @@ from pipeline.grading.gradebook.schema import (
     overrides,
     submissions,
 )
-from pipeline.grading.gradings import Batch, Grading, Member
+from pipeline.grading.gradings import Batch, Grading, Member, person
 from pipeline.grading.rubric import Rubric
 from pipeline.schemas.grade import read_grade
+from pipeline.submission.complaints import nearest
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -146,12 +143,6 @@ class Gradebook:
             lines = [] if last is None else lines_of(connection, last)
         return read_members(self._database, [line["grading_id"] for line in lines])
 
-    def names(self) -> list[str]:
-        """Return the submissions of the class list so far."""
-        with self._database.reading() as connection:
-            last = self._newest(connection)
-            return [] if last is None else list(points_of(connection, last))
-
     def finish(self, batch: Batch, *, rubric: Rubric) -> list[str]:
         """Make a batch that ran to its end the class list; one that changes nothing adds nothing.
 
@@ -180,13 +171,11 @@ class Gradebook:
                         "out_of": entry.grade.out_of,
                     }
                 )
-            text = rubric.model_dump_json()
-            last = self._newest(connection)
+            text, last = rubric.model_dump_json(), self._newest(connection)
             if last is not None and last.rubric == text and lines_of(connection, last) == listed:
                 return []
-            add_list(
-                connection, listed, assignment=self._assignment or "", at=self._at(), rubric=text
-            )
+            mine = self._assignment or ""
+            add_list(connection, listed, assignment=mine, at=self._at(), rubric=text)
             if last is None:
                 return []
             told = [f"rubric: {change}" for change in rubric_changes(last.rubric, text)]
@@ -225,12 +214,10 @@ class Gradebook:
             last = self._last(connection)
             of_batch = select(entries.c.position).where(entries.c.batch_id == last.id)
             positions = sorted(connection.scalars(of_batch))
-        rubric = read_rubric(last)
+        rubric, lines = read_rubric(last), class_list(last)
         for page in pages(positions):
             with self._database.reading() as connection:
-                rows = connection.execute(
-                    class_list().where(entries.c.batch_id == last.id, entries.c.position.in_(page))
-                ).all()
+                rows = connection.execute(lines.where(entries.c.position.in_(page))).all()
                 found = [
                     final_entry(connection, r, shared=read_flag(r.shared), rubric=rubric)
                     for r in rows
@@ -335,7 +322,7 @@ class Gradebook:
         out_of = {c.id: c.points for c in rubric.criteria}
         if criterion not in out_of:
             hint = nearest(criterion, list(out_of))
-            raise ConfigError(f"{criterion}: the rubric has no such criterion; {hint}")
+            raise ConfigError(f"{criterion}: the rubric has no such criterion{hint}")
         if points is not None and not 0 <= points <= out_of[criterion]:
             raise ConfigError(f"{criterion}: has 0 to {out_of[criterion]:g} points")
         given = Override(
@@ -359,10 +346,7 @@ class Gradebook:
         return add_row(connection, submissions, values) if number is None else number
 
     def _last(self, connection: Connection) -> Row:
-        newest = select(batches).order_by(batches.c.id.desc()).limit(1)
-        if self._assignment is not None:
-            newest = newest.where(batches.c.assignment == self._assignment)
-        row = connection.execute(newest).one_or_none()
+        row = self._newest(connection)
         if row is None:
             what = f"no grading of {self._assignment!r}" if self._assignment else "no grading"
             raise ConfigError(
@@ -373,14 +357,13 @@ class Gradebook:
     def _find(self, connection: Connection, team: str) -> tuple[Row, Row]:
         """Return the last batch and the line of a team in it."""
         last = self._last(connection)
-        of_batch = class_list(detail=False).where(entries.c.batch_id == last.id)
-        rows = connection.execute(of_batch).all()
-        exact = [r.position for r in rows if r.name == team]
-        found = exact or [r.position for r in rows if is_of(r.authors, team)]
+        names = class_list(last, submissions.c.name, gradings.c.authors)
+        rows = connection.execute(names).all()
+        found = [row.position for row in _named(team, rows)]
         if len(found) != 1:
-            hint = f"no such submission; {nearest(team, [row.name for row in rows])}"
+            hint = f"no such submission{nearest(team, [row.name for row in rows])}"
             raise ConfigError(f"{team}: {'is in several submissions: name one' if found else hint}")
-        line = class_list().where(entries.c.batch_id == last.id, entries.c.position == found[0])
+        line = class_list(last).where(entries.c.position == found[0])
         return last, connection.execute(line).one()
 
     def _find_ever(self, connection: Connection, team: str) -> Row:
@@ -392,15 +375,20 @@ class Gradebook:
             ever = select(*columns).join(submissions).order_by(gradings.c.id)
             if self._assignment is not None:
                 ever = ever.where(submissions.c.assignment == self._assignment)
-            rows = connection.execute(ever).all()
-            found = {r.submission_id: r for r in rows if r.name == team} or {
-                r.submission_id: r for r in rows if is_of(r.authors, team)
-            }
+            found = {r.submission_id: r for r in _named(team, connection.execute(ever).all())}
             if len(found) != 1:
                 raise
             return found.popitem()[1]
 
     def _newest(self, connection: Connection) -> Row | None:
-        """Return the batch of this assignment before the one that ends now."""
-        mine = select(batches).where(batches.c.assignment == (self._assignment or ""))
-        return connection.execute(mine.order_by(batches.c.id.desc()).limit(1)).one_or_none()
+        """Return the batch of this assignment, or of any, that ended last; None before one did."""
+        newest = select(batches).order_by(batches.c.id.desc()).limit(1)
+        if self._assignment is not None:
+            newest = newest.where(batches.c.assignment == self._assignment)
+        return connection.execute(newest).one_or_none()
+
+
+def _named(team: str, rows: Sequence[Row]) -> list[Row]:
+    """Return the rows of this name, or else of which this is an author, however typed."""
+    exact = [row for row in rows if row.name == team]
+    return exact or [row for row in rows if person(team) in map(person, row.authors)]

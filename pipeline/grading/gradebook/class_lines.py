@@ -1,9 +1,10 @@
 """The class as a table: a line a submission, or a row a submission and criterion."""
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+import json
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
 from math import nan
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pipeline.grading.rubric import Rubric
 from pipeline.schemas.grade import CODES, Code, Grade, Outcome
@@ -60,24 +61,20 @@ class Line:
             springs=grade.springs,
         )
 
+    @property
+    def text(self) -> str:
+        """As kept in the gradebook."""
+        return json.dumps(asdict(self))
+
     @classmethod
-    def of_plain(cls, grade: Mapping[str, Any], *, shared: bool) -> "Line":
-        """Return the line of a grade as plain data, which is not validated: that takes longest."""
-        codes = {*(flag["code"] for flag in grade["flags"]), *(["shared_data"] if shared else [])}
-        return cls(
-            name=grade["submission"],
-            authors=tuple(grade["authors"]),
-            status=grade["status"],
-            points=grade["points"],
-            out_of=grade["out_of"],
-            days_late=grade["days_late"],
-            deducted=grade["deducted"],
-            reason=grade["reason"],
-            criteria={c["id"]: (c["outcome"], c["points"]) for c in grade["criteria"]},
-            codes=tuple(sorted(codes, key=CODES.index)) if codes else (),
-            by_hand=(),
-            springs=tuple(grade["springs"]),
-        )
+    def read(cls, text: str, *, shared: bool) -> "Line":
+        """Return the line that `text` was of, now that recordings are `shared` or not."""
+        plain = json.loads(text)
+        codes = {*plain["codes"], *(["shared_data"] if shared else [])}
+        lists = {key: tuple(plain[key]) for key in ("authors", "by_hand", "springs")}
+        criteria = {id_: tuple(own) for id_, own in plain["criteria"].items()}
+        order = tuple(sorted(codes, key=CODES.index)) if codes else ()
+        return cls(**{**plain, **lists, "criteria": criteria, "codes": order})
 
 
 def wrong_springs(graded: Iterable[tuple[str, ...]]) -> str:

@@ -1,10 +1,8 @@
 """A gradebook that several people look at and change at the same time."""
 
-import json
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from sqlalchemy import Connection, Row, Select, func, insert, select
@@ -13,21 +11,17 @@ from pipeline.errors import ConfigError
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.class_lines import Line
 from pipeline.grading.gradebook.history import Event, read_events
-from pipeline.grading.gradebook.override import Override
-from pipeline.grading.gradebook.override_table import Wish
+from pipeline.grading.gradebook.override import Override, Wish
 from pipeline.grading.gradebook.rows import (
     OVERRIDE,
     Entry,
     as_it_counts,
     class_list,
     final_entry,
-    pages,
-    put_brief,
     read_flag,
     read_rubric,
 )
 from pipeline.grading.gradebook.schema import (
-    batches,
     briefs,
     entries,
     gradings,
@@ -36,7 +30,7 @@ from pipeline.grading.gradebook.schema import (
     submissions,
 )
 from pipeline.grading.rubric import Rubric
-from pipeline.schemas.grade import Flag, read_grade
+from pipeline.schemas.grade import Flag
 
 State = tuple[int, int, int]
 
@@ -101,15 +95,7 @@ class TeamNow:
 
 
 class OpenBook(Gradebook):
-    """A gradebook of which several processes show the newest, and change no more than they saw.
-
-    One of an earlier cartlab gets the tables that it has not; earlier ones go on reading it.
-    """
-
-    def __init__(self, place: str | Path, *, assignment: str | None = None) -> None:
-        super().__init__(place, assignment=assignment)
-        self._database.complete()
-        self._fill_briefs()
+    """A gradebook of which several processes show the newest, and change no more than they saw."""
 
     def state(self) -> State:
         """Return numbers that change whenever something else is to be shown."""
@@ -124,8 +110,8 @@ class OpenBook(Gradebook):
             last = self._last(connection)
             rubric = read_rubric(last)
             of_class = select(entries.c.submission_id).where(entries.c.batch_id == last.id)
-            of_lists = select(entries.c.grading_id).where(entries.c.batch_id == last.id)
-            rows = connection.execute(_brief_list().where(entries.c.batch_id == last.id)).all()
+            brief = gradings.c.id, gradings.c.submission_id, briefs.c.grade.label("brief")
+            rows = connection.execute(class_list(last, *brief)).all()
             given: dict[int, dict[int, Override]] = defaultdict(dict)
             mine = _overrides().where(overrides.c.submission_id.in_(of_class))
             for row in connection.execute(mine):
@@ -137,25 +123,38 @@ class OpenBook(Gradebook):
                 row.submission_id: row.key
                 for row in connection.execute(keys.where(gradings.c.id.in_(firsts)))
             }
-            looked = select(looks).where(looks.c.grading_id.in_(of_lists)).order_by(looks.c.id)
-            marks = {row.grading_id: row for row in connection.execute(looked)}
-        known = before.listings if before and before.rubric == rubric else ()
-        made = {listing.made_of: listing for listing in known}
-        listings = []
-        for row in rows:
-            own = given.get(row.submission_id, {})
-            made_of = (row.id, row.shared, *own)
-            listing = made.get(made_of)
-            if listing is None:
-                first = first_key[row.submission_id]
-                listing = _listing(
-                    row, [*own.values()], rubric=rubric, first_key=first, made_of=made_of
-                )
-            listings.append(listing)
+            of_list = select(entries.c.grading_id).where(entries.c.batch_id == last.id)
+            looked = select(looks).where(looks.c.grading_id.in_(of_list)).order_by(looks.c.id)
+            seen = {
+                row.grading_id: row.by if row.seen else "" for row in connection.execute(looked)
+            }
+            known = before.listings if before and before.rubric == rubric else ()
+            made = {listing.made_of: listing for listing in known}
+            listings = []
+            for row in rows:
+                shared, own = read_flag(row.shared), given.get(row.submission_id, {})
+                made_of = (row.id, row.shared, *own)
+                listing = made.get(made_of)
+                if listing is None:
+                    line = Line.read(row.brief, shared=shared is not None)
+                    if own:  # few have points by hand, and those need all of the grade
+                        whole = class_list(last).where(entries.c.position == row.position)
+                        grade = connection.execute(whole).one()
+                        line = Line.of(
+                            as_it_counts(grade, own.values(), shared=shared, rubric=rubric).grade
+                        )
+                    listing = Listing(
+                        line=line,
+                        grading=row.id,
+                        shared=shared,
+                        first_key=first_key[row.submission_id],
+                        made_of=made_of,
+                    )
+                listings.append(listing)
         return ClassNow(
             rubric=rubric,
             listings=tuple(listings),
-            seen={number: row.by for number, row in marks.items() if row.seen},
+            seen={number: by for number, by in seen.items() if by},
         )
 
     def team(self, name: str) -> TeamNow:
@@ -243,9 +242,8 @@ class OpenBook(Gradebook):
         with self._database.changing() as connection:
             last = self._last(connection)
             rubric = read_rubric(last)
-            of_batch = class_list(detail=False).add_columns(submissions.c.id.label("submission_id"))
-            lines = connection.execute(of_batch.where(entries.c.batch_id == last.id)).all()
-            named = {row.name: row for row in lines}
+            columns = submissions.c.name, gradings.c.submission_id
+            named = {row.name: row for row in connection.execute(class_list(last, *columns))}
             for wish in wishes:
                 row = named.get(wish.submission)
                 if row is None:
@@ -297,49 +295,6 @@ class OpenBook(Gradebook):
             for criterion, why in connection.execute(mine):
                 found[criterion].append(why)
         return dict(found)
-
-    def _fill_briefs(self) -> None:
-        """Add what gradings of an earlier cartlab lack."""
-        lacking = select(gradings.c.id).outerjoin(briefs).where(briefs.c.grading_id.is_(None))
-        lacking = lacking.where(gradings.c.id.in_(self._listed_now()))
-        with self._database.reading() as connection:
-            numbers = sorted(connection.scalars(lacking))
-        for page in pages(numbers):
-            with self._database.changing() as connection:
-                whole = select(gradings.c.id, gradings.c.grade).where(gradings.c.id.in_(page))
-                still = whole.where(gradings.c.id.in_(lacking))
-                for row in connection.execute(still).all():
-                    put_brief(connection, row.id, read_grade(row.grade))
-
-    def _listed_now(self) -> Select:
-        mine = select(func.max(batches.c.id)).group_by(batches.c.assignment)
-        return select(entries.c.grading_id).where(entries.c.batch_id.in_(mine))
-
-
-def _listing(
-    row: Row, given: Sequence[Override], *, rubric: Rubric, first_key: str, made_of: tuple[Any, ...]
-) -> Listing:
-    shared = read_flag(row.shared)
-    if given:
-        entry = as_it_counts(row, given, shared=shared, rubric=rubric, first_key=first_key)
-        line = Line.of(entry.grade)
-    else:
-        line = Line.of_plain(json.loads(row.grade), shared=shared is not None)
-    return Listing(line=line, grading=row.id, shared=shared, first_key=first_key, made_of=made_of)
-
-
-def _brief_list() -> Select:
-    """Return the query for the lines of class lists, with briefs as their grades."""
-    columns = gradings.c.id, gradings.c.submission_id, gradings.c.key, gradings.c.authors
-    chosen = select(
-        *columns, gradings.c.owner, briefs.c.grade, submissions.c.name, entries.c.shared
-    )
-    joined = (
-        entries.join(gradings, entries.c.grading_id == gradings.c.id)
-        .join(briefs, briefs.c.grading_id == gradings.c.id)
-        .join(submissions, entries.c.submission_id == submissions.c.id)
-    )
-    return chosen.select_from(joined).order_by(entries.c.position)
 
 
 def _overrides() -> Select:

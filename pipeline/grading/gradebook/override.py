@@ -1,15 +1,19 @@
-"""Points given by hand: who, when and why, and the grade with them in."""
+"""Points given by hand: who, when and why, one or many at once, and the grade with them in."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
+from pathlib import Path
 
 from pipeline.errors import ConfigError
 from pipeline.grading.gradings import person
 from pipeline.grading.references.tolerance import exact, late_deduction
 from pipeline.grading.rubric import Rubric
+from pipeline.grading.table import read_table
 from pipeline.schemas.grade import Criterion, Grade
 from pipeline.schemas.grade import Override as ByHand
+
+_HEADS = ("submission", "criterion", "points", "why")  # of a table with points for many
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,6 +57,45 @@ def read_points(text: str) -> float | None:
         return float(text.replace(",", "."))
     except ValueError:
         raise ConfigError(f"{text}: points are a number, or auto") from None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wish:
+    """A row of the table; points None: the automatic ones again."""
+
+    line: int
+    submission: str
+    criterion: str
+    points: float | None
+    why: str
+
+
+def read_wishes(path: Path) -> list[Wish]:
+    """Read a CSV with the columns submission, criterion, points (or auto) and why.
+
+    Raises
+    ------
+    ConfigError : it is no such table, with the line.
+    """
+    table = read_table(path)
+    missing = [name for name in _HEADS if name not in table.columns]
+    if missing or not table.columns.is_unique:
+        raise ConfigError(
+            f"{path.name}: needs the columns {', '.join(_HEADS)}, each once"
+            + (f"; it lacks {', '.join(missing)}" if missing else "")
+        )
+    wishes = []
+    for line, row in table.iterrows():
+        submission, criterion, points, why = (str(row[name]).strip() for name in _HEADS)
+        try:
+            given = read_points(points)
+        except ConfigError as error:
+            raise ConfigError(f"{path.name} line {line}: {error}") from None
+        wishes.append(
+            Wish(line=int(str(line)), submission=submission, criterion=criterion, points=given,
+                 why=why)
+        )  # fmt: skip
+    return wishes
 
 
 def with_overrides(grade: Grade, overrides: Mapping[str, Override], *, rubric: Rubric) -> Grade:

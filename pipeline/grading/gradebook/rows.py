@@ -5,12 +5,14 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 
 from pydantic import ValidationError
-from sqlalchemy import Connection, Row, Select, Table, insert, select
+from sqlalchemy import ColumnElement, Connection, Row, Select, Table, func, insert, select
 
 from pipeline.errors import ConfigError
+from pipeline.grading.gradebook.class_lines import Line
 from pipeline.grading.gradebook.override import Override, with_overrides
 from pipeline.grading.gradebook.schema import (
     Database,
+    batches,
     briefs,
     entries,
     figures,
@@ -93,18 +95,8 @@ def known_grading(
 
 
 def put_brief(connection: Connection, grading: int, grade: Grade) -> None:
-    """Add what the table of a class shows of a grading: all but the evidence."""
-    bare = {"message": "", "expected": {}, "found": {}}
-    plain = {"message": "", "evidence": {}}
-    brief = grade.model_copy(
-        update={
-            "criteria": tuple(c.model_copy(update=bare) for c in grade.criteria),
-            "flags": tuple(flag.model_copy(update=plain) for flag in grade.flags),
-            "notes": (),
-        }
-    )
-    text = brief.model_dump_json(by_alias=True)
-    connection.execute(insert(briefs).values(grading_id=grading, grade=text))
+    """Add what the table of a class shows of a grading."""
+    connection.execute(insert(briefs).values(grading_id=grading, grade=Line.of(grade).text))
 
 
 def read_figures(connection: Connection, grading: int) -> tuple[tuple[str, str], ...]:
@@ -175,14 +167,16 @@ def newest_of(connection: Connection, key: str, *, assignment: str) -> Row:
     return row
 
 
-def class_list(*, detail: bool = True) -> Select:
-    """Return the query for the lines of class lists, in order; grades only with `detail`."""
-    joined = entries.join(gradings, entries.c.grading_id == gradings.c.id).join(
-        submissions, entries.c.submission_id == submissions.c.id
+def class_list(batch: Row, *columns: ColumnElement) -> Select:
+    """Return the query for the lines of a class list, in order; default: with their grades."""
+    joined = (
+        entries.join(gradings, entries.c.grading_id == gradings.c.id)
+        .join(submissions, entries.c.submission_id == submissions.c.id)
+        .join(briefs, briefs.c.grading_id == gradings.c.id)
     )
-    columns = _ENTRY if detail else (submissions.c.name, gradings.c.authors)
-    chosen = select(*columns, entries.c.position, entries.c.shared)
-    return chosen.select_from(joined).order_by(entries.c.position)
+    chosen = select(*(columns or _ENTRY), entries.c.position, entries.c.shared)
+    mine = chosen.select_from(joined).where(entries.c.batch_id == batch.id)
+    return mine.order_by(entries.c.position)
 
 
 def final_entry(connection: Connection, row: Row, *, shared: Flag | None, rubric: Rubric) -> Entry:
@@ -200,7 +194,7 @@ def final_entry(connection: Connection, row: Row, *, shared: Flag | None, rubric
 
 
 def as_it_counts(
-    row: Row, ever: Iterable[Override], *, shared: Flag | None, rubric: Rubric, first_key: str
+    row: Row, ever: Iterable[Override], *, shared: Flag | None, rubric: Rubric, first_key: str = ""
 ) -> Entry:
     """Return a line with all overrides that there ever were of its submission."""
     newest = {override.criterion: override for override in ever if override.concerns(row.authors)}
@@ -216,6 +210,68 @@ def as_it_counts(
         grading=row.id,
         first_key=first_key,
     )
+
+
+def lines_of(connection: Connection, batch: Row) -> list[dict]:
+    """Return a class list as it was put in."""
+    columns = [column for column in entries.c if column.name != "batch_id"]
+    mine = select(*columns).where(entries.c.batch_id == batch.id).order_by(entries.c.position)
+    return [dict(row._mapping) for row in connection.execute(mine)]
+
+
+def points_of(connection: Connection, batch: Row) -> dict[str, float]:
+    """Return the points of a class list by submission."""
+    rows = connection.execute(class_list(batch, submissions.c.name, entries.c.points))
+    return {row.name: row.points for row in rows}
+
+
+def add_list(
+    connection: Connection, lines: list[dict], *, assignment: str, at: str, rubric: str
+) -> None:
+    """Add a class list."""
+    values = {"assignment": assignment, "at": at, "rubric": rubric}
+    number = add_row(connection, batches, values)
+    if lines:
+        connection.execute(insert(entries), [{**line, "batch_id": number} for line in lines])
+
+
+def by_other_rubrics(connection: Connection, batch: Row) -> list[str]:
+    """Return the submissions of a class list that were graded by another rubric than it has.
+
+    A grading is by the rubric of the first list that it stands in.
+    """
+    mine = select(entries.c.grading_id).where(entries.c.batch_id == batch.id)
+    first = (
+        select(entries.c.grading_id, func.min(entries.c.batch_id).label("batch_id"))
+        .where(entries.c.grading_id.in_(mine))
+        .group_by(entries.c.grading_id)
+        .subquery()
+    )
+    joined = (
+        select(submissions.c.name, batches.c.rubric)
+        .select_from(first)
+        .join(batches, batches.c.id == first.c.batch_id)
+        .join(gradings, gradings.c.id == first.c.grading_id)
+        .join(submissions, submissions.c.id == gradings.c.submission_id)
+        .where(batches.c.rubric != batch.rubric)
+    )
+    rows = connection.execute(joined).all()
+    now = _asked(read_rubric(batch))
+    others = {text for text in {row.rubric for row in rows} if _read(text) != now}
+    return sorted(row.name for row in rows if row.rubric in others)
+
+
+def _asked(rubric: Rubric) -> Rubric:
+    """Return what a rubric asks, without how it is shown."""
+    return rubric.model_copy(update={"title": "", "anonymous": False})
+
+
+def _read(text: str) -> Rubric | None:
+    """Return what a kept rubric asks, None where it is of another version of cartlab."""
+    try:
+        return _asked(Rubric.model_validate_json(text))
+    except ValidationError:
+        return None
 
 
 def last_named(connection: Connection, submission: int) -> tuple[str, ...]:

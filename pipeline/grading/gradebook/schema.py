@@ -33,7 +33,6 @@ from sqlalchemy import (
     event,
     func,
     insert,
-    inspect,
     make_url,
     select,
 )
@@ -176,8 +175,7 @@ overrides = Table(
     Index("overrides_by_submission", "submission_id"),
 )
 
-# A grade without its evidence, of which the table of a class is made. Gradebooks that are older
-# than this table get it, and what is in it, when they are opened by several at once.
+# What the table of a class shows of a grade: to read 2,000 whole ones takes seconds.
 briefs = Table(
     "briefs",
     metadata,
@@ -276,14 +274,6 @@ class Database:
             _take_turns(connection)
             yield connection
 
-    def complete(self) -> None:
-        """Make the tables that came after this gradebook was made."""
-        with self.reading() as connection:
-            whole = _is_whole(connection)
-        if not whole:
-            with self.writing() as connection:
-                _create(connection)
-
     def close(self) -> None:
         """Let go of the connections."""
         self._engine.dispose()
@@ -300,17 +290,12 @@ class Database:
 def _create(connection: Connection) -> None:
     """Make the tables that are not there; two runs that begin at once make them one by one."""
     _take_turns(connection)
-    if not _is_whole(connection):
-        metadata.create_all(connection)
+    metadata.create_all(connection)
 
 
 def _take_turns(connection: Connection) -> None:
     if connection.dialect.name == "postgresql":  # SQLite's write lock is held already
         connection.execute(select(func.pg_advisory_xact_lock(_TURN)))
-
-
-def _is_whole(connection: Connection) -> bool:
-    return metadata.tables.keys() <= set(inspect(connection).get_table_names())
 
 
 def _engine(place: str | Path, *, create: bool) -> Engine:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.grading.batch.runner import Limits, grade_batch, grades_of, run_here
+from pipeline.grading.batch.runner import Limits, grade_batch, run_here
 from pipeline.grading.batch.worker import Setup, Task, grade_task
 from pipeline.grading.batch.worker_process import Worker
 from pipeline.grading.gradebook.book import Gradebook
@@ -22,7 +22,7 @@ from pipeline.grading.publish import feedback_figures
 from pipeline.grading.publish.outputs import write_outputs
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.processes import LineProcess
-from pipeline.schemas.grade import grade_text
+from pipeline.schemas.grade import grade_text, read_grade
 from pipeline.synthesis import write_submission
 from tests.helpers.grades import n_graded
 from tests.helpers.waiting import PATIENCE, started, until
@@ -64,7 +64,14 @@ def run(paths, out, *, jobs=1, limits=None, execute=None, progress=lambda *_: No
             limits=limits or Limits(time=PATIENCE),
             progress=progress,
         )
-        return batch, {o.submission: (o, grade_text(g)) for o, g in grades_of(batch, book)}
+        rows = {}
+        for outcome in filter(None, (book.known(key, figures=False) for key in batch.keys)):
+            flag, grade = batch.shared.get(outcome.submission), read_grade(outcome.grade)
+            rows[outcome.submission] = (
+                outcome,
+                grade_text(grade.with_flags(flag) if flag else grade),
+            )
+        return batch, rows
 
 
 @pytest.fixture(scope="module")
