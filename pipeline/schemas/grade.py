@@ -88,6 +88,27 @@ class Grade(Document):
     ] = ()
     overrides: tuple[Override, ...] = ()
 
+    @classmethod
+    def failed(
+        cls,
+        submission: str,
+        reason: str,
+        *,
+        out_of: float,
+        authors: tuple[str, ...],
+        days_late: float,
+    ) -> "Grade":
+        """Return the grade of what could not be graded."""
+        return cls(
+            submission=submission,
+            authors=authors,
+            status="failed",
+            points=0.0,
+            out_of=out_of,
+            days_late=days_late,
+            reason=reason,
+        )
+
     def with_flags(self, *flags: Flag) -> "Grade":
         """Return the grade with further flags, in the order of the codes."""
         together = sorted((*self.flags, *flags), key=lambda flag: CODES.index(flag.code))

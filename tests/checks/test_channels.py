@@ -24,7 +24,9 @@ LATE = 5  # samples
 def hand_in(folder: Path, *, hide: tuple[str, ...] = (), late: int = 0) -> Path:
     """Write an honest submission of two carts; cart 2 is read so many samples late."""
     bench = prepare_bench(preset="throne-2dof", hide=hide)
-    write_submission(folder, chain=bench.chain, effects=bench.effects, seed=3, reported=True)
+    write_submission(
+        folder, chain=bench.chain, effects=bench.effects, seed=3, compact=True, reported=True
+    )
     for path in (folder / "data").glob("*.csv") if late else ():
         head, *rows = csv.reader(path.read_text(encoding="utf-8").splitlines())
         at = head.index("x2")
@@ -58,7 +60,14 @@ def test_a_late_channel_is_told_with_its_delay(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "hide", [(), ("coulomb_friction:cart=2,force=0.03",), ("input_delay:delay=0.03",)]
+    "hide",
+    [
+        (),
+        pytest.param(
+            ("coulomb_friction:cart=2,force=0.03",), marks=[pytest.mark.slow, pytest.mark.sample]
+        ),
+        ("input_delay:delay=0.03",),
+    ],
 )
 def test_friction_and_a_late_input_are_no_late_channel(tmp_path, hide):
     """A delay of the motor moves all carts alike, and friction no phase in proportion."""

@@ -57,6 +57,8 @@ def test_coarse_encoders_cost_no_points(seed):
     assert grade.points >= 0.99 * grade.out_of
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_table_of_three_carts_without_a_gain_is_none_of_two():
     """What is left of a table once a negative gain is out implies no carts."""
     team = make_team(2)

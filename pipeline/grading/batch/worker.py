@@ -8,13 +8,13 @@ import base64
 import faulthandler
 import json
 import os
+import re
 import sys
 import tempfile
 import traceback
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 from pipeline.errors import PipelineError
 from pipeline.grading.gradings import Grading
@@ -26,11 +26,13 @@ from pipeline.processes import limit_memory
 from pipeline.schemas.grade import Grade, grade_text
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.complaints import quote
-from pipeline.submission.named import named_authors
+from pipeline.submission.load import MAX_TOML_BYTES, NAME
 
 _GRACE = 30.0  # s; a worker without a parent to stop it ends by itself so long after the limit
 OUT_OF_MEMORY = "needs more memory than allowed"
 _DETAIL = 20_000  # characters of a traceback
+_TABLE = re.compile(r"\s*\[+\s*([\w.-]+)")
+_ID = re.compile(r"""\s*id\s*=\s*["'“”„]?([^"'“”#]+)""")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,6 +118,24 @@ def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = Fal
     )
 
 
+def named_authors(folder: Path) -> tuple[str, ...]:
+    """Return the ids under `[[authors]]` line by line, so that no slip elsewhere hides them.
+
+    Raises
+    ------
+    OSError : the file cannot be read.
+    """
+    with (folder / NAME).open(encoding="utf-8-sig", errors="replace") as file:
+        text = file.read(MAX_TOML_BYTES)
+    found, table = [], ""
+    for line in text.splitlines():
+        if heading := _TABLE.match(line):
+            table = heading[1]
+        elif table == "authors" and (id_ := _ID.match(line)):
+            found.append(id_[1].strip())
+    return tuple(dict.fromkeys(found))
+
+
 def _figures(submission: Submission, graded: Graded) -> tuple[tuple[tuple[str, str], ...], str]:
     """Return the figures; or none and why: a grade stands whatever happens to its pictures."""
     from pipeline.grading.publish.feedback_figures import (
@@ -145,18 +165,11 @@ def failed(
 ) -> Grading:
     """Return the outcome of a hand-in that could not be graded."""
     reason = "".join(c if c.isprintable() else "�" for c in " ".join(reason.split()))
-    grade = Grade(
-        submission=task.id,
-        authors=tuple(authors),
-        status="failed",
-        points=0.0,
-        out_of=out_of,
-        days_late=task.days_late,
-        reason=reason,
-    )
+    people = tuple(authors)
+    grade = Grade.failed(task.id, reason, out_of=out_of, authors=people, days_late=task.days_late)
     return Grading(
         submission=task.id,
-        authors=tuple(authors),
+        authors=people,
         key=task.key,
         status="failed",
         reason=reason,
@@ -175,12 +188,12 @@ def grading_line(outcome: Grading) -> bytes:
     """Return an outcome as one line of JSON."""
     plain = asdict(outcome)
     plain["fingerprints"] = base64.b64encode(outcome.fingerprints).decode()
-    return _line(plain)
+    return json.dumps(plain).encode() + b"\n"
 
 
 def read_grading(line: bytes) -> Grading:
     """Return the outcome that `grading_line` wrote."""
-    plain: dict[str, Any] = json.loads(line)
+    plain = json.loads(line)
     plain["fingerprints"] = base64.b64decode(plain["fingerprints"])
     plain["authors"] = tuple(plain["authors"])
     plain["figures"] = tuple((name, svg) for name, svg in plain["figures"])
@@ -189,11 +202,7 @@ def read_grading(line: bytes) -> Grading:
 
 def task_line(task: Task | Setup) -> bytes:
     """Return a task or the setup as one line of JSON."""
-    return _line(asdict(task))
-
-
-def _line(plain: dict[str, Any]) -> bytes:
-    return json.dumps(plain).encode() + b"\n"
+    return json.dumps(asdict(task)).encode() + b"\n"
 
 
 # --------------------------------------------------------------------------- process

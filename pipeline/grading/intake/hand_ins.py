@@ -5,7 +5,7 @@ import re
 import unicodedata
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 from pipeline.errors import ConfigError, SubmissionError
@@ -48,14 +48,16 @@ class HandIn:
         them by: "Jane Doe (moodle 1024)"; or "".
     handed_in : when, in ISO 8601, where the platform says so; or "".
     problem : why it cannot be opened, where that is plain already.
+    parent : the folder around it, until its id is settled.
     """
 
     id: str
-    sources: tuple[Path, ...]
+    sources: tuple[Path, ...] = ()
     owner: str = ""
     handed_in: str = ""
     days_late: float = 0.0
     problem: str = ""
+    parent: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,13 +70,6 @@ class _Walk:
 
 def _silent(text: str) -> None:
     pass
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Found(HandIn):
-    """A hand-in whose id is not settled: that is its name yet, `parent` the folder around it."""
-
-    parent: str
 
 
 def find_hand_ins(
@@ -99,7 +94,7 @@ def find_hand_ins(
     ConfigError : a path is not there, or there is nothing in it.
     """
     walk = _Walk(skip={path.resolve() for path in skip} | {scratch.resolve()}, say=say)
-    found: list[_Found] = []
+    found: list[HandIn] = []
     for number, path in enumerate(dict.fromkeys(path.resolve() for path in paths)):
         here = _at(path, scratch=scratch / f"class-{number}", walk=walk)
         if not here:
@@ -110,7 +105,7 @@ def find_hand_ins(
     return tuple(sorted(_with_ids(found, known=known), key=lambda hand_in: hand_in.id))
 
 
-def _at(path: Path, *, scratch: Path, walk: _Walk) -> list[_Found]:
+def _at(path: Path, *, scratch: Path, walk: _Walk) -> list[HandIn]:
     if path.name == NAME:
         path = path.parent
     if path.is_dir():
@@ -133,8 +128,8 @@ def _at(path: Path, *, scratch: Path, walk: _Walk) -> list[_Found]:
 
 
 def _with_refused(
-    found: Sequence[_Found], refused: Mapping[PurePosixPath, str], *, folder: Path
-) -> list[_Found]:
+    found: Sequence[HandIn], refused: Mapping[PurePosixPath, str], *, folder: Path
+) -> list[HandIn]:
     """Return the hand-ins of an archive with what was refused of them, and those refused whole."""
     whose = {
         source.relative_to(folder).parts: i for i, one in enumerate(found) for source in one.sources
@@ -149,7 +144,7 @@ def _with_refused(
         else:
             problems.setdefault(owner, why)
     return [
-        *(_Found(id=x, parent=folder.name, sources=(), problem=why) for x, why in lost.items()),
+        *(HandIn(id=x, parent=folder.name, problem=why) for x, why in lost.items()),
         *(replace(one, problem=problems.get(i, one.problem)) for i, one in enumerate(found)),
     ]
 
@@ -171,18 +166,18 @@ def _holds_a_class(archive: Path) -> bool:
 # ------------------------------------------------------------------------ folders
 
 
-def _in_folder(folder: Path, *, walk: _Walk, top: bool = True, depth: int = 0) -> list[_Found]:
+def _in_folder(folder: Path, *, walk: _Walk, top: bool = True, depth: int = 0) -> list[HandIn]:
     """Return the hand-ins in a folder; one that cannot be looked into is itself one."""
     try:
         return _looked_into(folder, walk=walk, top=top, depth=depth)
     except OSError as error:
         problem = f"cannot be read ({error.strerror or error})"
-        return [_Found(id=folder.name, parent=folder.parent.name, sources=(), problem=problem)]
+        return [HandIn(id=folder.name, parent=folder.parent.name, problem=problem)]
 
 
-def _looked_into(folder: Path, *, walk: _Walk, top: bool, depth: int) -> list[_Found]:
+def _looked_into(folder: Path, *, walk: _Walk, top: bool, depth: int) -> list[HandIn]:
     if _is_submission(folder) or depth > DEEPEST:
-        return [_Found(id=folder.name, parent=folder.parent.name, sources=(folder,))]
+        return [HandIn(id=folder.name, parent=folder.parent.name, sources=(folder,))]
     entries = [
         entry
         for entry in sorted(folder.iterdir())
@@ -244,23 +239,22 @@ def _may_be_one(entry: Path) -> bool:
     )
 
 
-def _single(entry: Path) -> _Found:
+def _single(entry: Path) -> HandIn:
     """Return a folder or archive that is one hand-in."""
     if entry.is_symlink():
-        return _Found(
+        return HandIn(
             id=entry.stem,
             parent=entry.parent.name,
-            sources=(),
             problem=f"{quote(entry.name)} is a link; hand in the files themselves",
         )
     if entry.is_dir():
-        return _Found(id=entry.name, parent=entry.parent.name, sources=(entry,))
+        return HandIn(id=entry.name, parent=entry.parent.name, sources=(entry,))
     return _archive(entry)
 
 
-def _archive(path: Path) -> _Found:
+def _archive(path: Path) -> HandIn:
     name, own = _folder_inside(path), path.stem.removesuffix(".tar")
-    return _Found(id=name or own, parent=own if name else path.parent.name, sources=(path,))
+    return HandIn(id=name or own, parent=own if name else path.parent.name, sources=(path,))
 
 
 def _folder_inside(archive: Path) -> str:
@@ -272,7 +266,7 @@ def _folder_inside(archive: Path) -> str:
 # ---------------------------------------------------------------- learning platforms
 
 
-def _from_platform(folder: Path, uploads: dict[Path, Upload], *, top: bool) -> list[_Found]:
+def _from_platform(folder: Path, uploads: dict[Path, Upload], *, top: bool) -> list[HandIn]:
     """Return a hand-in for every student, whatever number of files they uploaded."""
     # Further down, a student may have put metadata of their own.
     metadata = gradescope_metadata(folder) if top else {}
@@ -289,7 +283,7 @@ def _from_platform(folder: Path, uploads: dict[Path, Upload], *, top: bool) -> l
         sent = metadata.get(owner)
         shown = sent.names if sent and sent.names else owner
         found.append(
-            _Found(
+            HandIn(
                 id=inside or shown,
                 parent=shown if inside and not own else folder.name,
                 sources=sources,
@@ -320,7 +314,7 @@ def _name_inside(sources: Sequence[Path]) -> str:
 # ---------------------------------------------------------------------------- ids
 
 
-def _with_ids(found: Sequence[_Found], *, known: Iterable[str] = ()) -> list[HandIn]:
+def _with_ids(found: Sequence[HandIn], *, known: Iterable[str] = ()) -> list[HandIn]:
     """Give every hand-in its folder's name; where two are the same, the parent's before it."""
     names = [_fit(one.id) for one in found]
     longer = [_fit(f"{one.parent}-{one.id}") for one in found]
@@ -337,8 +331,7 @@ def _with_ids(found: Sequence[_Found], *, known: Iterable[str] = ()) -> list[Han
             number += 1
             unique = f"{name}-{number}"
         taken.add(unique.casefold())
-        own = {field.name: getattr(one, field.name) for field in fields(HandIn)}
-        hand_ins.append(HandIn(**{**own, "id": unique}))
+        hand_ins.append(replace(one, id=unique, parent=""))
     return hand_ins
 
 

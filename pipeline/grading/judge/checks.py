@@ -12,8 +12,7 @@ from pipeline.grading.judge.checks_loop import (
     judge_prefilter,
 )
 from pipeline.grading.judge.laws import MOST_WIDENING, judge_laws
-from pipeline.grading.judge.pieces import asked_pieces
-from pipeline.grading.judge.work import ALL, NONE, Verdict, Work, mean_share
+from pipeline.grading.judge.work import ALL, NONE, Verdict, Work, asked_pieces, mean_share
 from pipeline.grading.mistakes.impossible import not_positive
 from pipeline.grading.references.reference import OFF_SCALE, Reference, off_scale
 from pipeline.grading.references.tolerance import NO_CREDIT, as_typed, credit, percent_off, rounding

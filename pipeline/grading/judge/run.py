@@ -7,8 +7,7 @@ from fractions import Fraction
 
 from pipeline.errors import SubmissionError
 from pipeline.grading.judge.checks import judge
-from pipeline.grading.judge.pieces import missing_flag
-from pipeline.grading.judge.work import Work
+from pipeline.grading.judge.work import Work, missing_flag
 from pipeline.grading.mistakes.controller import diagnose_controller, reported_controller
 from pipeline.grading.mistakes.recordings import bad_runs, data_flag
 from pipeline.grading.mistakes.reduced import diagnose_reduced
@@ -49,17 +48,25 @@ def grade_submission(
     Recordings that cannot be read are flagged. Where none can be, or the carts are
     not as many as the rubric's, the grade is `failed` with its reason.
     """
+
+    def failed(reason: str) -> Graded:
+        authors = tuple(author.id for author in submission.authors)
+        grade = Grade.failed(
+            name, reason, out_of=rubric.out_of, authors=authors, days_late=days_late
+        )
+        return Graded(grade=grade, analysis=None)
+
     count = submission.system.carts
     if count != rubric.system.carts:
         carts = f"{count} cart{'s' if count > 1 else ''}"
         reason = f"the submission is for {carts}, the rubric for {rubric.system.carts}"
-        return _failed(submission, rubric, name=name, reason=reason, days_late=days_late)
+        return failed(reason)
     submission, notes = under_rubric(submission, rubric)
     say = progress or (lambda text: None)
     try:
         analysis = analyse(submission, design=False, progress=say)
     except SubmissionError as error:
-        return _failed(submission, rubric, name=name, reason=str(error), days_late=days_late)
+        return failed(str(error))
     analysis, springs = with_all_springs(submission, analysis, progress=say)
     if springs:
         asked = f"these recordings ask for springs that the rubric has not: {', '.join(springs)}"
@@ -184,21 +191,6 @@ def _under_calibration(experiment: Experiment, system: System) -> Experiment:
     if own is None or experiment.kind == "closed_loop" or not system.input.per_count:
         return experiment
     return experiment.model_copy(update={"input": InputOverride(sign=own.sign)})
-
-
-def _failed(
-    submission: Submission, rubric: Rubric, *, name: str, reason: str, days_late: float
-) -> Graded:
-    grade = Grade(
-        submission=name,
-        authors=tuple(author.id for author in submission.authors),
-        status="failed",
-        points=0.0,
-        out_of=rubric.out_of,
-        days_late=days_late,
-        reason=reason,
-    )
-    return Graded(grade=grade, analysis=None)
 
 
 # ------------------------------------------------------------------ criteria and flags

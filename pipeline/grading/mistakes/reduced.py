@@ -11,7 +11,6 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.grading.mistakes import limits
-from pipeline.grading.mistakes.transient import early_readings
 from pipeline.grading.references.reference import is_explained
 from pipeline.grading.words import WORDS
 from pipeline.results import Analysis, SinePoint
@@ -22,15 +21,11 @@ _TURN = 2 * np.pi
 
 @dataclass(frozen=True, kw_only=True)
 class _Rows:
-    """The rows of the table that a dwell stands for; each (n,).
-
-    `measured` is by their dwell, `early` what its first swings give, one array a way to read them.
-    """
+    """The rows of the table that a dwell stands for, and what that gives; each (n,)."""
 
     cart: Array
     reported: Array
     measured: Array
-    early: tuple[Array, ...]
 
 
 def diagnose_reduced(analysis: Analysis) -> list[Flag]:
@@ -55,7 +50,6 @@ def diagnose_reduced(analysis: Analysis) -> list[Flag]:
 
 def _rows(analysis: Analysis, *, stretch: float) -> _Rows | None:
     """Match rows with dwells, the table's frequencies multiplied; None where few match."""
-    runs = {record.id: record for record in analysis.records}
     matched: list[tuple[int, float, SinePoint]] = []
     for table in analysis.tables:
         points = [
@@ -72,16 +66,6 @@ def _rows(analysis: Analysis, *, stretch: float) -> _Rows | None:
         cart=np.array([cart for cart, _, _ in matched]),
         reported=np.array([ratio for _, ratio, _ in matched]),
         measured=np.array([p.gain for _, _, p in matched]),
-        early=tuple(
-            np.array(
-                [
-                    reading(runs[p.experiment], runs[p.experiment].position(p.cart))
-                    / p.input_amplitude
-                    for _, _, p in matched
-                ]
-            )
-            for reading in early_readings()
-        ),
     )
 
 
@@ -117,33 +101,14 @@ def _slips(analysis: Analysis, rows: _Rows | None) -> Iterator[_Slip]:
         return
     counts = [r.encoder_step(int(c)) for r in analysis.records for c in r.carts]
     count = float(np.median(counts)) if counts else 0.0
-    decibel = 20 * np.log10(rows.measured)
-    found: list[tuple[Code, str, Array]] = [
-        ("peak_to_peak", "reduced_twice", 2 * rows.measured),
-        ("peak_to_peak", "reduced_half", rows.measured / 2),
-        ("data_problem", "reduced_decibels", np.where(decibel > 0, decibel, np.nan)),
+    factors: list[tuple[Code, str, float]] = [
+        ("peak_to_peak", "reduced_twice", 2.0),
+        ("peak_to_peak", "reduced_half", 0.5),
     ]
     if count not in (0.0, 1.0):
-        found.insert(2, ("counts_for_length", "reduced_counts", rows.measured / count))
-    if analysis.carts == 2:
-        found.append(("carts_swapped", "reduced_swapped", _other_cart(analysis, rows)))
-    for early in rows.early:
-        if _share(early, rows.measured) < limits.ENOUGH_ROWS:
-            found.append(("transient_used", "reduced_early", early))
-    for code, said, predicted in found:
-        yield _Slip(code=code, said=said, predicted=predicted, rows=rows)
-
-
-def _other_cart(analysis: Analysis, rows: _Rows) -> Array:
-    """Return what the dwell of each row says of the other of two carts; NaN where nothing."""
-    gains = {(p.cart, round(p.omega, 6)): p.gain for p in analysis.sine_points}
-    omega = {p.gain: round(p.omega, 6) for p in analysis.sine_points}
-    return np.array(
-        [
-            gains.get((3 - int(cart), omega[gain]), np.nan)
-            for cart, gain in zip(rows.cart, rows.measured.tolist(), strict=True)
-        ]
-    )
+        factors.append(("counts_for_length", "reduced_counts", 1 / count))
+    for code, said, factor in factors:
+        yield _Slip(code=code, said=said, predicted=factor * rows.measured, rows=rows)
 
 
 def _flag(code: Code, said: str, rows: _Rows) -> Flag:

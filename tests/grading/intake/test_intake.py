@@ -371,9 +371,9 @@ def test_nothing_to_grade_is_said(tmp_path):
 @given(st.lists(st.text(min_size=1, max_size=30), min_size=1, max_size=6))
 def test_any_name_becomes_a_folders(tmp_path_factory, names):
     """Ids are different, printable, not too long, and lie where they should."""
-    from pipeline.grading.intake.hand_ins import _Found, _with_ids
+    from pipeline.grading.intake.hand_ins import HandIn, _with_ids
 
-    found = [_Found(id=name, parent="p", sources=()) for name in names]
+    found = [HandIn(id=name, parent="p") for name in names]
     ids = [hand_in.id for hand_in in _with_ids(found)]
     assert len({i.casefold() for i in ids}) == len(names)
     for i in ids:

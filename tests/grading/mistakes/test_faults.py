@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -112,10 +113,18 @@ SPOILT = {
 }
 
 
-def _cases() -> Iterator[tuple[str, str]]:
+# Those that are searched longest, and each for the same reason as a shorter one.
+SEARCHED = ("cart 1 turned in the sweep", "a tenth of the input in every step")
+LONG = [pytest.mark.slow, pytest.mark.sample]
+
+
+def _cases() -> Iterator[Any]:
     """Every case where no sign of the input is stated; where one is, those that look like one."""
-    yield from ((case, "") for case in SPOILT)
-    yield from ((case, ", sign = 1") for case in SPOILT if "turned" in case or "exchanged" in case)
+    for case in SPOILT:
+        yield pytest.param(case, "", marks=LONG if case in SEARCHED else ())
+        if "turned" in case or "exchanged" in case:
+            short = case in ("cart 1 turned in four dwells", "a step exchanged")
+            yield pytest.param(case, ", sign = 1", marks=() if short else LONG)
 
 
 @pytest.mark.parametrize(("case", "sign"), [*_cases()])
@@ -394,6 +403,8 @@ def test_carts_that_stick_and_creep_are_in_no_other_unit_of_time(bench):
     assert find_misread(stuck, chain, follow([stuck], chain)[stuck.id]) is None
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_cart_that_moves_farther_than_the_one_that_pulls_it_accuses_no_gain(bench, tmp_path):
     """One column in another unit in every file: no model, and no right number is called wrong."""
     folder = shutil.copytree(bench, tmp_path / "millimetres")
