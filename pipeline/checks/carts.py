@@ -5,15 +5,13 @@ from itertools import pairwise
 
 import numpy as np
 
+from pipeline.checks import limits
 from pipeline.names import gain_name, read_name
 from pipeline.plant.limits import HEAVY_DAMPING
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.laws import brackets
 from pipeline.plant.linear.recovery import recover_from_parameters
 from pipeline.results import EXPLAINED, ChainFit, Check
-
-_REDUNDANCY_LIMIT = 1e-9  # two routes to one number through unrounded values
-_BELOW_ZERO = 2.0  # standard errors that a mass, damping or spring may be below it
 
 
 def check_carts(fit: ChainFit | None, *, springs: Sequence[bool]) -> list[Check]:
@@ -74,8 +72,8 @@ def _sign_check(fit: ChainFit, *, springs: Sequence[bool]) -> Check:
         else "All masses, dampings and springs are positive."
     )
     value = worst if np.isfinite(worst) else None
-    good = worst <= _BELOW_ZERO
-    return Check.of("physical.signs", good, message, value=value, limit=_BELOW_ZERO)
+    good = worst <= limits.BELOW_ZERO
+    return Check.of("physical.signs", good, message, value=value, limit=limits.BELOW_ZERO)
 
 
 def _redundancy_checks(values: Mapping[str, float]) -> list[Check]:
@@ -83,10 +81,10 @@ def _redundancy_checks(values: Mapping[str, float]) -> list[Check]:
     return [
         Check.of(
             f"redundancy.{name}",
-            residual <= _REDUNDANCY_LIMIT,
+            residual <= limits.REDUNDANCY,
             f"Redundancy {name} ({meaning}): relative difference {residual:.1e}.",
             value=float(residual),
-            limit=_REDUNDANCY_LIMIT,
+            limit=limits.REDUNDANCY,
         )
         for name, residual in recover_from_parameters(values).residuals.items()
     ]
@@ -98,10 +96,10 @@ def _gain_order_check(values: Mapping[str, float], *, chain: Chain) -> Check:
     gains = [values[name] for name in names]
     # Equal gains are right where no spring holds the far end: rounding then decides the sign.
     rise = max(later / earlier - 1 for earlier, later in pairwise(gains))
-    good = rise <= _REDUNDANCY_LIMIT and min(gains) >= 0
+    good = rise <= limits.REDUNDANCY and min(gains) >= 0
     said = f"Static gains fall along the chain ({' ≥ '.join(names)} > 0): {_yes(good)}."
     value = max(float(rise), 0.0)
-    return Check.of("order.gains", good, said, value=value, limit=_REDUNDANCY_LIMIT)
+    return Check.of("order.gains", good, said, value=value, limit=limits.REDUNDANCY)
 
 
 def _frequency_order_checks(values: Mapping[str, float], *, n: int) -> list[Check]:
@@ -111,7 +109,7 @@ def _frequency_order_checks(values: Mapping[str, float], *, n: int) -> list[Chec
     for low, middle, high, _ in brackets(n):
         # How far outside the bracket, in percent of the value.
         excess = max(values[low] / values[middle], values[middle] / values[high]) - 1
-        good = excess <= _REDUNDANCY_LIMIT
+        good = excess <= limits.REDUNDANCY
         reason = " (not exact where a damping ratio is above 0.3)" if damped and not good else ""
         ends = f"_in_{read_name(low).suffix}{read_name(high).suffix}" if n == 3 else ""
         checks.append(

@@ -4,13 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pipeline.checks import limits
 from pipeline.results import ChainFit, Check, FrequencyResponse, Record
 
 LATE_CHANNEL = "late_channel"  # then the cart
-# Samples, and so many times the scatter of the dwells: a cart that friction holds seems late by
-# half a sample at most, in the median of the dwells, on benches all over what a lab may have.
-_LATE, _SURE = 2.0, 4.0
-_FEWEST = 5  # dwells
 _MAD_TO_SIGMA = 1.4826
 
 
@@ -29,11 +26,11 @@ def check_channels(
         return checks
     for other in dwells[1:]:
         omega, late = _lateness(dwells[0], other, fit=fit)
-        if omega.size < _FEWEST:
+        if omega.size < limits.FEWEST_DWELLS:
             continue
         delay = float(np.median(late))
         spread = _MAD_TO_SIGMA * float(np.median(np.abs(late - delay)))
-        limit = max(_LATE * float(np.median(samples)), _SURE * spread)
+        limit = max(limits.LATE * float(np.median(samples)), limits.LATE_SURE * spread)
         if abs(delay) > limit:
             word = "later" if delay > 0 else "earlier"
             message = (

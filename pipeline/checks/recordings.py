@@ -4,6 +4,7 @@ from collections.abc import Container, Iterable, Mapping, Sequence
 
 import numpy as np
 
+from pipeline.checks import limits
 from pipeline.estimation.units_and_clocks import TIME_UNITS
 from pipeline.ingest.columns import conversion
 from pipeline.ingest.input_sign import FEW_NAMES, Signs
@@ -12,11 +13,6 @@ from pipeline.results import SIGN, Check, LeftOut, Record, SinePoint
 from pipeline.submission import System
 
 SCALES = POSITION_SCALE, INPUT_SCALE = "position_scale", "input_scale"  # then the record's id
-_LONGEST = 3.0  # m from end to end: no bench has so long a track
-_LONGEST_WHOLE = 0.5  # … for one that is read to whole numbers alone, as counts are
-_LARGEST = 100.0  # V: no amplifier at a bench gives as much
-_HELD_SHARE = 0.2  # of a held cart's swing: a free one that moves less is not the free one
-_DWELL_LIMIT = 0.1  # relative: a dwell stated so far off is another one
 _DWELL_FACTORS = {
     2 * np.pi: "the stated ones look to be in rad/s, and `frequency` is in Hz",
     1 / (2 * np.pi): "the stated ones look to be divided by 2π",
@@ -49,7 +45,7 @@ def check_scales(records: Sequence[Record], *, system: System) -> list[Check]:
     unit, metres = system.position.unit, conversion(system.position.unit, "m")
     travel, run = _reached((r, float(np.ptp(r.y, axis=1).max())) for r in records)
     whole = all(np.array_equal(record.y, np.round(record.y)) for record in records)
-    if metres and travel > (limit := (_LONGEST_WHOLE if whole else _LONGEST) / metres):
+    if metres and travel > (limit := (limits.LONGEST_WHOLE if whole else limits.LONGEST) / metres):
         why = "in whole numbers only" if whole else "further than a bench is long"
         message = (
             f"{run}: the positions run through {travel:.4g} {unit}, {why}: these "
@@ -64,14 +60,16 @@ def check_scales(records: Sequence[Record], *, system: System) -> list[Check]:
     # Under feedback a bench may log another signal as its input.
     driven = [(r, r.u) for r in records if r.u is not None and r.kind != "closed_loop"]
     largest, run = _reached((r, float(np.abs(u).max())) for r, u in driven)
-    if volts and largest * volts > _LARGEST:
+    if volts and largest * volts > limits.LARGEST:
         message = (
             f"{run}: the input reaches {largest:.4g} {unit}, more than a bench's amplifier "
             "gives, and every static gain is off as much: is it in mV, or in counts? Head the "
             f"column `input [mV]`, or state input = {{ unit = {unit!r}, per_count = … }}."
         )
         checks.append(
-            Check.of(f"{INPUT_SCALE}.{run}", False, message, value=largest, limit=_LARGEST / volts)
+            Check.of(
+                f"{INPUT_SCALE}.{run}", False, message, value=largest, limit=limits.LARGEST / volts
+            )
         )
     return checks
 
@@ -149,7 +147,7 @@ def check_setup(records: Sequence[Record]) -> list[Check]:
         if not held or not any(cart in record.free for cart in record.carts):
             continue
         mover = max(held, key=lambda cart: held[cart])
-        good = free >= _HELD_SHARE * held[mover]
+        good = free >= limits.HELD_SHARE * held[mover]
         named = ", ".join(map(str, record.free))
         found = (
             f"the carts said to be free ({named}) are those that move."
@@ -160,7 +158,7 @@ def check_setup(records: Sequence[Record]) -> list[Check]:
         ratio = held[mover] / free if free > 0 else None
         message = f"{record.id}: {found}"
         checks.append(
-            Check.of(f"setup.{record.id}", good, message, value=ratio, limit=1 / _HELD_SHARE)
+            Check.of(f"setup.{record.id}", good, message, value=ratio, limit=1 / limits.HELD_SHARE)
         )
     return checks
 
@@ -173,12 +171,12 @@ def check_dwells(records: Sequence[Record], points: Sequence[SinePoint]) -> list
         for point in points
         if point.experiment in stated
     }
-    off = {name: r for name, r in ratios.items() if abs(np.log(r)) > _DWELL_LIMIT}
+    off = {name: r for name, r in ratios.items() if abs(np.log(r)) > limits.OTHER_DWELL}
     if not off:
         return []
     ratio = float(np.median(list(off.values())))
     why = why_other_frequency(ratio)
-    alike = all(abs(r / ratio - 1) < _DWELL_LIMIT for r in off.values())
+    alike = all(abs(r / ratio - 1) < limits.OTHER_DWELL for r in off.values())
     told = f", {ratio:.4g} times: {why}" if why and alike else ""
     named = ", ".join(list(off)[:_DWELLS_NAMED]) + (" …" if len(off) > _DWELLS_NAMED else "")
     message = (
@@ -190,6 +188,8 @@ def check_dwells(records: Sequence[Record], points: Sequence[SinePoint]) -> list
 def why_other_frequency(ratio: float) -> str:
     """Return what a dwell stated at so many times its frequency looks to be, or ""."""
     close = (
-        why for factor, why in _DWELL_FACTORS.items() if abs(ratio / factor - 1) < _DWELL_LIMIT
+        why
+        for factor, why in _DWELL_FACTORS.items()
+        if abs(ratio / factor - 1) < limits.OTHER_DWELL
     )
     return next(close, "")

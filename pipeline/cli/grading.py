@@ -5,7 +5,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,6 +16,8 @@ from pipeline.cli.common import INTERRUPTED, AsJson, app, say
 
 if TYPE_CHECKING:
     from rich.progress import Progress
+
+    from pipeline.grading.gradebook.book import Gradebook
 
 _MOST_TOLD = 20  # changes since the class list before
 
@@ -172,20 +174,12 @@ def override(
     assignment: Lab = None,
 ) -> None:
     """Give a criterion points by hand, which every later grading keeps."""
-    from pipeline.grading.gradebook.book import Gradebook
     from pipeline.grading.gradebook.override import read_points
     from pipeline.grading.publish.anonymous import meant
-    from pipeline.grading.publish.outputs import write_outputs
-    from pipeline.lock import alone_in
 
-    folder = Path(grades)
-    pages = folder.is_dir()
-    with Gradebook(grades, assignment=assignment) as book:
-        with alone_in(folder) if pages else nullcontext():
-            name = meant(book, team)
-            book.override(name, criterion, read_points(points), why=why, by=by)
-            if pages:
-                write_outputs(book, folder)
+    with _changing(grades, assignment) as book:
+        name = meant(book, team)
+        book.override(name, criterion, read_points(points), why=why, by=by)
         grade = book.entry(name).grade
     shown = grade.submission if name == team else team
     say(f"{shown}: {grade.points:g} of {grade.out_of:g} points")
@@ -200,23 +194,32 @@ def remove(
     assignment: Lab = None,
 ) -> None:
     """Take submissions off the class list; their history stays."""
-    from pipeline.grading.gradebook.book import Gradebook
     from pipeline.grading.publish.anonymous import meant
+
+    with _changing(grades, assignment) as book:
+        names = {meant(book, team): team for team in teams}
+        by_hand = [team for name, team in names.items() if book.entry(name).overrides]
+        gone = [names.get(name, name) for name in book.remove(list(names))]
+    say(f"no longer in the class: {', '.join(gone)}")
+    if by_hand:
+        say(f"with points given by hand, which count no more: {', '.join(by_hand)}")
+
+
+@contextmanager
+def _changing(grades: str, assignment: str | None) -> Iterator["Gradebook"]:
+    """Open a gradebook that is changed; its pages, where it has a folder of them, follow."""
+    from pipeline.grading.gradebook.book import Gradebook
     from pipeline.grading.publish.outputs import write_outputs
     from pipeline.lock import alone_in
 
     folder = Path(grades)
-    pages = folder.is_dir()
     with Gradebook(grades, assignment=assignment) as book:
-        with alone_in(folder) if pages else nullcontext():
-            names = {meant(book, team): team for team in teams}
-            by_hand = [team for name, team in names.items() if book.entry(name).overrides]
-            gone = [names.get(name, name) for name in book.remove(list(names))]
-            if pages:
-                write_outputs(book, folder)
-    say(f"no longer in the class: {', '.join(gone)}")
-    if by_hand:
-        say(f"with points given by hand, which count no more: {', '.join(by_hand)}")
+        if not folder.is_dir():
+            yield book
+            return
+        with alone_in(folder):
+            yield book
+            write_outputs(book, folder)
 
 
 @app.command()

@@ -1,5 +1,6 @@
 """The checks of the closed loop: gains, claims, prefilter, hardware."""
 
+from collections.abc import Callable
 from fractions import Fraction
 
 import numpy as np
@@ -8,8 +9,11 @@ from pipeline.arrays import Array
 from pipeline.grading import rubric as asked
 from pipeline.grading.judge.work import NONE, Verdict, Work, mean_share
 from pipeline.grading.mistakes.controller import Controller, does, same_gains
+from pipeline.grading.mistakes.loop_numbers import LoopNumbers
 from pipeline.grading.references.reference import OFF_SCALE, Reference, off_scale
 from pipeline.grading.references.tolerance import as_typed, credit, exact, percent_off, rounding
+
+Judged = Callable[[LoopNumbers], Fraction]
 
 
 def _loop(work: Work) -> tuple[Controller, Array] | Verdict:
@@ -22,6 +26,14 @@ def _loop(work: Work) -> tuple[Controller, Array] | Verdict:
     return work.controller, work.controller.gains
 
 
+def _best(
+    controller: Controller, gains: Array, judged: Judged
+) -> tuple[Fraction, LoopNumbers] | None:
+    """Return the share of the model on which the gains earn most, and what they do on it."""
+    found = [(judged(numbers), numbers) for numbers in controller.numbers(gains)]
+    return max(found, key=lambda one: one[0], default=None)
+
+
 def judge_gains(criterion: asked.Gains, work: Work) -> Verdict:
     """What the gains do on the carts, against the goal; the better of the models counts."""
     loop = _loop(work)
@@ -29,40 +41,41 @@ def judge_gains(criterion: asked.Gains, work: Work) -> Verdict:
         return loop
     controller, gains = loop
     goal = controller.goal
-    best, found, told = NONE, {}, ""
-    for numbers in controller.numbers(gains):
-        share = NONE
-        if numbers.stable and numbers.settling_time is not None:
-            over = Fraction(max(numbers.overshoot - goal.overshoot_percent, 0.0))
-            late = Fraction(100 * max(numbers.settling_time / goal.settling_time - 1, 0.0))
-            share = min(
-                credit(over, full=criterion.overshoot_full, none=criterion.overshoot_none),
-                credit(
-                    late,
-                    full=criterion.settling_full_percent,
-                    none=criterion.settling_none_percent,
-                ),
-            )
-        if not found or share > best:
-            best, told = share, does(numbers)
-            found = {
-                "stable": numbers.stable,
-                "overshoot_percent": numbers.overshoot if np.isfinite(numbers.overshoot) else None,
-                "settling_time": numbers.settling_time,
-                "poles": [[p.real, p.imag] for p in numbers.poles],
-            }
-    if not found:
+
+    def judged(numbers: LoopNumbers) -> Fraction:
+        if not numbers.stable or numbers.settling_time is None:
+            return NONE
+        over = Fraction(max(numbers.overshoot - goal.overshoot_percent, 0.0))
+        late = Fraction(100 * max(numbers.settling_time / goal.settling_time - 1, 0.0))
+        full, none = criterion.settling_full_percent, criterion.settling_none_percent
+        return min(
+            credit(over, full=criterion.overshoot_full, none=criterion.overshoot_none),
+            credit(late, full=full, none=none),
+        )
+
+    best = _best(controller, gains, judged)
+    if best is None:
         return Verdict(share=NONE, message="These gains cannot be simulated.")
+    share, numbers = best
     return Verdict(
-        share=best,
-        message=f"On your carts: {told}; the goal is {goal.overshoot_percent:g} % and "
+        share=share,
+        message=f"On your carts: {does(numbers)}; the goal is {goal.overshoot_percent:g} % and "
         f"{goal.settling_time:g} s.",
         expected={
             "overshoot_percent": goal.overshoot_percent,
             "settling_time": goal.settling_time,
         },
-        found=found,
+        found={
+            "stable": numbers.stable,
+            **_claimable(numbers),
+            "poles": [[p.real, p.imag] for p in numbers.poles],
+        },
     )
+
+
+def _claimable(numbers: LoopNumbers) -> dict[str, float | None]:
+    overshoot = numbers.overshoot if np.isfinite(numbers.overshoot) else None
+    return {"overshoot_percent": overshoot, "settling_time": numbers.settling_time}
 
 
 def judge_claims(criterion: asked.Claims, work: Work) -> Verdict:
@@ -72,8 +85,8 @@ def judge_claims(criterion: asked.Claims, work: Work) -> Verdict:
         return loop
     controller, gains = loop
     claims = {"overshoot_percent": controller.overshoot, "settling_time": controller.settling}
-    best, expected = None, {}
-    for numbers in controller.numbers(gains):
+
+    def judged(numbers: LoopNumbers) -> Fraction:
         shares = [NONE, NONE]
         if controller.overshoot is not None and np.isfinite(numbers.overshoot):
             off = abs(Fraction(controller.overshoot) - Fraction(numbers.overshoot))
@@ -85,19 +98,16 @@ def judge_claims(criterion: asked.Claims, work: Work) -> Verdict:
                 full=criterion.settling_full_percent,
                 none=criterion.settling_none_percent,
             )
-        if best is None or mean_share(shares) > best:
-            best = mean_share(shares)
-            expected = {
-                "overshoot_percent": numbers.overshoot if np.isfinite(numbers.overshoot) else None,
-                "settling_time": numbers.settling_time,
-            }
+        return mean_share(shares)
+
+    best = _best(controller, gains, judged)
+    share, expected = (best[0], _claimable(best[1])) if best else (NONE, {})
+    told = ", ".join(f"{k} {v:.3g}" for k, v in expected.items() if v is not None)
     return Verdict(
-        share=best if best is not None else NONE,
+        share=share,
         message="What the gains give."
-        if best == 1
-        else "Simulated on your carts these gains give "
-        + ", ".join(f"{k} {v:.3g}" for k, v in expected.items() if v is not None)
-        + ".",
+        if share == 1
+        else f"Simulated on your carts these gains give {told}.",
         expected=expected,
         found={name: float(v) for name, v in claims.items() if v is not None},
     )
@@ -112,19 +122,20 @@ def judge_prefilter(criterion: asked.Prefilter, work: Work) -> Verdict:
     typed = controller.prefilter
     if typed is None:
         return Verdict(share=NONE, message="No prefilter is reported.")
-    best, right = NONE, None
-    for numbers in controller.numbers(gains):
+
+    def judged(numbers: LoopNumbers) -> Fraction:
         signed = typed if numbers.prefilter > 0 else -typed
         error = percent_off(signed, Reference.at(abs(numbers.prefilter)), sigmas=0.0)
-        share = credit(error, full=criterion.full_percent, none=criterion.none_percent)
-        if right is None or share > best:
-            best, right = share, numbers.prefilter
-    if right is None:
+        return credit(error, full=criterion.full_percent, none=criterion.none_percent)
+
+    best = _best(controller, gains, judged)
+    if best is None:
         return Verdict(share=NONE, message="These gains cannot be simulated.")
+    share, right = best[0], best[1].prefilter
     return Verdict(
-        share=best,
+        share=share,
         message="One over the static gain of the loop, as it should be."
-        if best == 1
+        if share == 1
         else f"These gains need {right:.4g}, you report {as_typed(typed)}.",
         expected={"prefilter": right},
         found={"prefilter": float(typed)},

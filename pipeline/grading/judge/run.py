@@ -7,7 +7,7 @@ from fractions import Fraction
 
 from pipeline.errors import SubmissionError
 from pipeline.grading.judge.checks import judge
-from pipeline.grading.judge.work import Work, missing_flag
+from pipeline.grading.judge.work import Verdict, Work, missing_flag
 from pipeline.grading.mistakes.controller import diagnose_controller, reported_controller
 from pipeline.grading.mistakes.recordings import bad_runs, data_flag
 from pipeline.grading.mistakes.reduced import diagnose_reduced
@@ -199,38 +199,28 @@ def _under_calibration(experiment: Experiment, system: System) -> Experiment:
 def _criteria(work: Work) -> tuple[Criterion, ...]:
     done: dict[str, Criterion] = {}
     for asked in work.rubric.criteria:
-        parents = [p for p in asked.requires if done[p].outcome in ("fail", "skip")]
-        if parents:
-            title = done[parents[0]].title or parents[0]
-            found = Criterion(
-                id=asked.id,
-                title=asked.title,
-                outcome="skip",
-                points=0.0,
-                out_of=asked.points,
-                message=f"Not checked: it builds on {parents[0]!r} ({title}), "
-                f"which was {'not passed' if done[parents[0]].outcome == 'fail' else 'skipped'}.",
-                expected={},
-                found={},
-            )
-        else:
-            verdict = judge(asked, work)
-            points = _points(verdict.share, asked.points)
-            outcome = _outcome(verdict.share)
-            advised = outcome in ("partial", "fail") and not verdict.explained
-            more = f" {asked.message}" if asked.message and advised else ""
-            found = Criterion(
-                id=asked.id,
-                title=asked.title,
-                outcome=outcome,
-                points=points,
-                out_of=asked.points,
-                message=verdict.message + more,
-                expected=verdict.expected,
-                found=verdict.found,
-            )
-        done[asked.id] = found
+        parents = [done[p] for p in asked.requires if done[p].outcome in ("fail", "skip")]
+        verdict = _waits_for(parents[0]) if parents else judge(asked, work)
+        outcome = _outcome(verdict.share)
+        advised = outcome in ("partial", "fail") and not verdict.explained
+        more = f" {asked.message}" if asked.message and advised else ""
+        done[asked.id] = Criterion(
+            id=asked.id,
+            title=asked.title,
+            outcome=outcome,
+            points=_points(verdict.share, asked.points),
+            out_of=asked.points,
+            message=verdict.message + more,
+            expected=verdict.expected,
+            found=verdict.found,
+        )
     return tuple(done.values())
+
+
+def _waits_for(parent: Criterion) -> Verdict:
+    how = "not passed" if parent.outcome == "fail" else "skipped"
+    on = f"{parent.id!r} ({parent.title or parent.id})"
+    return Verdict(share=None, message=f"Not checked: it builds on {on}, which was {how}.")
 
 
 def _outcome(share: Fraction | None) -> Outcome:

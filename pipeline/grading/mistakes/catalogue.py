@@ -8,7 +8,7 @@ from decimal import Decimal
 
 import numpy as np
 
-from pipeline.grading.mistakes import limits
+from pipeline.grading import limits
 from pipeline.grading.mistakes.step_turns import StepTurns, step_turns
 from pipeline.grading.references.reference import Reference, is_explained
 from pipeline.grading.references.tolerance import as_typed

@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
-from pipeline.grading.mistakes import limits
+from pipeline.grading import limits
 from pipeline.grading.mistakes.loop_numbers import LoopNumbers, loop_numbers
 from pipeline.grading.mistakes.state_model import own_chain
 from pipeline.grading.references.reference import is_explained

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from decimal import Decimal
 from typing import Literal
 
-from pipeline.grading.mistakes import limits
+from pipeline.grading import limits
 from pipeline.grading.mistakes.catalogue import Mistake
 from pipeline.grading.references.reference import Reference
 from pipeline.grading.references.tolerance import Typed

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from decimal import Decimal
 
-from pipeline.grading.mistakes import limits
+from pipeline.grading import limits
 from pipeline.grading.references.tolerance import as_typed, rounding
 from pipeline.grading.words import WORDS
 from pipeline.names import read_name

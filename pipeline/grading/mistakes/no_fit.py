@@ -4,7 +4,7 @@ from decimal import Decimal
 from fractions import Fraction
 from math import exp
 
-from pipeline.grading.mistakes import limits
+from pipeline.grading import limits
 from pipeline.grading.references.reference import Reference, References
 from pipeline.grading.references.tolerance import half_digit, is_vague, percent_off, rounding
 from pipeline.grading.rubric import is_damping

@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline.checks.channels import LATE_CHANNEL
 from pipeline.checks.recordings import SCALES, why_other_frequency
-from pipeline.grading.mistakes import limits
+from pipeline.grading import limits
 from pipeline.grading.references.reference import is_explained
 from pipeline.ingest.channels import saturation
 from pipeline.ingest.inspect import line_frequency

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.grading.mistakes import limits
+from pipeline.grading import limits
 from pipeline.grading.references.reference import is_explained
 from pipeline.grading.words import WORDS
 from pipeline.results import Analysis, SinePoint

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.grading.mistakes import limits
+from pipeline.grading import limits
 from pipeline.grading.references.reference import Reference
 from pipeline.grading.references.tolerance import percent_off
 from pipeline.grading.rubric import is_damping

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 
-from pipeline.grading.mistakes import limits
+from pipeline.grading import limits
 from pipeline.grading.mistakes.catalogue import Mistake, known_mistakes
 from pipeline.grading.mistakes.explain import Explained, Explanation, Label, Table, explain
 from pipeline.grading.mistakes.impossible import BrokenOrder, broken_orders, not_positive

@@ -7,7 +7,7 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
-from pipeline.grading.mistakes import limits
+from pipeline.grading import limits
 from pipeline.grading.mistakes.catalogue import Mistake
 from pipeline.grading.references.reference import Reference
 from pipeline.grading.rubric import is_damping

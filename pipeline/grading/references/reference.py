@@ -7,6 +7,7 @@ import numpy as np
 
 from pipeline.checks.recordings import POSITION_SCALE, SCALES
 from pipeline.estimation.limits import FOLLOWED
+from pipeline.grading import limits
 from pipeline.grading.rubric import is_damping
 from pipeline.names import read_name
 from pipeline.plant.linear.chain import Chain
@@ -14,16 +15,6 @@ from pipeline.results import Analysis, Estimate, ParameterRow
 from pipeline.results_of_runs import StepEdge
 from pipeline.stages.limits import GAIN_AND_FREQUENCY_LIMIT
 
-# A fitted frequency or gain that far from the measured one: the fit has gone astray; factors.
-_ASTRAY, _ASTRAY_GAIN = 1.3, 1.6
-_STUCK = 1.2  # factor: a gain where carts stick so that no linear fit is near
-_SIGMAS = 3.0
-_MOST = 0.9  # of the records follow carts that are identified, whatever single points say
-_STILL = 3.0  # encoder steps
-_SAME = 1.03  # factor: bounds that near each other are one number to a reader
-_FAR = 2.5  # … so far that nobody believes it
-# A resonance or null read off the dwells: factor.
-_BY_EYE = 1.1
 OFF_SCALE = "the recordings are not in the units stated, see the data"
 
 
@@ -52,7 +43,7 @@ class Reference:
     @property
     def said(self) -> str:
         """What the recordings give, in words: a number, or from where to where it may lie."""
-        if self.low > 0 and self.within(_SAME):
+        if self.low > 0 and self.within(limits.ONE_NUMBER):
             return f"{self.value:.4g}"
         return f"{self.low:.3g} to {self.high:.3g}"
 
@@ -139,12 +130,16 @@ def recompute(analysis: Analysis) -> References:
             astray = (
                 row.final.value if row.final and read_name(row.name).is_gain else measured.value
             )
-            if measured.value / _FAR < astray < measured.value * _FAR:
+            if (
+                measured.value / limits.BEYOND_BELIEF
+                < astray
+                < measured.value * limits.BEYOND_BELIEF
+            ):
                 final[row.name] = measured.including(astray)
         if not trusted and read_name(row.name).is_gain:
             for table in (initial, final):
                 if row.name in table:
-                    table[row.name] = table[row.name].widened(_STUCK)
+                    table[row.name] = table[row.name].widened(limits.STUCK)
     # Without a fit nothing says that the peaks seen in the dwells are those they are taken for.
     for table in (initial, final) if not trusted else ():
         for name in [n for n, r in table.items() if r.source == "frequency_response"]:
@@ -166,10 +161,10 @@ def trusted_chain(analysis: Analysis) -> Chain | None:
         if row.initial is None or row.final is None or is_damping(row.name):
             continue
         before, after = row.initial.value, row.final.value
-        limit = _ASTRAY if read_name(row.name).is_frequency else _ASTRAY_GAIN
+        limit = limits.ASTRAY if read_name(row.name).is_frequency else limits.ASTRAY_GAIN
         if min(before, after) <= 0 or max(before / after, after / before) > limit:
             return None
-        if _SIGMAS * (row.final.std or 0.0) > (limit - 1) * after:
+        if limits.SIGMAS * (row.final.std or 0.0) > (limit - 1) * after:
             return None
     return analysis.chain
 
@@ -187,7 +182,9 @@ def is_followed(analysis: Analysis) -> bool:
     """
     bad = {one.experiment for one in analysis.left_out}
     left = [share for name, share in analysis.unexplained.items() if name not in bad]
-    return bool(left) and sum(share <= FOLLOWED for share in left) >= _MOST * len(left)
+    return bool(left) and sum(share <= FOLLOWED for share in left) >= limits.FOLLOWED_SHARE * len(
+        left
+    )
 
 
 def _final(
@@ -204,7 +201,7 @@ def _final(
     else:
         measured = _readings(row.name, analysis)
         if row.initial and (measured or not is_explained(analysis)):
-            spread = _BY_EYE if row.initial.source == "frequency_response" else 1.0
+            spread = limits.READ_BY_EYE if row.initial.source == "frequency_response" else 1.0
             measured += [row.initial.value / spread, row.initial.value * spread]
     told = fitted is not None and not (is_damping(row.name) and _undamped(analysis))
     # No unit, sign or clock is in a damping; but dry friction adds to it, more to dwells than to
@@ -228,7 +225,7 @@ def _agrees(value: float, fitted: Estimate) -> bool:
 
     Else it is of a recording that holds something else, and no bound of what is right.
     """
-    slack, factor = _SIGMAS * (fitted.std or 0.0), 1 + GAIN_AND_FREQUENCY_LIMIT / 100
+    slack, factor = limits.SIGMAS * (fitted.std or 0.0), 1 + GAIN_AND_FREQUENCY_LIMIT / 100
     least, most = fitted.value / factor, fitted.value * factor
     return least - slack <= value <= most + slack
 
@@ -264,7 +261,7 @@ def _initial(row: ParameterRow, final: Reference | None, analysis: Analysis) -> 
     bounds = [measured.value, *readings]
     if final is not None:
         bounds += [final.low, final.high]
-    spread = _BY_EYE if measured.source == "frequency_response" else 1.0
+    spread = limits.READ_BY_EYE if measured.source == "frequency_response" else 1.0
     return Reference(
         value=measured.value,
         low=min(bounds) / spread,
@@ -309,7 +306,7 @@ def _held(cart: int, analysis: Analysis) -> float:
         and r.u is not None
         and cart in r.free
         and cart in r.carts
-        and np.ptp(r.position(cart)) <= _STILL * r.encoder_step(cart)
+        and np.ptp(r.position(cart)) <= limits.STILL * r.encoder_step(cart)
     ]
     return max(held, default=0.0)
 

@@ -5,17 +5,12 @@ from collections.abc import Callable
 import numpy as np
 
 from pipeline.errors import PipelineError
+from pipeline.grading import limits
 from pipeline.grading.references.reference import is_explained, is_followed
 from pipeline.results import Analysis, ChainFit
 from pipeline.submission import Submission
 from pipeline.submission.load import spring_names
 from pipeline.workflow import analyse
-
-# Friction and the like remain whatever the springs: of χ², a missing spring leaves many times more.
-_BETTER = 10.0
-# A spring is there where it is so many standard errors from none, these as wide as what the fit
-# leaves, and such a share of the stiffest: a delay or friction is easily taken for a weak one.
-_SIGMAS, _SHARE = 10.0, 0.02
 
 
 def with_all_springs(
@@ -45,7 +40,7 @@ def with_all_springs(
         or (
             fit is not None
             and fit.method == other.fit.method
-            and fit.chi_square_per_dof > _BETTER * other.fit.chi_square_per_dof
+            and fit.chi_square_per_dof > limits.SPRING_EXPLAINS * other.fit.chi_square_per_dof
             and is_followed(other)
         )
     ):
@@ -61,6 +56,11 @@ def _there(fit: ChainFit) -> list[bool]:
     k = fit.chain.k
     # One that the fit holds at none has no standard error.
     return [
-        bool(k[j] > max(_SIGMAS * std.get(f"k_{j + 1}", np.inf), _SHARE * k.max()))
+        bool(
+            k[j]
+            > max(
+                limits.SPRING_SIGMAS * std.get(f"k_{j + 1}", np.inf), limits.SPRING_SHARE * k.max()
+            )
+        )
         for j in range(k.size)
     ]

@@ -1,4 +1,4 @@
-"""The decision limits of the mistakes, each with its reason.
+"""The decision limits of grading, each with its reason; those of shared recordings stand with them.
 
 What they come to together is measured, on benches all over what a lab may have: no flag for honest
 teams, the planted code for nine mistakes of ten and more (`tests/statistics/test_grading.py`,
@@ -6,6 +6,22 @@ teams, the planted code for nine mistakes of ten and more (`tests/statistics/tes
 """
 
 from decimal import Decimal
+
+# ---------------------------------------- what the recordings say, and whether it is to be trusted
+
+# A fitted frequency or gain that far from the measured one: the fit has gone astray; factors.
+ASTRAY, ASTRAY_GAIN = 1.3, 1.6
+STUCK = 1.2  # factor: a gain where carts stick so that no linear fit is near
+FOLLOWED_SHARE = 0.9  # of the records follow carts that are identified, whatever points say
+STILL = 3.0  # encoder steps: a cart that friction held
+ONE_NUMBER = 1.03  # factor: bounds that near each other are one number to a reader
+BEYOND_BELIEF = 2.5  # factor: a fit so far off leads no student astray
+READ_BY_EYE = 1.1  # factor: a resonance or null read off the dwells
+# Friction and the like remain whatever the springs: of χ², a missing spring leaves many times more.
+SPRING_EXPLAINS = 10.0
+# A spring is there where it is so many standard errors from none, these as wide as what the fit
+# leaves, and such a share of the stiffest: a delay or friction is easily taken for a weak one.
+SPRING_SIGMAS, SPRING_SHARE = 10.0, 0.02
 
 # ------------------------------------------------ from where on a number is worth a remark, percent
 

@@ -1,0 +1,21 @@
+"""The decision limits of the checks, each with its reason."""
+
+# ------------------------------------------------------------------------------- recordings
+
+LONGEST = 3.0  # m from end to end: no bench has so long a track
+LONGEST_WHOLE = 0.5  # … for one that is read to whole numbers alone, as counts are
+LARGEST = 100.0  # V: no amplifier at a bench gives as much
+HELD_SHARE = 0.2  # of a held cart's swing: a free one that moves less is not the free one
+OTHER_DWELL = 0.1  # relative: a dwell stated so far off is another one
+# Samples, and so many times the scatter of the dwells: a cart that friction holds seems late by
+# half a sample at most, in the median of the dwells, on benches all over what a lab may have.
+LATE, LATE_SURE = 2.0, 4.0
+FEWEST_DWELLS = 5  # a median of fewer is one of them
+
+# ------------------------------------------------------------------------- carts and loops
+
+REDUNDANCY = 1e-9  # two routes to one number through unrounded values
+BELOW_ZERO = 2.0  # standard errors that a mass, damping or spring may be below it
+# Of the coefficients of a loop's polynomial, which are of the size of their binomials. Rounding
+# leaves 1e-13 of them on plants that a bench can be; the other programs' gains up to 1e-8.
+SAME_LOOP = 1e-6
