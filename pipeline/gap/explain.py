@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from pipeline.gap import limits
 from pipeline.gap.data.runs import Run
 from pipeline.gap.data.sides import prepare, take_sides
 from pipeline.gap.fit.baseline import fit_baseline, measure_noise
 from pipeline.gap.fit.levenberg_marquardt import Fit, covariance, fit_model
 from pipeline.gap.fit.restart import holding_force
 from pipeline.gap.fit.structure import Candidate
-from pipeline.gap.limits import AS_REPEATS, OFFSET_AS_FREE, OFFSET_GAIN, TOO_GOOD
 from pipeline.gap.search.beam import choose, prune, search, steps_to
 from pipeline.gap.search.deadline import Deadline, OutOfTime
 from pipeline.gap.search.grow import fit_whole
@@ -91,7 +91,7 @@ def explain_gap(
         )
         chosen, found = _investigate(fit, study, deadline)
         for _ in range(_NOISE_ROUNDS):
-            if chosen.fit.chi > TOO_GOOD or deadline.cut:
+            if chosen.fit.chi > limits.TOO_GOOD or deadline.cut:
                 break
             # Less is left than was taken for noise: the misfit of the linear model was in it.
             quiet = _quieter(study, chosen)
@@ -191,7 +191,7 @@ def _with_noise(run: Run, sigma: dict[int, float]) -> Run:
 def _investigate(fit: Fit, study: Study, deadline: Deadline) -> tuple[Hypothesis, list[Hypothesis]]:
     """Return the hypothesis chosen and all that were judged in time, the linear one first."""
     baseline = judge(fit, study)
-    if baseline.at_floor or baseline.error < AS_REPEATS * study.repeatability:
+    if baseline.at_floor or baseline.error < limits.AS_REPEATS * study.repeatability:
         return baseline, [baseline]
     study.tell(f"linear model: error {baseline.error:.1%} of the motion on held-out runs")
     timed = replace(study, mapper=deadline.map)
@@ -233,7 +233,9 @@ def _with_offset(
     without = tuple(judge(fit_whole(h.fit, pinned), pinned, added=h.added) for h in path)
     fit = fit_whole(chosen.fit.with_effect(candidate, (offset.force,)), loose)
     final = judge(fit, loose, added=(candidate,))
-    if final.error > min(OFFSET_GAIN * without[-1].error, OFFSET_AS_FREE * chosen.error):
+    if final.error > min(
+        limits.OFFSET_GAIN * without[-1].error, limits.OFFSET_AS_FREE * chosen.error
+    ):
         return path, None
     return (*without, final), loose
 

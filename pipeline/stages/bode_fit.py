@@ -9,7 +9,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
@@ -21,12 +20,12 @@ from pipeline.estimation.chain.parametrisation import (
     physical_start,
 )
 from pipeline.estimation.chain.staged_fit import LogMagnitude, StagedFit, fit_stage_by_stage
-from pipeline.estimation.last_point import LastPoint
+from pipeline.estimation.minimise import minimise
 from pipeline.names import own_zeta, read_name
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.recovery import recover_chain
 from pipeline.results import EXPLAINED, ChainFit, Estimate, FrequencyResponse
-from pipeline.stages.limits import DECAY_AGREES, EXCESS_SIGMAS, PHASE_AGREES, VANISHING
+from pipeline.stages import limits
 
 _STARTS = 8  # random ones, tried where the first does not explain the data
 _START_SPREAD = 0.5  # of ln m and ln k of a random start: half to double, mostly
@@ -95,7 +94,7 @@ def fit_bode(
     remark = ""
     if data.n_phases:
         # As few magnitudes as parameters say nothing about what the phases should be.
-        limit = PHASE_AGREES * max(1.0, best.chi_square_per_dof**0.5)
+        limit = limits.PHASE_AGREES * max(1.0, best.chi_square_per_dof**0.5)
         if best.dof <= 0 or _phase_misfit(best, data) <= limit:
             best = _solve(P, data, best.theta, "polar")
         else:
@@ -189,18 +188,18 @@ def _solve(P: Parametrisation, data: Points, theta: Array, scale: Scale) -> _Fit
             r = np.full_like(r, np.nan)
         return r, J
 
-    at = LastPoint(evaluate)
     # A step that goes astray may overflow; least_squares then takes a shorter one.
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
-        if not np.isfinite(np.sum(at(theta)[0] ** 2)):
+        if not np.isfinite(np.sum(evaluate(theta)[0] ** 2)):
             raise DataError("Bode fit: no chain comes near responses as far apart as these")
-        solution = least_squares(
-            lambda theta: at(theta)[0],
+        solution = minimise(
+            evaluate,
             theta,
-            jac=lambda theta: at(theta)[1],  # pyright: ignore[reportArgumentType] - scipy's default is a string
-            x_scale="jac",
-            ftol=_NEAR if scale == "log" else _PRECISION,
-            max_nfev=_EVALUATIONS,
+            residual=lambda both: both[0],
+            jacobian=lambda both: both[1],
+            scale="jac",
+            tolerance=_NEAR if scale == "log" else _PRECISION,
+            max_evaluations=_EVALUATIONS,
         )
     return _Fitted(
         parametrisation=P,
@@ -235,7 +234,7 @@ def _fit_from_starts(
 def _widen(fitted: _Fitted, data: Points) -> tuple[_Fitted, float]:
     """Fit again with the relative error that makes the misfit what the errors allow; 0 if it is."""
     excess = fitted.chi_square_per_dof - 1
-    if data.from_table or excess <= EXCESS_SIGMAS * np.sqrt(2 / fitted.dof):
+    if data.from_table or excess <= limits.EXCESS_SIGMAS * np.sqrt(2 / fitted.dof):
         return fitted, 0.0
     share = 0.0
     for _ in range(_WIDENINGS):
@@ -276,7 +275,7 @@ def _hold_vanished(
     vanished = [
         name
         for name, value, size in zip(P.names, P.physical(chain), sizes, strict=True)
-        if value < (0.0 if name == "k_1" else VANISHING * size)
+        if value < (0.0 if name == "k_1" else limits.VANISHING * size)
     ]
     if not vanished:
         return fitted, data
@@ -290,7 +289,7 @@ def _hold_vanished(
         held = P.holding_at_zero(*(name for name in vanished if name not in names))
         along = replace(data, decays=told)
         both = _solve(held, along, held.pack(replace(chain, c=c)), fitted.scale)
-        if both.chi_square < fitted.chi_square + DECAY_AGREES * len(told):
+        if both.chi_square < fitted.chi_square + limits.DECAY_AGREES * len(told):
             return _hold_vanished(both, along, {})
     held = P.holding_at_zero(*vanished)
     return _hold_vanished(_solve(held, data, held.pack(chain), fitted.scale), data, {})

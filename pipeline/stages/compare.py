@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.names import read_name
 from pipeline.results import Estimate, ParameterRow
-from pipeline.stages.limits import DAMPING_LIMIT, GAIN_AND_FREQUENCY_LIMIT, SIGMA_LIMIT
+from pipeline.stages import limits
 
 _UNDECIDED = "the two estimates are too uncertain to agree or to disagree"
 AT_BOUND = (
@@ -49,7 +49,7 @@ def compare(
             if before.source != "assumed":
                 sigmas = _combined_sigmas(before, after)
                 consistent = abs(percent) <= change_limit(name)
-                if not consistent and sigmas is not None and sigmas <= SIGMA_LIMIT:
+                if not consistent and sigmas is not None and sigmas <= limits.SIGMA_LIMIT:
                     consistent, note = None, _UNDECIDED
         rows.append(
             ParameterRow(
@@ -77,7 +77,7 @@ def why_open(name: str, final: Estimate) -> str:
 
 def change_limit(name: str) -> float:
     """Return how far initial and final estimates may differ, in percent."""
-    return DAMPING_LIMIT if read_name(name).is_damping else GAIN_AND_FREQUENCY_LIMIT
+    return limits.DAMPING_LIMIT if read_name(name).is_damping else limits.GAIN_AND_FREQUENCY_LIMIT
 
 
 def _combined_sigmas(before: Estimate, after: Estimate) -> float | None:

@@ -20,7 +20,7 @@ from pipeline.names import (
     parameter_names,
 )
 from pipeline.results import Estimate, FrequencyResponse, Record, SinePoint
-from pipeline.stages.limits import CLEAR, LARGEST_RELATIVE_STD, LEAST_PROMINENCE, UNSETTLED_STD
+from pipeline.stages import limits
 
 # Two dwells are repeats where their frequencies differ by less than this: a fitted frequency is
 # good to some 1e-4, and no response changes by more than its error within it.
@@ -80,7 +80,7 @@ def _collect_cart(points: Sequence[SinePoint], *, cart: int) -> FrequencyRespons
         groups[-1].append(point)
     rows = []
     for group in groups:
-        extra = np.array([0.0 if p.settled else UNSETTLED_STD for p in group])
+        extra = np.array([0.0 if p.settled else limits.UNSETTLED_STD for p in group])
         gain = np.array([p.gain for p in group])
         magnitude, magnitude_std = _weighted_mean(
             gain, np.hypot([p.gain_std for p in group], extra * gain)
@@ -172,13 +172,13 @@ def _combined(
     for w in range(omega.size):
         G = np.array([row[0][w] for row in rows])
         std = np.array([row[1][w] for row in rows])
-        good = std <= LARGEST_RELATIVE_STD * np.abs(G)
+        good = std <= limits.LARGEST_RELATIVE_STD * np.abs(G)
         if not good.any():
             continue
         real, real_std = _weighted_mean(np.real(G[good]), std[good])
         imag, imag_std = _weighted_mean(np.imag(G[good]), std[good])
         magnitude, spread = abs(complex(real, imag)), max(real_std, imag_std)
-        if spread <= LARGEST_RELATIVE_STD * magnitude:
+        if spread <= limits.LARGEST_RELATIVE_STD * magnitude:
             phase = np.arctan2(imag, real)
             points.append((omega[w], magnitude, spread, phase, spread / magnitude))
     columns = np.array(points).reshape(-1, 5).T
@@ -266,11 +266,11 @@ def _extrema(response: FrequencyResponse, *, sign: int) -> list[_Extremum]:
     level, position = sign * np.log(magnitude), np.log(omegas)
     found = []
     for i in range(1, level.size - 1):
-        if not level[i - 1] < level[i] >= level[i + 1] or (sign > 0 and error[i] > CLEAR):
+        if not level[i - 1] < level[i] >= level[i + 1] or (sign > 0 and error[i] > limits.CLEAR):
             continue
         left, right = level[:i][::-1], level[i + 1 :]
         prominence = level[i] - max(_saddle(left, level[i]), _saddle(right, level[i]))
-        if prominence < max(LEAST_PROMINENCE, 6 * np.max(error[i - 1 : i + 2])):
+        if prominence < max(limits.LEAST_PROMINENCE, 6 * np.max(error[i - 1 : i + 2])):
             continue
         curve = np.polyfit(position[i - 1 : i + 2] - position[i], level[i - 1 : i + 2], 2)
         omega = omegas[i] * np.exp(-curve[1] / (2 * curve[0]))

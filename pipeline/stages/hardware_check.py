@@ -25,17 +25,7 @@ from pipeline.plant.loop.sampled_loop import (
     simulate_loop,
 )
 from pipeline.results import HardwareCheck, Record
-from pipeline.stages.limits import (
-    AT,
-    AWAY,
-    HALF_EXPLAINED,
-    RIGHT,
-    SMALL_CHANGE,
-    TIMES_WORSE,
-    TRUSTED,
-    WORTH_IT,
-    WRONG,
-)
+from pipeline.stages import limits
 
 _SERVO_PERIOD = 0.000884  # s; of the ECP controller, whose log keeps one sample in several
 _COARSE_LOG = 3.0  # servo periods between logged samples, from where on the two differ
@@ -123,7 +113,7 @@ def _open(run: MeasuredRun) -> _Simulated:
     """Drive the chain with the logged input, times a factor where the log cannot be right."""
     forced, unforced, scale = run.forced(), run.unforced(), run.input_scale()
     as_logged, scaled = run.misfit(unforced + forced), run.misfit(unforced + scale * forced)
-    if _plausible(scale) or scaled > min(WORTH_IT * as_logged, HALF_EXPLAINED):
+    if _plausible(scale) or scaled > min(limits.WORTH_IT * as_logged, limits.HALF_EXPLAINED):
         return _Simulated(y=unforced + forced, scale=scale, note="")
     note = (
         f"the logged input explains the motion only if taken {scale:.3g} times, so it is: "
@@ -135,12 +125,12 @@ def _open(run: MeasuredRun) -> _Simulated:
         factor=scale,
         scale=scale,
         note=note,
-        contradicted=scaled <= WRONG and not _plausible(abs(scale)),
+        contradicted=scaled <= limits.WRONG and not _plausible(abs(scale)),
     )
 
 
 def _plausible(factor: float) -> bool:
-    return 1 / TRUSTED <= factor <= TRUSTED
+    return 1 / limits.TRUSTED <= factor <= limits.TRUSTED
 
 
 # ------------------------------------------------------------------ closed loop
@@ -195,7 +185,7 @@ def _close(
     drive = opened.factor if opened else 1.0
     limit = min(np.inf if limit is None else limit, _plateau(run.record.u))
     loop, misfit = _run_loop(run, law, reference=reference, drive=drive, limit=limit)
-    to_beat, note, times_stated = WORTH_IT * misfit, "", 1.0
+    to_beat, note, times_stated = limits.WORTH_IT * misfit, "", 1.0
     for factor in _logged_per_stated(run, law, reference=reference, opened=opened):
         if misfit <= run.noise_floor:
             break
@@ -208,7 +198,7 @@ def _close(
     if loop is None:
         raise DataError("the stated controller makes it unstable")
     # A bench may count its input the other way under feedback, by right.
-    wrong = abs(times_stated) != 1.0 and misfit <= WRONG
+    wrong = abs(times_stated) != 1.0 and misfit <= limits.WRONG
     return _Simulated(y=loop.x, u=loop.u, note=note, contradicted=wrong)
 
 
@@ -299,7 +289,9 @@ def _median_ratio(logged: Array, stated: Array) -> float:
 def _not_as_stated(run: MeasuredRun, closed: _Simulated, opened: _Simulated) -> str:
     """Say that the stated controller is not what ran, where the plant follows what it was given."""
     loop, plant = run.misfit(closed.y), run.misfit(opened.y)
-    if opened.factor != 1.0 or not (plant <= RIGHT and loop > max(WRONG, TIMES_WORSE * plant)):
+    if opened.factor != 1.0 or not (
+        plant <= limits.RIGHT and loop > max(limits.WRONG, limits.TIMES_WORSE * plant)
+    ):
         return ""
     return (
         f"the carts follow the logged input to {100 * plant:.1f} %, but the loop with the stated "
@@ -325,8 +317,8 @@ def _another_cart(
         run.free[row]: abs(float((run.y[row, last] - run.rest[row]).mean()) / target - 1)
         for row in np.flatnonzero(run.seen).tolist()
     }
-    there = [other for other, away in off.items() if away <= AT]
-    if len(there) != 1 or off.get(cart, 0.0) < AWAY:
+    there = [other for other, away in off.items() if away <= limits.AT]
+    if len(there) != 1 or off.get(cart, 0.0) < limits.AWAY:
         return ""
     return (
         f"controlled_cart = {cart}, but cart {there[0]} comes to rest at the reference and cart "
@@ -407,7 +399,7 @@ def _judge(run: MeasuredRun, y: Array, *, row: int, window: slice | None, noise:
     t, after = run.record.t[window], y[window]
     before = y[: window.start].mean() if window.start > 0 else run.rest[row]
     level = after[-max(1, round(_SETTLED_SHARE * after.size)) :].mean()
-    if abs(level - before) <= max(noise, SMALL_CHANGE * np.max(np.abs(y - before))):
+    if abs(level - before) <= max(noise, limits.SMALL_CHANGE * np.max(np.abs(y - before))):
         return _Step(level=float(level))
     settling = float(step_response.settling_time(t, after, before=before, level=level, noise=noise))
     return _Step(

@@ -9,7 +9,7 @@ from pipeline.errors import DataError
 from pipeline.estimation.decay.free_decay import FreeDecay, find_decay, fit_decay
 from pipeline.estimation.noise import grain
 from pipeline.results import LogDecrement, Record
-from pipeline.stages.limits import GROWS, NO_DECAY
+from pipeline.stages import limits
 
 _PEAKS_FOR_REGRESSION = 4  # two amplitudes
 _PEAK_HALF_WIDTH = 0.5  # rad: so near a turning point a cosine is nearly a parabola
@@ -51,7 +51,7 @@ def fit_log_decrement(record: Record, *, cart: int) -> LogDecrement:
     pole = complex(fit.poles[0])
     omega_n, zeta = abs(pole), -pole.real / abs(pole)
     unexplained = fit.rms / float(np.ptp(y[window]))
-    if not (0 < zeta < 1 and pole.imag > 0 and unexplained < NO_DECAY):
+    if not (0 < zeta < 1 and pole.imag > 0 and unexplained < limits.NO_DECAY):
         raise DataError(
             f"{record.id}: log decrement needs a decaying oscillation of cart {cart}, found "
             f"zeta = {zeta:.3g} with {100 * unexplained:.0f} % of the motion unexplained"
@@ -204,7 +204,7 @@ def _note(record: Record, decay: FreeDecay, *, zeta: float, n_peaks: int) -> str
             f"{test.drop:.3g} of its rest point. Viscous damping alone would be zeta = "
             f"{test.zeta:.3g}; the {zeta:.3g} fitted without it holds for these amplitudes only"
         )
-    elif test and test.f_statistic > test.threshold and test.zeta > GROWS * zeta:
+    elif test and test.f_statistic > test.threshold and test.zeta > limits.GROWS * zeta:
         notes.append(
             "the decay is not exponential: the damping grows with the amplitude, and zeta is a mean"
         )

@@ -10,14 +10,7 @@ from pipeline.errors import DataError
 from pipeline.estimation.colour import colour
 from pipeline.estimation.noise import grain, noise_beyond_rounding, rounding_left
 from pipeline.results import Record, SinePoint
-from pipeline.stages.limits import (
-    FEW_COUNTS,
-    FREQUENCY_RELATIVE,
-    FREQUENCY_SIGMAS,
-    NO_SINE,
-    OFF_SINE,
-    STEADY_SPREAD,
-)
+from pipeline.stages import limits
 
 _MIN_SAMPLES = 12  # five unknowns, and something left to judge the fit by
 _WINDOW_CYCLES, _WINDOW_TIME = 3.0, 0.6  # a sliding window: the longer of the two; cycles, s
@@ -149,7 +142,7 @@ class Dwell:
         steady = self._steady_part(y, floor=floor)
         t = self._t[steady.start :]
         position, drive = self._fit(y, steady.start), self._fit(self._u, steady.start)
-        if drive.rms >= NO_SINE * abs(drive.z):
+        if drive.rms >= limits.NO_SINE * abs(drive.z):
             raise DataError(
                 f"{record.id}: a sine dwell needs an input of one frequency, found an amplitude of "
                 f"{abs(drive.z):.3g} at {omega / (2 * np.pi):.4g} Hz and {drive.rms:.3g} (rms) "
@@ -225,7 +218,7 @@ class Dwell:
         z = np.array([fit.z for fit in fits])
         latest, _ = last[-1]
         spread = float(np.max(np.abs(z - z.mean())))
-        agree = spread <= max(STEADY_SPREAD * abs(z.mean()), floor)
+        agree = spread <= max(limits.STEADY_SPREAD * abs(z.mean()), floor)
         if len(last) < 2 or not (agree or spread <= 3 * max(fit.std for fit in fits)):
             return _Steady(start=latest, settled=False, left=spread)
         start = self._carry_back(y, latest, floor=floor, stretches=len(windows))
@@ -361,7 +354,9 @@ def _frequency(t: Array, u: Array, *, stated: float | None) -> tuple[float, str]
         fitted = peak
     if stated is None:
         return fitted, ""
-    if abs(fitted - stated) <= max(FREQUENCY_SIGMAS * std, FREQUENCY_RELATIVE * stated):
+    if abs(fitted - stated) <= max(
+        limits.FREQUENCY_SIGMAS * std, limits.FREQUENCY_RELATIVE * stated
+    ):
         return stated, ""
     return fitted, (
         f"the input oscillates at {fitted / (2 * np.pi):.4g} Hz, not at the "
@@ -391,12 +386,12 @@ def _windows(t: Array, *, omega: float) -> list[tuple[int, int]]:
 
 
 def _note_small(amplitude: float, *, step: float) -> str:
-    if step == 0 or amplitude >= FEW_COUNTS * step:
+    if step == 0 or amplitude >= limits.FEW_COUNTS * step:
         return ""
     return f"the amplitude is {amplitude / step:.1f} encoder counts only"
 
 
 def _note_off_sine(fit: _Sine, *, floor: float) -> str:
-    if fit.rms <= max(2 * floor, OFF_SINE * abs(fit.z)):
+    if fit.rms <= max(2 * floor, limits.OFF_SINE * abs(fit.z)):
         return ""
     return f"{100 * fit.rms / abs(fit.z):.1f} % of the motion is not a sine of this frequency"

@@ -27,7 +27,7 @@ from pipeline.plant.loop.robustness import level_error_percent
 from pipeline.plant.loop.sampled_loop import StateFeedback, check_ticks, discretise, simulate_loop
 from pipeline.plant.loop.sampled_plant import RADIANS_PER_SAMPLE, SampledPlant, energy_weights
 from pipeline.results import FeedbackDesign
-from pipeline.stages.limits import LEVEL_ERROR, LEVEL_WARNING
+from pipeline.stages import limits
 
 Method = Literal["poles", "lqr"]
 
@@ -241,7 +241,7 @@ def _choose(plant: SampledPlant, candidates: _Candidates, goal: _Goal) -> tuple[
     within = candidates.peak <= goal.limit
     if not within.any():  # a step of this size is out of reach: design for a smaller one
         within = np.full_like(within, True)
-    for level_error, (settling, overshoot) in product((LEVEL_ERROR, np.inf), _AIMS):
+    for level_error, (settling, overshoot) in product((limits.LEVEL_ERROR, np.inf), _AIMS):
         good = within & (candidates.level_error <= level_error)
         good &= candidates.settling <= settling * goal.settling
         good &= candidates.overshoot <= max(overshoot * goal.overshoot, _UNSEEN)
@@ -341,7 +341,7 @@ def _message(plant: SampledPlant, goal: _Goal, design: FeedbackDesign) -> str:
             f"or dampings {100 * DAMPING_ERROR:g} % off"
         )
     error = float(level_error_percent(plant.chain, design.gains, cart=plant.cart))
-    if error > LEVEL_WARNING:
+    if error > limits.LEVEL_WARNING:
         said.append(
             f"these gains cancel much of the plant's own stiffness: errors of "
             f"{100 * MASS_SPRING_ERROR:g} % in the springs move the level by up to {error:.0f} %"

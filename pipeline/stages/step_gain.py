@@ -14,14 +14,7 @@ from pipeline.estimation.noise import grain, noise_beyond_rounding, rounding_lef
 from pipeline.estimation.peaks import extrema, plateaus
 from pipeline.results import Record, StepGain
 from pipeline.results_of_runs import StepEdge
-from pipeline.stages.limits import (
-    DRIFT_AGREES,
-    DRIFT_SIGMAS,
-    EXTRAPOLATES,
-    MOVED,
-    STEADY_SHARE,
-    STICKS_SIGMAS,
-)
+from pipeline.stages import limits
 
 _MIN_SAMPLES = 12
 _CREEP = 0.005  # of the input's range: two halves of a constant stretch differ by no more
@@ -99,17 +92,19 @@ def fit_step_gain(record: Record, *, cart: int) -> StepGain:
             f"{record.id}: step gain needs a step on whose two sides cart {cart} settles, found "
             f"{len(found) - 1} edges, none with both"
         )
-    moving = [edge for edge in edges if abs(edge.level_after - edge.level_before) > MOVED * size]
+    moving = [
+        edge for edge in edges if abs(edge.level_after - edge.level_before) > limits.MOVED * size
+    ]
     if not moving:
         raise DataError(
-            f"{record.id}: step gain needs cart {cart} to move by more than {MOVED:.0f} encoder "
-            "steps, found less"
+            f"{record.id}: step gain needs cart {cart} to move by more than {limits.MOVED:.0f} "
+            "encoder steps, found less"
         )
     gain, gain_std = _combine(moving)
     shift, shift_std = _rest_shift(found)
     spread = [abs(edge.gain - gain) / edge.gain_std for edge in moving]
-    sticks = len(moving) < len(edges) or max(spread) > STICKS_SIGMAS
-    sticks = sticks or (shift is not None and abs(shift) > STICKS_SIGMAS * shift_std)
+    sticks = len(moving) < len(edges) or max(spread) > limits.STICKS_SIGMAS
+    sticks = sticks or (shift is not None and abs(shift) > limits.STICKS_SIGMAS * shift_std)
     notes += _notes(found, moving, edges, shift=shift if sticks else None)
     return StepGain(
         experiment=record.id,
@@ -142,7 +137,7 @@ def _constant_parts(record: Record) -> list[tuple[int, int, float]]:
     ]
     share = sum(b - a for a, b in long) / u.size
     parts = [(a, b, float(np.mean(u[a:b]))) for a, b in long]
-    if share < STEADY_SHARE or not any(value for _, _, value in parts):
+    if share < limits.STEADY_SHARE or not any(value for _, _, value in parts):
         raise DataError(
             f"{record.id}: step gain needs an input that steps and then stays, found it constant "
             f"and not zero for {100 * share if any(p[2] for p in parts) else 0:.0f} % of the record"
@@ -234,13 +229,13 @@ def _extrapolated(t: Array, y: Array, *, n_modes: int, floor: float) -> _Level |
             continue
         fit = fit_ringing(t, y, poles=poles, drift=False)
         std = float(np.sqrt(fit.covariance[0, 0]))
-        left = max(2 * floor, EXTRAPOLATES * motion)
+        left = max(2 * floor, limits.EXTRAPOLATES * motion)
         if (
             fit.converged
             and bool(np.all(fit.poles.real < 0))
             and float(np.min(fit.poles.imag)) * (t[-1] - t[0]) >= np.pi  # half a period is seen
             and fit.rms <= left
-            and std <= EXTRAPOLATES * motion
+            and std <= limits.EXTRAPOLATES * motion
         ):
             return _Level(first=0, stop=y.size, value=fit.level, std=std, extrapolated=True)
     return None
@@ -251,7 +246,7 @@ def _with_unseen_start(
 ) -> tuple[list[_Plateau], list[str]]:
     """Put a rest before a record that starts with the input on and the cart just setting off."""
     head = found[0]
-    if head.u == 0 or not head.level or abs(head.level.value - y[0]) <= MOVED * size:
+    if head.u == 0 or not head.level or abs(head.level.value - y[0]) <= limits.MOVED * size:
         return found, []
     radian = _pace(t[: head.stop], y[: head.stop], size=size) / (2 * np.pi)
     n = max(5, int(np.searchsorted(t, t[0] + radian / 2)))
@@ -281,8 +276,10 @@ def _drift(t: Array, y: Array, levels: Sequence[_Level], *, size: float) -> floa
         return 0.0
     weight = 1 / np.square(errors)
     drift = float(np.average(slopes, weights=weight))
-    seen = abs(drift) > DRIFT_SIGMAS / np.sqrt(weight.sum())
-    alike = np.abs(np.array(slopes) - drift) <= DRIFT_AGREES * abs(drift) + 3 * np.array(errors)
+    seen = abs(drift) > limits.DRIFT_SIGMAS / np.sqrt(weight.sum())
+    alike = np.abs(np.array(slopes) - drift) <= limits.DRIFT_AGREES * abs(drift) + 3 * np.array(
+        errors
+    )
     return drift if seen and bool(np.all(alike)) else 0.0
 
 

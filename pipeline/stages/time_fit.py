@@ -27,7 +27,7 @@ from pipeline.estimation.colour import long_run_variance, score_covariance
 from pipeline.names import read_name
 from pipeline.plant.linear.chain import Chain
 from pipeline.results import ChainFit, Estimate, Record
-from pipeline.stages.limits import NEGLIGIBLE, REST_SIGMAS
+from pipeline.stages import limits
 
 _STRUCTURE_VALUES = 20  # independent values of the chain's own error in a record
 _DETERMINED = 1e-9  # smallest singular value of the scaled Jacobian over its largest
@@ -126,7 +126,7 @@ def _starts_at_rest(attempt: Attempt, index: int) -> bool:
     structure = (np.sum(misfit.residual**2) - misfit.residual.size) / _STRUCTURE_VALUES
     chance = max(long_run_variance(misfit.residual), structure)
     freed = misfit.n_nuisance - held.n_nuisance
-    return bool(gain <= chance * (freed + REST_SIGMAS * np.sqrt(2 * freed)))
+    return bool(gain <= chance * (freed + limits.REST_SIGMAS * np.sqrt(2 * freed)))
 
 
 def _covariance(attempt: Attempt) -> Array:
@@ -174,7 +174,9 @@ def _negligible(attempt: Attempt, covariance: Array) -> tuple[str, ...]:
     parametrisation, chain = attempt.parametrisation, attempt.chain
     share = parametrisation.physical(chain) / np.sqrt(np.diag(covariance))
     gone = [
-        name for name, value in zip(parametrisation.names, share, strict=True) if value < NEGLIGIBLE
+        name
+        for name, value in zip(parametrisation.names, share, strict=True)
+        if value < limits.NEGLIGIBLE
     ]
     walls = tuple(name for name in gone if name in ("k_1", f"k_{chain.n + 1}"))
     is_held = chain.k[0] > 0 or chain.k[-1] > 0

@@ -13,21 +13,10 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
+from pipeline.estimation import limits
 from pipeline.estimation.chain.modal_response import Modes, find_modes
 from pipeline.estimation.chain.parametrisation import Parametrisation
 from pipeline.estimation.chain.time_window import Window, compare, open_window
-from pipeline.estimation.limits import (
-    BETTER,
-    DETUNED,
-    DOUBTFUL,
-    FOLLOWED,
-    FRICTION_PER_ROOT,
-    LEAST_SHARE,
-    SAME_SCALE,
-    SEEN_STEPS,
-    TURNED,
-    UNMISTAKABLE,
-)
 from pipeline.estimation.units_and_clocks import FASTEST, LENGTH_SCALES, TIME_FACTORS
 from pipeline.plant.linear.chain import Chain
 from pipeline.results import Record
@@ -60,7 +49,7 @@ class Followed:
     @property
     def belongs(self) -> bool:
         """Whether the record follows."""
-        return self.share <= FOLLOWED
+        return self.share <= limits.FOLLOWED
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,12 +94,12 @@ def near(record: Record, chain: Chain) -> list[Followed]:
     one of them that is all of the motion.
     """
     modes = _modes(chain)
-    detuned = [replace(record, t=factor * record.t) for factor in DETUNED]
+    detuned = [replace(record, t=factor * record.t) for factor in limits.DETUNED]
     return [fit for other in detuned if (fit := _hold_against(other, chain, modes))]
 
 
 def find_misread(
-    record: Record, chain: Chain, fit: Followed, *, better: float = BETTER
+    record: Record, chain: Chain, fit: Followed, *, better: float = limits.BETTER
 ) -> Misread | None:
     """Return how a record must be read to follow the chain, so many times better than as it is.
 
@@ -118,15 +107,15 @@ def find_misread(
     ----------
     fit : how it follows as it is.
     """
-    found, least = None, min(fit.share / better, FOLLOWED)
-    if better > 1 and fit.share < DOUBTFUL:
+    found, least = None, min(fit.share / better, limits.FOLLOWED)
+    if better > 1 and fit.share < limits.DOUBTFUL:
         return None
     # As the bench counts its input: a record's own sign was found by what it holds.
     record = replace(record, u=0.0 - record.u) if record.turned and record.u is not None else record
     modes = _modes(chain)
     for misread, other in _readings(record, modes):
         held = _hold_against(other, chain, modes)
-        if held and held.share <= (min(least, TURNED) if misread.legal else least):
+        if held and held.share <= (min(least, limits.TURNED) if misread.legal else least):
             found, least = misread, held.share
     return found
 
@@ -147,7 +136,7 @@ def _readings(record: Record, modes: _ModesOf) -> Iterator[tuple[Misread, Record
         window = open_window(record)
     except DataError:
         return
-    if np.any(np.ptp(window.y, axis=1) < SEEN_STEPS * np.sqrt(12) * window.stated_sigma):
+    if np.any(np.ptp(window.y, axis=1) < limits.SEEN_STEPS * np.sqrt(12) * window.stated_sigma):
         return
     if (said := _say(window.carts, _weights(window, modes(window.free)))) is not None:
         misread, factors = said
@@ -176,9 +165,9 @@ def _say(carts: Sequence[int], weights: Array) -> tuple[Misread, Array] | None:
     A unit is that of the whole file: one cart near its null moves by any factor too little.
     """
     sign, size = np.sign(weights), np.abs(weights)
-    scales = [scale for scale in LENGTH_SCALES if scale >= UNMISTAKABLE]
+    scales = [scale for scale in LENGTH_SCALES if scale >= limits.UNMISTAKABLE]
     for scale in (*scales, *(1 / scale for scale in scales)):
-        if np.all(np.abs(size * scale - 1) < SAME_SCALE) and len(set(sign)) == 1:
+        if np.all(np.abs(size * scale - 1) < limits.SAME_SCALE) and len(set(sign)) == 1:
             words = (
                 "its positions or its input look to be in another unit: they move "
                 f"{scale:.3g} times as far as its input moves the carts"
@@ -228,9 +217,15 @@ def _hold_against(record: Record, chain: Chain, modes: _ModesOf) -> Followed | N
         missed=dict(zip(window.carts, residual, strict=True)),
         reach=dict(zip(window.carts, reach.tolist(), strict=True)),
         friction={
-            cart: float(FRICTION_PER_ROOT * np.sqrt(max(share, LEAST_SHARE)) * np.ptp(force) / 2)
+            cart: float(
+                limits.FRICTION_PER_ROOT
+                * np.sqrt(max(share, limits.LEAST_SHARE))
+                * np.ptp(force)
+                / 2
+            )
             for cart, share in zip(window.carts, lost, strict=True)
-            if share <= FOLLOWED and (force := force_on(record, chain, cart=cart)) is not None
+            if share <= limits.FOLLOWED
+            and (force := force_on(record, chain, cart=cart)) is not None
         },
     )
 

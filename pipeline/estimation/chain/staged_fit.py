@@ -10,9 +10,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from pipeline.arrays import Array
+from pipeline.estimation.minimise import minimise
 from pipeline.names import NULLS, gain_name, mode_suffixes, mode_zeta, own_omega, own_zeta
 from pipeline.plant.linear.chain import Chain, quadratic_factors
 from pipeline.plant.linear.recovery import recover_chain
@@ -96,23 +96,21 @@ def _fit(
     target = points.level + (0.0 if known is None else _log_factors(points.omega, known)[0])
     shape = factors.shape
 
-    def residuals(theta: Array) -> Array:
-        level, _ = _log_factors(points.omega, theta[1:].reshape(shape))
-        return points.weight * (theta[0] + power * level - target)
-
-    def jacobian(theta: Array) -> Array:
-        _, jacobian = _log_factors(points.omega, theta[1:].reshape(shape))
-        ones = np.ones((points.omega.size, 1))
-        return points.weight[:, None] * np.hstack([ones, power * jacobian])
+    def evaluate(theta: Array) -> tuple[Array, Array]:
+        level, jacobian = _log_factors(points.omega, theta[1:].reshape(shape))
+        columns = np.hstack([np.ones((points.omega.size, 1)), power * jacobian])
+        residual = theta[0] + power * level - target
+        return points.weight * residual, points.weight[:, None] * columns
 
     start = np.concatenate([[np.log(gain)], factors.ravel()])
     if points.omega.size < start.size:
         return gain, factors  # too few points for this stage; the joint fit sees all carts
-    found = least_squares(
-        residuals,
+    found = minimise(
+        evaluate,
         start,
-        jac=jacobian,  # pyright: ignore[reportArgumentType] - scipy's default is a string
-        max_nfev=_EVALUATIONS,
+        residual=lambda both: both[0],
+        jacobian=lambda both: both[1],
+        max_evaluations=_EVALUATIONS,
     ).x
     if np.max(np.abs(found - start)) > _RUNAWAY:
         return gain, factors

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
@@ -13,8 +12,8 @@ from pipeline.estimation.chain.modal_response import find_modes
 from pipeline.estimation.chain.parametrisation import Parametrisation
 from pipeline.estimation.chain.time_start import WIDTHS, even_chains, regress_chain
 from pipeline.estimation.chain.time_window import Misfit, Window, compare
-from pipeline.estimation.last_point import LastPoint
 from pipeline.estimation.limits import FOLLOWED
+from pipeline.estimation.minimise import minimise
 from pipeline.plant.linear.chain import Chain
 from pipeline.results import EXPLAINED
 
@@ -105,18 +104,18 @@ def descend(
     tolerance: float = _SEARCH_TOLERANCE,
 ) -> Attempt:
     """Minimise the sum of squared residuals from theta on, to a relative `tolerance`."""
-    at = LastPoint(lambda x: condense(look(windows, parametrisation, x).misfits))
     reach = np.where(parametrisation.logarithmic, _LOG_REACH, np.inf)
     lower = np.maximum(parametrisation.bounds[0], theta - reach)
     upper = np.minimum(parametrisation.bounds[1], theta + reach)
-    solution = least_squares(
-        lambda x: at(x)[:, -1],
+    solution = minimise(
+        lambda x: condense(look(windows, parametrisation, x).misfits),
         np.clip(theta, lower, upper),
-        jac=lambda x: at(x)[:, :-1],  # pyright: ignore[reportArgumentType] - scipy's default is a string
+        residual=lambda triangle: triangle[:, -1],
+        jacobian=lambda triangle: triangle[:, :-1],
         bounds=(lower, upper),
-        x_scale="jac",
-        ftol=tolerance,
-        max_nfev=_MOST_EVALUATIONS,
+        scale="jac",
+        tolerance=tolerance,
+        max_evaluations=_MOST_EVALUATIONS,
     )
     return replace(
         look(windows, parametrisation, solution.x),

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from pipeline.arrays import Array
-from pipeline.estimation.last_point import LastPoint
+from pipeline.estimation.minimise import minimise
 
 
 class Model(Protocol):
@@ -49,21 +48,21 @@ def fit_separable(
     scale: Array | float = 1.0,
 ) -> SeparableFit:
     """Fit a model of p to y (n,) from `start` (n_p,) on; `scale` is the size of p."""
-    at = LastPoint(lambda p: _solved(y, model(p)))
 
-    def jacobian(p: Array) -> Array:
-        J = at(p).model.derivatives(at(p).linear)
-        return J - at(p).basis @ (at(p).basis.T @ J)
+    def jacobian(point: _Point) -> Array:
+        J = point.model.derivatives(point.linear)
+        return J - point.basis @ (point.basis.T @ J)
 
-    fit = least_squares(
-        lambda p: at(p).residual,
+    fit = minimise(
+        lambda p: _solved(y, model(p)),
         start,
-        jac=jacobian,  # pyright: ignore[reportArgumentType] - scipy's default is a string
+        residual=lambda point: point.residual,
+        jacobian=jacobian,
         method="lm",
-        max_nfev=max_evaluations,
-        x_scale=scale,
+        max_evaluations=max_evaluations,
+        scale=scale,
     )
-    best = at(fit.x)
+    best = _solved(y, model(fit.x))
     return SeparableFit(
         p=fit.x, linear=best.linear, residual=best.residual, converged=bool(fit.success)
     )

@@ -16,15 +16,8 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.gap.data.runs import Run
 from pipeline.gap.fit.structure import Model, Structure
+from pipeline.plant.nonlinear.simulator import sensitivity
 from pipeline.plant.nonlinear.simulator.kernel import simulate_with_derivatives
-from pipeline.plant.nonlinear.simulator.sensitivity import (
-    BY_DAMPING,
-    BY_FRICTION,
-    BY_MASS,
-    BY_POSITION,
-    BY_STIFFNESS,
-    BY_VELOCITY,
-)
 
 _START_STEP = 1e-3  # for differences, of the swing or of the friction
 _TALL = 400  # rows of a matrix that are factorised at once
@@ -262,12 +255,18 @@ def _derivatives(
     carried beside the state, of the effects they are differences.
     """
     structure, theta = model.structure, model.theta
-    lanes = [(BY_POSITION, i) for i in layout.x0] + [(BY_VELOCITY, i) for i in layout.v0]
-    lanes += [(BY_FRICTION, i) for i in layout.scatter]
+    lanes = [(sensitivity.BY_POSITION, i) for i in layout.x0] + [
+        (sensitivity.BY_VELOCITY, i) for i in layout.v0
+    ]
+    lanes += [(sensitivity.BY_FRICTION, i) for i in layout.scatter]
     local, steps = len(lanes), np.zeros(0)
     if shared:
-        lanes += [(kind, i) for kind in (BY_MASS, BY_DAMPING) for i in range(structure.n)]
-        lanes += [(BY_STIFFNESS, j) for j in structure.rows]
+        lanes += [
+            (kind, i)
+            for kind in (sensitivity.BY_MASS, sensitivity.BY_DAMPING)
+            for i in range(structure.n)
+        ]
+        lanes += [(sensitivity.BY_STIFFNESS, j) for j in structure.rows]
         steps = structure.steps()[structure.base_size :]
     thetas = np.repeat(theta[None], 1 + steps.size, axis=0)
     thetas[1:, theta.size - steps.size :] += np.diag(steps)

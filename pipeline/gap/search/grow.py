@@ -5,12 +5,12 @@ from functools import partial
 
 import numpy as np
 
+from pipeline.gap import limits
 from pipeline.gap.data.runs import Run, cut_shots
 from pipeline.gap.fit.baseline import SHOT_LENGTH
 from pipeline.gap.fit.levenberg_marquardt import Fit, fit_model
 from pipeline.gap.fit.restart import restart_runs
 from pipeline.gap.fit.structure import Candidate, Model
-from pipeline.gap.limits import AT_FLOOR, THINNING
 from pipeline.gap.search.hypothesis import Hypothesis, Study, judge
 from pipeline.gap.search.rugged import polish, zoom
 from pipeline.gap.search.screen import Suspect, Team, candidates_at, screen
@@ -54,7 +54,7 @@ def grow(parent: Hypothesis, study: Study) -> Iterator[Hypothesis]:
     for candidates, fit in sorted(fits, key=lambda pair: pair[1].cost):
         if _is_contact(candidates) and candidates[0].key not in contacts:
             if fit.cost < _IN_THE_RUNNING * lowest and fit.chi < _POLISHED * parent.fit.chi:
-                fit = polish(fit, study.training, enough=AT_FLOOR, mapper=study.mapper)
+                fit = polish(fit, study.training, enough=limits.AT_FLOOR, mapper=study.mapper)
             contacts.add(candidates[0].key)
             yield judge(fit, study, added=candidates)
     closed = any(child.at_floor for child in plain)
@@ -133,7 +133,7 @@ def _starts(parent: Hypothesis, study: Study) -> list[tuple[tuple[Candidate, ...
         _short_refit(loose, s, pieces, study, top=suspects[0].share) for s in _short_list(suspects)
     ]
     short.sort(key=lambda pair: pair[1].cost)
-    closed = bool(short) and short[0][1].chi < AT_FLOOR
+    closed = bool(short) and short[0][1].chi < limits.AT_FLOOR
     within = _BESIDE_THE_FLOOR if closed else _OUT_OF_SIGHT
     within *= short[0][1].cost if short else np.inf
     chosen = [pair for pair in short[:_FULL_LIST] if pair[1].cost < within]
@@ -162,7 +162,7 @@ def _starts(parent: Hypothesis, study: Study) -> list[tuple[tuple[Candidate, ...
 
 def _promises(share: float, fit: Fit) -> bool:
     """Would who explains this share of the gap, as screened, lower the criterion at all?"""
-    return -fit.n_points / THINNING * np.log1p(-min(share, 0.999)) > _HINT
+    return -fit.n_points / limits.THINNING * np.log1p(-min(share, 0.999)) > _HINT
 
 
 def _short_list(suspects: Sequence[Suspect]) -> list[Suspect]:
@@ -253,7 +253,7 @@ def fit_whole(start: Model, study: Study) -> Fit:
         mapper=study.mapper,
     )
     for attempt in range(_FRICTION_ROUNDS):
-        if not structure.many_rests or fit.chi < AT_FLOOR:
+        if not structure.many_rests or fit.chi < limits.AT_FLOOR:
             break
         if np.quantile(fit.run_chi, 0.25) < _NEARLY_RIGHT:
             fit = restart_runs(fit, whole, mapper=study.mapper)

@@ -5,25 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.gap import limits
 from pipeline.gap.data.runs import Run
 from pipeline.gap.fit.baseline import fit_nuisance
 from pipeline.gap.fit.levenberg_marquardt import Fit, Mapper
 from pipeline.gap.fit.linearise import simulate_run
 from pipeline.gap.fit.structure import Candidate
-from pipeline.gap.limits import (
-    AT_FLOOR,
-    BIC_DROP,
-    CONTACT_GAIN,
-    ENOUGH_NOISE,
-    ENOUGH_REPEATS,
-    HELD_OUT_GAIN,
-    PARTIAL_CONTACT,
-    PARTIAL_GAIN,
-    RUN_GAIN,
-    RUN_SHARE,
-    SAME_LAW,
-    THINNING,
-)
 from pipeline.plant.nonlinear.effects import find_effect
 from pipeline.plant.nonlinear.effects.base import Effect
 
@@ -101,7 +88,7 @@ class Study:
 
     def explains(self, hypothesis: Hypothesis) -> bool:
         """Tell whether so little is left that the gap has its name."""
-        enough = max(ENOUGH_NOISE * self.floor, ENOUGH_REPEATS * self.repeatability)
+        enough = max(limits.ENOUGH_NOISE * self.floor, limits.ENOUGH_REPEATS * self.repeatability)
         return hypothesis.error <= enough
 
 
@@ -113,7 +100,7 @@ def judge(fit: Fit, study: Study, *, added: Sequence[Candidate] = ()) -> Hypothe
         model = simulate_run(fit, run, nuisance)
         errors.append(float(((run.y - model) ** 2).sum()))
         sizes.append(float((run.swing**2).sum() * run.t.size))
-    effective = fit.n_points / THINNING
+    effective = fit.n_points / limits.THINNING
     bic = effective * np.log(fit.cost / fit.n_points) + fit.theta.size * np.log(effective)
     error = float(np.sqrt(sum(errors) / sum(sizes)))
     return Hypothesis(
@@ -121,7 +108,7 @@ def judge(fit: Fit, study: Study, *, added: Sequence[Candidate] = ()) -> Hypothe
         held=held,
         error=error,
         bic=float(bic),
-        at_floor=fit.chi < AT_FLOOR and held.chi < AT_FLOOR,
+        at_floor=fit.chi < limits.AT_FLOOR and held.chi < limits.AT_FLOOR,
         added=tuple(added),
     )
 
@@ -130,7 +117,7 @@ def lowers_error(child: Hypothesis, parent: Hypothesis, study: Study) -> bool:
     """Is the held-out error lower, and by enough where too much for a name is left?"""
     added = child.key - parent.key
     contact = any(find_effect(key).contact for key, _ in added)
-    gain = PARTIAL_CONTACT if contact else PARTIAL_GAIN
+    gain = limits.PARTIAL_CONTACT if contact else limits.PARTIAL_GAIN
     return child.error < (1.0 if study.explains(child) else gain) * parent.error
 
 
@@ -138,11 +125,11 @@ def worth_it(child: Hypothesis, parent: Hypothesis, study: Study) -> bool:
     """Does a further effect help on runs the model has not seen?"""
     if not lowers_error(child, parent, study):
         return False
-    gain = CONTACT_GAIN if parent.has_contact else HELD_OUT_GAIN
-    drop = BIC_DROP if child.size != parent.size else SAME_LAW
+    gain = limits.CONTACT_GAIN if parent.has_contact else limits.HELD_OUT_GAIN
+    drop = limits.BIC_DROP if child.size != parent.size else limits.SAME_LAW
     if child.bic > parent.bic - drop or child.held.chi > gain**2 * parent.held.chi:
         return False
-    better = child.held.run_chi < RUN_GAIN**2 * parent.held.run_chi
+    better = child.held.run_chi < limits.RUN_GAIN**2 * parent.held.run_chi
     # A run with nothing but noise left cannot become better.
-    open_runs = parent.held.run_chi > AT_FLOOR
-    return bool(np.mean(better[open_runs] if open_runs.any() else better) >= RUN_SHARE)
+    open_runs = parent.held.run_chi > limits.AT_FLOOR
+    return bool(np.mean(better[open_runs] if open_runs.any() else better) >= limits.RUN_SHARE)

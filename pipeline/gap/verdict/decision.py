@@ -4,17 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pipeline.gap import limits
 from pipeline.gap.fit.linearise import simulate_run
-from pipeline.gap.limits import (
-    AS_REPEATS,
-    CLOSE_BIC,
-    CLOSE_ERROR,
-    CLOSE_GAIN,
-    MOSTLY,
-    NEAR_FLOOR,
-    NOTHING,
-    THINNING,
-)
 from pipeline.gap.search.beam import steps_to
 from pipeline.gap.search.hypothesis import Hypothesis, Study, lowers_error
 from pipeline.gap.types import GapWindow, Verdict
@@ -49,7 +40,7 @@ def reach_verdict(
     """
     baseline, chosen = steps[0], steps[-1]
     if not chosen.key:
-        least = max(NOTHING * study.floor, AS_REPEATS * study.repeatability)
+        least = max(limits.NOTHING * study.floor, limits.AS_REPEATS * study.repeatability)
         nothing = baseline.at_floor or baseline.error < least
         return ("none" if nothing else "unexplained"), steps, []
     explained = study.explains(chosen)
@@ -59,14 +50,14 @@ def reach_verdict(
         for rival in found
         if len(rival.key) == len(chosen.key)
         and rival.key != chosen.key
-        and rival.error < CLOSE_ERROR * chosen.error
-        and _evidence(chosen, rival, study) < min(CLOSE_GAIN * gain, CLOSE_BIC)
+        and rival.error < limits.CLOSE_ERROR * chosen.error
+        and _evidence(chosen, rival, study) < min(limits.CLOSE_GAIN * gain, limits.CLOSE_BIC)
         and not _same_thing(rival, chosen, sample_time=sample_time)
         and (explained or not _same_kind(rival, chosen))
     ]
     if not explained:
         without = _needless(chosen, [*found, *steps], study)
-        disputed = bool(close) and chosen.error > MOSTLY * baseline.error
+        disputed = bool(close) and chosen.error > limits.MOSTLY * baseline.error
         if without is not None or disputed:
             back = steps[:-1] if without is None else steps_to(without, [*found, *steps], study)
             return reach_verdict(back, found, study=study, sample_time=sample_time)
@@ -89,9 +80,9 @@ def _evidence(chosen: Hypothesis, rival: Hypothesis, study: Study) -> float:
     independent than the criterion counts, and much of the difference may be chance.
     """
     difference = rival.bic - chosen.bic
-    if chosen.fit.chi < NEAR_FLOOR**2:
+    if chosen.fit.chi < limits.NEAR_FLOOR**2:
         return difference
-    counted = chosen.fit.n_points / THINNING
+    counted = chosen.fit.n_points / limits.THINNING
     return difference * min(1.0, _independent_points(chosen, study) / counted)
 
 

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.arrays import Array
+from pipeline.gap import limits
 from pipeline.gap.data.runs import Run
 from pipeline.gap.fit.linearise import Nuisance
-from pipeline.gap.limits import OFFSET_SHARE, OFFSET_STEPS, OFFSET_SURE
 from pipeline.plant.linear.chain import Chain
 
 
@@ -38,7 +38,7 @@ def find_offset(chain: Chain, runs: Sequence[Run], nuisance: Sequence[Nuisance])
         total += float(zeros @ zeros)
         step = max(step, float((run.sigma * np.sqrt(12.0)).max()))
     count = sum(len(run.rows) for run in runs)
-    if np.sqrt(total / count) < OFFSET_STEPS * step:
+    if np.sqrt(total / count) < limits.OFFSET_STEPS * step:
         return None
     for cart in range(1, chain.n + 1):
         gains = [_compliance(chain, run, cart) for run in runs]
@@ -56,10 +56,10 @@ def find_offset(chain: Chain, runs: Sequence[Run], nuisance: Sequence[Nuisance])
         )
         smallest = step / np.sqrt(12.0) / max(float(np.abs(g).max()) for g, _ in pairs)
         std = max(float(forces.std(ddof=1)), smallest) / np.sqrt(forces.size)
-        sure = abs(float(forces.mean())) > OFFSET_SURE * std
+        sure = abs(float(forces.mean())) > limits.OFFSET_SURE * std
         if (
             sure
-            and unexplained < (1.0 - OFFSET_SHARE) * total
+            and unexplained < (1.0 - limits.OFFSET_SHARE) * total
             and (best is None or unexplained < best[0])
         ):
             best = (unexplained, Offset(cart=cart, force=float(forces.mean()), std=std))

@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline.estimation.chain.follow import measured
 from pipeline.estimation.units_and_clocks import LENGTH_SCALES
-from pipeline.identify.limits import FASTEST_MOVES, SAME, STUCK_JUMP, STUCK_SPEED, WITNESSES
+from pipeline.identify import limits
 from pipeline.ingest.channels import stuck_spans
 from pipeline.results import LeftOut, Record
 
@@ -28,7 +28,7 @@ def find_other_units(records: Sequence[Record], *, decays: bool = False) -> dict
             if (seen := [s for r in records if r.kind == kind and (s := steps.get(r.id, 0.0))])
         ]
         usual = max(by_kind, key=lambda step: sum(_alike(step, s) for s in by_kind), default=0.0)
-        if sum(_alike(step, usual) for step in by_kind) < WITNESSES:
+        if sum(_alike(step, usual) for step in by_kind) < limits.WITNESSES:
             continue
         scales = [s for scale in LENGTH_SCALES for s in (scale, 1 / scale)]
         for record in [r for r in records if r.id in steps and (r.kind == "decay") is decays]:
@@ -46,7 +46,7 @@ def find_other_units(records: Sequence[Record], *, decays: bool = False) -> dict
 
 
 def _alike(step: float, other: float) -> bool:
-    return abs(step - other) <= SAME * other
+    return abs(step - other) <= limits.SAME * other
 
 
 def _is_decimal(step: float) -> bool:
@@ -65,10 +65,10 @@ def find_stuck(records: Sequence[Record]) -> dict[str, LeftOut]:
         for cart in measured(record):
             y = record.position(cart)
             moves = np.abs(np.diff(y))
-            fastest = float(np.quantile(moves, FASTEST_MOVES))
+            fastest = float(np.quantile(moves, limits.FASTEST_MOVES))
             for first, last in stuck_spans(y):
-                away = last < moves.size and moves[last] >= STUCK_JUMP * fastest
-                if away or moves[first - 1] >= STUCK_SPEED * fastest:
+                away = last < moves.size and moves[last] >= limits.STUCK_JUMP * fastest
+                if away or moves[first - 1] >= limits.STUCK_SPEED * fastest:
                     reason = (
                         f"the encoder of cart {cart} stands still at speed from "
                         f"{record.t[first]:.4g} s to {record.t[last]:.4g} s: it stuck"

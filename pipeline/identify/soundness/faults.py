@@ -21,23 +21,7 @@ from pipeline.estimation.chain.follow import (
 )
 from pipeline.estimation.limits import FOLLOWED
 from pipeline.estimation.units_and_clocks import FASTEST, TIME_FACTORS
-from pipeline.identify.limits import (
-    CLOCK_UNIT,
-    FARTHER,
-    FEWEST_CYCLES,
-    FROZEN_ELSEWHERE,
-    FROZEN_SAMPLES,
-    FROZEN_SHARE,
-    SAME,
-    SEEN_COUNTS,
-    SEEN_SHARE,
-    SIGMAS,
-    STILL_INPUT,
-    STILL_SHARE,
-    STRAY,
-    STRAY_REACH,
-    WITNESSES,
-)
+from pipeline.identify import limits
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.simulate import simulate_linear
 from pipeline.results import LeftOut, Record, StepGain
@@ -115,8 +99,8 @@ def find_impossible_gains(gains: Sequence[StepGain]) -> dict[str, LeftOut]:
         before = by_cart.get((run, cart - 1))
         if before is None:
             continue
-        least = abs(gain.gain) - SIGMAS * gain.gain_std
-        if least > FARTHER * (abs(before.gain) + SIGMAS * before.gain_std):
+        least = abs(gain.gain) - limits.SIGMAS * gain.gain_std
+        if least > limits.FARTHER * (abs(before.gain) + limits.SIGMAS * before.gain_std):
             reason = (
                 f"cart {cart} comes to rest {abs(gain.gain / before.gain):.3g} times as far out as "
                 f"cart {cart - 1}, which pulls it: no springs do that, so a column looks to be in "
@@ -135,10 +119,10 @@ def _still(record: Record, cart: int) -> Iterator[slice]:
     if u is None:
         return
     edges = np.array([0, *(np.flatnonzero(np.diff(y)) + 1), y.size])
-    long = STILL_SHARE * y.size
+    long = limits.STILL_SHARE * y.size
     for i in np.flatnonzero(np.diff(edges) >= long):
         part = slice(int(edges[i]), int(edges[i + 1]))
-        changed = np.abs(u[part] - u[part.start]) >= STILL_INPUT * np.ptp(u)
+        changed = np.abs(u[part] - u[part.start]) >= limits.STILL_INPUT * np.ptp(u)
         if changed.any() and changed.size - np.argmax(changed) >= long:
             yield part
 
@@ -195,9 +179,9 @@ def _frozen(
     """
     for cart, missed in fit.missed.items():
         y = record.position(cart)
-        far = max(SEEN_COUNTS * steps[cart], FROZEN_SHARE * float(np.ptp(y)))
+        far = max(limits.SEEN_COUNTS * steps[cart], limits.FROZEN_SHARE * float(np.ptp(y)))
         edges = np.array([0, *(np.flatnonzero(np.diff(y)) + 1), y.size])
-        for i in np.flatnonzero(np.diff(edges) >= FROZEN_SAMPLES):
+        for i in np.flatnonzero(np.diff(edges) >= limits.FROZEN_SAMPLES):
             part = slice(int(edges[i]), int(edges[i + 1]))
             rest, moved = np.delete(missed, part), float(np.ptp(missed[part]))
             force = force_on(record, chain, cart=cart)
@@ -209,7 +193,7 @@ def _frozen(
                 continue
             elsewhere = float(np.mean(rest**2))
             follows = elsewhere < FOLLOWED * float(np.var(np.delete(y, part)))
-            if follows and np.sqrt(elsewhere) < FROZEN_ELSEWHERE * moved:
+            if follows and np.sqrt(elsewhere) < limits.FROZEN_ELSEWHERE * moved:
                 first, last = record.t[part.start], record.t[part.stop - 1]
                 yield (
                     f"the encoder of cart {cart} stands still from {first:.4g} s to {last:.4g} s, "
@@ -226,7 +210,7 @@ def _must_move(record: Record, chain: Chain, still: slice, *, cart: int, step: f
     if record.kind == "sine" and record.omega is not None:  # it may start in motion
         G = chain.frequency_response(np.array([record.omega]))[cart - 1, 0]
         far = min(far, float(abs(G) * np.ptp(record.u)))
-    return far >= max(SEEN_COUNTS * step, SEEN_SHARE * float(np.ptp(y)))
+    return far >= max(limits.SEEN_COUNTS * step, limits.SEEN_SHARE * float(np.ptp(y)))
 
 
 def _copies(records: Sequence[Record]) -> dict[str, str]:
@@ -246,15 +230,16 @@ def _short_dwell(record: Record) -> Iterator[str]:
     if record.kind == "sine" and record.omega is not None:
         duration = float(record.t[-1] - record.t[0]) + record.sample_time
         cycles = record.omega * duration / (2 * np.pi)
-        if cycles < FEWEST_CYCLES:
-            yield f"fewer than {FEWEST_CYCLES:g} cycles are no steady state: the file looks cut"
+        if cycles < limits.FEWEST_CYCLES:
+            most = f"{limits.FEWEST_CYCLES:g}"
+            yield f"fewer than {most} cycles are no steady state: the file looks cut"
 
 
 def _wrong_clock(record: Record, *, usual: float) -> Iterator[str]:
     """Yield the unit of a time column that makes this record's sampling the usual one."""
     for factor, words in TIME_FACTORS.items():
-        is_unit = max(factor, 1 / factor) >= CLOCK_UNIT  # twice as fast may be by right
-        if is_unit and abs(record.sample_time - factor * usual) < SAME * factor * usual:
+        is_unit = max(factor, 1 / factor) >= limits.CLOCK_UNIT  # twice as fast may be by right
+        if is_unit and abs(record.sample_time - factor * usual) < limits.SAME * factor * usual:
             yield (
                 f"its samples are {record.sample_time:.3g} s apart, those of the others "
                 f"{usual:.3g} s: {words}"
@@ -288,7 +273,7 @@ def _misread(
     if 2 * len(legal) > len(fits):  # then the bench counts so
         found = {name: misread for name, misread in found.items() if name not in legal}
     agreeing = sum(fit.belongs for name, fit in fits.items() if name not in found) + len(found)
-    return found if agreeing >= WITNESSES else {}
+    return found if agreeing >= limits.WITNESSES else {}
 
 
 def _so_read(misread: Misread, everywhere: bool) -> str:
@@ -312,9 +297,9 @@ def _strays(
         return
     for record in records:
         fit = fits.get(record.id)
-        if fit is None or fit.belongs or max(fit.reach.values()) < STRAY_REACH:
+        if fit is None or fit.belongs or max(fit.reach.values()) < limits.STRAY_REACH:
             continue
-        if all(min(near_by.lost.values()) > STRAY for near_by in near(record, chain)):
+        if all(min(near_by.lost.values()) > limits.STRAY for near_by in near(record, chain)):
             yield (
                 record.id,
                 "it does not move as the carts do that the other records show: "

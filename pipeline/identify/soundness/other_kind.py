@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.identify.limits import CUT_LENGTH, DRIVEN_DECAY, SAME, WITNESSES
+from pipeline.identify import limits
 from pipeline.ingest.inspect import is_stepped, line_frequency
 from pipeline.results import LeftOut, Record
 
@@ -38,7 +38,7 @@ def _another_input(record: Record, *, largest: float) -> Iterator[str]:
         yield "the input is no step: it looks like the file of another experiment"
     if record.kind == "sine" and not _is_sine(record.t, u):
         yield "the input is no sine: it looks like the file of another experiment"
-    if record.kind == "decay" and float(np.ptp(u[u.size // 2 :])) > DRIVEN_DECAY * largest:
+    if record.kind == "decay" and float(np.ptp(u[u.size // 2 :])) > limits.DRIVEN_DECAY * largest:
         yield "the input is at work in what should be a free decay"
 
 
@@ -61,10 +61,10 @@ def _cut(record: Record, records: Sequence[Record]) -> Iterator[str]:
     ]
     lengths = np.array([r.t[-1] - r.t[0] for r in others])
     usual = float(np.median(lengths)) if others else 0.0
-    alike = np.abs(lengths - usual) <= SAME * usual
+    alike = np.abs(lengths - usual) <= limits.SAME * usual
     samples = float(np.median([r.t.size for r in others] or [0]))
     length = float(record.t[-1] - record.t[0])
-    if alike.sum() < max(WITNESSES, len(others) / 2):
+    if alike.sum() < max(limits.WITNESSES, len(others) / 2):
         return
-    if length < CUT_LENGTH * usual and record.t.size < CUT_LENGTH * samples:
+    if length < limits.CUT_LENGTH * usual and record.t.size < limits.CUT_LENGTH * samples:
         yield f"it lasts {length:.3g} s, its repeats {usual:.3g} s: the file looks cut"

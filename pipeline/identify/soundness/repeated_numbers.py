@@ -12,15 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.estimation.units_and_clocks import TIME_FACTORS
-from pipeline.identify.limits import (
-    BY_THE_BENCH,
-    DAMPING_TOLERANCE,
-    LIKE_THE_FIT,
-    SAME_MISTAKE,
-    SAME_SIZE,
-    SIGMAS,
-    TOLERANCE,
-)
+from pipeline.identify import limits
 from pipeline.names import gain_name, own_omega, own_zeta, read_name
 from pipeline.results import Check, Estimate, LeftOut, LogDecrement, StepGain
 
@@ -53,7 +45,7 @@ class _Reading:
     low: float
     high: float
     size: float = 0.0
-    tolerance: float = TOLERANCE
+    tolerance: float = limits.TOLERANCE
 
 
 def compare_repeats(
@@ -113,7 +105,7 @@ def _readings(
     found: dict[str, list[_Reading]] = {}
     for decay in decays:
         name = own_omega(decay.cart, n=carts)
-        slack = SIGMAS * decay.omega_n_std
+        slack = limits.SIGMAS * decay.omega_n_std
         found.setdefault(name, []).append(
             _Reading(
                 run=decay.experiment,
@@ -122,7 +114,7 @@ def _readings(
                 high=decay.omega_n + slack,
             )
         )
-        slack = SIGMAS * decay.zeta_std
+        slack = limits.SIGMAS * decay.zeta_std
         # Dry friction adds the more damping the less the cart swings.
         sticks = decay.friction is not None and decay.friction.present
         ratios = [decay.zeta, *(decay.zeta_at_amplitude[1].tolist() if sticks else ())]
@@ -132,11 +124,11 @@ def _readings(
                 value=decay.zeta,
                 low=min(ratios) - slack,
                 high=max(ratios) + slack,
-                tolerance=DAMPING_TOLERANCE,
+                tolerance=limits.DAMPING_TOLERANCE,
             )
         )
     for step in steps:
-        name, slack = gain_name(step.cart, n=carts), SIGMAS * step.gain_std
+        name, slack = gain_name(step.cart, n=carts), limits.SIGMAS * step.gain_std
         low, high = step.interval or (step.gain, step.gain)  # where the cart sticks
         found.setdefault(name, []).append(
             _Reading(
@@ -161,7 +153,7 @@ def _contradictions(readings: Sequence[_Reading]) -> NDArray[np.bool_]:
 def _only_by_size(readings: Sequence[_Reading]) -> bool:
     """Whether steps of one size agree, those of another only among themselves: dry friction."""
     size = np.array([reading.size for reading in readings])
-    alike = np.abs(size[:, None] - size) <= SAME_SIZE * np.maximum(size[:, None], size)
+    alike = np.abs(size[:, None] - size) <= limits.SAME_SIZE * np.maximum(size[:, None], size)
     return not np.any(_contradictions(readings) & alike)
 
 
@@ -171,9 +163,9 @@ def _right_ones(readings: Sequence[_Reading], fitted: Estimate | None) -> list[_
     if not np.any(apart):
         return list(readings)
     if fitted is not None and fitted.std is not None:
-        near = LIKE_THE_FIT * abs(fitted.value)
+        near = limits.LIKE_THE_FIT * abs(fitted.value)
         like = [r for r in readings if abs(r.value - fitted.value) <= near]
-        if like and SIGMAS * fitted.std <= near:
+        if like and limits.SIGMAS * fitted.std <= near:
             near_it = np.array([reading in like for reading in readings])
             contrary = np.any(apart[:, near_it], axis=1) & ~near_it
             return [r for r, is_odd in zip(readings, contrary, strict=True) if not is_odd]
@@ -184,9 +176,13 @@ def _right_ones(readings: Sequence[_Reading], fitted: Estimate | None) -> list[_
 
 def _is_far(reading: _Reading, told: Estimate, *, name: str) -> bool:
     """Whether a reading and its errors are of another number than one that is well known."""
-    if told.std is None or told.value <= 0 or SIGMAS * told.std > LIKE_THE_FIT * told.value:
+    if (
+        told.std is None
+        or told.value <= 0
+        or limits.SIGMAS * told.std > limits.LIKE_THE_FIT * told.value
+    ):
         return False
-    factor = BY_THE_BENCH[read_name(name).symbol]
+    factor = limits.BY_THE_BENCH[read_name(name).symbol]
     return reading.high < told.value / factor or reading.low > told.value * factor
 
 
@@ -212,7 +208,7 @@ def _is_reversed(values: Mapping[str, float], usual: Mapping[str, float]) -> boo
 
 
 def _near(value: float, other: float) -> bool:
-    return abs(value - other) <= SAME_MISTAKE * abs(other)
+    return abs(value - other) <= limits.SAME_MISTAKE * abs(other)
 
 
 def _check(

@@ -6,7 +6,7 @@ from itertools import combinations
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.identify.limits import MATERIAL, SAME_DURATION, SAME_INPUT, SPREADS, SPREADS_OF_MANY
+from pipeline.identify import limits
 from pipeline.results import LeftOut, Record
 
 _AMPLIFICATION = 2.0  # of a relative difference of the inputs by a lightly damped chain
@@ -66,11 +66,11 @@ def _is_repeat(first: Record, other: Record) -> bool:
     spans = np.ptp(first.t), np.ptp(other.t)
     if (first.kind, first.free, first.carts) != (other.kind, other.free, other.carts):
         return False
-    if min(spans) < SAME_DURATION * max(spans):
+    if min(spans) < limits.SAME_DURATION * max(spans):
         return False
     t = _common_times(first, other)
     u = np.concatenate([_at(t, record, _excitation(record)) for record in (first, other)])
-    return bool(_rms(u[0] - u[1]) <= SAME_INPUT * _rms(u))
+    return bool(_rms(u[0] - u[1]) <= limits.SAME_INPUT * _rms(u))
 
 
 def _common_times(*records: Record) -> Array:
@@ -100,14 +100,14 @@ def _differences(group: Sequence[Record]) -> tuple[Array, Array]:
     y = y - np.median(y[:, :, :_START_SAMPLES], axis=2, keepdims=True)
     by_input = np.sqrt(np.mean((u[:, None] - u) ** 2, axis=2)) / _rms(u)
     differences = np.sqrt(np.mean((y[:, None] - y) ** 2, axis=(2, 3)))
-    return differences, (MATERIAL + _AMPLIFICATION * by_input) * _rms(y)
+    return differences, (limits.MATERIAL + _AMPLIFICATION * by_input) * _rms(y)
 
 
 def _farthest(
     differences: Array, left: Sequence[int], *, expected: Array
 ) -> tuple[int, float, float] | None:
     """Return index, distance and spread of the others of the repeat that stands off, if any."""
-    threshold = SPREADS.get(len(left), SPREADS_OF_MANY)
+    threshold = limits.SPREADS.get(len(left), limits.SPREADS_OF_MANY)
     candidates = []
     for index in left:
         others = [i for i in left if i != index]

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.linalg import hadamard
 
 from pipeline.arrays import Array
-from pipeline.plant.limits import DAMPING_ERROR, MASS_SPRING_ERROR
+from pipeline.plant import limits
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.loop.sampled_loop import StateFeedback, loop_matrix
 
@@ -23,9 +23,9 @@ def stays_stable(chain: Chain, controller: StateFeedback, *, sample_time: float)
     for sign in np.vstack([signs, -signs]):
         stiff, heavy, damped = np.split(sign, [n + 1, 2 * n + 1])
         plant = Chain(
-            m=chain.m * (1 + MASS_SPRING_ERROR * heavy),
-            c=chain.c * (1 + DAMPING_ERROR * damped),
-            k=chain.k * (1 + MASS_SPRING_ERROR * stiff),
+            m=chain.m * (1 + limits.MASS_SPRING_ERROR * heavy),
+            c=chain.c * (1 + limits.DAMPING_ERROR * damped),
+            k=chain.k * (1 + limits.MASS_SPRING_ERROR * stiff),
         )
         matrices.append(loop_matrix(plant, controller, sample_time=sample_time))
     return bool(np.abs(np.linalg.eigvals(np.array(matrices))).max() < 1.0)
@@ -41,7 +41,7 @@ def level_error_percent(chain: Chain, gains: Array, *, cart: int) -> Array:
     # Spring j adds k_j (e_j - e_{j-1})(e_j - e_{j-1})' to the stiffness; a wall has no e.
     ends = np.diff(np.eye(chain.n + 2)[1:-1], axis=1)  # (n, n + 1), one column each
     moved = chain.k * (x @ ends) * (inverse[..., cart - 1, :] @ ends)
-    return 100 * MASS_SPRING_ERROR * np.abs(moved).sum(-1) / np.abs(x[..., cart - 1])
+    return 100 * limits.MASS_SPRING_ERROR * np.abs(moved).sum(-1) / np.abs(x[..., cart - 1])
 
 
 def static_levels(chain: Chain, gains: Array) -> Array:
