@@ -18,9 +18,9 @@ import psutil
 from pipeline.bench.host.acquire import acquire
 from pipeline.bench.host.raw import read_raw
 from pipeline.bench.host.record import readings_of
+from pipeline.bench.live.observer import Anomalies
 from pipeline.bench.planning.plan import Limits
 from pipeline.bench.protocol.messages import Reading
-from pipeline.bench.watch.observer import Anomalies
 from pipeline.errors import ConfigError
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.submission import load_submission

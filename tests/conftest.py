@@ -99,7 +99,7 @@ def _group(nodeid: str) -> str:
 def _patient_host() -> Iterator[None]:
     """Bear with virtual benches, which have no processor of their own on a machine that is busy."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pipeline.bench.host.session._SILENCE", 3.0)
+        patch.setattr("pipeline.bench.host.session.SILENCE", 3.0)
         for module in ("session", "serial_line"):
             patch.setattr(f"pipeline.bench.host.{module}.FIRST_LINE", 5.0)
         yield

@@ -11,9 +11,8 @@ from pipeline.cli.common import INTERRUPTED, Folder, app
 from pipeline.errors import ConfigError
 
 if TYPE_CHECKING:
-    from pipeline.bench.watch.buttons import Buttons
-    from pipeline.bench.watch.observer import Observer
-    from pipeline.bench.watch.terminal import Terminal
+    from pipeline.bench.live.observer import Buttons, Observer
+    from pipeline.bench.live.terminal import Terminal
 
 
 @app.command()
@@ -44,7 +43,7 @@ def acquire(
     ] = False,
 ) -> None:
     """Carry out the plan on a bench, or take files as they appear, into a submission."""
-    from pipeline.bench.watch.terminal import Terminal
+    from pipeline.bench.live.terminal import Terminal
 
     if (port is None) == (source is None):
         raise ConfigError("say where the data come from: either --port or --import")
@@ -81,7 +80,7 @@ def _watching(
     if not web:
         yield [terminal], None
         return
-    from pipeline.bench.watch.web import LivePage
+    from pipeline.bench.live.page import LivePage
 
     with LivePage(folder) as page:
         terminal.remark(f"watch{'' if yes else ', and confirm,'} at {page.url}")

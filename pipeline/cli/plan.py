@@ -32,8 +32,8 @@ def plan(
     """Propose the experiments to record: write plan.toml, or add to it what the data allow."""
     from pipeline.bench.design.goal import WORST
     from pipeline.bench.design.next_plan import plan_next
-    from pipeline.bench.planning.make import make_plan
     from pipeline.bench.planning.plan_words import plan_data, plan_table
+    from pipeline.bench.planning.propose import make_plan
     from pipeline.submission import load_submission
 
     if goal and number is None:

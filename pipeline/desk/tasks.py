@@ -88,7 +88,7 @@ def unpack(archive: str, into: str, *, progress: Progress) -> list[str]:
 
 def plan(folder: str, stock: bool, *, progress: Progress) -> list[str]:
     """Write plan.toml, or add to it what the data allow."""
-    from pipeline.bench.planning.make import make_plan
+    from pipeline.bench.planning.propose import make_plan
 
     made = make_plan(load_submission(Path(folder)), stock=stock, progress=progress)
     return [made.said, made.trouble]

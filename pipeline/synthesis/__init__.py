@@ -15,8 +15,8 @@ from pipeline.results import FeedbackDesign
 from pipeline.stages.state_feedback import design_feedback
 from pipeline.submission import Design
 from pipeline.synthesis import claims, runs
-from pipeline.synthesis.bench import Bench, Run
 from pipeline.synthesis.files import Value, csv_text, toml_section
+from pipeline.synthesis.rig import Rig, Run
 
 # The ECP 210: its servo loop and its encoder.
 SAMPLE_TIME = 0.00884  # s
@@ -84,7 +84,7 @@ def write_submission(
         transients=not compact,
         sweep_time=12.0 if compact else 20.0,
     )
-    bench = Bench(
+    bench = Rig(
         chain=chain,
         sample_time=sample_time,
         count=count,

@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.submission.toml_file import Value
-from pipeline.synthesis.bench import Run
+from pipeline.synthesis.rig import Run
 from pipeline.synthesis.runs import INPUT_DECIMALS
 
 

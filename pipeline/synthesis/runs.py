@@ -16,7 +16,7 @@ from pipeline.plant.linear.dwells import (
 )
 from pipeline.plant.linear.simulate import simulate_linear
 from pipeline.plant.loop.sampled_loop import StateFeedback
-from pipeline.synthesis.bench import Hand, Run
+from pipeline.synthesis.rig import Hand, Run
 
 INPUT_DECIMALS = 5  # the input is set in steps of 10 µV, so the log holds what was applied
 FIGURE_FREQUENCY = 4.0  # Hz: the dwell of the paper's Figures 12-14

@@ -21,13 +21,13 @@ from pipeline.bench.host.raw import read_raw
 from pipeline.bench.host.record import readings_of
 from pipeline.bench.host.serial_line import open_line
 from pipeline.bench.host.session import Session
+from pipeline.bench.live.observer import Anomalies, RunOutcome
+from pipeline.bench.live.terminal import Terminal, sparkline
 from pipeline.bench.planning.gains import Scales
 from pipeline.bench.planning.orders import make_order
 from pipeline.bench.planning.plan import Limits, Plan, Recording, StateLoop
 from pipeline.bench.planning.plan_file import load_plan
 from pipeline.bench.protocol.messages import Description, Reading
-from pipeline.bench.watch.observer import Anomalies, Outcome
-from pipeline.bench.watch.terminal import Terminal, sparkline
 from pipeline.cli import app
 from pipeline.errors import ConfigError, HardwareError
 from pipeline.ingest.read import read_data
@@ -488,7 +488,7 @@ def test_the_view_tells_plan_rate_faults_and_positions():
 def test_without_a_terminal_only_trouble_is_told():
     """In a log file a run that went well leaves nothing, one that did not leaves its reason."""
     view, out = shown(terminal=False)
-    well = Outcome(recording=sine("a", seconds=1), lines=998)
+    well = RunOutcome(recording=sine("a", seconds=1), lines=998)
     with view:
         view.planned(Plan(limits=LIMITS, recordings=(well.recording,)), frozenset())
         view.started(well.recording)

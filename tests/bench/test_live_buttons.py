@@ -11,11 +11,10 @@ from pipeline.bench.host.acquire import acquire
 from pipeline.bench.host.raw import read_raw
 from pipeline.bench.host.record import readings_of
 from pipeline.bench.host.signals import Stopped
+from pipeline.bench.live.observer import Anomalies, Buttons, RunOutcome, Wish
+from pipeline.bench.live.page_state import LiveState
 from pipeline.bench.planning.plan import Limits
 from pipeline.bench.protocol.messages import Reading
-from pipeline.bench.watch.buttons import Buttons, Wish
-from pipeline.bench.watch.live_state import LiveState
-from pipeline.bench.watch.observer import Anomalies, Outcome
 from pipeline.submission import load_submission
 from tests.helpers.acquisitions import Notes, sine, write_work
 from tests.helpers.benches import emulator
@@ -39,7 +38,7 @@ class Finger(Notes):
         if not self._at_end and self.readings_seen[-1].ms > 500:
             self._press()
 
-    def finished(self, outcome: Outcome) -> None:
+    def finished(self, outcome: RunOutcome) -> None:
         """Press."""
         super().finished(outcome)
         if self._at_end:
@@ -50,7 +49,7 @@ class Finger(Notes):
             self.heeded.append(self.buttons.press(self._wishes.pop(0), turn=self.buttons.turn))
 
 
-def record(work: Path, port: str, finger: Finger, *only: str) -> list[Outcome]:
+def record(work: Path, port: str, finger: Finger, *only: str) -> list[RunOutcome]:
     """Carry the plan out."""
     with suppress(Stopped):
         acquire(work, port=port, observers=[finger], only=only, buttons=finger.buttons)

@@ -13,9 +13,9 @@ from pipeline.bench.emulator.links import open_link
 from pipeline.bench.host.acquire import acquire
 from pipeline.bench.host.experiments import cart_remarks, prepare_submission
 from pipeline.bench.host.serial_line import open_line
+from pipeline.bench.live.observer import Anomalies
 from pipeline.bench.planning.plan import Limits
 from pipeline.bench.protocol.messages import EXTENSIONS, WATCHDOG, Description, Reading
-from pipeline.bench.watch.observer import Anomalies
 from pipeline.cli import app
 from pipeline.errors import ConfigError, HardwareError
 from pipeline.submission import load_submission

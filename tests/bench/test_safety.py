@@ -20,6 +20,7 @@ from pipeline.bench.host.raw import RawHeader, RawWriter, read_raw
 from pipeline.bench.host.record import readings_of
 from pipeline.bench.host.serial_line import open_line
 from pipeline.bench.host.session import Session
+from pipeline.bench.live.observer import Anomalies
 from pipeline.bench.planning.gains import Scales
 from pipeline.bench.planning.orders import make_order
 from pipeline.bench.planning.plan import Limits, Recording, StateLoop
@@ -35,7 +36,6 @@ from pipeline.bench.protocol.messages import (
     encode,
     parse_description,
 )
-from pipeline.bench.watch.observer import Anomalies
 from pipeline.errors import ConfigError, DataError, HardwareError
 from pipeline.submission import System, load_submission
 from tests.helpers.acquisitions import LIMITS, Notes, host, sine, until_bytes, write_work
@@ -450,7 +450,7 @@ def test_a_raw_file_is_not_written_through_a_link(tmp_path):
 
 # ----------------------------------------------------------------- at the keyboard
 
-ASK = """from pipeline.bench.watch.terminal import Terminal
+ASK = """from pipeline.bench.live.terminal import Terminal
 Terminal().confirm('Hold cart 1')
 print('held')"""
 

@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.bench.host.stream import Stream
+from pipeline.bench.live.observer import Anomalies
 from pipeline.bench.protocol.messages import Reading, format_reading
 from pipeline.bench.protocol.stamps import fit_stamps
-from pipeline.bench.watch.observer import Anomalies
 
 
 def clock(n: int, *, period: float, phase: float = 0.3) -> np.ndarray:

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 
+from pipeline.bench.live.observer import Anomalies, RunOutcome
 from pipeline.bench.planning.plan import Limits, Plan, Recording
 from pipeline.bench.planning.plan_file import save_plan
 from pipeline.bench.protocol.messages import Reading
-from pipeline.bench.watch.observer import Anomalies, Outcome
 from pipeline.submission import load_submission
 from pipeline.submission.load import NAME
 from tests.helpers.waiting import started, until
@@ -48,7 +48,7 @@ class Notes:
     def __init__(self) -> None:
         self.confirmed: list[str] = []
         self.remarks: list[str] = []
-        self.outcomes: list[Outcome] = []
+        self.outcomes: list[RunOutcome] = []
         self.readings_seen: list[Reading] = []
         self.plans: list[tuple[int, frozenset[str]]] = []
 
@@ -71,7 +71,7 @@ class Notes:
         """Note the lines."""
         self.readings_seen += batch
 
-    def finished(self, outcome: Outcome) -> None:
+    def finished(self, outcome: RunOutcome) -> None:
         """Note the outcome."""
         self.outcomes.append(outcome)
 

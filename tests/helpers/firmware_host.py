@@ -98,7 +98,7 @@ def kept_going(serve: Callable[[Callable[[], bool]], None]) -> Iterator[None]:
 
 # A bench that has no processor of its own may be silent for a while.
 _PATIENT = (
-    "from pipeline.bench.host import session; session._SILENCE = 5.0; "
+    "from pipeline.bench.host import session; session.SILENCE = 5.0; "
     "from pipeline.cli import main; main()"
 )
 

@@ -5,8 +5,7 @@ from pathlib import Path
 
 from pipeline.bench.emulator.carts import TRUE_PERIOD, VirtualCarts, input_per_count
 from pipeline.bench.emulator.core import ReferenceCore
-from pipeline.bench.host.acquire import experiment_entry
-from pipeline.bench.host.experiments import add_experiment
+from pipeline.bench.host.experiments import add_experiment, recorded_entry
 from pipeline.bench.host.record import data_file, log_text
 from pipeline.bench.planning.gains import Scales
 from pipeline.bench.planning.orders import make_order
@@ -98,7 +97,7 @@ class VirtualBench:
             text = log_text(lines, carts=submission.system.carts, reference=False)
             (folder / "data").mkdir(exist_ok=True)
             write_file(folder / data_file(recording), text)
-            entry = experiment_entry(
+            entry = recorded_entry(
                 recording, file=data_file(recording), controller=None, remarks=()
             )
             submission = add_experiment(submission, entry)

@@ -16,8 +16,8 @@ from pipeline.plant.linear.simulate import simulate_linear
 from pipeline.resources import EXAMPLES
 from pipeline.submission import load_submission
 from pipeline.synthesis import COUNT, SAMPLE_TIME, write_submission
-from pipeline.synthesis.bench import Bench, Hand, Run
 from pipeline.synthesis.examples import CATALOGUE, write_examples
+from pipeline.synthesis.rig import Hand, Rig, Run
 
 PRESET_NAMES = list(PRESETS)
 NOISE = 0.2 * COUNT
@@ -195,7 +195,7 @@ def release_by_hand(**changes):
     t = SAMPLE_TIME * np.arange(500, dtype=np.float64)
     hand = Hand(cart=2, position=-1.5, release=0.4, fade=0.02)
     run = Run(id="d", kind="decay", t=t, u=np.zeros(500), free=(2,), hand=hand)
-    bench = Bench(chain=chain, sample_time=SAMPLE_TIME, count=COUNT, noise=NOISE, zero_error=0.0)
+    bench = Rig(chain=chain, sample_time=SAMPLE_TIME, count=COUNT, noise=NOISE, zero_error=0.0)
     return chain, hand, run, bench
 
 

@@ -19,8 +19,8 @@ from pipeline.plant.nonlinear.augmented import SteppedBench, rest_positions, sim
 from pipeline.plant.nonlinear.effects import CATALOGUE, AugmentedChain, Term, find_effect
 from pipeline.submission import load_submission
 from pipeline.synthesis import COUNT, SAMPLE_TIME, write_submission
-from pipeline.synthesis.bench import Bench, Hand, Run
 from pipeline.synthesis.hidden import prepare_bench, usual_term, write_bench
+from pipeline.synthesis.rig import Hand, Rig, Run
 from tests.truth.bench import Hidden, simulate_truth
 
 TWO = PRESETS["throne-2dof"]
@@ -30,7 +30,7 @@ OWN_CONTACT = {"backlash", "end_stop"}
 
 
 def bench(*terms, chain=TWO):
-    return Bench(
+    return Rig(
         chain=chain, sample_time=SAMPLE_TIME, count=COUNT, noise=0.0, zero_error=0.0, effects=terms
     )
 

@@ -19,11 +19,11 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import expect
 
+from pipeline.bench.live.observer import Anomalies, RunOutcome
+from pipeline.bench.live.page import LivePage
+from pipeline.bench.live.page_state import LiveState
 from pipeline.bench.planning.plan import Limits, Plan, Recording, StateLoop
 from pipeline.bench.protocol.messages import HEARTBEAT_EVERY, Reading
-from pipeline.bench.watch.live_state import LiveState
-from pipeline.bench.watch.observer import Anomalies, Outcome
-from pipeline.bench.watch.web import LivePage
 from pipeline.errors import ConfigError, HardwareError
 from tests.helpers.acquisitions import sine, write_work
 from tests.helpers.benches import emulator
@@ -130,10 +130,10 @@ def test_the_plan_says_what_is_done_now_and_broken(folder):
     state.started(SINE)
     assert [e["state"] for e in state.snapshot()["plan"]] == ["done", "now", "to come"]
     assert state.snapshot()["seconds_left"] == 13.0 + 8.0
-    state.finished(Outcome(recording=SINE, lines=5, partial="the cable was pulled"))
+    state.finished(RunOutcome(recording=SINE, lines=5, partial="the cable was pulled"))
     entry = state.snapshot()["plan"][1]
     assert (entry["state"], entry["why"]) == ("partial", "the cable was pulled")
-    state.finished(Outcome(recording=SINE, lines=9000, remarks=("the clock is slow",)))
+    state.finished(RunOutcome(recording=SINE, lines=9000, remarks=("the clock is slow",)))
     assert state.snapshot()["plan"][1]["state"] == "done"
     assert state.snapshot()["remarks"] == ["sine-01: the clock is slow"]
 
@@ -448,7 +448,7 @@ def test_it_shows_plan_progress_counters_and_curves(page, show):
     assert BLUE in window.evaluate(INK, "inputs")
     assert ORANGE not in window.evaluate(INK, "inputs")
 
-    page.finished(Outcome(recording=SINE, lines=2000, partial="a cart passed the limit"))
+    page.finished(RunOutcome(recording=SINE, lines=2000, partial="a cart passed the limit"))
     expect(window.locator("#plan .partial .why")).to_have_text("a cart passed the limit")
     page.started(LOOP)
     expect(window.locator("#plots .keys").first).to_contain_text("target")

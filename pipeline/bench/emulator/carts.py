@@ -9,8 +9,8 @@ from pipeline.arrays import Array
 from pipeline.bench.protocol.messages import FULL_SCALE, Hands
 from pipeline.plant.nonlinear.augmented import SteppedBench
 from pipeline.plant.nonlinear.effects import AugmentedChain
-from pipeline.synthesis.bench import Hand, before_stop
 from pipeline.synthesis.hidden import HiddenBench
+from pipeline.synthesis.rig import Hand, before_stop
 
 TRUE_PERIOD = 1.0024e-3  # s from tick to tick, where the controller believes in 1 ms
 REACH = 12.0  # times the travel that full duty moves the carts, about: 1 cm is some 300 counts

@@ -7,33 +7,30 @@ from pathlib import Path
 from pipeline.bench.host.experiments import (
     add_experiment,
     cart_remarks,
+    check_files,
     limit_words,
     prepare_submission,
+    recorded_entry,
     scale_remarks,
 )
-from pipeline.bench.host.raw import FOLDER as RAW
-from pipeline.bench.host.raw import read_raw
-from pipeline.bench.host.record import data_file, save_record
+from pipeline.bench.host.raw import free_raw_path
+from pipeline.bench.host.record import save_left_over, save_record
+from pipeline.bench.host.run_watch import STOPPED
 from pipeline.bench.host.serial_line import SerialLine, open_line
-from pipeline.bench.host.session import STOPPED, Session
+from pipeline.bench.host.session import Session
 from pipeline.bench.host.signals import Stopped, signals_held, stopping_on_signals
-from pipeline.bench.planning.gains import Scales, bench_gains, bench_scales, controller_table
-from pipeline.bench.planning.orders import Order, make_order
+from pipeline.bench.live.observer import Buttons, Observer, Observers, RunOutcome, Wish
+from pipeline.bench.planning.orders import Order, order_on
 from pipeline.bench.planning.plan import Plan, Recording
 from pipeline.bench.planning.plan_file import load_plan, plan_path, save_plan
 from pipeline.bench.planning.propose import extend_plan, propose_plan
-from pipeline.bench.protocol.messages import PidGains, StateGains
-from pipeline.bench.watch.buttons import Buttons, Wish
-from pipeline.bench.watch.observer import Observer, Observers, Outcome
+from pipeline.bench.thresholds import TRIES
 from pipeline.errors import ConfigError, DataError, HardwareError, PipelineError
 from pipeline.lock import alone_in
-from pipeline.output import own_folder
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.load import NAME
 from pipeline.synthesis.files import Value
-from pipeline.workflow import analyse
 
-_TRIES = 3  # of one recording; a fault that strikes three times is not chance
 _USUAL_BAUD = 115_200
 
 
@@ -44,7 +41,7 @@ def acquire(
     observers: Sequence[Observer],
     only: Collection[str] = (),
     buttons: Buttons | None = None,
-) -> tuple[Outcome, ...]:
+) -> tuple[RunOutcome, ...]:
     """Record what the plan asks for and is not there yet; return how each run ended.
 
     Every run that is complete stands in submission.toml at once, so a session that is broken off
@@ -93,7 +90,7 @@ class _Acquisition:
         self._buttons = buttons
         self._failed: dict[str, int] = {}  # tries of each recording that has not come off yet
 
-    def outcomes(self) -> Iterator[Outcome]:
+    def outcomes(self) -> Iterator[RunOutcome]:
         """Record until nothing is left; a line that was lost is opened again."""
         lost = True
         while lost:
@@ -106,7 +103,7 @@ class _Acquisition:
         submission = load_submission(self._folder)
         return load_plan(submission).baud if plan_path(submission).exists() else _USUAL_BAUD
 
-    def _on_line(self, line: SerialLine) -> Generator[Outcome, None, bool]:
+    def _on_line(self, line: SerialLine) -> Generator[RunOutcome, None, bool]:
         """Record over one line; return whether it was lost."""
         bench = line.bench
         new = not (self._folder / NAME).exists()
@@ -123,7 +120,7 @@ class _Acquisition:
             )
         for sentence in (*cart_remarks(submission, bench), *scale_remarks(submission, bench)):
             self._observer.remark(sentence)
-        for file in _recovered(self._folder, carts=submission.system.carts):
+        for file in save_left_over(self._folder, carts=submission.system.carts):
             self._observer.remark(f"{file} is what a session left that was cut off")
         plan = self._plan(submission, line)
         session = Session(
@@ -165,7 +162,7 @@ class _Acquisition:
         if run.file and (limit or self._buttons.pressed != "keep"):
             self._observer.remark(f"{run.file} is partial ({partial}); it is not in {NAME}")
         if limit:  # the same again would do the same harm
-            self._failed[name] = _TRIES
+            self._failed[name] = TRIES
             less = (
                 "divide its amplitude in plan.toml by four"
                 if run.outcome.recording.amplitude
@@ -179,7 +176,7 @@ class _Acquisition:
         wish = self._buttons.pressed or self._answer(run)
         self._heed_stop()
         if wish == "skip" or (wish == "keep" and not run.file):
-            self._failed[name] = _TRIES
+            self._failed[name] = TRIES
             return "skip"
         return wish
 
@@ -187,7 +184,7 @@ class _Acquisition:
         """Ask whether to record it again; a fault that struck too often is not asked about."""
         name = run.outcome.recording.id
         self._failed[name] = self._failed.get(name, 0) + 1
-        if self._failed[name] >= _TRIES:
+        if self._failed[name] >= TRIES:
             return "skip"
         offered: list[Wish] = ["repeat", "keep", "skip"] if run.file else ["repeat", "skip"]
         self._buttons.offer(*offered)
@@ -197,7 +194,7 @@ class _Acquisition:
             return "skip"
         return self._buttons.pressed or "repeat"
 
-    def _keep(self, run: "_Run") -> Outcome:
+    def _keep(self, run: "_Run") -> RunOutcome:
         """Note a run that ended early as an experiment, which says how it ended."""
         remark = f"partial, kept by hand: {run.outcome.partial}"
         outcome = replace(run.outcome, partial="", remarks=(*run.outcome.remarks, remark))
@@ -212,7 +209,7 @@ class _Acquisition:
         submission = load_submission(self._folder)
         file = save_record(run.path, folder=self._folder, carts=submission.system.carts)
         outcome = run.outcome
-        entry = experiment_entry(
+        entry = recorded_entry(
             outcome.recording, file=file, controller=run.controller, remarks=outcome.remarks
         )
         add_experiment(submission, entry)
@@ -228,14 +225,14 @@ class _Acquisition:
         known = {recording.id for recording in plan.recordings}
         if unknown := sorted(self._only - known):
             raise ConfigError(f"--only {unknown[0]}: plan.toml has {', '.join(sorted(known))}")
-        _check_files(plan, submission)
+        check_files(plan, submission)
         return plan
 
     def _next(self, plan: Plan, submission: Submission) -> Recording | None:
         done = _done(submission)
         for recording in plan.recordings:
             wanted = not self._only or recording.id in self._only
-            given_up = self._failed.get(recording.id, 0) >= _TRIES
+            given_up = self._failed.get(recording.id, 0) >= TRIES
             if wanted and recording.id not in done and not given_up:
                 return recording
         return None
@@ -249,7 +246,7 @@ class _Acquisition:
         if longer.recordings == plan.recordings:
             return plan
         save_plan(longer, submission)
-        _check_files(longer, submission)
+        check_files(longer, submission)
         return longer
 
     def _record(
@@ -261,11 +258,11 @@ class _Acquisition:
         line: SerialLine,
     ) -> "_Run":
         """Record one experiment and note it."""
-        path = _raw_path(self._folder, recording)
+        path = free_raw_path(self._folder, recording)
         try:
-            order, table = _order(recording, plan, submission, line)
+            order, table = order_on(recording, plan, submission, line.bench)
         except PipelineError as error:  # this bench cannot, or must not, do it: nothing is sent
-            self._failed[recording.id] = _TRIES
+            self._failed[recording.id] = TRIES
             return self._refused(recording, path, str(error))
         try:
             restless = session.prepare(recording)
@@ -294,7 +291,7 @@ class _Acquisition:
         path: Path,
         submission: Submission,
         let_in: Callable[[], None],
-    ) -> Outcome:
+    ) -> RunOutcome:
         try:
             return session.record(order, path, let_in=let_in)
         except KeyboardInterrupt:
@@ -304,7 +301,7 @@ class _Acquisition:
 
     def _refused(self, recording: Recording, path: Path, why: str) -> "_Run":
         """Tell of a recording that did not begin."""
-        outcome = Outcome(recording=recording, lines=0, partial=why)
+        outcome = RunOutcome(recording=recording, lines=0, partial=why)
         self._observer.finished(outcome)
         return _Run(outcome=outcome, path=path)
 
@@ -334,43 +331,14 @@ class _Run:
     controller : of a closed loop, as submission.toml tells of it.
     """
 
-    outcome: Outcome
+    outcome: RunOutcome
     path: Path
     file: str = ""
     controller: dict[str, Value] | None = None
 
 
-def _recovered(folder: Path, *, carts: int) -> list[str]:
-    """Save partial records of raw files that no data file was made of; return their names."""
-    saved = []
-    for path in sorted((folder / RAW).glob("*.raw")):
-        try:
-            recording = read_raw(path).header.recording
-            if path.stem.rpartition("-")[0] != recording.id:  # renamed, or meant to lead elsewhere
-                continue
-            made = [folder / data_file(recording, partial=partial) for partial in (False, True)]
-            if not any(file.exists() for file in made):
-                saved.append(save_record(path, folder=folder, carts=carts, partial=True))
-        except DataError:  # cut within its first lines
-            continue
-    return saved
-
-
 def _done(submission: Submission) -> frozenset[str]:
     return frozenset(experiment.id for experiment in submission.experiments)
-
-
-def _check_files(plan: Plan, submission: Submission) -> None:
-    """Raise ConfigError where a recording would be written over the data of another experiment."""
-    taken = {(submission.folder / e.file).resolve(): e.id for e in submission.experiments}
-    for recording in plan.recordings:
-        name = data_file(recording)
-        other = taken.get((submission.folder / name).resolve(), recording.id)
-        if other != recording.id:
-            raise ConfigError(
-                f"plan.toml: {recording.id}: {name} holds the experiment {other!r}; choose "
-                "another id"
-            )
 
 
 def _is_lost(line: SerialLine) -> bool:
@@ -380,58 +348,3 @@ def _is_lost(line: SerialLine) -> bool:
     except HardwareError:
         return True
     return False
-
-
-def _raw_path(folder: Path, recording: Recording) -> Path:
-    """Return a name not yet taken: each try of a recording has a raw file of its own."""
-    parent = own_folder(folder, RAW)
-    number = 1
-    while (path := parent / f"{recording.id}-{number}.raw").exists():
-        number += 1
-    return path
-
-
-def _order(
-    recording: Recording, plan: Plan, submission: Submission, line: SerialLine
-) -> tuple[Order, dict[str, Value] | None]:
-    """Return the order and, of a closed loop, the controller as submission.toml tells of it."""
-    system, bench = submission.system, line.bench
-    scales = Scales(
-        input=system.input.per_count or bench.input_per_count,
-        position=system.position.per_count or bench.position_per_count,
-    )
-    gains: PidGains | StateGains | None = None
-    table: dict[str, Value] | None = None
-    if recording.controller is not None:
-        analysis = analyse(submission)
-        scales = bench_scales(submission, bench=bench, analysis=analysis)
-        gains = bench_gains(
-            recording, submission=submission, analysis=analysis, bench=bench, limits=plan.limits
-        )
-        cart = recording.controller.cart
-        table = dict(controller_table(gains, cart=cart, scales=scales, carts=system.carts))
-    order = make_order(
-        recording, limits=plan.limits, scales=scales, system=system, bench=bench, gains=gains
-    )
-    return order, table
-
-
-def experiment_entry(
-    recording: Recording, *, file: str, controller: dict[str, Value] | None, remarks: Sequence[str]
-) -> dict[str, Value]:
-    """Return the keys of the `[[experiments]]` table of a recording."""
-    entry: dict[str, Value] = {
-        "id": recording.id,
-        "kind": recording.kind,
-        "carts": list(recording.carts),
-        "file": file,
-    }
-    if recording.kind == "sine":
-        entry["frequency"] = recording.frequency
-    if recording.controller is not None and controller is not None:
-        entry["controlled_cart"] = recording.controller.cart
-        entry["controller"] = controller
-    note = "; ".join([recording.note, *remarks] if recording.note else remarks)
-    if note:
-        entry["note"] = note
-    return entry

@@ -1,10 +1,12 @@
 """Additions to submission.toml: an experiment, a scale, a new file; what stands there is kept."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from pipeline.bench.planning.plan import Limits
+from pipeline.bench.host.record import data_file
+from pipeline.bench.planning.plan import Limits, Plan, Recording
 from pipeline.bench.protocol.messages import FULL_SCALE, Description
+from pipeline.bench.thresholds import ROUNDED, SAME_SCALE
 from pipeline.errors import ConfigError
 from pipeline.ingest.read import DUTY_COUNT
 from pipeline.output import new_folder, write_file
@@ -26,8 +28,6 @@ _TO_ADD = """\
 #overshoot_percent = 10.0
 #settling_time = 1.0              # s, to within 2 %
 """
-_ROUNDED = 1.01  # an input limit typed with fewer digits may pass full scale by so much
-_SAME = 1e-3  # scales that differ by less are the same number typed with fewer digits
 
 
 def add_experiment(submission: Submission, entry: Mapping[str, Value]) -> Submission:
@@ -38,6 +38,40 @@ def add_experiment(submission: Submission, entry: Mapping[str, Value]) -> Submis
     SubmissionError : the file cannot take it, or what comes of it would not be valid.
     """
     return edit_submission(submission.folder, lambda document: append_experiment(document, entry))
+
+
+def recorded_entry(
+    recording: Recording, *, file: str, controller: dict[str, Value] | None, remarks: Sequence[str]
+) -> dict[str, Value]:
+    """Return the keys of the `[[experiments]]` table of a recording."""
+    entry: dict[str, Value] = {
+        "id": recording.id,
+        "kind": recording.kind,
+        "carts": list(recording.carts),
+        "file": file,
+    }
+    if recording.kind == "sine":
+        entry["frequency"] = recording.frequency
+    if recording.controller is not None and controller is not None:
+        entry["controlled_cart"] = recording.controller.cart
+        entry["controller"] = controller
+    note = "; ".join([recording.note, *remarks] if recording.note else remarks)
+    if note:
+        entry["note"] = note
+    return entry
+
+
+def check_files(plan: Plan, submission: Submission) -> None:
+    """Raise ConfigError where a recording would be written over the data of another experiment."""
+    taken = {(submission.folder / e.file).resolve(): e.id for e in submission.experiments}
+    for recording in plan.recordings:
+        name = data_file(recording)
+        other = taken.get((submission.folder / name).resolve(), recording.id)
+        if other != recording.id:
+            raise ConfigError(
+                f"plan.toml: {recording.id}: {name} holds the experiment {other!r}; choose "
+                "another id"
+            )
 
 
 def prepare_submission(folder: Path, bench: Description, *, stock: bool) -> Submission:
@@ -91,7 +125,7 @@ def scale_remarks(submission: Submission, bench: Description) -> list[str]:
         f"{NAME} has {name}.per_count = {own.per_count:g}, the bench states {stated:g} {unit}; "
         f"that of {NAME} is used"
         for name, (own, unit, stated) in pairs.items()
-        if own.per_count and own.unit == unit and abs(own.per_count / stated - 1) > _SAME
+        if own.per_count and own.unit == unit and abs(own.per_count / stated - 1) > SAME_SCALE
     ]
 
 
@@ -117,7 +151,7 @@ def limit_words(limits: Limits, submission: Submission, bench: Description) -> s
     system = submission.system
     unit, position = system.input.unit, system.position.unit
     full = FULL_SCALE * abs(system.input.per_count or bench.input_per_count)
-    if limits.input > _ROUNDED * full:
+    if limits.input > ROUNDED * full:
         raise ConfigError(
             f"plan.toml: limits.input is {limits.input:g} {unit}, the bench gives at most "
             f"{full:g} {unit}: the plan was made for another bench; delete plan.toml and a new "

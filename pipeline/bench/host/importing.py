@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.bench.host.experiments import add_experiment
+from pipeline.bench.live.observer import Observer
 from pipeline.bench.planning.plan import Plan, Recording
 from pipeline.bench.planning.plan_file import load_plan, plan_path
 from pipeline.bench.planning.plan_words import hold_words
-from pipeline.bench.watch.observer import Observer
+from pipeline.bench.thresholds import SAME_FREQUENCY
 from pipeline.errors import ConfigError, SubmissionError
 from pipeline.ingest.fill import experiment_entry, free_carts, free_id
 from pipeline.ingest.formats.table import ENDINGS
@@ -24,7 +25,6 @@ from pipeline.submission.toml_file import Value
 LOOK_EVERY = 0.5  # s
 _COMPLETE = 2  # looks in a row at which size and time of a file were the same
 _CUT_SHORT = 20  # … at which a file that ends in mid-line is taken to stay so
-_SAME_FREQUENCY = 0.05  # of it: a dwell recorded for the one the plan asks for
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -220,7 +220,7 @@ class Importer:
             return None
         if recording.kind == "sine":
             found = inspection.frequency
-            near = found and abs(found / recording.frequency - 1) < _SAME_FREQUENCY
+            near = found and abs(found / recording.frequency - 1) < SAME_FREQUENCY
             return recording if inspection.kind == "sine" and near else None
         # A swept or switched input may look like either.
         alike = {"sweep": ("sweep", "step"), "step": ("step", "sweep")}

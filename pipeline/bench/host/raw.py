@@ -16,6 +16,7 @@ from typing import Any, Self
 from pipeline.bench.planning.plan import Limits, Recording
 from pipeline.bench.protocol.messages import Description
 from pipeline.errors import DataError
+from pipeline.output import own_folder
 
 FOLDER = "raw"
 _VERSION = "cartlab-raw/1"
@@ -148,3 +149,12 @@ def _header(line: bytes, *, name: str) -> RawHeader:
         )
     except (ValueError, KeyError, TypeError) as error:
         raise DataError(f"{name}: is no raw file of a bench: {error!r}") from None
+
+
+def free_raw_path(folder: Path, recording: Recording) -> Path:
+    """Return a name not yet taken: each try of a recording has a raw file of its own."""
+    parent = own_folder(folder, FOLDER)
+    number = 1
+    while (path := parent / f"{recording.id}-{number}.raw").exists():
+        number += 1
+    return path

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from pipeline.bench.host.raw import RawRun, read_raw
+from pipeline.bench.host.raw import FOLDER, RawRun, read_raw
 from pipeline.bench.host.stream import Stream
 from pipeline.bench.planning.plan import Recording
 from pipeline.bench.protocol.messages import Reading
@@ -63,3 +63,19 @@ def log_text(readings: Sequence[Reading], *, carts: int, reference: bool) -> str
         fields += [reading.target, reading.duty] if reference else [reading.duty]
         lines.append("\t".join(map(str, fields)))
     return "\n".join(lines) + "\n"
+
+
+def save_left_over(folder: Path, *, carts: int) -> list[str]:
+    """Save partial records of raw files that no data file was made of; return their names."""
+    saved = []
+    for path in sorted((folder / FOLDER).glob("*.raw")):
+        try:
+            recording = read_raw(path).header.recording
+            if path.stem.rpartition("-")[0] != recording.id:  # renamed, or meant to lead elsewhere
+                continue
+            made = [folder / data_file(recording, partial=partial) for partial in (False, True)]
+            if not any(file.exists() for file in made):
+                saved.append(save_record(path, folder=folder, carts=carts, partial=True))
+        except DataError:  # cut within its first lines
+            continue
+    return saved

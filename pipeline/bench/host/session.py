@@ -13,9 +13,11 @@ from datetime import datetime
 from pathlib import Path
 
 from pipeline.bench.host.raw import RawHeader, RawWriter
+from pipeline.bench.host.run_watch import STOPPED, RestTail, RunWatch
 from pipeline.bench.host.serial_line import FIRST_LINE, LUMP, SerialLine
 from pipeline.bench.host.signals import Stopped
 from pipeline.bench.host.stream import Stream
+from pipeline.bench.live.observer import Buttons, Observer, RunOutcome, Wish
 from pipeline.bench.planning.orders import Order
 from pipeline.bench.planning.plan import Limits, Recording
 from pipeline.bench.planning.plan_words import hold_words
@@ -30,15 +32,20 @@ from pipeline.bench.protocol.messages import (
     Wave,
     encode,
 )
-from pipeline.bench.protocol.stamps import OTHER
-from pipeline.bench.watch.buttons import Buttons, Wish
-from pipeline.bench.watch.observer import Observer, Outcome
+from pipeline.bench.thresholds import (
+    ENOUGH,
+    NEARLY,
+    OTHER_PERIOD,
+    REST_WINDOW,
+    SILENCE,
+    STILL,
+    UNREADABLE,
+)
 from pipeline.errors import HardwareError
 
 _NOTHING_MOVED = (
     "no cart that is free moved: is it held, is its encoder plugged in, is the motor on?"
 )
-STOPPED = "stopped: "  # begins why a run was ended that was not safe to go on with
 # Why a run ended that somebody ended with a button.
 BY_HAND: Mapping[Wish, str] = {
     "skip": "skipped by hand",
@@ -47,16 +54,8 @@ BY_HAND: Mapping[Wish, str] = {
 }
 
 _LOOK = 0.003  # s between looks at the port
-_FORWARD = 0.05  # s between batches handed to the observers
-_SILENCE = 0.5  # s without a byte in mid-run: the bench is gone
-_UNREADABLE = 0.25  # s of bytes that are no lines: the motor may be on, and nobody sees the carts
-_NEARLY = 100.0  # ms before the end at which silence is the end; after it lines are too many
 _AFTER_END = 0.02  # s the last lines may still be under way
 _REST_TRIES = 4
-_REST_WINDOW = 500.0  # ms at the end of a rest over which it is judged
-_ENOUGH = 1000  # lines that tell a clock's period
-_STILL = 4  # counts a cart at rest may flicker
-_ASTRAY = 5  # lines in a row of another target; a garbled line is alone
 _PULL_OUT = 1.7  # s a virtual hand takes to pull a cart out
 
 
@@ -127,7 +126,7 @@ class Session:
 
     def record(
         self, order: Order, path: Path, *, let_in: Callable[[], None] = lambda: None
-    ) -> Outcome:
+    ) -> RunOutcome:
         """Carry out one run and write its raw file.
 
         Whatever ends it early (a limit, the line, Ctrl-C, a signal), the bench is told to stop and
@@ -143,7 +142,7 @@ class Session:
         )
         recording = order.recording
         stream = self._stream(recording.carts, closed=recording.controller is not None)
-        watch = _Watch(
+        watch = RunWatch(
             order,
             carts=self._moving,
             period=self._period if self._line.bench.commands else None,
@@ -169,13 +168,13 @@ class Session:
             finally:
                 self._stop(always=bool(partial))
         watch.forward(stream.finish())
-        if not partial and recording.controller is None and stream.widest <= _STILL:
+        if not partial and recording.controller is None and stream.widest <= STILL:
             partial = _NOTHING_MOVED
         fit = stream.fit()
-        if stream.lines > _ENOUGH and not partial:
+        if stream.lines > ENOUGH and not partial:
             self._say_other_period(fit.period)
             self._period = fit.period
-        return Outcome(
+        return RunOutcome(
             recording=order.recording,
             lines=stream.lines,
             anomalies=stream.anomalies(fit),
@@ -185,9 +184,9 @@ class Session:
     def _say_other_period(self, period: float) -> None:
         """Say once that the bench does not keep to the period (ms) that it stated."""
         stated = 1e3 * self._line.bench.period
-        if not self._line.bench.commands or abs(self._period / stated - 1) > OTHER:
+        if not self._line.bench.commands or abs(self._period / stated - 1) > OTHER_PERIOD:
             return
-        if abs(period / stated - 1) > OTHER:
+        if abs(period / stated - 1) > OTHER_PERIOD:
             self._observer.remark(
                 f"the bench states a line every {stated:.3g} ms and sends one every {period:.3g} "
                 "ms: its times are right, but a controller that counts in its periods is not; "
@@ -212,7 +211,7 @@ class Session:
         moving: dict[int, int] = {}
         for _ in range(_REST_TRIES):
             self._observer.settling(recording, recording.settle)
-            last = _Tail(since=1e3 * recording.settle - _REST_WINDOW)
+            last = RestTail(since=1e3 * recording.settle - REST_WINDOW)
             self._start([Start(wave=Wave.DELTA, frequency=1 / recording.settle, amplitude=0)])
             trouble = self._listen(self._stream(()), seconds=recording.settle, check=last.keep)
             if trouble:
@@ -220,7 +219,7 @@ class Session:
             moving = {
                 cart: swing
                 for cart, swing in enumerate(last.swings[: self._carts], start=1)
-                if swing > _STILL
+                if swing > STILL
             }
             if not moving:
                 self._zero_at_rest(recording)
@@ -327,20 +326,20 @@ class Session:
                     return stream.broken
                 if lines:
                     first, unread = lines[0].ms if first is None else first, None
-                    if lines[-1].ms - first > end + _NEARLY:
+                    if lines[-1].ms - first > end + NEARLY:
                         return f"{STOPPED}the bench went on past the end of the run"
                 else:
                     unread = now if unread is None else unread
-                    if now - unread > _UNREADABLE:
+                    if now - unread > UNREADABLE:
                         return f"{STOPPED}what the bench sends cannot be read: nothing is watched"
             if why := self._by_hand():  # after the limits: what they say is never unsaid
                 return why
             quiet = now - last
             if stream.latest >= end - 2 * self._period and quiet > _AFTER_END:
                 return ""
-            if stream.latest >= end - _NEARLY and quiet > 2 * _AFTER_END + _SILENCE / 2:
+            if stream.latest >= end - NEARLY and quiet > 2 * _AFTER_END + SILENCE / 2:
                 return ""
-            if quiet > (_SILENCE if stream.latest >= 0 else FIRST_LINE):
+            if quiet > (SILENCE if stream.latest >= 0 else FIRST_LINE):
                 return (
                     f"the bench fell silent after {1e-3 * stream.latest:.3f} s{self._lateness()}"
                     if stream.latest >= 0
@@ -349,77 +348,3 @@ class Session:
             if len(data) < LUMP:  # nothing waits
                 since = now
                 time.sleep(_LOOK)
-
-
-class _Watch:
-    """Checks each line against the limits and the wave, and hands them on in batches.
-
-    Parameters
-    ----------
-    period : ms from line to line; None of a stock bench, whose waves nobody knows to the ms.
-    """
-
-    def __init__(
-        self, order: Order, *, carts: int, period: float | None, stream: Stream, observer: Observer
-    ) -> None:
-        self._order = order
-        self._carts = carts
-        self._period = period
-        self._astray = self._off = 0  # lines in a row
-        self._before: Reading | None = None
-        self._stream = stream
-        self._observer = observer
-        self._batch: list[Reading] = []
-        self._forwarded = time.monotonic()
-
-    def check(self, batch: Sequence[Reading]) -> str:
-        """Return why the run must stop, or ""."""
-        self._batch += batch
-        for reading in batch:
-            if passed := self._order.passed(reading, carts=self._carts):
-                return f"{STOPPED}{passed}"  # before anybody is told: the stop goes out first
-            if self._period is not None:
-                strays = self._order.strays(reading, period=self._period)
-                self._astray = self._astray + 1 if strays else 0
-                if self._astray == _ASTRAY:
-                    return (
-                        f"the bench follows another wave than it was sent, {reading.target} counts "
-                        f"at {1e-3 * reading.ms:.3f} s: the line changed a digit"
-                    )
-            off = self._order.drives_off(reading, before=self._before or reading)
-            self._off, self._before = self._off + 1 if off else 0, reading
-            if self._off == _ASTRAY:
-                return (
-                    f"{STOPPED}the bench drives its motor with {reading.duty} duty counts where it "
-                    f"was told {reading.target}, at {1e-3 * reading.ms:.3f} s"
-                )
-        now = time.monotonic()
-        if now - self._forwarded > _FORWARD:
-            self._forwarded = now
-            self.forward(())
-        return ""
-
-    def forward(self, batch: Sequence[Reading]) -> None:
-        """Hand on what waits, and this."""
-        waiting, self._batch = [*self._batch, *batch], []
-        if waiting:
-            self._observer.readings(waiting, self._stream.anomalies())
-
-
-class _Tail:
-    """The last lines of a rest."""
-
-    def __init__(self, *, since: float) -> None:
-        self._since = since
-        self._readings: list[Reading] = []
-
-    def keep(self, batch: Sequence[Reading]) -> str:
-        """Keep what is late enough; nothing is wrong with it."""
-        self._readings += [reading for reading in batch if reading.ms >= self._since]
-        return ""
-
-    @property
-    def swings(self) -> list[int]:
-        """How far each encoder went, counts."""
-        columns = zip(*(reading.counts for reading in self._readings), strict=True)
-        return [max(column) - min(column) for column in columns]

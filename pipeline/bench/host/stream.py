@@ -10,21 +10,24 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from pipeline.bench.live.observer import Anomalies
 from pipeline.bench.protocol.messages import FULL_SCALE, Reading, parse_reading
 from pipeline.bench.protocol.stamps import StampFit, even_period, fit_stamps
-from pipeline.bench.watch.observer import Anomalies
+from pipeline.bench.thresholds import (
+    CROWD,
+    CROWDED,
+    DRIVEN,
+    LATE,
+    LEAP,
+    MOVED,
+    NEIGHBOUR_MOVED,
+    SPIKE,
+    WINDOW,
+)
 
 _LONGEST_LINE = 512  # bytes; more without an end is noise
-_SPIKE = 32  # counts a true reading may stand out between its neighbours: a hit on an end stop
-_LATE = 0.02  # s behind the earliest lines: they waited somewhere for one another
-_FORGET = 1.0  # s after which the two clocks are set by one another anew
 _ODD = 0.005  # of the expected period: how far off a clock may well be
-_WINDOW = 1000  # ms over which an encoder is watched and losses are counted
-_MOVED, _NEIGHBOUR_MOVED = 20, 200  # counts
-_DRIVEN = 8  # duty counts; less moves no cart
-_LEAP = 1000  # ms between two stamps: no line for so long, or a clock that jumped
-_CROWD = 500  # lines whose stamps are looked at together …
-_CROWDED = 0.25  # … and the least share of their time the clock may go on meanwhile
+_FORGET = 1.0  # s after which the two clocks are set by one another anew
 
 
 class Stream:
@@ -163,16 +166,16 @@ class Stream:
         if before is not None and _stands_out(before, held, after, closed=self._closed):
             self._reject()
             return []
-        if held.ms - last > _LEAP:
+        if held.ms - last > LEAP:
             return self._break(
                 f"the bench's stamps leap from {1e-3 * last:.3f} to {1e-3 * held.ms:.3f} s: "
                 "its clock, or a second in which no line came"
             )
         self._keep(held)
-        if self.lines > _CROWD:
-            went_on = held.ms - self._stamps[-1 - _CROWD]
-            if went_on < _CROWDED * _CROWD * self._expected:
-                self._break(f"the bench's clock stands still: {_CROWD} lines in {went_on} ms of it")
+        if self.lines > CROWD:
+            went_on = held.ms - self._stamps[-1 - CROWD]
+            if went_on < CROWDED * CROWD * self._expected:
+                self._break(f"the bench's clock stands still: {CROWD} lines in {went_on} ms of it")
         return [held]
 
     def _break(self, why: str) -> list[Reading]:
@@ -190,7 +193,7 @@ class Stream:
         if now - self._lead_from > _FORGET:
             self._lead, self._new_lead, self._lead_from = self._new_lead, now - due, now
         self._new_lead = min(self._new_lead, now - due)
-        self._late += since - due > min(self._lead, self._new_lead) + _LATE
+        self._late += since - due > min(self._lead, self._new_lead) + LATE
 
 
 def _stands_out(before: Reading, held: Reading, after: Reading, *, closed: bool) -> bool:
@@ -199,7 +202,7 @@ def _stands_out(before: Reading, held: Reading, after: Reading, *, closed: bool)
         return True
     if held.ms < before.ms:
         return True
-    room = _SPIKE * max(1, after.ms - before.ms)
+    room = SPIKE * max(1, after.ms - before.ms)
     signals = [*zip(before.counts, held.counts, after.counts, strict=True)]
     signals.append((before.target, held.target, after.target))
     if not closed:
@@ -225,16 +228,16 @@ class _MissingSoFar:
         """Take note of a stamp."""
         self._stamps.append(ms)
         span, count = ms - self._stamps[0], len(self._stamps) - 1
-        if span < _WINDOW or not count:
+        if span < WINDOW or not count:
             return
         if (even := even_period(np.array(self._stamps))) is not None:
             self._period, self._seen_even = even, True
         else:
-            own = span / count
-            near = abs(own / self._expected - 1) < _ODD
+            measured = span / count
+            near = abs(measured / self._expected - 1) < _ODD
             first = self._period == self._expected
-            if near and not self._seen_even and (first or own < self._period):
-                self._period = own
+            if near and not self._seen_even and (first or measured < self._period):
+                self._period = measured
             self.lines += max(0, round(span / self._period) - count)
         self._stamps = [ms]
 
@@ -256,13 +259,13 @@ class _EncoderWatch:
     def stuck(self) -> int:
         """How many encoders froze while driven on, or never moved though their carts had to."""
         moved = {encoder: seen.width for encoder, seen in self._overall.items()}
-        pushed = self._driven.width >= _DRIVEN
+        pushed = self._driven.width >= DRIVEN
         never = {
             encoder
             for encoder, width in moved.items()
             if width == 0
             and pushed
-            and (encoder == 0 or max(moved.values()) >= _NEIGHBOUR_MOVED)
+            and (encoder == 0 or max(moved.values()) >= NEIGHBOUR_MOVED)
             and self._earlier is not None  # a run of less than a window tells nothing
         }
         return len(self._frozen | never)
@@ -283,7 +286,7 @@ class _EncoderWatch:
         duties = [reading.duty for reading in readings]
         self._duty.widen(duties)
         self._driven.widen(duties)
-        if readings[-1].ms - self._start >= _WINDOW:
+        if readings[-1].ms - self._start >= WINDOW:
             self._close(readings[-1].ms)
 
     def _close(self, ms: int) -> None:
@@ -291,11 +294,11 @@ class _EncoderWatch:
         duty = self._duty.width
         if self._earlier is not None:
             earlier, earlier_duty = self._earlier
-            if duty >= max(_DRIVEN, earlier_duty / 2):
+            if duty >= max(DRIVEN, earlier_duty / 2):
                 self._frozen |= {
                     encoder
                     for encoder, width in widths.items()
-                    if width == 0 and earlier[encoder] >= _MOVED
+                    if width == 0 and earlier[encoder] >= MOVED
                 }
         self._earlier, self._start = (widths, duty), ms
         self._ranges = {encoder: _Range() for encoder in self._encoders}

@@ -13,6 +13,7 @@ from typing import Any, Self, TypeAlias
 import numpy as np
 
 from pipeline.arrays import Array
+from pipeline.bench import thresholds
 from pipeline.bench.planning.plan import Limits, PidLoop, Recording, StateLoop
 from pipeline.bench.protocol.messages import FULL_SCALE, Description, PidGains, StateGains
 from pipeline.errors import DataError
@@ -36,7 +37,6 @@ _LONGEST_STEP = 10.0  # s a simulated step is followed for
 _PID_SHARES = (1.0, 0.5, 0.25, 0.1)  # of the carts' own stiffness that a proposed kp adds
 _PID_ZETA = 0.5  # of all carts as one mass, by a proposed kd
 _PID_INTEGRAL = 0.25  # of the slowest pole, by which a proposed ki comes to the level
-_UNSEEN_COUNTS = 2.0  # of overshoot: no encoder tells them from its own flicker
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -240,7 +240,7 @@ class _Trial:
         y, judged = x[cart - 1], {"before": 0.0, "level": np.float64(reference)}
         overshoot = float(step_response.overshoot_percent(y, **judged))
         settling = float(step_response.settling_time(t, y, **judged))
-        unseen = 100 * _UNSEEN_COUNTS * self.scales.position / abs(reference)
+        unseen = 100 * thresholds.UNSEEN_COUNTS * self.scales.position / abs(reference)
         # A goal that the design itself cannot meet was said to be so in its report.
         most = max(goal.overshoot_percent, design.overshoot_percent) + unseen
         longest = max(goal.settling_time, design.settling_time or np.inf)

@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
-from pipeline.bench.planning.gains import Scales
-from pipeline.bench.planning.plan import Limits, Recording
+from pipeline.bench.planning.gains import Scales, Table, bench_gains, bench_scales, controller_table
+from pipeline.bench.planning.plan import Limits, Plan, Recording
 from pipeline.bench.protocol.messages import (
     FULL_SCALE,
     ChirpEnd,
@@ -18,7 +18,8 @@ from pipeline.bench.protocol.messages import (
 )
 from pipeline.bench.protocol.waves import target_at
 from pipeline.errors import ConfigError, HardwareError
-from pipeline.submission import System
+from pipeline.submission import Submission, System
+from pipeline.workflow import analyse
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,6 +82,31 @@ class Order:
                     f"the limit is {most:.4g}"
                 )
         return ""
+
+
+def order_on(
+    recording: Recording, plan: Plan, submission: Submission, bench: Description
+) -> tuple[Order, Table | None]:
+    """Return the order and, of a closed loop, the controller as submission.toml tells of it."""
+    system = submission.system
+    scales = Scales(
+        input=system.input.per_count or bench.input_per_count,
+        position=system.position.per_count or bench.position_per_count,
+    )
+    gains: PidGains | StateGains | None = None
+    table: Table | None = None
+    if recording.controller is not None:
+        analysis = analyse(submission)
+        scales = bench_scales(submission, bench=bench, analysis=analysis)
+        gains = bench_gains(
+            recording, submission=submission, analysis=analysis, bench=bench, limits=plan.limits
+        )
+        cart = recording.controller.cart
+        table = dict(controller_table(gains, cart=cart, scales=scales, carts=system.carts))
+    order = make_order(
+        recording, limits=plan.limits, scales=scales, system=system, bench=bench, gains=gains
+    )
+    return order, table
 
 
 def make_order(

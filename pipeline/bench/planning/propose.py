@@ -6,12 +6,15 @@ with how much input. Once the dwells are recorded, the designed controller is ru
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from math import ceil, floor, log10
+from pathlib import Path
 
 import numpy as np
 
 from pipeline.bench.planning.gains import propose_pid
 from pipeline.bench.planning.plan import Limits, Plan, Recording, StateLoop
+from pipeline.bench.planning.plan_file import load_plan, plan_path, save_plan
 from pipeline.bench.protocol.messages import CHIRP_SPAN, FULL_SCALE, Description
 from pipeline.errors import DataError
 from pipeline.ingest.read import DUTY_COUNT
@@ -54,6 +57,46 @@ _PERIOD = 0.005  # s, of the simulation that finds amplitudes
 _PER_CYCLE = 40  # samples of it at least
 _LOOP_SETTLING = 3.0  # settling times from edge to edge of the set point
 _LOOP_EDGE = 2.0  # s at least
+
+
+@dataclass(frozen=True, kw_only=True)
+class MadePlan:
+    """A plan as it is written now.
+
+    Attributes
+    ----------
+    said : in one sentence, what was written.
+    trouble : why the data could not help to choose; "": they could, or there are none.
+    """
+
+    plan: Plan
+    path: Path
+    said: str
+    trouble: str
+
+
+def make_plan(
+    submission: Submission, *, stock: bool = False, progress: Callable[[str], None]
+) -> MadePlan:
+    """Write plan.toml, or add to it what the data allow.
+
+    Parameters
+    ----------
+    stock : the bench knows the stock commands only.
+    """
+    carts = submission.system.carts
+    bench = Description(name="stock", encoders=2, carts=carts) if stock else None
+    there = plan_path(submission).exists()
+    old = load_plan(submission) if there else propose_plan(submission, bench=bench)
+    progress("asking the data what else to record")
+    try:
+        new, trouble = extend_plan(old, submission, bench=bench), ""
+    except DataError as error:  # a plan that data cannot help stands as it is
+        new, trouble = old, str(error)
+    path = save_plan(new, submission)
+    added = len(new.recordings) - len(old.recordings)
+    said = f"{path}: {added} recordings added" if there else f"wrote {path}: check its [limits]"
+    return MadePlan(plan=new, path=path, said=said, trouble=trouble)
 
 
 def propose_plan(submission: Submission, *, bench: Description | None = None) -> Plan:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.bench.host.acquire import acquire
-from pipeline.bench.watch.web import LivePage
+from pipeline.bench.live.page import LivePage
 from pipeline.errors import PipelineError
 
 

@@ -8,9 +8,9 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response, StreamingResponse
 
 from pipeline.bench.host.serial_line import port_names
+from pipeline.bench.live.page import live_view
 from pipeline.bench.planning.plan_file import load_plan, plan_path
 from pipeline.bench.planning.plan_words import session_time, time_words, what_words
-from pipeline.bench.watch.web import live_view
 from pipeline.desk.benches import Session
 from pipeline.desk.state import Ask
 from pipeline.errors import ConfigError, PipelineError

@@ -1,11 +1,15 @@
-"""Who watches a session at the bench: the terminal, a web page, a test."""
+"""Who watches a session at the bench and may press a button: the terminal, a web page, a test."""
 
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Literal, Protocol, get_args
 
 from pipeline.bench.planning.plan import Plan, Recording
 from pipeline.bench.protocol.messages import Reading
+
+Wish = Literal["stop", "skip", "keep", "repeat"]
+WISHES: tuple[Wish, ...] = get_args(Wish)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +44,7 @@ class Anomalies:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Outcome:
+class RunOutcome:
     """How one recording ended.
 
     Attributes
@@ -85,7 +89,7 @@ class Observer(Protocol):
         """Hand on the lines that came, in order; `anomalies` are those of this run so far."""
         ...
 
-    def finished(self, outcome: Outcome) -> None:
+    def finished(self, outcome: RunOutcome) -> None:
         """Tell how the run ended."""
         ...
 
@@ -125,7 +129,7 @@ class Observers:
         for observer in self._observers:
             observer.readings(batch, anomalies)
 
-    def finished(self, outcome: Outcome) -> None:
+    def finished(self, outcome: RunOutcome) -> None:
         """Tell how the run ended."""
         for observer in self._observers:
             observer.finished(outcome)
@@ -134,3 +138,48 @@ class Observers:
         """Tell what concerns no single run."""
         for observer in self._observers:
             observer.remark(sentence)
+
+
+class Buttons:
+    """What a person wants done with the run at hand: pressed in one thread, done in another.
+
+    A button does nothing by itself. The acquisition says what it would heed now, looks at every
+    turn of its loop what was pressed, and decides.
+
+    Attributes
+    ----------
+    turn : which try of which recording the offer is about; a press for another is void.
+    offered : what would be heeded now besides "stop", which always is.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self.turn = 0
+        self.offered: tuple[Wish, ...] = ()
+        self._pressed: Wish | None = None
+
+    @property
+    def pressed(self) -> Wish | None:
+        """What was pressed in this turn; "stop" stays pressed."""
+        return self._pressed
+
+    def begin(self) -> None:
+        """Begin another turn, with nothing offered yet."""
+        with self._lock:
+            self.turn += 1
+            self.offered = ()
+            if self._pressed != "stop":
+                self._pressed = None
+
+    def offer(self, *wishes: Wish) -> None:
+        """Say what would be heeded now; what was pressed before in this turn stays so."""
+        with self._lock:
+            self.offered = wishes
+
+    def press(self, wish: Wish, *, turn: int) -> bool:
+        """Press one; return whether it will be heeded. "stop" will, at any time."""
+        with self._lock:
+            if wish != "stop" and (self._pressed or turn != self.turn or wish not in self.offered):
+                return False
+            self._pressed = wish
+            return True

@@ -25,8 +25,8 @@ from starlette.responses import PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from pipeline.bench.watch.buttons import WISHES
-from pipeline.bench.watch.live_state import LiveState
+from pipeline.bench.live.observer import WISHES
+from pipeline.bench.live.page_state import LiveState
 from pipeline.errors import HardwareError
 from pipeline.resources import TEMPLATES
 from pipeline.web.guard import HEADERS, guarded, own_names, refusal

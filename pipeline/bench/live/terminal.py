@@ -12,10 +12,10 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from pipeline.bench.live.observer import Anomalies, RunOutcome
 from pipeline.bench.planning.plan import Plan, Recording
 from pipeline.bench.planning.plan_words import session_time, time_words
 from pipeline.bench.protocol.messages import Reading
-from pipeline.bench.watch.observer import Anomalies, Outcome
 from pipeline.errors import ConfigError
 
 _BARS = "▁▂▃▄▅▆▇█"
@@ -91,7 +91,7 @@ class Terminal:
         """Show the newest lines."""
         self._view.take(batch, anomalies)
 
-    def finished(self, outcome: Outcome) -> None:
+    def finished(self, outcome: RunOutcome) -> None:
         """Print a line that stays."""
         self._view.recording = None
         name = outcome.recording.id

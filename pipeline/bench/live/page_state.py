@@ -7,11 +7,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from pipeline.bench.live.observer import Anomalies, Buttons, RunOutcome, Wish
 from pipeline.bench.planning.plan import Plan, Recording
 from pipeline.bench.planning.plan_words import session_time, what_words
 from pipeline.bench.protocol.messages import Reading
-from pipeline.bench.watch.buttons import Buttons, Wish
-from pipeline.bench.watch.observer import Anomalies, Outcome
 from pipeline.errors import ConfigError
 from pipeline.submission import Input, Position, Submission, load_submission
 
@@ -126,7 +125,7 @@ class LiveState:
             self._lines += len(batch)
             self._anomalies = anomalies
 
-    def finished(self, outcome: Outcome) -> None:
+    def finished(self, outcome: RunOutcome) -> None:
         """Tell how the run ended."""
         name = outcome.recording.id
         with self._lock:

@@ -86,7 +86,7 @@ class Motion:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Bench:
+class Rig:
     """The plant and its encoders.
 
     Attributes
