@@ -24,7 +24,7 @@ def plan(
         typer.Option(
             "--for",
             help="With --next: what is to be known better: a parameter (zeta_2), `design` (the "
-            "predicted overshoot), `worst`, `mean` or `volume`.",
+            "predicted overshoot), `worst`, `mean`, `volume`; `gap`: which explanation is right.",
         ),
     ] = None,
     as_json: AsJson = False,

@@ -4,6 +4,7 @@ from typing import Any
 
 from pipeline.gap.types import FoundEffect, Gap, GapWindow, NamedValue, Rival
 from pipeline.plant.linear.chain import Chain
+from pipeline.plant.nonlinear.effects.base import AugmentedChain
 from pipeline.schemas import gap as schema
 from pipeline.schemas.base import fields_of
 
@@ -24,23 +25,30 @@ def gap_json(gap: Gap, *, position_unit: str = "cm", input_unit: str = "V") -> d
         "where": [_window(window) for window in gap.where],
         "left": [_window(window) for window in gap.left],
         "next_experiment": gap.next_experiment,
+        "next_recording": gap.proposal.recording if gap.proposal else None,
+        "separation": gap.proposal.separation if gap.proposal else None,
         "training": list(gap.training),
         "held_out": list(gap.held_out),
         "friction_spread": {str(cart): spread for cart, spread in gap.spread.items()},
         "units": {"position": position_unit, "input": input_unit},
         "linear": _chain(gap.linear.chain),
-        "model": {
-            "chain": _chain(gap.model.chain),
-            "effects": [
-                {
-                    "effect": term.effect.key,
-                    "where": term.where,
-                    "parameters": term.effect.named(term.values),
-                }
-                for term in gap.model.terms
-            ],
-        },
+        "model": _model(gap.model),
+        "contenders": [{**_model(one.model), "weight": one.weight} for one in gap.contenders],
         "notes": list(gap.notes),
+    }
+
+
+def _model(model: AugmentedChain) -> dict[str, Any]:
+    return {
+        "chain": _chain(model.chain),
+        "effects": [
+            {
+                "effect": term.effect.key,
+                "where": term.where,
+                "parameters": term.effect.named(term.values),
+            }
+            for term in model.terms
+        ],
     }
 
 

@@ -23,6 +23,7 @@ from pipeline.gap.types import FoundEffect, Gap
 from pipeline.gap.verdict.account import (
     chain_std,
     compare_by_record,
+    list_contenders,
     list_effects,
     list_suspects,
     make_traces,
@@ -152,6 +153,7 @@ def explain_gap(
         left=left,
         complete=not deadline.cut,
         notes=tuple(notes),
+        contenders=() if enough else list_contenders(chosen, close or found),
     )
 
 

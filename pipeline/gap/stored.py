@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from pipeline.errors import ConfigError
 from pipeline.gap.document import gap_json
-from pipeline.gap.types import FoundEffect, Gap, GapWindow, NamedValue, RecordGap, Rival
+from pipeline.gap.types import Contender, FoundEffect, Gap, GapWindow, NamedValue, RecordGap, Rival
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.effects import AugmentedChain, Term, find_effect
 from pipeline.results import Analysis
@@ -51,7 +51,7 @@ def read_gap(text: str) -> tuple[Gap, dict[str, str]]:
 
 
 def _gap(document: Mapping[str, Any]) -> Gap:
-    errors, model = document["gap"], document["model"]
+    errors = document["gap"]
     return Gap(
         verdict=document["verdict"],
         effects=tuple(_effect(entry) for entry in document["effects"]),
@@ -63,9 +63,7 @@ def _gap(document: Mapping[str, Any]) -> Gap:
         where=tuple(_window(entry) for entry in document["where"]),
         next_experiment=str(document["next_experiment"]),
         linear=AugmentedChain(chain=_chain(document["linear"])),
-        model=AugmentedChain(
-            chain=_chain(model["chain"]), terms=tuple(_term(entry) for entry in model["effects"])
-        ),
+        model=_model(document["model"]),
         training=tuple(document["training"]),
         held_out=tuple(document["held_out"]),
         traces=(),
@@ -75,6 +73,16 @@ def _gap(document: Mapping[str, Any]) -> Gap:
         left=tuple(_window(entry) for entry in document["left"]),
         complete=document["complete"],
         notes=tuple(document["notes"]),
+        contenders=tuple(
+            Contender(model=_model(entry), weight=float(entry["weight"]))
+            for entry in document["contenders"]
+        ),
+    )
+
+
+def _model(entry: Mapping[str, Any]) -> AugmentedChain:
+    return AugmentedChain(
+        chain=_chain(entry["chain"]), terms=tuple(_term(term) for term in entry["effects"])
     )
 
 

@@ -1,7 +1,7 @@
 """What the gap workflow finds."""
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 from pipeline.arrays import Array
 from pipeline.plant.nonlinear.effects.base import AugmentedChain, Effect
@@ -92,6 +92,34 @@ class Trace:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Contender:
+    """A model that may be the true one; `weight` is its share by the Bayesian criterion."""
+
+    model: AugmentedChain
+    weight: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Proposal:
+    """The recording that would tell the contenders apart best.
+
+    Attributes
+    ----------
+    recording : a table of plan.toml.
+    separation : root mean square of the difference between the two likeliest that no refit of the
+        other takes up, in noises.
+    t, u : (n,) s and the input; `predicted` (contenders, n) positions of `cart`.
+    """
+
+    recording: dict[str, Any]
+    separation: float
+    cart: int
+    t: Array
+    u: Array
+    predicted: Array
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Gap:
     """Where simulation and measurement disagree, why, and what is left.
 
@@ -110,6 +138,8 @@ class Gap:
     training, held_out : ids of the runs.
     spread : learnt run-to-run spread of the dry friction, per cart, where the runs show any.
     notes : what a reader must know.
+    contenders : unless one is named: the models that may be true, the likeliest first.
+    proposal : what to record next, as a plan has it; None where nothing was weighed.
     """
 
     verdict: Verdict
@@ -132,3 +162,5 @@ class Gap:
     left: tuple[GapWindow, ...] = ()
     complete: bool = True
     notes: tuple[str, ...] = ()
+    contenders: tuple[Contender, ...] = ()
+    proposal: Proposal | None = None

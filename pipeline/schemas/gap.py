@@ -1,6 +1,6 @@
 """`gap.json`, schema `cartlab-gap/1`."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -88,6 +88,12 @@ class Model(Document):
     effects: tuple[Term, ...]
 
 
+class Contender(Model):
+    """A model that may be the true one."""
+
+    weight: Annotated[float, Field(description="by the Bayesian criterion among the contenders")]
+
+
 class GapSubmission(Document):
     """Which submission it is about."""
 
@@ -121,6 +127,13 @@ class Gap(Document):
         Field(description="where the final model does, under `partial` and `unexplained`"),
     ] = ()
     next_experiment: str
+    next_recording: Annotated[
+        dict[str, Any] | None,
+        Field(description="what tells the contenders apart best, as a table of plan.toml"),
+    ] = None
+    separation: Annotated[
+        Number, Field(description="of the two likeliest in it, in noises that no refit takes up")
+    ] = None
     training: tuple[str, ...]
     held_out: tuple[str, ...]
     friction_spread: Annotated[
@@ -129,6 +142,10 @@ class Gap(Document):
     units: Units
     linear: Annotated[Chain, Field(description="the linear chain that fits best")]
     model: Model
+    contenders: Annotated[
+        tuple[Contender, ...],
+        Field(description="unless one is named: models that may be true, the likeliest first"),
+    ] = ()
     notes: tuple[str, ...]
     submission: GapSubmission
     springs: tuple[bool, ...]

@@ -12,6 +12,7 @@ from pipeline.plant.loop.sampled_loop import simulate_loop
 from pipeline.results import FeedbackDesign
 from pipeline.submission.complaints import nearest
 
+GAP = "gap"  # what tells the explanations of a gap apart
 DESIGN, WORST, MEAN, VOLUME = "design", "worst", "mean", "volume"
 _STEP = 1e-4  # relative change of a parameter, of which the loop's overshoot is a difference
 

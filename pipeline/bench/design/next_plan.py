@@ -1,5 +1,6 @@
 """`cartlab plan --next`: the experiments that bring most, and what each will bring."""
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +9,7 @@ import numpy as np
 
 from pipeline.bench.design.candidates import propose_candidates
 from pipeline.bench.design.exchange import choose
-from pipeline.bench.design.goal import WORST, Goal, find_goal
+from pipeline.bench.design.goal import GAP, WORST, Goal, find_goal
 from pipeline.bench.design.information import Knowledge
 from pipeline.bench.host.raw import FOLDER as RAW
 from pipeline.bench.host.raw import read_raw
@@ -16,11 +17,14 @@ from pipeline.bench.planning.plan import Plan, Recording
 from pipeline.bench.planning.plan_file import load_plan, plan_path, save_plan
 from pipeline.bench.planning.plan_words import session_time, time_words
 from pipeline.bench.planning.propose import propose_plan, renamed
-from pipeline.errors import DataError
+from pipeline.errors import ConfigError, DataError
 from pipeline.results import Analysis
+from pipeline.schemas.gap import Gap as GapDocument
 from pipeline.submission import Submission
+from pipeline.submission.toml_file import read_text
 from pipeline.workflow import analyse
 
+_MOST_BYTES = 10_000_000  # of a gap.json
 _USUAL = frozenset("c")  # what a bench is taken to know of which nothing is recorded
 
 
@@ -31,17 +35,24 @@ class NextPlan:
     Attributes
     ----------
     errors : (n + 1,) of what `words` names, relative: now, and after each more.
+    separation : for "gap", of the two likeliest explanations, in noises.
     """
 
     words: str
     plan: Plan
     path: Path | None
     recordings: tuple[Recording, ...]
-    errors: tuple[float, ...]
+    errors: tuple[float, ...] = ()
+    separation: float | None = None
 
     @property
     def said(self) -> str:
         """What they bring, in one sentence."""
+        if self.separation is not None:
+            return (
+                f"{self.recordings[0].id} tells the two likeliest explanations of the gap apart by "
+                f"{self.separation:.2g} times the noise"
+            )
         many = len(self.recordings)
         after = f"these {many} recordings" if many > 1 else "this recording"
         return (
@@ -66,12 +77,23 @@ def plan_next(
     ConfigError : there is no such goal.
     """
     old = load_plan(submission) if plan_path(submission).exists() else propose_plan(submission)
+    taken = [entry.id for entry in (*old.recordings, *submission.experiments)]
+    if goal == GAP:
+        recording, separation = _decisive(submission.folder)
+        recordings = renamed([recording], taken=taken)
+        plan = old.model_copy(update={"recordings": (*old.recordings, *recordings)})
+        return NextPlan(
+            words="gap",
+            plan=plan,
+            path=save_plan(plan, submission),
+            recordings=recordings,
+            separation=separation,
+        )
     progress("asking the data what they tell")
     analysis = analyse(submission)
     progress("weighing the next experiments")
     commands = frozenset() if stock else known_commands(submission.folder)
     found = choose_next(analysis, old, n=n, goal=goal, commands=commands)
-    taken = [entry.id for entry in (*old.recordings, *submission.experiments)]
     recordings = renamed(found.recordings, taken=taken)
     plan = old.model_copy(update={"recordings": (*old.recordings, *recordings)})
     return NextPlan(
@@ -114,6 +136,24 @@ def choose_next(
     return NextPlan(
         words=words, plan=plan, path=None, recordings=recordings, errors=tuple(errors.tolist())
     )
+
+
+def _decisive(folder: Path) -> tuple[Recording, float]:
+    """Return the recording that `cartlab gap` proposes, and how far it sets explanations apart.
+
+    Raises
+    ------
+    DataError : there is no gap.json, or it proposes none.
+    """
+    path = folder / "gap" / "gap.json"
+    if not path.is_file():
+        raise DataError(f"--for gap: there is no {path}: run `cartlab gap {folder}` first")
+    text = read_text(path, where="gap/gap.json", limit=_MOST_BYTES, error=ConfigError)
+    found = GapDocument.model_validate_json(text)
+    if found.next_recording is None or found.separation is None:
+        raise DataError("--for gap: gap/gap.json proposes no recording, nothing is in dispute")
+    table = json.dumps(found.next_recording)
+    return Recording.model_validate_json(table), found.separation
 
 
 def _words(goal: Goal, known: Knowledge) -> str:

@@ -75,6 +75,12 @@ class MadePlan:
     trouble: str
 
 
+def plan_limits(submission: Submission) -> Limits:
+    """Return the limits of the submission's plan, or those that one would propose."""
+    there = plan_path(submission).exists()
+    return (load_plan(submission) if there else propose_plan(submission)).limits
+
+
 def make_plan(
     submission: Submission, *, stock: bool = False, progress: Callable[[str], None]
 ) -> MadePlan:

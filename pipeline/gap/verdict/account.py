@@ -11,11 +11,12 @@ from pipeline.gap.fit.levenberg_marquardt import Fit
 from pipeline.gap.fit.linearise import Nuisance, simulate_run
 from pipeline.gap.limits import AT_FLOOR
 from pipeline.gap.search.hypothesis import Hypothesis, Study
-from pipeline.gap.types import FoundEffect, NamedValue, RecordGap, Rival, Trace
+from pipeline.gap.types import Contender, FoundEffect, NamedValue, RecordGap, Rival, Trace
 from pipeline.plant.nonlinear.effects import find_effect
 from pipeline.plant.nonlinear.effects.base import Term
 
 _MOST_RIVALS = 4  # listed
+_CONTENDERS = 3  # among which an experiment is to decide
 _SAME_LENGTH, _SAME_LEVEL = 0.9, 0.01  # share of the samples, and of the largest input: a repeat
 _EDGES = 0.02  # share of the samples that may differ, by one at each edge of the input
 
@@ -236,3 +237,21 @@ def _same_input(a: Run, b: Run, t_a: Array, t_b: Array) -> bool:
         for run, t in ((a, t_a), (b, t_b))
     )
     return bool(np.mean(np.abs(u - v) > _SAME_LEVEL * np.abs(u).max()) < _EDGES)
+
+
+def list_contenders(chosen: Hypothesis, others: Sequence[Hypothesis]) -> tuple[Contender, ...]:
+    """Return the models that may be true, the chosen first, then the likeliest of the others.
+
+    One that has all effects of the chosen, or lacks some of them, is no other explanation.
+    """
+    rivals = [
+        one for one in others if one.key and not (one.key <= chosen.key or one.key >= chosen.key)
+    ]
+    if not chosen.key:  # nothing is named: suspects against one another
+        rivals = [one for one in others if one.key]
+    kept = [chosen, *sorted(rivals, key=lambda one: one.bic)[: _CONTENDERS - 1]]
+    likely = np.exp(-0.5 * np.array([one.bic - min(k.bic for k in kept) for one in kept]))
+    return tuple(
+        Contender(model=one.fit.structure.model(one.fit.theta), weight=float(weight))
+        for one, weight in zip(kept, likely / likely.sum(), strict=True)
+    )

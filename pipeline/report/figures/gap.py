@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pipeline.arrays import Array
-from pipeline.gap.types import FoundEffect, RecordGap, Trace
+from pipeline.gap.types import FoundEffect, Proposal, RecordGap, Trace
 from pipeline.gap.verdict.residual_force import ResidualForce
 from pipeline.report.figures.style import (
     MEASURED,
@@ -57,6 +57,20 @@ def before_after_figure(trace: Trace, *, noise: float, position_unit: str) -> Fi
         },
     )
     below.set_ylabel(f"residual [{position_unit}]")
+    below.set_xlabel("time [s]")
+    return figure
+
+
+def predicted_figure(proposal: Proposal, *, names: Sequence[str], position_unit: str) -> Figure:
+    """Return what the explanations predict of a recording to come, and how far they differ."""
+    figure, (above, below) = panels(1.5, 1.0)
+    first, second = proposal.predicted[:2]
+    plot_model(above, proposal.t, first, label=names[0])
+    plot_second(above, proposal.t, second, label=names[1])
+    above.set_ylabel(position_label(proposal.cart, position_unit))
+    legend_above(above)
+    plot_residuals(below, proposal.t, {"difference": second - first})
+    below.set_ylabel(f"difference [{position_unit}]")
     below.set_xlabel("time [s]")
     return figure
 

@@ -17,6 +17,7 @@ from pipeline.report.figures.gap import (
     before_after_figure,
     by_record_figure,
     force_figure,
+    predicted_figure,
     spectrum_figure,
     timing_figure,
 )
@@ -88,7 +89,7 @@ def build_gap_document(
     made = WORDS.text("made" if gap.complete else "made_so_far", version=__version__)
     parts += [
         ("runs", "Measured against simulated", lambda page: _runs(page, gap, worst[1:])),
-        ("apart", "What would tell the explanations apart", lambda page: _apart(gap)),
+        ("apart", "What would tell the explanations apart", lambda page: _apart(page, gap)),
         ("model", "The model with its effects", lambda page: _model(page, gap)),
         ("method", "How this was found", lambda page: _method(gap)),
         ("warnings", "Warnings", lambda page: remarks(analysis.warnings)),
@@ -214,16 +215,47 @@ def _runs(page: Page, gap: Gap, worst: Sequence[Trace]) -> list[Block]:
     return blocks
 
 
-def _apart(gap: Gap) -> list[Block]:
+def _apart(page: Page, gap: Gap) -> list[Block]:
+    predicted = _predicted(page, gap)
     if gap.verdict != "ambiguous":
-        return []
+        return predicted
     last, rival = contenders(gap)
     pair = [(last.effect, last.where), *([(rival.effect, rival.where)] if rival else [])]
     runs = bullet_list(
         WORDS.spans("apart_run", name=effect_name(effect, where), run=effect.deciding_run)
         for effect, where in pair
     )
-    return [paragraph(WORDS.spans("apart")), runs]
+    return [paragraph(WORDS.spans("apart")), runs, *predicted]
+
+
+def _predicted(page: Page, gap: Gap) -> list[Block]:
+    """Return the recording proposed, and what each explanation predicts of it."""
+    proposal = gap.proposal
+    if proposal is None:
+        return []
+    table = proposal.recording
+    if "release" in table:
+        said = WORDS.text("predicted_release", cart=str(table["release"]))
+    else:
+        said = WORDS.text(
+            "predicted_driven",
+            drive=page.drive,
+            **{key: str(table[key]) for key in ("wave", "amplitude", "frequency")},
+        )
+    names = [
+        listing([effect_name(term.effect, term.where) for term in one.model.terms])
+        or "the linear model"
+        for one in gap.contenders
+    ]
+    cart = str(proposal.cart)
+    figure = predicted_figure(proposal, names=names, position_unit=page.position)
+    caption = WORDS.text("predicted_caption", cart=cart, names="; ".join(names))
+    alt = WORDS.text("predicted_alt", cart=cart)
+    separation = f"{proposal.separation:.2g}"
+    return [
+        paragraph(WORDS.spans("predicted", recording=said, separation=separation)),
+        page.picture("predicted", figure, caption=caption, alt=alt),
+    ]
 
 
 # --------------------------------------------------------------------- the model

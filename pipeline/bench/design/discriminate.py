@@ -1,0 +1,234 @@
+"""Which experiment tells two explanations apart: where they differ most, whatever either is fitted.
+
+T-optimal: what counts of the difference of two predictions is what is left of it when the other
+model's parameters, start and encoder zeros have done what they can. Of several models each pair
+counts by the product of their probabilities, which bounds the expected fall of entropy.
+
+References: A. C. Atkinson, V. V. Fedorov, Biometrika 62 (1975), 57-70 and 289-303; G. E. P. Box,
+W. J. Hill, Technometrics 9 (1967), 57-71.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import combinations
+from math import ceil
+from typing import Literal
+
+import numpy as np
+
+from pipeline.arrays import Array
+from pipeline.bench.planning.plan import Limits, Recording
+from pipeline.bench.planning.propose import FURTHEST, rounded, rounded_down
+from pipeline.bench.protocol.messages import Start, Wave
+from pipeline.bench.protocol.waves import shape_at
+from pipeline.errors import DataError
+from pipeline.gap.types import Gap, Proposal
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.linear.dwells import SETTLED, settling_wait
+from pipeline.plant.linear.simulate import simulate_linear
+from pipeline.plant.nonlinear.augmented import simulate_augmented
+from pipeline.plant.nonlinear.effects.base import AugmentedChain, Term
+
+Kind = Literal["step", "sweep"]
+Shape = Literal["square", "triangle", "chirp"]
+
+_PERIOD = 5e-3  # s from sample to sample
+_TIME = 12.0  # s of a record, about
+_SIZES = (1.0, 0.5, 0.2)  # of what the limits allow: laws differ in how they grow with the motion
+_RELEASES = (0.6, 0.2)  # of the travel limit, from where a hand lets go
+_STEP = 1e-3  # relative, of a parameter's difference
+_LEAST_WEIGHT = 0.1  # of a contender: what swings overstates how sure the criterion is
+_SAME = 1e-9  # of the largest singular value: such a change of the parameters shows in nothing
+
+
+def with_proposal(gap: Gap, *, limits: Limits) -> Gap:
+    """Return the gap with the recording that tells its contenders apart best, if it has two."""
+    models = [one.model for one in gap.contenders]
+    if len(models) < 2 or not all(model.chain.is_tied for model in models):
+        return gap
+    weight = np.maximum([one.weight for one in gap.contenders], _LEAST_WEIGHT)
+    sigma = _noise(gap)
+    best, most = None, 0.0
+    for recording in _candidates(models[0].chain, limits):
+        found = _tell_apart(models, recording, sigma=sigma, travel=limits.travel)
+        if found is None:
+            continue
+        told, t, u, predicted = found
+        score = sum(
+            weight[i] * weight[j] * told[i, j] for i, j in combinations(range(len(models)), 2)
+        )
+        if score > most:
+            best, most = (recording, told, t, u, predicted), float(score)
+    if best is None:
+        return gap
+    recording, told, t, u, predicted = best
+    swing = np.abs(predicted[0] - predicted[1]).max(axis=1)
+    cart = int(np.argmax(swing))
+    proposal = Proposal(
+        recording=recording.model_dump(mode="json", exclude_defaults=True),
+        separation=float(np.sqrt(told[0, 1] / (t.size * len(recording.carts)))),
+        cart=cart + 1,
+        t=t,
+        u=u,
+        predicted=predicted[:, cart],
+    )
+    return replace(gap, proposal=proposal)
+
+
+def _noise(gap: Gap) -> Array:
+    """Return the noise (n,) of each cart, from its runs: what the floor is a share of."""
+    floor = {(row.experiment, row.cart): row.noise_floor for row in gap.by_record}
+    found: dict[int, list[float]] = {}
+    for trace in gap.traces:
+        share = floor.get((trace.experiment, trace.cart), gap.noise_floor)
+        rms = float(np.sqrt(np.mean((trace.measured - trace.zero) ** 2)))
+        found.setdefault(trace.cart, []).append(share * rms)
+    typical = float(np.median(np.concatenate(list(found.values()))))
+    n = gap.linear.chain.n
+    return np.array([np.median(found.get(cart, [typical])) for cart in range(1, n + 1)])
+
+
+# ------------------------------------------------------------------------- what is weighed
+
+
+def _candidates(chain: Chain, limits: Limits) -> Iterator[Recording]:
+    """Steps to either side, triangles and chirps in several sizes, and each cart let go."""
+    resonances = np.sort(np.abs(chain.poles)) / (2 * np.pi)
+    settle = rounded(settling_wait(chain, time_constants=SETTLED))
+    everyone = tuple(range(1, chain.n + 1))
+    slow, low, high = (
+        rounded(float(f)) for f in (1.5 / _TIME, 0.5 * resonances[0], 1.3 * resonances[-1])
+    )
+    waves: tuple[tuple[Shape, Kind, float, float | None], ...] = (
+        ("square", "step", slow, None),
+        ("square", "sweep", rounded(float(resonances[0])), None),
+        ("triangle", "sweep", slow, None),
+        ("triangle", "sweep", rounded(float(resonances[0])), None),
+        ("chirp", "sweep", low, high),
+    )
+    for wave, kind, f, end in waves:
+        whole = Recording(
+            id=f"apart-{wave}",
+            kind=kind,
+            carts=everyone,
+            wave=wave,
+            amplitude=1.0,
+            frequency=f,
+            frequency_end=end,
+            cycles=ceil(_TIME * f),
+            settle=settle,
+            aim="gap",
+        )
+        t, u = _input(whole)
+        reach = float(np.max(np.abs(simulate_linear(chain, t, u))))
+        largest = min(FURTHEST * limits.travel / reach, limits.input)
+        for size in _SIZES:
+            for sign in (1, -1) if wave == "square" else (1,):
+                amplitude = sign * rounded_down(size * largest)
+                yield whole.model_copy(update={"amplitude": amplitude})
+    for cart in everyone:
+        if chain.k[cart - 1] + chain.k[cart] > 0:
+            yield Recording(
+                id=f"apart-decay-{cart}",
+                kind="decay",
+                carts=(cart,),
+                wave="delta",
+                amplitude=0.0,
+                frequency=1 / _TIME,
+                release=cart,
+                settle=1.0,
+                aim="gap",
+            )
+
+
+def _input(recording: Recording) -> tuple[Array, Array]:
+    t = np.arange(0.0, recording.duration, _PERIOD)
+    start = Start(
+        wave=Wave[recording.wave.upper()],
+        frequency=recording.frequency,
+        amplitude=1,
+        cycles=recording.cycles,
+    )
+    shape = [shape_at(start, at, chirp_end=recording.frequency_end) for at in t]
+    return t, recording.amplitude * np.array(shape)
+
+
+# ------------------------------------------------------------------------- how far apart
+
+
+def _tell_apart(
+    models: Sequence[AugmentedChain], recording: Recording, *, sigma: Array, travel: float
+) -> tuple[Array, Array, Array, Array] | None:
+    """Return (models, models) what separates each two, times, input and predictions.
+
+    A separation is the square sum over the noise that neither model can take up; None where a
+    model would pass the travel limit. Of a release each height counts.
+    """
+    t, u = _input(recording)
+    starts = [None]
+    if recording.release:
+        unit = np.eye(sigma.size)[recording.release - 1]
+        starts = [share * travel * unit for share in _RELEASES]
+    free = [cart - 1 for cart in recording.carts]
+    told = np.zeros((len(models), len(models)))
+    predicted = np.zeros((len(models), sigma.size, t.size))
+    for x0 in starts:
+        try:
+            moved = [_predict(model, t, u, recording, x0) for model in models]
+            predicted = np.array([x for x, _ in moved])
+        except DataError:
+            return None
+        if np.abs(predicted).max() > travel:
+            return None
+        for i, j in combinations(range(len(models)), 2):
+            difference = ((predicted[i] - predicted[j]) / sigma[:, None])[free].ravel()
+            left = [
+                _left(difference, (by / sigma[:, None])[:, free]) for _, by in (moved[i], moved[j])
+            ]
+            told[i, j] += min(left)
+    return told / len(starts), t, u, predicted
+
+
+def _left(difference: Array, by: Array) -> float:
+    """Return the square sum of a difference (n,) that changes of the parameters leave."""
+    columns = by.reshape(len(by), -1).T
+    U, s, _ = np.linalg.svd(columns, full_matrices=False)
+    U = U[:, s > _SAME * s[0]]
+    rest = difference - U @ (U.T @ difference)
+    return float(rest @ rest)
+
+
+def _predict(
+    model: AugmentedChain, t: Array, u: Array, recording: Recording, x0: Array | None
+) -> tuple[Array, Array]:
+    """Return the readings (n, samples), and their derivatives (., n, samples) by what is free.
+
+    By every parameter of the chain and its effects, the start of a cart let go, the zeros.
+    """
+
+    def run(model: AugmentedChain, x0: Array | None) -> Array:
+        return simulate_augmented(model, t, u, free=recording.carts, x0=x0)
+
+    x = run(model, x0)
+    by = [(run(other, x0) - x) / _STEP for other in _changed(model)]
+    if x0 is not None:
+        by.append((run(model, x0 * (1 + _STEP)) - x) / _STEP)
+    zeros = np.repeat(np.eye(len(x))[:, :, None], t.size, axis=2)
+    return x, np.concatenate([by, zeros])
+
+
+def _changed(model: AugmentedChain) -> Iterator[AugmentedChain]:
+    """Yield the model with each parameter a little larger."""
+    chain = model.chain
+    for name in ("m", "c", "k"):
+        values: Array = getattr(chain, name)
+        for i in np.flatnonzero(values):
+            moved = values.copy()
+            moved[i] *= 1 + _STEP
+            yield replace(model, chain=replace(chain, **{name: moved}))
+    for at, term in enumerate(model.terms):
+        for i, value in enumerate(term.values):
+            moved = (*term.values[:i], value * (1 + _STEP), *term.values[i + 1 :])
+            new = Term(effect=term.effect, place=term.place, values=moved)
+            terms = (*model.terms[:at], new, *model.terms[at + 1 :])
+            yield replace(model, terms=terms)
