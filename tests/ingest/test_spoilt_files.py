@@ -167,7 +167,7 @@ def test_the_undamaged_file_is_read(name, submission):
 
 @pytest.mark.parametrize("name", FILES)
 @settings(
-    max_examples=60,
+    max_examples=30,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 @given(hits=st.lists(damage, min_size=1, max_size=4))
@@ -176,7 +176,7 @@ def test_a_damaged_file_is_an_error_or_a_record(name, hits, submission):
     try_everything(submission, damaged(FILES[name], hits))
 
 
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(
     raw=st.one_of(
         st.binary(max_size=400),
@@ -192,7 +192,7 @@ def test_junk_is_an_error_or_a_record(raw, submission):
     try_everything(submission, raw)
 
 
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(hits=st.lists(damage, min_size=1, max_size=4))
 def test_a_damaged_submission_file_is_an_error_or_a_submission(hits, tmp_path_factory):
     """`submission.toml` itself may be cut and garbled."""

@@ -7,8 +7,8 @@ import pytest
 
 from pipeline.errors import ConfigError
 from pipeline.report.document import Table, plain
-from pipeline.report.draft.changes import changes_line, compare_drafts, read_results
-from pipeline.report.draft.content import build_document
+from pipeline.report.draft.changes import change_blocks, changes_line, compare_drafts, read_results
+from pipeline.report.sections.page import Page
 from pipeline.resources import EXAMPLES
 from pipeline.results import Analysis, Estimate
 from pipeline.results_json import results_text
@@ -91,16 +91,15 @@ def test_checks_that_turned_and_files_that_changed_are_named():
 
 
 def test_the_report_has_a_section_on_the_changes():
-    """It stands after the summary, with both values; without an earlier draft there is none."""
+    """It has both values; without an earlier draft there is none."""
     before, after = make_analysis(2), with_final(make_analysis(2), "omega_b", 1.1)
-    document = build_document(after, changes=compare_drafts(draft_of(before), after), progress=None)
-    assert [section.id for section in document.sections[:2]] == ["summary", "changes"]
-    table = next(block for block in document.sections[1].blocks if isinstance(block, Table))
+    changes = compare_drafts(draft_of(before), after)
+    blocks = change_blocks(Page.of(after), changes)
+    table = next(block for block in blocks if isinstance(block, Table))
     (row,) = table.rows
     assert plain(row[0].text) == "ω_b"
     assert "+10.0 %" in plain(row[-1].text)
-    bare = build_document(after, progress=None)
-    assert "changes" not in [section.id for section in bare.sections]
+    assert change_blocks(Page.of(after), None) == []
 
 
 @pytest.mark.parametrize(
