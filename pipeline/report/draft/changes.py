@@ -8,6 +8,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from pipeline.errors import ConfigError
+from pipeline.report import limits
 from pipeline.report.document import Block, Cell, Span, bullet_list, cell, paragraph
 from pipeline.report.numbers import NOTHING, count, percent, significant, unit_text, with_error
 from pipeline.report.sections.housekeeping import OUTCOMES, TONES
@@ -20,7 +21,6 @@ from pipeline.schemas.results import Check, Results
 
 _MOST_BYTES = 20_000_000  # of a results.json; real ones have a few ten thousand
 _SAME = 1e-8  # relative: two processors agree to this on the ten digits of the file
-_WORTH_TELLING = 1.0  # standard errors; less is chance
 _ESTIMATES = ("final", "initial")
 
 
@@ -277,7 +277,7 @@ def _number_row(change: Change) -> list[Cell]:
     moved, sigmas = percent(change.percent, signed=True), change.sigmas
     if sigmas is not None:
         moved += f" ({_sigmas(sigmas)})"
-    is_chance = sigmas is not None and abs(sigmas) < _WORTH_TELLING
+    is_chance = sigmas is not None and abs(sigmas) < limits.CHANCE
     name = name_span(change.name) if change.what in _ESTIMATES else rich(clean(change.name))
     return [
         cell(name),

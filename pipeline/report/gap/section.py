@@ -13,6 +13,7 @@ from pipeline.estimation.measured_run import measured_run
 from pipeline.gap.stored import read_gap
 from pipeline.gap.types import Gap
 from pipeline.plant.nonlinear.effects import AugmentedChain
+from pipeline.report import limits
 from pipeline.report.document import Block, paragraph
 from pipeline.report.equations.effects import augmented_equations, law
 from pipeline.report.figures.style import (
@@ -43,8 +44,6 @@ from pipeline.submission.toml_file import read_text
 
 _PLACES = ("gap/gap.json", "gap.json")  # in the submission's folder
 _MOST_BYTES = 10_000_000  # ten times that of three carts and a hundred runs
-_WORTH = 0.6  # of the error must go before a factor on the logged input is believed
-_AS_LOGGED = 1.5  # a factor within this is no other scale, but the model's error
 _MOST_RUNS = 4
 
 
@@ -170,14 +169,14 @@ def _replay(
         found = [
             run.rest[:, None] + (y - rest[:, None])[rows]
             for factor in sorted(factors, key=lambda factor: factor != 1.0)
-            if factor == 1.0 or not 1 / _AS_LOGGED <= factor <= _AS_LOGGED
+            if factor == 1.0 or not 1 / limits.OTHER_SCALE <= factor <= limits.OTHER_SCALE
             for y in [simulate_augmented(model, record.t, factor * record.u, free=run.free, x0=x0)]
         ]
     except DataError:
         return []
     as_logged, *others = found
     best = min(others, key=run.misfit, default=as_logged)
-    chosen = best if run.misfit(best) < _WORTH * run.misfit(as_logged) else as_logged
+    chosen = best if run.misfit(best) < limits.WORTH_SCALING * run.misfit(as_logged) else as_logged
     replays = []
     for check in checks:
         row = run.free.index(check.cart)

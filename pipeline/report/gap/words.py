@@ -5,15 +5,13 @@ from dataclasses import replace
 
 from pipeline.gap.types import FoundEffect, Gap, NamedValue, RecordGap, Rival
 from pipeline.plant.nonlinear.effects.base import Effect
+from pipeline.report import limits
 from pipeline.report.document import Block, Spans, Tile, Tiles, Tone, bullet_list, paragraph, spans
 from pipeline.report.numbers import count, listing, significant, unit_text, with_error
 from pipeline.report.phrases import phrases
 from pipeline.report.words import clean, plain_lines
 
 WORDS = phrases("gap")
-
-_AS_GOOD = 1.15  # times the error: a rival that the data do not tell from what was chosen
-_NEGLIGIBLE = 1e-3  # of a value: an error this small stands in the table alone
 
 
 def verdict_title(gap: Gap) -> str:
@@ -172,7 +170,8 @@ def contenders(gap: Gap) -> tuple[FoundEffect, Rival | None]:
         (rival.confidence, i, found, rival)
         for i, found in enumerate(gap.effects)
         for rival in found.rivals
-        if rival.nrmse_after <= _AS_GOOD * gap.final and rival.effect.grows_from != found.effect.key
+        if rival.nrmse_after <= limits.AS_GOOD * gap.final
+        and rival.effect.grows_from != found.effect.key
     ]
     if not close:
         return gap.effects[-1], None
@@ -213,7 +212,7 @@ def _sizes_there(found: FoundEffect, *, several: bool) -> str:
 
 def _size(value: NamedValue) -> str:
     unit = unit_text(clean(value.unit))
-    exact = value.std is not None and value.std < _NEGLIGIBLE * abs(value.value)
+    exact = value.std is not None and value.std < limits.NEGLIGIBLE * abs(value.value)
     text = significant(value.value) if exact else with_error(value.value, value.std)
     return text + (f" {unit}" if unit else "")
 

@@ -3,6 +3,7 @@
 import numpy as np
 
 from pipeline.arrays import ComplexArray
+from pipeline.report import limits
 from pipeline.report.document import Block, Table, paragraph
 from pipeline.report.figures.time import design_figure, hardware_figure
 from pipeline.report.numbers import NOTHING, complex_text, count, percent, significant, unit_text
@@ -13,7 +14,6 @@ from pipeline.results import FeedbackDesign, HardwareCheck, Margins
 
 _WORDS = phrases("measurements")
 _TABLES = phrases("report")
-_AS_LOGGED = 0.05  # a factor on the input this near one is not worth a word
 
 
 def feedback_blocks(page: Page) -> list[Block]:
@@ -148,7 +148,7 @@ def hardware_blocks(page: Page) -> list[Block]:
     scales = [
         _WORDS.text("input_scale", run=c.experiment, scale=significant(c.input_scale, digits=3))
         for c in checks
-        if c.input_scale is not None and abs(c.input_scale - 1) > _AS_LOGGED
+        if c.input_scale is not None and abs(c.input_scale - 1) > limits.INPUT_AS_LOGGED
     ]
     return [*blocks, *remarks(list(dict.fromkeys(scales)))]
 

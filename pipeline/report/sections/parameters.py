@@ -7,6 +7,7 @@ import numpy as np
 
 from pipeline.names import read_name
 from pipeline.plant.linear.chain import Chain
+from pipeline.report import limits
 from pipeline.report.document import (
     Block,
     Cell,
@@ -34,8 +35,6 @@ from pipeline.stages.compare import change_limit
 from pipeline.stages.limits import SIGMA_LIMIT
 
 _WORDS = phrases("report")
-_NO_CHANGE = 0.05  # percent: nothing to speak of
-_FEW = 1 / 3  # of the limit for initial and final: other ways through the same data differ so much
 
 
 def parameter_blocks(page: Page) -> list[Block]:
@@ -130,7 +129,7 @@ def _off(name: str, yours: Decimal, found: Estimate | None) -> tuple[Cell, Cell]
     off = float(yours) - found.value
     share = percent(100 * off / abs(found.value), signed=True)
     rounding = 0.5 * 10.0 ** int(yours.as_tuple().exponent)
-    few = _FEW * change_limit(name) / 100 * abs(found.value)
+    few = limits.FEW * change_limit(name) / 100 * abs(found.value)
     if abs(off) <= rounding + SIGMA_LIMIT * (found.std or 0.0) + few:
         return cell(share), cell("")
     read = read_name(name)
@@ -161,7 +160,7 @@ def _staged_differences(analysis: Analysis) -> Block | None:
     if not changes:
         return None
     worst = max(changes, key=changes.__getitem__)
-    if changes[worst] < _NO_CHANGE:
+    if changes[worst] < limits.NO_CHANGE:
         return paragraph(_WORDS.text("staged_same"))
     return paragraph(
         _WORDS.text("staged_differs", share=percent(changes[worst])),

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.names import read_name
+from pipeline.report import limits
 from pipeline.report.document import (
     Block,
     Heading,
@@ -31,9 +32,6 @@ from pipeline.stages.limits import DAMPING_LIMIT
 _WORDS = phrases("questions")
 _MOST = 6  # a report with more would be a questionnaire
 _LISTED = 4  # runs; of more the first
-_FAR = 0.10  # of the motion: a difference between bench and model worth a question
-_LEVEL = 0.03  # of the level
-_OVERSHOOT = 5.0  # percent of the step
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,7 +193,7 @@ def _hardware(analysis: Analysis) -> Iterator[Asked]:
     design = analysis.feedback
     controlled = [c for c in closed if design is None or c.cart == design.cart] or closed
     off = max(controlled, key=_level_error, default=None)
-    if off and _level_error(off) > _LEVEL:
+    if off and _level_error(off) > limits.LEVEL:
         yield _of_run(
             off,
             "level",
@@ -204,11 +202,11 @@ def _hardware(analysis: Analysis) -> Iterator[Asked]:
             unit=clean(analysis.position_unit),
         )
     over = max(controlled, key=_overshoot_error, default=None)
-    if over and _overshoot_error(over) > _OVERSHOOT:
+    if over and _overshoot_error(over) > limits.OVERSHOOT:
         measured, model = percent(over.overshoot_measured), percent(over.overshoot_model)
         yield _of_run(over, "overshoot", measured=measured, model=model)
     far = max(analysis.hardware, key=lambda check: check.nrmse, default=None)
-    if far and far.nrmse > _FAR:
+    if far and far.nrmse > limits.CLOSE:
         yield _of_run(far, "hardware", share=percent(100 * far.nrmse))
 
 

@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 
 from pipeline.names import Name, read_name
+from pipeline.report import limits
 from pipeline.report.document import (
     Block,
     Items,
@@ -47,10 +48,6 @@ _OF_DATA = (
     "setup.",
     "hardware.",
 )  # checks of recordings, not of what they say
-_CALIBRATION = 1e-3  # no teaching bench's encoder and motor are known better than this
-_COARSE = 1e-2  # from here on two digits of an error leave four of the value
-_UNSURE_DIGITS = 3  # of a number whose standard error says too little: the model misses something
-_CLOSE = 0.10  # a simulation within 10 % of the motion is a good linear model's
 
 
 def summary(page: Page) -> list[Block]:
@@ -137,13 +134,13 @@ def _number_tile(name: str, final: Estimate, *, unit: str, is_sure: bool) -> Til
     """Return a number in four digits; a smaller error than any calibration's is only a note."""
     share = (final.std or 0.0) / abs(final.value) if final.value else 1.0
     if not is_sure:
-        value = significant(final.value, digits=_UNSURE_DIGITS)
-    elif 0 < share < _CALIBRATION:
+        value = significant(final.value, digits=limits.UNSURE_DIGITS)
+    elif 0 < share < limits.CALIBRATION:
         value = significant(final.value)
         error = _WORDS.text("statistical", share=f"{significant(100 * share, digits=1)} %")
         unit = f"{unit}, {error}" if unit else error
     else:
-        value = with_error(final.value, final.std, digits=2 if share >= _COARSE else 1)
+        value = with_error(final.value, final.std, digits=2 if share >= limits.COARSE else 1)
     return Tile(label=spans(name_span(name)), value=spans(value), note=spans(unit))
 
 
@@ -174,7 +171,7 @@ def _verdict_board(analysis: Analysis) -> tuple[Tile, ...]:
         tiles.append(Tile(spans(label), spans(value), spans(note), _tone(good), "#feedback"))
     if analysis.hardware:
         best, worst = _extremes(analysis)
-        good, note = worst.nrmse <= _CLOSE, _WORDS.text("tile_apart")
+        good, note = worst.nrmse <= limits.CLOSE, _WORDS.text("tile_apart")
         value = _range(best, worst, to="–")
         tiles.append(_tile("tile_hardware", value, note, good=good, url="#hardware"))
     return tuple(tiles)
@@ -269,7 +266,7 @@ def _hardware(analysis: Analysis) -> tuple[bool, Spans] | None:
     if not analysis.hardware:
         return None
     best, worst = _extremes(analysis)
-    return worst.nrmse <= _CLOSE, _WORDS.spans(
+    return worst.nrmse <= limits.CLOSE, _WORDS.spans(
         "hardware",
         range=_range(best, worst, to=" to "),
         cart=str(worst.cart),
@@ -331,7 +328,7 @@ def _advice(analysis: Analysis) -> Iterator[Spans]:
     if any(d.friction and d.friction.present for d in analysis.log_decrements):
         yield say("next_friction")
     doubted = {check.experiment for check in analysis.hardware if check.contradicted}
-    poor = [c for c in analysis.hardware if c.nrmse > _CLOSE and c.experiment not in doubted]
+    poor = [c for c in analysis.hardware if c.nrmse > limits.CLOSE and c.experiment not in doubted]
     if poor or (fit is not None and not fit.explains_data):
         yield say("next_left")
     if design is not None and not any(r.kind == "closed_loop" for r in analysis.records):

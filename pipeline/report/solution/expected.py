@@ -8,6 +8,7 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.names import read_name
 from pipeline.plant.linear.chain import Chain
+from pipeline.report import limits
 from pipeline.report.document import Block, bullet_list, cell, paragraph, spans
 from pipeline.report.equations import derivation
 from pipeline.report.equations.algebra import evaluate, work_out
@@ -22,11 +23,6 @@ from pipeline.schemas.base import fields_of, json_text
 
 _WORDS = phrases("solution")
 SCHEMA = "cartlab-solution/1"
-# What two careful teams on one bench differ by: gains and frequencies by some percent, damping
-# ratios by ten times that, since they are small and dry friction adds to them.
-GAIN_AND_FREQUENCY_TOLERANCE = 0.03
-DAMPING_TOLERANCE = 0.30
-SIGMAS = 3.0  # standard errors of the reference itself that widen a tolerance
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,14 +59,18 @@ def expected_parameters(analysis: Analysis) -> tuple[Expected, ...]:
                 unit=row.unit,
                 value=row.final.value,
                 std=row.final.std,
-                tolerance=max(share, SIGMAS * (row.final.std or 0.0)),
+                tolerance=max(share, limits.SIGMAS * (row.final.std or 0.0)),
             )
         )
     return tuple(found)
 
 
 def _share(name: str) -> float:
-    return DAMPING_TOLERANCE if read_name(name).is_damping else (GAIN_AND_FREQUENCY_TOLERANCE)
+    return (
+        limits.DAMPING_TOLERANCE
+        if read_name(name).is_damping
+        else (limits.GAIN_AND_FREQUENCY_TOLERANCE)
+    )
 
 
 def expected_model(chain: Chain, tolerances: Mapping[str, float]) -> ExpectedModel:
@@ -114,9 +114,9 @@ def expected_blocks(page: Page) -> list[Block]:
         paragraph(
             _WORDS.text(
                 "accepted",
-                share=f"{100 * GAIN_AND_FREQUENCY_TOLERANCE:g}",
-                damping_share=f"{100 * DAMPING_TOLERANCE:g}",
-                sigmas=f"{SIGMAS:g}",
+                share=f"{100 * limits.GAIN_AND_FREQUENCY_TOLERANCE:g}",
+                damping_share=f"{100 * limits.DAMPING_TOLERANCE:g}",
+                sigmas=f"{limits.SIGMAS:g}",
             )
         ),
         page.table(
