@@ -27,7 +27,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from pipeline.grading.batch.batch_run import grade_class
+from pipeline.grading.batch.grade_class import grade_class
 from pipeline.grading.batch.runner import Limits, grade_batch, run_here
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradings import Member

@@ -7,13 +7,13 @@ import sys
 import pytest
 
 from pipeline.errors import ConfigError
-from pipeline.grading.batch.batch_run import scratch_in
+from pipeline.grading.batch.grade_class import scratch_in
 from pipeline.lock import alone_in
 
 _HOLDER = """
 import sys
 from pathlib import Path
-from pipeline.grading.batch.batch_run import scratch_in
+from pipeline.grading.batch.grade_class import scratch_in
 from pipeline.lock import alone_in
 out = Path(sys.argv[1])
 with alone_in(out), scratch_in(out) as scratch:

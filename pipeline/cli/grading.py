@@ -53,7 +53,7 @@ def grade(
     ] = None,
 ) -> None:
     """Grade a class: gradebook, grades.csv, a page of the class, feedback for each student."""
-    from pipeline.grading.batch.batch_run import grade_class
+    from pipeline.grading.batch.grade_class import grade_class
     from pipeline.grading.batch.runner import Limits
 
     with _stopping(out), _batch_progress() as progress:

@@ -32,7 +32,7 @@ def regrade(
     progress: Progress,
 ) -> None:
     """Grade a class into a folder; an anonymous one says nothing that could name a team."""
-    from pipeline.grading.batch.batch_run import grade_class
+    from pipeline.grading.batch.grade_class import grade_class
     from pipeline.grading.batch.runner import Limits
 
     try:

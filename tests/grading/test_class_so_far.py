@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import ConfigError
-from pipeline.grading.batch.batch_run import grade_class
+from pipeline.grading.batch.grade_class import grade_class
 from pipeline.grading.batch.runner import Limits
 from pipeline.grading.batch.so_far import class_so_far
 from pipeline.grading.gradebook.book import Gradebook
@@ -55,7 +55,7 @@ def school(tmp_path_factory) -> Path:
 def _here(monkeypatch):
     """Grade in this process: what a worker does apart is no matter here."""
     monkeypatch.setattr(
-        "pipeline.grading.batch.batch_run.run_here", lambda *, jobs: in_this_process
+        "pipeline.grading.batch.grade_class.run_here", lambda *, jobs: in_this_process
     )
 
 

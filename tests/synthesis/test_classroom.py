@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from pipeline.grading.batch.batch_run import grade_class
+from pipeline.grading.batch.grade_class import grade_class
 from pipeline.grading.batch.runner import Limits
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.synthesis.classroom import PRESET, write_class

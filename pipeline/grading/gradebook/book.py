@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Self
 from sqlalchemy import Connection, Row, select
 
 from pipeline.errors import ConfigError
-from pipeline.grading.gradebook.changes import kept_by_hand, points_changes, rubric_changes
+from pipeline.grading.gradebook.changes import points_changes, rubric_changes
 from pipeline.grading.gradebook.class_lines import Line, class_frame
 from pipeline.grading.gradebook.history import Event, read_events
 from pipeline.grading.gradebook.override import Override
@@ -152,7 +152,7 @@ class Gradebook:
         ------
         KeyError : an outcome of the batch was never put in.
         """
-        listed, points, by_hand = [], {}, {}
+        listed, points, by_hand = [], {}, set()
         with self._database.writing() as connection:
             carry_overrides(connection, batch.moved, assignment=self._assignment or "")
             for position, key in enumerate(batch.keys):
@@ -160,7 +160,7 @@ class Gradebook:
                 shared = batch.shared.get(row.name)
                 entry = final_entry(connection, row, shared=shared, rubric=rubric)
                 points[row.name] = entry.grade.points
-                by_hand |= {row.name: entry.overrides} if entry.overrides else {}
+                by_hand |= {row.name} if entry.overrides else set()
                 listed.append(
                     {
                         "position": position,
@@ -181,7 +181,6 @@ class Gradebook:
             told = [f"rubric: {change}" for change in rubric_changes(last.rubric, text)]
             before = points_of(connection, last)
             before = {batch.moved.get(name, name): had for name, had in before.items()}
-            told += kept_by_hand(last.rubric, text, by_hand)
             return told + points_changes(before, points, by_hand=by_hand)
 
     # ---------------------------------------------------------------- what counts now

@@ -5,7 +5,6 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from pipeline.grading.gradebook.override import Override
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.words import points_text
 
@@ -30,22 +29,6 @@ def rubric_changes(before: str, now: str) -> list[str]:
         changes.append("the criteria stand in another order")
     old, new = (rubric.model_dump(exclude={"criteria"}) for rubric in rubrics)
     return changes + _differing(old, new)
-
-
-def kept_by_hand(before: str, now: str, given: Mapping[str, Mapping[str, Override]]) -> list[str]:
-    """Return which points given by hand, by submission, stay as they are under other points."""
-    try:
-        rubrics = [Rubric.model_validate_json(text) for text in (before, now)]
-    except ValidationError:
-        return []
-    old, new = ({c.id: c.points for c in rubric.criteria} for rubric in rubrics)
-    return [
-        f"{name}: {id_} was given {points_text(one.points)} of {points_text(old[id_])} points by "
-        f"hand; it has {points_text(new[id_])} now"
-        for name, overrides in given.items()
-        for id_, one in overrides.items()
-        if one.points is not None and id_ in old and id_ in new and old[id_] != new[id_]
-    ]
 
 
 def points_changes(

@@ -6,10 +6,10 @@ from fractions import Fraction
 from pathlib import Path
 
 from pipeline.errors import ConfigError
+from pipeline.grading.csv_table import read_table
 from pipeline.grading.gradings import person
 from pipeline.grading.references.tolerance import exact, late_deduction
 from pipeline.grading.rubric import Rubric
-from pipeline.grading.table import read_table
 from pipeline.schemas.grade import Criterion, Grade
 from pipeline.schemas.grade import Override as ByHand
 

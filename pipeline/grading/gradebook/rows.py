@@ -1,6 +1,7 @@
 """Rows of a gradebook as what they stand for."""
 
 import hashlib
+import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 
@@ -256,22 +257,14 @@ def by_other_rubrics(connection: Connection, batch: Row) -> list[str]:
         .where(batches.c.rubric != batch.rubric)
     )
     rows = connection.execute(joined).all()
-    now = _asked(read_rubric(batch))
-    others = {text for text in {row.rubric for row in rows} if _read(text) != now}
+    now = _asked(batch.rubric)
+    others = {text for text in {row.rubric for row in rows} if _asked(text) != now}
     return sorted(row.name for row in rows if row.rubric in others)
 
 
-def _asked(rubric: Rubric) -> Rubric:
-    """Return what a rubric asks, without how it is shown."""
-    return rubric.model_copy(update={"title": "", "anonymous": False})
-
-
-def _read(text: str) -> Rubric | None:
-    """Return what a kept rubric asks, None where it is of another version of cartlab."""
-    try:
-        return _asked(Rubric.model_validate_json(text))
-    except ValidationError:
-        return None
+def _asked(rubric: str) -> dict:
+    """Return what a kept rubric asks, without how it is shown."""
+    return json.loads(rubric) | {"title": "", "anonymous": False}
 
 
 def last_named(connection: Connection, submission: int) -> tuple[str, ...]:

@@ -9,9 +9,9 @@ from datetime import datetime
 from pathlib import Path
 
 from pipeline.errors import ConfigError
+from pipeline.grading.csv_table import read_table
 from pipeline.grading.intake.hand_ins import HandIn
 from pipeline.grading.rubric import Late
-from pipeline.grading.table import read_table
 from pipeline.submission.complaints import quote
 
 _DAY = 86_400.0  # s

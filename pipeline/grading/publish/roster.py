@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigError
+from pipeline.grading.csv_table import read_table
 from pipeline.grading.intake.lms_names import Platform
 from pipeline.grading.publish.students import Student, one_of
-from pipeline.grading.table import read_table
 from pipeline.output import csv_text
 from pipeline.submission.complaints import quote
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigError
-from pipeline.grading.table import read_table
+from pipeline.grading.csv_table import read_table
 from pipeline.submission.complaints import quote
 
 if TYPE_CHECKING:

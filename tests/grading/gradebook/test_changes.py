@@ -69,14 +69,6 @@ def test_the_gradebook_tells_and_history_keeps_it(tmp_path):
             f"a: 10 → {book.entry('a').grade.points:g} (with points given by hand)",
         ]
         _, events = book.history("a")
-        dearer = [
-            c.model_copy(update={"points": c.points + 2}) if c.id == "laws" else c
-            for c in late.criteria
-        ]
-        told = book.finish(batch, rubric=late.model_copy(update={"criteria": tuple(dearer)}))
-        worth = next(c.points for c in dearer if c.id == "laws")
-        said = f"a: laws was given 1 of {worth - 2:g} points by hand; it has {worth:g} now"
-        assert said in told
     assert events[-1].text == "rubric: anonymous False → True"
 
 

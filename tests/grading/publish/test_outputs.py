@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import ConfigError
+from pipeline.grading.csv_table import read_table
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.class_lines import Line
 from pipeline.grading.gradebook.override import Override, read_points, with_overrides
@@ -22,7 +23,6 @@ from pipeline.grading.publish.class_page import class_page
 from pipeline.grading.publish.export import results_text
 from pipeline.grading.publish.feedback import feedback_page
 from pipeline.grading.publish.outputs import grades_csv, write_outputs
-from pipeline.grading.table import read_table
 from pipeline.grading.words import WORDS
 from pipeline.schemas.grade import CODES, Flag
 from tests.helpers.grades import (
