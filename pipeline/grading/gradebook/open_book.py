@@ -109,53 +109,30 @@ class OpenBook(Gradebook):
         with self._database.reading() as connection:
             last = self._last(connection)
             rubric = read_rubric(last)
-            of_class = select(entries.c.submission_id).where(entries.c.batch_id == last.id)
-            brief = gradings.c.id, gradings.c.submission_id, briefs.c.grade.label("brief")
-            rows = connection.execute(class_list(last, *brief)).all()
-            given: dict[int, dict[int, Override]] = defaultdict(dict)
-            mine = _overrides().where(overrides.c.submission_id.in_(of_class))
-            for row in connection.execute(mine):
-                given[row.submission_id][row.id] = _read_override(row)
-            firsts = select(func.min(gradings.c.id)).where(gradings.c.submission_id.in_(of_class))
-            firsts = firsts.group_by(gradings.c.submission_id)
-            keys = select(gradings.c.submission_id, gradings.c.key)
-            first_key = {
-                row.submission_id: row.key
-                for row in connection.execute(keys.where(gradings.c.id.in_(firsts)))
-            }
-            of_list = select(entries.c.grading_id).where(entries.c.batch_id == last.id)
-            looked = select(looks).where(looks.c.grading_id.in_(of_list)).order_by(looks.c.id)
-            seen = {
-                row.grading_id: row.by if row.seen else "" for row in connection.execute(looked)
-            }
+            given, first_keys = _given(connection, last), _first_keys(connection, last)
             known = before.listings if before and before.rubric == rubric else ()
             made = {listing.made_of: listing for listing in known}
             listings = []
-            for row in rows:
+            columns = gradings.c.id, gradings.c.submission_id, briefs.c.grade.label("brief")
+            for row in connection.execute(class_list(last, *columns)).all():
                 shared, own = read_flag(row.shared), given.get(row.submission_id, {})
                 made_of = (row.id, row.shared, *own)
-                listing = made.get(made_of)
-                if listing is None:
+                if (listing := made.get(made_of)) is None:
                     line = Line.read(row.brief, shared=shared is not None)
                     if own:  # few have points by hand, and those need all of the grade
                         whole = class_list(last).where(entries.c.position == row.position)
-                        grade = connection.execute(whole).one()
-                        line = Line.of(
-                            as_it_counts(grade, own.values(), shared=shared, rubric=rubric).grade
-                        )
+                        found = connection.execute(whole).one()
+                        entry = as_it_counts(found, own.values(), shared=shared, rubric=rubric)
+                        line = Line.of(entry.grade)
                     listing = Listing(
                         line=line,
                         grading=row.id,
                         shared=shared,
-                        first_key=first_key[row.submission_id],
+                        first_key=first_keys[row.submission_id],
                         made_of=made_of,
                     )
                 listings.append(listing)
-        return ClassNow(
-            rubric=rubric,
-            listings=tuple(listings),
-            seen={number: by for number, by in seen.items() if by},
-        )
+            return ClassNow(rubric=rubric, listings=tuple(listings), seen=_seen(connection, last))
 
     def team(self, name: str) -> TeamNow:
         """Return all of a submission.
@@ -295,6 +272,33 @@ class OpenBook(Gradebook):
             for criterion, why in connection.execute(mine):
                 found[criterion].append(why)
         return dict(found)
+
+
+def _given(connection: Connection, batch: Row) -> dict[int, dict[int, Override]]:
+    """Return all that was ever given by hand in a class: by submission, by its own number."""
+    of_class = select(entries.c.submission_id).where(entries.c.batch_id == batch.id)
+    given: dict[int, dict[int, Override]] = defaultdict(dict)
+    mine = _overrides().where(overrides.c.submission_id.in_(of_class))
+    for row in connection.execute(mine):
+        given[row.submission_id][row.id] = _read_override(row)
+    return given
+
+
+def _first_keys(connection: Connection, batch: Row) -> dict[int, str]:
+    """Return, by submission, the key of what was first handed in."""
+    of_class = select(entries.c.submission_id).where(entries.c.batch_id == batch.id)
+    firsts = select(func.min(gradings.c.id)).where(gradings.c.submission_id.in_(of_class))
+    firsts = firsts.group_by(gradings.c.submission_id)
+    keys = select(gradings.c.submission_id, gradings.c.key).where(gradings.c.id.in_(firsts))
+    return {row.submission_id: row.key for row in connection.execute(keys)}
+
+
+def _seen(connection: Connection, batch: Row) -> dict[int, str]:
+    """Return who marked a grading as looked at, the newest mark of each."""
+    of_list = select(entries.c.grading_id).where(entries.c.batch_id == batch.id)
+    mine = select(looks).where(looks.c.grading_id.in_(of_list)).order_by(looks.c.id)
+    marks = {row.grading_id: row for row in connection.execute(mine)}
+    return {number: row.by for number, row in marks.items() if row.seen}
 
 
 def _overrides() -> Select:

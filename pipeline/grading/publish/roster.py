@@ -144,7 +144,8 @@ class Roster:
 
     def _of_all(self) -> "pd.Series":
         """Return which rows are about the assignments, not about a student."""
-        students = self.table["Student" if "Student" in self.table else self.table.columns[0]]
+        # Several columns may have no name, the first of them too.
+        students = self.table["Student"] if "Student" in self.table else self.table.iloc[:, 0]
         return students.str.contains(POINTS_POSSIBLE, regex=False)
 
     def _title(self, title: str) -> str:
