@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.checks import limits
+from pipeline.estimation.noise import MEDIAN_TO_SIGMA
 from pipeline.results import ChainFit, Check, FrequencyResponse, Record
 
 LATE_CHANNEL = "late_channel"  # then the cart
-_MAD_TO_SIGMA = 1.4826
 
 
 def check_channels(
@@ -29,7 +29,7 @@ def check_channels(
         if omega.size < limits.FEWEST_DWELLS:
             continue
         delay = float(np.median(late))
-        spread = _MAD_TO_SIGMA * float(np.median(np.abs(late - delay)))
+        spread = MEDIAN_TO_SIGMA * float(np.median(np.abs(late - delay)))
         limit = max(limits.LATE * float(np.median(samples)), limits.LATE_SURE * spread)
         if abs(delay) > limit:
             word = "later" if delay > 0 else "earlier"

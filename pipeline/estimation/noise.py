@@ -7,7 +7,7 @@ import numpy as np
 from pipeline.arrays import Array
 
 _NEIGHBOURS = (-3, -2, -1, 1, 2, 3)  # a quintic through these follows any motion we sample
-_MEDIAN_TO_SIGMA = 1.4826  # median absolute value to standard deviation, normal noise
+MEDIAN_TO_SIGMA = 1.4826  # median absolute value to standard deviation, normal noise
 
 
 def local_noise(t: Array, y: Array) -> float:
@@ -26,7 +26,7 @@ def local_noise(t: Array, y: Array) -> float:
     predicted = np.einsum("jn,jn->n", weights, _neighbours(y))
     scaled = (y[3:-3] - predicted) / np.sqrt(1 + np.einsum("jn,jn->n", weights, weights))
     moving = scaled[scaled != 0]  # a cart at rest on one count says nothing about the noise
-    return float(_MEDIAN_TO_SIGMA * np.median(np.abs(moving))) if moving.size else 0.0
+    return float(MEDIAN_TO_SIGMA * np.median(np.abs(moving))) if moving.size else 0.0
 
 
 def _neighbours(x: Array) -> Array:
@@ -41,12 +41,26 @@ def difference_noise(y: Array, *, order: int) -> Array:
     nor does a cart that rests on one count show any noise.
     """
     differences = np.diff(y, n=order, axis=-1)
-    return _MEDIAN_TO_SIGMA * np.median(np.abs(differences), axis=-1) / difference_gain(order)
+    return MEDIAN_TO_SIGMA * np.median(np.abs(differences), axis=-1) / difference_gain(order)
 
 
 def difference_gain(order: int) -> float:
     """Return how many times the standard deviation of white noise its differences have."""
     return float(np.sqrt(comb(2 * order, order)))
+
+
+def high_frequency_noise(residual: Array, *, half_width: int = 4) -> float:
+    """Estimate the white part of a residual: what a moving quadratic cannot follow."""
+    width = 2 * half_width + 1
+    if residual.size < 2 * width:
+        return float(residual.std())
+    offsets = np.arange(-half_width, half_width + 1.0)
+    basis = np.vander(offsets, 3)
+    smoother = np.linalg.pinv(basis)[-1]  # the fitted value in the middle
+    rest = residual - np.convolve(residual, smoother[::-1], mode="same")
+    rest = rest[half_width:-half_width]
+    gain = 1.0 - 2.0 * smoother[half_width] + float(smoother @ smoother)
+    return float(np.sqrt(np.mean(rest**2) / gain))
 
 
 def grain(t: Array, y: Array, *, step: float) -> float:

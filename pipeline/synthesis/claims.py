@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pipeline.names import read_name
 from pipeline.plant.linear.chain import Chain
 from pipeline.results import FeedbackDesign
 from pipeline.synthesis.files import Typed, Value
@@ -43,13 +44,13 @@ def initial_estimates(
     """
     typed: dict[str, Value] = {}
     for name, value in chain.parameters().items():
-        symbol, _, suffix = name.partition("_")
+        read = read_name(name)
         error = float(np.clip(rng.standard_normal(), -2, 2))
-        if chain.n > 1 and suffix.isalpha():
+        if read.is_by_eye and chain.n > 1:
             nearest = min((2 * math.pi * f for f in dwells_hz), key=lambda w: abs(w - value))
-            typed[name] = _GUESSED_ZETA if symbol == "zeta" else _significant(nearest)
+            typed[name] = _GUESSED_ZETA if read.is_ratio else _significant(nearest)
         else:
-            spread = _HAND_ERROR_DAMPING if symbol == "zeta" else _HAND_ERROR
+            spread = _HAND_ERROR_DAMPING if read.is_ratio else _HAND_ERROR
             typed[name] = _significant(value * (1 + spread * error))
     return typed
 

@@ -228,20 +228,6 @@ def cut_shots(run: Run, *, length: float) -> Run:
     return replace(run, shots=tuple(int(b) for b in bounds), shot_x=shot_x, shot_v=shot_v)
 
 
-def high_frequency_noise(residual: Array, *, half_width: int = 4) -> float:
-    """Estimate the white part of a residual: what a moving quadratic cannot follow."""
-    width = 2 * half_width + 1
-    if residual.size < 2 * width:
-        return float(residual.std())
-    offsets = np.arange(-half_width, half_width + 1.0)
-    basis = np.vander(offsets, 3)
-    smoother = np.linalg.pinv(basis)[-1]  # the fitted value in the middle
-    rest = residual - np.convolve(residual, smoother[::-1], mode="same")
-    rest = rest[half_width:-half_width]
-    gain = 1.0 - 2.0 * smoother[half_width] + float(smoother @ smoother)
-    return float(np.sqrt(np.mean(rest**2) / gain))
-
-
 def _dominant_frequency(t: Array, y: Array) -> float:
     """Return the frequency (Hz) at which the velocity is strongest."""
     uniform = np.linspace(t[0], t[-1], t.size)

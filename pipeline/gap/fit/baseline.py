@@ -7,7 +7,8 @@ from itertools import pairwise
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.gap.data.runs import Run, cut_shots, high_frequency_noise
+from pipeline.estimation.noise import high_frequency_noise
+from pipeline.gap.data.runs import Run, cut_shots
 from pipeline.gap.fit.levenberg_marquardt import Fit, Mapper, fit_model
 from pipeline.gap.fit.linearise import Nuisance, fresh_nuisance, simulate_run
 from pipeline.gap.fit.restart import restart_runs

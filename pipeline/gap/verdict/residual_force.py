@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.gap.data.runs import high_frequency_noise
+from pipeline.estimation.noise import high_frequency_noise
 from pipeline.gap.types import Gap, Trace
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.effects.base import AugmentedChain

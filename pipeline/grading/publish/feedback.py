@@ -11,6 +11,7 @@ from pipeline import __version__
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.shared import told
 from pipeline.grading.words import WORDS, points_text
+from pipeline.names import read_name
 from pipeline.report.document import (
     Block,
     Details,
@@ -263,7 +264,7 @@ def _label(name: str) -> str | tuple[Span, ...]:
     """Return a quantity, parameters of the carts as mathematics."""
     if not _NAME.fullmatch(name):
         return clean(name).replace("_", " ")
-    return spans(name_span(name), " [rad/s]" if name.startswith("omega") else "")
+    return spans(name_span(name), " [rad/s]" if read_name(name).is_frequency else "")
 
 
 def _value(value: Any) -> str:

@@ -15,6 +15,7 @@ from itertools import pairwise
 import numpy as np
 
 from pipeline.arrays import Array
+from pipeline.estimation.noise import MEDIAN_TO_SIGMA
 from pipeline.results import Record
 
 # The filter passes what is faster than 0.4 of the Nyquist frequency: a bench logged at 113 Hz
@@ -27,7 +28,6 @@ _LEVELS = 5  # a residual is kept as -5 … 5, in steps of two thirds of a stand
 _STEPS_PER_SIGMA = 1.5
 _KINK = 4.5  # standard deviations: more is the motion's own kink (a step, a stop), not noise
 _JUMP = 30.0  # standard deviations: no cart kinks so, but the input where the reference steps
-_MAD_TO_SIGMA = 1.4826
 _NOTHING = 1e-7  # of the travel: rounding in the filter
 
 _LEAST_SWING = 0.25  # of the largest: smaller swings move with the noise
@@ -166,7 +166,7 @@ def _sigma(noise: Array, *, travel: float) -> float:
     A cart at rest reads the same count for seconds: that would only tell how long it rested.
     """
     there = np.abs(noise[np.abs(noise) > _NOTHING * travel])
-    return _MAD_TO_SIGMA * float(np.median(there)) if there.size >= _FEWEST_SAMPLES else 0.0
+    return MEDIAN_TO_SIGMA * float(np.median(there)) if there.size >= _FEWEST_SAMPLES else 0.0
 
 
 @cache
