@@ -34,8 +34,12 @@ def other(tmp_path):
         process.kill()
 
 
-def test_a_second_run_is_refused_and_harms_nothing(other, tmp_path):
-    """It is told the process that writes there, whose scratch stays."""
+def test_a_second_run_is_refused_until_the_first_is_dead(other, tmp_path):
+    """It is told the process that writes there, whose scratch stays as long as it lives.
+
+    The lock of a dead one is gone with it; the next run removes its scratch, and its own at the
+    end.
+    """
     refused = pytest.raises(ConfigError, match=rf"another cartlab \(process {other.pid}\) writes")
     with refused, alone_in(tmp_path):
         pass
@@ -46,13 +50,8 @@ def test_a_second_run_is_refused_and_harms_nothing(other, tmp_path):
     assert f"(process {other.pid})" in done.stderr
     assert done.stderr.count("\n") == 1
     assert (tmp_path / f".scratch-{other.pid}" / "copy").is_file()
-
-
-def test_a_dead_run_is_no_obstacle(other, tmp_path):
-    """Its lock is gone with it; the next run removes its scratch, and its own at the end."""
     other.kill()
     other.wait()
-    assert (tmp_path / f".scratch-{other.pid}").is_dir()
     with alone_in(tmp_path), scratch_in(tmp_path) as scratch:
         assert [path.name for path in tmp_path.glob(".scratch*")] == [scratch.name]
     assert [path.name for path in tmp_path.iterdir()] == [".lock"]

@@ -18,8 +18,7 @@ from pipeline.errors import ConfigError, DataError, SubmissionError
 from pipeline.notebook import Lab, analyse
 from pipeline.resources import EXAMPLES
 from pipeline.results_json import results_dict, results_text
-from pipeline.submission import load_submission
-from pipeline.workflow import analyse as run
+from tests.helpers.examples import analysed
 from tests.helpers.places import ROOT
 from tests.report.test_report import Page
 
@@ -34,7 +33,7 @@ def lab() -> Lab:
 def test_analyse_is_the_packages_own(lab):
     """`from pipeline import analyse` is this function, and gives the very results of a report."""
     assert pipeline.analyse is analyse
-    assert results_text(lab.results) == results_text(run(load_submission(EXAMPLES / "two-cart")))
+    assert results_text(lab.results) == results_text(analysed("two-cart"))
 
 
 def test_nothing_heavy_is_loaded_until_it_is_asked_for():

@@ -6,8 +6,7 @@ import pytest
 
 from pipeline.resources import EXAMPLES
 from pipeline.results_json import results_text
-from pipeline.submission import load_submission
-from pipeline.workflow import analyse
+from tests.helpers.examples import analysed
 
 
 @pytest.fixture(scope="module")
@@ -15,7 +14,7 @@ def results():
     def refuse(token):
         raise AssertionError(f"{token} is not JSON")
 
-    text = results_text(analyse(load_submission(EXAMPLES / "two-cart")))
+    text = results_text(analysed("two-cart"))
     return json.loads(text, parse_constant=refuse)
 
 

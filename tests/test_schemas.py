@@ -11,13 +11,11 @@ import pytest
 from pipeline.errors import ConfigError
 from pipeline.gap.stored import gap_text
 from pipeline.report.solution.expected import solution_text
-from pipeline.resources import EXAMPLES
 from pipeline.results_json import results_text
 from pipeline.schemas.base import DIALECT
 from pipeline.schemas.export import MODELS, schema_text
-from pipeline.submission import load_submission
-from pipeline.workflow import analyse
 from tests.helpers.analysis_factory import make_analysis
+from tests.helpers.examples import analysed
 from tests.helpers.grades import write_class
 from tests.helpers.places import ROOT
 from tests.report.test_gap import make_gap
@@ -45,7 +43,7 @@ def test_the_shipped_schema_is_the_models_own(name):
 
 @pytest.fixture(scope="module", params=["one-cart", "two-cart", "three-cart"])
 def example(request):
-    return analyse(load_submission(EXAMPLES / request.param))
+    return analysed(request.param)
 
 
 def test_real_results_obey_the_schema(example):

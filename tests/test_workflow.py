@@ -12,13 +12,14 @@ from pipeline.resources import EXAMPLES
 from pipeline.results_json import results_text
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse, reference_design
+from tests.helpers.examples import analysed
 
 PRESET_OF = {"one-cart": "throne-1dof", "two-cart": "throne-2dof", "three-cart": "throne-3dof"}
 
 
 @pytest.fixture(scope="module")
 def analyses():
-    return {name: analyse(load_submission(EXAMPLES / name)) for name in PRESET_OF}
+    return {name: analysed(name) for name in PRESET_OF}
 
 
 @pytest.mark.parametrize("name", PRESET_OF)

@@ -85,7 +85,7 @@ def test_carts_on_some_springs_are_found(tmp_path, k):
     """Whichever wall has no spring, every named parameter is the bench's own."""
     m, c = np.array([3e-4, 2.5e-4, 2e-4]), np.array([1.2e-3, 8e-4, 6e-4])
     chain = Chain(m=m[: len(k) - 1], c=c[: len(k) - 1], k=np.array(k))
-    write_submission(tmp_path / "bench", chain=chain, seed=len(k))
+    write_submission(tmp_path / "bench", chain=chain, seed=len(k), compact=True)
     analysis = analyse(load_submission(tmp_path / "bench"))
     assert analysis.fit is not None
     assert analysis.fit.converged

@@ -6,7 +6,7 @@ sign and scale are put to the test, since some benches change both when the loop
 """
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -16,14 +16,8 @@ from pipeline.errors import DataError
 from pipeline.estimation.measured_run import MeasuredRun, measured_run
 from pipeline.plant.linear import step_response
 from pipeline.plant.linear.chain import Chain
-from pipeline.plant.loop.sampled_loop import (
-    Controller,
-    LoopRun,
-    Pid,
-    StateFeedback,
-    replay,
-    simulate_loop,
-)
+from pipeline.plant.loop import sampled_loop
+from pipeline.plant.loop.sampled_loop import Controller, LoopRun, Pid, StateFeedback
 from pipeline.results import HardwareCheck, Record
 from pipeline.stages import limits
 
@@ -71,24 +65,18 @@ def check_hardware(
         raise DataError(
             f"{record.id}: the hardware check needs a loop or an input to simulate: {found}"
         )
+    steered = _steered_cart(controller, controlled_cart)
     checks: list[HardwareCheck] = []
     if closed is not None:
         closed = replace(closed, scale=opened.scale if opened else None)
-        if opened and (note := _not_as_stated(run, closed, opened)):
-            closed = replace(closed, note=note, contradicted=True)
-        elif note := _another_cart(run, controller, controlled_cart):
-            closed = replace(closed, note=note, contradicted=True)
-        checks += _compare(run, closed, loop="closed")
+        wrong = opened and _not_as_stated(run, closed, opened)
+        if wrong := wrong or _another_cart(run, controller, controlled_cart):
+            closed = replace(closed, note=wrong, contradicted=True)
+        checks += _compare(run, closed, loop="closed", steered=steered)
     if opened is not None:
         note = "; ".join(filter(None, (trouble, opened.note)))
-        checks += _compare(run, replace(opened, note=note), loop="open")
-    steered = _steered_cart(controller, controlled_cart)
-    return tuple(
-        replace(check, set_point=record.reference)
-        if check.cart == steered and not check.contradicted
-        else check
-        for check in checks
-    )
+        checks += _compare(run, replace(opened, note=note), loop="open", steered=steered)
+    return tuple(checks)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -213,7 +201,7 @@ def _run_loop(
     best, least = None, _BLOWN_UP
     for law_as_run, sample_time, delay in _ways(run, law, drive=drive):
         with np.errstate(over="ignore", invalid="ignore"):
-            loop = simulate_loop(
+            loop = sampled_loop.simulate_loop(
                 run.chain,
                 law_as_run,
                 t=run.record.t,
@@ -263,7 +251,7 @@ def _logged_per_stated(
         return []
     factors = []
     for y in (run.y, opened.y) if run.seen.all() else (opened.y,):
-        stated = replay(law, t=record.t, y=y, reference=reference, free=run.free)
+        stated = sampled_loop.replay(law, t=record.t, y=y, reference=reference, free=run.free)
         factor = _median_ratio(record.u, stated)
         if _plausible(abs(factor)):
             factor = float(np.sign(factor))
@@ -310,9 +298,8 @@ def _another_cart(
     window = run.step_window(reference)
     if cart is None or window is None or (target := float(reference[window.stop - 1])) == 0.0:
         return ""
-    last = slice(
-        window.stop - max(1, round(_SETTLED_SHARE * (window.stop - window.start))), window.stop
-    )
+    settled = max(1, round(_SETTLED_SHARE * (window.stop - window.start)))
+    last = slice(window.stop - settled, window.stop)
     off = {
         run.free[row]: abs(float((run.y[row, last] - run.rest[row]).mean()) / target - 1)
         for row in np.flatnonzero(run.seen).tolist()
@@ -344,16 +331,20 @@ def _times(law: Controller, factor: float) -> Controller:
 
 
 def _compare(
-    run: MeasuredRun, simulated: _Simulated, *, loop: Literal["closed", "open"]
+    run: MeasuredRun,
+    simulated: _Simulated,
+    *,
+    loop: Literal["closed", "open"],
+    steered: int | None,
 ) -> list[HardwareCheck]:
     """Return a check for each measured cart that moved; the note goes with the first."""
-    record, note = run.record, simulated.note
+    record, note, contradicted = run.record, simulated.note, simulated.contradicted
     steps = record.reference if record.kind == "closed_loop" else record.u
     window = run.step_window(steps) if record.kind in ("closed_loop", "step") else None
     checks = []
     for row in np.flatnonzero(run.seen).tolist():
-        measured, model, rest = run.y[row], simulated.y[row], run.rest[row]
-        motion = float(np.sum((measured - rest) ** 2))
+        cart, measured, model = run.free[row], run.y[row], simulated.y[row]
+        motion = float(np.sum((measured - run.rest[row]) ** 2))
         if motion == 0:
             continue
         step_measured = _judge(run, measured, row=row, window=window, noise=3 * run.noise[row])
@@ -361,7 +352,7 @@ def _compare(
         checks.append(
             HardwareCheck(
                 experiment=record.id,
-                cart=run.free[row],
+                cart=cart,
                 loop=loop,
                 nrmse=float(np.sqrt(np.sum((measured - model) ** 2) / motion)),
                 overshoot_model=step_model.overshoot,
@@ -375,16 +366,16 @@ def _compare(
                 measured=measured,
                 model=model,
                 note=note,
-                contradicted=simulated.contradicted,
+                contradicted=contradicted,
                 effort=simulated.u,
+                set_point=record.reference if cart == steered and not contradicted else None,
             )
         )
         note = ""
     return checks
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Step:
+class _Step(NamedTuple):
     """Overshoot in percent, settling time in s, level as read; None where there is none."""
 
     overshoot: float | None = None

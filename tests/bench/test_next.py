@@ -38,6 +38,7 @@ from pipeline.submission import load_submission
 from pipeline.synthesis.hidden import prepare_bench
 from pipeline.workflow import analyse
 from tests.helpers.commandline import cartlab_here
+from tests.helpers.examples import analysed
 from tests.helpers.virtual import VirtualBench, new_folder
 
 LIMITS = Limits(input=0.5, travel=2.5)
@@ -216,7 +217,7 @@ def test_no_choice_passes_a_limit(analysis):
 
 def test_where_dwells_identify_dwells_are_chosen():
     """The carts are then fitted to dwells alone: another sweep would change nothing."""
-    analysis = analyse(load_submission(EXAMPLES / "two-cart"))
+    analysis = analysed("two-cart")
     found = choose_next(analysis, Plan(limits=LIMITS), n=2, goal="zeta_2", commands=COMMANDS)
     assert {r.kind for r in found.recordings} == {"sine"}
     assert found.errors[2] < found.errors[1] < found.errors[0]

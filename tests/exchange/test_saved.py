@@ -14,16 +14,15 @@ from pipeline.exchange import frames
 from pipeline.exchange.saved import matlab_file, save_tables
 from pipeline.resources import EXAMPLES
 from pipeline.results import Analysis
-from pipeline.submission import load_submission
-from pipeline.workflow import analyse
 from tests.helpers.commandline import cartlab_here
+from tests.helpers.examples import analysed
 
 TABLES = {"parameters", "checks", "decays", "steps", "dwells", "frequency_response"}
 
 
 @pytest.fixture(scope="module")
 def analysis() -> Analysis:
-    return analyse(load_submission(EXAMPLES / "two-cart"))
+    return analysed("two-cart")
 
 
 def matlab(analysis: Analysis) -> dict:

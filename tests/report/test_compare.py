@@ -13,10 +13,9 @@ from pipeline.resources import EXAMPLES
 from pipeline.results import Analysis, Estimate
 from pipeline.results_json import results_text
 from pipeline.schemas.results import Results
-from pipeline.submission import load_submission
-from pipeline.workflow import analyse
 from tests.helpers.analysis_factory import make_analysis
 from tests.helpers.commandline import cartlab_here
+from tests.helpers.examples import analysed
 
 
 def draft_of(analysis: Analysis) -> Results:
@@ -135,7 +134,7 @@ def test_other_benches_are_not_compared():
 
 def test_the_command_tells_the_change_in_one_line_of_stderr(tmp_path):
     """`--compare` with a results.json whose gain was edited says so, in the page and on stderr."""
-    earlier = json.loads(results_text(analyse(load_submission(EXAMPLES / "one-cart"))))
+    earlier = json.loads(results_text(analysed("one-cart")))
     earlier["parameters"][0]["final"] *= 0.9
     path = tmp_path / "earlier.json"
     path.write_text(json.dumps(earlier), encoding="utf-8")

@@ -27,6 +27,7 @@ from pipeline.results import Analysis, Estimate, StepGain
 from pipeline.submission import load_submission, new_submission
 from pipeline.workflow import analyse
 from tests.helpers.analysis_factory import make_analysis
+from tests.helpers.examples import analysed
 from tests.helpers.ucsd import write_two_cart_submission
 
 SECTIONS = (
@@ -292,7 +293,7 @@ def test_a_new_submission_says_how_to_answer_without_answering(tmp_path):
 
 def test_the_three_cart_example_answers_what_it_is_asked():
     """The shipped example's one question is answered in its notes."""
-    analysis = analyse(load_submission(EXAMPLES / "three-cart"))
+    analysis = analysed("three-cart")
     ((section, question),) = questions_of(analysis)
     assert (section, question.id) == ("frequency-response", "zeta_a")
     assert question.answer

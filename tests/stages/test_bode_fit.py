@@ -141,13 +141,13 @@ def test_the_staged_fit_is_reported_as_well():
 @pytest.mark.parametrize("phases", [False, True], ids=["magnitudes", "phases"])
 @pytest.mark.parametrize("preset", PRESETS)
 def test_intervals_cover_the_truth(preset, phases):
-    """Over 40 noisy sets, each parameter's 95 % interval holds the truth as often as it should."""
-    got = quality(PRESETS[preset], seeds=40, phases=phases)
+    """Over 16 noisy sets, each parameter's 95 % interval holds the truth as often as it should."""
+    got = quality(PRESETS[preset], seeds=16, phases=phases)
 
     # A right interval falls below this once in 1e4 tries.
-    assert np.all(got.coverage >= binom.ppf(1e-4, 40, 0.95) / 40)
-    # The mean of 40 chi²/dof with 17 dof and more: its standard error is 0.054 at most; 4 of them.
-    assert_allclose(np.mean(got.chi_square), 1.0, atol=0.22)
+    assert np.all(got.coverage >= binom.ppf(1e-4, 16, 0.95) / 16)
+    # The mean of 16 chi²/dof with 17 dof and more: its standard error is 0.086 at most; 4 of them.
+    assert_allclose(np.mean(got.chi_square), 1.0, atol=0.35)
 
 
 # ------------------------------------------------------------------ hard cases

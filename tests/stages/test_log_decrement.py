@@ -304,9 +304,9 @@ def flags(seeds, *, d):
 
 
 def test_friction_is_told_from_none():
-    """In forty decays each, none is seen where there is none, all where d = 0.01 cm."""
-    assert not flags(40, d=0.0).any()
-    assert flags(40, d=0.01).all()
+    """In twenty decays each, none is seen where there is none, all where d = 0.01 cm."""
+    assert not flags(20, d=0.0).any()
+    assert flags(20, d=0.01).all()
 
 
 # ---------------------------------------------------------------- standard errors

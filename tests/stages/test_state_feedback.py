@@ -226,7 +226,7 @@ def test_poles_and_prefilter_are_those_of_the_gains(name, method):
     force=st.floats(1e-4, 1e4),
     method=st.sampled_from(METHODS),
 )
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=6, deadline=None)
 def test_units_do_not_matter(position, force, method):
     """In other units of position and input the same controller comes out."""
     chain = PRESETS["throne-2dof"]

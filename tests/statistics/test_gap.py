@@ -24,7 +24,7 @@ from tests.truth.cases import make_case, make_rig
         ("extra_mode", 1),
         pytest.param("end_stop", 1, marks=[pytest.mark.slow, pytest.mark.sample]),
         ("force_offset", 2),
-        ("cogging", 2),
+        ("cogging", 1),
     ],
 )
 def test_names_the_hidden_effect(effect, n):
