@@ -33,6 +33,7 @@ from sqlalchemy import (
     event,
     func,
     insert,
+    inspect,
     make_url,
     select,
 )
@@ -290,7 +291,9 @@ class Database:
 def _create(connection: Connection) -> None:
     """Make the tables that are not there; two runs that begin at once make them one by one."""
     _take_turns(connection)
-    metadata.create_all(connection)
+    # Where all is there nothing is made anew: whoever may only read and add could not.
+    if not metadata.tables.keys() <= set(inspect(connection).get_table_names()):
+        metadata.create_all(connection)
 
 
 def _take_turns(connection: Connection) -> None:
