@@ -24,29 +24,14 @@ _UNIT = re.compile(
     r"[\[(]\s*([^\])]+?)\s*[\])]\s*$|(?<=[a-z0-9])_(s|ms|us|m|cm|mm|V|mV|N|counts?|Hz|dB)$"
 )
 
-# Factors to the SI unit of the same quantity.
-_SI: dict[str, tuple[str, float]] = {
-    "s": ("time", 1.0),
-    "sec": ("time", 1.0),
-    "ms": ("time", 1e-3),
-    "us": ("time", 1e-6),
-    "ns": ("time", 1e-9),
-    "min": ("time", 60.0),
-    "m": ("length", 1.0),
-    "cm": ("length", 1e-2),
-    "mm": ("length", 1e-3),
-    "um": ("length", 1e-6),
-    "in": ("length", 0.0254),
-    "inch": ("length", 0.0254),
-    "V": ("voltage", 1.0),
-    "mV": ("voltage", 1e-3),
-    "N": ("force", 1.0),
-    "mN": ("force", 1e-3),
-    "rad": ("angle", 1.0),
-    "deg": ("angle", 0.017453292519943295),
-    "Hz": ("frequency", 1.0),
-    "kHz": ("frequency", 1e3),
-    "rad/s": ("frequency", 0.15915494309189535),
+# Factors to one unit of the same quantity.
+_FACTORS = {
+    "time": {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0},
+    "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254, "inch": 0.0254},
+    "voltage": {"V": 1.0, "mV": 1e-3},
+    "force": {"N": 1.0, "mN": 1e-3},
+    "angle": {"rad": 1.0, "deg": 0.017453292519943295},
+    "frequency": {"Hz": 1.0, "kHz": 1e3, "rad/s": 0.15915494309189535},
 }
 
 
@@ -84,8 +69,8 @@ def conversion(found: str | None, wanted: str) -> float | None:
     """Return the factor from one unit to another; None where they are not of one quantity."""
     if found is None or found == wanted:
         return 1.0
-    a, b = (_SI.get(unit.replace("µ", "u").replace("μ", "u")) for unit in (found, wanted))
-    return a[1] / b[1] if a and b and a[0] == b[0] else None
+    a, b = (unit.replace("µ", "u").replace("μ", "u") for unit in (found, wanted))
+    return next((of[a] / of[b] for of in _FACTORS.values() if a in of and b in of), None)
 
 
 def assign_columns(

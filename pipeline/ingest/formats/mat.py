@@ -19,38 +19,14 @@ _MAX_INFLATED_BYTES = 200_000_000
 _MAX_COLUMNS = 64
 _MATRIX, _COMPRESSED = 14, 15
 _NUMBERS = {
-    1: "i1",
-    2: "u1",
-    3: "i2",
-    4: "u2",
-    5: "i4",
-    6: "u4",
-    7: "f4",
-    9: "f8",
-    12: "i8",
-    13: "u8",
-}
+    1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8",
+}  # fmt: skip
 _CLASSES = {
-    6: "f8",
-    7: "f4",
-    8: "i1",
-    9: "u1",
-    10: "i2",
-    11: "u2",
-    12: "i4",
-    13: "u4",
-    14: "i8",
-    15: "u8",
-}
+    6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8",
+}  # fmt: skip
 _OTHER_CLASSES = {
-    1: "cell",
-    2: "struct",
-    3: "object",
-    4: "text",
-    5: "sparse",
-    16: "function",
-    17: "object",
-}
+    1: "cell", 2: "struct", 3: "object", 4: "text", 5: "sparse", 16: "function", 17: "object",
+}  # fmt: skip
 _V4_TYPES = {0: "f8", 1: "f4", 2: "i4", 3: "i2", 4: "u2", 5: "u1"}
 _BENCH = ({"enc1", "duty", "time"}, {"cart1pos", "duty_cycle", "t_received"})
 

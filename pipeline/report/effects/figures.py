@@ -46,13 +46,13 @@ class _Run:
         """Velocities (n_carts, n) with the effect."""
         return np.gradient(self.with_it, self.t, axis=1)
 
-    def force_left(self, chain: Chain) -> Array:
+    def residual_force(self, chain: Chain) -> Array:
         """Forces (n_carts, n) that masses, dampings and springs leave, with the effect."""
         v = self.rate()
         a = np.gradient(v, self.t, axis=1)
-        left = chain.m[:, None] * a + chain.c[:, None] * v + chain.stiffness @ self.with_it
-        left[0] -= self.u
-        return left
+        force = chain.m[:, None] * a + chain.c[:, None] * v + chain.stiffness @ self.with_it
+        force[0] -= self.u
+        return force
 
 
 def effect_figure(term: Term, chain: Chain) -> Figure:
@@ -177,7 +177,7 @@ def _fingerprint(ax: Axes, term: Term, chain: Chain, run: _Run, *, cart: int) ->
 def _against_motion(ax: Axes, term: Term, chain: Chain, run: _Run, *, cart: int) -> None:
     """Plot the force that the linear chain leaves against what it depends on."""
     motion = run.rate() if term.effect.axis == "velocity" else run.with_it
-    force, seen, word = run.force_left(chain)[cart - 1], motion[cart - 1], f"of cart {cart}"
+    force, seen, word = run.residual_force(chain)[cart - 1], motion[cart - 1], f"of cart {cart}"
     if term.effect.place == "spring":
         walls = np.zeros((1, run.t.size))
         stretch = np.diff(np.concatenate([walls, motion, walls]), axis=0)
@@ -202,7 +202,7 @@ def _against_input(ax: Axes, term: Term, chain: Chain, run: _Run, *, cart: int) 
     u = size * np.sin(2 * np.pi * run.t / _DURATION)
     slow = _run("ramp", term, chain, run.t, u, free=run.free)
     ax.plot([-size, size], [-size, size], color=SECOND, ls="--", lw=1.0)
-    _cloud(ax, u[3:-3], (slow.force_left(chain)[0] + u)[3:-3])
+    _cloud(ax, u[3:-3], (slow.residual_force(chain)[0] + u)[3:-3])
     ax.set_xlabel(f"input [{INPUT}]")
     ax.set_ylabel(f"force that arrives [{INPUT}]")
 
@@ -211,7 +211,7 @@ def _about_an_edge(ax: Axes, term: Term, chain: Chain, run: _Run, *, cart: int) 
     """Plot the force that arrives on cart 1 about an edge of the input."""
     near = (run.t > _STEP[1] + _EDGE[0]) & (run.t < _STEP[1] + _EDGE[1])
     milliseconds = 1e3 * (run.t[near] - _STEP[1])
-    arriving = run.force_left(chain)[0] + run.u
+    arriving = run.residual_force(chain)[0] + run.u
     ax.plot(milliseconds, run.u[near], color=SECOND, ls="--", lw=1.0, drawstyle="steps-post")
     ax.plot(milliseconds, arriving[near], color=MODEL, lw=1.1)
     ax.set_xlabel("time about the step off [ms]")

@@ -1,6 +1,6 @@
 """From free bodies to transfer functions to the state model, for any number of carts.
 
-All equations are text that `derivation_algebra` shows and works out; the tests check each of them
+All equations are text that `algebra` shows and works out; the tests check each of them
 against the impedance matrix with a computer algebra system.
 
 Delta(s) is the monic characteristic polynomial of the whole chain, N(s) of carts 2 to n, R(s) of
@@ -29,7 +29,7 @@ def newton(springs: Sequence[bool]) -> list[Equation]:
     """Return Newton's law of every cart, each force written as it acts on the free body."""
     n = len(springs) - 1
     return [
-        Equation(f"{_of('m', i, n)}*ddx_{i}", "+".join(_forces(i, springs)).replace("+-", "-"))
+        Equation(f"{of_cart('m', i, n)}*ddx_{i}", "+".join(_forces(i, springs)).replace("+-", "-"))
         for i in range(1, n + 1)
     ]
 
@@ -37,7 +37,7 @@ def newton(springs: Sequence[bool]) -> list[Equation]:
 def _forces(i: int, springs: Sequence[bool]) -> list[str]:
     n = len(springs) - 1
     forces = ["u"] if i == 1 else []
-    forces.append(f"-({_of('c', i, n)}*dx_{i})")
+    forces.append(f"-({of_cart('c', i, n)}*dx_{i})")
     if n == 1:
         return [*forces, *(["-k*x_1"] if any(springs) else [])]
     if springs[i - 1]:
@@ -52,20 +52,27 @@ def laplace(springs: Sequence[bool]) -> list[Equation]:
     n = len(springs) - 1
     equations = []
     for i in range(1, n + 1):
-        own = [f"{_of('m', i, n)}*s**2", f"{_of('c', i, n)}*s", *_springs_at(i, springs)]
+        terms = [f"{of_cart('m', i, n)}*s**2", f"{of_cart('c', i, n)}*s", *springs_at(i, springs)]
         others = [f"k_{j}*X_{k}" for j, k in ((i, i - 1), (i + 1, i + 1)) if 1 <= k <= n]
         others += ["U"] if i == 1 else []
-        equations.append(Equation(f"({'+'.join(own)})*X_{i}", "+".join(others)))
+        equations.append(Equation(f"({'+'.join(terms)})*X_{i}", "+".join(others)))
     return equations
 
 
-def _springs_at(i: int, springs: Sequence[bool]) -> list[str]:
+def neighbours(i: int, springs: Sequence[bool]) -> list[tuple[int, str]]:
+    """Return the carts that a spring ties to cart i, each with the name of the spring."""
+    inside = ((j, max(i, j)) for j in (i - 1, i + 1) if 1 <= j < len(springs))
+    return [(j, f"k_{spring}") for j, spring in inside if springs[spring - 1]]
+
+
+def springs_at(i: int, springs: Sequence[bool]) -> list[str]:
+    """Return the names of the springs that end at a cart."""
     if len(springs) == 2:
         return ["k"] if any(springs) else []
     return [f"k_{j}" for j in (i, i + 1) if springs[j - 1]]
 
 
-def _of(letter: str, i: int, n: int) -> str:
+def of_cart(letter: str, i: int, n: int) -> str:
     """Return m_i; a lone cart needs no index."""
     return letter if n == 1 else f"{letter}_{i}"
 
@@ -78,7 +85,7 @@ def single_carts(springs: Sequence[bool]) -> list[Equation]:
     n = len(springs) - 1
     equations = []
     for i in range(1, n + 1):
-        held = "+".join(_springs_at(i, springs))
+        held = "+".join(springs_at(i, springs))
         equations += [
             Equation(f"w_{i}", f"({held})/m_{i}"),
             Equation(f"2*zeta_{i}*omega_{i}", f"c_{i}/m_{i}"),

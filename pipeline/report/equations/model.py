@@ -10,6 +10,8 @@ import numpy as np
 from pipeline.arrays import Array, ComplexArray
 from pipeline.plant.linear.chain import Chain, quadratic_factors
 from pipeline.report.document import Formula
+from pipeline.report.equations.algebra import shown
+from pipeline.report.equations.derivation import neighbours, of_cart, springs_at
 from pipeline.report.math.tree import (
     Math,
     Term,
@@ -17,7 +19,6 @@ from pipeline.report.math.tree import (
     fraction,
     lines,
     matrix,
-    negative,
     number,
     parens,
     power,
@@ -38,27 +39,7 @@ def formula(math: Math, *, copy: str = "") -> Formula:
     return Formula(math=math, alt=to_text(math), copy=copy)
 
 
-# ------------------------------------------------------------------- symbols
-
-
-def _indexed(letter: str, i: int, *, n: int) -> Term:
-    """Return m_i; a lone cart needs no index."""
-    return letter if n == 1 else sub(letter, str(i))
-
-
-def _springs_at(cart: int, springs: Sequence[bool]) -> list[Term]:
-    """Return the symbols of the springs that end at a cart."""
-    n = len(springs) - 1
-    if n == 1:
-        return ["k"] if any(springs) else []
-    return [sub("k", str(j)) for j in (cart, cart + 1) if springs[j - 1]]
-
-
-def _between(cart: int, neighbour: int, springs: Sequence[bool]) -> Term | None:
-    """Return the symbol of the spring between two neighbours, None where there is none."""
-    j = max(cart, neighbour)
-    inside = 1 <= neighbour < len(springs)
-    return sub("k", str(j)) if inside and springs[j - 1] else None
+# --------------------------------------------------- motion and state space, in names
 
 
 def equations_of_motion(
@@ -71,47 +52,34 @@ def equations_of_motion(
     n = len(springs) - 1
     equations = []
     for i in range(1, n + 1):
-        x = _position(i)
-        left: list[Term] = [
-            row(_indexed("m", i, n=n), _position(i, derivative=2)),
-            row(_indexed("c", i, n=n), _position(i, derivative=1)),
-        ]
-        held = _springs_at(i, springs)
-        if held:
-            left.append(row(held[0] if len(held) == 1 else parens(total(held)), x))
-        equation: list[Term] = [total(left)]
-        for neighbour in (i - 1, i + 1):
-            if k := _between(i, neighbour, springs):
-                equation += ["−", k, _position(neighbour)]
+        text = f"{of_cart('m', i, n)}*ddx_{i}+{of_cart('c', i, n)}*dx_{i}"
+        if held := springs_at(i, springs):
+            text += f"+({'+'.join(held)})*x_{i}"
+        text += "".join(f"-{k}*x_{j}" for j, k in neighbours(i, springs))
         force = forces[i - 1] if forces else "u" if i == 1 else "0"
-        equations.append(row(*equation, "=", force))
+        equations.append(row(shown(text), "=", force))
     return formula(lines(equations))
-
-
-# ------------------------------------------------------------------ state space
 
 
 def symbolic_state_space(springs: Sequence[bool]) -> Formula:
     """Return q' = A q + B u with the entries of A and B as fractions of m, c and k."""
     n = len(springs) - 1
-    size = range(2 * n)
-    A: list[list[Term]] = [["0"] * (2 * n) for _ in size]
-    B: list[list[Term]] = [["0"] for _ in size]
+    A = [["0"] * (2 * n) for _ in range(2 * n)]
+    B = [["0"] for _ in range(2 * n)]
     for i in range(1, n + 1):
-        place, speed = 2 * i - 2, 2 * i - 1
-        m = _indexed("m", i, n=n)
+        place, speed, m = 2 * i - 2, 2 * i - 1, of_cart("m", i, n)
         A[place][speed] = "1"
-        if held := _springs_at(i, springs):
-            A[speed][place] = negative(fraction(total(held), m))
-        A[speed][speed] = negative(fraction(_indexed("c", i, n=n), m))
-        for neighbour in (i - 1, i + 1):
-            if k := _between(i, neighbour, springs):
-                A[speed][2 * neighbour - 2] = fraction(k, m)
-    B[1][0] = fraction("1", _indexed("m", 1, n=n))
+        if held := springs_at(i, springs):
+            A[speed][place] = f"-(({'+'.join(held)})/{m})"
+        A[speed][speed] = f"-({of_cart('c', i, n)}/{m})"
+        for j, k in neighbours(i, springs):
+            A[speed][2 * j - 2] = f"{k}/{m}"
+    B[1][0] = f"1/{of_cart('m', 1, n)}"
     numbers = range(1, n + 1)
     q = [[_position(i, derivative=order)] for i in numbers for order in (0, 1)]
     q_dot = [[_position(i, derivative=order)] for i in numbers for order in (1, 2)]
-    return formula(row(matrix(q_dot), "=", matrix(A), matrix(q), "+", matrix(B), "u"))
+    A_shown, B_shown = (matrix([[shown(entry) for entry in r] for r in rows]) for rows in (A, B))
+    return formula(row(matrix(q_dot), "=", A_shown, matrix(q), "+", B_shown, "u"))
 
 
 def _position(i: int, *, derivative: int = 0) -> Math:
@@ -169,7 +137,7 @@ def symbolic_transfer_functions(springs: Sequence[bool]) -> Formula | None:
     nulls = {1: [[]], 2: [["2"], []], 3: [["x", "y"], ["3"], []]}[n]
     above = [[_symbolic_factor(null) for null in of_cart] for of_cart in nulls]
     below = [_symbolic_factor(mode) for mode in (["n"] if n == 1 else "abc"[:n])]
-    gains = [_indexed("K", i, n=n) for i in range(1, n + 1)]
+    gains = [shown(of_cart("K", i, n)) for i in range(1, n + 1)]
     return _over_common_denominator(gains, above, below)
 
 

@@ -32,7 +32,7 @@ class WorkedDesign:
     ----------
     phi (2n, 2n), gamma (2n,) : the plant over one sample.
     z : (2n,) poles that the loop has, in the z plane.
-    own, wanted : (2n + 1,) the polynomials of phi and of z, in falling powers.
+    open_loop, closed_loop : (2n + 1,) the polynomials of phi and of z, in falling powers.
     P : (2n, 2n) cost to go of the linear quadratic regulator, or None.
     gains : (2n,) by the formula shown; prefilter from them.
     """
@@ -40,8 +40,8 @@ class WorkedDesign:
     phi: Array
     gamma: Array
     z: ComplexArray
-    own: Array
-    wanted: Array
+    open_loop: Array
+    closed_loop: Array
     P: Array | None
     gains: Array
     prefilter: float
@@ -65,8 +65,8 @@ def work_design(chain: Chain, design: FeedbackDesign) -> WorkedDesign:
         phi=phi,
         gamma=gamma,
         z=z,
-        own=_polynomial_of(np.linalg.eigvals(phi)),
-        wanted=wanted,
+        open_loop=_polynomial_of(np.linalg.eigvals(phi)),
+        closed_loop=wanted,
         P=P,
         gains=gains,
         prefilter=float(1 / level),
@@ -201,8 +201,8 @@ def _placement(design: FeedbackDesign, worked: WorkedDesign) -> list[Block]:
             f"{words}Every pole s becomes z = exp(sT), and the poles multiply out to the wanted "
             "polynomial; the plant's own is that of Φ:"
         ),
-        formula(_polynomial("p", worked.wanted)),
-        formula(_polynomial("a", worked.own)),
+        formula(_polynomial("p", worked.closed_loop)),
+        formula(_polynomial("a", worked.open_loop)),
         paragraph(
             _WORDS.text("ackermann")
         ),
