@@ -5,7 +5,7 @@ from pathlib import Path, PurePosixPath
 from starlette.exceptions import HTTPException
 from starlette.responses import FileResponse, Response
 
-from pipeline.report.render.scripts import every_hash
+from pipeline.report.render.html import every_hash
 from pipeline.resources import TEMPLATES
 from pipeline.submission.load import outside
 

@@ -4,6 +4,7 @@ A table is added for every recording in `data/` that has none, and completed whe
 file tells. What stands there is nobody's to change; what is not sure is said as a comment.
 """
 
+import filecmp
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -237,15 +238,10 @@ class _Filling:
 
     def _same(self, file: str) -> str | None:
         """Return another file of the submission that holds the very same."""
-        path = self._folder / file
-        for table in self._tables:
-            other = self._folder / posix(str(table["file"]))
-            if (
-                other.is_file()
-                and other.stat().st_size == path.stat().st_size
-                and other.read_bytes() == path.read_bytes()
-            ):
-                return posix(str(table["file"]))
+        for name in (posix(str(table["file"])) for table in self._tables):
+            other = self._folder / name
+            if other.is_file() and filecmp.cmp(other, self._folder / file, shallow=False):
+                return name
         return None
 
     def _say_unknown(self, found: Found) -> None:

@@ -1,5 +1,6 @@
 """Take files recorded by other programs into a submission as they appear in a folder."""
 
+import filecmp
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -204,14 +205,8 @@ class Importer:
 
     def _is_known(self, path: Path) -> bool:
         """Tell whether a copy of the file lies in the submission."""
-        size = path.stat().st_size
         copies = [self._folder / experiment.file for experiment in self._submission.experiments]
-        return any(
-            copy.is_file()
-            and copy.stat().st_size == size
-            and copy.read_bytes() == path.read_bytes()
-            for copy in copies
-        )
+        return any(copy.is_file() and filecmp.cmp(copy, path, shallow=False) for copy in copies)
 
     def _match(self, inspection: Inspection) -> Recording | None:
         """Return the next recording of the plan if the file looks like it."""

@@ -290,6 +290,7 @@ class Session:
             guard = "" if self._line.knows("k") else "; the motor may be on: switch it off"
             self._observer.remark(f"the stop could not be sent: {error}{guard}")
 
+    @_no_collection()
     def _listen(
         self,
         stream: Stream,
@@ -299,17 +300,7 @@ class Session:
         arrived: Callable[[bytes], None] = lambda data: None,
     ) -> str:
         """Read lines until the run is over; return why it ended early, or ""."""
-        with _no_collection():
-            return self._look(stream, end=1e3 * seconds, arrived=arrived, check=check)
-
-    def _look(
-        self,
-        stream: Stream,
-        *,
-        end: float,
-        arrived: Callable[[bytes], None],
-        check: Callable[[Sequence[Reading]], str],
-    ) -> str:
+        end = 1e3 * seconds
         since = last = time.monotonic()
         first: int | None = None  # ms of the first line
         unread: float | None = None  # since when what comes is no line

@@ -64,7 +64,7 @@ class Terminal:
         ConfigError : nobody is there.
         """
         if self._yes:
-            self._say(f"{instruction}: taken as done")
+            self.remark(f"{instruction}: taken as done")
             return
         if not sys.stdin.isatty():
             raise ConfigError(f"{instruction}: nobody is at the keyboard (--yes: it is done)")
@@ -99,13 +99,10 @@ class Terminal:
             self._view.done.add(name)
         if outcome.partial or outcome.remarks or self._console.is_terminal:
             end = outcome.partial or f"{outcome.lines} lines"
-            self._say("; ".join([f"{name}: {end}", *outcome.remarks]))
+            self.remark("; ".join([f"{name}: {end}", *outcome.remarks]))
 
     def remark(self, sentence: str) -> None:
         """Print a sentence."""
-        self._say(sentence)
-
-    def _say(self, sentence: str) -> None:
         self._console.print(Text(sentence), soft_wrap=True)
 
 

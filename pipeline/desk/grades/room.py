@@ -20,8 +20,7 @@ from pipeline.grading.words import points_text
 from pipeline.report.figures.grading import distribution_figure
 from pipeline.report.figures.style import drawing
 from pipeline.report.figures.svg import plain_svg, to_svg
-from pipeline.report.render.html import render_drawing
-from pipeline.report.render.scripts import every_hash
+from pipeline.report.render.html import every_hash, render_drawing
 
 _ROWS = 50  # of a page
 _MOST_NEWS = 8

@@ -1,11 +1,16 @@
-"""A document as one self-contained HTML file: nothing loaded from anywhere, one script of ours."""
+"""A document as one self-contained HTML file: nothing loaded from anywhere, one script of ours.
+
+The page's policy knows the script by its hash.
+"""
 
 import base64
+import hashlib
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import cache
+from itertools import combinations
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
@@ -14,7 +19,6 @@ from pipeline.report.document import Block, Document, Picture, Table, Tiles, fla
 from pipeline.report.figures.style import MEASURED, MODEL, QUIET, SECOND, SHADE, THIRD
 from pipeline.report.figures.ticks import GRID
 from pipeline.report.math.tree import Term, to_mathml
-from pipeline.report.render.scripts import ALWAYS, EXPLORE, FINDER, script, script_hash
 from pipeline.resources import TEMPLATES
 
 # The style sheet says what each colour is in light and in dark.
@@ -22,6 +26,8 @@ _ROLES = {
     MEASURED: "ink", MODEL: "model", SECOND: "second", THIRD: "third", QUIET: "quiet",
     SHADE: "shade", GRID: "grid", "#444444": "axis", "#555555": "mark",
 }  # fmt: skip
+ALWAYS, EXPLORE, FINDER = "page.js", "explore.js", "finder.js"
+_SOMETIMES = (EXPLORE, FINDER)
 _TITLE = re.compile(r"<title>.*?</title>", re.DOTALL)
 _NARROW = " .,()"  # half a digit wide
 _WIDE = "±×%"  # wider than a digit
@@ -66,6 +72,24 @@ def render_drawing(svg: str) -> str:
     css = (TEMPLATES / "report.css").read_text(encoding="utf-8")
     colours = css[: css.index("* {")] + "text { fill: var(--f-ink); }"
     return _coloured(svg).replace("</title>", f"</title><style>{colours}</style>", 1)
+
+
+@cache
+def script(*names: str) -> str:
+    """Return scripts as the one that stands in a page."""
+    return "".join((TEMPLATES / name).read_text(encoding="utf-8") for name in names)
+
+
+def script_hash(text: str) -> str:
+    """Return the hash by which a page's policy knows its one script."""
+    return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"
+
+
+def every_hash() -> Iterable[str]:
+    """Return the hashes of all that may be a page's script."""
+    for n in range(len(_SOMETIMES) + 1):
+        for names in combinations(_SOMETIMES, n):
+            yield script_hash(script(ALWAYS, *names))
 
 
 def _scripts(document: Document) -> list[str]:
