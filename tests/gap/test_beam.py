@@ -5,7 +5,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from pipeline.gap.data.runs import make_run
-from pipeline.gap.data.split import split
+from pipeline.gap.data.sides import split
 from pipeline.gap.fit.baseline import fit_baseline
 from pipeline.gap.search.beam import by_promise, prune
 from pipeline.gap.search.grow import fit_whole

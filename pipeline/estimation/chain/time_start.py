@@ -1,7 +1,6 @@
 """A chain to start the time-domain fit from, found by linear regression alone.
 
-Each cart's equation of motion is multiplied by a smooth bump φ and integrated by parts until no
-derivative of a measured signal is left (modulating functions: M. Shinbrot, Trans. ASME 79, 1957):
+Each cart's equation of motion is multiplied by a bump φ and integrated by parts (`modulating`):
 
     m_i ∫ x_i φ'' - c_i ∫ x_i φ' + k_i ∫ (x_i - x_{i-1}) φ + k_{i+1} ∫ (x_i - x_{i+1}) φ = ∫ u φ
 
@@ -17,6 +16,7 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.estimation.chain.parametrisation import even_chain, physical_start
 from pipeline.estimation.chain.time_window import Window
+from pipeline.estimation.modulating import bump, bump_integral
 from pipeline.plant.linear.chain import Chain
 
 WIDTHS = (0.15, 0.3, 0.6, 1.2)  # s; a bump should span about one period of the carts
@@ -105,8 +105,7 @@ def _moments(window: Window, *, n: int, width: float) -> tuple[Array, Array] | N
     starts = np.linspace(0.0, duration - width, count)
     around = _around(t, starts, width)
     tau = np.clip((t[around] - starts[:, None]) / width, 0.0, 1.0)
-    b, db = tau * (1 - tau), 1 - 2 * tau
-    bumps = np.stack([b**4, 4 * b**3 * db / width, (12 * b**2 * db**2 - 8 * b**3) / width**2])
+    bumps = np.stack(bump(tau, span=width))
     bumps *= np.gradient(t)[around]  # trapezoid rule: a bump ends smoothly, so it is accurate
     x = np.zeros((3, n + 2, count))
     for cart, y in zip(window.carts, window.y, strict=True):
@@ -116,7 +115,7 @@ def _moments(window: Window, *, n: int, width: float) -> tuple[Array, Array] | N
         around = _around(window.drive_t, starts, width)
         tau = np.clip((window.drive_t[around] - starts[:, None]) / width, 0.0, 1.0)
         # ∫ φ: the input is held between samples, so its moment is exact.
-        area = width * tau**5 * np.polyval([1 / 9, -1 / 2, 6 / 7, -2 / 3, 1 / 5], tau)
+        area = width * bump_integral(tau)
         force = np.sum(window.drive_u[around][:, :-1] * np.diff(area, axis=1), axis=1)
     return x, force
 

@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from pipeline.arrays import Array
+from pipeline.estimation.modulating import bump
 from pipeline.estimation.noise import high_frequency_noise
 from pipeline.gap.data.runs import Run, cut_shots
 from pipeline.gap.fit.levenberg_marquardt import Fit, Mapper, fit_model
@@ -24,11 +25,6 @@ _MOVING = 0.9  # mean weight of the readings of a piece in which a cart moves
 
 def first_chain(runs: Sequence[Run], *, springs: Sequence[bool]) -> Chain:
     """Estimate masses, dampings and springs by modulating functions.
-
-    The equations of motion are multiplied by (s (1 - s))⁴ over windows and integrated by parts,
-    which moves all derivatives from the data to the window; what is left is linear.
-
-    Reference: M. Shinbrot, Trans. ASME 79 (1957), 579-588.
 
     Without any input the first mass is one.
     """
@@ -55,9 +51,7 @@ def first_chain(runs: Sequence[Run], *, springs: Sequence[bool]) -> Chain:
             t = run.t[piece]
             span = t[-1] - t[0]
             s = (t - t[0]) / span
-            w = (s * (1 - s)) ** 4
-            w1 = 4 * (s * (1 - s)) ** 3 * (1 - 2 * s) / span
-            w2 = (12 * (s * (1 - s)) ** 2 * (1 - 2 * s) ** 2 - 8 * (s * (1 - s)) ** 3) / span**2
+            w, w1, w2 = bump(s, span=span)
             local = x[:, piece]
             stretch = np.vstack([local, np.zeros(width)]) - np.vstack([np.zeros(width), local])
             for i in run.rows:

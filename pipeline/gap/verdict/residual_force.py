@@ -1,11 +1,7 @@
 """The force on each cart that masses, dampings and springs do not account for.
 
-Measured positions give no acceleration worth having. The equation of motion is averaged over a
-short window instead, with a weight that vanishes at the window's ends, and integrated by parts:
-the derivatives move from the data to the weight. What comes out is the exact mean of the force
-over the window, with the mean velocity, position and input beside it.
-
-Reference: M. Shinbrot, Trans. ASME 79 (1957), 579-588.
+Measured positions give no acceleration worth having. What modulating functions give is the exact
+mean of the force over a short window, with the mean velocity, position and input beside it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.arrays import Array
+from pipeline.estimation.modulating import bump, bump_integral
 from pipeline.estimation.noise import high_frequency_noise
 from pipeline.gap.types import Gap, Trace
 from pipeline.plant.linear.chain import Chain
@@ -153,12 +150,8 @@ def _average(
     local = t[windows]
     span = local[:, -1:] - local[:, :1]
     s = (local - local[:, :1]) / span
-    hump = s * (1 - s)
-    slope = 1 - 2 * s
     # The weight, its first and second derivative by time, and the share of time of each sample.
-    w = hump**4
-    w1 = 4 * hump**3 * slope / span
-    w2 = (12 * hump**2 * slope**2 - 8 * hump**3) / span**2
+    w, w1, w2 = bump(s, span=span)
     dt = np.gradient(local, axis=1)
     size = (w * dt).sum(1, keepdims=True)
     w, w1, w2 = (weight * dt / size for weight in (w, w1, w2))
@@ -170,7 +163,7 @@ def _average(
     w1 = w1 - w * w1.sum(1, keepdims=True)
     w1 = -w1 / (w1 * tau).sum(1, keepdims=True)
     # An input is held over the interval that follows its sample: the weight's exact share of it.
-    held = np.diff(_rise(s), axis=1)
+    held = np.diff(bump_integral(s), axis=1) / bump_integral(np.ones(1))
     pushes = np.array([(held * u[windows[:, :-1]]).sum(1) for u in inputs])
     i = cart - 1
     m, c = chain.m[i], chain.c[i]
@@ -191,9 +184,3 @@ def _average(
         velocity=np.array([-(w1 * x[windows]).sum(1) for x in measured]),
         noise=noise * float(np.sqrt(np.median((force_weight**2).sum(1)))),
     )
-
-
-def _rise(s: Array) -> Array:
-    """Return the integral of the weight from 0 to s, over that from 0 to 1."""
-    powers = s**5 / 5 - 4 * s**6 / 6 + 6 * s**7 / 7 - 4 * s**8 / 8 + s**9 / 9
-    return 630.0 * powers

@@ -210,27 +210,13 @@ class SteppedBench:
     # ------------------------------------------------------------------ inside
 
     def _advance(self, force: float, *, braking: float, h: float) -> None:
-        advance(
-            self._cart,
-            self._spring,
-            self._drive,
-            self._n,
-            self._N,
-            self._motor,
-            self._state,
-            self._K,
-            self._C,
-            np.ones(self._n),
-            force,
-            braking,
-            h,
-            bool(np.any(self._cart[:, DRY])),
-            False,  # smooth forces are looked for: a few more additions
-            self._switches,
-            self._active,
-            self._contact_step,
-            *self._no_sensitivities,
-        )
+        tables = self._cart, self._spring, self._drive
+        bodies = self._n, self._N, self._motor, self._state, self._K, self._C
+        dry = bool(np.any(self._cart[:, DRY]))
+        smooth = False  # smooth forces are looked for: a few more additions
+        switches = self._switches, self._active, self._contact_step
+        step = np.ones(self._n), force, braking, h, dry, smooth
+        advance(*tables, *bodies, *step, *switches, *self._no_sensitivities)
 
     def _shaped(self, command: float) -> float:
         """Return the input behind the dead zone and the saturation."""
