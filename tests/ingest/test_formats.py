@@ -175,10 +175,10 @@ def test_the_bench_log_is_told_from_an_ecp_export():
     assert got.whole == (True, False, True, True, True)
 
 
-def mat(version: str = "5", compress: bool = False, **variables: object) -> bytes:
+def mat(compress: bool = False, **variables: object) -> bytes:
     """Write a .mat file as MATLAB would."""
     stream = BytesIO()
-    scipy.io.savemat(stream, variables, format=version, do_compression=compress)
+    scipy.io.savemat(stream, variables, do_compression=compress)
     return stream.getvalue()
 
 
@@ -195,15 +195,6 @@ def test_mat_vectors_of_every_number_type_are_read(dtype, compress):
     assert got.form == "bench_mat"
     for name in ("time", "enc1", "duty"):
         assert_array_equal(column(got, name), oracle[name])
-
-
-@pytest.mark.parametrize("dtype", ["u1", "i2", "u2", "i4", "f4", "f8"])
-def test_mat_version_4_is_read(dtype):
-    """Old files too."""
-    values = np.arange(0, 100, 2).astype(dtype)
-    got = table(mat(version="4", t=TIME, x1=values))
-    assert_array_equal(column(got, "x1"), values)
-    assert_array_equal(column(got, "t"), TIME)
 
 
 def test_a_big_endian_mat_file_is_read():
