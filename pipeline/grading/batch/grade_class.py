@@ -20,7 +20,7 @@ from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.class_lines import wrong_springs
 from pipeline.grading.gradings import Batch
 from pipeline.grading.intake.hand_ins import find_hand_ins
-from pipeline.grading.intake.late_table import LateTable, settle_lateness
+from pipeline.grading.intake.late_table import read_late_table, settle_lateness
 from pipeline.grading.publish.outputs import write_outputs
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.rubric_file import load_rubric
@@ -81,7 +81,7 @@ def grade_class(
         folder holds another class, or another run is writing there.
     """
     rubric = load_rubric(rubric_file)
-    late_table = LateTable.read(lateness) if lateness else None
+    late_table = read_late_table(lateness) if lateness else {}
     _refuse_submission(check_folder(out))
     if gradebook is None:
         _refuse_another_class(out, assignment=rubric_file.stem)

@@ -4,7 +4,7 @@ The table has the columns `submission` and `days_late`: extensions, too, are a l
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
@@ -19,37 +19,29 @@ _HEADS = ["submission", "days_late"]
 _LONGEST = 3_650.0  # days: more is a slip of the keyboard
 
 
-@dataclass(frozen=True, kw_only=True)
-class LateTable:
-    """Days late by submission, in small letters."""
+def read_late_table(path: Path) -> dict[str, float]:
+    """Return days late by submission, in small letters.
 
-    file: str
-    days: Mapping[str, float]
-
-    @classmethod
-    def read(cls, path: Path) -> "LateTable":
-        """Read a table.
-
-        Raises
-        ------
-        ConfigError : it lacks a column, or a line in it cannot be understood.
-        """
-        table = read_table(path)
-        if not {*_HEADS} <= {*table.columns}:
-            raise ConfigError(f"{path.name}: expected columns {' and '.join(_HEADS)}")
-        days: dict[str, float] = {}
-        for line, *cells in table.loc[:, _HEADS].itertuples():
-            who, said = (str(cell).strip() for cell in cells[:2])
-            late = _number(said)
-            if late is None or not 0 <= late <= _LONGEST:
-                raise ConfigError(f"{path.name} line {line}: days_late: cannot read {quote(said)}")
-            if who:
-                days[who.casefold()] = late
-        return cls(file=path.name, days=days)
+    Raises
+    ------
+    ConfigError : the table lacks a column, or a line in it cannot be understood.
+    """
+    table = read_table(path)
+    if not {*_HEADS} <= {*table.columns}:
+        raise ConfigError(f"{path.name}: expected columns {' and '.join(_HEADS)}")
+    days: dict[str, float] = {}
+    for line, *cells in table.loc[:, _HEADS].itertuples():
+        who, said = (str(cell).strip() for cell in cells[:2])
+        late = _number(said)
+        if late is None or not 0 <= late <= _LONGEST:
+            raise ConfigError(f"{path.name} line {line}: days_late: cannot read {quote(said)}")
+        if who:
+            days[who.casefold()] = late
+    return days
 
 
 def settle_lateness(
-    hand_ins: Iterable[HandIn], *, late: Late, table: LateTable | None
+    hand_ins: Iterable[HandIn], *, late: Late, table: Mapping[str, float]
 ) -> tuple[list[HandIn], list[str]]:
     """Return the hand-ins with their lateness, and what a person should know about it.
 
@@ -57,17 +49,15 @@ def settle_lateness(
     """
     settled, known = [], set()
     for hand_in in hand_ins:
-        days = table.days.get(hand_in.id.casefold()) if table else None
+        days = table.get(hand_in.id.casefold())
         known.add(hand_in.id.casefold())
         if days is None and late.due is not None and hand_in.handed_in:
             waited = datetime.fromisoformat(hand_in.handed_in) - late.due
             days = max(0.0, waited.total_seconds() / _DAY)
         settled.append(hand_in if days is None else replace(hand_in, days_late=days))
-    missing = [name for name in table.days if name not in known] if table else []
-    remarks = (
-        [f"{table.file}: no such submission: {', '.join(missing)}"] if table and missing else []
-    )
-    return settled, remarks
+    missing = [name for name in table if name not in known]
+    said = f"in the table of lateness, and no such submission: {', '.join(missing)}"
+    return settled, [said] if missing else []
 
 
 def _number(text: str) -> float | None:

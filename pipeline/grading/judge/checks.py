@@ -1,8 +1,9 @@
 """The checks of a rubric: each gives a share of the points, and says why."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from decimal import Decimal
 from fractions import Fraction
+from typing import Any
 
 from pipeline.grading import rubric as asked
 from pipeline.grading.judge.checks_loop import (
@@ -24,33 +25,13 @@ _NAMED = 4  # so many are named in a message
 
 def judge(criterion: asked.Criterion, work: Work) -> Verdict:
     """Judge one criterion on its own; what it requires is seen to elsewhere."""
-    match criterion:
-        case asked.RequiredPieces():
-            return _required(work)
-        case asked.DataQuality():
-            return _data(work)
-        case asked.Parameters():
-            return _parameters(criterion, work)
-        case asked.InitialFinal():
-            return _initial_final(criterion, work)
-        case asked.Laws():
-            return _laws(criterion, work)
-        case asked.StateModel():
-            return _state_space(criterion, work)
-        case asked.Gains():
-            return judge_gains(criterion, work)
-        case asked.Claims():
-            return judge_claims(criterion, work)
-        case asked.Prefilter():
-            return judge_prefilter(criterion, work)
-        case asked.Hardware():
-            return judge_hardware(criterion, work)
+    return _JUDGES[criterion.check](criterion, work)
 
 
 # ------------------------------------------------------------------- pieces and data
 
 
-def _required(work: Work) -> Verdict:
+def _required(_: asked.RequiredPieces, work: Work) -> Verdict:
     pieces, missing = asked_pieces(work.rubric), work.missing
     if not pieces:
         return Verdict(share=ALL, message="Nothing in particular was asked for.")
@@ -66,7 +47,7 @@ def _required(work: Work) -> Verdict:
     )
 
 
-def _data(work: Work) -> Verdict:
+def _data(_: asked.DataQuality, work: Work) -> Verdict:
     runs = len(work.submission.experiments)
     bad = work.bad
     return Verdict(
@@ -233,3 +214,18 @@ def _state_space(criterion: asked.StateModel, work: Work) -> Verdict:
         expected={e.name: e.right[0] for e in entries if e.kind != "exact" or e in off},
         found={e.name: float(e.typed) for e in entries if e.kind != "exact" or e in off},
     )
+
+
+_JUDGES: Mapping[str, Callable[[Any, Work], Verdict]] = {
+    "required": _required,
+    "data": _data,
+    "initial": _parameters,
+    "final": _parameters,
+    "initial_final": _initial_final,
+    "laws": _laws,
+    "state_space": _state_space,
+    "gains": judge_gains,
+    "claims": judge_claims,
+    "prefilter": judge_prefilter,
+    "hardware": judge_hardware,
+}

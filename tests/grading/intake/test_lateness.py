@@ -6,7 +6,7 @@ import pytest
 
 from pipeline.errors import ConfigError
 from pipeline.grading.intake.hand_ins import HandIn
-from pipeline.grading.intake.late_table import LateTable, settle_lateness
+from pipeline.grading.intake.late_table import read_late_table, settle_lateness
 from pipeline.grading.rubric import Late
 from pipeline.grading.rubric_file import load_rubric
 
@@ -19,11 +19,11 @@ def hand_in(name: str, **fields) -> HandIn:
 
 def settle(tmp_path, *hand_ins: HandIn, text: str | None = None, due: datetime | None = None):
     """Return the days by id, and the remarks."""
-    table = None
+    table = {}
     if text is not None:
         path = tmp_path / "late.csv"
         path.write_text(text, encoding="utf-8")
-        table = LateTable.read(path)
+        table = read_late_table(path)
     settled, remarks = settle_lateness(hand_ins, late=Late(due=due), table=table)
     return {one.id: one.days_late for one in settled}, remarks
 
@@ -51,7 +51,7 @@ def test_a_table_of_ones_own_goes_first(tmp_path):
         due=DUE,
     )
     assert days == {"Team-01": 0.0, "team-02": 1.5, "team-03": 1.0}
-    assert remarks == ["late.csv: no such submission: team-99"]
+    assert remarks == ["in the table of lateness, and no such submission: team-99"]
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import ConfigError
-from pipeline.grading.intake.late_table import LateTable
+from pipeline.grading.intake.late_table import read_late_table
 from pipeline.grading.publish.roster import Roster
 from pipeline.grading.publish.students import Student
 from pipeline.grading.publish.survey import read_survey, survey_dict, survey_text
@@ -63,7 +63,7 @@ READERS = {
     "canvas": filled("canvas"),
     "moodle": filled("moodle"),
     "gradescope": filled("gradescope"),
-    "lateness": LateTable.read,
+    "lateness": read_late_table,
     "survey": tabulate,
 }
 
