@@ -24,7 +24,7 @@ from pipeline.grading.rubric_file import load_rubric
 from pipeline.processes import LineProcess
 from pipeline.schemas.grade import grade_text, read_grade
 from pipeline.synthesis import write_submission
-from tests.helpers.grades import n_graded
+from tests.helpers.grades import in_this_process, n_graded
 from tests.helpers.waiting import PATIENCE, started, until
 
 RUBRIC = load_rubric(Path("throne-1dof"))
@@ -96,9 +96,9 @@ def test_a_class_is_graded_and_sharing_is_flagged(graded):
 
 
 def test_the_number_of_processes_does_not_show(school, graded, tmp_path):
-    """One process after another gives the rows that two at once gave, in whatever order."""
+    """In one process, one after another, come the rows that two at once gave, in any order."""
     _, _, rows, _ = graded
-    _, alone = run([school], tmp_path, jobs=1)
+    _, alone = run([school], tmp_path, execute=in_this_process)
     assert alone == rows
 
 
@@ -183,12 +183,10 @@ def test_a_grade_stands_where_its_figures_fail(school, tmp_path, monkeypatch):
     assert "Singular matrix" in outcome.detail
 
 
-def test_what_this_machine_fails_at_is_tried_again(task, setup, tmp_path):
+def test_what_this_machine_fails_at_is_tried_again(task, tmp_path):
     """Where the scratch is full or gone the row says so, and does not stand for good."""
     (tmp_path / "scratch").touch()  # no folder can be made in it
-    setup = replace(setup, scratch=str(tmp_path / "scratch"))
-    with closing(Worker(setup, out_of=RUBRIC.out_of)) as worker:
-        outcome = worker.run(task)
+    outcome = grade_task(task, rubric=RUBRIC, scratch=tmp_path / "scratch")
     assert (outcome.status, outcome.settled) == ("failed", False)
     assert outcome.reason.startswith("cannot be read (")
 
@@ -211,7 +209,7 @@ def test_a_hang_is_stopped_and_tried_again(school, tmp_path):
     """Past the time limit there is a row that says so; a run that gives it more time grades it."""
     _, hung = run([school / "team-0"], tmp_path, limits=Limits(time=0.01))
     assert hung["team-0"][0].reason == "stopped after 0.01 s"
-    _, graded = run([school / "team-0"], tmp_path)
+    _, graded = run([school / "team-0"], tmp_path, execute=in_this_process)
     assert graded["team-0"][0].status == "graded"
 
 
@@ -276,7 +274,7 @@ def test_hostile_submissions_are_rows(tmp_path):
         folder.mkdir(parents=True)
         (folder / "submission.toml").write_bytes(text.encode())
         (folder / "junk.mat").write_bytes(b"MATLAB 5.0 MAT-file" + bytes(range(256)) * 8)
-    _, rows = run([tmp_path / "class"], tmp_path / "out")
+    _, rows = run([tmp_path / "class"], tmp_path / "out", execute=in_this_process)
     assert len(rows) == len(HOSTILE)
     for outcome, _ in rows.values():
         assert outcome.status == "failed"

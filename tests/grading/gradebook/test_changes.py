@@ -11,6 +11,7 @@ from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.changes import points_changes, rubric_changes
 from pipeline.grading.gradings import Batch
 from pipeline.synthesis import write_submission
+from tests.helpers.commandline import cartlab_here
 from tests.helpers.grades import make_grade, make_outcome, n_graded, two_cart_rubric
 from tests.helpers.places import ROOT
 from tests.helpers.waiting import started, until
@@ -92,7 +93,6 @@ def test_ctrl_c_says_how_to_go_on(tmp_path):
         "from there\n"
     )
     before = n_graded(tmp_path / "out")
-    again = subprocess.run(command, capture_output=True, text=True, check=True,
-                           cwd=ROOT)  # fmt: skip
+    again = cartlab_here(*command[3:], cwd=ROOT)
     assert "2 of 2 graded" in again.stderr
     assert 1 <= before < n_graded(tmp_path / "out") == 2

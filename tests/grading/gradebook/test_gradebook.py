@@ -400,9 +400,17 @@ def test_rows_are_only_added(open_book, place):
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked here")
-def test_a_kill_at_any_moment_loses_nothing_that_was_put_in(place):
+def test_a_kill_at_any_moment_loses_nothing_that_was_put_in(tmp_path):
     """Killed while it writes, a process leaves every outcome whole or not there at all."""
-    assert_nothing_lost(place, kills=8)
+    assert_nothing_lost(str(tmp_path), kills=8)
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked here")
+def test_a_dozen_kills_lose_nothing(place):
+    """The same, on a server too."""
+    assert_nothing_lost(place, kills=12)
 
 
 @pytest.mark.slow
