@@ -40,13 +40,10 @@ def scaled(one: Student, table: str, names: list[str], factor: float) -> Student
     return with_table(one, table, {n: factor * one.value(table, n) for n in names})
 
 
-@pytest.mark.parametrize(
-    ("carts", "seed", "hide"),
-    [*((carts, seed, ()) for carts in (1, 2, 3) for seed in (3, 4)), (2, 3, FRICTION)],
-)
-def test_an_honest_student_gets_no_flag(carts, seed, hide):
+@pytest.mark.parametrize(("carts", "hide"), [(1, ()), (2, ()), (3, ()), (2, FRICTION)])
+def test_an_honest_student_gets_no_flag(carts, hide):
     """Rounded numbers, some percent of error, guessed dampings, a sticking cart: no flag."""
-    one = student(carts, seed=seed, hide=hide)
+    one = student(carts, hide=hide)
     assert one.grade().flags == ()
     assert one.grade().points >= 0.95 * one.rubric.out_of
 
