@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from pipeline.bench.host.acquire import acquire
 from pipeline.bench.host.raw import read_raw
 from pipeline.bench.host.record import readings_of
+from pipeline.bench.protocol.command_reader import CommandReader
 from pipeline.bench.protocol.messages import (
     EXTENSIONS,
-    CommandReader,
     Description,
     Reading,
     Signal,

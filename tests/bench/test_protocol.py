@@ -4,11 +4,11 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from pipeline.bench.protocol.command_reader import CommandReader
 from pipeline.bench.protocol.messages import (
     STOCK_STOP,
     ChirpEnd,
     Command,
-    CommandReader,
     Description,
     Hands,
     PidGains,

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+from pipeline.bench.protocol.command_reader import CommandReader
 from pipeline.bench.protocol.messages import (
     FULL_SCALE,
     MOST_TONES,
     WATCHDOG,
     ChirpEnd,
     Command,
-    CommandReader,
     Description,
     Hands,
     PidGains,

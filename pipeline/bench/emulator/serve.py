@@ -9,9 +9,9 @@ from pipeline.bench.emulator.carts import TRUE_PERIOD, VirtualCarts
 from pipeline.bench.emulator.core import Core
 from pipeline.bench.emulator.faults import Faults
 from pipeline.bench.emulator.links import Link
+from pipeline.bench.protocol.command_reader import CommandReader
 from pipeline.bench.protocol.messages import (
     Command,
-    CommandReader,
     Description,
     Hands,
     Signal,
