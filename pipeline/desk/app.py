@@ -78,7 +78,6 @@ ROUTES: tuple[tuple[str, str, Handler], ...] = (
     ("/grades/{n:int}/team", "GET", team.show),
     ("/grades/{n:int}/team", "POST", team.act),
     ("/grades/{n:int}/figure", "GET", team.figure),
-    ("/grades/{n:int}/sign", "POST", team.sign),
     ("/grades/{n:int}/import", "POST", whole.take_table),
     ("/grades/{n:int}/export", "POST", whole.export_class),
     ("/grades/{n:int}/publish", "POST", whole.publish),

@@ -71,16 +71,16 @@ class Class:
         return {team.line.name: team for team in teams}
 
     @cached_property
-    def lost(self) -> Mapping[str, frozenset[str]]:
+    def lost(self) -> Mapping[str, set[str]]:
         """Who has not all points of a criterion; one that was never judged has none."""
-        return {
-            asked.id: frozenset(
-                name
-                for name, team in self.teams.items()
-                if team.line.criteria.get(asked.id, ("", 0.0))[1] < asked.points
-            )
-            for asked in self.rubric.criteria
-        }
+        lost: dict[str, set[str]] = {asked.id: set() for asked in self.rubric.criteria}
+        whole = {asked.id: asked.points for asked in self.rubric.criteria}
+        for name, team in self.teams.items():
+            judged = team.line.criteria
+            for key, points in whole.items():
+                if key not in judged or judged[key][1] < points:
+                    lost[key].add(name)
+        return lost
 
 
 def _user() -> str:

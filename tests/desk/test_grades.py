@@ -34,7 +34,7 @@ def ta(grades):
     with DeskServer() as server:
         visitor = Visitor.of(server.url)
         assert visitor.post("/open", folder=str(grades)).headers["location"] == ROOM
-        visitor.post(ROOM + "sign", by="Ada", of="team-01")
+        visitor.post(at("team-01"), do="sign", by="Ada")
         yield visitor
 
 

@@ -35,17 +35,18 @@ def show(ask: Ask) -> Response:
 
 
 def act(ask: Ask) -> Response:
-    """Do what a button says: accept, take the mark back, change points, undo."""
+    """Do what a button says: sign, accept, take the mark back, change points, undo."""
     shown = a_class(ask)
     team = a_team(ask, shown)
     book, name, what = ask.desk.books.book(ask.grades()), team.submission, ask.text("do")
     by = signed(ask)
     if what in ("accept", "unsee"):
         book.mark(name, by=by, seen=what == "accept")
+    if what in ("sign", "unsee"):
+        return ask.back(_address(ask, team.line.name))
+    if what == "accept":
         wanted = Filter.read(ask.request.query_params)
         after = wanted.beside(shown, team.line.name)[1]
-        if what == "unsee":
-            return ask.back(_address(ask, team.line.name))
         return ask.back(_address(ask, after) if after else f"{here(ask)}?{wanted.query}")
     criterion, seen = ask.text("criterion"), ask.text("seen")
     try:
@@ -62,13 +63,6 @@ def act(ask: Ask) -> Response:
         text = str(error).replace(" (--why)", "").replace(" (--by)", "")
         return _page(ask, wrong={criterion: text}, status=422)
     return ask.back(_address(ask, team.line.name) + f"#criterion-{criterion}", "Noted.")
-
-
-def sign(ask: Ask) -> Response:
-    """Take the name under which the person at this computer changes points."""
-    a_class(ask)
-    signed(ask)
-    return ask.back(_address(ask, ask.text("of")))
 
 
 def figure(ask: Ask) -> Response:
@@ -198,7 +192,7 @@ def _conflict(ask: Ask, shown: Class, team: Team, conflict: Conflict) -> Respons
             "why": conflict.now.why if conflict.now else "as graded",
             "by": conflict.now.by if conflict.now else "cartlab",
         },
-        back=f"{_address(ask, team.line.name)}#criterion-{criterion}",
+        back=_address(ask, team.line.name),  # with a fragment it would be this page, not loaded
     )
 
 
