@@ -1,9 +1,7 @@
 """The student's room over plain forms: files, table, form, report, answers, zip, and no harm."""
 
-import http.client
 import io
 import json
-import random
 import re
 import subprocess
 import sys
@@ -11,7 +9,6 @@ import threading
 import time
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from html import unescape
 from pathlib import Path
 from urllib.parse import unquote
@@ -279,30 +276,6 @@ def test_lines_of_a_note_stay_lines(filled):
     assert visitor.post(HERE + "experiments/0", seen=page.value("seen"), **row).status == 303
     experiment = load_submission(folder).experiments[0]
     assert (experiment.note, experiment.window) == (note, (0.5, 2.0))
-
-
-@pytest.mark.slow
-@pytest.mark.sample
-def test_what_was_confirmed_outlives_a_kill(tmp_path):
-    """The server is killed at random moments while a title is saved again and again."""
-    folder = a_submission(tmp_path / "team")
-    draw = random.Random(1)
-    command = [sys.executable, "-m", "pipeline", "desk", folder, "--no-browser"]
-    for _ in range(5):
-        with started(command, stderr=subprocess.PIPE, encoding="utf-8") as desk:
-            assert desk.stderr is not None
-            visitor = Visitor.of(desk.stderr.readline().split()[1])
-            seen, confirmed = visitor.get(HERE).value("seen"), load_submission(folder).title
-            threading.Timer(draw.uniform(0.0, 2.0), desk.kill).start()
-            number = 0
-            with suppress(OSError, http.client.HTTPException):
-                for number in range(10_000):
-                    visitor.post(HERE + "save", seen=seen, title=f"title {number}")
-                    confirmed = f"title {number}"
-                    seen = visitor.get(HERE).value("seen")
-        sent = f"title {number}"  # perhaps written, not confirmed
-        assert load_submission(folder).title in (confirmed, sent)
-        assert load_submission(folder).experiments
 
 
 @pytest.mark.parametrize("text", ["version = \n", "\xff", "version = 1\n[system]\ncarts = 9\n"])

@@ -84,7 +84,6 @@ def _take(given: str, content: BinaryIO, folder: Path) -> str:
             target = target.with_name(f"{Path(name).stem}-{number}{Path(name).suffix}")
         _check_room(raw, folder)
         target.parent.mkdir(exist_ok=True)
-        target.touch(exist_ok=False)  # whoever else put one there just now keeps it
         write_file(target, raw)
     return f"{quote(last)}: taken as {target.name}" if target.name != last else ""
 

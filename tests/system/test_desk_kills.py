@@ -1,0 +1,191 @@
+"""The desk's server is killed at random moments: what it confirmed is there, and nothing is half.
+
+A change is confirmed by the answer to its form; of a regrade, by the page that says it is done.
+"""
+
+import http.client
+import random
+import re
+import sqlite3
+import subprocess
+import sys
+import threading
+from contextlib import closing, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import psutil
+import pytest
+
+from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.open_book import OpenBook
+from pipeline.grading.gradebook.schema import FILE
+from pipeline.submission import load_submission
+from pipeline.submission.edit import edit_submission
+from tests.helpers.desks import Visitor, a_submission, some_files
+from tests.helpers.grades import write_class
+from tests.helpers.waiting import PATIENCE, started, until
+
+_RECORD = some_files(most=1)[0][1]
+
+
+@dataclass(kw_only=True)
+class _Save:
+    """Titles of a submission, one after the other."""
+
+    folder: Path
+    longest: float = 1.5  # s within which the server is killed
+    sent: int = 0
+    confirmed: int = 0
+
+    def prepare(self) -> None:
+        a_submission(self.folder)
+        edit_submission(self.folder, lambda document: document.update(title="title 0"))
+
+    def act(self, who: Visitor) -> None:
+        seen = who.get("/student/0/").value("seen")
+        answer = who.post("/student/0/save", seen=seen, title=f"title {self.sent}")
+        assert answer.status == 303
+
+    def check(self) -> None:
+        submission = load_submission(self.folder)
+        title = int(submission.title.removeprefix("title "))
+        assert title in (self.confirmed, self.sent)
+        assert submission.experiments
+        self.confirmed = title
+
+
+@dataclass(kw_only=True)
+class _Upload(_Save):
+    """Recordings, each of its own bytes; the form's answer comes when its table is written too."""
+
+    longest: float = 4.0
+
+    def content(self, number: int) -> bytes:
+        return _RECORD.rstrip()[: -number - 1]
+
+    def act(self, who: Visitor) -> None:
+        files = [(f"drop-{self.sent}.csv", self.content(self.sent))]
+        assert who.upload("/student/0/files", files).status == 303
+
+    def check(self) -> None:
+        stored = {
+            int(path.stem.removeprefix("drop-")): path.read_bytes()
+            for path in (self.folder / "data").glob("drop-*")
+        }
+        assert all(raw == self.content(number) for number, raw in stored.items())
+        assert set(range(1, self.confirmed + 1)) <= set(stored)
+        named = {experiment.file for experiment in load_submission(self.folder).experiments}
+        assert {f"data/drop-{n}.csv" for n in range(1, self.confirmed + 1)} <= named
+        self.confirmed = max(stored, default=0)
+
+
+@dataclass(kw_only=True)
+class _Override(_Save):
+    """Points by hand, each with its number as the reason."""
+
+    longest: float = 0.8
+
+    def prepare(self) -> None:
+        write_class(self.folder)
+
+    def act(self, who: Visitor) -> None:
+        team = "/grades/0/team?of=team-04"
+        seen = re.search(r'value="laws"><input type="hidden" name="seen" value="(.*?)"',
+                         who.get(team).text)  # fmt: skip
+        assert seen
+        sent = {"points": str(self.sent % 3 / 2), "why": f"change {self.sent}", "by": "Ada"}
+        answer = who.post(team, do="change", criterion="laws", seen=seen[1], **sent)
+        assert answer.status == 303
+
+    def check(self) -> None:
+        with OpenBook(self.folder) as book:
+            given = [one for _, one in book.changes_since(0) if one.why.startswith("change")]
+            assert [one.why for one in given] == [f"change {n + 1}" for n in range(len(given))]
+            assert [one.points for one in given] == [(n + 1) % 3 / 2 for n in range(len(given))]
+            assert len(given) in (self.confirmed, self.sent)
+            self.confirmed = len(given)
+            assert len(book.class_now().listings) == 16
+        _whole(self.folder)
+
+
+@dataclass(kw_only=True)
+class _Regrade(_Save):
+    """A submission that is another each time, graded beside one with points by hand."""
+
+    longest: float = 12.0
+    team: Path = field(init=False)
+
+    def prepare(self) -> None:
+        write_class(self.folder)
+        self.team = a_submission(self.folder.with_name("team-x"))
+
+    def act(self, who: Visitor) -> None:
+        new = f"title {self.sent}"
+        edit_submission(self.team, lambda document: document.update(title=new))
+        sent = {"paths": str(self.team), "rubric": "throne-2dof", "lateness": ""}
+        assert who.post("/grades/0/regrade", **sent).status == 303
+        until(lambda: "data-events" not in who.get("/grades/0/").text)
+        assert "Grading: done" in who.get("/grades/0/").text
+
+    def check(self) -> None:
+        _whole(self.folder)
+        with Gradebook(self.folder) as book:
+            teams = {entry.submission: entry for entry in book.entries()}
+            assert teams["team-02"].overrides["laws"].why == "right, <i>as told</i>"
+            assert len(teams) == 16 + ("team-x" in teams)
+            assert self.confirmed == 0 or "team-x" in teams
+
+
+def _whole(folder: Path) -> None:
+    with closing(sqlite3.connect(folder / FILE)) as book:
+        assert book.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
+        assert book.execute("PRAGMA foreign_key_check").fetchall() == []
+
+
+def kill_again_and_again(work: _Save, *, kills: int, seed: int) -> int:
+    """Kill the server so often, look at what is there each time; return what was confirmed."""
+    draw = random.Random(seed)
+    work.prepare()
+    command = [sys.executable, "-m", "pipeline", "desk", work.folder, "--no-browser"]
+    for _ in range(kills):
+        with started(command, stderr=subprocess.PIPE, encoding="utf-8") as desk:
+            _act_until_killed(work, desk, after=draw.uniform(0.0, work.longest))
+        work.check()
+    return work.confirmed
+
+
+def _act_until_killed(work: _Save, desk: subprocess.Popen, *, after: float) -> None:
+    """Ask for one change after the other; what the desk had started ends with it, by itself."""
+    assert desk.stderr is not None
+    who, started_by_it = Visitor.of(desk.stderr.readline().split()[1]), []
+
+    def end() -> None:
+        started_by_it.extend(psutil.Process(desk.pid).children(recursive=True))
+        desk.kill()
+
+    timer = threading.Timer(after, end)
+    timer.start()
+    with suppress(OSError, http.client.HTTPException):
+        while True:
+            work.sent = work.confirmed + 1
+            work.act(who)
+            work.confirmed += 1
+    timer.join()
+    desk.wait()
+    assert psutil.wait_procs(started_by_it, timeout=PATIENCE)[1] == []
+
+
+@pytest.mark.parametrize("work", [_Override, _Upload, _Regrade])
+def test_a_kill_loses_nothing(work, tmp_path):
+    """Once of each."""
+    kill_again_and_again(work(folder=tmp_path / "it"), kills=1, seed=1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("work", "kills"), [(_Override, 18), (_Upload, 16), (_Regrade, 16), (_Save, 5)]
+)
+def test_fifty_kills_lose_nothing(work, kills, tmp_path):
+    """At random moments of overrides, uploads and regrades; and five of saves."""
+    assert kill_again_and_again(work(folder=tmp_path / "it"), kills=kills, seed=2) > 0
