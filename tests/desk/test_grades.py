@@ -167,6 +167,32 @@ def test_a_team_has_its_numbers_beside_ours(ta):
     assert ta.get(f"{ROOM}figure?of=team-01&figure=../x").status == 404
 
 
+def test_a_record_stands_beside_its_criterion(tmp_path):
+    """The figure that shows a number of it; the others stand by themselves."""
+    names = ("record-K_1", "record-omega_2-zeta_2", "response-1", "other")
+    drawn = tuple((f"{n}.svg", f"<svg><title>{n}</title></svg>") for n in names)
+    grade = make_grade("team", share=0.5)
+    numbers = {"initial-gains": {"K_1": 3.0}, "initial-decays": {"zeta_2": 0.1}}
+    criteria = tuple(c.model_copy(update={"found": numbers.get(c.id, {})}) for c in grade.criteria)
+    outcome = make_outcome(grade.model_copy(update={"criteria": criteria}), figures=drawn)
+    with Gradebook(tmp_path, assignment="lab", create=True) as book:
+        book.put(outcome)
+        book.finish(_batch([outcome]), rubric=two_cart_rubric())
+    with DeskServer(folder=tmp_path) as server:
+        page = Visitor.of(server.url).get(at("team")).text
+    found = {
+        criterion: re.findall('figure=(.*?).svg"><img', unescape(article))
+        for criterion, article in re.findall(
+            r'(?s)<article id="criterion-(.*?)"(.*?)</article>', page
+        )
+    }
+    assert {criterion: figures for criterion, figures in found.items() if figures} == {
+        "initial-gains": ["record-K_1"],
+        "initial-decays": ["record-omega_2-zeta_2"],
+        "final-gains": ["response-1", "other"],
+    }
+
+
 def test_points_are_changed_as_the_command_does(ta, grades):
     """With a reason and a name, to be undone; the history tells all of it."""
     assert change(ta, "team-01", points="0,5", why="a clear plot").status == 303

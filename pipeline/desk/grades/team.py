@@ -19,6 +19,7 @@ from pipeline.grading.gradebook.override import read_points
 from pipeline.grading.publish.anonymous import anonymise, renamed_events
 from pipeline.grading.publish.class_page import feedback_link
 from pipeline.grading.publish.feedback import TONES, alternative, numbers_table, sentence
+from pipeline.grading.publish.feedback_figures import numbers_in
 from pipeline.grading.words import WORDS, points_text
 from pipeline.report.document import paragraph
 from pipeline.report.figures.svg import plain_svg
@@ -87,6 +88,13 @@ def _page(ask: Ask, *, wrong: dict[str, str] | None = None, status: int = 200) -
         events = renamed_events(events, team.submission, name)
     before, after = Filter.read(ask.request.query_params).beside(shown, name)
     reasons = book.reasons()
+    criteria = _criteria(grade, now, wrong=wrong or {}, ask=ask)
+    left = []
+    for file, svg in book.figures(now.entry):
+        address = f"{here(ask)}figure?{urlencode({'of': name, 'figure': file})}"
+        beside = next((c for c in criteria if _shows(file, c)), None)
+        place = left if beside is None else beside["figures"]
+        place.append({"address": address, "alt": alternative(svg)})
     return ask.page(
         "team",
         status=status,
@@ -100,15 +108,9 @@ def _page(ask: Ask, *, wrong: dict[str, str] | None = None, status: int = 200) -
         grade=grade,
         points=points_text,
         seen=now.seen,
-        criteria=_criteria(grade, now, wrong=wrong or {}, ask=ask),
+        criteria=criteria,
         flags=[_flag(ask, flag, shown) for flag in grade.flags],
-        figures=[
-            {
-                "address": f"{here(ask)}figure?{urlencode({'of': name, 'figure': file})}",
-                "alt": alternative(svg),
-            }
-            for file, svg in book.figures(now.entry)
-        ],
+        figures=left,
         reasons={c: found[:_MOST_REASONS] for c, found in reasons.items()},
         events=[(to_the_second(event.at), event_words(event)) for event in reversed(events)],
         news=news_of(ask, shown, since=shown.state[1]),
@@ -137,6 +139,9 @@ def _criteria(
                 "outcome": WORDS.text(f"outcome_{own.outcome}") if own else "not judged",
                 "tone": TONES[own.outcome] if own else "quiet",
                 "evidence": _evidence(own, asked.check) if own else "",
+                "check": asked.check,
+                "numbers": frozenset(own.found if own else ()),
+                "figures": [],
                 "version": now.versions[asked.id],
                 "changed": asked.id in now.changed,
                 "by_hand": f"by hand, {given.by}: {given.why}" if given else "",
@@ -146,6 +151,13 @@ def _criteria(
             }
         )
     return found
+
+
+def _shows(file: str, criterion: dict[str, Any]) -> bool:
+    """Tell whether a figure belongs beside a criterion: records by the numbers in them."""
+    if numbers := numbers_in(file):
+        return criterion["check"] == "initial" and not numbers.isdisjoint(criterion["numbers"])
+    return criterion["check"] == "final"
 
 
 def _evidence(criterion: Criterion, check: str) -> str:

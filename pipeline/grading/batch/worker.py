@@ -87,7 +87,7 @@ def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = Fal
                 submission, rubric=rubric, name=task.id, days_late=task.days_late
             )
             records = graded.analysis.records if graded.analysis else ()
-            drawn, detail = _figures(submission, graded) if figures else ((), "")
+            drawn, detail = _figures(submission, graded, rubric) if figures else ((), "")
             return Grading(
                 submission=task.id,
                 authors=graded.grade.authors,
@@ -136,16 +136,22 @@ def named_authors(folder: Path) -> tuple[str, ...]:
     return tuple(dict.fromkeys(found))
 
 
-def _figures(submission: Submission, graded: Graded) -> tuple[tuple[tuple[str, str], ...], str]:
+def _figures(
+    submission: Submission, graded: Graded, rubric: Rubric
+) -> tuple[tuple[tuple[str, str], ...], str]:
     """Return the figures; or none and why: a grade stands whatever happens to its pictures."""
     from pipeline.grading.publish.feedback_figures import (
         draw_figures,  # costs half a second at first
+        draw_records,
     )
 
     if graded.analysis is None:
         return (), ""
+    about = {asked.id for asked in rubric.criteria if asked.check == "initial"}
+    initial = [criterion for criterion in graded.grade.criteria if criterion.id in about]
     try:
-        return draw_figures(graded.analysis, submission.reported), ""
+        drawn = draw_figures(graded.analysis, submission.reported)
+        return drawn + draw_records(graded.analysis, initial), ""
     except Exception:
         return (), _traceback()
 

@@ -1,14 +1,23 @@
 """Figures of the feedback: what was measured, and what the reported numbers make of it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+
+from matplotlib.figure import Figure
 
 from pipeline.arrays import Array
+from pipeline.names import gain_name, own_omega, own_zeta
 from pipeline.plant.linear.recovery import transfer_functions
-from pipeline.report.figures.grading import reported_bode_figure
+from pipeline.report.figures.grading import (
+    reported_bode_figure,
+    reported_decay_figure,
+    reported_step_figure,
+)
 from pipeline.report.figures.style import drawing
 from pipeline.report.figures.svg import to_svg
-from pipeline.report.words import clean
-from pipeline.results import Analysis
+from pipeline.report.words import clean, name_span
+from pipeline.results import Analysis, Record
+from pipeline.schemas.grade import Criterion
 from pipeline.submission import Reported
 
 _MOST_CARTS = 3  # whose table stands for transfer functions
@@ -37,6 +46,59 @@ def draw_figures(analysis: Analysis, reported: Reported | None) -> tuple[tuple[s
             name = f"response-{response.cart}"
             drawn.append((f"{name}.svg", to_svg(figure, name=name, alt=alt)))
     return tuple(drawn)
+
+
+def draw_records(analysis: Analysis, criteria: Iterable[Criterion]) -> tuple[tuple[str, str], ...]:
+    """Return file names and SVG: the records of what lost points in the initial table.
+
+    Of repeats the one that says most. A file is named after the numbers in it, see `numbers_in`.
+
+    Parameters
+    ----------
+    criteria : those about the initial table.
+    """
+    off = [c for c in criteria if c.outcome in ("partial", "fail")]
+    pairs = {
+        name: (float(c.found[name]), float(c.expected[name]))
+        for c in off
+        for name in c.found
+        if name in c.expected
+    }
+    records = {record.id: record for record in analysis.records}
+    unit, drawn = clean(analysis.position_unit), []
+
+    def keep(draw: Callable[..., Figure], names: Sequence[str], *, record: Record, **how) -> None:
+        reported = ", ".join(f"{name_span(name).text} {pairs[name][0]:.4g}" for name in names)
+        recomputed = ", ".join(f"{pairs[name][1]:.4g}" for name in names)
+        told = f"reported {reported}; recomputed {recomputed}"
+        figure = draw(record=record, title=told, position_unit=unit, **how)
+        file = "-".join(("record", *names))
+        drawn.append((f"{file}.svg", to_svg(figure, name=file, alt=f"{clean(record.id)}: {told}.")))
+
+    with drawing():
+        for cart in range(1, analysis.carts + 1):
+            gain = gain_name(cart, n=analysis.carts)
+            own = [own(cart, n=analysis.carts) for own in (own_omega, own_zeta)]
+            steps = [step for step in analysis.step_gains if step.cart == cart]
+            decays = [decay for decay in analysis.log_decrements if decay.cart == cart]
+            if gain in pairs and steps:
+                step = min(steps, key=lambda step: step.gain_std)
+                keep(partial(reported_step_figure, step), [gain],
+                     record=records[step.experiment], reported=pairs[gain][0])  # fmt: skip
+            there = [name for name in own if name in pairs]
+            if there and decays:
+                decay = min(decays, key=lambda decay: decay.zeta_std)
+                measured = dict(zip(own, (decay.omega_n, decay.zeta), strict=True))
+                reported = tuple(pairs[n][0] if n in pairs else measured[n] for n in own)
+                keep(partial(reported_decay_figure, decay), there,
+                     record=records[decay.experiment], reported=reported)  # fmt: skip
+    return tuple(drawn)
+
+
+def numbers_in(file: str) -> frozenset[str]:
+    """Return the parameters that a figure of a record shows; of other figures none."""
+    kind, *names = file.removesuffix(".svg").split("-")
+    return frozenset(names if kind == "record" else ())
 
 
 def _response(values: Mapping[str, float]) -> tuple[Array, Sequence[Array]] | None:

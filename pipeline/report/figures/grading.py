@@ -3,21 +3,34 @@
 from collections.abc import Sequence
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from pipeline.arrays import Array
 from pipeline.plant.linear.chain import Chain
 from pipeline.report.figures.bode import bode_figure
-from pipeline.report.figures.style import MEASURED, MODEL, SECOND, legend_above, panels
+from pipeline.report.figures.style import (
+    LIFT,
+    MEASURED,
+    MODEL,
+    SECOND,
+    THIRD,
+    legend_above,
+    panels,
+    plot_line,
+)
 from pipeline.report.figures.svg import tell
+from pipeline.report.figures.time import decay_figure, step_figure
 from pipeline.report.words import clean
-from pipeline.results import FrequencyResponse
+from pipeline.results import FrequencyResponse, LogDecrement, Record, StepGain
 
 _BINS = 10
 _ROW = 0.2  # inches
 _LONGEST_NAME = 26  # letters, where the numbers of the axis would stand
 _LINE_POINTS = 300
+_CURVE_POINTS = 2000
+_FASTEST = 10.0  # times the measured frequency: hertz taken for rad/s, and the other way, are seen
 _WIDEST = 30.0  # dB that the reported curve may stick out above and below what was measured
 
 
@@ -90,6 +103,59 @@ def reported_bode_figure(
         ax.plot(omega[seen], decibel[seen], color=SECOND, ls="--", label="your numbers")
         ax.set_ylim(min(low, decibel[seen].min()), max(high, decibel[seen].max()))
     legend_above(ax)
+    return figure
+
+
+def reported_step_figure(
+    gain: StepGain, *, record: Record, reported: float, title: str, position_unit: str
+) -> Figure:
+    """Return a step record with the level that a reported gain leads to.
+
+    Parameters
+    ----------
+    title : the number as it is reported and as the record gives it.
+    """
+    figure = step_figure([[gain]], records=[record], position_unit=position_unit)
+    (ax,) = figure.axes
+    for number, edge in enumerate(gain.edges):
+        level = edge.level_before + reported * (edge.u_after - edge.u_before)
+        ax.plot(edge.window_after, (level, level), color=SECOND, ls="--", lw=1.4,
+                label="" if number else "your number")  # fmt: skip
+    return _titled(figure, ax, title)
+
+
+def reported_decay_figure(
+    decay: LogDecrement,
+    *,
+    record: Record,
+    reported: tuple[float, float],
+    title: str,
+    position_unit: str,
+) -> Figure:
+    """Return a decay with the one that begins alike and has the reported numbers.
+
+    Parameters
+    ----------
+    reported : natural frequency (rad/s) and damping ratio; a curve that would swing too fast to be
+        seen, or does not swing, is not drawn.
+    title : the numbers as they are reported and as the record gives them.
+    """
+    figure = decay_figure([decay], records=[record], position_unit=position_unit)
+    (ax,) = figure.axes
+    omega, zeta = reported
+    if 0 <= zeta < 1 and 0 < omega < _FASTEST * decay.omega_n:
+        t = np.linspace(decay.peak_t[0], decay.fit_t[-1], _CURVE_POINTS)
+        rest = (decay.envelope_upper[-1] + decay.envelope_lower[-1]) / 2
+        since = omega * (t - t[0])
+        swing = np.exp(-zeta * since) * np.cos(np.sqrt(1 - zeta**2) * since)
+        y = rest + (decay.peak_y[0] - rest) * swing
+        plot_line(ax, t - decay.release, y, name="your numbers", color=THIRD, ls="--", lw=1.0)
+    return _titled(figure, ax, title)
+
+
+def _titled(figure: Figure, ax: Axes, title: str) -> Figure:
+    ax.set_title(f"{ax.get_title(loc='left')}: {title}", loc="left")
+    legend_above(ax, columns=5, lift=LIFT)
     return figure
 
 

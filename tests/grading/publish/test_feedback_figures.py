@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pipeline.grading.publish.feedback_figures import draw_figures
+from pipeline.grading.publish.feedback_figures import draw_figures, draw_records, numbers_in
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.plant.linear.recovery import transfer_functions
 from pipeline.report.figures.grading import reported_magnitude
+from pipeline.schemas.grade import Criterion
 from tests.helpers.grading_students import student
 
 
@@ -55,3 +56,39 @@ def test_numbers_that_stand_for_no_response_have_no_curve(value):
     """A frequency of zero or beyond all bounds."""
     two = student(2).reporting(final={"omega_a": value})
     assert not any("your numbers" in svg for _, svg in draw_figures(two.analysis, two.reported))
+
+
+def test_a_number_that_lost_points_is_shown_on_its_record():
+    """With the number as reported and as recomputed; what was right is not drawn."""
+    honest = student(2)
+    wrong = {"K_1": 1.4 * honest.value("initial", "K_1"), "omega_2": 5.24}
+    two = honest.reporting(initial=wrong)
+    checks = {asked.id: asked.check for asked in two.rubric.criteria}
+    grade = two.grade()
+    criteria = [c for c in grade.criteria if checks[c.id] == "initial"]
+    figures = dict(draw_records(two.analysis, criteria))
+
+    shown = {name for file in figures for name in numbers_in(file)}
+    assert set(wrong) <= shown
+    of_gain = next(file for file in figures if numbers_in(file) == {"K_1"})
+    known = next(c.expected["K_1"] for c in criteria if "K_1" in c.expected)
+    reported = two.value("initial", "K_1")
+    title = f"reported K_1 {reported:.4g}; recomputed {known:.4g}"
+    assert title in figures[of_gain]
+    steps = {record.id for record in two.analysis.records if record.kind == "step"}
+    assert any(f"<title>{id_}: {title}" in figures[of_gain] for id_ in steps)
+    assert "your number" in figures[of_gain]
+    assert draw_records(honest.analysis, honest.grade().criteria[:0]) == ()
+
+
+@pytest.mark.parametrize(("omega", "zeta"), [(-3.0, 0.1), (1e9, 0.1), (20.0, 1.5), (20.0, -1.0)])
+def test_numbers_of_no_swing_are_told_and_not_drawn(omega, zeta):
+    """Whatever is reported, the record stands with the numbers beside it."""
+    two = student(2)
+    criterion = Criterion(
+        id="decays", title="", outcome="fail", points=0.0, out_of=1.0, message="",
+        expected={"omega_1": 20.0, "zeta_1": 0.05}, found={"omega_1": omega, "zeta_1": zeta},
+    )  # fmt: skip
+    ((_, svg),) = draw_records(two.analysis, [criterion])
+    assert f"reported ω_1 {omega:.4g}, ζ_1 {zeta:.4g}; recomputed 20, 0.05" in svg
+    assert "your numbers" not in svg
