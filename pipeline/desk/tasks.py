@@ -75,6 +75,22 @@ def report(folder: str, *, progress: Progress) -> dict[str, Any]:
     return told
 
 
+def gap(folder: str, budget: float, *, progress: Progress) -> None:
+    """Write what the linear model leaves out into the submission's own folder."""
+    from pipeline.gap.investigate import investigate
+    from pipeline.gap.stored import gap_text
+    from pipeline.report.gap.page import render_gap
+    from pipeline.workflow import analyse
+
+    submission = load_submission(Path(folder))
+    out = own_folder(submission.folder, "gap")
+    with alone_in(out):
+        analysis = analyse(submission, design=False, progress=progress)
+        found = investigate(analysis, budget=budget, progress=progress)
+        write_file(out / "gap.json", gap_text(found, analysis))
+        render_gap(found, analysis, out, progress=progress)
+
+
 def unpack(archive: str, into: str, *, progress: Progress) -> list[str]:
     """Unpack what was uploaded, by the limits of a hand-in; return the files."""
     from pipeline.grading.intake.unpack import HAND_IN, unpack
@@ -99,6 +115,7 @@ TASKS: Mapping[str, Callable[..., Any]] = {
     "files": files,
     "fill": fill,
     "report": report,
+    "gap": gap,
     "unpack": unpack,
     "plan": plan,
     "exercise": exercise,

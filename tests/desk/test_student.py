@@ -19,7 +19,7 @@ import pytest
 from pipeline.desk.app import DeskServer
 from pipeline.desk.jobs import Failed, Hand
 from pipeline.desk.student import files as uploads
-from pipeline.desk.student.files import take_upload
+from pipeline.desk.student.files import take_uploads
 from pipeline.errors import SubmissionError
 from pipeline.grading.intake.hand_ins import find_hand_ins
 from pipeline.submission import load_submission
@@ -54,6 +54,11 @@ def hand():
     hand = Hand()
     yield hand
     hand.close()
+
+
+def take_upload(name: str, content: io.BytesIO, folder: Path, *, hand: Hand) -> list[str]:
+    """Upload one file."""
+    return take_uploads([(name, content)], folder, hand=hand)
 
 
 def wrongs(page: str) -> list[str]:
@@ -155,6 +160,52 @@ def test_a_row_is_corrected_in_place(filled):
     assert experiment.id not in [e.id for e in load_submission(folder).experiments]
     assert (folder / experiment.file).is_file()
     assert "not in submission.toml" in visitor.get(HERE).text
+
+
+def test_what_another_tab_saved_is_not_what_was_typed_here(filled):
+    """Both versions have the fields that were touched in this one, and no others."""
+    visitor, _ = filled
+    page = visitor.get(HERE)
+    shown = {"title": page.value("title"), "section": page.value("section")}
+    seen = page.value("seen")
+    assert visitor.post(HERE + "save", seen=seen, **shown | {"section": "07"}).status == 303
+    answer = visitor.post(HERE + "save", seen=seen, **shown | {"title": "Mine"})
+    assert answer.status == 409
+    rows = re.findall(r'<tr><th scope="row">.*?<pre>(.*?)</pre>.*?<pre>(.*?)</pre>', answer.text)
+    assert rows == [("Mine", shown["title"])]
+
+
+def test_a_recording_is_moved_aside_and_comes_back(filled):
+    """Whole, over nothing; one that a table names is not, nor a file that is no recording."""
+    visitor, folder = filled
+    (folder / "data" / "bad.csv").write_bytes(b"nothing in it")
+    for round_ in ("bad.csv", "bad-2.csv"):
+        assert "data/bad.csv" in visitor.get(HERE).text
+        assert visitor.post(HERE + "aside", file="data/bad.csv").status == 303
+        assert (folder / "set-aside" / round_).read_bytes() == b"nothing in it"
+        assert round_ in visitor.get(HERE).text  # is said
+        assert "data/bad.csv" not in visitor.get(HERE).text
+        visitor.upload(HERE + "files", [("bad.csv", b"nothing in it")])
+    named = load_submission(folder).experiments[0].file
+    assert visitor.post(HERE + "aside", file=named).status == 422
+    for other in (NAME, "notes.md", "../x.csv", "data/../submission.toml", ""):
+        assert visitor.post(HERE + "aside", file=other).status == 404
+    assert load_submission(folder).experiments[0].file == named
+    assert (folder / named).is_file()
+
+
+def test_handing_in_warns_of_open_questions(filled):
+    """Until each has an answer; the zip is there all the same."""
+    visitor, folder = filled
+    ask_for(folder, "zeta", "level")
+    for answered, open_ in ((None, "2 questions"), ("zeta", "1 question "), ("level", "")):
+        if answered:
+            seen = visitor.get(HERE + "report").value("seen")
+            visitor.post(HERE + "answer", id=answered, answer="So.", seen=seen)
+        page = visitor.get(HERE).text
+        assert bool(re.search(r"have not answered", page)) == bool(open_)
+        assert open_ in page
+        assert "hand-in.zip" in page
 
 
 def test_edits_from_outside_show_and_are_not_written_over(filled):
@@ -323,6 +374,7 @@ NAMES = {
     "/etc/a.csv": "a.csv", "con.csv": "data-con.csv", "a:b.csv": "a-b.csv", ".hidden.csv": None,
     "a\x00b.csv": "a-b.csv", "a\nb.csv": "a-b.csv", "x" * 300 + ".csv": "x" * 116 + ".csv",
     "<script>.csv": "-script-.csv", "'; --.csv": "'; --.csv",
+    "学" * 116 + ".csv": "学" * 38 + ".csv", "x." * 60 + "csv": "-x." + "x." * 57 + "csv",
 }  # fmt: skip
 
 
@@ -403,6 +455,7 @@ def test_an_archive_is_taken_by_the_limits_of_a_hand_in(tmp_path, hand):
 def test_a_folder_has_room_for_a_hand_in(tmp_path, hand, monkeypatch):
     """Then nothing more is taken."""
     monkeypatch.setattr(uploads, "MAX_DATA_BYTES", 10)
+    (tmp_path / "whole").mkdir()
     (said,) = take_upload("a.csv", io.BytesIO(b"x" * 11), tmp_path, hand=hand)
     assert "larger than 10 bytes" in said
     limits = uploads.HAND_IN.__class__(members=2, total=15)
@@ -410,6 +463,9 @@ def test_a_folder_has_room_for_a_hand_in(tmp_path, hand, monkeypatch):
     assert take_upload("a.csv", io.BytesIO(b"x" * 10), tmp_path, hand=hand) == []
     (said,) = take_upload("b.csv", io.BytesIO(b"y" * 6), tmp_path, hand=hand)
     assert "at most 2 files and 15 bytes" in said
+    three = [(f"{n}.csv", io.BytesIO(b"123456"[:n])) for n in (4, 5, 6)]
+    (said,) = take_uploads(three, tmp_path / "whole", hand=hand)
+    assert said.startswith("'6.csv': not taken: a hand-in has at most 2 files")
 
 
 def test_names_and_texts_of_files_are_never_markup(room):
@@ -473,17 +529,61 @@ def test_a_job_tells_its_stages_survives_a_reload_and_is_stopped(filled):
     assert "Read the report" in visitor.get(HERE).text
 
 
-def test_a_file_that_ends_the_process_costs_its_own_row(room, monkeypatch):
-    """The others are shown; the next task has another process."""
+def test_a_file_that_ends_the_process_costs_its_own_row(room):
+    """The process that looks at it dies; the others are shown, the next task has another."""
     visitor, folder = room
     visitor.upload(HERE + "files", some_files(most=2))
-    monkeypatch.setattr("pipeline.desk.jobs._SHORT", 0.0)
-    (folder / "data" / "late.csv").write_bytes(some_files()[0][1])
-    time.sleep(0.01)
-    with pytest.raises(Failed):
-        Hand().do("look", folder=str(folder), file="data/late.csv", columns={})
-    monkeypatch.undo()
-    assert "late.csv" in visitor.get(HERE).text
+    before = {p: p.memory_info().rss for p in psutil.Process().children()}
+    (folder / "data" / "large.csv").write_bytes(b"time,x1\n" + b"0.001,0.25\n" * 4_000_000)
+    with ThreadPoolExecutor(1) as pool:
+        page = pool.submit(visitor.get, HERE)
+        reading: list[psutil.Process] = []
+
+        def grown() -> bool:
+            reading.extend(p for p, was in before.items() if p.memory_info().rss > was + 40_000_000)
+            return bool(reading)
+
+        until(grown)
+        reading[0].kill()
+        text = page.result().text
+    rows = dict(zip(re.findall(r'<tr>\n<th scope="row">(.*?)<', text), text.split("<tr>\n<th")[1:],
+                    strict=True))  # fmt: skip
+    assert {name for name, row in rows.items() if "the process ended" in row} == {"large.csv"}
+    assert len(rows) == 3
+    (folder / "data" / "large.csv").unlink()
+    assert "the process ended" not in visitor.get(HERE).text
+
+
+def test_a_job_whose_process_dies_says_so(filled):
+    """Nothing half is there; the desk goes on, and makes the report when asked again."""
+    visitor, folder = filled
+    visitor.get(HERE)
+    before = {p.pid for p in psutil.Process().children()}
+
+    def workers() -> list[psutil.Process]:
+        return [p for p in psutil.Process().children() if p.pid not in before]
+
+    visitor.post(HERE + "make-report")
+    until(workers)
+    until(lambda: "starting" not in visitor.get(HERE).text)  # it has begun
+    workers()[0].kill()
+    until(lambda: "the process ended" in " ".join(wrongs(visitor.get(HERE).text)))
+    assert not (folder / "report" / "report.html").exists()
+    visitor.post(HERE + "make-report")
+    until(lambda: "Read the report" in visitor.get(HERE).text)
+    assert wrongs(visitor.get(HERE).text) == []
+
+
+def test_the_gap_is_looked_for_as_a_job(filled, monkeypatch):
+    """The page is that of `cartlab gap`, in the folder, and shown."""
+    monkeypatch.setattr("pipeline.desk.student.room._GAP_BUDGET", 1.0)
+    visitor, folder = filled
+    assert visitor.get(HERE + "gap/gap.html").status == 404
+    assert visitor.post(HERE + "make-gap").status == 303
+    until(lambda: "gap/gap.html" in visitor.get(HERE).text)
+    page = visitor.get(HERE + "gap/gap.html")
+    assert page.headers["content-security-policy"].startswith("sandbox allow-scripts;")
+    assert json.loads((folder / "gap" / "gap.json").read_bytes())["schema"] == "cartlab-gap/1"
 
 
 def test_who_serves_is_gone_and_so_is_the_work(tmp_path):

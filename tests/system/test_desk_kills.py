@@ -6,6 +6,7 @@ A change is confirmed by the answer to its form; of a regrade, by the page that 
 import http.client
 import random
 import re
+import shutil
 import sqlite3
 import subprocess
 import sys
@@ -20,10 +21,12 @@ import pytest
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.open_book import OpenBook
 from pipeline.grading.gradebook.schema import FILE
+from pipeline.grading.gradings import Batch
+from pipeline.resources import RUBRICS
 from pipeline.submission import load_submission
 from pipeline.submission.edit import edit_submission
 from tests.helpers.desks import Visitor, a_submission, some_files
-from tests.helpers.grades import write_class
+from tests.helpers.grades import make_grade, make_outcome, two_cart_rubric, write_class
 from tests.helpers.waiting import PATIENCE, started, until
 
 _RECORD = some_files(most=1)[0][1]
@@ -34,9 +37,10 @@ class _Save:
     """Titles of a submission, one after the other."""
 
     folder: Path
+    page: str = "/student/0/"
     longest: float = 1.5  # s within which the server is killed
     sent: int = 0
-    confirmed: int = 0
+    confirmed: list[int] = field(default_factory=list)
 
     def prepare(self) -> None:
         a_submission(self.folder)
@@ -50,9 +54,8 @@ class _Save:
     def check(self) -> None:
         submission = load_submission(self.folder)
         title = int(submission.title.removeprefix("title "))
-        assert title in (self.confirmed, self.sent)
+        assert (self.confirmed or [0])[-1] <= title <= self.sent
         assert submission.experiments
-        self.confirmed = title
 
 
 @dataclass(kw_only=True)
@@ -74,16 +77,16 @@ class _Upload(_Save):
             for path in (self.folder / "data").glob("drop-*")
         }
         assert all(raw == self.content(number) for number, raw in stored.items())
-        assert set(range(1, self.confirmed + 1)) <= set(stored)
         named = {experiment.file for experiment in load_submission(self.folder).experiments}
-        assert {f"data/drop-{n}.csv" for n in range(1, self.confirmed + 1)} <= named
-        self.confirmed = max(stored, default=0)
+        assert {f"data/drop-{number}.csv" for number in self.confirmed} <= named
+        assert set(self.confirmed) <= set(stored)
 
 
 @dataclass(kw_only=True)
 class _Override(_Save):
     """Points by hand, each with its number as the reason."""
 
+    page: str = "/grades/0/"
     longest: float = 0.8
 
     def prepare(self) -> None:
@@ -100,11 +103,14 @@ class _Override(_Save):
 
     def check(self) -> None:
         with OpenBook(self.folder) as book:
-            given = [one for _, one in book.changes_since(0) if one.why.startswith("change")]
-            assert [one.why for one in given] == [f"change {n + 1}" for n in range(len(given))]
-            assert [one.points for one in given] == [(n + 1) % 3 / 2 for n in range(len(given))]
-            assert len(given) in (self.confirmed, self.sent)
-            self.confirmed = len(given)
+            given = {
+                int(one.why.removeprefix("change ")): one.points
+                for _, one in book.changes_since(0)
+                if one.why.startswith("change")
+            }
+            assert list(given) == sorted(given)
+            assert all(points == number % 3 / 2 for number, points in given.items())
+            assert set(self.confirmed) <= set(given) <= set(range(1, self.sent + 1))
             assert len(book.class_now().listings) == 16
         _whole(self.folder)
 
@@ -113,28 +119,38 @@ class _Override(_Save):
 class _Regrade(_Save):
     """A submission that is another each time, graded beside one with points by hand."""
 
-    longest: float = 12.0
+    page: str = "/grades/0/"
+    longest: float = 20.0
     team: Path = field(init=False)
+    rubric: Path = field(init=False)
 
     def prepare(self) -> None:
-        write_class(self.folder)
-        self.team = a_submission(self.folder.with_name("team-x"))
+        self.folder.mkdir()
+        outcome = make_outcome(make_grade("team-04"), fingerprints=b"")
+        with Gradebook(self.folder, assignment="lab", create=True) as book:
+            book.put(outcome)
+            book.finish(Batch(keys=(outcome.key,), shared={}), rubric=two_cart_rubric())
+            book.override("team-04", "laws", 0.5, why="as told", by="Ada")
+        self.team = a_submission(self.folder.with_name("team-x"), "two-cart")
+        self.rubric = self.folder.with_name("lab.toml")  # its name is the class's
+        shutil.copy(RUBRICS / "throne-2dof.toml", self.rubric)
 
     def act(self, who: Visitor) -> None:
         new = f"title {self.sent}"
         edit_submission(self.team, lambda document: document.update(title=new))
-        sent = {"paths": str(self.team), "rubric": "throne-2dof", "lateness": ""}
+        sent = {"paths": str(self.team), "rubric": str(self.rubric), "lateness": ""}
         assert who.post("/grades/0/regrade", **sent).status == 303
         until(lambda: "data-events" not in who.get("/grades/0/").text)
-        assert "Grading: done" in who.get("/grades/0/").text
+        page = who.get("/grades/0/").text
+        assert "Grading: done" in page, re.findall('class="wrong".*', page)
 
     def check(self) -> None:
         _whole(self.folder)
         with Gradebook(self.folder) as book:
             teams = {entry.submission: entry for entry in book.entries()}
-            assert teams["team-02"].overrides["laws"].why == "right, <i>as told</i>"
-            assert len(teams) == 16 + ("team-x" in teams)
-            assert self.confirmed == 0 or "team-x" in teams
+            assert teams["team-04"].overrides["laws"].why == "as told"
+            assert set(teams) <= {"team-04", "team-x"}
+            assert not self.confirmed or "team-x" in teams
 
 
 def _whole(folder: Path) -> None:
@@ -152,13 +168,14 @@ def kill_again_and_again(work: _Save, *, kills: int, seed: int) -> int:
         with started(command, stderr=subprocess.PIPE, encoding="utf-8") as desk:
             _act_until_killed(work, desk, after=draw.uniform(0.0, work.longest))
         work.check()
-    return work.confirmed
+    return len(work.confirmed)
 
 
 def _act_until_killed(work: _Save, desk: subprocess.Popen, *, after: float) -> None:
     """Ask for one change after the other; what the desk had started ends with it, by itself."""
     assert desk.stderr is not None
     who, started_by_it = Visitor.of(desk.stderr.readline().split()[1]), []
+    assert who.get(work.page).status == 200  # the processes that it needs are there
 
     def end() -> None:
         started_by_it.extend(psutil.Process(desk.pid).children(recursive=True))
@@ -167,10 +184,14 @@ def _act_until_killed(work: _Save, desk: subprocess.Popen, *, after: float) -> N
     timer = threading.Timer(after, end)
     timer.start()
     with suppress(OSError, http.client.HTTPException):
-        while True:
-            work.sent = work.confirmed + 1
-            work.act(who)
-            work.confirmed += 1
+        try:
+            while True:
+                work.sent += 1
+                work.act(who)
+                work.confirmed.append(work.sent)
+        except AssertionError:
+            timer.cancel()
+            raise
     timer.join()
     desk.wait()
     assert psutil.wait_procs(started_by_it, timeout=PATIENCE)[1] == []

@@ -3,7 +3,9 @@
 import re
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from contextlib import AbstractContextManager, nullcontext
+from itertools import count
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
@@ -27,65 +29,116 @@ from pipeline.submission.toml_file import decoded, parse_toml
 _TEXTS = {NAME: MAX_TOML_BYTES, "notes.md": MAX_NOTES_BYTES}
 _UNFIT = re.compile(r'[<>:"/\\|?*\x00-\x1f\x7f]|^[. ~]+|[. ]+$')  # in no name, on any system
 _RESERVED = re.compile(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?")
-_LONGEST = 120  # letters of a name
+_LONGEST = 120  # bytes of a name, whatever letters it has: systems take 255, some fewer
+_ASIDE = "set-aside"  # where recordings go that are not to be part of it
 
 
-def take_upload(name: str, content: BinaryIO, folder: Path, *, hand: Hand) -> list[str]:
-    """Store an uploaded file, or what is in an archive; return what a person would not expect."""
-    try:
-        if PurePosixPath(name.replace("\\", "/")).suffix.lower() == ".zip":
-            said = list(_take_archive(content, folder, hand=hand))
-        else:
-            said = [_take(name, content, folder)]
-    except (SubmissionError, Failed) as error:
-        said = [f"{quote(name)}: not taken: {error}"]
+def take_uploads(sent: Iterable[tuple[str, BinaryIO]], folder: Path, *, hand: Hand) -> list[str]:
+    """Store uploaded files, and what is in archives; return what a person would not expect."""
+    said: list[str] = []
+    with tempfile.TemporaryDirectory(prefix="cartlab-") as scratch:
+        files: list[tuple[str, BinaryIO | Path]] = []
+        for number, (name, content) in enumerate(sent):
+            if PurePosixPath(name.replace("\\", "/")).suffix.lower() != ".zip":
+                files.append((name, content))
+                continue
+            try:
+                files += _unpacked(content, Path(scratch) / str(number), hand=hand)
+            except (SubmissionError, Failed) as error:
+                said.append(f"{quote(name)}: not taken: {error}")
+        with turn_in(folder):
+            room = _Room(folder)
+            for name, given in files:
+                try:
+                    with (
+                        given.open("rb") if isinstance(given, Path) else nullcontext(given) as file
+                    ):
+                        said.append(_take(name, file.read(MAX_DATA_BYTES + 1), folder, room=room))
+                except SubmissionError as error:
+                    said.append(f"{quote(name)}: not taken: {error}")
     return [line for line in said if line]
 
 
-def _take_archive(content: BinaryIO, folder: Path, *, hand: Hand) -> Iterator[str]:
-    with tempfile.TemporaryDirectory(prefix="cartlab-") as scratch:
-        archive, into = Path(scratch) / "upload.zip", Path(scratch) / "files"
-        with archive.open("xb") as file:
-            shutil.copyfileobj(content, file)
-        for member in hand.do("unpack", archive=str(archive), into=str(into)):
-            if is_debris(PurePosixPath(member)):
-                continue
-            with (into / member).open("rb") as file:
-                try:
-                    yield _take(member, file, folder)
-                except SubmissionError as error:
-                    yield f"{quote(member)}: not taken: {error}"
+def _opened(given: BinaryIO | Path) -> AbstractContextManager[BinaryIO]:
+    return given.open("rb") if isinstance(given, Path) else nullcontext(given)
 
 
-def _take(given: str, content: BinaryIO, folder: Path) -> str:
+def _unpacked(content: BinaryIO, scratch: Path, *, hand: Hand) -> list[tuple[str, Path]]:
+    scratch.mkdir()
+    archive, into = scratch / "upload.zip", scratch / "files"
+    with archive.open("xb") as file:
+        shutil.copyfileobj(content, file)
+    members = hand.do("unpack", archive=str(archive), into=str(into))
+    return [(name, into / name) for name in members if not is_debris(PurePosixPath(name))]
+
+
+class _Room:
+    """What a folder still takes by a hand-in's limits; counted once, whoever has the turn adds."""
+
+    def __init__(self, folder: Path) -> None:
+        there = [p.stat().st_size for p in folder.rglob("*") if p.is_file() and p.name != TURN]
+        self._files, self._bytes = len(there), sum(there)
+
+    def check(self, raw: bytes) -> None:
+        """Refuse what there is no room for; what is not refused is stored."""
+        if len(raw) > MAX_DATA_BYTES:
+            raise SubmissionError(f"larger than {MAX_DATA_BYTES:,} bytes")
+        if self._files >= HAND_IN.members or self._bytes + len(raw) > HAND_IN.total:
+            raise SubmissionError(
+                f"a hand-in has at most {HAND_IN.members:,} files and {HAND_IN.total:,} bytes"
+            )
+        self._files, self._bytes = self._files + 1, self._bytes + len(raw)
+
+
+def _take(given: str, raw: bytes, folder: Path, *, room: _Room) -> str:
     """Store a file, under another name where its own is of something else; say if so."""
     last = PurePosixPath(given.replace("\\", "/")).name
-    raw = content.read(MAX_DATA_BYTES + 1)
     if last in _TEXTS:
         _check_text(raw, last)
-        with turn_in(folder):
-            if _is_sound(folder, last):
-                raise SubmissionError("there is one already, which stays as it is")
-            _check_room(raw, folder)
-            write_file(folder / last, raw)
+        if _is_sound(folder, last):
+            raise SubmissionError("there is one already, which stays as it is")
+        room.check(raw)
+        write_file(folder / last, raw)
         return ""
     if PurePosixPath(last).suffix.casefold() not in ENDINGS:
         raise SubmissionError(f"a recording ends in {', '.join(ENDINGS)}")
-    name = _UNFIT.sub("-", last)[-_LONGEST:]
+    name = _UNFIT.sub("-", last.encode(errors="ignore")[-_LONGEST:].decode(errors="ignore"))
     if _RESERVED.fullmatch(name):
         name = f"data-{name}"
-    with turn_in(folder):
-        target = own_folder(folder, "data") / name
-        number = 1
-        while target.exists() or target.is_symlink():
-            if not target.is_symlink() and target.is_file() and target.read_bytes() == raw:
-                return f"{quote(last)}: is there already"
-            number += 1
-            target = target.with_name(f"{Path(name).stem}-{number}{Path(name).suffix}")
-        _check_room(raw, folder)
-        target.parent.mkdir(exist_ok=True)
-        write_file(target, raw)
+    names = _names(own_folder(folder, "data") / name)
+    target = next(path for path in names if not _there(path) or _holds(path, raw))
+    if _there(target):
+        return f"{quote(last)}: is there already"
+    room.check(raw)
+    target.parent.mkdir(exist_ok=True)
+    write_file(target, raw)
     return f"{quote(last)}: taken as {target.name}" if target.name != last else ""
+
+
+def _there(path: Path) -> bool:
+    return path.exists() or path.is_symlink()
+
+
+def _holds(path: Path, raw: bytes) -> bool:
+    return not path.is_symlink() and path.is_file() and path.read_bytes() == raw
+
+
+def _names(path: Path) -> Iterator[Path]:
+    """Yield a path, then those beside it that it may have instead."""
+    yield path
+    for number in count(2):
+        yield path.with_name(f"{path.stem}-{number}{path.suffix}")
+
+
+def put_aside(file: str, folder: Path) -> str:
+    """Move a recording out of `data/`, over nothing; say where it is now."""
+    with turn_in(folder):
+        aside = own_folder(folder, _ASIDE)
+        aside.mkdir(exist_ok=True)
+        names = _names(aside / PurePosixPath(file).name)
+        target = next(path for path in names if not _there(path))
+        (folder / file).rename(target)
+    return f"{quote(file)} lies in {_ASIDE}/{target.name} now: no report and no zip has it."
 
 
 def _check_text(raw: bytes, name: str) -> None:
@@ -104,15 +157,3 @@ def _is_sound(folder: Path, name: str) -> bool:
     except SubmissionError:
         return False
     return True
-
-
-def _check_room(raw: bytes, folder: Path) -> None:
-    """Refuse what the folder has no room for by a hand-in's limits."""
-    if len(raw) > MAX_DATA_BYTES:
-        raise SubmissionError(f"larger than {MAX_DATA_BYTES:,} bytes")
-    files = (path for path in folder.rglob("*") if path.is_file() and path.name != TURN)
-    there = [path.stat().st_size for path in files]
-    if len(there) >= HAND_IN.members or sum(there) + len(raw) > HAND_IN.total:
-        raise SubmissionError(
-            f"a hand-in has at most {HAND_IN.members:,} files and {HAND_IN.total:,} bytes"
-        )

@@ -10,12 +10,13 @@ from urllib.parse import quote
 
 import tomlkit
 from starlette.datastructures import UploadFile
+from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
 from pipeline.desk.jobs import Failed
 from pipeline.desk.pages import served_file
 from pipeline.desk.state import NOTHING_KNOWN, Ask
-from pipeline.desk.student.files import take_upload
+from pipeline.desk.student.files import put_aside, take_uploads
 from pipeline.desk.student.form import (
     Field,
     apply,
@@ -48,6 +49,7 @@ from pipeline.submission.toml_file import read_text
 _ASKED = "report/questions.json"
 _MOST_ASKED = 1_000_000  # bytes
 _NOTES = "notes.md"
+_GAP_BUDGET = 60.0  # s, as `cartlab gap` has by default
 
 
 def show(ask: Ask) -> Response:
@@ -57,11 +59,21 @@ def show(ask: Ask) -> Response:
 
 def upload(ask: Ask) -> Response:
     """Take files, and write down what they are."""
-    folder, said = ask.folder(), []
-    for item in ask.form.getlist("files"):
-        if isinstance(item, UploadFile) and item.filename:
-            said += take_upload(item.filename, item.file, folder, hand=ask.desk.hand)
+    folder, items = ask.folder(), ask.form.getlist("files")
+    sent = [(i.filename, i.file) for i in items if isinstance(i, UploadFile) and i.filename]
+    said = take_uploads(sent, folder, hand=ask.desk.hand)
     return ask.back(_here(ask), *said, *_filled(ask, folder))
+
+
+def aside(ask: Ask) -> Response:
+    """Move a recording out of `data/` that no table names."""
+    folder, file = ask.folder(), ask.text("file")
+    if file not in ask.desk.hand.do("files", folder=str(folder)):
+        raise HTTPException(404, "there is no such recording")
+    document = read_document(submission_text(folder) if (folder / NAME).exists() else "")
+    if any(posix(str(table.get("file", ""))) == file for table in _tables(document)):
+        raise SubmissionError(f"{file}: {NAME} names it; take it out there first")
+    return ask.back(_here(ask), put_aside(file, folder))
 
 
 def fill(ask: Ask) -> Response:
@@ -71,23 +83,31 @@ def fill(ask: Ask) -> Response:
 
 def save(ask: Ask) -> Response:
     """Write the form into the file."""
-    document = read_document(submission_text(ask.folder()))
-    fields = [field for group in groups(document) for field in group.fields]
+    fields = [field for group in groups(_shown(ask)) for field in group.fields]
     return _save(ask, fields)
 
 
 def save_experiment(ask: Ask) -> Response:
     """Write one row of the table of files into its table, or take the table away."""
-    folder, index = ask.folder(), ask.request.path_params["index"]
+    index = ask.request.path_params["index"]
     if ask.text("remove"):
         return _edited(ask, lambda document: remove_experiment(document, index), changed=[])
-    return _save(ask, experiment_fields(read_document(submission_text(folder)), index))
+    return _save(ask, experiment_fields(_shown(ask), index))
 
 
 def start_report(ask: Ask) -> Response:
     """Have the report made."""
     folder = ask.folder()
     ask.desk.jobs.start("report", title="The report", place=folder, folder=str(folder))
+    return ask.back(_here(ask) + "#report")
+
+
+def start_gap(ask: Ask) -> Response:
+    """Have the data asked what the linear model leaves out."""
+    folder = ask.folder()
+    ask.desk.jobs.start(
+        "gap", title="The gap", place=folder, folder=str(folder), budget=_GAP_BUDGET
+    )
     return ask.back(_here(ask) + "#report")
 
 
@@ -128,6 +148,11 @@ def report_file(ask: Ask) -> Response:
     return served_file(ask.folder(), f"report/{ask.request.path_params['name']}")
 
 
+def gap_file(ask: Ask) -> Response:
+    """Return a file of the gap's page, likewise."""
+    return served_file(ask.folder(), f"gap/{ask.request.path_params['name']}")
+
+
 def packed(ask: Ask) -> Response:
     """Return the zip."""
     name = f"{ask.folder().name}.zip"
@@ -142,6 +167,12 @@ def packed(ask: Ask) -> Response:
 
 def _here(ask: Ask) -> str:
     return f"/student/{ask.request.path_params['n']}/"
+
+
+def _shown(ask: Ask) -> dict[str, Any]:
+    """Return the file that a form was filled in for: what differs from that was typed."""
+    text = ask.desk.shown.get(ask.text("seen"))
+    return read_document(submission_text(ask.folder()) if text is None else text)
 
 
 def _filled(ask: Ask, folder: Path) -> list[str]:
@@ -200,6 +231,7 @@ def _room(
     except SubmissionError as unreadable:
         error = unreadable
     document = read_document(text)
+    ask.desk.keep_shown(text, digest=text_digest(text))
     if error is None and text:
         error = _wrong(text, folder)
     rows = _rows(ask, folder, document)
@@ -207,7 +239,7 @@ def _room(
     every = [f for group in form for f in group.fields] + [f for r in rows for f in r["fields"]]
     shown, left = with_errors(every, changed, error)
     by_path = {field.path: field for field in shown}
-    job = ask.desk.jobs.of(folder)
+    job, told = ask.desk.jobs.of(folder), _told(folder)
     return ask.page(
         "student",
         status=status,
@@ -221,10 +253,20 @@ def _room(
         sound=bool(text) and error is None,
         job=job,
         report=_report_state(folder),
-        told=_told(folder),
+        told=told,
+        unanswered=_unanswered(folder, told),
+        gap=outside(folder, "gap/gap.html") is None,
         said=ask.told(),
         here=_here(ask),
     )
+
+
+def _unanswered(folder: Path, told: Mapping[str, Any]) -> int:
+    try:
+        notes = _notes(folder)
+    except SubmissionError:  # the report's page says what is wrong with them
+        notes = ""
+    return sum(not written_answer(notes, one["id"]).strip() for one in told["questions"])
 
 
 def _wrong(text: str, folder: Path) -> SubmissionError | None:
@@ -245,9 +287,7 @@ def _keeps(folder: Path) -> list[str]:
 
 def _rows(ask: Ask, folder: Path, document: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return a row for every data file, and for every table whose file is not there."""
-    tables = document.get("experiments")
-    listed = [t for t in tables if isinstance(t, dict)] if isinstance(tables, list) else []
-    listed = listed[:MOST_EXPERIMENTS]  # further ones are what is wrong with the file
+    listed = _tables(document)[:MOST_EXPERIMENTS]  # further ones are what is wrong with the file
     places: dict[str, list[int]] = {}
     for index, table in enumerate(listed):
         places.setdefault(posix(str(table.get("file", ""))), []).append(index)
@@ -261,6 +301,11 @@ def _rows(ask: Ask, folder: Path, document: Mapping[str, Any]) -> list[dict[str,
     for file, indices in places.items():
         rows += [_row(document, file, gone, index, listed) for index in indices]
     return rows
+
+
+def _tables(document: Mapping[str, Any]) -> list[dict[str, Any]]:
+    tables = document.get("experiments")
+    return [t for t in tables if isinstance(t, dict)] if isinstance(tables, list) else []
 
 
 def _row(
