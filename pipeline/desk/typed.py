@@ -5,23 +5,27 @@ from pathlib import Path
 from pipeline.errors import ConfigError
 
 
-def typed_path(typed: str, *, wanted: str) -> Path:
+def typed_path(typed: str, *, wanted: str, inside: Path | None = None) -> Path:
     """Return a path that was typed, from the root.
 
     Parameters
     ----------
     wanted : what to do where nothing was typed, in the words of the form.
+    inside : a folder that it may not lead out of, from which it is read; None: all of the computer.
 
     Raises
     ------
-    ConfigError : it is no path, or `~` of nobody whom this computer knows.
+    ConfigError : it is no path, leads out, or is `~` of nobody whom this computer knows.
     """
     if not typed or not typed.isprintable():
         raise ConfigError(wanted)
     try:
-        return Path(typed).expanduser().resolve()
+        path = (inside / typed if inside else Path(typed).expanduser()).resolve()
     except RuntimeError:
         raise ConfigError(f"{typed}: this computer knows nobody of that name") from None
+    if inside and not path.is_relative_to(inside):
+        raise ConfigError(f"{typed}: leads out of {inside.name}, where yours is made")
+    return path
 
 
 def whole_number(typed: str, *, name: str, least: int, most: int) -> int:

@@ -19,16 +19,18 @@ Place = Path | str  # a folder, or the address of a database
 Role = Literal["owner", "student", "ta", "instructor"]
 _MOST_BYTES = 1_000_000
 
-# The rooms that a role may enter, by the first part of their address. Rooms that write wherever
-# one says, read any file or open a port of this computer are for who started the desk.
+# The rooms that a role may enter, by the first part of their address. For who started the desk they
+# are about all of this computer, for others about what the key of the file lists, if anything.
 _ALL = frozenset({"", "static"})
 _ROOMS: dict[Role, frozenset[str]] = {
     "student": _ALL | {"student"},
     "ta": _ALL | {"grades"},
-    "instructor": _ALL | {"student", "grades", "solution", "effects"},
-    "owner": _ALL
-    | {"open", "student", "grades", "solution", "effects", "exercises", "rubric", "bench"},
+    "instructor": _ALL
+    | {"student", "grades", "solution", "effects", "exercises", "rubric", "bench"},
 }
+_ROOMS["owner"] = _ROOMS["instructor"] | {"open"}
+_ROOM_OF = {"folders": "student", "gradebooks": "grades", "workshop": "exercises", "ports": "bench"}
+_NEEDS = {"exercises": "workshop", "rubric": "workshop", "bench": "ports"}
 
 
 @dataclass(kw_only=True)
@@ -40,16 +42,22 @@ class User:
     folders : the submissions that they see, addressed by their place in this list: of another's
         there is no address. An owner's list grows as they open folders.
     gradebooks : likewise, the outputs of gradings, or addresses of databases.
+    workshop : the folder in which they make exercises and rubrics; an owner makes them anywhere.
+    ports : the benches at which they acquire; an owner may name any.
     """
 
     name: str
     role: Role
     folders: list[Path] = field(default_factory=list)
     gradebooks: list[Place] = field(default_factory=list)
+    workshop: Path | None = None
+    ports: tuple[str, ...] = ()
 
     def may(self, room: str) -> bool:
         """Whether they may enter a room; which of its places, their lists say."""
-        return room in _ROOMS[self.role]
+        needed = _NEEDS.get(room)
+        listed = needed is None or self.owns or bool(getattr(self, needed))
+        return room in _ROOMS[self.role] and listed
 
     @property
     def owns(self) -> bool:
@@ -84,6 +92,8 @@ class Listed(_Model):
     role: Literal["student", "ta", "instructor"]
     folders: tuple[str, ...] = ()
     gradebooks: tuple[str, ...] = ()
+    workshop: str = ""
+    ports: tuple[str, ...] = ()
 
 
 class Users(_Model):
@@ -124,6 +134,8 @@ def read_users(path: Path) -> tuple[Proxy, dict[str, User]]:
             role=user.role,
             folders=[root / folder for folder in user.folders],
             gradebooks=[one if "://" in one else root / one for one in user.gradebooks],
+            workshop=(root / user.workshop).resolve() if user.workshop else None,
+            ports=user.ports,
         )
         for user in found.users
     }
@@ -142,11 +154,10 @@ def _wrong(found: Users, root: Path) -> Iterator[str]:
         where = f"users: {user.name!r}"
         if names.count(user.name) > 1:
             yield f"{where} is there twice"
-        for room, places in (("student", user.folders), ("grades", user.gradebooks)):
-            if places and room not in _ROOMS[user.role]:
-                key = "folders" if room == "student" else "gradebooks"
-                yield f"{where}: a {user.role} sees no {key}; take them away, or give another role"
-        for place in (*user.folders, *user.gradebooks):
+        for key, room in _ROOM_OF.items():
+            if getattr(user, key) and room not in _ROOMS[user.role]:
+                yield f"{where}: a {user.role} has no {key}; take it away, or give another role"
+        for place in (*user.folders, *user.gradebooks, user.workshop):
             if "://" not in place and not (root / place).is_dir():
                 yield f"{where}: there is no folder {root / place}"
 

@@ -5,7 +5,8 @@ import socket
 import sys
 import time
 from contextlib import ExitStack
-from urllib.parse import urlsplit
+from html import unescape
+from urllib.parse import urlencode, urlsplit
 
 import psutil
 import pytest
@@ -14,6 +15,8 @@ from pipeline.desk.app import ROUTES, DeskServer
 from pipeline.desk.doors import MOST_FORM
 from pipeline.desk.users import read_users
 from pipeline.errors import ConfigError
+from pipeline.resources import RUBRICS
+from pipeline.submission import load_submission
 from tests.helpers.desks import PROXY, Visitor, a_submission, through_proxy, write_users
 from tests.helpers.grades import write_class
 from tests.helpers.waiting import PATIENCE, until
@@ -151,6 +154,13 @@ name = "i"
 role = "instructor"
 folders = ["one"]
 gradebooks = ["grades"]
+[[users]]
+name = "w"
+role = "instructor"
+folders = ["one"]
+gradebooks = ["grades"]
+workshop = "shop"
+ports = ["/dev/ttyACM9"]
 """
 
 
@@ -166,6 +176,8 @@ def lab(root):
     for name in ("one", "two", "three", "four"):
         a_submission(root / name)
     write_class(root / "grades")
+    (root / "shop").mkdir()
+    (root / "shop" / "out").symlink_to(root)
     with DeskServer(users=write_users(root, USERS)) as server:
         port = urlsplit(server.url).port or 0
         yield lambda name, **given: through_proxy(port, name, **given)
@@ -192,14 +204,15 @@ def test_a_ta_sees_the_gradebooks_they_are_listed_for(lab):
 
 
 # Of each room, by the first part of an address, who of a lab server is let in.
-ENTER = {"": "s t i", "static": "s t i", "student": "s i", "grades": "t i", "solution": "i",
-         "effects": "i", "open": "", "exercises": "", "rubric": "", "bench": ""}  # fmt: skip
+ENTER = {"": "s t i w", "static": "s t i w", "student": "s i w", "grades": "t i w",
+         "solution": "i w", "effects": "i w", "open": "", "exercises": "w", "rubric": "w",
+         "bench": "w"}  # fmt: skip
 
 
 @pytest.mark.parametrize("path", [*PATHS, "/student/0/events", "/grades/0/events"])
 def test_each_role_has_its_rooms(lab, path):
     """Every address: none of a room that is not one's own, whatever is sent there."""
-    for role, name in {"s": "s1", "t": "t", "i": "i"}.items():
+    for role, name in {"s": "s1", "t": "t", "i": "i", "w": "w"}.items():
         let_in = role in ENTER[path.split("/")[1]].split()
         if not let_in:
             answers = {lab(name).get(path).status, lab(name).post(path).status}
@@ -231,15 +244,41 @@ def test_a_page_that_is_asked_for_writes_nothing(lab, root):
 
     before = files()
     for path in (p for p, (_, method, _) in zip(PATHS, ROUTES, strict=True) if method == "GET"):
-        for name in ("s1", "t", "i"):
+        for name in ("s1", "t", "i", "w"):
             lab(name).get(path)
     assert files() == before
 
 
 def test_nobody_names_a_folder_of_the_server(lab, tmp_path):
     """Only the person at this computer opens folders by name."""
-    for name in ("s1", "t"):
+    for name in ("s1", "t", "w"):
         assert lab(name).post("/open", folder=str(tmp_path)).status == 403
+
+
+def test_an_instructor_makes_in_the_workshop_and_nowhere_else(lab, root):
+    """Exercises and rubrics, whatever is typed; and acquires at the ports of the list."""
+    who = lab("w")
+    bench = {"preset": "throne-1dof", "folders": "1", "seed": "0"}
+    made = who.post("/exercises/make", out="first", **bench)
+    assert made.status == 303
+    until(lambda: "done" in who.get(made.headers["location"]).text)
+    assert load_submission(root / "shop" / "first").experiments
+    rubric = (RUBRICS / "throne-1dof.toml").read_text(encoding="utf-8")
+    assert who.post("/rubric/save", file="a.toml", text=rubric, seen="new").status == 303
+    assert (root / "shop" / "a.toml").read_text(encoding="utf-8") == rubric.rstrip() + "\n"
+    (root / "b.toml").write_text(rubric, encoding="utf-8")
+    for out in ("../b", str(root / "b"), "~/b", "out/b", "first/../../b"):
+        answer = who.post("/exercises/make", out=out, **bench)
+        assert answer.status == 422, out
+        page = who.get(f"/rubric/?{urlencode({'file': f'{out}.toml'})}")
+        assert rubric.splitlines()[0] not in unescape(page.text), out
+        assert who.post("/rubric/save", file=f"{out}.toml", text=rubric, seen="new").status == 422
+    assert not (root / "b").exists()
+    for port in ("/dev/ttyACM8", "socket://127.0.0.1:9", ""):
+        assert who.post("/bench/0/acquire", port=port).status == 422
+    assert "/dev/ttyACM9" in who.get("/bench/0/").text
+    assert "/bench/0/" in who.get("/").text
+    assert "/bench/0/" not in lab("i").get("/").text
 
 
 def test_forged_names_are_refused(lab):
@@ -273,9 +312,12 @@ def test_forged_names_are_refused(lab):
         ((PROXY + USERS).replace("the-proxy-and-the-desk-know-it", "short"), "secret"),
         ((PROXY + USERS).replace("X-Proxy-Secret", "x-remote-user"), "another header"),
         ((PROXY + USERS).replace("127.0.0.1", "proxy.lab"), "proxy.address"),
-        ((PROXY + USERS).replace('"student"', '"ta"', 1), "a ta sees no folders"),
-        ((PROXY + USERS).replace('"ta"', '"student"'), "a student sees no gradebooks"),
+        ((PROXY + USERS).replace('"student"', '"ta"', 1), "a ta has no folders"),
+        ((PROXY + USERS).replace('"ta"', '"student"'), "a student has no gradebooks"),
         ((PROXY + USERS).replace('"two"', '"twoo"'), "there is no folder"),
+        ((PROXY + USERS).replace('"shop"', '"shops"'), "there is no folder"),
+        (PROXY + '[[users]]\nname = "t"\nrole = "ta"\nworkshop = "one"\n', "a ta has no workshop"),
+        (PROXY + '[[users]]\nname = "s"\nrole = "student"\nports = ["COM3"]\n', "no ports"),
         ((PROXY + USERS).replace('"s2"', '"s1"'), "there twice"),
         ((PROXY + USERS).replace("folders", "folder", 1), "did you mean 'folders'"),
         ((PROXY + USERS).replace("https://Lab.example.edu", "lab"), "site"),
@@ -283,7 +325,7 @@ def test_forged_names_are_refused(lab):
 )
 def test_a_wrong_list_is_one_line(text, why, tmp_path):
     """What is wrong with the file of users is said, and nothing is served."""
-    for name in ("one", "two", "three", "grades"):
+    for name in ("one", "two", "three", "grades", "shop"):
         (tmp_path / name).mkdir()
     (tmp_path / "users.toml").write_text(text, encoding="utf-8")
     (tmp_path / "users.toml").chmod(0o600)

@@ -14,7 +14,6 @@ import time
 from collections.abc import AsyncIterator, Collection, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 from urllib.parse import parse_qsl
 
@@ -90,12 +89,7 @@ class LivePage(LiveState):
             raise HardwareError("the page could not be served")
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         self.end()
         self._closing = True
         until = time.monotonic() + _GOODBYE

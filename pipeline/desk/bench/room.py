@@ -29,7 +29,7 @@ def show(ask: Ask) -> Response:
         here=_here(ask),
         session=session,
         live=Markup(live_view()) if session and not session.ended.is_set() else "",
-        ports=[(name.partition(" (")[0], name) for name in port_names()],
+        ports=_ports(ask),
         job=ask.desk.jobs.of(folder),
         said=ask.told(),
         **_plan(folder),
@@ -49,6 +49,8 @@ def start(ask: Ask) -> Response:
     folder, port = ask.folder(), ask.text("port")
     if not port:
         raise ConfigError("name the port of the bench, such as COM3, /dev/ttyACM0 or socket://…")
+    if not ask.user.owns and port not in ask.user.ports:
+        raise ConfigError(f"{port}: is not listed for you; there are {', '.join(ask.user.ports)}")
     only = [value for value in ask.form.getlist("only") if isinstance(value, str)]
     ask.desk.benches.start(folder, port=port, only=only)
     return ask.back(_here(ask))
@@ -63,6 +65,13 @@ def press(ask: Ask) -> Response:
 def events(ask: Ask) -> Response:
     """Pass on the news of the session."""
     return StreamingResponse(_running(ask).events(), media_type="text/event-stream")
+
+
+def _ports(ask: Ask) -> list[tuple[str, str]]:
+    """Return what ports there are to choose from, and what each is."""
+    if not ask.user.owns:
+        return [(name, name) for name in ask.user.ports]
+    return [(name.partition(" (")[0], name) for name in port_names()]
 
 
 def _here(ask: Ask) -> str:

@@ -43,7 +43,7 @@ def show(ask: Ask) -> Response:
         shown=list(zip(found["effects"], pictures, strict=True)),
         chosen=[one["key"] for one in found["effects"]],
         slide=SLIDE,
-        out=sent.get("out", str(Path.cwd() / "exercise")),
+        out=sent.get("out", str((ask.user.workshop or Path.cwd()) / "exercise")),
         folders=sent.get("folders", "1"),
         seed=sent.get("seed", "0"),
         reported=bool(sent.get("reported")),
@@ -64,7 +64,7 @@ def make(ask: Ask) -> Response:
     bench, found = _exercise(ask, ask.form)
     if found["wrong"]:
         raise ConfigError(found["wrong"])
-    out = _place(ask.text("out"))
+    out = _place(ask, ask.text("out"))
     if not out.parent.is_dir():
         raise ConfigError(f"{out}: there is no folder {out.parent} to make it in")
     ask.desk.jobs.start(
@@ -83,7 +83,7 @@ def make(ask: Ask) -> Response:
 
 def made(ask: Ask) -> Response:
     """Show how far an exercise is."""
-    out = _place(ask.request.query_params.get("out", ""))
+    out = _place(ask, ask.request.query_params.get("out", ""))
     job = ask.desk.jobs.of(out)
     if job is None:
         raise HTTPException(404, "no exercise was made there")
@@ -93,7 +93,7 @@ def made(ask: Ask) -> Response:
 
 def stop(ask: Ask) -> Response:
     """Stop the making."""
-    out = _place(ask.text("out"))
+    out = _place(ask, ask.text("out"))
     if job := ask.desk.jobs.of(out):
         job.stop.set()
     return RedirectResponse(f"/exercises/made?{urlencode({'out': out})}", status_code=303)
@@ -173,5 +173,6 @@ def _picture_url(bench: Mapping[str, str], hide: str) -> str:
     return f"/exercises/picture.svg?{urlencode({**bench, 'hide': hide})}"
 
 
-def _place(typed: str) -> Path:
-    return typed_path(typed, wanted="name a folder for the exercise, not there yet or empty")
+def _place(ask: Ask, typed: str) -> Path:
+    wanted = "name a folder for the exercise, not there yet or empty"
+    return typed_path(typed, wanted=wanted, inside=ask.user.workshop)

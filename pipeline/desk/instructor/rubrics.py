@@ -23,7 +23,7 @@ def show(ask: Ask) -> Response:
     """Show a rubric: a file of this computer, or a shipped one to begin with."""
     sent = ask.request.query_params
     typed, start = sent.get("file", ""), sent.get("start", "")
-    path = _path(typed) if typed else Path.cwd() / "rubric.toml"
+    path = _path(ask, typed or "rubric.toml")
     if path.exists():
         text = rubric_source(path)
         return _page(ask, path, text, seen=text_digest(text))
@@ -34,12 +34,12 @@ def show(ask: Ask) -> Response:
 
 def check(ask: Ask) -> Response:
     """Show what is wrong with what is typed; nothing is written."""
-    return _page(ask, _path(ask.text("file")), _typed(ask), seen=ask.text("seen"))
+    return _page(ask, _path(ask, ask.text("file")), _typed(ask), seen=ask.text("seen"))
 
 
 def save(ask: Ask) -> Response:
     """Write a rubric that is valid over the file that was shown, and over no other."""
-    path, text, seen = _path(ask.text("file")), _typed(ask), ask.text("seen")
+    path, text, seen = _path(ask, ask.text("file")), _typed(ask), ask.text("seen")
     now = rubric_source(path) if path.exists() else None
     if seen != (_NEW if now is None else text_digest(now)):
         return _page(ask, path, text, seen=seen, now=now or "", status=409)
@@ -87,8 +87,9 @@ def _typed(ask: Ask) -> str:
     return plain.rstrip() + "\n"
 
 
-def _path(typed: str) -> Path:
-    path = typed_path(typed, wanted="name the file of the rubric, such as rubric.toml")
+def _path(ask: Ask, typed: str) -> Path:
+    wanted = "name the file of the rubric, such as rubric.toml"
+    path = typed_path(typed, wanted=wanted, inside=ask.user.workshop)
     if path.suffix != ".toml":
         raise ConfigError(f"{path}: a rubric is a .toml file")
     if not path.parent.is_dir():
