@@ -2,8 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-
-from matplotlib.figure import Figure
+from typing import Any
 
 from pipeline.arrays import Array
 from pipeline.names import gain_name, own_omega, own_zeta
@@ -67,7 +66,7 @@ def draw_records(analysis: Analysis, criteria: Iterable[Criterion]) -> tuple[tup
     records = {record.id: record for record in analysis.records}
     unit, drawn = clean(analysis.position_unit), []
 
-    def keep(draw: Callable[..., Figure], names: Sequence[str], *, record: Record, **how) -> None:
+    def keep(draw: Callable[..., Any], names: Sequence[str], *, record: Record, **how) -> None:
         reported = ", ".join(f"{name_span(name).text} {pairs[name][0]:.4g}" for name in names)
         recomputed = ", ".join(f"{pairs[name][1]:.4g}" for name in names)
         told = f"reported {reported}; recomputed {recomputed}"
