@@ -23,7 +23,7 @@ from pipeline.plant.loop.margins import Margins
 from pipeline.plant.loop.sampled_loop import StateFeedback
 from pipeline.results_of_runs import LogDecrement, Record, SinePoint, StepGain
 
-Outcome = Literal["pass", "fail", "skip"]
+CheckOutcome = Literal["pass", "fail", "skip"]
 
 
 # χ² per degree of freedom up to which model and noise explain the data: by chance it is under 1.5
@@ -133,7 +133,7 @@ class Check:
     """One consistency check, in a sentence for a student; outcome against `limit`."""
 
     id: str
-    outcome: Outcome
+    outcome: CheckOutcome
     value: float | None
     limit: float | None
     message: str
@@ -149,7 +149,7 @@ class Check:
         limit: float | None = None,
     ) -> "Check":
         """Return a check that passed, or failed."""
-        outcome: Outcome = "pass" if good else "fail"
+        outcome: CheckOutcome = "pass" if good else "fail"
         return cls(id=id, outcome=outcome, value=value, limit=limit, message=message)
 
 

@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 
 from pipeline.names import read_name
-from pipeline.results import Check, LogDecrement, Outcome, ParameterRow, StepGain
+from pipeline.results import Check, CheckOutcome, LogDecrement, ParameterRow, StepGain
 from pipeline.stages.compare import change_limit
 
 
 def check_rows(rows: Sequence[ParameterRow]) -> list[Check]:
     """Judge every parameter that was measured in two ways; a wide error is no agreement."""
-    verdicts: dict[bool | None, tuple[Outcome, str]] = {
+    verdicts: dict[bool | None, tuple[CheckOutcome, str]] = {
         True: ("pass", "agree"),
         False: ("fail", "disagree"),
         None: ("skip", "are too uncertain to compare"),

@@ -11,7 +11,7 @@ from pipeline.checks import limits
 from pipeline.errors import DataError
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.loop.margins import Margins, closed_loop, stability_margins
-from pipeline.results import Check, FeedbackDesign, HardwareCheck, Outcome
+from pipeline.results import Check, CheckOutcome, FeedbackDesign, HardwareCheck
 
 if TYPE_CHECKING:
     import control
@@ -67,7 +67,7 @@ def check_loops(hardware: Sequence[HardwareCheck]) -> list[Check]:
     ]
 
 
-def _check(outcome: Outcome, value: float | None, message: str) -> Check:
+def _check(outcome: CheckOutcome, value: float | None, message: str) -> Check:
     return Check(
         id="feedback.gains", outcome=outcome, value=value, limit=limits.SAME_LOOP, message=message
     )
