@@ -112,20 +112,31 @@ class OpenBook(Gradebook):
             given, first_keys = _given(connection, last), _first_keys(connection, last)
             known = before.listings if before and before.rubric == rubric else ()
             made = {listing.made_of: listing for listing in known}
-            listings = []
             columns = gradings.c.id, gradings.c.submission_id, briefs.c.grade.label("brief")
-            for row in connection.execute(class_list(last, *columns)).all():
-                shared, own = read_flag(row.shared), given.get(row.submission_id, {})
-                made_of = (row.id, row.shared, *own)
+            rows = [
+                (row, (row.id, row.shared, *given.get(row.submission_id, ())))
+                for row in connection.execute(class_list(last, *columns))
+            ]
+            # Few have points by hand, and those need all of the grade.
+            by_hand = {row.submission_id for row, of in rows if of not in made} & given.keys()
+            whole = class_list(last).where(entries.c.submission_id.in_(by_hand))
+            entry_of = {
+                row.submission_id: as_it_counts(
+                    row,
+                    given[row.submission_id].values(),
+                    shared=read_flag(row.shared),
+                    rubric=rubric,
+                )
+                for row in connection.execute(whole)
+            }
+            listings = []
+            for row, made_of in rows:
                 if (listing := made.get(made_of)) is None:
-                    line = Line.read(row.brief, shared=shared is not None)
-                    if own:  # few have points by hand, and those need all of the grade
-                        whole = class_list(last).where(entries.c.position == row.position)
-                        found = connection.execute(whole).one()
-                        entry = as_it_counts(found, own.values(), shared=shared, rubric=rubric)
-                        line = Line.of(entry.grade)
+                    shared, entry = read_flag(row.shared), entry_of.get(row.submission_id)
                     listing = Listing(
-                        line=line,
+                        line=Line.of(entry.grade)
+                        if entry
+                        else Line.read(row.brief, shared=shared is not None),
                         grading=row.id,
                         shared=shared,
                         first_key=first_keys[row.submission_id],
