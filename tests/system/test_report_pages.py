@@ -34,7 +34,7 @@ CASES = (
       for case in ("real-one", "real-two")),
 )  # fmt: skip
 # One effect for each kind of picture.
-PICTURED = tuple({effect.axis: effect for effect in CATALOGUE}.values())
+PICTURED = tuple({effect.axis: effect for effect in reversed(CATALOGUE)}.values())
 LARGEST = 3_000_000  # bytes of a page
 WIDE, PHONE = (1280, 900), (390, 844)
 
