@@ -3,8 +3,9 @@
 # isort: off
 # In this order `cartlab --help` lists the commands: as a lab needs them.
 from pipeline.cli.common import app, main
-from pipeline.cli import reports, models, plan, acquire, emulate, grading, desk, demo
+from pipeline.cli import reports, models, plan, acquire, explore, emulate, grading, desk, demo
 
 __all__ = [
-    "acquire", "app", "demo", "desk", "emulate", "grading", "main", "models", "plan", "reports",
+    "acquire", "app", "demo", "desk", "emulate", "explore", "grading", "main", "models", "plan",
+    "reports",
 ]  # fmt: skip

@@ -49,18 +49,18 @@ def acquire(
         raise ConfigError("say where the data come from: either --port or --import")
     if web and port is None:
         raise ConfigError("--web shows a bench: it goes with --port")
-    with Terminal(yes=yes) as terminal, _saying_where(folder):
+    with Terminal(yes=yes) as terminal, saying_where(folder):
         if source is not None:
             _import(folder, source, terminal, once=once)
         elif port is not None:
-            with _watching(folder, terminal, web=web, yes=yes) as (observers, buttons):
+            with watching(folder, terminal, web=web, yes=yes) as (observers, buttons):
                 _record(
                     folder, port, terminal, observers=observers, buttons=buttons, only=only or ()
                 )
 
 
 @contextmanager
-def _saying_where(folder: Path) -> Iterator[None]:
+def saying_where(folder: Path) -> Iterator[None]:
     """Say of a full disk or a folder that is not one's own what to do about it."""
     try:
         yield
@@ -73,7 +73,7 @@ def _saying_where(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _watching(
+def watching(
     folder: Path, terminal: "Terminal", *, web: bool, yes: bool
 ) -> Iterator[tuple[list["Observer"], "Buttons | None"]]:
     """Yield who watches, the first of whom has the person confirm, and the page's buttons."""

@@ -21,6 +21,7 @@ from pipeline.gap.search.grow import fit_whole
 from pipeline.gap.search.hypothesis import Hypothesis, Study, judge
 from pipeline.gap.types import FoundEffect, Gap
 from pipeline.gap.verdict.account import (
+    chain_covariance,
     chain_std,
     compare_by_record,
     list_contenders,
@@ -148,6 +149,7 @@ def explain_gap(
         held_out=tuple(run.id for run in study.held_out),
         traces=traces,
         chain_std=chain_std(final),
+        chain_covariance=chain_covariance(final),
         spread=_learnt_spread(chosen.fit),
         suspects=list_suspects(found, effects) if verdict == "unexplained" else (),
         left=left,

@@ -134,7 +134,8 @@ class Gap:
     where, left : where the linear model departs most; and the final one, unless it is enough.
     complete : False where the time allowed ended the search: the best answer so far.
     linear, model : the linear chain that fits best, and the chain with the effects.
-    chain_std : standard errors of the latter's "m_1", "c_1", "k_1", …
+    chain_std : standard errors of the latter's "m_1", "c_1", "k_1", …; `chain_covariance` (n_p,
+        n_p) of the same, None where it could not be had or was read from a file.
     training, held_out : ids of the runs.
     spread : learnt run-to-run spread of the dry friction, per cart, where the runs show any.
     notes : what a reader must know.
@@ -157,6 +158,7 @@ class Gap:
     held_out: tuple[str, ...]
     traces: tuple[Trace, ...]
     chain_std: dict[str, float] = field(default_factory=dict)
+    chain_covariance: Array | None = None
     spread: dict[int, float] = field(default_factory=dict)
     suspects: tuple[Rival, ...] = ()
     left: tuple[GapWindow, ...] = ()

@@ -10,6 +10,8 @@ from pipeline.bench.host.record import data_file, log_text
 from pipeline.bench.planning.gains import Scales
 from pipeline.bench.planning.orders import make_order
 from pipeline.bench.planning.plan import Limits, Recording
+from pipeline.bench.planning.plan_file import load_plan, plan_path, save_plan
+from pipeline.bench.planning.propose import propose_plan
 from pipeline.bench.protocol.messages import (
     EXTENSIONS,
     Description,
@@ -117,3 +119,22 @@ def new_folder(folder: Path, bench: VirtualBench, *, springs: Sequence[bool]) ->
         encoding="utf-8",
     )
     return folder
+
+
+class VirtualSession:
+    """What an exploration records through: the bench, and the folder that the first call makes."""
+
+    def __init__(self, folder: Path, bench: VirtualBench) -> None:
+        self.folder, self.bench = folder, bench
+
+    def __call__(self, ids: Sequence[str]) -> list[str]:
+        """Carry out recordings of the plan; make submission and plan where there are none."""
+        if not (self.folder / NAME).exists():
+            new_folder(self.folder, self.bench, springs=[True] * (self.bench.description.carts + 1))
+        submission = load_submission(self.folder)
+        if not plan_path(submission).exists():
+            save_plan(propose_plan(submission, bench=self.bench.description), submission)
+        plan = load_plan(submission)
+        wanted = [recording for recording in plan.recordings if recording.id in ids]
+        self.bench.record(self.folder, wanted, limits=plan.limits)
+        return [recording.id for recording in wanted]

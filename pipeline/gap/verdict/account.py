@@ -141,6 +141,16 @@ def chain_std(fit: Fit) -> dict[str, float]:
     return {name: float(v * r) for (name, v), r in zip(values.items(), relative, strict=True)}
 
 
+def chain_covariance(fit: Fit) -> Array | None:
+    """Return the covariance of what `chain_std` has the standard errors of."""
+    if fit.covariance is None:
+        return None
+    size, std = fit.structure.base_size, np.array(list(chain_std(fit).values()))
+    relative = fit.covariance[:size, :size]
+    scale = std / np.sqrt(np.diag(relative))
+    return relative * np.outer(scale, scale)
+
+
 def _sides_of(hypothesis: Hypothesis, study: Study) -> list[tuple[Run, Nuisance, bool]]:
     """Return every run with its nuisance parameters, and whether it was held out."""
     training = zip(study.training, hypothesis.fit.nuisance, strict=True)

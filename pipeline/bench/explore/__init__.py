@@ -1,0 +1,1 @@
+"""The bench that investigates itself: record, identify, doubt, choose, again."""

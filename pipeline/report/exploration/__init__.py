@@ -1,0 +1,1 @@
+"""The diary of an exploration, as a page."""
