@@ -48,7 +48,14 @@ def plan(
                 submission, n=number, goal=goal or WORST, stock=stock, progress=progress
             )
             words = [f"{made.path}: {len(made.recordings)} recordings added", made.said]
-            further = {"next": {"for": made.words, "errors": made.errors}}
+            further = {
+                "next": {
+                    "for": made.words,
+                    "errors": made.errors,
+                    "planned": made.planned,
+                    "separation": made.separation,
+                }
+            }
     if as_json:
         data = plan_data(made.plan, submission) | further
         typer.echo(json.dumps(data, indent=1, ensure_ascii=False))

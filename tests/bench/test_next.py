@@ -17,7 +17,7 @@ from pipeline.bench.design.multisine import (
 from pipeline.bench.design.next_plan import choose_next
 from pipeline.bench.emulator.core import ReferenceCore
 from pipeline.bench.planning.plan import Limits, Plan, Recording
-from pipeline.bench.planning.plan_file import load_plan, save_plan
+from pipeline.bench.planning.plan_file import load_plan
 from pipeline.bench.planning.propose import extend_plan, propose_plan, renamed
 from pipeline.bench.protocol.messages import (
     EXTENSIONS,
@@ -229,7 +229,7 @@ def test_where_dwells_identify_dwells_are_chosen():
 def test_clipped_phases_keep_the_swing_low():
     """Of twelve lines on three carts the motion peaks lower than for the best of 500 by chance."""
     lines = np.arange(10, 70, 5)
-    omega = 2 * np.pi * 0.1 * lines
+    omega = np.asarray(2 * np.pi * 0.1 * lines, dtype=np.float64)
     G = PRESETS["throne-3dof"].frequency_response(omega)
     size = 1 / np.abs(G).max(axis=0)
     turning = np.exp(1j * omega[:, None] * np.linspace(0, 10, 2048, endpoint=False))
@@ -304,7 +304,11 @@ def test_the_command_adds_what_it_chose_to_the_plan(work):
     assert len(chosen) == 2
     assert {r.aim for r in chosen} == {"zeta"}
     assert extend_plan(plan, submission) == plan
-    save_plan(plan, submission)
+    again = json.loads(cartlab_here("plan", work, "--next", 1, "--for", "zeta", "--json").stdout)
+    planned = again["next"]["planned"]
+    assert set(planned) >= {r.id for r in chosen}
+    # What was promised for the first of two is what it would leave by itself.
+    assert planned[chosen[0].id] == pytest.approx(data["next"]["errors"][1], rel=1e-9)
 
 
 @pytest.mark.parametrize("words", [("--for", "zeta"), ("--next", 1, "--for", "zeta_9")])

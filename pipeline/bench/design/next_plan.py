@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +35,7 @@ class NextPlan:
     Attributes
     ----------
     errors : (n + 1,) of what `words` names, relative: now, and after each more.
+    planned : what each open recording of the plan would leave by itself, by id.
     separation : for "gap", of the two likeliest explanations, in noises.
     """
 
@@ -43,6 +44,7 @@ class NextPlan:
     path: Path | None
     recordings: tuple[Recording, ...]
     errors: tuple[float, ...] = ()
+    planned: dict[str, float] = field(default_factory=dict)
     separation: float | None = None
 
     @property
@@ -55,9 +57,14 @@ class NextPlan:
             )
         many = len(self.recordings)
         after = f"these {many} recordings" if many > 1 else "this recording"
+        already = "; ".join(
+            f"{name}, which the plan has, alone ± {_percent(error)}"
+            for name, error in self.planned.items()
+        )
         return (
             f"{self.words}: ± {_percent(self.errors[0])} now, ± {_percent(self.errors[-1])} after "
             f"{after} ({time_words(session_time(self.recordings))})"
+            + (f"; {already}" if already else "")
         )
 
 
@@ -102,6 +109,7 @@ def plan_next(
         path=save_plan(plan, submission),
         recordings=recordings,
         errors=found.errors,
+        planned=found.planned,
     )
 
 
@@ -124,6 +132,13 @@ def choose_next(
     if not errors[-1] < errors[0]:
         raise DataError(f"no experiment that the limits allow makes {wanted.words} better")
     words = _words(wanted, known)
+    done = {record.id for record in analysis.records}
+    kinds = ("sine",) if known.dwells else ("step", "sweep")
+    planned = {
+        one.id: float(wanted.of(known.told + known.of_recording(one)))
+        for one in plan.recordings
+        if one.id not in done and one.kind in kinds and len(one.carts) == analysis.carts
+    }
     recordings = tuple(
         candidates[one].model_copy(
             update={
@@ -134,7 +149,12 @@ def choose_next(
         for one, before, after in zip(chosen, errors, errors[1:], strict=False)
     )
     return NextPlan(
-        words=words, plan=plan, path=None, recordings=recordings, errors=tuple(errors.tolist())
+        words=words,
+        plan=plan,
+        path=None,
+        recordings=recordings,
+        errors=tuple(errors.tolist()),
+        planned=planned,
     )
 
 

@@ -8,12 +8,17 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.bench.design.discriminate import with_proposal
-from pipeline.bench.design.goal import VOLUME
 from pipeline.bench.design.next_plan import choose_next, known_commands
 from pipeline.bench.planning.plan import Plan, Recording
-from pipeline.bench.planning.plan_file import load_plan, save_plan
+from pipeline.bench.planning.plan_file import load_plan, plan_path, save_plan
 from pipeline.bench.planning.plan_words import session_time, time_words
-from pipeline.bench.planning.propose import AIM, renamed
+from pipeline.bench.planning.propose import (
+    AIM,
+    identified_chain,
+    large_steps,
+    propose_plan,
+    renamed,
+)
 from pipeline.errors import ConfigError, DataError
 from pipeline.estimation.chain.parametrisation import named_estimates
 from pipeline.gap.investigate import investigate
@@ -109,7 +114,10 @@ def explore(
     """
     known = (folder / NAME).exists() and bool(load_submission(folder).experiments)
     made = () if known else tuple(record([FIRST]))
-    plan = load_plan(load_submission(folder))
+    submission = load_submission(folder)
+    if not plan_path(submission).exists():
+        save_plan(propose_plan(submission), submission)
+    plan = load_plan(submission)
     if not known:
         steps = [r.id for r in plan.recordings if r.kind == "step" and not r.release]
         made += tuple(record(steps)) if steps else ()
@@ -234,8 +242,8 @@ def _next(
         return found.recordings[0], found.said
     furthest = max(float(np.ptp(record.y, axis=1).max()) / 2 for record in analysis.records)
     if furthest < AIM * plan.limits.travel:
-        found = choose_next(analysis, plan, n=1, goal=VOLUME, commands=commands)
-        return found.recordings[0], (
+        step, _ = large_steps(identified_chain(analysis), plan.limits)
+        return step, (
             f"no cart has moved by more than {furthest:.2g} of {plan.limits.travel:g} "
             f"{analysis.position_unit} allowed, and what acts further out would not show"
         )

@@ -302,12 +302,19 @@ def _reason(analysis: Analysis, *stages: str) -> str:
     return "; ".join(s.reason for s in analysis.skipped if s.stage in stages) or "see the report"
 
 
+def large_steps(chain: Chain, limits: Limits) -> list[Recording]:
+    """Return a step to each side that ends as far out as the carts are meant to go."""
+    settle = rounded(settling_wait(chain, time_constants=SETTLED))
+    hold = AIM * limits.travel / float(np.max(np.abs(chain.static_gains())))
+    size = min(_STEP * hold, limits.input)
+    return _steps([size, -size], carts=chain.n, edge=settle, settle=settle)
+
+
 def _driven(chain: Chain, limits: Limits) -> list[Recording]:
     """Return steps and dwells that move the carts as far as they are meant to go."""
     aim, furthest = AIM * limits.travel, FURTHEST * limits.travel
     settle = rounded(settling_wait(chain, time_constants=SETTLED))
-    size = min(_STEP * aim / float(np.max(np.abs(chain.static_gains()))), limits.input)
-    recordings = _steps([size, -size], carts=chain.n, edge=settle, settle=settle)
+    recordings = large_steps(chain, limits)
     wait = settling_wait(chain, time_constants=SETTLED_DWELL)
     for number, hertz in enumerate(dwell_frequencies(chain, n=_DWELLS), start=1):
         cycles = ceil(hertz * (wait + steady_time(hertz)))

@@ -1,0 +1,129 @@
+"""A bench that investigates itself, on the emulator's carts and over a real line."""
+
+import json
+
+import pytest
+
+from pipeline.bench.explore.explore import Wish, explore, read_time, read_wish
+from pipeline.errors import ConfigError
+from pipeline.report.exploration.page import NAME
+from pipeline.submission import load_submission
+from pipeline.synthesis.hidden import prepare_bench
+from pipeline.workflow import analyse
+from tests.helpers.benches import emulator
+from tests.helpers.commandline import cartlab_here
+from tests.helpers.virtual import VirtualBench, VirtualSession
+
+
+@pytest.mark.parametrize(
+    ("text", "wish"),
+    [
+        ("zeta 1%", Wish(prefix="zeta", error=0.01)),
+        ("1 %", Wish(error=0.01)),
+        ("all 0.5%", Wish(error=0.005)),
+        ("omega_1 0.05 %", Wish(prefix="omega_1", error=0.0005)),
+    ],
+)
+def test_wishes_are_read_as_one_says_them(text, wish):
+    """A name or none, and a percentage."""
+    assert read_wish(text) == wish
+
+
+def test_durations_are_read_as_one_says_them():
+    """In seconds, minutes or hours."""
+    assert [read_time(t) for t in ("90s", "20min", "20 min", "1.5h")] == [90, 1200, 1200, 5400]
+
+
+@pytest.mark.parametrize("text", ["zeta", "zeta 1", "zeta omega 1%", "1.5", "0%", "200%", "%"])
+def test_what_is_no_wish_is_refused(text):
+    """With an example of one."""
+    with pytest.raises(ConfigError, match="expected a name and a percentage"):
+        read_wish(text)
+
+
+@pytest.mark.parametrize("text", ["20", "min", "-3s", "20 parsec"])
+def test_what_is_no_duration_is_refused(text):
+    """With an example of one."""
+    with pytest.raises(ConfigError, match="expected a duration"):
+        read_time(text)
+
+
+@pytest.fixture(scope="module")
+def explored(tmp_path_factory):
+    """Hidden friction on one cart, explored until it is known ten times better than at first."""
+    bench = prepare_bench(preset="throne-1dof", model=None, hide=["coulomb_friction"])
+    folder = tmp_path_factory.mktemp("explored") / "work"
+    said: list[str] = []
+    session = VirtualSession(folder, VirtualBench(bench, seed=2))
+    turns = explore(
+        folder, record=session, wish=read_wish("all 1%"), seconds=400.0, tell=said.append
+    )
+    return folder, turns, said, bench
+
+
+def test_an_exploration_names_what_acts_and_knows_the_carts(explored):
+    """The friction is named on its cart, every parameter is known, and as it is."""
+    folder, turns, said, bench = explored
+    last = turns[-1]
+    assert last.verdict == "named"
+    (explanation,) = last.explanations
+    assert "cart 1" in explanation.name
+    assert all(error is not None and error < 0.01 for error in last.errors.values())
+    gap = json.loads((folder / "gap" / "gap.json").read_text(encoding="utf-8"))
+    assert gap["effects"][0]["effect"] == "coulomb_friction"
+    m = gap["chain"]["m"][0]
+    assert m == pytest.approx(bench.chain.m[0], rel=0.01)
+    assert said == [turn.said for turn in turns]
+
+
+def test_an_exploration_leaves_an_ordinary_submission_and_its_diary(explored):
+    """Every record stands in submission.toml and plan.toml; each turn in the diary."""
+    folder, turns, _, _ = explored
+    recorded = [name for turn in turns for name in turn.recorded]
+    submission = load_submission(folder)
+    assert [experiment.id for experiment in submission.experiments] == recorded
+    assert analyse(submission).records
+    diary = (folder / NAME).read_text(encoding="utf-8")
+    for turn in turns:
+        assert f"{turn.seconds:.0f} s" in diary
+
+
+def test_time_that_is_up_ends_it_before_the_next_recording(explored, tmp_path):
+    """No recording is begun that would go beyond; what it would have been is said."""
+    bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
+    session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=1))
+    turns = explore(
+        tmp_path / "work", record=session, wish=Wish(error=1e-7), seconds=90.0, tell=lambda s: None
+    )
+    assert len(turns) == 1
+    assert turns[0].seconds <= 90.0
+    assert "allowed are up" in turns[0].said
+
+
+def test_a_recording_that_does_not_come_off_is_not_asked_for_again(tmp_path):
+    """Somebody skips it, or a limit stops it: nothing is recorded, and the diary says so."""
+    bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
+    session, asked = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=1)), []
+
+    def record(ids):
+        asked.append(list(ids))
+        return session(ids) if len(asked) <= 2 else []
+
+    turns = explore(
+        tmp_path / "work", record=record, wish=Wish(error=1e-7), seconds=900.0, tell=lambda s: None
+    )
+    assert len(asked) == 3
+    assert "refused before" in turns[-1].said
+
+
+def test_the_command_explores_a_bench_over_its_line(tmp_path):
+    """From no folder at all to a submission with its diary, over a socket, faster than real."""
+    folder = tmp_path / "work"
+    with emulator("--speed", "8", "--port", "socket://127.0.0.1:0", preset="throne-1dof") as bench:
+        done = cartlab_here(
+            "explore", folder, "--port", bench.address, "--until", "all 5%", "--time", "2min"
+        )
+    assert done.returncode == 0, done.stderr
+    assert (folder / NAME).exists()
+    assert {e.kind for e in load_submission(folder).experiments} >= {"step", "sweep"}
+    assert "known" in done.stderr
