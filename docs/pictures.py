@@ -1,4 +1,4 @@
-"""Make the tutorials' and the gallery's pictures anew; the gallery's pages need Chromium."""
+"""Make the pictures of the tutorials, the gallery and the desk anew; pages need Chromium."""
 
 import shutil
 import tempfile
@@ -7,6 +7,7 @@ from pathlib import Path
 from playwright.sync_api import ViewportSize, sync_playwright
 
 from pipeline.cli.demo import demo
+from pipeline.desk.app import DeskServer
 from pipeline.output import write_file
 from pipeline.report.draft.content import build_document
 from pipeline.report.figures.svg import plain_svg
@@ -44,6 +45,7 @@ def main() -> None:
         tutorials(Path(folder) / "bench-4")
         demo(Path(folder) / "demo")
         gallery(Path(folder) / "demo")
+        desk(Path(folder) / "bench-4", Path(folder) / "demo" / "grades")
 
 
 def tutorials(out: Path) -> None:
@@ -69,6 +71,28 @@ def gallery(made: Path) -> None:
         for file, name in DEMO_PAGES.items():
             page.goto(f"{made.as_uri()}/{file}")
             page.screenshot(path=IMAGES / name)
+        browser.close()
+
+
+def desk(team: Path, grades: Path) -> None:
+    """Photograph three rooms: a team's files, a team of a class, an exercise being made."""
+    with DeskServer(folder=team) as server, sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"))
+        page = browser.new_page(viewport=WINDOW)
+        page.goto(server.url)
+        page.locator(".kicker").evaluate("it => { it.textContent = 'lab/bench-4' }")  # not of here
+        page.screenshot(path=IMAGES / "desk.png")
+        page.get_by_role("link", name="Desk", exact=True).click()
+        page.get_by_label("Folder on this computer").fill(str(grades))
+        page.get_by_role("button", name="Open").click()
+        page.get_by_role("link", name="team-2", exact=True).click()
+        page.locator(
+            "article.criterion", has=page.locator("img")
+        ).first.scroll_into_view_if_needed()
+        page.screenshot(path=IMAGES / "desk-team.png")
+        page.goto(f"{server.url.rsplit('/', 2)[0]}/exercises/?effect=coulomb_friction")
+        page.locator("#hidden img").scroll_into_view_if_needed()
+        page.screenshot(path=IMAGES / "desk-exercises.png")
         browser.close()
 
 

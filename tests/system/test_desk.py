@@ -50,7 +50,7 @@ def show(browser):
     for context in contexts:
         context.close()
     said = "the server responded with a status of (422|409)"  # on the page
-    ended = r"net::ERR_(CONNECTION_\w+|INCOMPLETE_CHUNKED_ENCODING|EMPTY_RESPONSE)"  # by the test
+    ended = r"net::ERR_(CONNECTION_\w+|INCOMPLETE_CHUNKED_ENCODING|EMPTY_RESPONSE)|htmx:sendError"
     assert [error for error in errors if not re.search(f"{said}|{ended}", error)] == []
 
 
