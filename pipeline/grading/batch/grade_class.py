@@ -89,7 +89,8 @@ def grade_class(
         known = _names_so_far(gradebook or out, assignment=rubric_file.stem)
         passed: list[str] = []
         found = find_hand_ins(paths, scratch=scratch, skip=[out], known=known, say=passed.append)
-        hand_ins, remarks = settle_lateness(found, late=rubric.late, table=late_table)
+        hand_ins, unknown = settle_lateness(found, late=rubric.late, table=late_table)
+        remarks = [f"{lateness.name}: {who}" for who in unknown] if lateness else []
         # The rubric's file says which assignment it is: its title may be mended on the way.
         with Gradebook(gradebook or out, assignment=rubric_file.stem, create=True) as book:
             hidden = rubric.anonymous or anonymous

@@ -43,7 +43,7 @@ def read_late_table(path: Path) -> dict[str, float]:
 def settle_lateness(
     hand_ins: Iterable[HandIn], *, late: Late, table: Mapping[str, float]
 ) -> tuple[list[HandIn], list[str]]:
-    """Return the hand-ins with their lateness, and what a person should know about it.
+    """Return the hand-ins with their lateness, and what a person should know about the table.
 
     The table goes before the deadline, and that before the mark a platform makes.
     """
@@ -56,8 +56,7 @@ def settle_lateness(
             days = max(0.0, waited.total_seconds() / _DAY)
         settled.append(hand_in if days is None else replace(hand_in, days_late=days))
     missing = [name for name in table if name not in known]
-    said = f"in the table of lateness, and no such submission: {', '.join(missing)}"
-    return settled, [said] if missing else []
+    return settled, [f"no such submission: {', '.join(missing)}"] if missing else []
 
 
 def _number(text: str) -> float | None:

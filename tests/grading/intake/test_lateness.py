@@ -51,7 +51,7 @@ def test_a_table_of_ones_own_goes_first(tmp_path):
         due=DUE,
     )
     assert days == {"Team-01": 0.0, "team-02": 1.5, "team-03": 1.0}
-    assert remarks == ["in the table of lateness, and no such submission: team-99"]
+    assert remarks == ["no such submission: team-99"]
 
 
 @pytest.mark.parametrize(
