@@ -1,0 +1,299 @@
+"""From one class to a million hand-ins: costs measured here, a cluster simulated with them.
+
+    python -m benchmarks.scaling measure [--teams 6]    # some minutes; keeps scaling.json
+    python -m benchmarks.scaling page                   # simulates, writes docs/scaling.md anew
+
+Seconds are of the processor, so that other work on the machine makes them longer only by what the
+memory and the caches are shared; the simulation draws service times from those measured.
+"""
+
+import argparse
+import heapq
+import json
+import re
+import tempfile
+import time
+from collections import deque
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.grading_batch import disguised, grade, write_class
+from pipeline.grading.batch.worker import Task, grade_task
+from pipeline.grading.gradings import Member
+from pipeline.grading.intake.files import packed
+from pipeline.grading.rubric_file import load_rubric
+from pipeline.grading.similarity.prints import fingerprint
+from pipeline.grading.similarity.shared import find_shared
+from pipeline.ingest.read import read_data
+from pipeline.output import write_file
+from pipeline.submission import load_submission
+
+COSTS = Path(__file__).with_name("scaling.json")
+PAGE = Path(__file__).parents[1] / "docs" / "scaling.md"
+PRESETS = ("throne-1dof", "throne-2dof", "throne-3dof")
+COMPARED = (50, 100, 200, 400)  # submissions at once
+NIGHT = 8 * 3600.0  # s
+HOUR = 3600.0
+
+# ------------------------------------------------------------------------------- costs
+
+
+def measure(*, teams: int) -> dict[str, Any]:
+    """Return what one hand-in costs: worker, client, comparison, bytes."""
+    costs: dict[str, Any] = {"seconds": {}}
+    records, sizes, packing = [], [], 0.0
+    with tempfile.TemporaryDirectory() as folder:
+        base = Path(folder)
+        for preset in PRESETS:
+            write_class(base / preset, teams, preset=preset)
+            rubric, seconds = load_rubric(Path(preset)), []
+            for number, team in enumerate(sorted((base / preset).iterdir())):
+                task = Task(id=team.name, key=team.name, sources=(str(team),))
+                start = time.process_time()
+                grading = grade_task(task, rubric=rubric, scratch=base)
+                if number:  # the first one also loads what all of them need
+                    seconds.append(round(time.process_time() - start, 3))
+                book = len(grading.grade) + len(grading.fingerprints)
+                start = time.process_time()
+                sizes.append((len(packed([team])), book))
+                packing += time.process_time() - start
+                records.append(read_data(load_submission(team)).records)
+            costs["seconds"][preset] = seconds
+        handed_in, kept = np.mean(sizes, axis=0)
+        costs |= {"handed_in": round(handed_in), "kept": round(kept)}
+        costs["pack"] = round(packing / len(sizes), 4)  # on a cluster only
+        # What the one client process does for each: hash, hand on, store, compare, write.
+        write_class(base / "few", teams, preset=PRESETS[0])
+        write_class(base / "many", 4 * teams, preset=PRESETS[0])
+        grade(base / "few", base / "first", preset=PRESETS[0], jobs=1)  # loads what is needed
+        few, many = (
+            grade(base / name, base / f"out-{name}", preset=PRESETS[0], jobs=1).parent
+            for name in ("few", "many")
+        )
+        costs["client"] = round((many - few) / (3 * teams), 4)
+    costs["compare"] = {}
+    rng = np.random.default_rng(1)
+    for n in COMPARED:
+        members = []
+        for number in range(n):
+            own = records[number % len(records)]
+            other = tuple(disguised(r, rng, noise=20.0) for r in own)
+            name = str(number)
+            members.append(
+                Member(submission=name, authors=(name,), fingerprints=fingerprint(other))
+            )
+        start = time.process_time()
+        find_shared(members)
+        costs["compare"][str(n)] = round(time.process_time() - start, 2)
+    return costs
+
+
+def comparison(costs: dict[str, Any]) -> tuple[float, float]:
+    """Return seconds a submission and seconds a pair of them, by least squares."""
+    n = np.array([float(x) for x in costs["compare"]])
+    seconds = np.array(list(costs["compare"].values()))
+    a, b = np.linalg.lstsq(np.column_stack([n, n**2]) / seconds[:, None], np.ones(n.size))[0]
+    return float(a), float(b)
+
+
+# -------------------------------------------------------------------------- simulation
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cluster:
+    """Machines that grade, and clients that send and store; times in s, rates per hour.
+
+    Attributes
+    ----------
+    loss : of each machine; what it was grading is done by another, and it is back after `repair`.
+    hang : share of hand-ins that run into the time limit, and are then a row with its reason.
+    """
+
+    machines: int
+    cores: int = 16
+    clients: int = 1
+    client_cost: float = 0.0
+    loss: float = 0.0
+    repair: float = 300.0
+    hang: float = 0.0
+    time_limit: float = 120.0
+    ahead: int = 2  # tasks under way for every core
+
+
+@dataclass(frozen=True, kw_only=True)
+class Night:
+    """What became of a run: seconds to the last stored result, core-seconds done and done twice."""
+
+    seconds: float
+    busy: float
+    again: float
+    client_busy: float
+
+
+def simulate(n: int, service: np.ndarray, *, cluster: Cluster, seed: int) -> Night:
+    """Run n hand-ins through a cluster, event by event."""
+    rng = np.random.default_rng(seed)
+    length = rng.choice(service, n)
+    length[rng.random(n) < cluster.hang] = cluster.time_limit
+    order, events = count(), []  # (time, order, what, of which)
+    ready: deque[int] = deque()
+    inbox, unsent, sent = 0, n, 0
+    free = [cluster.cores] * cluster.machines
+    idle = set(range(cluster.machines))
+    epoch = [0] * cluster.machines
+    running: list[dict[int, float]] = [{} for _ in free]
+    clients, stored, now = cluster.clients, 0, 0.0
+    busy = again = client_busy = 0.0
+    window = cluster.ahead * cluster.cores * cluster.machines
+
+    def at(delay: float, what: str, which: Any) -> None:
+        heapq.heappush(events, (now + delay, next(order), what, which))
+
+    if cluster.loss:
+        for machine in range(cluster.machines):
+            at(rng.exponential(HOUR / cluster.loss), "lost", machine)
+    while stored < n:
+        # Half of a client's work is sending, half is storing, which goes first.
+        while clients and (inbox or (unsent and sent - stored < window)):
+            clients -= 1
+            client_busy += cluster.client_cost / 2
+            if inbox:
+                inbox -= 1
+                at(cluster.client_cost / 2, "stored", None)
+            else:
+                unsent -= 1
+                sent += 1
+                at(cluster.client_cost / 2, "sent", n - unsent - 1)
+        while ready and idle:
+            machine, task = next(iter(idle)), ready.popleft()
+            free[machine] -= 1
+            if not free[machine]:
+                idle.discard(machine)
+            running[machine][task] = now
+            at(length[task], "graded", (machine, task, epoch[machine]))
+        now, _, what, which = heapq.heappop(events)
+        if what == "sent":
+            clients += 1
+            ready.append(which)
+        elif what == "stored":
+            clients += 1
+            stored += 1
+        elif what == "graded":
+            machine, task, of = which
+            if of == epoch[machine]:
+                busy += now - running[machine].pop(task)
+                free[machine] += 1
+                idle.add(machine)
+                inbox += 1
+        elif what == "lost":
+            again += sum(now - since for since in running[which].values())
+            ready.extendleft(running[which])
+            running[which].clear()
+            epoch[which] += 1
+            free[which] = 0
+            idle.discard(which)
+            at(cluster.repair, "back", which)
+        else:
+            free[which] = cluster.cores
+            idle.add(which)
+            at(rng.exponential(HOUR / cluster.loss), "lost", which)
+    return Night(seconds=now, busy=busy, again=again, client_busy=client_busy)
+
+
+# -------------------------------------------------------------------------------- page
+
+
+def tables(costs: dict[str, Any]) -> dict[str, str]:
+    """Return the tables of the page by their names."""
+    service = np.concatenate([np.array(v) for v in costs["seconds"].values()])
+    mean, client = float(service.mean()), costs["client"] + costs["pack"]
+    a, b = comparison(costs)
+    rows = [
+        *((f"a grade, {p}", f"{np.median(s):.2f} s, at most {max(s):.2f} s")
+          for p, s in costs["seconds"].items()),
+        ("a grade, a third of each", f"{mean:.2f} s"),
+        ("the client, a hand-in", f"{1e3 * costs['client']:.0f} ms, "
+            f"and {1e3 * costs['pack']:.0f} ms to pack it for a cluster"),
+        ("cores that one client keeps busy", f"{mean / client:.0f}"),
+        ("comparing n submissions", ", ".join(
+            f"{s:.1f} s ({n})" for n, s in costs["compare"].items())),
+        ("… that is", f"{1e3 * a:.1f} ms each and {1e6 * b:.0f} µs a pair"),
+        ("a hand-in, packed", f"{costs['handed_in'] / 1e3:.0f} kB"),
+        ("in the gradebook", f"{costs['kept'] / 1e3:.0f} kB"),
+    ]  # fmt: skip
+    measured = ["| what | costs |", "| --- | --- |", *(f"| {x} | {y} |" for x, y in rows)]
+
+    faults = {"loss": 0.5, "hang": 0.001}
+    runs = [
+        (10_000, Cluster(machines=1)),
+        (10_000, Cluster(machines=4)),
+        (10_000, Cluster(machines=4, clients=4)),
+        (1_000_000, Cluster(machines=2, clients=2)),
+        (1_000_000, Cluster(machines=8)),
+        (1_000_000, Cluster(machines=8, clients=10)),
+    ]
+    simulated = [
+        "| hand-ins | cores | clients | arithmetic, h | simulated, h | with faults, h "
+        "| core-hours paid | core-seconds done twice | clients busy |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for n, plain in runs:
+        cluster = Cluster(machines=plain.machines, clients=plain.clients, client_cost=client)
+        faulty = Cluster(**{**vars(cluster), **faults})
+        cores = cluster.cores * cluster.machines
+        clean = simulate(n, service, cluster=cluster, seed=1)
+        night = simulate(n, service, cluster=faulty, seed=1)
+        bound = max(n * mean / cores, n * client / cluster.clients)
+        if abs(clean.seconds / bound - 1) > 0.05:
+            raise RuntimeError(f"simulation {clean.seconds:.0f} s, arithmetic {bound:.0f} s")
+        shares = night.client_busy / night.seconds / cluster.clients
+        simulated.append(
+            f"| {n:,} | {cores} | {cluster.clients} | {bound / HOUR:.2f} "
+            f"| {clean.seconds / HOUR:.2f} | {night.seconds / HOUR:.2f} "
+            f"| {cores * night.seconds / HOUR:,.0f} | {night.again:.0f} "
+            f"| {100 * shares:.0f} % |"
+        )
+
+    compared = [
+        "| compared with one another | of one core | fingerprints and grades |",
+        "| --- | --- | --- |",
+    ]
+    for n in (100, 1_000, 10_000, 100_000, 1_000_000):
+        seconds = a * n + b * n * n
+        span = f"{seconds / HOUR:,.1f} h" if seconds > HOUR else f"{seconds:,.0f} s"
+        compared.append(f"| {n:,} | {span} | {n * costs['kept'] / 1e9:,.2f} GB |")
+    needed = [
+        "| hand-ins | core-hours | cores for a night of 8 h | clients | to store |",
+        "| --- | --- | --- | --- | --- |",
+    ]
+    for n in (200, 10_000, 1_000_000):
+        needed.append(
+            f"| {n:,} | {n * mean / HOUR:,.2f} | {int(np.ceil(n * mean / NIGHT))} "
+            f"| {int(np.ceil(n * client / NIGHT))} "
+            f"| {n * (costs['handed_in'] + costs['kept']) / 1e9:,.2f} GB |"
+        )
+    texts = {"measured": measured, "needed": needed, "simulated": simulated, "compared": compared}
+    return {name: "\n".join(lines) for name, lines in texts.items()}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("what", choices=("measure", "page"))
+    parser.add_argument("--teams", type=int, default=6)
+    options = parser.parse_args()
+    if options.what == "measure":
+        write_file(COSTS, json.dumps(measure(teams=options.teams), indent=1) + "\n")
+        return
+    text = PAGE.read_text(encoding="utf-8")
+    for name, table in tables(json.loads(COSTS.read_text(encoding="utf-8"))).items():
+        between = re.compile(rf"(<!-- {name} -->\n).*?(\n<!-- end -->)", re.DOTALL)
+        text = between.sub(lambda found, t=table: f"{found[1]}\n{t}\n{found[2]}", text, count=1)
+    write_file(PAGE, text)
+
+
+if __name__ == "__main__":
+    main()
