@@ -167,6 +167,7 @@ def main() -> None:
     table = "\n".join("| " + " | ".join(cells) + " |" for cells in rows)
     print(table)
     write_file(FIGURE, draw(results))
+    table += "\n\n![Worst standard error against time at the bench](figures/next.svg)"
     page = PAGE.read_text(encoding="utf-8")
     page = re.sub(
         r"(<!-- chosen -->\n).*?(\n<!-- end of chosen -->)", rf"\1\n{table}\n\2", page, flags=re.S
