@@ -1,7 +1,7 @@
 """The limits by which the stages decide, each with its reason."""
 
 # Decays. A fit that leaves more of the motion is of something else: of real carts, which
-# dry friction brakes, it leaves 1.3 to 2.1 % (15 decays).
+# dry friction brakes, it leaves 1.3 to 2.1 % (ten runs).
 NO_DECAY = 0.08
 GROWS = 1.05  # damping at large amplitudes over the mean, where it is worth a word
 
