@@ -17,10 +17,9 @@ from typing import Literal
 import numpy as np
 
 from pipeline.arrays import Array
+from pipeline.bench.design.information import sampled_input
 from pipeline.bench.planning.plan import Limits, Recording
 from pipeline.bench.planning.propose import FURTHEST, rounded, rounded_down
-from pipeline.bench.protocol.messages import Start, Wave
-from pipeline.bench.protocol.waves import shape_at
 from pipeline.errors import DataError
 from pipeline.gap.types import Gap, Proposal
 from pipeline.plant.linear.chain import Chain
@@ -119,7 +118,7 @@ def _candidates(chain: Chain, limits: Limits) -> Iterator[Recording]:
             settle=settle,
             aim="gap",
         )
-        t, u = _input(whole)
+        t, u = sampled_input(whole, period=_PERIOD)
         reach = float(np.max(np.abs(simulate_linear(chain, t, u))))
         largest = min(FURTHEST * limits.travel / reach, limits.input)
         for size in _SIZES:
@@ -141,18 +140,6 @@ def _candidates(chain: Chain, limits: Limits) -> Iterator[Recording]:
             )
 
 
-def _input(recording: Recording) -> tuple[Array, Array]:
-    t = np.arange(0.0, recording.duration, _PERIOD)
-    start = Start(
-        wave=Wave[recording.wave.upper()],
-        frequency=recording.frequency,
-        amplitude=1,
-        cycles=recording.cycles,
-    )
-    shape = [shape_at(start, at, chirp_end=recording.frequency_end) for at in t]
-    return t, recording.amplitude * np.array(shape)
-
-
 # ------------------------------------------------------------------------- how far apart
 
 
@@ -164,7 +151,8 @@ def _tell_apart(
     A separation is the square sum over the noise that neither model can take up; None where a
     model would pass the travel limit. Of a release each height counts.
     """
-    t, u = _input(recording)
+    t, u = sampled_input(recording, period=_PERIOD)
+    u = recording.amplitude * u
     starts = [None]
     if recording.release:
         unit = np.eye(sigma.size)[recording.release - 1]

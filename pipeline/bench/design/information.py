@@ -223,22 +223,27 @@ class Knowledge:
 
     def input(self, recording: Recording) -> tuple[Array, Array]:
         """Return the bench's sample times (n,), s, and the input (n,) at unit amplitude."""
-        t = np.arange(0.0, recording.duration, self.sample_time)
-        start = Start(
-            wave=Wave[recording.wave.upper()],
-            frequency=recording.frequency,
-            amplitude=1,
-            cycles=recording.cycles,
-        )
-        end, tones = recording.frequency_end, recording.sines
-        shape = partial(shape_at, start, chirp_end=end, tones=tones)
-        return t, np.array([shape(at) for at in t])
+        return sampled_input(recording, period=self.sample_time)
 
     def at_its_limits(self, recording: Recording, *, limits: Limits, share: float) -> float:
         """Return the input at which the cart that goes furthest takes `share` of the travel."""
         t, u = self.input(recording)
         x = simulate_linear(self.chain, t, u, free=recording.carts)
         return min(share * limits.travel / float(np.max(np.abs(x))), limits.input)
+
+
+def sampled_input(recording: Recording, *, period: float) -> tuple[Array, Array]:
+    """Return times (n,) every `period` s and the recording's input (n,) at unit amplitude."""
+    t = np.arange(0.0, recording.duration, period)
+    start = Start(
+        wave=Wave[recording.wave.upper()],
+        frequency=recording.frequency,
+        amplitude=1,
+        cycles=recording.cycles,
+    )
+    end, tones = recording.frequency_end, recording.sines
+    shape = partial(shape_at, start, chirp_end=end, tones=tones)
+    return t, np.array([shape(at) for at in t])
 
 
 def _fitted_records(analysis: Analysis, fit: ChainFit) -> list[Record]:
