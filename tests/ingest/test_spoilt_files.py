@@ -50,11 +50,12 @@ def _log() -> bytes:
     return ("Sample\tTime\tEncoder 1 Pos\tControl Effort\n" + "\n".join(rows)).encode()
 
 
-def _mat(*, compress: bool) -> bytes:
+def _mat(version: str, compress: bool) -> bytes:
     stream = BytesIO()
     variables = {"time": T, "enc1": X.astype("i2"), "duty": (400 * U).astype("i2")}
-    variables["run"] = {"P": 1.0, "wave": "Square"}  # type: ignore[assignment]
-    scipy.io.savemat(stream, variables, do_compression=compress)
+    if version == "5":
+        variables["run"] = {"P": 1.0, "wave": "Square"}  # type: ignore[assignment]
+    scipy.io.savemat(stream, variables, format=version, do_compression=compress)
     return stream.getvalue()
 
 
@@ -72,8 +73,9 @@ FILES = {
     "usb logger": b"Time [us],Displacement [mm]\n"
     + b"".join(b"%d,%d\n" % (8840 * i, i % 7) for i in range(N)),
     "bode": b"frequency,x1\n" + b"".join(b"%g,%g\n" % (0.5 * i, 1 / i) for i in range(1, N)),
-    "mat": _mat(compress=False),
-    "mat, compressed": _mat(compress=True),
+    "mat": _mat("5", False),
+    "mat, compressed": _mat("5", True),
+    "mat, version 4": _mat("4", False),
     "mat, matrix": _matrix(),
 }
 

@@ -256,12 +256,6 @@ def _ecp(body: str) -> str:
     return " Sample   Time   Commanded Pos   Encoder 1 Pos   Control Effort\n\n[" + body
 
 
-def _mat_4() -> bytes:
-    stream = io.BytesIO()
-    scipy.io.savemat(stream, {"time": np.arange(20.0), "enc1": np.arange(20.0)}, format="4")
-    return stream.getvalue()
-
-
 ECP_ROWS = ";\n".join(f"  {i}  {0.01 * i:.3f}  0  {i}  0.5000" for i in range(20))
 
 
@@ -351,7 +345,6 @@ BAD_DATA = {
     "gzip": (gzip.compress(b"time,x1\n"), r"a gzip archive; unpack it"),
     "HDF5": (b"\x89HDF\r\n\x1a\n" + bytes(100), r"save it again with save"),
     "MATLAB 7.3": (b"MATLAB 7.3 MAT-file" + bytes(600), r"a MATLAB 7\.3 file; save it again"),
-    "MATLAB 4": (_mat_4(), r"neither text nor a \.mat file .* save\(…, '-v7'\)"),
     "picture": (b"\x89PNG\r\n" + bytes(100), r"a picture"),
     "binary": (bytes(range(256)) * 10, r"neither text nor a \.mat file"),
     "broken UTF-16": (b"\xff\xfea", r"broken UTF-16 text"),

@@ -1,4 +1,4 @@
-"""MATLAB `.mat` files (versions 5 to 7): their real matrices and nothing else.
+"""MATLAB `.mat` files (versions 4 to 7): their real matrices and nothing else.
 
 A hostile file can ask scipy's reader for gigabytes or for objects to build; a log of a bench is
 a handful of plain vectors. So only those are read here, every length checked first. Layout:
@@ -27,6 +27,7 @@ _CLASSES = {
 _OTHER_CLASSES = {
     1: "cell", 2: "struct", 3: "object", 4: "text", 5: "sparse", 16: "function", 17: "object",
 }  # fmt: skip
+_V4_TYPES = {0: "f8", 1: "f4", 2: "i4", 3: "i2", 4: "u2", 5: "u1"}
 _BENCH = ({"enc1", "duty", "time"}, {"cart1pos", "duty_cycle", "t_received"})
 
 
@@ -43,7 +44,7 @@ class _Variable:
 
 def is_mat(raw: bytes) -> bool:
     """Tell a `.mat` file by its first bytes."""
-    return raw.startswith(b"MATLAB")
+    return raw.startswith(b"MATLAB") or _is_v4(raw)
 
 
 def read_mat(raw: bytes, *, source: str) -> Table:
@@ -56,7 +57,7 @@ def read_mat(raw: bytes, *, source: str) -> Table:
     if raw[:10] == b"MATLAB 7.3" or raw[512:516] == b"\x89HDF":
         raise SubmissionError(f"{source}: a MATLAB 7.3 file; save it again with save(…, '-v7')")
     try:
-        variables = list(_v5(raw))
+        variables = list(_v4(raw) if _is_v4(raw) else _v5(raw))
     except (_Broken, struct.error, zlib.error, ValueError, OverflowError, UnicodeDecodeError):
         raise SubmissionError(f"{source}: the .mat file is broken or cut short") from None
     return _table(variables, source=source)
@@ -210,3 +211,53 @@ def _matrix(content: bytes, order: str) -> _Variable:
         raise _Broken
     stored = numbers.astype(_CLASSES[flag & 0xFF])  # MATLAB stores whole doubles as short integers
     return _Variable(label, stored.reshape(shape, order="F"), str(stored.dtype))
+
+
+# ----------------------------------------------------------------------------- version 4
+
+
+def _is_v4(raw: bytes) -> bool:
+    return _v4_header(raw, 0) is not None
+
+
+def _v4_header(raw: bytes, at: int) -> tuple[str, str, int, int, int, bool] | None:
+    """Return (order, type, rows, columns, length of the name, complex), or None."""
+    if len(raw) < at + 20:
+        return None
+    for order in "<>":
+        code, rows, columns, imaginary, length = struct.unpack_from(order + "5i", raw, at)
+        machine, _, precision, kind = code // 1000, code // 100 % 10, code // 10 % 10, code % 10
+        if (
+            0 <= code < 5000
+            and machine == (0 if order == "<" else 1)
+            and code // 100 % 10 == 0
+            and precision in _V4_TYPES
+            and kind in (0, 1)
+            and rows >= 0
+            and columns >= 0
+            and imaginary in (0, 1)
+            and 1 < length <= 64
+        ):
+            return order, _V4_TYPES[precision], rows, columns, length, imaginary == 1 or kind == 1
+    return None
+
+
+def _v4(raw: bytes) -> Iterator[_Variable]:
+    at = 0
+    while at < len(raw):
+        header = _v4_header(raw, at)
+        if header is None:
+            raise _Broken
+        order, kind, rows, columns, length, unusable = header
+        label = raw[at + 20 : at + 20 + length].rstrip(b"\0").decode("ascii")
+        at += 20 + length
+        size = rows * columns * np.dtype(kind).itemsize * (2 if unusable else 1)
+        data = raw[at : at + rows * columns * np.dtype(kind).itemsize]
+        at += size
+        if at > len(raw) or not label.isprintable():
+            raise _Broken
+        if unusable or rows == 0 or columns == 0:
+            yield _Variable(label, None, "no real matrix")
+            continue
+        values = np.frombuffer(data, dtype=order + kind).reshape((rows, columns), order="F")
+        yield _Variable(label, values.astype(kind), kind)

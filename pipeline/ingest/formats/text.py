@@ -44,9 +44,7 @@ def _decode(raw: bytes, *, source: str) -> str:
             raise SubmissionError(f"{source}: broken UTF-16 text") from None
     control = sum(raw[:4096].count(byte) for byte in (0, 1, 2, 3, 4, 5, 6, 7, 8, 14, 15, 27))
     if control or b"\0" in raw:
-        raise SubmissionError(
-            f"{source}: neither text nor a .mat file that can be read (MATLAB: save(…, '-v7'))"
-        )
+        raise SubmissionError(f"{source}: neither text nor a .mat file that can be read")
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError:
