@@ -350,9 +350,8 @@ def _prefilter_slip(controller: Controller, right: float) -> str:
     typed = controller.prefilter
     assert typed is not None
     for text, value in _prefilter_slips(controller, right):
-        if abs(float(typed) - value) <= 0.5 * limits.PREFILTER * abs(value) + float(
-            rounding(typed)
-        ):
+        room = 0.5 * limits.PREFILTER * abs(value) + float(rounding(typed))
+        if abs(float(typed) - value) <= room:
             return text
     return ""
 
