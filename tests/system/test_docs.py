@@ -111,3 +111,12 @@ def test_every_picture_is_shown_somewhere():
     }
     for picture in (ROOT / "docs" / "images").rglob("*.*"):
         assert picture.resolve() in shown, picture.name
+
+
+def test_the_files_that_contributors_are_sent_to_are_there():
+    """Every path of CONTRIBUTING.md that is not to be written anew is in the repository."""
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    paths = re.findall(r"`((?:pipeline|tests|docs|templates|rubrics)/[\w./-]+)`", text)
+    assert len(paths) > 30
+    for path in paths:
+        assert "YOURS" in path or path.endswith("__pycache__") or (ROOT / path).exists(), path
