@@ -1,5 +1,6 @@
 """Things on the bench that the chain leaves out: end stops, hidden masses, a sensor's scale."""
 
+from pipeline.plant.limits import HARD
 from pipeline.plant.nonlinear.effects.base import Effect, Parameter
 from pipeline.plant.nonlinear.tables import Cart
 
@@ -24,7 +25,7 @@ END_STOP = Effect(
             "input/position",
             scale=lambda s: s.stiffness,
             trials=(20.0,),
-            lower=4.0,  # what is softer is a spring that changes
+            lower=HARD,  # what is softer is a spring that changes
             upper=3000.0,
             neutral=0.0,
         ),
