@@ -23,7 +23,7 @@ from pipeline.desk.home import enter, open_place, show_home
 from pipeline.desk.instructor import room as instructor
 from pipeline.desk.instructor import rubrics
 from pipeline.desk.pages import static_file
-from pipeline.desk.state import Ask, Desk, plain_error
+from pipeline.desk.state import Ask, Desk, plain_error, prepare_pages
 from pipeline.desk.student import room as student
 from pipeline.desk.users import User, read_users
 from pipeline.errors import ConfigError, PipelineError
@@ -131,6 +131,7 @@ class DeskServer:
             door = SecretDoor(owner, port=port, start=start)
             self.url = f"http://127.0.0.1:{port}/{door.secret}/"
         self._desk = Desk()
+        prepare_pages()
         strangers = Strangers()
         guard = Guard(
             app=application(self._desk), door=door, uploads=HAND_IN.total, strangers=strangers

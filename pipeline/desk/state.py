@@ -170,6 +170,12 @@ def _environment() -> Environment:
     return environment
 
 
+def prepare_pages() -> None:
+    """Compile all templates: a fifth of the first look at a large class, else."""
+    for name in _environment().list_templates(extensions=["j2"]):
+        _environment().get_template(name)
+
+
 def plain_error(ask: Ask, text: str, *, status: int) -> Response:
     """Return a page that says what is wrong."""
     return ask.page("wrong", status=status, title="That did not work", text=text)
