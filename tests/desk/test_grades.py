@@ -2,8 +2,10 @@
 
 import io
 import re
+import sqlite3
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from html import unescape
 from itertools import chain
 from threading import Barrier
@@ -14,6 +16,7 @@ import pytest
 from pipeline.desk.app import DeskServer
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.open_book import OpenBook
+from pipeline.grading.gradebook.schema import FILE
 from pipeline.grading.publish.export import export
 from tests.helpers.desks import BOUNDARY, Answer, Visitor, a_submission, through_proxy, write_users
 from tests.helpers.grades import fill_book, make_grade, make_outcome, two_cart_rubric, write_class
@@ -465,3 +468,23 @@ def test_the_lines_of_a_class_are_those_of_its_grades(grades):
         assert [one.line for one in second.listings] == [Line.of(e.grade) for e in book.entries()]
         same = [a is b for a, b in zip(first.listings, second.listings, strict=True)]
         assert same.count(False) == 1
+
+
+# ---------------------------------------------------------------------------- older books
+
+
+def test_an_older_gradebook_gets_what_it_lacks(grades):
+    """Once; what was in it is as it was, and an open one of before goes on."""
+    with Gradebook(grades) as book:
+        before = [(e.submission, e.grade) for e in book.entries()]
+        with closing(sqlite3.connect(grades / FILE)) as raw:
+            raw.executescript("DROP TABLE briefs; DROP TABLE looks")
+        with OpenBook(grades) as opened, OpenBook(grades) as again:
+            listings = opened.class_now().listings
+            assert [(n.line.name, n.line.points) for n in listings] == [
+                (name, grade.points) for name, grade in before
+            ]
+            assert again.class_now() == opened.class_now()
+            opened.mark("team-01", by="Ada", seen=True)
+            assert set(again.class_now().seen.values()) == {"Ada"}
+        assert [(e.submission, e.grade) for e in book.entries()] == before

@@ -34,6 +34,7 @@ from pipeline.grading.gradebook.rows import (
     pages,
     points_of,
     put_brief,
+    put_lacking_briefs,
     read_figures,
     read_flag,
     read_members,
@@ -83,6 +84,7 @@ class Gradebook:
         now: Callable[[], datetime] = lambda: datetime.now(UTC),
     ) -> None:
         self._database = Database(place, create=create)
+        put_lacking_briefs(self._database)
         self._now = now
         self._assignment = assignment
 

@@ -100,6 +100,18 @@ def put_brief(connection: Connection, grading: int, grade: Grade) -> None:
     connection.execute(insert(briefs).values(grading_id=grading, grade=Line.of(grade).text))
 
 
+def put_lacking_briefs(database: Database) -> None:
+    """Add the briefs of gradings by a version that kept none."""
+    lacking = select(gradings.c.id).outerjoin(briefs).where(briefs.c.grading_id.is_(None))
+    with database.reading() as connection:
+        numbers = connection.scalars(lacking.order_by(gradings.c.id)).all()
+    for page in pages(numbers):
+        with database.changing() as connection:
+            whole = select(gradings.c.id, gradings.c.grade).where(gradings.c.id.in_(page))
+            for row in connection.execute(whole.where(gradings.c.id.in_(lacking))).all():
+                put_brief(connection, row.id, read_grade(row.grade))
+
+
 def read_figures(connection: Connection, grading: int) -> tuple[tuple[str, str], ...]:
     """Return the figures of a grading: file names and SVG."""
     mine = select(figures.c.name, figures.c.svg).where(figures.c.grading_id == grading)

@@ -247,6 +247,10 @@ class Database:
             elif not self._engine.dialect.has_table(connection, settings.name):
                 raise ConfigError(f"{self.name}: holds no gradebook")
             _check_version(connection, name=self.name)
+            whole = _is_whole(connection)
+        if not whole:  # of a version that had fewer tables
+            with self.writing() as connection:
+                _create(connection)
 
     @property
     def name(self) -> str:
@@ -292,8 +296,12 @@ def _create(connection: Connection) -> None:
     """Make the tables that are not there; two runs that begin at once make them one by one."""
     _take_turns(connection)
     # Where all is there nothing is made anew: whoever may only read and add could not.
-    if not metadata.tables.keys() <= set(inspect(connection).get_table_names()):
+    if not _is_whole(connection):
         metadata.create_all(connection)
+
+
+def _is_whole(connection: Connection) -> bool:
+    return metadata.tables.keys() <= set(inspect(connection).get_table_names())
 
 
 def _take_turns(connection: Connection) -> None:
