@@ -127,3 +127,14 @@ def test_the_command_explores_a_bench_over_its_line(tmp_path):
     assert (folder / NAME).exists()
     assert {e.kind for e in load_submission(folder).experiments} >= {"step", "sweep"}
     assert "known" in done.stderr
+
+
+def test_one_large_step_shows_what_acts_far_out(tmp_path):
+    """Carts that drag holds back do not reach the distance wanted: the step is made once."""
+    bench = prepare_bench(preset="throne-1dof", model=None, hide=["quadratic_drag"])
+    session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=13))
+    turns = explore(
+        tmp_path / "work", record=session, wish=Wish(), seconds=300.0, tell=lambda s: None
+    )
+    assert [turn.verdict for turn in turns] == ["named"] * 2
+    assert turns[-1].recorded == ("step-3",)

@@ -13,7 +13,6 @@ from pipeline.bench.planning.plan import Plan, Recording
 from pipeline.bench.planning.plan_file import load_plan, plan_path, save_plan
 from pipeline.bench.planning.plan_words import session_time, time_words
 from pipeline.bench.planning.propose import (
-    AIM,
     identified_chain,
     large_steps,
     propose_plan,
@@ -36,6 +35,8 @@ from pipeline.workflow import analyse
 FIRST = "sweep"  # of the plan that is proposed where nothing is known: it needs no hands
 _SEARCH = 90.0  # s that a look for the gap may take
 _APART = 1.0  # noises: explanations that no recording sets further apart stay in dispute
+_FAR = 0.5  # of the travel limit: who has not moved so far has not shown all
+_FAR_OUT = "to see what acts far out"
 _SETTLED = ("named", "none")
 
 Record = Callable[[Sequence[str]], Sequence[str]]
@@ -241,9 +242,11 @@ def _next(
         found = choose_next(analysis, plan, n=1, goal=worst, commands=commands)
         return found.recordings[0], found.said
     furthest = max(float(np.ptp(record.y, axis=1).max()) / 2 for record in analysis.records)
-    if furthest < AIM * plan.limits.travel:
+    # Once: carts that something holds back go no further the second time.
+    made = any(r.note == _FAR_OUT for r in plan.recordings)
+    if furthest < _FAR * plan.limits.travel and not made:
         step, _ = large_steps(identified_chain(analysis), plan.limits)
-        return step, (
+        return step.model_copy(update={"note": _FAR_OUT}), (
             f"no cart has moved by more than {furthest:.2g} of {plan.limits.travel:g} "
             f"{analysis.position_unit} allowed, and what acts further out would not show"
         )
