@@ -170,7 +170,7 @@ def main() -> None:
     table += "\n\n![Worst standard error against time at the bench](figures/next.svg)"
     page = PAGE.read_text(encoding="utf-8")
     page = re.sub(
-        r"(<!-- chosen -->\n).*?(\n<!-- end of chosen -->)", rf"\1\n{table}\n\2", page, flags=re.S
+        r"(<!-- chosen -->\n).*?(<!-- end of chosen -->)", rf"\1\n{table}\n\n\2", page, flags=re.S
     )
     write_file(PAGE, page)
 
