@@ -135,6 +135,7 @@ def test_repeats_are_compared_by_the_edge_of_their_input():
 
     assert repeatability(runs) == pytest.approx(0.0, abs=1e-3)
     assert repeatability([runs[0], make_run(replace(later, u=0.5 * u), n=1)]) is None
+    assert repeatability([runs[0], replace(runs[1], id=runs[0].id)]) is None  # of one record
 
 
 def test_effects_that_only_together_explain_are_found_together():

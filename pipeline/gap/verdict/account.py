@@ -214,11 +214,12 @@ def repeatability(runs: Sequence[Run]) -> float | None:
     """Return the relative difference of runs with the same input, or None without such.
 
     Of two runs the second is read at the times of the first, their inputs' first edges together.
+    Two pieces of one record are no repeats: the later one begins in motion.
     """
     squares, sizes = 0.0, 0.0
     for i, a in enumerate(runs):
         for b in runs[:i]:
-            if a.free != b.free or a.rows != b.rows or not np.any(a.command):
+            if a.id == b.id or a.free != b.free or a.rows != b.rows or not np.any(a.command):
                 continue
             t = a.t - _edge(a) + _edge(b)
             inside = (t >= b.t[0]) & (t <= b.t[-1])
