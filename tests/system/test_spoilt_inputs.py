@@ -14,7 +14,7 @@ from pipeline.bench.planning.plan_file import load_plan, plan_path, plan_text
 from pipeline.bench.planning.propose import propose_plan
 from pipeline.errors import ConfigError
 from pipeline.gap.stored import gap_text, read_gap
-from pipeline.grading.intake.late_table import LateTable
+from pipeline.grading.intake.late_table import read_late_table
 from pipeline.grading.intake.lms_names import Platform, gradescope_metadata
 from pipeline.grading.publish.roster import Roster
 from pipeline.grading.publish.students import Student
@@ -101,7 +101,7 @@ def use(name: str, path: Path) -> None:
         roster = Roster.read(path, platform=path.stem)  # type: ignore[arg-type]
         roster.filled([student], {"Lab 3": lambda student: "1"})
     elif name == "late.csv":
-        LateTable.read(path)
+        read_late_table(path)
     elif name == "submission_metadata.yml":
         gradescope_metadata(path.parent)
     elif name == "rubric.toml":
