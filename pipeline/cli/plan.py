@@ -49,12 +49,9 @@ def plan(
             )
             words = [f"{made.path}: {len(made.recordings)} recordings added", made.said]
             further = {
-                "next": {
-                    "for": made.words,
-                    "errors": made.errors,
-                    "planned": made.planned,
-                    "separation": made.separation,
-                }
+                "next": {"for": made.words, "separation": made.separation}
+                if made.separation is not None
+                else {"for": made.words, "errors": made.errors, "planned": made.planned}
             }
     if as_json:
         data = plan_data(made.plan, submission) | further

@@ -195,7 +195,6 @@ def gap(
     as_json: AsJson = False,
 ) -> None:
     """Find what the linear model leaves out, name it, and show the gap shrink on held-out runs."""
-    from pipeline.bench.planning.propose import plan_limits
     from pipeline.gap.stored import gap_text
     from pipeline.output import check_folder, own_folder, write_file
     from pipeline.report.gap.page import render_gap
@@ -207,12 +206,12 @@ def gap(
     out = check_folder(out) if out else own_folder(submission.folder, "gap")
     with progress_line() as progress:
         analysis = analyse(submission, design=False, progress=progress)
-        from pipeline.bench.design.discriminate import with_proposal  # load the …
+        from pipeline.bench.design.discriminate import propose_for  # load the …
         from pipeline.gap.investigate import investigate  # … compiled simulator
 
         found = investigate(analysis, budget=budget, progress=progress)
         progress("weighing what to record next")
-        found = with_proposal(found, limits=plan_limits(submission))
+        found = propose_for(found, submission)
         out.mkdir(parents=True, exist_ok=True)
         write_file(out / "gap.json", text := gap_text(found, analysis))
         render_gap(found, analysis, out, pdf=pdf, progress=progress)

@@ -77,8 +77,7 @@ def report(folder: str, *, progress: Progress) -> dict[str, Any]:
 
 def gap(folder: str, budget: float, *, progress: Progress) -> None:
     """Write what the linear model leaves out into the submission's own folder."""
-    from pipeline.bench.design.discriminate import with_proposal
-    from pipeline.bench.planning.propose import plan_limits
+    from pipeline.bench.design.discriminate import propose_for
     from pipeline.gap.investigate import investigate
     from pipeline.gap.stored import gap_text
     from pipeline.report.gap.page import render_gap
@@ -89,7 +88,7 @@ def gap(folder: str, budget: float, *, progress: Progress) -> None:
     with alone_in(out):
         analysis = analyse(submission, design=False, progress=progress)
         found = investigate(analysis, budget=budget, progress=progress)
-        found = with_proposal(found, limits=plan_limits(submission))
+        found = propose_for(found, submission)
         write_file(out / "gap.json", gap_text(found, analysis))
         render_gap(found, analysis, out, progress=progress)
 

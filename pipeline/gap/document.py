@@ -26,6 +26,7 @@ def gap_json(gap: Gap, *, position_unit: str = "cm", input_unit: str = "V") -> d
         "left": [_window(window) for window in gap.left],
         "next_experiment": gap.next_experiment,
         "next_recording": gap.proposal.recording if gap.proposal else None,
+        "next_limits": gap.proposal.limits if gap.proposal else None,
         "separation": gap.proposal.separation if gap.proposal else None,
         "training": list(gap.training),
         "held_out": list(gap.held_out),

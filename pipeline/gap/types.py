@@ -106,12 +106,14 @@ class Proposal:
     Attributes
     ----------
     recording : a table of plan.toml.
+    limits : the plan's in which it was chosen, by name.
     separation : root mean square of the difference between the two likeliest that no refit of the
         other takes up, in noises.
     t, u : (n,) s and the input; `predicted` (contenders, n) positions of `cart`.
     """
 
     recording: dict[str, Any]
+    limits: dict[str, float]
     separation: float
     cart: int
     t: Array

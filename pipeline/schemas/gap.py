@@ -131,6 +131,9 @@ class Gap(Document):
         dict[str, Any] | None,
         Field(description="what tells the contenders apart best, as a table of plan.toml"),
     ] = None
+    next_limits: Annotated[
+        dict[str, float] | None, Field(description="the limits of plan.toml that it keeps")
+    ] = None
     separation: Annotated[
         Number, Field(description="of the two likeliest in it, in noises that no refit takes up")
     ] = None

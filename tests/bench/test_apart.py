@@ -1,24 +1,30 @@
 """The recording that tells two explanations apart: where they differ most, fitted or not."""
 
+import json
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from pipeline.bench.design.discriminate import _left, with_proposal
+from pipeline.bench.design.discriminate import _left, propose_for, with_proposal
 from pipeline.bench.design.next_plan import plan_next
-from pipeline.bench.planning.plan import Limits, Recording
-from pipeline.bench.planning.plan_file import load_plan
-from pipeline.errors import DataError
+from pipeline.bench.planning.plan import Limits, Plan, Recording
+from pipeline.bench.planning.plan_file import load_plan, save_plan
+from pipeline.errors import ConfigError, DataError
 from pipeline.gap.stored import gap_text, read_gap
 from pipeline.gap.types import Contender, Gap, Trace
+from pipeline.ingest.read import read_data
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.augmented import simulate_augmented
 from pipeline.plant.nonlinear.effects import find_effect
 from pipeline.plant.nonlinear.effects.base import AugmentedChain, make_term
 from pipeline.report.gap.page import build_gap_document
 from pipeline.report.render.html import render_html
-from pipeline.submission import load_submission
+from pipeline.resources import EXAMPLES
+from pipeline.submission import Submission, load_submission
+from tests.helpers.commandline import cartlab_here
 from tests.report.test_gap import make_gap, two_cart_analysis
 
 LIMITS = Limits(input=0.5, travel=2.5)
@@ -101,16 +107,78 @@ def test_another_dispute_gets_another_recording(proposed):
     assert with_proposal(disputed(DRY), limits=LIMITS).proposal is None
 
 
+def shipped(folder: Path) -> Submission:
+    """The shipped two carts in a folder of their own, with a plan of these limits."""
+    shutil.copytree(EXAMPLES / "two-cart", folder, dirs_exist_ok=True)
+    submission = load_submission(folder)
+    save_plan(Plan(limits=LIMITS), submission)
+    return submission
+
+
+def write_gap(gap: Gap, submission: Submission, **other: object) -> str:
+    """Write gap.json about the submission's data, with some entries of its own."""
+    system, files = submission.system, read_data(submission).files
+    units = {"position_unit": system.position.unit, "input_unit": system.input.unit}
+    text = gap_text(gap, replace(two_cart_analysis(), files=files, **units))
+    text = json.dumps(json.loads(text) | other)
+    (submission.folder / "gap").mkdir(exist_ok=True)
+    (submission.folder / "gap" / "gap.json").write_text(text, encoding="utf-8")
+    return text
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"verdict": "perhaps"},
+        {"next_recording": {"id": "apart-square"}},
+        {"next_limits": {"input": 5.0, "travel": 2.5}},
+        {"next_limits": None},
+        {"provenance": {"version": "1", "files": {"data/step-1.csv": 64 * "0"}}},
+    ],
+)
+def test_a_proposal_of_other_data_or_limits_is_refused(proposed, tmp_path, other):
+    """So is a gap.json that is none: one line, exit 2, and the plan stays as it was."""
+    submission = shipped(tmp_path)
+    write_gap(proposed, submission, **other)
+    before = (tmp_path / "plan.toml").read_bytes()
+    done = cartlab_here("plan", tmp_path, "--next", 1, "--for", "gap")
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert "again" in done.stderr
+    assert (tmp_path / "plan.toml").read_bytes() == before
+
+
+def test_nothing_is_added_that_would_break_the_plan(proposed, tmp_path):
+    """What passes a limit, or frees a cart that is not there, is not written."""
+    submission = shipped(tmp_path)
+    plan = load_plan(submission)
+    entry = Recording.model_validate_json(json.dumps(proposed.proposal.recording))
+    for spoilt in (
+        entry.model_copy(update={"amplitude": 0.6}),
+        entry.model_copy(update={"carts": (1, 2, 3)}),
+    ):
+        with pytest.raises(ConfigError):
+            save_plan(plan.model_copy(update={"recordings": (spoilt,)}), submission)
+        assert load_plan(submission) == plan
+
+
+def test_a_spoilt_plan_costs_the_proposal_only(tmp_path):
+    """The gap stays what it is, and a note says why nothing is proposed."""
+    submission = shipped(tmp_path)
+    assert propose_for(disputed(DRY, DRAG), submission).proposal is not None
+    (tmp_path / "plan.toml").write_text("version = [", encoding="utf-8")
+    gap = propose_for(disputed(DRY, DRAG), submission)
+    assert gap.proposal is None
+    assert "plan.toml" in gap.notes[-1]
+
+
 def test_the_recording_is_a_plan_entry_that_can_be_recorded(proposed, tmp_path):
     """From gap.json to plan.toml, once more under another name; the page draws it."""
     analysis = two_cart_analysis()
-    (tmp_path / "submission.toml").write_text("version = 1\n\n[system]\ncarts = 2\n")
-    submission = load_submission(tmp_path)
+    submission = shipped(tmp_path)
     with pytest.raises(DataError, match="run `cartlab gap"):
         plan_next(submission, n=1, goal="gap", progress=lambda text: None)
-    (tmp_path / "gap").mkdir()
-    text = gap_text(proposed, analysis)
-    (tmp_path / "gap" / "gap.json").write_text(text, encoding="utf-8")
+    text = write_gap(proposed, submission)
     again, _ = read_gap(text)
     assert [one.model.terms[0].effect.key for one in again.contenders] == [
         "coulomb_friction",
@@ -121,6 +189,8 @@ def test_the_recording_is_a_plan_entry_that_can_be_recorded(proposed, tmp_path):
         plan = load_plan(submission)
         assert [r.aim for r in plan.recordings].count("gap") == count
         assert made.separation == pytest.approx(proposed.proposal.separation)
+    with pytest.raises(ConfigError, match="expected --next 1"):
+        plan_next(submission, n=3, goal="gap", progress=lambda text: None)
     html = render_html(
         build_gap_document(
             replace(

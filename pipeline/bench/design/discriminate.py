@@ -19,14 +19,15 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.bench.design.information import sampled_input
 from pipeline.bench.planning.plan import Limits, Recording
-from pipeline.bench.planning.propose import FURTHEST, rounded, rounded_down
-from pipeline.errors import DataError
+from pipeline.bench.planning.propose import FURTHEST, plan_limits, rounded, rounded_down
+from pipeline.errors import DataError, PipelineError
 from pipeline.gap.types import Gap, Proposal
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.dwells import SETTLED, settling_wait
 from pipeline.plant.linear.simulate import simulate_linear
 from pipeline.plant.nonlinear.augmented import simulate_augmented
 from pipeline.plant.nonlinear.effects.base import AugmentedChain, Term
+from pipeline.submission import Submission
 
 Kind = Literal["step", "sweep"]
 Shape = Literal["square", "triangle", "chirp"]
@@ -40,8 +41,24 @@ _LEAST_WEIGHT = 0.1  # of a contender: what swings overstates how sure the crite
 _SAME = 1e-9  # of the largest singular value: such a change of the parameters shows in nothing
 
 
+def propose_for(gap: Gap, submission: Submission) -> Gap:
+    """Return the gap with a proposal within the limits of the submission's plan.
+
+    Where none can be made, for a spoilt plan.toml say, a note says why: the gap stays what it is.
+    """
+    try:
+        return with_proposal(gap, limits=plan_limits(submission))
+    except PipelineError as error:
+        return replace(gap, notes=(*gap.notes, f"no recording is proposed: {error}"))
+
+
 def with_proposal(gap: Gap, *, limits: Limits) -> Gap:
-    """Return the gap with the recording that tells its contenders apart best, if it has two."""
+    """Return the gap with the recording that tells its contenders apart best, if it has two.
+
+    Raises
+    ------
+    DataError : the carts never settle.
+    """
     models = [one.model for one in gap.contenders]
     if len(models) < 2 or not all(model.chain.is_tied for model in models):
         return gap
@@ -65,6 +82,7 @@ def with_proposal(gap: Gap, *, limits: Limits) -> Gap:
     cart = int(np.argmax(swing))
     proposal = Proposal(
         recording=recording.model_dump(mode="json", exclude_defaults=True),
+        limits=limits.model_dump(),
         separation=float(np.sqrt(told[0, 1] / (t.size * len(recording.carts)))),
         cart=cart + 1,
         t=t,

@@ -3,9 +3,11 @@
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from math import isclose
 from pathlib import Path
 
 import numpy as np
+from pydantic import ValidationError
 
 from pipeline.bench.design.candidates import propose_candidates
 from pipeline.bench.design.exchange import choose
@@ -13,11 +15,12 @@ from pipeline.bench.design.goal import GAP, WORST, Goal, find_goal
 from pipeline.bench.design.information import Knowledge
 from pipeline.bench.host.raw import FOLDER as RAW
 from pipeline.bench.host.raw import read_raw
-from pipeline.bench.planning.plan import Plan, Recording
+from pipeline.bench.planning.plan import Limits, Plan, Recording
 from pipeline.bench.planning.plan_file import load_plan, plan_path, save_plan
 from pipeline.bench.planning.plan_words import session_time, time_words
 from pipeline.bench.planning.propose import propose_plan, renamed
 from pipeline.errors import ConfigError, DataError
+from pipeline.ingest.read import read_data
 from pipeline.results import Analysis
 from pipeline.schemas.gap import Gap as GapDocument
 from pipeline.submission import Submission
@@ -25,6 +28,7 @@ from pipeline.submission.toml_file import read_text
 from pipeline.workflow import analyse
 
 _MOST_BYTES = 10_000_000  # of a gap.json
+_DIGITS = 1e-9  # relative: its numbers have ten digits
 _USUAL = frozenset("c")  # what a bench is taken to know of which nothing is recorded
 
 
@@ -81,12 +85,14 @@ def plan_next(
     Raises
     ------
     DataError : the data recorded do not identify the carts, so nothing can be weighed.
-    ConfigError : there is no such goal.
+    ConfigError : there is no such goal; gap.json is broken, or of other data or limits.
     """
     old = load_plan(submission) if plan_path(submission).exists() else propose_plan(submission)
     taken = [entry.id for entry in (*old.recordings, *submission.experiments)]
     if goal == GAP:
-        recording, separation = _decisive(submission.folder)
+        if n != 1:
+            raise ConfigError(f"--for gap chooses one recording: expected --next 1, found {n}")
+        recording, separation = _decisive(submission, old.limits)
         recordings = renamed([recording], taken=taken)
         plan = old.model_copy(update={"recordings": (*old.recordings, *recordings)})
         return NextPlan(
@@ -158,22 +164,39 @@ def choose_next(
     )
 
 
-def _decisive(folder: Path) -> tuple[Recording, float]:
+def _decisive(submission: Submission, limits: Limits) -> tuple[Recording, float]:
     """Return the recording that `cartlab gap` proposes, and how far it sets explanations apart.
 
     Raises
     ------
     DataError : there is no gap.json, or it proposes none.
+    ConfigError : it is broken, or of other data or limits than these.
     """
-    path = folder / "gap" / "gap.json"
+    path = submission.folder / "gap" / "gap.json"
+    command = f"`cartlab gap {submission.folder}`"
     if not path.is_file():
-        raise DataError(f"--for gap: there is no {path}: run `cartlab gap {folder}` first")
+        raise DataError(f"--for gap: there is no {path}: run {command} first")
     text = read_text(path, where="gap/gap.json", limit=_MOST_BYTES, error=ConfigError)
-    found = GapDocument.model_validate_json(text)
-    if found.next_recording is None or found.separation is None:
-        raise DataError("--for gap: gap/gap.json proposes no recording, nothing is in dispute")
-    table = json.dumps(found.next_recording)
-    return Recording.model_validate_json(table), found.separation
+    try:
+        found = GapDocument.model_validate_json(text)
+        if found.next_recording is None or found.separation is None:
+            raise DataError("--for gap: gap/gap.json proposes no recording")
+        recording = Recording.model_validate_json(json.dumps(found.next_recording))
+    except ValidationError:
+        raise ConfigError(
+            f"--for gap: gap/gap.json is not what cartlab gap writes: run {command} again"
+        ) from None
+    system = submission.system
+    of = (found.submission.carts, found.units.position, found.units.input)
+    here = (system.carts, system.position.unit, system.input.unit)
+    if of != here or found.provenance.files != read_data(submission).files:
+        raise ConfigError(f"--for gap: gap/gap.json is of other data: run {command} again")
+    kept = found.next_limits or {}
+    if not all(isclose(kept.get(name, 0.0), limit, rel_tol=_DIGITS) for name, limit in limits):
+        raise ConfigError(
+            f"--for gap: the limits in plan.toml are not those of gap/gap.json: run {command} again"
+        )
+    return recording, found.separation
 
 
 def _words(goal: Goal, known: Knowledge) -> str:

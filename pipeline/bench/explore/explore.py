@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.bench.design.discriminate import with_proposal
+from pipeline.bench.design.discriminate import propose_for
 from pipeline.bench.design.next_plan import choose_next, known_commands
 from pipeline.bench.planning.plan import Plan, Recording
 from pipeline.bench.planning.plan_file import load_plan, plan_path, save_plan
@@ -149,7 +149,7 @@ def _look(folder: Path, tell: Callable[[str], None]) -> tuple[Analysis, Gap]:
     submission = load_submission(folder)
     analysis = analyse(submission)
     gap = investigate(analysis, progress=lambda text: None, budget=_SEARCH)
-    gap = with_proposal(gap, limits=load_plan(submission).limits)
+    gap = propose_for(gap, submission)
     place = own_folder(folder, "gap")
     place.mkdir(exist_ok=True)
     write_file(place / "gap.json", gap_text(gap, analysis))

@@ -77,7 +77,7 @@ def save_plan(plan: Plan, submission: Submission) -> Path:
 
     Raises
     ------
-    ConfigError : the file that is there is broken.
+    ConfigError : the file that is there is broken, or would be; nothing is written then.
     ValueError : it does not begin with what stands in the file, which nobody overwrites.
     """
     path = plan_path(submission)
@@ -92,6 +92,8 @@ def save_plan(plan: Plan, submission: Submission) -> Path:
         text += "\n".join(_recording_text(r) for r in plan.recordings[n:])
     else:
         text = plan_text(plan, submission.system)
+    where = f"{submission.folder.resolve().name}/{NAME} cannot be written"
+    _parse(text, where=where, system=submission.system)
     write_file(path, text)
     return path
 
