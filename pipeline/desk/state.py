@@ -21,7 +21,7 @@ from pipeline.desk.jobs import Failed, Hand, Jobs
 from pipeline.desk.users import Place, User, place_name
 from pipeline.resources import TEMPLATES
 
-_MOST_SHOWN = 32  # texts that pages were filled in from, of 1 MB at the most
+_MOST_SHOWN = 32  # texts that pages of one person were filled in from, of 1 MB at the most
 _MOST_LOOKS = 5_000  # files of which is kept what they are
 NOTHING_KNOWN: dict[str, Any] = {
     "kind": None, "format": "", "duration": None, "remarks": [], "unsure": [], "lines": [],
@@ -39,7 +39,7 @@ class Desk:
     benches: Sessions = field(default_factory=Sessions)
     books: Books = field(default_factory=Books)
     said: dict[tuple[str, str], list[str]] = field(default_factory=dict)
-    shown: OrderedDict[str, str] = field(default_factory=OrderedDict)
+    _shown: dict[str, OrderedDict[str, str]] = field(default_factory=dict)
     _looks: OrderedDict[Path, tuple[Stamp, dict[str, Any]]] = field(default_factory=OrderedDict)
 
     def looks(
@@ -64,12 +64,20 @@ class Desk:
             found[file] = kept[1]
         return found
 
-    def keep_shown(self, text: str, *, digest: str) -> None:
-        """Keep what a page shows, by which a form that comes back tells what was typed in it."""
-        self.shown[digest] = text
-        self.shown.move_to_end(digest)
-        while len(self.shown) > _MOST_SHOWN:
-            self.shown.popitem(last=False)
+    def keep_shown(self, text: str, *, digest: str, to: str) -> None:
+        """Keep what a page shows, by which a form that comes back tells what was typed in it.
+
+        It is kept for every person: while one fills in a form, a class saves theirs.
+        """
+        texts = self._shown.setdefault(to, OrderedDict())
+        texts[digest] = text
+        texts.move_to_end(digest)
+        while len(texts) > _MOST_SHOWN:
+            texts.popitem(last=False)
+
+    def shown(self, digest: str, *, to: str) -> str | None:
+        """Return what a page showed somebody; None where it is not known any more."""
+        return self._shown.get(to, {}).get(digest)
 
     def _look(self, folder: Path, file: str, columns: dict[str, str | int]) -> dict[str, Any]:
         try:

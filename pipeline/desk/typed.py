@@ -15,14 +15,18 @@ def typed_path(typed: str, *, wanted: str, inside: Path | None = None) -> Path:
 
     Raises
     ------
-    ConfigError : it is no path, leads out, or is `~` of nobody whom this computer knows.
+    ConfigError : it is no path, leads out, is `~` of nobody whom this computer knows, or the
+        computer cannot look there.
     """
     if not typed or not typed.isprintable():
         raise ConfigError(wanted)
     try:
         path = (inside / typed if inside else Path(typed).expanduser()).resolve()
+        path.exists()
     except RuntimeError:
         raise ConfigError(f"{typed}: this computer knows nobody of that name") from None
+    except OSError as error:  # a name too long, a folder that is closed to whoever runs the desk
+        raise ConfigError(f"{_clipped(typed, most=60)}: {error.strerror}; {wanted}") from None
     if inside and not path.is_relative_to(inside):
         raise ConfigError(f"{typed}: leads out of {inside.name}, where yours is made")
     return path
@@ -39,5 +43,9 @@ def whole_number(typed: str, *, name: str, least: int, most: int) -> int:
     # However many digits it has, no more are read than the largest has.
     if number and len(number) <= len(str(most)) and least <= int(number) <= most:
         return int(number)
-    found = f"{typed[:20]}…" if len(typed) > 20 else typed
+    found = _clipped(typed, most=20)
     raise ConfigError(f"{name}: expected a whole number from {least} to {most}, found {found!r}")
+
+
+def _clipped(typed: str, *, most: int) -> str:
+    return f"{typed[:most]}…" if len(typed) > most else typed

@@ -17,6 +17,7 @@ from pipeline.desk.users import read_users
 from pipeline.errors import ConfigError
 from pipeline.resources import RUBRICS
 from pipeline.submission import load_submission
+from pipeline.submission.edit import edit_submission
 from tests.helpers.desks import PROXY, Visitor, a_submission, through_proxy, write_users
 from tests.helpers.grades import write_class
 from tests.helpers.waiting import PATIENCE, until
@@ -195,6 +196,22 @@ def test_everybody_sees_their_own(lab):
     assert lab("s1").post("/student/1/save", title="mine", seen="").status == 404
     assert lab("s1").upload("/student/1/files", [("a.csv", b"x")]).status == 404
     assert lab("s1").get("/").headers["location"] == "/student/0/"
+
+
+def test_a_form_outlasts_what_a_class_saves_meanwhile(lab, root):
+    """Only what was typed in it is shown as typed, however many states others saw since."""
+    page = lab("s1").get("/student/0/")
+    shown, seen = {name: page.value(name) for name in ("title", "section")}, page.value("seen")
+    saved = lab("s1").post("/student/0/save", seen=seen, **shown | {"section": "07"})
+    assert saved.status == 303
+    for number in range(40):
+        edit_submission(
+            root / "two", lambda document, n=number: document.update(title=f"state {n}")
+        )
+        assert lab("s2").get("/student/0/").status == 200
+    answer = lab("s1").post("/student/0/save", seen=seen, **shown | {"title": "Mine"})
+    rows = re.findall(r'<tr><th scope="row">.*?<pre>(.*?)</pre>.*?<pre>(.*?)</pre>', answer.text)
+    assert (answer.status, rows) == (409, [("Mine", shown["title"])])
 
 
 def test_a_ta_sees_the_gradebooks_they_are_listed_for(lab):

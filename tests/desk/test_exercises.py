@@ -183,8 +183,10 @@ def test_a_rubric_that_was_changed_meanwhile_is_not_written_over(visitor, tmp_pa
 
 
 @pytest.mark.parametrize(
-    "file", ["", "rubric.txt", "/nowhere/at/all/rubric.toml", "a\x00.toml", "~nosuch/r.toml"]
-)
+    "file",
+    ["", "rubric.txt", "/nowhere/at/all/rubric.toml", "a\x00.toml", "~nosuch/r.toml",
+     "a" * 300 + ".toml"],
+)  # fmt: skip
 def test_a_rubric_lies_where_it_can(visitor, file):
     """A name that is none is one clear sentence."""
     assert visitor.post("/rubric/save", file=file, text="x", seen="new").status == 422
@@ -209,7 +211,7 @@ def test_a_number_of_folders_is_read_whole(visitor, tmp_path, folders):
     assert not out.exists()
 
 
-@pytest.mark.parametrize("typed", ["~nosuch/x", "", "a\x00b"])
+@pytest.mark.parametrize("typed", ["~nosuch/x", "", "a\x00b", "a" * 300, "a/" * 5000])
 def test_a_place_that_is_none_is_said(visitor, typed):
     """Whichever form it is typed into; `~` of nobody is no fault of the desk's own."""
     sent = {"preset": "throne-1dof", "folders": "1", "seed": "0"}

@@ -22,6 +22,7 @@ from pipeline.desk.student import files as uploads
 from pipeline.desk.student.files import take_uploads
 from pipeline.errors import SubmissionError
 from pipeline.grading.intake.hand_ins import find_hand_ins
+from pipeline.lock import turn_in
 from pipeline.submission import load_submission
 from pipeline.submission.edit import edit_submission
 from pipeline.submission.load import NAME
@@ -192,6 +193,29 @@ def test_a_recording_is_moved_aside_and_comes_back(filled):
         assert visitor.post(HERE + "aside", file=other).status == 404
     assert load_submission(folder).experiments[0].file == named
     assert (folder / named).is_file()
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_moving_aside_waits_its_turn_before_it_looks(filled, named):
+    """Whether a table names it by then, or it is gone: one clear sentence, and nothing moves."""
+    visitor, folder = filled
+    recording = folder / "data" / "late.csv"
+    recording.write_bytes(b"nothing in it")
+    assert "data/late.csv" in visitor.get(HERE).text
+    with ThreadPoolExecutor(1) as pool:
+        with turn_in(folder):
+            moved = pool.submit(visitor.post, HERE + "aside", file="data/late.csv")
+            time.sleep(1.0)
+            assert not moved.done()
+            if named:
+                text = (folder / NAME).read_text(encoding="utf-8")
+                table = '\n[[experiments]]\nid = "late"\nkind = "decay"\nfile = "data/late.csv"\n'
+                (folder / NAME).write_text(text + table, encoding="utf-8")
+            else:
+                recording.unlink()
+        page = moved.result()
+    assert (page.status, "late.csv" in page.text) == (422, True)
+    assert recording.exists() == named
 
 
 def test_handing_in_warns_of_open_questions(filled):
@@ -466,6 +490,18 @@ def test_a_folder_has_room_for_a_hand_in(tmp_path, hand, monkeypatch):
     three = [(f"{n}.csv", io.BytesIO(b"123456"[:n])) for n in (4, 5, 6)]
     (said,) = take_uploads(three, tmp_path / "whole", hand=hand)
     assert said.startswith("'6.csv': not taken: a hand-in has at most 2 files")
+
+
+def test_what_is_no_part_of_a_hand_in_takes_no_room(tmp_path, hand, monkeypatch):
+    """What was set aside, reports, a bench's raw files; what the zip holds counts."""
+    for name in ("set-aside/old.csv", "report/report.html", "gap/gap.json", "raw/session-1/a.bin"):
+        (tmp_path / name).parent.mkdir(parents=True)
+        (tmp_path / name).write_bytes(bytes(100))
+    monkeypatch.setattr(uploads, "HAND_IN", uploads.HAND_IN.__class__(members=2, total=50))
+    (tmp_path / "notes.md").write_bytes(b"So.")
+    assert take_upload("a.csv", io.BytesIO(b"x"), tmp_path, hand=hand) == []
+    (said,) = take_upload("b.csv", io.BytesIO(b"y"), tmp_path, hand=hand)
+    assert "at most 2 files" in said
 
 
 def test_names_and_texts_of_files_are_never_markup(room):

@@ -10,11 +10,12 @@ from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
 from pipeline.desk.jobs import Failed, Hand
+from pipeline.desk.student.handin import BESIDE
 from pipeline.errors import SubmissionError
 from pipeline.grading.intake.unpack import HAND_IN, is_debris
 from pipeline.ingest.formats.table import ENDINGS
 from pipeline.lock import turn_in
-from pipeline.output import TURN, own_folder, write_file
+from pipeline.output import own_folder, write_file
 from pipeline.submission.complaints import quote
 from pipeline.submission.load import (
     MAX_DATA_BYTES,
@@ -50,9 +51,7 @@ def take_uploads(sent: Iterable[tuple[str, BinaryIO]], folder: Path, *, hand: Ha
             room = _Room(folder)
             for name, given in files:
                 try:
-                    with (
-                        given.open("rb") if isinstance(given, Path) else nullcontext(given) as file
-                    ):
+                    with _opened(given) as file:
                         said.append(_take(name, file.read(MAX_DATA_BYTES + 1), folder, room=room))
                 except SubmissionError as error:
                     said.append(f"{quote(name)}: not taken: {error}")
@@ -73,11 +72,16 @@ def _unpacked(content: BinaryIO, scratch: Path, *, hand: Hand) -> list[tuple[str
 
 
 class _Room:
-    """What a folder still takes by a hand-in's limits; counted once, whoever has the turn adds."""
+    """What a hand-in still takes by its limits; counted once, whoever has the turn adds.
+
+    What was set aside or made by a command lies in the same folder and is no part of a hand-in.
+    """
 
     def __init__(self, folder: Path) -> None:
-        there = [p.stat().st_size for p in folder.rglob("*") if p.is_file() and p.name != TURN]
-        self._files, self._bytes = len(there), sum(there)
+        there = [folder / name for name in (NAME, *BESIDE)]
+        there += own_folder(folder, "data").rglob("*")
+        sizes = [path.stat().st_size for path in there if path.is_file()]
+        self._files, self._bytes = len(sizes), sum(sizes)
 
     def check(self, raw: bytes) -> None:
         """Refuse what there is no room for; what is not refused is stored."""
@@ -131,13 +135,20 @@ def _names(path: Path) -> Iterator[Path]:
 
 
 def put_aside(file: str, folder: Path) -> str:
-    """Move a recording out of `data/`, over nothing; say where it is now."""
-    with turn_in(folder):
-        aside = own_folder(folder, _ASIDE)
-        aside.mkdir(exist_ok=True)
-        names = _names(aside / PurePosixPath(file).name)
-        target = next(path for path in names if not _there(path))
+    """Move a recording out of `data/`, over nothing; say where it is. The caller has the turn.
+
+    Raises
+    ------
+    SubmissionError : it is not there any more.
+    """
+    aside = own_folder(folder, _ASIDE)
+    aside.mkdir(exist_ok=True)
+    names = _names(aside / PurePosixPath(file).name)
+    target = next(path for path in names if not _there(path))
+    try:
         (folder / file).rename(target)
+    except FileNotFoundError:
+        raise SubmissionError(f"{file}: was moved or removed meanwhile") from None
     return f"{quote(file)} lies in {_ASIDE}/{target.name} now: no report and no zip has it."
 
 

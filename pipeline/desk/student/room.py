@@ -70,10 +70,12 @@ def aside(ask: Ask) -> Response:
     folder, file = ask.folder(), ask.text("file")
     if file not in ask.desk.hand.do("files", folder=str(folder)):
         raise HTTPException(404, "there is no such recording")
-    document = read_document(submission_text(folder) if (folder / NAME).exists() else "")
-    if any(posix(str(table.get("file", ""))) == file for table in _tables(document)):
-        raise SubmissionError(f"{file}: {NAME} names it; take it out there first")
-    return ask.back(_here(ask), put_aside(file, folder))
+    with turn_in(folder):
+        document = read_document(submission_text(folder) if (folder / NAME).exists() else "")
+        if any(posix(str(table.get("file", ""))) == file for table in _tables(document)):
+            raise SubmissionError(f"{file}: {NAME} names it; take it out there first")
+        said = put_aside(file, folder)
+    return ask.back(_here(ask), said)
 
 
 def fill(ask: Ask) -> Response:
@@ -171,7 +173,7 @@ def _here(ask: Ask) -> str:
 
 def _shown(ask: Ask) -> dict[str, Any]:
     """Return the file that a form was filled in for: what differs from that was typed."""
-    text = ask.desk.shown.get(ask.text("seen"))
+    text = ask.desk.shown(ask.text("seen"), to=ask.user.name)
     return read_document(submission_text(ask.folder()) if text is None else text)
 
 
@@ -231,7 +233,7 @@ def _room(
     except SubmissionError as unreadable:
         error = unreadable
     document = read_document(text)
-    ask.desk.keep_shown(text, digest=text_digest(text))
+    ask.desk.keep_shown(text, digest=text_digest(text), to=ask.user.name)
     if error is None and text:
         error = _wrong(text, folder)
     rows = _rows(ask, folder, document)
