@@ -29,10 +29,11 @@ def explore(
     ] = False,
 ) -> None:
     """Record, identify, look for the gap, choose the next recording, again, until it is known."""
+    from pipeline.bench.explore.explore import Recorded, read_time, read_wish
     from pipeline.bench.explore.explore import explore as go
-    from pipeline.bench.explore.explore import read_time, read_wish
     from pipeline.bench.host.acquire import acquire
     from pipeline.bench.live.terminal import Terminal
+    from pipeline.bench.planning.plan_words import session_time
     from pipeline.report.exploration.page import NAME
 
     wish, seconds = read_wish(until), read_time(limit)
@@ -42,9 +43,11 @@ def explore(
         watching(folder, terminal, web=web, yes=yes) as (observers, buttons),
     ):
 
-        def record(ids: Sequence[str]) -> list[str]:
+        def record(ids: Sequence[str]) -> Recorded:
             outcomes = acquire(folder, port=port, observers=observers, only=ids, buttons=buttons)
-            return [o.recording.id for o in outcomes if not o.partial]
+            ids = tuple(o.recording.id for o in outcomes if not o.partial)
+            tried = [o.recording for o in outcomes if o.lines]
+            return Recorded(ids=ids, seconds=session_time(tried))
 
         try:
             turns = go(folder, record=record, wish=wish, seconds=seconds, tell=terminal.remark)
@@ -52,3 +55,5 @@ def explore(
             terminal.remark("stopped; what was recorded is in the submission")
             raise typer.Exit(INTERRUPTED) from None
         terminal.remark(f"{len(turns)} turns; wrote {Path(folder) / NAME}")
+    if not turns[-1].reached:
+        raise typer.Exit(1)

@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from pipeline.bench.explore.explore import Wish, explore, read_time, read_wish
-from pipeline.errors import ConfigError
+from pipeline.bench.explore.explore import Recorded, Wish, explore, read_time, read_wish
+from pipeline.errors import ConfigError, DataError
 from pipeline.report.exploration.page import NAME
 from pipeline.submission import load_submission
 from pipeline.synthesis.hidden import prepare_bench
@@ -41,7 +41,9 @@ def test_what_is_no_wish_is_refused(text):
         read_wish(text)
 
 
-@pytest.mark.parametrize("text", ["20", "min", "-3s", "20 parsec"])
+@pytest.mark.parametrize(
+    "text", ["20", "min", "-3s", "20 parsec", "inf s", "1e999s", "1e308h", "nan s"]
+)
 def test_what_is_no_duration_is_refused(text):
     """With an example of one."""
     with pytest.raises(ConfigError, match="expected a duration"):
@@ -66,6 +68,8 @@ def test_an_exploration_names_what_acts_and_knows_the_carts(explored):
     folder, turns, said, bench = explored
     last = turns[-1]
     assert last.verdict == "named"
+    assert last.reached
+    assert "at least ±" in last.said  # beside effects the stated errors are the least
     (explanation,) = last.explanations
     assert "cart 1" in explanation.name
     assert all(error is not None and error < 0.01 for error in last.errors.values())
@@ -97,7 +101,58 @@ def test_time_that_is_up_ends_it_before_the_next_recording(explored, tmp_path):
     )
     assert len(turns) == 1
     assert turns[0].seconds <= 90.0
+    assert not turns[0].reached
     assert "allowed are up" in turns[0].said
+
+
+def test_time_bounds_the_first_recordings_too(tmp_path):
+    """The sweep fits and the steps do not; less than the sweep takes moves no cart."""
+    bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
+    virtual = VirtualBench(bench, seed=1)
+    session = VirtualSession(tmp_path / "work", virtual)
+    with pytest.raises(ConfigError, match="the first sweep takes"):
+        explore(tmp_path / "work", record=session, wish=Wish(), seconds=10.0, tell=lambda s: None)
+    assert virtual.seconds == 0.0
+    turns = explore(
+        tmp_path / "work", record=session, wish=Wish(error=1e-7), seconds=40.0, tell=lambda s: None
+    )
+    assert turns[-1].recorded == ("sweep",)
+    assert virtual.seconds <= 40.0
+
+
+def test_a_wish_that_meets_no_parameter_is_refused_before_a_cart_moves(explored):
+    """With the name that is nearest; nothing is recorded, nothing is claimed."""
+    folder, _, _, _ = explored
+    asked: list[str] = []
+
+    def record(ids):
+        asked.extend(ids)
+        return Recorded(ids=(), seconds=0.0)
+
+    with pytest.raises(ConfigError, match="did you mean 'zeta'"):
+        explore(
+            folder, record=record, wish=read_wish("Zeta 1%"), seconds=900.0, tell=lambda s: None
+        )
+    assert not asked
+    with pytest.raises(ConfigError, match="no such parameter"):
+        Wish(prefix="zeta_7").missing({"zeta_1": 0.1, "zeta_2": None})
+
+
+def test_carts_are_identified_where_the_gap_cannot_be_looked_for(tmp_path, monkeypatch):
+    """The exploration goes on by the parameters, and does not say that nothing else acts."""
+
+    def none(analysis, **other):
+        raise DataError("no run can be held out")
+
+    monkeypatch.setattr("pipeline.bench.explore.explore.investigate", none)
+    bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
+    session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=1))
+    turns = explore(
+        tmp_path / "work", record=session, wish=Wish(error=0.1), seconds=90.0, tell=lambda s: None
+    )
+    assert turns[-1].verdict == ""
+    assert turns[-1].errors
+    assert not turns[-1].reached
 
 
 def test_a_recording_that_does_not_come_off_is_not_asked_for_again(tmp_path):
@@ -107,7 +162,7 @@ def test_a_recording_that_does_not_come_off_is_not_asked_for_again(tmp_path):
 
     def record(ids):
         asked.append(list(ids))
-        return session(ids) if len(asked) <= 2 else []
+        return session(ids) if len(asked) <= 2 else Recorded(ids=(), seconds=20.0)
 
     turns = explore(
         tmp_path / "work", record=record, wish=Wish(error=1e-7), seconds=900.0, tell=lambda s: None

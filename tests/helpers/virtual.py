@@ -5,12 +5,14 @@ from pathlib import Path
 
 from pipeline.bench.emulator.carts import TRUE_PERIOD, VirtualCarts, input_per_count
 from pipeline.bench.emulator.core import ReferenceCore
+from pipeline.bench.explore.explore import Recorded
 from pipeline.bench.host.experiments import add_experiment, recorded_entry
 from pipeline.bench.host.record import data_file, log_text
 from pipeline.bench.planning.gains import Scales
 from pipeline.bench.planning.orders import make_order
 from pipeline.bench.planning.plan import Limits, Recording
 from pipeline.bench.planning.plan_file import load_plan, plan_path, save_plan
+from pipeline.bench.planning.plan_words import session_time
 from pipeline.bench.planning.propose import propose_plan
 from pipeline.bench.protocol.messages import (
     EXTENSIONS,
@@ -127,7 +129,7 @@ class VirtualSession:
     def __init__(self, folder: Path, bench: VirtualBench) -> None:
         self.folder, self.bench = folder, bench
 
-    def __call__(self, ids: Sequence[str]) -> list[str]:
+    def __call__(self, ids: Sequence[str]) -> Recorded:
         """Carry out recordings of the plan; make submission and plan where there are none."""
         if not (self.folder / NAME).exists():
             new_folder(self.folder, self.bench, springs=[True] * (self.bench.description.carts + 1))
@@ -137,4 +139,5 @@ class VirtualSession:
         plan = load_plan(submission)
         wanted = [recording for recording in plan.recordings if recording.id in ids]
         self.bench.record(self.folder, wanted, limits=plan.limits)
-        return [recording.id for recording in wanted]
+        ids = tuple(recording.id for recording in wanted)
+        return Recorded(ids=ids, seconds=session_time(wanted))

@@ -13,6 +13,7 @@ from pipeline.bench.planning.plan import Plan, Recording
 from pipeline.bench.planning.plan_file import load_plan, plan_path, save_plan
 from pipeline.bench.planning.plan_words import session_time, time_words
 from pipeline.bench.planning.propose import (
+    FIRST_SWEEP_TIME,
     identified_chain,
     large_steps,
     propose_plan,
@@ -25,10 +26,12 @@ from pipeline.gap.stored import gap_text
 from pipeline.gap.types import Gap
 from pipeline.names import listed
 from pipeline.output import own_folder, write_file
+from pipeline.plant.linear.chain import Chain
 from pipeline.report.exploration.page import write_diary
 from pipeline.report.exploration.turn import Explanation, Turn
 from pipeline.results import Analysis
-from pipeline.submission import load_submission
+from pipeline.submission import Submission, load_submission
+from pipeline.submission.complaints import nearest
 from pipeline.submission.load import NAME
 from pipeline.workflow import analyse
 
@@ -36,10 +39,19 @@ FIRST = "sweep"  # of the plan that is proposed where nothing is known: it needs
 _SEARCH = 90.0  # s that a look for the gap may take
 _APART = 1.0  # noises: explanations that no recording sets further apart stay in dispute
 _FAR = 0.5  # of the travel limit: who has not moved so far has not shown all
-_FAR_OUT = "to see what acts far out"
+_FAR_OUT = "far"  # the aim of the step that shows what acts far out
 _SETTLED = ("named", "none")
 
-Record = Callable[[Sequence[str]], Sequence[str]]
+
+@dataclass(frozen=True, kw_only=True)
+class Recorded:
+    """What came off of the recordings asked for, by id, and the s that all tries took."""
+
+    ids: tuple[str, ...]
+    seconds: float
+
+
+Record = Callable[[Sequence[str]], Recorded]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,8 +62,16 @@ class Wish:
     error: float = 0.01
 
     def missing(self, errors: dict[str, float | None]) -> dict[str, float]:
-        """Return the parameters that are not known so well yet, with their errors."""
+        """Return the parameters that are not known so well yet, with their errors.
+
+        Raises
+        ------
+        ConfigError : no parameter's name begins so.
+        """
         meant = {name: e for name, e in errors.items() if name.startswith(self.prefix)}
+        if not meant:
+            hint = nearest(self.prefix, list(errors))
+            raise ConfigError(f'--until "{self.prefix} …": there is no such parameter{hint}')
         return {
             name: np.inf if error is None else error
             for name, error in meant.items()
@@ -87,7 +107,7 @@ def read_time(text: str) -> float:
     unit = text.strip()[len(number) :].strip()
     seconds = {"s": 1.0, "sec": 1.0, "min": 60.0, "h": 3600.0}.get(unit)
     try:
-        if seconds is not None and float(number) > 0:
+        if seconds is not None and 0 < seconds * float(number) < np.inf:
             return seconds * float(number)
     except ValueError:
         pass
@@ -104,25 +124,40 @@ def explore(
 
     Parameters
     ----------
-    record : carries out recordings of the plan by their ids and returns those that came off; the
-        first call makes submission and plan where there are none.
-    seconds : at the bench, rests included; no recording is begun that would go beyond.
+    record : carries out recordings of the plan by their ids; the first call makes submission and
+        plan where there are none.
+    seconds : at the bench, rests included; no recording is begun that would go beyond. One that is
+        broken off counts each time it is tried.
     tell : takes a sentence at each turn.
 
     Raises
     ------
     DataError : the first recordings do not identify the carts.
+    ConfigError : the wish is for a parameter that such carts do not have, or the first sweep alone
+        takes longer than is allowed.
     """
     known = (folder / NAME).exists() and bool(load_submission(folder).experiments)
-    made = () if known else tuple(record([FIRST]))
+    if (folder / NAME).exists():
+        wish.missing(dict.fromkeys(_names(load_submission(folder))))
+    made, spent = (), 0.0
+    if not known:
+        first = _first_time(folder)
+        if first > seconds:
+            raise ConfigError(
+                f"--time: the first sweep takes {time_words(first)}, {time_words(seconds)} are "
+                "allowed"
+            )
+        came = record([FIRST])
+        made, spent = came.ids, came.seconds
     submission = load_submission(folder)
     if not plan_path(submission).exists():
         save_plan(propose_plan(submission), submission)
     plan = load_plan(submission)
     if not known:
-        steps = [r.id for r in plan.recordings if r.kind == "step" and not r.release]
-        made += tuple(record(steps)) if steps else ()
-    spent = session_time([r for r in plan.recordings if r.id in made])
+        steps = [r for r in plan.recordings if r.kind == "step" and not r.release]
+        if steps and spent + session_time(steps) <= seconds:
+            came = record([step.id for step in steps])
+            made, spent = (*made, *came.ids), spent + came.seconds
     turns: list[Turn] = []
     refused: set[str] = set()
     while True:
@@ -131,43 +166,66 @@ def explore(
         turn, recording = _decide(analysis, gap, plan, folder, wish=wish, refused=refused)
         if recording and spent + session_time([recording]) > seconds:
             left = f"the {time_words(seconds)} allowed are up before {recording.id} would be done"
-            turn, recording = replace(turn, said=f"{turn.said}, but {left}"), None
+            said = f"{turn.said}, but {left}"
+            turn, recording = replace(turn, said=said, reached=False), None
         turn = replace(turn, seconds=spent, recorded=made)
         turns.append(turn)
         write_diary(turns, analysis, folder, wanted=wish.error)
         tell(turn.said)
         if recording is None:
             return tuple(turns)
-        made = tuple(record([recording.id]))
-        spent += session_time([recording])
+        came = record([recording.id])
+        made, spent = came.ids, spent + came.seconds
         if not made:  # a limit, or somebody at the bench who did not want it
             refused.add(_shape(recording))
 
 
-def _look(folder: Path, tell: Callable[[str], None]) -> tuple[Analysis, Gap]:
-    """Identify the carts and look for the gap; both are of the data as they stand now."""
+def _names(submission: Submission) -> list[str]:
+    """Return what the parameters of the submission's carts are called."""
+    n = submission.system.carts
+    wall = float(submission.system.tied or n > 1)
+    chain = Chain(m=np.ones(n), c=np.full(n, 0.1), k=np.array([wall, *np.ones(n - 1), 0.0]))
+    return list(chain.parameters())
+
+
+def _first_time(folder: Path) -> float:
+    """Return what the first sweep takes, s: the plan's, or that of the plan to come."""
+    if (folder / NAME).exists() and plan_path(submission := load_submission(folder)).exists():
+        return session_time([r for r in load_plan(submission).recordings if r.id == FIRST])
+    return FIRST_SWEEP_TIME
+
+
+def _look(folder: Path, tell: Callable[[str], None]) -> tuple[Analysis, Gap | None]:
+    """Identify the carts and look for the gap, as the data stand now; None: it cannot be."""
     submission = load_submission(folder)
     analysis = analyse(submission)
-    gap = investigate(analysis, progress=lambda text: None, budget=_SEARCH)
+    try:
+        gap = investigate(analysis, progress=lambda text: None, budget=_SEARCH)
+    except DataError as error:
+        tell(f"the gap cannot be looked for: {error}")
+        return _identified(analysis, None), None
     gap = propose_for(gap, submission)
     place = own_folder(folder, "gap")
     place.mkdir(exist_ok=True)
     write_file(place / "gap.json", gap_text(gap, analysis))
-    return _with_effects(analysis, gap), gap
+    return _identified(analysis, gap), gap
 
 
-def _with_effects(analysis: Analysis, gap: Gap) -> Analysis:
+def _identified(analysis: Analysis, gap: Gap | None) -> Analysis:
     """Return the analysis with the carts as they are beside the effects that act on them.
 
     Raises
     ------
     DataError : neither with effects nor without them the carts are identified.
     """
-    fit, model, covariance = analysis.fit, gap.model, gap.chain_covariance
-    if fit is None or not (fit.converged or model.terms):
+    fit, acting = analysis.fit, gap is not None and bool(gap.model.terms)
+    if fit is None or not (fit.converged or acting):
         reasons = "; ".join(one.reason for one in analysis.skipped if "estimates" in one.stage)
         raise DataError(f"the carts are not identified: {reasons or 'see the report'}")
-    if not model.terms or covariance is None or not model.chain.is_tied:
+    if gap is None or not acting:
+        return analysis
+    model, covariance = gap.model, gap.chain_covariance
+    if covariance is None or not model.chain.is_tied:
         return analysis
     names = tuple(gap.chain_std)
     # What the linear chain leaves is no noise: the encoders' own is.
@@ -186,13 +244,13 @@ def _with_effects(analysis: Analysis, gap: Gap) -> Analysis:
 
 
 def _decide(
-    analysis: Analysis, gap: Gap, plan: Plan, folder: Path, *, wish: Wish, refused: set[str]
+    analysis: Analysis, gap: Gap | None, plan: Plan, folder: Path, *, wish: Wish, refused: set[str]
 ) -> tuple[Turn, Recording | None]:
     """Return the turn, and the recording to make next: it stands in the plan."""
     errors = _errors(analysis)
     missing = wish.missing(errors)
-    known = _known_words(missing, errors)
-    doubt = _doubt_words(gap)
+    known = _known_words(missing, errors, beside=gap is not None and bool(gap.model.terms))
+    doubt = _doubt_words(gap) if gap else "what else acts could not be looked for"
     recording, why = None, ""
     try:
         recording, why = _next(analysis, gap, plan, folder, missing=missing)
@@ -201,10 +259,7 @@ def _decide(
     if recording and _shape(recording) in refused:
         recording, why = None, f"{recording.id} was refused before, and nothing else tells as much"
     if recording:
-        taken = [r.id for r in plan.recordings] + [record.id for record in analysis.records]
-        (recording,) = renamed([recording], taken=taken)
-        longer = plan.model_copy(update={"recordings": (*plan.recordings, recording)})
-        save_plan(longer, load_submission(folder))
+        recording = _planned(recording, plan, folder)
         why = f"therefore {recording.id}: {why}"
     said = "; ".join(filter(None, [known, doubt, why or "so this is the end"]))
     return (
@@ -212,10 +267,11 @@ def _decide(
             seconds=0.0,
             recorded=(),
             errors=errors,
-            verdict=gap.verdict,
-            explanations=_explanations(gap),
-            left=gap.final,
-            floor=gap.noise_floor,
+            verdict=gap.verdict if gap else "",
+            explanations=_explanations(gap) if gap else (),
+            left=gap.final if gap else None,
+            floor=gap.noise_floor if gap else None,
+            reached=not missing and gap is not None and gap.verdict in _SETTLED,
             said=said,
         ),
         recording,
@@ -224,15 +280,15 @@ def _decide(
 
 def _next(
     analysis: Analysis,
-    gap: Gap,
+    gap: Gap | None,
     plan: Plan,
     folder: Path,
     *,
     missing: dict[str, float],
 ) -> tuple[Recording | None, str]:
     """Return what to record next and why; None where all is known, or nothing would help."""
-    settled, commands = gap.verdict in _SETTLED, known_commands(folder)
-    if gap.proposal is not None and gap.proposal.separation > _APART:
+    settled, commands = gap is None or gap.verdict in _SETTLED, known_commands(folder)
+    if gap is not None and gap.proposal is not None and gap.proposal.separation > _APART:
         recording = Recording.model_validate_json(json.dumps(gap.proposal.recording))
         return recording, (
             f"in it the explanations differ by {gap.proposal.separation:.2g} times the noise"
@@ -243,14 +299,27 @@ def _next(
         return found.recordings[0], found.said
     furthest = max(float(np.ptp(record.y, axis=1).max()) / 2 for record in analysis.records)
     # Once: carts that something holds back go no further the second time.
-    made = any(r.note == _FAR_OUT for r in plan.recordings)
+    recorded = {record.id for record in analysis.records}
+    made = any(r.aim == _FAR_OUT and r.id in recorded for r in plan.recordings)
     if furthest < _FAR * plan.limits.travel and not made:
         step, _ = large_steps(identified_chain(analysis), plan.limits)
-        return step.model_copy(update={"note": _FAR_OUT}), (
+        return step.model_copy(update={"aim": _FAR_OUT}), (
             f"no cart has moved by more than {furthest:.2g} of {plan.limits.travel:g} "
             f"{analysis.position_unit} allowed, and what acts further out would not show"
         )
     return None, "" if settled else "no recording within the limits would decide"
+
+
+def _planned(recording: Recording, plan: Plan, folder: Path) -> Recording:
+    """Return the recording as it stands in the plan: an open one that is the same, or a new one."""
+    submission = load_submission(folder)
+    done = {experiment.id for experiment in submission.experiments}
+    for one in plan.recordings:
+        if one.id not in done and one.aim == recording.aim and _shape(one) == _shape(recording):
+            return one
+    (new,) = renamed([recording], taken=[*done, *(r.id for r in plan.recordings)])
+    save_plan(plan.model_copy(update={"recordings": (*plan.recordings, new)}), submission)
+    return new
 
 
 def _shape(recording: Recording) -> str:
@@ -270,7 +339,17 @@ def _errors(analysis: Analysis) -> dict[str, float | None]:
     }
 
 
-def _known_words(missing: dict[str, float], errors: dict[str, float | None]) -> str:
+def _known_words(
+    missing: dict[str, float], errors: dict[str, float | None], *, beside: bool
+) -> str:
+    """Say how well the parameters are known, `beside` effects by errors that may be too small."""
+    if not missing and beside:
+        # The gap's fit counts each sample as new: what lasts makes such errors too small.
+        worst = max((error for error in errors.values() if error is not None), default=0.0)
+        return (
+            "by the errors that the gap's fit states, which are the least they can be, the goal is "
+            f"met; the worst of all is at least ± {100 * worst:.2g} %"
+        )
     if not missing:
         worst = max((error for error in errors.values() if error is not None), default=0.0)
         return f"every parameter asked for is known, the worst of all to ± {100 * worst:.2g} %"

@@ -50,6 +50,7 @@ _CHIRP_FROM = 0.5  # Hz; it ends 20 times higher
 _SWEEP_TIME = 20.0  # s
 _SWEEP_EDGE = 2.5  # s from edge to edge where the bench knows no chirp
 _FIRST_SETTLE = 5.0  # s
+FIRST_SWEEP_TIME = _SWEEP_TIME + _FIRST_SETTLE  # s, on every bench
 
 _DWELLS = 24
 _STEP = 0.9  # of the aim: where a step rests; it overshoots up to twice as far

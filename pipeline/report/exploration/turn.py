@@ -23,6 +23,7 @@ class Turn:
     verdict : of the gap; "" where it could not be looked for.
     explanations : in dispute, or the one that is named; none where the linear chain does.
     left, floor : what the model leaves of the motion, and what noise alone would.
+    reached : all that was asked for is known, and what else acts has a name or is not there.
     said : what is known, what is doubted and why the next recording is made, in one sentence.
     """
 
@@ -33,4 +34,5 @@ class Turn:
     explanations: tuple[Explanation, ...]
     left: float | None
     floor: float | None
+    reached: bool
     said: str
