@@ -72,10 +72,12 @@ class Class:
 
     @cached_property
     def lost(self) -> Mapping[str, set[str]]:
-        """Who has not all points of a criterion; one that was never judged has none."""
+        """Who was graded and has not all points of a criterion; one never judged has none."""
         lost: dict[str, set[str]] = {asked.id: set() for asked in self.rubric.criteria}
         whole = {asked.id: asked.points for asked in self.rubric.criteria}
         for name, team in self.teams.items():
+            if team.line.status == "failed":  # as on the class page: nothing was lost
+                continue
             judged = team.line.criteria
             for key, points in whole.items():
                 if key not in judged or judged[key][1] < points:
