@@ -51,6 +51,7 @@ const shown = (one) => {
   if (one.tagName !== "SELECT") return one.defaultValue;
   return ([...one.options].find((option) => option.defaultSelected) ?? one.options[0])?.value;
 };
+const differs = (one) => state(one) !== shown(one);
 const key = (one) =>
   [one.form?.dataset.row ?? one.form?.id, one.name.replace(/^experiments\.\d+/, ""), switched(one) && one.value].join("\n");
 const typed = (within) => [...within.querySelectorAll("input:not([type=hidden], [type=file]), select, textarea")].filter((one) => one.name);
@@ -61,7 +62,7 @@ document.addEventListener("htmx:beforeSend", (event) => {
 document.addEventListener("htmx:beforeSwap", (event) => {
   if (event.detail.target.id !== "main") return;
   const went = sent.get(event.detail.xhr) ?? new Map();
-  const kept = typed(event.detail.target).filter((one) => state(one) !== (went.has(one) ? went.get(one) : shown(one)));
+  const kept = typed(event.detail.target).filter((one) => (went.has(one) ? state(one) !== went.get(one) : differs(one)));
   before = heading();
   unsaved.set(before, new Map(kept.map((one) => [key(one), state(one)])));
 });
@@ -75,3 +76,13 @@ document.addEventListener("htmx:afterSwap", (event) => {
   }
   if (heading() !== before) scrollTo(0, 0); // another page altogether
 });
+
+// What is made of what is saved waits where something typed is not: what stands behind it says how to go on.
+const hold = (event) => {
+  const made = event.target.closest("[data-of-saved]");
+  if (!made || !typed(document).some(differs)) return;
+  event.preventDefault();
+  event.stopPropagation();
+  made.closest("p").nextElementSibling.hidden = false;
+};
+document.addEventListener("click", hold, true);

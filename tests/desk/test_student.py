@@ -232,6 +232,33 @@ def test_handing_in_warns_of_open_questions(filled):
         assert "hand-in.zip" in page
 
 
+def test_the_page_says_what_the_zip_holds(filled):
+    """A report and notes where there are any, and nothing else."""
+    visitor, folder = filled
+    (folder / "notes.md").unlink(missing_ok=True)
+
+    def said() -> str:
+        told = re.search(r"It holds [^<]*", visitor.get(HERE).text)
+        assert told
+        return told[0]
+
+    assert ("notes" in said(), "No report has been made yet." in said()) == (False, True)
+    ask_for(folder)
+    (folder / "report" / "report.pdf").write_bytes(b"%PDF")
+    (folder / "notes.md").write_text("Short.", encoding="utf-8")
+    assert said() == f"It holds {NAME}, the files that it names, your notes and the report."
+
+
+def test_of_a_file_that_cannot_be_read_no_columns_are_asked(filled):
+    """There are none to tell; of one that can be read and tells nothing they are."""
+    visitor, folder = filled
+    (folder / "data" / "new.csv").write_bytes(b"")
+    page = visitor.get(HERE).text
+    assert ("the file is empty" in page, "what its columns are" in page) == (True, False)
+    (folder / "data" / "new.csv").write_text("a,b\n1,2\n3,4\n5,6\n", encoding="utf-8")
+    assert "what its columns are" in visitor.get(HERE).text
+
+
 def test_edits_from_outside_show_and_are_not_written_over(filled):
     """A form of an older state is refused with both versions; so is an answer."""
     visitor, folder = filled

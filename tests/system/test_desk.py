@@ -145,6 +145,46 @@ def test_what_is_typed_stays_until_it_is_saved(show, tmp_path):
     assert (submission.title, submission.system.springs[0]) == ("typed", False)
 
 
+def test_what_is_made_of_the_file_waits_for_what_is_not_saved(show, tmp_path):
+    """Zip and report are held and say so; they go on where it is saved, or all the same."""
+    folder = a_submission(tmp_path / "team")
+    with DeskServer(folder=folder) as server:
+        window = show(server.url)
+        asked = []
+        window.on("request", lambda request: asked.append(request.url.rsplit("/", 1)[1]))
+        title, held = window.get_by_label("Title of the report"), window.get_by_role("alert")
+        title.fill("typed")
+        for section, name, role in (
+            ("#hand-in", "Hand in: the zip", "link"),
+            ("#report", "Make the report", "button"),
+            ("#report", "Look for what", "button"),
+        ):
+            within = window.locator(section)
+            shown = within.get_by_role("alert").count()
+            within.get_by_role(role, name=name).click()
+            expect(within.get_by_role("alert")).to_have_count(shown + 1)
+        assert not {"hand-in.zip", "make-report", "make-gap"}.intersection(asked)
+        assert violations(window) == []
+        with window.expect_download() as download:  # all the same
+            window.get_by_role("link", name="hand in without it").click()
+        with zipfile.ZipFile(download.value.path()) as archive:
+            assert "typed" not in archive.read(NAME).decode()
+
+        window.locator("#details").get_by_role("button", name="Save").click()
+        expect(window.get_by_text("Saved.")).to_be_visible()
+        expect(held).to_have_count(0)
+        with window.expect_download() as download:
+            window.get_by_role("link", name="Hand in: the zip").click()
+        with zipfile.ZipFile(download.value.path()) as archive:
+            assert 'title = "typed"' in archive.read(NAME).decode()
+
+        title.fill("typed again")
+        window.get_by_role("button", name="Make the report").click()
+        window.get_by_role("button", name="go on without it").click()
+        expect(window.locator("[data-events]")).to_contain_text("The report")
+        expect(title).to_have_value("typed again")
+
+
 @pytest.mark.parametrize("size", [WIDE, PHONE], ids=["wide", "phone"])
 def test_everybody_can_use_it(show, tmp_path, size):
     """Axe finds nothing by day and by night; nothing is wider than the screen; keys do."""

@@ -8,7 +8,7 @@ from pipeline.submission import load_submission
 from pipeline.submission.load import NAME, outside
 
 _FIXED_TIME = (1980, 1, 1, 0, 0, 0)  # same files, same bytes
-BESIDE = ("notes.md", "report/report.pdf")  # goes with it where it is there
+BESIDE = {"notes.md": "your notes", "report/report.pdf": "the report"}  # as the page calls them
 
 
 def hand_in(folder: Path) -> bytes:
@@ -20,13 +20,17 @@ def hand_in(folder: Path) -> bytes:
     """
     submission = load_submission(folder)
     names = dict.fromkeys([NAME, *(experiment.file for experiment in submission.experiments)])
-    beside = [name for name in BESIDE if outside(folder, name) is None]
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name in (*names, *beside):
+        for name in (*names, *beside(folder)):
             info = zipfile.ZipInfo(name, _FIXED_TIME)
             archive.writestr(info, (folder / name).read_bytes(), zipfile.ZIP_DEFLATED)
     return buffer.getvalue()
+
+
+def beside(folder: Path) -> list[str]:
+    """Return what goes with it: of `BESIDE`, what is there."""
+    return [name for name in BESIDE if outside(folder, name) is None]
 
 
 def missing(folder: Path) -> list[str]:

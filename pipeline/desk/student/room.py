@@ -28,11 +28,11 @@ from pipeline.desk.student.form import (
     typed,
     with_errors,
 )
-from pipeline.desk.student.handin import hand_in, missing
+from pipeline.desk.student.handin import BESIDE, beside, hand_in, missing
 from pipeline.errors import SubmissionError
 from pipeline.lock import turn_in
 from pipeline.output import write_file
-from pipeline.report.numbers import count
+from pipeline.report.numbers import count, listing
 from pipeline.report.sections.answers import with_answer, written_answer
 from pipeline.submission.edit import Outdated, edit_submission, submission_text, text_digest
 from pipeline.submission.load import (
@@ -253,6 +253,7 @@ def _room(
         wrong=left,
         keeps=_keeps(folder) if text and error is None else [],
         sound=bool(text) and error is None,
+        holds=listing([NAME, "the files that it names", *(BESIDE[one] for one in beside(folder))]),
         job=job,
         report=_report_state(folder),
         told=told,
