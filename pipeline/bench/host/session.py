@@ -215,7 +215,7 @@ class Session:
             self._start([Start(wave=Wave.DELTA, frequency=1 / recording.settle, amplitude=0)])
             trouble = self._listen(self._stream(()), seconds=recording.settle, check=last.keep)
             if trouble:
-                raise HardwareError(f"{recording.id}: while the carts came to rest, {trouble}")
+                raise HardwareError(f"while the carts came to rest, {trouble}")
             moving = {
                 cart: swing
                 for cart, swing in enumerate(last.swings[: self._carts], start=1)

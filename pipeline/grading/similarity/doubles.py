@@ -23,17 +23,21 @@ class Double:
     ----------
     author : "" where names are left out.
     recordings : the most that one of the submissions has in common with the others.
+    compared : each has recordings that could be read.
     """
 
     author: str
     submissions: tuple[str, ...]
     recordings: int = 0
+    compared: bool = True
 
     def __str__(self) -> str:
         """What a TA is told."""
         who = " ".join(clean(self.author).split()) or "One person"
         more = [f"{len(self.submissions) - _NAMED} more"] * (len(self.submissions) > _NAMED)
         where = listing([*map(clean, self.submissions[:_NAMED]), *more])
+        if not (self.recordings or self.compared):
+            return f"{who} is in {where}, whose recordings could not be compared"
         common = count(self.recordings, "recording") if self.recordings else "no recording"
         return f"{who} is in {where}, which have {common} in common"
 
@@ -55,7 +59,9 @@ def find_doubles(authors: Mapping[str, Sequence[str]]) -> list[Double]:
 
 def with_recordings(doubles: Iterable[Double], prints: Iterable[Member]) -> list[Double]:
     """Return them with what their submissions share; recordings handed out with the task count."""
-    shared = find_shared([replace(one, authors=(one.submission,)) for one in prints])
+    alone = [replace(one, authors=(one.submission,)) for one in prints]
+    shared = find_shared(alone)
+    read = {one.submission for one in alone if one.fingerprints}
     return [
         replace(
             double,
@@ -63,6 +69,7 @@ def with_recordings(doubles: Iterable[Double], prints: Iterable[Member]) -> list
                 len({r.experiment for r in shared.get(name, ()) if r.other in double.submissions})
                 for name in double.submissions
             ),
+            compared=read.issuperset(double.submissions),
         )
         for double in doubles
     ]

@@ -118,7 +118,7 @@ def design_blocks(page: Page) -> list[Block]:
         ),
         _numbers("Φ", worked.phi, "Phi"),
         _numbers("Γ", worked.gamma[:, None], "Gamma"),
-        *(_regulator(design, worked) if worked.P is not None else _placement(design, worked)),
+        *(_regulator(design, worked, chain) if worked.P is not None else _placement(design, worked)),
         _numbers("G", worked.gains[None, :], "G"),
         paragraph(_WORDS.text("prefilter", cart=design.cart)),
         formula(
@@ -162,11 +162,12 @@ def _margins(design: FeedbackDesign) -> list[Block]:
     return [paragraph(_WORDS.text("margins", margins=", ".join(found)))]
 
 
-def _regulator(design: FeedbackDesign, worked: WorkedDesign) -> list[Block]:
+def _regulator(design: FeedbackDesign, worked: WorkedDesign, chain: Chain) -> list[Block]:
     assert design.Q is not None
     assert worked.P is not None
+    weight = _WORDS.text("weight_tied" if chain.is_tied else "weight_free")
     return [
-        paragraph(_WORDS.text("regulator")),
+        paragraph(_WORDS.text("regulator", weight=weight)),
         _numbers("Q", design.Q, "Q"),
         formula(row("R", "≈", value_term(float(design.R or 1.0)))),
         paragraph(_WORDS.text("riccati")),

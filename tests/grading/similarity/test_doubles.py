@@ -75,6 +75,18 @@ def test_recordings_are_counted_not_pairs_of_submissions(recordings):
     assert counted[0] == counted[1] >= 3
 
 
+def test_what_could_not_be_read_was_not_compared(recordings):
+    """Without fingerprints nothing is said of what two submissions have in common."""
+    for left, compared in ((b"", False), (recordings[1], True)):
+        prints = [
+            Member(submission=name, authors=("s1",), fingerprints=kept)
+            for name, kept in (("a", recordings[0]), ("b", left))
+        ]
+        (double,) = with_recordings(find_doubles({"a": ("s1",), "b": ("s1",)}), prints)
+        assert (double.recordings, double.compared) == (0, compared)
+        assert ("could not be compared" in str(double)) is not compared
+
+
 def test_one_submission_each_is_nothing_to_tell():
     """Two authors of one team, or one id typed twice in it, stand nowhere else."""
     assert find_doubles({"a": ("x", "y"), "b": ("z", "Z ")}) == []
