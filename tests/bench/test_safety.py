@@ -119,6 +119,8 @@ def test_what_a_bench_cannot_do_is_left_out_and_the_rest_recorded(tmp_path):
             _, said = process.communicate()
     assert process.returncode == 1
     assert "knows no chirp; take its table out of plan.toml or change it" in said
+    assert "sweep: the bench" in said
+    assert "sweep: sweep:" not in said
     assert "less than half a count of the bench" in said
     assert "not recorded: faint, sweep" in said
     assert [e.id for e in load_submission(work).experiments] == ["dwell"]

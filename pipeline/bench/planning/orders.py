@@ -131,7 +131,7 @@ def make_order(
         if closed
         else (limits.input, system.input.unit, abs(scales.input))
     )
-    where = f"plan.toml: {recording.id}: amplitude {recording.amplitude:g} {unit}"
+    where = f"plan.toml: amplitude {recording.amplitude:g} {unit}"
     if abs(recording.amplitude) > limit:
         raise ConfigError(f"{where} passes the limit of {limit:g} {unit}")
     full = FULL_SCALE * per_count
@@ -145,15 +145,15 @@ def make_order(
     commands: list[Command] = []
     if gains is not None:
         if isinstance(gains, StateGains):
-            _check_known("f", "state feedback", recording, bench)
+            _check_known("f", "state feedback", bench)
         # A byte that is lost takes the gains with it: then none act, not those of an earlier run.
         commands += [PidGains(kp=0.0, ki=0.0, kd=0.0), gains]
     if recording.wave == "chirp":
-        _check_known("c", "chirp", recording, bench)
+        _check_known("c", "chirp", bench)
         if recording.frequency_end is not None:
             commands.append(ChirpEnd(frequency=recording.frequency_end))
     if recording.wave == "multisine":
-        _check_known("m", "multisine", recording, bench)
+        _check_known("m", "multisine", bench)
         commands += [Tone(harmonic=0), *recording.sines]
     commands.append(
         Start(
@@ -175,9 +175,9 @@ def make_order(
     )
 
 
-def _check_known(letter: str, name: str, recording: Recording, bench: Description) -> None:
+def _check_known(letter: str, name: str, bench: Description) -> None:
     if letter not in bench.commands:
         raise HardwareError(
-            f"{recording.id}: the bench {bench.name!r} knows no {name}; take its table "
-            "out of plan.toml or change it"
+            f"the bench {bench.name!r} knows no {name}; take its table out of plan.toml or "
+            "change it"
         )

@@ -118,7 +118,11 @@ def design_blocks(page: Page) -> list[Block]:
         ),
         _numbers("Φ", worked.phi, "Phi"),
         _numbers("Γ", worked.gamma[:, None], "Gamma"),
-        *(_regulator(design, worked, chain) if worked.P is not None else _placement(design, worked)),
+        *(
+            _placement(design, worked)
+            if worked.P is None
+            else _regulator(design, worked, tied=chain.is_tied)
+        ),
         _numbers("G", worked.gains[None, :], "G"),
         paragraph(_WORDS.text("prefilter", cart=design.cart)),
         formula(
@@ -162,10 +166,10 @@ def _margins(design: FeedbackDesign) -> list[Block]:
     return [paragraph(_WORDS.text("margins", margins=", ".join(found)))]
 
 
-def _regulator(design: FeedbackDesign, worked: WorkedDesign, chain: Chain) -> list[Block]:
+def _regulator(design: FeedbackDesign, worked: WorkedDesign, *, tied: bool) -> list[Block]:
     assert design.Q is not None
     assert worked.P is not None
-    weight = _WORDS.text("weight_tied" if chain.is_tied else "weight_free")
+    weight = _WORDS.text("weight_tied" if tied else "weight_free")
     return [
         paragraph(_WORDS.text("regulator", weight=weight)),
         _numbers("Q", design.Q, "Q"),
