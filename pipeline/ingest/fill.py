@@ -16,6 +16,7 @@ import tomlkit
 
 from pipeline.errors import ConfigError, SubmissionError
 from pipeline.ingest import limits
+from pipeline.ingest.formats.recognise import read_table
 from pipeline.ingest.formats.table import ENDINGS
 from pipeline.ingest.inspect import Inspection, data_files_in, inspect_file
 from pipeline.results_of_runs import Kind
@@ -170,7 +171,7 @@ def fill_submission(folder: Path) -> tuple[Found, ...]:
     def change(document: tomlkit.TOMLDocument) -> None:
         if new:
             _state_units(document, looked)
-        filling = _Filling(document, folder)
+        filling = _Filling(document, folder, looked)
         found.extend(filling.add(one) for one in looked)
 
     edit_submission(folder, change)
@@ -180,8 +181,11 @@ def fill_submission(folder: Path) -> tuple[Found, ...]:
 class _Filling:
     """A document to which the tables of files are added one after the other."""
 
-    def __init__(self, document: tomlkit.TOMLDocument, folder: Path) -> None:
+    def __init__(
+        self, document: tomlkit.TOMLDocument, folder: Path, looked: Sequence[Found]
+    ) -> None:
         self._document, self._folder = document, folder
+        self._inspections = {one.file: one.inspection for one in looked if one.inspection}
         system: Any = document.get("system", {})
         self._n = system.get("carts", 1)
 
@@ -237,12 +241,28 @@ class _Filling:
         )
 
     def _same(self, file: str) -> str | None:
-        """Return another file of the submission that holds the very same."""
+        """Return another file of the submission that holds the very same, if in another form."""
         for name in (posix(str(table["file"])) for table in self._tables):
             other = self._folder / name
             if other.is_file() and filecmp.cmp(other, self._folder / file, shallow=False):
                 return name
+            if self._same_ranges(name, file) and self._signals(name) == self._signals(file):
+                return name
         return None
+
+    def _same_ranges(self, *files: str) -> bool:
+        """Whether files may hold the same samples, without reading them again."""
+        seen = [
+            one and {c.role: (one.samples, c.low, c.high) for c in one.columns if c.role}
+            for one in map(self._inspections.get, files)
+        ]
+        return bool(seen[0]) and seen[0] == seen[1]
+
+    def _signals(self, file: str) -> dict[str, bytes]:
+        """Return the samples of each column that has a role."""
+        table, _ = read_table(self._folder, file, shown=file)
+        columns = self._inspections[file].columns
+        return {c.role: table.values[i].tobytes() for i, c in enumerate(columns) if c.role}
 
     def _say_unknown(self, found: Found) -> None:
         """Leave a table as a comment, to be filled in by who knows what the file is; once."""

@@ -1,8 +1,10 @@
 """What is wrong with a submission, in one line a student can act on."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from decimal import Decimal
 from difflib import get_close_matches
+from typing import Literal, get_args, get_origin
 
 from pydantic_core import ErrorDetails
 
@@ -76,6 +78,26 @@ def nearest(name: object, candidates: Sequence[str]) -> str:
     if close:
         return f"; did you mean {close[0]!r}?"
     return f"; known: {first_few(candidates, _MOST_KNOWN)}" if candidates else ""
+
+
+def takes_numbers(key: str) -> bool:
+    """Tell whether a key of the format holds numbers and no text, in whatever table it stands."""
+    kinds = [
+        kind
+        for model in _TABLES.values()
+        if key in model.model_fields
+        for kind in _kinds(model.model_fields[key].annotation)
+    ]
+    return any(kind in (int, float, Decimal) for kind in kinds) and str not in kinds
+
+
+def _kinds(annotation: object) -> Iterator[object]:
+    """Yield the plain types of an annotation."""
+    inner = get_args(annotation)
+    if not inner:
+        yield annotation
+    for one in inner:
+        yield from [type(one)] if get_origin(annotation) is Literal else _kinds(one)
 
 
 def dotted(location: Location, document: object) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from pipeline.errors import PipelineError
-from pipeline.submission.complaints import quote
+from pipeline.submission.complaints import quote, takes_numbers
 
 Value: TypeAlias = "str | bool | int | float | Sequence[Value] | Mapping[str, Value]"
 _MAX_KEY_DEPTH = 30  # tomllib's time grows with the square of a dotted key's depth
@@ -17,6 +17,7 @@ _AT = re.compile(r" \(at line (\d+), column (\d+)\)$")
 _NUMBER = r"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?"
 
 BACKSLASH = 'inside "…" a backslash begins a special character; folders are parted by /'
+_TEXT = "text stands in quotes"
 _UNCLOSED = "a list [ … ] before this line is not closed, or lacks a comma"
 
 # What a line looks like that TOML refuses, what is wrong with it, and what in it becomes what. The
@@ -77,12 +78,12 @@ _SLIPS: tuple[tuple[str, str, tuple[tuple[str, str], ...]], ...] = (
     ),
     (
         r"^[^=]*=\s*[A-Za-z_./\\]",
-        "text stands in quotes",
+        _TEXT,
         ((r"^([^=]*=)\s*([^#]*[^#\s])", r'\1 "\2"'),),
     ),
     (
         r"=\s*[\[{][^\"']*[\[{,\s][A-Za-z_]\w*\s*[,\]}]",
-        "text stands in quotes",
+        _TEXT,
         ((r"([\[{,=]\s*)(?!true\b|false\b)([A-Za-z_]\w*)(?=\s*[,\]}])", r'\1"\2"'),),
     ),
     (r"=\s*(\"[^\"]*|'[^']*)$", "the quote is not closed", ((r"([\"'])([^\"']*)$", r"\1\2\1"),)),
@@ -180,6 +181,9 @@ def _words(line: str, message: str) -> str:
     looked_at = line[:_LONGEST_LINE]
     for slip, words, mends in _SLIPS:
         if re.search(slip, looked_at):
+            key = looked_at.partition("=")[0].strip()
+            if words == _TEXT and takes_numbers(key):
+                return f"{key} takes a number, written in digits"
             return words + _mended(looked_at, mends)
     return f"not valid TOML: {message}"
 

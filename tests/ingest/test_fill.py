@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.io
 from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
@@ -106,6 +107,17 @@ def test_what_is_no_recording_gets_no_table(tmp_path):
         text = (tmp_path / "submission.toml").read_text(encoding="utf-8")
         assert text.count('# file = "data/riddle.csv"') == 1
         assert [e.id for e in load_submission(tmp_path).experiments] == ["a"]
+
+
+def test_the_same_samples_in_another_form_get_one_table(tmp_path):
+    """A recording saved as .csv and as .mat is one; another of the same ranges is its own."""
+    (tmp_path / "data").mkdir()
+    whole = {"time": T, "input": STEP, "x1": RING}
+    put(tmp_path, "a.csv", **whole)
+    put(tmp_path, "b.csv", **(whole | {"x1": RING[::-1]}))
+    table = np.loadtxt(tmp_path / "data" / "a.csv", delimiter=",", skiprows=1).T
+    scipy.io.savemat(tmp_path / "data" / "a.mat", dict(zip(whole, table, strict=True)))
+    assert [state for state, *_ in states(tmp_path).values()] == ["new", "copy", "new"]
 
 
 def test_a_bare_matrix_gets_its_columns(tmp_path):
@@ -235,7 +247,7 @@ def test_an_outdated_change_is_refused(tmp_path):
 
 def test_columns_that_are_stated_tell_what_a_file_is(tmp_path):
     """Under `[system]` for all files that have them, in an experiment's table for its own."""
-    put(tmp_path, "a.csv", clock=T, volts=STEP, sled=RING)
+    put(tmp_path, "a.csv", clock=T, volts=STEP, sled=2 * RING)
     put(tmp_path, "b.csv", time=T, input=SINE, x1=RING)
     put(tmp_path, "c.csv", clock=T, volts=STEP, other=RING)
     (tmp_path / "submission.toml").write_text(

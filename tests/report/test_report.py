@@ -456,7 +456,7 @@ def test_what_was_not_used_is_not_said_to_be():
     assert f"{len(dwells)} sine dwells" in whole
     assert f"{len(dwells) - 1} sine dwells" in text
     assert "the right name of it, for step-9" in text
-    assert f"Mend or record again {dwells[0]}:" in text
+    assert f"Mend, record again or take out {dwells[0]}:" in text
 
 
 def test_a_good_result_is_called_so():

@@ -280,7 +280,7 @@ def _bomb() -> bytes:
 BAD_DATA = {
     "empty": ("", r"step-a: data/step\.csv: the file is empty"),
     "blank lines": ("\n \n\n", r"the file is empty"),
-    "heading only": ("time,input,x1\n", r"data/step\.csv line 1: not a table of numbers"),
+    "heading only": ("time,input,x1\n", r"data/step\.csv line 1: headings, but no rows"),
     "comments only": ("# nothing\n# here\n", r"holds no rows of numbers"),
     "prose": ("Dear TA,\nour data got lost.\nSorry.\n", r"line \d: not a table of numbers"),
     "a word": (_replaced(12, "0.1,1,bad,0.2"), r"step\.csv line 12: 'x1' is no number: 'bad'"),
@@ -442,6 +442,7 @@ SLIPS = {
     "K = -0,5 # cm/V": ("comma", "K = -0.5 # cm/V"),
     "title = “Two carts”": ("curly", 'title = "Two carts"'),
     "kind = ‘step’": ("curly", "kind = 'step'"),
+    "frequency = two": ("in digits", None),
     "kind = decay": ("quotes", 'kind = "decay"'),
     "file = data/step.csv # ours": ("quotes", 'file = "data/step.csv" # ours'),
     "unit = { unit = V, sign = 1 }": ("quotes", 'unit = { unit = "V", sign = 1 }'),

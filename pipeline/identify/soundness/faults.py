@@ -221,7 +221,8 @@ def _copies(records: Sequence[Record]) -> dict[str, str]:
         what = (record.kind, record.free, record.t.tobytes(), record.y.tobytes())
         if first.setdefault(what, record.id) != record.id:
             copies[record.id] = (
-                f"it holds the samples of {first[what]}: a repeat is a recording of its own"
+                f"it holds the samples of {first[what]}: take it out, for a repeat is a recording "
+                "of its own"
             )
     return copies
 

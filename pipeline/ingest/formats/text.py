@@ -18,6 +18,7 @@ _SNIFFED_ROWS = 40
 _HEADING_WORDS = re.compile(
     r"encoder\s*\d+\s+(?:pos|vel|acc)\w*|commanded\s+\w+|control\s+effort|[^\s,;]+", re.IGNORECASE
 )
+_TIME_HEADING = re.compile(r"(?:^|[,;\t])\W*(?:sample\s+)?(?:t|time)(?![a-z])", re.IGNORECASE)
 _OPENING = re.compile(r"^[^\S\n]*(?:[A-Za-z]\w*\s*=\s*)?\[", re.MULTILINE)
 _LONGEST_HEADING = 100  # characters
 _LONGEST_UNIT = 8  # characters: "counts", "rad/s"
@@ -277,6 +278,9 @@ def _delimited(text: str, source: str) -> Table:
         )
     layout = _sniff([line for _, line in lines[start : start + _SNIFFED_ROWS + 1]])
     if layout is None:
+        number, line = lines[start]
+        if start + 1 == len(lines) and _TIME_HEADING.search(line):
+            raise SubmissionError(f"{source} line {number}: headings, but no rows of numbers below")
         number, line = lines[min(start + 1, len(lines) - 1)]
         raise SubmissionError(
             f"{source} line {number}: not a table of numbers, found {line.strip()[:40]!r}"
