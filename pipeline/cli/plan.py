@@ -51,7 +51,12 @@ def plan(
             further = {
                 "next": {"for": made.words, "separation": made.separation}
                 if made.separation is not None
-                else {"for": made.words, "errors": made.errors, "planned": made.planned}
+                else {
+                    "for": made.words,
+                    "now": made.now,
+                    "errors": made.errors,
+                    "planned": made.planned,
+                }
             }
     if as_json:
         data = plan_data(made.plan, submission) | further

@@ -107,13 +107,15 @@ class Proposal:
     ----------
     recording : a table of plan.toml.
     limits : the plan's in which it was chosen, by name.
-    separation : root mean square of the difference between the two likeliest that no refit of the
-        other takes up, in noises.
+    pair : the two contenders, from 0, that decided: by their weights it tells them apart best.
+    separation : root mean square of the difference between those two that no refit of the other
+        takes up, in noises.
     t, u : (n,) s and the input; `predicted` (contenders, n) positions of `cart`.
     """
 
     recording: dict[str, Any]
     limits: dict[str, float]
+    pair: tuple[int, int]
     separation: float
     cart: int
     t: Array

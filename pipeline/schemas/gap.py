@@ -135,7 +135,8 @@ class Gap(Document):
         dict[str, float] | None, Field(description="the limits of plan.toml that it keeps")
     ] = None
     separation: Annotated[
-        Number, Field(description="of the two likeliest in it, in noises that no refit takes up")
+        Number,
+        Field(description="of the two that decided, in noises that no refit takes up"),
     ] = None
     training: tuple[str, ...]
     held_out: tuple[str, ...]

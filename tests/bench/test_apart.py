@@ -8,7 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.bench.design.discriminate import _left, propose_for, with_proposal
+from pipeline.bench.design.discriminate import (
+    _candidates,
+    _left,
+    _tell_apart,
+    propose_for,
+    with_proposal,
+)
 from pipeline.bench.design.next_plan import plan_next
 from pipeline.bench.planning.plan import Limits, Plan, Recording
 from pipeline.bench.planning.plan_file import load_plan, save_plan
@@ -107,6 +113,41 @@ def test_another_dispute_gets_another_recording(proposed):
     assert with_proposal(disputed(DRY), limits=LIMITS).proposal is None
 
 
+def test_a_hopeless_contender_decides_nothing():
+    """One far beyond what is close has no say; the pair that decides is the one that is told."""
+    gap = disputed(DRY, DRAG, STIFF)
+    hopeless = replace(gap.contenders[2], weight=1e-12)
+    two = with_proposal(replace(gap, contenders=(*gap.contenders[:2], hopeless)), limits=LIMITS)
+    alone = with_proposal(disputed(DRY, DRAG), limits=LIMITS)
+    assert two.proposal is not None
+    assert alone.proposal is not None
+    assert two.proposal.recording == alone.proposal.recording
+    assert two.proposal.pair == (0, 1)
+    assert two.proposal.separation == pytest.approx(alone.proposal.separation)
+    swapped = (*gap.contenders[1:2], hopeless, gap.contenders[0])
+    other = with_proposal(replace(gap, contenders=swapped), limits=LIMITS).proposal
+    assert other is not None
+    assert other.pair == (0, 2)
+    assert other.separation == pytest.approx(alone.proposal.separation)
+
+
+def test_a_release_says_how_far_out_and_is_drawn_from_there():
+    """Each height is weighed by itself, and stands in the entry."""
+    heights = set()
+    for recording, height in _candidates(CHAIN, LIMITS):
+        assert (height > 0) == (recording.kind == "decay")
+        if recording.release:
+            heights.add(height)
+            assert f"{height:g} from the zero" in recording.note
+            told = _tell_apart(
+                [DRY, DRAG], recording, height, sigma=np.full(2, 1e-3), travel=LIMITS.travel
+            )
+            assert told is not None
+            predicted = told[3]
+            assert predicted[:, recording.release - 1, 0] == pytest.approx(height)
+    assert heights == {1.5, 0.5}
+
+
 def shipped(folder: Path) -> Submission:
     """The shipped two carts in a folder of their own, with a plan of these limits."""
     shutil.copytree(EXAMPLES / "two-cart", folder, dirs_exist_ok=True)
@@ -199,4 +240,4 @@ def test_the_recording_is_a_plan_entry_that_can_be_recorded(proposed, tmp_path):
             analysis,
         )
     )
-    assert "differ most in" in html
+    assert "tells the explanations in dispute apart best" in html

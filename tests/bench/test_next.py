@@ -2,10 +2,12 @@
 
 import itertools
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from pipeline.bench.design.candidates import propose_candidates
 from pipeline.bench.design.exchange import choose
 from pipeline.bench.design.goal import Goal, find_goal
 from pipeline.bench.design.information import Knowledge
@@ -14,7 +16,7 @@ from pipeline.bench.design.multisine import (
     optimal_tones,
     schroeder_phases,
 )
-from pipeline.bench.design.next_plan import choose_next
+from pipeline.bench.design.next_plan import STATISTICAL, choose_next
 from pipeline.bench.emulator.core import ReferenceCore
 from pipeline.bench.planning.plan import Limits, Plan, Recording
 from pipeline.bench.planning.plan_file import load_plan
@@ -29,10 +31,11 @@ from pipeline.bench.protocol.messages import (
     parse_reading,
 )
 from pipeline.bench.protocol.waves import target_at
-from pipeline.errors import ConfigError
+from pipeline.errors import ConfigError, DataError
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.plant.linear.simulate import simulate_linear
 from pipeline.plant.loop.sampled_loop import simulate_loop
+from pipeline.report.limits import CALIBRATION
 from pipeline.resources import EXAMPLES
 from pipeline.submission import load_submission
 from pipeline.synthesis.hidden import prepare_bench
@@ -95,7 +98,8 @@ def test_what_is_promised_is_kept(tmp_path):
     sweep = [r for r in plan.recordings if r.kind == "sweep"]
     bench.record(folder, sweep, limits=plan.limits)
     before = analyse(load_submission(folder))
-    chosen = choose_next(before, plan, n=1, goal="worst", commands=EXTENSIONS)
+    alone = Plan(limits=plan.limits)  # the plan's open steps are not recorded here
+    chosen = choose_next(before, alone, n=1, goal="worst", commands=EXTENSIONS)
     recordings = renamed(chosen.recordings, taken=["sweep", "sweep-1"])
     bench.record(folder, recordings, limits=plan.limits)
 
@@ -223,6 +227,27 @@ def test_where_dwells_identify_dwells_are_chosen():
     assert found.errors[2] < found.errors[1] < found.errors[0]
 
 
+def test_carts_that_hardly_settle_get_no_dwells():
+    """A transient of a slow mode would pass for a steady state: it is said, and none is chosen."""
+    known = Knowledge.of(analysed("two-cart"))
+    slow = replace(known, chain=replace(known.chain, c=0.2 * known.chain.c))
+    goal = find_goal("worst", slow, feedback=None)
+    with pytest.raises(DataError, match="do not settle"):
+        propose_candidates(slow, limits=LIMITS, commands=COMMANDS, goal=goal)
+
+
+def test_a_promise_below_any_calibration_says_so(analysis):
+    """And the worst parameter is named before and after, where that is another."""
+    found = choose_next(analysis, Plan(limits=LIMITS), n=1, goal="worst", commands=COMMANDS)
+    assert (STATISTICAL in found.said) == (found.errors[-1] < CALIBRATION)
+    assert (STATISTICAL in found.recordings[0].note) == (found.errors[-1] < CALIBRATION)
+    known = Knowledge.of(analysis)
+    worst, names = find_goal("worst", known, feedback=None), list(known.chain.parameters())
+    after = known.told + known.of_recording(found.recordings[0])
+    assert names[worst.worst(known.told)] in found.words
+    assert names[worst.worst(after)] in found.words
+
+
 # --------------------------------------------------------------------------- multisines
 
 
@@ -309,6 +334,9 @@ def test_the_command_adds_what_it_chose_to_the_plan(work):
     assert set(planned) >= {r.id for r in chosen}
     # What was promised for the first of two is what it would leave by itself.
     assert planned[chosen[0].id] == pytest.approx(data["next"]["errors"][1], rel=1e-9)
+    # What is planned is not promised twice.
+    assert again["next"]["errors"][0] == pytest.approx(data["next"]["errors"][2], rel=1e-9)
+    assert again["next"]["now"] == pytest.approx(data["next"]["now"], rel=1e-9)
 
 
 @pytest.mark.parametrize("words", [("--for", "zeta"), ("--next", 1, "--for", "zeta_9")])

@@ -33,9 +33,9 @@ def propose_candidates(
 
     Raises
     ------
-    DataError : none has an input that the limits allow.
+    DataError : none has an input that the limits allow, or settles.
     """
-    made = _dwells(known) if known.dwells else _broadband(known, limits, commands, goal)
+    made = list(_dwells(known) if known.dwells else _broadband(known, limits, commands, goal))
     settle = rounded(settling_wait(known.chain, time_constants=SETTLED))
     carts = tuple(range(1, known.chain.n + 1))
     candidates = []
@@ -45,13 +45,22 @@ def propose_candidates(
         if size > 0:
             candidates.append(whole.model_copy(update={"amplitude": rounded_down(size)}))
     if not candidates:
-        raise DataError("no next experiment: the limits of plan.toml allow none")
+        raise DataError(
+            "no next experiment: the limits of plan.toml allow none"
+            if made
+            else "no next experiment: dwells of these carts do not settle in the time one waits"
+        )
     return candidates
 
 
 def _dwells(known: Knowledge) -> Iterator[Recording]:
-    """Dwells that are measured for as long as one waits for their steady state."""
+    """Dwells that are measured for as long as one waits for their steady state.
+
+    None where nobody waits so long: a transient would pass for a steady state.
+    """
     wait = settling_wait(known.chain, time_constants=SETTLED_DWELL)
+    if wait * np.min(-known.chain.poles.real) < SETTLED:
+        return
     for hertz in dwell_frequencies(known.chain, n=_DWELLS):
         cycles = ceil(2 * wait * hertz)
         yield _free("sine-01", "sine", "sine", frequency=hertz, cycles=cycles)

@@ -21,6 +21,7 @@ from pipeline.bench.design.information import sampled_input
 from pipeline.bench.planning.plan import Limits, Recording
 from pipeline.bench.planning.propose import FURTHEST, plan_limits, rounded, rounded_down
 from pipeline.errors import DataError, PipelineError
+from pipeline.gap.limits import CLOSE_BIC
 from pipeline.gap.types import Gap, Proposal
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.dwells import SETTLED, settling_wait
@@ -37,7 +38,8 @@ _TIME = 12.0  # s of a record, about
 _SIZES = (1.0, 0.5, 0.2)  # of what the limits allow: laws differ in how they grow with the motion
 _RELEASES = (0.6, 0.2)  # of the travel limit, from where a hand lets go
 _STEP = 1e-3  # relative, of a parameter's difference
-_LEAST_WEIGHT = 0.1  # of a contender: what swings overstates how sure the criterion is
+_HOPELESS = np.exp(-0.5 * CLOSE_BIC)  # of the likeliest one's weight: no contender any more
+_LEAST_WEIGHT = 0.1  # of the others: what swings overstates how sure the criterion is
 _SAME = 1e-9  # of the largest singular value: such a change of the parameters shows in nothing
 
 
@@ -62,28 +64,31 @@ def with_proposal(gap: Gap, *, limits: Limits) -> Gap:
     models = [one.model for one in gap.contenders]
     if len(models) < 2 or not all(model.chain.is_tied for model in models):
         return gap
-    weight = np.maximum([one.weight for one in gap.contenders], _LEAST_WEIGHT)
+    weight = np.array([one.weight for one in gap.contenders])
+    weight = np.where(weight < _HOPELESS * weight.max(), 0.0, np.maximum(weight, _LEAST_WEIGHT))
+    if np.count_nonzero(weight) < 2:
+        return gap
     sigma = _noise(gap)
     best, most = None, 0.0
-    for recording in _candidates(models[0].chain, limits):
-        found = _tell_apart(models, recording, sigma=sigma, travel=limits.travel)
+    for recording, height in _candidates(models[0].chain, limits):
+        found = _tell_apart(models, recording, height, sigma=sigma, travel=limits.travel)
         if found is None:
             continue
         told, t, u, predicted = found
-        score = sum(
-            weight[i] * weight[j] * told[i, j] for i, j in combinations(range(len(models)), 2)
-        )
-        if score > most:
-            best, most = (recording, told, t, u, predicted), float(score)
+        score = np.outer(weight, weight) * told
+        if score.sum() > most:
+            i, j = divmod(int(np.argmax(score)), len(models))
+            best, most = (recording, told[i, j], (i, j), t, u, predicted), float(score.sum())
     if best is None:
         return gap
-    recording, told, t, u, predicted = best
-    swing = np.abs(predicted[0] - predicted[1]).max(axis=1)
+    recording, told, pair, t, u, predicted = best
+    swing = np.abs(predicted[pair[0]] - predicted[pair[1]]).max(axis=1)
     cart = int(np.argmax(swing))
     proposal = Proposal(
         recording=recording.model_dump(mode="json", exclude_defaults=True),
         limits=limits.model_dump(),
-        separation=float(np.sqrt(told[0, 1] / (t.size * len(recording.carts)))),
+        pair=pair,
+        separation=float(np.sqrt(told / (t.size * len(recording.carts)))),
         cart=cart + 1,
         t=t,
         u=u,
@@ -108,8 +113,11 @@ def _noise(gap: Gap) -> Array:
 # ------------------------------------------------------------------------- what is weighed
 
 
-def _candidates(chain: Chain, limits: Limits) -> Iterator[Recording]:
-    """Steps to either side, triangles and chirps in several sizes, and each cart let go."""
+def _candidates(chain: Chain, limits: Limits) -> Iterator[tuple[Recording, float]]:
+    """Steps to either side, triangles and chirps in several sizes, each cart let go at heights.
+
+    With each the height (position units) at which its cart is let go, 0 where none is.
+    """
     resonances = np.sort(np.abs(chain.poles)) / (2 * np.pi)
     settle = rounded(settling_wait(chain, time_constants=SETTLED))
     everyone = tuple(range(1, chain.n + 1))
@@ -142,10 +150,12 @@ def _candidates(chain: Chain, limits: Limits) -> Iterator[Recording]:
         for size in _SIZES:
             for sign in (1, -1) if wave == "square" else (1,):
                 amplitude = sign * rounded_down(size * largest)
-                yield whole.model_copy(update={"amplitude": amplitude})
+                yield whole.model_copy(update={"amplitude": amplitude}), 0.0
     for cart in everyone:
-        if chain.k[cart - 1] + chain.k[cart] > 0:
-            yield Recording(
+        if chain.k[cart - 1] + chain.k[cart] <= 0:
+            continue
+        for height in (rounded(share * limits.travel) for share in _RELEASES):
+            release = Recording(
                 id=f"apart-decay-{cart}",
                 kind="decay",
                 carts=(cart,),
@@ -154,45 +164,46 @@ def _candidates(chain: Chain, limits: Limits) -> Iterator[Recording]:
                 frequency=1 / _TIME,
                 release=cart,
                 settle=1.0,
+                note=f"let go {height:g} from the zero, in units of the travel limit",
                 aim="gap",
             )
+            yield release, height
 
 
 # ------------------------------------------------------------------------- how far apart
 
 
 def _tell_apart(
-    models: Sequence[AugmentedChain], recording: Recording, *, sigma: Array, travel: float
+    models: Sequence[AugmentedChain],
+    recording: Recording,
+    height: float,
+    *,
+    sigma: Array,
+    travel: float,
 ) -> tuple[Array, Array, Array, Array] | None:
     """Return (models, models) what separates each two, times, input and predictions.
 
     A separation is the square sum over the noise that neither model can take up; None where a
-    model would pass the travel limit. Of a release each height counts.
+    model would pass the travel limit.
     """
     t, u = sampled_input(recording, period=_PERIOD)
     u = recording.amplitude * u
-    starts = [None]
-    if recording.release:
-        unit = np.eye(sigma.size)[recording.release - 1]
-        starts = [share * travel * unit for share in _RELEASES]
+    x0 = height * np.eye(sigma.size)[recording.release - 1] if recording.release else None
+    try:
+        moved = [_predict(model, t, u, recording, x0) for model in models]
+    except DataError:
+        return None
+    predicted = np.array([x for x, _ in moved])
+    if np.abs(predicted).max() > travel:
+        return None
     free = [cart - 1 for cart in recording.carts]
     told = np.zeros((len(models), len(models)))
-    predicted = np.zeros((len(models), sigma.size, t.size))
-    for x0 in starts:
-        try:
-            moved = [_predict(model, t, u, recording, x0) for model in models]
-            predicted = np.array([x for x, _ in moved])
-        except DataError:
-            return None
-        if np.abs(predicted).max() > travel:
-            return None
-        for i, j in combinations(range(len(models)), 2):
-            difference = ((predicted[i] - predicted[j]) / sigma[:, None])[free].ravel()
-            left = [
-                _left(difference, (by / sigma[:, None])[:, free]) for _, by in (moved[i], moved[j])
-            ]
-            told[i, j] += min(left)
-    return told / len(starts), t, u, predicted
+    for i, j in combinations(range(len(models)), 2):
+        difference = ((predicted[i] - predicted[j]) / sigma[:, None])[free].ravel()
+        told[i, j] = min(
+            _left(difference, (by / sigma[:, None])[:, free]) for _, by in (moved[i], moved[j])
+        )
+    return told, t, u, predicted
 
 
 def _left(difference: Array, by: Array) -> float:

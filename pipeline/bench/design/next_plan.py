@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import ValidationError
 
+from pipeline.arrays import Array
 from pipeline.bench.design.candidates import propose_candidates
 from pipeline.bench.design.exchange import choose
 from pipeline.bench.design.goal import GAP, WORST, Goal, find_goal
@@ -21,6 +22,7 @@ from pipeline.bench.planning.plan_words import session_time, time_words
 from pipeline.bench.planning.propose import propose_plan, renamed
 from pipeline.errors import ConfigError, DataError
 from pipeline.ingest.read import read_data
+from pipeline.report.limits import CALIBRATION
 from pipeline.results import Analysis
 from pipeline.schemas.gap import Gap as GapDocument
 from pipeline.submission import Submission
@@ -29,6 +31,9 @@ from pipeline.workflow import analyse
 
 _MOST_BYTES = 10_000_000  # of a gap.json
 _DIGITS = 1e-9  # relative: its numbers have ten digits
+STATISTICAL = (
+    f"statistical error only: no bench is calibrated better than to {100 * CALIBRATION:g} %"
+)
 _USUAL = frozenset("c")  # what a bench is taken to know of which nothing is recorded
 
 
@@ -38,15 +43,18 @@ class NextPlan:
 
     Attributes
     ----------
-    errors : (n + 1,) of what `words` names, relative: now, and after each more.
+    now : error of what `words` names, relative, by what is recorded.
+    errors : (n + 1,) the same once the open recordings of the plan are there too, and after each
+        more.
     planned : what each open recording of the plan would leave by itself, by id.
-    separation : for "gap", of the two likeliest explanations, in noises.
+    separation : for "gap", of the two explanations that it tells apart best, in noises.
     """
 
     words: str
     plan: Plan
     path: Path | None
     recordings: tuple[Recording, ...]
+    now: float = float("nan")
     errors: tuple[float, ...] = ()
     planned: dict[str, float] = field(default_factory=dict)
     separation: float | None = None
@@ -56,7 +64,7 @@ class NextPlan:
         """What they bring, in one sentence."""
         if self.separation is not None:
             return (
-                f"{self.recordings[0].id} tells the two likeliest explanations of the gap apart by "
+                f"{self.recordings[0].id} tells two explanations of the gap apart by "
                 f"{self.separation:.2g} times the noise"
             )
         many = len(self.recordings)
@@ -65,10 +73,16 @@ class NextPlan:
             f"{name}, which the plan has, alone ± {_percent(error)}"
             for name, error in self.planned.items()
         )
+        open_ones = (
+            f" ± {_percent(self.errors[0])} once what the plan has is recorded,"
+            if self.planned
+            else ""
+        )
         return (
-            f"{self.words}: ± {_percent(self.errors[0])} now, ± {_percent(self.errors[-1])} after "
-            f"{after} ({time_words(session_time(self.recordings))})"
+            f"{self.words}: ± {_percent(self.now)} now,{open_ones} ± {_percent(self.errors[-1])} "
+            f"after {after} ({time_words(session_time(self.recordings))})"
             + (f"; {already}" if already else "")
+            + (f"; {STATISTICAL}" if self.errors[-1] < CALIBRATION else "")
         )
 
 
@@ -114,6 +128,7 @@ def plan_next(
         plan=plan,
         path=save_plan(plan, submission),
         recordings=recordings,
+        now=found.now,
         errors=found.errors,
         planned=found.planned,
     )
@@ -132,24 +147,30 @@ def choose_next(
     wanted = find_goal(goal, known, feedback=analysis.feedback)
     candidates = propose_candidates(known, limits=plan.limits, commands=commands, goal=wanted)
     told = np.array([known.of_recording(candidate) for candidate in candidates])
-    chosen = choose(told, known.told, n=n, goal=wanted)
-    sums = np.concatenate([known.told[None], told[list(chosen)]]).cumsum(axis=0)
+    done = {record.id for record in analysis.records}
+    kinds = ("sine",) if known.dwells else ("step", "sweep")
+    still = {
+        one.id: known.of_recording(one)
+        for one in plan.recordings
+        if one.id not in done
+        and one.kind in kinds
+        and len(one.carts) == analysis.carts
+        # One that passes the travel limit will be stopped.
+        and abs(one.amplitude) <= known.at_its_limits(one, limits=plan.limits, share=1.0)
+    }
+    start = known.told + sum(still.values())
+    chosen = choose(told, start, n=n, goal=wanted)
+    sums = np.concatenate([start[None], told[list(chosen)]]).cumsum(axis=0)
     errors = wanted.of(sums)
     if not errors[-1] < errors[0]:
         raise DataError(f"no experiment that the limits allow makes {wanted.words} better")
-    words = _words(wanted, known)
-    done = {record.id for record in analysis.records}
-    kinds = ("sine",) if known.dwells else ("step", "sweep")
-    planned = {
-        one.id: float(wanted.of(known.told + known.of_recording(one)))
-        for one in plan.recordings
-        if one.id not in done and one.kind in kinds and len(one.carts) == analysis.carts
-    }
+    words = _words(wanted, known, after=sums[-1])
     recordings = tuple(
         candidates[one].model_copy(
             update={
                 "aim": wanted.name,
-                "note": f"{words}: ± {_percent(before)} before, ± {_percent(after)} expected",
+                "note": f"{words}: ± {_percent(before)} before, ± {_percent(after)} expected"
+                + (f"; {STATISTICAL}" if after < CALIBRATION else ""),
             }
         )
         for one, before, after in zip(chosen, errors, errors[1:], strict=False)
@@ -159,8 +180,9 @@ def choose_next(
         plan=plan,
         path=None,
         recordings=recordings,
+        now=float(wanted.of(known.told)),
         errors=tuple(errors.tolist()),
-        planned=planned,
+        planned={name: float(wanted.of(known.told + one)) for name, one in still.items()},
     )
 
 
@@ -199,10 +221,12 @@ def _decisive(submission: Submission, limits: Limits) -> tuple[Recording, float]
     return recording, found.separation
 
 
-def _words(goal: Goal, known: Knowledge) -> str:
+def _words(goal: Goal, known: Knowledge, *, after: Array) -> str:
     if goal.name != WORST:
         return goal.words
-    return f"{goal.words} ({list(known.chain.parameters())[goal.worst(known.told)]})"
+    names = list(known.chain.parameters())
+    now, then = (names[goal.worst(told)] for told in (known.told, after))
+    return f"{goal.words} ({now})" if now == then else f"{goal.words} ({now} now, {then} then)"
 
 
 def _percent(share: float) -> str:

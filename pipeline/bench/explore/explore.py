@@ -27,6 +27,7 @@ from pipeline.gap.types import Gap
 from pipeline.names import listed
 from pipeline.output import own_folder, write_file
 from pipeline.plant.linear.chain import Chain
+from pipeline.plant.nonlinear.effects.base import AugmentedChain
 from pipeline.report.exploration.page import write_diary
 from pipeline.report.exploration.turn import Explanation, Turn
 from pipeline.results import Analysis
@@ -290,12 +291,14 @@ def _next(
     settled, commands = gap is None or gap.verdict in _SETTLED, known_commands(folder)
     if gap is not None and gap.proposal is not None and gap.proposal.separation > _APART:
         recording = Recording.model_validate_json(json.dumps(gap.proposal.recording))
-        return recording, (
-            f"in it the explanations differ by {gap.proposal.separation:.2g} times the noise"
-        )
+        disputed = [_terms(one.model) for one in gap.contenders]
+        names = " and ".join(f'"{disputed[i]}"' for i in gap.proposal.pair)
+        return recording, (f"in it {names} differ by {gap.proposal.separation:.2g} times the noise")
     if missing and settled:
         worst = max(missing, key=lambda name: missing[name])
-        found = choose_next(analysis, plan, n=1, goal=worst, commands=commands)
+        # What is open was refused, or is the next to be chosen: it tells nothing yet.
+        made = plan.model_copy(update={"recordings": ()})
+        found = choose_next(analysis, made, n=1, goal=worst, commands=commands)
         return found.recordings[0], found.said
     furthest = max(float(np.ptp(record.y, axis=1).max()) / 2 for record in analysis.records)
     # Once: carts that something holds back go no further the second time.
@@ -376,17 +379,15 @@ def _doubt_words(gap: Gap) -> str:
 
 
 def _explanations(gap: Gap) -> tuple[Explanation, ...]:
-    contenders = [(one.model.terms, one.weight) for one in gap.contenders]
+    contenders = [(one.model, one.weight) for one in gap.contenders]
     if gap.verdict == "named":
-        contenders = [(gap.model.terms, 1.0)]
-    return tuple(
-        Explanation(
-            name=" and ".join(_name(term.effect.title, term.where) for term in terms)
-            or "the linear chain",
-            weight=weight,
-        )
-        for terms, weight in contenders
-    )
+        contenders = [(gap.model, 1.0)]
+    return tuple(Explanation(name=_terms(model), weight=weight) for model, weight in contenders)
+
+
+def _terms(model: AugmentedChain) -> str:
+    names = [_name(term.effect.title, term.where) for term in model.terms]
+    return " and ".join(names) or "the linear chain"
 
 
 def _name(title: str, where: dict[str, int]) -> str:

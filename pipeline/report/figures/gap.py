@@ -64,9 +64,10 @@ def before_after_figure(trace: Trace, *, noise: float, position_unit: str) -> Fi
 def predicted_figure(proposal: Proposal, *, names: Sequence[str], position_unit: str) -> Figure:
     """Return what the explanations predict of a recording to come, and how far they differ."""
     figure, (above, below) = panels(1.5, 1.0)
-    first, second = proposal.predicted[:2]
-    plot_model(above, proposal.t, first, label=names[0])
-    plot_second(above, proposal.t, second, label=names[1])
+    first, second = proposal.predicted[list(proposal.pair)]
+    one, other = (names[i] for i in proposal.pair)
+    plot_model(above, proposal.t, first, label=one)
+    plot_second(above, proposal.t, second, label=other)
     above.set_ylabel(position_label(proposal.cart, position_unit))
     legend_above(above)
     plot_residuals(below, proposal.t, {"difference": second - first})

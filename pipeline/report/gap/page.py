@@ -249,11 +249,17 @@ def _predicted(page: Page, gap: Gap) -> list[Block]:
     ]
     cart = str(proposal.cart)
     figure = predicted_figure(proposal, names=names, position_unit=page.position)
-    caption = WORDS.text("predicted_caption", cart=cart, names="; ".join(names))
+    one, other = (names[i] for i in proposal.pair)
+    hand = WORDS.text("predicted_hand", note=table["note"]) if "note" in table else ""
+    caption = WORDS.text("predicted_caption", cart=cart, names=f"{one}; {other}")
     alt = WORDS.text("predicted_alt", cart=cart)
     separation = f"{proposal.separation:.2g}"
     return [
-        paragraph(WORDS.spans("predicted", recording=said, separation=separation)),
+        paragraph(
+            WORDS.spans(
+                "predicted", recording=said, separation=separation, one=one, other=other, hand=hand
+            )
+        ),
         page.picture("predicted", figure, caption=caption, alt=alt),
     ]
 
