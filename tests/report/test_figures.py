@@ -17,9 +17,11 @@ from matplotlib.patches import Rectangle
 from matplotlib.text import Text
 
 from pipeline.plant.linear.chain import Chain
+from pipeline.report.document import Picture, plain
 from pipeline.report.figures.bode import bode_figure, overview_figure, plot_phase
 from pipeline.report.figures.grading import distribution_figure
 from pipeline.report.figures.style import (
+    CART_MARKS,
     drawing,
     panels,
     plot_measured,
@@ -37,6 +39,8 @@ from pipeline.report.figures.time import (
     sine_figure,
     step_figure,
 )
+from pipeline.report.sections.measurements import step_blocks
+from pipeline.report.sections.page import Page
 from pipeline.results import FrequencyResponse
 from tests.helpers.analysis_factory import make_analysis
 
@@ -353,6 +357,35 @@ def test_phases_are_read_against_right_angles():
     texts = [text.get_text() for text in ax.texts if text.get_gid() == "tick-y"]
     assert {float(text.replace("−", "-")) % 90 for text in texts} == {0.0}
     assert len(texts) >= 3
+
+
+def test_labels_of_a_phase_that_turns_far_do_not_touch():
+    """Of six right angles or more every second one is labelled, of four all are."""
+    for least, step in ((-360.0, 90.0), (-540.0, 180.0)):
+        response = make_analysis(2).frequency_responses[1]
+        phase = np.radians(np.linspace(0.0, least, response.omega.size))
+        figure, (ax,) = panels(0.8)
+        with drawing():
+            plot_phase(ax, replace(response, phase=phase), chain=None)
+            to_svg(figure, name="x", alt="")
+        texts = [text.get_text() for text in ax.texts if text.get_gid() == "tick-y"]
+        ticks = sorted(float(text.replace("−", "-")) for text in texts)
+        assert np.diff(ticks).tolist() == [step] * int(-least / step)
+
+
+def test_carts_of_a_step_are_told_apart_without_colour():
+    """Each has a mark of its own, in the panel, in the legend and in the caption."""
+    analysis = make_analysis(3)
+    run = analysis.step_gains[0].experiment
+    gains = [gain for gain in analysis.step_gains if gain.experiment == run]
+    (record,) = (record for record in analysis.records if record.id == run)
+    with drawing():
+        figure = step_figure([gains], records=[record], position_unit="cm")
+    lines = figure.axes[0].get_lines()
+    marks = {str(line.get_label()): line.get_marker() for line in lines}
+    assert [marks[name] for name in ("x₁", "x₂", "x₃")] == list(CART_MARKS)[:3]
+    (picture,) = (b for b in step_blocks(Page.of(analysis)) if isinstance(b, Picture))
+    assert "Cart 1 circles, cart 2 squares, cart 3 triangles;" in plain(picture.caption)
 
 
 @pytest.mark.parametrize("points", [[10.0], [1.0, 9.0, 9.5, 4.0], [3.0] * 40])

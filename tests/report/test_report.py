@@ -13,10 +13,19 @@ import pypdf
 import pytest
 
 from pipeline.plant.linear.chain import Chain
-from pipeline.report.document import Document, Picture, Section, plain
+from pipeline.report.document import (
+    Document,
+    Paragraph,
+    Picture,
+    Section,
+    Table,
+    cell,
+    plain,
+    spans,
+)
 from pipeline.report.draft.write import render_report
 from pipeline.report.render.pdf import missing_characters, render_pdf
-from pipeline.report.sections.housekeeping import file_table
+from pipeline.report.sections.housekeeping import file_table, provenance_blocks
 from pipeline.report.sections.measurements import decay_blocks
 from pipeline.report.sections.page import Page as Shown
 from pipeline.report.sections.summary import terminal_summary
@@ -138,6 +147,40 @@ def test_no_page_ends_the_print_with_one_row_of_hashes(folders):
     rows = [len(re.findall(r"run-\d{3}", page.extract_text())) for page in pages]
     assert sum(rows) == 97
     assert min(rows) > 20
+
+
+def printed(*sections: Section) -> list[str]:
+    """Return the text of each page that sections are printed on."""
+    document = Document("A", "", (), sections, "the footer")
+    return [page.extract_text() for page in pypdf.PdfReader(io.BytesIO(render_pdf(document))).pages]
+
+
+@pytest.mark.parametrize("rows", [12, 20, 30])
+def test_a_table_longer_than_a_page_breaks_and_stays_with_its_heading(rows):
+    """However few its rows: it is their height that fills the page."""
+    text = "Dry friction holds the cart. " * 20
+    body = tuple((cell(f"row-{i:02d}"), cell(text)) for i in range(rows))
+    table = Table(1, spans("All checks."), (cell("Check"), cell("Found")), body, "ll")
+
+    pages = printed(Section("c", "Consistency", (table,)))
+
+    assert len(pages) > 1
+    assert "Consistency" in pages[0]
+    assert "row-00" in pages[0]
+    assert sum(len(re.findall(r"row-\d\d", page)) for page in pages) == rows
+
+
+def test_the_list_of_files_does_not_stand_alone_on_a_page():
+    """Wherever a page ends, its heading and its sentence go with it."""
+    files = {f"data/run-{i:03d}.csv": f"{i:064x}" for i in range(40)}
+    shown = Shown.of(replace(make_analysis(1), files=files))
+    blocks = tuple(provenance_blocks(shown, "Made by the program."))
+    line = Paragraph(spans("A line."))
+
+    pages = printed(*(Section(f"s{n}", "Provenance", (*[line] * n, *blocks)) for n in range(20)))
+
+    for page in pages:
+        assert page.count("Made by") == page.count("run-000")
 
 
 def test_the_page_stands_alone(folders):

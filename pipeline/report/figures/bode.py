@@ -29,6 +29,7 @@ from pipeline.results import FrequencyResponse
 _LINE_POINTS = 300
 _MARGIN = 0.08  # of the phase's span, above and below
 _SQUARE = 90.0  # degrees: phases are read against right angles
+_MOST_SQUARES = 5  # labels of more would touch: every second one is drawn
 _DB_PER_NEPER = 20 / np.log(10)
 _HIGHEST_PEAK = 100.0  # times the largest measured magnitude; without damping a peak has no end
 _WIDEST_BAR = 0.9  # of the magnitude: an error bar in decibels cannot reach down to zero
@@ -129,8 +130,10 @@ def plot_phase(ax: Axes, response: FrequencyResponse, *, chain: Chain | None) ->
     _points(ax, response.omega, np.degrees(phase), error)
     low, high = ax.dataLim.intervaly
     margin = _MARGIN * max(high - low, _SQUARE)
-    ax.set_ylim(low - margin, high + margin)
-    ax.yaxis.set_major_locator(MultipleLocator(_SQUARE if high - low > _SQUARE else _SQUARE / 2))
+    bottom, top = ax.set_ylim(low - margin, high + margin)
+    labels = top // _SQUARE + -bottom // _SQUARE + 1
+    step = 0.5 if high - low <= _SQUARE else 1.0 if labels <= _MOST_SQUARES else 2.0
+    ax.yaxis.set_major_locator(MultipleLocator(step * _SQUARE))
     ax.set_ylabel("phase [°]")
 
 

@@ -30,6 +30,7 @@ THIRD = "#009e73"
 QUIET = "#8a8a8a"
 SHADE = "#ececec"
 CART_LINES = ("-", "--", "-.", ":")  # carts that share a panel differ by line style as well
+CART_MARKS = {"o": "circles", "s": "squares", "^": "triangles", "D": "diamonds"}  # and points so
 CART_COLOURS = (MODEL, SECOND, THIRD, MEASURED)
 
 _BUCKETS = 240  # twice this many points a line: finer than print at this width shows

@@ -11,6 +11,7 @@ from pipeline.arrays import Array
 from pipeline.report.figures.style import (
     CART_COLOURS,
     CART_LINES,
+    CART_MARKS,
     LIFT,
     MEASURED,
     MODEL,
@@ -44,6 +45,7 @@ from pipeline.results import (
 _CYCLES_SHOWN = 10  # of the steady part: single cycles can still be seen
 _SINE_POINTS = 300
 _STEP_POINTS = 400  # several panels a figure: enough to follow a swing
+_STEP_MARKS = 16  # of each cart: enough to know it without its colour
 _SETTLED_BAND = 0.02  # the 2 % of the settling time
 _ROOM = 1.12  # above the largest value
 _LOOPS = {"closed": "loop model", "open": "model on measured input"}
@@ -140,9 +142,7 @@ def plot_step(ax: Axes, gains: Sequence[StepGain], *, record: Record) -> None:
     A level is dashed over the window that it was read from, behind the points.
     """
     for gain in gains:
-        style = (gain.cart - 1) % len(CART_LINES)
-        plot_measured(ax, record.t, record.position(gain.cart), most=_STEP_POINTS,
-                      name=f"x{subscript(gain.cart)}", color=CART_COLOURS[style])  # fmt: skip
+        _plot_cart_points(ax, record.t, record.position(gain.cart), cart=gain.cart)
         for edge in gain.edges:
             for window, level in (
                 (edge.window_before, edge.level_before),
@@ -152,6 +152,18 @@ def plot_step(ax: Axes, gains: Sequence[StepGain], *, record: Record) -> None:
     ax.plot([], [], color=MEASURED, ls="--", lw=0.8, label="level")
     for t in sorted({edge.t for gain in gains for edge in gain.edges}):
         ax.axvline(t, color=QUIET, lw=0.8, ls=":")
+
+
+def _plot_cart_points(ax: Axes, t: Array, y: Array, *, cart: int) -> None:
+    """Plot the points of one of several carts that share a panel, some with its own mark."""
+    style, name = (cart - 1) % len(CART_MARKS), f"x{subscript(cart)}"
+    plot_measured(ax, t, y, most=_STEP_POINTS, name=name, color=CART_COLOURS[style],
+                  in_legend=False)  # fmt: skip
+    # Every cart's marks at times of their own, or where carts move alike one would hide the other:
+    at = np.linspace(0, t.size - 1, len(CART_MARKS) * _STEP_MARKS).astype(int)
+    at = at[style :: len(CART_MARKS)]
+    ax.plot(t[at], y[at], list(CART_MARKS)[style], ms=3.6, mfc="white", mec=CART_COLOURS[style],
+            mew=0.9, label=name)  # fmt: skip
 
 
 def _plot_cart(ax: Axes, t: Array, y: Array, *, cart: int, lw: float = 1.0) -> None:

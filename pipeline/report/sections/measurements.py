@@ -5,6 +5,7 @@ import numpy as np
 from pipeline.names import mode_suffixes, omega_names
 from pipeline.report.document import Block, Details, Table, cell, paragraph, spans
 from pipeline.report.figures.bode import bode_figure, overview_figure
+from pipeline.report.figures.style import CART_MARKS
 from pipeline.report.figures.time import damping_figure, decay_figure, sine_figure, step_figure
 from pipeline.report.numbers import count, listing, percent, significant, with_error
 from pipeline.report.phrases import phrases
@@ -183,7 +184,7 @@ def step_blocks(page: Page) -> list[Block]:
             position_unit=page.position,
         )
         caption = _WORDS.text(
-            "steps", styles=_line_styles(page.analysis.carts), more=left_out(len(runs) - len(drawn))
+            "steps", styles=_marks(page.analysis.carts), more=left_out(len(runs) - len(drawn))
         )
         alt = _WORDS.text("steps_alt", records=count(len(drawn), "record"))
         blocks.append(page.picture("steps", figure, caption=caption, alt=alt))
@@ -205,9 +206,9 @@ def _step_table(page: Page) -> Table:
     )
 
 
-def _line_styles(carts: int) -> str:
-    styles = zip(range(1, carts + 1), ("solid", "dashed", "dash-dotted", "dotted"), strict=False)
-    return ", ".join(f"cart {cart} {style}" for cart, style in styles).capitalize()
+def _marks(carts: int) -> str:
+    marks = zip(range(1, carts + 1), CART_MARKS.values(), strict=False)
+    return ", ".join(f"cart {cart} {mark}" for cart, mark in marks).capitalize()
 
 
 def dwell_blocks(page: Page) -> list[Block]:
