@@ -50,12 +50,25 @@ def main() -> None:
     try:
         sys.exit(app(sys.argv[1:] or ["--help"], standalone_mode=False))
     except TyperException as error:  # a wrong option or argument
-        _fail(f"{error.format_message()} (cartlab --help explains)")
+        _fail(_misuse(error))
     except PipelineError as error:
         _fail(str(error))
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         _fail(f"{where}{error.strerror or error}: choose another place, for example with --out")
+
+
+def _misuse(error: TyperException) -> str:
+    """Return what is wrong with an option or an argument, and where to look."""
+    from pydantic import ValidationError
+
+    from pipeline.submission.complaints import refusal
+
+    if isinstance(error.__cause__, ValidationError):
+        error.message = refusal(error.__cause__.errors()[0])
+    context = getattr(error, "ctx", None)
+    command = f"{context.info_name} " if context and context.parent else ""
+    return f"{error.format_message().rstrip('.')} (cartlab {command}--help explains)"
 
 
 def _fail(message: str) -> None:

@@ -16,7 +16,7 @@ from pipeline.results_json import chain_entry, provenance
 from pipeline.schemas.base import fields_of, json_text
 from pipeline.schemas.gap import Gap as GapDocument
 from pipeline.schemas.gap import GapSubmission
-from pipeline.submission.complaints import quote
+from pipeline.submission.complaints import quote, refusal
 
 
 def gap_text(gap: Gap, analysis: Analysis) -> str:
@@ -44,8 +44,9 @@ def read_gap(text: str) -> tuple[Gap, dict[str, str]]:
         return _gap(document), dict(document["provenance"]["files"])
     except ValidationError as error:
         first = error.errors()[0]
-        where = ".".join(map(str, first["loc"]))
-        raise ConfigError(f"not what cartlab gap writes: {where}: {first['msg']}") from None
+        at = ".".join(map(str, first["loc"]))
+        what = f"{at}: {refusal(first)}" if at else refusal(first)
+        raise ConfigError(f"not what cartlab gap writes: {what}") from None
     except (ValueError, KeyError, TypeError) as error:  # null where a number is needed, say
         raise ConfigError(f"not what cartlab gap writes: {quote(str(error))}") from None
 

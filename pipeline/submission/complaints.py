@@ -39,7 +39,9 @@ TOP_LEVEL = tuple(
 _EXPECTED = {
     "string_type": "text in quotes",
     "int_type": "a whole number",
+    "int_parsing": "a whole number",
     "float_type": "a number",
+    "float_parsing": "a number",
     "bool_type": "true or false",
     "tuple_type": "a list [ … ]",
     "dict_type": "a table",
@@ -133,22 +135,33 @@ def explain(
     location = [part for part in error["loc"] if not isinstance(part, str) or part != "str"]
     table = ".".join(part for part in location[:-1] if isinstance(part, str))
     location = without_tag(location, document)
-    where, found = dotted(location, document), error["input"]
-    kind, context = error["type"], error.get("ctx", {})
+    where, found, kind = dotted(location, document), error["input"], error["type"]
     if kind == "missing":
         return f"{where}: is required and not there"
     if kind == "extra_forbidden":
         keys = tuple(tables[table].model_fields) if table in tables else top_level
         return f"{where}: unknown key{nearest(location[-1], keys)}"
-    if kind not in _EXPECTED:
-        return f"{where}: {error['msg']}, found {quote(found)}"
-    text = f"{where}: expected {_EXPECTED[kind].format(**context)}, found {quote(found)}"
+    text = f"{where}: {refusal(error)}"
     if kind == "tuple_type" and isinstance(found, dict):
         text += f"; begin each with [[{where}]], in double brackets"
     if kind == "literal_error" and isinstance(found, str):
-        close = get_close_matches(found, re.findall(r"'([^']*)'", context["expected"]), n=1)
+        close = get_close_matches(
+            found, re.findall(r"'([^']*)'", error.get("ctx", {}).get("expected", "")), n=1
+        )
         text += f"; did you mean {close[0]!r}?" if close else ""
     return text
+
+
+def refusal(error: ErrorDetails) -> str:
+    """Return what was expected and what was found of one pydantic error."""
+    kind, found = error["type"], quote(error["input"])
+    if kind == "json_invalid":
+        return "no JSON, or cut short"
+    if kind == "value_error":  # it says what was found itself
+        return error["msg"].removeprefix("Value error, ").rstrip(".")
+    if kind not in _EXPECTED:
+        return f"{error['msg']}, found {found}"
+    return f"expected {_EXPECTED[kind].format(**error.get('ctx', {}))}, found {found}"
 
 
 def without_tag(location: Location, document: object) -> list[int | str]:

@@ -105,7 +105,7 @@ def test_the_report_has_a_section_on_the_changes():
     ("text", "expected"),
     [
         ("not json", "no results.json of cartlab"),
-        ('{"schema": "cartlab-gap/1"}', "schema: Input should be 'cartlab-results/1'"),
+        ('{"schema": "cartlab-gap/1"}', "schema: expected 'cartlab-results/1', found"),
         ("[" * 10_000, "no results.json of cartlab"),
         ("{}", "schema: Field required"),
     ],

@@ -502,6 +502,16 @@ def test_what_was_not_used_is_not_said_to_be():
     assert f"Mend, record again or take out {dwells[0]}:" in text
 
 
+def test_skipped_stages_are_told_apart():
+    """The names of stages have commas in them, so what parts them is another sign."""
+    stages = [f"log decrement, decay-{i}, cart 1" for i in range(5)]
+    skipped = tuple(Skipped(stage=stage, reason="too short") for stage in stages)
+    text = terminal_summary(replace(make_analysis(1, repeats=1), skipped=skipped))
+    (line,) = (line for line in text.splitlines() if "Skipped: " in line)
+    assert line.count("cart 1; ") == 3
+    assert "; 2 more; " in line
+
+
 def test_a_good_result_is_called_so():
     """Nothing to complain of: the summary says so in a few lines."""
     analysis = make_analysis(1, repeats=1)
@@ -511,6 +521,7 @@ def test_a_good_result_is_called_so():
     good = replace(analysis, rows=rows, checks=checks, sine_points=points, skipped=(), warnings=())
     text = terminal_summary(good)
     assert "all 3 parameters measured in two ways" in text
+    assert text.count("statistical error") == 1
     assert "Nothing stands out" in text
     assert good.feedback is not None
     missed = replace(good.feedback, reachable=False, message="settling in 1 ms cannot be met")

@@ -62,7 +62,10 @@ def test_report_writes_everything_and_ends_well(tmp_path):
         (["simulate", "--preset", "throne-9dof", "--out", "x"], "throne-3dof"),
         (["report", str(EXAMPLES / "one-cart"), "--out", "blocked"], "is a file"),
         (["new", "blocked", "--carts", "2"], "blocked"),
-        (["new", "team", "--carts", "9"], "--carts"),
+        (
+            ["new", "team", "--carts", "9"],
+            "'--carts': expected at most 4, found '9' (cartlab new -",
+        ),
         (["report"], "DIR"),
         (["rport"], "rport"),
     ],

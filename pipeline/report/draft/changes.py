@@ -18,6 +18,7 @@ from pipeline.results import Analysis
 from pipeline.results_json import results_dict
 from pipeline.schemas.base import plain_json
 from pipeline.schemas.results import Check, Results
+from pipeline.submission.complaints import refusal
 
 _MOST_BYTES = 20_000_000  # of a results.json; real ones have a few ten thousand
 _SAME = 1e-8  # relative: two processors agree to this on the ten digits of the file
@@ -104,7 +105,7 @@ def read_results(path: Path) -> Results:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
-        what = f"{where}: {first['msg']}" if where else first["msg"]
+        what = f"{where}: {refusal(first)}" if where else refusal(first)
         raise ConfigError(f"{path}: no results.json of cartlab ({what})") from None
 
 

@@ -72,9 +72,10 @@ def terminal_summary(analysis: Analysis) -> str:
     """Return the summary as a few lines of plain text."""
     numbers = [
         f"{plain(tile.label)} = {plain(tile.value)} {plain(tile.note)}".rstrip()
-        for tile in _numbers_board(analysis)
+        for tile in _numbers_board(analysis, error="share")
     ]
-    it_has = [paragraph(f"It has {'; '.join(numbers)}.")] if numbers else []
+    only = f" {_WORDS.text('statistical_only')}" if any("±" in text for text in numbers) else ""
+    it_has = [paragraph(f"It has {'; '.join(numbers)}.{only}")] if numbers else []
     told = bullet_list(text for _, text in _findings(analysis))
     next_ = [paragraph(f"{_WORDS.text('next')}."), _next(analysis)]
     return plain_lines([_identified(analysis), *it_has, told, *next_])
@@ -114,11 +115,15 @@ def _identified(analysis: Analysis) -> Block:
     )
 
 
-def _numbers_board(analysis: Analysis) -> tuple[Tile, ...]:
-    """Return the gains and the resonances."""
+def _numbers_board(analysis: Analysis, *, error: str = "statistical") -> tuple[Tile, ...]:
+    """Return the gains and the resonances; `error` words those smaller than a calibration's."""
     return tuple(
         _number_tile(
-            row.name, row.final, unit=unit_text(clean(row.unit)), is_sure=_is_explained(analysis)
+            row.name,
+            row.final,
+            unit=unit_text(clean(row.unit)),
+            is_sure=_is_explained(analysis),
+            error=error,
         )
         for row in analysis.rows
         if row.final and (analysis.carts == 1 or _is_told(read_name(row.name)))
@@ -130,15 +135,15 @@ def _is_explained(analysis: Analysis) -> bool:
     return analysis.fit is not None and analysis.fit.explains_data
 
 
-def _number_tile(name: str, final: Estimate, *, unit: str, is_sure: bool) -> Tile:
+def _number_tile(name: str, final: Estimate, *, unit: str, is_sure: bool, error: str) -> Tile:
     """Return a number in four digits; a smaller error than any calibration's is only a note."""
     share = (final.std or 0.0) / abs(final.value) if final.value else 1.0
     if not is_sure:
         value = significant(final.value, digits=limits.UNSURE_DIGITS)
     elif 0 < share < limits.CALIBRATION:
         value = significant(final.value)
-        error = _WORDS.text("statistical", share=f"{significant(100 * share, digits=1)} %")
-        unit = f"{unit}, {error}" if unit else error
+        told = _WORDS.text(error, share=f"{significant(100 * share, digits=1)} %")
+        unit = f"{unit}, {told}" if unit else told
     else:
         value = with_error(final.value, final.std, digits=2 if share >= limits.COARSE else 1)
     return Tile(label=spans(name_span(name)), value=spans(value), note=spans(unit))
@@ -289,7 +294,8 @@ def _skipped(analysis: Analysis) -> tuple[bool, Spans] | None:
         return None
     names = list(dict.fromkeys(stage_name(skip.stage) for skip in analysis.skipped))
     more = len(names) - _MOST_TOLD
-    stages = listing(names[:_MOST_TOLD] + ([f"{more} more"] if more > 0 else []))
+    # A name has commas in it: "log decrement, decay-1, cart 1".
+    stages = "; ".join(names[:_MOST_TOLD] + ([f"{more} more"] if more > 0 else []))
     return False, _WORDS.spans("skipped", stages=stages)
 
 
