@@ -1,5 +1,9 @@
 """The whole analysis of carts that lack springs: a wall or both, down to a body on none."""
 
+import json
+import re
+import shutil
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -8,12 +12,17 @@ import pytest
 from pipeline.arrays import Array
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.simulate import simulate_linear
+from pipeline.report.draft.content import build_document
+from pipeline.report.sections.page import Page
+from pipeline.report.sections.parameters import parameter_table
+from pipeline.report.sections.summary import terminal_summary
 from pipeline.results import Analysis
 from pipeline.results_json import results_text
 from pipeline.submission import load_submission
 from pipeline.synthesis import write_submission
 from pipeline.workflow import analyse
 
+EXAMPLES = Path(__file__).parents[1] / "submissions"
 COUNT = 0.00227  # cm, the encoder step
 RATE = 200.0  # Hz
 BODY = Chain(m=np.array([3e-4]), c=np.array([1e-3]), k=np.zeros(2))  # V, cm, s: slows in 0.3 s
@@ -134,3 +143,22 @@ def test_two_carts_that_no_spring_ties_to_a_wall_are_found(tmp_path):
     found = [*fit.chain.m, *fit.chain.c, fit.chain.k[1]]
     assert np.all(np.abs(np.subtract(found, truth)) < SIGMAS * np.sqrt(np.diag(fit.covariance)))
     assert {"named parameters", "step gain"} <= {skip.stage for skip in analysis.skipped}
+
+
+@pytest.mark.parametrize(
+    "springs", [(False, True, False), (True, False, False)], ids=["no wall", "not joined"]
+)
+def test_springs_that_the_bench_does_not_have_are_asked_about(tmp_path, springs):
+    """Where no carts come of it the summary asks, and no heading or column is empty."""
+    shutil.copytree(EXAMPLES / "two-cart", tmp_path / "bench")  # between cart 2 and the wall is one
+    toml = tmp_path / "bench" / "submission.toml"
+    text = re.sub("springs = .*", f"springs = {json.dumps(springs)}", toml.read_text("utf-8"))
+    toml.write_text(text, encoding="utf-8")
+    analysis = analyse(load_submission(tmp_path / "bench"))
+
+    assert analysis.fit is None
+    assert "is `springs` right?" in terminal_summary(analysis).partition("What to do next")[2]
+    (model,) = (s for s in build_document(analysis, progress=None).sections if s.id == "model")
+    kinds = [block.kind for block in model.blocks]
+    assert "heading" not in [kinds[-1], *(a for a, b in pairwise(kinds) if a == b)]
+    assert len(parameter_table(Page.of(analysis)).head) == 4

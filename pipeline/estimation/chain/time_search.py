@@ -186,5 +186,8 @@ def search(
         if best.follows if tried <= len(near) else best.cost < EXPLAINED * best.dof:
             break
     if best is None:
-        raise DataError("time fit: needs records that show a chain in motion, found no start")
+        raise DataError(
+            "time fit: needs records that a chain with the springs stated can follow, found none: "
+            "is `springs` right?"
+        )
     return Found(best=look(full, parametrisation, best.theta), n_starts=tried, cut_short=cut_short)

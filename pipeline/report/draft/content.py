@@ -102,8 +102,10 @@ def _model(page: Page) -> list[Block]:
     if chain:
         blocks += [paragraph(_WORDS.text("state_numbers"))]
         blocks += numeric_state_space(chain)
-    blocks.append(Heading(spans("Transfer functions")))
-    if symbolic := symbolic_transfer_functions(analysis.springs):
+    symbolic = symbolic_transfer_functions(analysis.springs)
+    if symbolic or chain:
+        blocks.append(Heading(spans("Transfer functions")))
+    if symbolic:
         blocks.append(symbolic)
     if chain:
         blocks += [paragraph("With the identified numbers:"), numeric_transfer_functions(chain)]

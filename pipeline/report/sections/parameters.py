@@ -35,6 +35,7 @@ from pipeline.stages.compare import change_limit
 from pipeline.stages.limits import SIGMA_LIMIT
 
 _WORDS = phrases("report")
+_INITIAL_COLUMNS = 4  # the first ones, which are all that is filled without a fit
 
 
 def parameter_blocks(page: Page) -> list[Block]:
@@ -55,13 +56,16 @@ def parameter_blocks(page: Page) -> list[Block]:
 def parameter_table(page: Page) -> Table:
     """Return initial and final estimates as the paper's Tables 1-3, with errors and a verdict."""
     words, carts = {1: "one", 2: "two", 3: "three", 4: "four"}, page.analysis.carts
+    rows = page.analysis.rows
+    columns = None if any(row.final for row in rows) else _INITIAL_COLUMNS
+    head = ("Parameter", "Unit", "Initial estimate", "from", "Final estimate", "Change", "Limit",
+            "Verdict")  # fmt: skip
     return page.table(
         _WORDS.text("parameter_table", carts=words.get(carts, carts)),
-        ("Parameter", "Unit", "Initial estimate", "from", "Final estimate", "Change", "Limit",
-         "Verdict"),
-        [_parameter_row(row) for row in page.analysis.rows],
-        "lldlddrl",
-    )  # fmt: skip
+        head[:columns],
+        [_parameter_row(row)[:columns] for row in rows],
+        "lldlddrl"[:columns],
+    )
 
 
 def _parameter_row(row: ParameterRow) -> list[Cell]:

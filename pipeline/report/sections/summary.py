@@ -324,6 +324,7 @@ def _advice(analysis: Analysis) -> Iterator[Spans]:
             yield say(key, runs=clean(listing(runs[:_MOST_TOLD])) + more)
     if not (unreadable or left_out) and any(c.id.startswith(_OF_DATA) for c in failed):
         yield say("next_recordings")
+    reasons: list[str] = []
     if fit is None and not left_out:
         reasons = [skip.reason for skip in analysis.skipped if skip.stage == "final estimates"]
         yield (say("next_no_carts", reason=clean(reasons[-1])) if reasons else say("next_no_data"))
@@ -339,7 +340,7 @@ def _advice(analysis: Analysis) -> Iterator[Spans]:
         yield say("next_left")
     if design is not None and not any(r.kind == "closed_loop" for r in analysis.records):
         yield say("next_run")
-    if analysis.skipped and not left_out:
+    if analysis.skipped and not left_out and not reasons:  # what follows the carts waits for them
         yield say("next_skipped")
     if design and not design.reachable:
         yield say("next_goal", message=clean(design.message))
