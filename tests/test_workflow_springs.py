@@ -16,13 +16,13 @@ from pipeline.report.draft.content import build_document
 from pipeline.report.sections.page import Page
 from pipeline.report.sections.parameters import parameter_table
 from pipeline.report.sections.summary import terminal_summary
+from pipeline.resources import EXAMPLES
 from pipeline.results import Analysis
 from pipeline.results_json import results_text
 from pipeline.submission import load_submission
 from pipeline.synthesis import write_submission
 from pipeline.workflow import analyse
 
-EXAMPLES = Path(__file__).parents[1] / "submissions"
 COUNT = 0.00227  # cm, the encoder step
 RATE = 200.0  # Hz
 BODY = Chain(m=np.array([3e-4]), c=np.array([1e-3]), k=np.zeros(2))  # V, cm, s: slows in 0.3 s
@@ -157,7 +157,7 @@ def test_springs_that_the_bench_does_not_have_are_asked_about(tmp_path, springs)
     analysis = analyse(load_submission(tmp_path / "bench"))
 
     assert analysis.fit is None
-    assert "is `springs` right?" in terminal_summary(analysis).partition("What to do next")[2]
+    assert "springs stated right?" in terminal_summary(analysis).partition("What to do next")[2]
     (model,) = (s for s in build_document(analysis, progress=None).sections if s.id == "model")
     kinds = [block.kind for block in model.blocks]
     assert "heading" not in [kinds[-1], *(a for a, b in pairwise(kinds) if a == b)]

@@ -56,7 +56,7 @@ class Parametrisation:
             if not self.springs[j - 1]:
                 raise DataError(
                     f"the fit needs a spring between carts {j - 1} and {j}, found none: "
-                    f"the motor does not move cart {j}; is `springs` right?"
+                    f"the motor does not move cart {j}; are the springs stated right?"
                 )
 
     @cached_property

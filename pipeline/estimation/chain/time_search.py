@@ -187,7 +187,7 @@ def search(
             break
     if best is None:
         raise DataError(
-            "time fit: needs records that a chain with the springs stated can follow, found none: "
-            "is `springs` right?"
+            "time fit: needs records that a chain with these springs can follow, found none: "
+            "are the springs stated right?"
         )
     return Found(best=look(full, parametrisation, best.theta), n_starts=tried, cut_short=cut_short)
