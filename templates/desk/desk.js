@@ -77,10 +77,16 @@ document.addEventListener("htmx:afterSwap", (event) => {
   if (heading() !== before) scrollTo(0, 0); // another page altogether
 });
 
-// What is made of what is saved waits where something typed is not: what stands behind it says how to go on.
+// What is made of what is saved waits where something typed is not, nor on its way: what stands behind it says how to go on.
+let going = new WeakMap();
+document.addEventListener("htmx:beforeSend", (event) => {
+  const form = event.detail.elt.closest("form");
+  if (form) for (const one of typed(form)) going.set(one, state(one));
+});
+document.addEventListener("htmx:sendError", () => (going = new WeakMap()));
 const hold = (event) => {
   const made = event.target.closest("[data-of-saved]");
-  if (!made || !typed(document).some(differs)) return;
+  if (!made || !typed(document).some((one) => differs(one) && going.get(one) !== state(one))) return;
   event.preventDefault();
   event.stopPropagation();
   made.closest("p").nextElementSibling.hidden = false;
