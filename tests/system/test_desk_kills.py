@@ -60,12 +60,12 @@ class _Save:
 
 @dataclass(kw_only=True)
 class _Upload(_Save):
-    """Recordings, each of its own bytes; the form's answer comes when its table is written too."""
+    """Recordings, each of its own length; the form's answer comes when its table is written too."""
 
     longest: float = 4.0
 
     def content(self, number: int) -> bytes:
-        return _RECORD.rstrip()[: -number - 1]
+        return b"\n".join(_RECORD.splitlines()[: -number - 1])
 
     def act(self, who: Visitor) -> None:
         files = [(f"drop-{self.sent}.csv", self.content(self.sent))]
