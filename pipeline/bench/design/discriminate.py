@@ -19,7 +19,13 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.bench.design.information import sampled_input
 from pipeline.bench.planning.plan import Limits, Recording
-from pipeline.bench.planning.propose import FURTHEST, plan_limits, rounded, rounded_down
+from pipeline.bench.planning.propose import (
+    FURTHEST,
+    let_go,
+    plan_limits,
+    rounded,
+    rounded_down,
+)
 from pipeline.errors import DataError, PipelineError
 from pipeline.gap.limits import CLOSE_BIC
 from pipeline.gap.types import Gap, Proposal
@@ -155,19 +161,9 @@ def _candidates(chain: Chain, limits: Limits) -> Iterator[tuple[Recording, float
         if chain.k[cart - 1] + chain.k[cart] <= 0:
             continue
         for height in (rounded(share * limits.travel) for share in _RELEASES):
-            release = Recording(
-                id=f"apart-decay-{cart}",
-                kind="decay",
-                carts=(cart,),
-                wave="delta",
-                amplitude=0.0,
-                frequency=1 / _TIME,
-                release=cart,
-                settle=1.0,
-                note=f"let go {height:g} from the zero, in units of the travel limit",
-                aim="gap",
-            )
-            yield release, height
+            release = let_go(cart, name=f"apart-decay-{cart}", seconds=_TIME)
+            note = f"let go {height:g} from the zero, in units of the travel limit"
+            yield release.model_copy(update={"note": note, "aim": "gap"}), height
 
 
 # ------------------------------------------------------------------------- how far apart

@@ -6,8 +6,8 @@ Donev, R. D. Tobias, Optimum Experimental Designs, with SAS, 2007, chapter 12.
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.bench.design.goal import Goal
-from pipeline.plant.linear.chain import Array
 
 _GAIN = 1e-6  # relative; a smaller one is rounding
 _ROUNDS = 20

@@ -5,9 +5,10 @@ from typing import Literal
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.bench.design.information import Knowledge
 from pipeline.errors import ConfigError, DataError
-from pipeline.plant.linear.chain import Array, Chain
+from pipeline.plant.linear.chain import Chain
 from pipeline.plant.loop.sampled_loop import simulate_loop
 from pipeline.results import FeedbackDesign
 from pipeline.submission.complaints import nearest

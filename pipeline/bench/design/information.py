@@ -18,6 +18,7 @@ from typing import Self
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.bench.planning.plan import Limits, Recording
 from pipeline.bench.planning.propose import identified_chain
 from pipeline.bench.protocol.messages import Start, Wave
@@ -33,7 +34,7 @@ from pipeline.estimation.chain.time_search import look
 from pipeline.estimation.chain.time_window import Window, open_window
 from pipeline.estimation.colour import score_covariance
 from pipeline.estimation.noise import noise_beyond_rounding
-from pipeline.plant.linear.chain import Array, Chain
+from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.dwells import SETTLED_DWELL, settling_wait
 from pipeline.plant.linear.simulate import simulate_linear
 from pipeline.results import Analysis, ChainFit, FrequencyResponse, Record, SinePoint

@@ -10,10 +10,10 @@ Measurement 37 (1988), 145-147, for the clipping.
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.arrays import Array, ComplexArray
 from pipeline.bench.design.exchange import choose
 from pipeline.bench.design.goal import Goal
 from pipeline.bench.design.information import Knowledge
-from pipeline.plant.linear.chain import Array, ComplexArray
 
 Tones = tuple[tuple[int, float, float], ...]
 Lines = NDArray[np.int64]  # harmonics

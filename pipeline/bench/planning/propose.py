@@ -219,19 +219,21 @@ def _decays(cart: int, system: System) -> list[Recording]:
     """Let one cart go by hand, the others held; a cart without a spring cannot swing."""
     if not (system.springs[cart - 1] or system.springs[cart]):
         return []
-    return [
-        Recording(
-            id=f"decay-{cart}{repeat}",
-            kind="decay",
-            carts=(cart,),
-            wave="delta",
-            amplitude=0.0,
-            frequency=1 / _DECAY_TIME,
-            release=cart,
-            settle=1.0,
-        )
-        for repeat in _REPEATS
-    ]
+    return [let_go(cart, name=f"decay-{cart}{repeat}", seconds=_DECAY_TIME) for repeat in _REPEATS]
+
+
+def let_go(cart: int, *, name: str, seconds: float) -> Recording:
+    """Return the recording of one cart that a hand lets go, the others held."""
+    return Recording(
+        id=name,
+        kind="decay",
+        carts=(cart,),
+        wave="delta",
+        amplitude=0.0,
+        frequency=1 / seconds,
+        release=cart,
+        settle=1.0,
+    )
 
 
 def _first_steps(system: System, limits: Limits) -> list[Recording]:
