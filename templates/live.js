@@ -223,6 +223,7 @@
     showCounters(fresh.counters);
     redraw();
   });
+  news.addEventListener('ended', () => location.reload());  // at the desk: the page came too late to watch
   news.addEventListener('error', () => tell('The connection is lost; trying again …', true));
   news.addEventListener('open', () => tell(state.waits));
   const press = async (wish, number) => {

@@ -53,12 +53,14 @@ class Session:
             self.process.send(b"stop\n")
 
     def events(self) -> Iterator[bytes]:
-        """Yield the news of its live page as they come."""
+        """Yield the news of its live page as they come, and that it has ended."""
         with suppress(OSError, HTTPException):
             connection, answer = self._ask("GET", "events")
             with closing(connection):
                 while lump := answer.read1(_LUMP):
                     yield lump
+        if self.ended.wait(_TO_STOP):
+            yield b"event: ended\ndata:\n\n"
 
     def _ask(
         self, method: str, what: str, body: str | None = None

@@ -58,13 +58,16 @@ def start(ask: Ask) -> Response:
 
 def press(ask: Ask) -> Response:
     """Pass on a button; one of a page without scripts leads back to it."""
-    status = _running(ask).press(ask.text("wish"), ask.text("number"))
+    session = _session(ask)
+    if session.ended.is_set():
+        raise HTTPException(404, "the session is over")
+    status = session.press(ask.text("wish"), ask.text("number"))
     return ask.back(_here(ask)) if ask.text("plain") else Response(status_code=status)
 
 
 def events(ask: Ask) -> Response:
-    """Pass on the news of the session."""
-    return StreamingResponse(_running(ask).events(), media_type="text/event-stream")
+    """Pass on the news of the session; one that ended while its page was on the way says so."""
+    return StreamingResponse(_session(ask).events(), media_type="text/event-stream")
 
 
 def _ports(ask: Ask) -> list[tuple[str, str]]:
@@ -78,10 +81,10 @@ def _here(ask: Ask) -> str:
     return f"/bench/{ask.request.path_params['n']}/"
 
 
-def _running(ask: Ask) -> Session:
+def _session(ask: Ask) -> Session:
     session = ask.desk.benches.of(ask.folder())
-    if session is None or session.ended.is_set() or not session.url:
-        raise HTTPException(404, "no session is under way")
+    if session is None or not session.url:
+        raise HTTPException(404, "no session was begun here")
     return session
 
 
