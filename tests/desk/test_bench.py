@@ -52,7 +52,7 @@ def test_a_plan_is_proposed_and_a_session_recorded_and_stopped(tmp_path, real):
         # How far the stop is when the first news are sent is not ours to say.
         assert json.loads(states[0])["waits"] in ("Recording long.", "Stopping.")
         assert json.loads(states[-1])["waits"] == "The session is over."
-        # Told only when the room shows the plan again; a page drawn just before hears it and reloads.
+        # Told when the room shows the plan again: a page drawn just before hears it and reloads.
         assert heard[0].endswith(b"event: ended\ndata:\n\n")
         assert "Stopped. Begin again" in visitor.get("/bench/0/").text
         assert visitor.get("/bench/0/events").body == b"event: ended\ndata:\n\n"
