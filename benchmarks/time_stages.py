@@ -1,16 +1,8 @@
-"""How well the time-domain stages measure: sine dwells, decays, dry friction, steps.
-
-    python -m benchmarks.time_stages [--seeds 500]
-
-Random single carts and presets, the ECP 210's encoder (0.00227 cm a count), 113 Hz to 1 kHz.
-"""
-
-import argparse
-import time
-from collections.abc import Callable
+"""How well the time-domain stages measure: sine dwells, decays, dry friction, steps."""
 
 import numpy as np
 
+from benchmarks.page import Table, share
 from pipeline.arrays import Array
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.plant.linear.simulate import simulate_linear
@@ -20,6 +12,12 @@ from pipeline.stages.log_decrement import fit_log_decrement
 from pipeline.stages.sine import fit_sine
 from pipeline.stages.step_gain import fit_step_gain
 
+TITLE = "Decays, dwells and steps"
+WORDS = """
+What the stages before the fit make of one record each. Random single carts and presets, the ECP
+210's encoder (0.00227 cm a count), 113 Hz to 1 kHz; relative errors against the truth.
+"""
+TOOLS = ()
 COUNT = 0.00227  # cm
 RATES = (113.1, 333.0, 1000.0)  # Hz
 ZETAS = (0.01, 0.03, 0.07, 0.15)
@@ -64,25 +62,35 @@ def random_release(rng: np.random.Generator, *, zeta: float, fs: float, d: float
     return record(t, y + noise * COUNT * rng.normal(size=t.size), kind="decay")
 
 
-def decays(seeds: int) -> None:
-    print("\nζ from a clean decay, relative error (target 2e-3; aim 5e-4 rms)")
-    print("  ζ      fs/Hz   fit rms    fit max    peaks rms")
+def tables(*, quick: bool) -> list[Table]:
+    seeds = 12 if quick else 300
+    return [decays(max(seeds // 12, 4)), friction(seeds), dwells(seeds // 3), steps()]
+
+
+def decays(seeds: int) -> Table:
+    rows = []
     for zeta in ZETAS:
         for fs in RATES:
             rng = np.random.default_rng(1)
             errors = []
-            for _ in range(max(seeds // 12, 10)):
+            for _ in range(seeds):
                 got = fit_log_decrement(
                     random_release(rng, zeta=zeta, fs=fs, d=0.0, noise=0.0), cart=1
                 )
                 errors.append([got.zeta / zeta - 1, got.zeta_peaks / zeta - 1])
             rms = np.sqrt(np.mean(np.square(errors), axis=0))
             worst = np.max(np.abs(errors), axis=0)[0]
-            print(f"  {zeta:<6} {fs:<7} {rms[0]:.1e}    {worst:.1e}    {rms[1]:.1e}")
+            rows.append([f"{zeta}", f"{fs:g}", f"{rms[0]:.1e}", f"{worst:.1e}", f"{rms[1]:.1e}"])
+    return Table(
+        title=f"ζ of a clean decay, {seeds} seeds a line",
+        head=["ζ", "rate, Hz", "fit of the record, rms", "most", "logarithms of the peaks, rms"],
+        rows=rows,
+        note="The peaks' logarithms are the textbook's method, which the report shows beside.",
+    )
 
 
-def friction(seeds: int) -> None:
-    print("\ndry friction, share called present (targets: 1 % at d = 0, 99 % at d = 0.01 cm)")
+def friction(seeds: int) -> Table:
+    rows = []
     for d in (0.0, 0.002, 0.01):
         present = []
         for seed in range(seeds):
@@ -96,22 +104,37 @@ def friction(seeds: int) -> None:
             )
             test = fit_log_decrement(run, cart=1).friction
             present.append(test is not None and test.present)
-        print(f"  d = {d:<6} cm: {np.sum(present)} of {seeds}")
+        rows.append([f"{d}", share(sum(present), seeds)])
+    return Table(
+        title="Dry friction in one decay",
+        head=["a cart is held within, cm", "friction said to be present"],
+        rows=rows,
+    )
 
 
-def dwells(seeds: int) -> None:
-    print("\nsine dwells of 1 cm (target: amplitude within 5e-4)")
-    print("  fs/Hz   kept from   gain rms   max        phase rms   in 95 % intervals")
+def dwells(seeds: int) -> Table:
+    rows = []
     for fs in (113.1, 500.0):
         for from_rest in (True, False):
-            errors = np.array([_dwell_errors(seed, fs, from_rest) for seed in range(seeds // 3)])
+            errors = np.array([_dwell_errors(seed, fs, from_rest) for seed in range(seeds)])
             rms = np.sqrt(np.mean(errors[:, :2] ** 2, axis=0))
-            covered = np.mean(np.abs(errors[:, 2:]) < 1.96, axis=0)
-            print(
-                f"  {fs:<7} {'rest' if from_rest else 'steady':<11} {rms[0]:.1e}    "
-                f"{np.max(np.abs(errors[:, 0])):.1e}    {rms[1]:.1e}     "
-                f"{100 * covered[0]:.0f} %, {100 * covered[1]:.0f} %"
+            covered = 100 * np.mean(np.abs(errors[:, 2:]) < 1.96, axis=0)
+            rows.append(
+                [
+                    f"{fs:g}",
+                    "rest" if from_rest else "steady motion",
+                    f"{rms[0]:.1e}",
+                    f"{np.max(np.abs(errors[:, 0])):.1e}",
+                    f"{rms[1]:.1e}",
+                    f"{covered[0]:.0f} %, {covered[1]:.0f} %",
+                ]
             )
+    head = ["rate, Hz", "kept from", "gain, rms", "most", "phase, rms rad"]
+    return Table(
+        title=f"Sine dwells of 1 cm, {seeds} a line",
+        head=[*head, "within 95 % limits: gain, phase"],
+        rows=rows,
+    )
 
 
 def _dwell_errors(seed: int, fs: float, from_rest: bool) -> list[float]:
@@ -135,8 +158,8 @@ def _dwell_errors(seed: int, fs: float, from_rest: bool) -> list[float]:
     ]
 
 
-def steps() -> None:
-    print("\nsteps of 0.03 V on and off: gain, relative error and its standard error")
+def steps() -> Table:
+    rows = []
     for wait in (6.0, 2.0, 1.0):
         t = np.arange(0, 0.5 + 2 * wait, 0.00884)
         u = 0.03 * np.asarray((t >= 0.5) & (t < 0.5 + wait), dtype=np.float64)
@@ -146,45 +169,9 @@ def steps() -> None:
             for cart, truth in enumerate(chain.static_gains(), start=1):
                 got = fit_step_gain(run, cart=cart)
                 errors.append(f"{got.gain / truth - 1:+.1e} ± {got.gain_std / truth:.1e}")
-            print(f"  {wait:g} s each, {name}: {', '.join(errors)}")
-
-
-def speed() -> None:
-    print("\ntime per call, median of 20 (113 Hz)")
-    chain, t = PRESETS["throne-1dof"], np.arange(0, 8, 0.00884, dtype=np.float64)
-    rng = np.random.default_rng(0)
-    sine = 0.03 * np.sin(19 * t, dtype=np.float64)
-    step = 0.03 * np.asarray((t > 0.5) & (t < 4), dtype=np.float64)
-    runs = {
-        "sine": record(t, simulate_linear(chain, t, sine), kind="sine", u=sine, omega=19.0),
-        "step gain": record(t, simulate_linear(chain, t, step), kind="step", u=step),
-        "log decrement": random_release(rng, zeta=0.05, fs=113.1, d=0.0, noise=0.2),
-        "log decrement, friction": random_release(rng, zeta=0.05, fs=113.1, d=0.01, noise=0.2),
-    }
-    stages: dict[str, Callable[[Record], object]] = {
-        "sine": lambda run: fit_sine(run, cart=1),
-        "step gain": lambda run: fit_step_gain(run, cart=1),
-    }
-    for name, run in runs.items():
-        stage = stages.get(name, lambda run: fit_log_decrement(run, cart=1))
-        times = []
-        for _ in range(20):
-            start = time.perf_counter()
-            stage(run)
-            times.append(time.perf_counter() - start)
-        print(f"  {name}: {1e3 * np.median(times):.1f} ms")
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=500)
-    seeds = parser.parse_args().seeds
-    decays(seeds)
-    friction(seeds)
-    dwells(seeds)
-    steps()
-    speed()
-
-
-if __name__ == "__main__":
-    main()
+            rows.append([f"{wait:g}", name, ", ".join(errors)])
+    return Table(
+        title="Steps of 0.03 V, on and off",
+        head=["s each", "plant", "error of the static gain and its standard error, by cart"],
+        rows=rows,
+    )

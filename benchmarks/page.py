@@ -1,0 +1,139 @@
+"""The page of the benchmarks: what a table is, what stands below it, how one section is made anew.
+
+The page is its own store: each section stands between two comments, and a run writes only those of
+the benchmarks it made, with the machine and the versions they were made on.
+"""
+
+import os
+import platform
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError
+from importlib.metadata import version as version_of
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import psutil
+from matplotlib.figure import Figure
+
+from pipeline import __version__
+from pipeline.arrays import Array
+from pipeline.output import write_file
+from pipeline.report.figures.style import drawing
+from pipeline.report.figures.svg import plain_svg, to_svg
+
+NOT_INSTALLED = "not installed"
+_BASIC = ("numpy", "scipy", "numba")
+_SECTION = re.compile(r"<!-- (\w+) -->\n.*?<!-- end of \1 -->\n", re.DOTALL)
+_HEAD = "# Benchmarks\n"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """A table of the page, a figure below it, and what a sceptic has to know of both.
+
+    Attributes
+    ----------
+    rows : cells as text; a row of `missing` where another tool is not installed.
+    note : how each tool was used, and what it does well: Markdown, below the table.
+    picture : draws the figure, inside the style of the reports.
+    """
+
+    title: str
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    note: str = ""
+    picture: Callable[[], Figure] | None = None
+
+
+def installed(tool: str) -> bool:
+    """Tell whether a distribution is there."""
+    return version(tool) != NOT_INSTALLED
+
+
+def version(tool: str) -> str:
+    """Return the version of a distribution, or that it is not installed."""
+    try:
+        return version_of(tool)
+    except PackageNotFoundError:
+        return NOT_INSTALLED
+
+
+def missing(name: str, *, columns: int) -> list[str]:
+    """Return the row of a tool that is not installed."""
+    return [name, NOT_INSTALLED, *[""] * (columns - 2)]
+
+
+def spread(values: Iterable[float] | Array, *, digits: int = 2) -> str:
+    """Return the median and, in brackets, the quartiles, as significant digits."""
+    found = np.asarray(list(values), dtype=float)
+    if not found.size:
+        return "–"
+    low, middle, high = (
+        significant(q, digits=digits) for q in np.quantile(found, [0.25, 0.5, 0.75])
+    )
+    return f"{middle} ({low}–{high})" if found.size > 1 else middle
+
+
+def significant(value: float, *, digits: int = 2) -> str:
+    """Return a number to some significant digits, without an exponent where it can do without."""
+    if not np.isfinite(value) or value == 0 or not 1e-4 < abs(value) < 1e6:
+        return f"{value:.{digits}g}"
+    places = max(0, digits - 1 - int(np.floor(np.log10(abs(value)))))
+    return f"{value:.{places}f}"
+
+
+def share(hits: int, of: int) -> str:
+    """Return a share with what it is of."""
+    return f"{100 * hits / of:.0f} % ({hits} of {of})" if of else "–"
+
+
+def write_page(page: Path, made: dict[str, str], *, order: Sequence[str]) -> None:
+    """Write the sections made in place of those the page had; leave the others and the head."""
+    text = page.read_text(encoding="utf-8") if page.exists() else _HEAD
+    sections = {found[1]: found[0] for found in _SECTION.finditer(text)} | made
+    head = _SECTION.split(text, maxsplit=1)[0].rstrip() + "\n"
+    shown = [sections[name] for name in order if name in sections]
+    write_file(page, "\n".join([head, *shown]))
+
+
+def section(
+    name: str, module: ModuleType, tables: Sequence[Table], *, seconds: float, figures: Path | None
+) -> str:
+    """Return a benchmark's part of the page; its figures go into a folder, if there is one."""
+    parts = [f"<!-- {name} -->", f"## {module.TITLE}", module.WORDS.strip()]
+    for number, table in enumerate(tables, start=1):
+        parts += [f"### {table.title}", markdown(table)]
+        if table.picture is not None:
+            with drawing():
+                drawn = plain_svg(to_svg(table.picture(), name=f"{name}-{number}", alt=table.title))
+            if figures is not None:
+                figures.mkdir(parents=True, exist_ok=True)
+                write_file(figures / f"{name}-{number}.svg", drawn)
+                parts.append(f"![{table.title}](figures/{name}-{number}.svg)")
+        if table.note:
+            parts.append(table.note.strip())
+    tools = ", ".join(f"{tool} {version(tool)}" for tool in (*_BASIC, *module.TOOLS))
+    parts.append(
+        f"*Again: `python -m benchmarks {name}`. Made in {seconds:.0f} s of one core on "
+        f"{machine()}; cartlab {__version__}, {tools}.*"
+    )
+    return "\n\n".join(parts) + f"\n\n<!-- end of {name} -->\n"
+
+
+def markdown(table: Table) -> str:
+    """Return a table in Markdown."""
+    lines = [table.head, ["---"] * len(table.head), *table.rows]
+    assert all(len(line) == len(table.head) for line in lines), table.title
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def machine() -> str:
+    """Return what a time depends on, and nothing that tells whose machine it is."""
+    memory = psutil.virtual_memory().total / 1e9
+    return (
+        f"{os.cpu_count()} cores ({platform.machine()}), {memory:.0f} GB, {platform.system()}, "
+        f"Python {platform.python_version()}"
+    )

@@ -1,0 +1,80 @@
+"""The page of the benchmarks: one section made anew leaves the others, and quick ones run."""
+
+import sys
+
+import pytest
+
+from benchmarks import __main__ as command
+from benchmarks import page
+from benchmarks.page import Table, section, significant, spread, version, write_page
+
+CHEAP = ("feedback", "time_stages")
+
+
+class _Module:
+    TITLE, WORDS, TOOLS = "Speed", "What is compared.", ("numpy", "no-such-tool")
+
+
+def _section(name: str, cell: str) -> str:
+    table = Table(title="Times", head=["what", "s"], rows=[["ours", cell]])
+    return section(name, _Module, [table], seconds=1.0, figures=None)  # type: ignore[arg-type]
+
+
+def test_one_section_made_anew_leaves_the_others_and_the_head(tmp_path):
+    """The page is its own store: order is the list's, whatever was made first."""
+    file, order = tmp_path / "README.md", ("first", "second")
+    file.write_text("# Mine\n\nWritten by hand.\n", encoding="utf-8")
+
+    write_page(file, {"second": _section("second", "2.0")}, order=order)
+    write_page(file, {"first": _section("first", "1.0")}, order=order)
+    write_page(file, {"second": _section("second", "3.0")}, order=order)
+
+    text = file.read_text(encoding="utf-8")
+    assert text.startswith("# Mine\n\nWritten by hand.\n")
+    assert text.index("| ours | 1.0 |") < text.index("| ours | 3.0 |")
+    assert "2.0 |" not in text
+    assert text.count("## Speed") == 2
+
+
+def test_a_section_says_what_it_was_made_with():
+    """Versions of what is compared stand below, and what is not installed is said to be so."""
+    text = _section("first", "1.0")
+
+    assert f"numpy {version('numpy')}" in text
+    assert f"no-such-tool {page.NOT_INSTALLED}" in text
+
+
+@pytest.mark.parametrize("name", CHEAP)
+def test_quick_ones_run_and_leave_the_page_alone(name, monkeypatch, capsys):
+    """`--quick` tells its tables on stdout only."""
+    before = command.PAGE.read_bytes()
+    monkeypatch.setattr(sys, "argv", ["benchmarks", name, "--quick"])
+
+    command.main()
+
+    assert f"<!-- {name} -->" in capsys.readouterr().out
+    assert command.PAGE.read_bytes() == before
+
+
+def test_an_unknown_name_is_refused(monkeypatch):
+    """The names there are stand in the message; nothing is written."""
+    monkeypatch.setattr(sys, "argv", ["benchmarks", "no-such-benchmark"])
+
+    with pytest.raises(SystemExit) as refused:
+        command.main()
+
+    assert refused.value.code == 2
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(0.01234, "0.012"), (12.34, "12"), (123.4, "123"), (1e7, "1e+07")]
+)
+def test_numbers_keep_two_digits(value, text):
+    """As many digits as mean something."""
+    assert significant(value) == text
+
+
+def test_spread_is_median_and_quartiles():
+    """One value has none."""
+    assert spread([1.0, 2.0, 3.0, 4.0, 5.0]) == "3.0 (2.0–4.0)"
+    assert spread([2.0]) == "2.0"
