@@ -4,7 +4,10 @@ import json
 
 import pytest
 
-from pipeline.bench.explore.explore import Recorded, Wish, explore, read_time, read_wish
+from pipeline.bench.explore.explore import Recorded, explore
+from pipeline.bench.explore.wish import Wish, read_time, read_wish
+from pipeline.bench.host.signals import Stopped
+from pipeline.bench.planning.plan_file import load_plan, save_plan
 from pipeline.errors import ConfigError, DataError
 from pipeline.report.exploration.page import NAME
 from pipeline.submission import load_submission
@@ -155,8 +158,8 @@ def test_carts_are_identified_where_the_gap_cannot_be_looked_for(tmp_path, monke
     assert not turns[-1].reached
 
 
-def test_a_recording_that_does_not_come_off_is_not_asked_for_again(tmp_path):
-    """Somebody skips it, or a limit stops it: nothing is recorded, and the diary says so."""
+def test_a_bench_on_which_nothing_comes_off_is_left_after_three_tries(tmp_path):
+    """Each time another recording is chosen; the diary says what did not come off."""
     bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
     session, asked = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=1)), []
 
@@ -167,8 +170,69 @@ def test_a_recording_that_does_not_come_off_is_not_asked_for_again(tmp_path):
     turns = explore(
         tmp_path / "work", record=record, wish=Wish(error=1e-7), seconds=900.0, tell=lambda s: None
     )
-    assert len(asked) == 3
-    assert "refused before" in turns[-1].said
+    chosen = [ids[0] for ids in asked[2:]]
+    assert len(set(chosen)) == 3
+    assert [turn.said.split("; ")[0] for turn in turns[1:]] == [
+        f"{name} did not come off" for name in chosen
+    ]
+    assert not turns[-1].reached
+
+
+def test_a_person_vetoes_and_adds(tmp_path):
+    """Another is chosen than what is vetoed; what is added comes next; the diary says both."""
+    bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
+    folder, offered, recorded = tmp_path / "work", [], []
+    session = VirtualSession(folder, VirtualBench(bench, seed=1))
+
+    def vetoes(recording):
+        offered.append(recording)
+        if len(offered) == 1:
+            submission = load_submission(folder)
+            plan = load_plan(submission)
+            mine = plan.recordings[0].model_copy(
+                update={"id": "mine", "kind": "sweep", "wave": "square", "amplitude": 0.02,
+                        "release": None, "frequency": 0.5, "cycles": 3}
+            )  # fmt: skip
+            save_plan(plan.model_copy(update={"recordings": (*plan.recordings, mine)}), submission)
+        return len(offered) == 1
+
+    def record(ids):
+        recorded.extend(ids)
+        return session(ids)
+
+    turns = explore(
+        folder,
+        record=record,
+        wish=Wish(error=1e-7),
+        seconds=135.0,
+        tell=lambda s: None,
+        vetoes=vetoes,
+    )
+    first, mine, other = offered[:3]
+    assert mine.id == "mine"
+    assert not other.resembles(first)
+    assert {mine.id, other.id} <= set(recorded)
+    assert first.id not in recorded
+    assert turns[1].said.startswith(f"{first.id} was vetoed; ")
+    assert "mine, which was added by hand" in turns[1].said
+    assert turns[2].recorded == ("mine",)
+    assert f"{first.id} was vetoed" in (folder / NAME).read_text(encoding="utf-8")
+
+
+def test_thinking_can_be_ended(tmp_path):
+    """What watches the progress raises; what is recorded stays."""
+    bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
+    session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=1))
+
+    def enough(stage):
+        raise Stopped("by hand")
+
+    with pytest.raises(Stopped):
+        explore(
+            tmp_path / "work", record=session, wish=Wish(), seconds=90.0, tell=lambda s: None,
+            progress=enough,
+        )  # fmt: skip
+    assert len(load_submission(tmp_path / "work").experiments) == 3
 
 
 def test_the_command_explores_a_bench_over_its_line(tmp_path):

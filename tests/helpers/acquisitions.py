@@ -79,6 +79,13 @@ class Notes:
         """Note the sentence."""
         self.remarks.append(sentence)
 
+    def thinking(self, stage: str) -> None:
+        """Note nothing."""
+
+    def thought(self, sentence: str) -> None:
+        """Note the sentence."""
+        self.remarks.append(sentence)
+
 
 def host(folder: Path, port: str, *options: str) -> AbstractContextManager[subprocess.Popen[str]]:
     """Run `cartlab acquire` in a process of its own beside a block."""

@@ -49,24 +49,26 @@ _LEAST_WEIGHT = 0.1  # of the others: what swings overstates how sure the criter
 _SAME = 1e-9  # of the largest singular value: such a change of the parameters shows in nothing
 
 
-def propose_for(gap: Gap, submission: Submission) -> Gap:
+def propose_for(gap: Gap, submission: Submission, *, without: Sequence[Recording] = ()) -> Gap:
     """Return the gap with a proposal within the limits of the submission's plan.
 
-    Where none can be made, for a spoilt plan.toml say, a note says why: the gap stays what it is.
+    It resembles none of those it is to be `without`. Where none can be made, for a spoilt plan.toml
+    say, a note says why: the gap stays what it is.
     """
     try:
-        return with_proposal(gap, limits=plan_limits(submission))
+        return with_proposal(gap, limits=plan_limits(submission), without=without)
     except PipelineError as error:
         return replace(gap, notes=(*gap.notes, f"no recording is proposed: {error}"))
 
 
-def with_proposal(gap: Gap, *, limits: Limits) -> Gap:
+def with_proposal(gap: Gap, *, limits: Limits, without: Sequence[Recording] = ()) -> Gap:
     """Return the gap with the recording that tells its contenders apart best, if it has two.
 
     Raises
     ------
     DataError : the carts never settle.
     """
+    gap = replace(gap, proposal=None)
     models = [one.model for one in gap.contenders]
     if len(models) < 2 or not all(model.chain.is_tied for model in models):
         return gap
@@ -77,6 +79,8 @@ def with_proposal(gap: Gap, *, limits: Limits) -> Gap:
     sigma = _noise(gap)
     best, most = None, 0.0
     for recording, height in _candidates(models[0].chain, limits):
+        if any(recording.resembles(other) for other in without):
+            continue
         found = _tell_apart(models, recording, height, sigma=sigma, travel=limits.travel)
         if found is None:
             continue

@@ -1,7 +1,7 @@
 """`cartlab plan --next`: the experiments that bring most, and what each will bring."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from math import isclose
 from pathlib import Path
@@ -135,9 +135,19 @@ def plan_next(
 
 
 def choose_next(
-    analysis: Analysis, plan: Plan, *, n: int, goal: str, commands: frozenset[str]
+    analysis: Analysis,
+    plan: Plan,
+    *,
+    n: int,
+    goal: str,
+    commands: frozenset[str],
+    without: Sequence[Recording] = (),
 ) -> NextPlan:
     """Choose the `n` next experiments, each with the error expected once it is there.
+
+    Parameters
+    ----------
+    without : nothing that resembles one of these.
 
     Raises
     ------
@@ -145,7 +155,13 @@ def choose_next(
     """
     known = Knowledge.of(analysis)
     wanted = find_goal(goal, known, feedback=analysis.feedback)
-    candidates = propose_candidates(known, limits=plan.limits, commands=commands, goal=wanted)
+    candidates = [
+        one
+        for one in propose_candidates(known, limits=plan.limits, commands=commands, goal=wanted)
+        if not any(one.resembles(other) for other in without)
+    ]
+    if not candidates:
+        raise DataError("everything that would tell more was refused before")
     told = np.array([known.of_recording(candidate) for candidate in candidates])
     done = {record.id for record in analysis.records}
     kinds = ("sine",) if known.dwells else ("step", "sweep")

@@ -1,7 +1,7 @@
 """Record, identify, look for the gap, choose, record: until it is known, or time is up."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from pipeline.bench.design.discriminate import propose_for
 from pipeline.bench.design.next_plan import choose_next, known_commands
+from pipeline.bench.explore.wish import Wish
 from pipeline.bench.planning.plan import Plan, Recording
 from pipeline.bench.planning.plan_file import load_plan, plan_path, save_plan
 from pipeline.bench.planning.plan_words import session_time, time_words
@@ -24,6 +25,7 @@ from pipeline.estimation.chain.parametrisation import named_estimates
 from pipeline.gap.investigate import investigate
 from pipeline.gap.stored import gap_text
 from pipeline.gap.types import Gap
+from pipeline.lock import turn_in
 from pipeline.names import listed
 from pipeline.output import own_folder, write_file
 from pipeline.plant.linear.chain import Chain
@@ -32,7 +34,6 @@ from pipeline.report.exploration.page import write_diary
 from pipeline.report.exploration.turn import Explanation, Turn
 from pipeline.results import Analysis
 from pipeline.submission import Submission, load_submission
-from pipeline.submission.complaints import nearest
 from pipeline.submission.load import NAME
 from pipeline.workflow import analyse
 
@@ -42,86 +43,43 @@ _APART = 1.0  # noises: explanations that no recording sets further apart stay i
 _FAR = 0.5  # of the travel limit: who has not moved so far has not shown all
 _FAR_OUT = "far"  # the aim of the step that shows what acts far out
 _SETTLED = ("named", "none")
+_FAILURES = 3  # recordings in a row that a bench does not carry out: it is not their choice
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recorded:
-    """What came off of the recordings asked for, by id, and the s that all tries took."""
+    """What came off of the recordings asked for.
+
+    Attributes
+    ----------
+    ids : of what was recorded.
+    seconds : that all tries took.
+    vetoed : somebody at the bench did not want what is not there.
+    """
 
     ids: tuple[str, ...]
     seconds: float
+    vetoed: bool = False
 
 
 Record = Callable[[Sequence[str]], Recorded]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Wish:
-    """How well what is to be known: every parameter whose name begins so; "": all of them."""
-
-    prefix: str = ""
-    error: float = 0.01
-
-    def missing(self, errors: dict[str, float | None]) -> dict[str, float]:
-        """Return the parameters that are not known so well yet, with their errors.
-
-        Raises
-        ------
-        ConfigError : no parameter's name begins so.
-        """
-        meant = {name: e for name, e in errors.items() if name.startswith(self.prefix)}
-        if not meant:
-            hint = nearest(self.prefix, list(errors))
-            raise ConfigError(f'--until "{self.prefix} …": there is no such parameter{hint}')
-        return {
-            name: np.inf if error is None else error
-            for name, error in meant.items()
-            if error is None or error > self.error
-        }
-
-
-def read_wish(text: str) -> Wish:
-    """Read "zeta 1%", "1 %" or "omega_1 0.05 %".
-
-    Raises
-    ------
-    ConfigError : it is none of these.
-    """
-    *name, share = text.replace("%", " % ").split("%")[0].split() or [""]
-    try:
-        error = float(share) / 100
-    except ValueError:
-        error = 0.0
-    if not 0 < error < 1 or "%" not in text or len(name) > 1:
-        raise ConfigError(f'--until "{text}": expected a name and a percentage, as "zeta 1%"')
-    return Wish(prefix=name[0] if name and name[0] != "all" else "", error=error)
-
-
-def read_time(text: str) -> float:
-    """Read "20min", "90 s" or "1.5h"; return seconds.
-
-    Raises
-    ------
-    ConfigError : it is none of these.
-    """
-    number = text.strip().rstrip("minsech ")
-    unit = text.strip()[len(number) :].strip()
-    seconds = {"s": 1.0, "sec": 1.0, "min": 60.0, "h": 3600.0}.get(unit)
-    try:
-        if seconds is not None and 0 < seconds * float(number) < np.inf:
-            return seconds * float(number)
-    except ValueError:
-        pass
-    raise ConfigError(f'--time "{text}": expected a duration, as "20min" or "90s"')
-
-
 def explore(
-    folder: Path, *, record: Record, wish: Wish, seconds: float, tell: Callable[[str], None]
+    folder: Path,
+    *,
+    record: Record,
+    wish: Wish,
+    seconds: float,
+    tell: Callable[[str], None],
+    progress: Callable[[str], None] = lambda stage: None,
+    vetoes: Callable[[Recording], bool] = lambda recording: False,
 ) -> tuple[Turn, ...]:
     """Explore the bench behind `record` into a submission; return what was known turn by turn.
 
     The submission, gap/gap.json and the diary stand there after each turn, so whatever ends it
-    leaves them as they were.
+    leaves them as they were. A recording that somebody adds to plan.toml meanwhile comes before
+    what would be chosen.
 
     Parameters
     ----------
@@ -130,6 +88,9 @@ def explore(
     seconds : at the bench, rests included; no recording is begun that would go beyond. One that is
         broken off counts each time it is tried.
     tell : takes a sentence at each turn.
+    progress : takes a few words, often, while the data are asked; what it raises ends the
+        exploration.
+    vetoes : whether somebody does not want what was chosen; another is chosen then.
 
     Raises
     ------
@@ -138,8 +99,12 @@ def explore(
         takes longer than is allowed.
     """
     known = (folder / NAME).exists() and bool(load_submission(folder).experiments)
+    ours = {FIRST}  # in the plan; what else is there, and not recorded, somebody has added
     if (folder / NAME).exists():
-        wish.missing(dict.fromkeys(_names(load_submission(folder))))
+        submission = load_submission(folder)
+        wish.missing(dict.fromkeys(parameter_names_of(submission)))
+        if plan_path(submission).exists():
+            ours.update(one.id for one in load_plan(submission).recordings)
     made, spent = (), 0.0
     if not known:
         first = _first_time(folder)
@@ -151,37 +116,54 @@ def explore(
         came = record([FIRST])
         made, spent = came.ids, came.seconds
     submission = load_submission(folder)
+    usual = propose_plan(submission)
     if not plan_path(submission).exists():
-        save_plan(propose_plan(submission), submission)
-    plan = load_plan(submission)
+        save_plan(usual, submission)
+    ours.update(one.id for one in usual.recordings)
     if not known:
+        plan = load_plan(submission)
         steps = [r for r in plan.recordings if r.kind == "step" and not r.release]
         if steps and spent + session_time(steps) <= seconds:
             came = record([step.id for step in steps])
             made, spent = (*made, *came.ids), spent + came.seconds
+    analysis, gap = _look(folder, tell, progress)
     turns: list[Turn] = []
-    refused: set[str] = set()
+    refused: list[Recording] = []
+    before, failures = "", 0
     while True:
-        analysis, gap = _look(folder, tell)
         plan = load_plan(load_submission(folder))
-        turn, recording = _decide(analysis, gap, plan, folder, wish=wish, refused=refused)
+        turn, recording = _decide(
+            analysis, gap, plan, folder, wish=wish, refused=refused, ours=ours
+        )
         if recording and spent + session_time([recording]) > seconds:
             left = f"the {time_words(seconds)} allowed are up before {recording.id} would be done"
             said = f"{turn.said}, but {left}"
             turn, recording = replace(turn, said=said, reached=False), None
-        turn = replace(turn, seconds=spent, recorded=made)
+        elif recording and failures >= _FAILURES:
+            said = f"{turn.said}, but {failures} recordings in a row did not come off"
+            turn, recording = replace(turn, said=said, reached=False), None
+        turn = replace(turn, seconds=spent, recorded=made, said=before + turn.said)
         turns.append(turn)
         write_diary(turns, analysis, folder, wanted=wish.error)
         tell(turn.said)
         if recording is None:
             return tuple(turns)
-        came = record([recording.id])
+        ours.add(recording.id)
+        vetoed = vetoes(recording)
+        came = Recorded(ids=(), seconds=0.0, vetoed=True) if vetoed else record([recording.id])
         made, spent = came.ids, spent + came.seconds
-        if not made:  # a limit, or somebody at the bench who did not want it
-            refused.add(_shape(recording))
+        if made:
+            before, failures = "", 0
+            analysis, gap = _look(folder, tell, progress)
+            continue
+        refused.append(recording)
+        failures = 0 if came.vetoed else failures + 1
+        before = f"{recording.id} {'was vetoed' if came.vetoed else 'did not come off'}; "
+        if gap is not None:  # which recording decides is open again
+            gap = propose_for(gap, load_submission(folder), without=refused)
 
 
-def _names(submission: Submission) -> list[str]:
+def parameter_names_of(submission: Submission) -> list[str]:
     """Return what the parameters of the submission's carts are called."""
     n = submission.system.carts
     wall = float(submission.system.tied or n > 1)
@@ -196,12 +178,14 @@ def _first_time(folder: Path) -> float:
     return FIRST_SWEEP_TIME
 
 
-def _look(folder: Path, tell: Callable[[str], None]) -> tuple[Analysis, Gap | None]:
+def _look(
+    folder: Path, tell: Callable[[str], None], progress: Callable[[str], None]
+) -> tuple[Analysis, Gap | None]:
     """Identify the carts and look for the gap, as the data stand now; None: it cannot be."""
     submission = load_submission(folder)
-    analysis = analyse(submission)
+    analysis = analyse(submission, progress=progress)
     try:
-        gap = investigate(analysis, progress=lambda text: None, budget=_SEARCH)
+        gap = investigate(analysis, progress=progress, budget=_SEARCH)
     except DataError as error:
         tell(f"the gap cannot be looked for: {error}")
         return _identified(analysis, None), None
@@ -245,7 +229,14 @@ def _identified(analysis: Analysis, gap: Gap | None) -> Analysis:
 
 
 def _decide(
-    analysis: Analysis, gap: Gap | None, plan: Plan, folder: Path, *, wish: Wish, refused: set[str]
+    analysis: Analysis,
+    gap: Gap | None,
+    plan: Plan,
+    folder: Path,
+    *,
+    wish: Wish,
+    refused: Sequence[Recording],
+    ours: Collection[str],
 ) -> tuple[Turn, Recording | None]:
     """Return the turn, and the recording to make next: it stands in the plan."""
     errors = _errors(analysis)
@@ -254,13 +245,14 @@ def _decide(
     doubt = _doubt_words(gap) if gap else "what else acts could not be looked for"
     recording, why = None, ""
     try:
-        recording, why = _next(analysis, gap, plan, folder, missing=missing)
+        recording, why = _next(analysis, gap, plan, folder, missing=missing, refused=refused)
     except DataError as error:
         why = str(error)
-    if recording and _shape(recording) in refused:
-        recording, why = None, f"{recording.id} was refused before, and nothing else tells as much"
-    if recording:
-        recording = _planned(recording, plan, folder)
+    # After all that took its time: somebody may have chosen meanwhile.
+    if added := _added(folder, ours):
+        recording, why = added, f"next {added.id}, which was added by hand"
+    elif recording:
+        recording = _planned(recording, folder)
         why = f"therefore {recording.id}: {why}"
     said = "; ".join(filter(None, [known, doubt, why or "so this is the end"]))
     return (
@@ -286,6 +278,7 @@ def _next(
     folder: Path,
     *,
     missing: dict[str, float],
+    refused: Sequence[Recording],
 ) -> tuple[Recording | None, str]:
     """Return what to record next and why; None where all is known, or nothing would help."""
     settled, commands = gap is None or gap.verdict in _SETTLED, known_commands(folder)
@@ -298,12 +291,13 @@ def _next(
         worst = max(missing, key=lambda name: missing[name])
         # What is open was refused, or is the next to be chosen: it tells nothing yet.
         made = plan.model_copy(update={"recordings": ()})
-        found = choose_next(analysis, made, n=1, goal=worst, commands=commands)
+        found = choose_next(analysis, made, n=1, goal=worst, commands=commands, without=refused)
         return found.recordings[0], found.said
     furthest = max(float(np.ptp(record.y, axis=1).max()) / 2 for record in analysis.records)
     # Once: carts that something holds back go no further the second time.
     recorded = {record.id for record in analysis.records}
     made = any(r.aim == _FAR_OUT and r.id in recorded for r in plan.recordings)
+    made = made or any(r.aim == _FAR_OUT for r in refused)
     if furthest < _FAR * plan.limits.travel and not made:
         step, _ = large_steps(identified_chain(analysis), plan.limits)
         return step.model_copy(update={"aim": _FAR_OUT}), (
@@ -313,16 +307,25 @@ def _next(
     return None, "" if settled else "no recording within the limits would decide"
 
 
-def _planned(recording: Recording, plan: Plan, folder: Path) -> Recording:
-    """Return the recording as it stands in the plan: an open one that is the same, or a new one."""
+def _added(folder: Path, ours: Collection[str]) -> Recording | None:
+    """Return the first recording that somebody else has put into the plan since it began."""
     submission = load_submission(folder)
-    done = {experiment.id for experiment in submission.experiments}
-    for one in plan.recordings:
-        if one.id not in done and one.aim == recording.aim and _shape(one) == _shape(recording):
-            return one
-    (new,) = renamed([recording], taken=[*done, *(r.id for r in plan.recordings)])
-    save_plan(plan.model_copy(update={"recordings": (*plan.recordings, new)}), submission)
-    return new
+    done = {*ours, *(experiment.id for experiment in submission.experiments)}
+    return next((one for one in load_plan(submission).recordings if one.id not in done), None)
+
+
+def _planned(recording: Recording, folder: Path) -> Recording:
+    """Return the recording as it stands in the plan: an open one that is the same, or a new one."""
+    with turn_in(folder):
+        submission = load_submission(folder)
+        plan = load_plan(submission)
+        done = {experiment.id for experiment in submission.experiments}
+        for one in plan.recordings:
+            if one.id not in done and one.aim == recording.aim and _shape(one) == _shape(recording):
+                return one
+        (new,) = renamed([recording], taken=[*done, *(r.id for r in plan.recordings)])
+        save_plan(plan.model_copy(update={"recordings": (*plan.recordings, new)}), submission)
+        return new
 
 
 def _shape(recording: Recording) -> str:

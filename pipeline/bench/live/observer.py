@@ -97,6 +97,14 @@ class Observer(Protocol):
         """Tell what concerns no single run."""
         ...
 
+    def thinking(self, stage: str) -> None:
+        """Tell what the data are asked meanwhile, the bench at rest."""
+        ...
+
+    def thought(self, sentence: str) -> None:
+        """Tell what is known, what is doubted, what is recorded next and why."""
+        ...
+
 
 class Observers:
     """Several observers as one; the first of them has the person confirm."""
@@ -138,6 +146,16 @@ class Observers:
         """Tell what concerns no single run."""
         for observer in self._observers:
             observer.remark(sentence)
+
+    def thinking(self, stage: str) -> None:
+        """Tell what the data are asked meanwhile."""
+        for observer in self._observers:
+            observer.thinking(stage)
+
+    def thought(self, sentence: str) -> None:
+        """Tell what is known, what is doubted, what is recorded next and why."""
+        for observer in self._observers:
+            observer.thought(sentence)
 
 
 class Buttons:

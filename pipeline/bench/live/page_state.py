@@ -14,7 +14,7 @@ from pipeline.bench.protocol.messages import Reading
 from pipeline.errors import ConfigError
 from pipeline.submission import Input, Position, Submission, load_submission
 
-Phase = Literal["waiting", "settling", "recording", "over"]
+Phase = Literal["waiting", "settling", "recording", "thinking", "over"]
 
 _APART = 5  # ms between points shown: no eye sees more on a screen of ten seconds
 _KEPT = 2400  # points; what a page that reads too slowly has not fetched by then is left out
@@ -61,6 +61,9 @@ class LiveState:
         self._phase: Phase = "waiting"
         self._instruction: tuple[int, str] | None = None  # its number, its text
         self._asked = 0
+        self._stage = ""  # of what it thinks about
+        self._thoughts = 0
+        self._thought = ""
         self._remarks: deque[str] = deque(maxlen=_REMARKS)
         self._version = 0
         self._run = 0
@@ -143,6 +146,19 @@ class LiveState:
         with self._lock:
             self._remarks.append(sentence)
             self._version += 1
+
+    def thinking(self, stage: str) -> None:
+        """Tell what the data are asked meanwhile."""
+        with self._lock:
+            self._stage = stage
+        self._change("thinking", None)
+
+    def thought(self, sentence: str) -> None:
+        """Tell what is known, what is doubted, what is recorded next and why."""
+        with self._lock:
+            self._thoughts += 1
+            self._thought = sentence
+        self._change("waiting", None)
 
     def _change(self, phase: Phase, recording: Recording | None) -> None:
         with self._lock:
@@ -229,6 +245,7 @@ class LiveState:
                 "seconds_left": session_time(left),
                 "plan": [self._entry(recording) for recording in recordings],
                 "remarks": list(self._remarks),
+                "thought": {"number": self._thoughts, "text": self._thought},
             }
 
     def _waits(self) -> str:
@@ -239,6 +256,8 @@ class LiveState:
             return "Stopping."
         if self._instruction:
             return "Waiting for you."
+        if self._phase == "thinking":
+            return f"Asking the data: {self._stage}."
         if self._phase == "settling" and self._now:
             return f"Waiting for the carts to come to rest before {self._now.id}."
         if self._phase == "recording" and self._now:

@@ -68,16 +68,7 @@ class Terminal:
             return
         if not sys.stdin.isatty():
             raise ConfigError(f"{instruction}: nobody is at the keyboard (--yes: it is done)")
-        self._live.stop()
-        self._console.print(Text(f"{instruction}, then press Enter (Ctrl-C ends)"), end=" ")
-        try:
-            _forget_keys()
-            input()
-        except EOFError:
-            raise ConfigError(f"{instruction}: the keyboard was closed") from None
-        finally:
-            if self._console.is_terminal:
-                self._live.start()
+        self._ask(f"{instruction}, then press Enter")
 
     def settling(self, recording: Recording, seconds: float) -> None:
         """Show that the carts come to rest."""
@@ -105,6 +96,42 @@ class Terminal:
         """Print a sentence."""
         self._console.print(Text(sentence), soft_wrap=True)
 
+    def _ask(self, question: str) -> str:
+        """Return what is typed in answer.
+
+        Raises
+        ------
+        ConfigError : the keyboard is closed.
+        """
+        self._live.stop()
+        self._console.print(Text(f"{question} (Ctrl-C ends)"), end=" ")
+        try:
+            _forget_keys()
+            return input().strip()
+        except EOFError:
+            raise ConfigError(f"{question}: the keyboard was closed") from None
+        finally:
+            if self._console.is_terminal:
+                self._live.start()
+
+    def thinking(self, stage: str) -> None:
+        """Show what the data are asked."""
+        self._view.thinking = stage
+
+    def thought(self, sentence: str) -> None:
+        """Print what is known and what comes next."""
+        self._view.thinking = ""
+        self.remark(sentence)
+
+    def vetoes(self, recording: Recording) -> bool:
+        """Ask whether a recording is to be left out.
+
+        Raises
+        ------
+        ConfigError : the keyboard is closed.
+        """
+        return self._ask(f"Enter records {recording.id}, v and Enter vetoes it") == "v"
+
 
 class _View:
     """What is shown at the moment."""
@@ -113,6 +140,7 @@ class _View:
         self.plan: tuple[Recording, ...] = ()
         self.done: set[str] = set()
         self.recording: Recording | None = None
+        self.thinking = ""
         self._state = ""
         self._ms = 0
         self._anomalies = Anomalies()
@@ -122,6 +150,7 @@ class _View:
     def begin(self, recording: Recording, state: str) -> None:
         """Show another run."""
         self.recording, self._state, self._ms = recording, state, 0
+        self.thinking = ""
         self._anomalies = Anomalies()
         self._traces, self._arrived = [], deque()
 
@@ -151,7 +180,7 @@ class _View:
     def _run_lines(self) -> list[Text]:
         run = self.recording
         if run is None:
-            return []
+            return [Text(self.thinking)] if self.thinking else []
         state = self._state or (
             f"{1e-3 * self._ms:.1f} of {run.duration:.1f} s, {self._rate():.0f} lines/s, "
             f"line faults: {self._anomalies}"

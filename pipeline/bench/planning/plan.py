@@ -4,7 +4,8 @@ It stands in `plan.toml` in the submission folder. `cartlab plan` proposes it, a
 it, `cartlab acquire` carries it out.
 """
 
-from typing import Annotated, Literal
+from math import isclose
+from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -12,6 +13,9 @@ from pipeline.bench.protocol.messages import Tone
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+_ALIKE = 0.1  # relative: what is proposed again after other records differs by as much
 
 
 class _Model(BaseModel):
@@ -100,6 +104,15 @@ class Recording(_Model):
         """The highest at which it moves the carts on purpose, Hz."""
         last = self.frequency_end or self.frequency
         return max(self.frequency * max((h for h, *_ in self.tones), default=1), last)
+
+    def resembles(self, other: Self) -> bool:
+        """Whether who wants one of the two no more does not want the other either."""
+        words = (self.kind, self.wave, self.carts, self.release, self.controller)
+        if words != (other.kind, other.wave, other.carts, other.release, other.controller):
+            return False
+        mine = (self.amplitude, self.frequency, self.frequency_end or 0.0)
+        yours = (other.amplitude, other.frequency, other.frequency_end or 0.0)
+        return all(isclose(a, b, rel_tol=_ALIKE) for a, b in zip(mine, yours, strict=True))
 
 
 class Plan(_Model):

@@ -44,7 +44,7 @@ def _share(value: float) -> str:
 def _turns(turns: Sequence[Turn]) -> list[Block]:
     return [
         bullet_list(
-            spans(f"{turn.seconds:.0f} s, {', '.join(turn.recorded)}: ", clean(turn.said))
+            spans(", ".join([f"{turn.seconds:.0f} s", *turn.recorded]) + ": ", clean(turn.said))
             for turn in turns
         )
     ]

@@ -1,0 +1,64 @@
+"""An exploration of a bench on a line, which people watch and steer."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from pipeline.bench.explore.explore import Recorded, explore
+from pipeline.bench.explore.wish import Wish
+from pipeline.bench.host.acquire import acquire
+from pipeline.bench.host.session import BY_HAND
+from pipeline.bench.host.signals import Stopped
+from pipeline.bench.live.observer import Buttons, Observer, Observers
+from pipeline.bench.planning.plan import Recording
+from pipeline.bench.planning.plan_words import session_time
+from pipeline.report.exploration.turn import Turn
+
+
+def explore_bench(
+    folder: Path,
+    *,
+    port: str,
+    observers: Sequence[Observer],
+    buttons: Buttons | None,
+    wish: Wish,
+    seconds: float,
+    vetoes: Callable[[Recording], bool] = lambda recording: False,
+) -> tuple[Turn, ...]:
+    """Explore the bench at a port; return what was known turn by turn.
+
+    Parameters
+    ----------
+    observers, buttons : see `acquire`; "skip" vetoes a recording that was chosen, before it begins
+        or while it goes on, and "stop" ends the exploration, also while it thinks.
+    wish, seconds, vetoes : see `explore`.
+
+    Raises
+    ------
+    Stopped : a signal or a button ended it.
+    HardwareError, ConfigError, DataError : see `acquire` and `explore`.
+    """
+    everyone, buttons = Observers(observers), buttons or Buttons()
+
+    def record(ids: Sequence[str]) -> Recorded:
+        outcomes = acquire(folder, port=port, observers=observers, only=ids, buttons=buttons)
+        made = tuple(o.recording.id for o in outcomes if not o.partial)
+        skipped = {o.recording.id for o in outcomes if o.partial == BY_HAND["skip"]}
+        tried = [o.recording for o in outcomes if o.lines]
+        return Recorded(
+            ids=made, seconds=session_time(tried), vetoed=bool(skipped.difference(made))
+        )
+
+    def think(stage: str) -> None:
+        if buttons.pressed == "stop":
+            raise Stopped("by hand")
+        everyone.thinking(stage)
+
+    return explore(
+        folder,
+        record=record,
+        wish=wish,
+        seconds=seconds,
+        tell=everyone.thought,
+        progress=think,
+        vetoes=vetoes,
+    )
