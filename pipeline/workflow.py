@@ -1,4 +1,8 @@
-"""The straight line from a submission to its analysis: the only file that knows the order."""
+"""The straight line from a submission to its analysis.
+
+The stages that measure the carts stand in order in `identify/carts.py`, their fits in
+`identify/fit.py`; what follows them is here.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -2,7 +2,7 @@
 
 A chain fitted to carts with dry friction leaves smooth residuals, and an encoder at rest rounds
 the same way for seconds: neighbouring samples then tell the same thing, and counting each as new
-would make every standard error too small.
+would make every standard error too small. Here is the middle of the sandwich that puts it right.
 
 Reference: W. Newey & K. West, Econometrica 55, 1987; the lag window is Parzen's.
 """

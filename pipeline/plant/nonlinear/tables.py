@@ -51,8 +51,8 @@ class Drive(IntEnum):
     DELAY = 2
     LAG = 3
     DAMPING = 4  # on cart 1 while the commanded input is on
-    GAP = 5  # whole free play between motor and cart 1
-    MOTOR_MASS = 6  # the share of cart 1's mass on the motor's side of the gap
+    BACKLASH = 5  # whole free play between motor and cart 1
+    MOTOR_MASS = 6  # the share of cart 1's mass on the motor's side of it
     CONTACT_STIFFNESS = 7
     CONTACT_DAMPING = 8
     COGGING = 9  # force that repeats with the motor's position, …

@@ -160,7 +160,7 @@ BACKLASH = Effect(
         ),
     ),
     columns=lambda p: {
-        Drive.GAP: p["gap"],
+        Drive.BACKLASH: p["gap"],
         Drive.MOTOR_MASS: p["motor_mass"],
         Drive.CONTACT_STIFFNESS: p["contact_stiffness"],
         Drive.CONTACT_DAMPING: p["contact_damping"],

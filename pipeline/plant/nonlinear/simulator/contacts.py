@@ -1,9 +1,9 @@
-"""What switches inside a step: end stops, springs past a stretch, the two sides of a gap."""
+"""What switches inside a step: end stops, springs past a stretch, both sides of a backlash."""
 
 # isort: off
 from pipeline.plant.nonlinear.simulator.state import (
-    CHANGE, CONTACT_D, CONTACT_K, D2, D3, D4, D5, D6, FIX, GAP, PAST, STIFF, STOP, STOP_D, STOP_K,
-    STRETCH, V, X, jit, pair, tie,
+    BACKLASH, CHANGE, CONTACT_D, CONTACT_K, D2, D3, D4, D5, D6, FIX, PAST, STIFF, STOP, STOP_D,
+    STOP_K, STRETCH, V, X, jit, pair, tie,
 )  # fmt: skip
 
 
@@ -42,7 +42,7 @@ def contact(which, cart, drive, n, motor):
         side = 1.0 if cart[which, STOP] > 0.0 else -1.0
         return which, -1, side, cart[which, STOP_K], cart[which, STOP_D], abs(cart[which, STOP])
     side = 1.0 if which == 2 * n + 1 else -1.0
-    return motor, 0, side, drive[CONTACT_K], drive[CONTACT_D], 0.5 * drive[GAP]
+    return motor, 0, side, drive[CONTACT_K], drive[CONTACT_D], 0.5 * drive[BACKLASH]
 
 
 @jit

@@ -32,8 +32,8 @@ from pipeline.plant.nonlinear.simulator.step import advance, smooth_forces
 
 # isort: off
 from pipeline.plant.nonlinear.simulator.state import (
-    ACC, CHANGE, COGGING, CONTACT_K, COULOMB, COUPLING, CUBIC, DAHL, DAMPING, DEAD, DELAY, DRAG,
-    DRIVE_C, FIX, FORCE, GAIN, GAP, HID_C, HID_K, HID_M, INV, LAG, LIMIT, LOAD, MASS, MID_V,
+    ACC, BACKLASH, CHANGE, COGGING, CONTACT_K, COULOMB, COUPLING, CUBIC, DAHL, DAMPING, DEAD, DELAY,
+    DRAG, DRIVE_C, FIX, FORCE, GAIN, HID_C, HID_K, HID_M, INV, LAG, LIMIT, LOAD, MASS, MID_V,
     MID_X, MOTOR, OFFSET, ROWS, STATIC, STIFF, STOP_K, V, X, Z, jit, pair, tie,
 )  # fmt: skip
 
@@ -59,7 +59,7 @@ def _assemble(cart, spring, drive, free, s, K, C, parent):
         tie(C, j, n, spring[j, COUPLING])
     N = n
     motor = -1
-    if drive[GAP] > 0.0 and free[0]:
+    if drive[BACKLASH] > 0.0 and free[0]:
         motor = N
         s[INV, N] = 1.0 / drive[MOTOR]
         s[INV, 0] = 1.0 / max(cart[0, MASS] - drive[MOTOR], 0.02 * cart[0, MASS])

@@ -13,8 +13,8 @@ from numba import njit
 MASS, DAMPING, COULOMB, STATIC, STRIBECK, DAHL, DISTANCE, LOAD = (int(i) for i in range(8))
 DRAG, OFFSET, STOP, STOP_K, STOP_D, GAIN, HID_M, HID_K, HID_C = (int(i) for i in range(8, 17))
 STIFF, CUBIC, CHANGE, STRETCH, COUPLING = (int(i) for i in range(5))
-DEAD, LIMIT, DELAY, LAG, DRIVE_C, GAP, MOTOR, CONTACT_K, CONTACT_D = (int(i) for i in range(9))
-COGGING, PITCH, PHASE = (int(i) for i in range(9, 12))
+DEAD, LIMIT, DELAY, LAG, DRIVE_C, BACKLASH = (int(i) for i in range(6))
+MOTOR, CONTACT_K, CONTACT_D, COGGING, PITCH, PHASE = (int(i) for i in range(6, 12))
 
 # Rows of the state table: position, velocity, presliding state, last acceleration, inverse mass,
 # state in the middle of the step, force, time derivatives 2 to 6 of the position, and the dry
