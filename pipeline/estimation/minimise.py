@@ -18,30 +18,37 @@ def minimise(
     residual: Callable[[T], Array],
     jacobian: Callable[[T], Array],
     max_evaluations: int,
-    method: Literal["trf", "lm"] = "trf",
     bounds: tuple[Any, Any] = (-np.inf, np.inf),
-    scale: Array | float | Literal["jac"] = 1.0,
+    scale: float | Literal["jac"] = 1.0,
     tolerance: float = 1e-8,
 ) -> OptimizeResult:
     """Minimise the sum of squares of residual(at(p)) from `start` (n_p,) on.
 
-    Scipy asks for the residual at p, and then often for its derivatives (n, n_p) there: `at` is
-    worked out once for both. `tolerance` is the relative change of the cost to stop at.
+    `tolerance` is the relative change of the cost to stop at.
     """
-    last: list[tuple[Array, T]] = []
-
-    def once(p: Array) -> T:
-        if not (last and np.array_equal(last[0][0], p)):
-            last[:] = [(p.copy(), at(p))]
-        return last[0][1]
-
+    once = evaluated_once(at)
     return least_squares(
         lambda p: residual(once(p)),
         start,
         jac=lambda p: jacobian(once(p)),  # pyright: ignore[reportArgumentType] - scipy's default is a string
-        method=method,
         bounds=bounds,
         x_scale=scale,
         ftol=tolerance,
         max_nfev=max_evaluations,
     )
+
+
+def evaluated_once(at: Callable[[Array], T]) -> Callable[[Array], T]:
+    """Return `at`, not worked out twice for the same p (n_p,) in a row.
+
+    Scipy asks for the residual at p, and then often for its derivatives there.
+    """
+    last: list[tuple[Array, T]] = []
+
+    def once(p: Array) -> T:
+        if not (last and np.array_equal(last[0][0], p)):
+            own = p.copy()  # MINPACK goes on in the array it hands over
+            last[:] = [(own, at(own))]
+        return last[0][1]
+
+    return once

@@ -24,7 +24,7 @@ sample_time; before the first tick e is zero, so a reference that stands at the 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -157,7 +157,7 @@ def simulate_loop(
 
     states, efforts = np.empty((ticks.size, x0.size)), np.empty(ticks.size)
     x, acting = x0, 0.0
-    for tick, set_point in enumerate(r[nearest]):
+    for tick, set_point in enumerate(r[nearest].tolist()):
         law.measure(encoder.read(x[0::2]))
         if delay:
             applied = acting
@@ -256,10 +256,16 @@ def loop_matrix(chain: Chain, controller: StateFeedback, *, sample_time: float) 
 class _Encoder:
     rest: Array  # (f,)
     step: Array  # (f,); 0 where none is seen
+    rounds: bool = field(init=False)  # told once, not at every tick
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "rounds", bool(self.step.any()))
 
     def read(self, x: Array) -> Array:
         """Return what the controller sees of the positions (f,)."""
         y = x + self.rest
+        if not self.rounds:
+            return y
         coarse = self.step > 0
         np.divide(y, self.step, out=y, where=coarse)
         np.rint(y, out=y, where=coarse)

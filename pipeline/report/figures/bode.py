@@ -42,6 +42,15 @@ def bode_figure(
 
     Zero magnitudes, which a logarithm cannot show, are left out.
     """
+    figure = bode_panels(response, chain=chain, position_unit=position_unit, input_unit=input_unit)
+    legend_above(figure.axes[0])
+    return figure
+
+
+def bode_panels(
+    response: FrequencyResponse, *, chain: Chain | None, position_unit: str, input_unit: str
+) -> Figure:
+    """Return the figure without its legend, for who draws more into it."""
     response = _positive(response)
     has_phase = response.phase is not None
     heights = [1.3, *([0.8] if has_phase else []), *([0.5] if chain else [])]
@@ -50,7 +59,6 @@ def bode_figure(
     plot_magnitude(
         axes[0], response, chain=chain, position_unit=position_unit, input_unit=input_unit
     )
-    legend_above(axes[0])
     if has_phase:
         plot_phase(axes[1], response, chain=chain)
     if chain:
@@ -163,11 +171,15 @@ def _positive(response: FrequencyResponse) -> FrequencyResponse:
 
 
 def _points(ax: Axes, x: Array, y: Array, error: Array | None, *, label: str = "") -> None:
-    drawn = ax.errorbar(
-        x, y, error, fmt="D", ms=3.2, mew=0.8, mfc="white", color=MEASURED, elinewidth=0.7,
-        label=label or None, zorder=3,
-    )  # fmt: skip
-    tell(drawn.lines[0], x, y, name="measured")
+    """Plot diamonds with error bars (n,) or, below and above, (2, n): all bars are one path."""
+    (drawn,) = ax.plot(
+        x, y, "D", ms=3.2, mew=0.8, mfc="white", color=MEASURED, label=label or None, zorder=3
+    )
+    tell(drawn, x, y, name="measured")
+    if error is not None:
+        below, above = np.broadcast_to(error, (2, x.size))
+        ends = np.column_stack([y - below, y + above, np.full(x.size, np.nan)])
+        ax.plot(x.repeat(3), ends.ravel(), color=MEASURED, lw=0.7, zorder=2.9)
 
 
 def _fitted(response: FrequencyResponse, chain: Chain) -> tuple[Array, Array]:

@@ -9,7 +9,7 @@ from matplotlib.ticker import MaxNLocator
 
 from pipeline.arrays import Array
 from pipeline.plant.linear.chain import Chain
-from pipeline.report.figures.bode import bode_figure
+from pipeline.report.figures.bode import bode_panels
 from pipeline.report.figures.style import (
     LIFT,
     MEASURED,
@@ -91,17 +91,16 @@ def reported_bode_figure(
     reported : what reported parameters stand for, see `transfer_functions`; None draws no curve.
     units : of position and input.
     """
-    figure = bode_figure(response, chain=chain, position_unit=units[0], input_unit=units[1])
-    if reported is None:
-        return figure
+    figure = bode_panels(response, chain=chain, position_unit=units[0], input_unit=units[1])
     ax = figure.axes[0]
-    low, high = ax.get_ylim()
-    omega = np.geomspace(*ax.get_xlim(), _LINE_POINTS)
-    decibel = reported_magnitude(omega, cart=response.cart, reported=reported)
-    seen = np.abs(decibel - (low + high) / 2) < (high - low) / 2 + _WIDEST
-    if seen.any():
-        ax.plot(omega[seen], decibel[seen], color=SECOND, ls="--", label="your numbers")
-        ax.set_ylim(min(low, decibel[seen].min()), max(high, decibel[seen].max()))
+    if reported is not None:
+        low, high = ax.get_ylim()
+        omega = np.geomspace(*ax.get_xlim(), _LINE_POINTS)
+        decibel = reported_magnitude(omega, cart=response.cart, reported=reported)
+        seen = np.abs(decibel - (low + high) / 2) < (high - low) / 2 + _WIDEST
+        if seen.any():
+            ax.plot(omega[seen], decibel[seen], color=SECOND, ls="--", label="your numbers")
+            ax.set_ylim(min(low, decibel[seen].min()), max(high, decibel[seen].max()))
     legend_above(ax)
     return figure
 

@@ -1,0 +1,50 @@
+"""A model is worked out once for its residual and its derivatives, at a point of its own."""
+
+import numpy as np
+
+from pipeline.estimation.decay.separable import fit_separable
+from pipeline.estimation.minimise import evaluated_once
+
+
+class _Decay:
+    """exp(-p t), which keeps the rate p it was made for."""
+
+    def __init__(self, t, p):
+        self.t, self.p = t, p
+
+    @property
+    def columns(self):
+        return np.exp(-self.p[0] * self.t)[:, None]
+
+    def derivatives(self, linear):
+        return -self.t[:, None] * self.columns * linear
+
+
+def test_what_was_worked_out_keeps_its_point_when_the_caller_goes_on_in_its_array():
+    once = evaluated_once(lambda p: p)
+    p = np.array([1.0, 2.0])
+    first = once(p)
+    p[0] = 5.0
+    assert first[0] == 1.0
+    assert once(p)[0] == 5.0
+
+
+def test_the_same_point_is_worked_out_once():
+    seen = []
+    once = evaluated_once(lambda p: seen.append(p) or len(seen))
+    assert [once(np.ones(2)), once(np.ones(2)), once(np.zeros(2))] == [1, 1, 2]
+
+
+def test_a_separable_fit_finds_a_rate_and_an_amplitude_to_rounding():
+    t = np.linspace(0.0, 2.0, 200)
+    fit = fit_separable(
+        3.0 * np.exp(-1.7 * t),
+        lambda p: _Decay(t, p),
+        start=np.array([0.2]),
+        max_evaluations=50,
+    )
+    assert fit.converged
+    np.testing.assert_allclose([fit.p[0], fit.linear[0]], [1.7, 3.0], rtol=1e-9)
+    assert not fit_separable(
+        3.0 * np.exp(-1.7 * t), lambda p: _Decay(t, p), start=np.array([0.2]), max_evaluations=2
+    ).converged
