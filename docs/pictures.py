@@ -75,13 +75,19 @@ def gallery(made: Path) -> None:
 
 
 def desk(team: Path, grades: Path) -> None:
-    """Photograph three rooms: a team's files, a team of a class, an exercise being made."""
+    """Photograph a team's files and next experiment, a team of a class, an exercise being made."""
     with DeskServer(folder=team) as server, sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"))
         page = browser.new_page(viewport=WINDOW)
         page.goto(server.url)
         page.locator(".kicker").evaluate("it => { it.textContent = 'lab/bench-4' }")  # not of here
         page.screenshot(path=IMAGES / "desk.png")
+        own = "kind=sine&amplitude=0.01&frequency=3&seconds=20&goal=zeta_2"
+        page.goto(f"{server.url.rsplit('/', 2)[0]}/bench/0/weigh?{own}")
+        page.get_by_text("What would the program have chosen?").click()
+        page.locator("#brings").scroll_into_view_if_needed()
+        page.screenshot(path=IMAGES / "desk-lesson.png")
+        page.goto(f"{server.url.rsplit('/', 2)[0]}/")
         page.get_by_role("link", name="Desk", exact=True).click()
         page.get_by_label("Folder on this computer").fill(str(grades))
         page.get_by_role("button", name="Open").click()

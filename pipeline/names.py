@@ -60,6 +60,17 @@ class Name:
         """The cart (or spring) it belongs to, from 1."""
         return int(self.suffix) if self.suffix.isdigit() else None
 
+    @property
+    def words(self) -> str:
+        """What it is, as one says it: "damping ratio ζ of cart 1"."""
+        symbols = {"K": "static gain K", "omega": "frequency ω", "zeta": "damping ratio ζ"}
+        place = ""
+        if self.cart is not None:
+            place = f" of cart {self.suffix}"
+        elif self.is_by_eye and self.suffix != "n":
+            place = f" of {'null' if self.is_null else 'resonance'} {self.suffix}"
+        return symbols.get(self.symbol, self.symbol) + place
+
     def unit(self, *, position: str, input: str) -> str:
         """Return its unit; "" for a damping ratio."""
         units = {

@@ -18,7 +18,7 @@
   };
   const short = (value) => (value === undefined ? '–' : value.toPrecision(3).replace('-', '−'));
 
-  let state = { phase: 'waiting', waits: 'Waiting for the bench to answer.', turn: 0, offered: [], plan: [], remarks: [], units: {}, carts: 0, seconds: 0, seconds_left: 0 };
+  let state = { phase: 'waiting', waits: 'Waiting for the bench to answer.', turn: 0, offered: [], plan: [], remarks: [], units: {}, thought: { number: 0, text: '' }, carts: 0, seconds: 0, seconds_left: 0 };
   let since = performance.now(); // when the phase began
   let run = 0;
   let points = []; // [t, input, target, x1, …] of this run
@@ -39,6 +39,7 @@
     document.title = `${state.now ?? 'At the bench'} – cartlab`;
     $('title').textContent = state.title || 'cartlab';
     tell(state.waits);
+    showThought();
     for (const [id, unit] of [['positions', state.units.position], ['inputs', state.units.input]])
       $(id).closest('figure').querySelector('.unit').textContent = unit ? `in ${unit}` : '';
     // Asked whether to record again, the answer is one of the buttons that are offered.
@@ -57,6 +58,21 @@
     if (rekeyed) listKeys();
     $('told').hidden = state.remarks.length === 0;
     $('remarks').replaceChildren(...state.remarks.map((text) => make('li', text)));
+  };
+  // Of an exploration: why it records what it records, and its diary, which the desk shows below.
+  let thoughts = 0;
+  const showThought = () => {
+    const { number, text } = state.thought;
+    if (number === thoughts) return;
+    thoughts = number;
+    $('thought').hidden = false;
+    $('thought').textContent = `${text[0].toUpperCase()}${text.slice(1)}.`;
+    $('skip').textContent = 'Veto';
+    $('skip').title = 'Not this one: have another chosen';
+    const diary = $('diary');
+    if (!diary) return;
+    diary.closest('section').hidden = false;
+    diary.src = `${diary.dataset.page}?${number}#errors`;
   };
   const listPlan = () => {
     $('plan').replaceChildren(...state.plan.map((entry) => {

@@ -21,7 +21,7 @@ _LUMP = 65_536  # bytes
 
 @dataclass(kw_only=True, eq=False)
 class Session:
-    """One acquisition.
+    """One acquisition, or one exploration.
 
     Attributes
     ----------
@@ -31,6 +31,7 @@ class Session:
 
     port: str
     process: LineProcess
+    explores: bool = False
     url: str = ""
     said: str = ""
     ended: threading.Event = field(default_factory=threading.Event)
@@ -96,15 +97,28 @@ class Sessions:
         """Return the last one in a folder."""
         return self._sessions.get(folder)
 
-    def start(self, folder: Path, *, port: str, only: Sequence[str]) -> Session:
-        """Begin one; where one is under way, that is what is returned."""
+    def start(
+        self,
+        folder: Path,
+        *,
+        port: str,
+        only: Sequence[str] = (),
+        explore: tuple[str, str] = ("", ""),
+    ) -> Session:
+        """Begin one; where one is under way, that is what is returned.
+
+        Parameters
+        ----------
+        only : ids to acquire; () for the whole plan.
+        explore : until when to explore, and for how long, as `cartlab explore` takes them.
+        """
         with self._lock:
             before = self._sessions.get(folder)
             if before and not before.ended.is_set():
                 return before
-            session = Session(port=port, process=LineProcess(_PROCESS))
+            session = Session(port=port, process=LineProcess(_PROCESS), explores=any(explore))
             self._sessions[folder] = session
-        given = {"folder": str(folder), "port": port, "only": list(only)}
+        given = {"folder": str(folder), "port": port, "only": list(only), "explore": explore}
         with suppress(OSError):
             session.process.send(json.dumps(given).encode() + b"\n")
         threading.Thread(target=session.listen, daemon=True).start()

@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -112,6 +113,29 @@ def plan(folder: str, stock: bool, *, progress: Progress) -> list[str]:
     return [made.said, made.trouble]
 
 
+def weigh(
+    folder: str, recording: dict[str, Any], goal: str, *, progress: Progress
+) -> dict[str, Any]:
+    """Return what a recording would bring, beside the one that would be chosen."""
+    from pipeline.bench.design.next_plan import known_commands
+    from pipeline.bench.design.weigh import weigh as weighed
+    from pipeline.bench.planning.plan import Recording
+    from pipeline.bench.planning.plan_words import what_words
+    from pipeline.bench.planning.propose import current_plan
+    from pipeline.workflow import analyse
+
+    submission = load_submission(Path(folder))
+    found = weighed(
+        analyse(submission, progress=progress),
+        Recording.model_validate_json(json.dumps(recording)),
+        current_plan(submission),
+        goal=goal,
+        commands=known_commands(submission.folder),
+    )
+    chosen = what_words(found.chosen, submission)
+    return {**asdict(found), "chosen": chosen}
+
+
 TASKS: Mapping[str, Callable[..., Any]] = {
     "look": look,
     "files": files,
@@ -120,6 +144,7 @@ TASKS: Mapping[str, Callable[..., Any]] = {
     "gap": gap,
     "unpack": unpack,
     "plan": plan,
+    "weigh": weigh,
     "exercise": exercise,
     "effect_svg": effect_svg,
     "simulate": simulate,

@@ -1,5 +1,6 @@
 """What people type into a form, as what it says: a place on this computer, a whole number."""
 
+import math
 from pathlib import Path
 
 from pipeline.errors import ConfigError
@@ -45,6 +46,22 @@ def whole_number(typed: str, *, name: str, least: int, most: int) -> int:
         return int(number)
     found = _clipped(typed, most=20)
     raise ConfigError(f"{name}: expected a whole number from {least} to {most}, found {found!r}")
+
+
+def number(typed: str, *, name: str) -> float:
+    """Return a number that was typed, with a point or a comma; 0 where nothing was.
+
+    Raises
+    ------
+    ConfigError : it is none.
+    """
+    try:
+        value = float(typed.replace(",", ".") or 0)
+    except ValueError:
+        value = math.nan
+    if math.isfinite(value):
+        return value
+    raise ConfigError(f"{name}: expected a number, found {_clipped(typed, most=20)!r}")
 
 
 def _clipped(typed: str, *, most: int) -> str:

@@ -16,7 +16,8 @@ from pipeline.bench.design.multisine import (
     optimal_tones,
     schroeder_phases,
 )
-from pipeline.bench.design.next_plan import STATISTICAL, choose_next
+from pipeline.bench.design.next_plan import STATISTICAL, choose_next, tells_nothing
+from pipeline.bench.design.weigh import weigh
 from pipeline.bench.emulator.core import ReferenceCore
 from pipeline.bench.planning.plan import Limits, Plan, Recording
 from pipeline.bench.planning.plan_file import load_plan
@@ -217,6 +218,38 @@ def test_no_choice_passes_a_limit(analysis):
             assert np.abs(x).max() <= 0.8 * LIMITS.travel
             assert abs(recording.amplitude) <= LIMITS.input
         assert list(found.errors) == sorted(found.errors, reverse=True)
+
+
+def test_what_somebody_proposes_is_weighed_beside_what_is_chosen(analysis, known):
+    """Theirs alone, its own alone; the one is what `choose_next` promises of an open recording."""
+    mine = Recording(id="mine", kind="sweep", carts=(1, 2), wave="square", amplitude=0.02,
+                     frequency=0.4, cycles=8)  # fmt: skip
+    plan = Plan(limits=LIMITS)
+    found = weigh(analysis, mine, plan, goal="zeta_2", commands=COMMANDS)
+    alone = choose_next(analysis, plan, n=1, goal="zeta_2", commands=COMMANDS)
+    assert (found.now, found.best) == (alone.now, alone.errors[-1])
+    assert found.chosen == alone.recordings[0]
+    assert found.now > found.proposed > found.best
+    error = find_goal("zeta_2", known, feedback=None).of
+    assert found.proposed == pytest.approx(error(known.told + known.of_recording(mine)))
+    assert not found.why
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"kind": "decay", "wave": "delta", "amplitude": 0.0, "release": 1}, "this is a decay"),
+        ({"kind": "sine", "wave": "sine"}, "from steps and sweeps here, and this is a dwell"),
+        ({"carts": (1,)}, "all of them free"),
+        ({"amplitude": 0.5}, "stopped at the travel limit: an amplitude up to"),
+    ],
+)
+def test_a_proposal_that_brings_nothing_is_told_why(known, change, words):
+    """It is of another kind than the fit takes, holds a cart, or goes too far."""
+    mine = Recording(id="mine", kind="sweep", carts=(1, 2), wave="square", amplitude=0.02,
+                     frequency=0.4, cycles=8)  # fmt: skip
+    assert tells_nothing(mine, known, limits=LIMITS) == ""
+    assert words in tells_nothing(mine.model_copy(update=change), known, limits=LIMITS)
 
 
 def test_where_dwells_identify_dwells_are_chosen():

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from urllib.parse import urlencode
 
 import pytest
 
@@ -15,18 +16,17 @@ from pipeline.bench.planning.plan_file import load_plan
 from pipeline.desk.app import DeskServer
 from pipeline.submission import load_submission
 from tests.helpers.acquisitions import sine, write_work
-from tests.helpers.desks import Visitor
+from tests.helpers.desks import Visitor, a_recorded_cart
 from tests.helpers.waiting import PATIENCE, kill, until
 
+SWEEP = sine("sweep", seconds=300).model_copy(update={"kind": "sweep", "wave": "square"})
 
-def begun(visitor: Visitor, work: Path, port: str, *only: str) -> None:
+
+def begun(visitor: Visitor, work: Path, name: str, room: str = "acquire", **fields: str) -> None:
     """Have a session begin, and wait until it has written a second of a run."""
-    body = "&".join([f"port={port}", *(f"only={name}" for name in only)])
-    answer = visitor.send(
-        "/bench/0/acquire", body.encode(), kind="application/x-www-form-urlencoded"
-    )
+    answer = visitor.post(f"/bench/0/{room}", **fields)
     assert answer.status == 303, answer.text
-    raw = work / "raw" / f"{only[0]}-1.raw"
+    raw = work / "raw" / f"{name}-1.raw"
     until(lambda: raw.exists() and raw.stat().st_size > 20_000, "a run")
 
 
@@ -37,7 +37,7 @@ def test_a_plan_is_proposed_and_a_session_recorded_and_stopped(tmp_path, real):
         visitor = Visitor.of(server.url)
         page = visitor.get("/bench/0/")
         assert 'value="long" aria-label="long"' in page.text
-        begun(visitor, work, real.address, "long")
+        begun(visitor, work, "long", port=real.address, only="long")
         watched = visitor.get("/bench/0/")
         assert 'id="positions"' in watched.text
         heard: list[bytes] = []
@@ -65,27 +65,34 @@ def test_a_plan_is_proposed_and_a_session_recorded_and_stopped(tmp_path, real):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows ends no program so")
-def test_the_bench_is_stopped_when_the_desk_is_gone(tmp_path, real):
+@pytest.mark.parametrize(
+    ("name", "room", "fields"),
+    [
+        ("long", "acquire", {"only": "long"}),
+        ("sweep", "explore", {"what": "all", "error": "1", "minutes": "20"}),
+    ],
+)
+def test_the_bench_is_stopped_when_the_desk_is_gone(tmp_path, real, name, room, fields):
     """Kill -9 of the desk in mid-run: its acquisition tells the bench to stop and saves."""
-    work = write_work(tmp_path / "team", [sine("long", seconds=300)])
+    work = write_work(tmp_path / "team", [sine("long", seconds=300), SWEEP])
     command = [sys.executable, "-m", "pipeline", "desk", str(work), "--no-browser"]
     desk = subprocess.Popen(command, stderr=subprocess.PIPE, encoding="utf-8")
     try:
         assert desk.stderr is not None
         url = re.search(r"http://\S+", desk.stderr.readline())
         assert url is not None
-        begun(Visitor.of(url[0]), work, real.address, "long")
+        begun(Visitor.of(url[0]), work, name, room, port=real.address, **fields)
         desk.send_signal(signal.SIGKILL)
         desk.wait(PATIENCE)
         while (ended := real.event("run"))["ended"] == "complete":
             pass
         assert ended["ended"] == "stopped"
-        until((work / "data" / "long.partial.txt").exists)
+        until((work / "data" / f"{name}.partial.txt").exists)
     finally:
         kill(desk)
         assert desk.stderr is not None
         desk.stderr.close()
-    assert len(read_raw(work / "raw" / "long-1.raw").content) > 10_000  # half of what was there
+    assert len(read_raw(work / "raw" / f"{name}-1.raw").content) > 10_000  # half of what was there
 
 
 def test_a_plan_is_made_and_what_is_wrong_is_said(tmp_path):
@@ -102,3 +109,34 @@ def test_a_plan_is_made_and_what_is_wrong_is_said(tmp_path):
         visitor.post("/bench/0/acquire", port="socket://127.0.0.1:1")
         until(lambda: "nobody listens there" in visitor.get("/bench/0/").text)
     assert load_plan(load_submission(work)).recordings
+
+
+def test_an_experiment_is_proposed_weighed_and_added(tmp_path):
+    """± now, ± after yours, then what the program would have chosen; what is none is said."""
+    work = a_recorded_cart(tmp_path / "team")
+    mine = {"kind": "sweep", "amplitude": "0,01", "frequency": "0.5", "frequency_end": "5",
+            "seconds": "20", "goal": "zeta"}  # fmt: skip
+    with DeskServer(folder=work) as server:
+        visitor = Visitor.of(server.url)
+        answer = visitor.get(f"/bench/0/weigh?{urlencode(mine)}")
+        assert answer.status == 200, answer.text
+        shares = [float(share) for share in re.findall(r"<td>± ([\d.e-]+) %</td>", answer.text)]
+        now, after, best = shares
+        assert now > after > best
+        said = f"The damping ratio ζ: ± {now:.2g} % now, ± {after:.2g} % after yours"
+        assert said in answer.text
+        assert answer.text.index(said) < answer.text.index("What would the program have chosen?")
+        assert 'value="0,01"' in answer.text  # as it was typed
+        decay = visitor.get("/bench/0/weigh?kind=decay&seconds=20&cart=1")
+        assert "and this is a decay" in decay.text
+        for name, typed in (("amplitude", "20"), ("amplitude", "nan"), ("kind", "closed_loop"),
+                            ("cart", "9"), ("seconds", "1e999"), ("goal", "zeta_9")):  # fmt: skip
+            wrong = {**mine, name: typed}
+            assert visitor.get(f"/bench/0/weigh?{urlencode(wrong)}").status == 422
+        assert not (work / "plan.toml").exists()
+        assert visitor.post("/bench/0/add", **{**mine, "amplitude": "20"}).status == 422
+        assert visitor.post("/bench/0/add", **mine).status == 303
+        assert "sweep-1 is in the plan" in visitor.get("/bench/0/").text
+        assert visitor.post("/bench/0/explore", port="x", what="all", minutes="1").status == 422
+    (added,) = [one for one in load_plan(load_submission(work)).recordings if one.id == "sweep-1"]
+    assert (added.amplitude, added.frequency_end) == (0.01, 5.0)

@@ -10,6 +10,7 @@ from pathlib import Path
 from urllib.parse import urlencode, urlsplit
 
 from pipeline.resources import EXAMPLES
+from pipeline.submission.load import NAME
 from tests.helpers.waiting import PATIENCE
 
 BOUNDARY = "----cartlab"
@@ -131,4 +132,14 @@ def some_files(folder: str = "one-cart", *, most: int = 99) -> list[tuple[str, b
 def a_submission(folder: Path, example: str = "one-cart") -> Path:
     """Return a copy of a worked example."""
     shutil.copytree(EXAMPLES / example, folder, ignore=shutil.ignore_patterns("report"))
+    return folder
+
+
+def a_recorded_cart(folder: Path) -> Path:
+    """Return a submission of one cart with its steps and its sweep."""
+    shutil.copytree(EXAMPLES / "one-cart", folder)
+    head, *tables = (folder / NAME).read_text(encoding="utf-8").split("[[experiments]]\n")
+    kept = [one for one in tables if 'kind = "step"' in one or 'kind = "sweep"' in one]
+    text = "[[experiments]]\n".join([head, *kept]).partition("[reported")[0]
+    (folder / NAME).write_text(text, encoding="utf-8")
     return folder

@@ -8,6 +8,8 @@ from pipeline.desk.app import DeskServer
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.submission import load_submission
 from tests.helpers.acquisitions import sine, write_work
+from tests.helpers.benches import emulator
+from tests.helpers.desks import a_recorded_cart
 from tests.helpers.waiting import until
 from tests.system import test_desk
 from tests.system.test_report_pages import PHONE, WIDE
@@ -55,6 +57,45 @@ def test_a_session_is_begun_watched_and_decided_on(show, tmp_path, real):
         window.get_by_role("link", name="The plan as it is now").click()
         expect(window.get_by_text("Stopped. Begin again")).to_be_visible()
     assert [e.id for e in load_submission(work).experiments] == ["long", "next"]
+
+
+def test_an_exploration_is_watched_and_steered(show, tmp_path):
+    """Veto has another chosen, an experiment of one's own comes next, Esc ends; the diary tells."""
+    work = a_recorded_cart(tmp_path / "team")
+    with emulator("--speed", "8", preset="throne-1dof") as bench, DeskServer(folder=work) as server:
+        window = show(server.url, size=PHONE)
+        window.get_by_role("link", name="team: bench").click()
+        assert fits(window)
+        window.get_by_label("Port of the bench").fill(bench.address)
+        window.get_by_label("Until this is known").select_option(label="the damping ratio ζ")
+        window.get_by_label("to within ± %").fill("0.0001")
+        window.get_by_role("button", name="Explore").click()
+
+        thought = window.locator("#thought")
+        expect(thought).to_contain_text(re.compile(r"^Zeta is known .* therefore \S+:"))
+        chosen = re.search(r"therefore (\S+):", thought.inner_text())
+        assert chosen is not None
+        window.get_by_role("button", name="Veto").click()
+        window.get_by_text("Add an experiment of your own").click()
+        window.get_by_label("Amplitude").fill("20")
+        window.get_by_role("button", name="Add it to the plan").click()
+        expect(window.get_by_role("alert")).to_contain_text("amplitude: expected at most the limit")
+        window.get_by_label("Amplitude").fill("0.02")
+        window.get_by_label("How long").fill("200")
+        window.get_by_role("button", name="Add it to the plan").click()
+        expect(window.get_by_text("step-5 is in the plan")).to_be_visible()
+        expect(window.locator("#plan .now b")).to_have_text("step-5")
+        expect(thought).to_contain_text("step-5, which was added by hand")
+        diary = window.frame_locator("#diary")
+        expect(diary.locator("#turns")).to_contain_text(f"{chosen[1]} was vetoed")
+        expect(diary.locator("#errors svg")).to_be_visible()
+        assert fits(window)
+        window.keyboard.press("Escape")
+        expect(window.locator("#status")).to_have_text("The session is over.")
+        window.get_by_role("link", name="The plan as it is now").click()
+        window.get_by_role("link", name="The diary of the exploration").click()
+        expect(window.locator("#turns")).to_contain_text("step-5, which was added by hand")
+    assert chosen[1] not in {e.id for e in load_submission(work).experiments}
 
 
 def test_an_exercise_is_made_of_what_is_seen(show, tmp_path):

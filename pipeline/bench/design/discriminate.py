@@ -21,8 +21,8 @@ from pipeline.bench.design.information import sampled_input
 from pipeline.bench.planning.plan import Limits, Recording
 from pipeline.bench.planning.propose import (
     FURTHEST,
+    current_plan,
     let_go,
-    plan_limits,
     rounded,
     rounded_down,
 )
@@ -56,7 +56,7 @@ def propose_for(gap: Gap, submission: Submission, *, without: Sequence[Recording
     say, a note says why: the gap stays what it is.
     """
     try:
-        return with_proposal(gap, limits=plan_limits(submission), without=without)
+        return with_proposal(gap, limits=current_plan(submission).limits, without=without)
     except PipelineError as error:
         return replace(gap, notes=(*gap.notes, f"no recording is proposed: {error}"))
 

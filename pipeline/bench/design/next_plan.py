@@ -17,9 +17,9 @@ from pipeline.bench.design.information import Knowledge
 from pipeline.bench.host.raw import FOLDER as RAW
 from pipeline.bench.host.raw import read_raw
 from pipeline.bench.planning.plan import Limits, Plan, Recording
-from pipeline.bench.planning.plan_file import load_plan, plan_path, save_plan
+from pipeline.bench.planning.plan_file import save_plan
 from pipeline.bench.planning.plan_words import session_time, time_words
-from pipeline.bench.planning.propose import propose_plan, renamed
+from pipeline.bench.planning.propose import current_plan, renamed
 from pipeline.errors import ConfigError, DataError
 from pipeline.ingest.read import read_data
 from pipeline.report.limits import CALIBRATION
@@ -101,7 +101,7 @@ def plan_next(
     DataError : the data recorded do not identify the carts, so nothing can be weighed.
     ConfigError : there is no such goal; gap.json is broken, or of other data or limits.
     """
-    old = load_plan(submission) if plan_path(submission).exists() else propose_plan(submission)
+    old = current_plan(submission)
     taken = [entry.id for entry in (*old.recordings, *submission.experiments)]
     if goal == GAP:
         if n != 1:
@@ -164,15 +164,10 @@ def choose_next(
         raise DataError("everything that would tell more was refused before")
     told = np.array([known.of_recording(candidate) for candidate in candidates])
     done = {record.id for record in analysis.records}
-    kinds = ("sine",) if known.dwells else ("step", "sweep")
     still = {
         one.id: known.of_recording(one)
         for one in plan.recordings
-        if one.id not in done
-        and one.kind in kinds
-        and len(one.carts) == analysis.carts
-        # One that passes the travel limit will be stopped.
-        and abs(one.amplitude) <= known.at_its_limits(one, limits=plan.limits, share=1.0)
+        if one.id not in done and not tells_nothing(one, known, limits=plan.limits)
     }
     start = known.told + sum(still.values())
     chosen = choose(told, start, n=n, goal=wanted)
@@ -200,6 +195,21 @@ def choose_next(
         errors=tuple(errors.tolist()),
         planned={name: float(wanted.of(known.told + one)) for name, one in still.items()},
     )
+
+
+def tells_nothing(recording: Recording, known: Knowledge, *, limits: Limits) -> str:
+    """Return why a recording would not make the carts known better; "": it would."""
+    kinds = ("sine",) if known.dwells else ("step", "sweep")
+    if recording.kind not in kinds:
+        used = "dwells" if known.dwells else "steps and sweeps"
+        what = "dwell" if recording.kind == "sine" else recording.kind.replace("_", " ")
+        return f"the carts are identified from {used} here, and this is a {what}"
+    if len(recording.carts) < known.chain.n:
+        return "the carts are identified from records with all of them free"
+    most = known.at_its_limits(recording, limits=limits, share=1.0)
+    if abs(recording.amplitude) > most:
+        return f"it would be stopped at the travel limit: an amplitude up to {most:.2g} would not"
+    return ""
 
 
 def _decisive(submission: Submission, limits: Limits) -> tuple[Recording, float]:

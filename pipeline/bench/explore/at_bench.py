@@ -5,13 +5,14 @@ from pathlib import Path
 
 from pipeline.bench.explore.explore import Recorded, explore
 from pipeline.bench.explore.wish import Wish
-from pipeline.bench.host.acquire import acquire
+from pipeline.bench.host.acquire import acquire, ensure_plan
 from pipeline.bench.host.session import BY_HAND
 from pipeline.bench.host.signals import Stopped
 from pipeline.bench.live.observer import Buttons, Observer, Observers
 from pipeline.bench.planning.plan import Recording
 from pipeline.bench.planning.plan_words import session_time
 from pipeline.report.exploration.turn import Turn
+from pipeline.submission.load import NAME
 
 
 def explore_bench(
@@ -42,17 +43,17 @@ def explore_bench(
     def record(ids: Sequence[str]) -> Recorded:
         outcomes = acquire(folder, port=port, observers=observers, only=ids, buttons=buttons)
         made = tuple(o.recording.id for o in outcomes if not o.partial)
-        skipped = {o.recording.id for o in outcomes if o.partial == BY_HAND["skip"]}
         tried = [o.recording for o in outcomes if o.lines]
-        return Recorded(
-            ids=made, seconds=session_time(tried), vetoed=bool(skipped.difference(made))
-        )
+        skipped = any(o.partial.endswith(BY_HAND["skip"]) for o in outcomes)
+        return Recorded(ids=made, seconds=session_time(tried), vetoed=skipped and not made)
 
     def think(stage: str) -> None:
         if buttons.pressed == "stop":
             raise Stopped("by hand")
         everyone.thinking(stage)
 
+    if (folder / NAME).exists():
+        ensure_plan(folder, port=port)
     return explore(
         folder,
         record=record,

@@ -10,6 +10,7 @@ import numpy as np
 from pipeline.bench.design.discriminate import propose_for
 from pipeline.bench.design.next_plan import choose_next, known_commands
 from pipeline.bench.explore.wish import Wish
+from pipeline.bench.planning.by_hand import add_recording
 from pipeline.bench.planning.plan import Plan, Recording
 from pipeline.bench.planning.plan_file import load_plan, plan_path, save_plan
 from pipeline.bench.planning.plan_words import session_time, time_words
@@ -18,22 +19,19 @@ from pipeline.bench.planning.propose import (
     identified_chain,
     large_steps,
     propose_plan,
-    renamed,
 )
 from pipeline.errors import ConfigError, DataError
 from pipeline.estimation.chain.parametrisation import named_estimates
 from pipeline.gap.investigate import investigate
 from pipeline.gap.stored import gap_text
 from pipeline.gap.types import Gap
-from pipeline.lock import turn_in
-from pipeline.names import listed
+from pipeline.names import listed, parameter_names
 from pipeline.output import own_folder, write_file
-from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.effects.base import AugmentedChain
 from pipeline.report.exploration.page import write_diary
 from pipeline.report.exploration.turn import Explanation, Turn
 from pipeline.results import Analysis
-from pipeline.submission import Submission, load_submission
+from pipeline.submission import load_submission
 from pipeline.submission.load import NAME
 from pipeline.workflow import analyse
 
@@ -102,7 +100,8 @@ def explore(
     ours = {FIRST}  # in the plan; what else is there, and not recorded, somebody has added
     if (folder / NAME).exists():
         submission = load_submission(folder)
-        wish.missing(dict.fromkeys(parameter_names_of(submission)))
+        system = submission.system
+        wish.missing(dict.fromkeys(parameter_names(system.carts, rigid=not system.tied)))
         if plan_path(submission).exists():
             ours.update(one.id for one in load_plan(submission).recordings)
     made, spent = (), 0.0
@@ -131,6 +130,7 @@ def explore(
     refused: list[Recording] = []
     before, failures = "", 0
     while True:
+        progress("what to record next")
         plan = load_plan(load_submission(folder))
         turn, recording = _decide(
             analysis, gap, plan, folder, wish=wish, refused=refused, ours=ours
@@ -161,14 +161,6 @@ def explore(
         before = f"{recording.id} {'was vetoed' if came.vetoed else 'did not come off'}; "
         if gap is not None:  # which recording decides is open again
             gap = propose_for(gap, load_submission(folder), without=refused)
-
-
-def parameter_names_of(submission: Submission) -> list[str]:
-    """Return what the parameters of the submission's carts are called."""
-    n = submission.system.carts
-    wall = float(submission.system.tied or n > 1)
-    chain = Chain(m=np.ones(n), c=np.full(n, 0.1), k=np.array([wall, *np.ones(n - 1), 0.0]))
-    return list(chain.parameters())
 
 
 def _first_time(folder: Path) -> float:
@@ -316,16 +308,12 @@ def _added(folder: Path, ours: Collection[str]) -> Recording | None:
 
 def _planned(recording: Recording, folder: Path) -> Recording:
     """Return the recording as it stands in the plan: an open one that is the same, or a new one."""
-    with turn_in(folder):
-        submission = load_submission(folder)
-        plan = load_plan(submission)
-        done = {experiment.id for experiment in submission.experiments}
-        for one in plan.recordings:
-            if one.id not in done and one.aim == recording.aim and _shape(one) == _shape(recording):
-                return one
-        (new,) = renamed([recording], taken=[*done, *(r.id for r in plan.recordings)])
-        save_plan(plan.model_copy(update={"recordings": (*plan.recordings, new)}), submission)
-        return new
+    submission = load_submission(folder)
+    done = {experiment.id for experiment in submission.experiments}
+    for one in load_plan(submission).recordings:
+        if one.id not in done and one.aim == recording.aim and _shape(one) == _shape(recording):
+            return one
+    return add_recording(folder, recording)
 
 
 def _shape(recording: Recording) -> str:

@@ -73,6 +73,19 @@ def acquire(
         return tuple(work.outcomes())
 
 
+def ensure_plan(folder: Path, *, port: str) -> None:
+    """Write the plan of a submission that has none, within what the bench at the port gives.
+
+    Raises
+    ------
+    HardwareError : there is no bench.
+    """
+    submission = load_submission(folder)
+    if not plan_path(submission).exists():
+        with alone_in(folder), open_line(port, baud=_USUAL_BAUD) as line:
+            save_plan(propose_plan(submission, bench=line.bench), submission)
+
+
 class _Acquisition:
     def __init__(
         self,

@@ -144,7 +144,8 @@ class LiveState:
     def remark(self, sentence: str) -> None:
         """Tell what concerns no single run."""
         with self._lock:
-            self._remarks.append(sentence)
+            if sentence not in self._remarks:  # an exploration opens the line once a turn
+                self._remarks.append(sentence)
             self._version += 1
 
     def thinking(self, stage: str) -> None:

@@ -156,13 +156,14 @@ def _problems(plan: Plan, system: System) -> Iterator[tuple[Location, str]]:
         if name in first:
             yield ("recordings", i, "id"), f"used before, by recordings[{first[name] + 1}]"
         first.setdefault(name, i)
-        for key, what in _recording_problems(recording, plan.limits, system):
+        for key, what in recording_problems(recording, plan.limits, system):
             yield ("recordings", i, *key.split(".")), what
 
 
-def _recording_problems(
+def recording_problems(
     recording: Recording, limits: Limits, system: System
 ) -> Iterator[tuple[str, str]]:
+    """Yield (key, what is wrong) for what no single value of a recording shows."""
     n, carts, wave = system.carts, recording.carts, recording.wave
     if not _ID.fullmatch(recording.id):
         wanted = "letters, digits, dots, dashes; its data files are named after it"

@@ -76,10 +76,10 @@ class MadePlan:
     trouble: str
 
 
-def plan_limits(submission: Submission) -> Limits:
-    """Return the limits of the submission's plan, or those that one would propose."""
+def current_plan(submission: Submission, *, bench: Description | None = None) -> Plan:
+    """Return the plan of a submission, or the one that is proposed where it has none."""
     there = plan_path(submission).exists()
-    return (load_plan(submission) if there else propose_plan(submission)).limits
+    return load_plan(submission) if there else propose_plan(submission, bench=bench)
 
 
 def make_plan(
@@ -93,8 +93,7 @@ def make_plan(
     """
     carts = submission.system.carts
     bench = Description(name="stock", encoders=2, carts=carts) if stock else None
-    there = plan_path(submission).exists()
-    old = load_plan(submission) if there else propose_plan(submission, bench=bench)
+    there, old = plan_path(submission).exists(), current_plan(submission, bench=bench)
     progress("asking the data what else to record")
     try:
         new, trouble = extend_plan(old, submission, bench=bench), ""

@@ -1,8 +1,8 @@
 """The process in which the desk acquires: whatever the desk does, the bench is told to stop.
 
-A line of JSON on stdin says what to record; any other line, or the end of the lines because the
-desk is gone, is the Stop button. On stdout a line with the address of the live page, then one with
-how it ended.
+A line of JSON on stdin says what to record, or how far to explore; any other line, or the end of
+the lines because the desk is gone, is the Stop button. On stdout a line with the address of the
+live page, then one with how it ended.
 """
 
 import json
@@ -18,7 +18,7 @@ from pipeline.errors import PipelineError
 
 
 def main() -> None:
-    """Acquire, and tell."""
+    """Acquire or explore, and tell."""
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what a library prints is no answer
 
@@ -27,26 +27,48 @@ def main() -> None:
         answers.flush()
 
     given = json.loads(sys.stdin.buffer.readline())
+    folder = Path(given["folder"])
     try:
-        with LivePage(Path(given["folder"])) as page:
+        with LivePage(folder) as page:
             threading.Thread(target=_stop_on_word, args=(page,), daemon=True).start()
             say(url=page.url)
-            outcomes = acquire(
-                Path(given["folder"]),
-                port=given["port"],
-                observers=[page],
-                only=given["only"],
-                buttons=page.buttons,
-            )
+            work = _explore if any(given["explore"]) else _acquire
+            said = work(folder, given, page)
     except KeyboardInterrupt:
         say(over="Stopped. Begin again to go on where this ended.")
     except (PipelineError, OSError) as error:
         say(over=str(error))
     else:
-        whole = {outcome.recording.id for outcome in outcomes if not outcome.partial}
-        left = sorted({outcome.recording.id for outcome in outcomes} - whole)
-        told = [f"{len(whole)} recorded", *([f"not recorded: {', '.join(left)}"] if left else [])]
-        say(over="; ".join(told))
+        say(over=said)
+
+
+def _acquire(folder: Path, given: dict[str, Any], page: LivePage) -> str:
+    """Return what was recorded."""
+    outcomes = acquire(
+        folder, port=given["port"], observers=[page], only=given["only"], buttons=page.buttons
+    )
+    whole = {outcome.recording.id for outcome in outcomes if not outcome.partial}
+    left = sorted({outcome.recording.id for outcome in outcomes} - whole)
+    told = [f"{len(whole)} recorded", *([f"not recorded: {', '.join(left)}"] if left else [])]
+    return "; ".join(told)
+
+
+def _explore(folder: Path, given: dict[str, Any], page: LivePage) -> str:
+    """Return what is known at the end."""
+    from pipeline.bench.explore.at_bench import explore_bench
+    from pipeline.bench.explore.wish import read_time, read_wish
+
+    until, limit = given["explore"]
+    turns = explore_bench(
+        folder,
+        port=given["port"],
+        observers=[page],
+        buttons=page.buttons,
+        wish=read_wish(until),
+        seconds=read_time(limit),
+    )
+    reached = "What you wanted is known" if turns[-1].reached else "Not all you wanted is known"
+    return f"{reached}: {turns[-1].said}."
 
 
 def _stop_on_word(page: LivePage) -> None:

@@ -1,0 +1,94 @@
+"""A recording that a person wants, from the few numbers in which one says it."""
+
+from math import ceil
+from pathlib import Path
+from typing import Literal, get_args
+
+from pipeline.bench.planning.plan import Plan, Recording
+from pipeline.bench.planning.plan_file import LONGEST_RUN, recording_problems, save_plan
+from pipeline.bench.planning.propose import current_plan, let_go, renamed
+from pipeline.bench.protocol.messages import FREQUENCIES
+from pipeline.errors import ConfigError
+from pipeline.lock import turn_in
+from pipeline.submission import Submission, load_submission
+
+Kind = Literal["step", "sweep", "sine", "decay"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+
+_WAVES: dict[Kind, Literal["square", "chirp", "sine"]] = {
+    "step": "square",
+    "sweep": "chirp",
+    "sine": "sine",
+}
+_SHORTEST = 1.0  # s
+_EDGES = 4  # half periods of a step: off, on, off, on
+_SETTLE = 5.0  # s of rest beforehand, where the plan has no run of the motor to go by
+
+
+def recording_by_hand(
+    kind: Kind,
+    *,
+    plan: Plan,
+    submission: Submission,
+    seconds: float,
+    amplitude: float = 0.0,
+    frequency: float = 0.0,
+    frequency_end: float | None = None,
+    cart: int = 1,
+) -> Recording:
+    """Return the recording, all carts free unless one is let go; it rests as the plan's others do.
+
+    Parameters
+    ----------
+    seconds : that it lasts; made whole periods of a dwell or sweep.
+    amplitude : input units.
+    frequency, frequency_end : Hz, of a dwell, or from where to where a sweep goes.
+    cart : that is let go, of a decay.
+
+    Raises
+    ------
+    ConfigError : it is no recording that the limits of the plan allow; says which number, and why.
+    """
+    everyone = tuple(range(1, submission.system.carts + 1))
+    low, high = FREQUENCIES
+    if not _SHORTEST <= seconds <= LONGEST_RUN:
+        raise ConfigError(f"how long: expected {_SHORTEST:g} to {LONGEST_RUN:g} s")
+    named = {"frequency": frequency, "to": frequency_end or 0.0}
+    for name in {"sine": ["frequency"], "sweep": ["frequency", "to"]}.get(kind, []):
+        if not low <= named[name] <= high:
+            raise ConfigError(f"{name}: expected {low:g} to {high:g} Hz, found {named[name]:g}")
+    if kind == "decay":
+        made = let_go(cart, name=f"decay-{cart}", seconds=seconds)
+    else:
+        driven = [one.settle for one in plan.recordings if one.amplitude]
+        cycles = ceil(seconds * frequency) if kind != "step" else _EDGES // 2
+        made = Recording(
+            id=f"{kind}-1",
+            kind=kind,
+            carts=everyone,
+            wave=_WAVES[kind],
+            amplitude=amplitude,
+            frequency=frequency if kind != "step" else cycles / seconds,
+            frequency_end=frequency_end if kind == "sweep" else None,
+            cycles=cycles,
+            settle=driven[-1] if driven else _SETTLE,
+        )
+    for key, what in recording_problems(made, plan.limits, submission.system):
+        raise ConfigError(f"{key.replace('_', ' ')}: {what}")
+    return made
+
+
+def add_recording(folder: Path, recording: Recording) -> Recording:
+    """Put a recording at the end of a submission's plan; return it with the id it has there.
+
+    Raises
+    ------
+    ConfigError : the plan is broken; nothing is written then.
+    """
+    with turn_in(folder):
+        submission = load_submission(folder)
+        plan = current_plan(submission)
+        taken = [one.id for one in (*submission.experiments, *plan.recordings)]
+        (new,) = renamed([recording], taken=taken)
+        save_plan(plan.model_copy(update={"recordings": (*plan.recordings, new)}), submission)
+        return new
