@@ -164,8 +164,8 @@ def test_a_file_is_read_in_one_sitting():
 
 
 def test_tests_stand_in_folders_named_as_what_they_test():
-    """Beside those of the whole system, of statistics, and what tests are made with."""
-    others = {"helpers", "truth", "system", "statistics"}
+    """Beside those of the whole, of statistics, of benchmarks, and what tests are made with."""
+    others = {"helpers", "truth", "system", "statistics", "benchmarks"}
     folders = {path.parent.relative_to(ROOT / "tests") for path in ROOT.glob("tests/**/test_*.py")}
     homeless = [str(f) for f in folders if f.parts and f.parts[0] not in others
                 and not (PIPELINE / f).is_dir()]  # fmt: skip
