@@ -5,12 +5,16 @@ Tables are written so that a spreadsheet runs nothing that a student wrote.
 
 import re
 import secrets
+import time
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from numbers import Real
 from pathlib import Path
 
 from pipeline.errors import ConfigError
 
+_PART = re.compile(r"\.[0-9a-f]{16}\.part")
+_LEFT_OVER = 3600.0  # s: no write takes so long, and no two clocks are so far apart
 LOCK, TURN = ".lock", ".turn"  # of `pipeline.lock`
 # What looks like the start of a formula and is none: a number, and the dash for nothing.
 _PLAIN = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?|-", re.ASCII)
@@ -57,8 +61,12 @@ def own_folder(parent: Path, name: str) -> Path:
 
 
 def write_file(path: Path, content: str | bytes) -> None:
-    """Write a file whole or not at all; a link in its place is replaced, not followed."""
+    """Write a file whole or not at all; a link in its place is replaced, not followed.
+
+    What a program that was killed while it wrote has left there goes.
+    """
     raw = content.encode() if isinstance(content, str) else content
+    _clear_left_over(path.parent)
     part = path.with_name(f".{secrets.token_hex(8)}.part")  # of this write alone
     try:
         with part.open("xb") as file:
@@ -67,6 +75,13 @@ def write_file(path: Path, content: str | bytes) -> None:
     except BaseException:
         part.unlink(missing_ok=True)
         raise
+
+
+def _clear_left_over(folder: Path) -> None:
+    for part in folder.glob(".*.part"):
+        with suppress(OSError):  # another has just removed it
+            if _PART.fullmatch(part.name) and part.stat().st_mtime < time.time() - _LEFT_OVER:
+                part.unlink()
 
 
 def clear_files(folder: Path, pattern: str) -> None:

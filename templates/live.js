@@ -66,7 +66,7 @@
     if (number === thoughts) return;
     thoughts = number;
     $('thought').hidden = false;
-    $('thought').textContent = `${text[0].toUpperCase()}${text.slice(1)}.`;
+    $('thought').textContent = `${text.replace(/^[a-z]/, (first) => first.toUpperCase())}.`;
     $('skip').textContent = 'Veto';
     $('skip').title = 'Not this one: have another chosen';
     const diary = $('diary');

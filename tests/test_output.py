@@ -2,6 +2,7 @@
 
 import csv
 import io
+import os
 import re
 import unicodedata
 from concurrent.futures import ThreadPoolExecutor
@@ -42,6 +43,17 @@ def test_a_file_that_many_write_at_once_is_one_of_theirs(tmp_path):
     with pytest.raises(OSError, match="folder"):
         write_file(tmp_path / "folder", "x")
     assert {p.name for p in tmp_path.iterdir()} == {"notes.md", "folder"}
+
+
+def test_what_a_killed_write_left_goes_with_the_next(tmp_path):
+    """Only what is old and ours: others may be writing, a student may call files so."""
+    names = [f".{16 * '0'}.part", f".{16 * '1'}.part", ".mine.part", "left.part"]
+    for name in names:
+        (tmp_path / name).write_text("half")
+    for name in (names[0], *names[2:]):
+        os.utime(tmp_path / name, (0, 0))
+    write_file(tmp_path / "notes.md", "whole")
+    assert {p.name for p in tmp_path.iterdir()} == {"notes.md", *names[1:]}
 
 
 def test_a_link_is_replaced_not_followed(tmp_path):

@@ -21,7 +21,7 @@ from pipeline.desk.jobs import Failed, Hand, Jobs
 from pipeline.desk.users import Place, User, place_name
 from pipeline.resources import TEMPLATES
 
-_MOST_SHOWN = 32  # texts that pages of one person were filled in from, of 1 MB at the most
+_MOST_SHOWN = 32_000_000  # characters of the texts that pages of one person were filled in from
 _MOST_LOOKS = 5_000  # files of which is kept what they are
 NOTHING_KNOWN: dict[str, Any] = {
     "kind": None, "format": "", "duration": None, "remarks": [], "unsure": [], "lines": [],
@@ -72,7 +72,7 @@ class Desk:
         texts = self._shown.setdefault(to, OrderedDict())
         texts[digest] = text
         texts.move_to_end(digest)
-        while len(texts) > _MOST_SHOWN:
+        while sum(map(len, texts.values())) > _MOST_SHOWN:
             texts.popitem(last=False)
 
     def shown(self, digest: str, *, to: str) -> str | None:

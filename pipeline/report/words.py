@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pipeline.names import read_name
 from pipeline.report.document import Block, Items, Paragraph, Span, Spans, plain
 from pipeline.report.math.tree import GREEK, symbol
-from pipeline.report.numbers import listing, typeset
+from pipeline.report.numbers import listing, subscript, typeset
 
 SOURCES = {
     "step": "step",
@@ -36,6 +36,17 @@ def name_span(name: str) -> Span:
     read = read_name(name)
     plain = GREEK.get(read.symbol, read.symbol) + (f"_{read.suffix}" if read.suffix else "")
     return Span(plain, math=symbol(name))
+
+
+def symbol_text(name: str) -> str:
+    """Return a parameter's symbol where only text can stand: "ζ₁"; few letters can stand low."""
+    read, text = read_name(name), name_span(name).text
+    return text if read.cart is None else text.removesuffix(f"_{read.cart}") + subscript(read.cart)
+
+
+def with_symbols(text: str) -> str:
+    """Return a sentence with its parameters' symbols, as plain text."""
+    return _NAME.sub(lambda match: symbol_text(match[0]), text)
 
 
 def names_spans(names: list[str]) -> Spans:

@@ -127,3 +127,11 @@ def test_what_is_wrong_is_said_at_its_field(path, value, wrong):
     shown, left = with_errors(tuple(fields(WHOLE).values()), now, error.value)
     assert {field.path: wrong in field.wrong for field in shown if field.wrong} == {path: True}
     assert left == []
+
+
+def test_numbers_are_asked_for_by_their_symbols():
+    """As in the tables of the lab, not as a program spells them."""
+    (claims,) = [g for g in groups({"system": {"carts": 2}}) if g.title == "Your numbers"]
+    labels = {field.path: field.label for field in claims.fields}
+    assert labels["reported.initial.zeta_1"] == "ζ₁ initial"
+    assert labels["reported.final.omega_b"] == "ω_b final"

@@ -18,6 +18,7 @@ import pytest
 
 from pipeline.desk.app import DeskServer
 from pipeline.desk.jobs import Failed, Hand
+from pipeline.desk.state import Desk
 from pipeline.desk.student import files as uploads
 from pipeline.desk.student.files import take_uploads
 from pipeline.errors import SubmissionError
@@ -273,11 +274,26 @@ def test_edits_from_outside_show_and_are_not_written_over(filled):
         assert "From outside" in page.text
         assert (folder / NAME).read_text(encoding="utf-8") == title
     assert "Mine" in visitor.post(HERE + "save", seen=seen, title="Mine").text
-    assert visitor.post(HERE + "save", title="Mine").status == 409  # seen nothing
+    assert "You typed" in visitor.post(HERE + "save", seen=seen, title="Mine").text
+    unknown = visitor.post(HERE + "save", title="Mine")  # seen nothing
+    assert (unknown.status, "You typed" in unknown.text) == (409, False)
     (folder / "notes.md").write_text("Other words.\n", encoding="utf-8")
     page = visitor.post(HERE + "answer", id="zeta", answer="Mine", seen=seen)
     assert (page.status, "Other words." in page.text, "Mine" in page.text) == (409, True, True)
     assert (folder / "notes.md").read_text(encoding="utf-8") == "Other words.\n"
+
+
+def test_what_a_page_showed_is_known_a_hundred_states_later():
+    """A window is left open while others save; what is remembered of a person is bounded."""
+    desk, seen = Desk(), "seen"
+    desk.keep_shown("title = ''", digest=seen, to="")
+    for i in range(100):
+        desk.keep_shown(f"title = '{i}'", digest=str(i), to="")
+    assert desk.shown(seen, to="") == "title = ''"
+    for i in range(40):
+        desk.keep_shown(str(i % 10) * 1_000_000, digest=str(1000 + i), to="")
+    assert desk.shown(seen, to="") is None
+    assert desk.shown("1039", to="") is not None
 
 
 def test_of_two_at_once_one_is_told_of_the_other(filled):

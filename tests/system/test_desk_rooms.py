@@ -72,7 +72,7 @@ def test_an_exploration_is_watched_and_steered(show, tmp_path):
         window.get_by_role("button", name="Explore").click()
 
         thought = window.locator("#thought")
-        expect(thought).to_contain_text(re.compile(r"^Zeta is known .* therefore \S+:"))
+        expect(thought).to_contain_text(re.compile(r"^ζ is known .* therefore \S+:"))
         chosen = re.search(r"therefore (\S+):", thought.inner_text())
         assert chosen is not None
         window.get_by_role("button", name="Veto").click()

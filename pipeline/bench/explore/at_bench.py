@@ -12,6 +12,7 @@ from pipeline.bench.live.observer import Buttons, Observer, Observers
 from pipeline.bench.planning.plan import Recording
 from pipeline.bench.planning.plan_words import session_time
 from pipeline.report.exploration.turn import Turn
+from pipeline.report.words import with_symbols
 from pipeline.submission.load import NAME
 
 
@@ -59,7 +60,7 @@ def explore_bench(
         record=record,
         wish=wish,
         seconds=seconds,
-        tell=everyone.thought,
+        tell=lambda sentence: everyone.thought(with_symbols(sentence)),
         progress=think,
         vetoes=vetoes,
     )

@@ -57,6 +57,7 @@ def _explore(folder: Path, given: dict[str, Any], page: LivePage) -> str:
     """Return what is known at the end."""
     from pipeline.bench.explore.at_bench import explore_bench
     from pipeline.bench.explore.wish import read_time, read_wish
+    from pipeline.report.words import with_symbols
 
     until, limit = given["explore"]
     turns = explore_bench(
@@ -68,7 +69,7 @@ def _explore(folder: Path, given: dict[str, Any], page: LivePage) -> str:
         seconds=read_time(limit),
     )
     reached = "What you wanted is known" if turns[-1].reached else "Not all you wanted is known"
-    return f"{reached}: {turns[-1].said}."
+    return f"{reached}: {with_symbols(turns[-1].said)}."
 
 
 def _stop_on_word(page: LivePage) -> None:

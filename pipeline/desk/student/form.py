@@ -15,6 +15,7 @@ import tomlkit
 
 from pipeline.errors import SubmissionError
 from pipeline.names import parameter_names, read_name
+from pipeline.report.words import symbol_text
 from pipeline.resources import TEMPLATES
 from pipeline.submission.edit import toml_item
 from pipeline.submission.load import InvalidSubmission, spring_names
@@ -91,7 +92,7 @@ def groups(document: Mapping[str, Any]) -> list[Group]:
     claims = tuple(
         Field(
             path=f"reported.{which}.{name}",
-            label=f"{name} {which}",
+            label=f"{symbol_text(name)} {which}",
             help=read_name(name).unit(**units),
             kind="number",
         )

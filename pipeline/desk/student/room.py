@@ -352,6 +352,8 @@ def _edited(
 def _outdated(ask: Ask, name: str, text: str, changed: Sequence[Field]) -> Response:
     """Show both versions: the file as it is now, and what was typed."""
     now = read_document(text) if name == NAME else {}
+    # Of a page older than all that is known, nobody can say what was typed in it.
+    known = name != NAME or ask.desk.shown(ask.text("seen"), to=ask.user.name) is not None
     return ask.page(
         "outdated",
         status=409,
@@ -359,6 +361,7 @@ def _outdated(ask: Ask, name: str, text: str, changed: Sequence[Field]) -> Respo
         name=name,
         text=text,
         changed=[(field, field_text(now, field)) for field in changed],
+        had="You typed" if known else "Your page had",
         back=_here(ask) + ("report" if name == _NOTES else ""),
     )
 

@@ -13,7 +13,7 @@ from pipeline.report.figures.style import QUIET, SECOND, legend_above, panels
 from pipeline.report.phrases import phrases
 from pipeline.report.render.html import render_html
 from pipeline.report.sections.page import Page
-from pipeline.report.words import clean
+from pipeline.report.words import clean, name_span, rich, symbol_text
 from pipeline.results import Analysis
 
 NAME = "exploration.html"
@@ -44,7 +44,9 @@ def _share(value: float) -> str:
 def _turns(turns: Sequence[Turn]) -> list[Block]:
     return [
         bullet_list(
-            spans(", ".join([f"{turn.seconds:.0f} s", *turn.recorded]) + ": ", clean(turn.said))
+            spans(
+                ", ".join([f"{turn.seconds:.0f} s", *turn.recorded]) + ": ", rich(clean(turn.said))
+            )
             for turn in turns
         )
     ]
@@ -56,7 +58,7 @@ def _errors(page: Page, turns: Sequence[Turn], wanted: float) -> list[Block]:
         return []
     rows = [
         [
-            cell(name),
+            cell(name_span(name)),
             *(
                 cell("-" if (error := turn.errors.get(name)) is None else _share(error))
                 for turn in turns
@@ -83,7 +85,7 @@ def _shrinking(turns: Sequence[Turn], names: Sequence[str], wanted: float) -> Fi
     for name in names:
         errors = [turn.errors.get(name) for turn in turns]
         shown = [np.nan if error is None else 100 * error for error in errors]
-        ax.plot(seconds, shown, "o-", ms=3, lw=0.9, label=name)
+        ax.plot(seconds, shown, "o-", ms=3, lw=0.9, label=symbol_text(name))
     ax.axhline(100 * wanted, color=QUIET, lw=0.8, ls="--")
     ax.set_yscale("log")
     ax.set_xlabel("time at the bench [s]")
