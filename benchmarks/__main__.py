@@ -32,6 +32,8 @@ from benchmarks.page import section, write_page
 
 PAGE = Path(__file__).with_name("README.md")
 BENCHMARKS = (
+    "bode",
+    "gap_tools",
     "feedback",
     "time_fit",
     "time_stages",

@@ -1,15 +1,14 @@
 """Write `benchmarks/gap.md`: what the gap workflow gets right, how fast, and real rigs in pictures.
 
-    python benchmarks/gap_page.py RESULTS.jsonl… [--silverbox OUTPUT] [--rig FOLDER]
+    python benchmarks/gap_page.py RESULTS.jsonl… [--rig FOLDER]
 
-The results are those of `gap_confusion.py --report`, the output that of `silverbox.py`; FOLDER
-holds the recordings of an ECP 210. Without one of them its part of the page stays as it is.
+The results are those of `gap_confusion.py --report`; FOLDER holds the recordings of an ECP 210.
+Without one of them its part of the page stays as it is.
 """
 
 import argparse
 import json
 import os
-import re
 import sys
 import tempfile
 import time
@@ -25,7 +24,7 @@ from scipy.stats import beta
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.silverbox import start_at
+from benchmarks.free_runs import start_at
 from pipeline.gap.data.sides import prepare
 from pipeline.gap.explain import explain_gap
 from pipeline.gap.fit.baseline import fit_baseline
@@ -152,18 +151,6 @@ def sureness_of(rows: Sequence[dict]) -> str:
     )
 
 
-def silverbox_of(output: str) -> str:
-    """Return the official test errors, from what `silverbox.py` printed."""
-    errors = re.findall(r"^(multisine|arrow|no extrapolation): ([\d.]+) mV", output, re.MULTILINE)
-    named = re.findall(r"^  (\w+): ([\d.]+%) -> ([\d.]+%)", output, re.MULTILINE)
-    rows = [[_named(key), before, after] for key, before, after in named]
-    return (
-        table(["test part", "error"], [[name, f"{value} mV"] for name, value in errors])
-        + "\n"
-        + table(["effect", "error of the motion before", "after"], rows)
-    )
-
-
 # ------------------------------------------------------------------------- real rigs
 
 
@@ -181,8 +168,7 @@ def rigs_in(folder: Path) -> Iterator[Rig]:
     """Yield one cart at a time, and both."""
     from pipeline.submission import load_submission
     from pipeline.workflow import analyse
-    from tests.helpers.ucsd import write_two_cart_submission
-    from tests.statistics.test_gap_real import ecp_record
+    from tests.helpers.ucsd import ecp_record, write_two_cart_submission
 
     singles = (
         ("cart-1", "cart 1 alone: five steps", "DOF1_en1_input1", "step"),
@@ -296,7 +282,6 @@ def _draw(trace: Trace, study: Study, file: str) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description="Write the page of the gap workflow's benchmarks.")
     parser.add_argument("results", nargs="*", type=Path)
-    parser.add_argument("--silverbox", type=Path)
     parser.add_argument("--rig", type=Path)
     options = parser.parse_args()
     parts: dict[str, str] = {}
@@ -307,8 +292,6 @@ def main() -> None:
         parts["rates"] = summary_of(rows) + "\n" + sureness_of(rows)
         parts["confusion"] = confusion_of(rows)
         parts["pairs"] = pairs_of(rows)
-    if options.silverbox:
-        parts["silverbox"] = silverbox_of(options.silverbox.read_text(encoding="utf-8"))
     if options.rig:
         rigs = list(rigs_in(options.rig))
         explain_gap(rigs[0].records, springs=rigs[0].springs, budget=0.0)  # compiles the simulator

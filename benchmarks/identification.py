@@ -1,6 +1,4 @@
-"""How good is the Bode fit? Coverage, efficiency, convergence and time on the throne presets.
-
-    python benchmarks/identification.py [--seeds 2000]
+"""Noisy dwells of the throne presets, the least error possible with them, and what the fit makes.
 
 Dwells: 20, 25 and 30 frequencies, logarithmic from 0.3 to 7 Hz. The input amplitude gives the
 cart that moves most 1 cm, but is 1 V at most. Errors: 1 % of the amplitude and 0.00115 cm (half
@@ -11,9 +9,8 @@ Starts: "paper" are the initial estimates of the paper's Tables 1-3; "random" dr
 gains and frequencies from half to double.
 """
 
-import argparse
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +19,6 @@ from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.estimation.chain.parametrisation import Parametrisation, named_estimates
 from pipeline.plant.linear.chain import Chain
-from pipeline.plant.linear.presets import PRESETS
 from pipeline.results import ChainFit, FrequencyResponse
 from pipeline.stages.bode_fit import fit_bode
 
@@ -49,19 +45,19 @@ PAPER_STARTS = {
 }  # fmt: skip
 
 
-def dwell_errors(chain: Chain, omega: Array) -> Array:
-    """Return the standard error (n, n_w) of each magnitude, position unit per input unit."""
+def dwell_errors(chain: Chain, omega: Array, *, noise: float = 1.0) -> Array:
+    """Return the standard error (n, n_w) of each magnitude; `noise` is a factor on all of them."""
     size = np.abs(chain.frequency_response(omega))
     amplitude = np.minimum(LARGEST_MOTION / size.max(axis=0), LARGEST_INPUT)
-    return np.hypot(RELATIVE_STD * size, ABSOLUTE_STD / amplitude)
+    return noise * np.hypot(RELATIVE_STD * size, ABSOLUTE_STD / amplitude)
 
 
 def measure(
-    chain: Chain, *, rng: np.random.Generator, phases: bool = False
+    chain: Chain, *, rng: np.random.Generator, phases: bool = False, noise: float = 1.0
 ) -> tuple[FrequencyResponse, ...]:
     """Draw one set of dwells; errors as in the module's docstring."""
     omega = 2 * np.pi * np.geomspace(*BAND_HZ, POINTS[chain.n])
-    G, std = chain.frequency_response(omega), dwell_errors(chain, omega)
+    G, std = chain.frequency_response(omega), dwell_errors(chain, omega, noise=noise)
     noisy = np.abs(G) + std * rng.standard_normal(G.shape)
     phase = np.angle(G) + std / np.abs(G) * rng.standard_normal(G.shape)
     return tuple(
@@ -78,23 +74,33 @@ def measure(
     )
 
 
-def least_possible_std(chain: Chain, *, phases: bool = False) -> Array:
+def least_possible_std(chain: Chain, *, phases: bool = False, noise: float = 1.0) -> Array:
     """Return the Cramér-Rao bound on the error of every named parameter, all springs free."""
     omega = 2 * np.pi * np.geomspace(*BAND_HZ, POINTS[chain.n])
+    weight = 1 / dwell_errors(chain, omega, noise=noise)
+
+    def log_response(of: Chain) -> Array:
+        G = np.log(of.frequency_response(omega)).astype(
+            np.complex128
+        )  # real part size, imaginary phase
+        size = np.abs(chain.frequency_response(omega)) * weight
+        return np.concatenate([G.real * size, G.imag * size] if phases else [G.real * size])
+
+    return bound(chain, log_response)
+
+
+def bound(chain: Chain, measured: Callable[[Chain], Array]) -> Array:
+    """Return the Cramér-Rao bound where values of standard error 1 are measured, by name."""
     P = Parametrisation(n=chain.n, springs=(True,) * (chain.n + 1))
-    p, std = P.physical(chain), dwell_errors(chain, omega)
+    p = P.physical(chain)
     steps = 1e-6 * np.where(p > 0, p, np.max(chain.k))
-    G = chain.frequency_response(omega)
     columns = []
     for i, step in enumerate(steps):
         e = np.zeros(p.size)
         e[i] = step
-        ends = [P.chain(p + sign * e).frequency_response(omega) for sign in (1, -1)]
-        relative = (ends[0] - ends[1]) / (2 * step) / G  # d ln G: real part size, imaginary phase
-        weight = np.abs(G) / std
-        parts = [relative.real * weight] + ([relative.imag * weight] if phases else [])
-        columns.append(np.concatenate([part.ravel() for part in parts]))
-    J = np.stack(columns, axis=1) * steps
+        ends = [measured(P.chain(p + sign * e)) for sign in (1, -1)]
+        columns.append(((ends[0] - ends[1]) / 2).ravel())
+    J = np.stack(columns, axis=1)
     covariance = np.linalg.inv(J.T @ J) * np.outer(steps, steps)
     found = named_estimates(chain, names=P.names, covariance=covariance, source="bound")
     return np.array([estimate.std for estimate in found.values()])
@@ -178,30 +184,3 @@ def is_right(fit: ChainFit, chain: Chain) -> bool:
         for name, value in chain.parameters().items()
         if name in ("omega_n", "omega_a", "omega_b", "omega_c")
     )
-
-
-def main() -> None:
-    """Print the tables."""
-    parser = argparse.ArgumentParser(description="Quality of the Bode fit.")
-    parser.add_argument("--seeds", type=int, default=2000)
-    seeds = parser.parse_args().seeds
-    for preset, chain in PRESETS.items():
-        for phases in (False, True):
-            q = quality(chain, seeds=seeds, phases=phases)
-            kind = "with phases" if phases else "magnitudes"
-            geometric = float(np.exp(np.mean(np.log(q.efficiency))))
-            print(
-                f"{preset}, {kind}: coverage {q.coverage.min():.3f} to {q.coverage.max():.3f}, "
-                f"efficiency {geometric:.2f} (worst {q.efficiency.min():.2f} "
-                f"{q.names[int(np.argmin(q.efficiency))]}), "
-                f"median {np.median(q.milliseconds):.1f} ms, chi²/dof {q.chi_square.mean():.3f}"
-            )
-        shares = {
-            kind: converged_share(chain, kind=kind, seeds=seeds)
-            for kind in ("paper", "random", "wide")
-        }
-        print("   converged: " + ", ".join(f"{k} {100 * v:.2f} %" for k, v in shares.items()))
-
-
-if __name__ == "__main__":
-    main()

@@ -63,8 +63,8 @@ def random_release(rng: np.random.Generator, *, zeta: float, fs: float, d: float
 
 
 def tables(*, quick: bool) -> list[Table]:
-    seeds = 12 if quick else 300
-    return [decays(max(seeds // 12, 4)), friction(seeds), dwells(seeds // 3), steps()]
+    seeds = 3 if quick else 300
+    return [decays(-(-seeds // 12)), friction(seeds), dwells(-(-seeds // 3)), steps()]
 
 
 def decays(seeds: int) -> Table:

@@ -1,9 +1,31 @@
-"""Whole submissions made of the real ECP 210 recordings, copied to a temporary folder."""
+"""The real ECP 210 recordings: one by one, and as whole submissions in a temporary folder."""
 
 import shutil
 from pathlib import Path
 
+import numpy as np
+
+from pipeline.results import Record
+
 PID = '{ type = "pid", kp = 0.5, ki = 0.5, kd = 0.03, scale = 0.009765625, cart = 1 }'
+
+
+def ecp_record(path: Path, *, column: int, kind: str) -> Record:
+    """Read one encoder of a raw ECP export; positions in counts, the input's sign turned."""
+    lines = [line.strip(" [];\n") for line in path.read_text().splitlines()]
+    rows = np.array([line.split() for line in lines if line and line[0].isdigit()], dtype=float)
+    # Stamps are rounded to a millisecond: the clock itself is even.
+    t = np.asarray(np.polyval(np.polyfit(rows[:, 0], rows[:, 1], 1), rows[:, 0]), dtype=np.float64)
+    return Record(
+        id=path.stem,
+        kind="step" if kind == "step" else "decay",
+        t=t,
+        u=-rows[:, -1] if kind == "step" else None,
+        y=rows[:, column][None],
+        carts=(1,),
+        free=(1,),
+        resolution=np.array([1.0]),
+    )
 
 
 def write_two_cart_submission(folder: Path, data: Path, *, steps: tuple[int, ...]) -> Path:

@@ -11,29 +11,11 @@ from pipeline.gap.types import Gap
 from pipeline.results import Record
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
-from tests.helpers.ucsd import write_two_cart_submission
+from tests.helpers.ucsd import ecp_record, write_two_cart_submission
 
 DRY = ("coulomb_friction", "stiction", "presliding_friction")
 
 pytestmark = pytest.mark.slow
-
-
-def ecp_record(path: Path, *, column: int, kind: str) -> Record:
-    """Read one encoder of a raw ECP export; positions in counts, the input's sign turned."""
-    lines = [line.strip(" [];\n") for line in path.read_text().splitlines()]
-    rows = np.array([line.split() for line in lines if line and line[0].isdigit()], dtype=float)
-    # Stamps are rounded to a millisecond: the clock itself is even.
-    t = np.asarray(np.polyval(np.polyfit(rows[:, 0], rows[:, 1], 1), rows[:, 0]), dtype=np.float64)
-    return Record(
-        id=path.stem,
-        kind="step" if kind == "step" else "decay",
-        t=t,
-        u=-rows[:, -1] if kind == "step" else None,
-        y=rows[:, column][None],
-        carts=(1,),
-        free=(1,),
-        resolution=np.array([1.0]),
-    )
 
 
 def explain_five(folder: Path, name: str, *, column: int, kind: str) -> Gap:

@@ -1,0 +1,313 @@
+"""Other ways to a nonlinear model of one cart: records in, a model that runs freely out.
+
+Each tries the settings its documentation offers and keeps those with the least free-run error on
+the very records it learnt from, the sparser of nearly equal ones: cartlab has no more to choose by.
+"""
+
+import contextlib
+import io
+import itertools
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+
+from pipeline.arrays import Array
+
+_NEAR = 1.1  # times the least error: within, fewer terms are preferred
+_FAR = 1e3  # times the largest motion: a run that gets there has diverged
+
+
+@dataclass(frozen=True, kw_only=True)
+class Part:
+    """One record of one cart at even times: input and position (n,), as read.
+
+    `source` is what cartlab made of the record: its own model runs from that.
+    """
+
+    dt: float
+    u: Array
+    y: Array
+    first: int = 48  # sample to judge from: those before start what has a memory
+    source: Any = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Model:
+    """What was learnt: a free run of a part, every how many samples it speaks, and its words."""
+
+    run: Callable[[Part], Array]
+    every: int
+    words: str
+    terms: tuple[str, ...] = ()
+
+
+def error(model: Model, parts: Sequence[Part]) -> float:
+    """Return the free-run error over the motion, pooled; infinite where a run diverges."""
+    off = size = 0.0
+    for part in parts:
+        with np.errstate(all="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            found = model.run(part)
+        judged = slice(-(-part.first // model.every), None)
+        y = part.y[:: model.every][: found.size][judged]  # thinned, the last few may be left over
+        if not np.all(np.abs(found) < _FAR * np.abs(part.y).max()):
+            return np.inf
+        off += float(np.sum((found[judged] - y) ** 2))
+        size += float(np.sum(y**2))
+    return float(np.sqrt(off / size))
+
+
+def best(models: Iterator[Model], parts: Sequence[Part]) -> Model | None:
+    """Return the one with the fewest terms among those that run nearest to their own records."""
+    tried = [(error(model, parts), model) for model in models]
+    least = min((off for off, _ in tried), default=np.inf)
+    near = [
+        (len(model.terms), off, i) for i, (off, model) in enumerate(tried) if off <= _NEAR * least
+    ]
+    return tried[min(near)[2]][1] if np.isfinite(least) else None
+
+
+def _thinned(part: Part, every: int) -> tuple[Array, Array]:
+    """Return input and position of every so many samples; the input as its mean until the next."""
+    n = part.y.size // every * every
+    u = part.u[:n].reshape(-1, every).mean(axis=1) if every > 1 else part.u
+    return u, part.y[::every][: u.size]
+
+
+# -------------------------------------------------------------------------- PySINDy
+
+# By name, of position, velocity and input: what an engineer would put into the library.
+FEATURES: dict[str, Callable[[Any, Any, Any], Any]] = {
+    "1": lambda x, v, u: 1.0 + 0 * x,
+    "x": lambda x, v, u: x,
+    "v": lambda x, v, u: v,
+    "u": lambda x, v, u: u,
+    "x²": lambda x, v, u: x**2,
+    "x v": lambda x, v, u: x * v,
+    "v²": lambda x, v, u: v**2,
+    "x³": lambda x, v, u: x**3,
+    "x² v": lambda x, v, u: x**2 * v,
+    "x v²": lambda x, v, u: x * v**2,
+    "v³": lambda x, v, u: v**3,
+    "u²": lambda x, v, u: u**2,
+    "u v": lambda x, v, u: u * v,
+    "u³": lambda x, v, u: u**3,
+    "sign v": lambda x, v, u: np.sign(v),
+    "v |v|": lambda x, v, u: v * np.abs(v),
+    "|u| sign v": lambda x, v, u: np.abs(u) * np.sign(v),
+}
+LINEAR = ("x", "v", "u")
+_SUBSTEPS = 2
+_THRESHOLDS = (0.003, 0.006, 0.01, 0.02, 0.035, 0.06)  # of the acceleration
+
+
+def sindy(parts: Sequence[Part], *, windows: Sequence[int] = (5, 7, 11, 15)) -> Iterator[Model]:
+    """Fit sparse dynamics of position and velocity by PySINDy."""
+    ps = import_module("pysindy")
+    driven = any(np.any(part.u) for part in parts)
+    names = [name for name in FEATURES if driven or "u" not in name]
+    for window in windows:
+        smooth = ps.SmoothedFiniteDifference(
+            smoother_kws={"window_length": window, "polyorder": min(3, window - 2)}
+        )
+        # A derivative is that of the middle: between the hold before a sample and the one after.
+        u = [(part.u + np.roll(part.u, 1)) / 2 for part in parts]
+        v = [np.asarray(smooth(part.y, part.dt)).ravel() for part in parts]
+        states = [np.column_stack([part.y, slope]) for part, slope in zip(parts, v, strict=True)]
+        accelerations = [
+            np.asarray(smooth(slope, part.dt)).ravel() for part, slope in zip(parts, v, strict=True)
+        ]
+        size = np.linalg.norm(np.concatenate(accelerations))
+        for share in _THRESHOLDS:
+            model = ps.SINDy(
+                optimizer=ps.STLSQ(threshold=share * size, alpha=1e-8, normalize_columns=True),
+                feature_library=ps.CustomLibrary(
+                    library_functions=[FEATURES[name] for name in names],
+                    function_names=[lambda *_, name=name: name for name in names],
+                ),
+                differentiation_method=smooth,
+            )
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # a threshold that leaves nothing
+                model.fit(
+                    states, t=[part.dt * np.arange(part.y.size) for part in parts],
+                    u=[held[:, None] for held in u],
+                )  # fmt: skip
+            coefficients = np.asarray(model.coefficients())
+            kept = [i for i in range(len(names)) if np.any(coefficients[:, i])]
+            yield Model(
+                run=_integrated(coefficients, names, smooth),
+                every=1,
+                words="dv/dt = " + _sum(coefficients[1], names),
+                terms=tuple(names[i] for i in kept if coefficients[1, i]),
+            )
+
+
+def _integrated(coefficients: Array, names: Sequence[str], smooth: Any) -> Callable[[Part], Array]:
+    active = [
+        (FEATURES[name], *coefficients[:, i])
+        for i, name in enumerate(names)
+        if np.any(coefficients[:, i])
+    ]
+
+    def slope(x: float, v: float, u: float) -> tuple[float, float]:
+        values = [(of(x, v, u), a, b) for of, a, b in active]
+        return sum(f * a for f, a, _ in values), sum(f * b for f, _, b in values)
+
+    def run(part: Part) -> Array:
+        x, v = float(part.y[0]), float(np.asarray(smooth(part.y, part.dt)).ravel()[0])
+        out, h, far = np.full(part.y.size, np.inf), part.dt / _SUBSTEPS, _FAR * np.abs(part.y).max()
+        for k, u in enumerate(part.u.tolist()):
+            out[k] = x
+            if not abs(x) < far:
+                break
+            for _ in range(_SUBSTEPS):
+                a = slope(x, v, u)
+                b = slope(x + h / 2 * a[0], v + h / 2 * a[1], u)
+                c = slope(x + h / 2 * b[0], v + h / 2 * b[1], u)
+                d = slope(x + h * c[0], v + h * c[1], u)
+                x += h / 6 * (a[0] + 2 * b[0] + 2 * c[0] + d[0])
+                v += h / 6 * (a[1] + 2 * b[1] + 2 * c[1] + d[1])
+        return out
+
+    return run
+
+
+def _sum(coefficients: Sequence[float] | Array, names: Sequence[str]) -> str:
+    terms = [
+        f"{c:+.3g}" + f" {name}" * (name != "1")
+        for c, name in zip(coefficients, names, strict=True)
+        if c
+    ]
+    return " ".join(terms).replace(" +", " + ").removeprefix("+").replace(" -", " − ") or "0"
+
+
+# ----------------------------------------------------------------------- SysIdentPy
+
+
+def frols(
+    parts: Sequence[Part],
+    *,
+    lags: Sequence[int] = (2, 4, 6),
+    degrees: Sequence[int] = (1, 2, 3),
+    thinnings: Sequence[int] = (2, 4, 8),
+) -> Iterator[Model]:
+    """Select the terms of a polynomial NARX by SysIdentPy's FROLS and the Akaike criterion."""
+    selection = import_module("sysidentpy.model_structure_selection")
+    basis = import_module("sysidentpy.basis_function")
+    estimators = import_module("sysidentpy.parameter_estimation")
+    display = import_module("sysidentpy.utils.display_results")
+    driven = any(np.any(part.u) for part in parts)
+    for every, lag, degree in itertools.product(thinnings, lags, degrees):
+        thinned = [_thinned(part, every) for part in parts]
+        u, y = (np.concatenate(some)[:, None] for some in zip(*thinned, strict=True))
+        model = selection.FROLS(
+            ylag=lag,
+            xlag=lag,
+            order_selection=True,
+            info_criteria="aic",
+            n_info_values=_MOST_TERMS,
+            estimator=estimators.LeastSquares(),
+            basis_function=basis.Polynomial(degree=degree),
+            model_type="NARMAX" if driven else "NAR",
+        )
+        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+            warnings.simplefilter("ignore")
+            try:
+                model.fit(X=u if driven else None, y=y)
+            except (ValueError, np.linalg.LinAlgError):
+                continue  # fewer terms than are asked for
+
+        def run(part: Part, model: Any = model, every: int = every) -> Array:
+            u, y = _thinned(part, every)
+            whole = model.predict(
+                X=u[:, None] if driven else None,
+                y=y[: model.max_lag, None],
+                forecast_horizon=None if driven else y.size - model.max_lag,
+            )
+            return whole.ravel()[: y.size]
+
+        terms = display.results(
+            model.final_model, model.theta, model.err, model.n_terms,
+            err_precision=3, dtype="sci",
+        )  # fmt: skip
+        yield Model(
+            run=run,
+            every=every,
+            terms=tuple(row[0] for row in terms),
+            words="y(k) = " + _sum([float(row[1]) for row in terms], [row[0] for row in terms]),
+        )
+
+
+_MOST_TERMS = 15  # the default
+
+
+# ------------------------------------------------------------------ a neural network
+
+
+def network(
+    parts: Sequence[Part], *, lags: Sequence[int] = (2, 4, 6), thinnings: Sequence[int] = (1, 2, 4)
+) -> Iterator[Model]:
+    """Learn the next position's change from the last ones and inputs: scikit-learn's MLP."""
+    neural = import_module("sklearn.neural_network")
+    for every, lag in itertools.product(thinnings, lags):
+        thinned = [_thinned(part, every) for part in parts]
+        rows = [_regressors(u, y, lag) for u, y in thinned]
+        X = np.concatenate(rows)
+        Y = np.concatenate([np.diff(y)[lag - 1 :] for _, y in thinned])
+        mean, std, scale = X.mean(axis=0), X.std(axis=0), Y.std()
+        std[std == 0] = 1.0
+        net = neural.MLPRegressor(
+            hidden_layer_sizes=(_NEURONS, _NEURONS),
+            activation="tanh",
+            solver="lbfgs",
+            max_iter=_EPOCHS,
+            random_state=0,
+        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # not yet converged
+            net.fit((X - mean) / std, Y / scale)
+        layers = list(zip(net.coefs_, net.intercepts_, strict=True))
+
+        def run(
+            part: Part,
+            layers: Any = layers,
+            lag: int = lag,
+            every: int = every,
+            scaling: tuple[Array, Array, float] = (mean, std, scale),
+        ) -> Array:
+            u, y = _thinned(part, every)
+            mean, std, scale = scaling
+            out = y.copy()
+            far = _FAR * np.abs(y).max()
+            for k in range(lag, y.size):
+                z = np.concatenate([out[k - lag : k], u[k - lag : k]])
+                z = (z - mean) / std
+                for index, (W, b) in enumerate(layers):
+                    z = z @ W + b
+                    z = np.tanh(z) if index < len(layers) - 1 else z
+                out[k] = out[k - 1] + scale * float(z[0])
+                if not abs(out[k]) < far:
+                    out[k:] = np.inf
+                    break
+            return out
+
+        weights = sum(W.size + b.size for W, b in layers)
+        yield Model(run=run, every=every, words=f"{weights} weights")
+
+
+def _regressors(u: Array, y: Array, lag: int) -> Array:
+    last = [signal[i : signal.size - lag + i] for signal in (y, u) for i in range(lag)]
+    return np.column_stack(last)
+
+
+_NEURONS, _EPOCHS = 8, 2000
+TOOLS: tuple[tuple[str, str, Callable[..., Iterator[Model]]], ...] = (
+    ("PySINDy", "pysindy", sindy),
+    ("SysIdentPy, FROLS", "sysidentpy", frols),
+    ("scikit-learn, MLP NARX", "scikit-learn", network),
+)

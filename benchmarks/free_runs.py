@@ -1,0 +1,104 @@
+"""Records, models and free runs alike for all tools: who learns from what, who is judged how."""
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from benchmarks.black_boxes import TOOLS, Model, Part, best, error
+from benchmarks.page import installed, significant
+from pipeline.arrays import Array
+from pipeline.gap.data.runs import make_run
+from pipeline.gap.fit.linearise import fresh_nuisance, simulate_run
+from pipeline.gap.fit.structure import Candidate, Structure
+from pipeline.gap.fit.structure import Model as FitModel
+from pipeline.gap.types import Gap
+from pipeline.plant.nonlinear.effects.base import AugmentedChain
+from pipeline.results import Record
+
+OURS, LINEAR_CART = "cartlab", "linear"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Answer:
+    """One tool on one bench: its model (none if all diverge), error on other records, seconds."""
+
+    model: Model | None
+    error: float
+    seconds: float
+
+
+def part_of(record: Record, *, first: int = 48) -> Part:
+    """Return a record as all see it: as read, but from where the hand lets go."""
+    run = make_run(record, n=1)
+    u = np.zeros(record.t.size) if record.u is None else record.u
+    return Part(dt=record.sample_time, u=u[-run.t.size :], y=run.y[0], first=first, source=run)
+
+
+def start_at(model: AugmentedChain, *, springs: tuple[bool, ...]) -> FitModel:
+    """Return a model as the fits have it: its structure and its vector."""
+    structure = Structure(springs=springs)
+    for term in model.terms:
+        signs = tuple(float(np.sign(v) or 1.0) for v in term.values)
+        sizes = tuple(abs(v) for v in term.values)
+        structure = structure.with_effect(
+            Candidate(effect=term.effect, place=term.place, signs=signs, scales=sizes)
+        )
+    return structure.start(model.chain, [term.values for term in model.terms])
+
+
+def ours(model: AugmentedChain, gap: Gap, *, springs: tuple[bool, ...]) -> Model:
+    """Return cartlab's model as one that runs freely: nothing is fitted to the record.
+
+    Where the encoder reads nothing is learnt from the training records as well.
+    """
+    of = start_at(model, springs=springs)
+    zero = np.array([np.mean([trace.zero for trace in gap.traces if not trace.held_out])])
+
+    def run(part: Part) -> Array:
+        own = replace(part.source, zero=zero)
+        return simulate_run(of, own, fresh_nuisance(own))[0]
+
+    return Model(run=run, every=1, words=words_of(gap))
+
+
+def words_of(gap: Gap) -> str:
+    """Return the effects found, with their numbers."""
+    found = [
+        f"{f.effect.key.replace('_', ' ')} ("
+        + ", ".join(
+            f"{name.replace('_', ' ')} {v.value:.3g}{f' ± {v.std:.1g}' if v.std else ''} {v.unit}"
+            for name, v in f.parameters.items()
+        )
+        + ")"
+        for f in gap.effects
+    ]
+    return f"**{gap.verdict}**: {', '.join(found) or 'nothing beside the linear cart'}"
+
+
+def others(
+    training: Sequence[Part],
+    held_out: Sequence[Part],
+    *,
+    settings: Mapping[str, dict[str, tuple[int, ...]]] | None = None,
+) -> Iterator[tuple[str, Answer]]:
+    """Yield what each other tool that is installed makes of it."""
+    for name, tool, learn in TOOLS:
+        if installed(tool):
+            began = time.process_time()
+            model = best(learn(training, **(settings or {}).get(name, {})), training)
+            seconds = time.process_time() - began
+            off = np.inf if model is None else error(model, held_out)
+            yield name, Answer(model=model, error=off, seconds=seconds)
+
+
+def percent(value: float) -> str:
+    """Return a share of the motion."""
+    return f"{significant(100 * value)} %" if np.isfinite(value) else "diverges"
+
+
+def left_out(what: str, *, quick: bool, columns: int) -> list[str]:
+    """Return the row of what was not measured."""
+    why = "in a quick run" if quick else "its recordings are not on this machine"
+    return [what, f"left out: {why}", *[""] * (columns - 2)]

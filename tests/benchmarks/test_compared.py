@@ -1,0 +1,110 @@
+"""What others are compared by is fair: the right model, failures counted, free runs judged."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from benchmarks.black_boxes import Model, Part, best, error
+from benchmarks.bode import judged, modes_named, multisine
+from benchmarks.bode_tools import (
+    Dwells,
+    curve_fitted,
+    factors,
+    modes_of,
+    rational,
+    realised,
+    responses_of,
+    start_of,
+)
+from benchmarks.identification import measure
+from pipeline.plant.linear.presets import PRESETS
+
+OMEGA = 2 * np.pi * np.geomspace(0.3, 7.0, 30)
+
+
+def _vector(n: int, named: dict[str, float]) -> np.ndarray:
+    gains = [named["K"]] if n == 1 else [named[f"K_{i + 1}"] for i in range(n)]
+    named = {**named, "zeta_n": named.get("zeta", 0.0)}
+    pairs = [
+        named[f"{kind}_{key}"] for keys in factors(n) for key in keys for kind in ("omega", "zeta")
+    ]
+    return np.array([*gains, *pairs])
+
+
+@pytest.mark.parametrize("chain", PRESETS.values(), ids=list(PRESETS))
+def test_the_papers_transfer_functions_are_those_of_the_chain(chain):
+    """What Nelder–Mead and `curve_fit` fit can be right: the same response, by the same names."""
+    p = _vector(chain.n, chain.parameters())
+
+    assert p.shape == start_of(chain.n).shape
+    assert_allclose(rational(p, OMEGA, n=chain.n), chain.frequency_response(OMEGA), rtol=1e-9)
+
+
+def test_curve_fit_finds_the_truth_in_dwells_without_noise():
+    """From the paper's start, with phases, to the digits that its tolerance of 1e-8 allows."""
+    chain = PRESETS["throne-2dof"]
+    responses = measure(chain, rng=np.random.default_rng(0), phases=True, noise=1e-9)
+
+    found = curve_fitted(Dwells.of(responses))
+
+    truth = modes_named(chain, list(chain.parameters().values()))
+    assert_allclose(found.omega, truth.omega, rtol=1e-5)
+    assert found.gains is not None
+    assert truth.gains is not None
+    assert_allclose(found.gains, truth.gains, rtol=1e-5)
+
+
+def test_the_responses_for_a_modal_analysis_are_those_of_the_chain():
+    """The hold is undone and the transient left out; what the hold folds back is below 1 %."""
+    chain = PRESETS["throne-2dof"]
+    hertz, G = responses_of(multisine(chain, rng=np.random.default_rng(0), noise=1e-12))
+
+    band = (hertz > 0.3) & (hertz < 8.0)
+    true = chain.frequency_response(2 * np.pi * hertz[band])
+    assert np.all(np.abs(G[:, band] - true) < 0.01 * np.abs(true).max())
+
+
+def test_subspaces_find_the_truth_in_a_record_without_noise():
+    """A realisation of Markov parameters: the rest of 8 s of ringing is below a thousandth."""
+    chain = PRESETS["throne-1dof"]
+    found = realised(multisine(chain, rng=np.random.default_rng(0), noise=1e-9))
+
+    truth = modes_named(chain, list(chain.parameters().values()))
+    assert_allclose(found.omega, truth.omega, rtol=1e-3)
+
+
+def test_no_answer_is_infinitely_wrong():
+    """A method that stops, or finds too few resonances, is counted and not left out."""
+    chain = PRESETS["throne-1dof"]
+    truth = modes_named(chain, list(chain.parameters().values()))
+
+    tried = judged(
+        lambda: modes_of(np.array([-1.0 + 0j]), n=1, gains=None), truth=truth, least=truth
+    )
+
+    assert tried.modes == np.inf
+    assert not tried.right
+
+
+def test_a_free_run_is_judged_after_its_start_and_divergence_is_infinite():
+    """A constant error of a tenth of the motion is a tenth, whatever the first samples are."""
+    y = np.ones(100)
+    part = Part(dt=0.01, u=np.zeros(100), y=y, first=10)
+    near = np.where(np.arange(100) < 10, 50.0, 1.1)
+
+    assert_allclose(error(Model(run=lambda _: near, every=1, words=""), [part]), 0.1)
+    assert error(Model(run=lambda _: 1e9 * y, every=1, words=""), [part]) == np.inf
+
+
+def test_of_nearly_equal_models_the_sparser_is_taken():
+    """And none, where all of them diverge."""
+    part = Part(dt=0.01, u=np.zeros(100), y=np.ones(100), first=0)
+
+    def off_by(value: float, terms: int) -> Model:
+        return Model(run=lambda p: p.y * value, every=1, words=str(terms), terms=("x",) * terms)
+
+    chosen = best(iter([off_by(1.1, 5), off_by(1.105, 2), off_by(1.2, 1)]), [part])
+
+    assert chosen is not None
+    assert chosen.words == "2"
+    assert best(iter([off_by(1e9, 1)]), [part]) is None
