@@ -25,13 +25,16 @@ def demo(
     # On a new machine the simulator is compiled beside what does without it.
     compiling = get_context("spawn").Process(target=_compile, daemon=True)
     compiling.start()
+    say("1 of 3: the report of three carts")
     run_report(EXAMPLES / "three-cart", out=out / "report", pdf=True)
+    say("2 of 3: a class, graded")
     teams = out / "class"
     if not teams.exists():
         write_class(teams)
         for mistake in PLANTED:
             say(f"planted: {mistake}")
     grade([teams], rubric=Path(PRESET), out=out / "grades")
+    say("3 of 3: what a bench hides")
     bench = out / "bench"
     compiling.join()
     if not (bench / "submission.toml").exists():

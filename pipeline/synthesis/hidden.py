@@ -270,8 +270,13 @@ def _read_model(path: Path) -> HiddenBench:
     where = f"--model {path}"
     try:
         document = json.loads(read_text(path, where=where, limit=_MOST_BYTES, error=ConfigError))
-    except (RecursionError, ValueError) as error:
-        raise ConfigError(f"{where}: no JSON: {error}") from None
+    except json.JSONDecodeError as error:
+        raise ConfigError(
+            f"{where}: no JSON from line {error.lineno}, character {error.colno} on: give a file "
+            "as `cartlab gap` writes it, gap.json, whole"
+        ) from None
+    except (RecursionError, ValueError):
+        raise ConfigError(f"{where}: no JSON that a gap.json could hold") from None
     document = _mapping(document, where=where)
     model = _mapping(document.get("model", document), where=f"{where}: model")
     chain = _chain(model.get("chain"), where=f"{where}: chain")

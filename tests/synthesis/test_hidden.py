@@ -403,7 +403,8 @@ def test_a_model_in_counts_moves_as_far(tmp_path):
 @pytest.mark.parametrize(
     ("document", "message"),
     [
-        ("{", "no JSON"),
+        ("{", r"no JSON from line 1, character 2 on: give a file as `cartlab gap` writes it"),
+        ("[" * 100_000, "no JSON"),
         ("[]", "no JSON object"),
         ({"effects": []}, "chain: missing"),
         ({"chain": {"m": [1.0], "c": [0.1]}}, "chain: needs 'k'"),

@@ -90,12 +90,13 @@ def bench_gains(
 ) -> StateGains | PidGains:
     """Return what the bench is to be sent before a closed-loop recording starts.
 
+    What is wrong is said without the recording's name, which who tells of the recording gives.
+
     Raises
     ------
     DataError : the carts are not identified; or on the bench the loop would be unstable, would
         pass a limit, or would miss the goal of its design.
     """
-    name = recording.id
     trial = _Trial.of(
         recording, submission=submission, analysis=analysis, bench=bench, limits=limits
     )
@@ -104,8 +105,8 @@ def bench_gains(
         trial.refuse_pid(loop)
         return PidGains(kp=loop.kp, ki=loop.ki, kd=loop.kd)
     if loop is None:
-        raise DataError(f"{name}: has no controller")
-    law = _law(name, loop, analysis.feedback)
+        raise DataError("it has no controller")
+    law = _law(loop, analysis.feedback)
     goal = None if loop.gains else submission.design or Design(cart=loop.cart)
     trial.refuse_state(law, cart=loop.cart, goal=goal, design=analysis.feedback)
     spare = [0.0] * (2 * (bench.encoders - trial.chain.n))  # encoders that no cart is tied to
@@ -179,15 +180,15 @@ def _typed(value: float) -> float:
     return float(f"{value:.2g}")
 
 
-def _law(name: str, loop: StateLoop, design: FeedbackDesign | None) -> StateFeedback:
+def _law(loop: StateLoop, design: FeedbackDesign | None) -> StateFeedback:
     """Return the gains the plan states, or those of the design, as the bench runs them."""
     if loop.gains and loop.prefilter is not None:
         return StateFeedback(gains=np.array(loop.gains), prefilter=loop.prefilter)
     if design is None:
-        raise DataError(f"{name}: there is no controller to run; `cartlab report` says why")
+        raise DataError("there is no controller to run; `cartlab report` says why")
     if design.cart != loop.cart:
         raise DataError(
-            f"{name}: the controller is designed for cart {design.cart}, the plan has cart "
+            f"the controller is designed for cart {design.cart}, the plan has cart "
             f"{loop.cart}: change one, or state the gains"
         )
     return StateFeedback(gains=design.gains, prefilter=design.prefilter)
@@ -215,7 +216,7 @@ class _Trial:
     ) -> Self:
         fit = analysis.fit
         if fit is None or not fit.converged:
-            raise DataError(f"{recording.id}: a loop is closed on identified carts only")
+            raise DataError("a loop is closed on identified carts only")
         return cls(
             recording=recording,
             chain=fit.chain,
@@ -228,10 +229,10 @@ class _Trial:
         self, law: StateFeedback, *, cart: int, goal: Design | None, design: FeedbackDesign | None
     ) -> None:
         """Raise DataError where the loop is unstable, passes a limit or misses its goal."""
-        name, reference = self.recording.id, self.recording.amplitude
+        reference = self.recording.amplitude
         if not stays_stable(self.chain, law, sample_time=self.period):
             raise DataError(
-                f"{name}: with these gains the loop may be unstable at the bench's period of "
+                f"with these gains the loop may be unstable at the bench's period of "
                 f"{1e3 * self.period:g} ms{self._advice(goal)}"
             )
         t, x = self._step(law, delay=1)
@@ -246,7 +247,7 @@ class _Trial:
         longest = max(goal.settling_time, design.settling_time or np.inf)
         if overshoot > most or not settling <= longest + design.sample_time:
             raise DataError(
-                f"{name}: on the bench the step would overshoot by {overshoot:.2g} % and settle in "
+                f"on the bench the step would overshoot by {overshoot:.2g} % and settle in "
                 f"{settling:.2g} s, the design has {most:.2g} % and {longest:.2g} s"
                 f"{self._advice(goal)}"
             )
@@ -254,7 +255,7 @@ class _Trial:
     def refuse_pid(self, loop: PidLoop) -> None:
         """Raise DataError where the loop is unstable or passes a limit."""
         if loop.cart > self.chain.n:
-            raise DataError(f"{self.recording.id}: there is no cart {loop.cart} to control")
+            raise DataError(f"there is no cart {loop.cart} to control")
         law = Pid(
             kp=loop.kp,
             ki=loop.ki,
@@ -265,7 +266,7 @@ class _Trial:
         radius = np.abs(np.linalg.eigvals(_pid_matrix(self.chain, law, period=self.period))).max()
         if radius >= 1.0:
             raise DataError(
-                f"{self.recording.id}: with kp = {loop.kp:g}, ki = {loop.ki:g}, kd = {loop.kd:g} "
+                f"with kp = {loop.kp:g}, ki = {loop.ki:g}, kd = {loop.kd:g} "
                 f"on cart {loop.cart} the loop is unstable"
             )
         self._step(law, delay=0)
@@ -292,12 +293,12 @@ class _Trial:
         asked, reached = np.abs(motion.u).max(), np.abs(motion.x).max()
         if asked > self.limits.input:
             raise DataError(
-                f"{run.id}: the step takes an input of {asked:.3g}, the limit is "
+                f"the step takes an input of {asked:.3g}, the limit is "
                 f"{self.limits.input:g}: make the amplitude or the gains smaller"
             )
         if reached > self.limits.travel:
             raise DataError(
-                f"{run.id}: the step moves a cart by {reached:.3g}, the travel limit is "
+                f"the step moves a cart by {reached:.3g}, the travel limit is "
                 f"{self.limits.travel:g}: make the amplitude smaller"
             )
         return motion.t, motion.x
