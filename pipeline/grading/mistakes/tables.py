@@ -278,6 +278,10 @@ def _specific_flags(
         if first.rival and code not in first.rival.codes:
             evidence["or_else"] = [c for c in first.rival.codes if c not in first.mistake.codes]
             message += WORDS.text("or_else", help=first.rival.help(typed, reference))
+        other = _OTHER[first.table]
+        if any(one.table == other for one in mine):  # who mends one table leaves the other else
+            evidence["also_in"] = other
+            message += WORDS.text(f"also_{other}")
         flags.append(Flag(code=code, parameters=tuple(names), message=message, evidence=evidence))
     return flags
 

@@ -120,6 +120,7 @@ def test_frequencies_in_hz(carts, table):
     assert set(flag.parameters) == set(names)
     assert flag.evidence["ratio"] == pytest.approx(1 / TURN, rel=0.15)  # read off by eye: 10 %
     assert "/2π" in flag.message
+    assert "also_in" not in flag.evidence
 
 
 def test_a_named_mistake_is_told_once_and_nothing_else_is_advised():
@@ -129,7 +130,8 @@ def test_a_named_mistake_is_told_once_and_nothing_else_is_advised():
     hertz = scaled(scaled(one, "initial", names, 1 / TURN), "final", names, 1 / TURN).grade()
     (flag,) = hertz.flags
     assert "first estimate" in flag.message
-    assert flag.evidence["table"] == "initial"
+    assert (flag.evidence["table"], flag.evidence["also_in"]) == ("initial", "final")
+    assert flag.message.endswith("Your final estimates have the same mistake.")
     lost = {c.id: c.message for c in hertz.criteria if c.outcome in ("partial", "fail")}
     advice = {c.id: c.message for c in one.rubric.criteria if c.message}
     assert advice["initial-decays"] not in lost["initial-decays"]
