@@ -56,7 +56,7 @@ def analyse(
     data = read_data(submission)
     for name, reason in data.unreadable.items():
         log.skip(f"reading {name}", reason)
-    log.warn(reading_remarks(data))
+    log.warn(reading_remarks(data, unit=position))
 
     found, left_out = identify_from_sound(data, system=system, progress=progress)
     log.add(found.log)

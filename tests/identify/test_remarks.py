@@ -1,0 +1,35 @@
+"""What is said of the records as such."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.identify.remarks import reading_remarks
+from pipeline.ingest.read import read_data
+from pipeline.resources import EXAMPLES
+from pipeline.submission import load_submission
+
+
+@pytest.mark.parametrize("name", ["one-cart", "two-cart", "three-cart"])
+def test_centimetres_said_to_be_metres_are_asked_about(name):
+    """Carts that run at 60 km/h are in another unit; in centimetres, millimetres or counts not."""
+    data = read_data(load_submission(EXAMPLES / name))
+    (said,) = [one for one in reading_remarks(data, unit="m") if "m/s" in one]
+    assert "no cart at a bench runs so fast" in said
+    for unit in ("cm", "mm", "in", "count"):
+        assert not [one for one in reading_remarks(data, unit=unit) if "runs so fast" in one]
+
+
+def test_one_kind_of_recording_or_a_jump_accuses_no_unit():
+    """A slip in one file is its own, and an encoder that jumps is no cart that runs."""
+    data = read_data(load_submission(EXAMPLES / "one-cart"))
+    steps = replace(data, records=tuple(r for r in data.records if r.kind == "step"))
+    assert not [one for one in reading_remarks(steps, unit="m") if "runs so fast" in one]
+
+    def jumped(record):
+        y = 1e-2 * record.y
+        return replace(record, y=y + 5.0 * (np.arange(y.shape[1]) == y.shape[1] // 2))
+
+    jumpy = replace(data, records=tuple(map(jumped, data.records)))
+    assert not [one for one in reading_remarks(jumpy, unit="m") if "runs so fast" in one]
