@@ -59,17 +59,18 @@ def fit_separable(
 
     at = evaluated_once(lambda p: _solved(y, model(p)))
     # `least_squares` runs the same MINPACK routine, and takes as long again to prepare each call.
-    p, *_, status = leastsq(
-        lambda p: at(p).residual,
-        start,
-        Dfun=lambda p: jacobian(at(p)),
-        full_output=True,
-        ftol=_PRECISION,
-        xtol=_PRECISION,
-        gtol=_PRECISION,
-        maxfev=max_evaluations,
-        diag=np.broadcast_to(1 / np.asarray(scale, dtype=np.float64), start.shape),
-    )
+    with np.errstate(over="ignore"):  # in its covariance of p, which nobody asks for
+        p, *_, status = leastsq(
+            lambda p: at(p).residual,
+            start,
+            Dfun=lambda p: jacobian(at(p)),
+            full_output=True,
+            ftol=_PRECISION,
+            xtol=_PRECISION,
+            gtol=_PRECISION,
+            maxfev=max_evaluations,
+            diag=np.broadcast_to(1 / np.asarray(scale, dtype=np.float64), start.shape),
+        )
     best = at(p)
     return SeparableFit(p=p, linear=best.linear, residual=best.residual, converged=status in _FOUND)
 
