@@ -1,14 +1,9 @@
-"""How fast a batch is, what it stands, and how well shared recordings are found.
+"""A class to grade: what a batch of it costs, which disguised copies it finds, what kills do to it.
 
-    python -m benchmarks.grading_batch speed [--preset throne-2dof] [--teams 40] [--copies 1000]
-    python -m benchmarks.grading_batch kills [--kills 300]
-    python -m benchmarks.grading_batch shared [--teams 200]
+    python -m benchmarks.grading_batch [--kills 300]
 
-`speed`: submissions a second of one core's time, two jobs against one, a run with nothing changed,
-memory over a long run; on a busy machine believe the times of the processor.
-`kills`: kill -9 at random moments, then compare with a run left alone; all of it on a copy of the
-code, as a grade belongs to the code that made it.
-`shared`: honest teams on one bench (a third of them with hidden friction) and disguised copies.
+kills -9 at random moments, then compares with a run left alone; all of it on a copy of the code, as
+a grade belongs to the code that made it. The tables are part of `benchmarks/grading.py`.
 """
 
 import argparse
@@ -27,12 +22,11 @@ from pathlib import Path
 import numpy as np
 import psutil
 
+from benchmarks.page import Table
 from pipeline.grading.batch.grade_class import grade_class
-from pipeline.grading.batch.runner import Limits, grade_batch, run_here
+from pipeline.grading.batch.runner import Limits
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradings import Member
-from pipeline.grading.intake.hand_ins import find_hand_ins
-from pipeline.grading.rubric_file import load_rubric
 from pipeline.grading.similarity.prints import fingerprint
 from pipeline.grading.similarity.shared import find_shared
 from pipeline.ingest.read import read_data
@@ -55,6 +49,7 @@ DISGUISES = {
     "noise 1, cut, rescaled": {"noise": 1.0, "keep": 0.8, "scale": 1.3},
     "noise 2": {"noise": 2.0},
 }
+COPIED_KINDS = ("decay", "step", "sweep", "closed_loop")
 
 
 def write_class(folder: Path, teams: int, *, preset: str = PRESET) -> None:
@@ -82,9 +77,6 @@ class Cost:
         """Seconds of the processor, all processes together."""
         return self.parent + self.workers
 
-    def __str__(self) -> str:
-        return f"{self.clock:.1f} s, {self.cpu:.1f} s of the processor, {self.parent:.2f} here"
-
 
 @contextmanager
 def measured(costs: list[Cost]) -> Iterator[None]:
@@ -105,8 +97,16 @@ def measured(costs: list[Cost]) -> Iterator[None]:
     )
 
 
-def grade(folder: Path, out: Path, *, preset: str, jobs: int) -> Cost:
-    """Grade a class without figures, all files written."""
+def grade(
+    folder: Path,
+    out: Path,
+    *,
+    preset: str,
+    jobs: int = 1,
+    cluster: str | None = None,
+    figures: bool = False,
+) -> Cost:
+    """Grade a class, all files written."""
     costs: list[Cost] = []
     with measured(costs):
         grade_class(
@@ -114,56 +114,12 @@ def grade(folder: Path, out: Path, *, preset: str, jobs: int) -> Cost:
             rubric_file=Path(preset),
             out=out,
             jobs=jobs,
-            cluster=None,
+            cluster=cluster,
             limits=Limits(),
-            figures=False,
+            figures=figures,
             progress=lambda *_: None,
         )
     return costs[0]
-
-
-def memory(folder: Path, out: Path, *, preset: str) -> tuple[Cost, list[float]]:
-    """Grade a class with two jobs; return the MB that all processes held after each hand-in.
-
-    Only the grading: of copies all recordings are shared, and naming them would take the time.
-    """
-    process, costs, used = psutil.Process(), [], []
-
-    def progress(done: int, total: int, last: str) -> None:
-        family = (process, *process.children())
-        used.append(sum(p.memory_info().rss for p in family) / 1e6)
-
-    scratch = out / "scratch"
-    scratch.mkdir(parents=True)
-    with Gradebook(out, create=True) as book, measured(costs):
-        grade_batch(
-            find_hand_ins([folder], scratch=scratch),
-            rubric=load_rubric(Path(preset)),
-            book=book,
-            scratch=scratch,
-            execute=run_here(jobs=2),
-            progress=progress,
-        )
-    return costs[0], used
-
-
-def speed(base: Path, *, preset: str, teams: int, copies: int) -> None:
-    write_class(base / "class", teams, preset=preset)
-    one = grade(base / "class", base / "one", preset=preset, jobs=1)
-    two = grade(base / "class", base / "two", preset=preset, jobs=2)
-    again = grade(base / "class", base / "two", preset=preset, jobs=2)
-    print(f"{teams} submissions, {preset}, one job: {one}: {teams / one.cpu:.2f} a second and core")
-    print(f"two jobs: {two}: {one.clock / two.clock:.2f} times as fast")
-    print(f"nothing changed: {again}: {one.cpu / again.cpu:.0f} times less of the processor")
-    if copies:
-        for number in range(copies):
-            source = base / "class" / f"team-{number % teams:03d}"
-            target = base / "many" / f"team-{number:04d}"
-            shutil.copytree(source, target)
-            (target / "notes.md").write_text(f"number {number}", encoding="utf-8")
-        cost, used = memory(base / "many", base / "out-many", preset=preset)
-        marks = [used[round(share * (copies - 1))] for share in (0.1, 0.25, 0.5, 0.75, 1.0)]
-        print(f"{copies} in one run: {cost}; MB at 10, 25, 50, 75, 100 %:", *map(round, marks))
 
 
 def kills(base: Path, *, count: int) -> None:
@@ -226,7 +182,8 @@ def disguised(
     )
 
 
-def shared(base: Path, *, teams: int) -> None:
+def copies(base: Path, *, teams: int) -> Table:
+    """Return which disguised copies are found, among honest teams that are not taken for any."""
     records: list[tuple[Record, ...]] = []
     for seed in range(teams):
         folder = base / str(seed)
@@ -244,42 +201,37 @@ def shared(base: Path, *, teams: int) -> None:
         return Member(submission=name, authors=(name,), fingerprints=fingerprint(of))
 
     honest = [prints(str(i), of) for i, of in enumerate(records)]
-    start = time.process_time()
-    found = find_shared(honest)
-    pairs = teams * (teams - 1) // 2
-    print(f"{teams} honest teams: {sum(map(len, found.values())) // 2} false pairs of {pairs}, "
-          f"{time.process_time() - start:.1f} s")  # fmt: skip
-    rng = np.random.default_rng(5)
+    false, pairs = sum(map(len, find_shared(honest).values())) // 2, teams * (teams - 1) // 2
+    rng, rows = np.random.default_rng(5), []
     for name, options in DISGUISES.items():
         hits: dict[str, list[bool]] = defaultdict(list)
         for number in range(min(teams - 1, 20)):
             own, other = records[number], records[number + 1]
             whole = tuple(disguised(r, rng, **options) for r in own)
             hits["whole"].append(bool(find_shared([honest[number], prints("w", whole)])))
-            for kind in ("decay", "step", "sweep", "closed_loop"):
+            for kind in COPIED_KINDS:
                 one = disguised(next(r for r in own if r.kind == kind), rng, **options)
                 mixed = prints("m", (*other[:6], one))
                 hits[kind].append("m" in find_shared([honest[number], mixed]))
-        shares = ", ".join(f"{k} {100 * np.mean(v):.0f} %" for k, v in hits.items())
-        print(f"{name}: {shares}")
+        rows.append([name, *(f"{100 * np.mean(found):.0f} %" for found in hits.values())])
+    return Table(
+        title="Copied recordings",
+        head=["disguise", "all of them", *(f"one {kind}" for kind in COPIED_KINDS)],
+        rows=rows,
+        note=f"""
+{teams} honest teams on one bench of two carts, every third with friction hidden in it: {false}
+false pairs of {pairs}. Then copies of {min(teams - 1, 20)} of them, all recordings or one among six
+of another team's own. Noise is in encoder counts, added to what was read.
+""",
+    )
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=("speed", "kills", "shared"))
-    parser.add_argument("--preset", default=PRESET)
-    parser.add_argument("--teams", type=int, default=40)
-    parser.add_argument("--copies", type=int, default=0)
+    """Kill batches at random moments."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--kills", type=int, default=300)
-    options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        base = Path(folder)
-        if options.what == "speed":
-            speed(base, preset=options.preset, teams=options.teams, copies=options.copies)
-        elif options.what == "kills":
-            kills(base, count=options.kills)
-        else:
-            shared(base, teams=options.teams)
+        kills(Path(folder), count=parser.parse_args().kills)
 
 
 if __name__ == "__main__":
