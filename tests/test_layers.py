@@ -13,7 +13,7 @@ PIPELINE = ROOT / "pipeline"
 
 # From the ground up, rooms and the rooms within them; a module imports from its own room or below.
 LEVELS = (
-    ("__init__", "arrays", "errors", "names", "resources", "plant.limits"),
+    ("__init__", "arrays", "errors", "garbage", "names", "resources", "plant.limits"),
     ("output", "results_of_runs", "schemas"),
     ("lock", "processes", "web"),
     ("plant.linear",),

@@ -16,6 +16,7 @@ from typer.exceptions import TyperException
 
 from pipeline import __version__
 from pipeline.errors import PipelineError
+from pipeline.garbage import collect_seldom
 
 app = typer.Typer(
     name="cartlab",
@@ -44,6 +45,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON o
 
 def main() -> None:
     """Run the command line; an error that a person can act on is one line and exit status 2."""
+    collect_seldom()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # a console of few letters shows the others as \u…
             stream.reconfigure(errors="backslashreplace")

@@ -14,11 +14,13 @@ from typing import Any
 from pipeline.desk.jobs import MEMORY
 from pipeline.desk.tasks import TASKS
 from pipeline.errors import PipelineError
+from pipeline.garbage import collect_seldom
 from pipeline.processes import limit_memory
 
 
 def main() -> None:
     """Answer every task; end at once where nobody is there to be answered."""
+    collect_seldom()
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what a library prints is no answer
     faulthandler.enable()

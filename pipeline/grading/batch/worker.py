@@ -17,6 +17,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from pipeline.errors import PipelineError
+from pipeline.garbage import collect_seldom
 from pipeline.grading.gradings import Grading
 from pipeline.grading.intake.files import Changed, open_submission
 from pipeline.grading.judge.run import Graded, grade_submission
@@ -216,6 +217,7 @@ def task_line(task: Task | Setup) -> bytes:
 
 def main() -> None:
     """Answer every task on stdin; stdout is for answers only."""
+    collect_seldom()
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what a library prints is no answer
     tasks = sys.stdin.buffer

@@ -1,0 +1,12 @@
+"""When Python looks for garbage: seldom, as what libraries load stays for good."""
+
+import gc
+
+# Containers made since the last look. By default it is 700: in a report 500 looks at a few hundred
+# thousand objects, a tenth of its time, that free nothing; its memory is the same with either.
+_MADE = 100_000
+
+
+def collect_seldom() -> None:
+    """Look for cycles of dead objects less often, in a process that is ours alone."""
+    gc.set_threshold(_MADE)

@@ -1,0 +1,23 @@
+"""A command looks for garbage seldom."""
+
+import subprocess
+import sys
+
+LOOKS = """
+import gc, sys
+looks = []
+gc.callbacks.append(lambda phase, info: looks.append(phase) if phase == "start" else None)
+sys.argv = ["cartlab", "effects", "--json"]
+from pipeline.cli import main
+try:
+    main()
+except SystemExit:
+    sys.stderr.write(f"{len(looks)}\\n")
+"""
+
+
+def test_a_command_looks_for_garbage_a_few_times_only():
+    """By default it is a hundred times, for the imports of this one alone."""
+    command = [sys.executable, "-c", LOOKS]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert int(done.stderr.split()[-1]) < 40
