@@ -33,6 +33,7 @@ PAGE = Path(__file__).with_name("README.md")
 BENCHMARKS = (
     "bode",
     "gap_tools",
+    "silverbox",
     "feedback",
     "time_fit",
     "time_stages",

@@ -14,6 +14,7 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from pipeline.arrays import Array
 
@@ -31,6 +32,7 @@ class Part:
     dt: float
     u: Array
     y: Array
+    held: bool = True  # the input, from sample to sample; else band-limited
     first: int = 48  # sample to judge from: those before start what has a memory
     source: Any = None
 
@@ -102,6 +104,7 @@ FEATURES: dict[str, Callable[[Any, Any, Any], Any]] = {
 }
 LINEAR = ("x", "v", "u")
 _SUBSTEPS = 2
+_ORDER, _SHARP = 4, 6  # of the differences, with and without smoothing
 _THRESHOLDS = (0.003, 0.006, 0.01, 0.02, 0.035, 0.06)  # of the acceleration
 
 
@@ -111,11 +114,16 @@ def sindy(parts: Sequence[Part], *, windows: Sequence[int] = (5, 7, 11, 15)) -> 
     driven = any(np.any(part.u) for part in parts)
     names = [name for name in FEATURES if driven or "u" not in name]
     for window in windows:
-        smooth = ps.SmoothedFiniteDifference(
-            smoother_kws={"window_length": window, "polyorder": min(3, window - 2)}
+        smooth = (
+            ps.FiniteDifference(order=_SHARP)
+            if window == 1
+            else ps.SmoothedFiniteDifference(
+                smoother_kws={"window_length": window, "polyorder": min(3, window - 2)},
+                order=_ORDER,
+            )
         )
         # A derivative is that of the middle: between the hold before a sample and the one after.
-        u = [(part.u + np.roll(part.u, 1)) / 2 for part in parts]
+        u = [(part.u + np.roll(part.u, 1)) / 2 if part.held else part.u for part in parts]
         v = [np.asarray(smooth(part.y, part.dt)).ravel() for part in parts]
         states = [np.column_stack([part.y, slope]) for part, slope in zip(parts, v, strict=True)]
         accelerations = [
@@ -137,44 +145,48 @@ def sindy(parts: Sequence[Part], *, windows: Sequence[int] = (5, 7, 11, 15)) -> 
                     states, t=[part.dt * np.arange(part.y.size) for part in parts],
                     u=[held[:, None] for held in u],
                 )  # fmt: skip
-            coefficients = np.asarray(model.coefficients())
-            kept = [i for i in range(len(names)) if np.any(coefficients[:, i])]
+            acceleration = np.asarray(model.coefficients())[1]  # dx/dt = v is no question
             yield Model(
-                run=_integrated(coefficients, names, smooth),
+                run=_integrated(acceleration, names, smooth),
                 every=1,
-                words="dv/dt = " + _sum(coefficients[1], names),
-                terms=tuple(names[i] for i in kept if coefficients[1, i]),
+                words="dv/dt = " + _sum(acceleration, names),
+                terms=tuple(name for name, c in zip(names, acceleration, strict=True) if c),
             )
 
 
 def _integrated(coefficients: Array, names: Sequence[str], smooth: Any) -> Callable[[Part], Array]:
-    active = [
-        (FEATURES[name], *coefficients[:, i])
-        for i, name in enumerate(names)
-        if np.any(coefficients[:, i])
-    ]
+    terms = [(FEATURES[name], c) for name, c in zip(names, coefficients.tolist(), strict=True) if c]
 
     def slope(x: float, v: float, u: float) -> tuple[float, float]:
-        values = [(of(x, v, u), a, b) for of, a, b in active]
-        return sum(f * a for f, a, _ in values), sum(f * b for f, _, b in values)
+        return v, sum(c * of(x, v, u) for of, c in terms)
 
     def run(part: Part) -> Array:
         x, v = float(part.y[0]), float(np.asarray(smooth(part.y, part.dt)).ravel()[0])
         out, h, far = np.full(part.y.size, np.inf), part.dt / _SUBSTEPS, _FAR * np.abs(part.y).max()
-        for k, u in enumerate(part.u.tolist()):
+        for k, inputs in enumerate(_between(part).tolist()):
             out[k] = x
             if not abs(x) < far:
                 break
-            for _ in range(_SUBSTEPS):
-                a = slope(x, v, u)
-                b = slope(x + h / 2 * a[0], v + h / 2 * a[1], u)
-                c = slope(x + h / 2 * b[0], v + h / 2 * b[1], u)
-                d = slope(x + h * c[0], v + h * c[1], u)
+            for i in range(0, 2 * _SUBSTEPS, 2):
+                now, middle, then = inputs[i : i + 3]
+                a = slope(x, v, now)
+                b = slope(x + h / 2 * a[0], v + h / 2 * a[1], middle)
+                c = slope(x + h / 2 * b[0], v + h / 2 * b[1], middle)
+                d = slope(x + h * c[0], v + h * c[1], then)
                 x += h / 6 * (a[0] + 2 * b[0] + 2 * c[0] + d[0])
                 v += h / 6 * (a[1] + 2 * b[1] + 2 * c[1] + d[1])
         return out
 
     return run
+
+
+def _between(part: Part) -> Array:
+    """Return the input (n, 2 substeps + 1) from each sample to the next, ends included."""
+    shares = np.linspace(0, 1, 2 * _SUBSTEPS + 1)
+    if part.held:
+        return np.repeat(part.u[:, None], shares.size, axis=1)
+    samples = np.arange(part.u.size)
+    return CubicSpline(samples, part.u)(samples[:, None] + shares)
 
 
 def _sum(coefficients: Sequence[float] | Array, names: Sequence[str]) -> str:

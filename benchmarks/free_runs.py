@@ -33,7 +33,14 @@ def part_of(record: Record, *, first: int = 48) -> Part:
     """Return a record as all see it: as read, but from where the hand lets go."""
     run = make_run(record, n=1)
     u = np.zeros(record.t.size) if record.u is None else record.u
-    return Part(dt=record.sample_time, u=u[-run.t.size :], y=run.y[0], first=first, source=run)
+    return Part(
+        dt=record.sample_time,
+        u=u[-run.t.size :],
+        y=run.y[0],
+        held=record.hold == "zero_order",
+        first=first,
+        source=run,
+    )
 
 
 def start_at(model: AugmentedChain, *, springs: tuple[bool, ...]) -> FitModel:
@@ -89,7 +96,7 @@ def others(
             began = time.process_time()
             model = best(learn(training, **(settings or {}).get(name, {})), training)
             seconds = time.process_time() - began
-            off = np.inf if model is None else error(model, held_out)
+            off = np.inf if model is None else error(model, held_out) if held_out else np.nan
             yield name, Answer(model=model, error=off, seconds=seconds)
 
 
