@@ -34,11 +34,11 @@ BENCHMARKS = (
     "bode",
     "gap_tools",
     "silverbox",
+    "grading",
+    "report",
     "feedback",
     "time_fit",
     "time_stages",
-    "grading",
-    "report",
 )
 
 
