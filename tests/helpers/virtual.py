@@ -1,9 +1,13 @@
 """Recordings carried out on a virtual bench without a line or a clock: as fast as it computes."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
-from pipeline.bench.emulator.carts import TRUE_PERIOD, VirtualCarts, input_per_count
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.bench.emulator.carts import _NOISE, TRUE_PERIOD, VirtualCarts, input_per_count
 from pipeline.bench.emulator.core import ReferenceCore
 from pipeline.bench.explore.explore import Recorded
 from pipeline.bench.host.experiments import add_experiment, recorded_entry
@@ -24,6 +28,7 @@ from pipeline.bench.protocol.messages import (
     parse_reading,
 )
 from pipeline.output import write_file
+from pipeline.plant.nonlinear.augmented import simulate_augmented
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.load import NAME
 from pipeline.synthesis.hidden import HiddenBench
@@ -58,10 +63,19 @@ class VirtualBench:
         self._ticks += 1
         return [r for line in self._core.take().splitlines() if (r := parse_reading(line))]
 
-    def _wait(self, seconds: float) -> None:
-        for _ in range(round(seconds / TRUE_PERIOD)):
-            self._tick()
-        self.seconds += seconds
+    def _driven(self, *, held: Sequence[int], ticks: int) -> list[Reading]:
+        """Return the lines of as many ticks from rest, all carts' motion computed at once.
+
+        Without feedback the controller never looks at the counts: they are put in afterwards.
+        """
+        duties, lines, spare = np.zeros(ticks), [], (0,) * self.description.encoders
+        for tick in range(ticks):
+            now = int(1e3 * self._ticks * TRUE_PERIOD)
+            duties[tick] = self._core.tick(spare, stamp=now, now=0)
+            self._ticks += 1
+            lines += [(tick, r) for r in map(parse_reading, self._core.take().splitlines()) if r]
+        counts = _counts(self.carts, duties, held=held)
+        return [replace(line, counts=tuple(counts[tick].tolist())) for tick, line in lines]
 
     def carry_out(
         self, recording: Recording, *, submission: Submission, limits: Limits
@@ -76,18 +90,23 @@ class VirtualBench:
             bench=self.description,
         )
         held = tuple(cart for cart in range(1, n + 1) if cart not in recording.carts)
-        self.carts.take_in_hand(Hands(held=held))
-        self._wait(recording.settle)
+        # Whoever takes the carts in hand brings them to rest: nothing is to be seen while they wait.
+        self.carts.take_in_hand(Hands(held=held, released=recording.release or 0))
+        self._ticks += round(recording.settle / TRUE_PERIOD)
+        self.seconds += recording.settle
         if recording.release:
-            self.carts.take_in_hand(Hands(held=held, released=recording.release))
-            self._wait(_PULL_OUT * TRUE_PERIOD)
+            for _ in range(_PULL_OUT):
+                self._tick()
+            self.seconds += _PULL_OUT * TRUE_PERIOD
         for command in order.commands:
             self._core.receive(encode(command))
             if isinstance(command, Start):
                 self.carts.start()
-        lines = []
-        for _ in range(round(recording.duration / TRUE_PERIOD) + 2):
-            lines += self._tick()
+        ticks = round(recording.duration / TRUE_PERIOD) + 2
+        if recording.release or recording.controller:
+            lines = [line for _ in range(ticks) for line in self._tick()]
+        else:
+            lines = self._driven(held=held, ticks=ticks)
         self.seconds += recording.duration
         for line in lines:
             assert not (why := order.passed(line, carts=n)), f"{recording.id}: {why}"
@@ -105,6 +124,21 @@ class VirtualBench:
                 recording, file=data_file(recording), controller=None, remarks=()
             )
             submission = add_experiment(submission, entry)
+
+
+def _counts(
+    carts: VirtualCarts, duties: NDArray[np.float64], *, held: Sequence[int]
+) -> NDArray[np.int64]:
+    """Return what the encoders count at each tick under these duties, the first being zero."""
+    hidden = carts._bench
+    free = [cart for cart in range(1, hidden.chain.n + 1) if cart not in held]
+    t = TRUE_PERIOD * np.arange(duties.size)
+    x = simulate_augmented(carts._model, t, carts.input_per_count * duties, free=free)
+    noise = carts._noise_rng.standard_normal((duties.size, hidden.chain.n)) * carts._shaken
+    exact = x.T / hidden.count + carts._phase + _NOISE * noise
+    counts = np.zeros((duties.size, carts.encoders), dtype=np.int64)
+    counts[:, : hidden.chain.n] = np.rint(exact)
+    return counts - counts[0]
 
 
 def new_folder(folder: Path, bench: VirtualBench, *, springs: Sequence[bool]) -> Path:

@@ -32,8 +32,10 @@ from pipeline.gap.types import Gap, Proposal
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.dwells import SETTLED, settling_wait
 from pipeline.plant.linear.simulate import simulate_linear
-from pipeline.plant.nonlinear.augmented import simulate_augmented
+from pipeline.plant.nonlinear.augmented import rest_positions, simulate_augmented
 from pipeline.plant.nonlinear.effects.base import AugmentedChain, Term
+from pipeline.plant.nonlinear.simulator import sensitivity
+from pipeline.plant.nonlinear.simulator.kernel import simulate_with_derivatives
 from pipeline.submission import Submission
 
 Kind = Literal["step", "sweep"]
@@ -43,10 +45,10 @@ _PERIOD = 5e-3  # s from sample to sample
 _TIME = 12.0  # s of a record, about
 _SIZES = (1.0, 0.5, 0.2)  # of what the limits allow: laws differ in how they grow with the motion
 _RELEASES = (0.6, 0.2)  # of the travel limit, from where a hand lets go
-_STEP = 1e-3  # relative, of a parameter's difference
+_STEP = 1e-3  # relative, of an effect's parameter for a difference
 _HOPELESS = np.exp(-0.5 * CLOSE_BIC)  # of the likeliest one's weight: no contender any more
 _LEAST_WEIGHT = 0.1  # of the others: what swings overstates how sure the criterion is
-_SAME = 1e-9  # of the largest singular value: such a change of the parameters shows in nothing
+_SAME = 1e-9  # of the largest: such a change of the parameters shows in nothing
 
 
 def propose_for(gap: Gap, submission: Submission, *, without: Sequence[Recording] = ()) -> Gap:
@@ -209,6 +211,8 @@ def _tell_apart(
 def _left(difference: Array, by: Array) -> float:
     """Return the square sum of a difference (n,) that changes of the parameters leave."""
     columns = by.reshape(len(by), -1).T
+    size = np.linalg.norm(columns, axis=0)
+    columns = columns / np.maximum(size, _SAME * size.max())
     U, s, _ = np.linalg.svd(columns, full_matrices=False)
     U = U[:, s > _SAME * s[0]]
     rest = difference - U @ (U.T @ difference)
@@ -222,27 +226,43 @@ def _predict(
 
     By every parameter of the chain and its effects, the start of a cart let go, the zeros.
     """
-
-    def run(model: AugmentedChain, x0: Array | None) -> Array:
-        return simulate_augmented(model, t, u, free=recording.carts, x0=x0)
-
-    x = run(model, x0)
-    by = [(run(other, x0) - x) / _STEP for other in _changed(model)]
-    if x0 is not None:
-        by.append((run(model, x0 * (1 + _STEP)) - x) / _STEP)
-    zeros = np.repeat(np.eye(len(x))[:, :, None], t.size, axis=2)
-    return x, np.concatenate([by, zeros])
+    n = model.chain.n
+    start = rest_positions(model, free=recording.carts) if x0 is None else x0
+    of = [
+        (kind, i)
+        for kind, values in (
+            (sensitivity.BY_MASS, model.chain.m),
+            (sensitivity.BY_DAMPING, model.chain.c),
+            (sensitivity.BY_STIFFNESS, model.chain.k),
+        )
+        for i in np.flatnonzero(values)
+    ]
+    if recording.release:
+        of.append((sensitivity.BY_POSITION, recording.release - 1))
+    variants = [model, *_changed(model)]
+    tables = zip(*(variant.tables() for variant in variants), strict=True)
+    b = len(variants)
+    y, by_chain = simulate_with_derivatives(
+        *(np.stack(table) for table in tables),
+        np.broadcast_to(start, (b, 1, n)),
+        np.zeros((b, 1, n)),
+        np.ones((b, n)),
+        np.isin(np.arange(1, n + 1), recording.carts),
+        t,
+        t,
+        u,
+        np.array([0, t.size]),
+        1.0,
+        np.array(of).T,
+    )
+    by_effects = (y[1:] - y[0]) / _STEP
+    zeros = np.repeat(np.eye(n)[:, :, None], t.size, axis=2)
+    x = simulate_augmented(model, t, u, free=recording.carts, x0=start)
+    return x, np.concatenate([by_chain, by_effects, zeros])
 
 
 def _changed(model: AugmentedChain) -> Iterator[AugmentedChain]:
-    """Yield the model with each parameter a little larger."""
-    chain = model.chain
-    for name in ("m", "c", "k"):
-        values: Array = getattr(chain, name)
-        for i in np.flatnonzero(values):
-            moved = values.copy()
-            moved[i] *= 1 + _STEP
-            yield replace(model, chain=replace(chain, **{name: moved}))
+    """Yield the model with each parameter of an effect a little larger."""
     for at, term in enumerate(model.terms):
         for i, value in enumerate(term.values):
             moved = (*term.values[:i], value * (1 + _STEP), *term.values[i + 1 :])
