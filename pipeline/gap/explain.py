@@ -12,9 +12,10 @@ from pipeline.gap import limits
 from pipeline.gap.data.runs import Run
 from pipeline.gap.data.sides import prepare, take_sides
 from pipeline.gap.fit.baseline import fit_baseline, measure_noise
-from pipeline.gap.fit.levenberg_marquardt import Fit, covariance, fit_model
+from pipeline.gap.fit.levenberg_marquardt import Fit, fit_model
 from pipeline.gap.fit.restart import holding_force
 from pipeline.gap.fit.structure import Candidate
+from pipeline.gap.fit.uncertainty import covariance
 from pipeline.gap.search.beam import choose, prune, search, steps_to
 from pipeline.gap.search.deadline import Deadline, OutOfTime
 from pipeline.gap.search.grow import fit_whole

@@ -139,13 +139,13 @@ def fit_model(
     )
     damp = _DAMP
     for iteration in range(iterations):
-        inflate = _inflation(best)
+        inflate = inflation(best)
         best = replace(best, cost=best.chi_square + inflate**2 * float(best.run_prior.sum()))
         linear = _linearise_all(
             best, runs, inflate=inflate, scatter_free=scatter_free, shared=shared, mapper=mapper
         )
         reduced = [part.reduced for part in linear]
-        stacked = np.concatenate([*reduced, _anchor(runs, reduced[0].shape[1] - 1)])
+        stacked = np.concatenate([*reduced, anchor(runs, reduced[0].shape[1] - 1)])
         if not np.all(np.isfinite(stacked)):
             break
         for _attempt in range(_ATTEMPTS):
@@ -166,7 +166,7 @@ def fit_model(
     return best
 
 
-def _inflation(fit: Fit) -> float:
+def inflation(fit: Fit) -> float:
     """Return by how much the misfit of a model that is still wrong widens the noise."""
     return max(1.0, float(np.sqrt(fit.chi))) if np.isfinite(fit.chi) else 1.0
 
@@ -269,7 +269,7 @@ def _follow(
     )
 
 
-def _anchor(runs: Sequence[Run], size: int) -> Array:
+def anchor(runs: Sequence[Run], size: int) -> Array:
     """Return a row that holds the first free mass where no input gives forces a scale."""
     if any(np.any(run.command) for run in runs):
         return np.zeros((0, size + 1))
@@ -318,7 +318,7 @@ def project(
     -------
     (rows, k) what is left of them, and (rows,) what is left of the residual.
     """
-    linear = _linearise_all(fit, runs, inflate=_inflation(fit), extras=extras, mapper=mapper)
+    linear = _linearise_all(fit, runs, inflate=inflation(fit), extras=extras, mapper=mapper)
     stacked = np.concatenate([part.reduced for part in linear])
     shared, wide = stacked[:, : fit.theta.size], stacked[:, fit.theta.size :]
     if not np.all(np.isfinite(shared)):
@@ -331,22 +331,3 @@ def project(
     basis = basis[:, power > _SHOWN]
     projected = triangle(wide - basis @ (basis.T @ wide))
     return projected[:, :-1], projected[:, -1]
-
-
-def covariance(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
-    """Return the fit with the covariance of its parameters, scaled by its own misfit.
-
-    Where friction was fitted with one size for all runs, its spread is no part of the error.
-    """
-    scatter_free = any(np.any(nuisance.scatter != 1.0) for nuisance in fit.nuisance)
-    linear = _linearise_all(
-        fit, runs, inflate=_inflation(fit), scatter_free=scatter_free, mapper=mapper
-    )
-    parts = [*(part.reduced for part in linear), _anchor(runs, fit.theta.size)]
-    J = np.concatenate(parts)[:, :-1]
-    if not np.all(np.isfinite(J)):
-        return fit
-    _, s, vt = np.linalg.svd(J, full_matrices=False)
-    s = np.maximum(s, _DEAD * s[0])
-    cov = (vt.T / s**2) @ vt * max(1.0, fit.chi)
-    return replace(fit, covariance=cov)

@@ -118,7 +118,7 @@ class Layout:
     first_v0: bool
 
 
-def _layout(structure: Structure, run: Run, *, scatter_free: bool) -> Layout:
+def layout_of(structure: Structure, run: Run, *, scatter_free: bool) -> Layout:
     free = tuple(i for i, moves in enumerate(run.free) if moves)
     multiple = len(run.shots) > 2
     dry = structure.dry if scatter_free else (False,) * structure.n
@@ -190,20 +190,20 @@ def linearise(
     `run.thin`) are further columns to project.
     """
     run = run.thin
-    layout = _layout(model.structure, run, scatter_free=scatter_free)
-    columns = _columns(model, run, nuisance, layout, shared=shared, extras=extras)
-    prior = _start_prior(layout, run, _sizes(model, run), inflate=inflate)
+    layout = layout_of(model.structure, run, scatter_free=scatter_free)
+    columns = columns_of(model, run, nuisance, layout, shared=shared, extras=extras)
+    prior = start_prior(layout, run, usual_sizes(model, run), inflate=inflate)
     starts = prior.shape[1]
     shots = _eliminate_starts(_by_shot(columns / run.sigma[:, None], run), prior)
     rest = shots[:, starts:, starts:].reshape(-1, shots.shape[-1] - starts)
-    expected = _run_prior(layout, run, nuisance, rest.shape[-1], spread=spread, inflate=inflate)
+    expected = run_prior(layout, run, nuisance, rest.shape[-1], spread=spread, inflate=inflate)
     R, wide = triangle(np.concatenate([rest, expected])), len(expected)
     return Linear(
         reduced=R[wide:, wide:], run_wide=R[:wide], shots=shots[:, :starts], layout=layout
     )
 
 
-def _columns(
+def columns_of(
     model: Model,
     run: Run,
     nuisance: Nuisance,
@@ -232,7 +232,7 @@ def _eliminate_starts(points: Array, prior: Array) -> Array:
     return triangle(np.concatenate([np.moveaxis(points, 0, -1), wide], axis=1))
 
 
-def _run_prior(
+def run_prior(
     layout: Layout, run: Run, nuisance: Nuisance, columns: int, *, spread: Array, inflate: float
 ) -> Array:
     """Return (run-wide parameters, columns) of the priors on friction factors and zeros."""
@@ -285,7 +285,7 @@ def _differences(
     Behind a contact the misfit is full of narrow valleys: a finite step looks across them.
     """
     structure, theta = model.structure, model.theta
-    position, velocity = _sizes(model, run)
+    position, velocity = usual_sizes(model, run)
     steps = structure.steps() if shared else np.zeros(0)
     x_steps = _START_STEP * position[list(layout.x0)]
     v_steps = _START_STEP * velocity[list(layout.v0)]
@@ -313,7 +313,7 @@ def _differences(
     return y[0], by[: lane - 1], by[lane - 1 :]
 
 
-def _sizes(model: Model, run: Run) -> tuple[Array, Array]:
+def usual_sizes(model: Model, run: Run) -> tuple[Array, Array]:
     """Return the usual positions and velocities (2 n,) of the carts and what hides on them."""
     size = np.maximum(run.swing, 1e-9)
     chain = model.structure.chain(model.theta)
@@ -323,7 +323,7 @@ def _sizes(model: Model, run: Run) -> tuple[Array, Array]:
     return np.tile(position, 2), np.tile(position * np.maximum(rate, 1.0), 2)
 
 
-def _start_prior(layout: Layout, run: Run, sizes: tuple[Array, Array], *, inflate: float) -> Array:
+def start_prior(layout: Layout, run: Run, sizes: tuple[Array, Array], *, inflate: float) -> Array:
     """Return (shots, starts, starts) weak priors that keep starts the data do not show at home.
 
     In units of the swing; where a run starts at rest, its first velocity stays zero.

@@ -44,6 +44,7 @@ _DAHL_STEP = 2.3e-3  # s; the presliding state is held over half of it
 _STRIBECK_STEP = 1.2e-3  # s; the drop of friction from its static force is over in few of them
 _COGGING_STEP = 1e-3  # s; a cart crosses a small part of the pitch in it
 _LONGEST_STEP = 2.5e-3  # s; nonlinear forces are held over it
+_INSTANT = 1e-9  # s; times as near as this are one
 _BLOWN_UP = 1e9  # positions beyond this are a diverged model
 
 
@@ -85,6 +86,16 @@ def _integral(time, knots, held, at):
     since = time - knots[at]
     once = held[1, at] + held[0, at] * since
     return once, held[2, at] + 0.5 * (held[1, at] + once) * since, at
+
+
+@jit
+def _edge(now, end, delay, knots, held, at):
+    """Return when, between `now` and `end`, the delayed input first jumps: or `end`."""
+    while at < knots.size - 1 and knots[at + 1] + delay < end - _INSTANT:
+        at += 1
+        if knots[at] + delay > now + _INSTANT and held[0, at] != held[0, at - 1]:
+            return knots[at] + delay
+    return end
 
 
 @jit
@@ -194,9 +205,13 @@ def _simulate(
                 break
             interval = t[sample + 1] - t[sample]
             count = ceil(interval / longest - 1e-9)
-            h = interval / count
-            for sub in range(count):
-                now = t[sample] + sub * h
+            whole, now, sub = interval / count, t[sample], 0
+            while sub < count:
+                end = t[sample] + (sub + 1) * whole
+                h = whole
+                if dry and s[V, driven] == 0.0 or now > end - whole + _INSTANT:
+                    # What friction holds is to feel the whole of it until the input jumps.
+                    h = _edge(now, end, drive[DELAY], knots, held, at) - now
                 upto, upto2, at = _integral(now + h - drive[DELAY], knots, held, at)
                 mean = (upto - past) / h
                 # What comes early in the step moves the body further than its mean would.
@@ -220,6 +235,9 @@ def _simulate(
                 )  # fmt: skip
                 if not dry or s[V, driven] != 0.0:
                     s[X, driven] += early * s[INV, driven]
+                now += h
+                if now > end - _INSTANT:
+                    now, sub = end, sub + 1
             if not abs(s[X, 0]) + abs(s[X, n - 1]) < _BLOWN_UP:
                 return False
     return True

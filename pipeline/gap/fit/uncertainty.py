@@ -1,0 +1,111 @@
+"""How sure the parameters of a fitted model are, where what it leaves is not white.
+
+An encoder reads the same for as long as a cart rests, and friction lets it rest anywhere: all
+those readings share one rounding error, which is what then limits how well the friction is known.
+So the covariance is H⁻¹ S H⁻¹: H is the information that the fit counts with, S what such encoders
+make of the fitted motion, drawn many times. What the residual shows beyond that is added.
+
+Reference: L. Ljung, System Identification, 2nd ed., section 9.5, for the sandwich; B. Efron, R. J.
+Tibshirani, An Introduction to the Bootstrap, 1993, section 6.5, for the drawing.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from pipeline.arrays import Array
+from pipeline.estimation.colour import score_covariance
+from pipeline.estimation.noise import noise_beyond_rounding
+from pipeline.gap.data.runs import Run
+from pipeline.gap.fit.levenberg_marquardt import Fit, Mapper, anchor, inflation
+from pipeline.gap.fit.linearise import (
+    Nuisance,
+    columns_of,
+    layout_of,
+    run_prior,
+    simulate_run,
+    start_prior,
+    usual_sizes,
+)
+
+_DRAWS = 60  # of the encoders' errors: a standard error is then known to 9 %
+_SEED = 0
+_HIDDEN = 1e-9  # of the strongest direction: one that no run shows is as good as unknown
+
+
+def covariance(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
+    """Return the fit with the covariance of its parameters.
+
+    Where friction was fitted with one size for all runs, its spread is no part of the error.
+    """
+    free = any(np.any(nuisance.scatter != 1.0) for nuisance in fit.nuisance)
+
+    def weigh(job: tuple[Run, Nuisance]) -> Array:
+        return _weigh(fit, *job, scatter_free=free)
+
+    told = np.sum(list(mapper(weigh, zip(runs, fit.nuisance, strict=True))), axis=0)
+    held = anchor(runs, fit.theta.size)[:, :-1]
+    H, expected, found = told + np.stack([held.T @ held, *np.zeros((2, *told.shape[1:]))])
+    if not np.all(np.isfinite(told)):
+        return fit
+    size = np.sqrt(np.maximum(np.diag(H), np.finfo(float).tiny))
+    power, directions = np.linalg.eigh(H / np.outer(size, size))
+    power = np.maximum(power, _HIDDEN * power[-1])
+    inverse = (directions / power) @ directions.T / np.outer(size, size)
+    expected, found = inverse @ expected @ inverse, inverse @ found @ inverse
+    # A direction that is hidden says nothing of itself: its variance is what H leaves.
+    least = np.maximum(np.diag(found), np.diag(inverse))
+    more = np.sqrt(np.maximum(1.0, least / np.maximum(np.diag(expected), 1e-300)))
+    return replace(fit, covariance=expected * np.outer(more, more))
+
+
+def _weigh(fit: Fit, run: Run, nuisance: Nuisance, *, scatter_free: bool) -> Array:
+    """Return H, and S (each (size, size)) as encoders make it and as the residual shows it."""
+    thin, inflate = run.thin, inflation(fit)
+    layout = layout_of(fit.structure, thin, scatter_free=scatter_free)
+    columns = columns_of(fit, thin, nuisance, layout, shared=True, extras=None)
+    columns = columns * thin.weight / thin.sigma[:, None]
+    starts = len(layout.x0) + len(layout.v0)
+    local = starts + len(layout.scatter) + len(layout.zero)
+    own = _by_piece(columns[:starts], thin)
+    N = np.concatenate([own, columns[starts:local].reshape(local - starts, -1)]).T
+    prior = np.zeros((N.shape[1], N.shape[1]))
+    pieces = start_prior(layout, thin, usual_sizes(fit, thin), inflate=inflate)
+    for piece, firm in enumerate(pieces):
+        at = slice(piece * starts, (piece + 1) * starts)
+        prior[at, at] = firm
+    wide = 1 + local - starts  # the last column is the residual's
+    firm = run_prior(layout, thin, nuisance, wide, spread=fit.spread, inflate=inflate)
+    prior[len(own) :, len(own) :] = firm[:, :-1]
+    J = columns[local:-1].reshape(fit.theta.size, -1).T
+    known = np.concatenate([J, np.zeros((len(prior), fit.theta.size))])
+    taken = np.linalg.lstsq(np.concatenate([N, prior]), known, rcond=None)[0]
+    H = J.T @ (J - N @ taken)
+    J = (J - N @ taken).T.reshape(columns[local:-1].shape)
+    weight = J * thin.weight / thin.sigma[:, None]
+    scores = np.array([np.sum(weight * off, axis=(1, 2)) for off in _errors(fit, run, nuisance)])
+    return np.stack([H, scores.T @ scores / _DRAWS, score_covariance(columns[-1], J)])
+
+
+def _by_piece(columns: Array, run: Run) -> Array:
+    """Return (starts of each piece, points): the columns (starts, rows, samples), piece by piece."""
+    pieces = np.zeros((len(run.shots) - 1, *columns.shape))
+    for piece, (first, end) in enumerate(zip(run.shots, run.shots[1:], strict=False)):
+        pieces[piece, :, :, first:end] = columns[:, :, first:end]
+    return pieces.reshape(-1, columns[0].size)
+
+
+def _errors(fit: Fit, run: Run, nuisance: Nuisance):
+    """Yield what encoders err by on the fitted motion, as the fit sees it (rows, samples)."""
+    rng = np.random.default_rng(_SEED)
+    x = simulate_run(fit, run, nuisance)
+    steps = np.array([run.record.encoder_step(row + 1) for row in run.rows])
+    noise = [noise_beyond_rounding(s, step=step) for s, step in zip(run.sigma, steps, strict=True)]
+    for _ in range(_DRAWS):
+        read = x + np.array(noise)[:, None] * rng.standard_normal(x.shape)
+        for row, step in zip(read, steps, strict=True):
+            if step > 0:
+                phase = rng.uniform(-0.5, 0.5)
+                row[:] = step * (np.round(row / step + phase) - phase)
+        yield replace(run, y=read - x).thin.y
