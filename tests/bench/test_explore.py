@@ -72,7 +72,7 @@ def test_an_exploration_names_what_acts_and_knows_the_carts(explored):
     last = turns[-1]
     assert last.verdict == "named"
     assert last.reached
-    assert "at least ±" in last.said  # beside effects the stated errors are the least
+    assert "the worst of all to ±" in last.said
     (explanation,) = last.explanations
     assert "cart 1" in explanation.name
     assert all(error is not None and error < 0.01 for error in last.errors.values())
@@ -245,7 +245,7 @@ def test_the_command_explores_a_bench_over_its_line(tmp_path):
     assert done.returncode == 0, done.stderr
     assert (folder / NAME).exists()
     assert [e.kind for e in load_submission(folder).experiments] == ["sweep"]
-    assert "allowed are up" in done.stderr
+    assert "known" in done.stderr
 
 
 def test_one_large_step_shows_what_acts_far_out(tmp_path):

@@ -90,7 +90,7 @@ class VirtualBench:
             bench=self.description,
         )
         held = tuple(cart for cart in range(1, n + 1) if cart not in recording.carts)
-        # Whoever takes the carts in hand brings them to rest: nothing is to be seen while they wait.
+        # Whoever takes the carts in hand brings them to rest: nothing happens while they wait.
         self.carts.take_in_hand(Hands(held=held, released=recording.release or 0))
         self._ticks += round(recording.settle / TRUE_PERIOD)
         self.seconds += recording.settle
@@ -160,13 +160,17 @@ def new_folder(folder: Path, bench: VirtualBench, *, springs: Sequence[bool]) ->
 class VirtualSession:
     """What an exploration records through: the bench, and the folder that the first call makes."""
 
-    def __init__(self, folder: Path, bench: VirtualBench) -> None:
+    def __init__(
+        self, folder: Path, bench: VirtualBench, *, springs: Sequence[bool] | None = None
+    ) -> None:
+        """Take the springs for there, all of them, where nobody says which."""
         self.folder, self.bench = folder, bench
+        self.springs = springs or [True] * (bench.description.carts + 1)
 
     def __call__(self, ids: Sequence[str]) -> Recorded:
         """Carry out recordings of the plan; make submission and plan where there are none."""
         if not (self.folder / NAME).exists():
-            new_folder(self.folder, self.bench, springs=[True] * (self.bench.description.carts + 1))
+            new_folder(self.folder, self.bench, springs=self.springs)
         submission = load_submission(self.folder)
         if not plan_path(submission).exists():
             save_plan(propose_plan(submission, bench=self.bench.description), submission)

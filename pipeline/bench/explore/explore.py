@@ -38,7 +38,7 @@ from pipeline.workflow import analyse
 FIRST = "sweep"  # of the plan that is proposed where nothing is known: it needs no hands
 _SEARCH = 90.0  # s that a look for the gap may take
 _APART = 1.0  # noises: explanations that no recording sets further apart stay in dispute
-_FAR = 0.5  # of the travel limit: who has not moved so far has not shown all
+_HARD = 0.8  # of the step that takes the carts as far as they may go: as good as that
 _FAR_OUT = "far"  # the aim of the step that shows what acts far out
 _SETTLED = ("named", "none")
 _FAILURES = 3  # recordings in a row that a bench does not carry out: it is not their choice
@@ -233,7 +233,7 @@ def _decide(
     """Return the turn, and the recording to make next: it stands in the plan."""
     errors = _errors(analysis)
     missing = wish.missing(errors)
-    known = _known_words(missing, errors, beside=gap is not None and bool(gap.model.terms))
+    known = _known_words(missing, errors)
     doubt = _doubt_words(gap) if gap else "what else acts could not be looked for"
     recording, why = None, ""
     try:
@@ -285,16 +285,17 @@ def _next(
         made = plan.model_copy(update={"recordings": ()})
         found = choose_next(analysis, made, n=1, goal=worst, commands=commands, without=refused)
         return found.recordings[0], found.said
-    furthest = max(float(np.ptp(record.y, axis=1).max()) / 2 for record in analysis.records)
     # Once: carts that something holds back go no further the second time.
     recorded = {record.id for record in analysis.records}
     made = any(r.aim == _FAR_OUT and r.id in recorded for r in plan.recordings)
     made = made or any(r.aim == _FAR_OUT for r in refused)
-    if furthest < _FAR * plan.limits.travel and not made:
-        step, _ = large_steps(identified_chain(analysis), plan.limits)
+    step, _ = large_steps(identified_chain(analysis), plan.limits)
+    driven = [r.u for r in analysis.records if r.u is not None and r.kind in ("step", "sweep")]
+    hardest = max((float(np.abs(u).max()) for u in driven), default=0.0)
+    if not made and hardest < _HARD * abs(step.amplitude):
         return step.model_copy(update={"aim": _FAR_OUT}), (
-            f"no cart has moved by more than {furthest:.2g} of {plan.limits.travel:g} "
-            f"{analysis.position_unit} allowed, and what acts further out would not show"
+            f"no input was above {hardest:.2g} {analysis.input_unit}, and what only a larger one "
+            "or carts further out show would not be seen"
         )
     return None, "" if settled else "no recording within the limits would decide"
 
@@ -333,17 +334,8 @@ def _errors(analysis: Analysis) -> dict[str, float | None]:
     }
 
 
-def _known_words(
-    missing: dict[str, float], errors: dict[str, float | None], *, beside: bool
-) -> str:
-    """Say how well the parameters are known, `beside` effects by errors that may be too small."""
-    if not missing and beside:
-        # The gap's fit counts each sample as new: what lasts makes such errors too small.
-        worst = max((error for error in errors.values() if error is not None), default=0.0)
-        return (
-            "by the errors that the gap's fit states, which are the least they can be, the goal is "
-            f"met; the worst of all is at least ± {100 * worst:.2g} %"
-        )
+def _known_words(missing: dict[str, float], errors: dict[str, float | None]) -> str:
+    """Say how well the parameters are known."""
     if not missing:
         worst = max((error for error in errors.values() if error is not None), default=0.0)
         return f"every parameter asked for is known, the worst of all to ± {100 * worst:.2g} %"

@@ -119,6 +119,7 @@ class Layout:
 
 
 def layout_of(structure: Structure, run: Run, *, scatter_free: bool) -> Layout:
+    """Return which nuisance parameters a run has under a structure."""
     free = tuple(i for i, moves in enumerate(run.free) if moves)
     multiple = len(run.shots) > 2
     dry = structure.dry if scatter_free else (False,) * structure.n

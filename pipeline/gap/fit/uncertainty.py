@@ -9,7 +9,7 @@ Reference: L. Ljung, System Identification, 2nd ed., section 9.5, for the sandwi
 Tibshirani, An Introduction to the Bootstrap, 1993, section 6.5, for the drawing.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -89,14 +89,14 @@ def _weigh(fit: Fit, run: Run, nuisance: Nuisance, *, scatter_free: bool) -> Arr
 
 
 def _by_piece(columns: Array, run: Run) -> Array:
-    """Return (starts of each piece, points): the columns (starts, rows, samples), piece by piece."""
+    """Return columns (starts, rows, samples) as (starts of all pieces, points)."""
     pieces = np.zeros((len(run.shots) - 1, *columns.shape))
     for piece, (first, end) in enumerate(zip(run.shots, run.shots[1:], strict=False)):
         pieces[piece, :, :, first:end] = columns[:, :, first:end]
     return pieces.reshape(-1, columns[0].size)
 
 
-def _errors(fit: Fit, run: Run, nuisance: Nuisance):
+def _errors(fit: Fit, run: Run, nuisance: Nuisance) -> Iterator[Array]:
     """Yield what encoders err by on the fitted motion, as the fit sees it (rows, samples)."""
     rng = np.random.default_rng(_SEED)
     x = simulate_run(fit, run, nuisance)

@@ -209,7 +209,7 @@ def _simulate(
             while sub < count:
                 end = t[sample] + (sub + 1) * whole
                 h = whole
-                if dry and s[V, driven] == 0.0 or now > end - whole + _INSTANT:
+                if (dry and s[V, driven] == 0.0) or now > end - whole + _INSTANT:
                     # What friction holds is to feel the whole of it until the input jumps.
                     h = _edge(now, end, drive[DELAY], knots, held, at) - now
                 upto, upto2, at = _integral(now + h - drive[DELAY], knots, held, at)

@@ -1,0 +1,112 @@
+"""Benches drawn by chance, with what is hidden in them; rows that a study keeps as they come."""
+
+import json
+import re
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.output import write_file
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.nonlinear.effects import CATALOGUE, Effect, Term
+from pipeline.synthesis.hidden import HiddenBench, default_values, prepare_bench
+
+_SPREAD = 0.3  # of the logarithms of masses, dampings and springs about a preset's
+_SIZES = (0.6, 1.6)  # times the usual size of an effect
+PAGE = Path(__file__).with_name("next.md")
+Named = tuple[str, int]  # an effect and where it sits
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Drawn:
+    """A bench, which springs it has, and what is hidden in it."""
+
+    bench: HiddenBench
+    springs: tuple[bool, ...]
+    hidden: tuple[Named, ...]
+
+
+def draw(seed: int, *, effects: int) -> Drawn:
+    """Draw one to three carts about a preset, and as many effects of the catalogue."""
+    rng = np.random.default_rng(seed)
+    preset = list(PRESETS)[int(rng.integers(3))]
+    bench = prepare_bench(preset=preset, model=None, hide=[])
+    m, c, k = (
+        values * np.exp(rng.uniform(-_SPREAD, _SPREAD, values.size))
+        for values in (bench.chain.m, bench.chain.c, bench.chain.k)
+    )
+    chain = Chain(m=m, c=c, k=k)
+    bench = replace(bench, chain=chain, name=f"drawn-{seed}")
+    springs = tuple(bool(one > 0) for one in chain.k)
+    terms: list[Term] = []
+    while len(terms) < effects:
+        effect = CATALOGUE[int(rng.integers(len(CATALOGUE)))]
+        places = effect.places(springs)
+        if effect.only_rest or not places:
+            continue  # a constant force is looked for by the rest points, never by the search
+        place = places[int(rng.integers(len(places)))]
+        term = _sized(effect, place, chain, float(rng.uniform(*_SIZES)))
+        if not any(_alike(term.effect, other.effect) for other in terms):
+            terms.append(term)
+    hidden = tuple((term.effect.key, term.place) for term in terms)
+    return Drawn(bench=replace(bench, effects=tuple(terms)), springs=springs, hidden=hidden)
+
+
+def _sized(effect: Effect, place: int, chain: Chain, share: float) -> Term:
+    """Return the effect with its first parameter, and what goes with it, at a share of the usual.
+
+    Two of dry friction's grow together: a static force below the sliding one is none.
+    """
+    values = default_values(effect, chain, place=place, travel=1.0)
+    forces = [p.name for p in effect.parameters if p.unit == "input"] or [effect.names[0]]
+    forces = forces if effect.family else forces[:1]
+    sized = {name: value * share if name in forces else value for name, value in values.items()}
+    return Term(effect=effect, place=place, values=tuple(sized[name] for name in effect.names))
+
+
+def _alike(one: Effect, other: Effect) -> bool:
+    """One law, or one family of laws, twice: or contacts, behind which nothing is looked for."""
+    same_family = bool(one.family) and one.family == other.family
+    return one.key == other.key or same_family or (one.contact and other.contact)
+
+
+def kept_rows(
+    path: Path, wanted: Iterable[int], make: Callable[[int], dict], *, until: float
+) -> list[dict]:
+    """Return the rows of a study: one JSON line each in the file, which gets those it lacks.
+
+    None is begun once the clock (`time.monotonic`) is past `until`.
+    """
+    rows = {}
+    if path.exists():
+        rows = {row["seed"]: row for row in map(json.loads, path.open(encoding="utf-8"))}
+    with path.open("a", encoding="utf-8") as file:
+        for seed in wanted:
+            if seed not in rows and time.monotonic() < until:
+                rows[seed] = {"seed": seed, **make(seed)}
+                file.write(json.dumps(rows[seed]) + "\n")
+                file.flush()
+                print(rows[seed], flush=True)
+    return [rows[seed] for seed in sorted(rows)]
+
+
+def wilson(hits: int, n: int) -> str:
+    """Return a share with its 95 % interval (E. B. Wilson, J. Am. Stat. Assoc. 22, 1927)."""
+    if not n:
+        return "–"
+    z, share = 1.96, hits / n
+    middle = (share + z**2 / (2 * n)) / (1 + z**2 / n)
+    half = z / (1 + z**2 / n) * np.sqrt(share * (1 - share) / n + z**2 / (4 * n**2))
+    low, high = 100 * (middle - half), 100 * (middle + half)
+    return f"{100 * share:.0f} % ({hits} of {n}; {low:.0f}–{high:.0f} %)"
+
+
+def write_table(name: str, table: str) -> None:
+    """Write a table between its marks in `benchmarks/next.md`."""
+    page = PAGE.read_text(encoding="utf-8")
+    between = rf"(<!-- {name} -->\n).*?(<!-- end of {name} -->)"
+    write_file(PAGE, re.sub(between, rf"\1\n{table}\n\n\2", page, flags=re.DOTALL))

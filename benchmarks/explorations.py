@@ -1,0 +1,149 @@
+"""Benches that investigate themselves: what they say is there, how surely, in what time.
+
+    python -m benchmarks.explorations [--count 100] [--minutes 60]
+
+Each bench is drawn by chance, one to three carts with none, one or two hidden effects, on the
+emulator's carts, encoders and controller, tick by tick and without a line. `cartlab explore` asks
+for 1 % of everything, in ten minutes at most. A study that was stopped goes on where it left off.
+"""
+
+import argparse
+import os
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
+
+import json
+
+import numpy as np
+
+from benchmarks.drawn import Drawn, draw, kept_rows, wilson, write_table
+from pipeline.bench.explore.explore import Wish, explore
+from pipeline.bench.planning.plan_words import session_time
+from pipeline.bench.planning.propose import extend_plan, propose_plan
+from pipeline.errors import PipelineError
+from pipeline.submission import load_submission
+from tests.helpers.virtual import VirtualBench, VirtualSession
+
+ROWS = Path(__file__).with_name("explorations.jsonl")
+FIRST_SEED = 70_000
+ALLOWED = 600.0  # s at the bench
+
+
+def run(seed: int) -> dict:
+    """Explore one bench; return what was said, and whether it is so."""
+    drawn = draw(seed, effects=seed % 3)
+    bench = VirtualBench(drawn.bench, seed=seed)
+    began = time.process_time()
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch) / "work"
+        session = VirtualSession(folder, bench, springs=drawn.springs)
+        row = {"carts": bench.description.carts, "hidden": sorted(map(list, drawn.hidden))}
+        try:
+            turns = explore(
+                folder, record=session, wish=Wish(), seconds=ALLOWED, tell=lambda text: None
+            )
+        except (PipelineError, AssertionError) as error:
+            return row | {"ended": f"{type(error).__name__}: {error}"[:200]}
+        submission = load_submission(folder)
+        fixed = extend_plan(propose_plan(submission, bench=bench.description), submission)
+        gap_file = folder / "gap" / "gap.json"
+        gap = json.loads(gap_file.read_text(encoding="utf-8")) if gap_file.exists() else {}
+    found = [named_of(effect) for effect in gap.get("effects", ())]
+    return row | {
+        "verdicts": [turn.verdict for turn in turns],
+        "recorded": [list(turn.recorded) for turn in turns],
+        "found": sorted(map(list, found)),
+        "reached": turns[-1].reached,
+        "left": (turns[-1].left or 0.0) / (turns[-1].floor or 1.0),
+        "errors": off(gap, drawn),
+        "worst": max(e or np.inf for e in turns[-1].errors.values()),
+        "seconds": turns[-1].seconds,
+        "fixed": session_time(fixed.recordings),
+        "said": turns[-1].said[:300],
+        "cpu": round(time.process_time() - began, 1),
+    }
+
+
+def named_of(effect: dict) -> tuple[str, int]:
+    """Return an effect of gap.json and where it sits."""
+    return effect["effect"], next(iter(effect["where"].values()), 0)
+
+
+def off(gap: dict, drawn: Drawn) -> dict[str, float]:
+    """Return by how many standard errors each parameter is off, of chain and effects named."""
+    chain, errors = drawn.bench.chain, {}
+    if chain.n == 1:  # its two springs act as one
+        chain = replace(chain, k=np.array([chain.k.sum(), 0.0]))
+    for letter in "mck":
+        for i, true in enumerate(getattr(chain, letter), start=1):
+            std = gap.get("chain_std", {}).get(f"{letter}_{i}")
+            if std:
+                found = gap["chain"][letter][i - 1]
+                errors[f"{letter}_{i}"] = (found - float(true)) / std
+    terms = {(term.effect.key, term.place): term for term in drawn.bench.effects}
+    for effect in gap.get("effects", ()):
+        term = terms.get(named_of(effect))
+        for name, true in term.effect.named(term.values).items() if term else ():
+            value = effect["parameters"].get(name)
+            if value and value.get("std"):
+                errors[f"{effect['effect']}.{name}"] = (value["value"] - true) / value["std"]
+    return {name: round(float(value), 3) for name, value in errors.items()}
+
+
+def right(row: dict) -> bool:
+    """Is what acts named, all of it and nothing else: or nothing, where nothing does?"""
+    verdict = "named" if row["hidden"] else "none"
+    return row.get("verdicts", [""])[-1] == verdict and row["found"] == row["hidden"]
+
+
+def table(rows: list[dict]) -> str:
+    """Return the table of the study, in Markdown."""
+    head = ["hidden", "benches", "rightly named", "wrongly named", "within 2 standard errors"]
+    head += ["1 % reached", "time, median", "of the fixed plan's", "limits passed"]
+    lines = [head, ["---"] * len(head)]
+    for words, mine in (
+        *(
+            (("none", "one", "two")[n], [r for r in rows if len(r["hidden"]) == n])
+            for n in range(3)
+        ),
+        ("all", rows),
+    ):
+        done = [row for row in mine if "verdicts" in row]
+        if not done:
+            continue
+        named = [row for row in done if row["verdicts"][-1] in ("named", "none")]
+        z = np.array([z for row in done if right(row) for z in row["errors"].values()])
+        passed = sum("AssertionError" in row.get("ended", "") for row in mine)
+        lines.append(
+            [
+                words,
+                str(len(mine)),
+                wilson(sum(map(right, done)), len(mine)),
+                wilson(sum(not right(row) for row in named), len(mine)),
+                wilson(int(np.sum(np.abs(z) < 2)), z.size),
+                wilson(sum(row["reached"] for row in done), len(mine)),
+                f"{np.median([row['seconds'] for row in done]):.0f} s",
+                f"{np.median([row['seconds'] / row['fixed'] for row in done]):.2f}",
+                str(passed),
+            ]
+        )
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
+
+
+def main() -> None:
+    """Make what rows are missing, and write the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--count", type=int, default=100)
+    parser.add_argument("--minutes", type=float, default=np.inf, help="begin no bench after")
+    asked = parser.parse_args()
+    end = time.monotonic() + 60 * asked.minutes
+    seeds = range(FIRST_SEED, FIRST_SEED + asked.count)
+    write_table("explorations", table(kept_rows(ROWS, seeds, run, until=end)))
+
+
+if __name__ == "__main__":
+    main()

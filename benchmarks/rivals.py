@@ -1,0 +1,126 @@
+"""What one proposed experiment decides: hidden effects that the first records leave in dispute.
+
+    python -m benchmarks.rivals [--count 400] [--minutes 60]
+
+Each bench is drawn by chance with one or two hidden effects and records what `cartlab explore`
+begins with. Where the verdict is "ambiguous" or "partial", it records what `cartlab gap` proposes,
+looks again, and once more where it is still in dispute. The others end there. A study that was
+stopped goes on where it left off.
+"""
+
+import argparse
+import os
+import tempfile
+import time
+from pathlib import Path
+
+os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
+
+import json
+
+import numpy as np
+
+from benchmarks.drawn import draw, kept_rows, wilson, write_table
+from pipeline.bench.design.discriminate import propose_for
+from pipeline.bench.planning.plan import Recording
+from pipeline.bench.planning.plan_file import load_plan
+from pipeline.bench.planning.propose import renamed
+from pipeline.errors import PipelineError
+from pipeline.gap.investigate import investigate
+from pipeline.gap.types import Gap
+from pipeline.submission import load_submission
+from pipeline.workflow import analyse
+from tests.helpers.virtual import VirtualBench, VirtualSession
+
+ROWS = Path(__file__).with_name("rivals.jsonl")
+FIRST_SEED = 80_000
+MORE = 2  # proposed experiments, one after the other
+OPEN = ("ambiguous", "partial")
+BUDGET = 90.0  # s that a look for the gap may take, as in an exploration
+
+
+def run(seed: int) -> dict:
+    """Record the first set; while the gap is in dispute, record what it proposes."""
+    drawn = draw(seed, effects=1 + seed % 2)
+    bench = VirtualBench(drawn.bench, seed=seed)
+    began, looks = time.process_time(), []
+    row = {"carts": bench.description.carts, "hidden": sorted(map(list, drawn.hidden))}
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch) / "work"
+        session = VirtualSession(folder, bench, springs=drawn.springs)
+        try:
+            session(["sweep"])
+            plan = load_plan(load_submission(folder))
+            session([r.id for r in plan.recordings if r.kind == "step" and not r.release])
+            while True:
+                gap = look(folder)
+                looks.append(told(gap))
+                if gap.verdict not in OPEN or gap.proposal is None or len(looks) > MORE:
+                    break
+                proposed = Recording.model_validate_json(json.dumps(gap.proposal.recording))
+                taken = [e.id for e in load_submission(folder).experiments]
+                bench.record(folder, renamed([proposed], taken=taken), limits=plan.limits)
+        except (PipelineError, AssertionError) as error:
+            row["ended"] = f"{type(error).__name__}: {error}"[:200]
+    return row | {"looks": looks, "cpu": round(time.process_time() - began, 1)}
+
+
+def look(folder: Path) -> Gap:
+    """Return the gap as the records stand, with what it proposes."""
+    submission = load_submission(folder)
+    gap = investigate(analyse(submission), progress=lambda text: None, budget=BUDGET)
+    return propose_for(gap, submission)
+
+
+def told(gap: Gap) -> dict:
+    """Return what a look says, and what it proposes."""
+    return {
+        "verdict": gap.verdict,
+        "found": sorted([f.effect.key, next(iter(f.where.values()), 0)] for f in gap.effects),
+        "left": round(gap.final / gap.noise_floor, 3),
+        "proposed": gap.proposal and [gap.proposal.recording["id"], gap.proposal.separation],
+    }
+
+
+def right(row: dict, *, after: int) -> bool:
+    """Is what is hidden named, after so many proposed experiments at most?"""
+    last = row["looks"][: after + 1][-1]
+    return last["verdict"] == "named" and last["found"] == row["hidden"]
+
+
+def table(rows: list[dict]) -> str:
+    """Return the table of the study, in Markdown."""
+    head = ["first verdict", "benches", "named after one more", "after two", "wrong name then"]
+    lines = [head, ["---"] * len(head)]
+    rows = [row for row in rows if row["looks"]]
+    for words, verdicts in (("ambiguous", OPEN[:1]), ("partial", OPEN[1:]), ("either", OPEN)):
+        mine = [row for row in rows if row["looks"][0]["verdict"] in verdicts]
+        n = len(mine)
+        wrong = sum(
+            row["looks"][-1]["verdict"] == "named" and not right(row, after=MORE) for row in mine
+        )
+        lines.append(
+            [
+                words,
+                f"{n} of {len(rows)}",
+                wilson(sum(right(row, after=1) for row in mine), n),
+                wilson(sum(right(row, after=2) for row in mine), n),
+                wilson(wrong, n),
+            ]
+        )
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
+
+
+def main() -> None:
+    """Make what rows are missing, and write the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--count", type=int, default=400)
+    parser.add_argument("--minutes", type=float, default=np.inf, help="begin no bench after")
+    asked = parser.parse_args()
+    end = time.monotonic() + 60 * asked.minutes
+    seeds = range(FIRST_SEED, FIRST_SEED + asked.count)
+    write_table("rivals", table(kept_rows(ROWS, seeds, run, until=end)))
+
+
+if __name__ == "__main__":
+    main()
