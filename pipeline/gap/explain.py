@@ -39,6 +39,7 @@ from pipeline.plant.nonlinear.effects import CATALOGUE
 from pipeline.plant.nonlinear.effects.base import Effect, Term
 from pipeline.results import Record
 
+_SETTLED = 0.01  # chi-square: a tenth of a standard error
 _NOISE_ROUNDS = 2  # of measuring the noise anew
 _PINNED, _LOOSE = 1e-4, 0.5  # noises an encoder's zero may be off: not at all; by its rounding
 
@@ -110,8 +111,9 @@ def explain_gap(
                 study, found = judged_by, list(path)
         sample_time = max(run.record.sample_time for run in study.training)
         verdict, path, close = reach_verdict(path, found, study=study, sample_time=sample_time)
-        chosen = path[-1]
-        final = covariance(chosen.fit, study.training, mapper=pool.map)
+        final = covariance(_settled(path[-1].fit, study), study.training, mapper=pool.map)
+        chosen = replace(path[-1], fit=final)
+        path = (*path[:-1], chosen)
     if verdict not in ("none", "unexplained") and not study.explains(chosen):
         times = chosen.error / study.floor
         notes.append(f"{times:.1f} times the noise is left: something remains")
@@ -157,6 +159,19 @@ def explain_gap(
         complete=not deadline.cut,
         notes=tuple(notes),
         contenders=() if enough else list_contenders(chosen, close or found),
+    )
+
+
+def _settled(fit: Fit, study: Study) -> Fit:
+    """Return the fit where its cost falls no more: a search ends within some standard errors."""
+    return fit_model(
+        fit,
+        study.training,
+        nuisance=fit.nuisance,
+        spread=fit.spread,
+        scatter_free=any(np.any(nuisance.scatter != 1.0) for nuisance in fit.nuisance),
+        tolerance=_SETTLED / fit.n_points,
+        mapper=study.mapper,
     )
 
 

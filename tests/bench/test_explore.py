@@ -242,10 +242,10 @@ def test_the_command_explores_a_bench_over_its_line(tmp_path):
         done = cartlab_here(
             "explore", folder, "--port", bench.address, "--until", "all 5%", "--time", "40s"
         )
-    assert done.returncode == 0, done.stderr
+    assert done.returncode == 1, done.stderr
     assert (folder / NAME).exists()
     assert [e.kind for e in load_submission(folder).experiments] == ["sweep"]
-    assert "known" in done.stderr
+    assert "allowed are up" in done.stderr
 
 
 def test_one_large_step_shows_what_acts_far_out(tmp_path):

@@ -36,6 +36,7 @@ def standardised(folder, *, preset, hide, seed):
     runs = measure_noise(fit, runs, runs)
     fit = fit_model(fit, runs, nuisance=fit.nuisance, scatter_free=False, tolerance=1e-6)
     fit = covariance(fit, runs)
+    assert fit.covariance is not None
     return (fit.theta - start.theta) / np.sqrt(np.diag(fit.covariance))
 
 

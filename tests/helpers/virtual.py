@@ -132,7 +132,7 @@ def _counts(
     """Return what the encoders count at each tick under these duties, the first being zero."""
     hidden = carts._bench
     free = [cart for cart in range(1, hidden.chain.n + 1) if cart not in held]
-    t = TRUE_PERIOD * np.arange(duties.size)
+    t = np.asarray(TRUE_PERIOD * np.arange(duties.size), dtype=np.float64)
     x = simulate_augmented(carts._model, t, carts.input_per_count * duties, free=free)
     noise = carts._noise_rng.standard_normal((duties.size, hidden.chain.n)) * carts._shaken
     exact = x.T / hidden.count + carts._phase + _NOISE * noise

@@ -235,15 +235,17 @@ def _predict(
             (sensitivity.BY_DAMPING, model.chain.c),
             (sensitivity.BY_STIFFNESS, model.chain.k),
         )
-        for i in np.flatnonzero(values)
+        for i in np.flatnonzero(values).tolist()
     ]
     if recording.release:
         of.append((sensitivity.BY_POSITION, recording.release - 1))
     variants = [model, *_changed(model)]
-    tables = zip(*(variant.tables() for variant in variants), strict=True)
+    cart, spring, drive = zip(*(variant.tables() for variant in variants), strict=True)
     b = len(variants)
     y, by_chain = simulate_with_derivatives(
-        *(np.stack(table) for table in tables),
+        np.stack(cart),
+        np.stack(spring),
+        np.stack(drive),
         np.broadcast_to(start, (b, 1, n)),
         np.zeros((b, 1, n)),
         np.ones((b, n)),
