@@ -87,6 +87,7 @@ def test_what_is_known_is_what_the_fit_says(known, analysis):
     np.testing.assert_allclose(std, fitted, rtol=1e-3)  # differences of one step either way
 
 
+@pytest.mark.slow
 def test_what_is_promised_is_kept(tmp_path):
     """On the emulator's carts the fit afterwards states what was promised, and the truth is there.
 

@@ -43,7 +43,7 @@ def standardised(folder, *, preset, hide, seed):
 @pytest.mark.parametrize(
     ("preset", "hide", "seeds"),
     [
-        ("throne-1dof", ["coulomb_friction"], 4),
+        pytest.param("throne-1dof", ["coulomb_friction"], 4, marks=pytest.mark.slow),
         ("throne-2dof", ["coulomb_friction", "input_delay"], 2),
     ],
 )
