@@ -166,9 +166,10 @@ def _candidates(chain: Chain, limits: Limits) -> Iterator[tuple[Recording, float
     for cart in everyone:
         if chain.k[cart - 1] + chain.k[cart] <= 0:
             continue
-        for height in (rounded(share * limits.travel) for share in _RELEASES):
+        for share in _RELEASES:
+            height = rounded(share * limits.travel)
             release = let_go(cart, name=f"apart-decay-{cart}", seconds=_TIME)
-            note = f"let go {height:g} from the zero, in units of the travel limit"
+            note = f"let go at {share:.0%} of the travel limit, {height:g} from the zero"
             yield release.model_copy(update={"note": note, "aim": "gap"}), height
 
 
