@@ -2,8 +2,8 @@
 
     python -m benchmarks.rivals [--count 400] [--minutes 60]
 
-Each bench is drawn by chance with one or two hidden effects and records what `cartlab explore`
-begins with. Where the verdict is "ambiguous" or "partial", it records what `cartlab gap` proposes,
+Each bench is drawn by chance with one or two hidden effects and records one sweep, with which
+`cartlab explore` begins. Where the verdict is "ambiguous" or "partial", it records what `cartlab gap` proposes,
 looks again, and once more where it is still in dispute. The others end there. A study that was
 stopped goes on where it left off.
 """
@@ -40,7 +40,7 @@ BUDGET = 90.0  # s that a look for the gap may take, as in an exploration
 
 
 def run(seed: int) -> dict:
-    """Record the first set; while the gap is in dispute, record what it proposes."""
+    """Record a sweep; while the gap is in dispute, record what it proposes."""
     drawn = draw(seed, effects=1 + seed % 2)
     bench = VirtualBench(drawn.bench, seed=seed)
     began, looks = time.process_time(), []
@@ -51,7 +51,6 @@ def run(seed: int) -> dict:
         try:
             session(["sweep"])
             plan = load_plan(load_submission(folder))
-            session([r.id for r in plan.recordings if r.kind == "step" and not r.release])
             while True:
                 gap = look(folder)
                 looks.append(told(gap))

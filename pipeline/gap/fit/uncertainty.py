@@ -31,7 +31,7 @@ from pipeline.gap.fit.linearise import (
 
 _DRAWS = 60  # of the encoders' errors: a standard error is then known to 9 %
 _SEED = 0
-_HIDDEN = 1e-9  # of the strongest direction: one that no run shows is as good as unknown
+_HIDDEN = 1e-9  # of the strongest: what no run shows is as good as unknown
 
 
 def covariance(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
@@ -49,15 +49,18 @@ def covariance(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
     H, expected, found = told + np.stack([held.T @ held, *np.zeros((2, *told.shape[1:]))])
     if not np.all(np.isfinite(told)):
         return fit
-    size = np.sqrt(np.maximum(np.diag(H), np.finfo(float).tiny))
+    size = np.sqrt(np.maximum(np.diag(H), 0.0))
+    size = np.maximum(size, _HIDDEN * size.max())
     power, directions = np.linalg.eigh(H / np.outer(size, size))
     power = np.maximum(power, _HIDDEN * power[-1])
     inverse = (directions / power) @ directions.T / np.outer(size, size)
     expected, found = inverse @ expected @ inverse, inverse @ found @ inverse
-    # A direction that is hidden says nothing of itself: its variance is what H leaves.
     least = np.maximum(np.diag(found), np.diag(inverse))
-    more = np.sqrt(np.maximum(1.0, least / np.maximum(np.diag(expected), 1e-300)))
-    return replace(fit, covariance=expected * np.outer(more, more))
+    more = np.sqrt(np.maximum(1.0, least / np.maximum(np.diag(expected), _HIDDEN * least)))
+    cov = expected * np.outer(more, more)
+    # What no run shows gets no error from the encoders: it is as unknown as H says.
+    np.fill_diagonal(cov, np.maximum(np.diag(cov), least))
+    return replace(fit, covariance=cov)
 
 
 def _weigh(fit: Fit, run: Run, nuisance: Nuisance, *, scatter_free: bool) -> Array:
