@@ -292,6 +292,8 @@ def _next(
     step, _ = large_steps(identified_chain(analysis), plan.limits)
     driven = [r.u for r in analysis.records if r.u is not None and r.kind in ("step", "sweep")]
     hardest = max((float(np.abs(u).max()) for u in driven), default=0.0)
+    if not (made or settled):
+        return step.model_copy(update={"aim": _FAR_OUT}), "it takes the carts as far as they may go"
     if not made and hardest < _HARD * abs(step.amplitude):
         return step.model_copy(update={"aim": _FAR_OUT}), (
             f"no input was above {hardest:.2g} {analysis.input_unit}, and what only a larger one "
