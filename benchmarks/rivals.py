@@ -3,9 +3,9 @@
     python -m benchmarks.rivals [--count 400] [--minutes 60]
 
 Each bench is drawn by chance with one or two hidden effects and records one sweep, with which
-`cartlab explore` begins. Where the verdict is "ambiguous" or "partial", it records what `cartlab gap` proposes,
-looks again, and once more where it is still in dispute. The others end there. A study that was
-stopped goes on where it left off.
+`cartlab explore` begins. Where the verdict is "ambiguous" or "partial", it records what
+`cartlab gap` proposes, looks again, and once more where it is still in dispute. The others end
+there. A study that was stopped goes on where it left off.
 """
 
 import argparse
