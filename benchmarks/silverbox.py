@@ -121,5 +121,5 @@ PySINDy, SysIdentPy and the network as for the hidden effects above, but no samp
 plain differences of order 6 beside those smoothed over 5 samples, as there are nine a period.
 SysIdentPy with all products up to the third degree of 2 and 3 lags, the network with 3 and 5 lags.
 PySINDy's equation is short and says what the box is; differences of so few samples a period cost it
-the accuracy.
+the accuracy. The network learns the next sample, not the free run; the paper has recurrent ones.
 """

@@ -3,6 +3,7 @@
 import sys
 
 import pytest
+from matplotlib.figure import Figure
 
 from benchmarks import __main__ as command
 from benchmarks import page
@@ -42,6 +43,22 @@ def test_a_section_says_what_it_was_made_with():
 
     assert f"numpy {version('numpy')}" in text
     assert f"no-such-tool {page.NOT_INSTALLED}" in text
+
+
+def test_a_figure_is_written_beside_the_page_and_shown(tmp_path):
+    """It is drawn in the style of the reports, under the name of its benchmark."""
+
+    def draw() -> Figure:
+        figure = Figure()
+        figure.add_subplot().plot([1.0, 2.0], [3.0, 4.0], label="ours")
+        return figure
+
+    table = Table(title="Times", head=["what", "s"], rows=[["ours", "1.0"]], picture=draw)
+
+    text = section("first", _Module, [table], seconds=1.0, figures=tmp_path)  # type: ignore[arg-type]
+
+    assert "![Times](figures/first-1.svg)" in text
+    assert (tmp_path / "first-1.svg").read_text(encoding="utf-8").startswith("<svg")
 
 
 @pytest.mark.parametrize("name", CHEAP)
