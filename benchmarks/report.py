@@ -20,6 +20,7 @@ from benchmarks.page import Table, installed, missing, spread
 from pipeline.report.figures.style import MODEL, SECOND, legend_above, panels
 from pipeline.resources import EXAMPLES
 from pipeline.submission.load import NAME
+from pipeline.submission.models import MOST_EXPERIMENTS
 from pipeline.synthesis import write_submission
 
 TITLE = "Report"
@@ -31,7 +32,7 @@ source; a package manager compiles when it installs.
 """
 TOOLS = ("matplotlib", "typst", "nbconvert", "quarto-cli")
 EVERY = ("one-cart", "two-cart", "three-cart")
-RECORDS = (10, 30, 100, 300, 1000)
+RECORDS = (10, 30, 100, 300, MOST_EXPERIMENTS)
 _ROOT = Path(__file__).parents[1]
 _REPORT = (sys.executable, "-m", "pipeline", "report")
 _DOCUMENT = Path(__file__).with_name("lab_document.py")
@@ -138,15 +139,18 @@ def by_records(base: Path, *, records: Sequence[int]) -> Table:
 
     each = 1e3 * np.diff(seconds) / np.diff(records)
     said = f"{each.min():.0f} to {each.max():.0f} ms of a core" if each.size else ""
-    said = said and f" Each further record costs {said} along the table."
+    said = said and f"Each further record costs {said} along the table."
     return Table(
-        title="From 10 to 1,000 records",
+        title="By records",
         head=["records", "s of a core", "s on the clock", "MB"],
         rows=[
             [f"{n:,}", f"{cost.cpu:.1f}", f"{cost.clock:.1f}", f"{cost.memory:.0f}"]
             for n, cost in zip(records, costs, strict=True)
         ],
-        note=f"One cart; steps, decays and dwells of many sessions on one bench.{said}",
+        note=f"""
+One cart; steps, decays and dwells of many sessions on one bench, as many as a submission may have.
+{said}
+""",
         picture=picture if len(records) > 1 else None,
     )
 

@@ -13,7 +13,7 @@ Line = Annotated[str, Field(max_length=200)]
 # Units stand in the titles of figures, which scripts read.
 Unit = Annotated[str, Field(max_length=40, pattern=r"^[^\p{C}\p{Zl}\p{Zp}]*$")]
 MOST_AUTHORS = 50
-MOST_EXPERIMENTS = 300  # a class section's; every stage and every comparison goes through them
+MOST_EXPERIMENTS = 1_000  # every stage and every comparison goes through them
 Typed = Annotated[Decimal, Field(allow_inf_nan=False)]  # keeps the digits as typed: 0.10 has two
 
 

@@ -87,8 +87,8 @@ BAD_TOML = {
         r"authors: expected at most 50 values, found a list of 51",
     ),
     "many experiments": (
-        HEAD + "".join(STEP.replace("step-a", f"s{i}") for i in range(301)),
-        r"experiments: expected at most 300 values",
+        HEAD + "".join(STEP.replace("step-a", f"s{i}") for i in range(1001)),
+        r"experiments: expected at most 1000 values",
     ),
     "a unit of two lines": (
         GOOD.replace('unit = "cm"', r'unit = "c\nm"'),
