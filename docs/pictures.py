@@ -1,6 +1,8 @@
 """Make the pictures of the tutorials, the gallery and the desk anew; pages need Chromium."""
 
 import shutil
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -46,6 +48,7 @@ def main() -> None:
         demo(Path(folder) / "demo")
         gallery(Path(folder) / "demo")
         desk(Path(folder) / "bench-4", Path(folder) / "demo" / "grades")
+        exploration(Path(folder) / "bench-5")
 
 
 def tutorials(out: Path) -> None:
@@ -72,6 +75,33 @@ def gallery(made: Path) -> None:
             page.goto(f"{made.as_uri()}/{file}")
             page.screenshot(path=IMAGES / name)
         browser.close()
+
+
+def exploration(team: Path) -> None:
+    """Photograph a virtual bench that investigates itself, once it says why it goes on."""
+    command = [sys.executable, "-m", "pipeline", "emulate", "--preset", "throne-1dof"]
+    options = ["--hide", "coulomb_friction", "--speed", "8"]
+    with (
+        subprocess.Popen([*command, *options], stderr=subprocess.PIPE, text=True) as bench,
+        DeskServer(folder=team) as server,
+        sync_playwright() as playwright,
+    ):
+        assert bench.stderr is not None
+        address = next(line.split()[-1] for line in bench.stderr if line.startswith("ready: "))
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"))
+        page = browser.new_page(viewport=WINDOW)
+        page.goto(server.url)
+        page.get_by_role("link", name=f"{team.name}: bench").click()
+        page.get_by_label("Port of the bench").fill(address)
+        page.get_by_label("to within ± %").fill("0.01")
+        page.get_by_role("button", name="Explore").click()
+        page.locator("#thought:not([hidden])").wait_for(timeout=1e5)
+        page.locator("#status", has_text="Recording").wait_for(timeout=1e5)
+        page.wait_for_timeout(1e3)
+        page.locator(".kicker").first.evaluate("it => { it.textContent = 'lab/bench-5' }")
+        page.screenshot(path=IMAGES / "desk-explore.png")
+        browser.close()
+        bench.terminate()
 
 
 def desk(team: Path, grades: Path) -> None:

@@ -67,6 +67,7 @@
     thoughts = number;
     $('thought').hidden = false;
     $('thought').textContent = `${text.replace(/^[a-z]/, (first) => first.toUpperCase())}.`;
+    for (const whole of document.querySelectorAll('#whole, [for="whole"]')) whole.hidden = true; // nobody knows how long it takes
     $('skip').textContent = 'Veto';
     $('skip').title = 'Not this one: have another chosen';
     const diary = $('diary');
