@@ -16,7 +16,7 @@ from pipeline.plant.nonlinear.effects import CATALOGUE, Effect, Term
 from pipeline.synthesis.hidden import HiddenBench, default_values, prepare_bench
 
 _SPREAD = 0.3  # of the logarithms of masses, dampings and springs about a preset's
-_SIZES = (0.6, 1.6)  # times the usual size of an effect
+USUAL = (0.6, 1.6)  # times the usual size of an effect
 PAGE = Path(__file__).with_name("next.md")
 Named = tuple[str, int]  # an effect and where it sits
 
@@ -30,8 +30,8 @@ class Drawn:
     hidden: tuple[Named, ...]
 
 
-def draw(seed: int, *, effects: int) -> Drawn:
-    """Draw one to three carts about a preset, and as many effects of the catalogue."""
+def draw(seed: int, *, effects: int, sizes: tuple[float, float] = USUAL) -> Drawn:
+    """Draw one to three carts about a preset, and as many effects, `sizes` times the usual."""
     rng = np.random.default_rng(seed)
     preset = list(PRESETS)[int(rng.integers(3))]
     bench = prepare_bench(preset=preset, model=None, hide=[])
@@ -49,7 +49,7 @@ def draw(seed: int, *, effects: int) -> Drawn:
         if effect.only_rest or not places:
             continue  # a constant force is looked for by the rest points, never by the search
         place = places[int(rng.integers(len(places)))]
-        term = _sized(effect, place, chain, float(rng.uniform(*_SIZES)))
+        term = _sized(effect, place, chain, float(np.exp(rng.uniform(*np.log(sizes)))))
         if not any(_alike(term.effect, other.effect) for other in terms):
             terms.append(term)
     hidden = tuple((term.effect.key, term.place) for term in terms)

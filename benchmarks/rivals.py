@@ -2,7 +2,7 @@
 
     python -m benchmarks.rivals [--count 400] [--minutes 60]
 
-Each bench is drawn by chance with one or two hidden effects and records one sweep, with which
+Each bench is drawn by chance with one or two small hidden effects and records one sweep, with which
 `cartlab explore` begins. Where the verdict is "ambiguous" or "partial", it records what
 `cartlab gap` proposes, looks again, and once more where it is still in dispute. The others end
 there. A study that was stopped goes on where it left off.
@@ -34,6 +34,7 @@ from tests.helpers.virtual import VirtualBench, VirtualSession
 
 ROWS = Path(__file__).with_name("rivals.jsonl")
 FIRST_SEED = 80_000
+SMALL = (0.02, 0.3)  # times the usual size: larger effects have their name from one sweep
 MORE = 2  # proposed experiments, one after the other
 OPEN = ("ambiguous", "partial")
 BUDGET = 90.0  # s that a look for the gap may take, as in an exploration
@@ -41,7 +42,7 @@ BUDGET = 90.0  # s that a look for the gap may take, as in an exploration
 
 def run(seed: int) -> dict:
     """Record a sweep; while the gap is in dispute, record what it proposes."""
-    drawn = draw(seed, effects=1 + seed % 2)
+    drawn = draw(seed, effects=1 + seed % 2, sizes=SMALL)
     bench = VirtualBench(drawn.bench, seed=seed)
     began, looks = time.process_time(), []
     row = {"carts": bench.description.carts, "hidden": sorted(map(list, drawn.hidden))}

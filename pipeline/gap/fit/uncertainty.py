@@ -72,7 +72,7 @@ def _weigh(fit: Fit, run: Run, nuisance: Nuisance, *, scatter_free: bool) -> Arr
     starts = len(layout.x0) + len(layout.v0)
     local = starts + len(layout.scatter) + len(layout.zero)
     own = _by_piece(columns[:starts], thin)
-    N = np.concatenate([own, columns[starts:local].reshape(local - starts, -1)]).T
+    N = np.concatenate([own, columns[starts:local].reshape(local - starts, own.shape[1])]).T
     prior = np.zeros((N.shape[1], N.shape[1]))
     pieces = start_prior(layout, thin, usual_sizes(fit, thin), inflate=inflate)
     for piece, firm in enumerate(pieces):
