@@ -25,7 +25,8 @@ os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
 import numpy as np
 from scipy.stats import beta
 
-from benchmarks.grading_batch import Cost, copies, grade, write_class
+from benchmarks import grading_notebooks as notebooks
+from benchmarks.grading_batch import copies, grade, write_class
 from benchmarks.grading_notebooks import COPIED, Graded, cartlab, nbgrader, otter, write_teams
 from benchmarks.page import Table, installed, missing, share, spread
 from tests.helpers.grading_class import Team, make_team, with_spoilt_data, with_wrong_rubric
@@ -84,9 +85,10 @@ def mistakes(*, start: int, count: int) -> Table:
         head=["kind", "right (95 %)", "or", "other flags too", "no flag"],
         rows=[[kind, *_line(group)] for kind, group in groups.items()],
         note=f"""
-Right: all its flags and no other name in their place, and of an honest team none; the interval is
-that of Clopper and Pearson (1934). "Or": the number is two mistakes' as well, and the flag says
-both, the planted one second. Once its recordings are analysed a grading took {seconds} s of a core.
+Right: all its flags (others beside them are counted apart), and of an honest team none; the
+interval is that of Clopper and Pearson (1934). "Or": the number is two mistakes' as well, and the
+flag says both, the planted one second. Once its recordings are analysed a grading took {seconds} s
+of a core.
 """,
     )
 
@@ -166,7 +168,9 @@ def costs(base: Path, *, teams: int) -> Table:
     def measure(what: str, *, carts: int = 2, out: str = "", **how: Any) -> None:
         preset, out = f"throne-{carts}dof", out or f"out-{len(rows)}"
         cost = grade(base / f"{carts}", base / out, preset=preset, **how)
-        rows.append([what, str(carts), *_cost(cost, teams)])
+        each = "–" if "cluster" in how else f"{cost.cpu / teams:.2f}"
+        here = f"{cost.parent / teams:.2f}"
+        rows.append([what, str(carts), each, here, f"{cost.clock:.1f} s"])
 
     for carts in (1, 2, 3):
         measure("one worker", carts=carts)
@@ -194,11 +198,6 @@ workers than cores bring nothing; what a cluster brings is simulated in
     )
 
 
-def _cost(cost: Cost, teams: int) -> list[str]:
-    each = f"{cost.cpu / teams:.2f}" if cost.workers else "–"
-    return [each, f"{cost.parent / teams:.2f}", f"{cost.clock:.1f} s"]
-
-
 @contextmanager
 def _dask(workers: int) -> Iterator[str]:
     """Yield the address of a cluster on this machine: one thread in each of so many processes."""
@@ -222,16 +221,17 @@ def other_graders(base: Path, *, honest: int, each: int) -> Table:
     for name, grader in (("cartlab", cartlab), ("nbgrader", nbgrader), ("otter-grader", otter)):
         done = grader(base / "class", base)
         rows.append([name, *_judged(done, slips)] if done else missing(name, columns=6))
+    codes = ", ".join(f"`{code}`" for code in notebooks.SLIPS)
     return Table(
         title=f"The same {len(slips)} teams in a notebook",
         head=["grader", "s of a core each", "wrong numbers cost points", "said which mistake",
               "copied recordings found", "honest teams that lost points"],
         rows=rows,
         note=f"""
-One cart; {honest} honest teams, {each} each with {", ".join(slips_said())}, and {each} that hand in
+One cart; {honest} honest teams, {each} each with {codes}, and {each} that hand in
 two decays of another team. The notebook holds the six numbers of the two tables; a test for each
 recomputes it from the team's own recordings (`benchmarks/lab_reference.py`, what a TA would write
-with numpy and scipy) and allows 5 to 15 %. nbgrader 0.9: `autograde` and `generate_feedback` over
+with numpy and scipy) and allows 5 to 15 %. nbgrader: `autograde` and `generate_feedback` over
 the class; otter: `otter run` for each hand-in, as its `otter grade` needs Docker (and then shares
 the work among containers). cartlab grades the state model, the controller and the closed loop
 besides, which the notebook does not ask for. What the others do better: they grade any question
@@ -240,13 +240,6 @@ in, and nbgrader has a page to grade by hand. They name no mistake because a tes
 author wrote, and compare no hand-ins with each other.
 """,
     )  # fmt: skip
-
-
-def slips_said() -> list[str]:
-    """Return the mistakes of the class in the notebook, as their flags' codes."""
-    from benchmarks.grading_notebooks import SLIPS as NUMBERS
-
-    return [f"`{code}`" for code in NUMBERS]
 
 
 def _judged(done: Graded, slips: dict[str, str]) -> list[str]:

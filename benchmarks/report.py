@@ -52,9 +52,9 @@ def tables(*, quick: bool) -> list[Table]:
     with tempfile.TemporaryDirectory() as folder:
         base = Path(folder)
         return [
-            by_carts(base, runs=1 if quick else 7, examples=EVERY[:1] if quick else EVERY),
+            by_carts(base, runs=1 if quick else 5, examples=EVERY[:1] if quick else EVERY),
             by_records(base, records=RECORDS[:1] if quick else RECORDS),
-            documents(base, runs=1 if quick else 5),
+            documents(base, runs=1 if quick else 3),
         ]
 
 
