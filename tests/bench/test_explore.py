@@ -7,7 +7,8 @@ import pytest
 from pipeline.bench.explore.explore import Recorded, explore
 from pipeline.bench.explore.wish import Wish, read_time, read_wish
 from pipeline.bench.host.signals import Stopped
-from pipeline.bench.planning.plan_file import load_plan, save_plan
+from pipeline.bench.planning.by_hand import add_recording
+from pipeline.bench.planning.plan_file import load_plan
 from pipeline.errors import ConfigError, DataError
 from pipeline.report.exploration.page import NAME
 from pipeline.submission import load_submission
@@ -177,41 +178,32 @@ def test_a_bench_on_which_nothing_comes_off_is_left_after_three_tries(tmp_path):
 def test_a_person_vetoes_and_adds(tmp_path):
     """Another is chosen than what is vetoed; what is added comes next; the diary says both."""
     bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
-    folder, offered, recorded = tmp_path / "work", [], []
+    folder, offered, said = tmp_path / "work", [], []
     session = VirtualSession(folder, VirtualBench(bench, seed=1))
 
     def vetoes(recording):
         offered.append(recording)
         if len(offered) == 1:
-            submission = load_submission(folder)
-            plan = load_plan(submission)
-            mine = plan.recordings[0].model_copy(
-                update={"id": "mine", "kind": "sweep", "wave": "square", "amplitude": 0.02,
-                        "release": None, "frequency": 0.5, "cycles": 3}
-            )  # fmt: skip
-            save_plan(plan.model_copy(update={"recordings": (*plan.recordings, mine)}), submission)
+            step = next(one for one in load_plan(load_submission(folder)).recordings
+                        if one.kind == "step")  # fmt: skip
+            add_recording(folder, step.model_copy(update={"id": "mine", "amplitude": 0.015}))
+        elif len(offered) == 3:
+            raise Stopped("by hand")
         return len(offered) == 1
 
-    def record(ids):
-        recorded.extend(ids)
-        return session(ids)
-
-    turns = explore(
-        folder,
-        record=record,
-        wish=Wish(error=1e-7),
-        seconds=135.0,
-        tell=lambda s: None,
-        vetoes=vetoes,
-    )
-    first, mine, other = offered[:3]
+    with pytest.raises(Stopped):
+        explore(
+            folder, record=session, wish=Wish(error=1e-7), seconds=400.0, tell=said.append,
+            vetoes=vetoes,
+        )  # fmt: skip
+    first, mine, other = offered
     assert mine.id == "mine"
     assert not other.resembles(first)
-    assert {mine.id, other.id} <= set(recorded)
+    recorded = {experiment.id for experiment in load_submission(folder).experiments}
+    assert mine.id in recorded
     assert first.id not in recorded
-    assert turns[1].said.startswith(f"{first.id} was vetoed; ")
-    assert "mine, which was added by hand" in turns[1].said
-    assert turns[2].recorded == ("mine",)
+    assert said[1].startswith(f"{first.id} was vetoed; ")
+    assert "mine, which was added by hand" in said[1]
     assert f"{first.id} was vetoed" in (folder / NAME).read_text(encoding="utf-8")
 
 
