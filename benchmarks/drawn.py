@@ -101,7 +101,7 @@ def wilson(hits: int, n: int) -> str:
     z, share = 1.96, hits / n
     middle = (share + z**2 / (2 * n)) / (1 + z**2 / n)
     half = z / (1 + z**2 / n) * np.sqrt(share * (1 - share) / n + z**2 / (4 * n**2))
-    low, high = 100 * (middle - half), 100 * (middle + half)
+    low, high = 100 * max(0.0, middle - half), 100 * min(1.0, middle + half)
     return f"{100 * share:.0f} % ({hits} of {n}; {low:.0f}–{high:.0f} %)"
 
 
