@@ -191,8 +191,9 @@ def costs(base: Path, *, teams: int) -> Table:
         note="""
 All processes together, the start of the workers included (a worker loads what it needs once, some
 1.5 s); the client hashes, stores, compares the recordings and writes the class's pages. Processors
-of the workers on a Dask cluster are not the client's children: there only the clock tells. More
-workers than cores bring nothing; what a cluster brings is simulated in
+of the workers on a Dask cluster are not the client's children: there only the clock tells, which
+also has in it whatever else the machine did. More workers than cores bring nothing; what a cluster
+brings is simulated in
 [docs/scaling.md](../docs/scaling.md) with these costs.
 """,
     )
