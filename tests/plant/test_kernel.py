@@ -361,3 +361,21 @@ def test_an_input_that_changes_within_a_step_moves_the_carts_in_time(preset):
 
     exact = simulate_linear(chain, t, u)[:, coarse]
     assert_allclose(got, exact, atol=1e-4 * np.abs(exact).max())
+
+
+def test_an_input_that_jumps_inside_a_step_frees_a_held_cart_at_once():
+    """Whatever the steps: friction brakes the cart from the edge on, not from the step's begin."""
+    chain = PRESETS["throne-1dof"]
+    dry = make_term(find_effect("coulomb_friction"), place=1, values={"force": 6e-3}, chain=chain)
+    cart, spring, drive = AugmentedChain(chain=chain, terms=(dry,)).tables()
+    t, edge = sample_times(100, 4e-3), 0.0411
+    knots, command = np.array([0.0, edge]), np.array([0.0, 0.02])
+
+    def run(refine):
+        starts = np.array([0, t.size])
+        rest, ones = np.zeros((1, 1, 1)), np.ones((1, 1))
+        tables = cart[None], spring[None], drive[None]
+        free = np.array([True])
+        return simulate_batch(*tables, rest, rest, ones, free, t, knots, command, starts, refine)
+
+    assert np.abs(run(1.0) - run(64.0)).max() < 0.02 * COUNT
