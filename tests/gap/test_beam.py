@@ -7,7 +7,9 @@ from typing import Any
 from pipeline.gap.data.runs import make_run
 from pipeline.gap.data.sides import split
 from pipeline.gap.fit.baseline import fit_baseline
-from pipeline.gap.search.beam import by_promise, prune
+from pipeline.gap.fit.levenberg_marquardt import Fit
+from pipeline.gap.limits import BIC_DROP
+from pipeline.gap.search.beam import _exchanged, by_promise, prune
 from pipeline.gap.search.grow import fit_whole
 from pipeline.gap.search.hypothesis import Study, judge
 from pipeline.gap.search.screen import candidates_at
@@ -16,7 +18,7 @@ from tests.truth.bench import Hidden
 from tests.truth.cases import make_case
 
 COULOMB, DAHL = ("coulomb_friction", 1), ("presliding_friction", 1)
-CUBIC, DELAY = ("cubic_spring", 1), ("input_delay", 0)
+CUBIC, DELAY, LAG = ("cubic_spring", 1), ("input_delay", 0), ("actuator_lag", 0)
 STUDY: Any = SimpleNamespace(explains=lambda h: False)
 
 
@@ -50,33 +52,36 @@ def test_of_one_family_of_laws_the_best_is_grown():
     assert order(plain, rich, far) == [{DAHL}]
 
 
-def test_a_richer_law_that_explains_no_more_gives_way():
-    """Dry friction that yields over next to nothing is plain dry friction."""
-    hidden = [
-        Hidden(effect="coulomb_friction", place=1, parameters={"force": 0.0006}),
-        Hidden(effect="input_delay", parameters={"delay": 0.015}),
-    ]
+def begun(*hidden: Hidden) -> tuple[Fit, Study]:
+    """Return the linear fit and the study of one cart with these effects."""
     case = make_case(seed=46, n=1, effects=hidden, rate=113.1)
     runs = [make_run(record, n=1) for record in case.records]
     teach, tell = split(runs)
-    held_out = [runs[i] for i in tell]
-    training = [runs[i] for i in teach]
-    fit, training = fit_baseline(training, springs=case.springs, start=None)
+    fit, training = fit_baseline([runs[i] for i in teach], springs=case.springs, start=None)
     study = Study(
         training=tuple(training),
-        held_out=tuple(replace(run, sigma=training[0].sigma) for run in held_out),
+        held_out=tuple(replace(runs[i], sigma=training[0].sigma) for i in tell),
         springs=case.springs,
         catalogue=CATALOGUE,
         repeatability=0.0,
         mapper=map,
         tell=print,
     )
+    return fit, study
+
+
+def test_a_richer_law_that_explains_no_more_gives_way():
+    """Dry friction that yields over next to nothing is plain dry friction."""
+    fit, study = begun(
+        Hidden(effect="coulomb_friction", place=1, parameters={"force": 0.0006}),
+        Hidden(effect="input_delay", parameters={"delay": 0.015}),
+    )
     chain = fit.structure.chain(fit.theta)
     start = fit
     for key, values in (("input_delay", (0.015,)), ("presliding_friction", (0.0006, 1e-4))):
         effect = find_effect(key)
         place = 0 if effect.place == "input" else 1
-        candidate, _ = candidates_at(effect, place, runs=training, chain=chain)[0]
+        candidate, _ = candidates_at(effect, place, runs=study.training, chain=chain)[0]
         start = start.with_effect(candidate, values)
     rich = judge(fit_whole(start, study), study)
 
@@ -85,3 +90,24 @@ def test_a_richer_law_that_explains_no_more_gives_way():
     assert rich.key == {DAHL, DELAY}
     assert pruned.key == {COULOMB, DELAY}
     assert pruned.error < 1.01 * rich.error
+
+
+def test_which_of_two_lookalikes_came_first_does_not_stay():
+    """A lag found before the spring that bends gives way to the delay that is there."""
+    fit, study = begun(
+        Hidden(effect="cubic_spring", place=1, parameters={"coefficient": 0.003}),
+        Hidden(effect="input_delay", parameters={"delay": 0.014}),
+    )
+
+    def grown(model, key, *values):
+        chain = model.structure.chain(model.theta)
+        trials = candidates_at(find_effect(key[0]), key[1], runs=study.training, chain=chain)
+        start = model.with_effect(trials[0][0], values)
+        return judge(fit_whole(start, study), study, added=(trials[0][0],))
+
+    lag, delay = grown(fit, LAG, 0.014), grown(fit, DELAY, 0.014)
+    leader = grown(lag.fit, CUBIC, 0.003)
+    seen = {h.key: h for h in (lag, delay, leader)}
+    (other,) = _exchanged(leader, seen, study)
+    assert other.key == {DELAY, CUBIC}
+    assert other.bic < leader.bic - BIC_DROP
