@@ -26,7 +26,7 @@ from pipeline.synthesis import write_submission
 TITLE = "Report"
 WORDS = """
 `cartlab report` as a command of its own each time, start and imports included: seconds of the
-processor of all its processes, which other work on the machine lengthens less than the clock.
+processor of all its processes; the clock has in it whatever else the machine did at the time.
 "First" has no compiled Python files and no font list of matplotlib, as after an installation from
 source; a package manager compiles when it installs.
 """
