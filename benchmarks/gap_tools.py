@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf
 
+from matplotlib.figure import Figure
+
 from benchmarks.black_boxes import FEATURES, LINEAR, error
 from benchmarks.black_boxes import TOOLS as OTHERS
 from benchmarks.free_runs import (
@@ -139,7 +141,29 @@ def each(found: Sequence[Bench]) -> Table:
         head=head,
         rows=rows,
         note=_TOOLS_NOTE,
+        picture=lambda: picture(found),
     )
+
+
+def picture(found: Sequence[Bench]) -> Figure:
+    """Draw every bench's error over its noise, a mark a tool."""
+    figure = Figure(figsize=(6.5, 3.2), layout="constrained")
+    axes = figure.subplots()
+    names = (OURS, *(name for name, _, _ in OTHERS), LINEAR_CART)
+    for name, mark in zip(names, "oDs^_", strict=True):
+        answered = [
+            (number, bench.answers[name].error / bench.noise)
+            for number, bench in enumerate(found, start=1)
+            if name in bench.answers
+        ]
+        if answered:
+            axes.plot(*zip(*answered, strict=True), mark, markersize=5, label=name)
+    axes.set(yscale="log", xlim=(0, len(found) + 1))
+    axes.set_xlabel("bench, in the order of the table", labelpad=12)
+    axes.set_ylabel("error over the noise", labelpad=20)
+    axes.axhline(1.0, color="#888888", linewidth=0.8)
+    figure.legend(loc="outside lower center", ncols=5)
+    return figure
 
 
 def _hidden(bench: Bench) -> str:
