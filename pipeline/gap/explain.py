@@ -111,9 +111,14 @@ def explain_gap(
                 study, found = judged_by, list(path)
         sample_time = max(run.record.sample_time for run in study.training)
         verdict, path, close = reach_verdict(path, found, study=study, sample_time=sample_time)
-        final = covariance(_settled(path[-1].fit, study), study.training, mapper=pool.map)
-        chosen = replace(path[-1], fit=final)
+        chosen = path[-1]
+        with suppress(OutOfTime):
+            chosen = _settled(chosen, replace(study, mapper=deadline.map))
+        final = covariance(chosen.fit, study.training, mapper=pool.map)
+        chosen = replace(chosen, fit=final)
         path = (*path[:-1], chosen)
+    if verdict == "named" and not study.explains(chosen):
+        verdict = "partial"
     if verdict not in ("none", "unexplained") and not study.explains(chosen):
         times = chosen.error / study.floor
         notes.append(f"{times:.1f} times the noise is left: something remains")
@@ -121,6 +126,10 @@ def explain_gap(
         notes.append(
             f"the search ended after the {budget:g} s allowed: this is the best answer so far, and "
             "another run may come further (--budget SECONDS allows more)"
+        )
+    if chosen.has_contact and final.covariance is not None:
+        notes.append(
+            "beside a contact (a backlash, a stop) the stated errors are the least they can be"
         )
     driven = any(np.any(run.command) for run in study.training)
     effects = list_effects(
@@ -162,9 +171,13 @@ def explain_gap(
     )
 
 
-def _settled(fit: Fit, study: Study) -> Fit:
-    """Return the fit where its cost falls no more: a search ends within some standard errors."""
-    return fit_model(
+def _settled(hypothesis: Hypothesis, study: Study) -> Hypothesis:
+    """Return it where its cost falls no more: a search ends within some standard errors.
+
+    Its `bic` stays: its rivals are compared as the search left them, and so is it.
+    """
+    fit = hypothesis.fit
+    fit = fit_model(
         fit,
         study.training,
         nuisance=fit.nuisance,
@@ -173,6 +186,7 @@ def _settled(fit: Fit, study: Study) -> Fit:
         tolerance=_SETTLED / fit.n_points,
         mapper=study.mapper,
     )
+    return replace(judge(fit, study, added=hypothesis.added), bic=hypothesis.bic)
 
 
 def _learnt_spread(fit: Fit) -> dict[int, float]:

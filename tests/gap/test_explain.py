@@ -52,6 +52,17 @@ def test_friction_that_varies_from_run_to_run_stays_one_effect():
     assert names(gap) == [("coulomb_friction", 1)]
     # 4 % was put in; seven runs tell a spread within a factor of two.
     assert 0.02 < gap.spread[1] < 0.08
+    # The errors stated are those of the model returned, on the held-out runs as they are drawn.
+    held_out = [trace for trace in gap.traces if trace.held_out]
+    before, after = (
+        sum(float(np.sum((trace.measured - model) ** 2)) for trace, model in drawn)
+        for drawn in (
+            [(trace, trace.baseline) for trace in held_out],
+            [(trace, trace.final) for trace in held_out],
+        )
+    )
+    assert gap.final / gap.baseline == pytest.approx(np.sqrt(after / before), rel=1e-9)
+    assert gap.effects[-1].nrmse_after == gap.final
 
 
 def test_what_the_catalogue_lacks_is_not_misnamed():

@@ -1,19 +1,25 @@
-"""Standard errors of what a gap names: as large as the errors are."""
+"""Standard errors of friction and delay, where no bodies meet: about as large as the errors are."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from pipeline.bench.planning.propose import propose_plan
+from pipeline.gap.data.runs import make_run
 from pipeline.gap.data.sides import prepare
 from pipeline.gap.fit.baseline import measure_noise
-from pipeline.gap.fit.levenberg_marquardt import fit_model
+from pipeline.gap.fit.levenberg_marquardt import evaluate, fit_model
 from pipeline.gap.fit.structure import Structure
 from pipeline.gap.fit.uncertainty import covariance
 from pipeline.gap.search.screen import candidates_at
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.nonlinear.effects import find_effect
 from pipeline.submission import load_submission
 from pipeline.synthesis.hidden import prepare_bench
 from pipeline.workflow import analyse
 from tests.helpers.virtual import VirtualBench, new_folder
+from tests.truth.cases import make_case
 
 
 def standardised(folder, *, preset, hide, seed):
@@ -61,3 +67,33 @@ def test_parameters_are_off_by_what_is_stated(tmp_path, preset, hide, seeds):
     assert np.mean(np.abs(z) < 2) > 0.8
     assert np.sqrt(np.mean(z**2)) < 1.5
     assert np.sqrt(np.mean(z[:, -1] ** 2)) < 2.0
+
+
+def fitted(case):
+    """Return the linear chain fitted to a case, and its runs."""
+    runs = [make_run(record, n=case.n) for record in case.records]
+    true = Chain(m=np.array(case.m), c=np.array(case.c), k=np.array(case.k))
+    return fit_model(Structure(springs=case.springs).start(true), runs), runs
+
+
+def test_a_model_that_runs_away_has_no_errors():
+    """A spring that softens without end: its readings and derivatives are no numbers."""
+    fit, runs = fitted(make_case(seed=42, n=1, rate=113.1))
+    (stiff, _), *_ = candidates_at(
+        find_effect("cubic_spring"), 1, runs=runs, chain=fit.structure.chain(fit.theta)
+    )
+    soft = replace(stiff, signs=(-1.0,))
+    away = evaluate(fit.with_effect(soft, (-1.0,)), runs, fit.nuisance, spread=fit.spread)
+    assert not np.isfinite(away.cost)
+    assert covariance(away, runs).covariance is None
+
+
+def test_every_record_has_encoder_errors_of_its_own():
+    """A record that stands there twice is drawn for twice: not just half the covariance."""
+    fit, runs = fitted(make_case(seed=42, n=1, rate=113.1))
+    once = covariance(replace(fit, nuisance=fit.nuisance[:1]), runs[:1]).covariance
+    twice = covariance(replace(fit, nuisance=fit.nuisance[:1] * 2), runs[:1] * 2).covariance
+    assert once is not None
+    assert twice is not None
+    assert np.all(np.diag(twice) < np.diag(once))
+    assert not np.allclose(twice, once / 2, rtol=1e-3, atol=0.0)
