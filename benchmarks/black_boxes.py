@@ -1,7 +1,7 @@
 """Other ways to a nonlinear model of one cart: records in, a model that runs freely out.
 
 Each tries the settings its documentation offers and keeps those with the least free-run error on
-the very records it learnt from, the sparser of nearly equal ones: cartlab has no more to choose by.
+the records to choose by, the sparser of nearly equal ones.
 """
 
 import contextlib
@@ -64,7 +64,7 @@ def error(model: Model, parts: Sequence[Part]) -> float:
 
 
 def best(models: Iterator[Model], parts: Sequence[Part]) -> Model | None:
-    """Return the one with the fewest terms among those that run nearest to their own records."""
+    """Return the one with the fewest terms among those that run nearest to these records."""
     tried = [(error(model, parts), model) for model in models]
     least = min((off for off, _ in tried), default=np.inf)
     near = [

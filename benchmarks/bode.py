@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchmarks.bode_tools import DWELL_TOOLS, PERIOD, RECORD_TOOLS, Dwells, Modes
+from benchmarks.bode_tools import CURVE_FIT, DWELL_TOOLS, PERIOD, RECORD_TOOLS, Dwells, Modes
 from benchmarks.identification import (
     PAPER_STARTS,
     RIGHT,
@@ -221,6 +221,19 @@ _HEAD = ("tool", "carts", "ω, ζ over the bound: little noise", "middle", "much
 _HEAD += ("K over the bound", "right", "ms of a core")
 
 
+def _speed(trials: Trials) -> str:
+    """Say how much less time `curve_fit` took, by the medians of one, two and three carts."""
+    times = {
+        (name, n): np.median(
+            [one.milliseconds for noise in NOISES for one in trials[name, n, noise]]
+        )
+        for name in (OURS, CURVE_FIT)
+        for n in (1, 2, 3)
+    }
+    ratios = [times[OURS, n] / times[CURVE_FIT, n] for n in (1, 2, 3)]
+    return f"cartlab took {min(ratios):.0f} to {max(ratios):.0f} times as long as `curve_fit`."
+
+
 def picture(
     kinds: Sequence[tuple[str, Trials, Sequence[float]]],
 ) -> Figure:
@@ -276,14 +289,15 @@ def tables(*, quick: bool) -> list[Table]:
             title="From the magnitudes of sine dwells, as the paper's students have them",
             head=_HEAD,
             rows=rows_of(magnitudes, tools=blind, noises=NOISES),
-            note=f"{seeds} seeds a noise. {_DWELLS} {_FITS} Vector fitting, modal analysis and "
+            note=f"{seeds} seeds a noise. {_DWELLS} {_FITS} {_MAGNITUDES} "
+            f"{_speed(magnitudes)} Vector fitting, modal analysis and "
             "subspaces need phases, so that these data are not for them.",
         ),
         Table(
             title="With phases",
             head=_HEAD,
             rows=rows_of(complex_, tools=[(t[0], t[1]) for t in DWELL_TOOLS], noises=NOISES),
-            note=f"{_FITS} {_VECTORS}",
+            note=f"{_FITS} {_PHASES} {_speed(complex_)} {_VECTORS}",
         ),
         Table(
             title="From one record of a multisine",
@@ -301,10 +315,9 @@ three times that (much). A damping ratio below zero, which magnitudes cannot tel
 taken as positive."""
 _FITS = """Nelder–Mead is `fminsearch` with its defaults (tolerances 1e-4, 200 evaluations a
 parameter; scipy's are the same), on the paper's parameters of all carts at once and without
-weights. `curve_fit` has the same parameters, and each point's true standard error as `sigma`. What
-`curve_fit` shows: with honest weights a gradient method is nearly at the bound from the same
-starts, and three to ten times faster than cartlab. It is Nelder–Mead that three
-carts are too many for."""
+weights. `curve_fit` has the same parameters, and each point's true standard error as `sigma`."""
+_MAGNITUDES = "Linear: of magnitudes; logarithms: of theirs."
+_PHASES = """Linear: of real and imaginary parts; logarithms: of magnitudes', and phases."""
 _VECTORS = """Vector fitting: as many complex pole pairs as carts, common to all, started at
 logarithmic spacing, strictly proper, responses scaled to one; it takes no weights, and needs no
 start, which the others do."""
@@ -314,7 +327,7 @@ rest. cartlab, N4SID and ERA have the whole record and need no start. N4SID: the
 scaled to one, horizons of 40 samples (better on other seeds than the 20 by default). ERA: 400
 Markov parameters, the true order. sdypy-EMA: responses of the second and third period, the hold
 undone, 0.3 to 8 Hz, orders up to 40 for LSCF and 20 for rational fractions (beyond, it stops with
-an error), stable poles nearest to the paper's start; it tells poles but no static gains. N4SID is
-fast, needs nothing but the order, and serves for any linear system; only cartlab's numbers are
+an error), stable poles nearest to the paper's start; it tells poles but no static gains. N4SID
+needs nothing but the order, and serves for any linear system; only cartlab's numbers are
 those of masses, dampers and springs. In the figure: ω and ζ over the bound, medians; what is worse
 than 300 is drawn there."""

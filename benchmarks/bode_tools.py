@@ -178,11 +178,12 @@ def vector_fitted(dwells: Dwells) -> Modes:
     return modes_of(np.asarray(fit.poles), n=n, gains=scale * np.array(at_rest))
 
 
+CURVE_FIT = "scipy curve_fit"
 DWELL_TOOLS: tuple[tuple[str, str, bool, Callable[[Dwells], Modes]], ...] = (
     # name, distribution, needs phases, how
-    ("Nelder–Mead, linear magnitude", "scipy", False, lambda d: nelder_mead(d, log=False)),
-    ("Nelder–Mead, log magnitude", "scipy", False, lambda d: nelder_mead(d, log=True)),
-    ("scipy curve_fit", "scipy", False, curve_fitted),
+    ("Nelder–Mead, linear", "scipy", False, lambda d: nelder_mead(d, log=False)),
+    ("Nelder–Mead, logarithms", "scipy", False, lambda d: nelder_mead(d, log=True)),
+    (CURVE_FIT, "scipy", False, curve_fitted),
     ("scikit-rf vector fitting", "scikit-rf", True, vector_fitted),
 )
 

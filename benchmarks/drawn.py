@@ -1,5 +1,6 @@
 """Benches drawn by chance, with what is hidden in them; rows that a study keeps as they come."""
 
+import argparse
 import json
 import re
 import time
@@ -92,6 +93,26 @@ def kept_rows(
                 file.flush()
                 print(rows[seed], flush=True)
     return [rows[seed] for seed in sorted(rows)]
+
+
+def run_study(
+    doc: str,
+    name: str,
+    path: Path,
+    make: Callable[[int], dict],
+    table: Callable[[list[dict]], str],
+    *,
+    first: int,
+    count: int,
+) -> None:
+    """Make what rows of a study are missing, as the command line asks, and write its table."""
+    parser = argparse.ArgumentParser(description=doc)
+    parser.add_argument("--count", type=int, default=count)
+    parser.add_argument("--minutes", type=float, default=np.inf, help="begin no bench after")
+    asked = parser.parse_args()
+    end = time.monotonic() + 60 * asked.minutes
+    seeds = range(first, first + asked.count)
+    write_table(name, table(kept_rows(path, seeds, make, until=end)))
 
 
 def wilson(hits: int, n: int) -> str:

@@ -22,7 +22,7 @@ OURS, LINEAR_CART = "cartlab", "linear"
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """One tool on one bench: its model (none if all diverge), error on other records, seconds."""
+    """One tool on one bench: its model (none if all diverge), error where judged, seconds."""
 
     model: Model | None
     error: float
@@ -86,17 +86,18 @@ def words_of(gap: Gap) -> str:
 
 def others(
     training: Sequence[Part],
-    held_out: Sequence[Part],
+    choosing: Sequence[Part],
+    judged: Sequence[Part],
     *,
     settings: Mapping[str, dict[str, tuple[int, ...]]] | None = None,
 ) -> Iterator[tuple[str, Answer]]:
-    """Yield what each other tool that is installed makes of it."""
+    """Yield what each other tool that is installed learns, and chooses by the second records."""
     for name, tool, learn in TOOLS:
         if installed(tool):
             began = time.process_time()
-            model = best(learn(training, **(settings or {}).get(name, {})), training)
+            model = best(learn(training, **(settings or {}).get(name, {})), choosing)
             seconds = time.process_time() - began
-            off = np.inf if model is None else error(model, held_out) if held_out else np.nan
+            off = np.inf if model is None else error(model, judged) if judged else np.nan
             yield name, Answer(model=model, error=off, seconds=seconds)
 
 

@@ -105,7 +105,6 @@ def by_carts(base: Path, *, runs: int, examples: Sequence[str]) -> Table:
         title="The three examples",
         head=["report of", "first, s", "next, s", "without PDF, s", "next, clock s", "MB"],
         rows=rows,
-        note="Six tenths of the next ones are imports: scipy and control, matplotlib, our own.",
     )
 
 
@@ -202,7 +201,8 @@ def documents(base: Path, *, runs: int) -> Table:
             rows.append(missing(name, columns=4))
             continue
         cwd = folder if tool else _ROOT
-        costs = [run(command, cwd=cwd) for _ in range(runs + 1)][1:]
+        warmed = runs > 1  # the first then counts for nothing
+        costs = [run(command, cwd=cwd) for _ in range(runs + warmed)][warmed:]
         rows.append(
             [
                 name,

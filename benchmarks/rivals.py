@@ -5,10 +5,9 @@
 Each bench is drawn by chance with one or two small hidden effects and records one sweep, with which
 `cartlab explore` begins. Where the verdict is "ambiguous" or "partial", it records what
 `cartlab gap` proposes, looks again, and once more where it is still in dispute. The others end
-there. A study that was stopped goes on where it left off.
+there. All are told which springs there are. A study that was stopped goes on where it left off.
 """
 
-import argparse
 import os
 import tempfile
 import time
@@ -18,9 +17,7 @@ os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
 
 import json
 
-import numpy as np
-
-from benchmarks.drawn import draw, kept_rows, wilson, write_table
+from benchmarks.drawn import draw, run_study, wilson
 from pipeline.bench.design.discriminate import propose_for
 from pipeline.bench.planning.plan import Recording
 from pipeline.bench.planning.plan_file import load_plan
@@ -92,9 +89,8 @@ def table(rows: list[dict]) -> str:
     """Return the table of the study, in Markdown."""
     head = ["first verdict", "benches", "named after one more", "after two", "wrong name then"]
     lines = [head, ["---"] * len(head)]
-    rows = [row for row in rows if row["looks"]]
     for words, verdicts in (("ambiguous", OPEN[:1]), ("partial", OPEN[1:]), ("either", OPEN)):
-        mine = [row for row in rows if row["looks"][0]["verdict"] in verdicts]
+        mine = [row for row in rows if row["looks"] and row["looks"][0]["verdict"] in verdicts]
         n = len(mine)
         wrong = sum(
             row["looks"][-1]["verdict"] == "named" and not right(row, after=MORE) for row in mine
@@ -108,19 +104,10 @@ def table(rows: list[dict]) -> str:
                 wilson(wrong, n),
             ]
         )
+    failed = sum(not row["looks"] for row in rows)
+    lines.append(["none: the first look failed", f"{failed} of {len(rows)}", "–", "–", "–"])
     return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
 
 
-def main() -> None:
-    """Make what rows are missing, and write the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--count", type=int, default=400)
-    parser.add_argument("--minutes", type=float, default=np.inf, help="begin no bench after")
-    asked = parser.parse_args()
-    end = time.monotonic() + 60 * asked.minutes
-    seeds = range(FIRST_SEED, FIRST_SEED + asked.count)
-    write_table("rivals", table(kept_rows(ROWS, seeds, run, until=end)))
-
-
 if __name__ == "__main__":
-    main()
+    run_study(__doc__, "rivals", ROWS, run, table, first=FIRST_SEED, count=400)

@@ -9,6 +9,7 @@ from pipeline.results import Record
 from tests.truth.bench import Hidden, simulate_truth
 
 COUNT = 0.00227  # cm, the encoder step
+_SMALLER = (0.7, 0.95)  # of a case's largest input: that of its further records
 RATES = (113.1, 200.0, 250.0, 500.0, 1000.0)  # Hz
 
 _M = ([1.98587e-4], [3.128204e-4, 1.737182e-4], [3.2732e-4, 2.516715e-4, 1.960671e-4])
@@ -110,12 +111,29 @@ def make_case(
     return _case(m, c, k, hidden, records)
 
 
-def make_rig(*, seed: int, n: int) -> Case:
+def further_records(case: Case, *, seed: int) -> tuple[Record, ...]:
+    """Return records of a clean case's bench that are not among its own.
+
+    Other sizes of steps and sweep, none larger than it had; other releases, other noise.
+    """
+    rng = np.random.default_rng(seed)
+    m, c, k = np.array(case.m), np.array(case.c), np.array(case.k)
+    largest = max(np.abs(r.u).max() for r in case.records if r.u is not None)
+    large = rng.uniform(*_SMALLER) * largest
+    records = []
+    for name, kind, t, u, free, x0 in _plan(case.n, large, rng, 1.0 / case.records[0].sample_time):
+        y = simulate_truth(m=m, c=c, k=k, hidden=case.hidden, t=t, u=u, free=free, x0=x0)
+        y = np.round((y + 0.3 * COUNT * rng.standard_normal(y.shape)) / COUNT) * COUNT
+        records.append(_record(name, kind, t, u, y, free=free, count=COUNT))
+    return tuple(records)
+
+
+def make_rig(*, seed: int, n: int, trials: int = 3) -> Case:
     """Make a bench as a class meets it, with several effects that none shows alone.
 
     Dry friction of nearly one size on every cart, which differs from run to run; viscous damping
     of cart 1 that doubles while the motor drives; decays let go by hand, with a speed and a zero
-    of their own; a coarse encoder; three repeats of each run and no other sizes.
+    of their own; a coarse encoder; `trials` repeats of each run and no other sizes.
     """
     rng = np.random.default_rng(seed)
     m = np.array(_M[n - 1]) * rng.uniform(0.8, 1.25, n)
@@ -141,7 +159,7 @@ def make_rig(*, seed: int, n: int) -> Case:
     for name, kind, free in runs:
         held = stiffness[0, 0] if name == "alone" else 1.0 / np.linalg.inv(stiffness)[0, 0]
         size = held * rng.uniform(1.2, 1.8)
-        for trial in range(3):
+        for trial in range(trials):
             t = np.asarray(np.arange(round(6.0 / dt)) * dt, dtype=np.float64)
             x0, v0 = np.zeros(n), np.zeros(n)
             u = np.zeros(t.size)
