@@ -61,7 +61,11 @@ def tables(*, quick: bool) -> list[Table]:
         return [
             mistakes(start=60_000, count=1 if quick else 40),
             copies(base / "copies", teams=2 if quick else 60),
-            costs(base / "costs", teams=1 if quick else 24, ways=WAYS[4:6] if quick else WAYS),
+            costs(
+                base / "costs",
+                teams=1 if quick else 24,
+                ways=(*WAYS[4:6], WAYS[7]) if quick else WAYS,
+            ),
             other_graders(base / "others", honest=1 if quick else 4, each=0 if quick else 2),
         ]
 

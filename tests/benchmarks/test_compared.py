@@ -1,5 +1,8 @@
 """What others are compared by is fair: the right model, failures counted, free runs judged."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -16,8 +19,10 @@ from benchmarks.bode_tools import (
     responses_of,
     start_of,
 )
+from benchmarks.gap_tools import Bench, is_named
 from benchmarks.identification import measure
 from pipeline.plant.linear.presets import PRESETS
+from tests.truth.cases import COUNT, further_records, make_case
 
 OMEGA = 2 * np.pi * np.geomspace(0.3, 7.0, 30)
 
@@ -108,3 +113,40 @@ def test_of_nearly_equal_models_the_sparser_is_taken():
     assert chosen is not None
     assert chosen.words == "2"
     assert best(iter([off_by(1e9, 1)]), [part]) is None
+
+
+def test_further_records_are_of_the_same_bench_and_none_that_anybody_had():
+    """Nothing is larger than what could be learnt from, and the linear carts are the same."""
+    case = make_case(seed=7, n=1, rate=113.1)
+    further = further_records(case, seed=8)
+
+    def largest(records):
+        return max(np.abs(r.u).max() for r in records)
+
+    assert [r.id for r in further] == [r.id for r in case.records]
+    assert largest(further) < largest(case.records)
+    for had, new in zip(case.records, further, strict=True):
+        assert not np.array_equal(had.y, new.y)
+    had, new = case.records[0], further[0]  # steps: no resting level but that of the input
+    scale = np.abs(new.u).max() / np.abs(had.u).max()
+    assert np.abs(new.y - scale * had.y).max() < 4 * COUNT
+
+
+@pytest.mark.parametrize(
+    ("verdict", "hidden", "named"),
+    [
+        ("none", (), True),
+        ("unexplained", (), False),
+        ("named", ("cubic_spring",), True),
+        ("partial", ("cubic_spring",), False),
+        ("ambiguous", ("cubic_spring",), False),
+        ("named", ("backlash",), False),
+    ],
+)
+def test_only_what_is_said_as_named_counts_as_named(verdict, hidden, named):
+    """The right effects under another verdict are no promise."""
+    found = ("cubic_spring",) if verdict not in ("none", "unexplained") else ()
+    effects = tuple(SimpleNamespace(effect=SimpleNamespace(key=key)) for key in found)
+    gap: Any = SimpleNamespace(verdict=verdict, effects=effects)
+
+    assert is_named(Bench(hidden=hidden, noise=0.1, gap=gap, answers={})) is named
