@@ -96,7 +96,7 @@ def kept_rows(
 
 
 def run_study(
-    doc: str,
+    doc: str | None,
     name: str,
     path: Path,
     make: Callable[[int], dict],
