@@ -8,6 +8,7 @@ import secrets
 import time
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
+from functools import lru_cache
 from numbers import Real
 from pathlib import Path
 
@@ -63,7 +64,7 @@ def own_folder(parent: Path, name: str) -> Path:
 def write_file(path: Path, content: str | bytes) -> None:
     """Write a file whole or not at all; a link in its place is replaced, not followed.
 
-    What a program that was killed while it wrote has left there goes.
+    What a program that was killed while it wrote has left there goes, once in a process.
     """
     raw = content.encode() if isinstance(content, str) else content
     _clear_left_over(path.parent)
@@ -77,6 +78,9 @@ def write_file(path: Path, content: str | bytes) -> None:
         raise
 
 
+@lru_cache(
+    maxsize=1000
+)  # once a folder: to look through thousands of files takes as long as to write
 def _clear_left_over(folder: Path) -> None:
     for part in folder.glob(".*.part"):
         with suppress(OSError):  # another has just removed it

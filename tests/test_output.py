@@ -56,6 +56,16 @@ def test_what_a_killed_write_left_goes_with_the_next(tmp_path):
     assert {p.name for p in tmp_path.iterdir()} == {"notes.md", *names[1:]}
 
 
+def test_a_folder_is_looked_through_once(tmp_path):
+    """Among thousands of files a look takes longer than a write."""
+    write_file(tmp_path / "notes.md", "whole")
+    left = tmp_path / f".{16 * '0'}.part"
+    left.write_text("half")
+    os.utime(left, (0, 0))
+    write_file(tmp_path / "notes.md", "whole")
+    assert left.exists()
+
+
 def test_a_link_is_replaced_not_followed(tmp_path):
     """A link that a submission brought does not lead our output to another file."""
     victim = tmp_path / "victim"
