@@ -92,7 +92,7 @@ def exploration(team: Path) -> None:
         page = browser.new_page(viewport=WINDOW)
         page.goto(server.url)
         page.get_by_role("link", name=f"{team.name}: bench").click()
-        page.get_by_label("Port of the bench").fill(address)
+        page.locator("#explore-port").fill(address)
         page.get_by_label("to within ± %").fill("0.01")
         page.get_by_role("button", name="Explore").click()
         page.locator("#thought:not([hidden])").wait_for(timeout=1e5)

@@ -48,20 +48,22 @@ def whole_number(typed: str, *, name: str, least: int, most: int) -> int:
     raise ConfigError(f"{name}: expected a whole number from {least} to {most}, found {found!r}")
 
 
-def number(typed: str, *, name: str) -> float:
+def number(typed: str, *, name: str, above: float = -math.inf, below: float = math.inf) -> float:
     """Return a number that was typed, with a point or a comma; 0 where nothing was.
 
     Raises
     ------
-    ConfigError : it is none.
+    ConfigError : it is none, or not between `above` and `below`.
     """
     try:
         value = float(typed.replace(",", ".") or 0)
     except ValueError:
         value = math.nan
-    if math.isfinite(value):
+    if math.isfinite(value) and above < value < below:
         return value
-    raise ConfigError(f"{name}: expected a number, found {_clipped(typed, most=20)!r}")
+    bounds = f" above {above:g}" if above > -math.inf else ""
+    bounds += f" and below {below:g}" if below < math.inf else ""
+    raise ConfigError(f"{name}: expected a number{bounds}, found {_clipped(typed, most=20)!r}")
 
 
 def _clipped(typed: str, *, most: int) -> str:

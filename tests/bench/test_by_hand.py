@@ -3,7 +3,7 @@
 import pytest
 
 from pipeline.bench.planning.by_hand import add_recording, recording_by_hand
-from pipeline.bench.planning.plan_file import load_plan
+from pipeline.bench.planning.plan_file import add_recordings, load_plan
 from pipeline.errors import ConfigError
 from pipeline.submission import load_submission
 from tests.helpers.acquisitions import sine, write_work
@@ -48,9 +48,14 @@ def test_what_is_wanted_stands_in_the_plan_after_what_is_there(work, kind, numbe
         ("sine", {"amplitude": 0.1, "frequency": 1e308}, "frequency: expected"),
         ("sweep", {"amplitude": 0.1, "frequency": 1.0}, "to: expected 0.001 to 1000 Hz, found 0"),
         ("sweep", {"amplitude": 0.1, "frequency": 1.0, "frequency_end": -3.0}, "to: expected"),
-        ("sweep", {"amplitude": 0.1, "frequency": 1.0, "frequency_end": 1.0}, "frequency end: a"),
-        ("decay", {"cart": 1, "seconds": 1e-320}, "how long: expected 1 to 600 s"),
-        ("decay", {"cart": 1, "seconds": 601.0}, "how long"),
+        (
+            "sweep",
+            {"amplitude": 0.1, "frequency": 1.0, "frequency_end": 1.0},
+            "to: a chirp needs another",
+        ),
+        ("decay", {"cart": 1, "seconds": 1e-320}, "how long: expected 1 to 120 s"),
+        ("decay", {"cart": 1, "seconds": 121.0}, "how long: .* found 121"),
+        ("sine", {"amplitude": 0.1, "frequency": 0.005}, "frequency: expected at least 0.0083 Hz"),
     ],
 )
 def test_what_the_limits_do_not_allow_is_said_of_its_number(work, kind, numbers, words):
@@ -61,3 +66,27 @@ def test_what_the_limits_do_not_allow_is_said_of_its_number(work, kind, numbers,
     with pytest.raises(ConfigError, match=words):
         recording_by_hand(kind, plan=plan, submission=submission, **given)
     assert load_plan(submission) == plan
+
+
+@pytest.mark.parametrize(
+    ("seconds", "frequency", "cycles"), [(100.0, 0.07, 7), (101.0, 0.07, 8), (120.0, 0.07, 8)]
+)
+def test_whole_periods_last_as_long_as_typed(work, seconds, frequency, cycles):
+    """100 s at 0.07 Hz are 7, which 64 bits make 7.000000000000001; none goes beyond 120 s."""
+    submission = load_submission(work)
+    made = recording_by_hand(
+        "sine", plan=load_plan(submission), submission=submission, seconds=seconds,
+        amplitude=0.1, frequency=frequency,
+    )  # fmt: skip
+    assert made.cycles == cycles
+
+
+def test_what_others_added_meanwhile_stays(work):
+    """Whoever extends the plan may have thought of it for minutes, on the plan as it was."""
+    old = load_plan(load_submission(work))
+    theirs = add_recording(work, sine("theirs", seconds=5))
+    new = [sine(name, seconds=4) for name in ("sine-1", "theirs")]
+    plan = add_recordings(work, new, otherwise=old)
+    assert plan == load_plan(load_submission(work))
+    assert plan.recordings[:-2] == (*old.recordings, theirs)
+    assert [one.id for one in plan.recordings[-2:]] == ["sine-2", "theirs-2"]

@@ -1,14 +1,21 @@
 """A bench that investigates itself, on the emulator's carts and over a real line."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
-from pipeline.bench.explore.explore import Recorded, explore
+from pipeline.bench.design.candidates import propose_candidates
+from pipeline.bench.design.discriminate import propose_for
+from pipeline.bench.design.goal import find_goal
+from pipeline.bench.design.information import Knowledge
+from pipeline.bench.explore.explore import Recorded, _next, explore
 from pipeline.bench.explore.wish import Wish, read_time, read_wish
 from pipeline.bench.host.signals import Stopped
 from pipeline.bench.planning.by_hand import add_recording
-from pipeline.bench.planning.plan_file import load_plan
+from pipeline.bench.planning.plan import Limits
+from pipeline.bench.planning.plan_file import load_plan, save_plan
+from pipeline.bench.planning.propose import propose_plan
 from pipeline.errors import ConfigError, DataError
 from pipeline.report.exploration.page import NAME
 from pipeline.submission import load_submission
@@ -16,7 +23,8 @@ from pipeline.synthesis.hidden import prepare_bench
 from pipeline.workflow import analyse
 from tests.helpers.benches import emulator
 from tests.helpers.commandline import cartlab_here
-from tests.helpers.virtual import VirtualBench, VirtualSession
+from tests.helpers.desks import a_recorded_cart
+from tests.helpers.virtual import VirtualBench, VirtualSession, new_folder
 
 
 @pytest.mark.parametrize(
@@ -175,14 +183,23 @@ def test_a_bench_on_which_nothing_comes_off_is_left_after_three_tries(tmp_path):
     assert not turns[-1].reached
 
 
-def test_a_person_vetoes_and_adds(tmp_path):
-    """Another is chosen than what is vetoed; what is added comes next; the diary says both."""
+def test_a_person_vetoes_and_adds(tmp_path, monkeypatch):
+    """Another is chosen than what is vetoed; what is added comes next; the diary says both.
+
+    gap.json is written anew, with what decides if not what was vetoed.
+    """
     bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
     folder, offered, said = tmp_path / "work", [], []
     session = VirtualSession(folder, VirtualBench(bench, seed=1))
 
+    def proposed(gap, submission, *, without=()):
+        found = propose_for(gap, submission, without=without)
+        return replace(found, next_experiment="another") if without else found
+
     def vetoes(recording):
         offered.append(recording)
+        gap = json.loads((folder / "gap" / "gap.json").read_text(encoding="utf-8"))
+        assert (gap["next_experiment"] == "another") == (len(offered) == 2)
         if len(offered) == 1:
             step = next(one for one in load_plan(load_submission(folder)).recordings
                         if one.kind == "step")  # fmt: skip
@@ -191,6 +208,7 @@ def test_a_person_vetoes_and_adds(tmp_path):
             raise Stopped("by hand")
         return len(offered) == 1
 
+    monkeypatch.setattr("pipeline.bench.explore.explore.propose_for", proposed)
     with pytest.raises(Stopped):
         explore(
             folder, record=session, wish=Wish(error=1e-7), seconds=400.0, tell=said.append,
@@ -205,6 +223,50 @@ def test_a_person_vetoes_and_adds(tmp_path):
     assert said[1].startswith(f"{first.id} was vetoed; ")
     assert "mine, which was added by hand" in said[1]
     assert f"{first.id} was vetoed" in (folder / NAME).read_text(encoding="utf-8")
+
+
+def test_what_is_added_counts_whatever_it_is_called(tmp_path):
+    """An id that the program would give its own first step, where the plan had none at first."""
+    bench = VirtualBench(prepare_bench(preset="throne-1dof", model=None, hide=[]), seed=1)
+    folder = new_folder(tmp_path / "work", bench, springs=[True, True])
+    submission = load_submission(folder)
+    usual = propose_plan(submission, bench=bench.description)
+    sweep, step = (next(one for one in usual.recordings if one.id == name)
+                   for name in ("sweep", "step-1"))  # fmt: skip
+    save_plan(usual.model_copy(update={"recordings": (sweep,)}), submission)
+    session, offered = VirtualSession(folder, bench), []
+    session(["sweep"])
+
+    def add(stage):
+        if stage == "what to record next":
+            add_recording(folder, step)
+
+    def enough(recording):
+        offered.append(recording)
+        raise Stopped("by hand")
+
+    with pytest.raises(Stopped):
+        explore(
+            folder, record=session, wish=Wish(error=1e-7), seconds=400.0, tell=lambda s: None,
+            progress=add, vetoes=enough,
+        )  # fmt: skip
+    assert offered == [step]
+
+
+def test_where_all_that_tells_more_was_refused_the_large_step_is_left(tmp_path):
+    """Carts that were driven gently only may hide what acts far out."""
+    submission = load_submission(a_recorded_cart(tmp_path / "work"))
+    analysis = analyse(submission)
+    plan = propose_plan(submission)
+    plan = plan.model_copy(update={"limits": Limits(input=100.0, travel=100.0)})
+    goal = find_goal("zeta", known := Knowledge.of(analysis), feedback=None)
+    refused = propose_candidates(known, limits=plan.limits, commands=frozenset("c"), goal=goal)
+    step, why = _next(
+        analysis, None, plan, submission.folder, missing={"zeta": 0.1}, refused=refused
+    )
+    assert step is not None
+    assert step.aim == "far"
+    assert "no input was above" in why
 
 
 def test_thinking_can_be_ended(tmp_path):

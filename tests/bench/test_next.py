@@ -236,6 +236,15 @@ def test_what_somebody_proposes_is_weighed_beside_what_is_chosen(analysis, known
     assert not found.why
 
 
+def test_what_makes_the_fit_know_worse_says_so(analysis):
+    """A minute of rest whose rounding does not average out weighs more than what it tells."""
+    mine = Recording(id="mine", kind="step", carts=(1, 2), wave="square", amplitude=0.005,
+                     frequency=2 / 120, cycles=2)  # fmt: skip
+    found = weigh(analysis, mine, Plan(limits=LIMITS), goal="worst", commands=COMMANDS)
+    assert found.proposed > 1.01 * found.now
+    assert "know it worse" in found.why
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.bench.planning.by_hand import add_recording
 from pipeline.bench.planning.plan import Limits, PidLoop, Plan, Recording, StateLoop
 from pipeline.bench.planning.plan_file import load_plan, plan_path, plan_text, save_plan
-from pipeline.bench.planning.propose import AIM, extend_plan, propose_plan
+from pipeline.bench.planning.propose import AIM, extend_plan, let_go, make_plan, propose_plan
 from pipeline.bench.protocol.messages import FULL_SCALE, Description, Start, Wave
 from pipeline.bench.protocol.waves import target_at
 from pipeline.cli import main
@@ -29,6 +30,7 @@ from pipeline.submission import (
     load_submission,
     new_submission,
 )
+from tests.helpers.desks import a_recorded_cart
 
 EXAMPLE_OF = {"throne-1dof": "one-cart", "throne-2dof": "two-cart", "throne-3dof": "three-cart"}
 STOCK = Description(name="stock", encoders=2, carts=2)
@@ -316,6 +318,21 @@ def test_adding_keeps_every_byte_that_stood_there(tmp_path):
     assert len(of_kind(load_plan(submission), "sine")) > 20
     with pytest.raises(ValueError, match="not an extension"):
         save_plan(old, submission)
+
+
+def test_what_is_added_while_the_data_are_asked_stays(tmp_path):
+    """Whoever adds a recording meanwhile finds it in the plan, before what the data ask for."""
+    work = a_recorded_cart(tmp_path / "work")
+    submission = load_submission(work)
+    old = propose_plan(submission)
+    save_plan(old, submission)
+    mine = let_go(1, name="mine", seconds=10.0)
+    made = make_plan(submission, progress=lambda stage: add_recording(work, mine))
+    n = len(old.recordings)
+    assert made.plan == load_plan(submission)
+    assert made.plan.recordings[: n + 1] == (*old.recordings, mine)
+    assert f" {len(made.plan.recordings) - n - 1} recordings added" in made.said
+    assert of_kind(made.plan, "sine")
 
 
 RUN = """

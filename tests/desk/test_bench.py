@@ -14,6 +14,7 @@ import pytest
 from pipeline.bench.host.raw import read_raw
 from pipeline.bench.planning.plan_file import load_plan
 from pipeline.desk.app import DeskServer
+from pipeline.report.exploration.page import NAME as DIARY
 from pipeline.submission import load_submission
 from tests.helpers.acquisitions import sine, write_work
 from tests.helpers.desks import Visitor, a_recorded_cart
@@ -81,7 +82,13 @@ def test_the_bench_is_stopped_when_the_desk_is_gone(tmp_path, real, name, room, 
         assert desk.stderr is not None
         url = re.search(r"http://\S+", desk.stderr.readline())
         assert url is not None
-        begun(Visitor.of(url[0]), work, name, room, port=real.address, **fields)
+        (work / DIARY).write_text("of an older exploration", encoding="utf-8")
+        visitor = Visitor.of(url[0])
+        begun(visitor, work, name, room, port=real.address, **fields)
+        # The diary is shown once there is one of this exploration.
+        shown = re.findall(r'aria-labelledby="diary-title"(.*)>', visitor.get("/bench/0/").text)
+        assert all(how.startswith(" hidden>") for how in shown)
+        assert len(shown) == (room == "explore")
         desk.send_signal(signal.SIGKILL)
         desk.wait(PATIENCE)
         while (ended := real.event("run"))["ended"] == "complete":
@@ -109,6 +116,34 @@ def test_a_plan_is_made_and_what_is_wrong_is_said(tmp_path):
         visitor.post("/bench/0/acquire", port="socket://127.0.0.1:1")
         until(lambda: "nobody listens there" in visitor.get("/bench/0/").text)
     assert load_plan(load_submission(work)).recordings
+
+
+def test_exploring_has_a_form_of_its_own(tmp_path):
+    """Enter in its fields explores, at its own port; numbers as everywhere, wrong ones by name."""
+    work = a_recorded_cart(tmp_path / "team")
+    with DeskServer(folder=work) as server:
+        visitor = Visitor.of(server.url)
+        forms = re.findall(
+            r"<form[^>]*?action=[^>]*?>.*?</form>", visitor.get("/bench/0/").text, re.DOTALL
+        )
+        fields = {
+            re.findall(r'action="/bench/0/(\w+)"', form)[0]: set(re.findall(r'name="(\w+)"', form))
+            for form in forms
+        }
+        assert fields["explore"] == {"port", "what", "error", "minutes"}
+        assert fields["acquire"] == {"port"}
+        sound = {"port": "socket://127.0.0.1:1", "what": "all", "error": "1,5", "minutes": "0,5"}
+        for name, typed, said in (
+            ("error", "", "to within ± %: expected a number above 0 and below 100"),
+            ("error", "100", "to within ± %"),
+            ("minutes", "-1", "minutes: expected a number above 0"),
+            ("minutes", "soon", "minutes"),
+        ):
+            answer = visitor.post("/bench/0/explore", **{**sound, name: typed})
+            assert answer.status == 422
+            assert said in answer.text
+        assert visitor.post("/bench/0/explore", **sound).status == 303
+        until(lambda: "nobody listens there" in visitor.get("/bench/0/").text)
 
 
 def test_an_experiment_is_proposed_weighed_and_added(tmp_path):

@@ -17,9 +17,9 @@ from pipeline.bench.design.information import Knowledge
 from pipeline.bench.host.raw import FOLDER as RAW
 from pipeline.bench.host.raw import read_raw
 from pipeline.bench.planning.plan import Limits, Plan, Recording
-from pipeline.bench.planning.plan_file import save_plan
+from pipeline.bench.planning.plan_file import add_recordings, plan_path
 from pipeline.bench.planning.plan_words import session_time, time_words
-from pipeline.bench.planning.propose import current_plan, renamed
+from pipeline.bench.planning.propose import current_plan
 from pipeline.errors import ConfigError, DataError
 from pipeline.ingest.read import read_data
 from pipeline.report.limits import CALIBRATION
@@ -102,18 +102,16 @@ def plan_next(
     ConfigError : there is no such goal; gap.json is broken, or of other data or limits.
     """
     old = current_plan(submission)
-    taken = [entry.id for entry in (*old.recordings, *submission.experiments)]
     if goal == GAP:
         if n != 1:
             raise ConfigError(f"--for gap chooses one recording: expected --next 1, found {n}")
         recording, separation = _decisive(submission, old.limits)
-        recordings = renamed([recording], taken=taken)
-        plan = old.model_copy(update={"recordings": (*old.recordings, *recordings)})
+        plan = add_recordings(submission.folder, [recording], otherwise=old)
         return NextPlan(
             words="gap",
             plan=plan,
-            path=save_plan(plan, submission),
-            recordings=recordings,
+            path=plan_path(submission),
+            recordings=plan.recordings[-1:],
             separation=separation,
         )
     progress("asking the data what they tell")
@@ -121,13 +119,12 @@ def plan_next(
     progress("weighing the next experiments")
     commands = frozenset() if stock else known_commands(submission.folder)
     found = choose_next(analysis, old, n=n, goal=goal, commands=commands)
-    recordings = renamed(found.recordings, taken=taken)
-    plan = old.model_copy(update={"recordings": (*old.recordings, *recordings)})
+    plan = add_recordings(submission.folder, found.recordings, otherwise=old)
     return NextPlan(
         words=found.words,
         plan=plan,
-        path=save_plan(plan, submission),
-        recordings=recordings,
+        path=plan_path(submission),
+        recordings=plan.recordings[-n:],
         now=found.now,
         errors=found.errors,
         planned=found.planned,

@@ -8,6 +8,14 @@ from pipeline.bench.design.next_plan import choose_next, tells_nothing
 from pipeline.bench.planning.plan import Plan, Recording
 from pipeline.results import Analysis
 
+_WORSE = 1.01  # times the error of now: a difference that shows in two digits
+# The fit takes each sample to err by itself; what an encoder rounds away while a cart hardly moves
+# is the same error in many samples.
+_WHY_WORSE = (
+    "the fit would know it worse, for where carts rest, or move by few counts, what their encoders "
+    "round off does not average out; try a larger motion, or a shorter run"
+)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Weighed:
@@ -16,7 +24,7 @@ class Weighed:
     Attributes
     ----------
     words : what they are of, "zeta_2".
-    why : the one proposed changes nothing; "": it does.
+    why : the one proposed brings nothing, or harm; "": it does bring something.
     """
 
     words: str
@@ -42,6 +50,8 @@ def weigh(
     error = find_goal(goal, known, feedback=analysis.feedback).of
     why = tells_nothing(proposed, known, limits=plan.limits)
     after = found.now if why else float(error(known.told + known.of_recording(proposed)))
+    if after > _WORSE * found.now:
+        why = _WHY_WORSE
     return Weighed(
         words=found.words,
         now=found.now,

@@ -98,11 +98,12 @@ def explore(
     """
     known = (folder / NAME).exists() and bool(load_submission(folder).experiments)
     ours = {FIRST}  # in the plan; what else is there, and not recorded, somebody has added
+    planned = False
     if (folder / NAME).exists():
         submission = load_submission(folder)
         system = submission.system
         wish.missing(dict.fromkeys(parameter_names(system.carts, rigid=not system.tied)))
-        if plan_path(submission).exists():
+        if planned := plan_path(submission).exists():
             ours.update(one.id for one in load_plan(submission).recordings)
     made, spent = (), 0.0
     if not known:
@@ -118,7 +119,8 @@ def explore(
     usual = propose_plan(submission)
     if not plan_path(submission).exists():
         save_plan(usual, submission)
-    ours.update(one.id for one in usual.recordings)
+    if not planned:
+        ours.update(one.id for one in usual.recordings)
     if not known:
         plan = load_plan(submission)
         steps = [r for r in plan.recordings if r.kind == "step" and not r.release]
@@ -161,6 +163,7 @@ def explore(
         before = f"{recording.id} {'was vetoed' if came.vetoed else 'did not come off'}; "
         if gap is not None:  # which recording decides is open again
             gap = propose_for(gap, load_submission(folder), without=refused)
+            _write_gap(gap, analysis, folder)
 
 
 def _first_time(folder: Path) -> float:
@@ -182,10 +185,14 @@ def _look(
         tell(f"the gap cannot be looked for: {error}")
         return _identified(analysis, None), None
     gap = propose_for(gap, submission)
+    _write_gap(gap, analysis, folder)
+    return _identified(analysis, gap), gap
+
+
+def _write_gap(gap: Gap, analysis: Analysis, folder: Path) -> None:
     place = own_folder(folder, "gap")
     place.mkdir(exist_ok=True)
     write_file(place / "gap.json", gap_text(gap, analysis))
-    return _identified(analysis, gap), gap
 
 
 def _identified(analysis: Analysis, gap: Gap | None) -> Analysis:
@@ -274,6 +281,7 @@ def _next(
 ) -> tuple[Recording | None, str]:
     """Return what to record next and why; None where all is known, or nothing would help."""
     settled, commands = gap is None or gap.verdict in _SETTLED, known_commands(folder)
+    end = "" if settled else "no recording within the limits would decide"
     if gap is not None and gap.proposal is not None and gap.proposal.separation > _APART:
         recording = Recording.model_validate_json(json.dumps(gap.proposal.recording))
         disputed = [_terms(one.model) for one in gap.contenders]
@@ -283,8 +291,12 @@ def _next(
         worst = max(missing, key=lambda name: missing[name])
         # What is open was refused, or is the next to be chosen: it tells nothing yet.
         made = plan.model_copy(update={"recordings": ()})
-        found = choose_next(analysis, made, n=1, goal=worst, commands=commands, without=refused)
-        return found.recordings[0], found.said
+        try:
+            found = choose_next(analysis, made, n=1, goal=worst, commands=commands, without=refused)
+        except DataError as error:  # the large step is left
+            end = str(error)
+        else:
+            return found.recordings[0], found.said
     # Once: carts that something holds back go no further the second time.
     recorded = {record.id for record in analysis.records}
     made = any(r.aim == _FAR_OUT and r.id in recorded for r in plan.recordings)
@@ -299,7 +311,7 @@ def _next(
             f"no input was above {hardest:.2g} {analysis.input_unit}, and what only a larger one "
             "or carts further out show would not be seen"
         )
-    return None, "" if settled else "no recording within the limits would decide"
+    return None, end
 
 
 def _added(folder: Path, ours: Collection[str]) -> Recording | None:

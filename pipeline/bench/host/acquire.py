@@ -22,7 +22,7 @@ from pipeline.bench.host.signals import Stopped, signals_held, stopping_on_signa
 from pipeline.bench.live.observer import Buttons, Observer, Observers, RunOutcome, Wish
 from pipeline.bench.planning.orders import Order, order_on
 from pipeline.bench.planning.plan import Plan, Recording
-from pipeline.bench.planning.plan_file import load_plan, plan_path, save_plan
+from pipeline.bench.planning.plan_file import add_recordings, load_plan, plan_path, save_plan
 from pipeline.bench.planning.propose import extend_plan, propose_plan
 from pipeline.bench.thresholds import TRIES
 from pipeline.errors import ConfigError, DataError, HardwareError, PipelineError
@@ -256,9 +256,10 @@ class _Acquisition:
         except DataError as error:
             self._observer.remark(f"the plan is not extended: {error}")
             return plan
-        if longer.recordings == plan.recordings:
+        new = longer.recordings[len(plan.recordings) :]
+        if not new:
             return plan
-        save_plan(longer, submission)
+        longer = add_recordings(self._folder, new, otherwise=plan)
         check_files(longer, submission)
         return longer
 

@@ -1,15 +1,14 @@
 """A recording that a person wants, from the few numbers in which one says it."""
 
-from math import ceil
+from math import ceil, floor
 from pathlib import Path
 from typing import Literal, get_args
 
 from pipeline.bench.planning.plan import Plan, Recording
-from pipeline.bench.planning.plan_file import LONGEST_RUN, recording_problems, save_plan
-from pipeline.bench.planning.propose import current_plan, let_go, renamed
+from pipeline.bench.planning.plan_file import add_recordings, recording_problems
+from pipeline.bench.planning.propose import current_plan, let_go
 from pipeline.bench.protocol.messages import FREQUENCIES
 from pipeline.errors import ConfigError
-from pipeline.lock import turn_in
 from pipeline.submission import Submission, load_submission
 
 Kind = Literal["step", "sweep", "sine", "decay"]
@@ -21,6 +20,11 @@ _WAVES: dict[Kind, Literal["square", "chirp", "sine"]] = {
     "sine": "sine",
 }
 _SHORTEST = 1.0  # s
+_LONGEST = (
+    120.0  # s; of three carts at 1 kHz that is weighed in 1 s and 0.5 GB, 600 s in 20 s and 2 GB
+)
+_ROUNDING = 1e-9  # relative: 100 s at 0.07 Hz are 7 periods, whatever their product rounds to
+_TYPED = {"frequency_end": "to"}  # what a key of plan.toml is called by whoever types it
 _EDGES = 4  # half periods of a step: off, on, off, on
 _SETTLE = 5.0  # s of rest beforehand, where the plan has no run of the motor to go by
 
@@ -40,7 +44,7 @@ def recording_by_hand(
 
     Parameters
     ----------
-    seconds : that it lasts; made whole periods of a dwell or sweep.
+    seconds : that it lasts, 1 to 120; made whole periods of a dwell or sweep.
     amplitude : input units.
     frequency, frequency_end : Hz, of a dwell, or from where to where a sweep goes.
     cart : that is let go, of a decay.
@@ -51,8 +55,11 @@ def recording_by_hand(
     """
     everyone = tuple(range(1, submission.system.carts + 1))
     low, high = FREQUENCIES
-    if not _SHORTEST <= seconds <= LONGEST_RUN:
-        raise ConfigError(f"how long: expected {_SHORTEST:g} to {LONGEST_RUN:g} s")
+    if not _SHORTEST <= seconds <= _LONGEST:
+        expected = f"{_SHORTEST:g} to {_LONGEST:g} s"
+        raise ConfigError(
+            f"how long: expected {expected}, found {seconds:g}; plan.toml takes longer ones"
+        )
     named = {"frequency": frequency, "to": frequency_end or 0.0}
     for name in {"sine": ["frequency"], "sweep": ["frequency", "to"]}.get(kind, []):
         if not low <= named[name] <= high:
@@ -61,7 +68,7 @@ def recording_by_hand(
         made = let_go(cart, name=f"decay-{cart}", seconds=seconds)
     else:
         driven = [one.settle for one in plan.recordings if one.amplitude]
-        cycles = ceil(seconds * frequency) if kind != "step" else _EDGES // 2
+        cycles = _periods(seconds, frequency) if kind != "step" else _EDGES // 2
         made = Recording(
             id=f"{kind}-1",
             kind=kind,
@@ -74,8 +81,19 @@ def recording_by_hand(
             settle=driven[-1] if driven else _SETTLE,
         )
     for key, what in recording_problems(made, plan.limits, submission.system):
-        raise ConfigError(f"{key.replace('_', ' ')}: {what}")
+        raise ConfigError(f"{_TYPED.get(key, key)}: {what}")
     return made
+
+
+def _periods(seconds: float, frequency: float) -> int:
+    """Return how many whole periods last so long or a little longer, or as long as may be."""
+    most = floor(_LONGEST * frequency * (1 + _ROUNDING))
+    if not most:
+        raise ConfigError(
+            f"frequency: expected at least {1 / _LONGEST:.2g} Hz, of which a period fits into "
+            f"{_LONGEST:g} s, found {frequency:g}"
+        )
+    return min(ceil(seconds * frequency * (1 - _ROUNDING)), most)
 
 
 def add_recording(folder: Path, recording: Recording) -> Recording:
@@ -85,10 +103,5 @@ def add_recording(folder: Path, recording: Recording) -> Recording:
     ------
     ConfigError : the plan is broken; nothing is written then.
     """
-    with turn_in(folder):
-        submission = load_submission(folder)
-        plan = current_plan(submission)
-        taken = [one.id for one in (*submission.experiments, *plan.recordings)]
-        (new,) = renamed([recording], taken=taken)
-        save_plan(plan.model_copy(update={"recordings": (*plan.recordings, new)}), submission)
-        return new
+    plan = current_plan(load_submission(folder))
+    return add_recordings(folder, [recording], otherwise=plan).recordings[-1]

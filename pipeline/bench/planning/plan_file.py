@@ -1,7 +1,7 @@
 """`plan.toml`: read it, write it, add to it; whatever is wrong is one line a person can act on."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +11,9 @@ from pydantic import ValidationError
 from pipeline.bench.planning.plan import Limits, PidLoop, Plan, Recording, StateLoop
 from pipeline.bench.protocol.messages import FREQUENCIES, MOST_TONES
 from pipeline.errors import ConfigError
+from pipeline.lock import turn_in
 from pipeline.output import write_file
-from pipeline.submission import Submission, System
+from pipeline.submission import Submission, System, load_submission
 from pipeline.submission.complaints import Location, dotted, explain, quote
 from pipeline.submission.toml_file import parse_toml, read_text
 from pipeline.synthesis.files import toml_section
@@ -96,6 +97,45 @@ def save_plan(plan: Plan, submission: Submission) -> Path:
     _parse(text, where=where, system=submission.system)
     write_file(path, text)
     return path
+
+
+def add_recordings(folder: Path, proposed: Sequence[Recording], *, otherwise: Plan) -> Plan:
+    """Put recordings at the end of a submission's plan as it is by now; return that plan.
+
+    Whoever proposes them may have thought for minutes, while others added theirs. An id that is
+    taken becomes another.
+
+    Parameters
+    ----------
+    otherwise : the plan that they are added to where there is no file.
+
+    Raises
+    ------
+    ConfigError : the plan is broken, or would be; nothing is written then.
+    """
+    with turn_in(folder):
+        submission = load_submission(folder)
+        plan = load_plan(submission) if plan_path(submission).exists() else otherwise
+        taken = [one.id for one in (*submission.experiments, *plan.recordings)]
+        new = (*plan.recordings, *renamed(proposed, taken=taken))
+        plan = plan.model_copy(update={"recordings": new})
+        save_plan(plan, submission)
+        return plan
+
+
+def renamed(proposed: Sequence[Recording], *, taken: Sequence[str]) -> tuple[Recording, ...]:
+    """Return the recordings, each with an id of its own: "step-3" where there is a "step-2"."""
+    used, renamed = set(taken), []
+    for recording in proposed:
+        name = recording.id
+        while name in used:
+            stem, dash, number = name.rpartition("-")
+            counted = dash and number.isdecimal()
+            width = len(number)
+            name = f"{stem}-{int(number) + 1:0{width}d}" if counted else f"{name}-2"
+        used.add(name)
+        renamed.append(recording.model_copy(update={"id": name}))
+    return tuple(renamed)
 
 
 def plan_text(plan: Plan, system: System) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 
 from pipeline.bench.planning.gains import propose_pid
 from pipeline.bench.planning.plan import Limits, Plan, Recording, StateLoop
-from pipeline.bench.planning.plan_file import load_plan, plan_path, save_plan
+from pipeline.bench.planning.plan_file import add_recordings, load_plan, plan_path, renamed
 from pipeline.bench.protocol.messages import CHIRP_SPAN, FULL_SCALE, Description
 from pipeline.errors import DataError
 from pipeline.ingest.read import DUTY_COUNT
@@ -99,9 +99,10 @@ def make_plan(
         new, trouble = extend_plan(old, submission, bench=bench), ""
     except DataError as error:  # a plan that data cannot help stands as it is
         new, trouble = old, str(error)
-    path = save_plan(new, submission)
-    added = len(new.recordings) - len(old.recordings)
-    said = f"{path}: {added} recordings added" if there else f"wrote {path}: check its [limits]"
+    added = new.recordings[len(old.recordings) :]
+    new, path = add_recordings(submission.folder, added, otherwise=old), plan_path(submission)
+    told = f"{path}: {len(added)} recordings added"
+    said = told if there else f"wrote {path}: check its [limits]"
     return MadePlan(plan=new, path=path, said=said, trouble=trouble)
 
 
@@ -179,21 +180,6 @@ def _wants_loop(plan: Plan, submission: Submission) -> bool:
         and not dwells_to_come
         and "closed_loop" not in kinds | kinds_planned
     )
-
-
-def renamed(proposed: Sequence[Recording], *, taken: Sequence[str]) -> tuple[Recording, ...]:
-    """Return the recordings, each with an id of its own: "step-3" where there is a "step-2"."""
-    used, renamed = set(taken), []
-    for recording in proposed:
-        name = recording.id
-        while name in used:
-            stem, dash, number = name.rpartition("-")
-            counted = dash and number.isdecimal()
-            width = len(number)
-            name = f"{stem}-{int(number) + 1:0{width}d}" if counted else f"{name}-2"
-        used.add(name)
-        renamed.append(recording.model_copy(update={"id": name}))
-    return tuple(renamed)
 
 
 # --------------------------------------------------------- before anything is known

@@ -9,7 +9,7 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response, StreamingResponse
 
 from pipeline.bench.design.goal import WORST
-from pipeline.bench.explore.wish import read_time, read_wish
+from pipeline.bench.explore.wish import read_wish
 from pipeline.bench.host.serial_line import port_names
 from pipeline.bench.live.page import live_view
 from pipeline.bench.planning.by_hand import KINDS, add_recording, recording_by_hand
@@ -28,6 +28,7 @@ from pipeline.submission import Submission, load_submission
 from pipeline.submission.load import NAME, outside
 
 _TYPED = ("kind", "amplitude", "frequency", "frequency_end", "seconds", "cart", "goal")
+_MOST_MINUTES = 10_000.0  # of an exploration: a week
 _HALF = 140.0  # of the largest error bar's length, points
 
 
@@ -53,9 +54,10 @@ def start(ask: Ask) -> Response:
 
 def explore(ask: Ask) -> Response:
     """Begin to explore."""
-    until, limit = f"{ask.text('what')} {ask.text('error')}%", f"{ask.text('minutes')} min"
+    error = number(ask.text("error"), name="to within ± %", above=0, below=100)
+    minutes = number(ask.text("minutes"), name="minutes", above=0, below=_MOST_MINUTES)
+    until, limit = f"{ask.text('what')} {error!r}%", f"{minutes!r} min"
     read_wish(until)  # what is none is said before anything begins
-    read_time(limit)
     ask.desk.benches.start(ask.folder(), port=_port(ask), explore=(until, limit))
     return ask.back(_here(ask))
 
