@@ -11,6 +11,7 @@ import pytest
 from pipeline.bench.design.discriminate import (
     _candidates,
     _left,
+    _predict,
     _tell_apart,
     propose_for,
     with_proposal,
@@ -103,6 +104,19 @@ def test_what_the_parameters_can_take_up_is_no_difference():
     assert gap.proposal is None or gap.proposal.separation < 0.05 * other.proposal.separation
     J = np.random.default_rng(0).standard_normal((3, 2, 50))
     assert _left(J[0].ravel() * 2 - J[2].ravel(), J) == pytest.approx(0.0, abs=1e-20)
+
+
+def test_what_is_held_elsewhere_starts_there():
+    """A constant force shifts the carts, no more: another force or spring makes no transient."""
+    pushed = model("force_offset", place=1, force=0.004)
+    recording = Recording(
+        id="quiet", kind="step", carts=(1, 2), wave="square", amplitude=0.1, frequency=0.2, cycles=1
+    )
+    t = np.arange(0.0, 3.0, 5e-3)
+    x, by = _predict(pushed, t, np.zeros(t.size), recording, None)
+    assert np.abs(x[:, 0]).max() > 0.01
+    moved = np.ptp(by, axis=2).max(axis=1)
+    assert np.all(moved <= 5e-3 * np.abs(by).max())
 
 
 def test_another_dispute_gets_another_recording(proposed):

@@ -227,27 +227,36 @@ def _predict(
 
     By every parameter of the chain and its effects, the start of a cart let go, the zeros.
     """
-    n = model.chain.n
-    start = rest_positions(model, free=recording.carts) if x0 is None else x0
+    n, k = model.chain.n, model.chain.k
+    variants = [model, *_changed(model)]
+    # A constant force or cogging holds the carts elsewhere where it, or a spring, is another.
+    stiffer = [
+        replace(model, chain=replace(model.chain, k=k * (1 + _STEP * (np.arange(n + 1) == j))))
+        for j in np.flatnonzero(k)
+    ]
+    start, by_spring = (
+        np.array([rest_positions(one, free=recording.carts) if x0 is None else x0 for one in some])
+        for some in (variants, stiffer)
+    )
+    by_spring = (by_spring - start[0]) / (_STEP * k[k != 0.0, None])
     of = [
         (kind, i)
         for kind, values in (
             (sensitivity.BY_MASS, model.chain.m),
             (sensitivity.BY_DAMPING, model.chain.c),
-            (sensitivity.BY_STIFFNESS, model.chain.k),
+            (sensitivity.BY_STIFFNESS, k),
         )
         for i in np.flatnonzero(values).tolist()
     ]
-    if recording.release:
-        of.append((sensitivity.BY_POSITION, recording.release - 1))
-    variants = [model, *_changed(model)]
+    shared = len(of)
+    of += [(sensitivity.BY_POSITION, i) for i in range(n)]
     cart, spring, drive = zip(*(variant.tables() for variant in variants), strict=True)
     b = len(variants)
     y, by_chain = simulate_with_derivatives(
         np.stack(cart),
         np.stack(spring),
         np.stack(drive),
-        np.broadcast_to(start, (b, 1, n)),
+        start[:, None],
         np.zeros((b, 1, n)),
         np.ones((b, n)),
         np.isin(np.arange(1, n + 1), recording.carts),
@@ -258,10 +267,13 @@ def _predict(
         1.0,
         np.array(of).T,
     )
+    by_chain, by_start = by_chain[:shared], by_chain[shared:]
+    by_chain[shared - len(stiffer) :] += np.tensordot(by_spring, by_start, axes=1)
+    by_start = by_start[recording.release - 1 :][:1] if recording.release else by_start[:0]
     by_effects = (y[1:] - y[0]) / _STEP
     zeros = np.repeat(np.eye(n)[:, :, None], t.size, axis=2)
-    x = simulate_augmented(model, t, u, free=recording.carts, x0=start)
-    return x, np.concatenate([by_chain, by_effects, zeros])
+    x = simulate_augmented(model, t, u, free=recording.carts, x0=start[0])
+    return x, np.concatenate([by_chain, by_start, by_effects, zeros])
 
 
 def _changed(model: AugmentedChain) -> Iterator[AugmentedChain]:
