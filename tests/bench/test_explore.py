@@ -46,7 +46,9 @@ def test_durations_are_read_as_one_says_them():
     assert [read_time(t) for t in ("90s", "20min", "20 min", "1.5h")] == [90, 1200, 1200, 5400]
 
 
-@pytest.mark.parametrize("text", ["zeta", "zeta 1", "zeta omega 1%", "1.5", "0%", "200%", "%"])
+@pytest.mark.parametrize(
+    "text", ["zeta", "zeta 1", "zeta omega 1%", "1.5", "0%", "200%", "%", "zeta 1% K 2%"]
+)
 def test_what_is_no_wish_is_refused(text):
     """With an example of one."""
     with pytest.raises(ConfigError, match="expected a name and a percentage"):
@@ -128,19 +130,18 @@ def test_less_time_than_the_sweep_takes_moves_no_cart(tmp_path):
     assert virtual.seconds == 0.0
 
 
-def test_a_wish_that_meets_no_parameter_is_refused_before_a_cart_moves(explored):
+def test_a_wish_that_meets_no_parameter_is_refused_before_a_cart_moves(explored, tmp_path):
     """With the name that is nearest; nothing is recorded, nothing is claimed."""
-    folder, _, _, _ = explored
     asked: list[str] = []
 
     def record(ids):
         asked.extend(ids)
         return Recorded(ids=(), seconds=0.0)
 
-    with pytest.raises(ConfigError, match="did you mean 'zeta'"):
-        explore(
-            folder, record=record, wish=read_wish("Zeta 1%"), seconds=900.0, tell=lambda s: None
-        )
+    wish = read_wish("Zeta 1%")
+    for folder in (explored[0], tmp_path):  # whose carts are known, and not yet
+        with pytest.raises(ConfigError, match="did you mean 'zeta'"):
+            explore(folder, record=record, wish=wish, seconds=900.0, tell=lambda s: None)
     assert not asked
     with pytest.raises(ConfigError, match="no such parameter"):
         Wish(prefix="zeta_7").missing({"zeta_1": 0.1, "zeta_2": None})

@@ -118,6 +118,16 @@ def test_a_peak_without_end_does_not_hide_the_measurement():
     assert figure.axes[0].get_ylim()[1] < 20 * np.log10(magnitude.max()) + 50
 
 
+def test_what_was_measured_is_seen_where_nothing_else_is_drawn():
+    """The axis of an input without a model's line reaches as far as its samples."""
+    with drawing():
+        _, (ax,) = panels(1.0)
+        plot_measured(ax, np.linspace(0, 1, 5), np.array([-4.0, 0, 3, 0, 0]), in_legend=False)
+    low, high = ax.get_ylim()
+    assert low <= -4
+    assert high >= 3
+
+
 def test_a_student_s_dollar_signs_are_no_formula():
     """An id with dollar signs draws as it is."""
     with drawing():

@@ -37,6 +37,7 @@ from pipeline.workflow import analyse
 
 FIRST = "sweep"  # of the plan that is proposed where nothing is known: it needs no hands
 _SEARCH = 90.0  # s that a look for the gap may take
+_CARTS = range(1, 5)  # that a submission may have
 _APART = 1.0  # noises: explanations that no recording sets further apart stay in dispute
 _HARD = 0.8  # of the step that takes the carts as far as they may go: as good as that
 _FAR_OUT = "far"  # the aim of the step that shows what acts far out
@@ -105,6 +106,8 @@ def explore(
         wish.missing(dict.fromkeys(parameter_names(system.carts, rigid=not system.tied)))
         if planned := plan_path(submission).exists():
             ours.update(one.id for one in load_plan(submission).recordings)
+    else:  # what no carts have, no bench need move for
+        wish.missing(dict.fromkeys(name for n in _CARTS for name in parameter_names(n)))
     made, spent = (), 0.0
     if not known:
         first = _first_time(folder)
@@ -144,6 +147,8 @@ def explore(
         elif recording and failures >= _FAILURES:
             said = f"{turn.said}, but {failures} recordings in a row did not come off"
             turn, recording = replace(turn, said=said, reached=False), None
+        elif failures and not recording:  # what was still wanted is not there
+            turn = replace(turn, reached=False)
         turn = replace(turn, seconds=spent, recorded=made, said=before + turn.said)
         turns.append(turn)
         write_diary(turns, analysis, folder, wanted=wish.error)
@@ -242,6 +247,8 @@ def _decide(
     missing = wish.missing(errors)
     known = _known_words(missing, errors)
     doubt = _doubt_words(gap) if gap else "what else acts could not be looked for"
+    if gap and not gap.complete:
+        doubt += f" (so far: the search was ended after {_SEARCH:.0f} s)"
     recording, why = None, ""
     try:
         recording, why = _next(analysis, gap, plan, folder, missing=missing, refused=refused)

@@ -40,12 +40,13 @@ def read_wish(text: str) -> Wish:
     ------
     ConfigError : it is none of these.
     """
-    *name, share = text.replace("%", " % ").split("%")[0].split() or [""]
+    before, _, after = text.partition("%")
+    *name, share = before.split() or [""]
     try:
         error = float(share) / 100
     except ValueError:
         error = 0.0
-    if not 0 < error < 1 or "%" not in text or len(name) > 1:
+    if not 0 < error < 1 or "%" not in text or after.strip() or len(name) > 1:
         raise ConfigError(f'--until "{text}": expected a name and a percentage, as "zeta 1%"')
     return Wish(prefix=name[0] if name and name[0] != "all" else "", error=error)
 

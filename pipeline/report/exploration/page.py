@@ -90,7 +90,7 @@ def _shrinking(turns: Sequence[Turn], names: Sequence[str], wanted: float) -> Fi
     ax.set_yscale("log")
     ax.set_xlabel("time at the bench [s]")
     ax.set_ylabel("standard error [%]")
-    legend_above(ax)
+    legend_above(ax, columns=8)
     return figure
 
 
@@ -113,7 +113,7 @@ def _gap(page: Page, turns: Sequence[Turn]) -> list[Block]:
         [
             cell(f"{turn.seconds:.0f} s"),
             cell(turn.verdict),
-            cell("; ".join(f"{one.name} ({_share(one.weight)})" for one in turn.explanations)),
+            cell("; ".join(f"{one.name} ({100 * one.weight:.0f} %)" for one in turn.explanations)),
         ]
         for turn in looked
     ]

@@ -239,6 +239,7 @@ def plot_measured(
     tell(dots, t, y, name=name)
     ax.add_artist(dots)
     ax.update_datalim(points)
+    ax.autoscale_view()  # a patch does not ask for it, and nothing else may be drawn here
     if in_legend:
         ax.plot([], [], ".", color=color, ms=3 * _DOT, mew=0, label=name)
 

@@ -296,7 +296,8 @@ def _method(gap: Gap) -> list[Block]:
         for key, names in (("fitted_to", gap.training), ("runs_held_out", gap.held_out))
         if names
     )
-    return [paragraph(WORDS.spans("method")), runs, *remarks(list(gap.notes))]
+    method = WORDS.spans("method" if gap.complete else "method_so_far")
+    return [paragraph(method), runs, *remarks(list(gap.notes))]
 
 
 def _worst_first(gap: Gap) -> list[Trace]:

@@ -207,11 +207,11 @@ def _simulate(
             count = ceil(interval / longest - 1e-9)
             whole, now, sub = interval / count, t[sample], 0
             while sub < count:
-                end = t[sample] + (sub + 1) * whole
+                upon = t[sample] + (sub + 1) * whole
                 h = whole
-                if (dry and s[V, driven] == 0.0) or now > end - whole + _INSTANT:
+                if (dry and s[V, driven] == 0.0) or now > upon - whole + _INSTANT:
                     # What friction holds is to feel the whole of it until the input jumps.
-                    h = _edge(now, end, drive[DELAY], knots, held, at) - now
+                    h = _edge(now, upon, drive[DELAY], knots, held, at) - now
                 upto, upto2, at = _integral(now + h - drive[DELAY], knots, held, at)
                 mean = (upto - past) / h
                 # What comes early in the step moves the body further than its mean would.
@@ -236,8 +236,8 @@ def _simulate(
                 if not dry or s[V, driven] != 0.0:
                     s[X, driven] += early * s[INV, driven]
                 now += h
-                if now > end - _INSTANT:
-                    now, sub = end, sub + 1
+                if now > upon - _INSTANT:
+                    now, sub = upon, sub + 1
             if not abs(s[X, 0]) + abs(s[X, n - 1]) < _BLOWN_UP:
                 return False
     return True
