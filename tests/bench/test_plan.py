@@ -327,7 +327,11 @@ def test_what_is_added_while_the_data_are_asked_stays(tmp_path):
     old = propose_plan(submission)
     save_plan(old, submission)
     mine = let_go(1, name="mine", seconds=10.0)
-    made = make_plan(submission, progress=lambda stage: add_recording(work, mine))
+
+    def meanwhile(stage: str) -> None:
+        add_recording(work, mine)
+
+    made = make_plan(submission, progress=meanwhile)
     n = len(old.recordings)
     assert made.plan == load_plan(submission)
     assert made.plan.recordings[: n + 1] == (*old.recordings, mine)

@@ -68,7 +68,7 @@ class Terminal:
             return
         if not sys.stdin.isatty():
             raise ConfigError(f"{instruction}: nobody is at the keyboard (--yes: it is done)")
-        self._ask(f"{instruction}, then press Enter")
+        self._ask(instruction, keys="then press Enter")
 
     def settling(self, recording: Recording, seconds: float) -> None:
         """Show that the carts come to rest."""
@@ -96,15 +96,15 @@ class Terminal:
         """Print a sentence."""
         self._console.print(Text(sentence), soft_wrap=True)
 
-    def _ask(self, question: str) -> str:
-        """Return what is typed in answer.
+    def _ask(self, question: str, *, keys: str) -> str:
+        """Return what is typed in answer; `keys`: what to type.
 
         Raises
         ------
         ConfigError : the keyboard is closed.
         """
         self._live.stop()
-        self._console.print(Text(f"{question} (Ctrl-C ends)"), end=" ")
+        self._console.print(Text(f"{question}, {keys} (Ctrl-C ends)"), end=" ")
         try:
             _forget_keys()
             return input().strip()
@@ -130,7 +130,7 @@ class Terminal:
         ------
         ConfigError : the keyboard is closed.
         """
-        return self._ask(f"Enter records {recording.id}, v and Enter vetoes it") == "v"
+        return self._ask(f"Enter records {recording.id}", keys="v and Enter vetoes it") == "v"
 
 
 class _View:
