@@ -78,9 +78,8 @@ def write_file(path: Path, content: str | bytes) -> None:
         raise
 
 
-@lru_cache(
-    maxsize=1000
-)  # once a folder: to look through thousands of files takes as long as to write
+# Once a folder: to look through thousands of files takes as long as to write one.
+@lru_cache(maxsize=1000)
 def _clear_left_over(folder: Path) -> None:
     for part in folder.glob(".*.part"):
         with suppress(OSError):  # another has just removed it

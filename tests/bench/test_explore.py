@@ -147,6 +147,17 @@ def test_a_wish_that_meets_no_parameter_is_refused_before_a_cart_moves(explored,
         Wish(prefix="zeta_7").missing({"zeta_1": 0.1, "zeta_2": None})
 
 
+def test_a_wish_for_what_a_rigid_cart_has_is_heard(tmp_path):
+    """Nobody has said yet whether springs hold the carts: the first sweep is made."""
+    bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
+    session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=1))
+    with pytest.raises(ConfigError, match="the first sweep takes"):
+        explore(
+            tmp_path / "work", record=session, wish=Wish(prefix="mass"), seconds=10.0,
+            tell=lambda s: None,
+        )  # fmt: skip
+
+
 def test_carts_are_identified_where_the_gap_cannot_be_looked_for(tmp_path, monkeypatch):
     """The exploration goes on by the parameters, and does not say that nothing else acts."""
 

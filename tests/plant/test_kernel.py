@@ -379,3 +379,16 @@ def test_an_input_that_jumps_inside_a_step_frees_a_held_cart_at_once():
         return simulate_batch(*tables, rest, rest, ones, free, t, knots, command, starts, refine)
 
     assert np.abs(run(1.0) - run(64.0)).max() < 0.02 * COUNT
+
+
+def test_what_stands_behind_the_last_sample_is_no_time():
+    """A shot ends with its samples: driven on to a time behind them, the cart would be far away."""
+    chain = Chain(m=np.array([1e-4]), c=np.zeros(1), k=np.zeros(2))
+    cart, spring, drive = AugmentedChain(chain=chain, terms=()).tables()
+    t = np.append(sample_times(100, 4e-3), 2e4)[:-1]  # a view: the time behind is its neighbour
+    rest, free = np.zeros((1, 1, 1)), np.array([True])
+    (x,) = simulate_batch(
+        cart[None], spring[None], drive[None], rest, rest, np.ones((1, 1)), free,
+        t, t, np.full(t.size, 0.02), np.array([0, t.size]), 1.0,
+    )  # fmt: skip
+    assert_allclose(x[0], 0.5 * (0.02 / 1e-4) * t**2, rtol=1e-6, atol=1e-12)

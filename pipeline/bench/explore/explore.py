@@ -37,7 +37,11 @@ from pipeline.workflow import analyse
 
 FIRST = "sweep"  # of the plan that is proposed where nothing is known: it needs no hands
 _SEARCH = 90.0  # s that a look for the gap may take
-_CARTS = range(1, 5)  # that a submission may have
+# What there is to be known of carts as long as nobody has said how many there are.
+_NAMES = (
+    *parameter_names(1, rigid=True),
+    *(name for n in range(1, 5) for name in parameter_names(n)),
+)
 _APART = 1.0  # noises: explanations that no recording sets further apart stay in dispute
 _HARD = 0.8  # of the step that takes the carts as far as they may go: as good as that
 _FAR_OUT = "far"  # the aim of the step that shows what acts far out
@@ -107,7 +111,7 @@ def explore(
         if planned := plan_path(submission).exists():
             ours.update(one.id for one in load_plan(submission).recordings)
     else:  # what no carts have, no bench need move for
-        wish.missing(dict.fromkeys(name for n in _CARTS for name in parameter_names(n)))
+        wish.missing(dict.fromkeys(_NAMES))
     made, spent = (), 0.0
     if not known:
         first = _first_time(folder)

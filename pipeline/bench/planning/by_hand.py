@@ -20,9 +20,8 @@ _WAVES: dict[Kind, Literal["square", "chirp", "sine"]] = {
     "sine": "sine",
 }
 _SHORTEST = 1.0  # s
-_LONGEST = (
-    120.0  # s; of three carts at 1 kHz that is weighed in 1 s and 0.5 GB, 600 s in 20 s and 2 GB
-)
+# s; of three carts at 1 kHz that is weighed in 1 s and 0.5 GB, 600 s in 20 s and 2 GB
+_LONGEST = 120.0
 _ROUNDING = 1e-9  # relative: 100 s at 0.07 Hz are 7 periods, whatever their product rounds to
 _TYPED = {"frequency_end": "to"}  # what a key of plan.toml is called by whoever types it
 _EDGES = 4  # half periods of a step: off, on, off, on
