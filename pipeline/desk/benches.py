@@ -25,8 +25,8 @@ class Session:
 
     Attributes
     ----------
-    url : of its live page, known to nobody else; "" until it is served.
-    said : how it ended; "" while it goes on.
+    url : of its live page, known to nobody else; "" until it has something to show.
+    said : how it ended; "" while it goes on. `failed`: by what was wrong.
     """
 
     port: str
@@ -34,6 +34,7 @@ class Session:
     explores: bool = False
     url: str = ""
     said: str = ""
+    failed: bool = False
     ended: threading.Event = field(default_factory=threading.Event)
 
     def press(self, wish: str, number: str) -> int:
@@ -80,8 +81,10 @@ class Session:
                 if not line:
                     break
                 told = json.loads(line)
-                self.url, self.said = told.get("url", self.url), told.get("over", "")
-        self.said = self.said or f"the process ended ({self.process.ending()})"
+                self.url, self.said = told.get("url", self.url), told.get("over", self.said)
+                self.failed = told.get("failed", self.failed)
+        if not self.said:
+            self.said, self.failed = f"the process ended ({self.process.ending()})", True
         self.process.close()
         self.ended.set()
 

@@ -20,6 +20,7 @@ from tests.helpers.acquisitions import sine, write_work
 from tests.helpers.desks import Visitor, a_recorded_cart
 from tests.helpers.waiting import PATIENCE, kill, until
 
+NOBODY = "socket://127.0.0.1:1"
 SWEEP = sine("sweep", seconds=300).model_copy(update={"kind": "sweep", "wave": "square"})
 
 
@@ -113,8 +114,12 @@ def test_a_plan_is_made_and_what_is_wrong_is_said(tmp_path):
         assert visitor.post("/bench/0/plan").status == 303
         until((work / "plan.toml").exists)
         assert visitor.post("/bench/0/acquire", port=" ").status == 422
-        visitor.post("/bench/0/acquire", port="socket://127.0.0.1:1")
-        until(lambda: "nobody listens there" in visitor.get("/bench/0/").text)
+        visitor.post("/bench/0/explore", port=NOBODY, what="all", error="1", minutes="1")
+        shown = [visitor.get("/bench/0/").text]
+        until(lambda: shown.append(visitor.get("/bench/0/").text) or "alert" in shown[-1])
+        assert NOBODY in shown[0]
+        assert not any('id="positions"' in page for page in shown)  # nothing to watch, ever
+        assert "nobody listens there" in shown[-1]
     assert load_plan(load_submission(work)).recordings
 
 

@@ -2,19 +2,23 @@
 
 A line of JSON on stdin says what to record, or how far to explore; any other line, or the end of
 the lines because the desk is gone, is the Stop button. On stdout a line with the address of the
-live page, then one with how it ended.
+live page, once it has something to show, then one with how it ended.
 """
 
 import json
 import os
 import sys
 import threading
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from pipeline.bench.host.acquire import acquire
 from pipeline.bench.live.page import LivePage
 from pipeline.errors import PipelineError
+
+_LOOK = 0.05  # s between looks whether there is news
 
 
 def main() -> None:
@@ -31,13 +35,13 @@ def main() -> None:
     try:
         with LivePage(folder) as page:
             threading.Thread(target=_stop_on_word, args=(page,), daemon=True).start()
-            say(url=page.url)
+            threading.Thread(target=_say_where, args=(page, say), daemon=True).start()
             work = _explore if any(given["explore"]) else _acquire
             said = work(folder, given, page)
     except KeyboardInterrupt:
         say(over="Stopped. Begin again to go on where this ended.")
     except (PipelineError, OSError) as error:
-        say(over=str(error))
+        say(over=str(error), failed=True)
     else:
         say(over=said)
 
@@ -70,6 +74,14 @@ def _explore(folder: Path, given: dict[str, Any], page: LivePage) -> str:
     )
     reached = "What you wanted is known" if turns[-1].reached else "Not all you wanted is known"
     return f"{reached}: {with_symbols(turns[-1].said)}."
+
+
+def _say_where(page: LivePage, say: Callable[..., None]) -> None:
+    """Tell the page's address with its first news: before, it may be that no bench is there."""
+    while not page.version:
+        time.sleep(_LOOK)
+    if page.snapshot()["phase"] != "over":
+        say(url=page.url)
 
 
 def _stop_on_word(page: LivePage) -> None:
