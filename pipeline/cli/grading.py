@@ -81,8 +81,7 @@ def grade(
         say(f"{submission}: {reason}")
     if len(done.failed) == done.total > 1:
         say(f"not one could be graded: is {rubric} the rubric for these submissions?")
-    shared = f", {done.sharing} with recordings that another has too" if done.sharing else ""
-    say(f"{done.total - len(done.failed)} of {done.total} graded{shared}; wrote {out}")
+    say(f"{done.counted}; wrote {out}")
     if done.failed:
         raise typer.Exit(1)
 

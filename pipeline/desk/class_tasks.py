@@ -30,13 +30,13 @@ def regrade(
     anonymous: bool,
     *,
     progress: Progress,
-) -> None:
+) -> str:
     """Grade a class into a folder; an anonymous one says nothing that could name a team."""
     from pipeline.grading.batch.grade_class import grade_class
     from pipeline.grading.batch.runner import Limits
 
     try:
-        grade_class(
+        done = grade_class(
             [typed_path(path, wanted="name the submissions") for path in paths],
             rubric_file=Path(rubric),
             out=Path(folder),
@@ -52,3 +52,4 @@ def regrade(
         if anonymous:
             raise ConfigError("it could not begin; cartlab grade in a terminal says why") from None
         raise
+    return "; ".join([done.counted, *(() if anonymous else done.remarks)])

@@ -42,7 +42,7 @@ class Job:
     ----------
     place : the folder that it works in.
     asked : the task, and what it was given.
-    said : what it is about now, or what became of it.
+    said : what it is about now, or what became of it: the task's answer where that is a text.
     news : goes up whenever that changes.
     """
 
@@ -117,14 +117,14 @@ class Jobs:
         process = None
         try:
             process = LineProcess(_WORKER)
-            _work(
+            answer = _work(
                 process,
                 *job.asked,
                 limit=_LONGEST,
                 stop=job.stop,
                 tell=lambda stage: job.tell("running", stage),
             )
-            job.tell("done", "done")
+            job.tell("done", answer if isinstance(answer, str) else "done")
         except Failed as error:
             job.tell("stopped" if job.stop.is_set() else "failed", str(error))
         except OSError as error:

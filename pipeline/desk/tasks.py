@@ -105,12 +105,12 @@ def unpack(archive: str, into: str, *, progress: Progress) -> list[str]:
     return sorted(p.relative_to(target).as_posix() for p in target.rglob("*") if p.is_file())
 
 
-def plan(folder: str, stock: bool, *, progress: Progress) -> list[str]:
-    """Write plan.toml, or add to it what the data allow."""
+def plan(folder: str, stock: bool, *, progress: Progress) -> str:
+    """Write plan.toml, or add to it what the data allow; return why they allow nothing."""
     from pipeline.bench.planning.propose import make_plan
 
     made = make_plan(load_submission(Path(folder)), stock=stock, progress=progress)
-    return [made.said, made.trouble]
+    return made.trouble or "done"
 
 
 def weigh(

@@ -111,6 +111,14 @@ def test_the_class_is_filtered_by_what_a_team_has(ta, grades):
     )
 
 
+def test_the_class_says_who_shares_recordings(ta):
+    """How many at its head, leading to them; each in words, not by a code."""
+    page = ta.get(ROOM).text
+    assert re.search(r'href="[^"]*\?flag=shared_data">2 with recordings', page)
+    assert page.count("<td>a recording that another submission has too") == 2
+    assert "<td>shared_data" not in page
+
+
 def test_a_large_class_comes_a_page_at_a_time(tmp_path):
     """Every team stands on one page."""
     with Gradebook(tmp_path, assignment="lab", create=True) as book:
@@ -409,7 +417,7 @@ def test_a_class_is_graded_again_from_the_desk(tmp_path):
         who.post(ROOM + "regrade", paths=str(team), rubric="throne-1dof", lateness="")
         until(lambda: "data-events" not in who.get(ROOM).text)
         page = who.get(ROOM)
-        assert "Grading: done" in page.text, re.findall("class=.wrong.*", page.text)
+        assert "Grading: 1 of 1 graded" in page.text, re.findall("class=.wrong.*", page.text)
         assert names(page) == ["team-04", "team-05"]
         assert (grades / "feedback/team-05/feedback.html").is_file()
 

@@ -142,7 +142,7 @@ class _Regrade(_Save):
         assert who.post("/grades/0/regrade", **sent).status == 303
         until(lambda: "data-events" not in who.get("/grades/0/").text)
         page = who.get("/grades/0/").text
-        assert "Grading: done" in page, re.findall('class="wrong".*', page)
+        assert "Grading: 1 of 1 graded" in page, re.findall('class="wrong".*', page)
 
     def check(self) -> None:
         _whole(self.folder)

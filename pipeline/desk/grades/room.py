@@ -16,7 +16,7 @@ from pipeline.grading.publish.class_page import class_page
 from pipeline.grading.publish.feedback import feedback_page
 from pipeline.grading.publish.outputs import doubles_of
 from pipeline.grading.similarity.clusters import find_clusters, renamed
-from pipeline.grading.words import points_text
+from pipeline.grading.words import WORDS, points_text
 from pipeline.report.figures.grading import distribution_figure
 from pipeline.report.figures.style import drawing
 from pipeline.report.figures.svg import plain_svg, to_svg
@@ -73,6 +73,8 @@ def show(ask: Ask) -> Response:
         found=len(chosen),
         total=len(shown.teams),
         failed=sum(team.line.status == "failed" for team in shown.teams.values()),
+        sharing=sum("shared_data" in team.line.codes for team in shown.teams.values()),
+        words=WORDS,
         seen=sum(bool(team.seen) for team in shown.teams.values()),
         median=points_text(graded[len(graded) // 2]) if graded else "",
         out_of=points_text(shown.rubric.out_of),

@@ -52,6 +52,12 @@ class Summary:
     remarks: tuple[str, ...] = ()
     changes: tuple[str, ...] = ()
 
+    @property
+    def counted(self) -> str:
+        """The numbers, in words."""
+        shared = f", {self.sharing} with recordings that another has too" if self.sharing else ""
+        return f"{self.total - len(self.failed)} of {self.total} graded{shared}"
+
 
 def grade_class(
     paths: Sequence[Path],
