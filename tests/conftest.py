@@ -47,6 +47,14 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 FLAGS = "--headless --no-sandbox --disable-gpu --no-first-run --disable-background-networking"
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _silent_progress() -> Iterator[None]:
+    """What a command says here does not depend on how long it takes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pipeline.cli.common.FIRST_WORD", PATIENCE)
+        yield
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Compile the simulator while the workers collect their tests; each of them would, else."""
     if config.getoption("numprocesses") and "PYTEST_XDIST_WORKER" not in os.environ:

@@ -5,6 +5,8 @@ Everything heavy is imported by the command that needs it, so that `--help` answ
 """
 
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from io import TextIOWrapper
@@ -27,6 +29,7 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
+FIRST_WORD, _LAST_PAUSE = 2.0, 60.0  # s without a word, at first and at most
 INTERRUPTED = 130  # exit status, as of any program that Ctrl-C ends
 
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="A submission folder.")]
@@ -85,10 +88,7 @@ def say(text: str) -> None:
 
 @contextmanager
 def progress_line() -> Iterator[Callable[[str], None]]:
-    """Show what is being done while it is done, and say so where Ctrl-C ends it.
-
-    Silent where stderr is no terminal.
-    """
+    """Show what is being done while it is done, and say so where Ctrl-C ends it."""
     try:
         with _shown_line() as show:
             yield show
@@ -100,7 +100,8 @@ def progress_line() -> Iterator[Callable[[str], None]]:
 @contextmanager
 def _shown_line() -> Iterator[Callable[[str], None]]:
     if not sys.stderr.isatty():
-        yield lambda text: None
+        with said_now_and_then() as show:
+            yield show
         return
     from rich.console import Console
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -110,6 +111,29 @@ def _shown_line() -> Iterator[Callable[[str], None]]:
     with Progress(*columns, console=Console(stderr=True), transient=True) as shown:
         task = shown.add_task("starting", total=None)
         yield lambda text: shown.update(task, description=text)
+
+
+@contextmanager
+def said_now_and_then() -> Iterator[Callable[[str], None]]:
+    """Say what is being done after 2 s, and again after twice as long each time, up to a minute.
+
+    For a log, where no line can change: short work says nothing, long work never falls silent.
+    """
+    now, over, began = ["starting"], threading.Event(), time.monotonic()
+
+    def follow() -> None:
+        pause = FIRST_WORD
+        while not over.wait(pause):
+            say(f"{now[0]} … {time.monotonic() - began:.0f} s")
+            pause = min(2 * pause, _LAST_PAUSE)
+
+    following = threading.Thread(target=follow, daemon=True)
+    following.start()
+    try:
+        yield lambda text: now.__setitem__(0, text)
+    finally:
+        over.set()
+        following.join()
 
 
 def _version(value: bool) -> None:

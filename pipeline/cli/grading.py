@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pipeline.cli.common import INTERRUPTED, AsJson, app, say
+from pipeline.cli.common import INTERRUPTED, AsJson, app, said_now_and_then, say
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -110,9 +110,10 @@ def _stopping(out: Path) -> Iterator[None]:
 
 @contextmanager
 def _batch_progress() -> Iterator[Callable[[int, int, str], None]]:
-    """Show how many are done and how long the others will take; silent where nobody looks."""
+    """Show how many are done, and on a terminal how long the others will take."""
     if not sys.stderr.isatty():
-        yield lambda done, total, last: None
+        with said_now_and_then() as show:
+            yield lambda done, total, last: show(f"{done} of {total}: {last}".rstrip(": "))
         return
     from rich.console import Console
     from rich.progress import (

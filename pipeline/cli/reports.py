@@ -54,11 +54,13 @@ def inspect(
         listed += found
         if not found:
             unreadable.append(f"{folder}: no data files in it")
-    for file in listed:  # one broken file does not hide the others
-        try:
-            inspections.append(inspect_file(file))
-        except PipelineError as error:
-            unreadable.append(str(error))
+    with progress_line() as progress:
+        for file in listed:  # one broken file does not hide the others
+            progress(f"reading {file.name}")
+            try:
+                inspections.append(inspect_file(file))
+            except PipelineError as error:
+                unreadable.append(str(error))
     if as_json:
         typer.echo(json.dumps([i.to_dict() for i in inspections], indent=1, ensure_ascii=False))
     elif inspections and folders:
@@ -76,7 +78,9 @@ def fill(folder: Folder, as_json: AsJson = False) -> None:
     """Find out what the files in DIR/data are and write their tables into submission.toml."""
     from pipeline.ingest.fill import fill_submission, format_found
 
-    found = fill_submission(folder)
+    with progress_line() as progress:
+        progress("finding out what the files are")
+        found = fill_submission(folder)
     if as_json:
         typer.echo(json.dumps([f.to_dict() for f in found], indent=1, ensure_ascii=False))
     else:

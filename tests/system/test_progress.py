@@ -1,19 +1,23 @@
-"""Progress on a terminal; elsewhere only what a person has to know."""
+"""Progress: a line that changes on a terminal, elsewhere now and then a line more."""
 
 import os
 import signal
 import subprocess
 import sys
+import threading
+import time
 
 import pytest
 from rich.progress import Progress
 
-from pipeline.cli.grading import counting
+from pipeline.cli.common import progress_line
+from pipeline.cli.grading import _batch_progress, counting
 from pipeline.resources import EXAMPLES
 from tests.helpers.commandline import cartlab_here
+from tests.helpers.waiting import until
 
 
-def test_a_pipe_sees_no_progress(tmp_path):
+def test_short_work_says_nothing_to_a_pipe(tmp_path):
     """Where stderr is no terminal there is the summary alone, without control characters."""
     done = cartlab_here("report", EXAMPLES / "one-cart", "--out", tmp_path, "--no-pdf")
 
@@ -21,6 +25,26 @@ def test_a_pipe_sees_no_progress(tmp_path):
     assert "\x1b" not in done.stderr
     assert "free decays" not in done.stderr
     assert done.stderr.startswith("A single cart was identified")
+
+
+@pytest.mark.parametrize("work", [progress_line, _batch_progress])
+def test_long_work_tells_a_pipe_what_it_is_about(work, monkeypatch, capsys):
+    """Ever more seldom while it goes on, and no more once it is over."""
+    monkeypatch.setattr("pipeline.cli.common.FIRST_WORD", 0.02)
+    said, threads = [], threading.active_count()
+
+    def hear() -> str:
+        said.append(capsys.readouterr().err)
+        return "".join(said)
+
+    with work() as progress:
+        progress(*((3, 40, "fitting") if work is _batch_progress else ("fitting",)))
+        began = time.monotonic()
+        until(lambda: hear().count("fitting …") >= 3, "three lines")
+        # After 0.02, 0.06 and 0.14 s at the soonest.
+        assert time.monotonic() - began > 0.1
+    assert threading.active_count() == threads
+    assert ("3 of 40: fitting" in hear()) == (work is _batch_progress)
 
 
 def test_what_was_known_before_is_no_speed():

@@ -123,7 +123,7 @@ def _room(
     """
     folder = ask.folder()
     session = ask.desk.benches.of(folder)
-    under_way = session and not session.ended.is_set()
+    running = session if session and not session.ended.is_set() else None
     return ask.page(
         "bench",
         status=status,
@@ -131,8 +131,8 @@ def _room(
         folder=folder,
         here=_here(ask),
         session=session,
-        asks=under_way and not session.url,
-        live=Markup(live_view()) if under_way and session.url else "",
+        asks=running and not running.url,
+        live=Markup(live_view()) if running and running.url else "",
         ports=_ports(ask),
         job=ask.desk.jobs.of(folder),
         said=ask.told(),
