@@ -192,7 +192,10 @@ def gap(
     budget: Annotated[
         float,
         typer.Option(
-            metavar="SECONDS", min=0.0, help="Past it, the best answer so far, said as such."
+            metavar="SECONDS",
+            min=0.0,
+            help="Of the search; past it, the best answer so far, said as such. The carts are "
+            "identified before and the report is written after it, in seconds.",
         ),
     ] = 60.0,
     pdf: Annotated[bool, typer.Option("--pdf/--no-pdf", help="Write the PDF too.")] = True,

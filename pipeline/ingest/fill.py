@@ -129,7 +129,8 @@ def experiment_entry(
         entry["carts"] = [cart for cart in carts if cart <= n]
     entry["file"] = file
     if inspection.guessed:
-        entry["columns"] = dict(inspection.guessed)
+        missing = {f"x{cart}" for cart in inspection.positions if cart > n}
+        entry["columns"] = {k: v for k, v in inspection.guessed.items() if k not in missing}
     return entry
 
 

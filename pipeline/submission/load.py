@@ -50,9 +50,12 @@ def load_submission(path: Path) -> Submission:
     path = Path(path)
     toml = path if path.is_file() or path.suffix == ".toml" else path / NAME
     folder = toml.parent
-    where = f"{folder.resolve().name}/{toml.name}"
+    where = str(path) if toml == path else f"{folder.resolve().name}/{NAME}"
     if not folder.is_dir():
         raise SubmissionError(f"{quote(str(path))}: no such folder")
+    if toml != path and not toml.exists() and not toml.is_symlink():
+        hint = _near_file(folder, NAME, ()) or "; cartlab fill writes one for the files in data/"
+        raise SubmissionError(f"{quote(str(path))}: there is no file {NAME!r} in it{hint}")
     if (problem := outside(folder, toml.name)) is not None:
         raise SubmissionError(f"{where}: {problem}")
     return parse_submission(

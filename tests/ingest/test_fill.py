@@ -132,6 +132,20 @@ def test_a_bare_matrix_gets_its_columns(tmp_path):
     assert any("guessed" in one for one in found.unsure)
 
 
+def test_a_bare_matrix_of_more_carts_than_there_are_spoils_nothing(tmp_path):
+    """An encoder that the system has no cart for gets no column; all files get their tables."""
+    new_submission(tmp_path, carts=1)
+    rows = [
+        f"{t:.6f} {u:.4f} {x:.5f} {y:.5f}"
+        for t, u, x, y in zip(T, STEP, RING, 0.4 * RING, strict=True)
+    ]
+    (tmp_path / "data" / "bare.txt").write_text("\n".join(rows) + "\n")
+    put(tmp_path, "run.csv", time=T, input=SINE, x1=0.5 * RING)
+    assert set(states(tmp_path)) == {"data/bare.txt", "data/run.csv"}
+    columns = [set(e.columns or ()) for e in load_submission(tmp_path).experiments]
+    assert sorted(columns, key=len) == [set(), {"time", "input", "x1"}]
+
+
 def test_links_out_of_the_folder_are_not_followed(tmp_path):
     """A link to somebody else's file is no file of the submission."""
     put(tmp_path / "theirs", "a.csv", time=T, input=STEP, x1=RING)

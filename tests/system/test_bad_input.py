@@ -506,6 +506,7 @@ def test_a_path_that_is_no_submission_is_one_line(path, tmp_path):
     with pytest.raises(SubmissionError, match=one_line_patterns[path]) as caught:
         load_submission(tmp_path / path)
     assert "\n" not in str(caught.value)
+    assert str(tmp_path)[:12] in str(caught.value)  # as it was typed, from the root
 
 
 def test_notes_must_be_short_text(tmp_path):
