@@ -136,8 +136,8 @@ def test_a_bare_matrix_of_more_carts_than_there_are_spoils_nothing(tmp_path):
     """An encoder that the system has no cart for gets no column; all files get their tables."""
     new_submission(tmp_path, carts=1)
     rows = [
-        f"{t:.6f} {u:.4f} {x:.5f} {y:.5f}"
-        for t, u, x, y in zip(T, STEP, RING, 0.4 * RING, strict=True)
+        f"{t:.5f}\t{x:.0f}\t{y:.0f}\t{u}"
+        for t, x, y, u in zip(T, RING, np.roll(RING, 30), STEP, strict=True)
     ]
     (tmp_path / "data" / "bare.txt").write_text("\n".join(rows) + "\n")
     put(tmp_path, "run.csv", time=T, input=SINE, x1=0.5 * RING)
