@@ -262,6 +262,20 @@ def test_no_text_is_cut_or_covered(made, show):
             assert covered(drawn) == []
 
 
+def test_tables_fit_a_laptop_and_names_of_checks_a_phone(made, show):
+    """At 1280 pixels every column is in sight; at 390 the name of a check stands in one line."""
+    page = show(page_of(made))
+    page.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
+    wider = """() => Array.from(document.querySelectorAll('.wide:has(table)'))
+        .filter((e) => e.scrollWidth > e.clientWidth).map((e) => e.innerText)"""
+    assert page.evaluate(wider) == []
+    page.set_viewport_size({"width": PHONE[0], "height": PHONE[1]})
+    broken = """() => Array.from(
+        document.querySelectorAll('td:nth-child(2):not(:last-child) > code'))
+        .filter((e) => e.getClientRects().length > 1).map((e) => e.innerText)"""
+    assert page.evaluate(broken) == []
+
+
 @pytest.mark.parametrize("case", ["class", "feedback"])
 def test_a_phone_shows_the_numbers_of_a_table(case, folder, request, show):
     """The column of names stays in sight and takes at most half of the view."""
