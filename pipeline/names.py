@@ -131,10 +131,19 @@ def parameter_names(n: int, *, rigid: bool = False) -> list[str]:
 
 
 def listed(ids: Sequence[str], *, most: int = 4) -> str:
-    """Return the names of runs, the middle of more than `most` left out."""
+    """Return names, the middle of more than `most` left out."""
     if len(ids) <= most:
         return ", ".join(ids)
-    return f"{ids[0]}, {ids[1]} … {ids[-1]} ({len(ids)} runs)"
+    return f"{ids[0]}, {ids[1]} … {ids[-1]} ({len(ids)} in all)"
+
+
+def by_note(notes: Iterable[tuple[str, str]]) -> list[str]:
+    """Return one sentence a note, headed by the names of all it is about."""
+    about: dict[str, list[str]] = {}
+    for name, note in notes:
+        if note:
+            about.setdefault(note, []).append(name)
+    return [f"{listed(list(dict.fromkeys(names)))}: {note}" for note, names in about.items()]
 
 
 def first_few(names: Sequence[str], most: int) -> str:

@@ -21,11 +21,11 @@ from pipeline.checks.recordings import (
 )
 from pipeline.errors import DataError
 from pipeline.identify.carts import UNTIED
-from pipeline.identify.log import Log, Progress, by_note
+from pipeline.identify.log import Log, Progress
 from pipeline.identify.remarks import reading_remarks, turn_of_the_gains
 from pipeline.identify.sound import identify_from_sound
 from pipeline.ingest.read import read_data
-from pipeline.names import parameter_names
+from pipeline.names import by_note, parameter_names
 from pipeline.results import Analysis, ChainFit, FeedbackDesign, HardwareCheck, LeftOut, Record
 from pipeline.stages.compare import compare, why_open
 from pipeline.stages.hardware_check import check_hardware

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from pipeline.identify.fit import Fitted, fit_carts
-from pipeline.identify.log import Log, Progress, by_note
+from pipeline.identify.log import Log, Progress
 from pipeline.identify.soundness.repeated_numbers import Repeats, compare_repeats
 from pipeline.ingest.read import Ingested
-from pipeline.names import listed
+from pipeline.names import by_note, listed
 from pipeline.results import (
     ChainFit,
     Estimate,

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from typing import Any, ParamSpec, TypeVar
 
 from pipeline.errors import DataError
-from pipeline.names import listed
 from pipeline.results import Skipped
 
 P = ParamSpec("P")
@@ -58,12 +57,3 @@ class Log:
         """Add what another log holds."""
         self.skipped += other.skipped
         self.warn(other.warnings)
-
-
-def by_note(notes: Iterable[tuple[str, str]]) -> list[str]:
-    """Return one sentence a note, headed by all the runs it is about."""
-    runs: dict[str, list[str]] = {}
-    for run, note in notes:
-        if note:
-            runs.setdefault(note, []).append(run)
-    return [f"{listed(list(dict.fromkeys(ids)))}: {note}" for note, ids in runs.items()]

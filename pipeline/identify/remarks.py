@@ -6,10 +6,10 @@ from math import ceil
 import numpy as np
 
 from pipeline.identify import limits
-from pipeline.identify.log import by_note
 from pipeline.identify.soundness.encoders import find_other_units
 from pipeline.ingest.columns import conversion
 from pipeline.ingest.read import Ingested
+from pipeline.names import by_note
 from pipeline.results import Record
 
 

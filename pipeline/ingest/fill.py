@@ -19,6 +19,7 @@ from pipeline.ingest import limits
 from pipeline.ingest.formats.recognise import read_table
 from pipeline.ingest.formats.table import ENDINGS
 from pipeline.ingest.inspect import Inspection, data_files_in, inspect_file
+from pipeline.names import by_note
 from pipeline.results_of_runs import Kind
 from pipeline.submission.edit import (
     append_experiment,
@@ -320,14 +321,12 @@ def format_found(found: Sequence[Found]) -> str:
         "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
         for row in rows
     ]
-    said: dict[str, list[str]] = {}
-    for one in found:
-        for remark in (*one.remarks, *(f"unsure: {unsure}" for unsure in one.unsure)):
-            said.setdefault(remark, []).append(one.file)
-    for remark, files in said.items():
-        which = files[0] if len(files) == 1 else f"{len(files)} files"
-        lines.append(f"! {which}: {remark}")
-    return "\n".join(lines)
+    said = by_note(
+        (one.file, remark)
+        for one in found
+        for remark in (*one.remarks, *(f"unsure: {unsure}" for unsure in one.unsure))
+    )
+    return "\n".join([*lines, *(f"! {remark}" for remark in said)])
 
 
 def _carts_words(carts: Sequence[int]) -> str:

@@ -15,6 +15,7 @@ from pipeline.ingest.clock import Clock, clock_notes, read_clock
 from pipeline.ingest.columns import Column, assign_columns, conversion, holds_counts
 from pipeline.ingest.formats.recognise import read_table
 from pipeline.ingest.formats.table import ENDINGS, FORM_TITLES, Table
+from pipeline.names import by_note
 from pipeline.results_of_runs import Kind
 
 _MOST_CARTS = 4
@@ -264,7 +265,7 @@ def line_frequency(t: Array, u: Array) -> float | None:
 
 
 def format_inspections(inspections: Sequence[Inspection]) -> str:
-    """Return a table of one line a file; what is wrong with it stands below."""
+    """Return a table of one line a file; what is wrong with files stands below, once."""
     head = ("file", "format", "samples", "s", "Hz", "looks like", "columns")
     rows: list[tuple[str, ...]] = [head]
     for one in inspections:
@@ -274,12 +275,12 @@ def format_inspections(inspections: Sequence[Inspection]) -> str:
         )
         rows.append((one.file, one.format, str(one.samples), duration, rate, _looks(one), roles))
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = []
-    for row, one in zip(rows, (None, *inspections), strict=True):
-        cells = zip(row, widths, strict=True)
-        lines.append("  ".join(f"{cell:<{width}}" for cell, width in cells).rstrip())
-        lines += [f"  ! {problem}" for problem in one.problems] if one else []
-    return "\n".join(lines)
+    lines = [
+        "  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    ]
+    problems = by_note((one.file, problem) for one in inspections for problem in one.problems)
+    return "\n".join([*lines, *(f"! {problem}" for problem in problems)])
 
 
 def _looks(inspection: Inspection) -> str:

@@ -172,7 +172,7 @@ def test_what_is_no_data_file_is_one_line(tmp_path):
 
 
 def test_a_folder_is_a_table_of_one_line_a_file(tmp_path):
-    """Its `data` are looked into, what else lies there is not; problems stand below their file."""
+    """Its `data` are looked into, what else lies there is not; problems stand below."""
     (tmp_path / "data").mkdir()
     inspect(tmp_path / "data", time=T, input=STEP, x1=X)
     (tmp_path / "data" / "photo.jpg").write_bytes(b"no data")
@@ -181,4 +181,16 @@ def test_a_folder_is_a_table_of_one_line_a_file(tmp_path):
     head, line, *problems = format_inspections([inspect_file(file) for file in files]).splitlines()
     assert head.split()[:2] == ["file", "format"]
     assert line.endswith("time input x1")
-    assert all(problem.startswith("  ! ") for problem in problems)
+    assert all(problem.startswith("! ") for problem in problems)
+
+
+def test_what_is_wrong_with_many_files_is_said_once(tmp_path):
+    """A clock rounded in each of six files is one line under the table of them."""
+    (tmp_path / "data").mkdir()
+    for number in range(6):
+        inspect(tmp_path / "data", time=np.round(T, 2), input=STEP, x1=X)
+        (tmp_path / "data" / "a.csv").rename(tmp_path / "data" / f"{number}.csv")
+    files = data_files_in(tmp_path)
+    looked = [inspect_file(file) for file in files]
+    assert all(any("rounded" in problem for problem in one.problems) for one in looked)
+    assert format_inspections(looked).count("rounded") == 1

@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -31,6 +32,7 @@ from pipeline.desk.student.form import (
 from pipeline.desk.student.handin import BESIDE, beside, hand_in, missing
 from pipeline.errors import SubmissionError
 from pipeline.lock import turn_in
+from pipeline.names import by_note
 from pipeline.output import write_file
 from pipeline.report.numbers import count, listing
 from pipeline.report.sections.answers import with_answer, written_answer
@@ -49,6 +51,7 @@ from pipeline.submission.toml_file import read_text
 _ASKED = "report/questions.json"
 _MOST_ASKED = 1_000_000  # bytes
 _NOTES = "notes.md"
+_MANY = 3  # files of which the same is said: once, under the table
 _GAP_BUDGET = 60.0  # s, as `cartlab gap` has by default
 
 
@@ -248,6 +251,7 @@ def _room(
         title=folder.name,
         folder=folder,
         rows=[{**row, "fields": [by_path[f.path] for f in row["fields"]]} for row in rows],
+        often=_often(rows),
         groups=[group.filled(by_path) for group in form] if document else [],
         seen=text_digest(text),
         wrong=left,
@@ -262,6 +266,17 @@ def _room(
         said=ask.told(),
         here=_here(ask),
     )
+
+
+def _often(rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """Return what there is to say of many files, each with its sentence that names them."""
+    told = [(row["file"], said) for row in rows for said in row["look"]["remarks"]]
+    times = Counter(said for _, said in told)
+    many = [said for said, number in times.items() if number >= _MANY]
+    return {
+        said: by_note((file.removeprefix("data/"), one) for file, one in told if one == said)[0]
+        for said in many
+    }
 
 
 def _unanswered(folder: Path, told: Mapping[str, Any]) -> int:
