@@ -1,5 +1,6 @@
 """The noise of a measured signal, from sample to sample, and what rounding adds to it."""
 
+from functools import lru_cache
 from math import comb
 
 import numpy as np
@@ -18,15 +19,23 @@ def local_noise(t: Array, y: Array) -> float:
     """
     if t.size < 7:
         return 0.0
-    nodes = _neighbours(t) - t[3:-3]  # (6, n - 6)
-    weights = np.empty_like(nodes)  # Lagrange's, at zero
+    weights, size = _weights(t.tobytes())
+    predicted = np.einsum("jn,jn->n", weights, _neighbours(y))
+    scaled = (y[3:-3] - predicted) / size
+    moving = scaled[scaled != 0]  # a cart at rest on one count says nothing about the noise
+    return float(MEDIAN_TO_SIGMA * np.median(np.abs(moving))) if moving.size else 0.0
+
+
+@lru_cache(2)  # the carts of a record share its clock
+def _weights(clock: bytes) -> tuple[Array, Array]:
+    """Return Lagrange's weights (6, n - 6) of the neighbours, and how they scale white noise."""
+    t = np.frombuffer(clock)
+    nodes = _neighbours(t) - t[3:-3]
+    weights = np.empty_like(nodes)
     for j, node in enumerate(nodes):
         others = nodes[np.arange(len(nodes)) != j]
         weights[j] = np.prod(others / (others - node), axis=0)
-    predicted = np.einsum("jn,jn->n", weights, _neighbours(y))
-    scaled = (y[3:-3] - predicted) / np.sqrt(1 + np.einsum("jn,jn->n", weights, weights))
-    moving = scaled[scaled != 0]  # a cart at rest on one count says nothing about the noise
-    return float(MEDIAN_TO_SIGMA * np.median(np.abs(moving))) if moving.size else 0.0
+    return weights, np.sqrt(1 + np.einsum("jn,jn->n", weights, weights))
 
 
 def _neighbours(x: Array) -> Array:

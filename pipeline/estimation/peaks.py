@@ -17,16 +17,17 @@ def extrema(y: Array, *, prominence: float) -> list[int]:
     found: list[int] = []
     first = last = low = high = 0  # the running extreme is y[first] .. y[last]
     direction = 0
-    for i, value in enumerate(y):
+    values = y.tolist()  # read one by one, Python's own numbers take a third of the time
+    for i, value in enumerate(values):
         if direction == 0:  # until the first move shows which way it goes
-            low = i if value < y[low] else low
-            high = i if value > y[high] else high
-            if y[high] - y[low] >= prominence:
+            low = i if value < values[low] else low
+            high = i if value > values[high] else high
+            if values[high] - values[low] >= prominence:
                 direction = 1 if high > low else -1
                 found.append(min(low, high))
                 first = last = i
             continue
-        ahead = (value - y[first]) * direction
+        ahead = (value - values[first]) * direction
         if ahead > 0:
             first = last = i
         elif ahead == 0 and i == last + 1:
@@ -48,9 +49,9 @@ def plateaus(u: Array) -> list[tuple[int, int]]:
     """
     noise = float(difference_noise(u, order=2)) if u.size > 2 else 0.0
     tolerance = max(_FLAT_INPUT * float(np.ptp(u)), 6 * noise)
-    found, start = [], 0
-    for i, value in enumerate(u):
-        if abs(value - u[start]) > tolerance:
+    found, start, held = [], 0, u[0]
+    for i, value in enumerate(u.tolist()):
+        if abs(value - held) > tolerance:
             found.append((start, i))
-            start = i
+            start, held = i, value
     return [*found, (start, u.size)]

@@ -1,7 +1,5 @@
 """What channels themselves tell: an encoder's step, a mirror, a stuck encoder, a clipped input."""
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from pipeline.arrays import Array
@@ -55,11 +53,7 @@ def stuck_spans(x: Array) -> list[tuple[int, int]]:
     beyond any other move.
     """
     moves = np.abs(np.diff(x))
-    still = [
-        (first, last)
-        for first, last in _runs(moves == 0.0)
-        if last - first + 1 >= limits.STUCK_SAMPLES and first > 0
-    ]
+    still = [run for run in _runs(moves == 0.0, least=limits.STUCK_SAMPLES) if run[0] > 0]
     moving = moves[moves > 0]
     if not still or moving.size < 3:
         return []
@@ -75,11 +69,13 @@ def stuck_spans(x: Array) -> list[tuple[int, int]]:
     return [(first, last) for first, last in still if is_stuck(first, last)]
 
 
-def _runs(still: np.ndarray) -> Iterator[tuple[int, int]]:
-    """Yield (first, last) sample of each run of equal samples; still[i]: x[i] = x[i + 1]."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], still, [False]))))
-    for start, end in zip(edges[0::2], edges[1::2], strict=True):
-        yield int(start), int(end)
+def _runs(still: np.ndarray, *, least: int) -> list[list[int]]:
+    """Return [first, last] of each run of `least` equal samples or more.
+
+    still[i]: x[i] = x[i + 1].
+    """
+    runs = np.flatnonzero(np.diff(np.concatenate(([False], still, [False])))).reshape(-1, 2)
+    return runs[runs[:, 1] - runs[:, 0] + 1 >= least].tolist()
 
 
 def saturation(u: Array) -> float | None:
@@ -96,16 +92,14 @@ def saturation(u: Array) -> float | None:
         limit, gap = levels[top], abs(levels[top] - levels[following])
         if limit == 0.0 or counts[top] < limits.CLIPPED_SHARE * counts[following]:
             continue
-        for first, last in _runs((u[:-1] == limit) & (u[1:] == limit)):
+        at_limit = u == limit
+        for first, last in _runs(at_limit[:-1] & at_limit[1:], least=limits.CLIPPED_SAMPLES):
             entry = abs(limit - u[first - 1]) if first > 0 else np.inf
             leave = abs(limit - u[last + 1]) if last + 1 < u.size else np.inf
             m = last - first + 1
             # m samples of a crest, a parabola, lie within one level where it falls by so many to
             # the next; rounding adds one.
-            if (
-                m >= limits.CLIPPED_SAMPLES
-                and min(entry, leave) > max(3, 4 * m / (m - 1) ** 2 + 1) * gap
-            ):
+            if min(entry, leave) > max(3, 4 * m / (m - 1) ** 2 + 1) * gap:
                 return abs(float(limit))
     return None
 

@@ -1,5 +1,6 @@
 """Read `submission.toml` into a validated `Submission`; whatever is wrong is one line."""
 
+import errno
 import re
 import stat
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -329,10 +330,20 @@ def leaves(folder: Path, name: str) -> str | None:
     windows, relative = PureWindowsPath(name), Path(posix(name))
     if windows.drive or windows.root or relative.is_absolute() or ".." in windows.parts:
         return f"{shown} leaves the submission folder"
+    steps = [folder / part for part in (relative, *relative.parents)[:-1]]
     with suppress(OSError, RuntimeError):  # `outside` tells what cannot be followed
-        if not (folder / relative).resolve().is_relative_to(folder.resolve()):
+        linked = any(map(_may_be_link, steps))
+        if linked and not steps[0].resolve().is_relative_to(folder.resolve()):
             return f"{shown} leaves the submission folder through a link"
     return None
+
+
+def _may_be_link(path: Path) -> bool:
+    """Whether there is something that may lead elsewhere: a link, on Windows a junction."""
+    with suppress(OSError):
+        info = path.lstat()
+        return stat.S_ISLNK(info.st_mode) or bool(getattr(info, "st_reparse_tag", 0))
+    return False
 
 
 def outside(folder: Path, name: str, *, taken: Collection[str] = ()) -> str | None:
@@ -344,11 +355,12 @@ def outside(folder: Path, name: str, *, taken: Collection[str] = ()) -> str | No
         return problem
     shown = quote(name)
     try:
-        info = (folder / posix(name)).resolve().stat()
+        info = (folder / posix(name)).stat()
     except FileNotFoundError:
         return f"there is no file {shown}{_near_file(folder, posix(name), taken)}"
-    except (OSError, RuntimeError) as error:  # a loop of links is a RuntimeError before 3.13
-        return f"{shown} cannot be read ({getattr(error, 'strerror', None) or 'a loop of links'})"
+    except OSError as error:
+        why = "a loop of links" if error.errno == errno.ELOOP else error.strerror
+        return f"{shown} cannot be read ({why})"
     if stat.S_ISDIR(info.st_mode):
         return f"{shown} is a folder, a file was expected"
     if not stat.S_ISREG(info.st_mode):

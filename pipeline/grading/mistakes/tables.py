@@ -159,12 +159,16 @@ def _judge(
         apart = _disagreements(reported, references, blurred=False)
         apart = [name for _, name in apart if read_name(name).is_gain]
         suspect += [n for n in apart if n in errors and _agrees(reported.final[n], references, n)]
-    mistakes = known_mistakes({n: r for n, r in known.items() if n in table}, analysis, reported)
+    laws = broken_orders(table, initial=label == "initial")
+    unordered = _unordered(laws, label, reported, suspect=suspect) & errors.keys()
+    mistakes = []
+    if suspect or unordered:  # else there is nothing to explain
+        there = {name: reference for name, reference in known.items() if name in table}
+        mistakes = known_mistakes(there, analysis, reported)
     if label == "final":
         mistakes = [m for m in mistakes if _may_be_final(m, reported)]
         if len(suspect) >= min(2, analysis.carts):
             mistakes += transient_fits(analysis, table, known)
-    laws = broken_orders(table, initial=label == "initial")
     if any(law.is_of_gains for law in laws):  # a plain fact goes before a guess at one of them
         mistakes = [m for m in mistakes if m.whole or not _is_of_gains(m)]
     return _Judged(
@@ -173,7 +177,7 @@ def _judge(
         known={name: known[name] for name in errors},
         errors=errors,
         suspect=frozenset(suspect),
-        unordered=_unordered(laws, label, reported, suspect=suspect) & errors.keys(),
+        unordered=unordered,
         mistakes=mistakes,
         laws=laws,
         flags=[_impossible_flag(table, impossible, known, label)] if impossible else [],

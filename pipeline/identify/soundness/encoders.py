@@ -64,9 +64,9 @@ def find_stuck(records: Sequence[Record]) -> dict[str, LeftOut]:
     for record in records:
         for cart in measured(record):
             y = record.position(cart)
-            moves = np.abs(np.diff(y))
-            fastest = float(np.quantile(moves, limits.FASTEST_MOVES))
             for first, last in stuck_spans(y):
+                moves = np.abs(np.diff(y))
+                fastest = float(np.quantile(moves, limits.FASTEST_MOVES))
                 away = last < moves.size and moves[last] >= limits.STUCK_JUMP * fastest
                 if away or moves[first - 1] >= limits.STUCK_SPEED * fastest:
                     reason = (

@@ -113,12 +113,17 @@ def find_impossible_gains(gains: Sequence[StepGain]) -> dict[str, LeftOut]:
 # ------------------------------------------------------------------ single channels
 
 
+def _edges(y: np.ndarray) -> np.ndarray:
+    """Return where each stretch of one and the same reading starts, and where the last ends."""
+    return np.concatenate([[0], np.flatnonzero(np.diff(y)) + 1, [y.size]])
+
+
 def _still(record: Record, cart: int) -> Iterator[slice]:
     """Yield the samples of one and the same reading over which the input changes far."""
     u, y = record.u, record.position(cart)
     if u is None:
         return
-    edges = np.array([0, *(np.flatnonzero(np.diff(y)) + 1), y.size])
+    edges = _edges(y)
     long = limits.STILL_SHARE * y.size
     for i in np.flatnonzero(np.diff(edges) >= long):
         part = slice(int(edges[i]), int(edges[i + 1]))
@@ -180,12 +185,14 @@ def _frozen(
     for cart, missed in fit.missed.items():
         y = record.position(cart)
         far = max(limits.SEEN_COUNTS * steps[cart], limits.FROZEN_SHARE * float(np.ptp(y)))
-        edges = np.array([0, *(np.flatnonzero(np.diff(y)) + 1), y.size])
+        edges = _edges(y)
         for i in np.flatnonzero(np.diff(edges) >= limits.FROZEN_SAMPLES):
             part = slice(int(edges[i]), int(edges[i + 1]))
-            rest, moved = np.delete(missed, part), float(np.ptp(missed[part]))
-            force = force_on(record, chain, cart=cart)
-            if moved < far or not rest.size or force is None:
+            moved = float(np.ptp(missed[part]))
+            if moved < far:
+                continue
+            rest, force = np.delete(missed, part), force_on(record, chain, cart=cart)
+            if not rest.size or force is None:
                 continue
             # A cart at rest stays there for a moment after the input steps.
             early = force[part][: (part.stop - part.start) // 2]
