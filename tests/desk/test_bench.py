@@ -173,6 +173,9 @@ def test_an_experiment_is_proposed_weighed_and_added(tmp_path):
                             ("cart", "9"), ("seconds", "1e999"), ("goal", "zeta_9")):  # fmt: skip
             wrong = {**mine, name: typed}
             assert visitor.get(f"/bench/0/weigh?{urlencode(wrong)}").status == 422
+        blank = visitor.get(f"/bench/0/weigh?{urlencode(mine | {'frequency': ''})}")
+        assert blank.status == 422
+        assert "found" not in re.findall('class="wrong" role="alert">(.*?)<', blank.text)[0]
         assert not (work / "plan.toml").exists()
         assert visitor.post("/bench/0/add", **{**mine, "amplitude": "20"}).status == 422
         assert visitor.post("/bench/0/add", **mine).status == 303

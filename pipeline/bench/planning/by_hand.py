@@ -23,7 +23,14 @@ _SHORTEST = 1.0  # s
 # s; of three carts at 1 kHz that is weighed in 1 s and 0.5 GB, 600 s in 20 s and 2 GB
 _LONGEST = 120.0
 _ROUNDING = 1e-9  # relative: 100 s at 0.07 Hz are 7 periods, whatever their product rounds to
-_TYPED = {"frequency_end": "to"}  # what a key of plan.toml is called by whoever types it
+# The numbers that say what one of a kind is, as keys of plan.toml, and what else they are called.
+NEEDED: dict[Kind, tuple[str, ...]] = {
+    "step": ("amplitude",),
+    "sweep": ("amplitude", "frequency", "frequency_end"),
+    "sine": ("amplitude", "frequency"),
+    "decay": (),
+}
+TYPED = {"frequency_end": "to"}
 _EDGES = 4  # half periods of a step: off, on, off, on
 _SETTLE = 5.0  # s of rest beforehand, where the plan has no run of the motor to go by
 
@@ -59,10 +66,11 @@ def recording_by_hand(
         raise ConfigError(
             f"how long: expected {expected}, found {seconds:g}; plan.toml takes longer ones"
         )
-    named = {"frequency": frequency, "to": frequency_end or 0.0}
-    for name in {"sine": ["frequency"], "sweep": ["frequency", "to"]}.get(kind, []):
-        if not low <= named[name] <= high:
-            raise ConfigError(f"{name}: expected {low:g} to {high:g} Hz, found {named[name]:g}")
+    named = {"frequency": frequency, "frequency_end": frequency_end or 0.0}
+    for key in [key for key in named if key in NEEDED[kind]]:
+        if not low <= named[key] <= high:
+            name = TYPED.get(key, key)
+            raise ConfigError(f"{name}: expected {low:g} to {high:g} Hz, found {named[key]:g}")
     if kind == "decay":
         made = let_go(cart, name=f"decay-{cart}", seconds=seconds)
     else:
@@ -80,7 +88,7 @@ def recording_by_hand(
             settle=driven[-1] if driven else _SETTLE,
         )
     for key, what in recording_problems(made, plan.limits, submission.system):
-        raise ConfigError(f"{_TYPED.get(key, key)}: {what}")
+        raise ConfigError(f"{TYPED.get(key, key)}: {what}")
     return made
 
 

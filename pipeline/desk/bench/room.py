@@ -12,7 +12,13 @@ from pipeline.bench.design.goal import WORST
 from pipeline.bench.explore.wish import read_wish
 from pipeline.bench.host.serial_line import port_names
 from pipeline.bench.live.page import live_view
-from pipeline.bench.planning.by_hand import KINDS, add_recording, recording_by_hand
+from pipeline.bench.planning.by_hand import (
+    KINDS,
+    NEEDED,
+    TYPED,
+    add_recording,
+    recording_by_hand,
+)
 from pipeline.bench.planning.plan import Recording
 from pipeline.bench.planning.plan_file import load_plan, plan_path
 from pipeline.bench.planning.plan_words import session_time, time_words, what_words
@@ -157,9 +163,12 @@ def _wanted(typed: Mapping[str, str], submission: Submission) -> Recording:
     """Return the recording that was typed."""
     if typed["kind"] not in KINDS:
         raise ConfigError(f"kind: expected {', '.join(KINDS)}, found {typed['kind']!r}")
+    kind = KINDS[KINDS.index(typed["kind"])]
+    if blank := [TYPED.get(key, key) for key in NEEDED[kind] if not typed[key].strip()]:
+        raise ConfigError(f"{' and '.join(blank)}: what is it to be? The field is empty")
     carts = submission.system.carts
     return recording_by_hand(
-        KINDS[KINDS.index(typed["kind"])],
+        kind,
         plan=current_plan(submission),
         submission=submission,
         seconds=number(typed["seconds"], name="how long"),
