@@ -335,7 +335,7 @@ def test_what_is_added_while_the_data_are_asked_stays(tmp_path):
     n = len(old.recordings)
     assert made.plan == load_plan(submission)
     assert made.plan.recordings[: n + 1] == (*old.recordings, mine)
-    assert f" {len(made.plan.recordings) - n - 1} recordings added" in made.said
+    assert f" {len(made.plan.recordings) - n - 1} recording" in made.said
     assert of_kind(made.plan, "sine")
 
 

@@ -25,7 +25,7 @@ class Goal:
     Attributes
     ----------
     name : as `--for` takes it.
-    words : what the number is of, "zeta_2".
+    words : what the number is, "the error of zeta_2".
     rows : (k, n_p) derivatives of what is of interest by the relative parameters, as shares, of
         the overshoot as shares of the step. One row: c-optimal.
     mean : of several errors the "largest" (E-optimal in named parameters), the "root mean square"
@@ -70,21 +70,28 @@ def find_goal(name: str, known: Knowledge, *, feedback: FeedbackDesign | None) -
     """
     values, rows = known.chain.parameters(), known.by_parameters()
     if name == WORST:
-        return Goal(name=name, words="the worst relative error", rows=rows)
+        return Goal(name=name, words="the error of the least known parameter", rows=rows)
     if name == MEAN:
-        return Goal(name=name, words="the mean relative error", rows=rows, mean="root mean square")
+        return Goal(
+            name=name, words="the mean error of all parameters", rows=rows, mean="root mean square"
+        )
     if name == VOLUME:
-        return Goal(name=name, words="the mean error of m, c and k", rows=rows, mean="volume")
+        return Goal(
+            name=name,
+            words="the mean error of masses, dampings and springs",
+            rows=rows,
+            mean="volume",
+        )
     if name == DESIGN:
         if feedback is None:
             raise DataError("--for design: no controller is designed: add a [design] table first")
         row = _by_overshoot(known, feedback)
-        return Goal(name=name, words="the predicted overshoot", rows=row)
+        return Goal(name=name, words="the error of the predicted overshoot", rows=row)
     if name not in values:
         hint = nearest(name, [*values, DESIGN, WORST, MEAN, VOLUME])
         raise ConfigError(f"--for {name}: there is no such parameter or goal{hint}")
     at = list(values).index(name)
-    return Goal(name=name, words=name, rows=rows[at : at + 1])
+    return Goal(name=name, words=f"the error of {name}", rows=rows[at : at + 1])
 
 
 def _by_overshoot(known: Knowledge, feedback: FeedbackDesign) -> Array:

@@ -22,6 +22,7 @@ from pipeline.bench.planning.plan_words import session_time, time_words
 from pipeline.bench.planning.propose import current_plan
 from pipeline.errors import ConfigError, DataError
 from pipeline.ingest.read import read_data
+from pipeline.names import first_few
 from pipeline.report.limits import CALIBRATION
 from pipeline.results import Analysis
 from pipeline.schemas.gap import Gap as GapDocument
@@ -29,10 +30,11 @@ from pipeline.submission import Submission
 from pipeline.submission.toml_file import read_text
 from pipeline.workflow import analyse
 
+_ALONE = 4  # recordings of the plan of which a sentence says what each would leave
 _MOST_BYTES = 10_000_000  # of a gap.json
 _DIGITS = 1e-9  # relative: its numbers have ten digits
 STATISTICAL = (
-    f"statistical error only: no bench is calibrated better than to {100 * CALIBRATION:g} %"
+    f"that counts the noise alone: no bench is calibrated better than to {100 * CALIBRATION:g} %"
 )
 _USUAL = frozenset("c")  # what a bench is taken to know of which nothing is recorded
 
@@ -43,7 +45,7 @@ class NextPlan:
 
     Attributes
     ----------
-    now : error of what `words` names, relative, by what is recorded.
+    now : the error that `words` names, relative, by what is recorded.
     errors : (n + 1,) the same once the open recordings of the plan are there too, and after each
         more.
     planned : what each open recording of the plan would leave by itself, by id.
@@ -67,23 +69,23 @@ class NextPlan:
                 f"{self.recordings[0].id} tells two explanations of the gap apart by "
                 f"{self.separation:.2g} times the noise"
             )
-        many = len(self.recordings)
-        after = f"these {many} recordings" if many > 1 else "this recording"
-        already = "; ".join(
-            f"{name}, which the plan has, alone ± {_percent(error)}"
-            for name, error in self.planned.items()
+        these = "these are" if len(self.recordings) > 1 else "this one is"
+        done = "recorded"
+        steps = [f"{self.words}: ± {_percent(self.now)} now"]
+        if self.planned:
+            steps.append(f"± {_percent(self.errors[0])} once the plan so far is recorded")
+            done = "too"
+        steps.append(
+            f"± {_percent(self.errors[-1])} once {these} {done} "
+            f"({time_words(session_time(self.recordings))} at the bench)"
         )
-        open_ones = (
-            f" ± {_percent(self.errors[0])} once what the plan has is recorded,"
-            if self.planned
-            else ""
-        )
-        return (
-            f"{self.words}: ± {_percent(self.now)} now,{open_ones} ± {_percent(self.errors[-1])} "
-            f"after {after} ({time_words(session_time(self.recordings))})"
-            + (f"; {already}" if already else "")
-            + (f"; {STATISTICAL}" if self.errors[-1] < CALIBRATION else "")
-        )
+        alone = [f"{name} alone ± {_percent(error)}" for name, error in self.planned.items()]
+        sentences = [
+            ", ".join(steps),
+            *([f"of the plan so far, {first_few(alone, _ALONE)}"] if alone else []),
+            *([STATISTICAL] if self.errors[-1] < CALIBRATION else []),
+        ]
+        return "; ".join(sentences)
 
 
 def plan_next(
@@ -171,7 +173,7 @@ def choose_next(
     sums = np.concatenate([start[None], told[list(chosen)]]).cumsum(axis=0)
     errors = wanted.of(sums)
     if not errors[-1] < errors[0]:
-        raise DataError(f"no experiment that the limits allow makes {wanted.words} better")
+        raise DataError(f"no experiment that the limits allow makes {wanted.words} smaller")
     words = _words(wanted, known, after=sums[-1])
     recordings = tuple(
         candidates[one].model_copy(
@@ -249,7 +251,8 @@ def _words(goal: Goal, known: Knowledge, *, after: Array) -> str:
         return goal.words
     names = list(known.chain.parameters())
     now, then = (names[goal.worst(told)] for told in (known.told, after))
-    return f"{goal.words} ({now})" if now == then else f"{goal.words} ({now} now, {then} then)"
+    which = now if now == then else f"now {now}, then {then}"
+    return f"{goal.words} ({which})"
 
 
 def _percent(share: float) -> str:

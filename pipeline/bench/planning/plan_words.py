@@ -4,6 +4,7 @@ from collections.abc import Collection, Sequence
 from itertools import groupby
 
 from pipeline.bench.planning.plan import Plan, Recording
+from pipeline.report.numbers import count
 from pipeline.submission import Submission
 
 
@@ -22,7 +23,7 @@ def plan_table(plan: Plan, submission: Submission) -> str:
     return "\n".join(
         [
             *lines,
-            f"{len(plan.recordings)} recordings, {len(done)} done; "
+            f"{count(len(plan.recordings), 'recording')}, {len(done)} done; "
             + (f"the others take {time_words(session_time(left))}" if left else "nothing to do"),
             f"limits: {limits.input:g} {system.input.unit}, "
             f"{limits.travel:g} {system.position.unit} from the zero",

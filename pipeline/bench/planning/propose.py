@@ -27,6 +27,7 @@ from pipeline.plant.linear.dwells import (
     settling_wait,
     steady_time,
 )
+from pipeline.report.numbers import count
 from pipeline.results import Analysis
 from pipeline.submission import Design, Submission, System
 from pipeline.workflow import analyse
@@ -101,7 +102,7 @@ def make_plan(
         new, trouble = old, str(error)
     added = new.recordings[len(old.recordings) :]
     new, path = add_recordings(submission.folder, added, otherwise=old), plan_path(submission)
-    told = f"{path}: {len(added)} recordings added"
+    told = f"{path}: {count(len(added), 'recording')} added"
     said = told if there else f"wrote {path}: check its [limits]"
     return MadePlan(plan=new, path=path, said=said, trouble=trouble)
 

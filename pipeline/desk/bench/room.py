@@ -30,6 +30,7 @@ from pipeline.desk.typed import number, whole_number
 from pipeline.errors import ConfigError, PipelineError
 from pipeline.names import parameter_names, read_name
 from pipeline.report.exploration.page import NAME as DIARY
+from pipeline.report.words import with_symbols
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.load import NAME, outside
 
@@ -88,7 +89,8 @@ def weigh(ask: Ask) -> Response:
         found = ask.desk.hand.do("weigh", folder=str(folder), recording=wanted, goal=goal)
     except PipelineError as error:
         return _room(ask, status=422, typed=typed, refused=str(error))
-    words = f"the {read_name(typed['goal']).words}" if typed["goal"] else found["words"]
+    goal = typed["goal"]
+    words = f"the {read_name(goal).words}" if goal else with_symbols(found["words"])
     return _room(ask, typed=typed, weighed={**found, "words": words, "bars": _bars(found)})
 
 

@@ -97,10 +97,11 @@ def _summary(
     ]
     if len(points):
         out_of = points_text(rubric.out_of)
+        of = f" of the {len(points)} graded" if failed else ""
         remarks = sum(line.status == "graded" and bool(line.codes) for line in lines)
         tiles += [
-            Tile(spans("Mean"), spans(f"{points.mean():.2f} of {out_of}"), url="#points"),
-            Tile(spans("Median"), spans(f"{points.median():.2f} of {out_of}"), url="#points"),
+            Tile(spans(f"Mean{of}"), spans(f"{points.mean():.2f} of {out_of}"), url="#points"),
+            Tile(spans(f"Median{of}"), spans(f"{points.median():.2f} of {out_of}"), url="#points"),
             Tile(spans("With a remark"), spans(str(remarks)), url="#mistakes"),
         ]
     blocks: list[Block] = [Tiles(tuple(tiles))]
@@ -133,7 +134,7 @@ def _points(points: "pd.Series", rubric: Rubric, pictures: count) -> list[Block]
         f"Histogram of the points of {counted(len(points), 'submission')}, from {low} to {high} "
         f"of {points_text(rubric.out_of)}."
     )
-    caption = f"How many submissions have how many points; they go from {low} to {high}."
+    caption = f"How many of those graded have how many points; they go from {low} to {high}."
     figure = distribution_figure(points.to_list(), out_of=rubric.out_of)
     return [_picture(pictures, "distribution", to_svg(figure, name="distribution", alt=alt),
                      caption=caption, alt=alt)]  # fmt: skip
@@ -171,7 +172,7 @@ def _criteria(
             pictures,
             "difficulty",
             to_svg(figure, name="difficulty", alt=alt),
-            caption="The mean share of the points that each criterion earned.",
+            caption="The mean share of the points that each criterion earned in those graded.",
             alt=alt,
         ),
         make_table(

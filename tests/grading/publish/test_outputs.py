@@ -317,8 +317,8 @@ def test_the_class_page_counts_what_there_is():
     text = " ".join(html.split())
 
     assert "Could not be graded 1" in text
-    assert "Mean 10.00 of 20" in text
-    assert "Median 10.00 of 20" in text
+    assert "Mean of the 3 graded 10.00 of 20" in text
+    assert "Median of the 3 graded 10.00 of 20" in text
     assert "static gains from the steps 1 50 % 1 1 1 0" in text
     assert re.search(r"hz_for_rad_s \) 2 50 % b , c .* missing \) 1 25 % c ", text)
 
