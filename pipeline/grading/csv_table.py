@@ -33,7 +33,7 @@ def read_table(path: Path) -> "pd.DataFrame":
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
     except UnicodeDecodeError:
-        raise ConfigError(f"{path.name}: is not UTF-8 text; export it anew as CSV") from None
+        raise ConfigError(f"{path.name}: is not UTF-8 text; save it as CSV UTF-8") from None
     delimiter = max(",;\t", key=text.partition("\n")[0].count)
     # Not pandas' reader: it cannot tell the line of a row, which a message has to.
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter)

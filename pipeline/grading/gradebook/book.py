@@ -325,7 +325,9 @@ class Gradebook:
             hint = nearest(criterion, list(out_of))
             raise ConfigError(f"{criterion}: the rubric has no such criterion{hint}")
         if points is not None and not 0 <= points <= out_of[criterion]:
-            raise ConfigError(f"{criterion}: has 0 to {out_of[criterion]:g} points")
+            raise ConfigError(
+                f"{criterion}: expected 0 to {out_of[criterion]:g} points, found {points:g}"
+            )
         given = Override(
             criterion=criterion,
             points=points,

@@ -35,6 +35,11 @@ def read_late_table(path: Path) -> dict[str, float]:
         late = _number(said)
         if late is None or not 0 <= late <= _LONGEST:
             raise ConfigError(f"{path.name} line {line}: days_late: cannot read {quote(said)}")
+        if days.get(who.casefold(), late) != late:
+            raise ConfigError(
+                f"{path.name} line {line}: {quote(who)} is {late:g} days late here and "
+                f"{days[who.casefold()]:g} in a line before: leave one of them"
+            )
         if who:
             days[who.casefold()] = late
     return days

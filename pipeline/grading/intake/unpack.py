@@ -87,6 +87,8 @@ def unpack(archive: Path, into: Path, *, limits: Limits) -> dict[PurePosixPath, 
     SubmissionError : not a zip archive, broken, encrypted, or larger than the limits; one line.
     """
     shown = quote(archive.name)
+    if archive.is_file() and not archive.stat().st_size:
+        raise SubmissionError(f"{shown}: is empty (0 bytes): send or download it once more")
     into.mkdir(parents=True)
     try:
         with _opened(archive, limits=limits) as opened:

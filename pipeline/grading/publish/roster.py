@@ -106,7 +106,7 @@ class Roster:
             if name not in table:
                 table[name] = self.table.get(name, "")
             table.loc[self._of_all() & (table[name] == ""), name] = possible
-        index = self._index()
+        index, shared = self._index()
         matched = [(_row_of(student, index), student) for student in students]
         found: dict[Any, list[Student]] = {}
         for at, student in matched:
@@ -118,8 +118,12 @@ class Roster:
                 if not student.undecided:
                     table.loc[at, titles[title]] = value(student)
         # One of the authors, who are named, handed it in.
-        strangers = [s.called for at, s in matched if at is None and not s.uploader]
+        unmatched = [student for at, student in matched if at is None and not student.uploader]
+        twice = [s.called for s in unmatched if not shared.isdisjoint(_words(s))]
+        strangers = [s.called for s in unmatched if s.called not in twice]
         remarks = [s.undecided for s in settled.values() if s.undecided and s not in students]
+        if twice:
+            remarks.append(f"in several rows of {self.file}, so not exported: {', '.join(twice)}")
         if strangers:
             remarks.append(f"not in {self.file}, so not exported: {', '.join(strangers)}")
         reached = {student.grade.submission for several in found.values() for student in several}
@@ -155,8 +159,8 @@ class Roster:
                 return name
         return title
 
-    def _index(self) -> dict[tuple[str, str], Any]:
-        """Return the row of everything that says who it is about; none that two rows share."""
+    def _index(self) -> tuple[dict[tuple[str, str], Any], set[tuple[str, str]]]:
+        """Return the row of everything that says who it is about, and what several rows share."""
         import pandas as pd
 
         words = []
@@ -172,19 +176,21 @@ class Roster:
             pd.DataFrame({"kind": kind, "word": cells, "row": cells.index}) for kind, cells in words
         )
         rows = found[found["word"] != ""].drop_duplicates().set_index(["kind", "word"])["row"]
-        return rows.loc[~rows.index.duplicated(keep=False)].to_dict()
+        several = rows.index.duplicated(keep=False)
+        return rows.loc[~several].to_dict(), {*rows.index[several]}
 
 
 def _row_of(student: Student, index: Mapping[tuple[str, str], Any]) -> Any:
-    for word in (
+    return next((index[word] for word in _words(student) if word in index), None)
+
+
+def _words(student: Student) -> tuple[tuple[str, str], ...]:
+    """Return by what a student may be found, the surest first."""
+    return (
         ("number", student.number),
         ("id", student.id.casefold()),
         ("name", _letters(student.name)),
-    ):
-        at = index.get(word)
-        if at is not None:
-            return at
-    return None
+    )
 
 
 def _number(text: str) -> float | None:

@@ -291,9 +291,9 @@ def test_no_override_is_above_what_the_rubric_has_now(open_book):
         (("team-2", "pieces", 1.0), "x", "team-2: no such submission; did you mean .team-1"),
         (("team-1", "peices", 1.0), "x", "peices: the rubric has no such criterion; .*pieces"),
         (("team-1", "xyz", 1.0), "x", "no such criterion; known: pieces, .*"),
-        (("team-1", "pieces", 1.5), "x", "pieces: has 0 to 1 points"),
-        (("team-1", "pieces", -0.1), "x", "pieces: has 0 to 1 points"),
-        (("team-1", "pieces", float("nan")), "x", "pieces: has 0 to 1 points"),
+        (("team-1", "pieces", 1.5), "x", "pieces: expected 0 to 1 points, found 1.5"),
+        (("team-1", "pieces", -0.1), "x", "pieces: expected 0 to 1 points"),
+        (("team-1", "pieces", float("nan")), "x", "pieces: expected 0 to 1 points, found nan"),
         (("team-1", "pieces", 1.0), " ", "needs a reason"),
     ],
 )

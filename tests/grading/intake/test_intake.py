@@ -218,6 +218,9 @@ def test_one_students_zip_is_one_hand_in(tmp_path):
     assert (first.id, second.id) == ("team-07", "team-08")
     with pytest.raises(SubmissionError, match="not a whole zip archive"):
         opened(tmp_path, second)
+    bad.write_bytes(b"")  # an upload that was broken off
+    with pytest.raises(SubmissionError, match=r"'team-08\.zip': is empty"):
+        opened(tmp_path, *hand_ins(tmp_path, bad))
 
 
 def test_one_bad_hand_in_of_a_download_costs_its_own_row(tmp_path):

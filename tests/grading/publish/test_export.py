@@ -161,6 +161,20 @@ def test_canvas_own_export_is_filled_in(tmp_path):
     assert remarks[-1] == "not in roster.csv, so not exported: roeric"
 
 
+def test_who_stands_twice_in_a_roster_is_said_to(tmp_path):
+    """Nobody can say which row is meant: both stay as they were, and that is the reason told."""
+    roster = (
+        "Student,ID,SIS User ID,SIS Login ID,Section,Lab 3\n"
+        "    Points Possible,,,,,20\n"
+        '"Doe, Jane",1024,u1,jane@x.edu,A,\n'
+        '"Lee, Bo",7,u2,bo@x.edu,A,\n"Lee, Bo",8,u2,bo@x.edu,A,\n'
+    )
+    rows, remarks = write(tmp_path, HALF, FULL, platform="canvas", title="Lab 3", roster=roster)
+    assert canvas_import(rows) == {"Lab 3": {"1024": "10", "7": "", "8": ""}}
+    assert remarks[0] == "in several rows of roster.csv, so not exported: bo"
+    assert not any("not in roster.csv, so not exported: bo" in remark for remark in remarks)
+
+
 def test_moodle_takes_a_worksheet_where_participants_are_known(tmp_path):
     """With feedback as harmless HTML, within the maximum grade."""
     rows, _ = write(tmp_path, HALF, BROKEN, platform="moodle")
