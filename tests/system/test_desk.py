@@ -10,12 +10,12 @@ from pathlib import Path
 from urllib.error import HTTPError
 
 import pytest
-from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import expect
 
 from pipeline.desk.app import DeskServer
 from pipeline.submission import load_submission
 from pipeline.submission.load import NAME
+from tests.helpers.accessibility import violations
 from tests.helpers.desks import a_submission
 from tests.helpers.places import ROOT
 from tests.helpers.waiting import PATIENCE, started, until
@@ -56,23 +56,14 @@ def show(browser):
     assert [error for error in errors if not re.search(f"{said}|{ended}", error)] == []
 
 
-def violations(window) -> list:
-    """Return what axe finds, by day and by night."""
-    found = []
-    for scheme in ("light", "dark"):
-        window.emulate_media(color_scheme=scheme)
-        for one in Axe().run(window).response["violations"]:
-            found.append((scheme, one["id"], [node["target"] for node in one["nodes"]][:3]))
-    return found
-
-
 def test_a_student_goes_from_an_empty_folder_to_the_zip(show, tmp_path):
     """Files dropped, a mistake mended, the form, the report, the zip."""
     folder = tmp_path / "team"
     with DeskServer() as server:
         window = show(server.url)
         window.get_by_label("Folder on this computer").fill(str(folder))
-        window.get_by_role("button", name="Open").click()
+        with window.expect_navigation():  # to a page that has its scripts, which take the files
+            window.get_by_role("button", name="Open").click()
         expect(window.get_by_role("heading", level=1)).to_have_text("team")
 
         window.locator("#drop").set_input_files(FILES)

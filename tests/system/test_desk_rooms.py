@@ -7,6 +7,7 @@ from playwright.sync_api import expect
 from pipeline.desk.app import DeskServer
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.submission import load_submission
+from tests.helpers.accessibility import violations
 from tests.helpers.acquisitions import sine, write_work
 from tests.helpers.benches import emulator
 from tests.helpers.desks import a_recorded_cart
@@ -19,7 +20,7 @@ show = test_desk.show
 
 def fits(window) -> bool:
     """Tell whether nothing is wider than the screen, and axe finds nothing by day and by night."""
-    assert test_desk.violations(window) == []
+    assert violations(window) == []
     width = window.evaluate("document.documentElement.scrollWidth")
     return width <= window.viewport_size["width"]
 
@@ -32,7 +33,8 @@ def test_a_session_is_begun_watched_and_decided_on(show, tmp_path, real):
     )
     with DeskServer(folder=work) as server:
         window = show(server.url, size=PHONE)
-        window.get_by_role("link", name="team: bench").click()
+        with window.expect_navigation():
+            window.get_by_role("link", name="team: bench").click()
         assert fits(window)
         window.locator("#port").fill(real.address)
         for name in ("long", "next", "last"):
@@ -64,7 +66,8 @@ def test_an_exploration_is_watched_and_steered(show, tmp_path):
     work = a_recorded_cart(tmp_path / "team")
     with emulator("--speed", "8", preset="throne-1dof") as bench, DeskServer(folder=work) as server:
         window = show(server.url, size=PHONE)
-        window.get_by_role("link", name="team: bench").click()
+        with window.expect_navigation():
+            window.get_by_role("link", name="team: bench").click()
         assert fits(window)
         window.locator("#explore-port").fill(bench.address)
         window.get_by_label("Until this is known").select_option(label="the damping ratio ζ")
@@ -103,7 +106,8 @@ def test_an_exercise_is_made_of_what_is_seen(show, tmp_path):
     out = tmp_path / "exercise"
     with DeskServer() as server:
         window = show(server.url, size=WIDE)
-        window.get_by_role("link", name="Exercises").click()
+        with window.expect_navigation():
+            window.get_by_role("link", name="Exercises").click()
         window.locator('input[value="coulomb_friction"]').check()
         drawn = window.locator("#hidden img")
         expect(drawn).to_have_js_property("complete", True)
@@ -129,7 +133,8 @@ def test_a_rubric_is_edited_with_its_mistakes_beside_it(show, tmp_path):
         window.goto(f"{window.url}rubric/")
         window.get_by_label("Another rubric").fill(str(path))
         window.get_by_label("A new one begins with").select_option("throne-1dof")
-        window.get_by_role("button", name="Open").click()
+        with window.expect_navigation():
+            window.get_by_role("button", name="Open").click()
         text = window.locator("#text")
         good = text.input_value()
         text.fill(good.replace("points", "pionts", 1))
@@ -146,7 +151,8 @@ def test_a_rubric_is_edited_with_its_mistakes_beside_it(show, tmp_path):
         expect(window.get_by_text("Saved.")).to_be_visible()
         assert load_rubric(path)
         window.set_viewport_size({"width": 400, "height": 800})
-        window.get_by_role("link", name="Effects").click()
+        with window.expect_navigation():
+            window.get_by_role("link", name="Effects").click()
         window.locator("#coulomb_friction summary").click()
         drawn = window.locator("#coulomb_friction img")
         until(lambda: drawn.evaluate("image => image.naturalWidth") > 100)
