@@ -107,7 +107,18 @@ def test_an_exploration_leaves_an_ordinary_submission_and_its_diary(explored):
         assert f"{turn.seconds:.0f} s" in diary
 
 
-def test_time_that_is_up_ends_it_before_the_next_recording(explored, tmp_path):
+@pytest.fixture
+def no_gap(monkeypatch):
+    """Only the carts are identified: where the gap is of no concern, or cannot be looked for."""
+
+    def none(analysis, **other):
+        raise DataError("no run can be held out")
+
+    monkeypatch.setattr("pipeline.bench.explore.explore.investigate", none)
+
+
+@pytest.mark.usefixtures("no_gap")
+def test_time_that_is_up_ends_it_before_the_next_recording(tmp_path):
     """No recording is begun that would go beyond; what it would have been is said."""
     bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
     session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=1))
@@ -158,13 +169,9 @@ def test_a_wish_for_what_a_rigid_cart_has_is_heard(tmp_path):
         )  # fmt: skip
 
 
-def test_carts_are_identified_where_the_gap_cannot_be_looked_for(tmp_path, monkeypatch):
+@pytest.mark.usefixtures("no_gap")
+def test_carts_are_identified_where_the_gap_cannot_be_looked_for(tmp_path):
     """The exploration goes on by the parameters, and does not say that nothing else acts."""
-
-    def none(analysis, **other):
-        raise DataError("no run can be held out")
-
-    monkeypatch.setattr("pipeline.bench.explore.explore.investigate", none)
     bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
     session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=1))
     turns = explore(
@@ -175,6 +182,7 @@ def test_carts_are_identified_where_the_gap_cannot_be_looked_for(tmp_path, monke
     assert not turns[-1].reached
 
 
+@pytest.mark.usefixtures("no_gap")
 def test_a_bench_on_which_nothing_comes_off_is_left_after_three_tries(tmp_path):
     """Each time another recording is chosen; the diary says what did not come off."""
     bench = prepare_bench(preset="throne-1dof", model=None, hide=[])

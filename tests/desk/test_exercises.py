@@ -23,9 +23,9 @@ from tests.helpers.waiting import until
 FRICTION = {"effect": "coulomb_friction", "coulomb_friction.place": "2"}
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def visitor() -> Iterator[Visitor]:
-    """Somebody at a desk of their own."""
+    """Somebody at a desk, which starts a process for all that is drawn and made there."""
     with DeskServer() as server:
         yield Visitor.of(server.url)
 

@@ -9,6 +9,7 @@ import threading
 import time
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from html import unescape
 from pathlib import Path
 from urllib.parse import unquote
@@ -50,12 +51,24 @@ def filled(tmp_path):
         yield Visitor.of(server.url), folder
 
 
+class _LastingHand(Hand):
+    """Processes with which the next desk goes on."""
+
+    def close(self) -> None:
+        """Leave them."""
+
+
 @pytest.fixture(scope="module")
 def hand():
-    """A process for short tasks."""
-    hand = Hand()
+    """The processes for short tasks of all these desks: each would start its own."""
+    hand = _LastingHand()
     yield hand
-    hand.close()
+    super(_LastingHand, hand).close()
+
+
+@pytest.fixture(autouse=True)
+def _one_hand(hand, monkeypatch):
+    monkeypatch.setattr("pipeline.desk.app.Desk", partial(Desk, hand=hand))
 
 
 def take_upload(name: str, content: io.BytesIO, folder: Path, *, hand: Hand) -> list[str]:

@@ -9,6 +9,9 @@ from typing import Any
 import psutil
 
 PATIENCE = 120.0  # s after which what is awaited is taken never to come
+# Asking may take the processor from what is waited for: the longer that takes, the less often.
+_OFTEN, _SELDOM = 0.01, 0.1  # s between two looks, at first and at most, …
+_LATER = 0.1  # … and of the time waited so far
 
 
 def until(happened: Callable[[], object], what: str = "it") -> None:
@@ -18,10 +21,11 @@ def until(happened: Callable[[], object], what: str = "it") -> None:
     ------
     AssertionError : it never did.
     """
-    end = time.monotonic() + PATIENCE
+    begin = time.monotonic()
     while not happened():
-        assert time.monotonic() < end, f"{what} never happened"
-        time.sleep(0.01)
+        waited = time.monotonic() - begin
+        assert waited < PATIENCE, f"{what} never happened"
+        time.sleep(min(max(_OFTEN, _LATER * waited), _SELDOM))
 
 
 @contextmanager

@@ -13,7 +13,7 @@ ed., section 9.5.
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache
 from typing import Self
 
 import numpy as np
@@ -21,7 +21,7 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.bench.planning.plan import Limits, Recording
 from pipeline.bench.planning.propose import identified_chain
-from pipeline.bench.protocol.messages import Start, Wave
+from pipeline.bench.protocol.messages import Start, Tone, Wave
 from pipeline.bench.protocol.waves import shape_at
 from pipeline.errors import DataError
 from pipeline.estimation.chain.bode_points import Points, response_at, weighted_residuals
@@ -42,6 +42,7 @@ from pipeline.results import Analysis, ChainFit, FrequencyResponse, Record, Sine
 _NO_DAMPING = 1e-6  # of the critical one: what a fit held at zero, whose logarithm has a slope
 _SEED = 0  # of the noise a record is expected to have, …
 _NOISES = 3  # … of which so many are looked at: what one does to the parameters is chance
+_SHAPES = 64  # inputs that are kept: all weighed at once, for each is asked for twice or more
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -235,16 +236,24 @@ class Knowledge:
 
 def sampled_input(recording: Recording, *, period: float) -> tuple[Array, Array]:
     """Return times (n,) every `period` s and the recording's input (n,) at unit amplitude."""
-    t = np.arange(0.0, recording.duration, period)
     start = Start(
         wave=Wave[recording.wave.upper()],
         frequency=recording.frequency,
         amplitude=1,
         cycles=recording.cycles,
     )
-    end, tones = recording.frequency_end, recording.sines
-    shape = partial(shape_at, start, chirp_end=end, tones=tones)
-    return t, np.array([shape(at) for at in t])
+    return _sampled(start, recording.duration, period, recording.frequency_end, recording.sines)
+
+
+@lru_cache(maxsize=_SHAPES)
+def _sampled(
+    start: Start, duration: float, period: float, end: float | None, tones: tuple[Tone, ...]
+) -> tuple[Array, Array]:
+    t = np.arange(0.0, duration, period)
+    u = np.array([shape_at(start, at, chirp_end=end, tones=tones) for at in t.tolist()])
+    for array in (t, u):
+        array.flags.writeable = False
+    return t, u
 
 
 def _fitted_records(analysis: Analysis, fit: ChainFit) -> list[Record]:
