@@ -502,6 +502,18 @@ def test_what_was_not_used_is_not_said_to_be():
     assert f"Mend, record again or take out {dwells[0]}:" in text
 
 
+def test_a_file_that_cannot_be_read_asks_for_no_experiment():
+    """What is asked for is that file; only other stages that were skipped ask for more."""
+    unread = Skipped(stage="reading step-1", reason="empty")
+    other = Skipped(stage="hardware check", reason="no closed-loop run was recorded")
+    analysis = replace(make_analysis(1, repeats=1), unreadable={"step-1": "empty"})
+    asked = [
+        "Add the experiments" in terminal_summary(replace(analysis, skipped=skipped))
+        for skipped in ((unread,), (unread, other))
+    ]
+    assert asked == [False, True]
+
+
 def test_skipped_stages_are_told_apart():
     """The names of stages have commas in them, so what parts them is another sign."""
     stages = [f"log decrement, decay-{i}, cart 1" for i in range(5)]

@@ -159,7 +159,7 @@ class Roster:
                 return name
         return title
 
-    def _index(self) -> tuple[dict[tuple[str, str], Any], set[tuple[str, str]]]:
+    def _index(self) -> tuple[dict[tuple[str, str], Any], set[Any]]:
         """Return the row of everything that says who it is about, and what several rows share."""
         import pandas as pd
 
@@ -177,7 +177,7 @@ class Roster:
         )
         rows = found[found["word"] != ""].drop_duplicates().set_index(["kind", "word"])["row"]
         several = rows.index.duplicated(keep=False)
-        return rows.loc[~several].to_dict(), {*rows.index[several]}
+        return rows.loc[~several].to_dict(), set(rows.index[several].tolist())
 
 
 def _row_of(student: Student, index: Mapping[tuple[str, str], Any]) -> Any:

@@ -340,7 +340,9 @@ def _advice(analysis: Analysis) -> Iterator[Spans]:
         yield say("next_left")
     if design is not None and not any(r.kind == "closed_loop" for r in analysis.records):
         yield say("next_run")
-    if analysis.skipped and not left_out and not reasons:  # what follows the carts waits for them
+    unread = {f"reading {name}" for name in analysis.unreadable}  # asked for above
+    stages = {skip.stage for skip in analysis.skipped} - unread
+    if stages and not left_out and not reasons:  # what follows the carts waits for them
         yield say("next_skipped")
     if design and not design.reachable:
         yield say("next_goal", message=clean(design.message))
