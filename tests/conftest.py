@@ -1,5 +1,6 @@
 """Fixtures shared by the tests."""
 
+import gc
 import os
 import shutil
 import signal
@@ -82,6 +83,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     size = Counter(groups)
     order = {group: (group != _BENCHES, size[group], group) for group in size}
     items.sort(key=lambda item: order[_group(item.nodeid)])
+
+
+def pytest_collection_finish() -> None:
+    """Leave thousands of tests and modules out of what is looked through for garbage from now."""
+    gc.freeze()
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -3,7 +3,9 @@
 import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import closing
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -118,11 +120,22 @@ def make_outcome(grade: Grade, *, key: str = "", **changes: Any) -> Grading:
 
 def write_class(folder: Path, *, anonymous: bool = False) -> Path:
     """Write the pages of a class of all sorts into a folder, figures and hostile names included."""
-    folder.mkdir(exist_ok=True)
-    fill_book(folder, anonymous=anonymous)
-    with Gradebook(folder) as book:
-        write_outputs(book, folder)
+    for name, content in _class_files(anonymous=anonymous).items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content)
     return folder
+
+
+@cache
+def _class_files(*, anonymous: bool) -> dict[str, bytes]:
+    """Return the files of such a folder by their names, made once a process."""
+    with TemporaryDirectory() as place:
+        folder = Path(place)
+        fill_book(folder, anonymous=anonymous)
+        with Gradebook(folder) as book:
+            write_outputs(book, folder)
+        files = (path for path in folder.rglob("*") if path.is_file())
+        return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 
 
 def fill_book(place: str | Path, *, anonymous: bool = False) -> None:
