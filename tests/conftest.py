@@ -39,6 +39,12 @@ _WITH_BENCHES = {
     "bench/test_acquire", "bench/test_mistakes", "bench/test_safety", "bench/test_emulator",
     "system/test_live_page",
 }  # fmt: skip
+_LONGEST = {  # which end long after the others where they begin last
+    "bench/test_explore", "desk/test_grades", "desk/test_student", "gap/test_explain",
+    "grading/mistakes/test_faults", "grading/test_class", "report/test_report",
+    "statistics/test_gap", "synthesis/test_hidden", "system/test_desk_rooms",
+    "system/test_report_pages",
+}  # fmt: skip
 _FEW = 2  # files that are sooner done here than other processes are started
 
 # A shell starts what runs in the background deaf to Ctrl-C, and its children inherit that.
@@ -75,13 +81,15 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int | None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Have those begin that wait for benches, then files of few tests, which have the longest.
+    """Have those begin that wait for benches, then the longest files, then those of few tests.
 
     So at the end no worker is left alone with a long one.
     """
     groups = [_group(item.nodeid) for item in items]
     size = Counter(groups)
-    order = {group: (group != _BENCHES, size[group], group) for group in size}
+    order = {
+        group: (group != _BENCHES, group not in _LONGEST, size[group], group) for group in size
+    }
     items.sort(key=lambda item: order[_group(item.nodeid)])
 
 

@@ -177,7 +177,7 @@ def test_simulate_makes_a_submission_that_report_takes(tmp_path):
     )
     assert done.returncode == 0
     assert "[reported.final]" in (folder / "submission.toml").read_text(encoding="utf-8")
-    done = cartlab("report", folder, "--no-pdf")
+    done = cartlab_here("report", folder, "--no-pdf")
     assert (done.returncode, done.stdout) == (0, "")
     assert not (folder / "report" / "report.pdf").exists()
     again = cartlab_here("simulate", "--preset", "throne-1dof", "--out", folder)
