@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from pipeline.arrays import Array
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.plant.linear.simulate import simulate_linear
+from pipeline.plant.nonlinear.augmented import compile_simulator
 from pipeline.plant.nonlinear.effects import AugmentedChain, find_effect, make_term
 from pipeline.plant.nonlinear.simulator import contacts, kernel, sensitivity, state, step
 from pipeline.plant.nonlinear.simulator.kernel import simulate_batch
@@ -339,6 +341,16 @@ def test_arrays_of_any_kind_meet_the_same_simulator():
     mine = {id(one): one for module in modules for one in vars(module).values()}
     twice = [one for one in mine.values() if len(getattr(one, "signatures", ())) > 1]
     assert twice in ([], [state.stretch])  # which takes the row it reads as a constant
+
+
+def test_no_array_is_counted():
+    """Two threads that search would wait for each other at every count of who uses an array."""
+    compile_simulator()
+    folder = kernel._simulate.stats.cache_path
+    assert folder is not None
+    stored = list(Path(folder).glob("kernel._simulate*.nbc"))
+    assert stored
+    assert not any(b"NRT_incref" in file.read_bytes() for file in stored)
 
 
 @pytest.mark.parametrize("preset", list(PRESETS))
