@@ -149,6 +149,19 @@ def test_no_page_ends_the_print_with_one_row_of_hashes(folders):
     assert min(rows) > 20
 
 
+@pytest.mark.parametrize(("number", "tall", "pages"), [(6, 1.02, 4), (7, 0.66, 3), (2, 0.66, 1)])
+def test_figures_in_a_row_fill_pages(number, tall, pages):
+    """Of 58 or 40 % of a page's height each: one more a page, a little smaller; a few as drawn."""
+    svg = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 100 {100 * tall}"/>'
+    row = tuple(
+        Picture(
+            number=n, name=f"p{n}", caption=spans("Two words"), alt="nothing", svg=svg, width=5.2
+        )
+        for n in range(number)
+    )
+    assert len(printed(Section("f", "Figures", row))) == pages
+
+
 def printed(*sections: Section) -> list[str]:
     """Return the text of each page that sections are printed on."""
     document = Document("A", "", (), sections, "the footer")
