@@ -1,4 +1,4 @@
-"""A command looks for garbage seldom."""
+"""A command looks for garbage seldom, and not at its end."""
 
 import subprocess
 import sys
@@ -21,3 +21,21 @@ def test_a_command_looks_for_garbage_a_few_times_only():
     command = [sys.executable, "-c", LOOKS]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert int(done.stderr.split()[-1]) < 40
+
+
+ENDS = """
+from pipeline.garbage import collect_seldom
+class Cycle:
+    def __init__(self):
+        self.own = self
+    def __del__(self):
+        print("found")
+collect_seldom()
+Cycle()
+"""
+
+
+def test_what_is_left_at_the_end_is_the_systems():
+    """Python would look through everything that was loaded, twice."""
+    done = subprocess.run([sys.executable, "-c", ENDS], capture_output=True, text=True, check=True)
+    assert done.stdout == ""
