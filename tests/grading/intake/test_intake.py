@@ -209,6 +209,18 @@ def test_metadata_of_a_students_own_are_not_read(tmp_path):
     ]  # fmt: skip
 
 
+def test_a_zip_of_two_submissions_is_called_as_it_is(tmp_path):
+    """By neither of them, which may have a row of their own: nobody knows which is meant."""
+    twice = {f"{team}/submission.toml": TOML for team in ("team-01", "team-02")}
+    (tmp_path / "class").mkdir()
+    archive(tmp_path / "class" / "two.zip", twice)
+    archive(tmp_path / "class" / "one.zip", {"team-01/submission.toml": TOML})
+    one, two = hand_ins(tmp_path, tmp_path / "class")
+    assert (one.id, two.id) == ("team-01", "two")
+    with pytest.raises(SubmissionError, match="which one is to be graded"):
+        opened(tmp_path, two)
+
+
 def test_one_students_zip_is_one_hand_in(tmp_path):
     """A zip file that is no class is itself the hand-in, and a broken one has its row."""
     good = archive(tmp_path / "team-07.zip", {"submission.toml": TOML})
