@@ -4,7 +4,6 @@ import gc
 import os
 import shutil
 import signal
-import subprocess
 import sys
 from collections import Counter
 from collections.abc import Iterator
@@ -16,7 +15,8 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from tests.helpers.benches import Emulator, emulator
-from tests.helpers.places import REAL_DATA, ROOT
+from tests.helpers.compiled import await_compiler, start_compiler
+from tests.helpers.places import REAL_DATA
 from tests.helpers.waiting import PATIENCE
 
 # Where Python is told to keep nothing that it compiled, as in containers, each of the hundred
@@ -63,14 +63,11 @@ def _silent_progress() -> Iterator[None]:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Compile the simulator while the workers collect their tests; each of them would, else."""
+    """Compile the simulators while the workers collect their tests."""
     if config.getoption("numprocesses") and "PYTEST_XDIST_WORKER" not in os.environ:
-        script = "from tests.helpers.nursery import load_bench; load_bench()"
         until_the_end = ExitStack()
         config.add_cleanup(until_the_end.close)
-        until_the_end.enter_context(
-            subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.DEVNULL, cwd=ROOT)
-        )
+        until_the_end.enter_context(start_compiler())
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -96,6 +93,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_collection_finish() -> None:
     """Leave thousands of tests and modules out of what is looked through for garbage from now."""
     gc.freeze()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        await_compiler()
 
 
 @pytest.hookimpl(optionalhook=True)

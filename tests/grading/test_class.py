@@ -32,7 +32,7 @@ def flags(team: Team) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    "seed", [5, *(pytest.param(seed, marks=LONG) for seed in (30, 90, 60023, 60066))]
+    "seed", [30, *(pytest.param(seed, marks=LONG) for seed in (5, 90, 60023, 60066))]
 )
 def test_little_damping_accuses_nobody(seed):
     """Where dwells put a damping at zero, or dry friction has a share in it, nobody is wrong."""

@@ -75,7 +75,7 @@ def test_two_effects_are_found_together():
 @pytest.mark.parametrize(
     ("effect", "hardness", "part"),
     [
-        ("end_stop", 25.0, 0.6),
+        pytest.param("end_stop", 25.0, 0.6, marks=[pytest.mark.slow, pytest.mark.sample]),
         ("slack_spring", 3.0, 0.6),
         pytest.param("end_stop", 5.0, 0.9, marks=[pytest.mark.slow, pytest.mark.sample]),
         pytest.param("end_stop", 5.0, 0.6, marks=[pytest.mark.slow, pytest.mark.sample]),

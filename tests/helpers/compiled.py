@@ -1,0 +1,46 @@
+"""What the tests need compiled: once, before they begin; each of their processes would, else."""
+
+import os
+import subprocess
+import sys
+
+import psutil
+
+from tests.helpers.places import ROOT
+from tests.helpers.waiting import until
+
+_COMPILER = "CARTLAB_TESTS_COMPILER"  # its process, for those that wait for it
+
+
+def start_compiler() -> "subprocess.Popen[bytes]":
+    """Compile in a process beside this one, of which the processes started from now on know."""
+    script = "from tests.helpers.compiled import compile_all; compile_all()"
+    compiler = subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.DEVNULL, cwd=ROOT)
+    os.environ[_COMPILER] = str(compiler.pid)
+    return compiler
+
+
+def await_compiler() -> None:
+    """Wait until what another process compiles is there."""
+
+    def ended() -> bool:
+        try:
+            compiler = psutil.Process(int(os.environ[_COMPILER]))
+            return compiler.status() == psutil.STATUS_ZOMBIE
+        except psutil.NoSuchProcess:
+            return True
+
+    if _COMPILER in os.environ:
+        until(ended, "the end of the compiler")
+
+
+def compile_all() -> None:
+    """Compile the workflow's simulator and the truth's."""
+    import numpy as np
+
+    from pipeline.plant.nonlinear.augmented import compile_simulator
+    from tests.truth.bench import simulate_truth
+
+    compile_simulator()
+    t = 1e-3 * np.arange(2)
+    simulate_truth(m=[1.0], c=[0.0], k=[1.0, 0.0], t=t, u=np.zeros(2), free=(1,))
