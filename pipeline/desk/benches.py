@@ -67,6 +67,8 @@ class Session:
     def _ask(
         self, method: str, what: str, body: str | None = None
     ) -> tuple[HTTPConnection, HTTPResponse]:
+        if not self.url:  # there is no page yet to ask
+            raise ConnectionError
         url = urlsplit(self.url)
         connection = HTTPConnection(url.hostname or "", url.port, timeout=_ANSWERS)
         headers = {"Origin": f"http://{url.netloc}"}

@@ -118,6 +118,10 @@ def test_a_plan_is_made_and_what_is_wrong_is_said(tmp_path):
         shown = [visitor.get("/bench/0/").text]
         until(lambda: shown.append(visitor.get("/bench/0/").text) or "alert" in shown[-1])
         assert NOBODY in shown[0]
+        visitor.post("/bench/0/acquire", port=NOBODY)
+        assert visitor.post("/bench/0/press", wish="skip", number="0").status == 503
+        assert visitor.post("/bench/0/press", wish="stop", number="0").status == 204
+        until(lambda: "Waiting for the bench" not in visitor.get("/bench/0/").text)
         assert not any('id="positions"' in page for page in shown)  # nothing to watch, ever
         assert "nobody listens there" in shown[-1]
     assert load_plan(load_submission(work)).recordings

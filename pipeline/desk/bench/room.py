@@ -208,7 +208,7 @@ def _here(ask: Ask) -> str:
 
 def _session(ask: Ask) -> Session:
     session = ask.desk.benches.of(ask.folder())
-    if session is None or not session.url:
+    if session is None:
         raise HTTPException(404, "no session was begun here")
     return session
 
