@@ -50,7 +50,12 @@ def standardised(folder, *, preset, hide, seed):
     ("preset", "hide", "seeds"),
     [
         pytest.param("throne-1dof", ["coulomb_friction"], 4, marks=pytest.mark.slow),
-        ("throne-2dof", ["coulomb_friction", "input_delay"], 2),
+        pytest.param(
+            "throne-2dof",
+            ["coulomb_friction", "input_delay"],
+            2,
+            marks=[pytest.mark.slow, pytest.mark.sample],
+        ),
     ],
 )
 def test_parameters_are_off_by_what_is_stated(tmp_path, preset, hide, seeds):

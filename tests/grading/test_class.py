@@ -82,7 +82,9 @@ def test_a_model_made_of_a_vague_table_is_no_wrong_one(seed, digits):
 @pytest.mark.parametrize(
     ("seed", "turn", "slips", "codes"),
     [
-        (72014, 6, ("peak_count", "log10_for_ln"), {"peak_count", "log10_for_ln"}),
+        pytest.param(
+            72014, 6, ("peak_count", "log10_for_ln"), {"peak_count", "log10_for_ln"}, marks=LONG
+        ),
         (73025, 0, ("hz_for_rad_s",), {"hz_for_rad_s"}),  # one resonance seen anywhere by eye
         # the seventh period, of one decay
         pytest.param(73026, 0, ("peak_count",), {"peak_count"}, marks=LONG),
