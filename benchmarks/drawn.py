@@ -50,7 +50,9 @@ def draw(seed: int, *, effects: int, sizes: tuple[float, float] = USUAL) -> Draw
         if effect.only_rest or not places:
             continue  # a constant force is looked for by the rest points, never by the search
         place = places[int(rng.integers(len(places)))]
-        term = _sized(effect, place, chain, float(np.exp(rng.uniform(*np.log(sizes)))))
+        # A limit or a stop is where it is: nearer is more, further is none.
+        mine = sizes if effect.parameters[0].neutral is not None else USUAL
+        term = _sized(effect, place, chain, float(np.exp(rng.uniform(*np.log(mine)))))
         if not any(_alike(term.effect, other.effect) for other in terms):
             terms.append(term)
     hidden = tuple((term.effect.key, term.place) for term in terms)
@@ -60,13 +62,21 @@ def draw(seed: int, *, effects: int, sizes: tuple[float, float] = USUAL) -> Draw
 def _sized(effect: Effect, place: int, chain: Chain, share: float) -> Term:
     """Return the effect with its first parameter, and what goes with it, at a share of the usual.
 
-    Two of dry friction's grow together: a static force below the sliding one is none.
+    Of what it differs by from doing nothing. Two of dry friction's grow together: a static force
+    below the sliding one is none.
     """
     values = default_values(effect, chain, place=place, travel=1.0)
     forces = [p.name for p in effect.parameters if p.unit == "input"] or [effect.names[0]]
-    forces = forces if effect.family else forces[:1]
-    sized = {name: value * share if name in forces else value for name, value in values.items()}
-    return Term(effect=effect, place=place, values=tuple(sized[name] for name in effect.names))
+    sized = set(forces if effect.family else forces[:1])
+    return Term(
+        effect=effect,
+        place=place,
+        values=tuple(
+            none + share * (values[p.name] - none) if p.name in sized else values[p.name]
+            for p in effect.parameters
+            for none in [p.neutral or 0.0]
+        ),
+    )
 
 
 def _alike(one: Effect, other: Effect) -> bool:

@@ -34,7 +34,7 @@ FIRST_SEED = 80_000
 SMALL = (0.02, 0.3)  # times the usual size: larger effects have their name from one sweep
 MORE = 2  # proposed experiments, one after the other
 OPEN = ("ambiguous", "partial")
-BUDGET = 90.0  # s that a look for the gap may take, as in an exploration
+BUDGET = 300.0  # s that a look for the gap may take, as in an exploration
 
 
 def run(seed: int) -> dict:

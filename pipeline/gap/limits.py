@@ -20,6 +20,8 @@ AS_REPEATS = 1.1
 # J. American Statistical Association 90 (1995), 773-795), and by 2 ln 150 more where the best of
 # some 150 trials is taken; by their "strong" for a law that another cart already has.
 BIC_DROP, SAME_LAW = 20.0, 6.0
+# Times that, where runs that were held out are at the noise already and cannot tell.
+ALONE = 5.0
 # Times the noise, or what repeats differ by, that a name may leave. Wide for the sake of contacts,
 # whose own law is not the model's; nine of ten names leave at most 1.02 times the noise.
 ENOUGH_NOISE, ENOUGH_REPEATS = 2.0, 1.5

@@ -36,7 +36,7 @@ from pipeline.submission.load import NAME
 from pipeline.workflow import analyse
 
 FIRST = "sweep"  # of the plan that is proposed where nothing is known: it needs no hands
-_SEARCH = 90.0  # s that a look for the gap may take
+_SEARCH = 300.0  # s that a look for the gap may take; most take ten
 # What there is to be known of carts as long as nobody has said how many there are.
 _NAMES = (
     *parameter_names(1, rigid=True),

@@ -125,8 +125,12 @@ def worth_it(child: Hypothesis, parent: Hypothesis, study: Study) -> bool:
     """Does a further effect help on runs the model has not seen?"""
     if not lowers_error(child, parent, study):
         return False
-    gain = limits.CONTACT_GAIN if parent.has_contact else limits.HELD_OUT_GAIN
     drop = limits.BIC_DROP if child.size != parent.size else limits.SAME_LAW
+    if parent.held.chi < limits.AT_FLOOR < parent.fit.chi:
+        # Held-out runs in which the effect does not show cannot speak for it; they must not speak
+        # against it, and the others tell the more clearly.
+        return child.bic < parent.bic - limits.ALONE * drop and not child.has_contact
+    gain = limits.CONTACT_GAIN if parent.has_contact else limits.HELD_OUT_GAIN
     if child.bic > parent.bic - drop or child.held.chi > gain**2 * parent.held.chi:
         return False
     better = child.held.run_chi < limits.RUN_GAIN**2 * parent.held.run_chi
