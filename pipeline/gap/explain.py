@@ -142,6 +142,7 @@ def explain_gap(
     traces = make_traces(path[0], chosen, study)
     model = chosen.fit.structure.model(chosen.fit.theta)
     enough = verdict in ("none", "named")
+    settled = enough and study.is_noise(chosen)
     left = () if enough else find_windows(chosen.fit, study.training)
     return Gap(
         verdict=verdict,
@@ -167,7 +168,7 @@ def explain_gap(
         left=left,
         complete=not deadline.cut,
         notes=tuple(notes),
-        contenders=() if enough else list_contenders(chosen, close or found),
+        contenders=() if settled else list_contenders(chosen, close or found),
     )
 
 

@@ -103,7 +103,12 @@ def test_what_the_parameters_can_take_up_is_no_difference():
     assert other.proposal is not None
     assert gap.proposal is None or gap.proposal.separation < 0.05 * other.proposal.separation
     J = np.random.default_rng(0).standard_normal((3, 2, 50))
-    assert _left(J[0].ravel() * 2 - J[2].ravel(), J) == pytest.approx(0.0, abs=1e-20)
+    difference = J[0].ravel() * 2 - J[2].ravel()
+    assert _left(difference, J, np.full(2, np.inf)) == pytest.approx(0.0, abs=1e-20)
+    # What the records before pin costs its change over its error, squared.
+    known = np.array([1e-6, np.inf])
+    assert _left(difference, J, known) == pytest.approx(_left(2 * J[0].ravel(), J[1:], known[1:]))
+    assert _left(difference, J, np.array([1e3, np.inf])) == pytest.approx((2 / 1e3) ** 2, rel=1e-3)
 
 
 def test_what_is_held_elsewhere_starts_there():
@@ -153,8 +158,9 @@ def test_a_release_says_how_far_out_and_is_drawn_from_there():
         if recording.release:
             heights.add(height)
             assert f"{height:g} from the zero" in recording.note
+            unknown = np.full(6, np.inf)
             told = _tell_apart(
-                [DRY, DRAG], recording, height, sigma=np.full(2, 1e-3), travel=LIMITS.travel
+                [DRY, DRAG], recording, height, sigma=np.full(2, 1e-3), pinned=unknown
             )
             assert told is not None
             predicted = told[3]

@@ -1,8 +1,9 @@
 """Which experiment tells two explanations apart: where they differ most, whatever either is fitted.
 
 T-optimal: what counts of the difference of two predictions is what is left of it when the other
-model's parameters, start and encoder zeros have done what they can. Of several models each pair
-counts by the product of their probabilities, which bounds the expected fall of entropy.
+model's parameters, as far as all earlier records let them go, its start and the encoders' zeros
+have done what they can. Of several models each pair counts by the product of their probabilities,
+which bounds the expected fall of entropy.
 
 References: A. C. Atkinson, V. V. Fedorov, Biometrika 62 (1975), 57-70 and 289-303; G. E. P. Box,
 W. J. Hill, Technometrics 9 (1967), 57-71.
@@ -41,13 +42,15 @@ from pipeline.submission import Submission
 Kind = Literal["step", "sweep"]
 Shape = Literal["square", "triangle", "chirp"]
 
-_PERIOD = 5e-3  # s from sample to sample
+_PERIOD = 5e-3  # s from sample to sample, of which a cycle has some
+_PER_CYCLE, _BEYOND = 10, 2.0  # … and at least so many times the highest resonance is looked to
 _TIME = 12.0  # s of a record, about
 _SIZES = (1.0, 0.5, 0.2)  # of what the limits allow: laws differ in how they grow with the motion
 _RELEASES = (0.6, 0.2)  # of the travel limit, from where a hand lets go
 _STEP = 1e-3  # relative, of an effect's parameter for a difference
 _HOPELESS = np.exp(-0.5 * CLOSE_BIC)  # of the likeliest one's weight: no contender any more
 _LEAST_WEIGHT = 0.1  # of the others: what swings overstates how sure the criterion is
+_LOOSER = 3.0  # standard errors, by which a parameter may be off: each is of one explanation
 _SAME = 1e-9  # of the largest: such a change of the parameters shows in nothing
 
 
@@ -78,13 +81,13 @@ def with_proposal(gap: Gap, *, limits: Limits, without: Sequence[Recording] = ()
     weight = np.where(weight < _HOPELESS * weight.max(), 0.0, np.maximum(weight, _LEAST_WEIGHT))
     if np.count_nonzero(weight) < 2:
         return gap
-    sigma = _noise(gap)
+    sigma, pinned = _noise(gap), _pinned(gap)
     best, most = None, 0.0
     for recording, height in _candidates(models[0].chain, limits):
         if any(recording.resembles(other) for other in without):
             continue
-        found = _tell_apart(models, recording, height, sigma=sigma, travel=limits.travel)
-        if found is None:
+        found = _tell_apart(models, recording, height, sigma=sigma, pinned=pinned)
+        if found is None or np.abs(found[3][weight > 0.0]).max() > limits.travel:
             continue
         told, t, u, predicted = found
         score = np.outer(weight, weight) * told
@@ -122,6 +125,18 @@ def _noise(gap: Gap) -> Array:
     return np.array([np.median(found.get(cart, [typical])) for cart in range(1, n + 1)])
 
 
+def _pinned(gap: Gap) -> Array:
+    """Return how far the records still let each parameter of the chain go, as `_predict` has it."""
+    chain = gap.model.chain
+    return np.array(
+        [
+            _LOOSER * gap.chain_std.get(f"{letter}_{i + 1}", np.inf)
+            for letter, values in (("m", chain.m), ("c", chain.c), ("k", chain.k))
+            for i in np.flatnonzero(values).tolist()
+        ]
+    )
+
+
 # ------------------------------------------------------------------------- what is weighed
 
 
@@ -133,8 +148,14 @@ def _candidates(chain: Chain, limits: Limits) -> Iterator[tuple[Recording, float
     resonances = np.sort(np.abs(chain.poles)) / (2 * np.pi)
     settle = rounded(settling_wait(chain, time_constants=SETTLED))
     everyone = tuple(range(1, chain.n + 1))
-    slow, low, high = (
-        rounded(float(f)) for f in (1.5 / _TIME, 0.5 * resonances[0], 1.3 * resonances[-1])
+    slow, low, high, fastest = (
+        rounded(float(f))
+        for f in (
+            1.5 / _TIME,
+            0.5 * resonances[0],
+            1.3 * resonances[-1],
+            max(_BEYOND * resonances[-1], 1 / (_PER_CYCLE * _PERIOD)),
+        )
     )
     waves: tuple[tuple[Shape, Kind, float, float | None], ...] = (
         ("square", "step", slow, None),
@@ -142,6 +163,9 @@ def _candidates(chain: Chain, limits: Limits) -> Iterator[tuple[Recording, float
         ("triangle", "sweep", slow, None),
         ("triangle", "sweep", rounded(float(resonances[0])), None),
         ("chirp", "sweep", low, high),
+        # Carts move little up there, under all that the motor gives: what is late or soft shows.
+        ("chirp", "sweep", high, fastest),
+        ("chirp", "sweep", rounded(float(np.sqrt(high * fastest))), fastest),
     )
     for wave, kind, f, end in waves:
         whole = Recording(
@@ -182,12 +206,12 @@ def _tell_apart(
     height: float,
     *,
     sigma: Array,
-    travel: float,
+    pinned: Array,
 ) -> tuple[Array, Array, Array, Array] | None:
     """Return (models, models) what separates each two, times, input and predictions.
 
-    A separation is the square sum over the noise that neither model can take up; None where a
-    model would pass the travel limit.
+    A separation is the square sum over the noise that neither model can take up; None where the
+    motion of a model cannot be had.
     """
     t, u = sampled_input(recording, period=_PERIOD)
     u = recording.amplitude * u
@@ -197,21 +221,27 @@ def _tell_apart(
     except DataError:
         return None
     predicted = np.array([x for x, _ in moved])
-    if np.abs(predicted).max() > travel:
-        return None
     free = [cart - 1 for cart in recording.carts]
     told = np.zeros((len(models), len(models)))
     for i, j in combinations(range(len(models)), 2):
         difference = ((predicted[i] - predicted[j]) / sigma[:, None])[free].ravel()
         told[i, j] = min(
-            _left(difference, (by / sigma[:, None])[:, free]) for _, by in (moved[i], moved[j])
+            _left(difference, (by / sigma[:, None])[:, free], pinned)
+            for _, by in (moved[i], moved[j])
         )
     return told, t, u, predicted
 
 
-def _left(difference: Array, by: Array) -> float:
-    """Return the square sum of a difference (n,) that changes of the parameters leave."""
+def _left(difference: Array, by: Array, pinned: Array) -> float:
+    """Return the square sum of a difference (n,) that changes of the parameters leave.
+
+    Those of the chain, the first ones, are `pinned` (n_p,) by all earlier records: a change by so
+    much costs one.
+    """
     columns = by.reshape(len(by), -1).T
+    held = np.zeros((pinned.size, len(by)))
+    np.fill_diagonal(held, 1.0 / pinned)
+    columns, difference = np.vstack([columns, held]), np.append(difference, np.zeros(pinned.size))
     size = np.linalg.norm(columns, axis=0)
     columns = columns / np.maximum(size, _SAME * size.max())
     U, s, _ = np.linalg.svd(columns, full_matrices=False)

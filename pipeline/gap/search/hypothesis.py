@@ -91,6 +91,13 @@ class Study:
         enough = max(limits.ENOUGH_NOISE * self.floor, limits.ENOUGH_REPEATS * self.repeatability)
         return hypothesis.error <= enough
 
+    def is_noise(self, hypothesis: Hypothesis) -> bool:
+        """Tell whether nothing is left: of any run, or on held-out ones beyond what repeats do."""
+        quiet = hypothesis.error < limits.NOTHING * self.floor
+        quiet = quiet and hypothesis.fit.chi < limits.AT_FLOOR
+        as_repeats = hypothesis.error < limits.AS_REPEATS * self.repeatability
+        return hypothesis.at_floor or quiet or as_repeats
+
 
 def judge(fit: Fit, study: Study, *, added: Sequence[Candidate] = ()) -> Hypothesis:
     """Return the hypothesis a fit stands for."""

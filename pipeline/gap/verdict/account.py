@@ -253,13 +253,12 @@ def _same_input(a: Run, b: Run, t_a: Array, t_b: Array) -> bool:
 def list_contenders(chosen: Hypothesis, others: Sequence[Hypothesis]) -> tuple[Contender, ...]:
     """Return the models that may be true, the chosen first, then the likeliest of the others.
 
-    One that has all effects of the chosen, or lacks some of them, is no other explanation.
+    One that lacks some effects of the chosen is no other explanation; nor is one that has more,
+    where the chosen leaves no more than noise.
     """
-    rivals = [
-        one for one in others if one.key and not (one.key <= chosen.key or one.key >= chosen.key)
-    ]
-    if not chosen.key:  # nothing is named: suspects against one another
-        rivals = [one for one in others if one.key]
+    rivals = [one for one in others if one.key and not one.key <= chosen.key]
+    if chosen.at_floor:
+        rivals = [one for one in rivals if not one.key > chosen.key]
     kept = [chosen, *sorted(rivals, key=lambda one: one.bic)[: _CONTENDERS - 1]]
     likely = np.exp(-0.5 * np.array([one.bic - min(k.bic for k in kept) for one in kept]))
     return tuple(

@@ -40,9 +40,7 @@ def reach_verdict(
     """
     baseline, chosen = steps[0], steps[-1]
     if not chosen.key:
-        least = max(limits.NOTHING * study.floor, limits.AS_REPEATS * study.repeatability)
-        nothing = baseline.at_floor or baseline.error < least
-        return ("none" if nothing else "unexplained"), steps, []
+        return ("none" if study.is_noise(chosen) else "unexplained"), steps, []
     explained = study.explains(chosen)
     gain = baseline.bic - chosen.bic
     close = [
