@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.bench.emulator.carts import TRUE_PERIOD
 from pipeline.output import write_file
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.presets import PRESETS
@@ -58,8 +59,21 @@ def draw(seed: int, *, effects: int, sizes: tuple[float, float] = USUAL) -> Draw
         term = _sized(effect, place, chain, float(np.exp(rng.uniform(*np.log(mine)))))
         if not any(_alike(term.effect, other.effect) for other in terms):
             terms.append(term)
-    hidden = tuple((term.effect.key, term.place) for term in terms)
+    hidden = tuple(counted(term.effect, term.place, term.values[0]) for term in terms)
     return Drawn(bench=replace(bench, effects=tuple(terms)), springs=springs, hidden=hidden)
+
+
+def counted(effect: Effect, place: int, value: float) -> Named:
+    """Return an effect as it counts: two that provably cannot be told apart count as one.
+
+    Of sensors only ratios show, whichever has a scale of its own; a lag much shorter than a tick of
+    the bench is a delay.
+    """
+    if effect.same_as == effect.key:
+        return effect.key, 0
+    if effect.same_as and abs(value) < effect.same_below * TRUE_PERIOD:
+        return min(effect.key, effect.same_as), place
+    return effect.key, place
 
 
 def _sized(effect: Effect, place: int, chain: Chain, share: float) -> Term:

@@ -17,14 +17,14 @@ os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
 
 import json
 
-from benchmarks.drawn import draw, run_study, wilson
+from benchmarks.drawn import counted, draw, run_study, wilson
 from pipeline.bench.design.discriminate import propose_for
 from pipeline.bench.planning.plan import Recording
 from pipeline.bench.planning.plan_file import load_plan
 from pipeline.bench.planning.propose import renamed
 from pipeline.errors import PipelineError
 from pipeline.gap.investigate import investigate
-from pipeline.gap.types import Gap
+from pipeline.gap.types import FoundEffect, Gap
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
 from tests.helpers.virtual import VirtualBench, VirtualSession
@@ -73,10 +73,18 @@ def told(gap: Gap) -> dict:
     """Return what a look says, and what it proposes."""
     return {
         "verdict": gap.verdict,
-        "found": sorted([f.effect.key, next(iter(f.where.values()), 0)] for f in gap.effects),
+        "found": sorted(
+            list(counted(f.effect, next(iter(f.where.values()), 0), first_of(f)))
+            for f in gap.effects
+        ),
         "left": round(gap.final / gap.noise_floor, 3),
         "proposed": gap.proposal and [gap.proposal.recording["id"], gap.proposal.separation],
     }
+
+
+def first_of(found: FoundEffect) -> float:
+    """Return the first parameter of an effect."""
+    return next(iter(found.parameters.values())).value
 
 
 def right(row: dict, *, after: int) -> bool:

@@ -197,6 +197,12 @@ def _candidates(chain: Chain, limits: Limits) -> Iterator[tuple[Recording, float
             yield release.model_copy(update={"note": note, "aim": "gap"}), height
 
 
+def far_sweep(chain: Chain, limits: Limits) -> Recording:
+    """Return the sweep through the resonances that swings the carts as far as they may go."""
+    every = (recording for recording, _ in _candidates(chain, limits))
+    return next(one for one in every if one.wave == "chirp").model_copy(update={"id": "sweep"})
+
+
 # ------------------------------------------------------------------------- how far apart
 
 

@@ -1,21 +1,22 @@
 """Record, identify, look for the gap, choose, record: until it is known, or time is up."""
 
 import json
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from pipeline.bench.design.discriminate import propose_for
+from pipeline.bench.design.discriminate import far_sweep, propose_for
 from pipeline.bench.design.next_plan import choose_next, known_commands
 from pipeline.bench.explore.wish import Wish
 from pipeline.bench.planning.by_hand import add_recording
-from pipeline.bench.planning.plan import Plan, Recording
+from pipeline.bench.planning.plan import Limits, Plan, Recording
 from pipeline.bench.planning.plan_file import load_plan, plan_path, save_plan
 from pipeline.bench.planning.plan_words import session_time, time_words
 from pipeline.bench.planning.propose import (
     FIRST_SWEEP_TIME,
+    FURTHEST,
     identified_chain,
     large_steps,
     propose_plan,
@@ -45,8 +46,8 @@ _NAMES = (
 # Noises: explanations that no recording sets further apart stay in dispute. In 12 s, read 200 times
 # a second, of which every tenth reading is news, the criterion would differ by 20.
 _APART = 0.3
-_HARD = 0.8  # of the step that takes the carts as far as they may go: as good as that
-_FAR_OUT = "far"  # the aim of the step that shows what acts far out
+_HARD = 0.8  # of what takes the carts as far as they may go: as good as that
+_FAR_OUT = "far"  # the aim of what shows what acts far out
 _SETTLED = ("named", "none")
 _FAILURES = 3  # recordings in a row that a bench does not carry out: it is not their choice
 
@@ -312,21 +313,33 @@ def _next(
             end = str(error)
         else:
             return found.recordings[0], found.said
-    # Once: carts that something holds back go no further the second time.
+    # Each once: carts that something holds back go no further the second time.
     recorded = {record.id for record in analysis.records}
-    made = any(r.aim == _FAR_OUT and r.id in recorded for r in plan.recordings)
-    made = made or any(r.aim == _FAR_OUT for r in refused)
-    step, _ = large_steps(identified_chain(analysis), plan.limits)
-    driven = [r.u for r in analysis.records if r.u is not None and r.kind in ("step", "sweep")]
-    hardest = max((float(np.abs(u).max()) for u in driven), default=0.0)
-    if not (made or settled):
-        return step.model_copy(update={"aim": _FAR_OUT}), "it takes the carts as far as they may go"
-    if not made and hardest < _HARD * abs(step.amplitude):
-        return step.model_copy(update={"aim": _FAR_OUT}), (
-            f"no input was above {hardest:.2g} {analysis.input_unit}, and what only a larger one "
-            "or carts further out show would not be seen"
-        )
+    tried = [*refused, *(r for r in plan.recordings if r.id in recorded)]
+    for recording, unseen, of_all in _far_out(analysis, plan.limits):
+        alike = any(recording.resembles(other) for other in tried)
+        if not alike and (unseen or not settled):
+            return recording.model_copy(update={"aim": _FAR_OUT}), unseen if settled else of_all
     return None, end
+
+
+def _far_out(analysis: Analysis, limits: Limits) -> Iterator[tuple[Recording, str, str]]:
+    """Yield what shows what acts far out, what has not been seen without it, and why else.
+
+    A step as large as the carts may rest, and a sweep that swings them to both sides.
+    """
+    chain = identified_chain(analysis)
+    driven = [r for r in analysis.records if r.u is not None and r.kind in ("step", "sweep")]
+    hardest = max((float(np.abs(r.u).max()) for r in driven), default=0.0)
+    furthest = max((float(np.abs(y).max()) for r in driven for y in r.y), default=0.0)
+    step, swing = large_steps(chain, limits)[0], far_sweep(chain, limits)
+    words = f"no input was above {hardest:.2g} {analysis.input_unit}, and what only a larger one "
+    words += "or carts further out show would not be seen"
+    of_all = "it takes the carts as far as they may go"
+    yield step, words if hardest < _HARD * abs(step.amplitude) else "", of_all
+    words = f"no cart was further out than {furthest:.2g} {analysis.position_unit}, and what acts "
+    words += "there would not be seen"
+    yield swing, words if furthest < _HARD * FURTHEST * limits.travel else "", of_all
 
 
 def _added(folder: Path, ours: Collection[str]) -> Recording | None:

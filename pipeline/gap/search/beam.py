@@ -55,7 +55,7 @@ def _grow_the_best(
                 if child.bic < parent.bic - BIC_DROP:
                     children.append(child)
         leader = min(children, key=lambda h: h.bic, default=None)
-        if leader is not None and not any(child.at_floor for child in children):
+        if leader is not None:
             for other in _exchanged(leader, seen, study):
                 seen[other.key] = other
                 if other.sound and other.bic < leader.bic:

@@ -218,12 +218,13 @@ def _simulate(
                 early = upto2 - past2 - 0.5 * h * (past + upto)
                 past, past2 = upto, upto2
                 if drive[LAG] > 0.0:
-                    decay = exp(-h / drive[LAG])
-                    target = mean
-                    mean = target + (lagged - target) * drive[LAG] / h * (1.0 - decay)
-                    before = lagged
-                    lagged = target + (lagged - target) * decay
-                    early = (before - lagged) * h * h / 12.0
+                    # Exact for the straight line that has the mean and the moment of the input.
+                    tau, slope = drive[LAG], -12.0 * early / h**3
+                    decay = exp(-h / tau)
+                    fading = lagged - mean + slope * (0.5 * h + tau)
+                    lagged = mean + slope * (0.5 * h - tau) + fading * decay
+                    mean += fading * tau / h * (1.0 - decay) - slope * tau
+                    early += fading * tau * (0.5 * h * (1.0 + decay) - tau * (1.0 - decay))
                 drive_c = 0.0
                 if drive[DRIVE_C] != 0.0:
                     while on < knots.size - 1 and knots[on + 1] <= now + 0.5 * h:
