@@ -66,8 +66,10 @@ def test_what_is_no_duration_is_refused(text):
 
 @pytest.fixture(scope="module")
 def explored(tmp_path_factory):
-    """Hidden friction on one cart, explored until it is known ten times better than at first."""
-    bench = prepare_bench(preset="throne-1dof", model=None, hide=["coulomb_friction"])
+    """Friction on one cart, and a stop far out, explored until all is known well."""
+    bench = prepare_bench(
+        preset="throne-1dof", model=None, hide=["coulomb_friction", "end_stop:position=-1.7"]
+    )
     folder = tmp_path_factory.mktemp("explored") / "work"
     said: list[str] = []
     session = VirtualSession(folder, VirtualBench(bench, seed=2))
@@ -78,18 +80,18 @@ def explored(tmp_path_factory):
 
 
 def test_an_exploration_names_what_acts_and_knows_the_carts(explored):
-    """The friction is named on its cart, every parameter is known, and as it is."""
+    """Friction and stop are named, every parameter is known, and as it is."""
     folder, turns, said, bench = explored
     last = turns[-1]
     assert last.verdict == "named"
     assert last.reached
-    assert last.recorded == ("step-3",)  # one large step shows what only such a one shows
+    assert last.recorded == ("sweep-2",)  # one that swings the cart out shows what acts there
     assert "the worst of all to ±" in last.said
     (explanation,) = last.explanations
     assert "cart 1" in explanation.name
     assert all(error is not None and error < 0.01 for error in last.errors.values())
     gap = json.loads((folder / "gap" / "gap.json").read_text(encoding="utf-8"))
-    assert gap["effects"][0]["effect"] == "coulomb_friction"
+    assert {one["effect"] for one in gap["effects"]} == {"coulomb_friction", "end_stop"}
     m = gap["chain"]["m"][0]
     assert m == pytest.approx(bench.chain.m[0], rel=0.01)
     assert said == [turn.said for turn in turns]

@@ -404,3 +404,27 @@ def test_what_stands_behind_the_last_sample_is_no_time():
         t, t, np.full(t.size, 0.02), np.array([0, t.size]), 1.0,
     )  # fmt: skip
     assert_allclose(x[0], 0.5 * (0.02 / 1e-4) * t**2, rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("key", "values"),
+    [("actuator_lag", {"time_constant": 2.8e-3}), ("input_delay", {"delay": 2.8e-3})],
+)
+def test_what_is_late_is_as_late_in_long_steps(key, values):
+    """Of a fast sweep, four ticks a step: of a lag as of a delay less than a tenth of a count."""
+    chain = Chain(m=np.array([3e-4]), c=np.array([1e-3]), k=np.array([0.05, 0.0]))
+    term = make_term(find_effect(key), place=0, values=values, chain=chain)
+    cart, spring, drive = AugmentedChain(chain=chain, terms=(term,)).tables()
+    ticks = sample_times(4000, 1e-3)
+    u = 0.16 * np.sin(2 * np.pi * (7 * ticks + 13 / 8 * ticks**2))
+    rest, free = np.zeros((1, 1, 1)), np.array([True])
+
+    def run(every: int, refine: float):
+        t = ticks[::every]
+        (x,) = simulate_batch(
+            cart[None], spring[None], drive[None], rest, rest, np.ones((1, 1)), free,
+            t, ticks, u, np.array([0, t.size]), refine,
+        )  # fmt: skip
+        return x[0]
+
+    assert np.abs(run(4, 1.0) - run(1, 64.0)[::4]).max() < 0.1 * COUNT
