@@ -66,10 +66,8 @@ def test_what_is_no_duration_is_refused(text):
 
 @pytest.fixture(scope="module")
 def explored(tmp_path_factory):
-    """Friction on one cart, and a stop far out, explored until all is known well."""
-    bench = prepare_bench(
-        preset="throne-1dof", model=None, hide=["coulomb_friction", "end_stop:position=-1.7"]
-    )
+    """A stop far out, explored until all is known well."""
+    bench = prepare_bench(preset="throne-1dof", model=None, hide=["end_stop:position=-1.7"])
     folder = tmp_path_factory.mktemp("explored") / "work"
     said: list[str] = []
     session = VirtualSession(folder, VirtualBench(bench, seed=2))
@@ -80,7 +78,7 @@ def explored(tmp_path_factory):
 
 
 def test_an_exploration_names_what_acts_and_knows_the_carts(explored):
-    """Friction and stop are named, every parameter is known, and as it is."""
+    """The stop is named on its cart, every parameter is known, and as it is."""
     folder, turns, said, bench = explored
     last = turns[-1]
     assert last.verdict == "named"
@@ -91,7 +89,7 @@ def test_an_exploration_names_what_acts_and_knows_the_carts(explored):
     assert "cart 1" in explanation.name
     assert all(error is not None and error < 0.01 for error in last.errors.values())
     gap = json.loads((folder / "gap" / "gap.json").read_text(encoding="utf-8"))
-    assert {one["effect"] for one in gap["effects"]} == {"coulomb_friction", "end_stop"}
+    assert [one["effect"] for one in gap["effects"]] == ["end_stop"]
     m = gap["chain"]["m"][0]
     assert m == pytest.approx(bench.chain.m[0], rel=0.01)
     assert said == [turn.said for turn in turns]
