@@ -168,6 +168,52 @@ def test_a_release_says_how_far_out_and_is_drawn_from_there():
     assert heights == {1.5, 0.5}
 
 
+@pytest.fixture
+def swept(tmp_path) -> Callable[[list[str]], Callable[..., Gap]]:
+    """What makes a sweep of one cart with hidden effects, and hands out what looks for its gap."""
+    folder = tmp_path / "work"
+
+    def sweep(hide: list[str]) -> Callable[..., Gap]:
+        hidden = prepare_bench(preset="throne-1dof", model=None, hide=hide)
+        bench = VirtualBench(hidden, seed=1)
+        VirtualSession(folder, bench)(["sweep"])
+
+        def look(gap: Gap | None = None) -> Gap:
+            submission = load_submission(folder)
+            if gap is not None and gap.proposal is not None:
+                proposed = Recording.model_validate_json(json.dumps(gap.proposal.recording))
+                bench.record(folder, [proposed], limits=load_plan(submission).limits)
+                submission = load_submission(folder)
+            return propose_for(investigate(analyse(submission)), submission)
+
+        return look
+
+    return sweep
+
+
+def test_an_effect_that_the_held_out_end_does_not_show_is_found_all_the_same(swept):
+    """The end of a sweep, far beyond the resonance, says nothing of a spring: nor against it."""
+    slack = "slack_spring:spring=1,stiffness_change=0.0065,stretch=-0.55"
+    gap = swept(["input_delay:delay=0.00167", slack])()
+    found = {one.effect.key for one in gap.effects}
+    assert "slack_spring" in found
+    assert found & {"input_delay", "actuator_lag"}
+
+
+def test_a_fast_sweep_tells_a_lag_from_a_delay(swept):
+    """Beside a cubic spring they are in dispute, until the cart is driven beyond its resonance."""
+    hide = ["actuator_lag:time_constant=0.0028", "cubic_spring:coefficient=0.00016"]
+    look = swept(hide)
+    gap = look()
+    assert gap.verdict == "ambiguous"
+    assert gap.proposal is not None
+    omega_n = np.abs(gap.model.chain.poles).max()
+    assert gap.proposal.recording["frequency"] > 2 * omega_n / (2 * np.pi)
+    then = look(gap)
+    assert then.verdict == "named"
+    assert {one.effect.key for one in then.effects} == {"actuator_lag", "cubic_spring"}
+
+
 def shipped(folder: Path) -> Submission:
     """The shipped two carts in a folder of their own, with a plan of these limits."""
     shutil.copytree(EXAMPLES / "two-cart", folder, dirs_exist_ok=True)
