@@ -103,6 +103,13 @@ def explain_gap(
             again = _investigate(fit, quiet, deadline)
             if not deadline.cut:
                 study, (chosen, found) = quiet, again
+        if chosen.fit.chi < limits.AT_FLOOR < chosen.held.chi and not deadline.cut:
+            # What acts in the runs held out alone no search among the others finds.
+            turned = replace(study, training=study.held_out, held_out=study.training)
+            fit = fit_model(fit, turned.training, mapper=pool.map)
+            again = _investigate(fit, turned, deadline)
+            if again[0].at_floor and not deadline.cut:
+                study, (chosen, found) = turned, again
         path = steps_to(chosen, found, study)
         with suppress(OutOfTime):
             path, judged_by = _with_offset(path, replace(study, mapper=deadline.map))
