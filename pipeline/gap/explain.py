@@ -103,7 +103,7 @@ def explain_gap(
             again = _investigate(fit, quiet, deadline)
             if not deadline.cut:
                 study, (chosen, found) = quiet, again
-        if chosen.fit.chi < limits.AT_FLOOR < chosen.held.chi and not deadline.cut:
+        if chosen.fit.chi < limits.NEAR_FLOOR**2 < chosen.held.chi and not deadline.cut:
             # What acts in the runs held out alone no search among the others finds.
             turned = replace(study, training=study.held_out, held_out=study.training)
             fit = fit_model(fit, turned.training, mapper=pool.map)
