@@ -316,30 +316,31 @@ def _next(
     # Each once: carts that something holds back go no further the second time.
     recorded = {record.id for record in analysis.records}
     tried = [*refused, *(r for r in plan.recordings if r.id in recorded)]
-    for recording, unseen, of_all in _far_out(analysis, plan.limits):
+    for recording, unseen in _far_out(analysis, plan.limits):
         alike = any(recording.resembles(other) for other in tried)
         if not alike and (unseen or not settled):
-            return recording.model_copy(update={"aim": _FAR_OUT}), unseen if settled else of_all
+            why = unseen if settled else "it takes the carts as far as they may go"
+            return recording.model_copy(update={"aim": _FAR_OUT}), why
     return None, end
 
 
-def _far_out(analysis: Analysis, limits: Limits) -> Iterator[tuple[Recording, str, str]]:
-    """Yield what shows what acts far out, what has not been seen without it, and why else.
+def _far_out(analysis: Analysis, limits: Limits) -> Iterator[tuple[Recording, str]]:
+    """Yield what shows what acts far out, with what has not been seen so far: "", all has.
 
     A step as large as the carts may rest, and a sweep that swings them to both sides.
     """
     chain = identified_chain(analysis)
-    driven = [r for r in analysis.records if r.u is not None and r.kind in ("step", "sweep")]
-    hardest = max((float(np.abs(r.u).max()) for r in driven), default=0.0)
-    furthest = max((float(np.abs(y).max()) for r in driven for y in r.y), default=0.0)
+    driven = [record for record in analysis.records if record.kind in ("step", "sweep")]
+    inputs = [float(np.abs(record.u).max()) for record in driven if record.u is not None]
+    hardest = max(inputs, default=0.0)
+    furthest = max((float(np.abs(y).max()) for record in driven for y in record.y), default=0.0)
     step, swing = large_steps(chain, limits)[0], far_sweep(chain, limits)
     words = f"no input was above {hardest:.2g} {analysis.input_unit}, and what only a larger one "
     words += "or carts further out show would not be seen"
-    of_all = "it takes the carts as far as they may go"
-    yield step, words if hardest < _HARD * abs(step.amplitude) else "", of_all
+    yield step, words if hardest < _HARD * abs(step.amplitude) else ""
     words = f"no cart was further out than {furthest:.2g} {analysis.position_unit}, and what acts "
     words += "there would not be seen"
-    yield swing, words if furthest < _HARD * FURTHEST * limits.travel else "", of_all
+    yield swing, words if furthest < _HARD * FURTHEST * limits.travel else ""
 
 
 def _added(folder: Path, ours: Collection[str]) -> Recording | None:
