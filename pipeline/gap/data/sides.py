@@ -93,11 +93,11 @@ def _with_still_carts_held(records: list[Record], *, notes: list[str]) -> list[R
 
 
 def take_sides(runs: list[Run], *, notes: list[str]) -> tuple[list[Run], list[Run]]:
-    """Return training and held-out runs; a single run is cut in time."""
+    """Return training and held-out runs; where none is to spare the longest is cut in time."""
     teach, judge_by = split(runs)
     if judge_by:
         return [runs[i] for i in teach], [runs[i] for i in judge_by]
-    notes.append("one run of each kind: the last 40 % of the longest is held out")
+    notes.append("no run to spare: the last 40 % of the longest is held out")
     longest = max(range(len(runs)), key=lambda i: runs[i].t[-1] - runs[i].t[0])
     run = runs[longest]
     cut = int((1.0 - _LAST_SHARE) * _last_motion(run))
@@ -142,7 +142,7 @@ def split(runs: Sequence[Run]) -> tuple[list[int], list[int]]:
 
     Whole runs are held out. Of repeats one goes to each side; of three sizes of a kind the middle
     one is held out, so that both extremes teach; of two free decays one. Every kind keeps one
-    run in training. Nothing is held out of a single run: cut it in time instead.
+    run in training. Nothing is held out of a single run, or of two sweeps: cut one in time instead.
     """
     groups: dict[tuple, list[int]] = defaultdict(list)
     for index, run in enumerate(runs):
@@ -167,7 +167,8 @@ def split(runs: Sequence[Run]) -> tuple[list[int], list[int]]:
             held.append(min(sizes_apart, key=lambda i: abs(sizes[i])))
         elif len(sizes_apart) == 2:
             pairs.append(sizes_apart)
-    if not held:
+    # Of two sweeps and nothing else each may pass where the other does not: both teach.
+    if not held and any(runs[i].record.kind != "sweep" for pair in pairs for i in pair):
         held = [min(pair, key=lambda i: abs(_size(runs[i]))) for pair in pairs[:1]]
     return [i for i in range(len(runs)) if i not in held], sorted(held)
 
