@@ -137,9 +137,9 @@ def explore(
         if steps and spent + session_time(steps) <= seconds:
             came = record([step.id for step in steps])
             made, spent = (*made, *came.ids), spent + came.seconds
-    analysis, gap = _look(folder, tell, progress)
     turns: list[Turn] = []
     refused: list[Recording] = []
+    analysis, gap = _look(folder, tell, progress, refused=refused)
     before, failures = "", 0
     while True:
         progress("what to record next")
@@ -168,7 +168,7 @@ def explore(
         made, spent = came.ids, spent + came.seconds
         if made:
             before, failures = "", 0
-            analysis, gap = _look(folder, tell, progress)
+            analysis, gap = _look(folder, tell, progress, refused=refused)
             continue
         refused.append(recording)
         failures = 0 if came.vetoed else failures + 1
@@ -186,7 +186,11 @@ def _first_time(folder: Path) -> float:
 
 
 def _look(
-    folder: Path, tell: Callable[[str], None], progress: Callable[[str], None]
+    folder: Path,
+    tell: Callable[[str], None],
+    progress: Callable[[str], None],
+    *,
+    refused: Sequence[Recording],
 ) -> tuple[Analysis, Gap | None]:
     """Identify the carts and look for the gap, as the data stand now; None: it cannot be."""
     submission = load_submission(folder)
@@ -196,7 +200,7 @@ def _look(
     except DataError as error:
         tell(f"the gap cannot be looked for: {error}")
         return _identified(analysis, None), None
-    gap = propose_for(gap, submission)
+    gap = propose_for(gap, submission, without=refused)
     _write_gap(gap, analysis, folder)
     return _identified(analysis, gap), gap
 
