@@ -110,6 +110,7 @@ def explain_gap(
             again = _investigate(fit, turned, deadline)
             if again[0].at_floor and not deadline.cut:
                 study, (chosen, found) = turned, again
+                notes.append("training and held-out data changed sides: only the latter showed it")
         path = steps_to(chosen, found, study)
         with suppress(OutOfTime):
             path, judged_by = _with_offset(path, replace(study, mapper=deadline.map))

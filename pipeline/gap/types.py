@@ -143,7 +143,8 @@ class Gap:
     training, held_out : ids of the runs.
     spread : learnt run-to-run spread of the dry friction, per cart, where the runs show any.
     notes : what a reader must know.
-    contenders : unless one is named: the models that may be true, the likeliest first.
+    contenders : unless one leaves no more than noise: the models that may be true, the chosen
+        first, then the likeliest.
     proposal : what to record next, as a plan has it; None where nothing was weighed.
     """
 

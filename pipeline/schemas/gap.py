@@ -148,7 +148,7 @@ class Gap(Document):
     model: Model
     contenders: Annotated[
         tuple[Contender, ...],
-        Field(description="unless one is named: models that may be true, the likeliest first"),
+        Field(description="unless only noise is left: models that may be true, the chosen first"),
     ] = ()
     notes: tuple[str, ...]
     submission: GapSubmission

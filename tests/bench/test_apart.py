@@ -313,4 +313,4 @@ def test_the_recording_is_a_plan_entry_that_can_be_recorded(proposed, tmp_path):
             analysis,
         )
     )
-    assert "tells the explanations in dispute apart best" in html
+    assert "tells best which of these acts" in html

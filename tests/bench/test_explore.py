@@ -66,7 +66,7 @@ def test_what_is_no_duration_is_refused(text):
 
 @pytest.fixture(scope="module")
 def explored(tmp_path_factory):
-    """A stop far out, explored until all is known well."""
+    """A stop far out to one side, where no step goes, explored until all is known well."""
     bench = prepare_bench(preset="throne-1dof", model=None, hide=["end_stop:position=-1.7"])
     folder = tmp_path_factory.mktemp("explored") / "work"
     said: list[str] = []

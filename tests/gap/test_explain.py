@@ -11,12 +11,14 @@ from pipeline.gap.data.runs import make_run
 from pipeline.gap.document import gap_json
 from pipeline.gap.explain import explain_gap
 from pipeline.gap.fit.levenberg_marquardt import fit_model, project
+from pipeline.gap.fit.linearise import linearise
 from pipeline.gap.fit.structure import Structure
 from pipeline.gap.search.screen import candidates_at, find_teams
 from pipeline.gap.types import Gap
 from pipeline.gap.verdict.account import repeatability
 from pipeline.plant.linear.chain import Chain
-from pipeline.plant.nonlinear.effects import CATALOGUE, find_effect
+from pipeline.plant.nonlinear.augmented import simulate_augmented
+from pipeline.plant.nonlinear.effects import CATALOGUE, AugmentedChain, find_effect, make_term
 from pipeline.results import Record
 from tests.truth.bench import Hidden, simulate_truth
 from tests.truth.cases import COUNT, make_case
@@ -406,3 +408,45 @@ def test_a_run_without_its_input_is_left_out_and_said():
 
     assert first.id not in (*gap.training, *gap.held_out)
     assert any(first.id in note for note in gap.notes)
+
+
+def _late(*, seed: int) -> Record:
+    """A driven cart on a cubic spring, whose last 40 % alone go far enough to show it."""
+    chain = Chain(m=np.array([3e-4]), c=np.array([1e-3]), k=np.array([0.05, 0.0]))
+    term = make_term(
+        find_effect("cubic_spring"), place=1, values={"coefficient": 0.004}, chain=chain
+    )
+    t = np.arange(0.0, 24.0, 5e-3)
+    early = t < 15.0
+    phase = 2 * np.pi * np.cumsum(np.where(early, 1.2, 2.0)) * 5e-3
+    u = np.where(early, 0.01, 0.06) * np.sign(np.sin(phase))
+    y = simulate_augmented(AugmentedChain(chain=chain, terms=(term,)), t, u)
+    y = y + np.random.default_rng(seed).normal(0.0, 0.001, y.shape)
+    return Record(
+        id="sweep", kind="sweep", t=t, u=u, y=COUNT * np.round(y / COUNT), carts=(1,), free=(1,),
+        resolution=(COUNT,),
+    )  # fmt: skip
+
+
+def test_what_acts_in_the_held_out_data_alone_is_found_there():
+    """Training and held-out data change sides, and it is said."""
+    gap = explain_gap([_late(seed=0)], springs=[True, False])
+    assert names(gap) == [("cubic_spring", 1)]
+    assert gap.verdict == "named"
+    assert gap.final < 1.05 * gap.noise_floor
+    assert any("changed sides" in note for note in gap.notes)
+
+
+def test_a_slope_that_is_no_number_ends_a_fit(monkeypatch):
+    """Where a parameter lets the simulation run away the fit stays where it is."""
+    module = "pipeline.gap.fit.levenberg_marquardt.linearise"
+    monkeypatch.setattr(
+        module,
+        lambda *of, **how: replace(part := linearise(*of, **how), reduced=1e200 * part.reduced),
+    )
+    run = make_run(_late(seed=0), n=1)
+    start = Structure(springs=(True, False)).start(
+        Chain(m=np.array([4e-4]), c=np.array([1e-3]), k=np.array([0.05, 0.0]))
+    )
+    fit = fit_model(start, [run], iterations=5)
+    assert np.array_equal(fit.theta, start.theta)

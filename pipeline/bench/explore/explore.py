@@ -24,6 +24,7 @@ from pipeline.bench.planning.propose import (
 from pipeline.errors import ConfigError, DataError
 from pipeline.estimation.chain.parametrisation import named_estimates
 from pipeline.gap.investigate import investigate
+from pipeline.gap.limits import NOTHING
 from pipeline.gap.stored import gap_text
 from pipeline.gap.types import Gap
 from pipeline.names import listed, parameter_names
@@ -298,16 +299,17 @@ def _next(
     refused: Sequence[Recording],
 ) -> tuple[Recording | None, str]:
     """Return what to record next and why; None where all is known, or nothing would help."""
+    named = gap is None or gap.verdict in _SETTLED
     # A name that leaves more than noise is one of its contenders still.
-    settled = gap is None or (gap.verdict in _SETTLED and not gap.contenders)
+    settled = gap is None or (named and not gap.contenders)
     commands = known_commands(folder)
-    end = "" if settled else "no recording within the limits would decide"
+    end = "" if named else "no recording within the limits would decide"
     if gap is not None and gap.proposal is not None and gap.proposal.separation > _APART:
         recording = Recording.model_validate_json(json.dumps(gap.proposal.recording))
         disputed = [_terms(one.model) for one in gap.contenders]
         names = " and ".join(f'"{disputed[i]}"' for i in gap.proposal.pair)
         return recording, (f"in it {names} differ by {gap.proposal.separation:.2g} times the noise")
-    if missing and settled:
+    if missing and named:
         worst = max(missing, key=lambda name: missing[name])
         # What is open was refused, or is the next to be chosen: it tells nothing yet.
         made = plan.model_copy(update={"recordings": ()})
@@ -321,7 +323,10 @@ def _next(
     recorded = {record.id for record in analysis.records}
     tried = [*refused, *(r for r in plan.recordings if r.id in recorded)]
     for recording, unseen in _far_out(analysis, plan.limits):
-        alike = any(recording.resembles(other) for other in tried)
+        alike = any(
+            recording.resembles(other) or (other.kind, other.aim) == (recording.kind, _FAR_OUT)
+            for other in tried
+        )
         if not alike and (unseen or not settled):
             why = unseen if settled else "it takes the carts as far as they may go"
             return recording.model_copy(update={"aim": _FAR_OUT}), why
@@ -337,13 +342,16 @@ def _far_out(analysis: Analysis, limits: Limits) -> Iterator[tuple[Recording, st
     driven = [record for record in analysis.records if record.kind in ("step", "sweep")]
     inputs = [float(np.abs(record.u).max()) for record in driven if record.u is not None]
     hardest = max(inputs, default=0.0)
-    furthest = max((float(np.abs(y).max()) for record in driven for y in record.y), default=0.0)
+    furthest = min(
+        max((float((side * y).max()) for record in driven for y in record.y), default=0.0)
+        for side in (1, -1)
+    )
     step, swing = large_steps(chain, limits)[0], far_sweep(chain, limits)
     words = f"no input was above {hardest:.2g} {analysis.input_unit}, and what only a larger one "
     words += "or carts further out show would not be seen"
     yield step, words if hardest < _HARD * abs(step.amplitude) else ""
-    words = f"no cart was further out than {furthest:.2g} {analysis.position_unit}, and what acts "
-    words += "there would not be seen"
+    words = f"no cart was further out than {furthest:.2g} {analysis.position_unit} to both sides, "
+    words += "and what acts there would not be seen"
     yield swing, words if furthest < _HARD * FURTHEST * limits.travel else ""
 
 
@@ -405,6 +413,8 @@ def _doubt_words(gap: Gap) -> str:
         case "ambiguous":
             rivals = " or ".join(one.name for one in _explanations(gap)[:2])
             return f"it may be {rivals}"
+    if gap.final < NOTHING * gap.noise_floor:
+        return "something that the runs fitted show, and the others do not, has no name"
     return f"{times} is left and has no name"
 
 

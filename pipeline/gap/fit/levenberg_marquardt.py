@@ -29,6 +29,7 @@ _SCATTER_FLOOR, _SCATTER_TOP = 0.004, 0.2
 _SCATTER_PRIOR = (3.0, 0.04)  # weight in runs, and spread, of the prior on that spread
 _NUISANCE_SCALES = (1.0, 0.3, 0.05)  # of a run's own step, where the whole one raises its cost
 _SHOWN = 3e-4  # of a column: two that differ by less differ by their difference steps
+_HUGE = 1e100  # a slope, where a parameter lets the simulation run away; its square is no number
 _DEAD = 1e-9  # of the strongest column: a weaker one is rounding
 _ANCHOR = 1e6  # standard errors per unit of log mass
 _DAMP, _RELAX, _STIFFEN, _LEAST_DAMP = 1e-3, 6.0, 6.0, 1e-9
@@ -146,7 +147,7 @@ def fit_model(
         )
         reduced = [part.reduced for part in linear]
         stacked = np.concatenate([*reduced, anchor(runs, reduced[0].shape[1] - 1)])
-        if not np.all(np.isfinite(stacked)):
+        if not np.all(np.abs(stacked) < _HUGE):
             break
         for _attempt in range(_ATTEMPTS):
             delta = _step(stacked, best.theta, low, high, reach=structure.reach(), damp=damp)

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 
+from pipeline.gap.limits import NOTHING
 from pipeline.gap.types import FoundEffect, Gap, NamedValue, RecordGap, Rival
 from pipeline.plant.nonlinear.effects.base import Effect
 from pipeline.report import limits
@@ -115,7 +116,10 @@ def _explanation(effect: Effect, where: Mapping[str, int], error: float, sizes: 
 def _unexplained(gap: Gap) -> Block:
     said = {"noise": _noise(gap), "suspicion": _suspicion(gap), **shares(gap)}
     if not gap.effects:
-        return paragraph(WORDS.spans("unexplained" if gap.complete else "undecided", **said))
+        key = "unexplained" if gap.complete else "undecided"
+        if gap.final < NOTHING * gap.noise_floor:
+            key = f"{key}_taught"
+        return paragraph(WORDS.spans(key, **said))
     suspects = listing([effect_name(found.effect, found.where) for found in gap.effects])
     are = "suspect is" if len(gap.effects) == 1 else "suspects, together, are"
     key = "suspected" if gap.complete else "suspected_so_far"
