@@ -424,7 +424,7 @@ def _late(*, seed: int) -> Record:
     y = y + np.random.default_rng(seed).normal(0.0, 0.001, y.shape)
     return Record(
         id="sweep", kind="sweep", t=t, u=u, y=COUNT * np.round(y / COUNT), carts=(1,), free=(1,),
-        resolution=(COUNT,),
+        resolution=np.array([COUNT]),
     )  # fmt: skip
 
 

@@ -61,11 +61,11 @@ def before_after_figure(trace: Trace, *, noise: float, position_unit: str) -> Fi
     return figure
 
 
-def predicted_figure(proposal: Proposal, *, names: Sequence[str], position_unit: str) -> Figure:
-    """Return what the explanations predict of a recording to come, and how far they differ."""
+def predicted_figure(proposal: Proposal, *, names: tuple[str, str], position_unit: str) -> Figure:
+    """Return what a pair of explanations predicts of a recording, and how far they differ."""
     figure, (above, below) = panels(1.5, 1.0)
     first, second = proposal.predicted[list(proposal.pair)]
-    one, other = (names[i] for i in proposal.pair)
+    one, other = names
     plot_model(above, proposal.t, first, label=one)
     plot_second(above, proposal.t, second, label=other)
     above.set_ylabel(position_label(proposal.cart, position_unit))

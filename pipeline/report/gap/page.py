@@ -6,6 +6,7 @@ from pathlib import Path
 from pipeline import __version__
 from pipeline.gap.types import FoundEffect, Gap, RecordGap, Trace
 from pipeline.gap.verdict.residual_force import ResidualForce, residual_forces
+from pipeline.plant.nonlinear.effects.base import AugmentedChain
 from pipeline.report.document import (
     Block,
     Document,
@@ -242,14 +243,9 @@ def _predicted(page: Page, gap: Gap) -> list[Block]:
             drive=page.drive,
             **{key: str(table[key]) for key in ("wave", "amplitude", "frequency")},
         )
-    names = [
-        listing([effect_name(term.effect, term.where) for term in one.model.terms])
-        or "the linear model"
-        for one in gap.contenders
-    ]
     cart = str(proposal.cart)
-    figure = predicted_figure(proposal, names=names, position_unit=page.position)
-    one, other = (names[i] for i in proposal.pair)
+    one, other = _told_apart(*(gap.contenders[i].model for i in proposal.pair))
+    figure = predicted_figure(proposal, names=(one, other), position_unit=page.position)
     hand = WORDS.text("predicted_hand", note=table["note"]) if "note" in table else ""
     caption = WORDS.text("predicted_caption", cart=cart, names=f"{one}; {other}")
     alt = WORDS.text("predicted_alt", cart=cart)
@@ -262,6 +258,19 @@ def _predicted(page: Page, gap: Gap) -> list[Block]:
         ),
         page.picture("predicted", figure, caption=caption, alt=alt),
     ]
+
+
+def _told_apart(one: AugmentedChain, other: AugmentedChain) -> tuple[str, str]:
+    """Return what either model has that the other has not, in words."""
+    mine, yours = (
+        [effect_name(term.effect, term.where) for term in model.terms] for model in (one, other)
+    )
+    apart = (
+        [name for name in mine if name not in yours],
+        [name for name in yours if name not in mine],
+    )
+    first, second = map(listing, apart)
+    return first or f"without {second}", second or f"without {first}"
 
 
 # --------------------------------------------------------------------- the model
