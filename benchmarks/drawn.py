@@ -11,10 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.bench.emulator.carts import TRUE_PERIOD
+from pipeline.ingest.read import read_data
 from pipeline.output import write_file
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.plant.nonlinear.effects import CATALOGUE, Effect, Term
+from pipeline.submission import Submission
 from pipeline.synthesis.hidden import HiddenBench, default_values, prepare_bench
 
 _SPREAD = 0.3  # of the logarithms of masses, dampings and springs about a preset's
@@ -74,6 +76,20 @@ def counted(effect: Effect, place: int, value: float) -> Named:
     if effect.same_as and abs(value) < effect.same_below * TRUE_PERIOD:
         return min(effect.key, effect.same_as), place
     return effect.key, place
+
+
+def acted(drawn: Drawn, submission: Submission) -> list[list]:
+    """Return what is hidden, sorted, without stops that no cart has come to."""
+    records = read_data(submission).records
+    missed = set()
+    for term in drawn.bench.effects:
+        if term.effect.key == "end_stop":
+            at = term.values[0]
+            positions = [r.position(term.place) for r in records if term.place in r.carts]
+            furthest = max((float(np.max(np.sign(at) * x)) for x in positions), default=0.0)
+            if furthest < abs(at):
+                missed.add((term.effect.key, term.place))
+    return sorted(list(one) for one in drawn.hidden if one not in missed)
 
 
 def _sized(effect: Effect, place: int, chain: Chain, share: float) -> Term:

@@ -20,7 +20,7 @@ import json
 
 import numpy as np
 
-from benchmarks.drawn import Drawn, counted, draw, run_study, wilson
+from benchmarks.drawn import Drawn, acted, counted, draw, run_study, wilson
 from pipeline.bench.explore.explore import Wish, explore
 from pipeline.bench.planning.plan_words import session_time
 from pipeline.bench.planning.propose import extend_plan, propose_plan
@@ -51,6 +51,7 @@ def run(seed: int) -> dict:
         except (PipelineError, AssertionError) as error:
             return row | {"ended": f"{type(error).__name__}: {error}"[:200]}
         submission = load_submission(folder)
+        row["hidden"] = acted(drawn, submission)
         # What `cartlab plan` would still record: decays by hand and dwells, no sweep and steps.
         more = extend_plan(propose_plan(submission, bench=bench.description), submission)
         gap_file = folder / "gap" / "gap.json"

@@ -17,7 +17,7 @@ os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
 
 import json
 
-from benchmarks.drawn import counted, draw, run_study, wilson
+from benchmarks.drawn import acted, counted, draw, run_study, wilson
 from pipeline.bench.design.discriminate import propose_for
 from pipeline.bench.planning.plan import Recording
 from pipeline.bench.planning.plan_file import load_plan
@@ -57,6 +57,7 @@ def run(seed: int) -> dict:
                 proposed = Recording.model_validate_json(json.dumps(gap.proposal.recording))
                 taken = [e.id for e in load_submission(folder).experiments]
                 bench.record(folder, renamed([proposed], taken=taken), limits=plan.limits)
+            row["hidden"] = acted(drawn, load_submission(folder))
         except (PipelineError, AssertionError) as error:
             row["ended"] = f"{type(error).__name__}: {error}"[:200]
     return row | {"looks": looks, "cpu": round(time.process_time() - began, 1)}

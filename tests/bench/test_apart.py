@@ -148,6 +148,10 @@ def test_a_hopeless_contender_decides_nothing():
     assert two.proposal.recording == alone.proposal.recording
     assert two.proposal.pair == (0, 1)
     assert two.proposal.separation == pytest.approx(alone.proposal.separation)
+    chosen = replace(gap.contenders[0], weight=1e-40)  # by held-out runs, against the criterion
+    against = with_proposal(replace(gap, contenders=(chosen, gap.contenders[1])), limits=LIMITS)
+    assert against.proposal is not None
+    assert against.proposal.recording == alone.proposal.recording
     swapped = (*gap.contenders[1:2], hopeless, gap.contenders[0])
     other = with_proposal(replace(gap, contenders=swapped), limits=LIMITS).proposal
     assert other is not None

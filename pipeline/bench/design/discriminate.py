@@ -79,6 +79,7 @@ def with_proposal(gap: Gap, *, limits: Limits, without: Sequence[Recording] = ()
         return gap
     weight = np.array([one.weight for one in gap.contenders])
     weight = np.where(weight < _HOPELESS * weight.max(), 0.0, np.maximum(weight, _LEAST_WEIGHT))
+    weight[0] = max(weight[0], _LEAST_WEIGHT)  # the one chosen, whatever the criterion prefers
     if np.count_nonzero(weight) < 2:
         return gap
     sigma, pinned = _noise(gap), _pinned(gap)
