@@ -10,6 +10,13 @@ import numpy as np
 from pipeline.bench.design.discriminate import far_sweep, propose_for
 from pipeline.bench.design.next_plan import choose_next, known_commands
 from pipeline.bench.explore.wish import Wish
+from pipeline.bench.explore.words import (
+    doubt_words,
+    explanations,
+    known_words,
+    model_words,
+    relative_errors,
+)
 from pipeline.bench.planning.by_hand import add_recording
 from pipeline.bench.planning.plan import Limits, Plan, Recording
 from pipeline.bench.planning.plan_file import load_plan, plan_path, save_plan
@@ -24,14 +31,12 @@ from pipeline.bench.planning.propose import (
 from pipeline.errors import ConfigError, DataError
 from pipeline.estimation.chain.parametrisation import named_estimates
 from pipeline.gap.investigate import investigate
-from pipeline.gap.limits import NOTHING
 from pipeline.gap.stored import gap_text
 from pipeline.gap.types import Gap
-from pipeline.names import listed, parameter_names
+from pipeline.names import parameter_names
 from pipeline.output import own_folder, write_file
-from pipeline.plant.nonlinear.effects.base import AugmentedChain
 from pipeline.report.exploration.page import write_diary
-from pipeline.report.exploration.turn import Explanation, Turn
+from pipeline.report.exploration.turn import Turn
 from pipeline.results import Analysis
 from pipeline.submission import load_submission
 from pipeline.submission.load import NAME
@@ -255,10 +260,10 @@ def _decide(
     ours: Collection[str],
 ) -> tuple[Turn, Recording | None]:
     """Return the turn, and the recording to make next: it stands in the plan."""
-    errors = _errors(analysis)
+    errors = relative_errors(analysis)
     missing = wish.missing(errors)
-    known = _known_words(missing, errors)
-    doubt = _doubt_words(gap) if gap else "what else acts could not be looked for"
+    known = known_words(missing, errors)
+    doubt = doubt_words(gap) if gap else "what else acts could not be looked for"
     if gap and not gap.complete:
         doubt += f" (so far: the search was ended after {_SEARCH:.0f} s)"
     recording, why = None, ""
@@ -279,7 +284,7 @@ def _decide(
             recorded=(),
             errors=errors,
             verdict=gap.verdict if gap else "",
-            explanations=_explanations(gap) if gap else (),
+            explanations=explanations(gap) if gap else (),
             left=gap.final if gap else None,
             floor=gap.noise_floor if gap else None,
             reached=not missing and gap is not None and gap.verdict in _SETTLED,
@@ -306,7 +311,7 @@ def _next(
     end = "" if named else "no recording within the limits would decide"
     if gap is not None and gap.proposal is not None and gap.proposal.separation > _APART:
         recording = Recording.model_validate_json(json.dumps(gap.proposal.recording))
-        disputed = [_terms(one.model) for one in gap.contenders]
+        disputed = [model_words(one.model) for one in gap.contenders]
         names = " and ".join(f'"{disputed[i]}"' for i in gap.proposal.pair)
         return recording, (f"in it {names} differ by {gap.proposal.separation:.2g} times the noise")
     if missing and named:
@@ -375,61 +380,3 @@ def _planned(recording: Recording, folder: Path) -> Recording:
 def _shape(recording: Recording) -> str:
     """Return what a recording is, whatever it is called."""
     return recording.model_copy(update={"id": "", "note": "", "aim": ""}).model_dump_json()
-
-
-# ------------------------------------------------------------------------------ in words
-
-
-def _errors(analysis: Analysis) -> dict[str, float | None]:
-    """Return the relative standard error of each parameter."""
-    assert analysis.fit is not None
-    return {
-        name: None if e.std is None or not e.value else float(e.std / abs(e.value))
-        for name, e in analysis.fit.parameters.items()
-    }
-
-
-def _known_words(missing: dict[str, float], errors: dict[str, float | None]) -> str:
-    """Say how well the parameters are known."""
-    if not missing:
-        worst = max((error for error in errors.values() if error is not None), default=0.0)
-        return f"every parameter asked for is known, the worst of all to ± {100 * worst:.2g} %"
-    name = max(missing, key=lambda one: missing[one])
-    if not np.isfinite(missing[name]):
-        return f"{name} is not known at all"
-    return f"{name} is known to ± {100 * missing[name]:.2g} % only"
-
-
-def _doubt_words(gap: Gap) -> str:
-    named = listed([_name(found.effect.title, found.where) for found in gap.effects])
-    times = f"{gap.final / gap.noise_floor:.2g} times the noise" if gap.noise_floor else "a gap"
-    match gap.verdict:
-        case "none":
-            return "the linear carts explain the motion down to the noise"
-        case "named":
-            return f"what else acts has a name: {named}"
-        case "partial":
-            return f"{named} is only part of the gap, {times} is left"
-        case "ambiguous":
-            rivals = " or ".join(one.name for one in _explanations(gap)[:2])
-            return f"it may be {rivals}"
-    if gap.final < NOTHING * gap.noise_floor:
-        return "something that the runs fitted show, and the others do not, has no name"
-    return f"{times} is left and has no name"
-
-
-def _explanations(gap: Gap) -> tuple[Explanation, ...]:
-    contenders = [(one.model, one.weight) for one in gap.contenders]
-    if gap.verdict == "named":
-        contenders = [(gap.model, 1.0)]
-    return tuple(Explanation(name=_terms(model), weight=weight) for model, weight in contenders)
-
-
-def _terms(model: AugmentedChain) -> str:
-    names = [_name(term.effect.title, term.where) for term in model.terms]
-    return " and ".join(names) or "the linear chain"
-
-
-def _name(title: str, where: dict[str, int]) -> str:
-    place = " ".join(f"{key} {value}" for key, value in where.items())
-    return f"{title.lower()} on {place}" if place else title.lower()
