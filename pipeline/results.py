@@ -304,3 +304,8 @@ class Analysis:
     def chain(self) -> Chain | None:
         """The identified plant."""
         return self.fit.chain if self.fit else None
+
+    @property
+    def failed_checks(self) -> tuple[Check, ...]:
+        """The checks that were not passed: each is a reason to doubt the numbers."""
+        return tuple(check for check in self.checks if check.outcome == "fail")

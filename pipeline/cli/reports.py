@@ -112,8 +112,7 @@ def report(
         from pipeline.results_json import results_text
 
         typer.echo(results_text(analysis), nl=False)
-    failed = [check for check in analysis.checks if check.outcome == "fail"]
-    if failed:
+    if analysis.failed_checks:
         raise typer.Exit(1)
 
 
@@ -180,9 +179,14 @@ def solution(
     with progress_line() as progress:
         analysis, text = make_solution(submission, out, pdf=pdf, progress=progress)
     _say_unreadable(analysis)
-    say(_wrote(out, "solution", pdf=pdf))
+    for check in analysis.failed_checks:
+        say(f"cartlab: {check.id}: {check.message}")
+    doubtful = ", doubtful as the checks above failed" if analysis.failed_checks else ""
+    say(_wrote(out, "solution", pdf=pdf) + doubtful)
     if as_json:
         typer.echo(text, nl=False)
+    if doubtful:
+        raise typer.Exit(1)
 
 
 @app.command()

@@ -69,7 +69,7 @@ def report(folder: str, *, progress: Progress) -> dict[str, Any]:
         told = {
             "questions": asked,
             "changes": changes_line(changes) if changes else "",
-            "failed": [check.message for check in analysis.checks if check.outcome == "fail"],
+            "failed": [check.message for check in analysis.failed_checks],
             "unreadable": dict(analysis.unreadable),
         }
         write_file(out / ASKED, json.dumps(told, ensure_ascii=False))

@@ -50,6 +50,13 @@ class ReferenceFeedback(Document):
     margins: Margins | None = None
 
 
+class Doubt(Document):
+    """A consistency check that failed: the numbers are no reference before it is explained."""
+
+    id: str
+    message: str
+
+
 class Solution(Document):
     """What a rubric would expect, with tolerances."""
 
@@ -58,4 +65,5 @@ class Solution(Document):
     parameters: tuple[ExpectedParameter, ...]
     state_space: ExpectedStateSpace | None
     feedback: ReferenceFeedback | None
+    doubts: tuple[Doubt, ...] = ()
     provenance: Provenance

@@ -374,3 +374,17 @@ def test_solution_json_is_the_reference_for_programs():
     assert {p["name"] for p in found["parameters"]} == {row.name for row in analysis.rows}
     assert np.shape(found["state_space"]["A_tolerance"]) == (4, 4)
     assert len(found["feedback"]["gains"]) == 4
+
+
+def test_a_reference_that_failed_a_check_says_so_where_its_numbers_stand():
+    """In the file, under the title and before the table of what is expected; else nothing."""
+    doubtful = make_analysis(2)
+    (failed,) = doubtful.failed_checks
+    sound = replace(doubtful, checks=tuple(c for c in doubtful.checks if c != failed))
+    pages = [build_solution(analysis) for analysis in (doubtful, sound)]
+    told, silent = (next(s.blocks for s in page.sections if s.id == "expected") for page in pages)
+    (doubt,) = json.loads(solution_text(doubtful))["doubts"]
+    assert doubt == {"id": failed.id, "message": failed.message}
+    assert told[2:] == silent
+    assert pages[0].subtitle.startswith(pages[1].subtitle + " · doubtful")
+    assert json.loads(solution_text(sound))["doubts"] == []

@@ -82,7 +82,7 @@ def test_what_cannot_run_is_one_line_and_status_two(tmp_path, arguments, expecte
 
 
 def test_failed_checks_are_status_one(tmp_path):
-    """A submission whose steps have a wrong scale is reported, and the exit status says so."""
+    """Steps with a wrong scale are reported, a reference of them is doubtful: both are told."""
     folder = tmp_path / "scaled"
     shutil.copytree(EXAMPLES / "one-cart", folder)
     for file in (folder / "data").glob("step-*.csv"):
@@ -96,6 +96,12 @@ def test_failed_checks_are_status_one(tmp_path):
     done = cartlab_here("report", folder, "--no-pdf", "--json")
     checks = {check["id"]: check["outcome"] for check in json.loads(done.stdout)["checks"]}
     assert checks["record.step-1"] == "fail"
+    assert done.returncode == 1
+
+    done = cartlab_here("solution", folder, "--no-pdf", "--json")
+    failed = {name for name, outcome in checks.items() if outcome == "fail"}
+    assert {doubt["id"] for doubt in json.loads(done.stdout)["doubts"]} == failed
+    assert all(f"cartlab: {name}: " in done.stderr for name in failed)
     assert done.returncode == 1
 
 

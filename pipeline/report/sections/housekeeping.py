@@ -27,9 +27,8 @@ TONES: dict[str, Tone] = {"fail": "bad", "pass": "good", "skip": "quiet"}
 
 def check_blocks(page: Page) -> list[Block]:
     """Return what failed in sight, and the rest under a line that can be opened."""
-    checks = page.analysis.checks
-    failed = [check for check in checks if check.outcome == "fail"]
-    others = [check for check in checks if check.outcome != "fail"]
+    failed = page.analysis.failed_checks
+    others = [check for check in page.analysis.checks if check not in failed]
     passed = sum(check.outcome == "pass" for check in others)
     blocks: list[Block] = []
     if failed:

@@ -219,7 +219,7 @@ def _agreement(analysis: Analysis) -> tuple[bool, Spans] | None:
 
 def _checks(analysis: Analysis) -> tuple[bool, Spans] | None:
     done = [c for c in analysis.checks if c.outcome != "skip"]
-    failed = [c for c in done if c.outcome == "fail"]
+    failed = analysis.failed_checks
     if not done:
         return None
     checks = count(len(done), "check")
@@ -317,12 +317,13 @@ def _advice(analysis: Analysis) -> Iterator[Spans]:
     """Yield what to do about each thing that is not well."""
     say, fit, design = _WORDS.spans, analysis.fit, analysis.feedback
     unreadable, left_out = list(analysis.unreadable), [o.experiment for o in analysis.left_out]
-    failed = [check for check in analysis.checks if check.outcome == "fail"]
     for key, runs in (("next_unreadable", unreadable), ("next_left_out", left_out)):
         if runs:
             more = " …" if len(runs) > _MOST_TOLD else ""
             yield say(key, runs=clean(listing(runs[:_MOST_TOLD])) + more)
-    if not (unreadable or left_out) and any(c.id.startswith(_OF_DATA) for c in failed):
+    if not (unreadable or left_out) and any(
+        c.id.startswith(_OF_DATA) for c in analysis.failed_checks
+    ):
         yield say("next_recordings")
     reasons: list[str] = []
     if fit is None and not left_out:
@@ -350,6 +351,6 @@ def _advice(analysis: Analysis) -> Iterator[Spans]:
 
 def _look_into(analysis: Analysis) -> Spans:
     """Return what is left to do where nothing asks for more."""
-    if any(check.outcome == "fail" for check in analysis.checks):
+    if analysis.failed_checks:
         return _WORDS.spans("next_checks")
     return _WORDS.spans("next_warnings" if analysis.warnings else "next_nothing")

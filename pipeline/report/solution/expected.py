@@ -9,13 +9,13 @@ from pipeline.arrays import Array
 from pipeline.names import read_name
 from pipeline.plant.linear.chain import Chain
 from pipeline.report import limits
-from pipeline.report.document import Block, bullet_list, cell, paragraph, spans
+from pipeline.report.document import Block, Span, bullet_list, cell, paragraph, spans
 from pipeline.report.equations import derivation
 from pipeline.report.equations.algebra import evaluate, work_out
 from pipeline.report.numbers import percent, significant, unit_text
 from pipeline.report.phrases import phrases
 from pipeline.report.sections.page import Page
-from pipeline.report.words import clean, name_span
+from pipeline.report.words import clean, name_span, rich
 from pipeline.results import Analysis
 from pipeline.results_json import provenance
 from pipeline.schemas import solution as schema
@@ -110,7 +110,13 @@ def expected_blocks(page: Page) -> list[Block]:
     parameters = expected_parameters(analysis)
     if not parameters or analysis.chain is None:
         return []
-    blocks: list[Block] = [
+    blocks: list[Block] = []
+    if failed := analysis.failed_checks:
+        blocks += [
+            paragraph(Span(_WORDS.text("doubtful"), "strong")),
+            bullet_list(rich(clean(check.message)) for check in failed),
+        ]
+    blocks += [
         paragraph(
             _WORDS.text(
                 "accepted",
@@ -205,6 +211,7 @@ def solution_text(analysis: Analysis) -> str:
             poles=[[pole.real, pole.imag] for pole in design.poles],
             margins=design.margins and vars(design.margins),
         ),
+        "doubts": [fields_of(schema.Doubt, check) for check in analysis.failed_checks],
         "provenance": provenance(analysis),
     }
     return json_text(content)

@@ -56,6 +56,7 @@ def build_solution(
 ) -> Document:
     """Return the report with the worked sections in the place of the short ones on the model."""
     document = build_document(analysis, gap=gap, worked=_WORKED, progress=progress)
-    return replace(
-        document, subtitle=f"Worked reference for instructors · {count(analysis.carts, 'cart')}"
-    )
+    told = ["Worked reference for instructors", count(analysis.carts, "cart")]
+    if analysis.failed_checks:
+        told.append(f"doubtful: {count(len(analysis.failed_checks), 'check')} failed")
+    return replace(document, subtitle=" · ".join(told))
