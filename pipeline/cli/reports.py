@@ -43,14 +43,17 @@ def inspect(
         data_files_in,
         format_inspection,
         format_inspections,
+        format_not_read,
         inspect_file,
     )
 
     inspections, unreadable = [], []
-    folders = [file for file in files if file.is_dir()]
-    listed = [file for file in files if file not in folders]
+    folders = [
+        file / "data" if (file / "data").is_dir() else file for file in files if file.is_dir()
+    ]
+    listed = [file for file in files if not file.is_dir()]
     for folder in folders:
-        found = data_files_in(folder / "data" if (folder / "data").is_dir() else folder)
+        found = data_files_in(folder)
         listed += found
         if not found:
             unreadable.append(f"{folder}: no data files in it")
@@ -67,7 +70,7 @@ def inspect(
         typer.echo(format_inspections(inspections))
     elif inspections:
         typer.echo("\n\n".join(format_inspection(i) for i in inspections))
-    for message in unreadable:
+    for message in (*unreadable, *filter(None, map(format_not_read, folders))):
         say(f"cartlab: {message}")
     if unreadable:
         raise typer.Exit(1 if inspections else 2)
@@ -77,6 +80,7 @@ def inspect(
 def fill(folder: Folder, as_json: AsJson = False) -> None:
     """Find out what the files in DIR/data are and write their tables into submission.toml."""
     from pipeline.ingest.fill import fill_submission, format_found
+    from pipeline.ingest.inspect import format_not_read
 
     with progress_line() as progress:
         progress("finding out what the files are")
@@ -86,7 +90,10 @@ def fill(folder: Folder, as_json: AsJson = False) -> None:
     else:
         typer.echo(format_found(found))
     left = [f for f in found if f.state in ("unknown", "broken")]
-    say(f"wrote {folder / 'submission.toml'}: springs, units and what is marked unsure are yours")
+    did = "wrote" if any(f.state in ("new", "completed") for f in found) else "nothing to add to"
+    say(f"{did} {folder / 'submission.toml'}: springs, units and what is marked unsure are yours")
+    if not_read := format_not_read(folder / "data"):
+        say(f"cartlab: {not_read}")
     if left:
         say(f"cartlab: without a table: {', '.join(f.file for f in left)}")
         raise typer.Exit(1)

@@ -18,7 +18,7 @@ from pipeline.errors import ConfigError, SubmissionError
 from pipeline.ingest import limits
 from pipeline.ingest.formats.recognise import read_table
 from pipeline.ingest.formats.table import ENDINGS
-from pipeline.ingest.inspect import Inspection, data_files_in, inspect_file
+from pipeline.ingest.inspect import Inspection, data_files_in, format_not_read, inspect_file
 from pipeline.names import by_note
 from pipeline.results_of_runs import Kind
 from pipeline.submission.edit import (
@@ -34,6 +34,7 @@ from pipeline.submission.template import write_templates
 from pipeline.submission.toml_file import Value, parse_toml
 
 _MOST_CARTS = 4
+_UNSURE = "unsure: "  # begins a comment below a table, which whoever knows better takes out
 _NO_NAME = re.compile(r"[^\w.-]+", re.ASCII)
 
 State = Literal["new", "completed", "there", "copy", "unknown", "broken"]
@@ -163,8 +164,8 @@ def fill_submission(folder: Path) -> tuple[Found, ...]:
     ]
     if not looked:
         raise ConfigError(
-            f"{folder / 'data'}: no recording in it; copy your files there (they end in "
-            f"{', '.join(ENDINGS)})"
+            f"{folder / 'data'}: no recording in it; "
+            + (format_not_read(folder / "data") or f"copy yours there ({', '.join(ENDINGS)})")
         )
     if new:
         write_templates(folder, carts=_carts_seen(looked))
@@ -221,7 +222,7 @@ class _Filling:
             full = f"not added: {MOST_EXPERIMENTS} experiments are the most"
             return replace(found, remarks=(*found.remarks, full))
         unsure = (*found.unsure, *_unsure(found, self._n))
-        append_experiment(self._document, entry, remarks=[f"unsure: {one}" for one in unsure])
+        append_experiment(self._document, entry, remarks=[_UNSURE + one for one in unsure])
         return replace(found, state="new", experiment=name, unsure=unsure)
 
     def _complete(self, table: Any, found: Found, inspection: Inspection) -> Found:
@@ -239,7 +240,8 @@ class _Filling:
             state="completed" if len(table) > before else "there",
             experiment=str(table["id"]),
             kind=table.get("kind"),
-            carts=tuple(table.get("carts", ())),
+            carts=tuple(table.get("carts", range(1, self._n + 1))),
+            unsure=_marked(table),
         )
 
     def _same(self, file: str) -> str | None:
@@ -275,8 +277,15 @@ class _Filling:
         id_ = json.dumps(free_id(PurePosixPath(found.file).stem, ()))
         kind = 'kind = ""    # decay, step, sine, sweep, closed_loop or bode?'
         self._document.add(tomlkit.nl())
-        for text in (f"unsure: {why}", "[[experiments]]", f"id = {id_}", kind, line):
+        for text in (_UNSURE + why, "[[experiments]]", f"id = {id_}", kind, line):
             self._document.add(tomlkit.comment(comment_text(text)))
+
+
+def _marked(table: Any) -> tuple[str, ...]:
+    """Return what stands marked as unsure right below a table."""
+    own = table.as_string().partition("\n\n")[0]
+    lines = [line.strip().removeprefix("# ") for line in own.splitlines()]
+    return tuple(line.removeprefix(_UNSURE) for line in lines if line.startswith(_UNSURE))
 
 
 def _unsure(found: Found, n: int) -> Iterator[str]:
@@ -324,7 +333,7 @@ def format_found(found: Sequence[Found]) -> str:
     said = by_note(
         (one.file, remark)
         for one in found
-        for remark in (*one.remarks, *(f"unsure: {unsure}" for unsure in one.unsure))
+        for remark in (*one.remarks, *(_UNSURE + unsure for unsure in one.unsure))
     )
     return "\n".join([*lines, *(f"! {remark}" for remark in said)])
 

@@ -72,12 +72,29 @@ class Inspection:
 
 def data_files_in(folder: Path) -> list[Path]:
     """Return what may hold data in a folder and those below, "2" before "10"."""
+    return [path for path in _files_in(folder) if path.suffix.casefold() in ENDINGS]
+
+
+def format_not_read(folder: Path) -> str:
+    """Return which files in a folder and those below hold no data by their names; "" none."""
+    names = [
+        path.relative_to(folder.parent).as_posix()
+        for path in _files_in(folder)
+        if path.suffix.casefold() not in ENDINGS
+    ]
+    if not names:
+        return ""
+    return (
+        f"not read: {', '.join(names)} (recordings end in {', '.join(ENDINGS)}; "
+        "save what stands in a spreadsheet as .csv)"
+    )
+
+
+def _files_in(folder: Path) -> list[Path]:
     found = [
         path
         for path in folder.rglob("*")
-        if path.suffix.casefold() in ENDINGS
-        and not path.name.startswith((".", "~"))
-        and path.is_file()
+        if not path.name.startswith((".", "~")) and path.is_file()
     ]
     return sorted(found, key=_natural)
 
@@ -108,7 +125,8 @@ def inspect_file(path: Path, *, columns: Mapping[str, str | int] = {}) -> Inspec
     except SubmissionError as error:
         assigned, unused = {}, ()
         problems.append(str(error).removeprefix(f"{table.source}: "))
-    bare = not assigned and all(name.isdigit() for name in table.names)
+    unnamed = all(name.isdigit() for name in table.names)
+    bare = not assigned and unnamed
     guessed = _suggest_columns(table) if bare else {}
     if bare:
         assigned, _ = assign_columns(table, explicit=guessed, free=(1,))
@@ -117,7 +135,7 @@ def inspect_file(path: Path, *, columns: Mapping[str, str | int] = {}) -> Inspec
             "the columns have no names: say in submission.toml which is what"
             + (f", perhaps columns = {{ {line} }}" if guessed else "")
         )
-    elif unused:
+    elif unused and not unnamed:
         problems.append(f"no role for {', '.join(unused)}: name them in `columns` to use them")
     # Without names everything else is missing too.
     further = [] if bare and not guessed else problems

@@ -1,6 +1,7 @@
 """`cartlab fill`: what the files in `data/` are, written into `submission.toml` in place."""
 
 import json
+import re
 import shutil
 import tomllib
 from pathlib import Path
@@ -19,6 +20,7 @@ from pipeline.ingest.read import read_data
 from pipeline.resources import EXAMPLES
 from pipeline.submission import load_submission, new_submission
 from pipeline.submission.edit import Outdated, append_experiment, edit_submission, text_digest
+from tests.helpers.commandline import cartlab_here
 
 T = np.arange(1200) / 150.0
 RING = np.round(300 * np.exp(-0.5 * T) * np.cos(12 * T))
@@ -63,6 +65,41 @@ def test_a_folder_of_files_becomes_a_submission(tmp_path):
     assert "# unsure: what ran: controller" in text
     assert "#[design]" in text  # of the commented file that `cartlab new` writes
     assert len(read_data(submission).records) == 4
+
+
+def test_the_second_time_as_much_is_told_as_the_first(tmp_path):
+    """Free carts and what is unsure, until somebody takes the mark out of the file."""
+    still = 0 * T
+    put(tmp_path, "pull.csv", time=T, input=still, x1=RING, x2=still)
+    put(tmp_path, "loop.csv", time=T, input=RING / 999, reference=STEP, x1=RING, x2=RING)
+    rows = np.column_stack([T, RING, STEP])
+    np.savetxt(tmp_path / "data" / "numbers.txt", rows, fmt=["%.5f", "%.0f", "%.1f"])
+    first, second = fill_submission(tmp_path), fill_submission(tmp_path)
+    assert {found.state for found in first} == {"new"}
+    assert {found.state for found in second} == {"there"}
+    for one, again in zip(first, second, strict=True):
+        assert (one.carts, one.unsure) == (again.carts, again.unsure)
+    assert sum(bool(found.unsure) for found in second) == 2
+    toml = tmp_path / "submission.toml"
+    settled = [
+        line for line in toml.read_text(encoding="utf-8").splitlines() if "unsure" not in line
+    ]
+    toml.write_text("\n".join(settled), encoding="utf-8")
+    assert not any(found.unsure for found in fill_submission(tmp_path))
+
+
+@pytest.mark.parametrize("command", ["inspect", "fill"])
+def test_what_is_no_recording_by_its_name_is_said_to_be_left_out(tmp_path, command):
+    """A spreadsheet in `data/` is named beside the files that were read; alone, too."""
+    put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
+    (tmp_path / "data" / "b.xlsx").write_bytes(b"PK")
+    done = cartlab_here(command, tmp_path)
+    assert done.returncode == 0
+    assert re.findall(r"not read: (\S+) ", done.stderr) == ["data/b.xlsx"]
+    (tmp_path / "data" / "a.csv").unlink()
+    done = cartlab_here(command, tmp_path)
+    assert done.returncode == 2
+    assert re.findall(r"not read: (\S+) ", done.stderr) == ["data/b.xlsx"]
 
 
 def test_the_exporter_s_empty_columns_are_no_carts(tmp_path):
