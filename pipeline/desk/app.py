@@ -24,6 +24,7 @@ from pipeline.desk.instructor import room as instructor
 from pipeline.desk.instructor import rubrics
 from pipeline.desk.pages import static_file
 from pipeline.desk.state import Ask, Desk, plain_error, prepare_pages
+from pipeline.desk.student import report as student_report
 from pipeline.desk.student import room as student
 from pipeline.desk.users import User, read_users
 from pipeline.errors import ConfigError, PipelineError
@@ -47,13 +48,13 @@ ROUTES: tuple[tuple[str, str, Handler], ...] = (
     ("/student/{n:int}/aside", "POST", student.aside),
     ("/student/{n:int}/save", "POST", student.save),
     ("/student/{n:int}/experiments/{index:int}", "POST", student.save_experiment),
-    ("/student/{n:int}/make-report", "POST", student.start_report),
-    ("/student/{n:int}/make-gap", "POST", student.start_gap),
-    ("/student/{n:int}/gap/{name:path}", "GET", student.gap_file),
-    ("/student/{n:int}/stop", "POST", student.stop),
-    ("/student/{n:int}/report", "GET", student.report),
-    ("/student/{n:int}/report/{name:path}", "GET", student.report_file),
-    ("/student/{n:int}/answer", "POST", student.answer),
+    ("/student/{n:int}/make-report", "POST", student_report.start_report),
+    ("/student/{n:int}/make-gap", "POST", student_report.start_gap),
+    ("/student/{n:int}/gap/{name:path}", "GET", student_report.gap_file),
+    ("/student/{n:int}/stop", "POST", student_report.stop),
+    ("/student/{n:int}/report", "GET", student_report.show),
+    ("/student/{n:int}/report/{name:path}", "GET", student_report.report_file),
+    ("/student/{n:int}/answer", "POST", student_report.answer),
     ("/student/{n:int}/hand-in.zip", "GET", student.packed),
     ("/bench/{n:int}/", "GET", bench.show),
     ("/bench/{n:int}/plan", "POST", bench.plan),
@@ -91,7 +92,7 @@ ROUTES: tuple[tuple[str, str, Handler], ...] = (
     ("/grades/{n:int}/stop", "POST", whole.stop),
 )  # fmt: skip
 # A Stop does not wait for one of the threads in which all others are answered.
-STOPS = frozenset([student.stop, bench.press, instructor.stop, whole.stop])
+STOPS = frozenset([student_report.stop, bench.press, instructor.stop, whole.stop])
 EVENTS = {"/student/{n:int}/events": Ask.folder, "/grades/{n:int}/events": Ask.grades}
 
 

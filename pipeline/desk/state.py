@@ -116,9 +116,15 @@ class Ask:
             raise HTTPException(404, "there is nothing here that is yours to see")
         return places[number]
 
+    @property
+    def here(self) -> str:
+        """The address of the room that the request is about."""
+        return "/".join(self.request.url.path.split("/")[:3]).rstrip("/") + "/"
+
+    @property
     def _room(self) -> tuple[str, str]:
-        """Return whose room the address is in, and which."""
-        return self.user.name, "/".join(self.request.url.path.split("/")[:3])
+        """Whose room the address is in, and which."""
+        return self.user.name, self.here
 
     def text(self, name: str) -> str:
         """Return a field of the form as text, "" where it is not there."""
@@ -133,6 +139,7 @@ class Ask:
             .render(
                 user=self.user,
                 path=self.request.url.path,
+                here=self.here,
                 rooms=rooms(self.user),
                 version=__version__,
                 **context,
@@ -143,12 +150,12 @@ class Ask:
     def back(self, to: str, *said: str) -> Response:
         """Return to a page, which says this once."""
         if said:
-            self.desk.said.setdefault(self._room(), []).extend(said)
+            self.desk.said.setdefault(self._room, []).extend(said)
         return RedirectResponse(to, status_code=303)
 
     def told(self) -> list[str]:
         """Return what is to be said on this page, once."""
-        return self.desk.said.pop(self._room(), [])
+        return self.desk.said.pop(self._room, [])
 
 
 def rooms(user: User) -> list[tuple[str, str]]:

@@ -204,7 +204,8 @@ class _Filling:
             if posix(str(table["file"])) == found.file:
                 return self._complete(table, found, found.inspection)
         if (same := self._same(found.file)) is not None:
-            return replace(found, state="copy", remarks=(*found.remarks, f"is a copy of {same}"))
+            told = f"is a copy of {same}, whose table is for both"
+            return replace(found, state="copy", remarks=(told,))
         if found.kind is None:
             self._say_unknown(found)
             return found

@@ -263,6 +263,17 @@ def test_the_page_says_what_the_zip_holds(filled):
     assert said() == f"It holds {NAME}, the files that it names, your notes and the report."
 
 
+def test_a_recording_dropped_under_two_names_is_said_to_be_a_copy(room):
+    """In the answer to the drop, with the one that it is a copy of; only the first has a table."""
+    visitor, folder = room
+    (name, raw), *_ = some_files(most=1)
+    visitor.upload(HERE + "files", [(name, raw), ("theirs.csv", raw)])
+    page = visitor.get(HERE)
+    assert f"data/theirs.csv: is a copy of data/{name}" in unescape(page.text)
+    assert [e.file for e in load_submission(folder).experiments] == [f"data/{name}"]
+    assert "is a copy of" not in visitor.get(HERE).text  # said once
+
+
 def test_of_a_file_that_cannot_be_read_no_columns_are_asked(filled):
     """There are none to tell; of one that can be read and tells nothing they are."""
     visitor, folder = filled
@@ -668,7 +679,7 @@ def test_a_job_whose_process_dies_says_so(filled):
 
 def test_the_gap_is_looked_for_as_a_job(filled, monkeypatch):
     """The page is that of `cartlab gap`, in the folder, and shown."""
-    monkeypatch.setattr("pipeline.desk.student.room._GAP_BUDGET", 1.0)
+    monkeypatch.setattr("pipeline.desk.student.report._GAP_BUDGET", 1.0)
     visitor, folder = filled
     assert visitor.get(HERE + "gap/gap.html").status == 404
     assert visitor.post(HERE + "make-gap").status == 303

@@ -49,14 +49,14 @@ def plan(ask: Ask) -> Response:
     folder = ask.folder()
     stock = bool(ask.text("stock"))
     ask.desk.jobs.start("plan", title="The plan", place=folder, folder=str(folder), stock=stock)
-    return ask.back(_here(ask))
+    return ask.back(ask.here)
 
 
 def start(ask: Ask) -> Response:
     """Begin to acquire what is ticked; all of the plan where nothing is."""
     only = [value for value in ask.form.getlist("only") if isinstance(value, str)]
     ask.desk.benches.start(ask.folder(), port=_port(ask), only=only)
-    return ask.back(_here(ask))
+    return ask.back(ask.here)
 
 
 def explore(ask: Ask) -> Response:
@@ -66,7 +66,7 @@ def explore(ask: Ask) -> Response:
     until, limit = f"{ask.text('what')} {error!r}%", f"{minutes!r} min"
     read_wish(until)  # what is none is said before anything begins
     ask.desk.benches.start(ask.folder(), port=_port(ask), explore=(until, limit))
-    return ask.back(_here(ask))
+    return ask.back(ask.here)
 
 
 def add(ask: Ask) -> Response:
@@ -76,7 +76,7 @@ def add(ask: Ask) -> Response:
         new = add_recording(folder, _wanted(typed, load_submission(folder)))
     except PipelineError as error:
         return _room(ask, status=422, typed=typed, refused=str(error))
-    return ask.back(_here(ask), f"{new.id} is in the plan.")
+    return ask.back(ask.here, f"{new.id} is in the plan.")
 
 
 def weigh(ask: Ask) -> Response:
@@ -105,7 +105,7 @@ def press(ask: Ask) -> Response:
     if session.ended.is_set():
         raise HTTPException(404, "the session is over")
     status = session.press(ask.text("wish"), ask.text("number"))
-    return ask.back(_here(ask)) if ask.text("plain") else Response(status_code=status)
+    return ask.back(ask.here) if ask.text("plain") else Response(status_code=status)
 
 
 def events(ask: Ask) -> Response:
@@ -137,7 +137,6 @@ def _room(
         status=status,
         title=f"{folder.name} at the bench",
         folder=folder,
-        here=_here(ask),
         session=session,
         asks=running and not running.url,
         live=Markup(live_view()) if running and running.url else "",
@@ -200,10 +199,6 @@ def _ports(ask: Ask) -> list[tuple[str, str]]:
     if not ask.user.owns:
         return [(name, name) for name in ask.user.ports]
     return [(name.partition(" (")[0], name) for name in port_names()]
-
-
-def _here(ask: Ask) -> str:
-    return f"/bench/{ask.request.path_params['n']}/"
 
 
 def _session(ask: Ask) -> Session:

@@ -32,11 +32,6 @@ _OWN = (
 _DRAWING = "sandbox; default-src 'none'; style-src 'unsafe-inline'; frame-ancestors 'none'"
 
 
-def here(ask: Ask) -> str:
-    """Return the address of the room."""
-    return "/".join(ask.request.url.path.split("/")[:3]) + "/"
-
-
 def a_class(ask: Ask) -> Class:
     """Return the class that the address is about."""
     place = ask.grades()
@@ -67,7 +62,6 @@ def show(ask: Ask) -> Response:
     return ask.page(
         "grades",
         title=shown.rubric.title or place_name(ask.grades()),
-        here=here(ask),
         teams=chosen[_ROWS * (page - 1) : _ROWS * page],
         points=points_text,
         found=len(chosen),
@@ -98,7 +92,7 @@ def news(ask: Ask) -> Response:
     """Tell which points were changed since a page was shown; nothing where nothing is new."""
     shown = a_class(ask)
     since, told = (_number(ask, name) for name in ("since", "told"))
-    answer = ask.page("news", title="", here=here(ask), news=news_of(ask, shown, since=since))
+    answer = ask.page("news", title="", news=news_of(ask, shown, since=since))
     if shown.state[1] == told:
         answer.headers["HX-Reswap"] = "none"
     return answer

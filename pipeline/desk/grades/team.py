@@ -10,7 +10,7 @@ from starlette.responses import Response
 
 from pipeline.desk.books import Class, Team
 from pipeline.desk.grades.filters import Filter
-from pipeline.desk.grades.room import a_class, a_team, drawing_response, here, news_of, signature
+from pipeline.desk.grades.room import a_class, a_team, drawing_response, news_of, signature
 from pipeline.desk.state import Ask
 from pipeline.errors import ConfigError
 from pipeline.grading.gradebook.history import event_words, to_the_second
@@ -48,7 +48,7 @@ def act(ask: Ask) -> Response:
     if what == "accept":
         wanted = Filter.read(ask.request.query_params)
         after = wanted.beside(shown, team.line.name)[1]
-        return ask.back(_address(ask, after) if after else f"{here(ask)}?{wanted.query}")
+        return ask.back(_address(ask, after) if after else f"{ask.here}?{wanted.query}")
     criterion, seen = ask.text("criterion"), ask.text("seen")
     try:
         if what == "undo":
@@ -91,7 +91,7 @@ def _page(ask: Ask, *, wrong: dict[str, str] | None = None, status: int = 200) -
     criteria = _criteria(grade, now, wrong=wrong or {}, ask=ask)
     left = []
     for file, svg in book.figures(now.entry):
-        address = f"{here(ask)}figure?{urlencode({'of': name, 'figure': file})}"
+        address = f"{ask.here}figure?{urlencode({'of': name, 'figure': file})}"
         beside = next((c for c in criteria if _shows(file, c)), None)
         place = left if beside is None else beside["figures"]
         place.append({"address": address, "alt": alternative(svg)})
@@ -99,12 +99,11 @@ def _page(ask: Ask, *, wrong: dict[str, str] | None = None, status: int = 200) -
         "team",
         status=status,
         title=name,
-        here=here(ask),
-        back=f"{here(ask)}?{Filter.read(ask.request.query_params).query}",
+        back=f"{ask.here}?{Filter.read(ask.request.query_params).query}",
         own=_address(ask, name),
         before=_address(ask, before) if before else "",
         after=_address(ask, after) if after else "",
-        feedback=here(ask) + feedback_link(name),
+        feedback=ask.here + feedback_link(name),
         grade=grade,
         points=points_text,
         seen=now.seen,
@@ -222,4 +221,4 @@ def signed(ask: Ask) -> str:
 def _address(ask: Ask, name: str) -> str:
     """Return the address of a team, from which next and previous go on as before."""
     wanted = Filter.read(ask.request.query_params).query
-    return f"{here(ask)}team?{urlencode({'of': name})}" + (f"&{wanted}" if wanted else "")
+    return f"{ask.here}team?{urlencode({'of': name})}" + (f"&{wanted}" if wanted else "")

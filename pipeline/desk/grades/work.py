@@ -10,7 +10,7 @@ from starlette.datastructures import UploadFile
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
-from pipeline.desk.grades.room import a_class, here
+from pipeline.desk.grades.room import a_class
 from pipeline.desk.grades.team import signed
 from pipeline.desk.state import Ask
 from pipeline.errors import ConfigError
@@ -42,7 +42,7 @@ def take_table(ask: Ask) -> Response:
     said = f"{count(new, 'change')} taken over" + (
         f", {unchanged} were so before" * bool(unchanged)
     )
-    return ask.back(here(ask), f"{said}.")
+    return ask.back(ask.here, f"{said}.")
 
 
 def export_class(ask: Ask) -> Response:
@@ -74,7 +74,7 @@ def publish(ask: Ask) -> Response:
     a_class(ask)
     folder = _folder(ask)
     ask.desk.jobs.start("publish", title="Writing", place=folder, folder=str(folder))
-    return ask.back(here(ask) + "#work")
+    return ask.back(ask.here + "#work")
 
 
 def regrade(ask: Ask) -> Response:
@@ -97,7 +97,7 @@ def regrade(ask: Ask) -> Response:
         lateness=typed["lateness"],
         anonymous=shown.rubric.anonymous,
     )
-    return ask.back(here(ask) + "#work")
+    return ask.back(ask.here + "#work")
 
 
 def stop(ask: Ask) -> Response:
@@ -105,7 +105,7 @@ def stop(ask: Ask) -> Response:
     a_class(ask)
     if job := ask.desk.jobs.of(_folder(ask)):
         job.stop.set()
-    return ask.back(here(ask) + "#work")
+    return ask.back(ask.here + "#work")
 
 
 def _folder(ask: Ask) -> Path:

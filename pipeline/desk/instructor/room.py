@@ -47,7 +47,6 @@ def show(ask: Ask) -> Response:
         folders=sent.get("folders", "1"),
         seed=sent.get("seed", "0"),
         reported=bool(sent.get("reported")),
-        here="/exercises/",
     )
 
 
@@ -108,7 +107,6 @@ def show_solution(ask: Ask) -> Response:
         folder=folder,
         job=ask.desk.jobs.of(folder),
         there=outside(folder, "solution/solution.html") is None,
-        here=f"/solution/{ask.request.path_params['n']}/",
     )
 
 
@@ -116,7 +114,7 @@ def make_solution(ask: Ask) -> Response:
     """Have the reference made."""
     folder = ask.folder()
     ask.desk.jobs.start("solution", title="The solution", place=folder, folder=str(folder))
-    return RedirectResponse(f"/solution/{ask.request.path_params['n']}/", status_code=303)
+    return RedirectResponse(ask.here, status_code=303)
 
 
 def solution_file(ask: Ask) -> Response:
