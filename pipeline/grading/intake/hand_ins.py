@@ -22,6 +22,7 @@ from pipeline.grading.intake.unpack import (
     STRANGE_ARCHIVES,
     is_debris,
     member_names,
+    names_in_pieces,
     unpack,
 )
 from pipeline.submission.complaints import quote
@@ -151,8 +152,8 @@ def _with_refused(
 
 def _holds_a_class(archive: Path) -> bool:
     """Tell a download of many hand-ins from the archive of one student."""
-    names = member_names(archive, limits=CLASS)
-    tops = {path.parts[0] for path in names} | {path.parts[1] for path in names if path.parts[1:]}
+    names = member_names(archive, limits=CLASS) or names_in_pieces(archive)
+    tops = {part for path in names for part in path.parts[:2]}
     return (
         sum(path.name == NAME for path in names) > 1
         or any(parse_name(top) is not None for top in tops)

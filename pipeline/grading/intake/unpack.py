@@ -12,6 +12,8 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from itertools import islice
+from mmap import ACCESS_READ, mmap
 from pathlib import Path, PurePosixPath
 from typing import IO
 
@@ -22,7 +24,11 @@ _CHUNK = 1 << 16
 _RATIO_FROM = 1_000_000  # bytes; a smaller file may be as empty as it likes
 _END_OF_ZIP = 66_000  # bytes; there a comment may stand, which is read at once
 DEEPEST = 40  # folders in folders; a submission needs three
+_AGAIN = ": send or download it once more"
 _UTF8_NAME, _ENCRYPTED = 0x800, 0x1
+# What stands before each member, up to its name (APPNOTE.TXT 4.3.7), with the name's length.
+_HEAD = 30  # bytes
+_MEMBER = re.compile(rb"PK\x03\x04.{22}(..)..", re.DOTALL)
 
 # There a colon begins a stream, a last dot is dropped, and `nul.csv` is a device.
 _NOT_ON_WINDOWS = re.compile(r'(?i)[<>:"|?*\x00-\x1f]|[. ]$|^(con|prn|aux|nul|com\d|lpt\d)(\..*)?$')
@@ -88,13 +94,14 @@ def unpack(archive: Path, into: Path, *, limits: Limits) -> dict[PurePosixPath, 
     """
     shown = quote(archive.name)
     if archive.is_file() and not archive.stat().st_size:
-        raise SubmissionError(f"{shown}: is empty (0 bytes): send or download it once more")
+        raise SubmissionError(f"{shown}: is empty (0 bytes){_AGAIN}")
     into.mkdir(parents=True)
     try:
         with _opened(archive, limits=limits) as opened:
             return _extract(opened, into, budget=_Budget(limits=limits))
     except _TROUBLE as error:
-        raise SubmissionError(f"{shown}: {_why(error)}") from None
+        again = _AGAIN if isinstance(error, zipfile.BadZipFile) else ""
+        raise SubmissionError(f"{shown}: {_why(error)}{again}") from None
 
 
 def member_names(archive: Path, *, limits: Limits = HAND_IN) -> list[PurePosixPath]:
@@ -111,6 +118,20 @@ def member_names(archive: Path, *, limits: Limits = HAND_IN) -> list[PurePosixPa
         with suppress(_Refused):
             paths.append(_path(info))
     return [path for path in paths if not is_debris(path)]
+
+
+def names_in_pieces(archive: Path) -> list[PurePosixPath]:
+    """Return the names that stand before the members of an archive whose table of contents is lost.
+
+    Those in archives within it too: enough to tell what it was, not to unpack it.
+    """
+    if not archive.is_file() or not archive.stat().st_size:
+        return []
+    with archive.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as content:
+        heads = islice(_MEMBER.finditer(content), CLASS.members)
+        ends = [(head.end(), int.from_bytes(head[1], "little")) for head in heads]
+        names = [content[at : at + length].decode(errors="replace") for at, length in ends]
+    return [PurePosixPath(name) for name in names if not name.endswith("/")]
 
 
 class _Refused(Exception):
@@ -171,6 +192,11 @@ def _opened(archive: Path, *, limits: Limits) -> Iterator[zipfile.ZipFile]:
     if size > limits.total:
         raise _TooLarge(f"{size:,} bytes, the limit is {limits.total:,}")
     with _Bounded(archive, most=limits.directory) as file, zipfile.ZipFile(file) as opened:
+        # Cut short, it may end in the table of contents of an archive within it.
+        first = min((info.header_offset for info in opened.infolist()), default=0)
+        file.seek(0)
+        if first and _MEMBER.match(file.read(_HEAD)):
+            raise zipfile.BadZipFile("its own table of contents is missing")
         yield opened
 
 

@@ -235,6 +235,24 @@ def test_one_students_zip_is_one_hand_in(tmp_path):
         opened(tmp_path, *hand_ins(tmp_path, bad))
 
 
+@pytest.mark.parametrize("packed", [False, True])
+def test_a_class_that_was_cut_short_is_refused_by_its_name(tmp_path, packed):
+    """Nobody is marked by half a download, whatever is named beside it; one hand-in has a row."""
+    teams = {f"team-{n}": {"submission.toml": TOML, "data/a.csv": "1,2\n" * 99} for n in range(4)}
+    files = {f"{team}/{name}": text for team, own in teams.items() for name, text in own.items()}
+    if packed:
+        files = {f"{team}.zip": zip_bytes(tmp_path, own) for team, own in teams.items()}
+    download = archive(tmp_path / "class.zip", files)
+    whole = download.read_bytes()
+    single = archive(tmp_path / "team-9.zip", {"submission.toml": TOML})
+    single.write_bytes(single.read_bytes()[:-30])
+    download.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ConfigError, match=r"'class\.zip': not a whole zip archive"):
+        hand_ins(tmp_path, single, download)
+    (found,) = hand_ins(tmp_path, single)
+    assert found.id == "team-9"
+
+
 def test_one_bad_hand_in_of_a_download_costs_its_own_row(tmp_path):
     """Paths that lead out, depth, a password, broken bytes: the others of the class are there."""
     download = archive(
