@@ -268,9 +268,11 @@ def export_grades(
         to = check_folder(out or (folder if folder.is_dir() else Path()))
         done = export(book, lms.value, to, title=title, roster=roster)
     for remark in done.remarks:
-        say(remark)
+        say(remark.text)
     first, *more = done.files
     say(f"wrote {first}" + (f" and {len(more)} more" if more else ""))
+    if any(remark.left_out for remark in done.remarks):
+        raise typer.Exit(1)
 
 
 @app.command()

@@ -102,8 +102,9 @@ def test_a_name_writes_nothing_over_what_is_said(run, tmp_path):
         for outcome in outcomes:
             book.put(outcome)
         book.finish(Batch(keys=tuple(o.key for o in outcomes), shared={}), rubric=two_cart_rubric())
-    _, _, err = run("export", tmp_path, "--lms", "canvas")
+    status, _, err = run("export", tmp_path, "--lms", "canvas")
     assert err.startswith("eve  [2Kbob is in a (20) and b (10): left out")
+    assert status == 1  # who has points has none in the table
 
 
 def test_a_console_of_few_letters_is_no_error(grades, monkeypatch):
@@ -129,6 +130,15 @@ def test_an_export_lies_beside_the_grades(run, grades, tmp_path, lms):
     assert "nobody is named in it, so not exported: broken" in err
     run("export", grades, "--lms", lms, "--out", tmp_path / "elsewhere", "--title", "Lab")
     assert (tmp_path / "elsewhere" / f"{lms}.csv").is_file()
+
+
+def test_an_export_that_leaves_points_out_ends_so(run, grades, tmp_path):
+    """Where the platform's table has no row for a team that has points: exit status 1."""
+    roster = tmp_path / "roster.csv"
+    roster.write_text("Student,ID,SIS User ID,Section\nDoe,7,nobody-here,A\n", encoding="utf-8")
+    status, _, err = run("export", grades, "--lms", "canvas", "--roster", roster)
+    assert "not in roster.csv, so not exported" in err
+    assert status == 1
 
 
 def test_a_class_that_nobody_could_be_graded_of(run, tmp_path):

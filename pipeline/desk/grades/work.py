@@ -65,7 +65,9 @@ def export_class(ask: Ask) -> Response:
             for file in done.files:
                 archive.write(file, file.relative_to(out).as_posix())
             if done.remarks:  # they name students, which a page need not
-                archive.writestr("remarks.txt", "\n".join(done.remarks) + "\n")
+                archive.writestr(
+                    "remarks.txt", "".join(f"{remark.text}\n" for remark in done.remarks)
+                )
     return _download(packed.getvalue(), f"{platform}.zip", kind="application/zip")
 
 

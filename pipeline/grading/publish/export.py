@@ -21,7 +21,7 @@ from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.rows import Entry
 from pipeline.grading.intake.lms_names import Platform
 from pipeline.grading.publish.roster import POINTS_POSSIBLE, Roster
-from pipeline.grading.publish.students import Student, students_of
+from pipeline.grading.publish.students import Remark, Student, students_of
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.shared import told
 from pipeline.grading.words import WORDS, points_text
@@ -36,7 +36,7 @@ class Exported:
     """What was written, and what the person who uploads it should know."""
 
     files: tuple[Path, ...]
-    remarks: tuple[str, ...]
+    remarks: tuple[Remark, ...]
 
 
 def export(
@@ -72,8 +72,10 @@ def export(
         sent = [f"{s.name} ({s.grade.submission})" for s in students if s.uploader]
         if sent:
             remarks.append(
-                "found by their authors' ids alone; with a roster also by the number in the "
-                f"file's name: {', '.join(sent)}"
+                Remark(
+                    text="found by their authors' ids alone; with a roster also by the number in "
+                    f"the file's name: {', '.join(sent)}"
+                )
             )
     elif platform == "moodle":
         text = _moodle(students, rubric, title=title)
@@ -89,7 +91,7 @@ def export(
 
 def _filled(
     roster: Roster, platform: Platform, students: Sequence[Student], rubric: Rubric, *, title: str
-) -> tuple[str, list[str]]:
+) -> tuple[str, list[Remark]]:
     """Return a platform's own table with the grades in it, and what did not fit."""
     most = points_text(rubric.out_of)
     columns: dict[str, Callable[[Student], str]]

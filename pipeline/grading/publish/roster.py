@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.errors import ConfigError
 from pipeline.grading.csv_table import read_table
 from pipeline.grading.intake.lms_names import Platform
-from pipeline.grading.publish.students import Student, one_of
+from pipeline.grading.publish.students import Remark, Student, not_exported, one_of
 from pipeline.output import csv_text
 from pipeline.submission.complaints import quote
 
@@ -90,7 +90,7 @@ class Roster:
         *,
         keep: Collection[str] | None = None,
         possible: str = "",
-    ) -> tuple[str, list[str]]:
+    ) -> tuple[str, list[Remark]]:
         """Return the table with these columns filled in, and what did not fit.
 
         Parameters
@@ -119,13 +119,14 @@ class Roster:
                     table.loc[at, titles[title]] = value(student)
         # One of the authors, who are named, handed it in.
         unmatched = [student for at, student in matched if at is None and not student.uploader]
-        twice = [s.called for s in unmatched if not shared.isdisjoint(_words(s))]
-        strangers = [s.called for s in unmatched if s.called not in twice]
-        remarks = [s.undecided for s in settled.values() if s.undecided and s not in students]
+        twice = [s for s in unmatched if not shared.isdisjoint(_words(s))]
+        strangers = [s for s in unmatched if s not in twice]
+        open_ = [s.undecided for s in settled.values() if s.undecided and s not in students]
+        remarks = [Remark(text=text, left_out=True) for text in open_]
         if twice:
-            remarks.append(f"in several rows of {self.file}, so not exported: {', '.join(twice)}")
+            remarks.append(not_exported(f"in several rows of {self.file}", twice))
         if strangers:
-            remarks.append(f"not in {self.file}, so not exported: {', '.join(strangers)}")
+            remarks.append(not_exported(f"not in {self.file}", strangers))
         reached = {student.grade.submission for several in found.values() for student in several}
         lost = dict.fromkeys(
             s.grade.submission
@@ -133,7 +134,7 @@ class Roster:
             if len(s.grade.authors) > 1 and s.grade.submission not in reached
         )
         if lost:
-            remarks.append(f"nobody of these is in {self.file}: {', '.join(lost)}")
+            remarks.append(Remark(text=f"nobody of these is in {self.file}: {', '.join(lost)}"))
         by_number = [
             f"{s.name} ({s.grade.submission})"
             for s in settled.values()
@@ -141,8 +142,10 @@ class Roster:
         ]
         if by_number:
             remarks.append(
-                "found by the number in the file's name, so the same person as one of the "
-                f"authors: {', '.join(by_number)}"
+                Remark(
+                    text="found by the number in the file's name, so the same person as one of "
+                    f"the authors: {', '.join(by_number)}"
+                )
             )
         return csv_text([*table.columns], table.itertuples(index=False)), remarks
 

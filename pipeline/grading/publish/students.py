@@ -50,6 +50,19 @@ class Student:
         return self.id or self.name or self.grade.submission
 
 
+@dataclass(frozen=True, kw_only=True)
+class Remark:
+    """What the person who uploads a table should know.
+
+    Attributes
+    ----------
+    left_out : somebody who has points has none in the table.
+    """
+
+    text: str
+    left_out: bool = False
+
+
 def one_of(several: Sequence[Student]) -> Student:
     """Return what stands for one student in several submissions.
 
@@ -68,7 +81,9 @@ def one_of(several: Sequence[Student]) -> Student:
     )
 
 
-def students_of(entries: Sequence[Entry], *, platform: Platform) -> tuple[list[Student], list[str]]:
+def students_of(
+    entries: Sequence[Entry], *, platform: Platform
+) -> tuple[list[Student], list[Remark]]:
     """Return every student once, and what to say about it."""
     found: dict[str, list[Student]] = {}
     for entry in entries:
@@ -77,14 +92,13 @@ def students_of(entries: Sequence[Entry], *, platform: Platform) -> tuple[list[S
             nameless = student.number if student.uploader else entry.submission
             found.setdefault(person(student.id) or f"\0{nameless}", []).append(student)
     students = [one_of(several) for several in found.values()]
-    remarks = [student.undecided for student in students if student.undecided]
+    remarks = [Remark(text=s.undecided, left_out=True) for s in students if s.undecided]
     strangers = [s for s in students if not (s.id or s.name or s.number)]
-    if nobodys := [s.grade.submission for s in strangers if not s.by_hand]:
-        remarks.append(f"nobody is named in it, so not exported: {', '.join(nobodys)}")
+    if nobodys := [s for s in strangers if not s.by_hand]:
+        remarks.append(not_exported("nobody is named in it", nobodys))
     if by_hand := [s.grade.submission for s in strangers if s.by_hand]:
-        remarks.append(
-            f"nobody is named in it, so exported as who its folder is called: {', '.join(by_hand)}"
-        )
+        folders = f"so exported as who its folder is called: {', '.join(by_hand)}"
+        remarks.append(Remark(text=f"nobody is named in it, {folders}"))
     students = [
         replace(s, name=s.grade.submission) if s in strangers else s
         for s in students
@@ -93,8 +107,15 @@ def students_of(entries: Sequence[Entry], *, platform: Platform) -> tuple[list[S
     blank = dict.fromkeys(s.grade.submission for s in students if not (s.points or s.undecided))
     if blank:
         where = _GRADESCOPE_BLANK if platform == "gradescope" else "left blank"
-        remarks.append(f"could not be graded, {where}: {', '.join(blank)}")
+        remarks.append(Remark(text=f"could not be graded, {where}: {', '.join(blank)}"))
     return students, remarks
+
+
+def not_exported(why: str, students: Sequence[Student]) -> Remark:
+    """Return who is in no row of a table, and why."""
+    called = ", ".join(student.called for student in students)
+    lost = any(student.points or student.undecided for student in students)
+    return Remark(text=f"{why}, so not exported: {called}", left_out=lost)
 
 
 def _students(entry: Entry, *, platform: Platform) -> list[Student]:

@@ -39,7 +39,8 @@ def write(tmp_path: Path, *outcomes, platform, roster: str = "", overrides=(), *
             options["roster"] = tmp_path / "roster.csv"
         done = export(book, platform, tmp_path / "out", **options)
     text = done.files[0].read_bytes().decode()
-    return list(csv.reader(io.StringIO(text, newline=""))), done.remarks
+    said = tuple(remark.text for remark in done.remarks)
+    return list(csv.reader(io.StringIO(text, newline=""))), said
 
 
 def test_a_grade_is_better_than_none(tmp_path):
