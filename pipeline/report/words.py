@@ -62,6 +62,11 @@ def clean(text: str) -> str:
     )
 
 
+def capital(text: str) -> str:
+    """Return a phrase as a sentence begins."""
+    return text[:1].upper() + text[1:]
+
+
 def stage_name(stage: str) -> str:
     """Return a stage's name as words."""
     return clean(stage).replace("_", " ")

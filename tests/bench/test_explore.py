@@ -184,13 +184,14 @@ def test_carts_are_identified_where_the_gap_cannot_be_looked_for(tmp_path):
 
 @pytest.mark.usefixtures("no_gap")
 def test_a_bench_on_which_nothing_comes_off_is_left_after_three_tries(tmp_path):
-    """Each time another recording is chosen; the diary says what did not come off."""
+    """Each time another recording is chosen; the diary says what did not come off, and why."""
     bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
     session, asked = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=1)), []
 
     def record(ids):
         asked.append(list(ids))
-        return session(ids) if len(asked) <= 2 else Recorded(ids=(), seconds=20.0)
+        lost = Recorded(ids=(), seconds=20.0, why="the line is silent")
+        return session(ids) if len(asked) <= 2 else lost
 
     turns = explore(
         tmp_path / "work", record=record, wish=Wish(error=1e-7), seconds=900.0, tell=lambda s: None
@@ -198,7 +199,7 @@ def test_a_bench_on_which_nothing_comes_off_is_left_after_three_tries(tmp_path):
     chosen = [ids[0] for ids in asked[2:]]
     assert len(set(chosen)) == 3
     assert [turn.said.split("; ")[0] for turn in turns[1:]] == [
-        f"{name} did not come off" for name in chosen
+        f"{name} did not come off (the line is silent)" for name in chosen
     ]
     assert not turns[-1].reached
 

@@ -46,7 +46,13 @@ def explore_bench(
         made = tuple(o.recording.id for o in outcomes if not o.partial)
         tried = [o.recording for o in outcomes if o.lines]
         skipped = any(o.partial.endswith(BY_HAND["skip"]) for o in outcomes)
-        return Recorded(ids=made, seconds=session_time(tried), vetoed=skipped and not made)
+        ends = dict.fromkeys(o.partial for o in outcomes if o.partial)
+        return Recorded(
+            ids=made,
+            seconds=session_time(tried),
+            vetoed=skipped and not made,
+            why="; then ".join(ends),
+        )
 
     def think(stage: str) -> None:
         if buttons.pressed == "stop":

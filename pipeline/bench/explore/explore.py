@@ -14,6 +14,7 @@ from pipeline.bench.explore.words import (
     doubt_words,
     explanations,
     known_words,
+    lost_words,
     model_words,
     relative_errors,
 )
@@ -67,11 +68,13 @@ class Recorded:
     ids : of what was recorded.
     seconds : that all tries took.
     vetoed : somebody at the bench did not want what is not there.
+    why : else, what became of it, as far as that is known.
     """
 
     ids: tuple[str, ...]
     seconds: float
     vetoed: bool = False
+    why: str = ""
 
 
 Record = Callable[[Sequence[str]], Recorded]
@@ -178,7 +181,7 @@ def explore(
             continue
         refused.append(recording)
         failures = 0 if came.vetoed else failures + 1
-        before = f"{recording.id} {'was vetoed' if came.vetoed else 'did not come off'}; "
+        before = lost_words(recording.id, vetoed=came.vetoed, why=came.why) + "; "
         if gap is not None:  # which recording decides is open again
             gap = propose_for(gap, load_submission(folder), without=refused)
             _write_gap(gap, analysis, folder)

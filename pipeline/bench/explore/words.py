@@ -7,6 +7,7 @@ from pipeline.gap.types import Gap
 from pipeline.names import listed
 from pipeline.plant.nonlinear.effects.base import AugmentedChain
 from pipeline.report.exploration.turn import Explanation
+from pipeline.report.gap.words import effect_name
 from pipeline.results import Analysis
 
 
@@ -32,7 +33,7 @@ def known_words(missing: dict[str, float], errors: dict[str, float | None]) -> s
 
 def doubt_words(gap: Gap) -> str:
     """Say what acts beside the linear carts, or between which explanations that is open."""
-    named = listed([_name(found.effect.title, found.where) for found in gap.effects])
+    named = listed([effect_name(found.effect, found.where) for found in gap.effects])
     times = f"{gap.final / gap.noise_floor:.2g} times the noise" if gap.noise_floor else "a gap"
     match gap.verdict:
         case "none":
@@ -50,7 +51,7 @@ def doubt_words(gap: Gap) -> str:
 
 
 def explanations(gap: Gap) -> tuple[Explanation, ...]:
-    """Return the models that may be true, with their weights; of a named gap the one."""
+    """Return the models that may be true, the chosen first; of a named gap the one."""
     contenders = [(one.model, one.weight) for one in gap.contenders]
     if gap.verdict == "named":
         contenders = [(gap.model, 1.0)]
@@ -61,10 +62,12 @@ def explanations(gap: Gap) -> tuple[Explanation, ...]:
 
 def model_words(model: AugmentedChain) -> str:
     """Return the effects of a model by name and place."""
-    names = [_name(term.effect.title, term.where) for term in model.terms]
+    names = [effect_name(term.effect, term.where) for term in model.terms]
     return " and ".join(names) or "the linear chain"
 
 
-def _name(title: str, where: dict[str, int]) -> str:
-    place = " ".join(f"{key} {value}" for key, value in where.items())
-    return f"{title.lower()} on {place}" if place else title.lower()
+def lost_words(name: str, *, vetoed: bool, why: str) -> str:
+    """Say that a recording was chosen and is not there."""
+    if vetoed:
+        return f"{name} was vetoed"
+    return f"{name} did not come off" + (f" ({why})" if why else "")

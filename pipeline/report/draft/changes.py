@@ -13,7 +13,7 @@ from pipeline.report.document import Block, Cell, Span, bullet_list, cell, parag
 from pipeline.report.numbers import NOTHING, count, percent, significant, unit_text, with_error
 from pipeline.report.sections.housekeeping import OUTCOMES, TONES
 from pipeline.report.sections.page import Page
-from pipeline.report.words import clean, name_span, rich
+from pipeline.report.words import capital, clean, name_span, rich
 from pipeline.results import Analysis
 from pipeline.results_json import results_dict
 from pipeline.schemas.base import plain_json
@@ -231,7 +231,7 @@ def change_blocks(page: Page, changes: DraftChanges | None) -> list[Block]:
     if changes is None:
         return []
     line = changes_line(changes)
-    blocks: list[Block] = [paragraph(rich(line[:1].upper() + line[1:] + "."))]
+    blocks: list[Block] = [paragraph(rich(capital(line) + "."))]
     if changes.versions[0] != changes.versions[1]:
         blocks.append(
             paragraph(

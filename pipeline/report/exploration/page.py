@@ -13,11 +13,12 @@ from pipeline.report.figures.style import QUIET, SECOND, legend_above, panels
 from pipeline.report.phrases import phrases
 from pipeline.report.render.html import render_html
 from pipeline.report.sections.page import Page
-from pipeline.report.words import clean, name_span, rich, symbol_text
+from pipeline.report.words import capital, clean, name_span, rich, symbol_text
 from pipeline.results import Analysis
 
 NAME = "exploration.html"
 _WORDS = phrases("exploration")
+_LEAST = 0.01  # of a weight that is told as a number
 
 
 def write_diary(turns: Sequence[Turn], analysis: Analysis, folder: Path, *, wanted: float) -> Path:
@@ -97,6 +98,20 @@ def _shrinking(turns: Sequence[Turn], names: Sequence[str], wanted: float) -> Fi
     return figure
 
 
+def _explained(turn: Turn) -> list[str]:
+    """Return each explanation in dispute with its weight; of one alone there is none to tell."""
+    if len(turn.explanations) < 2:
+        return [one.name for one in turn.explanations]
+    weights = [
+        f"{100 * one.weight:.0f} %" if one.weight >= _LEAST else f"under {100 * _LEAST:.0f} %"
+        for one in turn.explanations
+    ]
+    weights[0] = f"in the model, {weights[0]}"
+    return [
+        f"{one.name} ({weight})" for one, weight in zip(turn.explanations, weights, strict=True)
+    ]
+
+
 def _gap(page: Page, turns: Sequence[Turn]) -> list[Block]:
     """Show what the model leaves, and between which explanations the data were undecided."""
     looked = [turn for turn in turns if turn.left is not None and turn.floor is not None]
@@ -116,7 +131,7 @@ def _gap(page: Page, turns: Sequence[Turn]) -> list[Block]:
         [
             cell(f"{turn.seconds:.0f} s"),
             cell(turn.verdict),
-            cell("; ".join(f"{one.name} ({100 * one.weight:.0f} %)" for one in turn.explanations)),
+            cell(capital("; ".join(_explained(turn)))),
         ]
         for turn in looked
     ]

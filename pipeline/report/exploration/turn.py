@@ -21,7 +21,8 @@ class Turn:
     recorded : ids of the recordings made in this turn.
     errors : relative standard error of each named parameter, by name; None where it has none.
     verdict : of the gap; "" where it could not be looked for.
-    explanations : in dispute, or the one that is named; none where the linear chain does.
+    explanations : in dispute, that of the model first, or the one that is named; none where the
+        linear chain does.
     left, floor : what the model leaves of the motion, and what noise alone would.
     reached : all that was asked for is known, and what else acts has a name or is not there.
     said : what is known, what is doubted and why the next recording is made, in one sentence.

@@ -30,7 +30,6 @@ from pipeline.report.gap.tables import (
 )
 from pipeline.report.gap.words import (
     WORDS,
-    capital,
     contenders,
     effect_name,
     error_board,
@@ -46,7 +45,7 @@ from pipeline.report.render.write import write_document
 from pipeline.report.sections.housekeeping import provenance_blocks
 from pipeline.report.sections.page import Page, Part, left_out, remarks
 from pipeline.report.sections.parameters import chain_table
-from pipeline.report.words import clean
+from pipeline.report.words import capital, clean
 from pipeline.results import Analysis
 
 _MOST_ROWS = 28  # runs in the overview; the JSON has all

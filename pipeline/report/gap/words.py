@@ -10,7 +10,7 @@ from pipeline.report import limits
 from pipeline.report.document import Block, Spans, Tile, Tiles, Tone, bullet_list, paragraph, spans
 from pipeline.report.numbers import count, listing, significant, unit_text, with_error
 from pipeline.report.phrases import phrases
-from pipeline.report.words import clean, plain_lines
+from pipeline.report.words import capital, clean, plain_lines
 
 WORDS = phrases("gap")
 
@@ -230,8 +230,3 @@ def share(value: float) -> str:
     """Return a share of the motion in percent, with as many digits as matter."""
     digits = 3 if value >= 0.0995 else 2
     return f"{significant(100 * value, digits=digits)} %"
-
-
-def capital(text: str) -> str:
-    """Return a phrase as a sentence begins."""
-    return text[:1].upper() + text[1:]
