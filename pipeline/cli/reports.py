@@ -146,18 +146,15 @@ def run_report(
         analysis, changes = make_report(
             submission, out, compared=compared, pdf=pdf, tables=tables, progress=progress
         )
-    say(terminal_summary(analysis))
-    _say_unreadable(analysis)
-    for line in (changes and changes_line(changes), open_line(analysis)):
-        if line:
-            say(line)
+    said = (changes and changes_line(changes), open_line(analysis))
+    for line in (terminal_summary(analysis), *_unreadable(analysis), *filter(None, said)):
+        say(line)
     say(_wrote(out, "report", pdf=pdf))
     return analysis
 
 
-def _say_unreadable(analysis: "Analysis") -> None:
-    for name, reason in analysis.unreadable.items():
-        say(f"cartlab: {name}: {reason}")
+def _unreadable(analysis: "Analysis") -> list[str]:
+    return [f"cartlab: {name}: {reason}" for name, reason in analysis.unreadable.items()]
 
 
 def _comparison(earlier: Path | None) -> "Callable[[Analysis], DraftChanges | None]":
@@ -185,9 +182,9 @@ def solution(
     out = check_folder(out) if out else own_folder(submission.folder, "solution")
     with progress_line() as progress:
         analysis, text = make_solution(submission, out, pdf=pdf, progress=progress)
-    _say_unreadable(analysis)
-    for check in analysis.failed_checks:
-        say(f"cartlab: {check.id}: {check.message}")
+    failed = [f"cartlab: {check.id}: {check.message}" for check in analysis.failed_checks]
+    for line in (*_unreadable(analysis), *failed):
+        say(line)
     doubtful = ", doubtful as the checks above failed" if analysis.failed_checks else ""
     say(_wrote(out, "solution", pdf=pdf) + doubtful)
     if as_json:
@@ -213,6 +210,23 @@ def gap(
     as_json: AsJson = False,
 ) -> None:
     """Find what the linear model leaves out, name it, and show the gap shrink on held-out runs."""
+    with progress_line() as progress:
+        text, told = explain(folder, out=out, budget=budget, pdf=pdf, progress=progress)
+    for line in told:
+        say(line)
+    if as_json:
+        typer.echo(text, nl=False)
+
+
+def explain(
+    folder: Path,
+    *,
+    out: Path | None,
+    budget: float,
+    pdf: bool = True,
+    progress: Callable[[str], None],
+) -> tuple[str, list[str]]:
+    """Write what a submission's linear model leaves out; return gap.json and what is to be said."""
     from pipeline.gap.stored import gap_text
     from pipeline.output import check_folder, own_folder, write_file
     from pipeline.report.gap.page import render_gap
@@ -222,22 +236,17 @@ def gap(
 
     submission = load_submission(folder)
     out = check_folder(out) if out else own_folder(submission.folder, "gap")
-    with progress_line() as progress:
-        analysis = analyse(submission, design=False, progress=progress)
-        from pipeline.bench.design.discriminate import propose_for  # load the …
-        from pipeline.gap.investigate import investigate  # … compiled simulator
+    analysis = analyse(submission, design=False, progress=progress)
+    from pipeline.bench.design.discriminate import propose_for  # load the …
+    from pipeline.gap.investigate import investigate  # … compiled simulator
 
-        found = investigate(analysis, budget=budget, progress=progress)
-        progress("weighing what to record next")
-        found = propose_for(found, submission)
-        out.mkdir(parents=True, exist_ok=True)
-        write_file(out / "gap.json", text := gap_text(found, analysis))
-        render_gap(found, analysis, out, pdf=pdf, progress=progress)
-    _say_unreadable(analysis)
-    say(terminal_verdict(found))
-    say(_wrote(out, "gap", pdf=pdf))
-    if as_json:
-        typer.echo(text, nl=False)
+    found = investigate(analysis, budget=budget, progress=progress)
+    progress("weighing what to record next")
+    found = propose_for(found, submission)
+    out.mkdir(parents=True, exist_ok=True)
+    write_file(out / "gap.json", text := gap_text(found, analysis))
+    render_gap(found, analysis, out, pdf=pdf, progress=progress)
+    return text, [*_unreadable(analysis), terminal_verdict(found), _wrote(out, "gap", pdf=pdf)]
 
 
 def _wrote(out: Path, name: str, *, pdf: bool) -> str:

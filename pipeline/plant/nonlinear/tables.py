@@ -67,14 +67,22 @@ NO_LIMIT = 1e30  # a saturation nobody reaches
 Tables = tuple[Array, Array, Array]
 
 
+def _neutral(of: type[IntEnum], values: dict[int, float]) -> Array:
+    row = np.zeros(len(of))
+    row[list(values)] = list(values.values())
+    row.flags.writeable = False
+    return row
+
+
+# Divisors and factors have a neutral value that is not zero.
+_CART = _neutral(Cart, {Cart.STRIBECK: 1.0, Cart.DISTANCE: 1.0, Cart.GAIN: 1.0})
+_SPRING = _neutral(Spring, {})
+_DRIVE = _neutral(Drive, {Drive.LIMIT: NO_LIMIT, Drive.PITCH: 1.0})
+
+
 def linear_tables(chain: Chain) -> Tables:
     """Return cart (n, 17), spring (n + 1, 5) and drive (12,) tables of a chain without effects."""
-    cart = np.zeros((chain.n, len(Cart)))
-    spring = np.zeros((chain.n + 1, len(Spring)))
-    drive = np.zeros(len(Drive))
+    cart, spring = np.tile(_CART, (chain.n, 1)), np.tile(_SPRING, (chain.n + 1, 1))
     cart[:, Cart.MASS], cart[:, Cart.DAMPING] = chain.m, chain.c
-    # Divisors and factors whose neutral value is not zero.
-    cart[:, [Cart.STRIBECK, Cart.DISTANCE, Cart.GAIN]] = 1.0
     spring[:, Spring.STIFFNESS] = chain.k
-    drive[Drive.LIMIT], drive[Drive.PITCH] = NO_LIMIT, 1.0
-    return cart, spring, drive
+    return cart, spring, _DRIVE.copy()

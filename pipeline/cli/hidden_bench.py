@@ -1,0 +1,25 @@
+"""The demonstration's bench: friction hidden in it, and found; `python -m` makes it apart."""
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from pipeline.cli.reports import explain
+
+_BUDGET = 600.0  # s: whatever else the machine does, a demonstration ends with the whole answer
+
+
+def find_hidden(out: Path, *, progress: Callable[[str], None]) -> list[str]:
+    """Write a bench that hides friction and what explains it; return what is to be said."""
+    from pipeline.synthesis.hidden import prepare_bench, write_bench
+
+    hidden, folder = prepare_bench(preset="throne-2dof", hide=["coulomb_friction"]), out / "bench"
+    if not (folder / "submission.toml").exists():
+        write_bench(folder, hidden, seed=0)
+    _, told = explain(folder, out=out / "gap", budget=_BUDGET, progress=progress)
+    return [*(f"hidden: {sentence}" for sentence in hidden.told), *told]
+
+
+if __name__ == "__main__":
+    json.dump(find_hidden(Path(sys.argv[1]), progress=lambda _: None), sys.stdout)
