@@ -29,8 +29,9 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # which shares the machine with others
 
 # The same examples every time, and no verdict on how fast a busy machine is.
 settings.register_profile(
-    "cartlab", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
-)
+    "cartlab", deadline=None, derandomize=True, max_examples=50,
+    suppress_health_check=[HealthCheck.too_slow],
+)  # fmt: skip
 settings.load_profile("cartlab")
 
 CHROMIUM = shutil.which("chromium")
@@ -124,6 +125,14 @@ def _patient_host() -> Iterator[None]:
         for module in ("session", "serial_line"):
             patch.setattr(f"pipeline.bench.host.{module}.FIRST_LINE", 5.0)
         yield
+
+
+@pytest.fixture
+def work_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Desks do their work in this process, not in others."""
+    from tests.helpers.desks import WorkerHere
+
+    monkeypatch.setattr("pipeline.desk.jobs.LineProcess", WorkerHere)
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ import os
 import queue
 import sys
 import threading
+from collections.abc import Callable
 from typing import Any
 
 from pipeline.desk.jobs import MEMORY
@@ -33,15 +34,20 @@ def main() -> None:
         answers.flush()
 
     while True:
-        name, given = json.loads(tasks.get())
-        try:
-            say(done=TASKS[name](**given, progress=lambda stage: say(stage=stage)))
-        except PipelineError as error:
-            say(failed=str(error))
-        except MemoryError:
-            say(failed="needs more memory than allowed")
-        except OSError as error:
-            say(failed=f"{error.filename or ''}: {error.strerror or error}".lstrip(": "))
+        answer(tasks.get(), say)
+
+
+def answer(task: bytes, say: Callable[..., None]) -> None:
+    """Do a task and say the lines about it."""
+    name, given = json.loads(task)
+    try:
+        say(done=TASKS[name](**given, progress=lambda stage: say(stage=stage)))
+    except PipelineError as error:
+        say(failed=str(error))
+    except MemoryError:
+        say(failed="needs more memory than allowed")
+    except OSError as error:
+        say(failed=f"{error.filename or ''}: {error.strerror or error}".lstrip(": "))
 
 
 def _listen(tasks: "queue.SimpleQueue[bytes]") -> None:

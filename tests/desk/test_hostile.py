@@ -10,7 +10,6 @@ from tests.helpers.desks import Visitor
 from tests.helpers.hostile import SECRET, write_hostile
 from tests.helpers.places import ROOT
 
-_MARKUP = re.compile(r"<script(?! src=\"/static/)|<img|<iframe(?! class)")
 _OURS = re.compile(r"\.turn|data/[^/]+|submission\.toml|notes\.md|\.lock")
 
 

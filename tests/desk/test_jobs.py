@@ -1,15 +1,20 @@
 """Work in processes of its own: nobody waits for another's, and what became of it is said."""
 
+import re
 import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 
+import psutil
 import pytest
 
 from pipeline.desk.app import DeskServer
 from pipeline.desk.jobs import _HANDS, _WAITING, Busy, Failed, Hand, Jobs
-from tests.helpers.desks import Visitor, a_submission
+from tests.helpers.desks import Visitor, a_submission, some_files, wrongs
 from tests.helpers.waiting import until
+
+HERE = "/student/0/"
 
 
 @pytest.fixture
@@ -46,6 +51,7 @@ def test_a_slow_folder_is_waited_for_by_who_looks_at_it_only(tmp_path):
         thread.join()
 
 
+@pytest.mark.usefixtures("work_here")
 def test_a_stop_waits_for_no_thread(tmp_path):
     """Where all that answer are busy, a page waits, and a Stop does not."""
     folder = a_submission(tmp_path / "team")
@@ -92,3 +98,84 @@ def test_one_thing_at_a_time_in_a_folder(tmp_path, jobs):
     job.stop.set()
     until(lambda: job.over)
     assert jobs.start("solution", title="The solution", **given) is not job
+
+
+def test_a_job_survives_a_reload_is_stopped_or_dies_and_tells_its_stages(tmp_path):
+    """The page of any later moment shows it.
+
+    Stopped or killed, nothing half is there, and the desk makes the report when asked again.
+    """
+    folder = a_submission(tmp_path / "team")
+    with DeskServer(folder=folder) as server:
+        visitor = Visitor.of(server.url)
+        visitor.get(HERE)
+        before = {p.pid for p in psutil.Process().children()}
+
+        def workers() -> list[psutil.Process]:
+            return [p for p in psutil.Process().children() if p.pid not in before]
+
+        assert visitor.post(HERE + "make-report").status == 303
+        assert visitor.post(HERE + "make-report").status == 303  # the same one
+        assert "data-events" in visitor.get(HERE).text
+        until(workers)
+        assert visitor.post(HERE + "stop").status == 303
+        until(lambda: "stopped" in " ".join(wrongs(visitor.get(HERE).text)))
+        news = visitor.get(HERE + "events")
+        assert news.headers["content-type"].startswith("text/event-stream")
+        assert news.text.startswith("event: end\n")
+
+        visitor.post(HERE + "make-report")
+        until(workers)
+        until(lambda: "starting" not in visitor.get(HERE).text)  # it has begun
+        workers()[0].kill()
+        until(lambda: "the process ended" in " ".join(wrongs(visitor.get(HERE).text)))
+        assert not (folder / "report" / "report.html").exists()
+
+        assert visitor.post(HERE + "make-report").status == 303
+        stages = re.findall(r"event: stage\ndata: (.*)", visitor.get(HERE + "events").text)
+        assert len(set(stages)) > 3
+        page = visitor.get(HERE).text
+        assert "Read the report" in page
+        assert wrongs(page) == []
+
+
+def test_a_file_that_ends_the_process_costs_its_own_row(tmp_path):
+    """The process that looks at it dies; the others are shown, the next task has another."""
+    with DeskServer(folder=tmp_path) as server:
+        visitor = Visitor.of(server.url)
+        visitor.upload(HERE + "files", some_files(most=2))
+        before = {p: p.memory_info().rss for p in psutil.Process().children()}
+        (tmp_path / "data" / "large.csv").write_bytes(b"time,x1\n" + b"0.001,0.25\n" * 4_000_000)
+        with ThreadPoolExecutor(1) as pool:
+            page = pool.submit(visitor.get, HERE)
+            reading: list[psutil.Process] = []
+
+            def grown() -> bool:
+                reading.extend(
+                    p for p, was in before.items() if p.memory_info().rss > was + 40_000_000
+                )
+                return bool(reading)
+
+            until(grown)
+            reading[0].kill()
+            text = page.result().text
+        names = re.findall(r'<tr>\n<th scope="row">(.*?)<', text)
+        rows = dict(zip(names, text.split("<tr>\n<th")[1:], strict=True))
+        assert {name for name, row in rows.items() if "the process ended" in row} == {"large.csv"}
+        assert len(rows) == 3
+        (tmp_path / "data" / "large.csv").unlink()
+        assert "the process ended" not in visitor.get(HERE).text
+
+
+def test_who_serves_is_gone_and_so_is_the_work(tmp_path):
+    """A worker whose desk was killed ends by itself."""
+    hand = Hand()
+    hand.do("files", folder=str(tmp_path))
+    process = hand._free.get()
+    hand._free.put(process)
+    assert process is not None
+    (child,) = [p for p in psutil.Process().children() if p.pid == process._process.pid]
+    assert process._process.stdin is not None
+    process._process.stdin.close()
+    until(lambda: not child.is_running() or child.status() == psutil.STATUS_ZOMBIE)
+    hand.close()

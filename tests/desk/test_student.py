@@ -9,12 +9,10 @@ import threading
 import time
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from html import unescape
 from pathlib import Path
 from urllib.parse import unquote
 
-import psutil
 import pytest
 
 from pipeline.desk.app import DeskServer
@@ -28,10 +26,11 @@ from pipeline.lock import turn_in
 from pipeline.submission import load_submission
 from pipeline.submission.edit import edit_submission
 from pipeline.submission.load import NAME
-from tests.helpers.desks import Visitor, a_submission, some_files
+from tests.helpers.desks import Visitor, a_submission, some_files, wrongs
 from tests.helpers.waiting import PATIENCE, started, until
 
 HERE = "/student/0/"
+pytestmark = pytest.mark.usefixtures("work_here")
 
 
 @pytest.fixture
@@ -51,34 +50,17 @@ def filled(tmp_path):
         yield Visitor.of(server.url), folder
 
 
-class _LastingHand(Hand):
-    """Processes with which the next desk goes on."""
-
-    def close(self) -> None:
-        """Leave them."""
-
-
 @pytest.fixture(scope="module")
 def hand():
-    """The processes for short tasks of all these desks: each would start its own."""
-    hand = _LastingHand()
+    """What does the short tasks of no desk."""
+    hand = Hand()
     yield hand
-    super(_LastingHand, hand).close()
-
-
-@pytest.fixture(autouse=True)
-def _one_hand(hand, monkeypatch):
-    monkeypatch.setattr("pipeline.desk.app.Desk", partial(Desk, hand=hand))
+    hand.close()
 
 
 def take_upload(name: str, content: io.BytesIO, folder: Path, *, hand: Hand) -> list[str]:
     """Upload one file."""
     return take_uploads([(name, content)], folder, hand=hand)
-
-
-def wrongs(page: str) -> list[str]:
-    """Return what a page says is wrong."""
-    return [unescape(w) for w in re.findall(r'class="wrong"[^>]*>([^<]*)<', page)]
 
 
 def ask_for(folder: Path, *ids: str) -> tuple[str, ...]:
@@ -612,71 +594,6 @@ def test_a_report_page_that_is_not_ours_runs_nothing(filled):
 # -------------------------------------------------------------------------------- jobs
 
 
-def test_a_job_tells_its_stages_survives_a_reload_and_is_stopped(filled):
-    """The page of any later moment shows it; stopped, nothing of it is written."""
-    visitor, folder = filled
-    before = {p.pid for p in psutil.Process().children()}
-    assert visitor.post(HERE + "make-report").status == 303
-    assert visitor.post(HERE + "make-report").status == 303  # the same one
-    assert "data-events" in visitor.get(HERE).text
-    until(lambda: {p.pid for p in psutil.Process().children()} - before)
-    assert visitor.post(HERE + "stop").status == 303
-    until(lambda: "stopped" in " ".join(wrongs(visitor.get(HERE).text)))
-    assert not (folder / "report" / "report.html").exists()
-    news = visitor.get(HERE + "events")
-    assert news.headers["content-type"].startswith("text/event-stream")
-    assert news.text.startswith("event: end\n")
-    assert visitor.post(HERE + "make-report").status == 303
-    stages = re.findall(r"event: stage\ndata: (.*)", visitor.get(HERE + "events").text)
-    assert len(set(stages)) > 3
-    assert "Read the report" in visitor.get(HERE).text
-
-
-def test_a_file_that_ends_the_process_costs_its_own_row(room):
-    """The process that looks at it dies; the others are shown, the next task has another."""
-    visitor, folder = room
-    visitor.upload(HERE + "files", some_files(most=2))
-    before = {p: p.memory_info().rss for p in psutil.Process().children()}
-    (folder / "data" / "large.csv").write_bytes(b"time,x1\n" + b"0.001,0.25\n" * 4_000_000)
-    with ThreadPoolExecutor(1) as pool:
-        page = pool.submit(visitor.get, HERE)
-        reading: list[psutil.Process] = []
-
-        def grown() -> bool:
-            reading.extend(p for p, was in before.items() if p.memory_info().rss > was + 40_000_000)
-            return bool(reading)
-
-        until(grown)
-        reading[0].kill()
-        text = page.result().text
-    rows = dict(zip(re.findall(r'<tr>\n<th scope="row">(.*?)<', text), text.split("<tr>\n<th")[1:],
-                    strict=True))  # fmt: skip
-    assert {name for name, row in rows.items() if "the process ended" in row} == {"large.csv"}
-    assert len(rows) == 3
-    (folder / "data" / "large.csv").unlink()
-    assert "the process ended" not in visitor.get(HERE).text
-
-
-def test_a_job_whose_process_dies_says_so(filled):
-    """Nothing half is there; the desk goes on, and makes the report when asked again."""
-    visitor, folder = filled
-    visitor.get(HERE)
-    before = {p.pid for p in psutil.Process().children()}
-
-    def workers() -> list[psutil.Process]:
-        return [p for p in psutil.Process().children() if p.pid not in before]
-
-    visitor.post(HERE + "make-report")
-    until(workers)
-    until(lambda: "starting" not in visitor.get(HERE).text)  # it has begun
-    workers()[0].kill()
-    until(lambda: "the process ended" in " ".join(wrongs(visitor.get(HERE).text)))
-    assert not (folder / "report" / "report.html").exists()
-    visitor.post(HERE + "make-report")
-    until(lambda: "Read the report" in visitor.get(HERE).text)
-    assert wrongs(visitor.get(HERE).text) == []
-
-
 def test_the_gap_is_looked_for_as_a_job(filled, monkeypatch):
     """The page is that of `cartlab gap`, in the folder, and shown."""
     monkeypatch.setattr("pipeline.desk.student.report._GAP_BUDGET", 1.0)
@@ -687,20 +604,6 @@ def test_the_gap_is_looked_for_as_a_job(filled, monkeypatch):
     page = visitor.get(HERE + "gap/gap.html")
     assert page.headers["content-security-policy"].startswith("sandbox allow-scripts;")
     assert json.loads((folder / "gap" / "gap.json").read_bytes())["schema"] == "cartlab-gap/1"
-
-
-def test_who_serves_is_gone_and_so_is_the_work(tmp_path):
-    """A worker whose desk was killed ends by itself."""
-    hand = Hand()
-    hand.do("files", folder=str(tmp_path))
-    process = hand._free.get()
-    hand._free.put(process)
-    assert process is not None
-    (child,) = [p for p in psutil.Process().children() if p.pid == process._process.pid]
-    assert process._process.stdin is not None
-    process._process.stdin.close()
-    until(lambda: not child.is_running() or child.status() == psutil.STATUS_ZOMBIE)
-    hand.close()
 
 
 def test_a_task_says_why_it_came_to_nothing(tmp_path, hand):

@@ -1,14 +1,19 @@
 """A desk that is served, and somebody who asks it as a browser without scripts does."""
 
 import http.client
+import json
+import queue
 import re
 import shutil
+import threading
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from html import unescape
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlencode, urlsplit
 
+from pipeline.desk.worker import answer
 from pipeline.resources import EXAMPLES
 from pipeline.submission.load import NAME
 from tests.helpers.waiting import PATIENCE
@@ -107,12 +112,52 @@ class Visitor:
             connection.close()
 
 
+class WorkerHere:
+    """What a desk's worker does, in a thread of this process: another takes a second to start.
+
+    One task at a time; it is waited for, not killed.
+    """
+
+    memory, runs = 0, True
+    _turn = threading.Lock()
+
+    def __init__(self, module: str) -> None:
+        self._lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        self._threads: list[threading.Thread] = []
+
+    def send(self, line: bytes) -> None:
+        """Begin a task."""
+        self._threads.append(threading.Thread(target=self._do, args=(line,)))
+        self._threads[-1].start()
+
+    def line(self, *, timeout: float) -> bytes:
+        """Return the next line about it."""
+        return self._lines.get(timeout=timeout)
+
+    def close(self) -> None:
+        """Wait for its end."""
+        for thread in self._threads:
+            thread.join()
+
+    def _do(self, task: bytes) -> None:
+        def say(**line: Any) -> None:
+            self._lines.put(json.dumps(line).encode())
+
+        with self._turn:
+            answer(task, say)
+
+
 def through_proxy(port: int, name: str, **given: str) -> Visitor:
     """Return who comes through the proxy of a lab server, which names them; "" for no name."""
     headers = {"X-Proxy-Secret": "the-proxy-and-the-desk-know-it"}
     if name:
         headers["X-Remote-User"] = name
     return Visitor(port=port, host="lab.example.edu", headers=headers, **given)
+
+
+def wrongs(page: str) -> list[str]:
+    """Return what a page says is wrong."""
+    return [unescape(w) for w in re.findall(r'class="wrong"[^>]*>([^<]*)<', page)]
 
 
 def write_users(folder: Path, text: str) -> Path:

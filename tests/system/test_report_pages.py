@@ -194,15 +194,6 @@ def covered(boxes: list[Box]) -> list[tuple[str, str]]:
 # ------------------------------------------------------------------- in the browser
 
 
-def test_everybody_can_read_it(made, show):
-    """Axe finds nothing serious or critical: names, roles, order of headings, contrast by night."""
-    page = show(page_of(made), color_scheme="light", bypass_csp=True)
-    page.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
-
-    grave = [v for v in violations(page) if v.impact in ("serious", "critical")]
-    assert grave == []
-
-
 # Every run of text outside mathematics and drawings, every formula as a whole, and every text of
 # a drawing: with its box, and the box that may cut it.
 BOXES = """() => {
@@ -234,10 +225,25 @@ DRAWN = """() => [...document.querySelectorAll('figure svg')].map((svg) => {
 })"""
 
 
-def test_no_text_is_cut_or_covered(made, show):
-    """Nothing sticks out but what can be scrolled, no text lies on another, figures hold theirs."""
-    page = show(page_of(made))
+WIDER = """() => Array.from(document.querySelectorAll('.wide:has(table)'))
+    .filter((e) => e.scrollWidth > e.clientWidth).map((e) => e.innerText)"""
+BROKEN = """() => Array.from(document.querySelectorAll('td:nth-child(2):not(:last-child) > code'))
+    .filter((e) => e.getClientRects().length > 1).map((e) => e.innerText)"""
+NAMES = """() => Array.from(document.querySelectorAll('.numbered :is(th, td):first-child'),
+    (cell) => cell.getBoundingClientRect().width)"""
+
+
+def test_everybody_can_read_it_on_every_screen(made, show):
+    """Axe finds nothing serious or critical: names, roles, order of headings, contrast by night.
+
+    Nothing sticks out but what can be scrolled, no text lies on another, figures hold theirs. On a
+    laptop every column of a table is in sight; on a phone the name of a check stands in one line,
+    and a column of names beside numbers takes at most half of the view.
+    """
+    page = show(page_of(made), color_scheme="light", bypass_csp=True)
     page.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
+    assert [v for v in violations(page) if v.impact in ("serious", "critical")] == []
+    assert page.evaluate(WIDER) == []
     for width, height in (WIDE, PHONE):
         page.set_viewport_size({"width": width, "height": height})
 
@@ -252,31 +258,8 @@ def test_no_text_is_cut_or_covered(made, show):
             drawn = [Box(*text) for text in texts]
             assert [text for text in drawn if not text.lies_in(Box._make([*edge, ""]))] == []
             assert covered(drawn) == []
-
-
-def test_tables_fit_a_laptop_and_names_of_checks_a_phone(made, show):
-    """At 1280 pixels every column is in sight; at 390 the name of a check stands in one line."""
-    page = show(page_of(made))
-    page.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
-    wider = """() => Array.from(document.querySelectorAll('.wide:has(table)'))
-        .filter((e) => e.scrollWidth > e.clientWidth).map((e) => e.innerText)"""
-    assert page.evaluate(wider) == []
-    page.set_viewport_size({"width": PHONE[0], "height": PHONE[1]})
-    broken = """() => Array.from(
-        document.querySelectorAll('td:nth-child(2):not(:last-child) > code'))
-        .filter((e) => e.getClientRects().length > 1).map((e) => e.innerText)"""
-    assert page.evaluate(broken) == []
-
-
-@pytest.mark.parametrize("case", ["class", "feedback"])
-def test_a_phone_shows_the_numbers_of_a_table(case, folder, request, show):
-    """The column of names stays in sight and takes at most half of the view."""
-    page = show(page_of(folder(case, request)), size=PHONE)
-    widths = page.evaluate("""() => Array.from(document.querySelectorAll('details'),
-        (fold) => fold.open = true) && Array.from(
-        document.querySelectorAll('.numbered :is(th, td):first-child'),
-        (cell) => cell.getBoundingClientRect().width)""")
-    assert 0 < max(widths) <= PHONE[0] / 2
+    assert page.evaluate(BROKEN) == []
+    assert 0 < max(page.evaluate(NAMES)) <= PHONE[0] / 2
 
 
 def test_a_class_is_searched_and_sorted(folder, request, show):
