@@ -90,7 +90,12 @@ def test_a_class_is_what_simulate_writes(visitor, tmp_path):
     assert force is not None
     out = tmp_path / "class"
     answer = visitor.post(
-        "/exercises/make", preset="throne-1dof", out=str(out), folders="2", seed="5", effect="coulomb_friction"
+        "/exercises/make",
+        preset="throne-1dof",
+        out=str(out),
+        folders="2",
+        seed="5",
+        effect="coulomb_friction",
     )
     assert answer.status == 303
     wait_for(visitor, answer.headers["location"])

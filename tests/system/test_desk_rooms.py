@@ -2,6 +2,7 @@
 
 import re
 
+import pytest
 from playwright.sync_api import expect
 
 from pipeline.desk.app import DeskServer
@@ -16,6 +17,7 @@ from tests.system import test_desk
 from tests.system.test_report_pages import PHONE, WIDE
 
 show = test_desk.show
+pytestmark = pytest.mark.usefixtures("work_here")
 
 
 def fits(window) -> bool:
