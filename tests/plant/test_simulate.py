@@ -187,6 +187,17 @@ def test_input_that_runs_straight_between_samples():
     assert_allclose(x[0], t**3 / 12, atol=1e-12)
 
 
+@pytest.mark.parametrize("n", [2, 3, 4, 10, 101])
+def test_even_and_uneven_times_agree(n):
+    """Records of one interval are simulated in blocks, others sample by sample."""
+    rng = np.random.default_rng(n)
+    t, u, x0 = clock(n), rng.standard_normal(n), rng.standard_normal(6)
+    uneven = t.copy()
+    uneven[-1] += 1e-11
+    ours, others = (simulate_linear(THREE, at, u, x0=x0) for at in (t, uneven))
+    assert_allclose(ours, others, rtol=0, atol=1e-8 * np.abs(others).max())
+
+
 def test_the_last_input_has_no_time_to_act():
     """The sample at the end of the record is held only beyond it."""
     t = clock(20)
