@@ -16,7 +16,7 @@ from pipeline.bench.design.multisine import (
     optimal_tones,
     schroeder_phases,
 )
-from pipeline.bench.design.next_plan import STATISTICAL, choose_next, tells_nothing
+from pipeline.bench.design.next_plan import STATISTICAL, _doubt, choose_next, tells_nothing
 from pipeline.bench.design.weigh import weigh
 from pipeline.bench.emulator.core import ReferenceCore
 from pipeline.bench.planning.plan import Limits, Plan, Recording
@@ -382,9 +382,26 @@ def test_the_command_adds_what_it_chose_to_the_plan(work):
     assert again["next"]["now"] == pytest.approx(data["next"]["now"], rel=1e-9)
 
 
-@pytest.mark.parametrize("words", [("--for", "zeta"), ("--next", 1, "--for", "zeta_9")])
-def test_what_cannot_be_chosen_is_one_line(work, words):
-    """A goal without a number, a name that is none."""
+def test_what_is_written_is_counted(work):
+    """With the recordings that every bench begins with, where there was no plan yet."""
+    done = cartlab_here("plan", work, "--next", 2, "--for", "zeta")
+    usual = len(propose_plan(load_submission(work)).recordings)
+    assert f"the {usual} recordings that a bench begins with, and 2 chosen beside" in done.stderr
+    done = cartlab_here("plan", work, "--next", 1, "--for", "zeta")
+    assert "plan.toml: 1 recording added" in done.stderr
+
+
+def test_beside_a_misfit_the_errors_are_doubted(analysis, tmp_path):
+    """They count noise, and tell nothing where more than noise is left."""
+    for chi_square, doubted in ((556.0, True), (1.0, False)):
+        fit = replace(analysis.fit, chi_square_per_dof=chi_square)
+        assert bool(_doubt(replace(analysis, fit=fit), tmp_path)) == doubted
+
+
+@pytest.mark.parametrize("words", [("--for", "zeta"), ("--next", 1, "--for", "omega_x")])
+def test_what_cannot_be_chosen_is_one_line(work, words, monkeypatch):
+    """A goal without a number, a name that is none: before the data are asked."""
+    monkeypatch.setattr("pipeline.bench.design.next_plan.analyse", None)
     done = cartlab_here("plan", work, *words)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1

@@ -1,5 +1,6 @@
 """What a next experiment is to make better: one number of the parameters' covariance."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -60,6 +61,18 @@ class Goal:
         return int(np.argmax(self._variances(*told)))
 
 
+def check_goal(name: str, *, names: Sequence[str]) -> None:
+    """Refuse what is no goal for carts with parameters of these names.
+
+    Raises
+    ------
+    ConfigError : there is no such goal.
+    """
+    goals = [*names, DESIGN, WORST, MEAN, VOLUME]
+    if name not in goals:
+        raise ConfigError(f"--for {name}: there is no such parameter or goal{nearest(name, goals)}")
+
+
 def find_goal(name: str, known: Knowledge, *, feedback: FeedbackDesign | None) -> Goal:
     """Return the goal of a name: a parameter's, "design", "worst", "mean" or "volume".
 
@@ -69,6 +82,7 @@ def find_goal(name: str, known: Knowledge, *, feedback: FeedbackDesign | None) -
     DataError : "design" without one.
     """
     values, rows = known.chain.parameters(), known.by_parameters()
+    check_goal(name, names=[*values])
     if name == WORST:
         return Goal(name=name, words="the error of the least known parameter", rows=rows)
     if name == MEAN:
@@ -87,9 +101,6 @@ def find_goal(name: str, known: Knowledge, *, feedback: FeedbackDesign | None) -
             raise DataError("--for design: no controller is designed: add a [design] table first")
         row = _by_overshoot(known, feedback)
         return Goal(name=name, words="the error of the predicted overshoot", rows=row)
-    if name not in values:
-        hint = nearest(name, [*values, DESIGN, WORST, MEAN, VOLUME])
-        raise ConfigError(f"--for {name}: there is no such parameter or goal{hint}")
     at = list(values).index(name)
     return Goal(name=name, words=f"the error of {name}", rows=rows[at : at + 1])
 

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import isclose
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from pipeline.arrays import Array
 from pipeline.bench.design.candidates import propose_candidates
 from pipeline.bench.design.exchange import choose
-from pipeline.bench.design.goal import GAP, WORST, Goal, find_goal
+from pipeline.bench.design.goal import GAP, WORST, Goal, check_goal, find_goal
 from pipeline.bench.design.information import Knowledge
 from pipeline.bench.host.raw import FOLDER as RAW
 from pipeline.bench.host.raw import read_raw
@@ -22,8 +22,9 @@ from pipeline.bench.planning.plan_words import session_time, time_words
 from pipeline.bench.planning.propose import current_plan
 from pipeline.errors import ConfigError, DataError
 from pipeline.ingest.read import read_data
-from pipeline.names import first_few
+from pipeline.names import first_few, parameter_names
 from pipeline.report.limits import CALIBRATION
+from pipeline.report.numbers import count
 from pipeline.results import Analysis
 from pipeline.schemas.gap import Gap as GapDocument
 from pipeline.submission import Submission
@@ -50,6 +51,8 @@ class NextPlan:
         more.
     planned : what each open recording of the plan would leave by itself, by id.
     separation : for "gap", of the two explanations that it tells apart best, in noises.
+    wrote : what became of plan.toml, in words.
+    doubt : why the errors do not hold, whatever is recorded; "": they do.
     """
 
     words: str
@@ -60,14 +63,21 @@ class NextPlan:
     errors: tuple[float, ...] = ()
     planned: dict[str, float] = field(default_factory=dict)
     separation: float | None = None
+    wrote: str = ""
+    doubt: str = ""
 
     @property
     def said(self) -> str:
         """What they bring, in one sentence."""
+        return "; ".join(self.sentences)
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What they bring, and what to make of it."""
         if self.separation is not None:
             return (
                 f"{self.recordings[0].id} tells two explanations of the gap apart by "
-                f"{self.separation:.2g} times the noise"
+                f"{self.separation:.2g} times the noise",
             )
         these = "these are" if len(self.recordings) > 1 else "this one is"
         done = "recorded"
@@ -80,12 +90,13 @@ class NextPlan:
             f"({time_words(session_time(self.recordings))} at the bench)"
         )
         alone = [f"{name} alone ± {_percent(error)}" for name, error in self.planned.items()]
-        sentences = [
+        told = (
             ", ".join(steps),
-            *([f"of the plan so far, {first_few(alone, _ALONE)}"] if alone else []),
-            *([STATISTICAL] if self.errors[-1] < CALIBRATION else []),
-        ]
-        return "; ".join(sentences)
+            f"of the plan so far, {first_few(alone, _ALONE)}" if alone else "",
+            STATISTICAL if self.errors[-1] < CALIBRATION else "",
+            self.doubt,
+        )
+        return tuple(sentence for sentence in told if sentence)
 
 
 def plan_next(
@@ -103,33 +114,45 @@ def plan_next(
     DataError : the data recorded do not identify the carts, so nothing can be weighed.
     ConfigError : there is no such goal; gap.json is broken, or of other data or limits.
     """
-    old = current_plan(submission)
+    path = plan_path(submission)
+    old, new = current_plan(submission), not path.exists()
     if goal == GAP:
         if n != 1:
             raise ConfigError(f"--for gap chooses one recording: expected --next 1, found {n}")
         recording, separation = _decisive(submission, old.limits)
-        plan = add_recordings(submission.folder, [recording], otherwise=old)
-        return NextPlan(
-            words="gap",
-            plan=plan,
-            path=plan_path(submission),
-            recordings=plan.recordings[-1:],
-            separation=separation,
+        found = NextPlan(
+            words="gap", plan=old, path=path, recordings=(recording,), separation=separation
         )
-    progress("asking the data what they tell")
-    analysis = analyse(submission)
-    progress("weighing the next experiments")
-    commands = frozenset() if stock else known_commands(submission.folder)
-    found = choose_next(analysis, old, n=n, goal=goal, commands=commands)
+        done = {experiment.id for experiment in submission.experiments}
+        open_ = [one for one in old.recordings if one.id not in done]
+        if not new and (there := next((o for o in open_ if o.resembles(recording)), None)):
+            return replace(found, recordings=(there,), wrote=f"{path}: has {there.id} already")
+    else:
+        system = submission.system
+        check_goal(goal, names=parameter_names(system.carts, rigid=not system.tied))
+        progress("asking the data what they tell")
+        analysis = analyse(submission)
+        progress("weighing the next experiments")
+        commands = frozenset() if stock else known_commands(submission.folder)
+        found = choose_next(analysis, old, n=n, goal=goal, commands=commands)
+        found = replace(found, path=path, doubt=_doubt(analysis, submission.folder))
     plan = add_recordings(submission.folder, found.recordings, otherwise=old)
-    return NextPlan(
-        words=found.words,
-        plan=plan,
-        path=plan_path(submission),
-        recordings=plan.recordings[-n:],
-        now=found.now,
-        errors=found.errors,
-        planned=found.planned,
+    wrote = f"{path}: {count(n, 'recording')} added"
+    if new and old.recordings:
+        usual = count(len(old.recordings), "recording")
+        wrote = f"wrote {path}: the {usual} that a bench begins with, and {n} chosen beside"
+    return replace(found, plan=plan, recordings=plan.recordings[-n:], wrote=wrote)
+
+
+def _doubt(analysis: Analysis, folder: Path) -> str:
+    """Return that the errors count noise, where more than noise is left."""
+    fit = analysis.fit
+    if fit is None or fit.explains_data:
+        return ""
+    return (
+        f"the linear carts leave more than the noise (χ² per degree of freedom "
+        f"{fit.chi_square_per_dof:.3g}), so that parameters may be off by more than these errors: "
+        f"`cartlab gap {folder}` looks for what else acts"
     )
 
 

@@ -278,7 +278,9 @@ def identified_chain(analysis: Analysis) -> Chain:
     fit = analysis.fit
     if fit is None or not fit.converged:
         why = fit.message if fit else _reason(analysis, "final estimates", "Bode fit")
-        raise DataError(f"no dwells can be proposed, the carts are not identified: {why}")
+        raise DataError(
+            f"the carts are not identified, and by them is chosen what to record next: {why}"
+        )
     if not fit.chain.is_tied:
         raise DataError(
             "no dwells can be proposed: no spring ties the carts to a wall, so they drift; add "
