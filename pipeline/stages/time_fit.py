@@ -99,17 +99,11 @@ def _open(records: Sequence[Record]) -> tuple[list[Window], list[str]]:
 
 
 def _informed(attempt: Attempt, index: int) -> Window:
-    """Return a window that knows its errors, from its residuals, and whether it starts at rest.
-
-    Errors are never taken below the stated ones.
-    """
+    """Return a window that knows its errors, from its residuals, and whether it starts at rest."""
     window, misfit = attempt.windows[index], attempt.misfits[index]
-    ratio = np.sqrt(np.mean(misfit.residual**2, axis=1))
-    return replace(
-        window,
-        at_rest=window.kind != "decay" and _starts_at_rest(attempt, index),
-        sigma=window.sigma * np.maximum(ratio, 1.0),
-    )
+    rms = window.sigma * np.sqrt(np.mean(misfit.residual**2, axis=1))
+    at_rest = window.kind != "decay" and _starts_at_rest(attempt, index)
+    return window.informed(rms, at_rest=at_rest)
 
 
 def _starts_at_rest(attempt: Attempt, index: int) -> bool:

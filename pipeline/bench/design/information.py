@@ -31,7 +31,7 @@ from pipeline.estimation.chain.parametrisation import (
     parameter_jacobian,
 )
 from pipeline.estimation.chain.time_search import look
-from pipeline.estimation.chain.time_window import Window, open_window
+from pipeline.estimation.chain.time_window import Window, open_window, weighed
 from pipeline.estimation.colour import score_covariance
 from pipeline.estimation.noise import noise_beyond_rounding
 from pipeline.plant.linear.chain import Chain
@@ -108,6 +108,7 @@ class Knowledge:
             * w.stated_sigma
             for w in windows
         ]
+        windows = [w.informed(rms, at_rest=True) for w, rms in zip(windows, left, strict=True)]
         total = _median_by_cart(windows, left, n=chain.n)
         shaken = [
             noise_beyond_rounding(rms, step=one) for rms, one in zip(total, known.step, strict=True)
@@ -150,8 +151,9 @@ class Knowledge:
             free=recording.carts,
             stated_sigma=sigma,
             sigma=sigma,
+            step=self.step,
             at_rest=True,
-        )
+        ).informed(sigma, at_rest=True)
         return self._of_window(window) * np.array([1.0, self.beyond])[:, None, None]
 
     def _of_window(self, window: Window) -> Array:
@@ -160,11 +162,11 @@ class Knowledge:
         theta = self.parametrisation.pack(self.chain)
         (misfit,) = look([window], self.parametrisation, theta).misfits
         J = misfit.jacobian * (self.size / self.parametrisation.dp_dtheta(theta))[:, None, None]
-        exact = window.y + misfit.residual * window.sigma[:, None]
+        x = simulate_linear(self.chain, window.drive_t, window.drive_u, free=window.free)
+        exact = x[rows, :: window.stride]
         flat = J.reshape(theta.size, -1)
         S = np.mean(
-            [score_covariance(off / window.sigma[:, None], J) for off in self._errors(exact, rows)],
-            axis=0,
+            [score_covariance(weighed(off, window), J) for off in self._errors(exact, rows)], axis=0
         )
         return np.stack([flat @ flat.T, S])
 
@@ -172,9 +174,11 @@ class Knowledge:
         """Yield what encoders of these carts err by on exact positions (p, n), several times."""
         rng, step = np.random.default_rng(_SEED), self.step[rows, None]
         for _ in range(_NOISES):
-            read = exact + self.noise[rows, None] * rng.standard_normal(exact.shape)
+            # Where between two counts an encoder begins is chance.
+            from_count = exact + step * rng.uniform(-0.5, 0.5, size=step.shape)
+            read = from_count + self.noise[rows, None] * rng.standard_normal(exact.shape)
             whole = step * np.round(read / np.where(step > 0, step, 1.0))
-            yield np.where(step > 0, whole, read) - exact
+            yield np.where(step > 0, whole, read) - from_count
 
     def _of_dwell(self, recording: Recording) -> Array:
         """Return what the steady state tells, as precisely as that of the dwells so far."""

@@ -7,7 +7,7 @@ import numpy as np
 from pipeline.arrays import Array, ComplexArray
 from pipeline.errors import DataError
 from pipeline.estimation.chain.modal_response import Modes, drive_modes
-from pipeline.estimation.noise import local_noise
+from pipeline.estimation.noise import local_noise, noise_beyond_rounding, rounding_left
 from pipeline.plant.linear.simulate import OVERSAMPLING, interpolate_band_limited
 from pipeline.results import Record
 from pipeline.results_of_runs import Kind
@@ -33,7 +33,10 @@ class Window:
     carts, free : as in `Record`; the held carts are gone from both.
     stated_sigma : (p,) standard error of a position, by encoder step and local noise.
     sigma : (p,) standard error to weigh with; at least the stated one.
+    step : (p,) of the encoders, position units; 0 where none is known.
     at_rest : True where the carts start at rest, else position and speed at t = 0 are unknown.
+    shared : (p,) of the readings before the input begins, the variance of the error they have in
+        common over sigma²: what an encoder rounds off while nothing moves is one error.
     """
 
     id: str
@@ -47,7 +50,32 @@ class Window:
     free: tuple[int, ...]
     stated_sigma: Array
     sigma: Array
+    step: Array
     at_rest: bool
+    shared: Array | float = 0.0
+
+    @property
+    def n_resting(self) -> int:
+        """How many samples there are before the input begins; 0 where none does."""
+        if self.drive_u is None or not np.any(self.drive_u):
+            return 0
+        return int(np.searchsorted(self.t, self.drive_t[np.flatnonzero(self.drive_u)[0]]))
+
+    def informed(self, rms: Array, *, at_rest: bool) -> "Window":
+        """Return the same with the errors that a fit has left.
+
+        Parameters
+        ----------
+        rms : (p,) of the residuals, position units. No error is taken below the stated one.
+        at_rest : the carts start at rest.
+        """
+        sigma = np.maximum(self.stated_sigma, rms)
+        left = [
+            rounding_left(noise_beyond_rounding(one, step=step), step=step)
+            for one, step in zip(sigma.tolist(), self.step.tolist(), strict=True)
+        ]
+        shared = (np.array(left) * self.step / sigma) ** 2 / 12 if at_rest else 0.0
+        return replace(self, sigma=sigma, at_rest=at_rest, shared=shared)
 
     def thinned(self, most: int) -> "Window":
         """Return the same with at most twice as many samples as `most`; the input keeps all."""
@@ -141,6 +169,7 @@ def open_window(record: Record) -> Window:
         free=tuple(sorted(record.free)),
         stated_sigma=sigma,
         sigma=sigma,
+        step=steps,
         at_rest=False,
     )
 
@@ -160,7 +189,7 @@ def compare(window: Window, modes: Modes) -> Misfit:
     if not window.at_rest:
         start = modes.entry.T[:, None] * shapes  # (2f, p, n_m)
         columns.append(_real_part(start, free_motion))
-    local = (np.concatenate(columns) / window.sigma[:, None]).reshape(-1, p * n).T
+    local = weighed(np.concatenate(columns), window).reshape(-1, p * n).T
     scale = np.linalg.norm(local, axis=0)
     scale[scale == 0] = 1.0
     Q, R = np.linalg.qr(local / scale)
@@ -179,7 +208,7 @@ def compare(window: Window, modes: Modes) -> Misfit:
             d_shapes * modes.drive + shapes * modes.d_drive[:, None],
             by_shape * modes.d_poles[:, None],
         ]
-    rest = (rest / window.sigma[:, None]).reshape(-1)
+    rest = weighed(rest, window).reshape(-1)
     along = basis.T @ rest
     if not window.at_rest:
         found = -(Vt[kept].T @ (along / s[kept])) / scale
@@ -192,13 +221,26 @@ def compare(window: Window, modes: Modes) -> Misfit:
         jacobian = _real_part(np.concatenate(d_weights, axis=2), np.concatenate(signals))
     else:
         jacobian = np.zeros((n_p, p, n))
-    jacobian = (jacobian / window.sigma[:, None]).reshape(n_p, p * n)
+    jacobian = weighed(jacobian, window).reshape(n_p, p * n)
     jacobian = jacobian - (jacobian @ basis) @ basis.T
     return Misfit(
         residual=(rest - basis @ along).reshape(p, n),
         jacobian=jacobian.reshape(n_p, p, n),
         n_nuisance=int(np.count_nonzero(kept)),
     )
+
+
+def weighed(values: Array, window: Window) -> Array:
+    """Return values (…, p, n) over sigma, the mean of the first rest for no more than it tells.
+
+    The whitening of n readings with an error in common: of their covariance 1 + shared, the
+    vector of ones has the eigenvalue 1 + n shared and all else one.
+    """
+    weighed, n = values / window.sigma[:, None], window.n_resting
+    if n and np.any(window.shared):
+        mean = np.mean(weighed[..., :n], axis=-1)
+        weighed[..., :n] -= (mean * (1 - 1 / np.sqrt(1 + n * window.shared)))[..., None]
+    return weighed
 
 
 def _real_part(weights: ComplexArray, signals: ComplexArray) -> Array:
