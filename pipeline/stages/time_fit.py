@@ -101,9 +101,8 @@ def _open(records: Sequence[Record]) -> tuple[list[Window], list[str]]:
 def _informed(attempt: Attempt, index: int) -> Window:
     """Return a window that knows its errors, from its residuals, and whether it starts at rest."""
     window, misfit = attempt.windows[index], attempt.misfits[index]
-    rms = window.sigma * np.sqrt(np.mean(misfit.residual**2, axis=1))
     at_rest = window.kind != "decay" and _starts_at_rest(attempt, index)
-    return window.informed(rms, at_rest=at_rest)
+    return window.informed(misfit.residual * window.sigma[:, None], at_rest=at_rest)
 
 
 def _starts_at_rest(attempt: Attempt, index: int) -> bool:

@@ -237,9 +237,9 @@ def test_what_somebody_proposes_is_weighed_beside_what_is_chosen(analysis, known
 
 
 def test_what_makes_the_fit_know_worse_says_so(analysis):
-    """A minute of rest whose rounding does not average out weighs more than what it tells."""
+    """Minutes of rest whose rounding does not average out weigh more than what they tell."""
     mine = Recording(id="mine", kind="step", carts=(1, 2), wave="square", amplitude=0.005,
-                     frequency=2 / 120, cycles=2)  # fmt: skip
+                     frequency=2 / 120, cycles=4)  # fmt: skip
     found = weigh(analysis, mine, Plan(limits=LIMITS), goal="worst", commands=COMMANDS)
     assert found.proposed > 1.01 * found.now
     assert "know it worse" in found.why

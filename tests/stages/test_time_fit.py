@@ -10,7 +10,7 @@ from pipeline.errors import DataError
 from pipeline.estimation.chain.modal_response import find_modes
 from pipeline.estimation.chain.parametrisation import Parametrisation
 from pipeline.estimation.chain.time_search import search
-from pipeline.estimation.chain.time_window import compare, open_window, usable_segment
+from pipeline.estimation.chain.time_window import compare, open_window, usable_segment, weighed
 from pipeline.estimation.colour import long_run_variance, score_covariance
 from pipeline.ingest.read import read_data
 from pipeline.plant.linear.chain import Chain
@@ -19,7 +19,7 @@ from pipeline.plant.linear.simulate import simulate_linear
 from pipeline.results import ChainFit, Record
 from pipeline.stages.time_fit import fit_records
 from pipeline.submission import load_submission
-from tests.helpers.time_records import decay_record, measure, random_chain, step_record
+from tests.helpers.time_records import COUNT, decay_record, measure, random_chain, step_record
 from tests.helpers.ucsd import write_two_cart_submission
 
 
@@ -353,6 +353,40 @@ def test_correlated_residuals_count_for_less():
     # spectrum: sqrt(2/5.5) = 0.6, and 0.08 for the mean of 60.
     assert_allclose(ratios / runs, 1.0, atol=0.3)
     assert long_run_variance(fast[0]) == 1.0  # never below the mean square
+
+
+def test_a_long_rest_before_the_step_is_one_reading():
+    """What an encoder rounds off while nothing moves makes a gain no less certain than it is."""
+    chain, rng, runs, rate = PRESETS["throne-1dof"], np.random.default_rng(18), 24, 500.0
+    t = np.arange(int(10 * rate)) / rate
+    u = np.where(t > 5.0, 1.0 / chain.static_gains()[0], 0.0)
+    y = simulate_linear(chain, t, u)
+    off, white = [], []
+    for _ in range(runs):
+        record = measure(
+            y + COUNT * rng.uniform(), t, u, kind="step", carts=(1,), rng=rng, noise=0.0005
+        )
+        fit = fit_records([record], n=1, springs=(True, True))
+        off.append(errors(fit, chain))
+        moving = t >= 5.0 - 1.5 / rate  # the same, no rest before it
+        short = replace(record, t=t[moving] - t[moving][0], u=u[moving], y=record.y[:, moving])
+        white.append(std(fit, "K") / std(fit_records([short], n=1, springs=(True, True)), "K"))
+    # 24 draws tell a spread to 14 %.
+    assert 0.6 < np.sqrt(np.mean(np.square(off)[:, 0])) < 1.4
+    assert 0.5 < np.median(white) < 1.1
+
+
+def test_readings_of_a_rest_share_an_error():
+    """Weighed, the mean of a first rest tells what a mean with that error in common tells."""
+    chain, rng = PRESETS["throne-2dof"], np.random.default_rng(19)
+    window = open_window(step_record(chain, rng=rng, noise=0.0))
+    n = window.n_resting
+    assert window.t[n - 1] <= 0.1 < window.t[n + 1]
+    informed = window.informed(np.zeros_like(window.y), at_rest=True)
+    ones = weighed(np.ones_like(window.y), informed)[:, :n] * informed.sigma[:, None]
+    assert_allclose(np.sum(ones**2, axis=1), n / (1 + n * informed.shared))
+    for plain in (window, window.informed(np.zeros_like(window.y), at_rest=False)):
+        assert_allclose(weighed(window.y, plain), window.y / plain.sigma[:, None])
 
 
 # -------------------------------------------------------------------- real carts

@@ -104,12 +104,13 @@ class Knowledge:
             return known
         windows = [open_window(record) for record in records]
         left = [
-            np.array([_rms(fit.standardised[f"{w.id} cart {cart}"]) for cart in w.carts])
-            * w.stated_sigma
+            np.array([fit.standardised[f"{w.id} cart {cart}"] for cart in w.carts])
+            * w.stated_sigma[:, None]
             for w in windows
         ]
-        windows = [w.informed(rms, at_rest=True) for w, rms in zip(windows, left, strict=True)]
-        total = _median_by_cart(windows, left, n=chain.n)
+        moving = [w.rms_in_motion(one) for w, one in zip(windows, left, strict=True)]
+        windows = [w.informed(one, at_rest=True) for w, one in zip(windows, left, strict=True)]
+        total = _median_by_cart(windows, moving, n=chain.n)
         shaken = [
             noise_beyond_rounding(rms, step=one) for rms, one in zip(total, known.step, strict=True)
         ]
@@ -153,7 +154,9 @@ class Knowledge:
             sigma=sigma,
             step=self.step,
             at_rest=True,
-        ).informed(sigma, at_rest=True)
+        )
+        noise = np.broadcast_to(sigma[:, None], window.y.shape)
+        window = window.informed(noise, at_rest=True)
         return self._of_window(window) * np.array([1.0, self.beyond])[:, None, None]
 
     def _of_window(self, window: Window) -> Array:
@@ -162,8 +165,9 @@ class Knowledge:
         theta = self.parametrisation.pack(self.chain)
         (misfit,) = look([window], self.parametrisation, theta).misfits
         J = misfit.jacobian * (self.size / self.parametrisation.dp_dtheta(theta))[:, None, None]
-        x = simulate_linear(self.chain, window.drive_t, window.drive_u, free=window.free)
-        exact = x[rows, :: window.stride]
+        exact = window.y + misfit.residual * window.sigma[:, None]
+        resting = window.n_resting
+        exact[:, :resting] = exact[:, [resting]]  # whose residual is not weighed down
         flat = J.reshape(theta.size, -1)
         S = np.mean(
             [score_covariance(weighed(off, window), J) for off in self._errors(exact, rows)], axis=0
@@ -280,10 +284,6 @@ def _fitted_records(analysis: Analysis, fit: ChainFit) -> list[Record]:
             "record a sweep first"
         )
     return records
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def _median_by_cart(

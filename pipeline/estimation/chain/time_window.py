@@ -61,18 +61,26 @@ class Window:
             return 0
         return int(np.searchsorted(self.t, self.drive_t[np.flatnonzero(self.drive_u)[0]]))
 
-    def informed(self, rms: Array, *, at_rest: bool) -> "Window":
-        """Return the same with the errors that a fit has left.
+    def rms_in_motion(self, residual: Array) -> Array:
+        """Return the root mean square (p,) of residuals (p, n) from the input's beginning on.
+
+        At rest it is chance whether an encoder flickers between two counts or stays on one.
+        """
+        return np.sqrt(np.mean(residual[:, self.n_resting :] ** 2, axis=1))
+
+    def informed(self, residual: Array, *, at_rest: bool) -> "Window":
+        """Return the same with its errors as a fit has left them, nowhere below the stated ones.
 
         Parameters
         ----------
-        rms : (p,) of the residuals, position units. No error is taken below the stated one.
+        residual : (p, n) position units.
         at_rest : the carts start at rest.
         """
-        sigma = np.maximum(self.stated_sigma, rms)
+        sigma = np.maximum(self.stated_sigma, np.sqrt(np.mean(residual**2, axis=1)))
+        moving = self.rms_in_motion(residual)
         left = [
-            rounding_left(noise_beyond_rounding(one, step=step), step=step)
-            for one, step in zip(sigma.tolist(), self.step.tolist(), strict=True)
+            rounding_left(noise_beyond_rounding(rms, step=step), step=step)
+            for rms, step in zip(moving.tolist(), self.step.tolist(), strict=True)
         ]
         shared = (np.array(left) * self.step / sigma) ** 2 / 12 if at_rest else 0.0
         return replace(self, sigma=sigma, at_rest=at_rest, shared=shared)
@@ -236,8 +244,8 @@ def weighed(values: Array, window: Window) -> Array:
     The whitening of n readings with an error in common: of their covariance 1 + shared, the
     vector of ones has the eigenvalue 1 + n shared and all else one.
     """
-    weighed, n = values / window.sigma[:, None], window.n_resting
-    if n and np.any(window.shared):
+    weighed = values / window.sigma[:, None]
+    if np.any(window.shared) and (n := window.n_resting):
         mean = np.mean(weighed[..., :n], axis=-1)
         weighed[..., :n] -= (mean * (1 - 1 / np.sqrt(1 + n * window.shared)))[..., None]
     return weighed
