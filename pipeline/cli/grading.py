@@ -15,7 +15,7 @@ import typer
 from pipeline.cli.common import INTERRUPTED, AsJson, app, said_now_and_then, say
 
 if TYPE_CHECKING:
-    from rich.progress import Progress
+    from rich.progress import Progress, ProgressColumn
 
     from pipeline.grading.gradebook.book import Gradebook
 
@@ -116,25 +116,31 @@ def _batch_progress() -> Iterator[Callable[[int, int, str], None]]:
             yield lambda done, total, last: show(f"{done} of {total}: {last}".rstrip(": "))
         return
     from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(*columns(), console=Console(stderr=True), transient=True) as shown:
+        yield counting(shown)
+
+
+def columns() -> "tuple[ProgressColumn, ...]":
+    """Return what a line of progress has: "3/40 ━━━ 0:00:06 so far, 0:01:05 to go, team-3"."""
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
-        Progress,
         TextColumn,
         TimeElapsedColumn,
         TimeRemainingColumn,
     )
 
-    columns = (
+    return (
         MofNCompleteColumn(),
         BarColumn(),
         TimeElapsedColumn(),
-        TextColumn("left"),
+        TextColumn("so far,"),
         TimeRemainingColumn(),
+        TextColumn("to go,"),
         TextColumn("{task.description}", markup=False),  # a submission may be called "[b]"
     )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as shown:
-        yield counting(shown)
 
 
 def counting(shown: "Progress") -> Callable[[int, int, str], None]:

@@ -1,6 +1,8 @@
 """Progress: a line that changes on a terminal, elsewhere now and then a line more."""
 
+import io
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -8,10 +10,11 @@ import threading
 import time
 
 import pytest
+from rich.console import Console
 from rich.progress import Progress
 
 from pipeline.cli.common import progress_line
-from pipeline.cli.grading import _batch_progress, counting
+from pipeline.cli.grading import _batch_progress, columns, counting
 from pipeline.resources import EXAMPLES
 from tests.helpers.commandline import cartlab_here
 from tests.helpers.waiting import until
@@ -59,6 +62,20 @@ def test_what_was_known_before_is_no_speed():
         show(done, 1000, "")
     assert bar.tasks[0].completed == 996
     assert bar.tasks[0].time_remaining == pytest.approx(8.0, abs=1.0)
+
+
+def test_a_time_says_what_it_is_of():
+    """Behind each of the two times stands whether it is gone or to come."""
+    now = 0.0
+    bar = Progress(*columns(), get_time=lambda: now, disable=True)
+    show = counting(bar)
+    for done in range(4):
+        show(done, 8, "team-3")
+        now += 2.0
+    console = Console(width=120, file=io.StringIO(), record=True)
+    console.print(bar)
+    line = console.export_text().strip()
+    assert re.search(r"3/8 .* 0:00:08 so far, 0:00:\d\d to go, team-3$", line)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo terminals")

@@ -107,7 +107,9 @@ def doubles_of(
     return sorted(
         (
             replace(
-                double, author="", submissions=tuple(sorted(names[s] for s in double.submissions))
+                double,
+                authors=("",) * len(double.authors),
+                submissions=tuple(sorted(names[s] for s in double.submissions)),
             )
             for double in found
         ),

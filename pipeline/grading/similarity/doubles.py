@@ -17,29 +17,32 @@ _NAMED = 8  # submissions named of one person
 
 @dataclass(frozen=True, kw_only=True)
 class Double:
-    """Somebody in several submissions.
+    """Who stands in the same several submissions.
 
     Attributes
     ----------
-    author : "" where names are left out.
+    authors : each "" where names are left out.
     recordings : the most that one of the submissions has in common with the others.
     compared : each has recordings that could be read.
     """
 
-    author: str
+    authors: tuple[str, ...]
     submissions: tuple[str, ...]
     recordings: int = 0
     compared: bool = True
 
     def __str__(self) -> str:
         """What a TA is told."""
-        who = " ".join(clean(self.author).split()) or "One person"
+        named = [" ".join(clean(author).split()) for author in self.authors]
+        several = len(named) > 1
+        who = listing(named) if all(named) else f"{len(named)} people" if several else "One person"
+        are = "are" if several else "is"
         more = [f"{len(self.submissions) - _NAMED} more"] * (len(self.submissions) > _NAMED)
         where = listing([*map(clean, self.submissions[:_NAMED]), *more])
         if not (self.recordings or self.compared):
-            return f"{who} is in {where}, whose recordings could not be compared"
+            return f"{who} {are} in {where}, whose recordings could not be compared"
         common = count(self.recordings, "recording") if self.recordings else "no recording"
-        return f"{who} is in {where}, which have {common} in common"
+        return f"{who} {are} in {where}, which have {common} in common"
 
 
 def find_doubles(authors: Mapping[str, Sequence[str]]) -> list[Double]:
@@ -50,10 +53,13 @@ def find_doubles(authors: Mapping[str, Sequence[str]]) -> list[Double]:
         for author in people:
             typed.setdefault(person(author), author)
             found.setdefault(person(author), {})[submission] = None
+    together: dict[tuple[str, ...], list[str]] = {}
+    for who, submissions in sorted(found.items()):
+        if len(submissions) > 1:
+            together.setdefault(tuple(submissions), []).append(typed[who])
     return [
-        Double(author=typed[who], submissions=tuple(submissions))
-        for who, submissions in sorted(found.items())
-        if len(submissions) > 1
+        Double(authors=tuple(people), submissions=submissions)
+        for submissions, people in together.items()
     ]
 
 

@@ -1,6 +1,7 @@
 """People in several submissions of a class: told to the TA, accused of nothing."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -46,7 +47,7 @@ def told(folder: Path, recordings, *, anonymous: bool = False) -> list[Double]:
 def test_a_copy_with_the_victims_id_is_told(recordings, tmp_path):
     """Who is in both, and how many recordings both have, on the page and to the caller."""
     (double,) = told(tmp_path, recordings)
-    assert (double.author, double.submissions) == ("bob", ("team-1", "team-9"))
+    assert (double.authors, double.submissions) == (("bob",), ("team-1", "team-9"))
     assert double.recordings >= 3
     said = f"bob is in team-1 and team-9, which have {double.recordings} recordings in common"
     assert str(double) == said
@@ -85,6 +86,16 @@ def test_what_could_not_be_read_was_not_compared(recordings):
         (double,) = with_recordings(find_doubles({"a": ("s1",), "b": ("s1",)}), prints)
         assert (double.recordings, double.compared) == (0, compared)
         assert ("could not be compared" in str(double)) is not compared
+
+
+def test_partners_in_the_same_two_submissions_are_told_of_once():
+    """Their submissions are one pair, with names and without; who is in a third is told apart."""
+    teams = {"a": ("x", "y"), "b": ("Y", "x"), "c": ("z",), "d": ("z", "x2")}
+    both, alone = find_doubles(teams)
+    assert (both.authors, both.submissions) == (("x", "y"), ("a", "b"))
+    assert (alone.authors, alone.submissions) == (("z",), ("c", "d"))
+    assert str(both).startswith("x and y are in a and b")
+    assert str(replace(both, authors=("", ""))).startswith("2 people are in a and b")
 
 
 def test_one_submission_each_is_nothing_to_tell():
