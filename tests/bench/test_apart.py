@@ -202,6 +202,8 @@ def swept(tmp_path) -> Callable[[list[str]], Callable[..., Gap]]:
     return sweep
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_an_effect_that_the_held_out_end_does_not_show_is_found_all_the_same(swept):
     """The end of a sweep, far beyond the resonance, says nothing of a spring: nor against it."""
     slack = "slack_spring:spring=1,stiffness_change=0.0065,stretch=-0.55"
@@ -211,6 +213,8 @@ def test_an_effect_that_the_held_out_end_does_not_show_is_found_all_the_same(swe
     assert found & {"input_delay", "actuator_lag"}
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_fast_sweep_tells_a_lag_from_a_delay(swept):
     """Beside a cubic spring they are in dispute, until the cart is driven beyond its resonance."""
     hide = ["actuator_lag:time_constant=0.0028", "cubic_spring:coefficient=0.00016"]

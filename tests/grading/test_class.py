@@ -90,7 +90,9 @@ def test_a_model_made_of_a_vague_table_is_no_wrong_one(seed, digits):
         pytest.param(73026, 0, ("peak_count",), {"peak_count"}, marks=LONG),
         # typed too coarsely to be 6/5
         pytest.param(72007, 3, ("initial_off",), {"initial_off"}, marks=LONG),
-        (72021, 0, ("hz_for_rad_s", "log10_for_ln"), {"hz_for_rad_s", "log10_for_ln"}),
+        pytest.param(
+            72021, 0, ("hz_for_rad_s", "log10_for_ln"), {"hz_for_rad_s", "log10_for_ln"}, marks=LONG
+        ),
     ],
 )
 def test_what_makes_the_whole_table_likeliest_is_named(seed, turn, slips, codes):

@@ -10,21 +10,23 @@ from tests.gap.test_explain import explain, names
 from tests.truth.bench import Hidden
 from tests.truth.cases import make_case, make_rig
 
+LONG = [pytest.mark.slow, pytest.mark.sample]
+
 
 @pytest.mark.parametrize(
     ("effect", "n"),
     [
-        ("coulomb_friction", 2),
-        pytest.param("presliding_friction", 1, marks=[pytest.mark.slow, pytest.mark.sample]),
-        pytest.param("cubic_spring", 2, marks=[pytest.mark.slow, pytest.mark.sample]),
-        ("slack_spring", 1),
+        pytest.param("coulomb_friction", 2, marks=LONG),
+        pytest.param("presliding_friction", 1, marks=LONG),
+        pytest.param("cubic_spring", 2, marks=LONG),
+        pytest.param("slack_spring", 1, marks=LONG),
         ("drive_damping", 1),
-        ("dead_zone", 1),
+        pytest.param("dead_zone", 1, marks=LONG),
         ("input_delay", 1),
         ("extra_mode", 1),
-        pytest.param("end_stop", 1, marks=[pytest.mark.slow, pytest.mark.sample]),
+        pytest.param("end_stop", 1, marks=LONG),
         ("force_offset", 2),
-        ("cogging", 1),
+        pytest.param("cogging", 1, marks=LONG),
     ],
 )
 def test_names_the_hidden_effect(effect, n):
@@ -75,12 +77,12 @@ def test_two_effects_are_found_together():
 @pytest.mark.parametrize(
     ("effect", "hardness", "part"),
     [
-        pytest.param("end_stop", 25.0, 0.6, marks=[pytest.mark.slow, pytest.mark.sample]),
+        pytest.param("end_stop", 25.0, 0.6, marks=LONG),
         ("slack_spring", 3.0, 0.6),
-        pytest.param("end_stop", 5.0, 0.9, marks=[pytest.mark.slow, pytest.mark.sample]),
-        pytest.param("end_stop", 5.0, 0.6, marks=[pytest.mark.slow, pytest.mark.sample]),
-        pytest.param("slack_spring", 0.5, 0.9, marks=[pytest.mark.slow, pytest.mark.sample]),
-        pytest.param("slack_spring", 8.0, 0.6, marks=[pytest.mark.slow, pytest.mark.sample]),
+        pytest.param("end_stop", 5.0, 0.9, marks=LONG),
+        pytest.param("end_stop", 5.0, 0.6, marks=LONG),
+        pytest.param("slack_spring", 0.5, 0.9, marks=LONG),
+        pytest.param("slack_spring", 8.0, 0.6, marks=LONG),
     ],
 )
 def test_a_stop_and_a_stiffening_spring_are_told_apart(effect, hardness, part):

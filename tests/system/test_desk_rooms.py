@@ -8,7 +8,6 @@ from playwright.sync_api import expect
 from pipeline.desk.app import DeskServer
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.submission import load_submission
-from tests.helpers.accessibility import violations
 from tests.helpers.acquisitions import sine, write_work
 from tests.helpers.benches import emulator
 from tests.helpers.desks import a_recorded_cart
@@ -16,15 +15,8 @@ from tests.helpers.waiting import until
 from tests.system import test_desk
 from tests.system.test_report_pages import PHONE, WIDE
 
-show = test_desk.show
+show, fits = test_desk.show, test_desk.fits
 pytestmark = pytest.mark.usefixtures("work_here")
-
-
-def fits(window) -> bool:
-    """Tell whether nothing is wider than the screen, and axe finds nothing by day and by night."""
-    assert violations(window) == []
-    width = window.evaluate("document.documentElement.scrollWidth")
-    return width <= window.viewport_size["width"]
 
 
 def test_a_session_is_begun_watched_and_decided_on(show, tmp_path, real):

@@ -115,6 +115,8 @@ SPOILT = {
 
 # Those that are searched longest, and each for the same reason as a shorter one.
 SEARCHED = (
+    "cart 1 turned in every step",
+    "all dwells exchanged",
     "cart 1 turned in the sweep",
     "a tenth of the input in every step",
     "a third of the input in every step",
