@@ -29,8 +29,9 @@ HELD_OUT_GAIN = 0.95  # on held-out runs: of the root of chi-square, 10 % in squ
 RUN_GAIN, RUN_SHARE = 0.97, 0.6  # … and 6 % in more than half of the runs, whichever they are
 PARTIAL_GAIN = 0.9  # of the error, where too much for a name is left: a tenth is worth telling
 # What a contact, with its many parameters, must take there; and what must be gained behind one,
-# whose own law is known to a factor: a second effect would mop up the rest of the bounce.
-PARTIAL_CONTACT, CONTACT_GAIN = 0.55, 0.5
+# whose own law is known to a factor: a second effect would mop up the rest of the bounce. Below
+# this chi-square that rest is all there is, unless noise alone is left with the second.
+PARTIAL_CONTACT, CONTACT_GAIN, CONTACT_LAW = 0.55, 0.5, 10.0
 
 # A rival: within 15 % of the error, and in the criterion nearer than a tenth of what is gained, and
 # than twice what an effect must gain.

@@ -18,7 +18,7 @@ DELAY, CUBIC, DRAG, DEAD = (
 )
 
 
-def hypothesis(*keys: tuple[str, int], error: float, bic: float) -> Any:
+def hypothesis(*keys: tuple[str, int], error: float, bic: float, held: float = 1.0) -> Any:
     """Return what a verdict looks at of a hypothesis: no fit is made here."""
     effects = [SimpleNamespace(key=key, effect=find_effect(key[0])) for key in keys]
     structure = SimpleNamespace(effects=effects)
@@ -28,6 +28,7 @@ def hypothesis(*keys: tuple[str, int], error: float, bic: float) -> Any:
         bic=bic,
         at_floor=False,
         fit=SimpleNamespace(chi=1.0, n_points=100_000, structure=structure),
+        held=SimpleNamespace(chi=held, n_points=10_000),
     )
 
 
@@ -79,3 +80,11 @@ def test_a_rival_far_less_likely_is_none():
     both = hypothesis(COULOMB, SECOND, error=0.015, bic=-1000)
     other = hypothesis(DRAG, DEAD, error=0.0151, bic=-950)
     assert verdict_on(one, both, others=(other,))[0] == "named"
+
+
+@pytest.mark.parametrize(("held", "verdict"), [(1.0, "ambiguous"), (1.05, "named")])
+def test_runs_held_out_are_evidence_too(held: float, verdict: str):
+    """Of 30 by the runs fitted and 1000 ln 1.05 = 49 by the others, 40 make a rival none."""
+    drag = hypothesis(DRAG, error=0.01, bic=-1000)
+    cubic = hypothesis(CUBIC, error=0.01, bic=-970, held=held)
+    assert verdict_on(drag, others=(cubic,))[0] == verdict

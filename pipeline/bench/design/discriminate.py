@@ -28,7 +28,7 @@ from pipeline.bench.planning.propose import (
     rounded_down,
 )
 from pipeline.errors import DataError, PipelineError
-from pipeline.gap.limits import CLOSE_BIC
+from pipeline.gap.limits import CLOSE_BIC, THINNING
 from pipeline.gap.types import Gap, Proposal
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.dwells import SETTLED, settling_wait
@@ -37,6 +37,7 @@ from pipeline.plant.nonlinear.augmented import rest_positions, simulate_augmente
 from pipeline.plant.nonlinear.effects.base import AugmentedChain, Term
 from pipeline.plant.nonlinear.simulator import sensitivity
 from pipeline.plant.nonlinear.simulator.kernel import simulate_with_derivatives
+from pipeline.plant.nonlinear.tables import WITH_INPUT
 from pipeline.submission import Submission
 
 Kind = Literal["step", "sweep"]
@@ -49,6 +50,7 @@ _SIZES = (1.0, 0.5, 0.2)  # of what the limits allow: laws differ in how they gr
 _RELEASES = (0.6, 0.2)  # of the travel limit, from where a hand lets go
 _STEP = 1e-3  # relative, of an effect's parameter for a difference
 _HOPELESS = np.exp(-0.5 * CLOSE_BIC)  # of the likeliest one's weight: no contender any more
+_DECIDED = CLOSE_BIC * THINNING  # square sum that settles two: what is beyond it serves nobody
 _LEAST_WEIGHT = 0.1  # of the others: what swings overstates how sure the criterion is
 _LOOSER = 3.0  # standard errors, by which a parameter may be off: each is of one explanation
 _SAME = 1e-9  # of the largest: such a change of the parameters shows in nothing
@@ -91,7 +93,7 @@ def with_proposal(gap: Gap, *, limits: Limits, without: Sequence[Recording] = ()
         if found is None or np.abs(found[3][weight > 0.0]).max() > limits.travel:
             continue
         told, t, u, predicted = found
-        score = np.outer(weight, weight) * told
+        score = np.outer(weight, weight) * np.minimum(told, _DECIDED)
         if score.sum() > most:
             i, j = divmod(int(np.argmax(score)), len(models))
             best, most = (recording, told[i, j], (i, j), t, u, predicted), float(score.sum())
@@ -231,12 +233,28 @@ def _tell_apart(
     free = [cart - 1 for cart in recording.carts]
     told = np.zeros((len(models), len(models)))
     for i, j in combinations(range(len(models)), 2):
+        if not u.any() and _need_input(models[i], models[j]):
+            continue
         difference = ((predicted[i] - predicted[j]) / sigma[:, None])[free].ravel()
         told[i, j] = min(
             _left(difference, (by / sigma[:, None])[:, free], pinned)
             for _, by in (moved[i], moved[j])
         )
     return told, t, u, predicted
+
+
+def _need_input(one: AugmentedChain, other: AugmentedChain) -> bool:
+    """Do two models differ in nothing but what acts on an input, a lag for a delay, say?
+
+    What still parts their free motions is chance: a contact bounces otherwise in either.
+    """
+    mine, others = ({(t.effect.key, t.place): t for t in m.terms} for m in (one, other))
+    lone = [(mine | others)[key] for key in mine.keys() ^ others.keys()]
+    return all(
+        term.effect.place == "input"
+        and term.effect.columns(term.effect.named(term.values)).keys() <= WITH_INPUT
+        for term in lone
+    )
 
 
 def _left(difference: Array, by: Array, pinned: Array) -> float:

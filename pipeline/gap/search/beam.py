@@ -6,7 +6,7 @@ from contextlib import suppress
 import numpy as np
 
 from pipeline.gap.fit.structure import Candidate
-from pipeline.gap.limits import BIC_DROP
+from pipeline.gap.limits import BIC_DROP, CONTACT_LAW
 from pipeline.gap.search.deadline import OutOfTime
 from pipeline.gap.search.grow import fit_whole, grow
 from pipeline.gap.search.hypothesis import Hypothesis, Study, judge, lowers_error, worth_it
@@ -16,9 +16,8 @@ _PATIENCE = 2  # hypotheses grown in a row from which none comes with a lower he
 _DEPTH = 6  # effects
 _HOPELESS = 5.0  # a hypothesis with this many times the best one's chi-square is not grown
 _STEP = 0.81  # of the chi-square: a tenth of the error, which a further effect must take
-_CONTACT_STEP = 0.3  # a contact that is there takes more, and without it others can be searched …
+_CONTACT_STEP = 0.3  # a contact that is there takes more, and without it others can be searched
 _AS_GOOD = 1.5  # times the chi-square of one, which another may leave and be as likely
-_CONTACT_LAW = 10.0  # … chi-square that a contact of another law leaves: nothing to explain
 
 
 def search(baseline: Hypothesis, study: Study, *, depth: int = _DEPTH) -> list[Hypothesis]:
@@ -57,9 +56,10 @@ def _grow_the_best(
         leader = min(children, key=lambda h: h.bic, default=None)
         if leader is not None:
             for other in _exchanged(leader, seen, study):
-                seen[other.key] = other
-                if other.sound and other.bic < leader.bic:
-                    children.append(other)
+                if other.key not in seen or other.bic < seen[other.key].bic:
+                    seen[other.key] = other
+                    if other.sound and other.bic < leader.bic:
+                        children.append(other)
         if any(child.at_floor for child in children):
             break
         if children:
@@ -99,7 +99,10 @@ def _exchanged(
             continue
         for other in list(seen.values()):
             key = leader.key - {old.key} | other.key
-            if len(other.key) != 1 or key in seen or other.fit.chi > _AS_GOOD * alone.fit.chi:
+            if len(other.key) != 1 or other.fit.chi > _AS_GOOD * alone.fit.chi:
+                continue
+            # In one of many valleys of a contact it may have been another's.
+            if key in seen and seen[key].fit.chi < _AS_GOOD * leader.fit.chi:
                 continue
             (new,), (term,) = other.fit.structure.effects, other.fit.terms
             start = leader.fit.without(index).with_effect(new, term.values)
@@ -131,8 +134,8 @@ def by_promise(
 def _leads_on(child: Hypothesis, before: float) -> bool:
     """May a further effect still make this one the best? `before` is the chi-square without."""
     if any(c.effect.contact for c in child.added):
-        return _CONTACT_LAW < child.fit.chi < _CONTACT_STEP * before
-    if child.has_contact and child.fit.chi < _CONTACT_LAW:
+        return child.fit.chi < _CONTACT_STEP * before
+    if child.has_contact and child.fit.chi < CONTACT_LAW:
         return False
     # One of two effects may do little by itself.
     return child.size == 1 or child.fit.chi < _STEP * before

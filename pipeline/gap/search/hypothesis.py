@@ -43,6 +43,14 @@ class Hypothesis:
         return self.fit.structure.has_contact
 
     @property
+    def leaves_noise(self) -> bool:
+        """Whether noise alone is left of training runs, and little more of those held out.
+
+        A contact found to a thousandth bounces otherwise in the end.
+        """
+        return self.fit.chi < limits.AT_FLOOR and self.held.chi < limits.NEAR_FLOOR**2
+
+    @property
     def size(self) -> int:
         """How many laws act: one of dry friction counts once, on however many carts it acts."""
         effects = self.fit.structure.effects
@@ -136,8 +144,13 @@ def worth_it(child: Hypothesis, parent: Hypothesis, study: Study) -> bool:
     if parent.held.chi < limits.AT_FLOOR < parent.fit.chi:
         # Held-out runs in which the effect does not show cannot speak for it; they must not speak
         # against it, and the others tell the more clearly.
-        return child.bic < parent.bic - limits.ALONE * drop and not child.has_contact
-    gain = limits.CONTACT_GAIN if parent.has_contact else limits.HELD_OUT_GAIN
+        mopping = child.has_contact and not child.leaves_noise
+        return child.bic < parent.bic - limits.ALONE * drop and not mopping
+    gain = limits.HELD_OUT_GAIN
+    if parent.has_contact and not child.leaves_noise:
+        if parent.fit.chi < limits.CONTACT_LAW:
+            return False
+        gain = limits.CONTACT_GAIN
     if child.bic > parent.bic - drop or child.held.chi > gain**2 * parent.held.chi:
         return False
     better = child.held.run_chi < limits.RUN_GAIN**2 * parent.held.run_chi

@@ -74,11 +74,15 @@ def _needless(chosen: Hypothesis, found: Sequence[Hypothesis], study: Study) -> 
 def _evidence(chosen: Hypothesis, rival: Hypothesis, study: Study) -> float:
     """Return by how much the chosen is the likelier, in units of the criterion.
 
-    What a model leaves that is not noise swings with the carts: far fewer of its points are
-    independent than the criterion counts, and much of the difference may be chance.
+    The runs held out, to which neither is fitted, count alike where little but noise is left. What
+    a model leaves that is not noise swings with the carts: far fewer of its points are independent
+    than the criterion counts, and much of the difference may be chance.
     """
     difference = rival.bic - chosen.bic
     if chosen.fit.chi < limits.NEAR_FLOOR**2:
+        if chosen.held.chi < limits.NEAR_FLOOR**2:
+            points = chosen.held.n_points / limits.THINNING
+            difference += points * float(np.log(rival.held.chi / chosen.held.chi))
         return difference
     counted = chosen.fit.n_points / limits.THINNING
     return difference * min(1.0, _independent_points(chosen, study) / counted)

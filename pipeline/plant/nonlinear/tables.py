@@ -62,6 +62,8 @@ class Drive(IntEnum):
 
 # Dry friction: what holds a cart at rest, and differs from run to run by a factor of its own.
 DRY = (Cart.COULOMB, Cart.STATIC, Cart.LOAD, Cart.DAHL)
+# What changes nothing in a motion without an input.
+WITH_INPUT = {Drive.DEAD_ZONE, Drive.LIMIT, Drive.DELAY, Drive.LAG, Drive.DAMPING}
 NO_LIMIT = 1e30  # a saturation nobody reaches
 
 Tables = tuple[Array, Array, Array]
