@@ -167,6 +167,8 @@ def test_a_team_has_its_numbers_beside_ours(ta):
     page = ta.get(at("team-01")).text
     assert "3.12" in page
     assert "19.6" in page
+    remark = page.split('id="remarks"')[1].split("</section>")[0]
+    assert re.findall(r"<th [^>]*>(.*?)</th>", remark) == ["Reported", "Recomputed", "Ratio"]
     figure = re.search(r'<img class="drawing" src="(.*?)"', page)
     assert figure
     drawn = ta.get(unescape(figure[1]))
@@ -180,12 +182,16 @@ def test_a_team_has_its_numbers_beside_ours(ta):
 
 
 def test_a_record_stands_beside_its_criterion(tmp_path):
-    """The figure that shows a number of it; the others stand by themselves."""
+    """The figure that shows a number of it, a response by what was lost; others by themselves."""
     names = ("record-K_1", "record-omega_2-zeta_2", "response-1", "other")
     drawn = tuple((f"{n}.svg", f"<svg><title>{n}</title></svg>") for n in names)
     grade = make_grade("team", share=0.5)
     numbers = {"initial-gains": {"K_1": 3.0}, "initial-decays": {"zeta_2": 0.1}}
-    criteria = tuple(c.model_copy(update={"found": numbers.get(c.id, {})}) for c in grade.criteria)
+    passed = {"final-gains": {"outcome": "pass"}}
+    criteria = tuple(
+        c.model_copy(update={"found": numbers.get(c.id, {})} | passed.get(c.id, {}))
+        for c in grade.criteria
+    )
     outcome = make_outcome(grade.model_copy(update={"criteria": criteria}), figures=drawn)
     with Gradebook(tmp_path, assignment="lab", create=True) as book:
         book.put(outcome)
@@ -201,8 +207,9 @@ def test_a_record_stands_beside_its_criterion(tmp_path):
     assert {criterion: figures for criterion, figures in found.items() if figures} == {
         "initial-gains": ["record-K_1"],
         "initial-decays": ["record-omega_2-zeta_2"],
-        "final-gains": ["response-1", "other"],
+        "final-frequencies": ["response-1"],
     }
+    assert "figure=other.svg" in page.split('id="evidence"')[1]
 
 
 def test_points_are_changed_as_the_command_does(ta, grades):
@@ -388,7 +395,9 @@ def test_the_export_is_that_of_the_command(ta, grades, tmp_path, platform):
     assert "attachment" in answer.headers["content-disposition"]
     expected = {f.relative_to(tmp_path / "out").as_posix(): f.read_bytes() for f in done.files}
     if done.remarks:
-        expected["remarks.txt"] = ("\n".join(done.remarks) + "\n").encode()
+        expected["remarks.txt"] = (
+            "\n".join(remark.text for remark in done.remarks) + "\n"
+        ).encode()
     if len(expected) == 1:
         assert answer.body == expected[f"{platform}.csv"]
     else:

@@ -1,7 +1,6 @@
 """A team at the desk: its points beside the evidence, and what a person decides about them."""
 
 from itertools import count
-from numbers import Real
 from typing import Any
 from urllib.parse import urlencode
 
@@ -18,8 +17,14 @@ from pipeline.grading.gradebook.open_book import Conflict, TeamNow
 from pipeline.grading.gradebook.override import read_points
 from pipeline.grading.publish.anonymous import anonymise, renamed_events
 from pipeline.grading.publish.class_page import feedback_link
-from pipeline.grading.publish.feedback import TONES, alternative, numbers_table, sentence
-from pipeline.grading.publish.feedback_figures import numbers_in
+from pipeline.grading.publish.feedback import (
+    TONES,
+    alternative,
+    evidence_table,
+    numbers_table,
+    sentence,
+)
+from pipeline.grading.publish.feedback_figures import is_response, numbers_in
 from pipeline.grading.words import WORDS, points_text
 from pipeline.report.document import paragraph
 from pipeline.report.figures.svg import plain_svg
@@ -92,7 +97,9 @@ def _page(ask: Ask, *, wrong: dict[str, str] | None = None, status: int = 200) -
     left = []
     for file, svg in book.figures(now.entry):
         address = f"{ask.here}figure?{urlencode({'of': name, 'figure': file})}"
-        beside = next((c for c in criteria if _shows(file, c)), None)
+        about = [criterion for criterion in criteria if _shows(file, criterion)]
+        # Of several, those who lost points by what it shows look there.
+        beside = min(about, key=lambda criterion: not criterion["lost"], default=None)
         place = left if beside is None else beside["figures"]
         place.append({"address": address, "alt": alternative(svg)})
     return ask.page(
@@ -137,6 +144,7 @@ def _criteria(
                 "out_of": points_text(asked.points),
                 "outcome": WORDS.text(f"outcome_{own.outcome}") if own else "not judged",
                 "tone": TONES[own.outcome] if own else "quiet",
+                "lost": own is not None and own.outcome in ("partial", "fail"),
                 "evidence": _evidence(own, asked.check) if own else "",
                 "check": asked.check,
                 "numbers": frozenset(own.found if own else ()),
@@ -156,7 +164,7 @@ def _shows(file: str, criterion: dict[str, Any]) -> bool:
     """Tell whether a figure belongs beside a criterion: records by the numbers in them."""
     if numbers := numbers_in(file):
         return criterion["check"] == "initial" and not numbers.isdisjoint(criterion["numbers"])
-    return criterion["check"] == "final"
+    return is_response(file) and criterion["check"] == "final"
 
 
 def _evidence(criterion: Criterion, check: str) -> str:
@@ -169,16 +177,12 @@ def _evidence(criterion: Criterion, check: str) -> str:
 def _flag(ask: Ask, flag: Flag, shown: Class) -> dict[str, Any]:
     """Return a remark with its evidence; who shares a recording is a team to look at."""
     others = flag.evidence.get("submissions", ()) if flag.code == "shared_data" else ()
-    numbers = {
-        name.replace("_", " "): f"{value:.4g}" if isinstance(value, float) else f"{value}"
-        for name, value in flag.evidence.items()
-        if isinstance(value, Real | str)
-    }
+    table = evidence_table(flag, numbers=count(0))
     return {
         "title": WORDS.text(f"title_{flag.code}"),
         "text": sentence(flag.message),
         "look": WORDS.text(f"place_{flag.code}"),
-        "numbers": numbers,
+        "numbers": render_blocks([table]) if table else "",
         "others": [(name, _address(ask, name) if name in shown.teams else "") for name in others],
     }
 

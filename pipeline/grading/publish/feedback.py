@@ -40,6 +40,11 @@ from pipeline.schemas.grade import Criterion, Flag, Grade, Outcome
 _TITLE = re.compile(r"<title>(.*?)</title>", re.DOTALL)
 _NAME = re.compile(r"(omega|zeta|K)(_\w)?")
 TONES: dict[Outcome, Tone] = {"pass": "good", "partial": "", "fail": "bad", "skip": "quiet"}
+_EVIDENCE = {  # what is not called as it is in grade.json
+    "mistake_gives": "The mistake gives",
+    "overshoot_percent": "Overshoot [%]",
+    "settling_time": "Settling time [s]",
+}
 _MOST_ROWS = 60  # of one criterion
 _LONGEST_TEXT = 200  # letters of a value that is no number
 
@@ -254,6 +259,18 @@ def numbers_table(criterion: Criterion, *, check: str, numbers: count) -> Table 
         rows,
         "lddd" if compared else "ldd",
     )
+
+
+def evidence_table(flag: Flag, *, numbers: count) -> Table | None:
+    """Return the numbers that a remark rests on, None where it rests on none."""
+    found = {name: v for name, v in flag.evidence.items() if isinstance(v, Real)}
+    if not found:
+        return None
+    of = flag.evidence.get("parameter")
+    caption = rich(f"The numbers of {clean(of)}." if isinstance(of, str) else "The numbers.")
+    heads = [_EVIDENCE.get(name) or _capital(clean(name).replace("_", " ")) for name in found]
+    row = [cell(_value(value)) for value in found.values()]
+    return make_table(next(numbers), caption, heads, [row], "r" * len(row))
 
 
 def _is_shown(value: Any) -> bool:

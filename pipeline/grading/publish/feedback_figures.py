@@ -19,6 +19,7 @@ from pipeline.results import Analysis, Record
 from pipeline.schemas.grade import Criterion
 from pipeline.submission import Reported
 
+_RESPONSE = "response"  # begins a figure's name
 _MOST_CARTS = 3  # whose table stands for transfer functions
 _LARGEST = 1e9  # of gains and frequencies, and its reciprocal the least: no figure shows more
 
@@ -42,7 +43,7 @@ def draw_figures(analysis: Analysis, reported: Reported | None) -> tuple[tuple[s
             )
             told = "the curve of the reported final table" if curve else "no complete final table"
             alt = f"Measured frequency response of cart {response.cart}, its fit, and {told}."
-            name = f"response-{response.cart}"
+            name = f"{_RESPONSE}-{response.cart}"
             drawn.append((f"{name}.svg", to_svg(figure, name=name, alt=alt)))
     return tuple(drawn)
 
@@ -98,6 +99,11 @@ def numbers_in(file: str) -> frozenset[str]:
     """Return the parameters that a figure of a record shows; of other figures none."""
     kind, *names = file.removesuffix(".svg").split("-")
     return frozenset(names if kind == "record" else ())
+
+
+def is_response(file: str) -> bool:
+    """Whether a figure is the frequency response of a cart, with the final table's curve."""
+    return file.startswith(f"{_RESPONSE}-")
 
 
 def _response(values: Mapping[str, float]) -> tuple[Array, Sequence[Array]] | None:
