@@ -38,6 +38,7 @@ PRESETS = ("throne-1dof", "throne-2dof", "throne-3dof")
 COMPARED = (50, 100, 200, 400)  # submissions at once
 NIGHT = 8 * 3600.0  # s
 HOUR = 3600.0
+PRICES = (0.02, 0.05)  # of a core-hour in a rented cluster, dollars or euros
 
 # ------------------------------------------------------------------------------- costs
 
@@ -267,14 +268,15 @@ def tables(costs: dict[str, Any]) -> dict[str, str]:
         span = f"{seconds / HOUR:,.1f} h" if seconds > HOUR else f"{seconds:,.0f} s"
         compared.append(f"| {n:,} | {span} | {n * costs['kept'] / 1e9:,.2f} GB |")
     needed = [
-        "| hand-ins | core-hours | cores for a night of 8 h | clients | to store |",
-        "| --- | --- | --- | --- | --- |",
+        "| hand-ins | core-hours | cores for a night of 8 h | clients | to store | to pay |",
+        "| --- | --- | --- | --- | --- | --- |",
     ]
     for n in (200, 10_000, 1_000_000):
         needed.append(
             f"| {n:,} | {n * mean / HOUR:,.2f} | {int(np.ceil(n * mean / NIGHT))} "
             f"| {int(np.ceil(n * client / NIGHT))} "
-            f"| {n * (costs['handed_in'] + costs['kept']) / 1e9:,.2f} GB |"
+            f"| {n * (costs['handed_in'] + costs['kept']) / 1e9:,.2f} GB "
+            f"| {n * mean / HOUR * PRICES[0]:,.2f} to {n * mean / HOUR * PRICES[1]:,.2f} |"
         )
     texts = {"measured": measured, "needed": needed, "simulated": simulated, "compared": compared}
     return {name: "\n".join(lines) for name, lines in texts.items()}

@@ -120,3 +120,16 @@ def test_the_files_that_contributors_are_sent_to_are_there():
     assert len(paths) > 30
     for path in paths:
         assert "YOURS" in path or path.endswith("__pycache__") or (ROOT / path).exists(), path
+
+
+def test_the_hooks_before_a_commit_are_the_checks_of_ci():
+    """Each of ruff, pyright and mkdocs that `.ci/run` calls is a hook, with its strictness."""
+    checked = re.findall(
+        r"^(?:\w+=\S+ )?((?:ruff|pyright|mkdocs)\b.*)", (ROOT / ".ci/run").read_text(), re.MULTILINE
+    )
+    hooks = re.findall(
+        r"^ +name: (.*)", (ROOT / ".pre-commit-config.yaml").read_text(), re.MULTILINE
+    )
+    assert len(checked) == len(hooks) > 0
+    for line, hook in zip(checked, hooks, strict=True):
+        assert line.startswith(hook)
