@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.grading_batch import disguised, grade, write_class
+from benchmarks.page import significant
 from pipeline.grading.batch.worker import Task, grade_task
 from pipeline.grading.gradings import Member
 from pipeline.grading.intake.files import packed
@@ -272,11 +273,11 @@ def tables(costs: dict[str, Any]) -> dict[str, str]:
         "| --- | --- | --- | --- | --- | --- |",
     ]
     for n in (200, 10_000, 1_000_000):
+        low, high = (significant(n * mean / HOUR * price) for price in PRICES)
         needed.append(
             f"| {n:,} | {n * mean / HOUR:,.2f} | {int(np.ceil(n * mean / NIGHT))} "
             f"| {int(np.ceil(n * client / NIGHT))} "
-            f"| {n * (costs['handed_in'] + costs['kept']) / 1e9:,.2f} GB "
-            f"| {n * mean / HOUR * PRICES[0]:,.2f} to {n * mean / HOUR * PRICES[1]:,.2f} |"
+            f"| {n * (costs['handed_in'] + costs['kept']) / 1e9:,.2f} GB | {low} to {high} |"
         )
     texts = {"measured": measured, "needed": needed, "simulated": simulated, "compared": compared}
     return {name: "\n".join(lines) for name, lines in texts.items()}
