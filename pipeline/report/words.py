@@ -67,11 +67,6 @@ def capital(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
-def stage_name(stage: str) -> str:
-    """Return a stage's name as words."""
-    return clean(stage).replace("_", " ")
-
-
 def plain_lines(blocks: Iterable[Block]) -> str:
     """Return paragraphs and lists as lines of plain text."""
     lines = []

@@ -537,6 +537,15 @@ def test_skipped_stages_are_told_apart():
     assert "; 2 more; " in line
 
 
+def test_an_id_keeps_its_underscores_where_it_was_skipped(tmp_path):
+    """In the summary, on the terminal and in the list, as it stands in submission.toml."""
+    skipped = (Skipped(stage="log decrement, my_decay_1, cart 1", reason="too short"),)
+    analysis = replace(make_analysis(1), skipped=skipped)
+    assert "my_decay_1" in terminal_summary(analysis)
+    page, _ = render(analysis, tmp_path)
+    assert page.count("my_decay_1, cart 1") >= 2
+
+
 def test_a_good_result_is_called_so():
     """Nothing to complain of: the summary says so in a few lines."""
     analysis = make_analysis(1, repeats=1)

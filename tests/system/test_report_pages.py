@@ -36,7 +36,7 @@ CASES = (
 # One effect for each kind of picture.
 PICTURED = tuple({effect.axis: effect for effect in reversed(CATALOGUE)}.values())
 LARGEST = 3_000_000  # bytes of a page
-WIDE, PHONE = (1280, 900), (390, 844)
+WIDE, LAPTOP, PHONE = (1280, 900), (1100, 800), (390, 844)
 
 
 @pytest.fixture(scope="module")
@@ -240,7 +240,9 @@ def test_everybody_can_read_it_on_every_screen(made, show):
     page = show(page_of(made), color_scheme="light", bypass_csp=True)
     page.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
     assert [v for v in violations(page) if v.impact in ("serious", "critical")] == []
-    assert page.evaluate(WIDER) == []
+    for width, height in (WIDE, LAPTOP):
+        page.set_viewport_size({"width": width, "height": height})
+        assert page.evaluate(WIDER) == []
     for width, height in (WIDE, PHONE):
         page.set_viewport_size({"width": width, "height": height})
 

@@ -9,18 +9,23 @@ from pipeline.grading.mistakes.catalogue import Mistake, known_mistakes
 from pipeline.grading.mistakes.explain import Explained, Explanation, Label, Table, explain
 from pipeline.grading.mistakes.impossible import BrokenOrder, broken_orders, not_positive
 from pipeline.grading.mistakes.no_fit import copied_final
+from pipeline.grading.mistakes.table_flags import (
+    OTHER,
+    copied_flag,
+    disagreement_flag,
+    impossible_flag,
+    limit,
+    off_flag,
+    specific_flags,
+)
 from pipeline.grading.mistakes.transient import transient_fits
 from pipeline.grading.references.reference import Reference, References
-from pipeline.grading.references.tolerance import as_typed, percent_off
+from pipeline.grading.references.tolerance import percent_off
 from pipeline.grading.rubric import is_damping
-from pipeline.grading.words import WORDS
 from pipeline.names import read_name
 from pipeline.results import Analysis
-from pipeline.schemas.grade import CODES, Code, Flag
+from pipeline.schemas.grade import Code, Flag
 from pipeline.submission import Reported
-
-_TOLD: dict[Label, str] = {"initial": "first_estimate", "final": "final_estimate"}
-_OTHER: dict[Label, Label] = {"initial": "final", "final": "initial"}
 
 # What comes of reading a decay or a step; in a final table only where it was taken over.
 _FROM_TIME_RECORDS = {"peak_count", "log10_for_ln", "peak_for_steady_state", "transient_used"}
@@ -51,8 +56,8 @@ def diagnose_tables(reported: Reported, *, references: References, analysis: Ana
     alone = {label: one.explain() for label, one in judged.items()}
     # What one table alone leaves open the mistakes of the other may decide.
     found: dict[Label, Explanation] = {
-        label: one.explain(believed=alone[_OTHER[label]].codes)
-        if alone[_OTHER[label]].codes
+        label: one.explain(believed=alone[OTHER[label]].codes)
+        if alone[OTHER[label]].codes
         else alone[label]
         for label, one in judged.items()
     }
@@ -70,16 +75,16 @@ def diagnose_tables(reported: Reported, *, references: References, analysis: Ana
         impossible = {name for law in broken for name in law.names}
         left[label] = [name for name in rest if name not in impossible]
     if copied:
-        flags.append(_copied_flag(reported, copied, references))
+        flags.append(copied_flag(reported, copied, references))
     explained = [
         e
         for label, one in found.items()
         for e in one.explained
         if not judged[label].suspect.isdisjoint(e.names)
     ]
-    flags += _specific_flags(explained, tables, references)
+    flags += specific_flags(explained, tables, references)
     flags += [
-        _off_flag(tables[label], names, getattr(references, label), label)
+        off_flag(tables[label], names, getattr(references, label), label)
         for label, names in left.items()
         if names
     ]
@@ -88,7 +93,7 @@ def diagnose_tables(reported: Reported, *, references: References, analysis: Ana
     # A mistake in one of the tables parts them; also where the recordings give no number.
     kinds = {name[0] for one in explained for name in one.names}
     if apart := [one for one in apart if one[1] not in named and one[1][0] not in kinds]:
-        flags.append(_disagreement_flag(reported, apart))
+        flags.append(disagreement_flag(reported, apart))
     corrected = _corrected(reported.final, explained, references.final)
     corrected |= {name: references.final[name].value for name in left["final"]}
     named_in: dict[Label, frozenset[str]] = {
@@ -180,7 +185,7 @@ def _judge(
         unordered=unordered,
         mistakes=mistakes,
         laws=laws,
-        flags=[_impossible_flag(table, impossible, known, label)] if impossible else [],
+        flags=[impossible_flag(table, impossible, known, label)] if impossible else [],
     )
 
 
@@ -188,7 +193,7 @@ def _unordered(
     laws: Sequence[BrokenOrder], label: Label, reported: Reported, *, suspect: Sequence[str]
 ) -> frozenset[str]:
     """Return the gains that are not in their order and not as in the other table."""
-    other: Table = getattr(reported, _OTHER[label])
+    other: Table = getattr(reported, OTHER[label])
     table: Table = getattr(reported, label)
     gains = [law for law in laws if law.is_of_gains and not set(law.names).isdisjoint(suspect)]
     return frozenset(
@@ -233,124 +238,6 @@ def _corrected(
     return corrected
 
 
-def limit(name: str, table: str) -> float:
-    """Return from how many percent on a reported number is worth a remark."""
-    if is_damping(name):
-        return limits.OFF_DAMPING
-    if table == "final":
-        return limits.OFF_FINAL
-    return limits.OFF_BY_EYE if read_name(name).is_by_eye else limits.OFF_INITIAL
-
-
-# ------------------------------------------------------------------------ flags
-
-
-def _evidence(name: str, typed: Decimal, reference: Reference | None, table: str) -> dict:
-    evidence: dict = {"parameter": name, "table": table, "reported": float(typed)}
-    if reference is not None:
-        evidence["recomputed"] = reference.value
-        if reference.value:
-            evidence["ratio"] = float(typed) / reference.value
-    return evidence
-
-
-def _specific_flags(
-    explained: Sequence[Explained], tables: Mapping[Label, Table], references: References
-) -> list[Flag]:
-    """Return one flag a code, over both tables; the first number stands for all in the text."""
-    flags = []
-    for code in CODES:
-        mine = [one for one in explained if code in one.mistake.codes]
-        if not mine:
-            continue
-        names = list(dict.fromkeys(name for one in mine for name in one.names))
-        first = min(mine, key=lambda one: len(one.mistake.codes))
-        name = next(name for name in first.names if name in first.mistake.predicted)
-        typed = tables[first.table][name]
-        reference: Reference = getattr(references, first.table)[name]
-        predicted = first.mistake.predicted[name]
-        evidence = _evidence(name, typed, reference, first.table)
-        evidence |= {"mistake_gives": predicted.value}
-        if len(first.mistake.codes) > 1:
-            evidence["together_with"] = [c for c in first.mistake.codes if c != code]
-        message = WORDS.text(
-            "mistake",
-            name=name,
-            table=WORDS.text(_TOLD[first.table]),
-            help=first.mistake.help(typed, reference),
-        )
-        if first.rival and code not in first.rival.codes:
-            evidence["or_else"] = [c for c in first.rival.codes if c not in first.mistake.codes]
-            message += WORDS.text("or_else", help=first.rival.help(typed, reference))
-        other = _OTHER[first.table]
-        if any(one.table == other for one in mine):  # who mends one table leaves the other else
-            evidence["also_in"] = other
-            message += WORDS.text(f"also_{other}")
-        flags.append(Flag(code=code, parameters=tuple(names), message=message, evidence=evidence))
-    return flags
-
-
-def _off_flag(
-    table: Table, names: Sequence[str], known: Mapping[str, Reference], label: str
-) -> Flag:
-    def error(name: str) -> float:
-        return float(percent_off(table[name], known[name], sigmas=limits.SIGMAS)) / limit(
-            name, label
-        )
-
-    worst = max(names, key=error)
-    reference, typed = known[worst], table[worst]
-    ratio = float(typed) / reference.value if reference.value else 0.0
-    look = {"K": "look_gain", "o": "look_frequency", "z": "look_damping"}.get(worst[0], "look")
-    if any(abs(ratio / 10.0**power - 1) < 0.05 for power in (-3, -2, -1, 1, 2, 3)):
-        look = "look_power"
-    code: Code = "initial_off" if label == "initial" else "final_off"
-    return Flag(
-        code=code,
-        parameters=tuple(names),
-        message=WORDS.text(
-            "off",
-            name=worst,
-            recomputed=reference.said,
-            reported=as_typed(typed),
-            look=WORDS.text(look),
-        ),
-        evidence=_evidence(worst, typed, reference, label),
-    )
-
-
-def _impossible_flag(
-    table: Table, names: Sequence[str], known: Mapping[str, Reference], label: Label
-) -> Flag:
-    name = names[0]
-    return Flag(
-        code="physically_impossible",
-        parameters=tuple(names),
-        message=WORDS.text(
-            "not_positive",
-            name=name,
-            reported=as_typed(table[name]),
-            table=WORDS.text(_TOLD[label]),
-            hint=WORDS.text("hint_sign" if table[name] else "hint_digits"),
-        ),
-        evidence=_evidence(name, table[name], known.get(name), label),
-    )
-
-
-def _copied_flag(reported: Reported, copied: Sequence[str], references: References) -> Flag:
-    def error(name: str) -> float:
-        known = references.final.get(name)
-        return float(percent_off(reported.final[name], known, sigmas=0.0)) if known else 0.0
-
-    worst = max(copied, key=error)
-    return Flag(
-        code="no_fit_done",
-        parameters=tuple(copied),
-        message=WORDS.text("copied", name=worst),
-        evidence=_evidence(worst, reported.final[worst], references.final.get(worst), "final"),
-    )
-
-
 def _disagreements(
     reported: Reported, references: References, *, blurred: bool
 ) -> list[tuple[float, str]]:
@@ -383,21 +270,3 @@ def _disagreements(
         if error > (worth + limits.OFF_BY_EYE if by_eye else worth):
             apart.append((error / worth, name))
     return sorted(apart, reverse=True)
-
-
-def _disagreement_flag(reported: Reported, apart: Sequence[tuple[float, str]]) -> Flag:
-    _, worst = apart[0]
-    initial, final = reported.initial[worst], reported.final[worst]
-    return Flag(
-        code="initial_final_disagree",
-        parameters=tuple(name for _, name in apart),
-        message=WORDS.text(
-            "disagree", name=worst, initial=as_typed(initial), final=as_typed(final)
-        ),
-        evidence={
-            "parameter": worst,
-            "initial": float(initial),
-            "final": float(final),
-            "ratio": float(final / initial),
-        },
-    )

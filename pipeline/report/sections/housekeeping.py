@@ -17,7 +17,7 @@ from pipeline.report.document import (
 from pipeline.report.numbers import count
 from pipeline.report.phrases import phrases
 from pipeline.report.sections.page import Page
-from pipeline.report.words import clean, rich, stage_name
+from pipeline.report.words import clean, rich
 from pipeline.results import Check
 
 _WORDS = phrases("report")
@@ -62,7 +62,7 @@ def _check_table(page: Page, checks: Sequence[Check], caption: str) -> Table:
 def skipped_blocks(page: Page) -> list[Block]:
     """Return which stages were skipped, and why."""
     told = [
-        spans(Span(f"{stage_name(skip.stage)}: ", "strong"), rich(clean(skip.reason)))
+        spans(Span(f"{clean(skip.stage)}: ", "strong"), rich(clean(skip.reason)))
         for skip in page.analysis.skipped
     ]
     return [bullet_list(told)] if told else []

@@ -30,7 +30,7 @@ from pipeline.report.numbers import (
 from pipeline.report.phrases import phrases
 from pipeline.report.sections.measurements import overview_blocks
 from pipeline.report.sections.page import Page
-from pipeline.report.words import clean, name_span, names_spans, plain_lines, rich, stage_name
+from pipeline.report.words import clean, name_span, names_spans, plain_lines, rich
 from pipeline.results import SIGN, Analysis, Check, Estimate, HardwareCheck
 
 _WORDS = phrases("summary")
@@ -292,7 +292,7 @@ def _range(best: HardwareCheck, worst: HardwareCheck, *, to: str) -> str:
 def _skipped(analysis: Analysis) -> tuple[bool, Spans] | None:
     if not analysis.skipped:
         return None
-    names = list(dict.fromkeys(stage_name(skip.stage) for skip in analysis.skipped))
+    names = list(dict.fromkeys(clean(skip.stage) for skip in analysis.skipped))
     more = len(names) - _MOST_TOLD
     # A name has commas in it: "log decrement, decay-1, cart 1".
     stages = "; ".join(names[:_MOST_TOLD] + ([f"{more} more"] if more > 0 else []))
