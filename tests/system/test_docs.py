@@ -47,16 +47,9 @@ def run_page(page: Path, monkeypatch, folder: Path, *, slow: bool) -> int:
 TUTORIALS = [page for page in PAGES if page.name.startswith(("tutorial", "commands"))]
 
 
-@pytest.mark.parametrize(
-    "page",
-    [
-        pytest.param(page, marks=[pytest.mark.slow, pytest.mark.sample])
-        if page.stem != "commands"  # which shows each command; the tutorials are longer
-        else page
-        for page in TUTORIALS
-    ],
-    ids=lambda page: page.stem,
-)
+@pytest.mark.slow
+@pytest.mark.sample
+@pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
 def test_what_a_page_says_to_type_works(page, monkeypatch, tmp_path, capsys):
     """From an empty folder, every command ends with the exit status that the page states.
 
