@@ -91,26 +91,41 @@ def page_of(made: Path) -> Path:
     return page
 
 
+@pytest.fixture(scope="module")
+def window(browser):
+    """The window in which most pages are shown: another takes a second to open."""
+    return browser.new_context().new_page()
+
+
 @pytest.fixture
-def show(browser):
-    """Open a page in a window of its own; errors of its script fail the test."""
-    contexts, errors = [], []
+def show(browser, window):
+    """Open a page, in a window of its own where that has options; its errors fail the test."""
+    pages, errors = [], []
+
+    def on_error(error) -> None:
+        errors.append(str(error))
+
+    def on_line(line) -> None:
+        if line.type == "error":
+            errors.append(line.text)
 
     def opened(path: Path, *, size=WIDE, **options):
-        context = browser.new_context(
-            viewport={"width": size[0], "height": size[1]}, reduced_motion="reduce", **options
-        )
-        context.set_default_timeout(1e3 * PATIENCE)
-        contexts.append(context)
-        page = context.new_page()
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        page.on("console", lambda line: errors.append(line.text) if line.type == "error" else None)
+        page = browser.new_context(**options).new_page() if options else window
+        pages.append(page)
+        page.set_default_timeout(1e3 * PATIENCE)
+        page.set_viewport_size({"width": size[0], "height": size[1]})
+        page.emulate_media(color_scheme="light", reduced_motion="reduce")
+        page.on("pageerror", on_error)
+        page.on("console", on_line)
         page.goto(path.as_uri())
         return page
 
     yield opened
-    for context in contexts:
-        context.close()
+    for page in pages:
+        page.remove_listener("pageerror", on_error)
+        page.remove_listener("console", on_line)
+        if page is not window:
+            page.context.close()
     assert errors == []
 
 
@@ -237,7 +252,7 @@ def test_everybody_can_read_it_on_every_screen(made, show):
     Nothing sticks out but what can be scrolled, no text lies on another, figures hold theirs. On a
     laptop every column of a table is in sight; on a phone the name of a check stands in one line.
     """
-    page = show(page_of(made), color_scheme="light", bypass_csp=True)
+    page = show(page_of(made))
     page.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
     assert [v for v in violations(page) if v.impact in ("serious", "critical")] == []
     for width, height in (WIDE, LAPTOP):
