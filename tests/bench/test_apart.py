@@ -159,6 +159,38 @@ def test_a_hopeless_contender_decides_nothing():
     assert other.separation == pytest.approx(alone.proposal.separation)
 
 
+def test_what_is_settled_has_little_say():
+    """Of two nearly settled pairs and an open one the recording is for the open one."""
+    late, lagged = (
+        model("input_delay", place=0, delay=2e-3),
+        model("actuator_lag", place=0, time_constant=2e-3),
+    )
+    gap = disputed(late, lagged, DRY)
+    weighed = (*gap.contenders[:2], replace(gap.contenders[2], weight=1e-8))
+    three = with_proposal(replace(gap, contenders=weighed), limits=LIMITS).proposal
+    two = with_proposal(disputed(late, lagged), limits=LIMITS).proposal
+    assert two is not None
+    assert three is not None
+    assert three.recording == two.recording
+    assert three.pair == (0, 1)
+
+
+def test_what_acts_on_the_input_alone_shows_in_no_decay():
+    """A lag and a delay part where there is an input, whatever bounces beside them."""
+    late, lagged = (
+        model("input_delay", place=0, delay=2e-3),
+        model("actuator_lag", place=0, time_constant=3e-3),
+    )
+    softer = replace(lagged, chain=replace(CHAIN, k=CHAIN.k * 0.9))
+    decay = next(r for r, _ in _candidates(CHAIN, LIMITS) if r.release)
+    for other, apart in ((softer, False), (DRY, True)):
+        told = _tell_apart(
+            [late, other], decay, 0.5, sigma=np.full(2, 1e-3), pinned=np.full(6, 1e-6)
+        )
+        assert told is not None
+        assert (told[0][0, 1] > 0) == apart
+
+
 def test_a_release_says_how_far_out_and_is_drawn_from_there():
     """Each height is weighed by itself, and stands in the entry."""
     heights = set()
