@@ -4,6 +4,9 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
+import pytest
+
 from pipeline.gap.data.runs import make_run
 from pipeline.gap.data.sides import split
 from pipeline.gap.fit.baseline import fit_baseline
@@ -11,7 +14,7 @@ from pipeline.gap.fit.levenberg_marquardt import Fit
 from pipeline.gap.limits import BIC_DROP
 from pipeline.gap.search.beam import _exchanged, by_promise, prune
 from pipeline.gap.search.grow import fit_whole
-from pipeline.gap.search.hypothesis import Study, judge
+from pipeline.gap.search.hypothesis import Hypothesis, Study, judge, worth_it
 from pipeline.gap.search.screen import candidates_at
 from pipeline.plant.nonlinear.effects import CATALOGUE, find_effect
 from tests.truth.bench import Hidden
@@ -111,3 +114,32 @@ def test_which_of_two_lookalikes_came_first_does_not_stay():
     (other,) = _exchanged(leader, seen, study)
     assert other.key == {DELAY, CUBIC}
     assert other.bic < leader.bic - BIC_DROP
+
+
+def judged(*keys: tuple[str, int], chi: float, held: float, bic: float) -> Hypothesis:
+    """Return a hypothesis with what it leaves of training and held-out runs."""
+    effects = [SimpleNamespace(key=key, effect=find_effect(key[0])) for key in keys]
+    structure: Any = SimpleNamespace(effects=effects, has_contact=("backlash", 0) in keys)
+    fit: Any = SimpleNamespace(chi=chi, structure=structure)
+    left: Any = SimpleNamespace(chi=held, run_chi=np.full(3, held))
+    return Hypothesis(fit=fit, held=left, error=held**0.5, bic=bic, at_floor=max(chi, held) < 1.15)
+
+
+@pytest.mark.parametrize(
+    ("parent", "child", "worth"),
+    [
+        ((6.0, 11.0), (1.0, 1.9), True),  # noise alone is left with it
+        ((6.0, 11.0), (1.0, 3.0), False),  # of the runs fitted only
+        ((6.0, 11.0), (2.0, 2.0), False),  # less than there was: the rest of the bounce
+        ((40.0, 60.0), (15.0, 14.0), True),  # half the error, where much is left
+        ((40.0, 60.0), (15.0, 20.0), False),
+        ((5.0, 1.0), (1.0, 0.9), True),  # the runs held out cannot tell
+        ((5.0, 1.0), (2.0, 0.9), False),
+    ],
+)
+def test_what_acts_beside_a_contact(parent, child, worth):
+    """Its own law is known to a factor, so that others would mop up what it leaves."""
+    alone = judged(("backlash", 0), chi=parent[0], held=parent[1], bic=0.0)
+    both = judged(("backlash", 0), DELAY, chi=child[0], held=child[1], bic=-1000.0)
+    study: Any = SimpleNamespace(explains=lambda h: h.error < 1.5)
+    assert worth_it(both, alone, study) == worth
