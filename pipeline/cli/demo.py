@@ -1,6 +1,7 @@
 """The whole job on what is shipped."""
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -34,7 +35,8 @@ def demo(
             write_class(teams)
             for mistake in PLANTED:
                 say(f"planted: {mistake}")
-        grade([teams], rubric=Path(PRESET), out=out / "grades", jobs=1)  # a core is taken
+        jobs = max(1, (os.cpu_count() or 1) - 1)  # a core is taken
+        grade([teams], rubric=Path(PRESET), out=out / "grades", jobs=jobs)
         say("3 of 3: what a bench hides")
         for line in found_beside(beside, out):
             say(line)
@@ -44,10 +46,8 @@ def demo(
 def search_beside(out: Path) -> Iterator[subprocess.Popen[str]]:
     """Look for what a bench hides meanwhile: it takes as long as all else together."""
     command = [sys.executable, "-P", "-m", "pipeline.cli.hidden_bench", str(out)]
-    none = subprocess.DEVNULL
-    with subprocess.Popen(
-        command, stdin=none, stdout=subprocess.PIPE, stderr=none, text=True
-    ) as beside:
+    pipe, none = subprocess.PIPE, subprocess.DEVNULL
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=none, text=True) as beside:
         try:
             yield beside
         finally:
@@ -58,9 +58,11 @@ def found_beside(beside: subprocess.Popen[str], out: Path) -> list[str]:
     """Return what is to be said of the bench; what the other process could not do is done here."""
     with progress_line() as progress:
         progress("looking for what the bench hides")
-        told, _ = beside.communicate()
-        if beside.returncode == 0:
+        assert beside.stdout is not None
+        told = beside.stdout.read()  # its stdin stays open: at the end of that it ends
+        if beside.wait() == 0:
             return json.loads(told)
+        say(f"the process beside this one failed (status {beside.returncode}): once more, here")
         from pipeline.cli.hidden_bench import find_hidden
 
         return find_hidden(out, progress=progress)

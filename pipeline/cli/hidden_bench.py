@@ -1,7 +1,9 @@
 """The demonstration's bench: friction hidden in it, and found; `python -m` makes it apart."""
 
 import json
+import os
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -21,5 +23,11 @@ def find_hidden(out: Path, *, progress: Callable[[str], None]) -> list[str]:
     return [*(f"hidden: {sentence}" for sentence in hidden.told), *told]
 
 
+def _end_with_the_first() -> None:
+    os.read(0, 1)  # returns where whoever began this is gone, however it ended
+    os._exit(1)  # whatever is under way: files are written whole or not at all
+
+
 if __name__ == "__main__":
+    threading.Thread(target=_end_with_the_first, daemon=True).start()
     json.dump(find_hidden(Path(sys.argv[1]), progress=lambda _: None), sys.stdout)

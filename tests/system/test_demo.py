@@ -1,12 +1,16 @@
 """The demonstration's second process: it does not outlive the first, and hides no failure."""
 
+import subprocess
+import sys
+
+import psutil
 import pytest
 
 from pipeline.cli.demo import found_beside, search_beside
 from pipeline.errors import SubmissionError
 
 
-def test_what_the_other_process_could_not_do_is_said_by_this_one(tmp_path):
+def test_what_the_other_process_could_not_do_is_said_by_this_one(tmp_path, capsys):
     """A bench of an earlier run that somebody spoilt is named, as the command alone would."""
     (tmp_path / "bench").mkdir()
     (tmp_path / "bench" / "submission.toml").write_text("version = 1\n", encoding="utf-8")
@@ -15,6 +19,7 @@ def test_what_the_other_process_could_not_do_is_said_by_this_one(tmp_path):
         found_beside(beside, tmp_path)
 
     assert beside.returncode == 1
+    assert "status 1" in capsys.readouterr().err
 
 
 def test_an_interrupted_demonstration_leaves_no_process_behind(tmp_path):
@@ -22,4 +27,20 @@ def test_an_interrupted_demonstration_leaves_no_process_behind(tmp_path):
     with pytest.raises(KeyboardInterrupt), search_beside(tmp_path) as beside:
         raise KeyboardInterrupt
     assert beside.returncode
+    assert not (tmp_path / "gap").exists()
+
+
+def test_a_killed_demonstration_leaves_no_process_behind(tmp_path):
+    """Killed, the first process can end nothing: the second sees that it is gone."""
+    first = (
+        "import sys, time; from pathlib import Path; from pipeline.cli.demo import search_beside\n"
+        "with search_beside(Path(sys.argv[1])) as beside:\n"
+        "    print(beside.pid, flush=True); time.sleep(60)"
+    )
+    command = [sys.executable, "-c", first, str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as killed:
+        assert killed.stdout is not None
+        second = psutil.Process(int(killed.stdout.readline()))
+        killed.kill()
+    assert psutil.wait_procs([second], timeout=60)[1] == []
     assert not (tmp_path / "gap").exists()
