@@ -130,6 +130,9 @@ def explain_gap(
     if verdict not in ("none", "unexplained") and not study.explains(chosen):
         times = chosen.error / study.floor
         notes.append(f"{times:.1f} times the noise is left: something remains")
+    elif verdict == "named" and _may_be_half(chosen, study):
+        times = chosen.error / study.floor
+        notes.append(f"{times:.1f} times the noise is left: a second, smaller effect may act")
     if deadline.cut:
         notes.append(
             f"the search ended after the {budget:g} s allowed: this is the best answer so far, and "
@@ -178,6 +181,12 @@ def explain_gap(
         notes=tuple(notes),
         contenders=() if settled else list_contenders(chosen, close or found),
     )
+
+
+def _may_be_half(chosen: Hypothesis, study: Study) -> bool:
+    """Does a name leave what no contact's own law, and no difference of repeats, explains?"""
+    enough = max(limits.FURTHER * study.floor, limits.ENOUGH_REPEATS * study.repeatability)
+    return chosen.error > enough and not chosen.has_contact
 
 
 def _settled(hypothesis: Hypothesis, study: Study) -> Hypothesis:

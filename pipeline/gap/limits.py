@@ -22,10 +22,10 @@ AS_REPEATS = 1.1
 BIC_DROP, SAME_LAW = 20.0, 6.0
 # Times that, where runs that were held out are at the noise already and cannot tell.
 ALONE = 5.0
-# Times the noise, or what repeats differ by, that a name may leave: of contacts, whose own law is
-# not the model's, and of others NEAR_FLOOR. Nine of ten names leave at most 1.02 times the noise;
-# of 131 that were all that acted none left 1.3, of 38 that were half of it five did.
-ENOUGH_BOUNCE, ENOUGH_REPEATS = 2.0, 1.5
+# Times the noise, or what repeats differ by, that a name may leave. Wide for the sake of contacts,
+# whose own law is not the model's; nine of ten names leave at most 1.02 times the noise, and who
+# leaves more than FURTHER without a contact is often half of what acts, which is said.
+ENOUGH_NOISE, ENOUGH_REPEATS, FURTHER = 2.0, 1.5, 1.3
 HELD_OUT_GAIN = 0.95  # on held-out runs: of the root of chi-square, 10 % in squares …
 RUN_GAIN, RUN_SHARE = 0.97, 0.6  # … and 6 % in more than half of the runs, whichever they are
 PARTIAL_GAIN = 0.9  # of the error, where too much for a name is left: a tenth is worth telling

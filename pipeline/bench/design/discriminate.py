@@ -50,7 +50,7 @@ _SIZES = (1.0, 0.5, 0.2)  # of what the limits allow: laws differ in how they gr
 _RELEASES = (0.6, 0.2)  # of the travel limit, from where a hand lets go
 _STEP = 1e-3  # relative, of an effect's parameter for a difference
 _HOPELESS = np.exp(-0.5 * CLOSE_BIC)  # of the likeliest one's weight: no contender any more
-_DECIDED = CLOSE_BIC * THINNING  # square sum that settles two: what is beyond it serves nobody
+_DECIDED = CLOSE_BIC * THINNING  # square sum that settles two
 _LEAST_WEIGHT = 0.1  # of the others: what swings overstates how sure the criterion is
 _LOOSER = 3.0  # standard errors, by which a parameter may be off: each is of one explanation
 _SAME = 1e-9  # of the largest: such a change of the parameters shows in nothing
@@ -85,7 +85,7 @@ def with_proposal(gap: Gap, *, limits: Limits, without: Sequence[Recording] = ()
     if np.count_nonzero(weight) < 2:
         return gap
     sigma, pinned = _noise(gap), _pinned(gap)
-    best, most = None, 0.0
+    best, most = None, (0.0, 0.0)
     for recording, height in _candidates(models[0].chain, limits):
         if any(recording.resembles(other) for other in without):
             continue
@@ -93,10 +93,13 @@ def with_proposal(gap: Gap, *, limits: Limits, without: Sequence[Recording] = ()
         if found is None or np.abs(found[3][weight > 0.0]).max() > limits.travel:
             continue
         told, t, u, predicted = found
-        score = np.outer(weight, weight) * np.minimum(told, _DECIDED)
-        if score.sum() > most:
+        counted = np.outer(weight, weight)
+        score = counted * told
+        # First as many pairs as can be are settled; then the further apart the better.
+        value = float((counted * np.minimum(told, _DECIDED)).sum()), float(score.sum())
+        if value > most:
             i, j = divmod(int(np.argmax(score)), len(models))
-            best, most = (recording, told[i, j], (i, j), t, u, predicted), float(score.sum())
+            best, most = (recording, told[i, j], (i, j), t, u, predicted), value
     if best is None:
         return gap
     recording, told, pair, t, u, predicted = best

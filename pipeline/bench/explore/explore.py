@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.bench.design.discriminate import far_sweep, propose_for
+from pipeline.bench.design.goal import GAP
 from pipeline.bench.design.next_plan import choose_next, known_commands
 from pipeline.bench.explore.wish import Wish
 from pipeline.bench.explore.words import (
@@ -56,6 +57,7 @@ _APART = 0.3
 _HARD = 0.8  # of what takes the carts as far as they may go: as good as that
 _FAR_OUT = "far"  # the aim of what shows what acts far out
 _SETTLED = ("named", "none")
+_OFTEN = 2  # times that one recording is to tell explanations apart, before another has its turn
 _FAILURES = 3  # recordings in a row that a bench does not carry out: it is not their choice
 
 
@@ -148,7 +150,8 @@ def explore(
             made, spent = (*made, *came.ids), spent + came.seconds
     turns: list[Turn] = []
     refused: list[Recording] = []
-    analysis, gap = _look(folder, tell, progress, refused=refused)
+    asked: list[Recording] = []  # to decide between explanations, and recorded
+    analysis, gap = _look(folder, tell, progress, without=())
     before, failures = "", 0
     while True:
         progress("what to record next")
@@ -177,14 +180,22 @@ def explore(
         made, spent = came.ids, spent + came.seconds
         if made:
             before, failures = "", 0
-            analysis, gap = _look(folder, tell, progress, refused=refused)
+            if recording.aim == GAP:
+                asked.append(recording)
+            analysis, gap = _look(folder, tell, progress, without=_not_again(refused, asked))
             continue
         refused.append(recording)
         failures = 0 if came.vetoed else failures + 1
         before = lost_words(recording.id, vetoed=came.vetoed, why=came.why) + "; "
         if gap is not None:  # which recording decides is open again
-            gap = propose_for(gap, load_submission(folder), without=refused)
+            submission = load_submission(folder)
+            gap = propose_for(gap, submission, without=_not_again(refused, asked))
             _write_gap(gap, analysis, folder)
+
+
+def _not_again(refused: Sequence[Recording], asked: Sequence[Recording]) -> Sequence[Recording]:
+    """Return what is not proposed again: refused, or made often without deciding anything."""
+    return [*refused, *(r for r in asked if sum(map(r.resembles, asked)) >= _OFTEN)]
 
 
 def _first_time(folder: Path) -> float:
@@ -199,7 +210,7 @@ def _look(
     tell: Callable[[str], None],
     progress: Callable[[str], None],
     *,
-    refused: Sequence[Recording],
+    without: Sequence[Recording],
 ) -> tuple[Analysis, Gap | None]:
     """Identify the carts and look for the gap, as the data stand now; None: it cannot be."""
     submission = load_submission(folder)
@@ -209,7 +220,7 @@ def _look(
     except DataError as error:
         tell(f"the gap cannot be looked for: {error}")
         return _identified(analysis, None), None
-    gap = propose_for(gap, submission, without=refused)
+    gap = propose_for(gap, submission, without=without)
     _write_gap(gap, analysis, folder)
     return _identified(analysis, gap), gap
 

@@ -244,11 +244,11 @@ def weighed(values: Array, window: Window) -> Array:
     The whitening of n readings with an error in common: of their covariance 1 + shared, the
     vector of ones has the eigenvalue 1 + n shared and all else one.
     """
-    weighed = values / window.sigma[:, None]
+    scaled = values / window.sigma[:, None]
     if np.any(window.shared) and (n := window.n_resting):
-        mean = np.mean(weighed[..., :n], axis=-1)
-        weighed[..., :n] -= (mean * (1 - 1 / np.sqrt(1 + n * window.shared)))[..., None]
-    return weighed
+        mean = np.mean(scaled[..., :n], axis=-1)
+        scaled[..., :n] -= (mean * (1 - 1 / np.sqrt(1 + n * window.shared)))[..., None]
+    return scaled
 
 
 def _real_part(weights: ComplexArray, signals: ComplexArray) -> Array:

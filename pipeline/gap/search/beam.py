@@ -56,9 +56,11 @@ def _grow_the_best(
         leader = min(children, key=lambda h: h.bic, default=None)
         if leader is not None:
             for other in _exchanged(leader, seen, study):
+                if not (other.sound and np.isfinite(other.error)):
+                    continue
                 if other.key not in seen or other.bic < seen[other.key].bic:
                     seen[other.key] = other
-                    if other.sound and other.bic < leader.bic:
+                    if other.bic < leader.bic:
                         children.append(other)
         if any(child.at_floor for child in children):
             break
@@ -101,7 +103,7 @@ def _exchanged(
             key = leader.key - {old.key} | other.key
             if len(other.key) != 1 or other.fit.chi > _AS_GOOD * alone.fit.chi:
                 continue
-            # In one of many valleys of a contact it may have been another's.
+            # A contact's fit ends in one of many valleys: one that leaves much in a poor one.
             if key in seen and seen[key].fit.chi < _AS_GOOD * leader.fit.chi:
                 continue
             (new,), (term,) = other.fit.structure.effects, other.fit.terms

@@ -96,8 +96,7 @@ class Study:
 
     def explains(self, hypothesis: Hypothesis) -> bool:
         """Tell whether so little is left that the gap has its name."""
-        noises = limits.ENOUGH_BOUNCE if hypothesis.has_contact else limits.NEAR_FLOOR
-        enough = max(noises * self.floor, limits.ENOUGH_REPEATS * self.repeatability)
+        enough = max(limits.ENOUGH_NOISE * self.floor, limits.ENOUGH_REPEATS * self.repeatability)
         return hypothesis.error <= enough
 
     def is_noise(self, hypothesis: Hypothesis) -> bool:

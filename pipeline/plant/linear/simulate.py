@@ -1,7 +1,7 @@
 """Simulate a chain: exactly, for an input held between samples, at any sample times."""
 
 from collections.abc import Sequence
-from math import ceil, isqrt
+from math import isqrt
 
 import numpy as np
 from scipy.linalg import expm
@@ -82,18 +82,21 @@ def _by_blocks(transition: Array, forced: Array, x: Array) -> Array:
     """
     n, n_states = forced.shape
     length = isqrt(n)
-    blocks = ceil(n / length)
-    padded = np.vstack([forced, np.zeros((blocks * length - n, n_states))])
-    padded = padded.reshape(blocks, length, n_states)
-    states, powers = np.empty_like(padded), np.empty((length, n_states, n_states))
+    blocks = n // length
+    states = np.empty_like(forced)
+    split = states[: blocks * length].reshape(blocks, length, n_states)
+    input_split = forced[: blocks * length].reshape(blocks, length, n_states)
+    powers = np.empty((length, n_states, n_states))
     own, power = np.zeros((blocks, n_states)), np.eye(n_states)
     for i in range(length):
-        states[:, i] = own = own @ transition.T + padded[:, i]
+        split[:, i] = own = own @ transition.T + input_split[:, i]
         powers[i] = power = transition @ power
-    for block in states:
+    for block in split:
         block += powers @ x
         x = block[-1]
-    return states.reshape(-1, n_states)[:n]
+    for i in range(blocks * length, n):
+        states[i] = x = transition @ x + forced[i]
+    return states
 
 
 def interpolate_band_limited(t: Array, u: Array) -> tuple[Array, Array]:
