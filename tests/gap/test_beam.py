@@ -12,7 +12,7 @@ from pipeline.gap.data.sides import split
 from pipeline.gap.fit.baseline import fit_baseline
 from pipeline.gap.fit.levenberg_marquardt import Fit
 from pipeline.gap.limits import BIC_DROP
-from pipeline.gap.search.beam import _exchanged, by_promise, prune
+from pipeline.gap.search.beam import _exchanged, _leads_on, by_promise, prune
 from pipeline.gap.search.grow import fit_whole
 from pipeline.gap.search.hypothesis import Hypothesis, Study, judge, worth_it
 from pipeline.gap.search.screen import candidates_at
@@ -114,6 +114,18 @@ def test_which_of_two_lookalikes_came_first_does_not_stay():
     (other,) = _exchanged(leader, seen, study)
     assert other.key == {DELAY, CUBIC}
     assert other.bic < leader.bic - BIC_DROP
+    for times, again in ((1.0, False), (3.0, True)):  # what ended in a poor valley has another go
+        known: Any = SimpleNamespace(key=other.key, fit=SimpleNamespace(chi=times * leader.fit.chi))
+        exchanged = [h.key for h in _exchanged(leader, seen | {other.key: known}, study)]
+        assert exchanged == [other.key] * again
+
+
+@pytest.mark.parametrize(("before", "leads"), [(57.0, True), (15.0, False)])
+def test_behind_a_contact_that_explains_most_is_looked_for_more(before, leads):
+    """However little it leaves: what is there beside it may leave noise alone."""
+    alone = judged(("backlash", 0), chi=6.0, held=11.0, bic=0.0)
+    alone = replace(alone, added=tuple(alone.fit.structure.effects))
+    assert _leads_on(alone, before) == leads
 
 
 def judged(*keys: tuple[str, int], chi: float, held: float, bic: float) -> Hypothesis:

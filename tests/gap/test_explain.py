@@ -2,6 +2,8 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ import pytest
 from pipeline.errors import DataError
 from pipeline.gap.data.runs import make_run
 from pipeline.gap.document import gap_json
-from pipeline.gap.explain import explain_gap
+from pipeline.gap.explain import _may_be_half, explain_gap
 from pipeline.gap.fit.levenberg_marquardt import fit_model, project
 from pipeline.gap.fit.linearise import linearise
 from pipeline.gap.fit.structure import Structure
@@ -450,3 +452,15 @@ def test_a_slope_that_is_no_number_ends_a_fit(monkeypatch):
     )
     fit = fit_model(start, [run], iterations=5)
     assert np.array_equal(fit.theta, start.theta)
+
+
+@pytest.mark.parametrize(
+    ("error", "contact", "repeatability", "said"),
+    [(0.014, False, 0.0, True), (0.012, False, 0.0, False), (0.014, True, 0.0, False),
+     (0.014, False, 0.01, False)],
+)  # fmt: skip
+def test_a_name_that_leaves_more_than_noise_says_so(error, contact, repeatability, said):
+    """Not beside a contact, whose own law is not the model's, nor within what repeats differ by."""
+    chosen: Any = SimpleNamespace(error=error, has_contact=contact)
+    study: Any = SimpleNamespace(floor=0.01, repeatability=repeatability)
+    assert _may_be_half(chosen, study) == said
