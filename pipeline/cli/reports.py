@@ -82,6 +82,8 @@ def fill(folder: Folder, as_json: AsJson = False) -> None:
     from pipeline.ingest.fill import fill_submission, format_found
     from pipeline.ingest.inspect import format_not_read
 
+    toml = folder / "submission.toml"
+    before = toml.read_bytes() if toml.is_file() else None
     with progress_line() as progress:
         progress("finding out what the files are")
         found = fill_submission(folder)
@@ -90,8 +92,8 @@ def fill(folder: Folder, as_json: AsJson = False) -> None:
     else:
         typer.echo(format_found(found))
     left = [f for f in found if f.state in ("unknown", "broken")]
-    did = "wrote" if any(f.state in ("new", "completed") for f in found) else "nothing to add to"
-    say(f"{did} {folder / 'submission.toml'}: springs, units and what is marked unsure are yours")
+    did = "nothing to add to" if toml.read_bytes() == before else "wrote"
+    say(f"{did} {toml}: springs, units and what is marked unsure are yours")
     if not_read := format_not_read(folder / "data"):
         say(f"cartlab: {not_read}")
     if left:

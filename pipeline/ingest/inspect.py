@@ -15,10 +15,14 @@ from pipeline.ingest.clock import Clock, clock_notes, read_clock
 from pipeline.ingest.columns import Column, assign_columns, conversion, holds_counts
 from pipeline.ingest.formats.recognise import read_table
 from pipeline.ingest.formats.table import ENDINGS, FORM_TITLES, Table
-from pipeline.names import by_note
+from pipeline.names import by_note, first_few
 from pipeline.results_of_runs import Kind
 
 _MOST_CARTS = 4
+_MAY_HOLD_SOME = frozenset(  # recordings, in a form that is not read
+    ".xlsx .xlsm .xlsb .xls .ods .numbers .zip .rar .7z .gz .tgz .tar .h5 .hdf5 .npy .npz "
+    ".parquet .tdms .json .xml .out .fig .doc .docx .rtf .pdf".split()
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,16 +80,16 @@ def data_files_in(folder: Path) -> list[Path]:
 
 
 def format_not_read(folder: Path) -> str:
-    """Return which files in a folder and those below hold no data by their names; "" none."""
+    """Return which files in a folder and those below may hold recordings unread; "" none."""
     names = [
         path.relative_to(folder.parent).as_posix()
         for path in _files_in(folder)
-        if path.suffix.casefold() not in ENDINGS
+        if not path.suffix or path.suffix.casefold() in _MAY_HOLD_SOME
     ]
     if not names:
         return ""
     return (
-        f"not read: {', '.join(names)} (recordings end in {', '.join(ENDINGS)}; "
+        f"not read: {first_few(names, 4)} (recordings end in {', '.join(ENDINGS)}; "
         "save what stands in a spreadsheet as .csv)"
     )
 
@@ -94,7 +98,8 @@ def _files_in(folder: Path) -> list[Path]:
     found = [
         path
         for path in folder.rglob("*")
-        if not path.name.startswith((".", "~")) and path.is_file()
+        if not any(part.startswith((".", "~")) for part in path.relative_to(folder).parts)
+        and path.is_file()
     ]
     return sorted(found, key=_natural)
 

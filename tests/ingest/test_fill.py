@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 from pipeline.cli import app
 from pipeline.errors import ConfigError, SubmissionError
 from pipeline.ingest.fill import data_files, fill_submission
+from pipeline.ingest.inspect import format_not_read
 from pipeline.ingest.read import read_data
 from pipeline.resources import EXAMPLES
 from pipeline.submission import load_submission, new_submission
@@ -100,6 +101,31 @@ def test_what_is_no_recording_by_its_name_is_said_to_be_left_out(tmp_path, comma
     done = cartlab_here(command, tmp_path)
     assert done.returncode == 2
     assert re.findall(r"not read: (\S+) ", done.stderr) == ["data/b.xlsx"]
+
+
+def test_only_what_may_hold_recordings_is_said_to_be_left_out(tmp_path):
+    """Neither what a tool hides, nor a picture or a script; and of many only the first few."""
+    put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
+    data = tmp_path / "data"
+    for name in (".git/HEAD", ".cache/b.csv", "report/bode.svg", "plot.py", "Thumbs.db"):
+        (data / name).parent.mkdir(exist_ok=True)
+        (data / name).write_bytes(b"")
+    assert data_files(tmp_path) == ["data/a.csv"]
+    assert format_not_read(data) == ""
+    for number in range(20):
+        (data / f"run {number}.ods").write_bytes(b"PK")
+    assert re.findall(r"run (\d+)\.ods", format_not_read(data)) == list("0123")
+    assert "16 more" in format_not_read(data)
+
+
+def test_fill_says_whether_it_wrote(tmp_path):
+    """A comment for a file that nothing tells of is written, too; the same again is nothing."""
+    said = []
+    for name in ("a.csv", "b.csv", "b.csv"):
+        put(tmp_path, name, p=RING, q=STEP)
+        done = CliRunner().invoke(app, ["fill", str(tmp_path)], standalone_mode=False)
+        said.append("wrote" in done.stderr and "nothing to add" not in done.stderr)
+    assert said == [True, True, False]
 
 
 def test_the_exporter_s_empty_columns_are_no_carts(tmp_path):
