@@ -152,11 +152,13 @@ def _with_refused(
 
 def _holds_a_class(archive: Path) -> bool:
     """Tell a download of many hand-ins from the archive of one student."""
-    names = member_names(archive, limits=CLASS) or names_in_pieces(archive)
+    whole = member_names(archive, limits=CLASS)
+    names = whole or names_in_pieces(archive)
     tops = {part for path in names for part in path.parts[:2]}
     return (
         sum(path.name == NAME for path in names) > 1
         or any(parse_name(top) is not None for top in tops)
+        or (not whole and any(path.suffix.lower() == ".zip" for path in names[:1]))
         or (
             sum(path.suffix.lower() == ".zip" for path in names) > 1
             and not any(path.name == NAME for path in names)

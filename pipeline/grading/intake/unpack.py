@@ -23,6 +23,8 @@ from pipeline.submission.complaints import quote
 _CHUNK = 1 << 16
 _RATIO_FROM = 1_000_000  # bytes; a smaller file may be as empty as it likes
 _END_OF_ZIP = 66_000  # bytes; there a comment may stand, which is read at once
+# The record at the end says where the table of contents stands (4.3.16), or that another does.
+_PLACE, _ELSEWHERE = 16, 0xFFFFFFFF
 DEEPEST = 40  # folders in folders; a submission needs three
 _AGAIN = ": send or download it once more"
 _UTF8_NAME, _ENCRYPTED = 0x800, 0x1
@@ -192,12 +194,23 @@ def _opened(archive: Path, *, limits: Limits) -> Iterator[zipfile.ZipFile]:
     if size > limits.total:
         raise _TooLarge(f"{size:,} bytes, the limit is {limits.total:,}")
     with _Bounded(archive, most=limits.directory) as file, zipfile.ZipFile(file) as opened:
-        # Cut short, it may end in the table of contents of an archive within it.
-        first = min((info.header_offset for info in opened.infolist()), default=0)
-        file.seek(0)
-        if first and _MEMBER.match(file.read(_HEAD)):
+        if _is_cut(file, opened.start_dir):
             raise zipfile.BadZipFile("its own table of contents is missing")
         yield opened
+
+
+def _is_cut(file: IO[bytes], contents: int) -> bool:
+    """Whether the contents at the end are those of an archive within: they say another place.
+
+    That which unpacks itself says so too, and begins with a program.
+    """
+    file.seek(0)
+    if not _MEMBER.match(file.read(_HEAD)):
+        return False
+    file.seek(max(file.seek(0, io.SEEK_END) - _END_OF_ZIP, 0))
+    end = file.read(_END_OF_ZIP)
+    (stated,) = struct.unpack_from("<L", end, end.rindex(b"PK\x05\x06") + _PLACE)
+    return stated not in (contents, _ELSEWHERE)
 
 
 def _extract(opened: zipfile.ZipFile, into: Path, *, budget: _Budget) -> dict[PurePosixPath, str]:

@@ -253,6 +253,29 @@ def test_a_class_that_was_cut_short_is_refused_by_its_name(tmp_path, packed):
     assert found.id == "team-9"
 
 
+@pytest.mark.parametrize("how", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
+def test_a_class_cut_within_its_first_packed_hand_in_is_refused(tmp_path, how):
+    """One packed hand-in is all that is seen of it, and that is no row."""
+    own = zip_bytes(tmp_path, {"submission.toml": TOML, "data/a.csv": "1,2\n" * 99})
+    download = tmp_path / "class.zip"
+    with zipfile.ZipFile(download, "w", how) as packing:
+        packing.writestr("team-0.zip", own)
+        packing.writestr("team-1.zip", own)
+    download.write_bytes(download.read_bytes()[:200])
+    with pytest.raises(ConfigError, match=r"'class\.zip': not a whole zip archive"):
+        hand_ins(tmp_path, download)
+
+
+def test_a_zip_out_of_which_a_file_was_taken_is_whole(tmp_path):
+    """Taken out in place, a first member leaves its bytes; the table of contents is its own."""
+    taken = archive(tmp_path / "team-1.zip", {"draft.txt": "x", "submission.toml": TOML})
+    with zipfile.ZipFile(taken, "a") as opened_again:
+        del opened_again.filelist[0]
+        opened_again.comment = b"tidied"  # the contents are written anew
+    (found,) = hand_ins(tmp_path, taken)
+    assert opened(tmp_path, found) == ["submission.toml"]
+
+
 def test_one_bad_hand_in_of_a_download_costs_its_own_row(tmp_path):
     """Paths that lead out, depth, a password, broken bytes: the others of the class are there."""
     download = archive(
