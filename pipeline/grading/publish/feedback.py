@@ -262,15 +262,20 @@ def numbers_table(criterion: Criterion, *, check: str, numbers: count) -> Table 
 
 
 def evidence_table(flag: Flag, *, numbers: count) -> Table | None:
-    """Return the numbers that a remark rests on, None where it rests on none."""
-    found = {name: v for name, v in flag.evidence.items() if isinstance(v, Real)}
+    """Return the numbers and texts that a remark rests on, None where it rests on none."""
+    of = flag.evidence.get("parameter")
+    found = {
+        name: value
+        for name, value in flag.evidence.items()
+        if _is_shown(value) and value != "" and name != "parameter"
+    }
     if not found:
         return None
-    of = flag.evidence.get("parameter")
     caption = rich(f"The numbers of {clean(of)}." if isinstance(of, str) else "The numbers.")
     heads = [_EVIDENCE.get(name) or _capital(clean(name).replace("_", " ")) for name in found]
     row = [cell(_value(value)) for value in found.values()]
-    return make_table(next(numbers), caption, heads, [row], "r" * len(row))
+    sides = ("l" if isinstance(value, bool | str) else "r" for value in found.values())
+    return make_table(next(numbers), caption, heads, [row], "".join(sides))
 
 
 def _is_shown(value: Any) -> bool:

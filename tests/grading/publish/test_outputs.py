@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import re
+from itertools import count
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -21,9 +22,10 @@ from pipeline.grading.gradings import Batch
 from pipeline.grading.publish.anonymous import KEY_FILE, anonymise, pseudonyms
 from pipeline.grading.publish.class_page import class_page
 from pipeline.grading.publish.export import results_text
-from pipeline.grading.publish.feedback import feedback_page
+from pipeline.grading.publish.feedback import evidence_table, feedback_page
 from pipeline.grading.publish.outputs import grades_csv, write_outputs
 from pipeline.grading.words import WORDS
+from pipeline.report.document import plain
 from pipeline.schemas.grade import CODES, Flag
 from tests.helpers.grades import (
     failed_grade,
@@ -36,6 +38,23 @@ from tests.helpers.grades import (
 )
 
 RUBRIC = two_cart_rubric()
+
+
+def test_a_remark_s_evidence_keeps_its_words():
+    """The table meant, a slip that explains it and yes or no stand beside the numbers."""
+    evidence = {
+        "parameter": "A[2,1]", "table": "initial", "reported": 3.0, "stable": False,
+        "slip": "rows 1 and 2 are exchanged", "also_in": "final", "ran": [1.0], "gone": "",
+    }  # fmt: skip
+    flag = Flag(code="wrong_state_space", parameters=(), message="x", evidence=evidence)
+    table = evidence_table(flag, numbers=count(1))
+    assert table is not None
+    shown = {plain(h.text): plain(c.text) for h, c in zip(table.head, table.rows[0], strict=True)}
+    assert shown == {
+        "Table": "initial", "Reported": "3", "Stable": "no",
+        "Slip": "rows 1 and 2 are exchanged", "Also in": "final",
+    }  # fmt: skip
+    assert table.align == "lrlll"
 
 
 @pytest.fixture(scope="module")
