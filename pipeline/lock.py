@@ -2,14 +2,16 @@
 
 import os
 import sqlite3
+import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 from pipeline.errors import ConfigError
 from pipeline.output import LOCK, TURN
 
 _PATIENCE = 30.0  # s for a turn, which takes less than one
+_AGAIN = 0.02  # s until who waits asks again
 
 # Where a database keeps its user's number, by SQLite's file format; the lock keeps its process
 # there, to be read by whoever the lock keeps out.
@@ -56,9 +58,28 @@ def turn_in(folder: Path) -> Iterator[None]:
 def _locked(lock: Path, *, patience: float = 0.0) -> Iterator[None]:
     if lock.is_symlink():
         raise ConfigError(f"{lock}: is a link; remove it")
+    end = time.monotonic() + patience
+    while (connection := _taken(lock)) is None:
+        if time.monotonic() >= end:
+            process = int.from_bytes(lock.read_bytes()[_PROCESS], "big")
+            who = f" (process {process})" if process else ""
+            raise ConfigError(
+                f"{lock.parent}: another cartlab{who} writes there; wait for it, or name another "
+                "folder"
+            )
+        time.sleep(_AGAIN)
+    with closing(connection):
+        yield
+
+
+def _taken(lock: Path) -> sqlite3.Connection | None:
+    """Return the connection that holds the lock until it is closed; None where another has it.
+
+    It is not waited for here: of several that wait within SQLite each keeps the others waiting.
+    """
     with ExitStack() as stack:
         try:
-            connection = sqlite3.connect(lock, timeout=patience, isolation_level=None)
+            connection = sqlite3.connect(lock, timeout=0.0, isolation_level=None)
             stack.callback(connection.close)
             connection.execute("PRAGMA journal_mode = MEMORY")  # no further file
             connection.execute("PRAGMA locking_mode = EXCLUSIVE")  # a commit keeps the lock
@@ -68,10 +89,6 @@ def _locked(lock: Path, *, patience: float = 0.0) -> Iterator[None]:
         except sqlite3.Error as error:
             if error.sqlite_errorcode != sqlite3.SQLITE_BUSY:
                 raise ConfigError(f"{lock}: {error}; is the folder yours to write?") from None
-            process = int.from_bytes(lock.read_bytes()[_PROCESS], "big")
-            who = f" (process {process})" if process else ""
-            raise ConfigError(
-                f"{lock.parent}: another cartlab{who} writes there; wait for it, or name another "
-                "folder"
-            ) from None
-        yield
+            return None
+        stack.pop_all()
+        return connection

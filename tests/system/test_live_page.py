@@ -545,6 +545,7 @@ def test_the_end_is_told(folder, browser):
         window.goto(page.url)
         record(page)
         expect(window.locator("#status")).to_have_text("Recording sine-01.")
+        until(lambda: BLUE in window.evaluate(INK, "positions"))
     expect(window.locator("#status")).to_have_text("The session is over.")
     assert BLUE in window.evaluate(INK, "positions")
     context.close()
