@@ -12,7 +12,7 @@ from pipeline.gap.data.sides import split
 from pipeline.gap.fit.baseline import fit_baseline
 from pipeline.gap.fit.levenberg_marquardt import Fit
 from pipeline.gap.limits import BIC_DROP
-from pipeline.gap.search.beam import _exchanged, _leads_on, by_promise, prune
+from pipeline.gap.search.beam import _exchanged, _leads_on, by_promise, choose, prune, search
 from pipeline.gap.search.grow import fit_whole
 from pipeline.gap.search.hypothesis import Hypothesis, Study, judge, worth_it
 from pipeline.gap.search.screen import candidates_at
@@ -55,9 +55,9 @@ def test_of_one_family_of_laws_the_best_is_grown():
     assert order(plain, rich, far) == [{DAHL}]
 
 
-def begun(*hidden: Hidden) -> tuple[Fit, Study]:
+def begun(*hidden: Hidden, rate: float = 113.1) -> tuple[Fit, Study]:
     """Return the linear fit and the study of one cart with these effects."""
-    case = make_case(seed=46, n=1, effects=hidden, rate=113.1)
+    case = make_case(seed=46, n=1, effects=hidden, rate=rate)
     runs = [make_run(record, n=1) for record in case.records]
     teach, tell = split(runs)
     fit, training = fit_baseline([runs[i] for i in teach], springs=case.springs, start=None)
@@ -71,6 +71,20 @@ def begun(*hidden: Hidden) -> tuple[Fit, Study]:
         tell=print,
     )
     return fit, study
+
+
+def test_what_hides_below_the_floor_is_told_by_many_readings():
+    """Hardly any friction beside a delay that alone leaves what may be noise."""
+    fit, study = begun(
+        Hidden(effect="coulomb_friction", place=1, parameters={"force": 2.4e-6}),
+        Hidden(effect="input_delay", parameters={"delay": 0.014}),
+        rate=884.7,
+    )
+    baseline = judge(fit, study)
+    found = search(baseline, study)
+    (alone,) = (h for h in found if h.key == {DELAY})
+    assert alone.at_floor
+    assert choose(found, baseline, study).key == {DELAY, COULOMB}
 
 
 def test_a_richer_law_that_explains_no_more_gives_way():
@@ -154,4 +168,20 @@ def test_what_acts_beside_a_contact(parent, child, worth):
     alone = judged(("backlash", 0), chi=parent[0], held=parent[1], bic=0.0)
     both = judged(("backlash", 0), DELAY, chi=child[0], held=child[1], bic=-1000.0)
     study: Any = SimpleNamespace(explains=lambda h: h.error < 1.5)
+    assert worth_it(both, alone, study) == worth
+
+
+@pytest.mark.parametrize(
+    ("first", "bic", "worth"),
+    [
+        (CUBIC, -70.0, True),
+        (CUBIC, -50.0, False),  # within what the best of many trials may gain on held-out noise
+        (("backlash", 0), -1000.0, False),  # the rest of the bounce
+    ],
+)
+def test_what_acts_beside_what_may_be_all(first, bic, worth):
+    """Runs held out that are at the noise cannot tell; the criterion must, the more clearly."""
+    alone = judged(first, chi=1.1, held=1.05, bic=0.0)
+    both = judged(first, DELAY, chi=1.0, held=1.04, bic=bic)
+    study: Any = SimpleNamespace(explains=lambda h: True)
     assert worth_it(both, alone, study) == worth

@@ -62,7 +62,8 @@ def _grow_the_best(
                     seen[other.key] = other
                     if other.bic < leader.bic:
                         children.append(other)
-        if any(child.at_floor for child in children):
+        # Who is at the floor is grown once more, for what the criterion alone can tell.
+        if parent.at_floor or any(child.at_floor and child.fit.chi < 1.0 for child in children):
             break
         if children:
             leader = min(children, key=lambda h: h.bic)

@@ -141,11 +141,11 @@ def worth_it(child: Hypothesis, parent: Hypothesis, study: Study) -> bool:
     if not lowers_error(child, parent, study):
         return False
     drop = limits.BIC_DROP if child.size != parent.size else limits.SAME_LAW
-    if parent.held.chi < limits.AT_FLOOR < parent.fit.chi:
+    if parent.held.chi < limits.AT_FLOOR:
         # Held-out runs in which the effect does not show cannot speak for it; they must not speak
-        # against it, and the others tell the more clearly.
-        mopping = child.has_contact and not child.leaves_noise
-        return child.bic < parent.bic - limits.ALONE * drop and not mopping
+        # against it, and the others tell the more clearly. Beside a contact it may mop up.
+        clear = child.bic < parent.bic - limits.ALONE * drop
+        return clear and not (child.has_contact and (parent.at_floor or not child.leaves_noise))
     gain = limits.HELD_OUT_GAIN
     if parent.has_contact and not child.leaves_noise:
         if parent.fit.chi < limits.CONTACT_LAW:
