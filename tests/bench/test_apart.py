@@ -191,6 +191,22 @@ def test_of_those_that_settle_a_pair_the_best_is_proposed(proposed):
     assert mine == max(told)
 
 
+def test_what_would_not_settle_it_is_recorded_for_longer(proposed):
+    """A lag and a delay of a tenth of a millisecond differ too little in twelve seconds."""
+    late, lagged = (
+        model("input_delay", place=0, delay=1e-4),
+        model("actuator_lag", place=0, time_constant=1e-4),
+    )
+    short, long = (
+        Recording.model_validate_json(json.dumps(gap.proposal.recording))
+        for gap in (proposed, with_proposal(disputed(late, lagged), limits=LIMITS))
+        if gap.proposal is not None
+    )
+    assert short.duration < 20
+    assert 40 < long.duration < 60
+    assert long.resembles(long.model_copy(update={"cycles": long.cycles // 4}))
+
+
 def test_what_acts_on_the_input_alone_shows_in_no_decay():
     """A lag and a delay part where there is an input, whatever bounces beside them."""
     late, lagged = (

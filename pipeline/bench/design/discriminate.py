@@ -10,7 +10,7 @@ W. J. Hill, Technometrics 9 (1967), 57-71.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 from math import ceil
 from typing import Literal
@@ -45,7 +45,8 @@ Shape = Literal["square", "triangle", "chirp"]
 
 _PERIOD = 5e-3  # s from sample to sample, of which a cycle has some
 _PER_CYCLE, _BEYOND = 10, 2.0  # … and at least so many times the highest resonance is looked to
-_TIME = 12.0  # s of a record, about
+_TIME = 12.0  # s of a record, about …
+_LONGEST = 4  # … and times that, where it would not settle the two that it tells apart best
 _SIZES = (1.0, 0.5, 0.2)  # of what the limits allow: laws differ in how they grow with the motion
 _RELEASES = (0.6, 0.2)  # of the travel limit, from where a hand lets go
 _STEP = 1e-3  # relative, of an effect's parameter for a difference
@@ -54,6 +55,19 @@ _DECIDED = CLOSE_BIC * THINNING  # square sum that settles two
 _LEAST_WEIGHT = 0.1  # of the others: what swings overstates how sure the criterion is
 _LOOSER = 3.0  # standard errors, by which a parameter may be off: each is of one explanation
 _SAME = 1e-9  # of the largest: such a change of the parameters shows in nothing
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Weighed:
+    """What a recording is worth, and the two models that it tells apart best, by how much."""
+
+    worth: tuple[float, float]
+    recording: Recording
+    pair: tuple[int, int]
+    told: float
+    t: Array
+    u: Array
+    predicted: Array
 
 
 def propose_for(gap: Gap, submission: Submission, *, without: Sequence[Recording] = ()) -> Gap:
@@ -85,35 +99,49 @@ def with_proposal(gap: Gap, *, limits: Limits, without: Sequence[Recording] = ()
     if np.count_nonzero(weight) < 2:
         return gap
     sigma, pinned = _noise(gap), _pinned(gap)
-    best, most = None, (0.0, 0.0)
-    for recording, height in _candidates(models[0].chain, limits):
-        if any(recording.resembles(other) for other in without):
-            continue
+
+    def weighed(recording: Recording, height: float) -> _Weighed | None:
         found = _tell_apart(models, recording, height, sigma=sigma, pinned=pinned)
         if found is None or np.abs(found[3][weight > 0.0]).max() > limits.travel:
-            continue
+            return None
         told, t, u, predicted = found
         counted = np.outer(weight, weight)
         score = counted * told
-        # First as many pairs as can be are settled; then the further apart the better.
-        value = float((counted * np.minimum(told, _DECIDED)).sum()), float(score.sum())
-        if value > most:
-            i, j = divmod(int(np.argmax(score)), len(models))
-            best, most = (recording, told[i, j], (i, j), t, u, predicted), value
-    if best is None:
+        i, j = divmod(int(np.argmax(score)), len(models))
+        return _Weighed(
+            # First as many pairs as can be are settled; then the further apart the better.
+            worth=(float((counted * np.minimum(told, _DECIDED)).sum()), float(score.sum())),
+            recording=recording,
+            pair=(i, j),
+            told=float(told[i, j]),
+            t=t,
+            u=u,
+            predicted=predicted,
+        )
+
+    options = [
+        weighed(recording, height)
+        for recording, height in _candidates(models[0].chain, limits)
+        if not any(recording.resembles(other) for other in without)
+    ]
+    best = max((one for one in options if one), key=lambda one: one.worth, default=None)
+    if best is None or best.worth <= (0.0, 0.0):
         return gap
-    recording, told, pair, t, u, predicted = best
-    swing = np.abs(predicted[pair[0]] - predicted[pair[1]]).max(axis=1)
-    cart = int(np.argmax(swing))
+    if best.told < _DECIDED and not best.recording.release:
+        times = min(_LONGEST, ceil(_DECIDED / best.told))
+        longer = {"cycles": times * best.recording.cycles}
+        best = weighed(best.recording.model_copy(update=longer), 0.0) or best
+    one, other = best.pair
+    cart = int(np.argmax(np.abs(best.predicted[one] - best.predicted[other]).max(axis=1)))
     proposal = Proposal(
-        recording=recording.model_dump(mode="json", exclude_defaults=True),
+        recording=best.recording.model_dump(mode="json", exclude_defaults=True),
         limits=limits.model_dump(),
-        pair=pair,
-        separation=float(np.sqrt(told / (t.size * len(recording.carts)))),
+        pair=best.pair,
+        separation=float(np.sqrt(best.told / (best.t.size * len(best.recording.carts)))),
         cart=cart + 1,
-        t=t,
-        u=u,
-        predicted=predicted[:, cart],
+        t=best.t,
+        u=best.u,
+        predicted=best.predicted[:, cart],
     )
     return replace(gap, proposal=proposal)
 
