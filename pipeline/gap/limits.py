@@ -20,9 +20,8 @@ AS_REPEATS = 1.1
 # J. American Statistical Association 90 (1995), 773-795), and by 2 ln 150 more where the best of
 # some 150 trials is taken; by their "strong" for a law that another cart already has.
 BIC_DROP, SAME_LAW = 20.0, 6.0
-# Times that, where runs that were held out are at the noise already and cannot tell. Of 240 benches
-# with one effect or two, nothing that was not there and made their error lower took one.
-ALONE = 3.0
+# Times that, where runs that were held out are at the noise already and cannot tell.
+ALONE = 5.0
 # Times the noise, or what repeats differ by, that a name may leave. Wide for the sake of contacts,
 # whose own law is not the model's; nine of ten names leave at most 1.02 times the noise, and who
 # leaves more than FURTHER without a contact is often half of what acts, which is said.
