@@ -185,7 +185,7 @@ def solution(
     with progress_line() as progress:
         analysis, text = make_solution(submission, out, pdf=pdf, progress=progress)
     failed = [f"cartlab: {check.id}: {check.message}" for check in analysis.failed_checks]
-    for line in (*_unreadable(analysis), *failed):
+    for line in failed:  # what could not be read is among them
         say(line)
     doubtful = ", doubtful as the checks above failed" if analysis.failed_checks else ""
     say(_wrote(out, "solution", pdf=pdf) + doubtful)

@@ -82,7 +82,7 @@ def test_what_cannot_run_is_one_line_and_status_two(tmp_path, arguments, expecte
 
 
 def test_failed_checks_are_status_one(tmp_path):
-    """Steps with a wrong scale are reported, a reference of them is doubtful: both are told."""
+    """A submission whose steps have a wrong scale is reported, and the exit status says so."""
     folder = tmp_path / "scaled"
     shutil.copytree(EXAMPLES / "one-cart", folder)
     for file in (folder / "data").glob("step-*.csv"):
@@ -98,17 +98,12 @@ def test_failed_checks_are_status_one(tmp_path):
     assert checks["record.step-1"] == "fail"
     assert done.returncode == 1
 
-    done = cartlab_here("solution", folder, "--no-pdf", "--json")
-    failed = {name for name, outcome in checks.items() if outcome == "fail"}
-    assert {doubt["id"] for doubt in json.loads(done.stdout)["doubts"]} == failed
-    assert all(f"cartlab: {name}: " in done.stderr for name in failed)
-    assert done.returncode == 1
-
 
 def test_a_file_that_cannot_be_read_is_its_own_run_s_problem(tmp_path):
     """One missing, one broken: told on stderr and in results.json with status 1, the rest is there.
 
-    Without a single file that can be read there is nothing to report.
+    A reference made of them is doubtful, for each reason, told once. Without a single file that can
+    be read there is nothing to report.
     """
     folder = tmp_path / "team"
     shutil.copytree(EXAMPLES / "one-cart", folder)
@@ -135,6 +130,12 @@ def test_a_file_that_cannot_be_read_is_its_own_run_s_problem(tmp_path):
     page = html.unescape((folder / "report" / "report.html").read_text(encoding="utf-8"))
     assert all(reason.partition(";")[0] in page for reason in reasons.values())
     assert all(parameter["initial"] and parameter["final"] for parameter in found["parameters"])
+
+    done = cartlab_here("solution", folder, "--no-pdf", "--json")
+    assert done.returncode == 1
+    assert {doubt["id"] for doubt in json.loads(done.stdout)["doubts"]} == failed
+    assert all(f"cartlab: {name}: " in done.stderr for name in failed)
+    assert all(done.stderr.count(reason) == 1 for reason in reasons.values())
 
     for file in (folder / "data").iterdir():
         file.unlink()
