@@ -28,6 +28,7 @@ from pipeline.grading.publish.feedback_figures import is_response, numbers_in
 from pipeline.grading.words import WORDS, points_text
 from pipeline.report.document import paragraph
 from pipeline.report.figures.svg import plain_svg
+from pipeline.report.numbers import NOTHING
 from pipeline.report.render.html import render_blocks, render_drawing
 from pipeline.report.words import rich
 from pipeline.schemas.grade import Criterion, Flag, Grade
@@ -140,7 +141,7 @@ def _criteria(
             {
                 "id": asked.id,
                 "title": asked.title or asked.id,
-                "points": points_text(own.points) if own else "–",
+                "points": points_text(own.points) if own else NOTHING,
                 "out_of": points_text(asked.points),
                 "outcome": WORDS.text(f"outcome_{own.outcome}") if own else "not judged",
                 "tone": TONES[own.outcome] if own else "quiet",
@@ -181,7 +182,6 @@ def _flag(ask: Ask, flag: Flag, shown: Class) -> dict[str, Any]:
     return {
         "title": WORDS.text(f"title_{flag.code}"),
         "text": sentence(flag.message),
-        "look": WORDS.text(f"place_{flag.code}"),
         "numbers": render_blocks([table]) if table else "",
         "others": [(name, _address(ask, name) if name in shown.teams else "") for name in others],
     }

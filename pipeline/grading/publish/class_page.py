@@ -39,7 +39,7 @@ from pipeline.report.figures.svg import to_svg
 from pipeline.report.numbers import NOTHING, listing
 from pipeline.report.numbers import count as counted
 from pipeline.report.render.html import render_html
-from pipeline.report.words import clean
+from pipeline.report.words import capital, clean
 from pipeline.schemas.grade import CODES, Code
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ def _summary(
         ]
     blocks: list[Block] = [Tiles(tuple(tiles))]
     if asked := wrong_springs(line.springs for line in lines if line.status == "graded"):
-        blocks.append(paragraph(f"{asked[0].upper()}{asked[1:]}"))
+        blocks.append(paragraph(capital(asked)))
     if failed:
         said = "could not be graded; points can be given by hand"
         reasons = bullet_list(

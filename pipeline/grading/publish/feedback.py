@@ -34,7 +34,7 @@ from pipeline.report.figures.style import WIDTH
 from pipeline.report.numbers import NOTHING, percent, significant, typeset
 from pipeline.report.numbers import count as counted
 from pipeline.report.render.html import render_html
-from pipeline.report.words import clean, name_span, rich
+from pipeline.report.words import capital, clean, name_span, rich
 from pipeline.schemas.grade import Criterion, Flag, Grade, Outcome
 
 _TITLE = re.compile(r"<title>(.*?)</title>", re.DOTALL)
@@ -169,7 +169,7 @@ def sentence(text: str) -> str:
     text = clean(text).strip()
     word = text.split(" ", 1)[0]
     if word.isascii() and word.isalpha() and word.islower():
-        text = text[0].upper() + text[1:]
+        text = capital(text)
     return text if not text or text[-1] in ".!?" else f"{text}."
 
 
@@ -188,7 +188,7 @@ def _remarks(flags: Sequence[Flag]) -> list[Block]:
 
 
 def _capital(text: str) -> str:
-    return text[0].upper() + text[1:] if text.split(" ", 1)[0].isalpha() else text
+    return capital(text) if text.split(" ", 1)[0].isalpha() else text
 
 
 # ------------------------------------------------------------------------- criteria

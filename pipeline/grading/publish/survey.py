@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigError
 from pipeline.grading.csv_table import read_table
+from pipeline.report.numbers import NOTHING
 from pipeline.submission.complaints import quote
 
 if TYPE_CHECKING:
@@ -172,7 +173,7 @@ def survey_text(survey: Survey) -> str:
         parts.append(_markdown(["Question", *SCALE], rows))
         parts.append("Table 4: Results of student questionnaires at end of the course.")
     if len(survey.means):
-        shown = survey.means.map(lambda mean: "–" if isnan(mean) else f"{mean:.2f}")
+        shown = survey.means.map(lambda mean: NOTHING if isnan(mean) else f"{mean:.2f}")
         rows = [[str(text) for text in row] for row in shown.itertuples()]
         parts.append(_markdown(["Concept", *LEVELS], rows))
         parts.append("Table 5: Pre and post course knowledge and confidence (average score).")

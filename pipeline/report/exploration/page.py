@@ -10,6 +10,7 @@ from pipeline.output import write_file
 from pipeline.report.document import Block, bullet_list, cell, spans
 from pipeline.report.exploration.turn import Turn
 from pipeline.report.figures.style import QUIET, SECOND, legend_above, panels
+from pipeline.report.numbers import NOTHING
 from pipeline.report.phrases import phrases
 from pipeline.report.render.html import render_html
 from pipeline.report.sections.page import Page
@@ -61,7 +62,7 @@ def _errors(page: Page, turns: Sequence[Turn], wanted: float) -> list[Block]:
         [
             cell(name_span(name)),
             *(
-                cell("-" if (error := turn.errors.get(name)) is None else _share(error))
+                cell(NOTHING if (error := turn.errors.get(name)) is None else _share(error))
                 for turn in turns
             ),
         ]

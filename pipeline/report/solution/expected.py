@@ -12,7 +12,7 @@ from pipeline.report import limits
 from pipeline.report.document import Block, Span, bullet_list, cell, paragraph, spans
 from pipeline.report.equations import derivation
 from pipeline.report.equations.algebra import evaluate, work_out
-from pipeline.report.numbers import percent, significant, unit_text
+from pipeline.report.numbers import NOTHING, percent, significant, unit_text
 from pipeline.report.phrases import phrases
 from pipeline.report.sections.page import Page
 from pipeline.report.words import clean, name_span, rich
@@ -133,13 +133,13 @@ def expected_blocks(page: Page) -> list[Block]:
                     cell(name_span(p.name)),
                     cell(unit_text(clean(p.unit)) or "1"),
                     cell(significant(p.value)),
-                    cell(percent(100 * p.tolerance / abs(p.value)) if p.value else "–"),
+                    cell(percent(100 * p.tolerance / abs(p.value)) if p.value else NOTHING),
                     cell(significant(p.value - p.tolerance)),
                     cell(significant(p.value + p.tolerance)),
                     cell(
                         significant(p.value / (2 * np.pi))
                         if read_name(p.name).is_frequency
-                        else "–",
+                        else NOTHING,
                         "quiet",
                     ),
                 ]
