@@ -29,11 +29,10 @@ from pipeline.submission.edit import (
     toml_item,
 )
 from pipeline.submission.load import NAME, outside, posix, stated_columns
-from pipeline.submission.models import MOST_EXPERIMENTS
+from pipeline.submission.models import MOST_CARTS, MOST_EXPERIMENTS
 from pipeline.submission.template import write_templates
 from pipeline.submission.toml_file import Value, parse_toml
 
-_MOST_CARTS = 4
 _UNSURE = "unsure: "  # begins a comment below a table, which whoever knows better takes out
 _NO_NAME = re.compile(r"[^\w.-]+", re.ASCII)
 
@@ -306,7 +305,7 @@ def _carts_seen(looked: Sequence[Found]) -> int:
     carts = [
         cart for one in looked if one.inspection for cart in one.carts or one.inspection.positions
     ]
-    return max((cart for cart in carts if cart <= _MOST_CARTS), default=1)
+    return max((cart for cart in carts if cart <= MOST_CARTS), default=1)
 
 
 def _state_units(document: tomlkit.TOMLDocument, looked: Sequence[Found]) -> None:

@@ -17,8 +17,8 @@ from pipeline.ingest.formats.recognise import read_table
 from pipeline.ingest.formats.table import ENDINGS, FORM_TITLES, Table
 from pipeline.names import by_note, first_few
 from pipeline.results_of_runs import Kind
+from pipeline.submission.models import MOST_CARTS
 
-_MOST_CARTS = 4
 _MAY_HOLD_SOME = frozenset(  # recordings, in a form that is not read
     ".xlsx .xlsm .xlsb .xls .ods .numbers .zip .rar .7z .gz .tgz .tar .h5 .hdf5 .npy .npz "
     ".parquet .tdms .json .xml .out .fig .doc .docx .rtf .pdf".split()
@@ -189,7 +189,7 @@ def _suggest_columns(table: Table) -> dict[str, int]:
     encoders = [i for i in after if table.whole[i]]
     if len(encoders) > 1 and mirrors(*table.values[encoders[:2]]):
         encoders = encoders[1:]
-    if not encoders or len(encoders) > _MOST_CARTS:
+    if not encoders or len(encoders) > MOST_CARTS:
         return {}
     given |= {f"x{cart}": i for cart, i in enumerate(encoders, start=1)}
     return {role: i + 1 for role, i in given.items()}

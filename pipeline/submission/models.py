@@ -13,6 +13,7 @@ Line = Annotated[str, Field(max_length=200)]
 # Units stand in the titles of figures, which scripts read.
 Unit = Annotated[str, Field(max_length=40, pattern=r"^[^\p{C}\p{Zl}\p{Zp}]*$")]
 MOST_AUTHORS = 50
+MOST_CARTS = 4
 MOST_EXPERIMENTS = 1_000  # every stage and every comparison goes through them
 Typed = Annotated[Decimal, Field(allow_inf_nan=False)]  # keeps the digits as typed: 0.10 has two
 
@@ -56,7 +57,7 @@ class System(_Model):
     `columns` (role to heading or number) are those of every recording that has them.
     """
 
-    carts: Annotated[int, Field(ge=1, le=4)]
+    carts: Annotated[int, Field(ge=1, le=MOST_CARTS)]
     springs: tuple[bool, ...]
     input: Input = Input()
     position: Position = Position()
@@ -68,7 +69,7 @@ class System(_Model):
         """Fill in `springs` where they are left out."""
         if isinstance(table, dict) and "springs" not in table:
             carts = table.get("carts")
-            if isinstance(carts, int) and 1 <= carts <= 4:
+            if isinstance(carts, int) and 1 <= carts <= MOST_CARTS:
                 return {**table, "springs": (True,) * (carts + 1)}
         return table
 

@@ -19,6 +19,7 @@ from pipeline.report.words import symbol_text
 from pipeline.resources import TEMPLATES
 from pipeline.submission.edit import toml_item
 from pipeline.submission.load import InvalidSubmission, spring_names
+from pipeline.submission.models import MOST_CARTS
 
 _NUMBER = re.compile(r"[-+]?(0|[1-9]\d*)(\.\d+)?([eE][-+]?\d+)?")
 _INLINE = ("input", "position", "controller", "columns")  # tables that stand in one line
@@ -192,7 +193,7 @@ def _field(entry: Mapping[str, Any], path: str) -> Field:
 
 def _carts(document: Mapping[str, Any]) -> int:
     carts = _at(document, "system.carts")
-    return carts if isinstance(carts, int) and 1 <= carts <= 4 else 1
+    return carts if isinstance(carts, int) and 1 <= carts <= MOST_CARTS else 1
 
 
 def _filled(fields: Iterable[Field], document: Mapping[str, Any], carts: int) -> tuple[Field, ...]:
