@@ -149,16 +149,7 @@ def reference_design(submission: Submission, fit: ChainFit | None) -> FeedbackDe
     if not fit.converged:
         raise DataError(f"the fit of the carts did not converge: {fit.message}")
     task = submission.design or Design(cart=submission.system.carts)
-    return design_feedback(
-        fit.chain,
-        cart=task.cart,
-        reference=task.reference,
-        overshoot_percent=task.overshoot_percent,
-        settling_time=task.settling_time,
-        input_limit=task.input_limit,
-        sample_time=task.sample_time,
-        method=task.method,
-    )
+    return design_feedback(fit.chain, **dict(task))
 
 
 def _design(submission: Submission, fit: ChainFit | None, *, log: Log) -> FeedbackDesign | None:

@@ -174,16 +174,7 @@ def preset_chain(name: str) -> Chain:
 
 def _design(believed: Chain, task: Design) -> FeedbackDesign:
     """Return the controller as it is typed into the bench: gains to four digits."""
-    design = design_feedback(
-        believed,
-        cart=task.cart,
-        reference=task.reference,
-        overshoot_percent=task.overshoot_percent,
-        settling_time=task.settling_time,
-        input_limit=task.input_limit,
-        sample_time=task.sample_time,
-        method=task.method,
-    )
+    design = design_feedback(believed, **dict(task))
     return replace(
         design,
         gains=np.array([float(f"{gain:.4g}") for gain in design.gains]),

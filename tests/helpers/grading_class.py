@@ -350,16 +350,7 @@ def _designed(team: Team, chain: Chain) -> Feedback | None:
     """Return a controller made for the team's own carts, as typed."""
     task = team.submission.design or Design(cart=chain.n)
     try:
-        design = design_feedback(
-            chain,
-            cart=task.cart,
-            reference=task.reference,
-            overshoot_percent=task.overshoot_percent,
-            settling_time=task.settling_time,
-            input_limit=task.input_limit,
-            sample_time=task.sample_time,
-            method=task.method,
-        )
+        design = design_feedback(chain, **dict(task))
     except DataError:
         return None
     if design.settling_time is None:
