@@ -116,13 +116,16 @@ def test_the_files_that_contributors_are_sent_to_are_there():
 
 
 def test_the_hooks_before_a_commit_are_the_checks_of_ci():
-    """Each of ruff, pyright and mkdocs that `.ci/run` calls is a hook, with its strictness."""
+    """Each of ruff, pyright and mkdocs that `.ci/run` calls is run by a hook, as strictly."""
     checked = re.findall(
         r"^(?:\w+=\S+ )?((?:ruff|pyright|mkdocs)\b.*)", (ROOT / ".ci/run").read_text(), re.MULTILINE
     )
     hooks = re.findall(
-        r"^ +name: (.*)", (ROOT / ".pre-commit-config.yaml").read_text(), re.MULTILINE
+        r"^ +name: (.*)\n +entry: (.*)",
+        (ROOT / ".pre-commit-config.yaml").read_text(),
+        re.MULTILINE,
     )
     assert len(checked) == len(hooks) > 0
-    for line, hook in zip(checked, hooks, strict=True):
-        assert line.startswith(hook)
+    for line, (name, entry) in zip(checked, hooks, strict=True):
+        assert line.startswith(name)
+        assert entry.startswith(name)
