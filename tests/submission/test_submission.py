@@ -1,7 +1,6 @@
 """`submission.toml` becomes a validated model, digits as typed, defaults filled in."""
 
 import re
-import time
 from decimal import Decimal
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,6 +13,7 @@ from pipeline.errors import ConfigError, SubmissionError
 from pipeline.ingest.read import read_data
 from pipeline.names import parameter_names
 from pipeline.submission import Pid, StateFeedback, load_submission, new_submission
+from pipeline.submission.load import InvalidSubmission
 
 FULL = """\
 version = 1
@@ -250,12 +250,11 @@ gains = [1, 0, 1, 0]
         load_submission(tmp_path)
 
 
-def test_a_hundred_thousand_mistakes_are_told_at_once(tmp_path):
-    """The first is worded, the others counted: what each may have meant would take minutes."""
+def test_of_many_thousand_mistakes_the_first_are_worded(tmp_path):
+    """The others are counted: what each may have meant would take minutes."""
     keys = "".join(f"k{i} = 1\n" for i in range(60_000))
     text = f"version = 1\n[system]\ncarts = 1\n{keys}"
     (tmp_path / "submission.toml").write_text(text, encoding="utf-8")
-    began = time.process_time()
-    with pytest.raises(SubmissionError, match=r"unknown key.*\(and 59999 more\)"):
+    with pytest.raises(InvalidSubmission, match=r"unknown key.*\(and 59999 more\)") as told:
         load_submission(tmp_path)
-    assert time.process_time() - began < 20  # takes one; all of them took a hundred
+    assert len(told.value.problems) <= 100

@@ -2,7 +2,6 @@
 
 import os
 import sys
-import time
 import zipfile
 from pathlib import Path
 
@@ -352,11 +351,12 @@ def test_a_team_without_its_file_keeps_its_name(tmp_path, beside):
 
 
 def test_a_name_of_many_numbers_is_read_at_once():
-    """A member's name has up to 65,535 letters, and no form of name is tried from each of them."""
-    start = time.process_time()
+    """No form of name is tried from each of its letters: of so many that would take hours.
+
+    A member's name has 65,535 at most.
+    """
     for part in ("_1", "_LATE_1", "_assignsubmission_", "anon_", "-1.a"):
-        parse_name(part * (65_000 // len(part)) + "\n")
-    assert time.process_time() - start < 1  # s; from each letter: seven for one name
+        parse_name(part * (1_000_000 // len(part)) + "\n")
 
 
 def test_archives_in_archives_are_opened_to_a_depth(tmp_path):
