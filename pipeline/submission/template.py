@@ -7,6 +7,7 @@ from pipeline.names import parameter_names
 from pipeline.output import write_file
 from pipeline.resources import TEMPLATES
 from pipeline.submission.load import NAME, spring_names
+from pipeline.submission.models import MOST_CARTS
 
 _NOTES = """\
 <!-- What you write here becomes the discussion of the report (Markdown). Comments like this do not.
@@ -26,10 +27,10 @@ def new_submission(folder: Path, *, carts: int) -> None:
 
     Raises
     ------
-    ConfigError : the folder holds something already, or the number of carts is not 1 to 4.
+    ConfigError : the folder holds something already, or there cannot be so many carts.
     """
-    if not 1 <= carts <= 4:
-        raise ConfigError(f"carts: expected 1 to 4, found {carts}")
+    if not 1 <= carts <= MOST_CARTS:
+        raise ConfigError(f"carts: expected 1 to {MOST_CARTS}, found {carts}")
     folder = Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ConfigError(f"{folder}: is there already and not empty; name a new folder")
