@@ -19,7 +19,7 @@ from pipeline.grading.intake.lms_names import parse_name
 from pipeline.grading.intake.unpack import HAND_IN, STRANGE_ARCHIVES, Limits, is_debris, unpack
 from pipeline.names import first_few
 from pipeline.submission.complaints import quote
-from pipeline.submission.load import MAX_DATA_BYTES, NAME
+from pipeline.submission.load import NAME
 
 _DEEPEST = 12  # folders below the hand-in's
 _ARCHIVES_IN_ARCHIVES = 3
@@ -112,7 +112,8 @@ def open_submission(sources: Sequence[Path], into: Path, *, digest: str = "") ->
 def _files(sources: Sequence[Path]) -> Iterator[tuple[str, Path]]:
     """Yield (name below the hand-in, path) of the files to grade, sorted by name, each once.
 
-    Of too many or too large files the smallest are taken: data files are small, films are not.
+    Of too many or too large files the smallest are taken: data files are small, films are not. A
+    recording that is only larger than may be is among them, so that it is refused, not missed.
     Bytes that are no text in a name are replaced, here as on another machine.
     """
     found: list[tuple[int, str, Path]] = []
@@ -143,9 +144,7 @@ def _walk(folder: Path, below: PurePosixPath) -> Iterator[tuple[int, str, Path]]
             if entry.is_dir(follow_symlinks=False):
                 yield from _walk(Path(entry.path), name)
             elif entry.is_file(follow_symlinks=False):
-                size = entry.stat(follow_symlinks=False).st_size
-                if size <= MAX_DATA_BYTES:
-                    yield size, str(name), Path(entry.path)
+                yield entry.stat(follow_symlinks=False).st_size, str(name), Path(entry.path)
 
 
 def _less(limits: Limits, folder: Path) -> Limits:

@@ -167,7 +167,9 @@ def _why(error: Exception) -> str:
     if isinstance(error, OSError | RuntimeError):  # the disk's complaint, or a decoder's
         said = getattr(error, "strerror", None) or _line(error)
         return f"cannot be unpacked ({said})"
-    return f"not a whole zip archive ({_line(error)})"
+    said = _line(error)
+    more = "" if said == "File is not a zip file" else f" ({said})"  # which says it once more
+    return f"not a whole zip archive{more}"
 
 
 class _Bounded(io.BufferedReader):

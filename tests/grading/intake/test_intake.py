@@ -14,6 +14,7 @@ from pipeline.grading.intake.files import digest, open_submission, packed, unpac
 from pipeline.grading.intake.hand_ins import find_hand_ins
 from pipeline.grading.intake.lms_names import parse_name
 from pipeline.grading.intake.unpack import HAND_IN
+from pipeline.submission.load import MAX_DATA_BYTES, outside
 
 TOML = "version = 1\n"
 
@@ -227,7 +228,7 @@ def test_one_students_zip_is_one_hand_in(tmp_path):
     bad.write_bytes(b"PK\x03\x04 no more")
     first, second = hand_ins(tmp_path, good, bad)
     assert (first.id, second.id) == ("team-07", "team-08")
-    with pytest.raises(SubmissionError, match="not a whole zip archive"):
+    with pytest.raises(SubmissionError, match=r"'team-08\.zip': not a whole zip archive: send"):
         opened(tmp_path, second)
     bad.write_bytes(b"")  # an upload that was broken off
     with pytest.raises(SubmissionError, match=r"'team-08\.zip': is empty"):
@@ -403,6 +404,14 @@ def test_links_and_pipes_are_not_followed(tmp_path):
     assert "is a link" in linked.problem
     assert opened(tmp_path, team) == ["submission.toml"]
     assert len(digest(team.sources)) == 64
+
+
+def test_a_recording_that_is_too_large_is_refused_and_not_missed(tmp_path):
+    """Who handed in a file that is larger than may be is told so, not that there is none."""
+    team = tree(tmp_path / "team-01", {"submission.toml": TOML, "data/long.csv": ""})
+    os.truncate(team / "data" / "long.csv", MAX_DATA_BYTES + 1)
+    folder = open_submission([team], tmp_path / "opened")
+    assert "100,000,001 bytes, the limit is 100,000,000" in str(outside(folder, "data/long.csv"))
 
 
 def test_a_hand_in_travels_whole(tmp_path):
