@@ -91,13 +91,13 @@ def fill(folder: Folder, as_json: AsJson = False) -> None:
         typer.echo(json.dumps([f.to_dict() for f in found], indent=1, ensure_ascii=False))
     else:
         typer.echo(format_found(found))
-    left = [f for f in found if f.state in ("unknown", "broken")]
+    left = [f for f in found if f.state in ("unknown", "broken", "missing")]
     did = "nothing to add to" if toml.read_bytes() == before else "wrote"
     say(f"{did} {toml}: springs, units and what is marked unsure are yours")
     if not_read := format_not_read(folder / "data"):
         say(f"cartlab: {not_read}")
     if left:
-        say(f"cartlab: without a table: {', '.join(f.file for f in left)}")
+        say(f"cartlab: of no use yet: {', '.join(f.file for f in left)}")
         raise typer.Exit(1)
 
 

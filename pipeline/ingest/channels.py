@@ -104,13 +104,18 @@ def saturation(u: Array) -> float | None:
     return None
 
 
+def never_changes(name: str) -> str:
+    """Return in words that a position stands still, while another or the input does not."""
+    return f"{name!r} never changes: a held cart, or an encoder that is stuck"
+
+
 def channel_problems(t: Array, u: Array | None, positions: dict[str, Array]) -> list[str]:
     """Return in words what is wrong with the input and the positions (heading to values)."""
     problems = []
     moving = any(np.ptp(x) > 0 for x in positions.values())
     for name, x in positions.items():
         if np.ptp(x) == 0.0 and (moving or (u is not None and np.ptp(u) > 0)):
-            problems.append(f"{name!r} never changes: a held cart, or an encoder that is stuck")
+            problems.append(never_changes(name))
         problems += [
             f"{name!r} stands still at speed from {t[first]:.4g} s to {t[last]:.4g} s: "
             "the encoder stuck"

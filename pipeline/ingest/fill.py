@@ -16,6 +16,7 @@ import tomlkit
 
 from pipeline.errors import ConfigError, SubmissionError
 from pipeline.ingest import limits
+from pipeline.ingest.channels import never_changes
 from pipeline.ingest.formats.recognise import read_table
 from pipeline.ingest.formats.table import ENDINGS
 from pipeline.ingest.inspect import Inspection, data_files_in, format_not_read, inspect_file
@@ -36,7 +37,7 @@ from pipeline.submission.toml_file import Value, parse_toml
 _UNSURE = "unsure: "  # begins a comment below a table, which whoever knows better takes out
 _NO_NAME = re.compile(r"[^\w.-]+", re.ASCII)
 
-State = Literal["new", "completed", "there", "copy", "unknown", "broken"]
+State = Literal["new", "completed", "there", "copy", "unknown", "broken", "missing"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +48,7 @@ class Found:
     ----------
     file : below the submission's folder.
     state : its table is new, completed or was there; or there is none, for it is a copy of another
-        file, nothing tells what it is, or it cannot be read.
+        file, or nothing tells what it is; or it cannot be read, or has a table and is not there.
     experiment : the id of its table; "" without one.
     carts : that were free, as far as the file tells; () all.
     inspection : None where the file cannot be read.
@@ -126,8 +127,9 @@ def experiment_entry(
 ) -> dict[str, Value]:
     """Return the keys of the `[[experiments]]` table of a file; `n` carts has the system."""
     entry: dict[str, Value] = {"id": name, "kind": kind}
-    if carts and len(carts) < n:
-        entry["carts"] = [cart for cart in carts if cart <= n]
+    known = [cart for cart in carts if cart <= n]
+    if known and len(known) < n:
+        entry["carts"] = known
     entry["file"] = file
     if inspection.guessed:
         missing = {f"x{cart}" for cart in inspection.positions if cart > n}
@@ -174,7 +176,9 @@ def fill_submission(folder: Path) -> tuple[Found, ...]:
         if new:
             _state_units(document, looked)
         filling = _Filling(document, folder, looked)
+        missing = list(filling.missing())  # before a file under its new name gets a table
         found.extend(filling.add(one) for one in looked)
+        found.extend(missing)
 
     edit_submission(folder, change)
     return tuple(found)
@@ -235,14 +239,29 @@ class _Filling:
             table["kind"] = found.kind
         if "columns" not in table and inspection.guessed:
             table["columns"] = toml_item(inspection.guessed)
+        carts = tuple(table.get("carts", range(1, self._n + 1)))
+        held = [column for cart, column in inspection.positions.items() if cart not in carts]
+        known = {never_changes(column.name) for column in held}  # said in the table, no news
         return replace(
             found,
             state="completed" if len(table) > before else "there",
             experiment=str(table["id"]),
             kind=table.get("kind"),
-            carts=tuple(table.get("carts", range(1, self._n + 1))),
+            carts=carts,
+            remarks=tuple(remark for remark in found.remarks if remark not in known),
             unsure=_marked(table),
         )
+
+    def missing(self) -> Iterator[Found]:
+        """Yield the files that have a table and are not there, with what may be meant."""
+        files = {posix(str(table["file"])): table for table in self._tables}
+        for file, table in files.items():
+            wrong = outside(self._folder, file, taken=files)
+            if wrong is not None:
+                name, kind = str(table.get("id", "")), table.get("kind")
+                yield Found(
+                    file=file, state="missing", experiment=name, kind=kind, remarks=(wrong,)
+                )
 
     def _same(self, file: str) -> str | None:
         """Return another file of the submission that holds the very same, if in another form."""
@@ -296,6 +315,9 @@ def _unsure(found: Found, n: int) -> Iterator[str]:
     if found.kind == "closed_loop":
         yield "what ran: controller = { type = … }" + (", controlled_cart = …" if n > 1 else "")
     positions = found.inspection.positions
+    for cart in (cart for cart in found.carts if cart > n):
+        renamed = ", or columns = { x1 = … }" if n == 1 else ""
+        yield f"{positions[cart].name!r} moves, but carts = {n}: more carts{renamed}?"
     if n > 1 and list(positions) == [1] and not re.search(r"\d", positions[1].name):
         yield "is it cart 1 that it measures? Else columns = { x2 = … }"
 
@@ -322,7 +344,7 @@ def _state_units(document: tomlkit.TOMLDocument, looked: Sequence[Found]) -> Non
 def format_found(found: Sequence[Found]) -> str:
     """Return a table of one line a file, what is wrong or not sure below."""
     rows = [
-        (one.file, one.state, one.kind or "?", _carts_words(one.carts), one.experiment or "-")
+        (one.file, one.state, one.kind or "?", _carts_words(one), one.experiment or "-")
         for one in found
     ]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -338,7 +360,9 @@ def format_found(found: Sequence[Found]) -> str:
     return "\n".join([*lines, *(f"! {remark}" for remark in said)])
 
 
-def _carts_words(carts: Sequence[int]) -> str:
-    if not carts:
+def _carts_words(found: Found) -> str:
+    if found.inspection is None:
+        return "-"
+    if not found.carts:
         return "all carts"
-    return f"cart{'s' if len(carts) > 1 else ''} {', '.join(map(str, carts))}"
+    return f"cart{'s' if len(found.carts) > 1 else ''} {', '.join(map(str, found.carts))}"

@@ -209,6 +209,42 @@ def test_a_bare_matrix_of_more_carts_than_there_are_spoils_nothing(tmp_path):
     assert sorted(columns, key=len) == [set(), {"time", "input", "x1"}]
 
 
+@pytest.mark.parametrize(("carts", "asked"), [(1, "x1 = …"), (2, "more carts")])
+def test_a_cart_that_the_system_has_not_is_asked_about(tmp_path, carts, asked):
+    """Its table stands, without `carts`, and says which column moves against what is stated."""
+    new_submission(tmp_path, carts=carts)
+    put(tmp_path, "pull.csv", time=T, input=0 * T, x1=0 * T, x2=0 * T, x3=RING)
+    (found,) = fill_submission(tmp_path)
+    (unsure,) = found.unsure
+    assert f"'x3' moves, but carts = {carts}" in unsure
+    assert asked in unsure
+    (experiment,) = load_submission(tmp_path).experiments
+    assert experiment.carts == tuple(range(1, carts + 1))
+
+
+def test_a_held_cart_that_is_stated_is_no_remark(tmp_path):
+    """A still encoder is asked about where the carts are a guess, not once they stand."""
+    put(tmp_path, "run.csv", time=T, input=STEP, x1=RING, x2=0.4 * RING)
+    put(tmp_path, "pull.csv", time=T, input=0 * T, x1=RING, x2=0 * T)
+    first, second = fill_submission(tmp_path), fill_submission(tmp_path)
+    assert "'x2' never changes" in " ".join(first[0].remarks)
+    assert second[0].remarks == ()
+    toml = tmp_path / "submission.toml"
+    toml.write_text(toml.read_text(encoding="utf-8").replace("carts = [1]\n", "", 1), "utf-8")
+    assert "'x2' never changes" in " ".join(fill_submission(tmp_path)[0].remarks)
+
+
+def test_a_table_without_its_file_is_told(tmp_path):
+    """A file that was renamed gets a table of its own, and the old one its hint."""
+    put(tmp_path, "step-1.csv", time=T, input=STEP, x1=RING)
+    fill_submission(tmp_path)
+    (tmp_path / "data" / "step-1.csv").rename(tmp_path / "data" / "step1.csv")
+    new, lost = fill_submission(tmp_path)
+    assert (new.state, new.file) == ("new", "data/step1.csv")
+    assert (lost.state, lost.experiment, lost.kind) == ("missing", "step-1", "step")
+    assert "did you mean 'data/step1.csv'?" in lost.remarks[0]
+
+
 def test_links_out_of_the_folder_are_not_followed(tmp_path):
     """A link to somebody else's file is no file of the submission."""
     put(tmp_path / "theirs", "a.csv", time=T, input=STEP, x1=RING)
@@ -251,7 +287,7 @@ def test_what_is_no_table_is_one_line(old, new, where, tmp_path):
 
 
 def test_the_command_says_what_it_did(tmp_path):
-    """A table or JSON on stdout; exit status 1 where a file is left without a table."""
+    """A table or JSON on stdout; exit status 1 where a file is of no use yet."""
     put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
     result = CliRunner().invoke(app, ["fill", str(tmp_path)], catch_exceptions=False)
     assert result.exit_code == 0
