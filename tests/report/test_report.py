@@ -563,6 +563,34 @@ def test_a_good_result_is_called_so():
         assert "Nothing stands out" not in terminal_summary(worse)
 
 
+def test_what_may_be_either_of_two_values_is_said_with_both():
+    """A gain of the fit that may be that of the steps, or not, does not stand alone."""
+    analysis = make_analysis(1)
+    (first, *others) = analysis.rows
+    initial, final = Estimate(value=29.0, std=0.1, source="step"), first.final
+    assert final is not None
+    final = replace(final, value=35.0, std=3.5)
+    open_ = replace(first, initial=initial, final=final, change_sigmas=1.7, consistent=None)
+    text = terminal_summary(replace(analysis, rows=(open_, *others)))
+    assert "K (29.00 ± 0.10 at first, 35.0 ± 3.5 from the fit)" in text
+    assert "Too uncertain" not in terminal_summary(analysis)
+
+
+def test_gains_that_the_fit_cannot_give_ask_for_the_springs():
+    """Steps against a fit of fewer springs than may be there; dry friction is told on its own."""
+    analysis = make_analysis(2)
+    assert analysis.fit is not None
+    smooth = tuple(replace(decay, friction=None) for decay in analysis.log_decrements)
+    rows = tuple(replace(row, consistent=not row.name.startswith("K")) for row in analysis.rows)
+    poor = replace(analysis.fit, chi_square_per_dof=1e6)
+    asked = replace(
+        analysis, springs=(True, True, False), rows=rows, fit=poor, log_decrements=smooth
+    )
+    assert "See whether springs is right" in terminal_summary(asked)
+    for other in ({"springs": (True, True, True)}, {"fit": analysis.fit}):
+        assert "See whether springs" not in terminal_summary(replace(asked, **other))
+
+
 def test_a_wrong_sign_is_said_first_and_nothing_else_is_advised():
     """A stated sign that the data contradict comes first; what may follow from it is not sought."""
     analysis = make_analysis(1, repeats=1)

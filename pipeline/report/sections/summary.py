@@ -83,7 +83,7 @@ def terminal_summary(analysis: Analysis) -> str:
 
 def _findings(analysis: Analysis) -> list[tuple[bool, Spans]]:
     """Return whether each thing found is well, with a sentence about it."""
-    found = (_sign, _agreement, _checks, _friction, _design, _hardware, _skipped)
+    found = (_sign, _agreement, _undecided, _checks, _friction, _design, _hardware, _skipped)
     return [finding for of in found if (finding := of(analysis))]
 
 
@@ -217,6 +217,23 @@ def _agreement(analysis: Analysis) -> tuple[bool, Spans] | None:
     return False, _WORDS.spans("disagree", changes=rich(listing(changes)), parameters=parameters)
 
 
+def _undecided(analysis: Analysis) -> tuple[bool, Spans] | None:
+    """What was measured twice and may be either: a number of the board must not stand alone."""
+    told = [
+        _WORDS.text(
+            "undecided_one",
+            name=row.name,
+            initial=with_error(row.initial.value, row.initial.std),
+            final=with_error(row.final.value, row.final.std),
+        )
+        for row in analysis.rows
+        if row.consistent is None and row.change_sigmas is not None and row.initial and row.final
+    ]
+    if not told:
+        return None
+    return False, _WORDS.spans("undecided", parameters=rich(listing(told)))
+
+
 def _checks(analysis: Analysis) -> tuple[bool, Spans] | None:
     done = [c for c in analysis.checks if c.outcome != "skip"]
     failed = analysis.failed_checks
@@ -331,6 +348,8 @@ def _advice(analysis: Analysis) -> Iterator[Spans]:
         yield (say("next_no_carts", reason=clean(reasons[-1])) if reasons else say("next_no_data"))
     if off := [row.name for row in analysis.rows if row.consistent is False]:
         yield say("next_off", names=names_spans(off))
+    if _may_lack_springs(analysis):
+        yield say("next_springs")
     if short := sorted({point.experiment for point in analysis.sine_points if not point.settled}):
         yield say("next_short", runs=clean(listing(short)))
     if any(d.friction and d.friction.present for d in analysis.log_decrements):
@@ -347,6 +366,13 @@ def _advice(analysis: Analysis) -> Iterator[Spans]:
         yield say("next_skipped")
     if design and not design.reachable:
         yield say("next_goal", message=clean(design.message))
+
+
+def _may_lack_springs(analysis: Analysis) -> bool:
+    """Tell whether steps contradict a fit that leaves springs out, where dry friction does not."""
+    fit, dry = analysis.fit, any(d.friction and d.friction.present for d in analysis.log_decrements)
+    off = any(row.consistent is False and read_name(row.name).is_gain for row in analysis.rows)
+    return off and not dry and fit is not None and not (fit.explains_data or all(analysis.springs))
 
 
 def _look_into(analysis: Analysis) -> Spans:
