@@ -76,16 +76,16 @@ def check_decays(decays: Sequence[LogDecrement], *, position_unit: str) -> list[
 
 
 def check_steps(steps: Sequence[StepGain], *, gain_unit: str) -> list[Check]:
-    """Ask whether every step has one gain: a cart that sticks has an interval of them."""
+    """Ask whether every step has one gain: a cart that sticks has at least an interval of them."""
     checks = []
     for step in steps:
         found, width = "settles where its springs put it.", None
         if step.interval:
             low, high = step.interval
             width = high - low
-            found = (
-                "sticks: its static gain is only known to lie between "
-                f"{low:.4g} and {high:.4g} {gain_unit}."
+            found = (  # the rest points show the least that friction can hold, not the most
+                f"sticks: its rest points put the static gain between {low:.4g} and {high:.4g} "
+                f"{gain_unit}, and it may be farther off."
             )
         name = f"step.{step.experiment}.cart_{step.cart}"
         message = f"{step.experiment}: cart {step.cart} {found}"

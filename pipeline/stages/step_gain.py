@@ -326,7 +326,7 @@ def _rest_shift(found: Sequence[_Plateau]) -> tuple[float | None, float]:
 
 
 def _interval(edges: Sequence[StepEdge], *, shift: float) -> tuple[float, float]:
-    """Return the gains that friction allows: each rest point may be off by half the shift."""
+    """Return the gains that friction allows at least: a rest point is off by half the shift."""
     gains = [edge.gain for edge in edges]
     slack = abs(shift) / (2 * min(abs(edge.u_after - edge.u_before) for edge in edges))
     slack = max(slack, max(edge.gain_std for edge in edges))
