@@ -371,14 +371,18 @@ def outside(folder: Path, name: str, *, taken: Collection[str] = ()) -> str | No
 
 
 def _near_file(folder: Path, name: str, taken: Collection[str]) -> str:
-    """Return "; did you mean …?" for a file of this name elsewhere, or of a similar one."""
+    """Return "; did you mean …?" for a file of this name elsewhere, or a similar one in its place.
+
+    A similar one elsewhere may be a table that a report wrote.
+    """
     try:
         paths = sorted(p for p in islice(folder.rglob("*"), _MOST_LOOKED_AT) if p.is_file())
     except OSError:
         return ""
     files = [path.relative_to(folder).as_posix() for path in paths]
     files = [file for file in files if file not in taken]
-    last = PurePosixPath(name).name.casefold()
-    same = [file for file in files if PurePosixPath(file).name.casefold() == last]
-    hint = f"; did you mean {same[0]!r}?" if same else nearest(name, files)
+    meant = PurePosixPath(name)
+    same = [file for file in files if PurePosixPath(file).name.casefold() == meant.name.casefold()]
+    beside = [file for file in files if PurePosixPath(file).parent == meant.parent]
+    hint = f"; did you mean {same[0]!r}?" if same else nearest(name, beside)
     return hint if "did you mean" in hint else ""

@@ -489,6 +489,10 @@ def test_no_file_is_proposed_that_is_another_experiments(tmp_path):
     assert read_data(load_submission(folder)).unreadable == {
         "step-b": "there is no file 'data/step2.csv'"
     }
+    (folder / "report" / "tables").mkdir(parents=True)
+    (folder / "report" / "tables" / "steps.csv").write_text("record,gain\n")  # is no recording
+    (said,) = read_data(load_submission(folder)).unreadable.values()
+    assert "did you mean" not in said
     (folder / "data" / "Step2.csv.csv").write_text("\n".join(good_rows()))
     (said,) = read_data(load_submission(folder)).unreadable.values()
     assert said.endswith("; did you mean 'data/Step2.csv.csv'?")
