@@ -563,6 +563,18 @@ def test_a_good_result_is_called_so():
         assert "Nothing stands out" not in terminal_summary(worse)
 
 
+def test_one_swing_shows_no_rise_of_the_damping():
+    """The figure of damping against swing stands where a record has two of them."""
+    analysis = make_analysis(1)
+    one = tuple(
+        replace(decay, zeta_at_amplitude=decay.zeta_at_amplitude[:, :1])
+        for decay in analysis.log_decrements
+    )
+    alone = replace(analysis, log_decrements=one)
+    drawn = [[block.kind for block in decay_blocks(Shown.of(a))] for a in (analysis, alone)]
+    assert drawn[0].count("picture") == drawn[1].count("picture") + 1
+
+
 def test_what_may_be_either_of_two_values_is_said_with_both():
     """A gain of the fit that may be that of the steps, or not, does not stand alone."""
     analysis = make_analysis(1)

@@ -130,8 +130,8 @@ def decay_blocks(page: Page) -> list[Block]:
             **said,
         )
         blocks.append(page.picture(f"decay-cart-{cart}", figure, caption=caption, alt=alt))
-    rubbing = [d for d in decays if d.friction and d.friction.present and d.zeta_at_amplitude.size]
-    if rubbing:
+    rubbing = [d for d in decays if d.friction and d.friction.present]
+    if rubbing := [d for d in rubbing if d.zeta_at_amplitude.shape[1] > 1]:  # one is no rise
         figure = damping_figure(rubbing, position_unit=page.position)
         caption, alt = _WORDS.text("damping"), _WORDS.text("damping_alt")
         blocks.append(page.picture("damping", figure, caption=caption, alt=alt))
