@@ -74,9 +74,10 @@ def grade(
         say(remark)
     if done.changes:
         say("since the class list before:")
-        more = [f"and {len(done.changes) - _MOST_TOLD} more; cartlab history tells each"]
-        for change in [*done.changes[:_MOST_TOLD], *more * (len(done.changes) > _MOST_TOLD)]:
+        for change in done.changes[:_MOST_TOLD]:
             say(f"  {change}")
+        if (more := len(done.changes) - _MOST_TOLD) > 0:
+            say(f"  and {more} more; cartlab history tells each")
     for submission, reason in done.failed:
         say(f"{submission}: {reason}")
     if len(done.failed) == done.total > 1:

@@ -91,8 +91,10 @@ def count(n: int, noun: str) -> str:
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
 
-def listing(items: list[str]) -> str:
-    """Return "a", "a and b", "a, b and c"."""
+def listing(items: Sequence[str], *, most: int | None = None) -> str:
+    """Return "a", "a and b", "a, b and c"; those beyond `most` as a number, "a, b and 3 more"."""
+    if most is not None and len(items) > most:
+        items = [*items[:most], f"{len(items) - most} more"]
     if len(items) < 2:
         return "".join(items)
     return f"{', '.join(items[:-1])} and {items[-1]}"

@@ -92,6 +92,11 @@ def test_percentages_carry_their_sign_where_they_are_changes():
 def test_listing_reads_as_english():
     """Commas, and an "and" before the last."""
     assert [listing(list("abc")[:n]) for n in range(4)] == ["", "a", "a and b", "a, b and c"]
+    assert [listing("abcd"[:n], most=2) for n in (2, 3, 4)] == [
+        "a and b",
+        "a, b and 1 more",
+        "a, b and 2 more",
+    ]
 
 
 def test_margins_say_lag_lead_and_no_limit():

@@ -38,10 +38,9 @@ def take_table(ask: Ask) -> Response:
                  points=wish.points, why=wish.why)
         )  # fmt: skip
     new = ask.desk.books.book(ask.grades()).change_all(meant, by=by)
-    unchanged = len(meant) - new
-    said = f"{count(new, 'change')} taken over" + (
-        f", {unchanged} were so before" * bool(unchanged)
-    )
+    said = f"{count(new, 'change')} taken over"
+    if unchanged := len(meant) - new:
+        said += f", {unchanged} were so before"
     return ask.back(ask.here, f"{said}.")
 
 

@@ -169,8 +169,7 @@ def _people(authors: Sequence[str]) -> str:
 
 
 def _names(names: Sequence[str]) -> str:
-    more = [f"{len(names) - _NAMED} more"] * (len(names) > _NAMED)
-    return listing([*names[:_NAMED], *more])
+    return listing(names, most=_NAMED)
 
 
 def _names_so_far(place: Path | str, *, assignment: str) -> list[str]:

@@ -263,7 +263,7 @@ def _row(line: Line) -> list[Cell]:
     share = 100 * exact(line.points) / exact(line.out_of) if line.out_of else 0
     return [
         cell(_link(line.name)),
-        cell(clean(listing(list(line.authors))) or NOTHING),
+        cell(clean(listing(line.authors)) or NOTHING),
         cell(points_text(line.points)),
         cell(f"{math.floor(share)}"),  # 100 is for all points alone
         cell(f"{line.days_late:.3g}" if line.days_late else "0"),

@@ -35,10 +35,10 @@ class Double:
         """What a TA is told."""
         named = [" ".join(clean(author).split()) for author in self.authors]
         several = len(named) > 1
-        who = listing(named) if all(named) else f"{len(named)} people" if several else "One person"
+        nameless = f"{len(named)} people" if several else "One person"
+        who = listing(named) if all(named) else nameless
         are = "are" if several else "is"
-        more = [f"{len(self.submissions) - _NAMED} more"] * (len(self.submissions) > _NAMED)
-        where = listing([*map(clean, self.submissions[:_NAMED]), *more])
+        where = listing([clean(name) for name in self.submissions], most=_NAMED)
         if not (self.recordings or self.compared):
             return f"{who} {are} in {where}, whose recordings could not be compared"
         common = count(self.recordings, "recording") if self.recordings else "no recording"

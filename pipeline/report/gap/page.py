@@ -300,7 +300,7 @@ def _model(page: Page, gap: Gap) -> list[Block]:
 
 def _method(gap: Gap) -> list[Block]:
     runs = bullet_list(
-        WORDS.spans(key, runs=clean(listing(list(names))))
+        WORDS.spans(key, runs=clean(listing(names)))
         for key, names in (("fitted_to", gap.training), ("runs_held_out", gap.held_out))
         if names
     )
