@@ -7,6 +7,7 @@ from pipeline.report.document import plain
 from pipeline.report.sections.measurements import dwell_table
 from pipeline.report.sections.page import Page
 from pipeline.report.sections.parameters import parameter_table, reported_table
+from pipeline.report.sections.summary import terminal_summary
 from tests.helpers.analysis_factory import make_analysis
 
 
@@ -20,9 +21,10 @@ def test_a_number_of_ones_own_that_is_off_says_what_to_look_at():
     rows = make_analysis(1).rows
     true = {row.name: row.final.value for row in rows if row.final}
     mine = {"K": f"{true['K']:.3g}", "omega_n": f"{true['omega_n'] / 6.2832:.3g}"}
-    table = reported_table(
-        page(rows, {"initial": {}, "final": {k: Decimal(v) for k, v in mine.items()}})
-    )
+    shown = page(rows, {"initial": {}, "final": {k: Decimal(v) for k, v in mine.items()}})
+    assert "what you report of ω_n:" in terminal_summary(shown.analysis)
+    assert "what you report" not in terminal_summary(page(rows).analysis)
+    table = reported_table(shown)
     gain, frequency = ([plain(cell.text) for cell in row] for row in table.rows)
     assert gain[2] == mine["K"]
     assert gain[-1] == ""

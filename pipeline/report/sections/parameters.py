@@ -130,16 +130,32 @@ def _off(name: str, yours: Decimal, found: Estimate | None) -> tuple[Cell, Cell]
     """Return how far a number is off, and what to look at where that is too far."""
     if found is None or not found.value or found.source == "assumed":
         return cell(NOTHING, "quiet"), cell("")
-    off = float(yours) - found.value
-    share = percent(100 * off / abs(found.value), signed=True)
-    rounding = 0.5 * 10.0 ** int(yours.as_tuple().exponent)
-    few = limits.FEW * change_limit(name) / 100 * abs(found.value)
-    if abs(off) <= rounding + SIGMA_LIMIT * (found.std or 0.0) + few:
+    share = percent(100 * (float(yours) - found.value) / abs(found.value), signed=True)
+    if not _is_off(name, yours, found):
         return cell(share), cell("")
     read = read_name(name)
     kinds = {"gain": read.is_gain, "damping": read.is_ratio, "frequency": read.is_frequency}
     look = next((_WORDS.text(f"look_{kind}") for kind, is_it in kinds.items() if is_it), "")
     return cell(share, "bad"), cell(look)
+
+
+def _is_off(name: str, yours: Decimal, found: Estimate | None) -> bool:
+    if found is None or not found.value or found.source == "assumed":
+        return False
+    rounding = 0.5 * 10.0 ** int(yours.as_tuple().exponent)
+    few = limits.FEW * change_limit(name) / 100 * abs(found.value)
+    return abs(float(yours) - found.value) > rounding + SIGMA_LIMIT * (found.std or 0.0) + few
+
+
+def reported_off(analysis: Analysis) -> list[str]:
+    """Return the parameters of which the students report what their data do not give."""
+    return [
+        row.name
+        for row in analysis.rows
+        for column, claimed in analysis.reported.items()
+        if (yours := claimed.get(row.name)) is not None
+        and _is_off(row.name, yours, getattr(row, column))
+    ]
 
 
 def _parameter_notes(rows: Sequence[ParameterRow]) -> list[Spans]:

@@ -30,6 +30,7 @@ from pipeline.report.numbers import (
 from pipeline.report.phrases import phrases
 from pipeline.report.sections.measurements import overview_blocks
 from pipeline.report.sections.page import Page
+from pipeline.report.sections.parameters import reported_off
 from pipeline.report.words import clean, name_span, names_spans, plain_lines, rich
 from pipeline.results import SIGN, Analysis, Check, Estimate, HardwareCheck
 
@@ -348,6 +349,8 @@ def _advice(analysis: Analysis) -> Iterator[Spans]:
         yield (say("next_no_carts", reason=clean(reasons[-1])) if reasons else say("next_no_data"))
     if off := [row.name for row in analysis.rows if row.consistent is False]:
         yield say("next_off", names=names_spans(off))
+    if wrong := list(dict.fromkeys(reported_off(analysis))):
+        yield say("next_reported", names=names_spans(wrong))
     if _may_lack_springs(analysis):
         yield say("next_springs")
     if short := sorted({point.experiment for point in analysis.sine_points if not point.settled}):
