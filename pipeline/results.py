@@ -84,6 +84,7 @@ class ChainFit:
         ended at its bound says so (`Estimate.at_bound`) and is in no table.
     staged : the named parameters the stage-by-stage fit (last cart first) found, for the report.
     chi_square_per_dof : near 1 where model and stated noise explain the data; see `explains_data`.
+    misfit : of a "bode_fit" by how much of their magnitude points lie off it, beyond their errors.
     standardised : per cart (n_w,) or per record (n,): residual over its standard error.
     """
 
@@ -100,6 +101,7 @@ class ChainFit:
     n_starts: int
     converged: bool
     message: str
+    misfit: float = 0.0
     standardised: dict[str, Array] = field(default_factory=dict)
 
     @property

@@ -362,6 +362,7 @@ def _result(
         n_starts=tried,
         converged=fitted.converged,
         message="; ".join(text for text in remarks if text),
+        misfit=share,
         standardised={
             str(cart + 1): standardised[data.cart == cart] for cart in np.unique(data.cart)
         },

@@ -270,6 +270,19 @@ def test_where_dwells_identify_dwells_are_chosen():
     assert found.errors[2] < found.errors[1] < found.errors[0]
 
 
+def test_a_new_dwell_lies_as_far_off_as_those_before():
+    """Where friction, say, puts every point off the carts, one more tells what they tell."""
+    known = Knowledge.of(analysed("two-cart"))
+    dwell = Recording(
+        id="sine-new", kind="sine", carts=(1, 2), wave="sine", amplitude=0.05, frequency=2.0,
+        cycles=40,
+    )  # fmt: skip
+    exact, off = (replace(known, misfit=share).of_recording(dwell)[0] for share in (0.0, 0.1))
+    twice = replace(known, misfit=0.2).of_recording(dwell)[0]
+    assert np.trace(off) < 0.1 * np.trace(exact)
+    assert off == pytest.approx(4 * twice, rel=0.05, abs=1e-3 * np.abs(off).max())
+
+
 def test_carts_that_hardly_settle_get_no_dwells():
     """A transient of a slow mode would pass for a steady state: it is said, and none is chosen."""
     known = Knowledge.of(analysed("two-cart"))

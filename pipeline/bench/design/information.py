@@ -58,6 +58,7 @@ class Knowledge:
     sample_time : s, of the bench.
     beyond : how many times S is what encoders leave: friction, say, leaves more.
     dwells : so far; where there are any, the carts are identified from dwells alone.
+    misfit : by how much of its magnitude a dwell lies off the carts, beyond its error.
     """
 
     chain: Chain
@@ -69,6 +70,7 @@ class Knowledge:
     sample_time: float
     beyond: float = 1.0
     dwells: tuple[SinePoint, ...] = ()
+    misfit: float = 0.0
 
     @classmethod
     def of(cls, analysis: Analysis) -> Self:
@@ -99,6 +101,7 @@ class Knowledge:
             noise=np.zeros(chain.n),
             sample_time=float(np.median([record.sample_time for record in records])),
             dwells=analysis.sine_points if fit.method == "bode_fit" else (),
+            misfit=fit.misfit,
         )
         if known.dwells:
             return known
@@ -196,7 +199,8 @@ class Knowledge:
             turned = float(np.median(share * [p.phase_std * p.amplitude for p in mine]))
             phase_std = turned / response.magnitude
             responses.append(replace(response, magnitude_std=np.full(1, std), phase_std=phase_std))
-        data, P = Points.collect(responses, n=self.chain.n), self.parametrisation
+        data = Points.collect(responses, n=self.chain.n).widened(self.misfit)
+        P = self.parametrisation
         _, J = weighted_residuals(P, data, "polar", P.physical(self.chain))
         J = J * self.size
         return np.tile(J.T @ J, (2, 1, 1))

@@ -250,7 +250,10 @@ def _decisive(submission: Submission, limits: Limits) -> tuple[Recording, float]
     try:
         found = GapDocument.model_validate_json(text)
         if found.next_recording is None or found.separation is None:
-            raise DataError("--for gap: gap/gap.json proposes no recording")
+            raise DataError(
+                "--for gap: gap/gap.json proposes no recording: there is nothing that one would "
+                f'decide (its verdict is "{found.verdict}")'
+            )
         recording = Recording.model_validate_json(json.dumps(found.next_recording))
     except ValidationError:
         raise ConfigError(

@@ -42,6 +42,7 @@ from pipeline.report.exploration.turn import Turn
 from pipeline.results import Analysis
 from pipeline.submission import load_submission
 from pipeline.submission.load import NAME
+from pipeline.submission.models import MOST_CARTS
 from pipeline.workflow import analyse
 
 FIRST = "sweep"  # of the plan that is proposed where nothing is known: it needs no hands
@@ -49,11 +50,11 @@ _SEARCH = 300.0  # s that a look for the gap may take; most take ten
 # What there is to be known of carts as long as nobody has said how many there are.
 _NAMES = (
     *parameter_names(1, rigid=True),
-    *(name for n in range(1, 5) for name in parameter_names(n)),
+    *(name for n in range(1, MOST_CARTS + 1) for name in parameter_names(n)),
 )
-# Noises: explanations that no recording sets further apart stay in dispute. In 12 s, read 200 times
-# a second, of which every tenth reading is news, the criterion would differ by 20.
-_APART = 0.3
+# Noises squared, times seconds: explanations that no recording sets further apart stay in dispute.
+# Read 200 times a second, of which every tenth reading is news, the criterion would differ by 20.
+_APART = 1.0
 _HARD = 0.8  # of what takes the carts as far as they may go: as good as that
 _FAR_OUT = "far"  # the aim of what shows what acts far out
 _SETTLED = ("named", "none")
@@ -323,11 +324,12 @@ def _next(
     settled = gap is None or (named and not gap.contenders)
     commands = known_commands(folder)
     end = "" if named else "no recording within the limits would decide"
-    if gap is not None and gap.proposal is not None and gap.proposal.separation > _APART:
-        recording = Recording.model_validate_json(json.dumps(gap.proposal.recording))
+    decides = gap and gap.proposal
+    if gap and decides and decides.separation**2 * decides.t[-1] > _APART:
+        recording = Recording.model_validate_json(json.dumps(decides.recording))
         disputed = [model_words(one.model) for one in gap.contenders]
-        names = " and ".join(f'"{disputed[i]}"' for i in gap.proposal.pair)
-        return recording, (f"in it {names} differ by {gap.proposal.separation:.2g} times the noise")
+        names = " and ".join(f'"{disputed[i]}"' for i in decides.pair)
+        return recording, f"in it {names} differ by {decides.separation:.2g} times the noise"
     if missing and named:
         worst = max(missing, key=lambda name: missing[name])
         # What is open was refused, or is the next to be chosen: it tells nothing yet.

@@ -6,7 +6,7 @@ from typing import Literal, get_args
 
 from pipeline.bench.planning.plan import Plan, Recording
 from pipeline.bench.planning.plan_file import add_recordings, recording_problems
-from pipeline.bench.planning.propose import current_plan, let_go
+from pipeline.bench.planning.propose import EDGES, current_plan, let_go
 from pipeline.bench.protocol.messages import FREQUENCIES
 from pipeline.errors import ConfigError
 from pipeline.submission import Submission, load_submission
@@ -31,7 +31,6 @@ NEEDED: dict[Kind, tuple[str, ...]] = {
     "decay": (),
 }
 TYPED = {"frequency_end": "to"}
-_EDGES = 4  # half periods of a step: off, on, off, on
 _SETTLE = 5.0  # s of rest beforehand, where the plan has no run of the motor to go by
 
 
@@ -75,7 +74,7 @@ def recording_by_hand(
         made = let_go(cart, name=f"decay-{cart}", seconds=seconds)
     else:
         driven = [one.settle for one in plan.recordings if one.amplitude]
-        cycles = _periods(seconds, frequency) if kind != "step" else _EDGES // 2
+        cycles = _periods(seconds, frequency) if kind != "step" else EDGES // 2
         made = Recording(
             id=f"{kind}-1",
             kind=kind,

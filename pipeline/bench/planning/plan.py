@@ -99,12 +99,6 @@ class Recording(_Model):
         """The tones of a multisine, as a bench is told them."""
         return tuple(Tone(harmonic=h, share=share, phase=p) for h, share, p in self.tones)
 
-    @property
-    def highest_frequency(self) -> float:
-        """The highest at which it moves the carts on purpose, Hz."""
-        last = self.frequency_end or self.frequency
-        return max(self.frequency * max((h for h, *_ in self.tones), default=1), last)
-
     def resembles(self, other: Self) -> bool:
         """Whether who wants one of the two no more does not want the other either."""
         words = (self.kind, self.wave, self.carts, self.release, self.controller)

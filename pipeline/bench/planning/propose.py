@@ -46,7 +46,7 @@ _FIRST_SWEEP = 0.02
 _REPEATS = "ab"  # of a decay
 _DECAY_TIME = 10.0  # s
 _FIRST_EDGE = 5.0  # s from edge to edge of the first steps
-_EDGES = 4  # half periods of a step: off, on, off, on
+EDGES = 4  # half periods of a step: off, on, off, on
 _CHIRP_FROM = 0.5  # Hz; it ends 20 times higher
 _SWEEP_TIME = 20.0  # s
 _SWEEP_EDGE = 2.5  # s from edge to edge where the bench knows no chirp
@@ -242,7 +242,7 @@ def _steps(
             wave="square",
             amplitude=rounded_down(amplitude),
             frequency=rounded_down(0.5 / edge),
-            cycles=_EDGES // 2,
+            cycles=EDGES // 2,
             settle=settle,
         )
         for number, amplitude in enumerate(amplitudes, start=1)
@@ -351,7 +351,7 @@ def _loop(
         wave="square",
         amplitude=rounded_down(size) if size < abs(task.reference) else task.reference,
         frequency=rounded_down(0.5 / edge),
-        cycles=_EDGES // 2,
+        cycles=EDGES // 2,
         controller=StateLoop(cart=feedback.cart),
         settle=rounded(settling_wait(identified_chain(analysis), time_constants=SETTLED)),
     )
