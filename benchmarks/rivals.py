@@ -1,6 +1,6 @@
 """What one proposed experiment decides: hidden effects that the first records leave in dispute.
 
-    python -m benchmarks.rivals [--count 400] [--minutes 60]
+    python -m benchmarks.rivals [--count 480] [--minutes 60]
 
 Each bench is drawn by chance with one or two small hidden effects and records one sweep, with which
 `cartlab explore` begins. Where the verdict is "ambiguous" or "partial", it records what
@@ -119,4 +119,4 @@ def table(rows: list[dict]) -> str:
 
 
 if __name__ == "__main__":
-    run_study(__doc__, "rivals", ROWS, run, table, first=FIRST_SEED, count=400)
+    run_study(__doc__, "rivals", ROWS, run, table, first=FIRST_SEED, count=480)
