@@ -31,7 +31,7 @@ from pipeline.output import write_file
 from pipeline.plant.linear.chain import Array, Chain
 from pipeline.plant.linear.dwells import SETTLED, SETTLED_DWELL, settling_wait, steady_time
 from pipeline.plant.linear.presets import PRESETS
-from pipeline.report.figures.style import drawing
+from pipeline.report.figures.style import LIFT, drawing, legend_above, small_multiples
 from pipeline.report.figures.svg import plain_svg, to_svg
 from pipeline.results import Analysis
 from pipeline.submission import load_submission
@@ -128,22 +128,18 @@ def row(preset: str, runs: list[tuple[list[Stage], Array]]) -> list[str]:
 def draw(results: dict[str, list[tuple[list[Stage], Array]]]) -> str:
     """Draw the worst error against bench time."""
     with drawing():
-        from matplotlib.figure import Figure
-
-        figure = Figure(figsize=(6.5, 2.6), layout="constrained")
-        for axes, (preset, runs) in zip(
-            figure.subplots(1, 3, sharey=True), results.items(), strict=False
-        ):
+        figure, panels = small_multiples(list(results), height=1.9, share_y=True)
+        for axes, runs in zip(panels, results.values(), strict=True):
             for number, (stages, _) in enumerate(runs):
                 worst = [100 * np.nanmax(stage.stated) for stage in stages]
                 seconds = [stage.seconds for stage in stages]
                 label = ("first set, then chosen", "log-spaced dwells") if not number else ("", "")
                 axes.plot(seconds[:2], worst[:2], "o-", color="C0", label=label[0])
                 axes.plot(seconds[2:], worst[2:], "s", color="C1", label=label[1])
-            axes.set(title=preset, xlabel="time at the bench in s", yscale="log")
-            axes.set_xlim(0.0)
-        figure.axes[0].set_ylabel("worst standard error in %")
-        figure.axes[0].legend()
+            axes.set(xlabel="time at the bench in s", yscale="log")
+        panels[0].set_xlim(0.0)
+        panels[0].set_ylabel("worst standard error in %")
+        legend_above(panels[0], lift=LIFT)
         return plain_svg(to_svg(figure, name="next", alt="worst standard error against bench time"))
 
 
