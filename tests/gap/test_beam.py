@@ -174,7 +174,7 @@ def test_what_acts_beside_a_contact(parent, child, worth):
     ("first", "bic", "worth"),
     [
         (CUBIC, -110.0, True),
-        (CUBIC, -90.0, False),  # within what the best of many trials may gain on held-out noise
+        (CUBIC, -90.0, False),  # too little for the criterion alone
         (("backlash", 0), -1000.0, False),  # the rest of the bounce
     ],
 )
