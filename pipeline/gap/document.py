@@ -30,6 +30,7 @@ def gap_json(gap: Gap, *, position_unit: str = "cm", input_unit: str = "V") -> d
         "separation": gap.proposal.separation if gap.proposal else None,
         "training": list(gap.training),
         "held_out": list(gap.held_out),
+        "left_out": [fields_of(schema.LeftOut, one) for one in gap.left_out],
         "friction_spread": {str(cart): spread for cart, spread in gap.spread.items()},
         "units": {"position": position_unit, "input": input_unit},
         "linear": _chain(gap.linear.chain),

@@ -1,7 +1,9 @@
 """The gap workflow on the data of a submission."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
+from pipeline.gap.data.sides import drop_left_out
 from pipeline.gap.explain import explain_gap
 from pipeline.gap.types import Gap
 from pipeline.plant.nonlinear.augmented import compile_simulator
@@ -13,18 +15,18 @@ def investigate(
 ) -> Gap:
     """Explain the gap of the time records of a submission, starting from the identified chain.
 
-    A record that does not hold what happened is no gap of the model. Past `budget` s, the
-    compilation apart, the best answer so far is returned.
+    Recordings that the identification left out neither train nor judge here, and no figure of the
+    gap is about them. Past `budget` s, the compilation apart, the best answer so far is returned.
 
     Raises
     ------
     DataError : no usable record.
     """
+    records, notes = drop_left_out(analysis.records, left_out=analysis.left_out)
     progress("preparing the simulator; once on each machine it is compiled, which takes a while")
     compile_simulator()
-    wrong = {one.experiment for one in analysis.left_out if one.is_wrong}
-    return explain_gap(
-        [record for record in analysis.records if record.id not in wrong],
+    gap = explain_gap(
+        records,
         springs=analysis.springs,
         chain=analysis.chain,
         position_unit=analysis.position_unit,
@@ -32,3 +34,4 @@ def investigate(
         budget=budget,
         tell=progress,
     )
+    return replace(gap, left_out=analysis.left_out, notes=(*notes, *gap.notes))

@@ -11,7 +11,7 @@ from pipeline.gap.document import gap_json
 from pipeline.gap.types import Contender, FoundEffect, Gap, GapWindow, NamedValue, RecordGap, Rival
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.effects import AugmentedChain, Term, find_effect
-from pipeline.results import Analysis
+from pipeline.results import Analysis, LeftOut
 from pipeline.results_json import chain_entry, provenance
 from pipeline.schemas.base import fields_of, json_text
 from pipeline.schemas.gap import Gap as GapDocument
@@ -67,6 +67,7 @@ def _gap(document: Mapping[str, Any]) -> Gap:
         model=_model(document["model"]),
         training=tuple(document["training"]),
         held_out=tuple(document["held_out"]),
+        left_out=tuple(LeftOut(**entry) for entry in document["left_out"]),
         traces=(),
         chain_std=dict(document["chain_std"]),
         spread={int(cart): value for cart, value in document["friction_spread"].items()},

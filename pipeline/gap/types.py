@@ -5,6 +5,7 @@ from typing import Any, Literal
 
 from pipeline.arrays import Array
 from pipeline.plant.nonlinear.effects.base import AugmentedChain, Effect
+from pipeline.results import LeftOut
 
 Verdict = Literal["named", "partial", "none", "ambiguous", "unexplained"]
 
@@ -141,6 +142,7 @@ class Gap:
     chain_std : standard errors of the latter's "m_1", "c_1", "k_1", …; `chain_covariance` (n_p,
         n_p) of the same, None where it could not be had or was read from a file.
     training, held_out : ids of the runs.
+    left_out : recordings that the identification did not use, and why: no part of any figure here.
     spread : learnt run-to-run spread of the dry friction, per cart, where the runs show any.
     notes : what a reader must know.
     contenders : unless one leaves no more than noise: the models that may be true, the chosen
@@ -169,5 +171,6 @@ class Gap:
     left: tuple[GapWindow, ...] = ()
     complete: bool = True
     notes: tuple[str, ...] = ()
+    left_out: tuple[LeftOut, ...] = ()
     contenders: tuple[Contender, ...] = ()
     proposal: Proposal | None = None

@@ -94,6 +94,17 @@ class Contender(Model):
     weight: Annotated[float, Field(description="by the Bayesian criterion among the contenders")]
 
 
+class LeftOut(Document):
+    """A recording that the identification of the carts left out; the gap is not about it."""
+
+    experiment: str
+    reason: Annotated[str, Field(description="in words that follow its name")]
+    is_wrong: Annotated[
+        bool,
+        Field(description="it does not hold what happened; else it only stands off its repeats"),
+    ] = False
+
+
 class GapSubmission(Document):
     """Which submission it is about."""
 
@@ -140,6 +151,7 @@ class Gap(Document):
     ] = None
     training: tuple[str, ...]
     held_out: tuple[str, ...]
+    left_out: tuple[LeftOut, ...] = ()
     friction_spread: Annotated[
         dict[str, float], Field(description="run-to-run spread of the dry friction, by cart")
     ]

@@ -8,7 +8,8 @@ import numpy as np
 
 from pipeline.errors import DataError
 from pipeline.gap.data.runs import Run, cut_shots, make_run
-from pipeline.results import Record
+from pipeline.names import by_note
+from pipeline.results import LeftOut, Record
 
 _LAST_SHARE = 0.4  # of a single run is held out
 _MOST_DWELLS = 4  # sine dwells used; they say little beyond their frequency
@@ -17,6 +18,24 @@ _STILL = 3.0  # encoder steps within which a cart stands still
 _FEWEST, _SHORTEST = 50, 0.5  # samples, s
 _SAME_SIZE = 0.06  # relative; sizes closer than this are repeats
 _WINDOW = 0.5  # s; a chain without springs drifts, so it is judged over windows
+
+
+def drop_left_out(
+    records: Sequence[Record], *, left_out: Sequence[LeftOut]
+) -> tuple[list[Record], list[str]]:
+    """Return the records without those that the identification left out, and a note a reason.
+
+    Raises
+    ------
+    DataError : every record is left out.
+    """
+    out = {one.experiment for one in left_out}
+    kept = [record for record in records if record.id not in out]
+    reasons = by_note((one.experiment, one.reason) for one in left_out)
+    notes = [f"left out, as in the report: {reason}" for reason in reasons]
+    if records and not kept:
+        raise DataError(f"gap: every recording is left out; {'; '.join(notes)}")
+    return kept, notes
 
 
 def prepare(records: Sequence[Record], *, springs: tuple[bool, ...], notes: list[str]) -> list[Run]:
