@@ -75,5 +75,5 @@ def test_nothing_left_is_an_error_that_says_why(analysis):
         LeftOut(experiment=record.id, reason="its clock stood still", is_wrong=True)
         for record in analysis.records
     )
-    with pytest.raises(DataError, match="left out, as in the report: step-1.*: its clock stood"):
+    with pytest.raises(DataError, match=r"left out, as in the report: step-1.*: its clock stood"):
         investigate(replace(analysis, left_out=out), progress=lambda text: None)
