@@ -39,15 +39,15 @@ def inspect(
 
     Of a folder (its data/, where it has one) a table with one line a file.
     """
+    from pipeline.ingest.folder import data_files_in, files_not_read, not_read_notes
     from pipeline.ingest.inspect import (
-        data_files_in,
         format_inspection,
         format_inspections,
-        format_not_read,
         inspect_file,
+        unread_entry,
     )
 
-    inspections, unreadable = [], []
+    inspections, entries, unreadable = [], [], []
     folders = [
         file / "data" if (file / "data").is_dir() else file for file in files if file.is_dir()
     ]
@@ -62,15 +62,24 @@ def inspect(
             progress(f"reading {file.name}")
             try:
                 inspections.append(inspect_file(file))
+                entries.append(inspections[-1].to_dict())
             except PipelineError as error:
                 unreadable.append(str(error))
+                entries.append(unread_entry(file, "broken", str(error)))
+    not_read: list[tuple[str, str, str]] = []
+    for folder in folders:
+        for one in files_not_read(folder, root=folder):
+            not_read.append((f"{folder.name}/{one.file}", one.reason, one.advice))
+            entries.append(
+                unread_entry(folder / one.file, "not_read", one.reason, advice=one.advice)
+            )
     if as_json:
-        typer.echo(json.dumps([i.to_dict() for i in inspections], indent=1, ensure_ascii=False))
+        typer.echo(json.dumps(entries, indent=1, ensure_ascii=False))
     elif inspections and folders:
         typer.echo(format_inspections(inspections))
     elif inspections:
         typer.echo("\n\n".join(format_inspection(i) for i in inspections))
-    for message in (*unreadable, *filter(None, map(format_not_read, folders))):
+    for message in (*unreadable, *not_read_notes(not_read)):
         say(f"cartlab: {message}")
     if unreadable:
         raise typer.Exit(1 if inspections else 2)
@@ -79,8 +88,7 @@ def inspect(
 @app.command()
 def fill(folder: Folder, as_json: AsJson = False) -> None:
     """Find out what the files in DIR/data are and write their tables into submission.toml."""
-    from pipeline.ingest.fill import fill_submission, format_found
-    from pipeline.ingest.inspect import format_not_read
+    from pipeline.ingest.fill import fill_submission, format_found, format_passed_over
 
     toml = folder / "submission.toml"
     before = toml.read_bytes() if toml.is_file() else None
@@ -94,8 +102,8 @@ def fill(folder: Folder, as_json: AsJson = False) -> None:
     left = [f for f in found if f.state in ("unknown", "broken", "missing")]
     did = "nothing to add to" if toml.read_bytes() == before else "wrote"
     say(f"{did} {toml}: springs, units and what is marked unsure are yours")
-    if not_read := format_not_read(folder / "data"):
-        say(f"cartlab: {not_read}")
+    for message in format_passed_over(found):
+        say(f"cartlab: {message}")
     if left:
         say(f"cartlab: of no use yet: {', '.join(f.file for f in left)}")
         raise typer.Exit(1)

@@ -14,7 +14,7 @@ from pipeline.desk.class_tasks import publish, regrade
 from pipeline.desk.exercises import effect_svg, exercise, simulate, solution
 from pipeline.errors import ConfigError, SubmissionError
 from pipeline.ingest.columns import assign_columns
-from pipeline.ingest.fill import Found, data_files, fill_submission, look_at
+from pipeline.ingest.fill import Found, data_files, fill_submission, look_at, passed_over
 from pipeline.ingest.formats.recognise import read_table
 from pipeline.lock import alone_in
 from pipeline.output import own_folder, write_file
@@ -41,6 +41,12 @@ def look(
 def files(folder: str, *, progress: Progress) -> list[str]:
     """Return the data files that there are."""
     return data_files(Path(folder))
+
+
+def not_read(folder: str, named: list[str], *, progress: Progress) -> list[dict[str, str]]:
+    """Return the files that are not looked into, with what to do; those `named` have a table."""
+    found = passed_over(Path(folder), named=named)
+    return [{"file": one.file, "reason": one.remarks[0], "advice": one.advice} for one in found]
 
 
 def fill(folder: str, *, progress: Progress) -> list[dict[str, Any]]:
@@ -139,6 +145,7 @@ def weigh(
 TASKS: Mapping[str, Callable[..., Any]] = {
     "look": look,
     "files": files,
+    "not_read": not_read,
     "fill": fill,
     "report": report,
     "gap": gap,

@@ -7,7 +7,7 @@ file tells. What stands there is nobody's to change; what is not sure is said as
 import filecmp
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
@@ -17,9 +17,17 @@ import tomlkit
 from pipeline.errors import ConfigError, SubmissionError
 from pipeline.ingest import limits
 from pipeline.ingest.channels import never_changes
+from pipeline.ingest.folder import (
+    NotRead,
+    data_files_in,
+    files_not_read,
+    not_read_notes,
+    recordings_beside,
+    refused,
+)
 from pipeline.ingest.formats.recognise import read_table
 from pipeline.ingest.formats.table import ENDINGS
-from pipeline.ingest.inspect import Inspection, data_files_in, format_not_read, inspect_file
+from pipeline.ingest.inspect import NO_CLOCK, Inspection, inspect_file
 from pipeline.names import by_note
 from pipeline.results_of_runs import Kind
 from pipeline.submission.edit import (
@@ -35,9 +43,13 @@ from pipeline.submission.template import write_templates
 from pipeline.submission.toml_file import Value, parse_toml
 
 _UNSURE = "unsure: "  # begins a comment below a table, which whoever knows better takes out
+_TO_STATE = {  # what a file does not tell
+    "columns": "columns = { }    # which is what, by name or number: time, input, x1, …",
+    "sample_rate": "sample_rate = 0    # Hz",
+}
 _NO_NAME = re.compile(r"[^\w.-]+", re.ASCII)
 
-State = Literal["new", "completed", "there", "copy", "unknown", "broken", "missing"]
+State = Literal["new", "completed", "there", "copy", "unknown", "broken", "missing", "not_read"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,11 +60,13 @@ class Found:
     ----------
     file : below the submission's folder.
     state : its table is new, completed or was there; or there is none, for it is a copy of another
-        file, or nothing tells what it is; or it cannot be read, or has a table and is not there.
+        file, or nothing tells what it is; or it cannot be read, or has a table and is not there;
+        or it is not read, for it is no recording by its name, or lies beside `data/`.
     experiment : the id of its table; "" without one.
     carts : that were free, as far as the file tells; () all.
     inspection : None where the file cannot be read.
     remarks : what is wrong; unsure : what a person has to say.
+    advice : what to do for a file that is not read; "" where it may stay as it is.
     """
 
     file: str
@@ -63,6 +77,7 @@ class Found:
     inspection: Inspection | None = None
     remarks: tuple[str, ...] = ()
     unsure: tuple[str, ...] = ()
+    advice: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """Return what was found as plain values for JSON."""
@@ -76,6 +91,22 @@ def data_files(folder: Path) -> list[str]:
         name
         for path in found
         if outside(folder, name := path.relative_to(folder).as_posix()) is None
+    ]
+
+
+def passed_over(folder: Path, *, named: Collection[str] = ()) -> list[Found]:
+    """Return the files of a submission that are not looked into; those `named` have a table."""
+    names = [path.relative_to(folder).as_posix() for path in data_files_in(folder / "data")]
+    closed = [one for name in names if name not in named and (one := refused(folder, name))]
+    others = [
+        *files_not_read(folder / "data", root=folder),
+        *recordings_beside(folder, named=named),
+    ]
+    listed: list[tuple[State, list[NotRead]]] = [("broken", closed), ("not_read", others)]
+    return [
+        Found(file=one.file, state=state, remarks=(one.reason,), advice=one.advice)
+        for state, ones in listed
+        for one in ones
     ]
 
 
@@ -98,7 +129,7 @@ def look_at(folder: Path, file: str, *, columns: Mapping[str, str | int] = {}) -
         kind=inspection.kind,
         carts=carts,
         inspection=inspection,
-        remarks=inspection.problems,
+        remarks=(*inspection.problems, *filter(None, [inspection.ranges])),
         unsure=unsure,
     )
 
@@ -164,10 +195,9 @@ def fill_submission(folder: Path) -> tuple[Found, ...]:
         look_at(folder, file, columns=stated_columns(document, file)) for file in data_files(folder)
     ]
     if not looked:
-        raise ConfigError(
-            f"{folder / 'data'}: no recording in it; "
-            + (format_not_read(folder / "data") or f"copy yours there ({', '.join(ENDINGS)})")
-        )
+        what = "; ".join(_not_looked_into(passed_over(folder)))
+        what = what or f"copy yours there ({', '.join(ENDINGS)})"
+        raise ConfigError(f"{folder / 'data'}: no recording in it; {what}")
     if new:
         write_templates(folder, carts=_carts_seen(looked))
     found: list[Found] = []
@@ -181,7 +211,7 @@ def fill_submission(folder: Path) -> tuple[Found, ...]:
         found.extend(missing)
 
     edit_submission(folder, change)
-    return tuple(found)
+    return (*found, *passed_over(folder, named=[one.file for one in found if one.experiment]))
 
 
 class _Filling:
@@ -242,6 +272,10 @@ class _Filling:
         carts = tuple(table.get("carts", range(1, self._n + 1)))
         held = [column for cart, column in inspection.positions.items() if cart not in carts]
         known = {never_changes(column.name) for column in held}  # said in the table, no news
+        if "sample_rate" in table:
+            known.add(NO_CLOCK)
+        if "columns" in table and not inspection.guessed:
+            known.add(inspection.ranges)
         return replace(
             found,
             state="completed" if len(table) > before else "there",
@@ -296,7 +330,8 @@ class _Filling:
         id_ = json.dumps(free_id(PurePosixPath(found.file).stem, ()))
         kind = 'kind = ""    # decay, step, sine, sweep, closed_loop or bode?'
         self._document.add(tomlkit.nl())
-        for text in (_UNSURE + why, "[[experiments]]", f"id = {id_}", kind, line):
+        needs = [_TO_STATE[key] for key in found.inspection.needs] if found.inspection else []
+        for text in (_UNSURE + why, "[[experiments]]", f"id = {id_}", kind, line, *needs):
             self._document.add(tomlkit.comment(comment_text(text)))
 
 
@@ -342,7 +377,8 @@ def _state_units(document: tomlkit.TOMLDocument, looked: Sequence[Found]) -> Non
 
 
 def format_found(found: Sequence[Found]) -> str:
-    """Return a table of one line a file, what is wrong or not sure below."""
+    """Return a table of one line a file, what is wrong or not sure below; not of those not read."""
+    found = [one for one in found if one.state != "not_read"]
     rows = [
         (one.file, one.state, one.kind or "?", _carts_words(one), one.experiment or "-")
         for one in found
@@ -355,9 +391,22 @@ def format_found(found: Sequence[Found]) -> str:
     said = by_note(
         (one.file, remark)
         for one in found
-        for remark in (*one.remarks, *(_UNSURE + unsure for unsure in one.unsure))
+        for remark in (
+            *one.remarks,
+            *filter(None, [one.advice]),
+            *(_UNSURE + unsure for unsure in one.unsure),
+        )
     )
     return "\n".join([*lines, *(f"! {remark}" for remark in said)])
+
+
+def format_passed_over(found: Iterable[Found]) -> list[str]:
+    """Return which files are not read, a line for each reason, and what to do."""
+    return _not_looked_into([one for one in found if one.state == "not_read"])
+
+
+def _not_looked_into(found: Iterable[Found]) -> list[str]:
+    return not_read_notes((one.file, one.remarks[0], one.advice) for one in found)
 
 
 def _carts_words(found: Found) -> str:

@@ -1,9 +1,9 @@
 """What a data file holds, before anything is made of it."""
 
-import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,15 +14,13 @@ from pipeline.ingest.channels import channel_problems, encoder_step, mirrors
 from pipeline.ingest.clock import Clock, clock_notes, read_clock
 from pipeline.ingest.columns import Column, assign_columns, conversion, holds_counts
 from pipeline.ingest.formats.recognise import read_table
-from pipeline.ingest.formats.table import ENDINGS, FORM_TITLES, Table
+from pipeline.ingest.formats.table import FORM_TITLES, Table, Variable
 from pipeline.names import by_note, first_few
 from pipeline.results_of_runs import Kind
 from pipeline.submission.models import MOST_CARTS
 
-_MAY_HOLD_SOME = frozenset(  # recordings, in a form that is not read
-    ".xlsx .xlsm .xlsb .xls .ods .numbers .zip .rar .7z .gz .tgz .tar .h5 .hdf5 .npy .npz "
-    ".parquet .tdms .json .xml .out .fig .doc .docx .rtf .pdf".split()
-)
+NO_CLOCK = "no time column: state `sample_rate`"
+_MOST_COLUMNS = 16  # spelt out in a sentence
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +45,8 @@ class Inspection:
     rate : Hz. None, as the other times, where the file has no time column.
     kind : the kind of experiment it looks like; `frequency` (Hz) of a sine dwell.
     problems : what to look at before using the file.
+    needs : keys that its table in `submission.toml` has to state: "columns", "sample_rate".
+    variables : of a binary file, read or not.
     guessed : column numbers by role, where the file has no headings and the signals tell.
     """
 
@@ -61,6 +61,8 @@ class Inspection:
     kind: Kind | None
     frequency: float | None
     problems: tuple[str, ...]
+    needs: tuple[str, ...]
+    variables: tuple[Variable, ...]
     guessed: Mapping[str, int]
 
     @property
@@ -69,44 +71,19 @@ class Inspection:
         roles = {column.role: column for column in self.columns if column.role}
         return {int(role[1:]): roles[role] for role in sorted(roles) if role[0] == "x"}
 
+    @property
+    def ranges(self) -> str:
+        """Which column runs from where to where, for who has to say what each is; "" if named."""
+        if "columns" not in self.needs:
+            return ""
+        said = [
+            f"{column.name} from {column.low:.4g} to {column.high:.4g}" for column in self.columns
+        ]
+        return f"the columns: {first_few(said, _MOST_COLUMNS)}"
+
     def to_dict(self) -> dict:
         """Return the inspection as plain values for JSON."""
-        return asdict(self)
-
-
-def data_files_in(folder: Path) -> list[Path]:
-    """Return what may hold data in a folder and those below, "2" before "10"."""
-    return [path for path in _files_in(folder) if path.suffix.casefold() in ENDINGS]
-
-
-def format_not_read(folder: Path) -> str:
-    """Return which files in a folder and those below may hold recordings unread; "" none."""
-    names = [
-        path.relative_to(folder.parent).as_posix()
-        for path in _files_in(folder)
-        if not path.suffix or path.suffix.casefold() in _MAY_HOLD_SOME
-    ]
-    if not names:
-        return ""
-    return (
-        f"not read: {first_few(names, 4)} (recordings end in {', '.join(ENDINGS)}; "
-        "save what stands in a spreadsheet as .csv)"
-    )
-
-
-def _files_in(folder: Path) -> list[Path]:
-    found = [
-        path
-        for path in folder.rglob("*")
-        if not any(part.startswith((".", "~")) for part in path.relative_to(folder).parts)
-        and path.is_file()
-    ]
-    return sorted(found, key=_natural)
-
-
-def _natural(path: Path) -> list[tuple[str, int]]:
-    parts = re.findall(r"(\D*)(\d{0,9})", path.as_posix().casefold())
-    return [(text, int(n or -1)) for text, n in parts]
+        return {"state": "read", **asdict(self), "advice": ""}
 
 
 def inspect_file(path: Path, *, columns: Mapping[str, str | int] = {}) -> Inspection:
@@ -135,11 +112,7 @@ def inspect_file(path: Path, *, columns: Mapping[str, str | int] = {}) -> Inspec
     guessed = _suggest_columns(table) if bare else {}
     if bare:
         assigned, _ = assign_columns(table, explicit=guessed, free=(1,))
-        line = ", ".join(f"{role} = {number}" for role, number in guessed.items())
-        problems.append(
-            "the columns have no names: say in submission.toml which is what"
-            + (f", perhaps columns = {{ {line} }}" if guessed else "")
-        )
+        problems.append(_name_them(guessed))
     elif unused and not unnamed:
         problems.append(f"no role for {', '.join(unused)}: name them in `columns` to use them")
     # Without names everything else is missing too.
@@ -147,6 +120,11 @@ def inspect_file(path: Path, *, columns: Mapping[str, str | int] = {}) -> Inspec
     clock = _clock(table, assigned, further) if "frequency" not in assigned else None
     kind, frequency = _guess(table, assigned, clock, further)
     roles = {column.index: role for role, column in assigned.items()}
+    needs = []
+    if bare or (kind != "bode" and not any(role[0] == "x" for role in assigned)):
+        needs.append("columns")
+    if kind != "bode" and "time" not in assigned:
+        needs.append("sample_rate")
     return Inspection(
         file=str(path),
         format=FORM_TITLES[table.form],
@@ -169,7 +147,32 @@ def inspect_file(path: Path, *, columns: Mapping[str, str | int] = {}) -> Inspec
         kind=kind,
         frequency=frequency,
         problems=tuple(problems),
+        needs=tuple(needs),
+        variables=table.variables,
         guessed=guessed,
+    )
+
+
+def unread_entry(file: Path, state: str, problem: str, *, advice: str = "") -> dict[str, Any]:
+    """Return the JSON of a file that is not inspected, with the keys of one that is.
+
+    `state` is "broken" or "not_read"; `advice` says what to do.
+    """
+    nothing: dict[str, Any] = dict.fromkeys(field.name for field in fields(Inspection))
+    lists = {name: [] for name in ("columns", "needs", "variables")}
+    told = {"file": str(file), "problems": [problem], "advice": advice}
+    return {"state": state, **nothing, **lists, "samples": 0, "guessed": {}, **told}
+
+
+def _name_them(guessed: Mapping[str, int]) -> str:
+    """Return how to say what columns without names are; `guessed` may tell."""
+    said = "the columns have no names: say in submission.toml which is what"
+    if guessed:
+        line = ", ".join(f"{role} = {number}" for role, number in guessed.items())
+        return f"{said}, perhaps columns = {{ {line} }}"
+    return (
+        f"{said}, by their numbers from 1: columns = {{ time = …, input = …, x1 = … }}; none looks "
+        "like the time: without it, state sample_rate = … (Hz) in its place"
     )
 
 
@@ -208,7 +211,7 @@ def _clock(table: Table, columns: Mapping[str, Column], problems: list[str]) -> 
     column, n = columns.get("time"), table.values.shape[1]
     factor = conversion(column.unit, "s") if column else None
     if column is None or factor is None or n < 3:
-        problems.append("no time column: state `sample_rate`" if n >= 3 else f"only {n} samples")
+        problems.append(NO_CLOCK if n >= 3 else f"only {n} samples")
         return None
     clock = read_clock(table.values[column.index] * factor)
     try:
@@ -302,7 +305,11 @@ def format_inspections(inspections: Sequence[Inspection]) -> str:
         "  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip()
         for row in rows
     ]
-    problems = by_note((one.file, problem) for one in inspections for problem in one.problems)
+    problems = by_note(
+        (one.file, said)
+        for one in inspections
+        for said in (*one.problems, *filter(None, [one.ranges]))
+    )
     return "\n".join([*lines, *(f"! {problem}" for problem in problems)])
 
 
@@ -314,6 +321,9 @@ def _looks(inspection: Inspection) -> str:
 def format_inspection(inspection: Inspection) -> str:
     """Return the inspection as plain text."""
     lines = [inspection.file, f"  format    {inspection.format}"]
+    if inspection.variables:
+        read = [str(one) for one in inspection.variables if one.read]
+        lines.append(f"  read      {first_few(read, _MOST_COLUMNS)}")
     samples = f"{inspection.samples} samples"
     if inspection.duration is not None and inspection.rate is not None:
         jitter = inspection.jitter or 0.0

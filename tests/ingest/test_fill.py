@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from pipeline.cli import app
 from pipeline.errors import ConfigError, SubmissionError
 from pipeline.ingest.fill import data_files, fill_submission
-from pipeline.ingest.inspect import format_not_read
+from pipeline.ingest.folder import files_not_read, not_read_notes
 from pipeline.ingest.read import read_data
 from pipeline.resources import EXAMPLES
 from pipeline.submission import load_submission, new_submission
@@ -103,19 +103,25 @@ def test_what_is_no_recording_by_its_name_is_said_to_be_left_out(tmp_path, comma
     assert re.findall(r"not read: (\S+) ", done.stderr) == ["data/b.xlsx"]
 
 
-def test_only_what_may_hold_recordings_is_said_to_be_left_out(tmp_path):
-    """Neither what a tool hides, nor a picture or a script; and of many only the first few."""
+def test_every_file_is_named_but_for_what_a_tool_hides(tmp_path):
+    """A picture and a script are no recordings, and are told so; of many only the first few."""
     put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
     data = tmp_path / "data"
     for name in (".git/HEAD", ".cache/b.csv", "report/bode.svg", "plot.py", "Thumbs.db"):
         (data / name).parent.mkdir(exist_ok=True)
         (data / name).write_bytes(b"")
     assert data_files(tmp_path) == ["data/a.csv"]
-    assert format_not_read(data) == ""
+    found = files_not_read(data, root=tmp_path)
+    assert [(one.file, one.reason, one.advice) for one in found] == [
+        ("data/plot.py", "no recording", ""),
+        ("data/report/bode.svg", "no recording", ""),
+    ]
     for number in range(20):
         (data / f"run {number}.ods").write_bytes(b"PK")
-    assert re.findall(r"run (\d+)\.ods", format_not_read(data)) == list("0123")
-    assert "16 more" in format_not_read(data)
+    found = files_not_read(data, root=tmp_path)
+    sheets, _ = not_read_notes((one.file, one.reason, one.advice) for one in reversed(found))
+    assert re.findall(r"run (\d+)\.ods", sheets) == ["19", "18", "17", "16"]
+    assert "16 more (a spreadsheet; save each sheet as .csv)" in sheets
 
 
 def test_fill_says_whether_it_wrote(tmp_path):
@@ -250,7 +256,14 @@ def test_links_out_of_the_folder_are_not_followed(tmp_path):
     put(tmp_path / "theirs", "a.csv", time=T, input=STEP, x1=RING)
     put(tmp_path / "mine", "b.csv", time=T, input=STEP, x1=RING)
     (tmp_path / "mine" / "data" / "a.csv").symlink_to(tmp_path / "theirs" / "data" / "a.csv")
-    assert list(states(tmp_path / "mine")) == ["data/b.csv"]
+    found = {one.file: one for one in fill_submission(tmp_path / "mine")}
+    assert {file: one.state for file, one in found.items()} == {
+        "data/b.csv": "new", "data/a.csv": "broken",
+    }  # fmt: skip
+    refused = found["data/a.csv"]
+    assert refused.inspection is None
+    assert "leaves the submission folder through a link" in refused.remarks[0]
+    assert refused.advice == "put the file itself here in place of the link"
 
 
 def test_nothing_to_fill_in_is_one_line(tmp_path):

@@ -231,9 +231,9 @@ def test_what_a_mat_file_holds_besides_is_mentioned():
     """Structs, text and single numbers are left out, and named."""
     got = table(mat(time=TIME, x1=X1, run={"P": 1.0}, name="bench 4", rate=113.0))
     assert got.names == ("time", "x1")
-    assert sorted(got.notes[0].removeprefix("not read: ").split(", ")) == [
-        "name (text)", "rate (float64)", "run (struct)",
-    ]  # fmt: skip
+    said = "not read: run (1 × 1, struct), name (1 × 7, text), rate (1 × 1, float64)"
+    assert got.notes == (said,)
+    assert [v.read for v in got.variables] == [True, True, False, False, False]
 
 
 def test_a_counter_that_ran_over_is_made_continuous():

@@ -9,9 +9,9 @@ import pytest
 import scipy.io
 
 from pipeline.errors import SubmissionError
+from pipeline.ingest.folder import data_files_in
 from pipeline.ingest.inspect import (
     Inspection,
-    data_files_in,
     format_inspection,
     format_inspections,
     inspect_file,
@@ -142,11 +142,13 @@ def test_columns_without_names_get_a_line_to_use(tmp_path):
 
 
 def test_columns_without_a_clock_get_no_suggestion(tmp_path):
-    """Where no column advances as time does, only the need of names is said."""
+    """Where no column advances as time does, it is said how to name them, and their rate."""
     scipy.io.savemat(tmp_path / "a.mat", {"data": np.column_stack([X, STEP, np.sin(9 * T)])})
-    problems = inspect_file(tmp_path / "a.mat").problems
-    assert "the columns have no names: say in submission.toml which is what" in problems
-    assert "sample_rate" not in problems
+    got = inspect_file(tmp_path / "a.mat")
+    assert got.needs == ("columns", "sample_rate")
+    (said,) = got.problems
+    assert "say in submission.toml which is what, by their numbers from 1: columns = {" in said
+    assert "state sample_rate = … (Hz)" in said
 
 
 @pytest.mark.skipif(os.name == "nt", reason="links need rights on Windows")

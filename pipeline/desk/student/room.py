@@ -29,6 +29,7 @@ from pipeline.desk.student.form import (
 )
 from pipeline.desk.student.handin import BESIDE, beside, hand_in, missing
 from pipeline.errors import SubmissionError
+from pipeline.ingest.inspect import NO_CLOCK
 from pipeline.lock import turn_in
 from pipeline.names import by_note
 from pipeline.report.numbers import count, listing
@@ -138,6 +139,8 @@ def _room(
     if error is None and text:
         error = _wrong(text, folder)
     rows = _rows(ask, folder, document)
+    named = [row["file"] for row in rows if row["index"] is not None]
+    not_read = ask.desk.hand.do("not_read", folder=str(folder), named=named)
     form = groups(document)
     every = [f for group in form for f in group.fields] + [f for r in rows for f in r["fields"]]
     shown, left = with_errors(every, changed, error)
@@ -149,6 +152,7 @@ def _room(
         folder=folder,
         rows=[{**row, "fields": [by_path[f.path] for f in row["fields"]]} for row in rows],
         often=_often(rows),
+        not_read=not_read,
         groups=[group.filled(by_path) for group in form] if document else [],
         seen=text_digest(text),
         wrong=left,
@@ -222,6 +226,8 @@ def _row(
     listed: Sequence[Mapping[str, Any]],
 ) -> dict[str, Any]:
     fields = () if index is None else experiment_fields(document, index)
+    if index is not None and "sample_rate" in listed[index]:
+        look = {**look, "remarks": [one for one in look["remarks"] if one != NO_CLOCK]}
     if any(field.path.endswith("controller.type") and not field.value for field in fields):
         look = {**look, "unsure": [*look["unsure"], "say what controller ran, below its kind"]}
     return {

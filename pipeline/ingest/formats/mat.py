@@ -5,18 +5,24 @@ a handful of plain vectors. So only those are read here, every length checked fi
 "MAT-File Format", The MathWorks, R2023b.
 """
 
+import math
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 
 from pipeline.errors import SubmissionError
-from pipeline.ingest.formats.table import Form, Table, refuse_unusable
+from pipeline.ingest.formats.table import Form, Table, Variable, refuse_unusable
+from pipeline.names import first_few
 
 _MAX_INFLATED_BYTES = 200_000_000
 _MAX_COLUMNS = 64
+_MOST_NAMED = 8
+_MOST_VARIABLES, _MOST_DIMENSIONS, _LONGEST_NAME = 1000, 32, 64  # no workspace has more
+_SETTINGS = 0.1  # of the longest: what is shorter is gains or a list of poles, no signal cut short
 _MATRIX, _COMPRESSED = 14, 15
 _NUMBERS = {
     1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8",
@@ -27,6 +33,7 @@ _CLASSES = {
 _OTHER_CLASSES = {
     1: "cell", 2: "struct", 3: "object", 4: "text", 5: "sparse", 16: "function", 17: "object",
 }  # fmt: skip
+_OPAQUE = 17  # an object: its name stands where others have their size
 _V4_TYPES = {0: "f8", 1: "f4", 2: "i4", 3: "i2", 4: "u2", 5: "u1"}
 _BENCH = ({"enc1", "duty", "time"}, {"cart1pos", "duty_cycle", "t_received"})
 
@@ -35,11 +42,32 @@ class _Broken(Exception):
     """The bytes do not follow the format."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Variable:
     name: str
     values: np.ndarray | None  # None: not a real matrix
     kind: str
+    shape: tuple[int, ...] = ()  # where there are no values …
+    bytes: int = 0  # … and how many bytes it takes
+
+    @property
+    def size(self) -> tuple[int, ...]:
+        return self.shape if self.values is None else self.values.shape
+
+    @property
+    def samples(self) -> int:
+        return max(self.numbers.shape)
+
+    @property
+    def numbers(self) -> np.ndarray:
+        assert self.values is not None
+        return self.values
+
+    def made(self, *, read: bool, advice: str = "") -> Variable:
+        return Variable(name=self.name, size=self.size, kind=self.kind, read=read, advice=advice)
+
+    def __str__(self) -> str:
+        return str(self.made(read=False))
 
 
 def is_mat(raw: bytes) -> bool:
@@ -57,9 +85,14 @@ def read_mat(raw: bytes, *, source: str) -> Table:
     if raw[:10] == b"MATLAB 7.3" or raw[512:516] == b"\x89HDF":
         raise SubmissionError(f"{source}: a MATLAB 7.3 file; save it again with save(…, '-v7')")
     try:
-        variables = list(_v4(raw) if _is_v4(raw) else _v5(raw))
+        read = _v4(raw) if _is_v4(raw) else _v5(raw)
+        variables = list(islice(read, _MOST_VARIABLES + 1))
     except (_Broken, struct.error, zlib.error, ValueError, OverflowError, UnicodeDecodeError):
         raise SubmissionError(f"{source}: the .mat file is broken or cut short") from None
+    if len(variables) > _MOST_VARIABLES:
+        raise SubmissionError(
+            f"{source}: holds more than {_MOST_VARIABLES:,} variables; keep those of the recording"
+        )
     return _table(variables, source=source)
 
 
@@ -67,44 +100,32 @@ def read_mat(raw: bytes, *, source: str) -> Table:
 
 
 def _table(variables: list[_Variable], *, source: str) -> Table:
-    usable = [v for v in variables if v.values is not None]
-    vectors = [v for v in usable if v.values is not None and _is_vector(v.values)]
-    matrices = [v for v in usable if v.values is not None and min(v.values.shape) > 1]
-    if not vectors and not matrices:
-        kinds = ", ".join(f"{v.name} ({v.kind})" for v in variables[:8]) or "nothing"
-        raise SubmissionError(f"{source}: holds no vector or matrix of numbers, but {kinds}")
+    record = _record(variables, source=source)
     notes: list[str] = []
-    if vectors:
-        names = [v.name for v in vectors]
-        lengths = {v.values.size for v in vectors if v.values is not None}
-        if len(lengths) > 1:
-            sizes = ", ".join(f"{v.name} {v.values.size}" for v in vectors if v.values is not None)
-            raise SubmissionError(f"{source}: the vectors differ in length: {sizes}")
-        arrays = [v.values.ravel() for v in vectors if v.values is not None]
-        used = set(names)
-        form: Form = "bench_mat" if any(b <= used for b in _BENCH) else "variables"
-    else:
-        if len(matrices) > 1:
-            listed = ", ".join(v.name for v in matrices[:8])
-            raise SubmissionError(f"{source}: holds several matrices ({listed}); keep one")
-        matrix = matrices[0].values
-        assert matrix is not None
-        if matrix.shape[0] < matrix.shape[1]:
-            matrix = matrix.T
-            notes.append(f"{matrices[0].name} lies on its side: its rows are taken as the columns")
-        if matrix.shape[1] > _MAX_COLUMNS:
-            raise SubmissionError(
-                f"{source}: {matrices[0].name} has more than {_MAX_COLUMNS} columns"
-            )
-        arrays = list(matrix.T)
-        names = [str(i) for i in range(1, len(arrays) + 1)]
-        used = {matrices[0].name}
-        form = "matrix"
-    if len(names) > _MAX_COLUMNS:
-        raise SubmissionError(f"{source}: holds more than {_MAX_COLUMNS} vectors")
-    left_out = [f"{v.name} ({v.kind})" for v in variables if v.name not in used]
-    if left_out:
-        notes.append(f"not read: {', '.join(left_out[:8])}")
+    names, arrays = [], []
+    joined = len(record) > 1
+    for variable in record:
+        values = variable.numbers
+        if _is_vector(values):
+            names.append(variable.name)
+            arrays.append(values.ravel())
+            continue
+        if values.shape[0] < values.shape[1]:
+            values = values.T
+            notes.append(f"{variable.name} lies on its side: its rows are taken as the columns")
+        arrays += list(values.T)
+        numbers = range(1, values.shape[1] + 1)
+        names += [f"{variable.name} column {i}" if joined else str(i) for i in numbers]
+    used = {variable.name for variable in record}
+    longest = max(variable.samples for variable in record)
+    form: Form = "variables" if joined or _is_vector(record[0].numbers) else "matrix"
+    if any(bench <= used for bench in _BENCH):
+        form = "bench_mat"
+    made = tuple(
+        v.made(read=True) if v in record else v.made(read=False, advice=_advice(v, longest=longest))
+        for v in variables
+    )
+    notes += _not_read([variable for variable in made if not variable.read])
     columns = []
     for name, column in zip(names, arrays, strict=True):
         wide = column.astype(np.float64)
@@ -122,7 +143,86 @@ def _table(variables: list[_Variable], *, source: str) -> Table:
         whole=tuple(bool((column == np.round(column)).all()) for column in values),
         lines=None,
         notes=tuple(notes),
+        variables=made,
     )
+
+
+def _record(variables: Sequence[_Variable], *, source: str) -> list[_Variable]:
+    """Return the variables that are the recording: those with as many samples as the longest.
+
+    Raises
+    ------
+    SubmissionError : there is none, or its parts do not go together.
+    """
+    signals = [v for v in variables if v.values is not None and v.samples > 1]
+    if not signals:
+        found = first_few([str(v) for v in variables], _MOST_NAMED) or "nothing"
+        told = {v.name: advice for v in variables if (advice := _advice(v, longest=0))}
+        first = next((f"; {name}: {advice}" for name, advice in told.items()), "")
+        raise SubmissionError(f"{source}: holds no vector or matrix of numbers, but {found}{first}")
+    signals = [v for v in signals if min(v.size) <= _MAX_COLUMNS] or signals
+    longest = max(v.samples for v in signals)
+    signals = [v for v in signals if v.samples > _SETTINGS * longest]
+    sizes = first_few([str(v) for v in signals], _MOST_NAMED)
+    vectors = [v for v in signals if _is_vector(v.numbers)]
+    if all(v.samples < longest for v in vectors):  # a matrix has more
+        vectors, signals = [], [v for v in signals if v.samples == longest]
+    if len({v.samples for v in vectors}) > 1:
+        raise SubmissionError(f"{source}: the vectors differ in length: {sizes}")
+    matrices = [v for v in signals if not _is_vector(v.numbers)]
+    if not vectors and len(matrices) > 1:
+        raise SubmissionError(f"{source}: holds several matrices ({sizes}); keep one")
+    if len(vectors) > _MAX_COLUMNS:
+        raise SubmissionError(f"{source}: holds more than {_MAX_COLUMNS} vectors")
+    if not vectors:
+        if min(matrices[0].size) > _MAX_COLUMNS:
+            raise SubmissionError(f"{source}: {matrices[0]} has more than {_MAX_COLUMNS} columns")
+        return matrices
+    if any(bench <= {v.name for v in vectors} for bench in _BENCH):
+        return vectors  # a bench log is complete; what lies beside it was made of it
+    matrices = [matrix for matrix in matrices if matrix.samples == vectors[0].samples]
+    columns = len(vectors) + sum(min(matrix.size) for matrix in matrices)
+    return [*vectors, *matrices] if columns <= _MAX_COLUMNS else vectors
+
+
+def _not_read(variables: Sequence[Variable]) -> list[str]:
+    """Return what is said of the variables that are not read, the largest first."""
+    large = [v for v in variables if v.advice]
+    large.sort(key=lambda v: -math.prod(v.size))
+    notes = [f"not read: {v}; {v.advice}" for v in large[:_MOST_NAMED]]
+    rest = [str(v) for v in (*large[_MOST_NAMED:], *(v for v in variables if not v.advice))]
+    return notes + ([f"not read: {first_few(rest, _MOST_NAMED)}"] if rest else [])
+
+
+def _advice(variable: _Variable, *, longest: int) -> str:
+    """Return what to do for a variable that may hold a recording to be read; "" of others.
+
+    `longest` is how many samples the recording has that was found beside it.
+    """
+    name = variable.name
+    if variable.values is not None:
+        if variable.samples <= _MAX_COLUMNS:
+            return ""
+        return f"if it is a recording, save it in a file of its own: save('new.mat', '{name}')"
+    if variable.bytes < 8 * longest:  # too few for the times alone
+        return ""
+    match variable.kind:
+        case "struct":
+            return (
+                f"if the recording is in it, save its fields: save('new.mat', '-struct', '{name}')"
+            )
+        case "object":
+            return (
+                "if it is a table or a timetable, write it as text: "
+                f"writetable({name}, 'new.csv') or writetimetable({name}, 'new.csv')"
+            )
+        case "cell":
+            return "if the recording is in it, save each of its vectors as a variable"
+        case "sparse":
+            return f"if it is a recording, save full({name})"
+        case "complex" | "array of more than two dimensions" | "no real matrix":
+            return "if it is a recording, save it as real vectors, one a signal"
+    return ""
 
 
 def _is_vector(values: np.ndarray) -> bool:
@@ -164,7 +264,9 @@ def _v5(raw: bytes) -> Iterator[_Variable]:
             if len(content) < size:
                 raise _Broken
         if kind == _MATRIX and content:
-            yield _matrix(content, order)
+            variable = _matrix(content, order)
+            if variable.name:  # MATLAB keeps what its objects share without a name
+                yield variable
     if at < len(raw) and raw[at:].strip(b"\0"):
         raise _Broken
 
@@ -188,28 +290,34 @@ def _element(content: bytes, at: int, order: str) -> tuple[int, bytes, int]:
 
 def _matrix(content: bytes, order: str) -> _Variable:
     _, flags, at = _element(content, 0, order)
-    _, dims, at = _element(content, at, order)
-    _, name, at = _element(content, at, order)
     (flag,) = struct.unpack_from(order + "I", flags)
+    code = flag & 0xFF
+    shape: tuple[int, ...] = ()
+    if code != _OPAQUE:
+        _, dims, at = _element(content, at, order)
+        if len(dims) > 4 * _MOST_DIMENSIONS:
+            raise _Broken
+        shape = tuple(int(d) for d in np.frombuffer(dims, dtype=order + "i4"))
+    _, name, at = _element(content, at, order)
     label = name.decode("ascii")
-    if not label.isprintable():
+    if not label.isprintable() or len(label) > _LONGEST_NAME:
         raise _Broken
-    if (flag & 0xFF) not in _CLASSES:
-        return _Variable(label, None, _OTHER_CLASSES.get(flag & 0xFF, "unknown"))
+    if code not in _CLASSES:
+        kind = _OTHER_CLASSES.get(code, "unknown")
+        return _Variable(label, None, kind, shape, len(content))
     if flag & 0x0800:
-        return _Variable(label, None, "complex")
-    shape = tuple(int(d) for d in np.frombuffer(dims, dtype=order + "i4"))
+        return _Variable(label, None, "complex", shape, len(content))
     if len(shape) != 2 or min(shape) < 0:
-        return _Variable(label, None, "array of more than two dimensions")
+        return _Variable(label, None, "array of more than two dimensions", shape, len(content))
     if 0 in shape:
-        return _Variable(label, None, "empty")
+        return _Variable(label, None, "empty", shape)
     kind, data, _ = _element(content, at, order)
     if kind not in _NUMBERS:
         raise _Broken
     numbers = np.frombuffer(data, dtype=order + _NUMBERS[kind])
     if numbers.size != shape[0] * shape[1]:
         raise _Broken
-    stored = numbers.astype(_CLASSES[flag & 0xFF])  # MATLAB stores whole doubles as short integers
+    stored = numbers.astype(_CLASSES[code])  # MATLAB stores whole doubles as short integers
     return _Variable(label, stored.reshape(shape, order="F"), str(stored.dtype))
 
 
@@ -257,7 +365,7 @@ def _v4(raw: bytes) -> Iterator[_Variable]:
         if at > len(raw) or not label.isprintable():
             raise _Broken
         if unusable or rows == 0 or columns == 0:
-            yield _Variable(label, None, "no real matrix")
+            yield _Variable(label, None, "no real matrix", (rows, columns), size)
             continue
         values = np.frombuffer(data, dtype=order + kind).reshape((rows, columns), order="F")
         yield _Variable(label, values.astype(kind), kind)

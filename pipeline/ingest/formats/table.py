@@ -29,6 +29,30 @@ FORM_TITLES: dict[Form, str] = {
 }
 
 
+@dataclass(frozen=True, kw_only=True)
+class Variable:
+    """A variable of a binary file, and what was made of it.
+
+    Attributes
+    ----------
+    size : rows and columns, as far as they could be read; () where not.
+    kind : the type of its numbers, or what it is instead.
+    read : its numbers are among the columns.
+    advice : what to do for it to be read, where it may hold a recording; else "".
+    """
+
+    name: str
+    size: tuple[int, ...]
+    kind: str
+    read: bool
+    advice: str = ""
+
+    def __str__(self) -> str:
+        """Return "data (20000 × 7, float64)"."""
+        size = " × ".join(map(str, self.size))
+        return f"{self.name} ({', '.join(filter(None, (size, self.kind)))})"
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Table:
     """The columns of one file.
@@ -43,6 +67,7 @@ class Table:
     lines : (n,) line of the file each row stands in; None in a binary file.
     cut : what shows that the file was cut short, or None.
     notes : what reading had to mend or leave out.
+    variables : of a binary file, in its order.
     """
 
     source: str
@@ -53,6 +78,7 @@ class Table:
     lines: NDArray[np.int64] | None
     cut: str | None = None
     notes: tuple[str, ...] = ()
+    variables: tuple[Variable, ...] = ()
 
     def place(self, row: int) -> str:
         """Return "line 12" (or "sample 12" of a binary file) for a row counted from 0."""

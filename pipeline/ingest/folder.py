@@ -1,0 +1,146 @@
+"""Which files of a folder hold recordings, and what there is to say of every other."""
+
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.errors import SubmissionError
+from pipeline.ingest.formats.mat import is_mat
+from pipeline.ingest.formats.recognise import read_table
+from pipeline.ingest.formats.table import ENDINGS
+from pipeline.names import first_few
+from pipeline.submission.load import outside
+
+_HEAD = 1000  # bytes, by which a text is told from other files
+_MOST_NAMED = 4  # in a sentence; the JSON names all
+_DEBRIS = frozenset({"thumbs.db", "desktop.ini"})  # what a system leaves; the rest of it is hidden
+_AS_TEXT = "save the recording as .csv"
+# What may hold a recording in a form that is not read: what it is, and what to do.
+_FORMS = {
+    ".xlsx .xlsm .xlsb .xls .ods .numbers": ("a spreadsheet", "save each sheet as .csv"),
+    ".zip .rar .7z .gz .tgz .tar": ("an archive", "unpack it"),
+    ".h5 .hdf5 .npy .npz .parquet .tdms": ("data in a form that is not read", _AS_TEXT),
+    ".json .xml .out": ("data in a form that is not read", _AS_TEXT),
+    ".fig": ("a MATLAB figure", "save the data that it shows as .csv"),
+    ".doc .docx .rtf .pdf": ("a document", "save a table of numbers in it as .csv"),
+}
+_FORM_OF = {ending: form for endings, form in _FORMS.items() for ending in endings.split()}
+
+
+@dataclass(frozen=True, kw_only=True)
+class NotRead:
+    """A file that no recording is read from.
+
+    Attributes
+    ----------
+    file : its name, printable.
+    reason : why it is not read.
+    advice : what to do, where it may hold a recording; else "".
+    """
+
+    file: str
+    reason: str
+    advice: str
+
+
+def data_files_in(folder: Path) -> list[Path]:
+    """Return what may hold data in a folder and those below, "2" before "10"."""
+    return [path for path in _entries(folder) if _is_recording(path)]
+
+
+def files_not_read(folder: Path, *, root: Path) -> list[NotRead]:
+    """Return every other file of a folder and those below, with what to do about it.
+
+    Names are below `root`, which no file may leave by a link. What a system or a tool hides is
+    passed over.
+    """
+    names = [p.relative_to(root).as_posix() for p in _entries(folder) if not _is_recording(p)]
+    return [refused(root, name) or _not_read(root, name) for name in names]
+
+
+def refused(root: Path, name: str) -> NotRead | None:
+    """Return why a file below `root` is not opened, None where it may be."""
+    problem = outside(root, name)
+    if problem is None:
+        return None
+    if (root / name).is_symlink():
+        advice = "put the file itself here in place of the link"
+    elif not name.isprintable():
+        advice = "rename it, in letters and digits"
+    else:
+        advice = ""
+    shown = name if name.isprintable() else name.encode("unicode_escape").decode("ascii")
+    return NotRead(file=shown, reason=problem, advice=advice)
+
+
+def recordings_beside(folder: Path, *, named: Iterable[str]) -> list[NotRead]:
+    """Return the recordings that lie beside `data/`, but for those `named` in submission.toml."""
+    known = set(named)
+    found = []
+    for path in sorted(folder.iterdir(), key=_natural) if folder.is_dir() else ():
+        name = path.name
+        if _is_hidden(name) or name in known or not _is_recording(path):
+            continue
+        if outside(folder, name) is None and _is_table(folder, name):
+            reason = "it lies beside data/, and only what is in data/ is looked at"
+            found.append(NotRead(file=name, reason=reason, advice="move it into data/"))
+    return found
+
+
+def not_read_notes(found: Iterable[tuple[str, str, str]]) -> list[str]:
+    """Return a line for each reason and advice, with the files that it is about."""
+    about: dict[str, list[str]] = {}
+    for file, reason, advice in found:
+        about.setdefault("; ".join(filter(None, (reason, advice))), []).append(file)
+    return [f"not read: {first_few(names, _MOST_NAMED)} ({why})" for why, names in about.items()]
+
+
+def _not_read(root: Path, name: str) -> NotRead:
+    """Say of a file, not a recording by its ending, what it is: by the ending, then by content."""
+    ending = Path(name).suffix.casefold()
+    if ending in _FORM_OF:
+        reason, advice = _FORM_OF[ending]
+        return NotRead(file=name, reason=reason, advice=advice)
+    what = f"its ending is {ending}" if ending else "its name has no ending"
+    if _is_table(root, name):
+        return NotRead(file=name, reason=f"a table of numbers, but {what}", advice="end it in .csv")
+    return NotRead(file=name, reason="no recording", advice="")
+
+
+def _is_table(root: Path, name: str) -> bool:
+    try:
+        with (root / name).open("rb") as file:
+            head = file.read(_HEAD)
+        if b"\0" in head and not is_mat(head):  # a film may be large
+            return False
+        read_table(root, name)
+    except (SubmissionError, OSError):
+        return False
+    return True
+
+
+def _is_recording(path: Path) -> bool:
+    return path.suffix.casefold() in ENDINGS and path.is_file()
+
+
+def _entries(folder: Path) -> list[Path]:
+    """Return all that is no folder in a folder and those below; links are not followed."""
+    return sorted(_walk(folder), key=_natural)
+
+
+def _walk(folder: Path) -> Iterator[Path]:
+    for path in folder.rglob("*"):
+        if any(map(_is_hidden, path.relative_to(folder).parts)):
+            continue
+        if path.is_symlink() or not path.is_dir():
+            yield path
+
+
+def _is_hidden(name: str) -> bool:
+    return name.startswith((".", "~")) or name.casefold() in _DEBRIS
+
+
+def _natural(path: Path) -> list[tuple[str, int]]:
+    parts = re.findall(r"(\D*)(\d{0,9})", path.as_posix().casefold())
+    return [(text, int(n or -1)) for text, n in parts]
