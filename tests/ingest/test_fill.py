@@ -1,6 +1,7 @@
 """`cartlab fill`: what the files in `data/` are, written into `submission.toml` in place."""
 
 import json
+import os
 import re
 import shutil
 import tomllib
@@ -388,3 +389,67 @@ def test_columns_that_are_stated_tell_what_a_file_is(tmp_path):
         "data/c.csv": ("completed", "c", "step"),
     }
     assert len(read_data(load_submission(tmp_path)).records) == 3
+
+
+def test_whatever_lies_there_is_named_with_what_to_do(tmp_path):
+    """Sheets, links to nowhere, tables of another ending or place: a state and an advice each."""
+    put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
+    data = tmp_path / "data"
+    text = (data / "a.csv").read_text(encoding="utf-8")
+    (data / "book.xlsx").write_bytes(b"PK")
+    (data / "scope.lvm").write_text(text, encoding="utf-8")
+    (data / "film.mp4").write_bytes(b"\0" * 100)
+    (tmp_path / "spare.csv").write_text(text.replace("0.5", "0.7"), encoding="utf-8")
+    (tmp_path / "words.txt").write_text("to do: everything", encoding="utf-8")
+    done = CliRunner().invoke(app, ["fill", str(tmp_path), "--json"], catch_exceptions=False)
+    assert done.exit_code == 0
+    told = {row["file"]: (row["state"], row["advice"]) for row in json.loads(done.stdout)}
+    assert told == {
+        "data/a.csv": ("new", ""),
+        "data/book.xlsx": ("not_read", "save each sheet as .csv"),
+        "data/scope.lvm": ("not_read", "end it in .csv"),
+        "data/film.mp4": ("not_read", ""),
+        "spare.csv": ("not_read", "move it into data/"),
+    }
+    for file, (state, advice) in told.items():
+        assert state == "new" or (f"not read: {file} (" in done.stderr and advice in done.stderr)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such names")
+@pytest.mark.parametrize("name", ["run\u200b1.csv", "run\u202f1.csv", os.fsdecode(b"run\xff.csv")])
+def test_a_name_that_no_table_may_have_is_told(tmp_path, name):
+    """A recording whose name cannot be printed is no longer passed over without a word."""
+    put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
+    shutil.copy(tmp_path / "data" / "a.csv", tmp_path / "data" / name)
+    for command in (["fill"], ["fill", "--json"], ["inspect"], ["inspect", "--json"]):
+        done = cartlab_here(*command, tmp_path)
+        assert done.returncode == 1, done.stderr
+        assert r"run\u" in done.stdout + done.stderr or r"run\x" in done.stdout + done.stderr
+        assert "Traceback" not in done.stderr
+    (other,) = [one for one in fill_submission(tmp_path) if one.file != "data/a.csv"]
+    assert (other.state, other.advice) == ("broken", "rename it, in letters and digits")
+    assert other.file.isprintable()
+
+
+def test_a_bare_matrix_without_a_clock_says_how_to_name_it(tmp_path):
+    """Ranges of the columns are told, and the commented table has the keys to be filled in."""
+    (tmp_path / "data").mkdir()
+    scipy.io.savemat(tmp_path / "data" / "m.mat", {"log": np.column_stack([RING, STEP]), "K": 3.0})
+    (found,) = fill_submission(tmp_path)
+    assert found.state == "unknown"
+    assert found.inspection is not None
+    assert found.inspection.needs == ("columns", "sample_rate")
+    ranges = f"1 from {RING.min():.4g} to {RING.max():.4g}, 2 from {STEP.min():.4g}"
+    assert any(ranges in remark for remark in found.remarks)
+    toml = tmp_path / "submission.toml"
+    text = toml.read_text(encoding="utf-8")
+    table = text[text.index('# [[experiments]]\n# id = "m"') :]
+    table = re.sub("^# ", "", table, flags=re.MULTILINE)
+    table = table.replace('kind = ""', 'kind = "step"').replace("{ }", "{ x1 = 1, input = 2 }")
+    table = table.replace("sample_rate = 0", "sample_rate = 100")
+    toml.write_text(f"{text}\n{table}", encoding="utf-8")
+    (found,) = fill_submission(tmp_path)
+    assert (found.state, found.kind) == ("there", "step")
+    assert not any("sample_rate" in remark or "columns" in remark for remark in found.remarks)
+    (record,) = read_data(load_submission(tmp_path)).records
+    assert record.sample_time == pytest.approx(0.01)

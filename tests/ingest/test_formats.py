@@ -255,3 +255,68 @@ def test_a_file_of_blanks_of_any_sort_is_empty():
     """A next-line mark alone, as some mainframes end lines, is no row without columns."""
     with pytest.raises(SubmissionError, match="the file is empty"):
         table(b"\x85")
+
+
+def test_the_recording_is_the_matrix_whatever_lies_beside_it():
+    """Twelve settings and a list of gains hide no matrix; none of them is taken for a recording."""
+    matrix = np.column_stack([TIME, X1, U])
+    settings = {f"p{i}": float(i) for i in range(12)}
+    got = table(mat(**settings, gains=[1.0, 2.0, 3.0], log=matrix))
+    assert (got.form, got.names) == ("matrix", ("1", "2", "3"))
+    assert_array_equal(got.values, matrix.T)
+    read = [variable for variable in got.variables if variable.read]
+    assert [(one.name, one.size) for one in read] == [("log", matrix.shape)]
+    assert len(got.variables) == 14
+
+
+def test_a_matrix_beside_vectors_of_its_length_gives_its_columns_too():
+    """What `[y, t] = lsim(…)` gives: t is a column, and so is each one of y, by its number."""
+    got = table(mat(t=TIME, y=np.column_stack([X1, U])))
+    assert set(got.names) == {"t", "y column 1", "y column 2"}
+    assert_array_equal(column(got, "y column 2"), U)
+
+
+def test_what_may_hold_another_recording_is_told_with_what_to_do():
+    """A further matrix, and a struct as large as the recording, say how they would be read."""
+    further = mat(time=TIME, x1=X1, log=np.ones((90, 70)), raw={"t": TIME, "x": X1, "u": U})
+    notes = {v.name: v.advice for v in table(further).variables if not v.read}
+    assert "save('new.mat', '-struct', 'raw')" in notes["raw"]
+    assert "save('new.mat', 'log')" in notes["log"]
+    with pytest.raises(SubmissionError, match=r"holds several matrices \(a \(.* × 2, float64\), b"):
+        table(mat(a=np.column_stack([TIME, X1]), b=np.column_stack([TIME, U])))
+    with pytest.raises(SubmissionError, match=r"but log \(1 × 1, struct\); log: .*'-struct'"):
+        table(mat(log={"t": TIME, "x1": X1}))
+
+
+def test_a_matlab_table_is_told_by_its_name():
+    """An object has no size where others have one; what MATLAB keeps for it has no name."""
+    flags, name = np.array([6, 8, 17, 0], dtype="<u4").tobytes(), b"run7".ljust(8, b"\0")
+    body = flags + np.array([1, 4], dtype="<u4").tobytes() + name
+    kept = scipy_element(np.zeros((1, 400), "u1"), name="")
+    raw = mat(rate=113.0) + np.array([14, len(body)], dtype="<u4").tobytes() + body + kept
+    with pytest.raises(SubmissionError, match=r"run7 \(object\); run7: .*writetable\(run7"):
+        table(raw)
+
+
+def scipy_element(values: np.ndarray, *, name: str) -> bytes:
+    """Return a variable's bytes as they stand in a file, under a name of the same length."""
+    raw = mat(**{name or "x": values})[128:]
+    if name:
+        return raw
+    named = np.array([1 | 1 << 16], dtype="<u4").tobytes() + b"x"
+    return raw.replace(named, np.array([1], dtype="<u4").tobytes() + b"\0")
+
+
+def test_a_mat_file_of_names_alone_is_refused():
+    """A file of many thousand variables, or with a name of a megabyte, is one short error."""
+    with pytest.raises(SubmissionError, match="more than 1,000 variables"):
+        table(mat(**{f"v{i}": 1.0 for i in range(1001)}))
+    raw = bytearray(mat(x1=X1))
+    long = b"a" * 1_000_000
+    element = np.array([1, len(long)], dtype="<u4").tobytes() + long
+    flags = np.array([6, 8, 1, 0, 5, 8, 0, 0], dtype="<u4").tobytes()
+    body = flags + element
+    raw += np.array([14, len(body)], dtype="<u4").tobytes() + body
+    with pytest.raises(SubmissionError) as caught:
+        table(bytes(raw))
+    assert len(str(caught.value)) < 200
