@@ -76,10 +76,8 @@ class Inspection:
         """Which column runs from where to where, for who has to say what each is; "" if named."""
         if "columns" not in self.needs:
             return ""
-        said = [
-            f"{column.name} from {column.low:.4g} to {column.high:.4g}" for column in self.columns
-        ]
-        return f"the columns: {first_few(said, _MOST_COLUMNS)}"
+        said = [f"{one.name} ({one.low:.4g} to {one.high:.4g})" for one in self.columns]
+        return f"the columns and their ranges: {first_few(said, _MOST_COLUMNS)}"
 
     def to_dict(self) -> dict:
         """Return the inspection as plain values for JSON."""
@@ -100,7 +98,6 @@ def inspect_file(path: Path, *, columns: Mapping[str, str | int] = {}) -> Inspec
     real = Path(path).resolve()  # a link is the caller's own business here
     table, _ = read_table(real.parent, real.name, shown=str(path))
     problems = [f"{table.cut}: the file was cut short"] if table.cut else []
-    problems += table.notes
     stated = {role: column for role, column in columns.items() if table.has(column)}
     try:
         assigned, unused = assign_columns(table, explicit=stated, free=(1,))
@@ -119,6 +116,7 @@ def inspect_file(path: Path, *, columns: Mapping[str, str | int] = {}) -> Inspec
     further = [] if bare and not guessed else problems
     clock = _clock(table, assigned, further) if "frequency" not in assigned else None
     kind, frequency = _guess(table, assigned, clock, further)
+    problems += table.notes
     roles = {column.index: role for role, column in assigned.items()}
     needs = []
     if bare or (kind != "bode" and not any(role[0] == "x" for role in assigned)):

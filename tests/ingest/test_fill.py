@@ -439,7 +439,7 @@ def test_a_bare_matrix_without_a_clock_says_how_to_name_it(tmp_path):
     assert found.state == "unknown"
     assert found.inspection is not None
     assert found.inspection.needs == ("columns", "sample_rate")
-    ranges = f"1 from {RING.min():.4g} to {RING.max():.4g}, 2 from {STEP.min():.4g}"
+    ranges = f"1 ({RING.min():.4g} to {RING.max():.4g}), 2 ({STEP.min():.4g} to"
     assert any(ranges in remark for remark in found.remarks)
     toml = tmp_path / "submission.toml"
     text = toml.read_text(encoding="utf-8")

@@ -190,7 +190,10 @@ def _not_read(variables: Sequence[Variable]) -> list[str]:
     large = [v for v in variables if v.advice]
     large.sort(key=lambda v: -math.prod(v.size))
     notes = [f"not read: {v}; {v.advice}" for v in large[:_MOST_NAMED]]
-    rest = [str(v) for v in (*large[_MOST_NAMED:], *(v for v in variables if not v.advice))]
+    alike: dict[str, list[str]] = {}
+    for v in (*large[_MOST_NAMED:], *(v for v in variables if not v.advice)):
+        alike.setdefault(str(v).removeprefix(v.name), []).append(v.name)
+    rest = [first_few(names, _MOST_NAMED) + what for what, names in alike.items()]
     return notes + ([f"not read: {first_few(rest, _MOST_NAMED)}"] if rest else [])
 
 
