@@ -37,7 +37,7 @@ from pipeline.submission.edit import (
     submission_text,
     toml_item,
 )
-from pipeline.submission.load import NAME, outside, posix, stated_columns
+from pipeline.submission.load import NAME, leaves, outside, posix, stated_columns
 from pipeline.submission.models import MOST_CARTS, MOST_EXPERIMENTS
 from pipeline.submission.template import write_templates
 from pipeline.submission.toml_file import Value, parse_toml
@@ -96,6 +96,8 @@ def data_files(folder: Path) -> list[str]:
 
 def passed_over(folder: Path, *, named: Collection[str] = ()) -> list[Found]:
     """Return the files of a submission that are not looked into; those `named` have a table."""
+    if problem := leaves(folder, "data"):  # what is there is nobody's business here
+        return [Found(file="data", state="broken", remarks=(problem,))]
     names = [path.relative_to(folder).as_posix() for path in data_files_in(folder / "data")]
     closed = [one for name in names if name not in named and (one := refused(folder, name))]
     others = [

@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import re
 import subprocess
 import sys
@@ -622,3 +623,17 @@ def test_saving_what_is_not_valid_changes_nothing(tmp_path):
     with pytest.raises(SubmissionError):
         edit_submission(folder, lambda document: document.pop("system"))
     assert (folder / NAME).read_bytes() == before
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such names, and links need rights")
+def test_files_that_are_not_read_are_named_with_what_to_do(filled):
+    """A spreadsheet and a link out of the folder stand below the table, each with its advice."""
+    visitor, folder = filled
+    assert "Not read" not in visitor.get(HERE).text
+    (folder / "data" / "book.xlsx").write_bytes(b"PK")
+    (folder / "data" / "<b>.docx").write_bytes(b"PK")
+    (folder / "data" / "away.csv").symlink_to(__file__)
+    page = unescape(visitor.get(HERE).text)
+    assert "<b>data/book.xlsx</b>: a spreadsheet; save each sheet as .csv" in page
+    assert "put the file itself here in place of the link" in page
+    assert "&lt;b&gt;.docx" in visitor.get(HERE).text

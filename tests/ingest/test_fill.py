@@ -267,6 +267,18 @@ def test_links_out_of_the_folder_are_not_followed(tmp_path):
     assert refused.advice == "put the file itself here in place of the link"
 
 
+def test_a_data_folder_that_is_a_link_tells_no_name_behind_it(tmp_path):
+    """Where `data` leads out of the submission, nothing of what lies there is named."""
+    put(tmp_path / "theirs", "a.csv", time=T, input=STEP, x1=RING)
+    (tmp_path / "theirs" / "data" / "grades.xlsx").write_bytes(b"PK")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "data").symlink_to(tmp_path / "theirs" / "data")
+    with pytest.raises(ConfigError, match="leaves the submission folder through a link") as told:
+        fill_submission(tmp_path / "mine")
+    assert "grades" not in str(told.value)
+    assert "a.csv" not in str(told.value)
+
+
 def test_nothing_to_fill_in_is_one_line(tmp_path):
     """No folder, no file, a broken `submission.toml`: an error, and nothing is written."""
     with pytest.raises(ConfigError, match="no such folder"):
