@@ -220,6 +220,62 @@ def test_nothing_to_name_is_said():
     assert "The model with its effects" not in text
 
 
+def test_the_page_of_none_speaks_of_no_effects():
+    """Verdict none: one model is drawn and named; the result, what it covers, what comes next."""
+    gap = replace(make_gap("none", ()), final=0.031, baseline=0.031, where=())
+    page = page_of(gap)
+
+    for wrong in (
+        "With no effect",
+        "Where the linear model fails",
+        "what each model leaves",
+        "before (ring)",
+        "was then tried at every place",
+    ):
+        assert wrong not in page.text
+    assert "with the effects" not in html_of(gap)  # nor in the legends of the figures
+    assert tones(gap) == ["good", ""]
+    assert "Error of every run beside its noise" in page.text
+    assert "cart 1 up to" in page.text
+    assert "the input up to 0.0500 V" in page.text
+    # Of the noise's 3 %: the root of 1.15 - 1, which is where a search begins.
+    assert "by more than about 1.2 % of their motion" in page.text
+    assert page.text.index("What to do next") < page.text.rindex("Error of every run")
+    assert "What to do next." in terminal_verdict(gap)
+
+
+def test_what_no_effect_explains_is_drawn_without_effects():
+    """Verdict unexplained: one model where nothing is suspected; else the suspects', called so."""
+    alone = make_gap("unexplained", ())
+    assert "with the effects" not in html_of(alone)
+    assert "With no effect" not in page_of(alone).text
+    suspected = make_gap("unexplained")
+    assert "With 1 suspect" in page_of(suspected).text
+    assert "The model with the suspects" in page_of(suspected).text
+    assert "with the effects" not in html_of(suspected)
+    assert "with the suspects" in html_of(suspected)
+
+
+def test_two_explanations_are_neither_right_nor_wrong():
+    """Verdict ambiguous: the error that both leave is marked neither as good nor as bad."""
+    assert tones(make_gap("ambiguous")) == ["", "", ""]
+    assert (
+        "One explanation: dry (Coulomb) friction on cart 2" in page_of(make_gap("ambiguous")).text
+    )
+    assert tones(make_gap("named")) == ["", "good", ""]
+    assert tones(make_gap("partial")) == ["", "bad", ""]
+
+
+def html_of(gap: Gap) -> str:
+    """Return the page of a gap report, its figures' own texts in it."""
+    return render_html(build_gap_document(gap, two_cart_analysis()))
+
+
+def tones(gap: Gap) -> list[str]:
+    """Return how the tiles at the top are marked."""
+    return re.findall(r'<div class="tile (\w*)"', html_of(gap))
+
+
 def test_two_explanations_are_both_told():
     """Verdict ambiguous: both are described, and what would tell them apart."""
     text = page_of(make_gap("ambiguous")).text

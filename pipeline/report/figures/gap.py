@@ -26,6 +26,7 @@ from pipeline.report.figures.style import (
 from pipeline.report.numbers import subscript
 from pipeline.report.words import clean
 
+ADDED = "with the effects"  # what the model with more than masses, dampings and springs is called
 _ROW = 0.19  # inches, of one run in the overview
 _LONGEST_NAME = 30
 _MOST_POINTS = 500  # of a cloud
@@ -39,23 +40,26 @@ _ROOM = 1.06
 # ---------------------------------------------------------------------- in time
 
 
-def before_after_figure(trace: Trace, *, noise: float, position_unit: str) -> Figure:
-    """Return one cart in one run: measured, both models, and what each leaves below."""
+def before_after_figure(
+    trace: Trace, *, noise: float, position_unit: str, added: str = ADDED
+) -> Figure:
+    """Return one cart in one run: measured, both models, and what each leaves below.
+
+    `added` names the model with what was added to the linear one; "" where nothing was.
+    """
+    models = {"linear model": trace.baseline}
+    if added:
+        models = {added: trace.final} | models
     figure, (above, below) = panels(1.5, 1.0)
     plot_measured(above, trace.t, trace.measured)
-    plot_second(above, trace.t, trace.baseline, label="linear model")
-    plot_model(above, trace.t, trace.final, label="with the effects")
+    (name, model), *others = models.items()
+    for other, y in others:
+        plot_second(above, trace.t, y, label=other)
+    plot_model(above, trace.t, model, label=name)
     above.set_ylabel(position_label(trace.cart, position_unit))
     legend_above(above)
     below.axhspan(-2 * noise, 2 * noise, color=SHADE, lw=0)
-    plot_residuals(
-        below,
-        trace.t,
-        {
-            "with the effects": trace.measured - trace.final,
-            "linear model": trace.measured - trace.baseline,
-        },
-    )
+    plot_residuals(below, trace.t, {name: trace.measured - y for name, y in models.items()})
     below.set_ylabel(f"residual [{position_unit}]")
     below.set_xlabel("time [s]")
     return figure
@@ -79,10 +83,13 @@ def predicted_figure(proposal: Proposal, *, names: tuple[str, str], position_uni
 # ------------------------------------------------------------------- run by run
 
 
-def by_record_figure(rows: Sequence[RecordGap]) -> Figure:
-    """Return the error of every run and cart before and after, with its noise."""
+def by_record_figure(rows: Sequence[RecordGap], *, added: str = ADDED) -> Figure:
+    """Return the error of every run and cart before and after, with its noise.
+
+    `added` as in `before_after_figure`.
+    """
     figure, (ax,) = panels(_ROW * len(rows) + 0.1)
-    plot_by_record(ax, rows)
+    plot_by_record(ax, rows, added=added)
     legend_above(ax)
     ax.set_xlabel("error, share of the motion [%]")
     # The names stand where the numbers of the axis would.
@@ -92,7 +99,7 @@ def by_record_figure(rows: Sequence[RecordGap]) -> Figure:
     return figure
 
 
-def plot_by_record(ax: Axes, rows: Sequence[RecordGap]) -> None:
+def plot_by_record(ax: Axes, rows: Sequence[RecordGap], *, added: str = ADDED) -> None:
     """Plot a bar from before to after for each run and cart; a tick marks the noise."""
     y = -np.arange(len(rows), dtype=float)
     before, after, noise = (
@@ -100,9 +107,10 @@ def plot_by_record(ax: Axes, rows: Sequence[RecordGap]) -> None:
         for name in ("baseline", "final", "noise_floor")
     )
     ax.set_xscale("log")
-    ax.hlines(y, after, before, color=QUIET, lw=1.4)
-    ax.plot(before, y, "o", ms=4.5, mfc="white", mec=SECOND, mew=1.1, label="linear model")
-    ax.plot(after, y, "o", ms=4.5, color=MODEL, mec=MODEL, label="with the effects")
+    if added:
+        ax.hlines(y, after, before, color=QUIET, lw=1.4)
+        ax.plot(before, y, "o", ms=4.5, mfc="white", mec=SECOND, mew=1.1, label="linear model")
+    ax.plot(after, y, "o", ms=4.5, color=MODEL, mec=MODEL, label=added or "linear model")
     ax.plot(noise, y, "|", ms=8.0, color=MEASURED, mew=1.2, label="noise")
     every = np.concatenate([before, after, noise])
     every = every[every > 0]
@@ -121,7 +129,11 @@ def plot_by_record(ax: Axes, rows: Sequence[RecordGap]) -> None:
 
 
 def force_figure(
-    found: FoundEffect, forces: Sequence[ResidualForce], *, units: tuple[str, str]
+    found: FoundEffect,
+    forces: Sequence[ResidualForce],
+    *,
+    units: tuple[str, str],
+    added: str = ADDED,
 ) -> Figure | None:
     """Return the force that the linear part leaves, against what the effect makes it depend on.
 
@@ -160,7 +172,7 @@ def force_figure(
         ax.set_ylabel(f"force left over [{drive}]")
     if not shown:
         return None
-    plot_force(ax, shown)
+    plot_force(ax, shown, added=added)
     if axis == "input":
         reach = np.max(np.abs(np.concatenate([x for x, _, _ in shown])))
         ax.plot([-reach, reach], [-reach, reach], color=SECOND, ls="--", lw=1.0, label="linear")
@@ -169,7 +181,9 @@ def force_figure(
     return figure
 
 
-def plot_force(ax: Axes, shown: Sequence[tuple[Array, Array, Array]]) -> None:
+def plot_force(
+    ax: Axes, shown: Sequence[tuple[Array, Array, Array]], *, added: str = ADDED
+) -> None:
     """Plot clouds of (x, measured, model): measured as points, the model's as smaller ones."""
     x, measured, model = (np.concatenate(parts) for parts in zip(*shown, strict=True))
     order = np.linspace(0, x.size - 1, min(x.size, _MOST_POINTS)).astype(int)
@@ -177,11 +191,13 @@ def plot_force(ax: Axes, shown: Sequence[tuple[Array, Array, Array]]) -> None:
     ax.plot(x[order], measured[order], "o", ms=3.4, mfc="none", mec=MEASURED, mew=0.5,
             label="measured")  # fmt: skip
     ax.plot(x[order], model[order], ".", color=MODEL, ms=3.0, mew=0)
-    ax.plot([], [], ".", color=MODEL, ms=6.0, mew=0, label="with the effects")  # for the legend
+    ax.plot([], [], ".", color=MODEL, ms=6.0, mew=0, label=added)  # for the legend
     ax.set_xlim(*(_ROOM * np.array([x.min(), x.max()]) if x.min() < 0 < x.max() else (None, None)))
 
 
-def timing_figure(forces: Sequence[ResidualForce], *, drive: str) -> Figure | None:
+def timing_figure(
+    forces: Sequence[ResidualForce], *, drive: str, added: str = ADDED
+) -> Figure | None:
     """Return the force that arrives on cart 1 around the sharpest edge of the input."""
     own = [f for f in forces if f.cart == 1 and np.ptp(f.u) > 0]
     if not own:
@@ -195,14 +211,14 @@ def timing_figure(forces: Sequence[ResidualForce], *, drive: str) -> Figure | No
     ax.plot(force.t[kept], measured, ".", color=MEASURED, ms=4.0, mew=0, label="measured")
     ax.plot(force.t[kept], force.u[kept], color=SECOND, ls="--", lw=1.1, label="logged input")
     ax.plot(force.t[kept], (force.model + force.arriving)[kept], color=MODEL, lw=1.1,
-            label="with the effects")  # fmt: skip
+            label=added)  # fmt: skip
     ax.set_ylabel(f"force on cart 1 [{drive}]")
     ax.set_xlabel("time [s]")
     legend_above(ax)
     return figure
 
 
-def spectrum_figure(traces: Sequence[Trace], *, position_unit: str) -> Figure:
+def spectrum_figure(traces: Sequence[Trace], *, position_unit: str, added: str = ADDED) -> Figure:
     """Return the amplitude over frequency of motion and misfits, pooled over runs."""
     longest = max(float(t.t[-1] - t.t[0]) for t in traces)
     dt = max(float(np.median(np.diff(t.t))) for t in traces)
@@ -228,7 +244,7 @@ def spectrum_figure(traces: Sequence[Trace], *, position_unit: str) -> Figure:
     ax.set_yscale("log")
     ax.plot(f[index], motion[index], color=MEASURED, lw=0.8, ls=":", label="measured motion")
     ax.plot(f[index], before[index], color=SECOND, ls="--", lw=1.0, label="residual, linear model")
-    ax.plot(f[index], after[index], color=MODEL, lw=1.0, label="residual, with the effects")
+    ax.plot(f[index], after[index], color=MODEL, lw=1.0, label=f"residual, {added}")
     ax.set_ylabel(f"amplitude [{position_unit}]")
     ax.set_xlabel("frequency [Hz]")
     legend_above(ax)

@@ -30,15 +30,18 @@ from pipeline.report.gap.tables import (
 )
 from pipeline.report.gap.words import (
     WORDS,
+    added_name,
     contenders,
     effect_name,
     error_board,
     next_block,
     place_name,
+    scope_blocks,
     share,
     shares,
     verdict_blocks,
     verdict_title,
+    whole_model,
 )
 from pipeline.report.numbers import count, listing, percent
 from pipeline.report.render.write import write_document
@@ -72,13 +75,18 @@ def build_gap_document(
     page = Page.of(analysis)
     worst = _worst_first(gap)
     forces = residual_forces(gap, free={record.id: record.free for record in analysis.records})
+    where = WORDS.text("where_enough" if gap.verdict == "none" else "where_fails")
     parts: list[Part] = [
         ("summary", verdict_title(gap), lambda page: _summary(page, gap, worst[:1])),
-        ("where", "Where the linear model fails", lambda page: _where(page, gap)),
+        ("where", where, lambda page: _where(page, gap)),
     ]
     for i, found in enumerate(gap.effects):
         name = effect_name(found.effect, found.where)
-        title = f"Suspect: {name}" if gap.verdict == "unexplained" else name
+        title = name
+        if gap.verdict == "unexplained":
+            title = WORDS.text("suspect", name=name)
+        elif gap.verdict == "ambiguous" and found is contenders(gap)[0]:
+            title = WORDS.text("one_explanation", name=name)
         parts.append(
             (
                 f"effect-{i + 1}",
@@ -90,7 +98,7 @@ def build_gap_document(
     parts += [
         ("runs", "Measured against simulated", lambda page: _runs(page, gap, worst[1:])),
         ("apart", "What would tell the explanations apart", lambda page: _apart(page, gap)),
-        ("model", "The model with its effects", lambda page: _model(page, gap)),
+        ("model", capital(whole_model(gap)), lambda page: _model(page, gap)),
         ("method", "How this was found", lambda page: _method(gap)),
         ("warnings", "Warnings", lambda page: remarks(analysis.warnings)),
         ("provenance", "Provenance", lambda page: provenance_blocks(page, made)),
@@ -108,6 +116,8 @@ def build_gap_document(
 def _summary(page: Page, gap: Gap, worst: Sequence[Trace]) -> list[Block]:
     blocks = [*verdict_blocks(gap), error_board(gap), error_table(page, gap)]
     blocks += [_before_after(page, gap, trace, number=1) for trace in worst]
+    if gap.verdict == "none":
+        blocks += scope_blocks(gap, position=page.position, drive=page.drive)
     return blocks + next_block(gap)
 
 
@@ -117,19 +127,19 @@ def _where(page: Page, gap: Gap) -> list[Block]:
         return []
     shown = rows[:_MOST_ROWS]
     top, more = shown[0], left_out(len(rows) - len(shown))
+    alone = "" if gap.effects else "_linear"
     alt = WORDS.text(
-        "by_record_alt",
+        f"by_record_alt{alone}",
         runs=count(len(shown), "run"),
         run=top.experiment,
         cart=top.cart,
         **shares(top),
     )
-    caption = WORDS.text("by_record", more=more)
-    blocks: list[Block] = [
-        page.picture("by-record", by_record_figure(shown), caption=caption, alt=alt)
-    ]
+    caption = WORDS.text(f"by_record{alone}", more=more)
+    figure = by_record_figure(shown, added=added_name(gap))
+    blocks: list[Block] = [page.picture("by-record", figure, caption=caption, alt=alt)]
     if gap.where:
-        blocks.append(window_table(page, gap.where, model="linear_model"))
+        blocks.append(window_table(page, gap.where, model=WORDS.text("linear_model")))
     return blocks
 
 
@@ -139,17 +149,19 @@ def _before_after(page: Page, gap: Gap, trace: Trace, *, number: int) -> Block:
     if row is not None and row.final > 0:
         left = trace.measured - trace.final
         noise = row.noise_floor * (float((left**2).mean() ** 0.5) / row.final)
+    alone = "" if gap.effects else "_linear"
     said = {
         "cart": str(trace.cart),
         "run": trace.experiment,
         "held": WORDS.text("held_out" if trace.held_out else "used"),
-        "errors": WORDS.text("run_errors", **shares(row)) if row else "",
+        "errors": WORDS.text(f"run_errors{alone}", **shares(row)) if row else "",
     }
+    added, model = added_name(gap), whole_model(gap)
     return page.picture(
         f"before-after-{number}",
-        before_after_figure(trace, noise=noise, position_unit=page.position),
-        caption=WORDS.text("before_after", **said),
-        alt=WORDS.text("before_after_alt", **said),
+        before_after_figure(trace, noise=noise, position_unit=page.position, added=added),
+        caption=WORDS.text(f"before_after{alone}", **said),
+        alt=WORDS.text(f"before_after_alt{alone}", model=model, **said),
     )
 
 
@@ -182,22 +194,25 @@ def _evidence(
     page: Page, gap: Gap, found: FoundEffect, *, forces: Sequence[ResidualForce], number: int
 ) -> list[Block]:
     """Return the figure that shows the effect: force against what causes it, or in time."""
-    axis = found.effect.axis
+    axis, added = found.effect.axis, added_name(gap)
     if axis == "frequency":
         held_out = [trace for trace in gap.traces if trace.held_out]
         if not held_out:
             return []
-        shown, figure = "shown_frequency", spectrum_figure(held_out, position_unit=page.position)
+        shown = "shown_frequency"
+        figure = spectrum_figure(held_out, position_unit=page.position, added=added)
     elif axis == "time":
-        shown, figure = "shown_time", timing_figure(forces, drive=page.drive)
+        shown, figure = "shown_time", timing_figure(forces, drive=page.drive, added=added)
     else:
         units = (page.position, page.drive)
-        shown, figure = "shown_force", force_figure(found, forces, units=units)
+        shown, figure = "shown_force", force_figure(found, forces, units=units, added=added)
     if figure is None:
         return []
     name = effect_name(found.effect, found.where)
     others = WORDS.text("others") if len(gap.effects) > 1 else ""
-    caption = WORDS.text("evidence", name=name, shown=WORDS.text(shown, others=others))
+    caption = WORDS.text(
+        "evidence", name=name, shown=WORDS.text(shown, others=others, model=whole_model(gap))
+    )
     alt = WORDS.text("evidence_alt", name=name, axis=axis, fingerprint=found.effect.fingerprint)
     return [page.picture(f"effect-{number}", figure, caption=caption, alt=alt)]
 
@@ -211,7 +226,7 @@ def _runs(page: Page, gap: Gap, worst: Sequence[Trace]) -> list[Block]:
         for i, trace in enumerate(worst[:_MORE_TRACES], start=2)
     ]
     if gap.left and gap.effects:
-        blocks.append(window_table(page, gap.left, model="model_with_effects"))
+        blocks.append(window_table(page, gap.left, model=whole_model(gap)))
     return blocks
 
 
@@ -304,7 +319,10 @@ def _method(gap: Gap) -> list[Block]:
         for key, names in (("fitted_to", gap.training), ("runs_held_out", gap.held_out))
         if names
     )
-    method = WORDS.spans("method" if gap.complete else "method_so_far")
+    if gap.verdict == "none":
+        method = WORDS.spans("method_none")
+    else:
+        method = WORDS.spans("method" if gap.complete else "method_so_far")
     return [paragraph(method), runs, *remarks(list(gap.notes))]
 
 

@@ -28,9 +28,11 @@ from pipeline.report.figures.style import (
 from pipeline.report.gap.tables import error_table
 from pipeline.report.gap.words import (
     WORDS,
+    added_name,
     effect_name,
     error_board,
     next_block,
+    scope_blocks,
     share,
     shares,
     verdict_blocks,
@@ -38,7 +40,7 @@ from pipeline.report.gap.words import (
 )
 from pipeline.report.numbers import listing
 from pipeline.report.sections.page import Page
-from pipeline.report.words import clean
+from pipeline.report.words import capital, clean
 from pipeline.results import Analysis, HardwareCheck, Record
 from pipeline.submission.toml_file import read_text
 
@@ -83,7 +85,7 @@ def gap_in_short(gap: Gap | None) -> list[Block]:
     name = listing([effect_name(found.effect, found.where) for found in gap.effects])
     names = f" ({name})" if name and gap.verdict in ("named", "partial") else ""
     said = WORDS.spans(
-        "in_short",
+        "in_short" if gap.effects else "in_short_linear",
         verdict=f"{verdict_title(gap)}{names}",
         **shares(gap),
     )
@@ -99,6 +101,8 @@ def gap_blocks(page: Page, gap: Gap | None) -> list[Block]:
     if terms:
         blocks.append(augmented_equations(page.analysis.springs, terms))
         blocks += [law(terms, index) for index in range(len(terms))]
+    if gap.verdict == "none":
+        blocks += scope_blocks(gap, position=page.position, drive=page.drive)
     return [*blocks, *next_block(gap), paragraph(WORDS.spans("story"))]
 
 
@@ -132,9 +136,10 @@ def augmented_hardware_blocks(page: Page, gap: Gap | None) -> list[Block]:
         (clean(one.check.experiment), str(one.check.cart), share(one.check.nrmse), share(one.nrmse))
         for one in every
     ]
-    head = ("Record", "Cart", "Linear model", "With the effects")
-    table = page.table(WORDS.text("replay_table"), head, rows, "lcdd")
-    blocks: list[Block] = [paragraph(WORDS.spans("replay")), table]
+    added = added_name(gap)
+    head = ("Record", "Cart", "Linear model", capital(added))
+    table = page.table(WORDS.text("replay_table", added=added), head, rows, "lcdd")
+    blocks: list[Block] = [paragraph(WORDS.spans("replay", added=added)), table]
     drawn = [(run, found) for run, found in replays.items() if found][:_MOST_RUNS]
     for i, (run, found) in enumerate(drawn, start=1):
         worst = max(found, key=lambda replay: replay.nrmse)
@@ -142,9 +147,9 @@ def augmented_hardware_blocks(page: Page, gap: Gap | None) -> list[Block]:
         blocks.append(
             page.picture(
                 f"hardware-effects-{i}",
-                _replay_figure(found, position_unit=page.position),
-                caption=WORDS.text("replay_caption", run=run),
-                alt=WORDS.text("replay_alt", run=run, error=error, cart=cart),
+                _replay_figure(found, position_unit=page.position, added=added),
+                caption=WORDS.text("replay_caption", run=run, added=added),
+                alt=WORDS.text("replay_alt", run=run, error=error, cart=cart, added=added),
             )
         )
     return blocks
@@ -186,13 +191,13 @@ def _replay(
     return replays
 
 
-def _replay_figure(replays: Sequence[_Replay], *, position_unit: str) -> Figure:
+def _replay_figure(replays: Sequence[_Replay], *, position_unit: str, added: str) -> Figure:
     figure, axes = panels(*[1.05] * len(replays))
     for ax, replay in zip(axes, replays, strict=True):
         check = replay.check
         plot_measured(ax, check.t, check.measured)
         plot_second(ax, check.t, check.model, label="linear model")
-        plot_model(ax, check.t, replay.model, label="with the effects")
+        plot_model(ax, check.t, replay.model, label=added)
         keep_in_sight(ax, check.measured)
         ax.set_ylabel(position_label(check.cart, position_unit))
     legend_above(axes[0])

@@ -23,9 +23,9 @@ def error_table(page: Page, gap: Gap) -> Table:
 
 
 def window_table(page: Page, windows: Sequence[GapWindow], *, model: str) -> Table:
-    """Return where a model, named by a key of the catalogue, fails most."""
+    """Return where a model, "the linear model" say, fails most."""
     return page.table(
-        WORDS.text("window_table", model=WORDS.text(model)),
+        WORDS.text("window_table", model=model),
         ("Run", "Cart", "From [s]", "To [s]", "What happens", "Share"),
         [
             (
@@ -66,7 +66,9 @@ def rival_table(page: Page, found: FoundEffect, gap: Gap) -> Table:
         weight = f"{100 * confidence:.1f} %" if confidence >= 5e-4 else "< 0.1 %"
         return [cell(name, tone), cell(share(error), tone), cell(weight, tone)]
 
-    chosen = line(effect_name(found.effect, found.where), gap.final, found.confidence, "good")
+    sure = gap.verdict in ("named", "partial")
+    name = effect_name(found.effect, found.where)
+    chosen = line(name, gap.final, found.confidence, "good" if sure else "")
     others = [
         line(effect_name(rival.effect, rival.where), rival.nrmse_after, rival.confidence)
         for rival in found.rivals

@@ -3,7 +3,9 @@
 from collections.abc import Mapping
 from dataclasses import replace
 
-from pipeline.gap.limits import NOTHING
+import numpy as np
+
+from pipeline.gap.limits import AS_REPEATS, AT_FLOOR, NOTHING
 from pipeline.gap.types import FoundEffect, Gap, NamedValue, RecordGap, Rival
 from pipeline.plant.nonlinear.effects.base import Effect
 from pipeline.report import limits
@@ -15,6 +17,18 @@ from pipeline.report.words import capital, clean, plain_lines
 WORDS = phrases("gap")
 
 
+def added_name(gap: Gap) -> str:
+    """Return what the model with more than the linear one is called; "" where there is none."""
+    if not gap.effects:
+        return ""
+    return WORDS.text("with_suspects" if gap.verdict == "unexplained" else "with_effects")
+
+
+def whole_model(gap: Gap) -> str:
+    """Return what the last model is called in a sentence, "the model with its effects"."""
+    return WORDS.text("model_suspects" if gap.verdict == "unexplained" else "model_effects")
+
+
 def verdict_title(gap: Gap) -> str:
     """Return the verdict in a few words."""
     undecided = gap.verdict == "unexplained" and not gap.complete
@@ -22,14 +36,17 @@ def verdict_title(gap: Gap) -> str:
 
 
 def error_board(gap: Gap) -> Tiles:
-    """Return the error on runs no fit has seen: before, after, and what noise alone makes."""
-    effects = count(len(gap.effects), "effect") if gap.effects else "no effect"
-    tone: Tone = "good" if gap.verdict in ("none", "named") else "bad"
-    tiles = [
-        _tile("linear", gap.baseline),
-        replace(_tile("effects", gap.final, effects=effects), tone=tone),
-        _tile("noise", gap.noise_floor),
-    ]
+    """Return the error on runs no fit has seen: before, after, and what noise alone makes.
+
+    The last model has the tone of the verdict; of two explanations neither is wrong or right yet.
+    """
+    tones: dict[str, Tone] = {"none": "good", "named": "good", "ambiguous": ""}
+    tiles = [_tile("linear", gap.baseline)]
+    if gap.effects:
+        what = "suspect" if gap.verdict == "unexplained" else "effect"
+        tiles.append(_tile("effects", gap.final, effects=count(len(gap.effects), what)))
+    tiles[-1] = replace(tiles[-1], tone=tones.get(gap.verdict, "bad"))
+    tiles.append(_tile("noise", gap.noise_floor))
     if gap.repeatability is not None:
         tiles.append(_tile("repeats", gap.repeatability))
     return Tiles(tuple(tiles))
@@ -45,7 +62,9 @@ def verdict_blocks(gap: Gap) -> list[Block]:
     so_far = [] if gap.complete else [paragraph(WORDS.spans("so_far"))]
     match gap.verdict:
         case "none":
-            said: list[Block] = [paragraph(WORDS.spans("none", **shares(gap)))]
+            said: list[Block] = [
+                paragraph(WORDS.spans("none", noise=_noise(gap), baseline=share(gap.baseline)))
+            ]
         case "named" | "partial":
             said = [_named(gap)]
         case "ambiguous":
@@ -55,8 +74,36 @@ def verdict_blocks(gap: Gap) -> list[Block]:
     return [*so_far, *said]
 
 
+def scope_blocks(gap: Gap, *, position: str, drive: str) -> list[Block]:
+    """Say of a linear model that is enough what that covers, and what would have shown."""
+    repeats = AS_REPEATS * (gap.repeatability or 0.0)
+    noise = float(np.sqrt(AT_FLOOR)) * gap.noise_floor
+    # A search begins above both: the square of what is hidden adds to that of the noise.
+    hidden = float(np.sqrt(max(noise, repeats) ** 2 - gap.noise_floor**2))
+    lost = WORDS.text("lost_in_repeats" if repeats > noise else "lost_in_noise")
+    blocks: list[Block] = [
+        paragraph(WORDS.spans("none_hidden", share=share(hidden), lost=lost)),
+    ]
+    reach: dict[int, float] = {}
+    for trace in gap.traces:
+        far = float(np.max(np.abs(trace.measured - trace.zero)))
+        reach[trace.cart] = max(far, reach.get(trace.cart, 0.0))
+    if not reach:  # read from a file
+        return blocks
+    said = [
+        f"cart {cart} up to {significant(far, digits=3)} {position}"
+        for cart, far in sorted(reach.items())
+    ]
+    driven = max(float(np.max(np.abs(trace.u))) for trace in gap.traces)
+    if driven > 0:
+        said.append(f"the input up to {significant(driven, digits=3)} {drive}")
+    return [paragraph(WORDS.spans("none_reach", reach=listing(said))), *blocks]
+
+
 def next_block(gap: Gap) -> list[Block]:
-    """Say which experiment comes next, nothing where none is needed."""
+    """Say what comes next."""
+    if gap.verdict == "none":
+        return [paragraph(WORDS.spans("next_none"))]
     if not gap.next_experiment:
         return []
     key = f"next_{gap.verdict}" if gap.verdict in ("named", "ambiguous") else "next"
