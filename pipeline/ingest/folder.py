@@ -12,11 +12,11 @@ from pipeline.ingest.formats.table import ENDINGS
 from pipeline.names import first_few
 from pipeline.submission.load import outside
 
-_HEAD = 1000  # bytes, by which a text is told from other files
+_HEAD = 1000  # bytes that show whether a file is text
 _MOST_NAMED = 4  # in a sentence; the JSON names all
 _DEBRIS = frozenset({"thumbs.db", "desktop.ini"})  # what a system leaves; the rest of it is hidden
 _AS_TEXT = "save the recording as .csv"
-# What may hold a recording in a form that is not read: what it is, and what to do.
+# Forms that are not read but may hold a recording: their names, and the advice to give.
 _FORMS = {
     ".xlsx .xlsm .xlsb .xls .ods .numbers": ("a spreadsheet", "save each sheet as .csv"),
     ".zip .rar .7z .gz .tgz .tar": ("an archive", "unpack it"),
@@ -52,8 +52,7 @@ def data_files_in(folder: Path) -> list[Path]:
 def files_not_read(folder: Path, *, root: Path) -> list[NotRead]:
     """Return every other file of a folder and those below, with what to do about it.
 
-    Names are below `root`, which no file may leave by a link. What a system or a tool hides is
-    passed over.
+    Names are below `root`, which no file may leave by a link. Hidden files are passed over.
     """
     names = [p.relative_to(root).as_posix() for p in _entries(folder) if not _is_recording(p)]
     return [refused(root, name) or _not_read(root, name) for name in names]

@@ -45,7 +45,7 @@ class Inspection:
     rate : Hz. None, as the other times, where the file has no time column.
     kind : the kind of experiment it looks like; `frequency` (Hz) of a sine dwell.
     problems : what to look at before using the file.
-    needs : keys that its table in `submission.toml` has to state: "columns", "sample_rate".
+    needs : keys that its table in `submission.toml` has to state ("columns", "sample_rate").
     variables : of a binary file, read or not.
     guessed : column numbers by role, where the file has no headings and the signals tell.
     """

@@ -186,7 +186,7 @@ def _record(variables: Sequence[_Variable], *, source: str) -> list[_Variable]:
 
 
 def _not_read(variables: Sequence[Variable]) -> list[str]:
-    """Return what is said of the variables that are not read, the largest first."""
+    """Return a note on each variable that is not read, the largest first."""
     large = [v for v in variables if v.advice]
     large.sort(key=lambda v: -math.prod(v.size))
     notes = [f"not read: {v}; {v.advice}" for v in large[:_MOST_NAMED]]
