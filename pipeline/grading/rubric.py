@@ -1,5 +1,6 @@
 """The rubric: what a lab asks, the criteria with their points and tolerances, the late policy."""
 
+from collections.abc import Mapping
 from decimal import Decimal
 from fnmatch import fnmatchcase
 from typing import Annotated, Literal
@@ -8,12 +9,21 @@ from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
 
 from pipeline.names import parameter_names
 from pipeline.results_of_runs import Kind
+from pipeline.schemas.grade import CODES, Code
 from pipeline.submission import Design, System
 
 Points = Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)]
 Percent = Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)]
 Sigmas = Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1, le=1000)]
+Step = Annotated[float, Field(ge=0.01, le=1000, allow_inf_nan=False)]
+Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+
+# The least share of a criterion's points that a remark costs, where the rubric says nothing. The
+# tolerances already weigh each wrong number; but one wrong entry among the many of A and B makes
+# another model of the carts, and its share of the entries does not say so.
+FLAG_COSTS: Mapping[Code, float] = {"wrong_state_space": 0.5}
+COSTING: tuple[Code, ...] = tuple(code for code in CODES if code != "shared_data")
 
 
 class _Model(BaseModel):
@@ -186,6 +196,8 @@ class Rubric(_Model):
     Attributes
     ----------
     system, design : win over the submission's own; without `design` the submission's is used.
+    step : points are rounded to it.
+    flags : by code, the least share of its criterion's points that a remark costs.
     anonymous : names stay out of what is written unless asked for.
     examples : submission folders handed out with the task, from the rubric's own folder: their
         recordings may stand in anybody's submission.
@@ -197,6 +209,8 @@ class Rubric(_Model):
     design: Design | None = None
     required: Required = Required()
     late: Late = Late()
+    step: Step = 0.01
+    flags: dict[str, Share] = {}
     anonymous: bool = False
     examples: tuple[str, ...] = ()
     criteria: tuple[Criterion, ...]
@@ -210,6 +224,11 @@ class Rubric(_Model):
     def out_of(self) -> float:
         """All points there are."""
         return float(sum(Decimal(str(criterion.points)) for criterion in self.criteria))
+
+    @property
+    def flag_costs(self) -> dict[Code, float]:
+        """The least share of a criterion's points that each remark costs, defaults filled in."""
+        return {code: self.flags.get(code, FLAG_COSTS.get(code, 0.0)) for code in COSTING}
 
 
 def matching(patterns: tuple[str, ...], names: list[str]) -> list[str]:
