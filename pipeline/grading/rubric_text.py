@@ -18,7 +18,6 @@ def rubric_dict(rubric: Rubric) -> dict[str, Any]:
     """Return the rubric as plain data, defaults filled in, patterns written out."""
     plain = rubric.model_dump(mode="json")
     plain["out_of"] = rubric.out_of
-    plain["flags"] = rubric.flag_costs
     for criterion, entry in zip(rubric.criteria, plain["criteria"], strict=True):
         if isinstance(criterion, Parameters | InitialFinal):
             entry["parameters"] = matching(criterion.parameters, rubric.names)
@@ -45,7 +44,7 @@ def rubric_text(rubric: Rubric) -> str:
         "rubric.txt.j2",
         rubric=rubric,
         springs=[name for name, there in springs if there],
-        costs={code: cost for code, cost in rubric.flag_costs.items() if cost},
+        costs={code: cost for code, cost in rubric.flags.model_dump().items() if cost},
         nothing=rubric.required == Required(),
         named=named,
         dampings=dampings,

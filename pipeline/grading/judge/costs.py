@@ -30,18 +30,18 @@ def charge(
 
     Several remarks on one criterion cost what the dearest does, not their sum.
     """
-    costs = rubric.flag_costs
     mine = [flag for flag in flags if concerns(flag, criterion, names=rubric.names)]
-    dearest = max(mine, key=lambda flag: costs[flag.code], default=None)
+    dearest = max(mine, key=lambda flag: rubric.flags.of(flag.code), default=None)
     if dearest is None or verdict.share is None:
         return verdict
-    kept: Fraction = ALL - exact(costs[dearest.code])
+    cost = rubric.flags.of(dearest.code)
+    kept: Fraction = ALL - exact(cost)
     if verdict.share <= kept:
         return verdict
     said = WORDS.text(
         "costs",
         title=WORDS.text(f"title_{dearest.code}"),
-        percent=f"{100 * costs[dearest.code]:g}",
+        percent=f"{100 * cost:g}",
     )
     return replace(verdict, share=kept, message=f"{verdict.message} {said}")
 
