@@ -4,6 +4,7 @@ import re
 from collections.abc import Collection, Iterator, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
+from decimal import Decimal
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, get_args
@@ -14,7 +15,6 @@ from pydantic_core import ErrorDetails
 from pipeline import submission
 from pipeline.errors import ConfigError
 from pipeline.grading import rubric
-from pipeline.grading.references.tolerance import exact
 from pipeline.grading.rubric import InitialFinal, Parameters, Rubric, matching
 from pipeline.resources import RUBRICS
 from pipeline.submission.complaints import (
@@ -275,7 +275,7 @@ def _contradictions(
         points = criterion.points
         if points != round(points, 2):
             yield ("criteria", i, "points"), f"{points:g}: points go to the hundredth"
-        elif exact(points) % exact(found.step):
+        elif Decimal(str(points)) % Decimal(str(found.step)):
             yield ("criteria", i, "points"), f"{points:g} is no multiple of step = {found.step:g}"
         if isinstance(criterion, Parameters | InitialFinal):
             for pattern in criterion.parameters:

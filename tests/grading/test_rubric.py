@@ -155,7 +155,7 @@ def test_a_slip_in_a_line_hides_no_other_mistake(tmp_path):
 
 
 def test_a_table_without_its_bracket_is_one_mistake(tmp_path):
-    """What stands under a heading that is none is not said to be missing, nor to be no criterion."""
+    """What stands under a heading that is none is not missing, and a criterion is still one."""
     text = GOOD.replace("[[criteria]]", "[[criteria]", 1).replace("[required]", "[required")
     with pytest.raises(ConfigError) as caught:
         load_rubric(write(tmp_path, text))
