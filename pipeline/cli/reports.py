@@ -172,18 +172,26 @@ def _comparison(earlier: Path | None) -> "Callable[[Analysis], DraftChanges | No
 def solution(
     folder: Folder,
     out: Annotated[Path | None, typer.Option(help="Where to write; default: DIR/solution.")] = None,
+    rubric: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Says what is accepted; default: the shipped one for so many carts.",
+        ),
+    ] = None,
     pdf: Annotated[bool, typer.Option("--pdf/--no-pdf", help="Write the PDF too.")] = True,
     as_json: AsJson = False,
 ) -> None:
     """Write the instructor's reference: derivations, numbers put in, what to expect."""
+    from pipeline.grading.rubric_file import load_rubric
     from pipeline.output import check_folder, own_folder
     from pipeline.report.solution.write import make_solution
     from pipeline.submission import load_submission
 
-    submission = load_submission(folder)
+    submission, asked = load_submission(folder), load_rubric(rubric) if rubric else None
     out = check_folder(out) if out else own_folder(submission.folder, "solution")
     with progress_line() as progress:
-        analysis, text = make_solution(submission, out, pdf=pdf, progress=progress)
+        analysis, text = make_solution(submission, out, rubric=asked, pdf=pdf, progress=progress)
     failed = [f"cartlab: {check.id}: {check.message}" for check in analysis.failed_checks]
     for line in failed:  # what could not be read is among them
         say(line)
