@@ -134,7 +134,7 @@ def run_report(
     tables: bool = False,
 ) -> "Analysis":
     """Write the report of a submission and say in a few lines what it found."""
-    from pipeline.output import check_folder, own_folder
+    from pipeline.output import named_folder, own_folder
     from pipeline.report.draft.changes import changes_line
     from pipeline.report.draft.write import make_report
     from pipeline.report.sections.questions import open_line
@@ -142,7 +142,7 @@ def run_report(
     from pipeline.submission import load_submission
 
     submission = load_submission(folder)
-    out = check_folder(out) if out else own_folder(submission.folder, "report")
+    out = named_folder(out) if out else own_folder(submission.folder, "report")
     compared = _comparison(compare)
     with progress_line() as progress:
         analysis, changes = make_report(
@@ -184,12 +184,12 @@ def solution(
 ) -> None:
     """Write the instructor's reference: derivations, numbers put in, what to expect."""
     from pipeline.grading.rubric_file import load_rubric
-    from pipeline.output import check_folder, own_folder
+    from pipeline.output import named_folder, own_folder
     from pipeline.report.solution.write import make_solution
     from pipeline.submission import load_submission
 
     submission, asked = load_submission(folder), load_rubric(rubric) if rubric else None
-    out = check_folder(out) if out else own_folder(submission.folder, "solution")
+    out = named_folder(out) if out else own_folder(submission.folder, "solution")
     with progress_line() as progress:
         analysis, text = make_solution(submission, out, rubric=asked, pdf=pdf, progress=progress)
     failed = [f"cartlab: {check.id}: {check.message}" for check in analysis.failed_checks]
@@ -238,14 +238,14 @@ def explain(
 ) -> tuple[str, list[str]]:
     """Write what a submission's linear model leaves out; return gap.json and what is to be said."""
     from pipeline.gap.stored import gap_text
-    from pipeline.output import check_folder, own_folder, write_file
+    from pipeline.output import named_folder, own_folder, write_file
     from pipeline.report.gap.page import render_gap
     from pipeline.report.gap.words import terminal_verdict
     from pipeline.submission import load_submission
     from pipeline.workflow import analyse
 
     submission = load_submission(folder)
-    out = check_folder(out) if out else own_folder(submission.folder, "gap")
+    out = named_folder(out) if out else own_folder(submission.folder, "gap")
     analysis = analyse(submission, design=False, progress=progress)
     from pipeline.bench.design.discriminate import propose_for  # load the …
     from pipeline.gap.investigate import investigate  # … compiled simulator

@@ -25,7 +25,7 @@ from pipeline.grading.publish.students import Remark, Student, students_of
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.shared import told
 from pipeline.grading.words import WORDS, points_text
-from pipeline.output import csv_text, own_folder, write_file
+from pipeline.output import csv_text, named_folder, own_folder, write_file
 from pipeline.schemas.grade import Grade
 
 _HOURS = 24.0
@@ -51,13 +51,17 @@ def export(
 
     Parameters
     ----------
+    out : a folder, there or not yet; or a .csv file, which gets the table and nothing beside it.
     title : of the assignment as the platform has it; default: the rubric's.
     roster : the table that the platform exports.
 
     Raises
     ------
-    ConfigError : the roster is no such table, or its grades go up to another maximum.
+    ConfigError : the roster is no such table, or its grades go up to another maximum; `out` is
+        another file.
     """
+    table = out if out.suffix.lower() == ".csv" and not out.is_dir() else None
+    folder = table.parent if table else named_folder(out)
     rubric = book.rubric
     title = title or rubric.title or "cartlab"
     entries = list(book.entries())
@@ -81,11 +85,11 @@ def export(
         text = _moodle(students, rubric, title=title)
     else:
         text = _gradescope(students, rubric)
-    out.mkdir(parents=True, exist_ok=True)
-    files = [out / f"{platform}.csv"]
+    folder.mkdir(parents=True, exist_ok=True)
+    files = [table or folder / f"{platform}.csv"]
     write_file(files[0], text)
-    if platform == "gradescope":
-        files += _write_results(entries, own_folder(out, "gradescope"))
+    if platform == "gradescope" and not table:
+        files += _write_results(entries, own_folder(folder, "gradescope"))
     return Exported(files=tuple(files), remarks=tuple(remarks))
 
 
