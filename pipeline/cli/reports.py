@@ -139,6 +139,7 @@ def run_report(
     from pipeline.report.draft.write import make_report
     from pipeline.report.sections.questions import open_line
     from pipeline.report.sections.summary import terminal_summary
+    from pipeline.report.words import with_symbols
     from pipeline.submission import load_submission
 
     submission = load_submission(folder)
@@ -148,7 +149,7 @@ def run_report(
         analysis, changes = make_report(
             submission, out, compared=compared, pdf=pdf, tables=tables, progress=progress
         )
-    said = (changes and changes_line(changes), open_line(analysis))
+    said = (changes and with_symbols(changes_line(changes)), open_line(analysis))
     for line in (terminal_summary(analysis), *_unreadable(analysis), *filter(None, said)):
         say(line)
     say(_wrote(out, "report", pdf=pdf))
@@ -186,13 +187,14 @@ def solution(
     from pipeline.grading.rubric_file import load_rubric
     from pipeline.output import named_folder, own_folder
     from pipeline.report.solution.write import make_solution
+    from pipeline.report.words import with_symbols
     from pipeline.submission import load_submission
 
     submission, asked = load_submission(folder), load_rubric(rubric) if rubric else None
     out = named_folder(out) if out else own_folder(submission.folder, "solution")
     with progress_line() as progress:
         analysis, text = make_solution(submission, out, rubric=asked, pdf=pdf, progress=progress)
-    failed = [f"cartlab: {check.id}: {check.message}" for check in analysis.failed_checks]
+    failed = [f"cartlab: {with_symbols(check.message)}" for check in analysis.failed_checks]
     for line in failed:  # what could not be read is among them
         say(line)
     doubtful = ", doubtful as the checks above failed" if analysis.failed_checks else ""

@@ -108,13 +108,14 @@ def judge_claims(criterion: asked.Claims, work: Work) -> Verdict:
         return mean_share(shares)
 
     best = _best(controller, gains, judged)
-    share, expected = (best[0], _claimable(best[1])) if best else (NONE, {})
-    told = ", ".join(f"{k} {v:.3g}" for k, v in expected.items() if v is not None)
+    if best is None:
+        return Verdict(share=NONE, message="These gains cannot be simulated.")
+    share, expected = best[0], _claimable(best[1])
     return Verdict(
         share=share,
         message="What the gains give."
         if share == 1
-        else f"Simulated on your carts these gains give {told}.",
+        else f"Simulated on your carts with these gains: {does(best[1])}.",
         expected=expected,
         found={name: float(v) for name, v in claims.items() if v is not None},
     )

@@ -20,6 +20,7 @@ from pipeline.grading.references.tolerance import exact, late_deduction, roundin
 from pipeline.grading.rubric import Rubric
 from pipeline.ingest.columns import conversion
 from pipeline.results import Analysis
+from pipeline.schemas.base import Units
 from pipeline.schemas.grade import CODES, Criterion, Flag, Grade, Outcome
 from pipeline.submission import Experiment, InputOverride, Reported, Submission, System
 from pipeline.workflow import analyse
@@ -133,6 +134,7 @@ def grade_analysis(
         deducted=float(deducted),
         criteria=criteria,
         flags=tuple(flags),
+        units=Units(position=analysis.position_unit, input=analysis.input_unit),
         notes=signed,
     )
 
