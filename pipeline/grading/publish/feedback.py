@@ -91,7 +91,7 @@ def _summary(grade: Grade) -> list[Block]:
     by_hand = Tile(spans("Set by hand"), spans(counted_criteria(len(overrides))))
     if grade.status == "failed":
         tile = Tile(spans("Points"), spans(points), tone="" if overrides else "bad")
-        how, then = "", "Mend it and hand it in again, or talk to your instructor."
+        how, then = "", "Fix it and hand it in again, or talk to your instructor."
         if overrides:
             how, then = " automatically", "Its points were given by hand."
         said = Span(f"This submission could not be graded{how}. ", "strong")

@@ -63,9 +63,8 @@ def build_document(
     page = Page.of(analysis)
     asked = ask(analysis)
     notes = "" if answer else analysis.discussion or ""
-    answers, rest = split_notes(discussion_blocks(notes), asked)
-    if answer:
-        answers = {question.id: (answer(question),) for question in asked}
+    written, rest = split_notes(discussion_blocks(notes), asked)
+    answers = {one.id: (answer(one),) for one in asked} if answer else written
     made = _WORDS.text("made", version=__version__)
     parts: Sequence[Part] = (
         ("summary", "Summary", lambda page: [*summary(page), *gap_in_short(gap)]),
@@ -93,7 +92,6 @@ def build_document(
     return page.document(
         placed(sections, asked, answers),
         about=f"Identification and control of {count(analysis.carts, 'cart')}",
-        untitled=f"Identification of {count(analysis.carts, 'cart')}",
     )
 
 

@@ -4,7 +4,7 @@ A question stands where its figures are. It is answered in `notes.md` under a he
 with the question's id; what stands under no such heading is the discussion.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -269,7 +269,7 @@ def split_notes(
 
 
 def placed(
-    sections: Sequence[Section], asked: Sequence[Asked], answers: dict[str, tuple[Block, ...]]
+    sections: Sequence[Section], asked: Sequence[Asked], answers: Mapping[str, tuple[Block, ...]]
 ) -> tuple[Section, ...]:
     """Return the sections with each question at the end of its own, else of the discussion."""
     there = {section.id for section in sections}
@@ -295,7 +295,7 @@ def placed(
 
 
 def open_questions(
-    asked: Sequence[Asked], answers: dict[str, tuple[Block, ...]], *, by_model: bool = False
+    asked: Sequence[Asked], answers: Mapping[str, tuple[Block, ...]], *, by_model: bool = False
 ) -> list[Paragraph]:
     """Return a paragraph that leads to every question, and says which are not answered.
 
