@@ -346,7 +346,8 @@ def test_numbers_of_a_criterion_have_words_and_units():
     ("name", "unit"),
     [
         ("K_1", "cm/V"), ("omega_a", "rad/s"), ("zeta_2", ""), ("mass", "V\xa0s²/cm"),
-        ("A(2, 1)", "1/s²"), ("A(4, 4)", "1/s"), ("A(1, 2)", ""), ("B(2)", "cm/(V\xa0s²)"), ("B(1)", ""),
+        ("A(2, 1)", "1/s²"), ("A(4, 4)", "1/s"), ("A(1, 2)", ""),
+        ("B(2)", "cm/(V\xa0s²)"), ("B(1)", ""),
     ],
 )  # fmt: skip
 def test_a_number_has_its_unit(name, unit):
