@@ -81,7 +81,7 @@ def rubric_source(path: Path) -> str:
 
 
 class InvalidRubric(ConfigError):
-    """What stands in a rubric is not what may stand there.
+    """A rubric with mistakes in it.
 
     Attributes
     ----------
@@ -131,7 +131,7 @@ class _Validated:
 
 
 def _is_of_slip(complaint: _Complaint, line: int, read: Toml) -> bool:
-    """Whether what is missing may stand in a line that is no TOML."""
+    """Whether a missing key may be in a line that is not TOML."""
     if not complaint.missing:
         return False
     lines = read.text.split("\n")
@@ -146,7 +146,7 @@ def _validate(document: dict, *, lost: Collection[str]) -> _Validated:
 
     Parameters
     ----------
-    lost : ids of criteria that may be in lines that are no TOML.
+    lost : ids of criteria that may be in lines that are not TOML.
     """
     complaints: list[_Complaint] = []
     criteria = document.get("criteria")
@@ -175,7 +175,7 @@ def _try(document: dict) -> tuple[Rubric | None, list[ErrorDetails]]:
 
 
 def _with_check(own: Any, i: int, document: dict, complaints: list[_Complaint]) -> Any:
-    """Return a criterion with a check that there is, so that its other keys can be looked at."""
+    """Return a criterion with a known check, so that its other keys can be checked too."""
     if not isinstance(own, dict) or own.get("check") in _CHECKS:
         return own
     at: Location = ("criteria", i, "check")

@@ -143,13 +143,13 @@ def _too_large(where: str, size: int, limit: int) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Toml:
-    """What of a text is TOML.
+    """The readable part of a text, and its slips.
 
     Attributes
     ----------
-    document : what the lines hold that can be read.
-    text : those lines, each where it was; the others are empty.
-    slips : (line, what is wrong) of the others, in the order of the text; line 0 is all of it.
+    document : the content of the lines that can be read.
+    text : those lines, each in its place; the others are empty.
+    slips : (line, what is wrong) of the others, in their order. Line 0 means the whole text.
     """
 
     document: dict[str, Any]

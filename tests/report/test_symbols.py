@@ -20,13 +20,13 @@ _AS_IN_FILES = re.compile(r"\b(?:omega|zeta)(?:_\w)?\b|overshoot_percent|settlin
 
 
 def raw(html: str) -> list[str]:
-    """Return the names that a reader of a page meets as they stand in files."""
+    """Return the names on a page that are spelt as in files."""
     return _AS_IN_FILES.findall(unescape(_HIDDEN.sub(" ", html)))
 
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
 def test_reports_write_symbols(carts):
-    """The report, the solution and the terminal; what is to be typed stands as code."""
+    """The report, the solution and the terminal; a key to be typed is set as code."""
     analysis = make_analysis(carts)
     assert raw(render_html(build_document(analysis, progress=None))) == []
     assert raw(render_html(build_solution(analysis))) == []

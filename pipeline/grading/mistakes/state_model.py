@@ -275,9 +275,9 @@ def model_harm(
 ) -> Harm | None:
     """Return what the wrong entries of a model predict that carts on springs never do, if anything.
 
-    It grows without end, or a positive input drives a cart to the negative side. Entries that are
-    imprecise stand as they should be: honest errors of stiff chains may do the same. Another order
-    of the states is no harm.
+    It grows without end, or a positive input drives a cart to the negative side. Imprecise entries
+    are taken as right: in a stiff chain honest errors could do the same. Another order of the
+    states is no harm.
 
     Parameters
     ----------

@@ -7,7 +7,7 @@ from pathlib import Path
 from pipeline.gap.types import Gap
 from pipeline.grading.rubric import Rubric
 from pipeline.output import write_file
-from pipeline.report.document import Document, Paragraph
+from pipeline.report.document import Document, Paragraph, Span, paragraph
 from pipeline.report.draft.content import Part, build_document
 from pipeline.report.gap.section import with_gap
 from pipeline.report.numbers import count
@@ -80,8 +80,8 @@ def build_solution(
 ) -> Document:
     """Return the report with the worked sections in the place of the short ones on the model.
 
-    Nothing that students wrote stands in it: their notes are left out, and each question of the
-    data has a model answer.
+    It holds no text of students: their notes are left out, and each question of the data has a
+    model answer.
     """
     accepted = rubric or default_rubric(analysis)
     worked: tuple[Part, ...] = (
@@ -102,4 +102,5 @@ def build_solution(
 
 def model_answer(question: Asked) -> Paragraph:
     """Return what a good answer to a question says."""
-    return Paragraph(rich(_WORDS.text(f"answer_{question.kind}")))
+    lead = Span(_WORDS.text("model_answer"), "strong")
+    return paragraph(lead, rich(_WORDS.text(f"answer_{question.kind}")))
