@@ -15,6 +15,7 @@ from pipeline.report.gap.section import with_gap
 from pipeline.report.render.html import render_fragment
 from pipeline.report.sections.questions import ask
 from pipeline.report.sections.summary import terminal_summary
+from pipeline.report.words import with_symbols
 from pipeline.results import Analysis, FeedbackDesign
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse as run
@@ -151,7 +152,7 @@ class Lab:
     @property
     def questions(self) -> dict[str, str]:
         """What this data raises, by the id under which `notes.md` answers it."""
-        return {question.id: question.text for question in ask(self.results)}
+        return {question.id: with_symbols(question.text) for question in ask(self.results)}
 
     @property
     def sections(self) -> tuple[str, ...]:

@@ -15,6 +15,7 @@ from pathlib import Path
 from pipeline.errors import ConfigError
 
 _PART = re.compile(r"\.[0-9a-f]{16}\.part")
+_FILES = (".html", ".pdf", ".json", ".csv", ".xlsx", ".zip", ".db", ".sqlite")
 _LEFT_OVER = 3600.0  # s: no write takes so long, and no two clocks are so far apart
 LOCK, TURN = ".lock", ".turn"  # of `pipeline.lock`
 # What looks like the start of a formula and is none: a number, and the dash for nothing.
@@ -36,6 +37,19 @@ def check_folder(out: Path) -> Path:
     return out
 
 
+def named_folder(out: Path) -> Path:
+    """Return a folder that a person named, there or not yet.
+
+    Raises
+    ------
+    ConfigError : something else is in its place, or its name is meant for a file: several are
+        written.
+    """
+    if not out.is_dir() and out.suffix.lower() in _FILES:
+        raise ConfigError(f"{out}: several files are written; name a folder with --out")
+    return check_folder(out)
+
+
 def new_folder(out: Path) -> Path:
     """Return the folder, not yet there or empty but for locks.
 
@@ -43,7 +57,7 @@ def new_folder(out: Path) -> Path:
     ------
     ConfigError : there is something in it, which a new submission would be mixed with.
     """
-    if check_folder(out).is_dir() and any(path.name not in (LOCK, TURN) for path in out.iterdir()):
+    if named_folder(out).is_dir() and any(path.name not in (LOCK, TURN) for path in out.iterdir()):
         raise ConfigError(f"{out}: is not empty; name a new folder with --out")
     return out
 

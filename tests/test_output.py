@@ -18,6 +18,7 @@ from pipeline.output import (
     clear_files,
     csv_text,
     harmless,
+    named_folder,
     new_folder,
     own_folder,
     write_file,
@@ -92,6 +93,16 @@ def test_a_file_in_the_way_is_refused(tmp_path):
     (tmp_path / "out").write_text("")
     with pytest.raises(ConfigError, match="out: is a file"):
         check_folder(tmp_path / "out")
+
+
+@pytest.mark.parametrize("name", ["report.pdf", "gs.csv", "Grades.HTML"])
+def test_a_file_s_name_is_no_new_folder(tmp_path, name):
+    """Who types one expects a file; a folder that is called so already is one."""
+    with pytest.raises(ConfigError, match="name a folder with --out"):
+        named_folder(tmp_path / name)
+    (tmp_path / name).mkdir()
+    assert named_folder(tmp_path / name).is_dir()
+    assert named_folder(tmp_path / "lab 3.2") == tmp_path / "lab 3.2"
 
 
 def test_stale_files_go(tmp_path):

@@ -21,11 +21,11 @@ def demo(
     out: Annotated[Path, typer.Option(help="Where to write.")] = Path("cartlab-demo"),
 ) -> None:
     """Run the whole job: a shipped example, a class of three, a bench that hides friction."""
-    from pipeline.output import check_folder
+    from pipeline.output import named_folder
     from pipeline.resources import EXAMPLES
     from pipeline.synthesis.classroom import PLANTED, PRESET, write_class
 
-    out = check_folder(out)
+    out = named_folder(out)
     with search_beside(out) as beside:
         say("1 of 3: the report of three carts")
         run_report(EXAMPLES / "three-cart", out=out / "report", pdf=True)

@@ -256,7 +256,10 @@ class Platform(StrEnum):
 def export_grades(
     grades: Grades,
     lms: Annotated[Platform, typer.Option(help="The learning platform.")],
-    out: Annotated[Path | None, typer.Option(help="Where to write; default: GRADES.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="A folder, or FILE.csv for the table alone; default: GRADES."),
+    ] = None,
     roster: Annotated[
         Path | None, typer.Option(metavar="CSV", help="The platform's own table, to be filled in.")
     ] = None,
@@ -268,11 +271,10 @@ def export_grades(
     """Write the class grades for import into a learning platform."""
     from pipeline.grading.gradebook.book import Gradebook
     from pipeline.grading.publish.export import export
-    from pipeline.output import check_folder
 
     folder = Path(grades)
     with Gradebook(grades, assignment=assignment) as book:
-        to = check_folder(out or (folder if folder.is_dir() else Path()))
+        to = out or (folder if folder.is_dir() else Path())
         done = export(book, lms.value, to, title=title, roster=roster)
     for remark in done.remarks:
         say(remark.text)

@@ -50,11 +50,11 @@ def effects(
 
     chosen = [find_effect(name)] if name else CATALOGUE
     if out:
-        from pipeline.output import check_folder
+        from pipeline.output import named_folder
         from pipeline.report.effects.page import render_effects
 
         with progress_line() as progress:
-            render_effects(chosen, check_folder(out), progress=progress)
+            render_effects(chosen, named_folder(out), progress=progress)
         say(f"wrote {out / 'effects.html'}")
     if as_json:
         typer.echo(json.dumps(catalogue_data(chosen), indent=1, ensure_ascii=False))

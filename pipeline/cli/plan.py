@@ -34,6 +34,7 @@ def plan(
     from pipeline.bench.design.next_plan import plan_next
     from pipeline.bench.planning.plan_words import plan_data, plan_table
     from pipeline.bench.planning.propose import make_plan
+    from pipeline.report.words import with_symbols
     from pipeline.submission import load_submission
 
     if goal and number is None:
@@ -47,7 +48,7 @@ def plan(
             made = plan_next(
                 submission, n=number, goal=goal or WORST, stock=stock, progress=progress
             )
-            words = [made.wrote, *made.sentences]
+            words = [made.wrote, *map(with_symbols, made.sentences)]
             further = {
                 "next": {"for": made.words, "separation": made.separation}
                 if made.separation is not None

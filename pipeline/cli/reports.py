@@ -142,21 +142,22 @@ def run_report(
     tables: bool = False,
 ) -> "Analysis":
     """Write the report of a submission and say in a few lines what it found."""
-    from pipeline.output import check_folder, own_folder
+    from pipeline.output import named_folder, own_folder
     from pipeline.report.draft.changes import changes_line
     from pipeline.report.draft.write import make_report
     from pipeline.report.sections.questions import open_line
     from pipeline.report.sections.summary import terminal_summary
+    from pipeline.report.words import with_symbols
     from pipeline.submission import load_submission
 
     submission = load_submission(folder)
-    out = check_folder(out) if out else own_folder(submission.folder, "report")
+    out = named_folder(out) if out else own_folder(submission.folder, "report")
     compared = _comparison(compare)
     with progress_line() as progress:
         analysis, changes = make_report(
             submission, out, compared=compared, pdf=pdf, tables=tables, progress=progress
         )
-    said = (changes and changes_line(changes), open_line(analysis))
+    said = (changes and with_symbols(changes_line(changes)), open_line(analysis))
     for line in (terminal_summary(analysis), *_unreadable(analysis), *filter(None, said)):
         say(line)
     say(_wrote(out, "report", pdf=pdf))
@@ -180,19 +181,28 @@ def _comparison(earlier: Path | None) -> "Callable[[Analysis], DraftChanges | No
 def solution(
     folder: Folder,
     out: Annotated[Path | None, typer.Option(help="Where to write; default: DIR/solution.")] = None,
+    rubric: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Says what is accepted; default: the shipped one for so many carts.",
+        ),
+    ] = None,
     pdf: Annotated[bool, typer.Option("--pdf/--no-pdf", help="Write the PDF too.")] = True,
     as_json: AsJson = False,
 ) -> None:
     """Write the instructor's reference: derivations, numbers put in, what to expect."""
-    from pipeline.output import check_folder, own_folder
+    from pipeline.grading.rubric_file import load_rubric
+    from pipeline.output import named_folder, own_folder
     from pipeline.report.solution.write import make_solution
+    from pipeline.report.words import with_symbols
     from pipeline.submission import load_submission
 
-    submission = load_submission(folder)
-    out = check_folder(out) if out else own_folder(submission.folder, "solution")
+    submission, asked = load_submission(folder), load_rubric(rubric) if rubric else None
+    out = named_folder(out) if out else own_folder(submission.folder, "solution")
     with progress_line() as progress:
-        analysis, text = make_solution(submission, out, pdf=pdf, progress=progress)
-    failed = [f"cartlab: {check.id}: {check.message}" for check in analysis.failed_checks]
+        analysis, text = make_solution(submission, out, rubric=asked, pdf=pdf, progress=progress)
+    failed = [f"cartlab: {with_symbols(check.message)}" for check in analysis.failed_checks]
     for line in failed:  # what could not be read is among them
         say(line)
     doubtful = ", doubtful as the checks above failed" if analysis.failed_checks else ""
@@ -238,14 +248,14 @@ def explain(
 ) -> tuple[str, list[str]]:
     """Write what a submission's linear model leaves out; return gap.json and what is to be said."""
     from pipeline.gap.stored import gap_text
-    from pipeline.output import check_folder, own_folder, write_file
+    from pipeline.output import named_folder, own_folder, write_file
     from pipeline.report.gap.page import render_gap
     from pipeline.report.gap.words import terminal_verdict
     from pipeline.submission import load_submission
     from pipeline.workflow import analyse
 
     submission = load_submission(folder)
-    out = check_folder(out) if out else own_folder(submission.folder, "gap")
+    out = named_folder(out) if out else own_folder(submission.folder, "gap")
     analysis = analyse(submission, design=False, progress=progress)
     from pipeline.bench.design.discriminate import propose_for  # load the …
     from pipeline.gap.investigate import investigate  # … compiled simulator

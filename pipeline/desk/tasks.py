@@ -59,6 +59,7 @@ def report(folder: str, *, progress: Progress) -> dict[str, Any]:
     from pipeline.report.draft.changes import changes_line, compare_drafts, read_results
     from pipeline.report.draft.write import make_report
     from pipeline.report.sections.questions import ask
+    from pipeline.report.words import with_symbols
 
     submission = load_submission(Path(folder))
     out = own_folder(submission.folder, "report")
@@ -71,11 +72,13 @@ def report(folder: str, *, progress: Progress) -> dict[str, Any]:
 
     with alone_in(out):
         analysis, changes = make_report(submission, out, compared=compared, progress=progress)
-        asked = [{"id": question.id, "text": question.text} for question in ask(analysis)]
+        asked = [
+            {"id": question.id, "text": with_symbols(question.text)} for question in ask(analysis)
+        ]
         told = {
             "questions": asked,
-            "changes": changes_line(changes) if changes else "",
-            "failed": [check.message for check in analysis.failed_checks],
+            "changes": with_symbols(changes_line(changes)) if changes else "",
+            "failed": [with_symbols(check.message) for check in analysis.failed_checks],
             "unreadable": dict(analysis.unreadable),
         }
         write_file(out / ASKED, json.dumps(told, ensure_ascii=False))

@@ -6,6 +6,7 @@ teams, the planted code for nine mistakes of ten and more (`tests/statistics/tes
 """
 
 from decimal import Decimal
+from fractions import Fraction
 
 # ---------------------------------------- what the recordings say, and whether it is to be trusted
 
@@ -103,6 +104,14 @@ EXACT = 1e-6  # a 0 or 1 of A is met within what a computer adds to it: 1.2e-17 
 # Standard errors of an honest table's numbers, and how many of them its A and B may lie off: two
 # routes from the table to one coupling part by as much.
 HONEST, HONEST_DAMPING, HONEST_SIGMAS = 0.01, 0.1, 2.0
+
+# ----------------------------------------------------------------- what wrong numbers come to
+
+# At most so much of a criterion is kept by a model or a controller that would break the bench, or
+# move it the wrong way: all its other numbers are of no use then.
+KEPT_IF_HARMFUL = Fraction(1, 4)
+# Growth per second over the largest eigenvalue: less is what a computer leaves of a free body.
+GROWS = 1e-6
 
 # -------------------------------------------------------------------------------- the controller
 

@@ -8,12 +8,15 @@ from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
 
 from pipeline.names import parameter_names
 from pipeline.results_of_runs import Kind
+from pipeline.schemas.grade import Code
 from pipeline.submission import Design, System
 
 Points = Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)]
 Percent = Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)]
 Sigmas = Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1, le=1000)]
+Step = Annotated[float, Field(ge=0.01, le=1000, allow_inf_nan=False)]
+Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 
 
 class _Model(BaseModel):
@@ -48,6 +51,38 @@ class Late(_Model):
     percent_per_day: Percent = 0.0
     grace_days: Annotated[float, Field(ge=0, le=365, allow_inf_nan=False)] = 0.0
     most_percent: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 100.0
+
+
+class FlagCosts(_Model):
+    """By code, the least share of its criterion's points that a remark costs.
+
+    The tolerances already weigh each wrong number. But one wrong entry among the many of A and B
+    makes another model of the carts, and its share of the entries does not say so. Whether
+    `shared_data` is a copy is for a person to say, who gives the points by hand.
+    """
+
+    hz_for_rad_s: Share = 0.0
+    peak_count: Share = 0.0
+    peak_for_steady_state: Share = 0.0
+    peak_to_peak: Share = 0.0
+    transient_used: Share = 0.0
+    carts_swapped: Share = 0.0
+    counts_for_length: Share = 0.0
+    log10_for_ln: Share = 0.0
+    no_fit_done: Share = 0.0
+    final_off: Share = 0.0
+    initial_off: Share = 0.0
+    initial_final_disagree: Share = 0.0
+    physically_impossible: Share = 0.0
+    wrong_state_space: Share = 0.5
+    wrong_gains: Share = 0.0
+    wrong_prefilter: Share = 0.0
+    missing: Share = 0.0
+    data_problem: Share = 0.0
+
+    def of(self, code: Code) -> float:
+        """Return what the remark of a code costs."""
+        return getattr(self, code, 0.0)
 
 
 class _Criterion(_Model):
@@ -186,6 +221,7 @@ class Rubric(_Model):
     Attributes
     ----------
     system, design : win over the submission's own; without `design` the submission's is used.
+    step : points are rounded to it.
     anonymous : names stay out of what is written unless asked for.
     examples : submission folders handed out with the task, from the rubric's own folder: their
         recordings may stand in anybody's submission.
@@ -197,6 +233,8 @@ class Rubric(_Model):
     design: Design | None = None
     required: Required = Required()
     late: Late = Late()
+    step: Step = 0.01
+    flags: FlagCosts = FlagCosts()
     anonymous: bool = False
     examples: tuple[str, ...] = ()
     criteria: tuple[Criterion, ...]

@@ -1,7 +1,11 @@
 """Read a rubric; every mistake in it is one line that names file, line, key and what is near."""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from copy import deepcopy
+from dataclasses import dataclass
+from decimal import Decimal
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, get_args
 
@@ -13,9 +17,17 @@ from pipeline.errors import ConfigError
 from pipeline.grading import rubric
 from pipeline.grading.rubric import InitialFinal, Parameters, Rubric, matching
 from pipeline.resources import RUBRICS
-from pipeline.submission.complaints import Location, dotted, explain, nearest, without_tag
+from pipeline.submission.complaints import (
+    Location,
+    dotted,
+    explain,
+    nearest,
+    quote,
+    told_once,
+    without_tag,
+)
 from pipeline.submission.load import spring_names
-from pipeline.submission.toml_file import parse_toml, read_text
+from pipeline.submission.toml_file import Toml, at_line, read_text, read_toml
 
 _MAX_BYTES = 1_000_000
 _CHECKS: dict[str, type[BaseModel]] = {
@@ -31,9 +43,14 @@ _TABLES: dict[str, type[BaseModel]] = {
     "required": rubric.Required,
     "required.experiments": rubric.RequiredRuns,
     "late": rubric.Late,
+    "flags": rubric.FlagCosts,
     **{f"criteria.{check}": model for check, model in _CHECKS.items()},
 }
+_OF_CRITERIA = tuple(rubric.DataQuality.model_fields)  # the keys that every check has
+# Values that contradict nothing, for those that are wrong or missing.
+_HARMLESS: dict[str | int, Any] = {"version": 1, "points": 1.0, "id": "criterion", "kind": "step"}
 _HEADER = re.compile(r"\s*(\[\[?)\s*([^\[\]]+?)\s*\]\]?\s*(?:#.*)?$")
+_ID = re.compile(r"^\s*id\s*=\s*[\"']([^\"']*)", re.MULTILINE)
 _KEY = re.compile(r"\s*([A-Za-z0-9_.\"'-]+)\s*=")
 
 
@@ -63,45 +80,148 @@ def rubric_source(path: Path) -> str:
     return read_text(path, where=path.name, limit=_MAX_BYTES, error=ConfigError)
 
 
+class InvalidRubric(ConfigError):
+    """A rubric with mistakes in it.
+
+    Attributes
+    ----------
+    problems : (line, what is wrong) in the order of the file; line 0 is all of it.
+    """
+
+    def __init__(self, where: str, problems: Sequence[tuple[int, str]]) -> None:
+        self.problems = tuple(problems)
+        super().__init__("\n".join(at_line(where, line, what) for line, what in self.problems))
+
+
 def parse_rubric(text: str, *, where: str) -> Rubric:
     """Check the text of a rubric; `where` is what to call the file.
 
     Raises
     ------
-    ConfigError : one line for every mistake, with file, line, key and what was expected.
+    InvalidRubric : with every mistake, its line, its key and what was expected.
     """
-    document = parse_toml(text, where=where, error=ConfigError)
-    problems = _validate(document)
-    if isinstance(problems, Rubric):
-        found, problems = problems, list(_contradictions(problems))
-        if not problems:
-            return found
-        problems = [(at, f"{dotted(at, document)}: {what}") for at, what in problems]
-    lines = [(_line_of(text, at), what) for at, what in problems]
-    raise ConfigError("\n".join(f"{where} line {line}: {what}" for line, what in sorted(lines)))
+    read = read_toml(text, tables=_TABLES)
+    problems = list(read.slips)
+    if read.document or not problems:
+        lost = set(_ID.findall(text)) if problems else set()
+        found = _validate(_tuples(read.document), lost=lost)
+        if not problems and not found.complaints and found.rubric is not None:
+            return found.rubric
+        problems += [
+            (line, one.what)
+            for one in found.complaints
+            if not ((line := _line_of(read.text, one.at)) and _is_of_slip(one, line, read))
+        ]
+    raise InvalidRubric(where, sorted(problems))
 
 
-def _validate(document: dict) -> Rubric | list[tuple[Location, str]]:
+@dataclass(frozen=True, kw_only=True)
+class _Complaint:
+    """What is wrong at a place of the document; `missing`: there is nothing."""
+
+    at: Location
+    what: str
+    missing: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Validated:
+    rubric: Rubric | None
+    complaints: Sequence[_Complaint]
+
+
+def _is_of_slip(complaint: _Complaint, line: int, read: Toml) -> bool:
+    """Whether a missing key may be in a line that is not TOML."""
+    if not complaint.missing:
+        return False
+    lines = read.text.split("\n")
+    headings = [n for n, typed in enumerate(lines, start=1) if typed.lstrip().startswith("[")]
+    end = next((n for n in headings if n > line), len(lines) + 1)
+    # A whole table is missing where its heading is the slip, wherever that is.
+    return any(len(complaint.at) == 1 or line <= slip < end for slip, _ in read.slips)
+
+
+def _validate(document: dict, *, lost: Collection[str]) -> _Validated:
+    """Check a document; what is wrong with one value hides nothing of what is with another.
+
+    Parameters
+    ----------
+    lost : ids of criteria that may be in lines that are not TOML.
+    """
+    complaints: list[_Complaint] = []
+    criteria = document.get("criteria")
+    if isinstance(criteria, tuple):
+        tagged = [_with_check(own, i, document, complaints) for i, own in enumerate(criteria)]
+        document = {**document, "criteria": tuple(tagged)}
+    rubric, wrong = _try(document)
+    complaints += [_complaint(error, document) for error in told_once(wrong)]
+    if wrong:
+        rubric, _ = _try(_without(document, wrong))
+    if rubric is not None:
+        own = criteria if isinstance(criteria, tuple) else ()
+        ids = [one.get("id") if isinstance(one, dict) else None for one in own]
+        complaints += [
+            _Complaint(at=at, what=f"{dotted(at, document)}: {what}")
+            for at, what in _contradictions(rubric, ids, lost=lost)
+        ]
+    return _Validated(rubric=rubric, complaints=complaints)
+
+
+def _try(document: dict) -> tuple[Rubric | None, list[ErrorDetails]]:
     try:
-        return Rubric.model_validate(_tuples(document), strict=True)
+        return Rubric.model_validate(document, strict=True), []
     except ValidationError as error:
-        plain, top = _tuples(document), tuple(Rubric.model_fields)
-        return [_complaint(e, plain, top) for e in error.errors()]
+        return None, error.errors()
 
 
-def _complaint(
-    error: ErrorDetails, document: dict, top_level: Sequence[str]
-) -> tuple[Location, str]:
+def _with_check(own: Any, i: int, document: dict, complaints: list[_Complaint]) -> Any:
+    """Return a criterion with a known check, so that its other keys can be checked too."""
+    if not isinstance(own, dict) or own.get("check") in _CHECKS:
+        return own
+    at: Location = ("criteria", i, "check")
+    meant = get_close_matches("check", [key for key in own if key not in _OF_CRITERIA], n=1)
+    if "check" in own:
+        typed = own["check"]
+        what = f"no such check {quote(typed)}{nearest(typed, tuple(_CHECKS))}"
+    elif meant:
+        at, typed = ("criteria", i, meant[0]), own[meant[0]]
+        what = "unknown key; did you mean 'check'?"
+    else:
+        typed, what = "", f"is required and not there{nearest('', tuple(_CHECKS))}"
+    missing = not meant and "check" not in own
+    complaints.append(_Complaint(at=at, what=f"{dotted(at, document)}: {what}", missing=missing))
+    left = {key: value for key, value in own.items() if key not in meant}
+    close = get_close_matches(str(typed), list(_CHECKS), n=1)
+    if not close:  # its own keys are those of no check, so only what all have is looked at
+        left = {key: value for key, value in left.items() if key in _OF_CRITERIA}
+    return {**left, "check": close[0] if close else "data"}
+
+
+def _complaint(error: ErrorDetails, document: dict) -> _Complaint:
     """Return where a pydantic error is, without what is no key of the file, and what it says."""
-    if error["type"] in ("union_tag_invalid", "union_tag_not_found"):
-        at = [*error["loc"], "check"]
-        found = error["input"].get("check", "") if isinstance(error["input"], dict) else ""
-        known = nearest(found, tuple(_CHECKS))
-        return at, f"{dotted(at, document)}: no such check {found!r}{known}"
-    return (
-        without_tag(error["loc"], document),
-        explain(error, document, tables=_TABLES, top_level=top_level),
+    return _Complaint(
+        at=without_tag(error["loc"], document),
+        what=explain(error, document, tables=_TABLES, top_level=tuple(Rubric.model_fields)),
+        missing=error["type"] == "missing",
     )
+
+
+def _without(document: dict, wrong: Sequence[ErrorDetails]) -> dict:
+    """Return a document with harmless values, or none, where others are wrong."""
+    left = deepcopy(document)
+    for error in wrong:
+        *way, key = without_tag(error["loc"], document)
+        here: Any = left
+        for part in way:
+            try:
+                here = here[part]
+            except (KeyError, IndexError, TypeError):
+                here = None
+        if isinstance(here, dict) and key in _HARMLESS:
+            here[key] = _HARMLESS[key]
+        elif isinstance(here, dict):
+            here.pop(key, None)
+    return left
 
 
 def _tuples(value: Any) -> Any:
@@ -113,10 +233,15 @@ def _tuples(value: Any) -> Any:
 # ------------------------------------------------- what the tables say about one another
 
 
-def _contradictions(found: Rubric) -> Iterator[tuple[Location, str]]:
+def _contradictions(
+    found: Rubric, ids: Sequence[object], *, lost: Collection[str]
+) -> Iterator[tuple[Location, str]]:
+    """Yield (location, what is wrong); `ids` are those of the criteria as they were typed."""
     n, names = found.system.carts, found.names
     if not found.criteria:
         yield ("criteria",), "there is none; add a [[criteria]] table for each"
+    if found.step != round(found.step, 2):
+        yield ("step",), f"{found.step:g}: points go to the hundredth"
     if len(found.system.springs) != n + 1:
         yield (
             ("system", "springs"),
@@ -136,19 +261,22 @@ def _contradictions(found: Rubric) -> Iterator[tuple[Location, str]]:
         for pattern in getattr(found.required, table):
             if not matching((pattern,), names):
                 yield ("required", table), f"no parameter {pattern!r}{nearest(pattern, names)}"
-    seen: set[str] = set()
-    ids = [criterion.id for criterion in found.criteria]
-    for i, criterion in enumerate(found.criteria):
-        if criterion.id in seen:
-            yield ("criteria", i, "id"), f"{criterion.id!r} is used before"
+    seen: set[object] = set()
+    known_ids = [id_ for id_ in ids if isinstance(id_, str)]
+    for i, (id_, criterion) in enumerate(zip(ids, found.criteria, strict=True)):
+        if id_ is not None and id_ in seen:
+            yield ("criteria", i, "id"), f"{id_!r} is used before"
         for parent in criterion.requires:
-            if parent not in seen:
+            if parent not in seen and (parent in ids or parent not in lost):
                 where = "comes later" if parent in ids else "is no criterion"
-                known = "" if parent in ids else nearest(parent, ids)
+                known = "" if parent in ids else nearest(parent, known_ids)
                 yield ("criteria", i, "requires"), f"{parent!r} {where}{known}"
-        seen.add(criterion.id)
-        if criterion.points != round(criterion.points, 2):
-            yield ("criteria", i, "points"), f"{criterion.points:g}: points go to the hundredth"
+        seen.add(id_)
+        points = criterion.points
+        if points != round(points, 2):
+            yield ("criteria", i, "points"), f"{points:g}: points go to the hundredth"
+        elif Decimal(str(points)) % Decimal(str(found.step)):
+            yield ("criteria", i, "points"), f"{points:g} is no multiple of step = {found.step:g}"
         if isinstance(criterion, Parameters | InitialFinal):
             for pattern in criterion.parameters:
                 if not matching((pattern,), names):

@@ -25,8 +25,3 @@ AS_GOOD = 1.15  # times the error: a rival that the data do not tell from what w
 # A factor on the logged input is believed where 0.6 of the error goes with it; within 1.5 it is no
 # other scale, but the model's error.
 WORTH_SCALING, OTHER_SCALE = 0.6, 1.5
-
-# ---- what a rubric would accept. What two careful teams on one bench differ by: gains and
-# frequencies by some percent, damping ratios by ten times that, since they are small and dry
-# friction adds to them; and by the standard errors of the reference itself.
-GAIN_AND_FREQUENCY_TOLERANCE, DAMPING_TOLERANCE, SIGMAS = 0.03, 0.30, 3.0

@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import ConfigDict, Field
 
-from pipeline.schemas.base import Document, json_text
+from pipeline.schemas.base import Document, Units, json_text
 
 Outcome = Literal["pass", "partial", "fail", "skip"]
 Code = Literal[
@@ -78,10 +78,15 @@ class Grade(Document):
     out_of: float
     days_late: float = 0.0
     deducted: Annotated[float, Field(description="for lateness, already out of `points`")] = 0.0
-    reason: Annotated[str, Field(description="why it could not be graded, or empty")] = ""
+    reason: Annotated[
+        str, Field(description="why it could not be graded, a line for each reason, or empty")
+    ] = ""
     criteria: tuple[Criterion, ...] = ()
     flags: tuple[Flag, ...] = ()
     notes: tuple[str, ...] = ()
+    units: Annotated[
+        Units | None, Field(description="of the numbers in the criteria; none where not judged")
+    ] = None
     springs: Annotated[
         tuple[str, ...],
         Field(description="that the recordings ask for and the rubric does not have"),

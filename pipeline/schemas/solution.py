@@ -17,13 +17,16 @@ class SolutionSubmission(Document):
 
 
 class ExpectedParameter(Document):
-    """A parameter with the half-width of what is accepted, both in its unit."""
+    """A parameter and what the rubric gives full points for; null where it is not judged."""
 
     name: str
     unit: str
     value: float
     std: Number
-    tolerance: float
+    percent: Annotated[Number, Field(description="beyond the reference's own bounds")]
+    low: Annotated[Number, Field(description="the least for full points, in its unit")]
+    high: Annotated[Number, Field(description="the most for full points, in its unit")]
+    tolerance: Annotated[Number, Field(description="half of the way between the two")]
 
 
 class ExpectedStateSpace(Document):
@@ -62,6 +65,7 @@ class Solution(Document):
 
     schema_: Annotated[Literal["cartlab-solution/1"], Field(alias="schema")]
     submission: SolutionSubmission
+    rubric: Annotated[str, Field(description="title of the one that says what is accepted")]
     parameters: tuple[ExpectedParameter, ...]
     state_space: ExpectedStateSpace | None
     feedback: ReferenceFeedback | None

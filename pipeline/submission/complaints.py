@@ -14,6 +14,7 @@ from pipeline.submission import models
 Location = Sequence[int | str]
 
 _LONGEST_QUOTE = 60  # characters of a found value worth showing
+MOST_TOLD = 20  # problems of a file; to find what a misspelt key may mean takes a while
 _MOST_KNOWN = 40  # of what would do
 
 # The tables of the format, by their dotted path without the numbers.
@@ -82,11 +83,14 @@ def nearest(name: object, candidates: Sequence[str]) -> str:
     return f"; known: {first_few(candidates, _MOST_KNOWN)}" if candidates else ""
 
 
-def takes_numbers(key: str) -> bool:
-    """Tell whether a key of the format holds numbers and no text, in whatever table it stands."""
+def takes_numbers(key: str, tables: Mapping[str, type[models.BaseModel]] | None = None) -> bool:
+    """Tell whether a key of a format holds numbers and no text, in whatever table it stands.
+
+    `tables` are the models of the format, by default those of a submission.
+    """
     kinds = [
         kind
-        for model in _TABLES.values()
+        for model in (_TABLES if tables is None else tables).values()
         if key in model.model_fields
         for kind in _kinds(model.model_fields[key].annotation)
     ]
@@ -162,6 +166,26 @@ def refusal(error: ErrorDetails) -> str:
     if kind not in _EXPECTED:
         return f"{error['msg']}, found {found}"
     return f"expected {_EXPECTED[kind].format(**error.get('ctx', {}))}, found {found}"
+
+
+def told_once(errors: Sequence[ErrorDetails]) -> list[ErrorDetails]:
+    """Return errors, unknown keys first, without what is only missing because it is misspelt."""
+    unknown = [error for error in errors if error["type"] == "extra_forbidden"]
+
+    def is_misspelt(error: ErrorDetails) -> bool:
+        *table, key = error["loc"]
+        typed = [str(one["loc"][-1]) for one in unknown if [*one["loc"][:-1]] == table]
+        return bool(get_close_matches(str(key), typed[:_MOST_KNOWN], n=1))
+
+    others = [error for error in errors if error["type"] != "extra_forbidden"]
+    return [*unknown, *(e for e in others if e["type"] != "missing" or not is_misspelt(e))]
+
+
+def all_told(where: str, problems: Sequence[str], *, more: int = 0) -> str:
+    """Return what is wrong with a file, a line for each problem, and how many more there are."""
+    beyond = max(len(problems) - MOST_TOLD, 0) + more
+    lines = [f"{where}: {what}" for what in problems[:MOST_TOLD]]
+    return "\n".join([*lines, *([f"{where}: and {beyond} more"] if beyond else [])])
 
 
 def without_tag(location: Location, document: object) -> list[int | str]:

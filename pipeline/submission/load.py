@@ -14,12 +14,15 @@ from pydantic import ValidationError
 from pipeline.errors import SubmissionError
 from pipeline.names import parameter_names
 from pipeline.submission.complaints import (
+    MOST_TOLD,
     TOP_LEVEL,
     Location,
+    all_told,
     dotted,
     explain,
     nearest,
     quote,
+    told_once,
     without_tag,
 )
 from pipeline.submission.models import Experiment, Reported, StateFeedback, Submission
@@ -32,7 +35,6 @@ MAX_DATA_BYTES = 100_000_000  # over half an hour at 1 kHz
 _LARGEST = Decimal("1e30")  # beyond any physical number in any unit, yet safe to multiply
 _MOST_DIGITS = 1_000
 _MOST_SHOWN = 30_000  # characters of the notes: fifteen pages
-_MOST_WORDED = 20  # problems; to find what a misspelt key may mean takes a while
 _MOST_LOOKED_AT = 1_000  # files and folders, for the one that may be meant
 COMMENT = re.compile(r"<!--.*?(?:-->|\Z)", re.DOTALL)  # one left open runs to the end
 _SYSTEM_COLUMNS = ("time", "input", "reference", "frequency")
@@ -71,15 +73,14 @@ class InvalidSubmission(SubmissionError):
 
     Attributes
     ----------
-    problems : the first that were found, each with its place; the text is the very first.
+    problems : the first that were found, each with its place; the text has a line for each.
     """
 
     def __init__(
         self, where: str, problems: Sequence[tuple[Location, str]], *, more: int = 0
     ) -> None:
         self.problems = tuple(problems)
-        others = len(problems) - 1 + more
-        super().__init__(f"{where}: {problems[0][1]}{f' (and {others} more)' if others else ''}")
+        super().__init__(all_told(where, [what for _, what in problems], more=more))
 
 
 def parse_submission(text: str, *, folder: Path, where: str = NAME) -> Submission:
@@ -118,10 +119,11 @@ def parse_submission(text: str, *, folder: Path, where: str = NAME) -> Submissio
 
 
 def _validate(document: dict, *, where: str) -> Submission:
-    for key in document:
-        if key not in TOP_LEVEL:
-            what = f"{dotted([key], document)}: unknown key{nearest(key, TOP_LEVEL)}"
-            raise InvalidSubmission(where, [((key,), what)])
+    unknown: list[tuple[Location, str]] = [
+        ((key,), f"{dotted([key], document)}: unknown key{nearest(key, TOP_LEVEL)}")
+        for key in islice((key for key in document if key not in TOP_LEVEL), MOST_TOLD)
+    ]
+    document = {key: value for key, value in document.items() if key in TOP_LEVEL}
     try:
         plain = {key: _plain(value, (key,)) for key, value in document.items()}
     except _Unusable as error:
@@ -130,13 +132,16 @@ def _validate(document: dict, *, where: str) -> Submission:
     except RecursionError:
         raise SubmissionError(f"{where}: lists or tables nest too deeply") from None
     try:
-        return Submission.model_validate(plain, strict=True)
+        submission = Submission.model_validate(plain, strict=True)
     except ValidationError as error:
-        # A misspelt required key is both unknown and missing: the first says more.
-        found = sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
-        first = found[:_MOST_WORDED]
+        found = told_once(error.errors())
+        first = found[:MOST_TOLD]
         worded = [(without_tag(e["loc"], plain), explain(e, plain)) for e in first]
-        raise InvalidSubmission(where, worded, more=len(found) - len(first)) from None
+        more = len(found) - len(first)
+        raise InvalidSubmission(where, [*unknown, *worded], more=more) from None
+    if unknown:
+        raise InvalidSubmission(where, unknown)
+    return submission
 
 
 class _Unusable(Exception):

@@ -3,16 +3,22 @@
 import re
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
+
+from pydantic import BaseModel
 
 from pipeline.errors import PipelineError
 from pipeline.submission.complaints import quote, takes_numbers
 
+Tables: TypeAlias = Mapping[str, type[BaseModel]]
 Value: TypeAlias = "str | bool | int | float | Sequence[Value] | Mapping[str, Value]"
 _MAX_KEY_DEPTH = 30  # tomllib's time grows with the square of a dotted key's depth
 _DOTTED_KEY = re.compile(r"[\w\"'-]+(?:[ \t]*\.[ \t]*[\w\"'-]+)*")
 _LONGEST_LINE, _SHOWN = 300, 60  # characters of a line that are looked at, and shown
+_LONGEST_MENDED, _MOST_PASSES = 50_000, 30  # characters that are read again after a slip; times
+_BEGINS = re.compile(r"\s*(#|\[|[\w\"'.-]+\s*=)")  # a line that is no rest of the one before
 _AT = re.compile(r" \(at line (\d+), column (\d+)\)$")
 _NUMBER = r"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?"
 
@@ -135,12 +141,29 @@ def _too_large(where: str, size: int, limit: int) -> str:
     return f"{where}: {size:,} bytes, the limit is {limit:,}"
 
 
+@dataclass(frozen=True, kw_only=True)
+class Toml:
+    """The readable part of a text, and its slips.
+
+    Attributes
+    ----------
+    document : the content of the lines that can be read.
+    text : those lines, each in its place; the others are empty.
+    slips : (line, what is wrong) of the others, in their order. Line 0 means the whole text.
+    """
+
+    document: dict[str, Any]
+    text: str
+    slips: tuple[tuple[int, str], ...] = ()
+
+
 def parse_toml(
     text: str,
     *,
     where: str,
     error: type[PipelineError],
     parse_float: Callable[[str], Any] = float,
+    tables: Tables | None = None,
 ) -> dict[str, Any]:
     """Parse TOML that somebody typed.
 
@@ -148,32 +171,76 @@ def parse_toml(
     ----------
     where : what to call the file; a line's number is added.
     error : whose mistake it is.
+    tables : the models of the format, by default those of a submission.
 
     Raises
     ------
-    PipelineError : of the kind `error`; one line with the line's number and what to write.
+    PipelineError : of the kind `error`; for each slip a line with its number and what to write.
     """
+    read = read_toml(text, parse_float=parse_float, tables=tables)
+    if read.slips:
+        raise error("\n".join(at_line(where, line, what) for line, what in read.slips))
+    return read.document
+
+
+def at_line(where: str, line: int, what: str) -> str:
+    """Return what is wrong with a line of a file, or with all of it where the line is 0."""
+    return f"{where} line {line}: {what}" if line else f"{where}: {what}"
+
+
+def read_toml(
+    text: str,
+    *,
+    parse_float: Callable[[str], Any] = float,
+    tables: Tables | None = None,
+) -> Toml:
+    """Read what can be read of TOML that somebody typed: a slip hides nothing in other lines."""
     for key in _DOTTED_KEY.finditer(text):
         if key.group().count(".") > _MAX_KEY_DEPTH:
             line = text.count("\n", 0, key.start()) + 1
-            raise error(f"{where} line {line}: keys nest too deeply")
-    try:
-        return tomllib.loads(text, parse_float=parse_float)
-    except tomllib.TOMLDecodeError as wrong:
-        message = " ".join(str(wrong).split())
-        at = _AT.search(message)
-        line = int(at[1]) if at else text.count("\n") + 1
-        typed = text.split("\n")[line - 1].strip()
-        shown = typed if typed.isprintable() and len(typed) <= _SHOWN else quote(typed)
-        words = _words(typed, _AT.sub("", message))
-        raise error(f"{where} line {line}: {words}; found {shown or 'the end'}") from None
-    except RecursionError:
-        raise error(f"{where}: lists or tables nest too deeply") from None
-    except ValueError:  # an integer of thousands of digits
-        raise error(f"{where}: a number has too many digits") from None
+            return Toml(document={}, text="", slips=((line, "keys nest too deeply"),))
+    typed, slips = text.split("\n"), list[tuple[int, str]]()
+    lines, emptied = list(typed), 0
+    for _ in range(_MOST_PASSES if len(text) <= _LONGEST_MENDED else 1):
+        try:
+            document = tomllib.loads("\n".join(lines), parse_float=parse_float)
+            return Toml(document=document, text="\n".join(lines), slips=tuple(slips))
+        except tomllib.TOMLDecodeError as wrong:
+            message = " ".join(str(wrong).split())
+            at = _AT.search(message)
+            line = int(at[1]) if at else len(lines)
+            words = _words(typed[line - 1].strip(), _AT.sub("", message), tables)
+            # The rest of a list or text whose first line is gone is no mistake of its own.
+            if line != emptied + 1 or _BEGINS.match(typed[line - 1]):
+                shown = typed[line - 1].strip()
+                shown = shown if shown.isprintable() and len(shown) <= _SHOWN else quote(shown)
+                slips.append((line, f"{words}; found {shown or 'the end'}"))
+            first, emptied = _spoilt(lines, line, words)
+            if not any(map(str.strip, lines[first - 1 : emptied])):
+                break
+            lines[first - 1 : emptied] = [""] * (emptied + 1 - first)
+        except RecursionError:
+            slips.append((0, "lists or tables nest too deeply"))
+            break
+        except ValueError:  # an integer of thousands of digits
+            slips.append((0, "a number has too many digits"))
+            break
+    return Toml(document={}, text="", slips=tuple(slips))
 
 
-def _words(line: str, message: str) -> str:
+def _spoilt(lines: Sequence[str], line: int, words: str) -> tuple[int, int]:
+    """Return the first and last line that a slip, found at `line`, takes with it."""
+    if words == _UNCLOSED:
+        for n in range(line - 1, 0, -1):
+            if lines[n - 1].count("[") > lines[n - 1].count("]"):
+                return n, line - 1
+    if lines[line - 1].lstrip().startswith("["):  # its keys would go to the table before
+        after = (n for n in range(line, len(lines)) if lines[n].lstrip().startswith("["))
+        return line, next(after, len(lines))
+    return line, line
+
+
+def _words(line: str, message: str, tables: Tables | None) -> str:
     """Return what is wrong with a line, by what it looks like, else by what the parser says."""
     for said, words in _SAID:
         if re.fullmatch(said, message):
@@ -182,7 +249,7 @@ def _words(line: str, message: str) -> str:
     for slip, words, mends in _SLIPS:
         if re.search(slip, looked_at):
             key = looked_at.partition("=")[0].strip()
-            if words == _TEXT and takes_numbers(key):
+            if words == _TEXT and takes_numbers(key, tables):
                 return f"{key} takes a number, written in digits"
             return words + _mended(looked_at, mends)
     return f"not valid TOML: {message}"

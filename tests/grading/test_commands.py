@@ -132,6 +132,21 @@ def test_an_export_lies_beside_the_grades(run, grades, tmp_path, lms):
     assert (tmp_path / "elsewhere" / f"{lms}.csv").is_file()
 
 
+@pytest.mark.parametrize("lms", ["canvas", "moodle", "gradescope"])
+def test_an_export_into_a_file_writes_that_file(run, grades, tmp_path, lms):
+    """`--out gs.csv` is the table, and nothing else; another file's name is refused."""
+    folder = tmp_path / "exported"
+    status, _, err = run("export", grades, "--lms", lms, "--out", folder / "gs.csv")
+    assert status == 0
+    assert err.strip().endswith(f"wrote {folder / 'gs.csv'}")
+    assert [path.name for path in folder.iterdir()] == ["gs.csv"]
+    run("export", grades, "--lms", lms, "--out", tmp_path)
+    assert (folder / "gs.csv").read_bytes() == (tmp_path / f"{lms}.csv").read_bytes()
+    status, _, err = run("export", grades, "--lms", lms, "--out", tmp_path / "gs.xlsx")
+    assert status == 2
+    assert "gs.xlsx: several files are written; name a folder" in err
+
+
 def test_an_export_that_leaves_points_out_ends_so(run, grades, tmp_path):
     """Where the platform's table has no row for a team that has points: exit status 1."""
     roster = tmp_path / "roster.csv"

@@ -6,9 +6,11 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import ConfigError
+from pipeline.grading.rubric import FlagCosts
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.grading.rubric_text import rubric_dict, rubric_text
 from pipeline.resources import RUBRICS
+from pipeline.schemas.grade import CODES
 
 SHIPPED = sorted(RUBRICS.glob("*.toml"))
 GOOD = """\
@@ -82,6 +84,33 @@ def test_a_pattern_is_written_out(tmp_path):
         ('unit = "V"', 'unti = "V"', 6, r"system\.input\.unti: unknown key; did you mean 'unit'"),
         ("points = 2", "pionts = 2", 16, r"criteria\[1\]\.pionts \(gains\): unknown key; did you"),
         ("points = 2", "points = 0", 16, r"points \(gains\): expected more than 0"),
+        (
+            'check = "final"',
+            'chek = "final"',
+            17,
+            r"\.chek \(gains\): unknown key; did you mean 'chec",
+        ),
+        ('check = "final"\n', "", 14, r"check \(gains\): is required and not there; known: req"),
+        ("points = 2", "points = two", 16, r"points takes a number, written in digits; found po"),
+        (
+            "version = 1",
+            "version = 1\nstep = 0.4",
+            23,
+            r"points \(model\): 1\.5 is no multiple of st",
+        ),
+        (
+            "version = 1",
+            "version = 1\nstep = 0.125",
+            2,
+            r"step: 0\.125: points go to the hundredth",
+        ),
+        ("[required]", "[flags]\nwrong_state = 1\n[required]", 9, r"you mean 'wrong_state_space'"),
+        (
+            "[required]",
+            "[flags]\nmissing = 2\n[required]",
+            9,
+            r"flags\.missing: expected at most 1",
+        ),
         ('check = "final"', 'check = "finla"', 17, r"no such check 'finla'; did you mean 'final'"),
         ('"K_*"]\n\n[[r', '"K_9"]\n\n[[r', 9, r"required\.final: no parameter 'K_9'"),
         ('parameters = ["K_*"]', 'parameters = ["L_*"]', 18, r"no parameter 'L_\*'"),
@@ -109,8 +138,29 @@ def test_every_mistake_has_its_own_line(tmp_path):
     with pytest.raises(ConfigError) as caught:
         load_rubric(write(tmp_path, text))
     lines = [int(line.split()[2].rstrip(":")) for line in str(caught.value).splitlines()]
-    assert lines == sorted(lines)
-    assert {1, 12, 16} <= set(lines)
+    assert lines == [1, 12, 16]
+
+
+def test_a_slip_in_a_line_hides_no_other_mistake(tmp_path):
+    """No TOML, a check, a value, a key, and what tables say of one another: all at once."""
+    text = GOOD.replace("version = 1", "vresion = 1").replace("points = 2", "points = two")
+    text = text.replace('kind = "step"', "kind = stpe").replace('unit = "V"', 'unti = "V"')
+    text = text.replace('check = "state_space"', 'chek = "state_spaec"\nfull_percent = 30')
+    text = text.replace('requires = ["gains"]', 'requires = ["gians"]')
+    text += '\n[[criteria]]\nid = "model"\npoints = -1\ncheck = "data"\nparameters = ["K_*"]\n'
+    with pytest.raises(ConfigError) as caught:
+        load_rubric(write(tmp_path, text))
+    lines = [int(line.split()[2].rstrip(":")) for line in str(caught.value).splitlines()]
+    assert lines == [1, 6, 12, 16, 23, 24, 25, 28, 29, 31], str(caught.value)
+
+
+def test_a_table_without_its_bracket_is_one_mistake(tmp_path):
+    """What stands under a heading that is none is not missing, and a criterion is still one."""
+    text = GOOD.replace("[[criteria]]", "[[criteria]", 1).replace("[required]", "[required")
+    with pytest.raises(ConfigError) as caught:
+        load_rubric(write(tmp_path, text))
+    said = str(caught.value).splitlines()
+    assert [int(line.split()[2].rstrip(":")) for line in said] == [8, 14]
 
 
 def test_a_criterion_may_only_build_on_an_earlier_one(tmp_path):
@@ -124,6 +174,12 @@ def test_a_rubric_that_is_not_there_names_the_shipped_ones():
     """A misspelt name is answered with the nearest shipped rubric."""
     with pytest.raises(ConfigError, match="did you mean 'throne-2dof'"):
         load_rubric(Path("throne-2dofs"))
+
+
+def test_every_remark_has_its_cost():
+    """Each code may be given a cost, but for the one that a person decides."""
+    assert {*FlagCosts.model_fields} == {*CODES} - {"shared_data"}
+    assert all(load_rubric(path).flags.wrong_state_space == 0.5 for path in SHIPPED)
 
 
 def test_toml_that_is_none_says_where(tmp_path):

@@ -132,6 +132,22 @@ def test_wrong_terms_are_refused(key, place, values, message):
         make_term(find_effect(key), place=place, values=values, chain=PRESETS["throne-2dof"])
 
 
+@pytest.mark.parametrize(
+    ("typed", "meant"),
+    [
+        ("friction", "'coulomb_friction', 'presliding_friction' or 'load_friction'"),
+        ("Coulomb friction", "'coulomb_friction'"),
+        ("delay", "'input_delay'"),
+        ("dahl", "'presliding_friction'"),
+        ("colomb_frction", "'coulomb_friction'"),
+    ],
+)
+def test_a_word_of_a_name_finds_the_effects_that_have_it(typed, meant):
+    """The commonest comes first; a misspelt name finds the nearest."""
+    with pytest.raises(ConfigError, match=rf"did you mean {meant}\?"):
+        find_effect(typed)
+
+
 def test_unknown_effect_is_refused():
     """A name that is not in the catalogue is one clear error that lists the names."""
     with pytest.raises(ConfigError, match="no effect 'glue'; known: coulomb_friction"):

@@ -85,6 +85,6 @@ def test_what_is_written_is_what_the_report_shows(lines, answer, at):
         new = with_answer(notes, "level", answer)
     except SubmissionError:
         return
-    asked = [Asked(id="level", section="x", text="")]
+    asked = [Asked(kind="level", id="level", section="x", text="")]
     assert bool(split_notes(discussion_blocks(new), asked)[0]) == bool(discussion_blocks(answer))
     assert written_answer(new, "level") == answer.strip()

@@ -23,7 +23,9 @@ from pipeline.report.document import (
     plain,
     spans,
 )
+from pipeline.report.draft.content import build_document
 from pipeline.report.draft.write import render_report
+from pipeline.report.render.html import render_html
 from pipeline.report.render.pdf import missing_characters, render_pdf
 from pipeline.report.sections.housekeeping import file_table, provenance_blocks
 from pipeline.report.sections.measurements import decay_blocks
@@ -235,6 +237,20 @@ def test_the_page_can_be_found_and_heard(folders):
     assert sum(tag == "title" for tag, _ in page.tags) == 1  # one in a drawing would pop up
     assert sum(attrs.get("display") == "block" for tag, attrs in page.tags if tag == "math") >= 6
     assert ("html", {"lang": "en"}) in page.tags
+
+
+def test_a_report_without_a_title_says_what_it_is_once():
+    """What it is about is its title then, and stands nowhere above it."""
+    analysis = make_analysis(2)
+    named = build_document(analysis, progress=None)
+    bare = build_document(replace(analysis, title=" "), progress=None)
+    assert (named.title, named.subtitle) == (
+        "The 2-cart system, bench 4", "Section 03 · Identification and control of 2 carts",
+    )  # fmt: skip
+    assert (bare.title, bare.subtitle) == ("Identification and control of 2 carts", "Section 03")
+    nothing = build_document(replace(analysis, title="", section=""), progress=None)
+    assert nothing.subtitle == ""
+    assert "kicker" not in render_html(nothing).split("<main", 1)[-1].split("<section", 1)[0]
 
 
 def test_the_same_analysis_gives_the_same_bytes(folders, tmp_path):

@@ -3,7 +3,9 @@
 import json
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from decimal import Decimal
+from html import unescape
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -13,18 +15,30 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from sympy.parsing.sympy_parser import parse_expr
 
+from pipeline.errors import ConfigError
+from pipeline.grading.rubric_file import load_rubric
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.presets import PRESETS
-from pipeline.report.document import Formula
+from pipeline.report.document import Formula, plain
 from pipeline.report.equations import derivation
 from pipeline.report.equations.algebra import evaluate, shown, shown_with, value_term, work_out
 from pipeline.report.equations.derivation import work_state_model
 from pipeline.report.math.tree import to_text
+from pipeline.report.render.html import render_html
+from pipeline.report.sections.questions import Asked, Kind, ask
 from pipeline.report.solution.design import work_design
-from pipeline.report.solution.expected import expected_model, expected_parameters, solution_text
-from pipeline.report.solution.write import build_solution
+from pipeline.report.solution.expected import (
+    check_carts,
+    default_rubric,
+    expected_model,
+    expected_parameters,
+    solution_text,
+)
+from pipeline.report.solution.write import build_solution, model_answer
+from pipeline.resources import RUBRICS
 from pipeline.stages.state_feedback import design_feedback
 from tests.helpers.analysis_factory import make_analysis
+from tests.helpers.grading_students import student
 from tests.plant.test_chain import chains
 
 s = sympy.Symbol("s")
@@ -292,12 +306,55 @@ def test_ackermann_is_exact_in_symbols():
 
 def test_the_reference_passes_its_own_tolerances_and_a_slip_does_not():
     """Every expected value lies within, a frequency in Hz or a doubled gain far outside."""
-    for p in expected_parameters(make_analysis(3)):
-        assert p.tolerance > 0
+    analysis = make_analysis(3)
+    for p in expected_parameters(analysis, default_rubric(analysis)):
+        assert p.tolerance is not None
+        assert p.low is not None
+        assert p.high is not None
+        assert p.low < p.value < p.high
         if p.name.startswith("omega"):
             assert abs(p.value / (2 * np.pi) - p.value) > p.tolerance
         if p.name.startswith("K"):
             assert abs(2 * p.value - p.value) > p.tolerance
+
+
+@pytest.mark.parametrize("carts", [1, 2, 3])
+def test_the_solution_accepts_what_the_rubric_gives_full_points_for(carts):
+    """Each bound, handed in by a student with these recordings, earns all; beyond it, less."""
+    one = student(carts)
+    expected = expected_parameters(one.analysis, one.rubric)
+    assert len(expected) == len(one.rubric.names)
+    for p in expected:
+        assert p.low is not None
+        assert p.high is not None
+        for bound, out in ((p.low, 0.995), (p.high, 1.005)):
+            shares = []
+            for value in (bound * (2 - out), bound * out**4):
+                typed = {p.name: Decimal(f"{value:.8f}")}
+                graded = one.reporting(final=typed).grade().criteria
+                (judged,) = (c for c in graded if c.id.startswith("final") and p.name in c.found)
+                shares.append("you report" not in judged.message)
+            assert shares == [True, False], (p, bound)
+
+
+def test_another_rubric_has_other_bounds(tmp_path):
+    """What `--rubric` names is what the page and the file accept, and what they are called by."""
+    analysis = make_analysis(2)
+    text = (RUBRICS / "throne-2dof.toml").read_text(encoding="utf-8")
+    text = text.replace(
+        'parameters = ["zeta_*"]', 'parameters = ["zeta_a"]\ndamping_full_percent = 7'
+    )
+    (tmp_path / "lab.toml").write_text(text.replace("Two carts:", "Strict:"), encoding="utf-8")
+    rubric = load_rubric(tmp_path / "lab.toml")
+    found = json.loads(solution_text(analysis, rubric=rubric))
+    accepted = {p["name"]: p["percent"] for p in found["parameters"]}
+    assert (accepted["zeta_a"], accepted["K_1"], accepted["zeta_b"]) == (7, 5, None)
+    assert found["rubric"] == rubric.title
+    page = render_html(build_solution(analysis, rubric=rubric))
+    assert "Strict: identification" in page
+    assert "not judged" in page
+    with pytest.raises(ConfigError, match="the rubric is for 2 carts, the submission for 1"):
+        check_carts(rubric, carts=1)
 
 
 @given(chains(min_carts=2, max_carts=3), st.integers(0, 2**32 - 1))
@@ -341,6 +398,30 @@ def test_the_document_works_everything_out(carts):
     A, B, _, _ = analysis.chain.state_space()
     for value in (*A[(A != 0) & (A != 1)], *B[B != 0]):
         assert to_text(value_term(float(abs(value)))) in alts
+
+
+@pytest.mark.parametrize("carts", [1, 2, 3])
+def test_nothing_that_students_wrote_stands_in_the_solution(carts):
+    """Their notes are left out, and every question of the data has a model answer."""
+    analysis = make_analysis(carts)
+    asked = ask(analysis)
+    notes = "# Discussion\n\nOurs alone.\n" + "".join(
+        f"\n## {a.id}\n\nNo idea.\n" for a in asked[1:]
+    )
+    page = render_html(build_solution(replace(analysis, discussion=notes)))
+    for words in ("Ours alone", "No idea", "To be answered", "notes.md"):
+        assert words not in page
+    for question in asked:
+        answer = plain(model_answer(question).text).removeprefix("Model answer: ")
+        assert f"Model answer: </strong>{answer[:30]}" in unescape(page)
+
+
+@pytest.mark.parametrize("kind", get_args(Kind))
+def test_every_kind_of_question_has_a_model_answer(kind):
+    """There is one to read for each, and it is no question itself."""
+    answer = model_answer(Asked(kind=kind, id="x", section="x", text="x"))
+    assert len(plain(answer.text)) > 100
+    assert "?" not in plain(answer.text)
 
 
 def test_what_has_no_table_is_left_out():

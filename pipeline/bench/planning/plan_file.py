@@ -14,7 +14,7 @@ from pipeline.errors import ConfigError
 from pipeline.lock import turn_in
 from pipeline.output import write_file
 from pipeline.submission import Submission, System, load_submission
-from pipeline.submission.complaints import Location, dotted, explain, quote
+from pipeline.submission.complaints import Location, all_told, dotted, explain, quote, told_once
 from pipeline.submission.toml_file import parse_toml, read_text
 from pipeline.synthesis.files import toml_section
 
@@ -162,12 +162,11 @@ def _recording_text(recording: Recording) -> str:
 
 
 def _parse(text: str, *, where: str, system: System) -> Plan:
-    document = _tuples(parse_toml(text, where=where, error=ConfigError))
+    document = _tuples(parse_toml(text, where=where, error=ConfigError, tables=_TABLES))
     try:
         plan = Plan.model_validate(document, strict=True)
     except ValidationError as error:
-        # A misspelt required key is both unknown and missing: the first says more.
-        errors = sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
+        errors = told_once(error.errors())
         top = tuple(Plan.model_fields)
         problems = [explain(e, document, tables=_TABLES, top_level=top) for e in errors]
     else:
@@ -175,8 +174,7 @@ def _parse(text: str, *, where: str, system: System) -> Plan:
         problems = [f"{dotted(at, document)}: {what}" for at, what in found]
         if not problems:
             return plan
-    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-    raise ConfigError(f"{where}: {problems[0]}{more}")
+    raise ConfigError(all_told(where, problems))
 
 
 def _tuples(value: Any) -> Any:

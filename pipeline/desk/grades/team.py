@@ -30,7 +30,8 @@ from pipeline.report.document import paragraph
 from pipeline.report.figures.svg import plain_svg
 from pipeline.report.numbers import NOTHING
 from pipeline.report.render.html import render_blocks, render_drawing
-from pipeline.report.words import rich
+from pipeline.report.words import rich, with_symbols
+from pipeline.schemas.base import Units
 from pipeline.schemas.grade import Criterion, Flag, Grade
 
 _MOST_REASONS = 30
@@ -116,7 +117,7 @@ def _page(ask: Ask, *, wrong: dict[str, str] | None = None, status: int = 200) -
         points=points_text,
         seen=now.seen,
         criteria=criteria,
-        flags=[_flag(ask, flag, shown) for flag in grade.flags],
+        flags=[_flag(ask, flag, shown, grade.units) for flag in grade.flags],
         figures=left,
         reasons={c: found[:_MOST_REASONS] for c, found in reasons.items()},
         events=[(to_the_second(event.at), event_words(event)) for event in reversed(events)],
@@ -146,7 +147,7 @@ def _criteria(
                 "outcome": WORDS.text(f"outcome_{own.outcome}") if own else "not judged",
                 "tone": TONES[own.outcome] if own else "quiet",
                 "lost": own is not None and own.outcome in ("partial", "fail"),
-                "evidence": _evidence(own, asked.check) if own else "",
+                "evidence": _evidence(own, asked.check, grade.units) if own else "",
                 "check": asked.check,
                 "numbers": frozenset(own.found if own else ()),
                 "figures": [],
@@ -168,20 +169,20 @@ def _shows(file: str, criterion: dict[str, Any]) -> bool:
     return is_response(file) and criterion["check"] == "final"
 
 
-def _evidence(criterion: Criterion, check: str) -> str:
+def _evidence(criterion: Criterion, check: str, units: Units | None) -> str:
     """Return what was said and the numbers, theirs beside ours."""
-    table = numbers_table(criterion, check=check, numbers=count(0))
+    table = numbers_table(criterion, check=check, units=units, numbers=count(0))
     said = paragraph(rich(sentence(criterion.message)))
     return render_blocks([said, *([table] if table else [])])
 
 
-def _flag(ask: Ask, flag: Flag, shown: Class) -> dict[str, Any]:
+def _flag(ask: Ask, flag: Flag, shown: Class, units: Units | None) -> dict[str, Any]:
     """Return a remark with its evidence; who shares a recording is a team to look at."""
     others = flag.evidence.get("submissions", ()) if flag.code == "shared_data" else ()
-    table = evidence_table(flag, numbers=count(0))
+    table = evidence_table(flag, units=units, numbers=count(0))
     return {
         "title": WORDS.text(f"title_{flag.code}"),
-        "text": sentence(flag.message),
+        "text": with_symbols(sentence(flag.message)),
         "numbers": render_blocks([table]) if table else "",
         "others": [(name, _address(ask, name) if name in shown.teams else "") for name in others],
     }

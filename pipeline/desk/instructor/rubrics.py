@@ -1,6 +1,5 @@
 """The rubric editor: what `check-rubric` says, beside the lines; what is wrong is not saved."""
 
-import re
 from pathlib import Path
 from urllib.parse import urlencode
 
@@ -9,13 +8,12 @@ from starlette.responses import RedirectResponse, Response
 from pipeline.desk.state import Ask
 from pipeline.desk.typed import typed_path
 from pipeline.errors import ConfigError
-from pipeline.grading.rubric_file import parse_rubric, rubric_source
+from pipeline.grading.rubric_file import InvalidRubric, parse_rubric, rubric_source
 from pipeline.grading.rubric_text import rubric_text
 from pipeline.output import write_file
 from pipeline.resources import RUBRICS
 from pipeline.submission.edit import text_digest
 
-_AT = re.compile(r"^.*? line (\d+): (.*)$")
 _NEW = "new"  # what a form has seen of a file that is not there
 
 
@@ -74,9 +72,8 @@ def _problems(text: str) -> list[tuple[int, str]]:
     """Return what is wrong: the number of the line, 0 for none, and the sentence."""
     try:
         parse_rubric(text, where="rubric")
-    except ConfigError as error:
-        found = [(_AT.match(line), line) for line in str(error).split("\n")]
-        return [(int(at[1]), at[2]) if at else (0, line) for at, line in found]
+    except InvalidRubric as error:
+        return list(error.problems)
     return []
 
 

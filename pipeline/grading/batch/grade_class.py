@@ -27,7 +27,7 @@ from pipeline.grading.rubric_file import load_rubric
 from pipeline.grading.similarity.prints import fingerprint
 from pipeline.ingest.read import read_data
 from pipeline.lock import alone_in
-from pipeline.output import check_folder, own_folder
+from pipeline.output import named_folder, own_folder
 from pipeline.report.numbers import listing
 from pipeline.resources import EXAMPLES
 from pipeline.submission import load_submission
@@ -88,7 +88,7 @@ def grade_class(
     """
     rubric = load_rubric(rubric_file)
     late_table = read_late_table(lateness) if lateness else {}
-    _refuse_submission(check_folder(out))
+    _refuse_submission(named_folder(out))
     if gradebook is None:
         _refuse_another_class(out, assignment=rubric_file.stem)
     with alone_in(out), scratch_in(out) as scratch:

@@ -170,8 +170,9 @@ def failed(
     settled: bool = True,
     detail: str = "",
 ) -> Grading:
-    """Return the outcome of a hand-in that could not be graded."""
-    reason = "".join(c if c.isprintable() else "�" for c in " ".join(reason.split()))
+    """Return the outcome of a hand-in that could not be graded; each of its lines is a reason."""
+    lines = (" ".join(line.split()) for line in reason.split("\n"))
+    reason = "".join(c if c.isprintable() or c == "\n" else "�" for c in "\n".join(lines))
     people = tuple(authors)
     grade = Grade.failed(task.id, reason, out_of=out_of, authors=people, days_late=task.days_late)
     return Grading(

@@ -15,6 +15,7 @@ from pipeline.grading.gradebook.schema import (
     overrides,
     submissions,
 )
+from pipeline.grading.words import on_one_line
 from pipeline.schemas.grade import read_grade
 
 FAILED = "could not be graded: "  # before the reason, in the text of an event
@@ -57,7 +58,7 @@ def read_events(connection: Connection, submission: int, *, named: bool = True) 
 def _graded(connection: Connection, submission: int) -> Iterator[Event]:
     mine = select(gradings).where(gradings.c.submission_id == submission)
     for row in connection.execute(mine.order_by(gradings.c.id)):
-        text = FAILED + row.reason
+        text = FAILED + on_one_line(row.reason)
         if row.status != "failed":
             text = ", ".join(flag.code for flag in read_grade(row.grade).flags)
         yield Event(at=row.at, what="graded", points=row.points, out_of=row.out_of, text=text)

@@ -116,7 +116,7 @@ def with_overrides(grade: Grade, overrides: Mapping[str, Override], *, rubric: R
         if own is not None:
             criteria.append(own)
     earned = sum((exact(criterion.points) for criterion in criteria), Fraction(0))
-    deducted = late_deduction(earned, late=rubric.late, days_late=grade.days_late)
+    deducted = late_deduction(earned, late=rubric.late, step=rubric.step, days_late=grade.days_late)
     changed = {
         "criteria": tuple(criteria),
         "points": float(earned - deducted),

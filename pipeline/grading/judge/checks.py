@@ -5,6 +5,7 @@ from decimal import Decimal
 from fractions import Fraction
 from typing import Any
 
+from pipeline.grading import limits
 from pipeline.grading import rubric as asked
 from pipeline.grading.judge.checks_loop import (
     judge_claims,
@@ -15,9 +16,11 @@ from pipeline.grading.judge.checks_loop import (
 from pipeline.grading.judge.laws import MOST_WIDENING, judge_laws
 from pipeline.grading.judge.work import ALL, NONE, Verdict, Work, asked_pieces, mean_share
 from pipeline.grading.mistakes.impossible import not_positive
+from pipeline.grading.mistakes.state_model import model_harm
 from pipeline.grading.references.reference import OFF_SCALE, Reference, off_scale
 from pipeline.grading.references.tolerance import NO_CREDIT, as_typed, credit, percent_off, rounding
 from pipeline.grading.rubric import is_damping, matching
+from pipeline.grading.words import WORDS
 from pipeline.names import first_few
 
 _NAMED = 4  # so many are named in a message
@@ -109,11 +112,11 @@ def _parameters(criterion: asked.Parameters, work: Work) -> Verdict:
     )
 
 
-def _credit(error: Fraction, name: str, limits: asked.Parameters | asked.InitialFinal) -> Fraction:
+def _credit(error: Fraction, name: str, asks: asked.Parameters | asked.InitialFinal) -> Fraction:
     if is_damping(name):
-        full, none = limits.damping_full_percent, limits.damping_none_percent
+        full, none = asks.damping_full_percent, asks.damping_none_percent
     else:
-        full, none = limits.full_percent, limits.none_percent
+        full, none = asks.full_percent, asks.none_percent
     return credit(error, full=full, none=none)
 
 
@@ -203,14 +206,18 @@ def _state_space(criterion: asked.StateModel, work: Work) -> Verdict:
         if entry.kind != "exact" or share < 1
     ]
     off = [e for e, share in zip(entries, shares, strict=True) if share < 1]
+    named = "; ".join(
+        f"{e.name} = {as_typed(e.typed)}, expected {e.right[0]:.4g}" for e in off[:_NAMED]
+    )
+    share, message = mean_share(counted), f"{named}." if off else "A and B follow from the table."
+    springs = work.analysis.springs
+    n, tied = len(springs) - 1, springs[0] or springs[-1]
+    if harm := model_harm(space, entries, models=work.state_models, n=n, tied=tied):
+        share = min(share, limits.KEPT_IF_HARMFUL)
+        message = f"{WORDS.text(f'model_{harm}')} {message}"
     return Verdict(
-        share=mean_share(counted),
-        message="; ".join(
-            f"{e.name} = {as_typed(e.typed)}, expected {e.right[0]:.4g}" for e in off[:_NAMED]
-        )
-        + "."
-        if off
-        else "A and B follow from the table.",
+        share=share,
+        message=message,
         expected={e.name: e.right[0] for e in entries if e.kind != "exact" or e in off},
         found={e.name: float(e.typed) for e in entries if e.kind != "exact" or e in off},
     )

@@ -6,12 +6,14 @@ from fractions import Fraction
 import numpy as np
 
 from pipeline.arrays import Array
+from pipeline.grading import limits
 from pipeline.grading import rubric as asked
 from pipeline.grading.judge.work import NONE, Verdict, Work, mean_share
 from pipeline.grading.mistakes.controller import Controller, does, same_gains
 from pipeline.grading.mistakes.loop_numbers import LoopNumbers
 from pipeline.grading.references.reference import OFF_SCALE, Reference, off_scale
 from pipeline.grading.references.tolerance import as_typed, credit, exact, percent_off, rounding
+from pipeline.grading.words import WORDS
 
 Judged = Callable[[LoopNumbers], Fraction]
 
@@ -57,10 +59,15 @@ def judge_gains(criterion: asked.Gains, work: Work) -> Verdict:
     if best is None:
         return Verdict(share=NONE, message="These gains cannot be simulated.")
     share, numbers = best
+    only_on_paper = ""
+    if runaway := controller.runaway(gains):
+        if numbers.stable:
+            only_on_paper = f" {WORDS.text('only_on_paper', does=does(numbers))}"
+        share, numbers = min(share, limits.KEPT_IF_HARMFUL), runaway
     return Verdict(
         share=share,
         message=f"On your carts: {does(numbers)}; the goal is {goal.overshoot_percent:g} % and "
-        f"{goal.settling_time:g} s.",
+        f"{goal.settling_time:g} s.{only_on_paper}",
         expected={
             "overshoot_percent": goal.overshoot_percent,
             "settling_time": goal.settling_time,
@@ -101,13 +108,14 @@ def judge_claims(criterion: asked.Claims, work: Work) -> Verdict:
         return mean_share(shares)
 
     best = _best(controller, gains, judged)
-    share, expected = (best[0], _claimable(best[1])) if best else (NONE, {})
-    told = ", ".join(f"{k} {v:.3g}" for k, v in expected.items() if v is not None)
+    if best is None:
+        return Verdict(share=NONE, message="These gains cannot be simulated.")
+    share, expected = best[0], _claimable(best[1])
     return Verdict(
         share=share,
         message="What the gains give."
         if share == 1
-        else f"Simulated on your carts these gains give {told}.",
+        else f"Simulated on your carts with these gains: {does(best[1])}.",
         expected=expected,
         found={name: float(v) for name, v in claims.items() if v is not None},
     )

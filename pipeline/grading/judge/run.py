@@ -1,12 +1,12 @@
 """Grade one submission: its own recordings are analysed anew, nothing it brings is believed."""
 
-import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
 from pipeline.errors import SubmissionError
 from pipeline.grading.judge.checks import judge
+from pipeline.grading.judge.costs import charge
 from pipeline.grading.judge.work import Verdict, Work, missing_flag
 from pipeline.grading.mistakes.controller import diagnose_controller, reported_controller
 from pipeline.grading.mistakes.recordings import bad_runs, data_flag
@@ -16,15 +16,14 @@ from pipeline.grading.mistakes.tables import diagnose_tables
 from pipeline.grading.references.reference import in_scale, recompute, trusted_chain
 from pipeline.grading.references.signs import turned_round
 from pipeline.grading.references.springs import with_all_springs
-from pipeline.grading.references.tolerance import exact, late_deduction, rounding
+from pipeline.grading.references.tolerance import exact, late_deduction, rounding, to_step
 from pipeline.grading.rubric import Rubric
 from pipeline.ingest.columns import conversion
 from pipeline.results import Analysis
+from pipeline.schemas.base import Units
 from pipeline.schemas.grade import CODES, Criterion, Flag, Grade, Outcome
 from pipeline.submission import Experiment, InputOverride, Reported, Submission, System
 from pipeline.workflow import analyse
-
-_CENTS = 100  # points are given to the hundredth
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -121,9 +120,10 @@ def grade_analysis(
         bad=bad_runs(analysis),
         named=diagnosis.named,
     )
-    criteria = _criteria(work)
+    flags = sorted([*diagnosis.flags, *_flags(work)], key=lambda flag: CODES.index(flag.code))
+    criteria = _criteria(work, flags)
     earned = sum((Fraction(str(c.points)) for c in criteria), Fraction(0))
-    deducted = late_deduction(earned, late=rubric.late, days_late=days_late)
+    deducted = late_deduction(earned, late=rubric.late, step=rubric.step, days_late=days_late)
     return Grade(
         submission=name,
         authors=tuple(author.id for author in submission.authors),
@@ -133,9 +133,8 @@ def grade_analysis(
         days_late=days_late,
         deducted=float(deducted),
         criteria=criteria,
-        flags=tuple(
-            sorted([*diagnosis.flags, *_flags(work)], key=lambda flag: CODES.index(flag.code))
-        ),
+        flags=tuple(flags),
+        units=Units(position=analysis.position_unit, input=analysis.input_unit),
         notes=signed,
     )
 
@@ -196,19 +195,21 @@ def _under_calibration(experiment: Experiment, system: System) -> Experiment:
 # ------------------------------------------------------------------ criteria and flags
 
 
-def _criteria(work: Work) -> tuple[Criterion, ...]:
+def _criteria(work: Work, flags: Sequence[Flag]) -> tuple[Criterion, ...]:
     done: dict[str, Criterion] = {}
     for asked in work.rubric.criteria:
         parents = [done[p] for p in asked.requires if done[p].outcome in ("fail", "skip")]
         verdict = _waits_for(parents[0]) if parents else judge(asked, work)
-        outcome = _outcome(verdict.share)
+        verdict = charge(verdict, asked, flags, rubric=work.rubric)
+        points = to_step((verdict.share or 0) * exact(asked.points), work.rubric.step)
+        outcome = _outcome(verdict.share, points, out_of=exact(asked.points))
         advised = outcome in ("partial", "fail") and not verdict.explained
         more = f" {asked.message}" if asked.message and advised else ""
         done[asked.id] = Criterion(
             id=asked.id,
             title=asked.title,
             outcome=outcome,
-            points=_points(verdict.share, asked.points),
+            points=float(points),
             out_of=asked.points,
             message=verdict.message + more,
             expected=verdict.expected,
@@ -223,17 +224,11 @@ def _waits_for(parent: Criterion) -> Verdict:
     return Verdict(share=None, message=f"Not checked: it builds on {on}, which was {how}.")
 
 
-def _outcome(share: Fraction | None) -> Outcome:
+def _outcome(share: Fraction | None, points: Fraction, *, out_of: Fraction) -> Outcome:
+    """Return how a criterion went, by the points it is given: what rounding forgives has passed."""
     if share is None:
         return "skip"
-    return "pass" if share == 1 else "fail" if share == 0 else "partial"
-
-
-def _points(share: Fraction | None, points: float) -> float:
-    """Return the points to the hundredth, halves up: exact, so that no share loses its order."""
-    return float(
-        Fraction(math.floor((share or 0) * exact(points) * _CENTS + Fraction(1, 2)), _CENTS)
-    )
+    return "pass" if points == out_of else "fail" if points == 0 else "partial"
 
 
 def _flags(work: Work) -> list[Flag]:

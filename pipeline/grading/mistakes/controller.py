@@ -37,6 +37,7 @@ class Controller:
     goal : what must be met; what a reference design reaches where neither it nor these gains do.
     blurred : the reference's gains are as uncertain as friction makes them.
     doubt : relative error of the prefilter that the models' own errors leave.
+    reference : the chain that the recordings give, the first of the models; None without one.
     own : the student's table is complete, so that what they designed for is known.
     """
 
@@ -49,21 +50,33 @@ class Controller:
     goal: Design
     blurred: bool
     own: bool
+    reference: Chain | None
     doubt: float = 0.0
 
     def numbers(self, gains: Array) -> list[LoopNumbers]:
         """Return what gains do on each of the models."""
-        found = [
-            loop_numbers(
-                chain,
-                gains,
-                cart=self.goal.cart,
-                settling=self.goal.settling_time,
-                sample_time=self.goal.sample_time,
-            )
-            for chain in self.models
-        ]
+        found = [self._on(chain, gains) for chain in self.models]
         return [numbers for numbers in found if numbers is not None]
+
+    def runaway(self, gains: Array) -> LoopNumbers | None:
+        """Return what gains do on the recorded carts where that grows, and so fast that it counts.
+
+        What grows less than e-fold in the settling time asked for may be the model's own error.
+        """
+        numbers = self._on(self.reference, gains) if self.reference is not None else None
+        if numbers is None or numbers.stable:
+            return None
+        fast = float(numbers.poles.real.max()) * self.goal.settling_time > 1
+        return numbers if fast else None
+
+    def _on(self, chain: Chain, gains: Array) -> LoopNumbers | None:
+        return loop_numbers(
+            chain,
+            gains,
+            cart=self.goal.cart,
+            settling=self.goal.settling_time,
+            sample_time=self.goal.sample_time,
+        )
 
     def reaches_goal(self, gains: Array) -> bool:
         """Whether gains do what is asked for on one of the models."""
@@ -152,6 +165,7 @@ def reported_controller(
         goal=submission.design or Design(cart=n),
         blurred=not is_explained(analysis),
         own=any(model is not None for model in own),
+        reference=chain,
     )
     controller = replace(controller, doubt=_doubt(controller, submission, analysis))
     if controller.gains is None or controller.reaches_goal(controller.gains):

@@ -1,6 +1,7 @@
 """The reported A and B: every entry against the student's own table or the reference."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
@@ -77,7 +78,7 @@ def compare_entries(space: StateSpace, *, models: Sequence[StateModel], n: int) 
         kind = kinds[i][j]
         entries.append(
             Entry(
-                name=f"A({i + 1}, {j + 1})" if j < 2 * n else f"B({i + 1})",
+                name=_entry_name(i, j, n=n),
                 kind=kind,
                 typed=number,
                 right=tuple(value for value, _ in known),
@@ -238,6 +239,10 @@ def _kinds(n: int) -> list[list[Kind]]:
     return kinds
 
 
+def _entry_name(i: int, j: int, *, n: int) -> str:
+    return f"A({i + 1}, {j + 1})" if j < 2 * n else f"B({i + 1})"
+
+
 def _matrix(space: StateSpace, n: int) -> dict[tuple[int, int], Decimal]:
     typed = {(i, j): value for i, row in enumerate(space.A) for j, value in enumerate(row)}
     return typed | {(i, 2 * n): value for i, value in enumerate(space.B)}
@@ -253,6 +258,70 @@ def _entry_error(typed: Decimal, right: float, kind: Kind, *, slack: float = 0.0
         value=size, low=max(size - slack, 0.0), high=size + slack, std=0.0, source=""
     )
     return percent_off(typed if right > 0 else -typed, reference, sigmas=0.0)
+
+
+# -------------------------------------------------------------------- what it comes to
+
+Harm = Literal["unstable", "wrong_way"]
+
+
+def model_harm(
+    space: StateSpace,
+    entries: Sequence[Entry],
+    *,
+    models: Sequence[StateModel],
+    n: int,
+    tied: bool,
+) -> Harm | None:
+    """Return what the wrong entries of a model predict that carts on springs never do, if anything.
+
+    It grows without end, or a positive input drives a cart to the negative side. Imprecise entries
+    are taken as right: in a stiff chain honest errors could do the same. Another order of the
+    states is no harm.
+
+    Parameters
+    ----------
+    tied : a spring holds the carts to a wall, so that a constant input moves them to a level.
+    """
+    wrong = {entry.name for entry in entries if entry.wrong}
+    whole = [one.right for one in models if np.all(np.isfinite(one.right))]
+    if not wrong or not whole or not (space.A and space.B):
+        return None
+    typed = _matrix(space, n)
+    found = []
+    for right in whole:
+        reported = right.copy()
+        for at, number in typed.items():
+            if _entry_name(*at, n=n) in wrong:
+                reported[at] = float(number)
+        A, B = reported[:, :-1], reported[:, -1]
+        found.append("unstable" if _grows(A) else _backwards(A, B, n=n, tied=tied))
+    return found[0] if all(found) else None
+
+
+def _grows(A: Array) -> bool:
+    found = np.linalg.eigvals(A)
+    return bool(found.real.max() > limits.GROWS * float(np.abs(found).max()))
+
+
+def _backwards(A: Array, B: Array, *, n: int, tied: bool) -> Harm | None:
+    """Return whether a positive input drives cart 1 off, or holds a cart, on the negative side."""
+    orders = [np.arange(2 * n), *(np.argsort(order) for _, order in _reordered(n))]
+    meant = [A[np.ix_(o, o)] for o in orders]
+    # In the order that is meant each position is followed by its velocity.
+    kinematic = np.eye(2 * n)[1::2]
+    known = [i for i, one in enumerate(meant) if np.allclose(one[0::2], kinematic)] or [0]
+    ways = [_drives_back(meant[i], b, tied=tied) for i in known for b in (B[orders[i]], B)]
+    return "wrong_way" if all(ways) else None
+
+
+def _drives_back(A: Array, B: Array, *, tied: bool) -> bool:
+    if B[1] < 0:
+        return True
+    if tied:
+        with suppress(np.linalg.LinAlgError):
+            return bool(np.any(np.linalg.solve(A, -B)[0::2] < 0))
+    return False
 
 
 # ------------------------------------------------------------------------- the flag

@@ -73,7 +73,7 @@ def _hidden_reason(reason: str, submission: str, own: str) -> str:
     if not reason:
         return ""
     name = re.escape(submission)
-    path = re.compile(rf"^{name}(?=:)|(?<![^\s'\"(]){name}(?=[/\\])")
+    path = re.compile(rf"^{name}(?=:)|(?<![^\s'\"(]){name}(?=[/\\])", re.MULTILINE)
     return path.sub(own, _ARCHIVE.sub("the archive: ", reason))
 
 

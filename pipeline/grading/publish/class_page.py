@@ -15,7 +15,7 @@ from pipeline.grading.references.tolerance import exact
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.clusters import Cluster
 from pipeline.grading.similarity.doubles import Double
-from pipeline.grading.words import WORDS, points_text
+from pipeline.grading.words import WORDS, on_one_line, points_text
 from pipeline.names import first_few
 from pipeline.report.document import (
     Block,
@@ -110,7 +110,8 @@ def _summary(
     if failed:
         said = "could not be graded; points can be given by hand"
         reasons = bullet_list(
-            spans(_link(line.name), f": {clean(line.reason)}", _hand(line)) for line in failed
+            spans(_link(line.name), f": {clean(on_one_line(line.reason))}", _hand(line))
+            for line in failed
         )
         if len(failed) > _MOST_FAILED:
             blocks.append(Details(spans(f"{len(failed)} {said}"), (reasons,)))

@@ -24,8 +24,9 @@ from pipeline.grading.publish.roster import POINTS_POSSIBLE, Roster
 from pipeline.grading.publish.students import Remark, Student, students_of
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.shared import told
-from pipeline.grading.words import WORDS, points_text
-from pipeline.output import csv_text, own_folder, write_file
+from pipeline.grading.words import WORDS, on_one_line, points_text
+from pipeline.output import csv_text, named_folder, own_folder, write_file
+from pipeline.report.words import with_symbols
 from pipeline.schemas.grade import Grade
 
 _HOURS = 24.0
@@ -51,13 +52,17 @@ def export(
 
     Parameters
     ----------
+    out : a folder, there or not yet; or a .csv file, which gets the table and nothing beside it.
     title : of the assignment as the platform has it; default: the rubric's.
     roster : the table that the platform exports.
 
     Raises
     ------
-    ConfigError : the roster is no such table, or its grades go up to another maximum.
+    ConfigError : the roster is no such table, or its grades go up to another maximum; `out` is
+        another file.
     """
+    table = out if out.suffix.lower() == ".csv" and not out.is_dir() else None
+    folder = table.parent if table else named_folder(out)
     rubric = book.rubric
     title = title or rubric.title or "cartlab"
     entries = list(book.entries())
@@ -81,11 +86,11 @@ def export(
         text = _moodle(students, rubric, title=title)
     else:
         text = _gradescope(students, rubric)
-    out.mkdir(parents=True, exist_ok=True)
-    files = [out / f"{platform}.csv"]
+    folder.mkdir(parents=True, exist_ok=True)
+    files = [table or folder / f"{platform}.csv"]
     write_file(files[0], text)
-    if platform == "gradescope":
-        files += _write_results(entries, own_folder(out, "gradescope"))
+    if platform == "gradescope" and not table:
+        files += _write_results(entries, own_folder(folder, "gradescope"))
     return Exported(files=tuple(files), remarks=tuple(remarks))
 
 
@@ -155,14 +160,19 @@ def _comment(student: Student) -> str:
 def _said(grade: Grade, *, by_hand: Collection[str]) -> list[str]:
     """Return what was lost or given by hand, and what to look at, a line each."""
     if grade.status == "failed" and not grade.criteria:
-        return [f"Could not be graded: {grade.reason}"]
+        return [f"Could not be graded: {on_one_line(grade.reason)}"]
     lost = [
-        f"{c.title or c.id}: {points_text(c.points)} of {points_text(c.out_of)}. {c.message}"
+        f"{c.title or c.id}: {points_text(c.points)} of {points_text(c.out_of)}. "
+        f"{with_symbols(c.message)}"
         for c in grade.criteria
         if c.points < c.out_of or c.id in by_hand
     ]
     late = [f"Late: {points_text(grade.deducted)} points off."] if grade.deducted else []
-    return [*lost, *map(told, grade.flags), *late]
+    return [*lost, *_told(grade), *late]
+
+
+def _told(grade: Grade) -> list[str]:
+    return [with_symbols(told(flag)) for flag in grade.flags]
 
 
 # ----------------------------------------------------------------------- Gradescope
@@ -222,7 +232,7 @@ def results_text(grade: Grade, *, by_hand: bool = False) -> str:
     how = " automatically, points were given by hand" if by_hand else ""
     failed = grade.status == "failed"
     output = [f"Could not be graded{how}: {grade.reason}"] if failed else []
-    output += map(told, grade.flags)
+    output += _told(grade)
     if grade.deducted:
         output.append(f"Late: {points_text(grade.deducted)} points off.")
     document = {
@@ -239,7 +249,7 @@ def results_text(grade: Grade, *, by_hand: bool = False) -> str:
                 "status": "passed" if c.outcome == "pass" else "failed",
                 "name": c.title or c.id,
                 "number": str(i),
-                "output": f"{WORDS.text(f'outcome_{c.outcome}')}: {c.message}",
+                "output": f"{WORDS.text(f'outcome_{c.outcome}')}: {with_symbols(c.message)}",
                 "tags": [c.id],
                 "visibility": "visible",
             }

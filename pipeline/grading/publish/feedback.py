@@ -31,20 +31,19 @@ from pipeline.report.document import (
     spans,
 )
 from pipeline.report.figures.style import WIDTH
-from pipeline.report.numbers import NOTHING, percent, significant, typeset
+from pipeline.report.numbers import NOTHING, percent, significant, typeset, unit_text
 from pipeline.report.numbers import count as counted
 from pipeline.report.render.html import render_html
 from pipeline.report.words import capital, clean, name_span, rich
+from pipeline.schemas.base import Units
 from pipeline.schemas.grade import Criterion, Flag, Grade, Outcome
 
 _TITLE = re.compile(r"<title>(.*?)</title>", re.DOTALL)
 _NAME = re.compile(r"(omega|zeta|K)(_\w)?")
 TONES: dict[Outcome, Tone] = {"pass": "good", "partial": "", "fail": "bad", "skip": "quiet"}
-_EVIDENCE = {  # what is not called as it is in grade.json
-    "mistake_gives": "The mistake gives",
-    "overshoot_percent": "Overshoot [%]",
-    "settling_time": "Settling time [s]",
-}
+_ENTRY = re.compile(r"([AB])\((\d+)(?:, (\d+))?\)")
+_SHARE = "_percent"  # ends the name of a number that is a percentage itself
+_FINEST = 2  # decimals of such a number
 _MOST_ROWS = 60  # of one criterion
 _LONGEST_TEXT = 200  # letters of a value that is no number
 
@@ -92,17 +91,21 @@ def _summary(grade: Grade) -> list[Block]:
     by_hand = Tile(spans("Set by hand"), spans(counted_criteria(len(overrides))))
     if grade.status == "failed":
         tile = Tile(spans("Points"), spans(points), tone="" if overrides else "bad")
-        how, then = "", "Mend it and hand it in again, or talk to your instructor."
+        how, then = "", "Fix it and hand it in again, or talk to your instructor."
         if overrides:
             how, then = " automatically", "Its points were given by hand."
-        return [
-            Tiles((tile, by_hand) if overrides else (tile,)),
-            paragraph(
-                Span(f"This submission could not be graded{how}. ", "strong"),
-                f"{sentence(grade.reason)} {then}",
-            ),
-            *_notes(grade),
-        ]
+        said = Span(f"This submission could not be graded{how}. ", "strong")
+        first, *others = map(sentence, grade.reason.split("\n"))
+        told: list[Block] = (
+            [
+                paragraph(said, "Each of these is a reason:"),
+                bullet_list(map(spans, (first, *others))),
+                paragraph(then),
+            ]
+            if others
+            else [paragraph(said, f"{first} {then}")]
+        )
+        return [Tiles((tile, by_hand) if overrides else (tile,)), *told, *_notes(grade)]
     passed = sum(c.outcome == "pass" for c in grade.criteria)
     tiles = [
         Tile(spans("Points"), spans(points)),
@@ -215,7 +218,9 @@ def _criteria(grade: Grade, rubric: Rubric, numbers: count) -> list[Block]:
     for criterion in grade.criteria:
         title = _capital(clean(criterion.title or criterion.id))
         said = paragraph(rich(sentence(criterion.message)))
-        table = numbers_table(criterion, check=checks.get(criterion.id, ""), numbers=numbers)
+        table = numbers_table(
+            criterion, check=checks.get(criterion.id, ""), units=grade.units, numbers=numbers
+        )
         inside: list[Block] = [said, *([table] if table else [])]
         if criterion.outcome == "pass":
             blocks.append(Details(spans(f"{title}: passed"), tuple(inside)))
@@ -227,7 +232,9 @@ def _criteria(grade: Grade, rubric: Rubric, numbers: count) -> list[Block]:
     return blocks
 
 
-def numbers_table(criterion: Criterion, *, check: str, numbers: count) -> Table | None:
+def numbers_table(
+    criterion: Criterion, *, check: str, units: Units | None, numbers: count
+) -> Table | None:
     """Return the numbers of a criterion side by side, None where it has none."""
     names = [
         name
@@ -248,8 +255,10 @@ def numbers_table(criterion: Criterion, *, check: str, numbers: count) -> Table 
     rows = []
     for name in names[:_MOST_ROWS]:
         expected, found = criterion.expected.get(name), criterion.found.get(name)
-        row = [cell(_label(name)), cell(_value(found)), cell(_value(expected))]
-        rows.append([*row, cell(_off(found, expected))] if compared else row)
+        row = [
+            cell(_label(name, units)), cell(_value(name, found)), cell(_value(name, expected))
+        ]  # fmt: skip
+        rows.append([*row, cell(_off(name, found, expected))] if compared else row)
     more = len(names) - len(rows)
     caption = f"{_capital(clean(criterion.title or criterion.id))}, in numbers."
     return make_table(
@@ -261,7 +270,7 @@ def numbers_table(criterion: Criterion, *, check: str, numbers: count) -> Table 
     )
 
 
-def evidence_table(flag: Flag, *, numbers: count) -> Table | None:
+def evidence_table(flag: Flag, *, units: Units | None, numbers: count) -> Table | None:
     """Return the numbers and texts that a remark rests on, None where it rests on none."""
     of = flag.evidence.get("parameter")
     found = {
@@ -271,38 +280,69 @@ def evidence_table(flag: Flag, *, numbers: count) -> Table | None:
     }
     if not found:
         return None
-    caption = rich(f"The numbers of {clean(of)}." if isinstance(of, str) else "The numbers.")
-    heads = [_EVIDENCE.get(name) or _capital(clean(name).replace("_", " ")) for name in found]
-    row = [cell(_value(value)) for value in found.values()]
+    unit = _unit(of, units) if isinstance(of, str) else ""
+    of_what = f" of {clean(of)}{f', in {unit}' if unit else ''}" if isinstance(of, str) else ""
+    heads = [_called(name) for name in found]
+    row = [cell(_value(name, value)) for name, value in found.items()]
     sides = ("l" if isinstance(value, bool | str) else "r" for value in found.values())
-    return make_table(next(numbers), caption, heads, [row], "".join(sides))
+    return make_table(next(numbers), rich(f"The numbers{of_what}."), heads, [row], "".join(sides))
 
 
 def _is_shown(value: Any) -> bool:
     return isinstance(value, Real | str)
 
 
-def _label(name: str) -> str | tuple[Span, ...]:
-    """Return a quantity, parameters of the carts as mathematics."""
-    if not _NAME.fullmatch(name):
-        return clean(name).replace("_", " ")
-    return spans(name_span(name), " [rad/s]" if read_name(name).is_frequency else "")
+def _label(name: str, units: Units | None) -> str | tuple[Span, ...]:
+    """Return a quantity with its unit, parameters of the carts as mathematics."""
+    unit = _unit(name, units)
+    shown = name_span(name) if _NAME.fullmatch(name) else Span(_called(name))
+    return spans(shown, f" [{unit}]" if unit else "")
 
 
-def _value(value: Any) -> str:
+def _called(name: str) -> str:
+    """Return what a number is called; one that nobody named as it stands in grade.json."""
+    key = f"quantity_{name}"
+    return WORDS.text(key) if key in WORDS.by_key else _capital(clean(name).replace("_", " "))
+
+
+def _unit(name: str, units: Units | None) -> str:
+    """Return the unit of a parameter, of the prefilter, or of an entry of A or B; else ""."""
+    if entry := _ENTRY.fullmatch(name):
+        if int(entry[2]) % 2:  # a velocity, which is 0 or 1 of the states
+            return ""
+        if entry[1] == "A":
+            return "1/s" if int(entry[3]) % 2 == 0 else "1/s²"
+        return unit_text(f"{clean(units.position)}/({clean(units.input)} s^2)") if units else ""
+    if units is None:
+        return "rad/s" if read_name(name).is_frequency else ""
+    position, drive = clean(units.position), clean(units.input)
+    if name == "prefilter":
+        return f"{drive}/{position}"
+    return unit_text(read_name(name).unit(position=position, input=drive))
+
+
+def _value(name: str, value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, Real):
+        number = round(float(value), _FINEST) if name.endswith(_SHARE) else float(value)
         # A number that was typed with fewer digits is shown as it was.
-        return min(significant(float(value)), typeset(f"{float(value):.6g}"), key=len)
+        return min(significant(number), typeset(f"{number:.6g}"), key=len)
     return clean(value)[:_LONGEST_TEXT] if isinstance(value, str) else NOTHING
 
 
-def _off(found: Any, expected: Any) -> str:
-    numbers = [v for v in (found, expected) if isinstance(v, Real) and not isinstance(v, bool)]
-    if len(numbers) < 2 or float(numbers[1]) == 0:
+def _off(name: str, found: Any, expected: Any) -> str:
+    """Return how far two numbers are apart: percentages by points, all others as a share."""
+    if not (_is_number(found) and _is_number(expected)):
         return NOTHING
-    return percent(100 * (float(numbers[0]) / float(numbers[1]) - 1), signed=True)
+    if name.endswith(_SHARE):
+        apart = round(float(found), _FINEST) - round(float(expected), _FINEST)
+        return WORDS.text("points_apart", difference=typeset(f"{apart:+.3g}")) if apart else "0"
+    return percent(100 * (float(found) / float(expected) - 1), signed=True) if expected else NOTHING
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool)
 
 
 # -------------------------------------------------------------------------- figures

@@ -18,6 +18,7 @@ from pipeline.grading.publish.feedback import feedback_page
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.clusters import find_clusters, renamed
 from pipeline.grading.similarity.doubles import Double, find_doubles, with_recordings
+from pipeline.grading.words import on_one_line
 from pipeline.output import csv_text, own_folder, write_file
 from pipeline.resources import TEMPLATES
 from pipeline.schemas.grade import Flag, grade_text
@@ -134,7 +135,7 @@ def grades_csv(lines: Sequence[Line], *, rubric: Rubric) -> str:
             *(line.criteria[id_][1] if id_ in line.criteria else "" for id_ in ids),
             " ".join(line.codes),
             " ".join(line.by_hand),
-            line.reason,
+            on_one_line(line.reason),
         )
         for line in lines
     ]

@@ -12,7 +12,6 @@ from pipeline.grading.rubric import Late
 
 Number = TypeVar("Number", float, Fraction)
 
-_CENTS = 100  # points are taken to the hundredth
 NO_CREDIT = Fraction(10**6)  # percent; of a number that is zero or has the wrong sign
 # The most that rounding may excuse, of the number: that of two digits, 10 for 10.5. One digit says
 # too little of what was measured, and "0e2" nothing at all.
@@ -121,8 +120,16 @@ def credit(error: Fraction, *, full: float, none: float) -> Fraction:
     return (bottom - error) / (bottom - top)
 
 
-def late_deduction(earned: Fraction, *, late: Late, days_late: float) -> Fraction:
-    """Return the points off those earned: so much for every day begun after the grace."""
+def to_step(points: Fraction, step: float) -> Fraction:
+    """Return points to the rubric's step, halves up: exact, so that no share loses its order."""
+    return math.floor(points / exact(step) + Fraction(1, 2)) * exact(step)
+
+
+def late_deduction(earned: Fraction, *, late: Late, step: float, days_late: float) -> Fraction:
+    """Return the points off those earned: so much for every day begun after the grace.
+
+    To the rubric's step, halves down: in the student's favour, as the points are.
+    """
     days = max(0, math.ceil(days_late - late.grace_days))
     share = min(exact(late.percent_per_day) * days, exact(late.most_percent)) / 100
-    return Fraction(math.floor(earned * share * _CENTS + Fraction(1, 2)), _CENTS)
+    return -to_step(-earned * share, step)

@@ -8,6 +8,7 @@ from pipeline.report.document import (
     Block,
     Document,
     Heading,
+    Paragraph,
     paragraph,
     spans,
 )
@@ -37,7 +38,7 @@ from pipeline.report.sections.measurements import (
 from pipeline.report.sections.notes import discussion_blocks
 from pipeline.report.sections.page import Page, Part, remarks
 from pipeline.report.sections.parameters import fitted_chain_table, parameter_blocks
-from pipeline.report.sections.questions import ask, open_questions, placed, split_notes
+from pipeline.report.sections.questions import Asked, ask, open_questions, placed, split_notes
 from pipeline.report.sections.summary import summary
 from pipeline.results import Analysis
 
@@ -49,6 +50,7 @@ def build_document(
     *,
     gap: Gap | None = None,
     worked: Sequence[Part] = (),
+    answer: Callable[[Asked], Paragraph] | None = None,
     changes: DraftChanges | None = None,
     progress: Callable[[str], None] | None,
 ) -> Document:
@@ -56,10 +58,13 @@ def build_document(
 
     `gap` is the gap analysis of the same data, where there is one; `worked` are sections that
     stand in the place of the one on the model; `changes` is what an earlier draft had otherwise.
+    `answer` gives the model answer to a question: then the students' notes are left out.
     """
     page = Page.of(analysis)
     asked = ask(analysis)
-    answers, rest = split_notes(discussion_blocks(analysis.discussion or ""), asked)
+    notes = "" if answer else analysis.discussion or ""
+    written, rest = split_notes(discussion_blocks(notes), asked)
+    answers = {one.id: (answer(one),) for one in asked} if answer else written
     made = _WORDS.text("made", version=__version__)
     parts: Sequence[Part] = (
         ("summary", "Summary", lambda page: [*summary(page), *gap_in_short(gap)]),
@@ -74,7 +79,11 @@ def build_document(
         ("hardware", "Model and measurement", lambda page: _hardware(page, gap)),
         ("gap", "What the linear model leaves out", lambda page: gap_blocks(page, gap)),
         ("checks", "Consistency checks", check_blocks),
-        ("discussion", "Discussion", lambda page: [*open_questions(asked, answers), *rest]),
+        (
+            "discussion",
+            "Discussion",
+            lambda page: [*open_questions(asked, answers, by_model=answer is not None), *rest],
+        ),
         ("warnings", "Warnings", lambda page: remarks(analysis.warnings)),
         ("skipped", "What was skipped", skipped_blocks),
         ("provenance", "Provenance", lambda page: provenance_blocks(page, made)),
@@ -83,7 +92,6 @@ def build_document(
     return page.document(
         placed(sections, asked, answers),
         about=f"Identification and control of {count(analysis.carts, 'cart')}",
-        untitled=f"Identification of {count(analysis.carts, 'cart')}",
     )
 
 

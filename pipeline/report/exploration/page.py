@@ -34,7 +34,7 @@ def write_diary(turns: Sequence[Turn], analysis: Analysis, folder: Path, *, want
         doing="diary",
         progress=None,
     )
-    document = page.document(sections, about=_WORDS.text("about"), untitled=_WORDS.text("about"))
+    document = page.document(sections, about=_WORDS.text("about"))
     write_file(folder / NAME, render_html(document))
     return folder / NAME
 

@@ -106,7 +106,6 @@ def build_gap_document(
     return page.document(
         page.sections(parts, doing="gap report", progress=progress),
         about="What the linear model leaves out",
-        untitled=f"The gap of {count(analysis.carts, 'cart')}",
     )
 
 

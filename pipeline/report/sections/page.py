@@ -46,14 +46,18 @@ class Page:
             drive=clean(analysis.input_unit),
         )
 
-    def document(self, sections: Iterable[Section], *, about: str, untitled: str) -> Document:
-        """Return the sections under title, authors and what the document is about."""
+    def document(self, sections: Iterable[Section], *, about: str) -> Document:
+        """Return the sections under title, authors and what the document is about.
+
+        What it is about is the title where the students gave none, and is then said once.
+        """
         analysis = self.analysis
-        section = f"Section {clean(analysis.section)} · " if analysis.section else ""
+        title = clean(analysis.title).strip()
+        section = [f"Section {clean(analysis.section)}"] if analysis.section else []
         people = analysis.authors
         return Document(
-            title=clean(analysis.title).strip() or untitled,
-            subtitle=f"{section}{about}",
+            title=title or about,
+            subtitle=" · ".join([*section, *([about] if title else [])]),
             authors=tuple(clean(f"{name} ({id_})" if name else id_) for id_, name in people),
             sections=tuple(sections),
             footer=f"cartlab {__version__}",

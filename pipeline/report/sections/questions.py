@@ -4,8 +4,9 @@ A question stands where its figures are. It is answered in `notes.md` under a he
 with the question's id; what stands under no such heading is the discussion.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -34,10 +35,17 @@ _MOST = 6  # a report with more would be a questionnaire
 _LISTED = 4  # runs; of more the first
 
 
+Kind = Literal[
+    "sign", "damping", "signs_differ", "gain", "frequency", "assumed", "friction", "sticking",
+    "misfit", "level", "overshoot", "hardware",
+]  # fmt: skip
+
+
 @dataclass(frozen=True, kw_only=True)
 class Asked:
-    """A question in plain text; `section` is where its figures are."""
+    """A question in plain text; `kind` is what it is about, `section` where its figures are."""
 
+    kind: Kind
     id: str
     section: str
     text: str
@@ -69,7 +77,7 @@ def _turned(analysis: Analysis) -> Iterator[Asked]:
     runs = listing(names) if len(names) <= _LISTED else f"{names[0]} and {len(names) - 1} more"
     there = {"step": "steps", "sine": "frequency-response", "closed_loop": "hardware"}
     section = there.get(turned[0].kind, "discussion")
-    yield Asked(id="sign", section=section, text=_WORDS.text("sign", runs=runs))
+    yield Asked(kind="sign", id="sign", section=section, text=_WORDS.text("sign", runs=runs))
 
 
 def _off(analysis: Analysis) -> list[ParameterRow]:
@@ -95,7 +103,7 @@ def _gains_and_frequencies(analysis: Analysis) -> Iterator[Asked]:
         return  # the largest change stands for the others
 
 
-def _of_row(row: ParameterRow, key: str, **values: str) -> Asked:
+def _of_row(row: ParameterRow, key: Kind, **values: str) -> Asked:
     """Ask why two estimates differ."""
     initial, final = (
         SOURCES.get(one.source, clean(one.source)) if one else ""
@@ -104,7 +112,7 @@ def _of_row(row: ParameterRow, key: str, **values: str) -> Asked:
     text = _WORDS.text(
         key, name=row.name, change=_change(row), initial=initial, final=final, **values
     )
-    return Asked(id=row.name, section="parameters", text=text)
+    return Asked(kind=key, id=row.name, section="parameters", text=text)
 
 
 def _assumed(analysis: Analysis) -> Iterator[Asked]:
@@ -128,7 +136,7 @@ def _assumed(analysis: Analysis) -> Iterator[Asked]:
         feature="null" if read_name(row.name).is_null else "peak",
         sharper="flatter" if final > initial else "sharper",
     )
-    yield Asked(id=row.name, section="frequency-response", text=text)
+    yield Asked(kind="assumed", id=row.name, section="frequency-response", text=text)
 
 
 def _friction(analysis: Analysis) -> Iterator[Asked]:
@@ -148,7 +156,7 @@ def _friction(analysis: Analysis) -> Iterator[Asked]:
                 unit = clean(analysis.position_unit)
                 rise = _WORDS.text("friction_rises", unit=unit, **told)
         text = _WORDS.text("friction", run=decay.experiment, cart=cart, rise=rise)
-        yield Asked(id=f"friction-{cart}", section="decays", text=text)
+        yield Asked(kind="friction", id=f"friction-{cart}", section="decays", text=text)
 
 
 def _sticking(analysis: Analysis) -> Iterator[Asked]:
@@ -163,7 +171,7 @@ def _sticking(analysis: Analysis) -> Iterator[Asked]:
         low=significant(low, digits=3),
         high=significant(high, digits=3),
     )
-    yield Asked(id=f"sticking-{worst.cart}", section="steps", text=text)
+    yield Asked(kind="sticking", id=f"sticking-{worst.cart}", section="steps", text=text)
 
 
 def _misfit(analysis: Analysis) -> Iterator[Asked]:
@@ -185,7 +193,7 @@ def _misfit(analysis: Analysis) -> Iterator[Asked]:
             sigmas=significant(sigmas, digits=2),
             chi_square=significant(fit.chi_square_per_dof, digits=3),
         )
-        yield Asked(id="misfit", section="frequency-response", text=text)
+        yield Asked(kind="misfit", id="misfit", section="frequency-response", text=text)
 
 
 def _hardware(analysis: Analysis) -> Iterator[Asked]:
@@ -210,9 +218,9 @@ def _hardware(analysis: Analysis) -> Iterator[Asked]:
         yield _of_run(far, "hardware", share=percent(100 * far.nrmse))
 
 
-def _of_run(check: HardwareCheck, key: str, **values: str) -> Asked:
+def _of_run(check: HardwareCheck, key: Kind, **values: str) -> Asked:
     text = _WORDS.text(key, run=check.experiment, cart=check.cart, **values)
-    return Asked(id=key, section="hardware", text=text)
+    return Asked(kind=key, id=key, section="hardware", text=text)
 
 
 def _level_error(check: HardwareCheck) -> float:
@@ -261,7 +269,7 @@ def split_notes(
 
 
 def placed(
-    sections: Sequence[Section], asked: Sequence[Asked], answers: dict[str, tuple[Block, ...]]
+    sections: Sequence[Section], asked: Sequence[Asked], answers: Mapping[str, tuple[Block, ...]]
 ) -> tuple[Section, ...]:
     """Return the sections with each question at the end of its own, else of the discussion."""
     there = {section.id for section in sections}
@@ -287,13 +295,17 @@ def placed(
 
 
 def open_questions(
-    asked: Sequence[Asked], answers: dict[str, tuple[Block, ...]]
+    asked: Sequence[Asked], answers: Mapping[str, tuple[Block, ...]], *, by_model: bool = False
 ) -> list[Paragraph]:
-    """Return a paragraph that leads to every question, and says which are not answered."""
+    """Return a paragraph that leads to every question, and says which are not answered.
+
+    `by_model`: the answers are not the students', but model answers.
+    """
     if not asked:
         return []
     missing = [question for question in asked if question.id not in answers]
     missed = "none" if not missing else "all" if len(missing) == len(asked) else "some"
+    state = "by_model" if by_model else f"{missed}_missing"
     links: list[Span] = []
     for question in asked:
         links += [
@@ -304,7 +316,7 @@ def open_questions(
         "raised",
         questions=count(len(asked), "question"),
         ids=tuple(links),
-        state=_WORDS.text(f"{missed}_missing", count=len(missing)),
+        state=_WORDS.text(state, count=len(missing)),
     )
     return [paragraph(raised)]
 

@@ -1,25 +1,31 @@
 """What a rubric would expect: every number with its tolerance, and why so wide."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from pipeline.arrays import Array
+from pipeline.errors import ConfigError
+from pipeline.grading import rubric as asked
+from pipeline.grading.references.reference import recompute
+from pipeline.grading.rubric import Rubric, matching
+from pipeline.grading.rubric_file import load_rubric
 from pipeline.names import read_name
 from pipeline.plant.linear.chain import Chain
-from pipeline.report import limits
 from pipeline.report.document import Block, Span, bullet_list, cell, paragraph, spans
 from pipeline.report.equations import derivation
 from pipeline.report.equations.algebra import evaluate, work_out
-from pipeline.report.numbers import NOTHING, percent, significant, unit_text
+from pipeline.report.numbers import NOTHING, count, percent, significant, unit_text
 from pipeline.report.phrases import phrases
 from pipeline.report.sections.page import Page
 from pipeline.report.words import clean, name_span, rich
+from pipeline.resources import RUBRICS
 from pipeline.results import Analysis
 from pipeline.results_json import provenance
 from pipeline.schemas import solution as schema
 from pipeline.schemas.base import fields_of, json_text
+from pipeline.submission import Input, System
 
 _WORDS = phrases("solution")
 SCHEMA = "cartlab-solution/1"
@@ -27,13 +33,26 @@ SCHEMA = "cartlab-solution/1"
 
 @dataclass(frozen=True, kw_only=True)
 class Expected:
-    """A parameter with the half-width of what is accepted, both in its unit."""
+    """A final estimate, and from where to where the rubric gives full points for it.
+
+    Attributes
+    ----------
+    percent : that the rubric allows beyond the reference's own bounds; None if it is not judged.
+    low, high : the bounds for full points, in the parameter's unit; None if it is not judged.
+    """
 
     name: str
     unit: str
     value: float
     std: float | None
-    tolerance: float
+    percent: float | None
+    low: float | None
+    high: float | None
+
+    @property
+    def tolerance(self) -> float | None:
+        """Half of the way between the bounds."""
+        return None if self.low is None or self.high is None else (self.high - self.low) / 2
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -46,31 +65,65 @@ class ExpectedModel:
     B_tolerance: Array
 
 
-def expected_parameters(analysis: Analysis) -> tuple[Expected, ...]:
-    """Return the final estimates with their tolerances."""
-    found = []
+def default_rubric(analysis: Analysis) -> Rubric:
+    """Return the shipped rubric for so many carts, else one with the checks' own limits."""
+    shipped = RUBRICS / f"throne-{analysis.carts}dof.toml"
+    if shipped.is_file():
+        return load_rubric(shipped)
+    checks = (
+        asked.Parameters(id="final", points=1.0, check="final"),
+        asked.StateModel(id="state-model", points=1.0, check="state_space"),
+    )
+    system = System(carts=analysis.carts, springs=analysis.springs, input=Input(unit="V"))
+    return Rubric(version=1, title=_WORDS.text("no_rubric"), system=system, criteria=checks)
+
+
+def check_carts(rubric: Rubric, *, carts: int) -> None:
+    """Insist that a rubric is for so many carts.
+
+    Raises
+    ------
+    ConfigError : it is for others.
+    """
+    if rubric.system.carts != carts:
+        for_ = count(rubric.system.carts, "cart")
+        raise ConfigError(f"the rubric is for {for_}, the submission for {carts}")
+
+
+def expected_parameters(analysis: Analysis, rubric: Rubric) -> tuple[Expected, ...]:
+    """Return the final estimates with what the rubric accepts, by the grading's own reference."""
+    known, found = recompute(analysis).final, []
     for row in analysis.rows:
         if row.final is None:
             continue
-        share = _share(row.name) * abs(row.final.value)
+        asks, reference = _final_check(rubric, row.name), known.get(row.name)
+        share = low = high = None
+        if asks is not None and reference is not None and reference.low > 0:
+            damping = read_name(row.name).is_damping
+            share = asks.damping_full_percent if damping else asks.full_percent
+            slack, factor = asks.sigmas * reference.std, 1 + share / 100
+            low, high = (reference.low - slack) / factor, (reference.high + slack) * factor
         found.append(
             Expected(
                 name=row.name,
                 unit=row.unit,
                 value=row.final.value,
                 std=row.final.std,
-                tolerance=max(share, limits.SIGMAS * (row.final.std or 0.0)),
+                percent=share,
+                low=None if low is None else max(low, 0.0),
+                high=high,
             )
         )
     return tuple(found)
 
 
-def _share(name: str) -> float:
-    return (
-        limits.DAMPING_TOLERANCE
-        if read_name(name).is_damping
-        else (limits.GAIN_AND_FREQUENCY_TOLERANCE)
-    )
+def _final_check(rubric: Rubric, name: str) -> asked.Parameters | None:
+    """Return the criterion that judges a final estimate, None if nothing judges it."""
+    for criterion in rubric.criteria:
+        if isinstance(criterion, asked.Parameters) and criterion.check == "final":
+            if matching(criterion.parameters, [name]):
+                return criterion
+    return None
 
 
 def expected_model(chain: Chain, tolerances: Mapping[str, float]) -> ExpectedModel:
@@ -104,10 +157,10 @@ def expected_model(chain: Chain, tolerances: Mapping[str, float]) -> ExpectedMod
     )
 
 
-def expected_blocks(page: Page) -> list[Block]:
+def expected_blocks(page: Page, rubric: Rubric) -> list[Block]:
     """Return the tables of what is expected, and how to judge a hand-in by them."""
     analysis = page.analysis
-    parameters = expected_parameters(analysis)
+    parameters = expected_parameters(analysis, rubric)
     if not parameters or analysis.chain is None:
         return []
     blocks: list[Block] = []
@@ -117,25 +170,18 @@ def expected_blocks(page: Page) -> list[Block]:
             bullet_list(rich(clean(check.message)) for check in failed),
         ]
     blocks += [
-        paragraph(
-            _WORDS.text(
-                "accepted",
-                share=f"{100 * limits.GAIN_AND_FREQUENCY_TOLERANCE:g}",
-                damping_share=f"{100 * limits.DAMPING_TOLERANCE:g}",
-                sigmas=f"{limits.SIGMAS:g}",
-            )
-        ),
+        paragraph(_WORDS.text("accepted", rubric=clean(rubric.title) or _WORDS.text("untitled"))),
         page.table(
             _WORDS.text("expected_table"),
-            ("Parameter", "Unit", "Expected", "± accepted", "from", "to", "In Hz: a slip"),
+            ("Parameter", "Unit", "Expected", "Full points within", "from", "to", "In Hz: a slip"),
             [
                 [
                     cell(name_span(p.name)),
                     cell(unit_text(clean(p.unit)) or "1"),
                     cell(significant(p.value)),
-                    cell(percent(100 * p.tolerance / abs(p.value)) if p.value else NOTHING),
-                    cell(significant(p.value - p.tolerance)),
-                    cell(significant(p.value + p.tolerance)),
+                    cell(f"{p.percent:g} %" if p.percent is not None else "not judged"),
+                    cell(significant(p.low)),
+                    cell(significant(p.high)),
                     cell(
                         significant(p.value / (2 * np.pi))
                         if read_name(p.name).is_frequency
@@ -149,9 +195,28 @@ def expected_blocks(page: Page) -> list[Block]:
         ),
     ]
     if analysis.chain.is_tied and analysis.chain.n <= derivation.MOST_CARTS:
-        model = expected_model(analysis.chain, {p.name: p.tolerance for p in parameters})
-        blocks += [_state_table(page, model)]
+        model = expected_model(analysis.chain, _tolerances(parameters))
+        blocks += [_state_table(page, model), *_state_judged(rubric)]
     return [*blocks, paragraph("How to judge a hand-in:"), _advice(analysis)]
+
+
+def _tolerances(parameters: Iterable[Expected]) -> dict[str, float]:
+    return {p.name: p.tolerance for p in parameters if p.tolerance is not None}
+
+
+def _state_judged(rubric: Rubric) -> list[Block]:
+    """Return how the rubric judges A and B; nothing where it does not."""
+    return [
+        paragraph(
+            _WORDS.text(
+                "state_judged",
+                full=f"{criterion.full_percent:g}",
+                damping=f"{criterion.damping_full_percent:g}",
+            )
+        )
+        for criterion in rubric.criteria
+        if isinstance(criterion, asked.StateModel)
+    ]
 
 
 def _state_table(page: Page, model: ExpectedModel) -> Block:
@@ -166,7 +231,7 @@ def _state_table(page: Page, model: ExpectedModel) -> Block:
         for i, (value, tolerance) in enumerate(zip(model.B, model.B_tolerance, strict=True))
         if tolerance > 0
     ]
-    return page.table(_WORDS.text("state_table"), ("Entry", "Expected", "± accepted"), rows, "lrr")
+    return page.table(_WORDS.text("state_table"), ("Entry", "Expected", "moves by ±"), rows, "lrr")
 
 
 def _state_row(name: str, value: float, tolerance: float) -> list:
@@ -184,11 +249,15 @@ def _advice(analysis: Analysis) -> Block:
     return bullet_list(spans(text) for text in advice)
 
 
-def solution_text(analysis: Analysis) -> str:
-    """Return `solution.json` as text, numbers at ten significant digits."""
-    parameters = expected_parameters(analysis)
+def solution_text(analysis: Analysis, *, rubric: Rubric | None = None) -> str:
+    """Return `solution.json` as text, numbers at ten significant digits.
+
+    `rubric` says what is accepted; by default that of `default_rubric`.
+    """
+    rubric = rubric or default_rubric(analysis)
+    parameters = expected_parameters(analysis, rubric)
     chain, design = analysis.chain, analysis.feedback
-    model = chain and expected_model(chain, {p.name: p.tolerance for p in parameters})
+    model = chain and expected_model(chain, _tolerances(parameters))
     content = {
         "schema": SCHEMA,
         "submission": fields_of(
@@ -196,7 +265,10 @@ def solution_text(analysis: Analysis) -> str:
             analysis,
             units={"position": analysis.position_unit, "input": analysis.input_unit},
         ),
-        "parameters": [fields_of(schema.ExpectedParameter, p) for p in parameters],
+        "rubric": rubric.title,
+        "parameters": [
+            fields_of(schema.ExpectedParameter, p, tolerance=p.tolerance) for p in parameters
+        ],
         "state_space": model
         and {
             "A": model.A,

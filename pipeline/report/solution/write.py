@@ -5,36 +5,55 @@ from dataclasses import replace
 from pathlib import Path
 
 from pipeline.gap.types import Gap
+from pipeline.grading.rubric import Rubric
 from pipeline.output import write_file
-from pipeline.report.document import Document
+from pipeline.report.document import Document, Paragraph, Span, paragraph
 from pipeline.report.draft.content import Part, build_document
 from pipeline.report.gap.section import with_gap
 from pipeline.report.numbers import count
+from pipeline.report.phrases import phrases
 from pipeline.report.render.write import write_document
+from pipeline.report.sections.questions import Asked
 from pipeline.report.solution.design import design_blocks
-from pipeline.report.solution.expected import expected_blocks, solution_text
+from pipeline.report.solution.expected import (
+    check_carts,
+    default_rubric,
+    expected_blocks,
+    solution_text,
+)
 from pipeline.report.solution.model import motion_blocks, state_blocks, transfer_blocks
+from pipeline.report.words import rich
 from pipeline.results import Analysis
 from pipeline.submission import Submission
 from pipeline.workflow import analyse
 
-_WORKED: tuple[Part, ...] = (
-    ("motion", "Equations of motion", motion_blocks),
-    ("transfer-functions", "Transfer functions", transfer_blocks),
-    ("state-model", "From the table to the state model", state_blocks),
-    ("worked-design", "The controller, worked", design_blocks),
-    ("expected", "What to expect of a hand-in", expected_blocks),
-)
+_WORDS = phrases("solution")
 
 
 def make_solution(
-    submission: Submission, out: Path, *, pdf: bool = True, progress: Callable[[str], None]
+    submission: Submission,
+    out: Path,
+    *,
+    rubric: Rubric | None = None,
+    pdf: bool = True,
+    progress: Callable[[str], None],
 ) -> tuple[Analysis, str]:
-    """Analyse a submission, write its reference; return the analysis and solution.json."""
+    """Analyse a submission, write its reference; return the analysis and solution.json.
+
+    Parameters
+    ----------
+    rubric : says what is accepted; by default the shipped one for so many carts.
+
+    Raises
+    ------
+    ConfigError : the rubric is for another number of carts.
+    """
+    if rubric is not None:
+        check_carts(rubric, carts=submission.system.carts)
     analysis, gap = with_gap(analyse(submission, progress=progress), submission.folder)
     out.mkdir(parents=True, exist_ok=True)
-    write_file(out / "solution.json", text := solution_text(analysis))
-    render_solution(analysis, out, gap=gap, pdf=pdf, progress=progress)
+    write_file(out / "solution.json", text := solution_text(analysis, rubric=rubric))
+    render_solution(analysis, out, rubric=rubric, gap=gap, pdf=pdf, progress=progress)
     return analysis, text
 
 
@@ -42,21 +61,46 @@ def render_solution(
     analysis: Analysis,
     out: Path,
     *,
+    rubric: Rubric | None = None,
     gap: Gap | None = None,
     pdf: bool = True,
     progress: Callable[[str], None] | None = None,
 ) -> None:
     """Write `solution.html`, `solution.pdf` and `figures/*.svg` into the folder `out`."""
-    document = build_solution(analysis, gap=gap, progress=progress)
+    document = build_solution(analysis, rubric=rubric, gap=gap, progress=progress)
     write_document(document, out, name="solution", pdf=pdf)
 
 
 def build_solution(
-    analysis: Analysis, *, gap: Gap | None = None, progress: Callable[[str], None] | None = None
+    analysis: Analysis,
+    *,
+    rubric: Rubric | None = None,
+    gap: Gap | None = None,
+    progress: Callable[[str], None] | None = None,
 ) -> Document:
-    """Return the report with the worked sections in the place of the short ones on the model."""
-    document = build_document(analysis, gap=gap, worked=_WORKED, progress=progress)
+    """Return the report with the worked sections in the place of the short ones on the model.
+
+    It holds no text of students: their notes are left out, and each question of the data has a
+    model answer.
+    """
+    accepted = rubric or default_rubric(analysis)
+    worked: tuple[Part, ...] = (
+        ("motion", "Equations of motion", motion_blocks),
+        ("transfer-functions", "Transfer functions", transfer_blocks),
+        ("state-model", "From the table to the state model", state_blocks),
+        ("worked-design", "The controller, worked", design_blocks),
+        ("expected", "What to expect of a hand-in", lambda page: expected_blocks(page, accepted)),
+    )
+    document = build_document(
+        analysis, gap=gap, worked=worked, answer=model_answer, progress=progress
+    )
     told = ["Worked reference for instructors", count(analysis.carts, "cart")]
     if analysis.failed_checks:
         told.append(f"doubtful: {count(len(analysis.failed_checks), 'check')} failed")
     return replace(document, subtitle=" · ".join(told))
+
+
+def model_answer(question: Asked) -> Paragraph:
+    """Return what a good answer to a question says."""
+    lead = Span(_WORDS.text("model_answer"), "strong")
+    return paragraph(lead, rich(_WORDS.text(f"answer_{question.kind}")))

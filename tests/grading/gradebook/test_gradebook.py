@@ -199,17 +199,18 @@ def test_shared_data_is_flagged_in_the_class_list(open_book):
 def test_points_given_by_hand_survive_regrading(open_book):
     """They count in place of the automatic ones, lateness comes off anew, and they can go again."""
     book = open_book()
-    first = make_grade("team-1", share=0.5, days_late=1.0)  # 10 % of it is lost
+    # 10 % of it is lost, to the rubric's quarter of a point: 1.1 is 1, and 0.65 is 0.75.
+    first = make_grade("team-1", share=0.5, days_late=1.0)
     finish(book, make_outcome(first, key="1"))
 
     given = book.override("team-1", "state-model", 2.0, why="right in another order", by="Ada")
 
     assert (given.by, given.why, given.at) == ("Ada", "right in another order", given.at)
-    assert book.entry("team-1").grade.points == pytest.approx((10 + 1) * 0.9)
+    assert book.entry("team-1").grade.points == pytest.approx(10 + 1 - 1)
     finish(book, make_outcome(make_grade("team-1", share=0.25, days_late=1.0), key="2"))
     grade = book.entry("team-1").grade
-    assert grade.points == pytest.approx((5 - 0.5 + 2) * 0.9)
-    assert grade.deducted == pytest.approx((5 - 0.5 + 2) * 0.1)
+    assert grade.points == pytest.approx(5 - 0.5 + 2 - 0.75)
+    assert grade.deducted == pytest.approx(0.75)
     (model,) = [c for c in grade.criteria if c.id == "state-model"]
     assert (model.points, model.outcome) == (2.0, "pass")
     assert model.message.endswith("Set by hand from 0.5 to 2 of 2: right in another order")

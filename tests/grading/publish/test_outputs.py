@@ -14,6 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import ConfigError
+from pipeline.grading.batch.grade_class import grade_class
+from pipeline.grading.batch.runner import Limits
 from pipeline.grading.csv_table import read_table
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.class_lines import Line
@@ -22,11 +24,12 @@ from pipeline.grading.gradings import Batch
 from pipeline.grading.publish.anonymous import KEY_FILE, anonymise, pseudonyms
 from pipeline.grading.publish.class_page import class_page
 from pipeline.grading.publish.export import results_text
-from pipeline.grading.publish.feedback import evidence_table, feedback_page
+from pipeline.grading.publish.feedback import evidence_table, feedback_page, numbers_table
 from pipeline.grading.publish.outputs import grades_csv, write_outputs
 from pipeline.grading.words import WORDS
 from pipeline.report.document import plain
-from pipeline.schemas.grade import CODES, Flag
+from pipeline.schemas.base import Units
+from pipeline.schemas.grade import CODES, Criterion, Flag
 from tests.helpers.grades import (
     failed_grade,
     hertz_flag,
@@ -47,7 +50,7 @@ def test_a_remark_s_evidence_keeps_its_words():
         "slip": "rows 1 and 2 are exchanged", "also_in": "final", "ran": [1.0], "gone": "",
     }  # fmt: skip
     flag = Flag(code="wrong_state_space", parameters=(), message="x", evidence=evidence)
-    table = evidence_table(flag, numbers=count(1))
+    table = evidence_table(flag, units=None, numbers=count(1))
     assert table is not None
     shown = {plain(h.text): plain(c.text) for h, c in zip(table.head, table.rows[0], strict=True)}
     assert shown == {
@@ -88,7 +91,8 @@ def test_every_submission_has_its_row(graded):
     assert (broken["status"], broken["points"], broken["pieces"]) == ("failed", "0", "")
     assert broken["reason"] == "submission.toml line 3: <b>cart</b> is no key"
     by_hand = rows["team-02"]  # 95 % of 20, 1 in place of 0.95 for one criterion, 1 day late
-    assert float(by_hand["points"]) == pytest.approx((19 - 0.95 + 1) * 0.9, abs=0.006)
+    # 10 % of 19.05 are 1.905, which is 2 to the rubric's quarter of a point.
+    assert float(by_hand["points"]) == pytest.approx(19 - 0.95 + 1 - 2.0, abs=1e-9)
     assert (by_hand["laws"], by_hand["by_hand"], by_hand["remarks"]) == ("1", "laws", "shared_data")
     assert rows["team-03"]["pieces"] == "0.9"
     assert rows["team-05"]["authors"] == "s4 <script>alert(1)</script>"
@@ -294,7 +298,66 @@ def test_a_submission_that_could_not_be_graded_hears_why():
     grade = failed_grade("team-1", "no submission.toml in it")
     html = feedback_page(grade, rubric=RUBRIC, figures=(), name="team-1")
     assert "No submission.toml in it." in html
-    assert "Mend it and hand it in again" in html
+    assert "Fix it and hand it in again" in html
+
+
+def test_a_broken_submission_hears_every_reason(tmp_path):
+    """Three mistakes in its file are three lines of the feedback, and one cell of the table."""
+    folder = tmp_path / "class" / "team-1"
+    (folder / "data").mkdir(parents=True)
+    text = 'version = 1\n[system]\ncarts = 2\nspring = [true]\n[design]\ncart = "two"\n[reportd]\n'
+    (folder / "submission.toml").write_text(text, encoding="utf-8")
+    out = tmp_path / "grades"
+    grade_class(
+        [folder], rubric_file=Path("throne-2dof"), out=out, jobs=1, cluster=None,
+        limits=Limits(), figures=False, progress=lambda *_: None,
+    )  # fmt: skip
+    html = (out / "feedback" / "team-1" / "feedback.html").read_text(encoding="utf-8")
+    wanted = ("system.spring: unknown key", "design.cart: expected", "reportd: unknown key")
+    for words in wanted:
+        assert sum(words in item for item in re.findall(r"<li>(.*?)</li>", html)) == 1
+    assert "more)" not in html
+    (row,) = csv.DictReader((out / "grades.csv").read_text(encoding="utf-8").splitlines())
+    assert all(words in row["reason"] for words in wanted)
+
+
+def test_numbers_of_a_criterion_have_words_and_units():
+    """An overshoot of 0 beside one of 10⁻⁷ % is no difference; points are no share of a share."""
+    units = Units(position="cm", input="V")
+    claims = Criterion(
+        id="c", title="claims", outcome="partial", points=1, out_of=2, message="",
+        expected={"overshoot_percent": 3.7e-7, "settling_time": 0.5, "prefilter": 0.07},
+        found={"overshoot_percent": 0.0, "settling_time": 0.6, "prefilter": 0.14},
+    )  # fmt: skip
+    shown = numbers_table(claims, check="claims", units=units, numbers=count(1))
+    assert shown is not None
+    assert [[plain(cell.text) for cell in row] for row in shown.rows] == [
+        ["Overshoot [%]", "0", "0", "0"],
+        ["Settling time [s]", "0.6", "0.5", "+20.0 %"],
+        ["Prefilter [V/cm]", "0.14", "0.07", "+100 %"],
+    ]
+    off = claims.model_copy(update={"found": {"overshoot_percent": 22.0}})
+    shown = numbers_table(off, check="claims", units=units, numbers=count(1))
+    assert shown is not None
+    assert plain(shown.rows[0][3].text) == "+22 percentage points"
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [
+        ("K_1", "cm/V"), ("omega_a", "rad/s"), ("zeta_2", ""), ("mass", "V\xa0s²/cm"),
+        ("A(2, 1)", "1/s²"), ("A(4, 4)", "1/s"), ("A(1, 2)", ""),
+        ("B(2)", "cm/(V\xa0s²)"), ("B(1)", ""),
+    ],
+)  # fmt: skip
+def test_a_number_has_its_unit(name, unit):
+    """Parameters, and the entries of A and B whose states are a position and a velocity."""
+    one = make_grade("a").criteria[0].model_copy(update={"expected": {name: 1.0}, "found": {}})
+    units = Units(position="cm", input="V")
+    shown = numbers_table(one, check="final", units=units, numbers=count(1))
+    assert shown is not None
+    label = plain(shown.rows[0][0].text)
+    assert label.endswith(f" [{unit}]") if unit else "[" not in label
 
 
 _VALUES = (

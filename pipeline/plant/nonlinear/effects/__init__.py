@@ -3,7 +3,9 @@
 To add one: write an `Effect` in a file here and list it below.
 """
 
+import re
 from difflib import get_close_matches
+from operator import attrgetter
 
 from pipeline.errors import ConfigError
 from pipeline.plant.nonlinear.effects import actuator, cogging, friction, springs, structure
@@ -31,6 +33,9 @@ CATALOGUE: tuple[Effect, ...] = (
     structure.EXTRA_MODE,
 )
 
+_WORD = re.compile(r"[a-z]+")
+_LONGEST = 60  # letters of a name that are looked at
+
 __all__ = ["CATALOGUE", "AugmentedChain", "Effect", "Parameter", "Term", "find_effect", "make_term"]
 
 
@@ -39,12 +44,27 @@ def find_effect(key: str) -> Effect:
 
     Raises
     ------
-    ConfigError : no such effect; the message has the nearest name, or all.
+    ConfigError : no such effect; the message has the names that share a word, or the nearest.
     """
     for effect in CATALOGUE:
         if effect.key == key:
             return effect
     keys = [effect.key for effect in CATALOGUE]
-    close = get_close_matches(key, keys, n=1, cutoff=0.5)
-    known = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(keys)}"
+    near = _with_words(key) or get_close_matches(key, keys, n=1, cutoff=0.5)
+    *others, last = map(repr, near or [""])
+    meant = f"{', '.join(others)} or {last}" if others else last
+    known = f"did you mean {meant}?" if near else f"known: {', '.join(keys)}"
     raise ConfigError(f"no effect {key[:60]!r}; {known}")
+
+
+def _with_words(typed: str) -> list[str]:
+    """Return the effects that have all the words typed in their name, else in their title.
+
+    In the order of the catalogue, which begins with the commonest.
+    """
+    words = set(_WORD.findall(typed[:_LONGEST].lower()))
+    for names in (attrgetter("key"), attrgetter("title")):
+        found = [e.key for e in CATALOGUE if words and words <= {*_WORD.findall(names(e).lower())}]
+        if found:
+            return found
+    return []

@@ -1,0 +1,58 @@
+"""What a remark costs at least: the share of a criterion that the rubric names for its flag."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from fractions import Fraction
+
+from pipeline.grading import rubric as asked
+from pipeline.grading.judge.work import ALL, Verdict
+from pipeline.grading.references.tolerance import exact
+from pipeline.grading.rubric import Rubric, matching
+from pipeline.grading.words import WORDS
+from pipeline.schemas.grade import Code, Flag
+
+# The check that a remark is about; one on a table of parameters names its table in the evidence.
+_ABOUT: Mapping[Code, str] = {
+    "initial_final_disagree": "initial_final",
+    "wrong_state_space": "state_space",
+    "wrong_gains": "gains",
+    "wrong_prefilter": "prefilter",
+    "missing": "required",
+    "data_problem": "data",
+}
+_REDUCED = "data"  # a table that the students reduced themselves is one of their recordings
+
+
+def charge(
+    verdict: Verdict, criterion: asked.Criterion, flags: Sequence[Flag], *, rubric: Rubric
+) -> Verdict:
+    """Return a verdict that keeps no more than the dearest remark on its criterion leaves.
+
+    Several remarks on one criterion cost what the dearest does, not their sum.
+    """
+    mine = [flag for flag in flags if concerns(flag, criterion, names=rubric.names)]
+    dearest = max(mine, key=lambda flag: rubric.flags.of(flag.code), default=None)
+    if dearest is None or verdict.share is None:
+        return verdict
+    cost = rubric.flags.of(dearest.code)
+    kept: Fraction = ALL - exact(cost)
+    if verdict.share <= kept:
+        return verdict
+    said = WORDS.text(
+        "costs",
+        title=WORDS.text(f"title_{dearest.code}"),
+        percent=f"{100 * cost:g}",
+    )
+    return replace(verdict, share=kept, message=f"{verdict.message} {said}")
+
+
+def concerns(flag: Flag, criterion: asked.Criterion, *, names: list[str]) -> bool:
+    """Whether a remark is about what a criterion judges."""
+    if flag.code in _ABOUT:
+        return _ABOUT[flag.code] == criterion.check
+    tables = {flag.evidence.get("table"), flag.evidence.get("also_in")} - {None}
+    if not tables:
+        return criterion.check == _REDUCED
+    if not isinstance(criterion, asked.Parameters) or criterion.check not in tables:
+        return False
+    return not set(flag.parameters).isdisjoint(matching(criterion.parameters, names))

@@ -1,0 +1,204 @@
+"""Points follow consequences: harmful models, what remarks cost at least, and the rubric's step."""
+
+from dataclasses import replace
+from decimal import Decimal
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from pipeline.grading.mistakes.state_model import StateModel, compare_entries, model_harm
+from pipeline.grading.references.tolerance import exact, late_deduction, to_step
+from pipeline.grading.rubric import Late, Rubric
+from pipeline.plant.linear.presets import PRESETS
+from pipeline.schemas.grade import Criterion, Grade
+from pipeline.submission import StateSpace
+from tests.helpers.grading_students import Student, student, typed
+
+
+def model(one: Student) -> tuple[np.ndarray, np.ndarray]:
+    """Return A and B as a student reports them."""
+    space = one.reported.state_space
+    assert space is not None
+    return np.array(space.A, dtype=float), np.array(space.B, dtype=float)
+
+
+def with_model(one: Student, A: np.ndarray, B: np.ndarray) -> Student:
+    """Return the student with another model, typed to three digits."""
+    return one.reporting(state_space=space_of(A, B))
+
+
+def space_of(A: np.ndarray, B: np.ndarray) -> StateSpace:
+    """Return a model as typed to three digits."""
+    rows = tuple(tuple(typed(float(a)) if a else Decimal(0) for a in row) for row in A)
+    return StateSpace(A=rows, B=tuple(typed(float(b)) if b else Decimal(0) for b in B))
+
+
+def under(one: Student, **changed: object) -> Student:
+    """Return the student under a rubric with other values."""
+    plain = one.rubric.model_dump(mode="json") | changed
+    return replace(one, rubric=Rubric.model_validate(plain))
+
+
+def criterion(grade: Grade, id_: str) -> Criterion:
+    """Return a criterion of a grade."""
+    (found,) = [c for c in grade.criteria if c.id == id_]
+    return found
+
+
+# ---------------------------------------------------------------------- harmful models
+
+
+def _flip_stiffness(A: np.ndarray, B: np.ndarray) -> None:
+    A[1, 0] *= -1
+
+
+def _flip_dampings(A: np.ndarray, B: np.ndarray) -> None:
+    A[1, 1] *= -1
+    A[3, 3] *= -1
+
+
+def _flip_input(A: np.ndarray, B: np.ndarray) -> None:
+    B *= -1
+
+
+def _flip_couplings(A: np.ndarray, B: np.ndarray) -> None:
+    A[1, 2] *= -1
+    A[3, 0] *= -1
+
+
+@pytest.mark.parametrize(
+    ("slip", "said"),
+    [
+        (_flip_stiffness, "is unstable"),
+        (_flip_dampings, "is unstable"),
+        (_flip_input, "the wrong way"),
+        (_flip_couplings, "the wrong way"),
+    ],
+)
+def test_a_harmful_model_keeps_a_quarter_at_most(slip, said):
+    """One sign makes a model that blows up or moves the other way: its other entries are no use."""
+    one = student(2)
+    A, B = model(one)
+    slip(A, B)
+    found = criterion(with_model(one, A, B).grade(), "state-model")
+    assert found.points <= 0.25 * found.out_of
+    assert said in found.message
+
+
+@pytest.mark.parametrize("carts", [2, 3])
+@pytest.mark.parametrize("first", ["positions", "last cart"])
+def test_another_order_of_the_states_is_no_harm(carts, first):
+    """It is the same motion under other names: wrong, and it costs what the remark does."""
+    one = student(carts)
+    A, B = model(one)
+    both = [[*range(0, 2 * carts, 2), *range(1, 2 * carts, 2)]]
+    both += [[2 * i + part for i in reversed(range(carts)) for part in (0, 1)]]
+    order = both[first == "last cart"]
+    found = criterion(with_model(one, A[np.ix_(order, order)], B[order]).grade(), "state-model")
+    assert found.points < found.out_of
+    assert "a quarter" not in found.message
+
+
+@pytest.mark.parametrize("preset", sorted(PRESETS))
+def test_an_honest_model_does_no_harm(preset):
+    """Entries up to a tenth off, either way: three carts would then grow, and it is no mistake."""
+    chain, rng = PRESETS[preset], np.random.default_rng(5)
+    A, B, _, _ = chain.state_space()
+    right = np.hstack([A, B])
+    models = [StateModel(right=right, slack=np.zeros_like(right))]
+    grown = 0
+    for _ in range(100):
+        off = np.exp(rng.uniform(-0.1, 0.1, A.shape)) * A
+        off[A == 1.0] = 1.0
+        grown += bool(np.linalg.eigvals(off).real.max() > 0)
+        space = space_of(off, B[:, 0])
+        entries = compare_entries(space, models=models, n=chain.n)
+        harm = model_harm(space, entries, models=models, n=chain.n, tied=chain.is_tied)
+        assert harm is None
+    assert bool(grown) == (chain.n == 3)
+
+
+def test_gains_that_only_work_on_paper_keep_a_quarter_at_most():
+    """Gains for carts ten times as heavy as those on the bench are stable on the table alone."""
+    one = student(2)
+    feedback, times = one.reported.feedback, 30
+    assert feedback is not None
+    heavy = {name: one.value("final", name) / times for name in ("K_1", "K_2")}
+    gains = tuple(times * gain for gain in feedback.gains)
+    wrong = one.reporting(final=heavy, feedback=feedback.model_copy(update={"gains": gains}))
+    found = criterion(wrong.grade(), "feedback")
+    assert found.points <= 0.25 * found.out_of
+    assert "On your carts: the loop is unstable" in found.message
+
+
+# ------------------------------------------------------------- what a remark costs at least
+
+
+def test_an_error_in_the_model_costs_half_where_the_rubric_says_nothing():
+    """A single coupling too weak is one entry of many, and another model of the carts."""
+    one = student(2)
+    A, B = model(one)
+    A[1, 2] *= 0.5
+    plain = with_model(under(one, flags={}), A, B)
+    found = criterion(plain.grade(), "state-model")
+    assert found.points == 0.5 * found.out_of
+    assert "costs at least 50 %" in found.message
+    free = criterion(under(plain, flags={"wrong_state_space": 0}).grade(), "state-model")
+    assert 0.5 * free.out_of < free.points < free.out_of
+
+
+def test_a_remark_on_a_table_costs_the_criteria_of_its_numbers():
+    """Hz in the final frequencies: those criteria pay, the gains and the first estimates do not."""
+    one = student(2)
+    hertz = {
+        name: one.value("final", name) / (2 * np.pi)
+        for name in one.reported.final
+        if name.startswith("omega")
+    }
+    dear = under(one.reporting(final=hertz), flags={"hz_for_rad_s": 1.0, "final_off": 1.0})
+    grade = dear.grade()
+    assert {flag.code for flag in grade.flags} == {"hz_for_rad_s"}
+    for id_, kept in (("final-frequencies", 0), ("final-gains", 1), ("initial-decays", 1)):
+        found = criterion(grade, id_)
+        assert found.points == kept * found.out_of, id_
+
+
+def test_of_two_remarks_on_one_criterion_the_dearer_counts():
+    """A slip in one number and another number off: the costs are not added."""
+    one = student(2)
+    off = {"omega_1": one.value("final", "omega_1") / (2 * np.pi)}
+    off |= {"omega_b": one.value("final", "omega_b") * 1.35}
+    costs = {"hz_for_rad_s": 0.25, "final_off": 0.75, "physically_impossible": 0.5}
+    grade = under(one.reporting(final=off), flags=costs).grade()
+    worst = max(costs[flag.code] for flag in grade.flags if flag.code in costs)
+    assert len(grade.flags) > 1
+    assert criterion(grade, "final-frequencies").points == (1 - worst) * 2
+
+
+# ------------------------------------------------------------------------------ the step
+
+
+@pytest.mark.parametrize("step", [0.01, 0.1, 0.25, 0.5, 1.0])
+def test_points_are_multiples_of_the_step(step):
+    """Whatever a student got wrong, points and total are such as a person would give."""
+    one = under(student(2), step=step)
+    off = {name: one.value("final", name) * 1.11 for name in one.reported.final}
+    grade = one.reporting(final=off).grade(days_late=1.5)
+    for points in (grade.points, grade.deducted, *(c.points for c in grade.criteria)):
+        assert exact(points) % exact(step) == 0
+    outcomes = {(c.outcome, c.points == c.out_of, c.points == 0) for c in grade.criteria}
+    assert outcomes <= {
+        ("pass", True, False),
+        ("partial", False, False),
+        ("fail", False, True),
+        ("skip", False, True),
+    }
+
+
+def test_halves_are_rounded_for_the_student():
+    """1.75 in steps of a half is 2; a day late takes 10 % of 17.5, which is 1.5 and not 2."""
+    assert to_step(Fraction("1.75"), 0.5) == 2
+    late = Late(percent_per_day=10.0)
+    assert late_deduction(Fraction("17.5"), late=late, step=0.5, days_late=1.0) == Fraction("1.5")
+    assert late_deduction(Fraction("17.5"), late=late, step=0.01, days_late=1.0) == Fraction("1.75")

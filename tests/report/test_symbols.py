@@ -1,0 +1,48 @@
+"""Parameters have their symbols wherever a person reads, whatever they are called in files."""
+
+import re
+from decimal import Decimal
+from html import unescape
+
+import pytest
+
+from pipeline.grading.publish.export import results_text
+from pipeline.grading.publish.feedback import feedback_page
+from pipeline.report.draft.content import build_document
+from pipeline.report.render.html import render_html
+from pipeline.report.sections.summary import terminal_summary
+from pipeline.report.solution.write import build_solution
+from tests.helpers.analysis_factory import make_analysis
+from tests.helpers.grading_students import student
+
+_HIDDEN = re.compile(r"<(script|style|code)\b.*?</\1>|<[^>]*>", re.DOTALL)
+_AS_IN_FILES = re.compile(r"\b(?:omega|zeta)(?:_\w)?\b|overshoot_percent|settling_time|nrmse")
+
+
+def raw(html: str) -> list[str]:
+    """Return the names on a page that are spelt as in files."""
+    return _AS_IN_FILES.findall(unescape(_HIDDEN.sub(" ", html)))
+
+
+@pytest.mark.parametrize("carts", [1, 2, 3])
+def test_reports_write_symbols(carts):
+    """The report, the solution and the terminal; a key to be typed is set as code."""
+    analysis = make_analysis(carts)
+    assert raw(render_html(build_document(analysis, progress=None))) == []
+    assert raw(render_html(build_solution(analysis))) == []
+    assert raw(terminal_summary(analysis)) == []
+
+
+def test_grades_write_symbols():
+    """The feedback to a student with many mistakes, and what a platform shows of it."""
+    one = student(2)
+    off = {name: one.value("final", name) * 2 for name in ("zeta_b", "omega_1", "K_1")}
+    feedback = one.reported.feedback
+    assert feedback is not None
+    claims = feedback.model_copy(update={"overshoot_percent": Decimal(30)})
+    grade = one.reporting(final=off, initial={"zeta_1": -0.05}, feedback=claims).grade()
+    assert len(grade.flags) > 1
+    assert raw(feedback_page(grade, rubric=one.rubric, figures=(), name="team-07")) == []
+    shown = results_text(grade)
+    assert raw("".join(re.findall(r'"output": "(.*)"', shown))) == []
+    assert "ζ_b" in shown
