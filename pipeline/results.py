@@ -17,6 +17,8 @@ from dataclasses import dataclass, field
 from decimal import Decimal
 from typing import Literal
 
+import numpy as np
+
 from pipeline.arrays import Array, ComplexArray, freeze
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.loop.margins import Margins
@@ -105,6 +107,11 @@ class ChainFit:
     standardised: dict[str, Array] = field(default_factory=dict)
 
     @property
+    def std(self) -> dict[str, float]:
+        """The standard errors of the physical parameters that have one."""
+        return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+
+    @property
     def explains_data(self) -> bool:
         """Whether model and stated noise explain the data."""
         return self.chi_square_per_dof <= EXPLAINED
@@ -139,6 +146,16 @@ class Check:
     value: float | None
     limit: float | None
     message: str
+
+    @property
+    def kind(self) -> str:
+        """What is asked, whatever it is asked of: "decay" of "decay.run-1.cart_1"."""
+        return self.id.partition(".")[0]
+
+    @property
+    def about(self) -> str:
+        """Of what it is asked, "" where there is one thing only: "run-1.cart_1"."""
+        return self.id.partition(".")[2]
 
     @classmethod
     def of(

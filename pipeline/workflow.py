@@ -18,6 +18,7 @@ from pipeline.checks.recordings import (
     check_scales,
     check_setup,
     check_signs,
+    check_units,
 )
 from pipeline.errors import DataError
 from pipeline.identify.carts import UNTIED
@@ -79,6 +80,7 @@ def analyse(
     checks = [
         *signs,
         *check_files(data.unreadable),
+        *check_units(data.records, system=system),
         *check_scales(sound, system=system),
         *check_left_out(left_out, records=data.records),
         *check_setup(data.records),

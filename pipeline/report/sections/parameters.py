@@ -3,8 +3,6 @@
 from collections.abc import Mapping, Sequence
 from decimal import Decimal
 
-import numpy as np
-
 from pipeline.names import read_name
 from pipeline.plant.linear.chain import Chain
 from pipeline.report import limits
@@ -191,8 +189,7 @@ def _staged_differences(analysis: Analysis) -> Block | None:
 
 def fitted_chain_table(page: Page, fit: ChainFit) -> Table:
     """Return masses, dampings and springs of a joint fit."""
-    std = dict(zip(fit.names, np.sqrt(np.diag(fit.covariance)), strict=True))
-    return chain_table(page, fit.chain, std=std)
+    return chain_table(page, fit.chain, std=fit.std)
 
 
 def chain_table(page: Page, chain: Chain, *, std: Mapping[str, float]) -> Table:
