@@ -41,7 +41,7 @@ class FrequencyResponse:
     """X_cart/U at omega: (n_w,) arrays, ascending; carries its own grid, never interpolated.
 
     `phase` (rad) and its error are None for a table of amplitude ratios. `source`: sine dwells,
-    a table the students reduced, or transforms of step and sweep records.
+    a table the students reduced, or transforms of step and sweep records; `experiments` are those.
     """
 
     cart: int
@@ -51,6 +51,7 @@ class FrequencyResponse:
     phase: Array | None
     phase_std: Array | None
     source: Literal["dwells", "table", "records"]
+    experiments: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         freeze(self, "omega", "magnitude", "magnitude_std", "phase", "phase_std")
@@ -62,12 +63,14 @@ class Estimate:
 
     `at_bound`: a fit ended at the bound of what is possible (a damping of zero), so `value` is
     that bound and no measurement, `std` is None, and nothing may be concluded from either.
+    `experiments` are the recordings it rests on; of a fit's, see `ChainFit.experiments`.
     """
 
     value: float
     std: float | None
     source: str
     at_bound: bool = False
+    experiments: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -88,6 +91,7 @@ class ChainFit:
     chi_square_per_dof : near 1 where model and stated noise explain the data; see `explains_data`.
     misfit : of a "bode_fit" by how much of their magnitude points lie off it, beyond their errors.
     standardised : per cart (n_w,) or per record (n,): residual over its standard error.
+    experiments : the recordings that it was fitted to.
     """
 
     method: Literal["bode_fit", "time_fit"]
@@ -105,6 +109,7 @@ class ChainFit:
     message: str
     misfit: float = 0.0
     standardised: dict[str, Array] = field(default_factory=dict)
+    experiments: tuple[str, ...] = ()
 
     @property
     def std(self) -> dict[str, float]:
@@ -124,7 +129,8 @@ class ChainFit:
 class ParameterRow:
     """A line of the paper's Tables 1-3.
 
-    `consistent` is None where there is nothing to compare, or errors too wide to tell.
+    `consistent` is None where there is nothing to compare, or errors too wide to tell;
+    `independent` tells whether the two share no recording, None where there are not two.
     """
 
     name: str
@@ -134,6 +140,7 @@ class ParameterRow:
     change_percent: float | None
     change_sigmas: float | None
     consistent: bool | None
+    independent: bool | None = None
     note: str = ""
 
 
@@ -262,10 +269,14 @@ class HardwareCheck:
 
 @dataclass(frozen=True, kw_only=True)
 class Skipped:
-    """A stage that could not run, and why."""
+    """A stage that could not run, and why; `missing` is what it lacks, in words, if that can be had.
+
+    Where the recordings are there and do not serve, the reason says why, and nothing is missing.
+    """
 
     stage: str
     reason: str
+    missing: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -75,6 +75,7 @@ def analyse(
         names=list(final) or parameter_names(system.carts, rigid=system.rigid),
         position_unit=position,
         input_unit=drive,
+        fitted_to=fit.experiments if fit else (),
     )
     signs = check_signs(data.signs, without=wrong)
     checks = [
@@ -88,8 +89,8 @@ def analyse(
         *check_channels(found.responses, fit, records=sound),
         *found.repeats.checks,
         *check_rows(rows),
-        *check_decays(found.decays, position_unit=position),
-        *check_steps(found.gains, gain_unit=f"{position}/{drive}"),
+        *check_decays(found.decays, records=data.records, position_unit=position),
+        *check_steps(found.gains, decays=found.decays, gain_unit=f"{position}/{drive}"),
         *check_carts(fit, springs=system.springs),
     ]
 
@@ -156,7 +157,11 @@ def reference_design(submission: Submission, fit: ChainFit | None) -> FeedbackDe
 
 def _design(submission: Submission, fit: ChainFit | None, *, log: Log) -> FeedbackDesign | None:
     if submission.design is None:
-        log.skip("state feedback", "no goal is stated: add a [design] table to submission.toml")
+        log.skip(
+            "state feedback",
+            "no goal is stated: add a [design] table to submission.toml",
+            missing="a [design] table with the goal of the controller",
+        )
         return None
     return log.attempt("state feedback", reference_design, submission, fit)
 
@@ -171,8 +176,11 @@ def _hardware(
 ) -> list[HardwareCheck]:
     runs = {record.id: record for record in records if record.kind == "closed_loop"}
     if not runs or fit is None:
-        missing = "the carts are not identified" if runs else "no closed-loop run was recorded"
-        log.skip("hardware check", missing)
+        if runs:
+            log.skip("hardware check", "the carts are not identified")
+        else:
+            reason = "no closed-loop run was recorded"
+            log.skip("hardware check", reason, missing="a closed-loop run")
         return []
     for one in left_out:
         if runs.pop(one.experiment, None):

@@ -67,6 +67,7 @@ def read_data(submission: Submission) -> Ingested:
     points: Points = {}
     warnings: list[str] = []
     unreadable: dict[str, str] = {}
+    tables_read: list[str] = []
     taken = {experiment.file for experiment in submission.experiments}
     for experiment in submission.experiments:
         with _noted(experiment, unreadable):
@@ -76,7 +77,8 @@ def read_data(submission: Submission) -> Ingested:
                 )
             table, _ = tables[experiment.file]
             if experiment.kind == "bode":
-                _read_bode(table, experiment, submission.system, points, warnings)
+                if _read_bode(table, experiment, submission.system, points, warnings):
+                    tables_read.append(experiment.id)
             else:
                 opened.append(_open(table, experiment, submission.system))
     records: list[Record] = []
@@ -88,7 +90,7 @@ def read_data(submission: Submission) -> Ingested:
         raise SubmissionError(_none_readable(unreadable))
     warnings += _unused_scale(records, submission.system)
     records, found, signs = with_signs(records, submission)
-    responses, spread = frequency_responses(points)
+    responses, spread = frequency_responses(points, experiments=tables_read)
     return Ingested(
         records=tuple(records),
         tables=responses,
@@ -137,20 +139,21 @@ def _copies(tables: Mapping[str, tuple[Table, str]]) -> list[str]:
 
 def _read_bode(
     table: Table, experiment: Experiment, system: System, points: Points, warnings: list[str]
-) -> None:
-    """Add the rows of a Bode table to `points`."""
+) -> bool:
+    """Add the rows of a Bode table to `points`; return whether it can be used."""
     if len(experiment.carts) < system.carts:
         warnings.append(
             f"{experiment.id}: not used: a bode table is fitted with all carts free, "
             f"here only {list(experiment.carts)} are"
         )
-        return
+        return False
     _refuse_cut(table)
     columns, unused = assign_columns(table, explicit=experiment.columns, free=experiment.carts)
     for cart, rows in read_points(table, columns, carts=experiment.carts).items():
         points.setdefault(cart, []).extend(rows)
     if unused:
         warnings.append(f"{experiment.id}: columns not used: {', '.join(unused)}")
+    return True
 
 
 def _refuse_cut(table: Table) -> None:

@@ -44,6 +44,10 @@ class Parameter(Document):
     consistent: Annotated[
         bool | None, Field(description="null: nothing to compare, or too uncertain")
     ]
+    independent: Annotated[
+        bool | None,
+        Field(description="false: both rest on the same recordings; null: there are not two"),
+    ] = None
     note: str
 
 

@@ -19,6 +19,7 @@ from pipeline.report.document import (
 )
 from pipeline.report.numbers import (
     NOTHING,
+    listing,
     percent,
     significant,
     unit_text,
@@ -41,7 +42,7 @@ def parameter_blocks(page: Page) -> list[Block]:
     rows, reported = page.analysis.rows, page.analysis.reported
     if not rows:
         return []
-    blocks: list[Block] = [paragraph(_WORDS.text("parameters")), parameter_table(page)]
+    blocks: list[Block] = [paragraph(_origins(page.analysis)), parameter_table(page)]
     if remarks := _parameter_notes(rows):
         blocks.append(bullet_list(remarks))
     if staged := _staged_differences(page.analysis):
@@ -49,6 +50,27 @@ def parameter_blocks(page: Page) -> list[Block]:
     if any(reported.values()):
         blocks += [Heading(spans(_WORDS.text("reported"))), reported_table(page)]
     return blocks
+
+
+def _origins(analysis: Analysis) -> Spans:
+    """Say which estimates come from what; only of sources that there are."""
+    names: dict[str, list[str]] = {}
+    for row in analysis.rows:
+        if row.initial:
+            names.setdefault(row.initial.source, []).append(row.name)
+    sources = [
+        _WORDS.text(f"from_{source}", names=listing(names[source]))
+        for source in ("step", "log_decrement", "frequency_response", "assumed")
+        if source in names
+    ]
+    fit = analysis.fit
+    return rich(
+        _WORDS.text(
+            "parameters",
+            initial=_WORDS.text("initial_from", sources=listing(sources)) if sources else "",
+            final=_WORDS.text("final_from", fit=_WORDS.text(f"from_{fit.method}")) if fit else "",
+        ).strip()
+    )
 
 
 def parameter_table(page: Page) -> Table:
@@ -162,6 +184,8 @@ def _parameter_notes(rows: Sequence[ParameterRow]) -> list[Spans]:
     for row in rows:
         if row.note:
             by_note.setdefault(row.note, []).append(row.name)
+    if same := [row.name for row in rows if row.independent is False]:
+        by_note[_WORDS.text("same_recordings")] = same
     return [spans(rich(", ".join(names)), ": ", rich(clean(n))) for n, names in by_note.items()]
 
 

@@ -82,7 +82,8 @@ def _damping(analysis: Analysis) -> Iterator[Asked]:
     if off:
         row, *others = off
         also = listing([f"{other.name} by {_change(other)}" for other in others])
-        yield _of_row(row, "damping", also=f" ({also})" if also else "")
+        key = "damping_same" if row.independent is False else "damping"
+        yield _of_row(row, key, also=f" ({also})" if also else "")
 
 
 def _gains_and_frequencies(analysis: Analysis) -> Iterator[Asked]:
@@ -90,8 +91,13 @@ def _gains_and_frequencies(analysis: Analysis) -> Iterator[Asked]:
         name = read_name(row.name)
         if name.is_ratio or row.initial is None or row.final is None:
             continue
-        differ = row.initial.value * row.final.value < 0
-        yield _of_row(row, "signs_differ" if differ else "gain" if name.is_gain else "frequency")
+        if row.initial.value * row.final.value < 0:
+            key = "signs_differ"
+        elif row.initial.source == "frequency_response":
+            key = "response"
+        else:
+            key = "gain" if name.is_gain else "frequency"
+        yield _of_row(row, key)
         return  # the largest change stands for the others
 
 

@@ -1,7 +1,7 @@
 """The summary: what was identified, what agrees, what does not, and what to do next."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 
 from pipeline.names import Name, read_name
 from pipeline.report import limits
@@ -32,23 +32,42 @@ from pipeline.report.sections.measurements import overview_blocks
 from pipeline.report.sections.page import Page
 from pipeline.report.sections.parameters import reported_off
 from pipeline.report.words import clean, name_span, names_spans, plain_lines, rich
-from pipeline.results import SIGN, Analysis, Check, Estimate, HardwareCheck
+from pipeline.results import SIGN, Analysis, Check, Estimate, HardwareCheck, ParameterRow
 
 _WORDS = phrases("summary")
-_KINDS = {  # what carts are identified from
+_KINDS = {  # of recordings
     "decay": "decay",
     "step": "step",
     "sine": "sine dwell",
     "sweep": "sweep",
+    "closed_loop": "closed-loop run",
     "bode": "table of amplitude ratios",
 }
 _MOST_TOLD = 3  # of one kind: a summary is short
-_OF_DATA = (
-    "repeats.",
-    "dwells.",
-    "setup.",
-    "hardware.",
-)  # checks of recordings, not of what they say
+# The checks, the worst failure first: what spoils every number, what spoils some, and what the
+# linear carts leave out. One that is not listed stands before the last group.
+_WORST_FIRST = (
+    SIGN,
+    "data",
+    "record",
+    "position_unit",
+    "input_unit",
+    "position_scale",
+    "input_scale",
+    "setup",
+    "dwells",
+    "fit.identified",
+    "fit.converged",
+    "physical",
+    "vanishing",
+    "repeats",
+    "initial_final",
+    "hardware",
+    "feedback",
+)
+_LAST = ("fit.explains_data", "step", "decay")
+_AT_THE_TOP = (SIGN, "position_unit", "input_unit")  # what is wrong with every number
+_ALIKE = ("initial_final", "step", "decay")  # of these one message stands for all
 
 
 def summary(page: Page) -> list[Block]:
@@ -84,36 +103,58 @@ def terminal_summary(analysis: Analysis) -> str:
 
 def _findings(analysis: Analysis) -> list[tuple[bool, Spans]]:
     """Return whether each thing found is well, with a sentence about it."""
-    found = (_sign, _agreement, _undecided, _checks, _friction, _design, _hardware, _skipped)
+    found = (_set_up, _agreement, _undecided, _checks, _friction, _design, _hardware, _skipped)
     return [finding for of in found if (finding := of(analysis))]
 
 
 def _identified(analysis: Analysis) -> Block:
-    unused = {one.experiment for one in analysis.left_out}
-    kinds = Counter(record.kind for record in analysis.records if record.id not in unused)
-    used = listing([count(kinds[kind], noun) for kind, noun in _KINDS.items() if kinds[kind]])
     single, fit = analysis.carts == 1, analysis.fit
     carts = _WORDS.text("one_cart" if single else "carts", n=analysis.carts)
-    source = _WORDS.text("from_runs" if used else "from_data", runs=used)
     if fit is None:
+        unused = {one.experiment for one in analysis.left_out}
+        used = _runs(analysis, [r.id for r in analysis.records if r.id not in unused])
+        source = _WORDS.text("from_runs" if used else "from_data", runs=used)
         reasons = _WORDS.spans("reasons") if analysis.skipped else ""
         return paragraph(
             _WORDS.spans("not_identified", carts=carts, source=source, reasons=reasons)
         )
+    used = _runs(analysis, fit.experiments)
     failed = "" if fit.converged else _WORDS.text("not_converged", message=clean(fit.message))
     return paragraph(
         _WORDS.spans(
             "identified",
             carts=carts,
-            source=source,
+            source=_WORDS.text("from_runs" if used else "from_data", runs=used),
             fit=_WORDS.text("one_fit" if single else "joint_fit"),
             what=_WORDS.text(fit.method),
             points=str(fit.n_points),
             chi_square=significant(fit.chi_square_per_dof, digits=3),
             quality=_WORDS.text("explained" if fit.explains_data else "unexplained"),
+            first=_first_estimates(analysis, fitted_to=fit.experiments),
             failed=failed,
         )
     )
+
+
+def _first_estimates(analysis: Analysis, *, fitted_to: Sequence[str]) -> str:
+    """Return which recordings the initial estimates rest on, "" where none is measured."""
+    runs = dict.fromkeys(
+        run for row in analysis.rows if row.initial for run in row.initial.experiments
+    )
+    others = [run for run in runs if run not in fitted_to]
+    if not runs:
+        return ""
+    if not others:
+        return _WORDS.text("first_same")
+    key = "first_others" if len(others) == len(runs) else "first_both"
+    return _WORDS.text(key, runs=_runs(analysis, others))
+
+
+def _runs(analysis: Analysis, ids: Collection[str]) -> str:
+    """Return how many recordings of each kind these are; a table stands for itself."""
+    known = {record.id: record.kind for record in analysis.records}
+    kinds = Counter(known.get(id_, "bode") for id_ in dict.fromkeys(ids))
+    return listing([count(kinds[kind], noun) for kind, noun in _KINDS.items() if kinds[kind]])
 
 
 def _numbers_board(analysis: Analysis, *, error: str = "statistical") -> tuple[Tile, ...]:
@@ -196,14 +237,15 @@ def _tone(good: bool) -> Tone:
     return "good" if good else "bad"
 
 
-def _sign(analysis: Analysis) -> tuple[bool, Spans] | None:
+def _set_up(analysis: Analysis) -> tuple[bool, Spans] | None:
     """Everything that follows hangs on it, so it comes first."""
-    wrong = _wrong_sign(analysis)
-    return (False, _WORDS.spans("sign", message=wrong)) if wrong else None
-
-
-def _wrong_sign(analysis: Analysis) -> str:
-    return next((clean(c.message) for c in analysis.checks if c.id == SIGN), "")
+    wrong = [check for check in analysis.failed_checks if _group(check) in _AT_THE_TOP]
+    if not wrong:
+        return None
+    said = (
+        _WORDS.spans(_key("top_", _group(c)), message=_sentence(clean(c.message))) for c in wrong
+    )
+    return False, tuple(span for one in said for span in (*one, Span(" ")))[:-1]
 
 
 def _agreement(analysis: Analysis) -> tuple[bool, Spans] | None:
@@ -211,11 +253,26 @@ def _agreement(analysis: Analysis) -> tuple[bool, Spans] | None:
     if not judged:
         return None
     parameters = count(len(judged), "parameter")
-    off = [row for row in judged if not row.consistent]
+    off, same = [row for row in judged if not row.consistent], _same_recordings(judged)
     if not off:
-        return True, _WORDS.spans("agree", parameters=parameters)
+        return True, _WORDS.spans("agree", parameters=parameters, same=same)
     changes = [f"{row.name} ({percent(row.change_percent, signed=True)})" for row in off]
-    return False, _WORDS.spans("disagree", changes=rich(listing(changes)), parameters=parameters)
+    return False, _WORDS.spans(
+        "disagree",
+        changes=rich(listing(changes)),
+        rest=_WORDS.text("rest" if len(off) < len(judged) else "no_rest", parameters=parameters),
+        same=same,
+    )
+
+
+def _same_recordings(judged: Sequence[ParameterRow]) -> Spans:
+    """Say of which parameters the two estimates are no two measurements."""
+    same = [row.name for row in judged if row.independent is False]
+    if not same:
+        return ()
+    if len(same) == len(judged):
+        return _WORDS.spans("all_same")
+    return _WORDS.spans("some_same", names=names_spans(same))
 
 
 def _undecided(analysis: Analysis) -> tuple[bool, Spans] | None:
@@ -243,27 +300,27 @@ def _checks(analysis: Analysis) -> tuple[bool, Spans] | None:
     checks = count(len(done), "check")
     if not failed:
         return True, _WORDS.spans("consistent", checks=checks)
-    # Initial against final and dry friction are told on their own; of each kind, the first.
-    kinds: dict[str, Check] = {}
-    for check in failed:
-        kind = check.id.partition(".")[0]
-        if check.id != SIGN and not kind.startswith(("initial_final", "decay")):
-            kinds.setdefault(kind, check)
-    told = list(kinds.values())[:_MOST_TOLD]
-    said = rich(clean("".join(f" {_sentence(check.message)}" for check in told)))
-    more = _WORDS.spans("all_checks") if len(failed) > len(told) else ()
-    return False, _WORDS.spans(
-        "inconsistent", failed=str(len(failed)), checks=checks, told=(*said, *more)
-    )
-
-
-def _sentence(text: str) -> str:
-    return text if text.endswith((".", "?", "!")) else f"{text}."
+    return False, _WORDS.spans("inconsistent", failed=str(len(failed)), checks=checks)
 
 
 def _friction(analysis: Analysis) -> tuple[bool, Spans] | None:
-    carts = sorted({d.cart for d in analysis.log_decrements if d.friction and d.friction.present})
-    return (False, _WORDS.spans("friction", carts=_carts(carts))) if carts else None
+    """Say which runs show dry friction: decays, or what rings after a step."""
+    shown = [d for d in analysis.log_decrements if d.friction and d.friction.present]
+    if not shown:
+        return None
+    stepped, said = _stepped(analysis), []
+    for key in ("decays_of", "ringing_of"):
+        of_kind = [d for d in shown if (d.experiment in stepped) == (key == "ringing_of")]
+        if of_kind:
+            carts = _carts(sorted({d.cart for d in of_kind}))
+            runs = listing(list(dict.fromkeys(d.experiment for d in of_kind)), most=_MOST_TOLD)
+            said.append(_WORDS.text(key, carts=carts, runs=clean(runs)))
+    return False, _WORDS.spans("friction", where=listing(said))
+
+
+def _stepped(analysis: Analysis) -> set[str]:
+    """Return the steps: what rings after one was not let go."""
+    return {record.id for record in analysis.records if record.kind == "step"}
 
 
 def _design(analysis: Analysis) -> tuple[bool, Spans] | None:
@@ -326,47 +383,113 @@ def _carts(carts: list[int]) -> str:
 
 
 def _next(analysis: Analysis) -> Items:
-    if wrong := _wrong_sign(analysis):  # what else is odd may come from it
-        return bullet_list([spans(wrong), _WORDS.spans("next_again")])
-    return bullet_list(list(_advice(analysis)) or [_look_into(analysis)])
+    """Name every failed check with what to do, the worst first; then what else there is to do."""
+    failed, advice = list(_failed(analysis)), list(_advice(analysis))
+    return bullet_list([*failed, *advice] or [_nothing_left(analysis)])
+
+
+def _failed(analysis: Analysis) -> Iterator[Spans]:
+    groups: dict[str, list[Check]] = {}
+    for check in analysis.failed_checks:
+        groups.setdefault(_group(check), []).append(check)
+    for group in sorted(groups, key=_place):
+        checks = sorted(groups[group], key=_excess, reverse=True)
+        told = checks[: 1 if group in _ALIKE else _MOST_TOLD]
+        told = () if group in _AT_THE_TOP else told  # said there
+        messages = dict.fromkeys(_sentence(clean(check.message)) for check in told)
+        yield _WORDS.spans(
+            "failed",
+            action=_action(group, checks, analysis),
+            told=rich("".join(f"{message} " for message in messages)),
+            names=_names(groups[group]),
+        )
+        if group == SIGN:
+            yield _WORDS.spans("next_again")
+
+
+def _group(check: Check) -> str:
+    """Return what one action is for: checks of a kind; those of the fit ask different things."""
+    return check.id if check.kind in ("fit", "input") else check.kind
+
+
+def _place(group: str) -> tuple[int, int]:
+    for part, groups in ((0, _WORST_FIRST), (2, _LAST)):
+        if group in groups:
+            return part, groups.index(group)
+    return 1, 0
+
+
+def _excess(check: Check) -> float:
+    """Return how far beyond its limit a check is, where that can be told."""
+    if check.value is None or not check.limit:
+        return 0.0
+    return abs(check.value / check.limit)
+
+
+def _action(group: str, checks: Sequence[Check], analysis: Analysis) -> Spans:
+    """Return what to do about the failed checks of a group."""
+    if group == "initial_final":
+        return _WORDS.spans("do_initial_final", names=names_spans([c.about for c in checks]))
+    if group == "fit.identified":
+        return _to_identify(analysis)
+    if group == "decay":
+        decays = {d.experiment for d in analysis.log_decrements} - _stepped(analysis)
+        return _WORDS.spans("do_decay" if decays else "do_first_decay")
+    known = group in (*_WORST_FIRST, *_LAST)
+    return _WORDS.spans(_key("do_", group if known else "other"))
+
+
+def _key(what: str, group: str) -> str:
+    """Return where the sentence about a group of checks stands."""
+    return f"{what}{group.replace('.', '_')}"
+
+
+def _to_identify(analysis: Analysis) -> Spans:
+    """Return what lets the carts be identified, or why they cannot be."""
+    for skip in reversed(analysis.skipped):
+        if skip.stage == "final estimates":
+            if skip.missing:
+                return _WORDS.spans("do_record_for_fit", missing=skip.missing)
+            return _WORDS.spans("do_identify", reason=_sentence(clean(skip.reason)))
+    return _WORDS.spans("do_fit_identified")
+
+
+def _names(checks: Sequence[Check]) -> Spans:
+    """Return the names of failed checks of a group, as the report's table has them."""
+    abouts = [clean(check.about) for check in checks if check.about]
+    if len(checks) == 1 or len(abouts) < len(checks):
+        return spans(Span(", ".join(clean(check.id) for check in checks), "code"))
+    return spans(Span(f"{clean(checks[0].kind)}: {', '.join(abouts)}", "code"))
+
+
+def _sentence(text: str) -> str:
+    return text if text.endswith((".", "?", "!")) else f"{text}."
 
 
 def _advice(analysis: Analysis) -> Iterator[Spans]:
-    """Yield what to do about each thing that is not well."""
+    """Yield what else to do, that no failed check asks for."""
     say, fit, design = _WORDS.spans, analysis.fit, analysis.feedback
-    unreadable, left_out = list(analysis.unreadable), [o.experiment for o in analysis.left_out]
-    for key, runs in (("next_unreadable", unreadable), ("next_left_out", left_out)):
-        if runs:
-            more = " …" if len(runs) > _MOST_TOLD else ""
-            yield say(key, runs=clean(listing(runs[:_MOST_TOLD])) + more)
-    if not (unreadable or left_out) and any(
-        c.id.startswith(_OF_DATA) for c in analysis.failed_checks
-    ):
-        yield say("next_recordings")
-    reasons: list[str] = []
-    if fit is None and not left_out:
-        reasons = [skip.reason for skip in analysis.skipped if skip.stage == "final estimates"]
-        yield (say("next_no_carts", reason=clean(reasons[-1])) if reasons else say("next_no_data"))
-    if off := [row.name for row in analysis.rows if row.consistent is False]:
-        yield say("next_off", names=names_spans(off))
+    asked = {_group(check) for check in analysis.failed_checks}
     if wrong := list(dict.fromkeys(reported_off(analysis))):
         yield say("next_reported", names=names_spans(wrong))
     if _may_lack_springs(analysis):
         yield say("next_springs")
     if short := sorted({point.experiment for point in analysis.sine_points if not point.settled}):
         yield say("next_short", runs=clean(listing(short)))
-    if any(d.friction and d.friction.present for d in analysis.log_decrements):
-        yield say("next_friction")
     doubted = {check.experiment for check in analysis.hardware if check.contradicted}
     poor = [c for c in analysis.hardware if c.nrmse > limits.CLOSE and c.experiment not in doubted]
-    if poor or (fit is not None and not fit.explains_data):
-        yield say("next_left")
-    if design is not None and not any(r.kind == "closed_loop" for r in analysis.records):
+    left = poor or (fit is not None and not fit.explains_data)
+    if left and "fit.explains_data" not in asked:
+        yield say("do_fit_explains_data")
+    to_run = design is not None and not any(r.kind == "closed_loop" for r in analysis.records)
+    if to_run:
         yield say("next_run")
-    unread = {f"reading {name}" for name in analysis.unreadable}  # asked for above
-    stages = {skip.stage for skip in analysis.skipped} - unread
-    if stages and not left_out and not reasons:  # what follows the carts waits for them
-        yield say("next_skipped")
+    # What follows the carts waits for them, and for the recordings that are to be fixed.
+    if fit is not None and not asked & {"data", "record"}:
+        lacking = [s for s in analysis.skipped if not (to_run and s.stage == "hardware check")]
+        missing = dict.fromkeys(skip.missing for skip in lacking if skip.missing)
+        if missing:
+            yield say("next_missing", missing=rich(clean(listing(list(missing)))))
     if design and not design.reachable:
         yield say("next_goal", message=clean(design.message))
 
@@ -378,8 +501,5 @@ def _may_lack_springs(analysis: Analysis) -> bool:
     return off and not dry and fit is not None and not (fit.explains_data or all(analysis.springs))
 
 
-def _look_into(analysis: Analysis) -> Spans:
-    """Return what is left to do where nothing asks for more."""
-    if analysis.failed_checks:
-        return _WORDS.spans("next_checks")
+def _nothing_left(analysis: Analysis) -> Spans:
     return _WORDS.spans("next_warnings" if analysis.warnings else "next_nothing")
