@@ -269,9 +269,10 @@ class HardwareCheck:
 
 @dataclass(frozen=True, kw_only=True)
 class Skipped:
-    """A stage that could not run, and why; `missing` is what it lacks, in words, if that can be had.
+    """A stage that could not run, and why.
 
-    Where the recordings are there and do not serve, the reason says why, and nothing is missing.
+    `missing` is what would let it run, in words. Where recordings are there and do not serve,
+    the reason says why, and nothing is missing.
     """
 
     stage: str

@@ -39,7 +39,8 @@ def check_rows(rows: Sequence[ParameterRow]) -> list[Check]:
 def _advice(row: ParameterRow) -> str:
     """Return what to look at, of what the two estimates rest on."""
     name, before, after = read_name(row.name), row.initial, row.final
-    assert before is not None and after is not None
+    assert before is not None
+    assert after is not None
     if before.value * after.value < 0:
         return " Their signs differ: is the sign of the input in submission.toml right?"
     dwells = after.source == "bode_fit"
