@@ -133,16 +133,16 @@ def _step_check(step: StepGain, *, shown: Sequence[str], gain_unit: str) -> Chec
         outcome, found = (
             "skip",
             (
-                f"shows one gain, but dry friction shows on this cart in {runs}: it may hold the cart "
-                "off its level here, too, alike on both sides."
+                f"shows one gain, but dry friction shows on this cart in {runs}: it may hold "
+                "the cart off its level here, too, alike on both sides."
             ),
         )
     elif edges < 2:
         outcome, found = (
             "skip",
             (
-                "settles after one edge of the input only, so nothing tells whether friction holds it "
-                "off its level. A step on and off again would."
+                "settles after one edge of the input only, so nothing tells whether friction holds "
+                "it off its level. A step on and off again would."
             ),
         )
     else:

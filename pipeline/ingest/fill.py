@@ -228,7 +228,13 @@ class _Filling:
             return replace(found, remarks=(*found.remarks, full))
         unsure = (*found.unsure, *_unsure(found, self._n))
         append_experiment(self._document, entry, remarks=[_UNSURE + one for one in unsure])
-        remarks = _beside_held(found, found.carts or range(1, self._n + 1))
+        carts = found.carts or range(1, self._n + 1)
+        held = [
+            f"{column.name!r} never changes, so cart {cart} is written as held"
+            for cart, column in found.inspection.positions.items()
+            if cart <= self._n and cart not in carts and column.low == column.high
+        ]
+        remarks = (*_beside_held(found, carts), *held)
         return replace(found, state="new", experiment=name, remarks=remarks, unsure=unsure)
 
     def _complete(self, table: Any, found: Found, inspection: Inspection) -> Found:

@@ -11,7 +11,7 @@ from pipeline.checks.carts import check_vanishing
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.resources import EXAMPLES
-from pipeline.results import Check, ChainFit
+from pipeline.results import ChainFit, Check
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
 from tests.helpers.examples import analysed
