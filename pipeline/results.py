@@ -293,6 +293,32 @@ class LeftOut:
     is_wrong: bool
 
 
+@dataclass(frozen=True, kw_only=True)
+class Assumption:
+    """Something about the bench that every number rests on, and how the data support it.
+
+    Attributes
+    ----------
+    key : of submission.toml ("system.springs"); `about` says which ("wall-1"), "" the only one.
+    value : what was taken.
+    origin : "stated" in submission.toml, found from the "data", or a "default".
+    support : "open" where the data do not tell.
+    found, found_std : the number that the data give for it, if it is one.
+    experiments : the recordings that it is about, or that tell it.
+    reason : how the data support or contradict it, or why they do not tell.
+    """
+
+    key: str
+    about: str = ""
+    value: bool | str | float | tuple[int, ...]
+    origin: Literal["stated", "data", "default"]
+    support: Literal["supported", "contradicted", "open"]
+    found: float | None = None
+    found_std: float | None = None
+    experiments: tuple[str, ...] = ()
+    reason: str
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Analysis:
     """All results of one submission, in pipeline order.
@@ -301,7 +327,8 @@ class Analysis:
     to its reason, `unexplained` each driven recording in which the carts move to the share of its
     motion's power that the fitted carts leave. `rows` are the table; `chain` is None where no fit
     was possible (then `skipped` says why). `tables` are the students' own reduced tables, also
-    where dwells stand in their place; `reported` their numbers, initial and final, as typed.
+    where dwells stand in their place; `reported` their numbers, initial and final, as typed;
+    `assumptions` what all of it rests on.
     """
 
     title: str
@@ -330,6 +357,7 @@ class Analysis:
     discussion: str | None  # notes.md, without its comments
     left_out: tuple[LeftOut, ...] = ()
     reported: Mapping[str, Mapping[str, Decimal]] = field(default_factory=dict)
+    assumptions: tuple[Assumption, ...] = ()
 
     @property
     def chain(self) -> Chain | None:

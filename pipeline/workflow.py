@@ -21,6 +21,7 @@ from pipeline.checks.recordings import (
     check_units,
 )
 from pipeline.errors import DataError
+from pipeline.identify.assumptions import list_assumptions
 from pipeline.identify.carts import UNTIED
 from pipeline.identify.log import Log, Progress
 from pipeline.identify.remarks import reading_remarks, turn_of_the_gains
@@ -134,6 +135,7 @@ def analyse(
         discussion=submission.discussion,
         left_out=tuple(left_out),
         reported=submission.typed,
+        assumptions=list_assumptions(submission, data=data, fit=fit, checks=checks),
     )
 
 

@@ -16,7 +16,7 @@ from pipeline.ingest.columns import (
 from pipeline.ingest.input_sign import FEW_NAMES, Signs
 from pipeline.names import listed
 from pipeline.results import SIGN, Check, LeftOut, Record, SinePoint
-from pipeline.results_of_runs import OtherUnit
+from pipeline.results_of_runs import HeadingUnit
 from pipeline.submission import System
 
 SCALES = POSITION_SCALE, INPUT_SCALE = "position_scale", "input_scale"  # then the record's id
@@ -53,10 +53,10 @@ def check_units(records: Sequence[Record], *, system: System) -> list[Check]:
         ("position", position, position_units()),
         ("input", drive, input_units()),
     ):
-        headed: dict[str, OtherUnit] = {}
+        headed: dict[str, HeadingUnit] = {}
         for record in records:
-            for other in record.other_units:
-                if other.role == role:
+            for other in record.heading_units:
+                if other.role == role and not other.converts:
                     headed.setdefault(record.id, other)
         if not is_known(unit, known):
             checks.append(_unit_check(role, _unknown(unit, role=role, known=known)))

@@ -18,7 +18,7 @@ from pipeline.ingest.formats.recognise import read_table
 from pipeline.ingest.formats.table import Table, refuse_extreme
 from pipeline.ingest.input_sign import Signs, with_signs
 from pipeline.results import FrequencyResponse, Record
-from pipeline.results_of_runs import OtherUnit
+from pipeline.results_of_runs import HeadingUnit
 from pipeline.submission import Experiment, Submission, System
 
 DUTY_COUNT = 5 / 4096  # V; the UCSD bench's amplifier gives 5 V for 4096 counts
@@ -207,14 +207,14 @@ def _read_record(opened: _Opened, clock: Clock, system: System) -> Record:
     """Return the record with the input's scale applied, but not yet a sign that must be found."""
     table, experiment, columns = opened.table, opened.experiment, opened.columns
     positions = opened.positions
-    notes, others = list(table.notes), list[OtherUnit]()
+    notes, headed = list(table.notes), list[HeadingUnit]()
     extra = [c.name for role, c in columns.items() if role[0] == "x" and c not in positions]
     if opened.unused or extra:
         notes.append(f"columns not used: {', '.join([*opened.unused, *extra])}")
     if (time := columns.get("time")) is not None:
         notes += clock_notes(table, time, clock, sample_rate=experiment.sample_rate)
     keep = _window(clock, experiment)
-    scales = [_position_scale(table, column, system, notes, others) for column in positions]
+    scales = [_position_scale(table, column, system, notes, headed) for column in positions]
     y = np.array(
         [table.values[c.index] * scale for c, scale in zip(positions, scales, strict=True)]
     )
@@ -222,8 +222,8 @@ def _read_record(opened: _Opened, clock: Clock, system: System) -> Record:
         scale if holds_counts(table, c) else encoder_step(row)
         for c, row, scale in zip(positions, y, scales, strict=True)
     ]
-    u, input_scale = _input(table, columns, experiment, system, notes, others)
-    reference = _reference(table, columns, experiment, system, notes, others, keep)
+    u, input_scale = _input(table, columns, experiment, system, notes, headed)
+    reference = _reference(table, columns, experiment, system, notes, headed, keep)
     measured = {f"the position of cart {c.cart}": row for c, row in zip(positions, y, strict=True)}
     measured |= {"the input": u, "the reference": reference, "the time": clock.t - clock.t[0]}
     for what, values in measured.items():
@@ -249,7 +249,7 @@ def _read_record(opened: _Opened, clock: Clock, system: System) -> Record:
         notes=tuple(notes),
         position_scale=scales[0],
         input_scale=input_scale,
-        other_units=tuple(dict.fromkeys(others)),
+        heading_units=tuple(dict.fromkeys(headed)),
     )
 
 
@@ -293,7 +293,7 @@ def _window(clock: Clock, experiment: Experiment) -> slice:
 
 
 def _position_scale(
-    table: Table, column: Column, system: System, notes: list[str], others: list[OtherUnit]
+    table: Table, column: Column, system: System, notes: list[str], headed: list[HeadingUnit]
 ) -> float:
     """Return position units per number in the file."""
     unit, per_count = system.position.unit, system.position.per_count
@@ -306,7 +306,7 @@ def _position_scale(
             f"{table.source}: {column.name!r} holds encoder counts; state how many {unit} one "
             f"count is: position = {{ unit = {unit!r}, per_count = … }}"
         )
-    return _unit_scale(column, unit, "position", notes, others)
+    return _unit_scale(column, unit, "position", notes, headed)
 
 
 def _unit_scale(
@@ -314,16 +314,19 @@ def _unit_scale(
     unit: str,
     role: Literal["position", "input"],
     notes: list[str],
-    others: list[OtherUnit],
+    headed: list[HeadingUnit],
 ) -> float:
     """Return the factor from the heading's unit to the submission's, and say what was done.
 
-    Where the one does not convert into the other, the column joins the `others`.
+    What the heading states joins those `headed`, whether it converts or not.
     """
     factor = conversion(column.unit, unit)
-    if factor is None or column.unit is None:
-        if column.unit is not None:
-            others.append(OtherUnit(role=role, heading=column.name, unit=column.unit))
+    if column.unit is not None:
+        converts = factor is not None
+        headed.append(
+            HeadingUnit(role=role, heading=column.name, unit=column.unit, converts=converts)
+        )
+    if factor is None:
         return 1.0
     if factor != 1.0:
         notes.append(f"{column.name!r} was converted from {column.unit} to {unit}")
@@ -336,7 +339,7 @@ def _input(
     experiment: Experiment,
     system: System,
     notes: list[str],
-    others: list[OtherUnit],
+    headed: list[HeadingUnit],
 ) -> tuple[Array | None, float]:
     """Return the input in input units and the scale used, both without a sign to be found."""
     column = columns.get("input")
@@ -363,7 +366,7 @@ def _input(
         if per_count is None:
             notes.append(f"{column.name!r} is taken as duty counts of 5/4096 {system.input.unit}")
     else:
-        scale = _unit_scale(column, system.input.unit, "input", notes, others)
+        scale = _unit_scale(column, system.input.unit, "input", notes, headed)
     return values * scale, scale
 
 
@@ -378,7 +381,7 @@ def _reference(
     experiment: Experiment,
     system: System,
     notes: list[str],
-    others: list[OtherUnit],
+    headed: list[HeadingUnit],
     keep: slice,
 ) -> Array | None:
     """Return the set point of a closed loop: the experiment's own, else the file's column."""
@@ -399,4 +402,4 @@ def _reference(
     ):
         notes.append(f"{column.name!r} only mirrors {first.name!r} and is no reference")
         return None
-    return values[keep] * _position_scale(table, column, system, notes, others)
+    return values[keep] * _position_scale(table, column, system, notes, headed)

@@ -28,6 +28,7 @@ from pipeline.report.numbers import (
     with_error,
 )
 from pipeline.report.phrases import phrases
+from pipeline.report.sections.housekeeping import taken_text
 from pipeline.report.sections.measurements import overview_blocks
 from pipeline.report.sections.page import Page
 from pipeline.report.sections.parameters import reported_off
@@ -103,7 +104,17 @@ def terminal_summary(analysis: Analysis) -> str:
 
 def _findings(analysis: Analysis) -> list[tuple[bool, Spans]]:
     """Return whether each thing found is well, with a sentence about it."""
-    found = (_set_up, _agreement, _undecided, _checks, _friction, _design, _hardware, _skipped)
+    found = (
+        _set_up,
+        _assumed,
+        _agreement,
+        _undecided,
+        _checks,
+        _friction,
+        _design,
+        _hardware,
+        _skipped,
+    )
     return [finding for of in found if (finding := of(analysis))]
 
 
@@ -246,6 +257,15 @@ def _set_up(analysis: Analysis) -> tuple[bool, Spans] | None:
         _WORDS.spans(_key("top_", _group(c)), message=_sentence(clean(c.message))) for c in wrong
     )
     return False, tuple(span for one in said for span in (*one, Span(" ")))[:-1]
+
+
+def _assumed(analysis: Analysis) -> tuple[bool, Spans] | None:
+    """Name what nobody stated and the data do not tell either."""
+    taken = [a for a in analysis.assumptions if a.origin == "default" and a.support == "open"]
+    if not taken:
+        return None
+    said = [clean(f"{f'{one.key} {one.about}'.strip()} ({taken_text(one)})") for one in taken]
+    return False, _WORDS.spans("assumed", taken=listing(said))
 
 
 def _agreement(analysis: Analysis) -> tuple[bool, Spans] | None:
