@@ -57,6 +57,7 @@ _WORST_FIRST = (
     "input_scale",
     "setup",
     "dwells",
+    "late_channel",
     "fit.identified",
     "fit.converged",
     "physical",
