@@ -365,6 +365,11 @@ class Analysis:
         return self.fit.chain if self.fit else None
 
     @property
+    def steps(self) -> frozenset[str]:
+        """The steps: what rings after one was not let go."""
+        return frozenset(record.id for record in self.records if record.kind == "step")
+
+    @property
     def failed_checks(self) -> tuple[Check, ...]:
         """The checks that were not passed: each is a reason to doubt the numbers."""
         return tuple(check for check in self.checks if check.outcome == "fail")

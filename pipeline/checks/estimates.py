@@ -43,10 +43,12 @@ def _advice(row: ParameterRow) -> str:
     assert after is not None
     if before.value * after.value < 0:
         return " Their signs differ: is the sign of the input in submission.toml right?"
-    dwells = after.source == "bode_fit"
+    response = after.source == "bode_fit"
     if name.is_ratio:
         seen = (
-            "a dwell of amplitude A sees ζ + 2d/(πA)" if dwells else "small swings see more of it"
+            "a steady sine of amplitude A sees ζ + 2d/(πA)"
+            if response
+            else "small swings see more of it"
         )
         return (
             f" Damping ratios differ where dry friction is at work: {seen}, so ask which of the "
@@ -60,8 +62,12 @@ def _advice(row: ParameterRow) -> str:
     if name.is_gain:
         looks["frequency_response"] = "the points at the lowest frequencies"
     look = looks.get(before.source, "{runs}").format(runs=listed(before.experiments))
-    beside = ", and at the dwells near this frequency" if dwells and name.is_frequency else ""
-    lowest = ", and at the lowest frequencies" if dwells and before.source == "step" else ""
+    beside = (
+        ", and at the points of the response near this frequency"
+        if response and name.is_frequency
+        else ""
+    )
+    lowest = ", and at the lowest frequencies" if response and before.source == "step" else ""
     return f" Look at {look}{beside}{lowest}."
 
 

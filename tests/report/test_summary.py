@@ -9,7 +9,7 @@ import pytest
 from pipeline.report.document import Details, Table, plain
 from pipeline.report.sections.housekeeping import check_blocks
 from pipeline.report.sections.page import Page
-from pipeline.report.sections.parameters import parameter_blocks
+from pipeline.report.sections.parameters import parameter_blocks, parameter_table
 from pipeline.report.sections.questions import ask
 from pipeline.report.sections.summary import terminal_summary
 from pipeline.resources import EXAMPLES
@@ -51,6 +51,8 @@ def test_only_steps_are_no_two_ways_and_no_decays(tmp_path):
     assert "decays of" not in text
     assert not any("the decay of cart" in check.message for check in analysis.checks)
     assert any(line.startswith("Record decays from two") for line in next_part(analysis))
+    sources = [plain(line[3].text) for line in parameter_table(Page.of(analysis)).rows]
+    assert sources == ["step", "ringing after a step", "ringing after a step"]
     assert every_failed_check_is_named(analysis)
     assert any("a [design] table" in line for line in next_part(analysis))
     assert not any("experiments that the skipped" in line for line in next_part(analysis))

@@ -1,6 +1,6 @@
 """What was identified: initial and final estimates, the students' own numbers, the chain."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from decimal import Decimal
 
 from pipeline.names import read_name
@@ -28,7 +28,7 @@ from pipeline.report.numbers import (
 )
 from pipeline.report.phrases import phrases
 from pipeline.report.sections.page import Page
-from pipeline.report.words import SOURCES, clean, name_span, names_spans, rich
+from pipeline.report.words import clean, name_span, names_spans, rich, source_text
 from pipeline.results import Analysis, ChainFit, Estimate, ParameterRow
 from pipeline.stages.compare import change_limit
 from pipeline.stages.limits import SIGMA_LIMIT
@@ -83,13 +83,13 @@ def parameter_table(page: Page) -> Table:
     return page.table(
         _WORDS.text("parameter_table", carts=words.get(carts, carts)),
         head[:columns],
-        [_parameter_row(row)[:columns] for row in rows],
+        [_parameter_row(row, steps=page.analysis.steps)[:columns] for row in rows],
         "lldlddrl"[:columns],
     )
 
 
-def _parameter_row(row: ParameterRow) -> list[Cell]:
-    source = SOURCES.get(row.initial.source, clean(row.initial.source)) if row.initial else ""
+def _parameter_row(row: ParameterRow, *, steps: Collection[str]) -> list[Cell]:
+    source = source_text(row.initial, steps=steps)
     change = percent(row.change_percent, signed=True)
     if row.change_sigmas is not None:
         change += f" ({significant(row.change_sigmas, digits=2)} σ)"

@@ -329,19 +329,14 @@ def _friction(analysis: Analysis) -> tuple[bool, Spans] | None:
     shown = [d for d in analysis.log_decrements if d.friction and d.friction.present]
     if not shown:
         return None
-    stepped, said = _stepped(analysis), []
+    said = []
     for key in ("decays_of", "ringing_of"):
-        of_kind = [d for d in shown if (d.experiment in stepped) == (key == "ringing_of")]
+        of_kind = [d for d in shown if (d.experiment in analysis.steps) == (key == "ringing_of")]
         if of_kind:
             carts = _carts(sorted({d.cart for d in of_kind}))
             runs = listing(list(dict.fromkeys(d.experiment for d in of_kind)), most=_MOST_TOLD)
             said.append(_WORDS.text(key, carts=carts, runs=clean(runs)))
     return False, _WORDS.spans("friction", where=listing(said))
-
-
-def _stepped(analysis: Analysis) -> set[str]:
-    """Return the steps: what rings after one was not let go."""
-    return {record.id for record in analysis.records if record.kind == "step"}
 
 
 def _design(analysis: Analysis) -> tuple[bool, Spans] | None:
@@ -454,7 +449,7 @@ def _action(group: str, checks: Sequence[Check], analysis: Analysis) -> Spans:
     if group == "fit.identified":
         return _to_identify(analysis)
     if group == "decay":
-        decays = {d.experiment for d in analysis.log_decrements} - _stepped(analysis)
+        decays = {d.experiment for d in analysis.log_decrements} - analysis.steps
         return _WORDS.spans("do_decay" if decays else "do_first_decay")
     known = group in (*_WORST_FIRST, *_LAST)
     return _WORDS.spans(_key("do_", group if known else "other"))
