@@ -125,20 +125,23 @@ def _sign(system: System, data: Ingested, *, failed: Sequence[Check]) -> Iterato
     driven = [r for r in data.records if r.u is not None and np.ptp(r.u) > 0]
     if not driven:
         return
-    told = [name for name, sign in data.signs.found.items() if sign]
+    stated = system.input.sign
     usual = 1 if sum(1 if r.input_scale > 0 else -1 for r in driven) >= 0 else -1
+    sign = stated or usual
+    told = [name for name, found in data.signs.found.items() if found == sign]
+    others = [name for name, found in data.signs.found.items() if found == -sign]
     wrong = next((check.message for check in failed if check.id == SIGN), "")
     support: Support = "open"
     if wrong:
         support, reason = "contradicted", wrong
     elif told:
-        support, reason = "supported", f"{listed(told)} tell it"
+        but = f", but {listed(others)} {'count' if others[1:] else 'counts'} the other way"
+        support, reason = "supported", f"{listed(told)} tell it{but if others else ''}"
     else:
         reason = "no recording tells it"
-    stated = system.input.sign
     yield Assumption(
         key="system.input.sign",
-        value=float(stated or usual),
+        value=float(sign),
         origin="stated" if stated else "data" if told else "default",
         support=support,
         experiments=tuple(told),

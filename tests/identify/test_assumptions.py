@@ -116,4 +116,7 @@ def test_a_held_cart_that_was_not_measured_is_open(tmp_path):
     assert found["experiments.carts (1,)"].support == "open"
     assert "was not measured" in found["experiments.carts (1,)"].reason
     assert found["system.position.unit"].support == "supported"
-    assert found["system.input.sign"].origin == "data"
+    sign = found["system.input.sign"]
+    assert (sign.value, sign.origin, sign.support) == (-1.0, "data", "supported")
+    assert "pid" not in sign.experiments  # its log counts the other way
+    assert "but pid counts the other way" in sign.reason

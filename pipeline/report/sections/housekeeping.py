@@ -69,7 +69,7 @@ def assumption_blocks(page: Page) -> list[Block]:
         [
             cell(Span(clean(one.key), "code")),
             cell(clean(one.about)),
-            cell(clean(taken_text(one))),
+            cell(rich(clean(taken_text(one)))),
             cell(_WORDS.text(f"origin_{one.origin}"), "quiet"),
             cell(_WORDS.text(f"support_{one.support}"), SUPPORT[one.support]),
             cell(rich(clean(one.reason))),
