@@ -150,3 +150,8 @@ def first_few(names: Sequence[str], most: int) -> str:
     """Return names with commas between them, those beyond the first few as a number."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more
+
+
+def toml_flags(flags: Iterable[bool]) -> str:
+    """Return flags as they stand in a file: "[false, true]"."""
+    return f"[{', '.join('true' if flag else 'false' for flag in flags)}]"

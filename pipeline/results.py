@@ -17,6 +17,8 @@ from dataclasses import dataclass, field
 from decimal import Decimal
 from typing import Literal
 
+import numpy as np
+
 from pipeline.arrays import Array, ComplexArray, freeze
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.loop.margins import Margins
@@ -39,7 +41,7 @@ class FrequencyResponse:
     """X_cart/U at omega: (n_w,) arrays, ascending; carries its own grid, never interpolated.
 
     `phase` (rad) and its error are None for a table of amplitude ratios. `source`: sine dwells,
-    a table the students reduced, or transforms of step and sweep records.
+    a table the students reduced, or transforms of step and sweep records; `experiments` are those.
     """
 
     cart: int
@@ -49,6 +51,7 @@ class FrequencyResponse:
     phase: Array | None
     phase_std: Array | None
     source: Literal["dwells", "table", "records"]
+    experiments: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         freeze(self, "omega", "magnitude", "magnitude_std", "phase", "phase_std")
@@ -60,12 +63,14 @@ class Estimate:
 
     `at_bound`: a fit ended at the bound of what is possible (a damping of zero), so `value` is
     that bound and no measurement, `std` is None, and nothing may be concluded from either.
+    `experiments` are the recordings it rests on; of a fit's, see `ChainFit.experiments`.
     """
 
     value: float
     std: float | None
     source: str
     at_bound: bool = False
+    experiments: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -86,6 +91,7 @@ class ChainFit:
     chi_square_per_dof : near 1 where model and stated noise explain the data; see `explains_data`.
     misfit : of a "bode_fit" by how much of their magnitude points lie off it, beyond their errors.
     standardised : per cart (n_w,) or per record (n,): residual over its standard error.
+    experiments : the recordings that it was fitted to.
     """
 
     method: Literal["bode_fit", "time_fit"]
@@ -103,6 +109,12 @@ class ChainFit:
     message: str
     misfit: float = 0.0
     standardised: dict[str, Array] = field(default_factory=dict)
+    experiments: tuple[str, ...] = ()
+
+    @property
+    def std(self) -> dict[str, float]:
+        """The standard errors of the physical parameters that have one."""
+        return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
     @property
     def explains_data(self) -> bool:
@@ -117,7 +129,8 @@ class ChainFit:
 class ParameterRow:
     """A line of the paper's Tables 1-3.
 
-    `consistent` is None where there is nothing to compare, or errors too wide to tell.
+    `consistent` is None where there is nothing to compare, or errors too wide to tell;
+    `independent` tells whether the two share no recording, None where there are not two.
     """
 
     name: str
@@ -127,6 +140,7 @@ class ParameterRow:
     change_percent: float | None
     change_sigmas: float | None
     consistent: bool | None
+    independent: bool | None = None
     note: str = ""
 
 
@@ -139,6 +153,16 @@ class Check:
     value: float | None
     limit: float | None
     message: str
+
+    @property
+    def kind(self) -> str:
+        """What is asked, whatever it is asked of: "decay" of "decay.run-1.cart_1"."""
+        return self.id.partition(".")[0]
+
+    @property
+    def about(self) -> str:
+        """Of what it is asked, "" where there is one thing only: "run-1.cart_1"."""
+        return self.id.partition(".")[2]
 
     @classmethod
     def of(
@@ -245,10 +269,15 @@ class HardwareCheck:
 
 @dataclass(frozen=True, kw_only=True)
 class Skipped:
-    """A stage that could not run, and why."""
+    """A stage that could not run, and why.
+
+    `missing` is what would let it run, in words. Where recordings are there and do not serve,
+    the reason says why, and nothing is missing.
+    """
 
     stage: str
     reason: str
+    missing: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -264,6 +293,32 @@ class LeftOut:
     is_wrong: bool
 
 
+@dataclass(frozen=True, kw_only=True)
+class Assumption:
+    """Something about the bench that every number rests on, and how the data support it.
+
+    Attributes
+    ----------
+    key : of submission.toml ("system.springs"); `about` says which ("wall-1"), "" the only one.
+    value : what was taken.
+    origin : "stated" in submission.toml, found from the "data", or a "default".
+    support : "open" where the data do not tell.
+    found, found_std : the number that the data give for it, if it is one.
+    experiments : the recordings that it is about, or that tell it.
+    reason : how the data support or contradict it, or why they do not tell.
+    """
+
+    key: str
+    about: str = ""
+    value: bool | str | float | tuple[int, ...]
+    origin: Literal["stated", "data", "default"]
+    support: Literal["supported", "contradicted", "open"]
+    found: float | None = None
+    found_std: float | None = None
+    experiments: tuple[str, ...] = ()
+    reason: str
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Analysis:
     """All results of one submission, in pipeline order.
@@ -272,7 +327,8 @@ class Analysis:
     to its reason, `unexplained` each driven recording in which the carts move to the share of its
     motion's power that the fitted carts leave. `rows` are the table; `chain` is None where no fit
     was possible (then `skipped` says why). `tables` are the students' own reduced tables, also
-    where dwells stand in their place; `reported` their numbers, initial and final, as typed.
+    where dwells stand in their place; `reported` their numbers, initial and final, as typed;
+    `assumptions` what all of it rests on.
     """
 
     title: str
@@ -301,11 +357,17 @@ class Analysis:
     discussion: str | None  # notes.md, without its comments
     left_out: tuple[LeftOut, ...] = ()
     reported: Mapping[str, Mapping[str, Decimal]] = field(default_factory=dict)
+    assumptions: tuple[Assumption, ...] = ()
 
     @property
     def chain(self) -> Chain | None:
         """The identified plant."""
         return self.fit.chain if self.fit else None
+
+    @property
+    def steps(self) -> frozenset[str]:
+        """The steps: what rings after one was not let go."""
+        return frozenset(record.id for record in self.records if record.kind == "step")
 
     @property
     def failed_checks(self) -> tuple[Check, ...]:

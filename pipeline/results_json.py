@@ -41,6 +41,7 @@ def results_dict(analysis: Analysis) -> dict[str, Any]:
             margins=design.margins and vars(design.margins),
         ),
         "hardware": _hardware(analysis.hardware),
+        "assumptions": [fields_of(schema.Assumption, one) for one in analysis.assumptions],
         "skipped": [fields_of(schema.Skipped, skip) for skip in analysis.skipped],
         "warnings": analysis.warnings,
         "provenance": provenance(analysis),

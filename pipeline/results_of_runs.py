@@ -12,6 +12,16 @@ Kind = Literal["decay", "step", "sine", "sweep", "closed_loop", "bode"]
 Hold = Literal["zero_order", "band_limited"]
 
 
+@dataclass(frozen=True, kw_only=True)
+class HeadingUnit:
+    """A unit that a heading states; `converts`: into the submission's, else it was not heeded."""
+
+    role: Literal["position", "input"]
+    heading: str
+    unit: str
+    converts: bool
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Record:
     """One measured time series, in physical units.
@@ -32,6 +42,7 @@ class Record:
     turned : its input was found to count the other way than the bench's others, and was turned.
     position_scale, input_scale : what the file's own numbers were multiplied by to get y and u
         (the sign included); a controller's gains may be in the file's units.
+    heading_units : what the headings of positions and input state.
     """
 
     id: str
@@ -50,6 +61,7 @@ class Record:
     turned: bool = False
     position_scale: float = 1.0
     input_scale: float = 1.0
+    heading_units: tuple[HeadingUnit, ...] = ()
 
     def __post_init__(self) -> None:
         freeze(self, "t", "u", "y", "reference", "resolution")

@@ -18,8 +18,10 @@ from pipeline.checks.recordings import (
     check_scales,
     check_setup,
     check_signs,
+    check_units,
 )
 from pipeline.errors import DataError
+from pipeline.identify.assumptions import list_assumptions
 from pipeline.identify.carts import UNTIED
 from pipeline.identify.log import Log, Progress
 from pipeline.identify.remarks import reading_remarks, turn_of_the_gains
@@ -74,11 +76,13 @@ def analyse(
         names=list(final) or parameter_names(system.carts, rigid=system.rigid),
         position_unit=position,
         input_unit=drive,
+        fitted_to=fit.experiments if fit else (),
     )
     signs = check_signs(data.signs, without=wrong)
     checks = [
         *signs,
         *check_files(data.unreadable),
+        *check_units(data.records, system=system),
         *check_scales(sound, system=system),
         *check_left_out(left_out, records=data.records),
         *check_setup(data.records),
@@ -86,8 +90,8 @@ def analyse(
         *check_channels(found.responses, fit, records=sound),
         *found.repeats.checks,
         *check_rows(rows),
-        *check_decays(found.decays, position_unit=position),
-        *check_steps(found.gains, gain_unit=f"{position}/{drive}"),
+        *check_decays(found.decays, records=data.records, position_unit=position),
+        *check_steps(found.gains, decays=found.decays, gain_unit=f"{position}/{drive}"),
         *check_carts(fit, springs=system.springs),
     ]
 
@@ -131,6 +135,7 @@ def analyse(
         discussion=submission.discussion,
         left_out=tuple(left_out),
         reported=submission.typed,
+        assumptions=list_assumptions(submission, data=data, fit=fit, checks=checks),
     )
 
 
@@ -154,7 +159,11 @@ def reference_design(submission: Submission, fit: ChainFit | None) -> FeedbackDe
 
 def _design(submission: Submission, fit: ChainFit | None, *, log: Log) -> FeedbackDesign | None:
     if submission.design is None:
-        log.skip("state feedback", "no goal is stated: add a [design] table to submission.toml")
+        log.skip(
+            "state feedback",
+            "no goal is stated: add a [design] table to submission.toml",
+            missing="a [design] table with the goal of the controller",
+        )
         return None
     return log.attempt("state feedback", reference_design, submission, fit)
 
@@ -169,8 +178,11 @@ def _hardware(
 ) -> list[HardwareCheck]:
     runs = {record.id: record for record in records if record.kind == "closed_loop"}
     if not runs or fit is None:
-        missing = "the carts are not identified" if runs else "no closed-loop run was recorded"
-        log.skip("hardware check", missing)
+        if runs:
+            log.skip("hardware check", "the carts are not identified")
+        else:
+            reason = "no closed-loop run was recorded"
+            log.skip("hardware check", reason, missing="a closed-loop run")
         return []
     for one in left_out:
         if runs.pop(one.experiment, None):

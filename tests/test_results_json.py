@@ -34,6 +34,7 @@ def test_it_has_every_documented_key(results):
         "checks",
         "feedback",
         "hardware",
+        "assumptions",
         "skipped",
         "warnings",
         "provenance",

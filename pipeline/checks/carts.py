@@ -6,12 +6,15 @@ from itertools import pairwise
 import numpy as np
 
 from pipeline.checks import limits
-from pipeline.names import gain_name, read_name
+from pipeline.names import gain_name, read_name, toml_flags
 from pipeline.plant.limits import HEAVY_DAMPING
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.laws import brackets
 from pipeline.plant.linear.recovery import recover_from_parameters
 from pipeline.results import EXPLAINED, ChainFit, Check
+from pipeline.stages.limits import SIGMA_LIMIT
+
+VANISHING = "vanishing"  # then the mass, damping or spring: "k_3"
 
 
 def check_carts(fit: ChainFit | None, *, springs: Sequence[bool]) -> list[Check]:
@@ -22,6 +25,7 @@ def check_carts(fit: ChainFit | None, *, springs: Sequence[bool]) -> list[Check]
     chain = fit.chain
     values = {name: estimate.value for name, estimate in fit.parameters.items()}
     checks = [*_fit_checks(fit), _sign_check(fit, springs=springs)]
+    checks += check_vanishing(fit, springs=springs)
     if chain.n in (2, 3) and "omega_a" in values and all(springs[1:-1]):
         checks += _redundancy_checks(values)
     if chain.n >= 2 and "omega_a" in values:
@@ -54,11 +58,7 @@ def _fit_checks(fit: ChainFit) -> list[Check]:
 
 def _sign_check(fit: ChainFit, *, springs: Sequence[bool]) -> Check:
     """No mass, damping or spring may be negative by more than its standard error allows."""
-    chain = fit.chain
-    values = {f"m_{i}": m for i, m in enumerate(chain.m, start=1)}
-    values |= {f"c_{i}": c for i, c in enumerate(chain.c, start=1)}
-    values |= {f"k_{i}": k for i, k in enumerate(chain.k, start=1) if springs[i - 1]}
-    std = dict(zip(fit.names, np.sqrt(np.diag(fit.covariance)), strict=True))
+    values, std = physical_values(fit.chain, springs=springs), fit.std
     below = {
         name: -value / std[name] if std.get(name) else np.inf
         for name, value in values.items()
@@ -69,11 +69,97 @@ def _sign_check(fit: ChainFit, *, springs: Sequence[bool]) -> Check:
     message = (
         f"Not positive: {names}; up to {worst:.1f} standard errors below zero."
         if below
-        else "All masses, dampings and springs are positive."
+        else "No mass, damping or spring is below zero."
     )
     value = worst if np.isfinite(worst) else None
     good = worst <= limits.BELOW_ZERO
     return Check.of("physical.signs", good, message, value=value, limit=limits.BELOW_ZERO)
+
+
+def physical_values(chain: Chain, *, springs: Sequence[bool]) -> dict[str, float]:
+    """Return the masses, dampings and springs that are said to be there, by name.
+
+    One cart has one stiffness, the sum of its two.
+    """
+    present = [any(springs), False] if chain.n == 1 else springs
+    values = {f"m_{i}": float(m) for i, m in enumerate(chain.m, start=1)}
+    values |= {f"c_{i}": float(c) for i, c in enumerate(chain.c, start=1)}
+    springs_there = zip(chain.k, present, strict=True)
+    return values | {f"k_{i}": float(k) for i, (k, there) in enumerate(springs_there, 1) if there}
+
+
+def check_vanishing(fit: ChainFit, *, springs: Sequence[bool]) -> list[Check]:
+    """Fail for each mass, damping or spring that may as well not be there.
+
+    It is zero within its error, or negligible beside the larger of its neighbours of the same
+    sort.
+    """
+    if not fit.converged:
+        return []
+    values, std = physical_values(fit.chain, springs=springs), fit.std
+    checks = []
+    for name, value in values.items():
+        sigmas = value / std[name] if std.get(name) else None
+        beside = _larger_neighbour(name, values)
+        share = value / values[beside] if beside else 1.0
+        if value == 0 or (sigmas is not None and abs(sigmas) <= SIGMA_LIMIT):
+            found = f"{name} ends at zero"
+            if sigmas:
+                found = f"{name} = {value:.2g} ± {std[name]:.1g} is zero within its error"
+            measured, limit = sigmas, SIGMA_LIMIT
+        elif 0 < share < limits.NEGLIGIBLE:
+            found = f"{name} = {value:.2g} is {100 * share:.2g} % of {beside}, next to nothing"
+            measured, limit = share, limits.NEGLIGIBLE
+        else:
+            continue
+        message = f"{found}. {_ask_if_there(name, springs=springs)}"
+        checks.append(
+            Check.of(f"{VANISHING}.{name}", False, message, value=measured or 0.0, limit=limit)
+        )
+    return checks
+
+
+def _larger_neighbour(name: str, values: Mapping[str, float]) -> str:
+    """Return the larger of the neighbours of the same sort that are positive, or ""."""
+    read = read_name(name)
+    assert read.cart is not None
+    beside = [f"{read.symbol}_{read.cart + step}" for step in (-1, 1)]
+    return max((o for o in beside if values.get(o, 0.0) > 0), key=lambda o: values[o], default="")
+
+
+def _ask_if_there(name: str, *, springs: Sequence[bool]) -> str:
+    """Return the question that a vanishing parameter raises, and the line to change."""
+    read, n = read_name(name), len(springs) - 1
+    assert read.cart is not None
+    i = read.cart
+    if read.symbol == "c":
+        alone = f", carts = [{i}]" if n > 1 else ""
+        return (
+            f"Do the recordings tell the damping of cart {i}? A decay of it does: add one to "
+            f'submission.toml, [[experiments]] with kind = "decay"{alone}.'
+        )
+    if read.symbol == "m":
+        fewer = f"carts = {n - 1}, or " if n > 1 else ""
+        return (
+            f"Is there a cart {i}, and does its column hold its position? If not, change in "
+            f"submission.toml {fewer}columns = {{ x{i} = … }}."
+        )
+    if n == 1:
+        return (
+            "Is there a spring at all? If not, change in submission.toml "
+            f"springs = {toml_flags([False, False])}."
+        )
+    if 1 < i <= n:
+        return (
+            f"Does a spring tie cart {i} to cart {i - 1}? If not, the motor does not move cart "
+            f"{i}: change in submission.toml carts = {i - 1}."
+        )
+    ends = f"wall-{i}" if i == 1 else f"{n}-wall"
+    fewer = [flag and j != i for j, flag in enumerate(springs, start=1)]
+    return (
+        f"Is there a spring {ends}? If not, change in submission.toml "
+        f"springs = {toml_flags(fewer)}."
+    )
 
 
 def _redundancy_checks(values: Mapping[str, float]) -> list[Check]:

@@ -2,8 +2,8 @@
 
 from collections.abc import Sequence
 
-from pipeline.names import read_name
-from pipeline.results import Check, CheckOutcome, LogDecrement, ParameterRow, StepGain
+from pipeline.names import listed, read_name
+from pipeline.results import Check, CheckOutcome, LogDecrement, ParameterRow, Record, StepGain
 from pipeline.stages.compare import change_limit
 
 
@@ -22,6 +22,7 @@ def check_rows(rows: Sequence[ParameterRow]) -> list[Check]:
         outcome, verdict = verdicts[row.consistent]
         sigmas = "" if row.change_sigmas is None else f", {row.change_sigmas:.1f} standard errors"
         advice = _advice(row) if outcome == "fail" else ""
+        same = "" if row.independent is not False else " Both rest on the same recordings."
         checks.append(
             Check(
                 id=f"initial_final.{row.name}",
@@ -29,29 +30,52 @@ def check_rows(rows: Sequence[ParameterRow]) -> list[Check]:
                 value=abs(row.change_percent),
                 limit=limit,
                 message=f"Initial and final {row.name} {verdict}: "
-                f"{row.change_percent:+.1f} %{sigmas} (limit {limit:.0f} %).{advice}",
+                f"{row.change_percent:+.1f} %{sigmas} (limit {limit:.0f} %).{same}{advice}",
             )
         )
     return checks
 
 
 def _advice(row: ParameterRow) -> str:
-    name = read_name(row.name)
-    if row.initial and row.final and row.initial.value * row.final.value < 0:
+    """Return what to look at, of what the two estimates rest on."""
+    name, before, after = read_name(row.name), row.initial, row.final
+    assert before is not None
+    assert after is not None
+    if before.value * after.value < 0:
         return " Their signs differ: is the sign of the input in submission.toml right?"
+    response = after.source == "bode_fit"
     if name.is_ratio:
-        return (
-            " Damping ratios differ where dry friction is at work: a dwell of amplitude A sees "
-            "ζ + 2d/(πA), so ask which of the two methods saw the larger amplitude."
+        seen = (
+            "a steady sine of amplitude A sees ζ + 2d/(πA)"
+            if response
+            else "small swings see more of it"
         )
+        return (
+            f" Damping ratios differ where dry friction is at work: {seen}, so ask which of the "
+            "two methods saw the larger amplitude."
+        )
+    looks = {
+        "step": "the rest and settled levels of {runs}",
+        "log_decrement": "the peaks of {runs}",
+        "frequency_response": "the points near this frequency",
+    }
     if name.is_gain:
-        return " Look at the rest and settled levels of the steps, and at the lowest frequencies."
-    return " Look at the peaks of the decay and at the dwells near this frequency."
+        looks["frequency_response"] = "the points at the lowest frequencies"
+    look = looks.get(before.source, "{runs}").format(runs=listed(before.experiments))
+    beside = (
+        ", and at the points of the response near this frequency"
+        if response and name.is_frequency
+        else ""
+    )
+    lowest = ", and at the lowest frequencies" if response and before.source == "step" else ""
+    return f" Look at {look}{beside}{lowest}."
 
 
-def check_decays(decays: Sequence[LogDecrement], *, position_unit: str) -> list[Check]:
+def check_decays(
+    decays: Sequence[LogDecrement], *, records: Sequence[Record] = (), position_unit: str
+) -> list[Check]:
     """Ask of every decay whether viscous damping alone explains it."""
-    checks = []
+    checks, kinds = [], {record.id: record.kind for record in records}
     for decay in decays:
         if (test := decay.friction) is None:
             continue
@@ -63,11 +87,14 @@ def check_decays(decays: Sequence[LogDecrement], *, position_unit: str) -> list[
             else "is as exponential as its noise lets one see "
             f"(F = {test.f_statistic:.1f}, dry friction from {test.threshold:.1f} on)."
         )
+        what = f"the decay of cart {decay.cart}"
+        if kinds.get(decay.experiment) == "step":
+            what = f"the ringing of cart {decay.cart} after the step"
         checks.append(
             Check.of(
                 f"decay.{decay.experiment}.cart_{decay.cart}",
                 not test.present,
-                f"{decay.experiment}: the decay of cart {decay.cart} {found}",
+                f"{decay.experiment}: {what} {found}",
                 value=test.f_statistic,
                 limit=test.threshold,
             )
@@ -75,19 +102,62 @@ def check_decays(decays: Sequence[LogDecrement], *, position_unit: str) -> list[
     return checks
 
 
-def check_steps(steps: Sequence[StepGain], *, gain_unit: str) -> list[Check]:
-    """Ask whether every step has one gain: a cart that sticks has at least an interval of them."""
-    checks = []
+def check_steps(
+    steps: Sequence[StepGain], *, decays: Sequence[LogDecrement] = (), gain_unit: str
+) -> list[Check]:
+    """Ask whether every step has one gain: a cart that sticks has at least an interval of them.
+
+    A step that shows one gain may still be held off by friction: it stops short alike on the way
+    out and back. So it passes only where several edges agree and nothing shows dry friction on
+    that cart.
+    """
+    rubs: dict[int, list[str]] = {}
+    for decay in decays:
+        if decay.friction and decay.friction.present:
+            rubs.setdefault(decay.cart, []).append(decay.experiment)
     for step in steps:
-        found, width = "settles where its springs put it.", None
         if step.interval:
-            low, high = step.interval
-            width = high - low
-            found = (  # the rest points show the least that friction can hold, not the most
+            rubs.setdefault(step.cart, []).append(step.experiment)
+    return [_step_check(step, shown=rubs.get(step.cart, ()), gain_unit=gain_unit) for step in steps]
+
+
+def _step_check(step: StepGain, *, shown: Sequence[str], gain_unit: str) -> Check:
+    outcome: CheckOutcome
+    edges, width = len(step.edges), None
+    if step.interval:
+        low, high = step.interval
+        width = high - low
+        outcome, found = (
+            "fail",
+            (  # the rest points show the least that friction can hold
                 f"sticks: its rest points put the static gain between {low:.4g} and {high:.4g} "
                 f"{gain_unit}, and it may be farther off."
-            )
-        name = f"step.{step.experiment}.cart_{step.cart}"
-        message = f"{step.experiment}: cart {step.cart} {found}"
-        checks.append(Check.of(name, step.interval is None, message, value=width))
-    return checks
+            ),
+        )
+    elif shown:
+        runs = listed(list(dict.fromkeys(shown)))
+        outcome, found = (
+            "skip",
+            (
+                f"shows one gain, but dry friction shows on this cart in {runs}: it may hold "
+                "the cart off its level here, too, alike on both sides."
+            ),
+        )
+    elif edges < 2:
+        outcome, found = (
+            "skip",
+            (
+                "settles after one edge of the input only, so nothing tells whether friction holds "
+                "it off its level. A step on and off again would."
+            ),
+        )
+    else:
+        back = "" if step.rest_shift is None else ", and it returns to its first rest"
+        outcome, found = "pass", f"shows one gain at all {edges} edges of the input{back}."
+    return Check(
+        id=f"step.{step.experiment}.cart_{step.cart}",
+        outcome=outcome,
+        value=width,
+        limit=None,
+        message=f"{step.experiment}: cart {step.cart} {found}",
+    )

@@ -16,6 +16,9 @@ FEWEST_DWELLS = 5  # a median of fewer is one of them
 
 REDUNDANCY = 1e-9  # two routes to one number through unrounded values
 BELOW_ZERO = 2.0  # standard errors that a mass, damping or spring may be below it
+# Share of its larger neighbour: no bench's masses, dampers or springs differ fifty times. Where
+# there is no spring, dry friction and loose screws feign one of up to 1 % of the next.
+NEGLIGIBLE = 0.02
 # Of the coefficients of a loop's polynomial, which are of the size of their binomials. Rounding
 # leaves 1e-13 of them on plants that a bench can be; the other programs' gains up to 1e-8.
 SAME_LOOP = 1e-6

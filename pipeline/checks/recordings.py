@@ -6,10 +6,17 @@ import numpy as np
 
 from pipeline.checks import limits
 from pipeline.estimation.units_and_clocks import TIME_UNITS
-from pipeline.ingest.columns import conversion
+from pipeline.ingest.columns import (
+    conversion,
+    input_units,
+    is_count,
+    is_known,
+    position_units,
+)
 from pipeline.ingest.input_sign import FEW_NAMES, Signs
 from pipeline.names import listed
 from pipeline.results import SIGN, Check, LeftOut, Record, SinePoint
+from pipeline.results_of_runs import HeadingUnit
 from pipeline.submission import System
 
 SCALES = POSITION_SCALE, INPUT_SCALE = "position_scale", "input_scale"  # then the record's id
@@ -33,6 +40,68 @@ def check_files(unreadable: Mapping[str, str]) -> list[Check]:
         )
         for name, reason in unreadable.items()
     ]
+
+
+def check_units(records: Sequence[Record], *, system: System) -> list[Check]:
+    """Fail where a unit is unknown, or is not the one that headings or the numbers speak of."""
+    position, drive = system.position.unit, system.input.unit
+    fractions = [
+        record.id for record in records if is_count(position) and _has_fractions_of_a_count(record)
+    ]
+    checks = []
+    for role, unit, known in (
+        ("position", position, position_units()),
+        ("input", drive, input_units()),
+    ):
+        headed: dict[str, HeadingUnit] = {}
+        for record in records:
+            for other in record.heading_units:
+                if other.role == role and not other.converts:
+                    headed.setdefault(record.id, other)
+        if not is_known(unit, known):
+            checks.append(_unit_check(role, _unknown(unit, role=role, known=known)))
+        elif headed:
+            runs, other = list(headed), next(iter(headed.values()))
+            checks.append(
+                _unit_check(
+                    role,
+                    f"{listed(runs)}: {other.heading!r} is taken to be in {unit}, the unit in "
+                    f"submission.toml. Is it in {other.unit}? If so, change {role} = "
+                    f'{{ unit = "{other.unit}" }}; if not, change the heading.',
+                    n=len(runs),
+                )
+            )
+        elif role == "position" and fractions:
+            checks.append(
+                _unit_check(
+                    role,
+                    f"{listed(fractions)}: the positions hold fractions, and a count has none. In "
+                    "which unit are they? No heading says it, so every static gain is said to be "
+                    f"in {position}/{drive}. If they are in cm, change in submission.toml "
+                    'position = { unit = "cm" }.',
+                    n=len(fractions),
+                )
+            )
+    return checks
+
+
+def _unit_check(role: str, message: str, *, n: int | None = None) -> Check:
+    value, limit = (None, None) if n is None else (float(n), 0.0)
+    return Check.of(f"{role}_unit", False, message, value=value, limit=limit)
+
+
+def _unknown(unit: str, *, role: str, known: Sequence[str]) -> str:
+    """Return the question what an unknown unit is."""
+    meant = next((one for one in known if one.casefold() == unit.casefold()), "")
+    hint = f"did you mean {meant!r}?" if meant else f"known: {', '.join(known)}"
+    return (
+        f"The {role} unit {unit!r} is not known ({hint}), and every static gain is in it. Is it "
+        f"right? If not, change in submission.toml {role} = {{ unit = … }}."
+    )
+
+
+def _has_fractions_of_a_count(record: Record) -> bool:
+    return record.position_scale == 1.0 and not np.array_equal(record.y, np.round(record.y))
 
 
 def check_scales(records: Sequence[Record], *, system: System) -> list[Check]:

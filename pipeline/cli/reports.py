@@ -88,13 +88,15 @@ def inspect(
 @app.command()
 def fill(folder: Folder, as_json: AsJson = False) -> None:
     """Find out what the files in DIR/data are and write their tables into submission.toml."""
-    from pipeline.ingest.fill import fill_submission, format_found, format_passed_over
+    from pipeline.identify.springs import fill as fill_folder
+    from pipeline.ingest.fill import format_found, format_passed_over
 
     toml = folder / "submission.toml"
     before = toml.read_bytes() if toml.is_file() else None
     with progress_line() as progress:
         progress("finding out what the files are")
-        found = fill_submission(folder)
+        filled = fill_folder(folder)
+    found = filled.files
     if as_json:
         typer.echo(json.dumps([f.to_dict() for f in found], indent=1, ensure_ascii=False))
     else:
@@ -102,7 +104,7 @@ def fill(folder: Folder, as_json: AsJson = False) -> None:
     left = [f for f in found if f.state in ("unknown", "broken", "missing")]
     did = "nothing to add to" if toml.read_bytes() == before else "wrote"
     say(f"{did} {toml}: springs, units and what is marked unsure are yours")
-    for message in format_passed_over(found):
+    for message in (*filled.doubts, *format_passed_over(found)):
         say(f"cartlab: {message}")
     if left:
         say(f"cartlab: of no use yet: {', '.join(f.file for f in left)}")

@@ -25,6 +25,7 @@ _MOST_SHOWN = 32_000_000  # characters of the texts that pages of one person wer
 _MOST_LOOKS = 5_000  # files of which is kept what they are
 NOTHING_KNOWN: dict[str, Any] = {
     "kind": None, "format": "", "duration": None, "remarks": [], "unsure": [], "lines": [],
+    "fractions": False,
 }  # fmt: skip
 Stamp = tuple[int, int, dict[str, str | int]]  # time, size, columns as stated
 Found = TypeVar("Found", Path, Place)

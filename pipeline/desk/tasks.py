@@ -13,8 +13,9 @@ from pipeline.arrays import Array
 from pipeline.desk.class_tasks import publish, regrade
 from pipeline.desk.exercises import effect_svg, exercise, simulate, solution
 from pipeline.errors import ConfigError, SubmissionError
+from pipeline.identify.springs import fill as fill_folder
 from pipeline.ingest.columns import assign_columns
-from pipeline.ingest.fill import Found, data_files, fill_submission, look_at, passed_over
+from pipeline.ingest.fill import Found, data_files, has_fractions, look_at, passed_over
 from pipeline.ingest.formats.recognise import read_table
 from pipeline.lock import alone_in
 from pipeline.output import own_folder, write_file
@@ -51,7 +52,7 @@ def not_read(folder: str, named: list[str], *, progress: Progress) -> list[dict[
 
 def fill(folder: str, *, progress: Progress) -> list[dict[str, Any]]:
     """Write the tables of the files in `data/`."""
-    return [_plain(found) for found in fill_submission(Path(folder))]
+    return [_plain(found) for found in fill_folder(Path(folder)).files]
 
 
 def report(folder: str, *, progress: Progress) -> dict[str, Any]:
@@ -172,6 +173,7 @@ def _plain(found: Found) -> dict[str, Any]:
         "kind": found.kind,
         "remarks": list(found.remarks),
         "unsure": list(found.unsure),
+        "fractions": has_fractions(found),
         "format": inspection.format if inspection else "",
         "duration": inspection.duration if inspection else None,
     }

@@ -167,12 +167,11 @@ def _log_decrements(
         alone = [r for r in records if r.free == (cart,) and cart in r.carts]
         runs = [r for r in alone if r.kind == "decay"] or [r for r in alone if r.kind == "step"]
         if not runs:
-            log.skip(
+            _skip_without(
+                log,
                 f"log decrement, cart {cart}",
-                _none(
-                    f"decay in which cart {cart} alone is free",
-                    [r for r in out if r.free == (cart,) and r.kind in ("decay", "step")],
-                ),
+                f"decay in which cart {cart} alone is free" if len(springs) > 2 else "decay",
+                out=[r for r in out if r.free == (cart,) and r.kind in ("decay", "step")],
             )
         for run in runs:
             decay = log.attempt_once(
@@ -187,11 +186,14 @@ def _sticks(decay: LogDecrement) -> bool:
     return decay.friction is not None and decay.friction.present
 
 
-def _none(what: str, out: Sequence[Record]) -> str:
-    """Say that there is none of some records, or that all of them are left out."""
-    if not out:
-        return f"no {what} was recorded"
-    return f"every {what} is left out: {listed([r.id for r in out])} (the checks say why)"
+def _skip_without(log: Log, stage: str, what: str, *, out: Sequence[Record]) -> None:
+    """Note that there is none of some records, or that all of them are left out."""
+    if out:
+        log.skip(
+            stage, f"every {what} is left out: {listed([r.id for r in out])} (the checks say why)"
+        )
+    else:
+        log.skip(stage, f"no {what} was recorded", missing=f"a {what}")
 
 
 def _step_gains(
@@ -204,7 +206,7 @@ def _step_gains(
     if not runs:
         n = system.carts
         steps = [r for r in out if r.kind == "step" and len(r.free) == n]
-        log.skip("step gain", _none("step with all carts free", steps))
+        _skip_without(log, "step gain", "step with all carts free" if n > 1 else "step", out=steps)
     gains = []
     for run in runs:
         for cart in run.carts:
@@ -244,15 +246,20 @@ def _frequency_response(
     if data.tables:
         return data.tables
     if not any(record.kind == "sine" and record not in out for record in data.records):
-        log.skip("sine steady state", _none("sine dwell", [r for r in out if r.kind == "sine"]))
+        dwells = [r for r in out if r.kind == "sine"]
+        _skip_without(log, "sine steady state", "sine dwell", out=dwells)
     if not driven:
         log.skip(
-            "frequency response", "no usable dwell, no table, and no step or sweep to take it from"
+            "frequency response",
+            "no usable dwell, no table, and no step or sweep with all carts free to take it from",
         )
         return ()
     responses = log.attempt("frequency response", response_from_records, driven)
     if responses:
-        log.warn(["the frequency response comes from the step and sweep records, not from dwells"])
+        used = {run for response in responses for run in response.experiments}
+        kinds = {record.kind for record in driven if record.id in used}
+        runs = " and ".join(f"{kind} records" for kind in ("step", "sweep") if kind in kinds)
+        log.warn([f"the frequency response comes from the {runs}, not from dwells"])
     return responses or ()
 
 

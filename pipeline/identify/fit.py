@@ -68,8 +68,16 @@ def fit_carts(
         bode = replace(bode, by_dwells="sine" in mine)
     if not driven:
         if bode is None:
-            found = "the Bode fit gave none, and there is no" if has_points else "no dwells, table,"
-            log.skip("final estimates", f"{found} step or sweep with all carts free to fit them to")
+            run = "step or sweep with all carts free" if n > 1 else "step or sweep"
+            log.skip(
+                "final estimates",
+                f"the Bode fit gave none, and there is no {run} to fit them to"
+                if has_points
+                else f"there is no usable sine dwell, no table of amplitude ratios, and no {run}",
+                missing=f"a {run}"
+                if has_points
+                else f"sine dwells over the resonances, or a {run}",
+            )
         return bode or Fitted()
     if bode and not dwells:
         return bode
@@ -95,7 +103,9 @@ def fit_carts(
         better = not bode.by_dwells or _is_closer(other, bode, dwells)
     if not better:
         return bode
-    log.warn(["the fit rests on the steps and sweeps: the dwells do not follow one chain"])
+    kinds = {run.kind for run in driven if run.id in other.fit.experiments}
+    used = " and ".join(f"{kind}s" for kind in ("step", "sweep") if kind in kinds)
+    log.warn([f"the fit rests on the {used}: the dwells do not follow one chain"])
     return other
 
 

@@ -54,3 +54,8 @@ MATERIAL = 0.05  # of the response; a smaller difference changes nothing anybody
 # (along one shape, normally distributed) this flags 5 % of the sets, and far fewer where they
 # differ in several ways; three repeats leave one difference to judge by, hence the caution.
 SPREADS, SPREADS_OF_MANY = {3: 30.0, 4: 8.0}, 5.0
+
+# Springs from steps. The weakest spring of a bench, over the one before it: a tenth and more. And
+# inputs that are one level, as a share of their range; a cart that ends farther from where it began
+# than this share of its motion is held by no spring, for friction holds it off by far less.
+WEAKEST, SAME_LEVEL, AWAY = 0.1, 0.02, 0.5

@@ -45,9 +45,9 @@ class Log:
             return None
         return found
 
-    def skip(self, stage: str, reason: str) -> None:
-        """Note why a stage did not run."""
-        self.skipped.append(Skipped(stage=stage, reason=reason))
+    def skip(self, stage: str, reason: str, *, missing: str = "") -> None:
+        """Note why a stage did not run, and what would let it."""
+        self.skipped.append(Skipped(stage=stage, reason=reason, missing=missing))
 
     def warn(self, texts: Iterable[str]) -> None:
         """Add what is not said yet."""

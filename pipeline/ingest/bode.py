@@ -71,7 +71,9 @@ def _positive(table: Table, column: Column) -> Array:
     return values
 
 
-def frequency_responses(points: Points) -> tuple[tuple[FrequencyResponse, ...], str]:
+def frequency_responses(
+    points: Points, *, experiments: Sequence[str] = ()
+) -> tuple[tuple[FrequencyResponse, ...], str]:
     """Return one response a cart, repeats averaged, and where its standard errors come from.
 
     Rows at one frequency are repeats: their pooled relative spread is the standard error of all
@@ -106,6 +108,7 @@ def frequency_responses(points: Points) -> tuple[tuple[FrequencyResponse, ...], 
             phase=None,
             phase_std=None,
             source="table",
+            experiments=tuple(experiments),
         )
         for cart, (omega, magnitude, repeats) in averaged.items()
     )

@@ -1,7 +1,7 @@
 """Which column is what: time, input, reference, the position of each cart; and its unit."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from pipeline.errors import SubmissionError
@@ -30,9 +30,16 @@ _FACTORS = {
     "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254, "inch": 0.0254},
     "voltage": {"V": 1.0, "mV": 1e-3},
     "force": {"N": 1.0, "mN": 1e-3},
-    "angle": {"rad": 1.0, "deg": 0.017453292519943295},
+    "current": {"A": 1.0, "mA": 1e-3},
+    "torque": {"N m": 1.0, "Nm": 1.0, "N·m": 1.0},
+    "angle": {"rad": 1.0, "deg": 0.017453292519943295, "°": 0.017453292519943295}
+    | {"turn": 6.283185307179586, "rev": 6.283185307179586},
     "frequency": {"Hz": 1.0, "kHz": 1e3, "rad/s": 0.15915494309189535},
 }
+_OF_POSITIONS = ("length", "angle")
+_OF_INPUTS = ("voltage", "current", "force", "torque")
+_PLAIN = ("count", "counts", "pulse", "pulses")  # of an encoder, or of what a controller puts out
+_SHARES = ("duty", "%")  # of the largest input
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,8 +76,33 @@ def conversion(found: str | None, wanted: str) -> float | None:
     """Return the factor from one unit to another; None where they are not of one quantity."""
     if found is None or found == wanted:
         return 1.0
-    a, b = (unit.replace("µ", "u").replace("μ", "u") for unit in (found, wanted))
+    a, b = _plain_micro(found), _plain_micro(wanted)
     return next((of[a] / of[b] for of in _FACTORS.values() if a in of and b in of), None)
+
+
+def is_count(unit: str) -> bool:
+    """Tell whether a position unit is the encoder's own."""
+    return unit.rstrip("s") == "count"
+
+
+def position_units() -> tuple[str, ...]:
+    """Return the units that positions are known in."""
+    return (*_PLAIN, *(unit for quantity in _OF_POSITIONS for unit in _FACTORS[quantity]))
+
+
+def input_units() -> tuple[str, ...]:
+    """Return the units that inputs are known in."""
+    known = (unit for quantity in _OF_INPUTS for unit in _FACTORS[quantity])
+    return (*_PLAIN, *_SHARES, *known)
+
+
+def is_known(unit: str, known: Collection[str]) -> bool:
+    """Tell whether a unit is one of those known, whichever way its µ is typed."""
+    return _plain_micro(unit) in known
+
+
+def _plain_micro(unit: str) -> str:
+    return unit.replace("µ", "u").replace("μ", "u")
 
 
 def assign_columns(

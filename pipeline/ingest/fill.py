@@ -17,6 +17,7 @@ import tomlkit
 from pipeline.errors import ConfigError, SubmissionError
 from pipeline.ingest import limits
 from pipeline.ingest.channels import never_changes
+from pipeline.ingest.columns import is_count, is_known, position_units
 from pipeline.ingest.folder import (
     NotRead,
     data_files_in,
@@ -28,7 +29,7 @@ from pipeline.ingest.folder import (
 from pipeline.ingest.formats.recognise import read_table
 from pipeline.ingest.formats.table import ENDINGS
 from pipeline.ingest.inspect import NO_CLOCK, Inspection, inspect_file
-from pipeline.names import by_note
+from pipeline.names import by_note, first_few
 from pipeline.results_of_runs import Kind
 from pipeline.submission.edit import (
     append_experiment,
@@ -259,7 +260,14 @@ class _Filling:
             return replace(found, remarks=(*found.remarks, full))
         unsure = (*found.unsure, *_unsure(found, self._n))
         append_experiment(self._document, entry, remarks=[_UNSURE + one for one in unsure])
-        return replace(found, state="new", experiment=name, unsure=unsure)
+        carts = found.carts or range(1, self._n + 1)
+        held = [
+            f"{column.name!r} never changes, so cart {cart} is written as held"
+            for cart, column in found.inspection.positions.items()
+            if cart <= self._n and cart not in carts and column.low == column.high
+        ]
+        remarks = (*_beside_held(found, carts), *held)
+        return replace(found, state="new", experiment=name, remarks=remarks, unsure=unsure)
 
     def _complete(self, table: Any, found: Found, inspection: Inspection) -> Found:
         """Give a table the keys that it cannot do without and its file tells."""
@@ -272,10 +280,7 @@ class _Filling:
         if "columns" not in table and inspection.guessed:
             table["columns"] = toml_item(inspection.guessed)
         carts = tuple(table.get("carts", range(1, self._n + 1)))
-        held = [column for cart, column in inspection.positions.items() if cart not in carts]
-        known = {never_changes(column.name) for column in held}  # said in the table, no news
-        if "sample_rate" in table:
-            known.add(NO_CLOCK)
+        known = {NO_CLOCK} if "sample_rate" in table else set()  # said in the table, no news
         if "columns" in table and not inspection.guessed:
             known.add(inspection.ranges)
         return replace(
@@ -284,7 +289,7 @@ class _Filling:
             experiment=str(table["id"]),
             kind=table.get("kind"),
             carts=carts,
-            remarks=tuple(remark for remark in found.remarks if remark not in known),
+            remarks=tuple(one for one in _beside_held(found, carts) if one not in known),
             unsure=_marked(table),
         )
 
@@ -335,6 +340,62 @@ class _Filling:
         needs = [_TO_STATE[key] for key in found.inspection.needs] if found.inspection else []
         for text in (_UNSURE + why, "[[experiments]]", f"id = {id_}", kind, line, *needs):
             self._document.add(tomlkit.comment(comment_text(text)))
+
+
+def _beside_held(found: Found, carts: Collection[int]) -> tuple[str, ...]:
+    """Return the remarks but those on carts that the table says are held: they stand still."""
+    assert found.inspection is not None
+    positions = found.inspection.positions.items()
+    known = {never_changes(column.name) for cart, column in positions if cart not in carts}
+    return tuple(remark for remark in found.remarks if remark not in known)
+
+
+def has_fractions(found: Found) -> bool:
+    """Whether a position of a recording is not in whole numbers, as counts are."""
+    if found.inspection is None or found.kind == "bode":
+        return False
+    return not all(column.whole for column in found.inspection.positions.values())
+
+
+def unit_doubt(unit: str, *, fractions: Sequence[str]) -> str:
+    """Return what speaks against a unit of the positions, or "".
+
+    Parameters
+    ----------
+    fractions : the files that hold some.
+    """
+    if not is_known(unit, position_units()):
+        return f"the unit {unit!r} is not known: is it right?"
+    if not is_count(unit) or not fractions:
+        return ""
+    have = "has" if len(fractions) == 1 else "have"
+    return f"a count has no fractions, and {first_few(fractions, 1)} {have} some: is it cm?"
+
+
+def system_doubts(folder: Path) -> tuple[str, ...]:
+    """Return what stands marked as unsure beside a key of `[system]`, each with its key."""
+    system: Any = tomlkit.parse(submission_text(folder).replace("\r\n", "\n")).get("system", {})
+    comments = {key: item.trivia.comment.removeprefix("# ") for key, item in system.value.items()}
+    return tuple(
+        f"{key}: {comment}" for key, comment in comments.items() if comment.startswith(_UNSURE)
+    )
+
+
+def mark_system(folder: Path, key: str, *, doubt: str, value: "Value | None" = None) -> None:
+    """Put a value into `[system]`, and a doubt or a reason as the comment behind it."""
+
+    def change(document: tomlkit.TOMLDocument) -> None:
+        system: Any = document["system"]
+        if value is not None:
+            system[key] = toml_item(value)
+        system[key].comment(comment_text(doubt))
+
+    edit_submission(folder, change)
+
+
+def unsure(doubt: str) -> str:
+    """Return a comment that marks a doubt, which whoever knows better takes out."""
+    return _UNSURE + doubt
 
 
 def _marked(table: Any) -> tuple[str, ...]:

@@ -25,7 +25,10 @@ _MOST_COLUMNS = 16  # spelt out in a sentence
 
 @dataclass(frozen=True, kw_only=True)
 class ColumnInspection:
-    """One column: its heading, the role it would play, its range and the encoder step seen."""
+    """One column: its heading, the role it would play, its range and the encoder step seen.
+
+    `whole` : it holds whole numbers only, as an encoder's counts are.
+    """
 
     name: str
     role: str | None
@@ -33,6 +36,7 @@ class ColumnInspection:
     low: float
     high: float
     step: float | None
+    whole: bool
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,6 +138,7 @@ def inspect_file(path: Path, *, columns: Mapping[str, str | int] = {}) -> Inspec
                 low=float(values.min()) + 0.0,  # never "-0"
                 high=float(values.max()) + 0.0,
                 step=encoder_step(values) or None if roles.get(i, " ")[0] == "x" else None,
+                whole=bool(table.whole[i]),
             )
             for i, (name, values) in enumerate(zip(table.names, table.values, strict=True))
         ),

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -12,11 +13,12 @@ from pipeline.ingest import limits
 from pipeline.ingest.bode import Points, frequency_responses, read_points
 from pipeline.ingest.channels import channel_problems, encoder_step, mirrors
 from pipeline.ingest.clock import Clock, clock_notes, read_clocks, time_stamps
-from pipeline.ingest.columns import Column, assign_columns, conversion, holds_counts
+from pipeline.ingest.columns import Column, assign_columns, conversion, holds_counts, is_count
 from pipeline.ingest.formats.recognise import read_table
 from pipeline.ingest.formats.table import Table, refuse_extreme
 from pipeline.ingest.input_sign import Signs, with_signs
 from pipeline.results import FrequencyResponse, Record
+from pipeline.results_of_runs import HeadingUnit
 from pipeline.submission import Experiment, Submission, System
 
 DUTY_COUNT = 5 / 4096  # V; the UCSD bench's amplifier gives 5 V for 4096 counts
@@ -65,6 +67,7 @@ def read_data(submission: Submission) -> Ingested:
     points: Points = {}
     warnings: list[str] = []
     unreadable: dict[str, str] = {}
+    tables_read: list[str] = []
     taken = {experiment.file for experiment in submission.experiments}
     for experiment in submission.experiments:
         with _noted(experiment, unreadable):
@@ -74,7 +77,8 @@ def read_data(submission: Submission) -> Ingested:
                 )
             table, _ = tables[experiment.file]
             if experiment.kind == "bode":
-                _read_bode(table, experiment, submission.system, points, warnings)
+                if _read_bode(table, experiment, submission.system, points, warnings):
+                    tables_read.append(experiment.id)
             else:
                 opened.append(_open(table, experiment, submission.system))
     records: list[Record] = []
@@ -86,7 +90,7 @@ def read_data(submission: Submission) -> Ingested:
         raise SubmissionError(_none_readable(unreadable))
     warnings += _unused_scale(records, submission.system)
     records, found, signs = with_signs(records, submission)
-    responses, spread = frequency_responses(points)
+    responses, spread = frequency_responses(points, experiments=tables_read)
     return Ingested(
         records=tuple(records),
         tables=responses,
@@ -135,20 +139,21 @@ def _copies(tables: Mapping[str, tuple[Table, str]]) -> list[str]:
 
 def _read_bode(
     table: Table, experiment: Experiment, system: System, points: Points, warnings: list[str]
-) -> None:
-    """Add the rows of a Bode table to `points`."""
+) -> bool:
+    """Add the rows of a Bode table to `points`; return whether it can be used."""
     if len(experiment.carts) < system.carts:
         warnings.append(
             f"{experiment.id}: not used: a bode table is fitted with all carts free, "
             f"here only {list(experiment.carts)} are"
         )
-        return
+        return False
     _refuse_cut(table)
     columns, unused = assign_columns(table, explicit=experiment.columns, free=experiment.carts)
     for cart, rows in read_points(table, columns, carts=experiment.carts).items():
         points.setdefault(cart, []).extend(rows)
     if unused:
         warnings.append(f"{experiment.id}: columns not used: {', '.join(unused)}")
+    return True
 
 
 def _refuse_cut(table: Table) -> None:
@@ -202,14 +207,14 @@ def _read_record(opened: _Opened, clock: Clock, system: System) -> Record:
     """Return the record with the input's scale applied, but not yet a sign that must be found."""
     table, experiment, columns = opened.table, opened.experiment, opened.columns
     positions = opened.positions
-    notes = list(table.notes)
+    notes, headed = list(table.notes), list[HeadingUnit]()
     extra = [c.name for role, c in columns.items() if role[0] == "x" and c not in positions]
     if opened.unused or extra:
         notes.append(f"columns not used: {', '.join([*opened.unused, *extra])}")
     if (time := columns.get("time")) is not None:
         notes += clock_notes(table, time, clock, sample_rate=experiment.sample_rate)
     keep = _window(clock, experiment)
-    scales = [_position_scale(table, column, system, notes) for column in positions]
+    scales = [_position_scale(table, column, system, notes, headed) for column in positions]
     y = np.array(
         [table.values[c.index] * scale for c, scale in zip(positions, scales, strict=True)]
     )
@@ -217,8 +222,8 @@ def _read_record(opened: _Opened, clock: Clock, system: System) -> Record:
         scale if holds_counts(table, c) else encoder_step(row)
         for c, row, scale in zip(positions, y, scales, strict=True)
     ]
-    u, input_scale = _input(table, columns, experiment, system, notes)
-    reference = _reference(table, columns, experiment, system, notes, keep)
+    u, input_scale = _input(table, columns, experiment, system, notes, headed)
+    reference = _reference(table, columns, experiment, system, notes, headed, keep)
     measured = {f"the position of cart {c.cart}": row for c, row in zip(positions, y, strict=True)}
     measured |= {"the input": u, "the reference": reference, "the time": clock.t - clock.t[0]}
     for what, values in measured.items():
@@ -244,6 +249,7 @@ def _read_record(opened: _Opened, clock: Clock, system: System) -> Record:
         notes=tuple(notes),
         position_scale=scales[0],
         input_scale=input_scale,
+        heading_units=tuple(dict.fromkeys(headed)),
     )
 
 
@@ -286,33 +292,41 @@ def _window(clock: Clock, experiment: Experiment) -> slice:
 # ------------------------------------------------------------------------ units and signs
 
 
-def _position_scale(table: Table, column: Column, system: System, notes: list[str]) -> float:
+def _position_scale(
+    table: Table, column: Column, system: System, notes: list[str], headed: list[HeadingUnit]
+) -> float:
     """Return position units per number in the file."""
     unit, per_count = system.position.unit, system.position.per_count
     if holds_counts(table, column):
         if per_count is not None:
             return per_count
-        if unit.rstrip("s") == "count" or not (table.form == "ecp" or column.is_counted):
+        if is_count(unit) or not (table.form == "ecp" or column.is_counted):
             return 1.0
         raise SubmissionError(
             f"{table.source}: {column.name!r} holds encoder counts; state how many {unit} one "
             f"count is: position = {{ unit = {unit!r}, per_count = … }}"
         )
-    values = table.values[column.index]
-    if unit.rstrip("s") == "count" and column.unit is None and np.any(values != np.round(values)):
-        notes.append(
-            f"{column.name!r} holds fractions, yet no length unit is stated and so they count as "
-            'encoder counts: state position = { unit = "…" }'
-        )
-        return 1.0
-    return _unit_scale(column, unit, notes)
+    return _unit_scale(column, unit, "position", notes, headed)
 
 
-def _unit_scale(column: Column, unit: str, notes: list[str]) -> float:
-    """Return the factor from the heading's unit to the submission's, and say what was done."""
+def _unit_scale(
+    column: Column,
+    unit: str,
+    role: Literal["position", "input"],
+    notes: list[str],
+    headed: list[HeadingUnit],
+) -> float:
+    """Return the factor from the heading's unit to the submission's, and say what was done.
+
+    What the heading states joins those `headed`, whether it converts or not.
+    """
     factor = conversion(column.unit, unit)
+    if column.unit is not None:
+        converts = factor is not None
+        headed.append(
+            HeadingUnit(role=role, heading=column.name, unit=column.unit, converts=converts)
+        )
     if factor is None:
-        notes.append(f"{column.name!r} is taken to be in {unit}, the unit of the submission")
         return 1.0
     if factor != 1.0:
         notes.append(f"{column.name!r} was converted from {column.unit} to {unit}")
@@ -325,6 +339,7 @@ def _input(
     experiment: Experiment,
     system: System,
     notes: list[str],
+    headed: list[HeadingUnit],
 ) -> tuple[Array | None, float]:
     """Return the input in input units and the scale used, both without a sign to be found."""
     column = columns.get("input")
@@ -351,7 +366,7 @@ def _input(
         if per_count is None:
             notes.append(f"{column.name!r} is taken as duty counts of 5/4096 {system.input.unit}")
     else:
-        scale = _unit_scale(column, system.input.unit, notes)
+        scale = _unit_scale(column, system.input.unit, "input", notes, headed)
     return values * scale, scale
 
 
@@ -366,6 +381,7 @@ def _reference(
     experiment: Experiment,
     system: System,
     notes: list[str],
+    headed: list[HeadingUnit],
     keep: slice,
 ) -> Array | None:
     """Return the set point of a closed loop: the experiment's own, else the file's column."""
@@ -386,4 +402,4 @@ def _reference(
     ):
         notes.append(f"{column.name!r} only mirrors {first.name!r} and is no reference")
         return None
-    return values[keep] * _position_scale(table, column, system, notes)
+    return values[keep] * _position_scale(table, column, system, notes, headed)

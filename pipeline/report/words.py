@@ -2,12 +2,13 @@
 
 import re
 import unicodedata
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 from pipeline.names import read_name
 from pipeline.report.document import Block, Items, Paragraph, Span, Spans, plain
 from pipeline.report.math.tree import GREEK, symbol
 from pipeline.report.numbers import listing, subscript, typeset
+from pipeline.results import Estimate
 
 SOURCES = {
     "step": "step",
@@ -17,6 +18,7 @@ SOURCES = {
     "assumed": "assumed",
     "frequency_response": "response",
 }
+AFTER_A_STEP = "ringing after a step"  # in place of a decay
 _NAME = re.compile(r"\b(?:omega|zeta|K|X|m|c|k)_(?:\d|[a-h]|[nxy])\b|\b(?:omega|zeta)\b")
 
 
@@ -29,6 +31,15 @@ def rich(text: str) -> Spans:
         parts += [Span(text[end : match.start()]), name_span(match[0])]
         end = match.end()
     return tuple(part for part in (*parts, Span(text[end:])) if part.text)
+
+
+def source_text(estimate: Estimate | None, *, steps: Collection[str]) -> str:
+    """Return what an estimate comes from; what rings after one of the `steps` is no decay."""
+    if estimate is None:
+        return ""
+    if estimate.source == "log_decrement" and set(estimate.experiments) & set(steps):
+        return AFTER_A_STEP
+    return SOURCES.get(estimate.source, clean(estimate.source))
 
 
 def name_span(name: str) -> Span:

@@ -44,6 +44,10 @@ class Parameter(Document):
     consistent: Annotated[
         bool | None, Field(description="null: nothing to compare, or too uncertain")
     ]
+    independent: Annotated[
+        bool | None,
+        Field(description="false: both rest on the same recordings; null: there are not two"),
+    ] = None
     note: str
 
 
@@ -188,6 +192,27 @@ class Skipped(Document):
     reason: str
 
 
+class Assumption(Document):
+    """Something about the bench that every number rests on, and how the data support it."""
+
+    key: Annotated[str, Field(description="of submission.toml: system.springs, …")]
+    about: Annotated[str, Field(description="which one, where there are several: wall-1")]
+    value: Annotated[
+        bool | float | str | tuple[int, ...], Field(description="what was stated or taken")
+    ]
+    origin: Literal["stated", "data", "default"]
+    support: Annotated[
+        Literal["supported", "contradicted", "open"],
+        Field(description="open: the data do not tell"),
+    ]
+    found: Annotated[Number, Field(description="what the data give for it, if it is a number")]
+    found_std: Number
+    experiments: Annotated[
+        tuple[str, ...], Field(description="the recordings it is about, or that tell it")
+    ]
+    reason: str
+
+
 class Results(Document):
     """All results of one submission. A number that could not be had is null, never 0 or NaN."""
 
@@ -203,6 +228,9 @@ class Results(Document):
     checks: tuple[Check, ...]
     feedback: Feedback | None
     hardware: tuple[Hardware, ...]
+    assumptions: Annotated[
+        tuple[Assumption, ...], Field(description="springs, units, scales, sign, free carts")
+    ] = ()
     skipped: tuple[Skipped, ...]
     warnings: tuple[str, ...]
     provenance: Provenance

@@ -102,7 +102,10 @@ def fit_bode(
     best, share = _widen(best, data)
     best, used = _hold_vanished(best, data.widened(share), decays or {})
     data = replace(data, decays=used.decays)
-    return _result(best, data, share=share, staged=staged, tried=tried, remark=remark)
+    fit = _result(best, data, share=share, staged=staged, tried=tried, remark=remark)
+    runs = [run for response in responses for run in response.experiments]
+    runs += [run for decay in data.decays.values() for run in decay.experiments]
+    return replace(fit, experiments=tuple(dict.fromkeys(runs)))
 
 
 # ---------------------------------------------------------------------- starts

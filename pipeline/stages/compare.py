@@ -4,7 +4,7 @@ Nearly every parameter is estimated in two ways (Throne 2005, Tables 1-3): frequ
 usually agree within some percent, damping ratios often do not.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -30,12 +30,18 @@ def compare(
     names: Sequence[str],
     position_unit: str,
     input_unit: str,
+    fitted_to: Collection[str] = (),
 ) -> tuple[ParameterRow, ...]:
-    """Set the initial beside the final estimate of every parameter in `names`."""
+    """Set the initial beside the final estimate of every parameter in `names`.
+
+    Parameters
+    ----------
+    fitted_to : the recordings that the final estimates come from.
+    """
     rows = []
     for name in names:
         before, after = initial.get(name), final.get(name)
-        percent = sigmas = consistent = None
+        percent = sigmas = consistent = independent = None
         note = ""
         if before is not None and before.source == "assumed":
             note = "the initial value was assumed, not measured"
@@ -47,6 +53,7 @@ def compare(
         elif before is not None and after is not None and before.value != 0:
             percent = 100 * (after.value - before.value) / abs(before.value)
             if before.source != "assumed":
+                independent = set(before.experiments).isdisjoint(fitted_to)
                 sigmas = _combined_sigmas(before, after)
                 consistent = abs(percent) <= change_limit(name)
                 if not consistent and sigmas is not None and sigmas <= limits.SIGMA_LIMIT:
@@ -60,6 +67,7 @@ def compare(
                 change_percent=percent,
                 change_sigmas=sigmas,
                 consistent=consistent,
+                independent=independent,
                 note=note,
             )
         )

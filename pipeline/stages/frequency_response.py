@@ -1,6 +1,7 @@
 """Measured frequency response: from dwells, or from step and sweep records; its peaks and nulls."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -102,6 +103,7 @@ def _collect_cart(points: Sequence[SinePoint], *, cart: int) -> FrequencyRespons
         phase=phase,
         phase_std=phase_std,
         source="dwells",
+        experiments=tuple(p.experiment for p in ordered),
     )
 
 
@@ -148,7 +150,8 @@ def response_from_records(records: Sequence[Record]) -> tuple[FrequencyResponse,
         ]
         response = _combined(omega, rows, cart=cart)
         if response.omega.size:
-            responses.append(response)
+            measured = tuple(run.id for run in runs if cart in run.carts)
+            responses.append(replace(response, experiments=measured))
     if not responses:
         raise DataError(
             "frequency response: at no frequency does the motion in "
@@ -230,7 +233,10 @@ def find_resonances(responses: Sequence[FrequencyResponse], *, n: int) -> dict[s
     if n == 3 and 1 in by_cart:
         found |= _estimates(omega_names(NULLS), _strongest(nulls[1], 2))
     assumed = [mode_zeta(suffix) for suffix in (*symbols, *NULLS)]
-    return found | {
+    # Peaks are those that the carts share, and gains are corrected by them.
+    runs = tuple(dict.fromkeys(run for response in responses for run in response.experiments))
+    measured = {name: replace(one, experiments=runs) for name, one in found.items()}
+    return measured | {
         name: Estimate(value=ASSUMED_ZETA, std=None, source="assumed")
         for name in assumed
         if by_cart and name in names

@@ -226,6 +226,7 @@ def _result(
         converged=attempt.converged and explained,
         message=_message(attempt, remarks),
         standardised=standardised,
+        experiments=tuple(dict.fromkeys(window.id for window in attempt.windows)),
     )
 
 

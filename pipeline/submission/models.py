@@ -58,20 +58,22 @@ class System(_Model):
     """
 
     carts: Annotated[int, Field(ge=1, le=MOST_CARTS)]
-    springs: tuple[bool, ...]
+    springs: tuple[bool, ...] = ()
     input: Input = Input()
     position: Position = Position()
     columns: dict[str, str | int] = {}
 
-    @model_validator(mode="before")
-    @classmethod
-    def _all_springs(cls, table: object) -> object:
-        """Fill in `springs` where they are left out."""
-        if isinstance(table, dict) and "springs" not in table:
-            carts = table.get("carts")
-            if isinstance(carts, int) and 1 <= carts <= MOST_CARTS:
-                return {**table, "springs": (True,) * (carts + 1)}
-        return table
+    @model_validator(mode="after")
+    def _all_springs(self) -> "System":
+        """Fill in `springs` where they are left out; that nobody stated them stays known."""
+        if not self.states_springs:
+            object.__setattr__(self, "springs", (True,) * (self.carts + 1))
+        return self
+
+    @property
+    def states_springs(self) -> bool:
+        """Whether the springs were stated: else all were taken to be there."""
+        return "springs" in self.model_fields_set
 
     @property
     def rigid(self) -> bool:

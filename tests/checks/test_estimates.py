@@ -1,7 +1,15 @@
 """Checks of single estimates: what they promise of a number."""
 
-from pipeline.checks.estimates import check_steps
-from pipeline.results import StepGain
+from dataclasses import replace
+
+from typer.testing import CliRunner
+
+from pipeline.checks.estimates import check_rows, check_steps
+from pipeline.cli import app
+from pipeline.results import Estimate, ParameterRow, StepGain
+from pipeline.submission import load_submission
+from pipeline.workflow import analyse
+from tests.helpers.examples import analysed
 
 
 def test_the_interval_of_a_cart_that_sticks_is_no_bound():
@@ -22,3 +30,68 @@ def test_the_interval_of_a_cart_that_sticks_is_no_bound():
     checks = check_steps(steps, gain_unit="cm/V")
     assert [check.outcome for check in checks] == ["fail", "fail"]
     assert all("may be farther off" in check.message for check in checks)
+
+
+def test_a_step_that_friction_holds_off_does_not_pass_as_settled(tmp_path):
+    """It stops short alike on both sides, so its gain looks like one; others show the friction."""
+    hidden = "coulomb_friction:cart=1,force=0.003"
+    done = CliRunner().invoke(
+        app,
+        ["simulate", "--preset", "throne-1dof", "--hide", hidden, "--seed", "3",
+         "--out", str(tmp_path / "s")],
+    )  # fmt: skip
+    assert done.exit_code == 0
+    analysis = analyse(load_submission(tmp_path / "s"), design=False)
+    alike = [gain for gain in analysis.step_gains if gain.interval is None]
+    assert alike  # some show one gain at all edges
+    outcomes = {check.about: check for check in analysis.checks if check.kind == "step"}
+    for gain in alike:
+        check = outcomes[f"{gain.experiment}.cart_1"]
+        assert check.outcome == "skip"
+        assert "dry friction shows on this cart in decay-1a" in check.message
+    assert not any(check.outcome == "pass" for check in outcomes.values())
+
+
+def test_one_edge_does_not_tell_whether_a_cart_sticks():
+    """A step that is never switched off shows one level only; on and off again it is a test."""
+    (gain, *_) = analysed("one-cart").step_gains
+    both, one = check_steps(
+        [gain, replace(gain, edges=gain.edges[:1], rest_shift=None)], gain_unit="cm/V"
+    )
+    assert (both.outcome, one.outcome) == ("pass", "skip")
+    assert "at all 2 edges" in both.message
+    assert "one edge" in one.message
+
+
+def row(name: str, source: str, final: str) -> ParameterRow:
+    """Return a parameter whose two estimates disagree."""
+    return ParameterRow(
+        name=name,
+        unit="",
+        initial=Estimate(value=1.0, std=0.01, source=source, experiments=("run-7",)),
+        final=Estimate(value=2.0, std=0.01, source=final),
+        change_percent=100.0,
+        change_sigmas=70.0,
+        consistent=False,
+        independent=True,
+    )
+
+
+def test_advice_looks_only_at_what_there_is():
+    """No dwells, decays or steps are named where the estimates do not rest on them."""
+    said = {
+        (name, source, final): check_rows([row(name, source, final)])[0].message
+        for name, source, final in (
+            ("K_1", "step", "time_fit"),
+            ("K_1", "step", "bode_fit"),
+            ("K_1", "frequency_response", "bode_fit"),
+            ("omega_1", "log_decrement", "time_fit"),
+            ("omega_a", "frequency_response", "time_fit"),
+            ("zeta_1", "log_decrement", "time_fit"),
+        )
+    }
+    for (_, source, final), text in said.items():
+        assert ("dwell" in text) <= (final == "bode_fit")
+        assert ("peaks of run-7" in text) <= (source == "log_decrement")
+        assert ("settled levels of run-7" in text) == (source == "step")
+    assert "decay" not in " ".join(said.values())

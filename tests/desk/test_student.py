@@ -142,6 +142,22 @@ def test_what_is_wrong_stands_beside_its_field(filled):
     assert wrongs(page.text) == ["there is no cart 7, the system has only cart 1"]
 
 
+def test_a_unit_in_doubt_is_asked_about_beside_its_field(room):
+    """Positions in fractions are no counts; with the unit stated the question is gone."""
+    visitor, folder = room
+    visitor.upload(HERE + "files", some_files())
+    page = visitor.get(HERE)
+    assert 'id="system-position-unit-asked"' in page.text
+    assert "a count has no fractions" in page.text
+    given = {"system.position.unit": "furlong"}
+    visitor.post(HERE + "save", seen=page.value("seen"), **given)
+    page = visitor.get(HERE)
+    assert "is not known: is it right?" in page.text
+    visitor.post(HERE + "save", seen=page.value("seen"), **{"system.position.unit": "cm"})
+    assert "system-position-unit-asked" not in visitor.get(HERE).text
+    assert load_submission(folder).system.position.unit == "cm"
+
+
 def test_a_row_is_corrected_in_place(filled):
     """Kind, carts, window of one file; and its table is taken out, the file stays."""
     visitor, folder = filled

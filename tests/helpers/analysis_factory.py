@@ -46,7 +46,7 @@ def make_analysis(carts: int = 2, *, seed: int = 1, repeats: int = 2) -> Analysi
     step, gains = _step(chain, rng)
     dwells, points = _dwells(chain, rng)
     control, hardware, feedback = _closed_loop(chain, rng)
-    fit = _fit(chain, n_points=len(points))
+    fit = _fit(chain, n_points=len(points), dwells=[record.id for record in dwells])
     records = (*(record for record, _ in decays), step, *dwells, control)
     return Analysis(
         title=f"The {carts}-cart system, bench 4",
@@ -240,7 +240,7 @@ def _responses(points: tuple[SinePoint, ...]) -> tuple[FrequencyResponse, ...]:
     return tuple(responses)
 
 
-def _fit(chain: Chain, *, n_points: int) -> ChainFit:
+def _fit(chain: Chain, *, n_points: int, dwells: list[str]) -> ChainFit:
     names = tuple(
         [f"m_{i}" for i in range(1, chain.n + 1)]
         + [f"c_{i}" for i in range(1, chain.n + 1)]
@@ -264,6 +264,7 @@ def _fit(chain: Chain, *, n_points: int) -> ChainFit:
         n_starts=1,
         converged=True,
         message="converged",
+        experiments=tuple(dwells),
     )
 
 

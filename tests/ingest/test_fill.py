@@ -230,15 +230,16 @@ def test_a_cart_that_the_system_has_not_is_asked_about(tmp_path, carts, asked):
 
 
 def test_a_held_cart_that_is_stated_is_no_remark(tmp_path):
-    """A still encoder is asked about where the carts are a guess, not once they stand."""
+    """That its cart is written as held is said once; without the table's word it is a question."""
     put(tmp_path, "run.csv", time=T, input=STEP, x1=RING, x2=0.4 * RING)
     put(tmp_path, "pull.csv", time=T, input=0 * T, x1=RING, x2=0 * T)
     first, second = fill_submission(tmp_path), fill_submission(tmp_path)
-    assert "'x2' never changes" in " ".join(first[0].remarks)
+    assert first[0].remarks == ("'x2' never changes, so cart 2 is written as held",)
     assert second[0].remarks == ()
     toml = tmp_path / "submission.toml"
     toml.write_text(toml.read_text(encoding="utf-8").replace("carts = [1]\n", "", 1), "utf-8")
-    assert "'x2' never changes" in " ".join(fill_submission(tmp_path)[0].remarks)
+    asked = " ".join(fill_submission(tmp_path)[0].remarks)
+    assert "'x2' never changes: a held cart, or an encoder that is stuck" in asked
 
 
 def test_a_table_without_its_file_is_told(tmp_path):

@@ -8,7 +8,7 @@ import pytest
 import scipy.io
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pipeline.checks.recordings import check_signs
+from pipeline.checks.recordings import check_signs, check_units
 from pipeline.errors import SubmissionError
 from pipeline.ingest.read import DUTY_COUNT, Ingested, read_data
 from pipeline.plant.linear.presets import PRESETS
@@ -147,12 +147,58 @@ def test_whole_ecp_values_without_a_scale_are_counts(tmp_path):
     assert_array_equal(record.position(1), X1)
 
 
-@pytest.mark.parametrize(("system", "said"), [("", True), ('position = { unit = "cm" }', False)])
-def test_fractions_of_a_count_are_noticed(system, said, tmp_path):
-    """Whoever forgets the unit is told so: an encoder has no fractions of a count."""
-    data = read(tmp_path, system, STEP, csv(time=T, input=U, x1=Y[0] / 440, x2=Y[1] / 440))
-    notes = " ".join(data.records[0].notes)
-    assert ("fractions" in notes) == said
+@pytest.mark.parametrize(
+    ("system", "asked"),
+    [
+        ("", True),
+        ('position = { unit = "count" }', True),
+        ('position = { unit = "cm" }', False),
+        ('position = { unit = "deg" }', False),
+    ],
+)
+def test_fractions_of_a_count_are_asked_about(system, asked, tmp_path):
+    """Whoever forgets the unit is asked for it: an encoder has no fractions of a count."""
+    folder = tmp_path / "s"
+    data = read(folder, system, STEP, csv(time=T, input=U, x1=Y[0] / 440, x2=Y[1] / 440))
+    checks = check_units(data.records, system=load_submission(folder).system)
+    assert [check.id for check in checks] == ["position_unit"] * asked
+    assert all('position = { unit = "cm" }' in check.message for check in checks)
+
+
+@pytest.mark.parametrize(
+    ("system", "ids"),
+    [
+        ('position = { unit = "furlong" }', ["position_unit"]),
+        ('position = { unit = "CM" }', ["position_unit"]),
+        ('position = { unit = "µm" }', []),
+        ('position = { unit = "in" }\ninput = { unit = "N" }', []),
+        ('position = { unit = "turn" }\ninput = { unit = "duty" }', []),
+        ('position = { unit = "rad" }\ninput = { unit = "A" }', []),
+        ('position = { unit = "mm" }\ninput = { unit = "furlong" }', ["input_unit"]),
+    ],
+)
+def test_a_unit_that_nobody_knows_is_asked_about(system, ids, tmp_path):
+    """What benches are measured in is known; anything else is no unit in silence."""
+    folder = tmp_path / "s"
+    data = read(folder, system, STEP, csv(time=T, input=U, x1=Y[0] / 440, x2=Y[1] / 440))
+    checks = check_units(data.records, system=load_submission(folder).system)
+    assert [check.id for check in checks] == ids
+    assert all("is not known" in check.message for check in checks)
+    if "CM" in system:
+        assert "did you mean 'cm'?" in checks[0].message
+
+
+def test_a_heading_in_another_unit_is_asked_about(tmp_path):
+    """Centimetres by their heading and counts by the file: somebody has to say which."""
+    folder = tmp_path / "s"
+    data = read(folder, "", STEP, csv(time=T, input__N=U, x1__cm=Y[0] / 440, x2=X2))
+    checks = check_units(data.records, system=load_submission(folder).system)
+    assert [check.id for check in checks] == ["position_unit", "input_unit"]
+    assert 'position = { unit = "cm" }' in checks[0].message
+    assert 'input = { unit = "N" }' in checks[1].message
+    whole = read(tmp_path / "t", "", STEP, csv(time=T, input__V=U, x1__mm=X1, x2__mm=X2))
+    (check,) = check_units(whole.records, system=load_submission(tmp_path / "t").system)
+    assert 'position = { unit = "mm" }' in check.message
 
 
 def bench_log(effort: np.ndarray) -> str:

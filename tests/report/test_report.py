@@ -12,6 +12,7 @@ import numpy as np
 import pypdf
 import pytest
 
+from pipeline.checks.recordings import check_files, check_left_out
 from pipeline.plant.linear.chain import Chain
 from pipeline.report.document import (
     Document,
@@ -522,22 +523,33 @@ def test_what_was_not_used_is_not_said_to_be():
     dwells = [record.id for record in analysis.records if record.kind == "sine"]
     left_out = LeftOut(experiment=dwells[0], reason="froze", is_wrong=True)
     whole = terminal_summary(analysis)
+    assert analysis.fit is not None
+    unreadable = {"step-9": "there is no file"}
+    checks = check_left_out([left_out], records=analysis.records) + check_files(unreadable)
     text = terminal_summary(
-        replace(analysis, left_out=(left_out,), unreadable={"step-9": "there is no file"})
+        replace(
+            analysis,
+            fit=replace(analysis.fit, experiments=tuple(dwells[1:])),
+            left_out=(left_out,),
+            unreadable=unreadable,
+            checks=tuple(checks),
+        )
     )
     assert f"{len(dwells)} sine dwells" in whole
     assert f"{len(dwells) - 1} sine dwells" in text
-    assert "the right name of it, for step-9" in text
-    assert f"Mend, record again or take out {dwells[0]}:" in text
+    assert "Give a file that can be read, or its right name. step-9 could not be read" in text
+    assert "Fix what was left out, record it again or take it out." in text
+    assert f"is {dwells[0]}: froze" in text
 
 
 def test_a_file_that_cannot_be_read_asks_for_no_experiment():
     """What is asked for is that file; only other stages that were skipped ask for more."""
     unread = Skipped(stage="reading step-1", reason="empty")
-    other = Skipped(stage="hardware check", reason="no closed-loop run was recorded")
+    reason = "no closed-loop run was recorded"
+    other = Skipped(stage="hardware check", reason=reason, missing="a closed-loop run")
     analysis = replace(make_analysis(1, repeats=1), unreadable={"step-1": "empty"})
     asked = [
-        "Add the experiments" in terminal_summary(replace(analysis, skipped=skipped))
+        "add a closed-loop run" in terminal_summary(replace(analysis, skipped=skipped))
         for skipped in ((unread,), (unread, other))
     ]
     assert asked == [False, True]
@@ -570,7 +582,7 @@ def test_a_good_result_is_called_so():
     points = tuple(replace(point, settled=True) for point in analysis.sine_points)
     good = replace(analysis, rows=rows, checks=checks, sine_points=points, skipped=(), warnings=())
     text = terminal_summary(good)
-    assert "all 3 parameters measured in two ways" in text
+    assert "all 3 parameters estimated in two ways." in text
     assert text.count("statistical error") == 1
     assert "Nothing stands out" in text
     assert good.feedback is not None
@@ -619,14 +631,15 @@ def test_gains_that_the_fit_cannot_give_ask_for_the_springs():
         assert "See whether springs" not in terminal_summary(replace(asked, **other))
 
 
-def test_a_wrong_sign_is_said_first_and_nothing_else_is_advised():
-    """A stated sign that the data contradict comes first; what may follow from it is not sought."""
+def test_a_wrong_sign_is_said_first():
+    """A stated sign that the data contradict comes first; what else fails may follow from it."""
     analysis = make_analysis(1, repeats=1)
     wrong = Check(id=SIGN, outcome="fail", value=3.0, limit=0.0, message="set sign = 1 there")
     off = tuple(replace(row, consistent=False) for row in analysis.rows)
     text = terminal_summary(replace(analysis, checks=(wrong, *analysis.checks), rows=off))
     findings, _, advice = text.partition("What to do next.")
     first = next(line for line in findings.splitlines() if line.startswith("- "))
-    assert first == "- Wrong sign: set sign = 1 there"
-    assert advice.count("- ") == 2
-    assert "set sign = 1 there" in advice
+    assert first == "- Wrong sign: set sign = 1 there."
+    said = [line for line in advice.splitlines() if line]
+    assert said[0] == "- Correct the sign of the input. Failed: input.sign"
+    assert "may come from the sign" in said[1]

@@ -14,6 +14,7 @@ from typing import Any
 import tomlkit
 
 from pipeline.errors import SubmissionError
+from pipeline.ingest.fill import unit_doubt
 from pipeline.names import parameter_names, read_name
 from pipeline.report.words import symbol_text
 from pipeline.resources import TEMPLATES
@@ -33,6 +34,7 @@ class Field:
 
     Attributes
     ----------
+    asked : what speaks against the value, though it can be used.
     names : of the flags.
     """
 
@@ -44,6 +46,7 @@ class Field:
     names: tuple[str, ...] = ()
     value: str = ""
     wrong: str = ""
+    asked: str = ""
 
     @property
     def on(self) -> list[bool]:
@@ -102,6 +105,17 @@ def groups(document: Mapping[str, Any]) -> list[Group]:
     )
     found.insert(3, Group(title="Your numbers", fields=claims, optional=True))
     return [replace(group, fields=_filled(group.fields, document, carts)) for group in found]
+
+
+def asked_for_unit(fields: Iterable[Field], fractions: Sequence[str]) -> tuple[Field, ...]:
+    """Return the fields, with what speaks against the unit of positions; see `unit_doubt`."""
+    path = "system.position.unit"
+    return tuple(
+        replace(field, asked=unit_doubt(field.value or "count", fractions=fractions))
+        if field.path == path
+        else field
+        for field in fields
+    )
 
 
 def field_text(document: Mapping[str, Any], field: Field) -> str:

@@ -19,6 +19,7 @@ from pipeline.desk.student.files import put_aside, take_uploads
 from pipeline.desk.student.form import (
     Field,
     apply,
+    asked_for_unit,
     experiment_fields,
     field_text,
     groups,
@@ -144,7 +145,8 @@ def _room(
     form = groups(document)
     every = [f for group in form for f in group.fields] + [f for r in rows for f in r["fields"]]
     shown, left = with_errors(every, changed, error)
-    by_path = {field.path: field for field in shown}
+    fractions = [row["file"] for row in rows if row["look"]["fractions"]]
+    by_path = {field.path: field for field in asked_for_unit(shown, fractions)}
     return ask.page(
         "student",
         status=status,

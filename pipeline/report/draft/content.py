@@ -24,6 +24,7 @@ from pipeline.report.gap.section import augmented_hardware_blocks, gap_blocks, g
 from pipeline.report.numbers import count
 from pipeline.report.phrases import phrases
 from pipeline.report.sections.housekeeping import (
+    assumption_blocks,
     check_blocks,
     provenance_blocks,
     skipped_blocks,
@@ -79,6 +80,7 @@ def build_document(
         ("hardware", "Model and measurement", lambda page: _hardware(page, gap)),
         ("gap", "What the linear model leaves out", lambda page: gap_blocks(page, gap)),
         ("checks", "Consistency checks", check_blocks),
+        ("assumptions", "Assumptions", assumption_blocks),
         (
             "discussion",
             "Discussion",

@@ -14,14 +14,15 @@ from pipeline.report.document import (
     paragraph,
     spans,
 )
-from pipeline.report.numbers import count
+from pipeline.report.numbers import count, listing
 from pipeline.report.phrases import phrases
 from pipeline.report.sections.page import Page
 from pipeline.report.words import clean, rich
-from pipeline.results import Check
+from pipeline.results import Assumption, Check
 
 _WORDS = phrases("report")
 OUTCOMES = {"fail": "failed", "pass": "passed", "skip": "not checked"}  # in the order of a table
+SUPPORT: dict[str, Tone] = {"supported": "good", "contradicted": "bad", "open": "quiet"}
 TONES: dict[str, Tone] = {"fail": "bad", "pass": "good", "skip": "quiet"}
 
 
@@ -57,6 +58,38 @@ def _check_table(page: Page, checks: Sequence[Check], caption: str) -> Table:
         ],
         "lll",
     )
+
+
+def assumption_blocks(page: Page) -> list[Block]:
+    """Return what all numbers rest on, where each was said, and how the data support it."""
+    assumptions = page.analysis.assumptions
+    if not assumptions:
+        return []
+    rows = [
+        [
+            cell(Span(clean(one.key), "code")),
+            cell(clean(one.about)),
+            cell(rich(clean(taken_text(one)))),
+            cell(_WORDS.text(f"origin_{one.origin}"), "quiet"),
+            cell(_WORDS.text(f"support_{one.support}"), SUPPORT[one.support]),
+            cell(rich(clean(one.reason))),
+        ]
+        for one in assumptions
+    ]
+    head = ("Key", "Which", "Taken as", "From", "Do the data support it?", "Why")
+    return [page.table(_WORDS.text("assumption_table"), head, rows, "llllll")]
+
+
+def taken_text(one: Assumption) -> str:
+    """Return the value of an assumption, as one says it."""
+    if isinstance(one.value, bool):
+        return "there" if one.value else "not there"
+    if isinstance(one.value, tuple):
+        carts = listing([str(cart) for cart in one.value])
+        return f"cart{'s' if len(one.value) > 1 else ''} {carts} free"
+    if isinstance(one.value, str):
+        return one.value
+    return f"{one.value:+g}" if one.key.endswith("sign") else f"{one.value:g}"
 
 
 def skipped_blocks(page: Page) -> list[Block]:

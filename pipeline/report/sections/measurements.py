@@ -39,8 +39,20 @@ def response_blocks(page: Page) -> list[Block]:
     if not blocks:
         return []
     found = {response.source for response in page.analysis.frequency_responses}
-    used = [_WORDS.text(f"source_{key}") for key in ("dwells", "table", "records") if key in found]
+    said = {"source_dwells": {}, "source_table": {}, "source_records": {"kinds": _kinds(page)}}
+    used = [
+        _WORDS.text(key, **values)
+        for key, values in said.items()
+        if key.removeprefix("source_") in found
+    ]
     return [paragraph(_WORDS.text("source", sources=listing(used))), *blocks]
+
+
+def _kinds(page: Page) -> str:
+    """Return of which kinds the records are that a response was taken from."""
+    runs = {run for r in page.analysis.frequency_responses for run in r.experiments}
+    kinds = {page.records[run].kind for run in runs if run in page.records}
+    return listing([_WORDS.text(f"of_{kind}") for kind in ("step", "sweep") if kind in kinds])
 
 
 def overview_blocks(page: Page) -> list[Block]:
@@ -112,13 +124,14 @@ def decay_blocks(page: Page) -> list[Block]:
             continue
         records = [page.records[decay.experiment] for decay in drawn]
         figure = decay_figure(drawn, records=records, position_unit=page.position)
-        first, sticks = drawn[0], any(d.friction and d.friction.present for d in drawn)
+        first = drawn[0]
+        sticks = [clean(d.experiment) for d in drawn if d.friction and d.friction.present]
         said = {"cart": str(cart), "zeta": with_error(first.zeta, first.zeta_std)}
         caption = _WORDS.text(
             "decay",
             run=clean(first.experiment),
             freed=_WORDS.text("let_go" if records[0].kind == "decay" else "stepped"),
-            sticking=_WORDS.text("decay_sticking") if sticks else "",
+            sticking=_WORDS.text("decay_sticking", sticking=listing(sticks)) if sticks else "",
             more=left_out(len(of_cart) - len(drawn)),
             **said,
         )
@@ -133,7 +146,8 @@ def decay_blocks(page: Page) -> list[Block]:
     rubbing = [d for d in decays if d.friction and d.friction.present]
     if rubbing := [d for d in rubbing if d.zeta_at_amplitude.shape[1] > 1]:  # one is no rise
         figure = damping_figure(rubbing, position_unit=page.position)
-        caption, alt = _WORDS.text("damping"), _WORDS.text("damping_alt")
+        runs = listing(list(dict.fromkeys(clean(d.experiment) for d in rubbing)))
+        caption, alt = _WORDS.text("damping", runs=runs), _WORDS.text("damping_alt")
         blocks.append(page.picture("damping", figure, caption=caption, alt=alt))
     return blocks
 

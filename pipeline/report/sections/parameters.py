@@ -1,9 +1,7 @@
 """What was identified: initial and final estimates, the students' own numbers, the chain."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from decimal import Decimal
-
-import numpy as np
 
 from pipeline.names import read_name
 from pipeline.plant.linear.chain import Chain
@@ -21,6 +19,7 @@ from pipeline.report.document import (
 )
 from pipeline.report.numbers import (
     NOTHING,
+    listing,
     percent,
     significant,
     unit_text,
@@ -29,7 +28,7 @@ from pipeline.report.numbers import (
 )
 from pipeline.report.phrases import phrases
 from pipeline.report.sections.page import Page
-from pipeline.report.words import SOURCES, clean, name_span, names_spans, rich
+from pipeline.report.words import clean, name_span, names_spans, rich, source_text
 from pipeline.results import Analysis, ChainFit, Estimate, ParameterRow
 from pipeline.stages.compare import change_limit
 from pipeline.stages.limits import SIGMA_LIMIT
@@ -43,7 +42,7 @@ def parameter_blocks(page: Page) -> list[Block]:
     rows, reported = page.analysis.rows, page.analysis.reported
     if not rows:
         return []
-    blocks: list[Block] = [paragraph(_WORDS.text("parameters")), parameter_table(page)]
+    blocks: list[Block] = [paragraph(_origins(page.analysis)), parameter_table(page)]
     if remarks := _parameter_notes(rows):
         blocks.append(bullet_list(remarks))
     if staged := _staged_differences(page.analysis):
@@ -51,6 +50,27 @@ def parameter_blocks(page: Page) -> list[Block]:
     if any(reported.values()):
         blocks += [Heading(spans(_WORDS.text("reported"))), reported_table(page)]
     return blocks
+
+
+def _origins(analysis: Analysis) -> Spans:
+    """Say which estimates come from what; only of sources that there are."""
+    names: dict[str, list[str]] = {}
+    for row in analysis.rows:
+        if row.initial:
+            names.setdefault(row.initial.source, []).append(row.name)
+    sources = [
+        _WORDS.text(f"from_{source}", names=listing(names[source]))
+        for source in ("step", "log_decrement", "frequency_response", "assumed")
+        if source in names
+    ]
+    fit = analysis.fit
+    return rich(
+        _WORDS.text(
+            "parameters",
+            initial=_WORDS.text("initial_from", sources=listing(sources)) if sources else "",
+            final=_WORDS.text("final_from", fit=_WORDS.text(f"from_{fit.method}")) if fit else "",
+        ).strip()
+    )
 
 
 def parameter_table(page: Page) -> Table:
@@ -63,13 +83,13 @@ def parameter_table(page: Page) -> Table:
     return page.table(
         _WORDS.text("parameter_table", carts=words.get(carts, carts)),
         head[:columns],
-        [_parameter_row(row)[:columns] for row in rows],
+        [_parameter_row(row, steps=page.analysis.steps)[:columns] for row in rows],
         "lldlddrl"[:columns],
     )
 
 
-def _parameter_row(row: ParameterRow) -> list[Cell]:
-    source = SOURCES.get(row.initial.source, clean(row.initial.source)) if row.initial else ""
+def _parameter_row(row: ParameterRow, *, steps: Collection[str]) -> list[Cell]:
+    source = source_text(row.initial, steps=steps)
     change = percent(row.change_percent, signed=True)
     if row.change_sigmas is not None:
         change += f" ({significant(row.change_sigmas, digits=2)} σ)"
@@ -164,6 +184,8 @@ def _parameter_notes(rows: Sequence[ParameterRow]) -> list[Spans]:
     for row in rows:
         if row.note:
             by_note.setdefault(row.note, []).append(row.name)
+    if same := [row.name for row in rows if row.independent is False]:
+        by_note[_WORDS.text("same_recordings")] = same
     return [spans(rich(", ".join(names)), ": ", rich(clean(n))) for n, names in by_note.items()]
 
 
@@ -191,8 +213,7 @@ def _staged_differences(analysis: Analysis) -> Block | None:
 
 def fitted_chain_table(page: Page, fit: ChainFit) -> Table:
     """Return masses, dampings and springs of a joint fit."""
-    std = dict(zip(fit.names, np.sqrt(np.diag(fit.covariance)), strict=True))
-    return chain_table(page, fit.chain, std=std)
+    return chain_table(page, fit.chain, std=fit.std)
 
 
 def chain_table(page: Page, chain: Chain, *, std: Mapping[str, float]) -> Table:

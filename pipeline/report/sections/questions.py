@@ -26,7 +26,7 @@ from pipeline.report.numbers import count, listing, percent, significant
 from pipeline.report.phrases import phrases
 from pipeline.report.sections.answers import named
 from pipeline.report.sections.notes import discussion_blocks, even_headings
-from pipeline.report.words import SOURCES, clean, rich
+from pipeline.report.words import clean, rich, source_text
 from pipeline.results import Analysis, HardwareCheck, ParameterRow
 from pipeline.stages.limits import DAMPING_LIMIT
 
@@ -90,7 +90,8 @@ def _damping(analysis: Analysis) -> Iterator[Asked]:
     if off:
         row, *others = off
         also = listing([f"{other.name} by {_change(other)}" for other in others])
-        yield _of_row(row, "damping", also=f" ({also})" if also else "")
+        key = "damping_same" if row.independent is False else "damping"
+        yield _of_row(row, analysis, key, also=f" ({also})" if also else "")
 
 
 def _gains_and_frequencies(analysis: Analysis) -> Iterator[Asked]:
@@ -98,17 +99,19 @@ def _gains_and_frequencies(analysis: Analysis) -> Iterator[Asked]:
         name = read_name(row.name)
         if name.is_ratio or row.initial is None or row.final is None:
             continue
-        differ = row.initial.value * row.final.value < 0
-        yield _of_row(row, "signs_differ" if differ else "gain" if name.is_gain else "frequency")
+        if row.initial.value * row.final.value < 0:
+            key = "signs_differ"
+        elif row.initial.source == "frequency_response":
+            key = "response"
+        else:
+            key = "gain" if name.is_gain else "frequency"
+        yield _of_row(row, analysis, key)
         return  # the largest change stands for the others
 
 
-def _of_row(row: ParameterRow, key: Kind, **values: str) -> Asked:
+def _of_row(row: ParameterRow, analysis: Analysis, key: Kind, **values: str) -> Asked:
     """Ask why two estimates differ."""
-    initial, final = (
-        SOURCES.get(one.source, clean(one.source)) if one else ""
-        for one in (row.initial, row.final)
-    )
+    initial, final = (source_text(one, steps=analysis.steps) for one in (row.initial, row.final))
     text = _WORDS.text(
         key, name=row.name, change=_change(row), initial=initial, final=final, **values
     )

@@ -1,13 +1,12 @@
 """The summary: what was identified, what agrees, what does not, and what to do next."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Sequence
 
 from pipeline.names import Name, read_name
 from pipeline.report import limits
 from pipeline.report.document import (
     Block,
-    Items,
     Span,
     Spans,
     Tile,
@@ -28,27 +27,23 @@ from pipeline.report.numbers import (
     with_error,
 )
 from pipeline.report.phrases import phrases
+from pipeline.report.sections.actions import next_steps, set_up_in_doubt
+from pipeline.report.sections.housekeeping import taken_text
 from pipeline.report.sections.measurements import overview_blocks
 from pipeline.report.sections.page import Page
-from pipeline.report.sections.parameters import reported_off
 from pipeline.report.words import clean, name_span, names_spans, plain_lines, rich
-from pipeline.results import SIGN, Analysis, Check, Estimate, HardwareCheck
+from pipeline.results import Analysis, Estimate, HardwareCheck, ParameterRow
 
 _WORDS = phrases("summary")
-_KINDS = {  # what carts are identified from
+_KINDS = {  # of recordings
     "decay": "decay",
     "step": "step",
     "sine": "sine dwell",
     "sweep": "sweep",
+    "closed_loop": "closed-loop run",
     "bode": "table of amplitude ratios",
 }
 _MOST_TOLD = 3  # of one kind: a summary is short
-_OF_DATA = (
-    "repeats.",
-    "dwells.",
-    "setup.",
-    "hardware.",
-)  # checks of recordings, not of what they say
 
 
 def summary(page: Page) -> list[Block]:
@@ -66,7 +61,7 @@ def summary(page: Page) -> list[Block]:
     if problems:
         blocks.append(bullet_list(problems))
     blocks += overview_blocks(page)
-    return [*blocks, paragraph(Span(_WORDS.text("next"), "strong")), _next(analysis)]
+    return [*blocks, paragraph(Span(_WORDS.text("next"), "strong")), next_steps(analysis)]
 
 
 def terminal_summary(analysis: Analysis) -> str:
@@ -78,42 +73,74 @@ def terminal_summary(analysis: Analysis) -> str:
     only = f" {_WORDS.text('statistical_only')}" if any("±" in text for text in numbers) else ""
     it_has = [paragraph(f"It has {'; '.join(numbers)}.{only}")] if numbers else []
     told = bullet_list(text for _, text in _findings(analysis))
-    next_ = [paragraph(f"{_WORDS.text('next')}."), _next(analysis)]
+    next_ = [paragraph(f"{_WORDS.text('next')}."), next_steps(analysis)]
     return plain_lines([_identified(analysis), *it_has, told, *next_])
 
 
 def _findings(analysis: Analysis) -> list[tuple[bool, Spans]]:
     """Return whether each thing found is well, with a sentence about it."""
-    found = (_sign, _agreement, _undecided, _checks, _friction, _design, _hardware, _skipped)
+    found = (
+        set_up_in_doubt,
+        _assumed,
+        _agreement,
+        _undecided,
+        _checks,
+        _friction,
+        _design,
+        _hardware,
+        _skipped,
+    )
     return [finding for of in found if (finding := of(analysis))]
 
 
 def _identified(analysis: Analysis) -> Block:
-    unused = {one.experiment for one in analysis.left_out}
-    kinds = Counter(record.kind for record in analysis.records if record.id not in unused)
-    used = listing([count(kinds[kind], noun) for kind, noun in _KINDS.items() if kinds[kind]])
     single, fit = analysis.carts == 1, analysis.fit
     carts = _WORDS.text("one_cart" if single else "carts", n=analysis.carts)
-    source = _WORDS.text("from_runs" if used else "from_data", runs=used)
     if fit is None:
+        unused = {one.experiment for one in analysis.left_out}
+        used = _runs(analysis, [r.id for r in analysis.records if r.id not in unused])
+        source = _WORDS.text("from_runs" if used else "from_data", runs=used)
         reasons = _WORDS.spans("reasons") if analysis.skipped else ""
         return paragraph(
             _WORDS.spans("not_identified", carts=carts, source=source, reasons=reasons)
         )
+    used = _runs(analysis, fit.experiments)
     failed = "" if fit.converged else _WORDS.text("not_converged", message=clean(fit.message))
     return paragraph(
         _WORDS.spans(
             "identified",
             carts=carts,
-            source=source,
+            source=_WORDS.text("from_runs" if used else "from_data", runs=used),
             fit=_WORDS.text("one_fit" if single else "joint_fit"),
             what=_WORDS.text(fit.method),
             points=str(fit.n_points),
             chi_square=significant(fit.chi_square_per_dof, digits=3),
             quality=_WORDS.text("explained" if fit.explains_data else "unexplained"),
+            first=_first_estimates(analysis, fitted_to=fit.experiments),
             failed=failed,
         )
     )
+
+
+def _first_estimates(analysis: Analysis, *, fitted_to: Sequence[str]) -> str:
+    """Return which recordings the initial estimates rest on, "" where none is measured."""
+    runs = dict.fromkeys(
+        run for row in analysis.rows if row.initial for run in row.initial.experiments
+    )
+    others = [run for run in runs if run not in fitted_to]
+    if not runs:
+        return ""
+    if not others:
+        return _WORDS.text("first_same")
+    key = "first_others" if len(others) == len(runs) else "first_both"
+    return _WORDS.text(key, runs=_runs(analysis, others))
+
+
+def _runs(analysis: Analysis, ids: Collection[str]) -> str:
+    """Return how many recordings of each kind these are; a table stands for itself."""
+    known = {record.id: record.kind for record in analysis.records}
+    kinds = Counter(known.get(id_, "bode") for id_ in dict.fromkeys(ids))
+    return listing([count(kinds[kind], noun) for kind, noun in _KINDS.items() if kinds[kind]])
 
 
 def _numbers_board(analysis: Analysis, *, error: str = "statistical") -> tuple[Tile, ...]:
@@ -196,14 +223,13 @@ def _tone(good: bool) -> Tone:
     return "good" if good else "bad"
 
 
-def _sign(analysis: Analysis) -> tuple[bool, Spans] | None:
-    """Everything that follows hangs on it, so it comes first."""
-    wrong = _wrong_sign(analysis)
-    return (False, _WORDS.spans("sign", message=wrong)) if wrong else None
-
-
-def _wrong_sign(analysis: Analysis) -> str:
-    return next((clean(c.message) for c in analysis.checks if c.id == SIGN), "")
+def _assumed(analysis: Analysis) -> tuple[bool, Spans] | None:
+    """Name what nobody stated and the data do not tell either."""
+    taken = [a for a in analysis.assumptions if a.origin == "default" and a.support == "open"]
+    if not taken:
+        return None
+    said = [clean(f"{f'{one.key} {one.about}'.strip()} ({taken_text(one)})") for one in taken]
+    return False, _WORDS.spans("assumed", taken=listing(said))
 
 
 def _agreement(analysis: Analysis) -> tuple[bool, Spans] | None:
@@ -211,11 +237,26 @@ def _agreement(analysis: Analysis) -> tuple[bool, Spans] | None:
     if not judged:
         return None
     parameters = count(len(judged), "parameter")
-    off = [row for row in judged if not row.consistent]
+    off, same = [row for row in judged if not row.consistent], _same_recordings(judged)
     if not off:
-        return True, _WORDS.spans("agree", parameters=parameters)
+        return True, _WORDS.spans("agree", parameters=parameters, same=same)
     changes = [f"{row.name} ({percent(row.change_percent, signed=True)})" for row in off]
-    return False, _WORDS.spans("disagree", changes=rich(listing(changes)), parameters=parameters)
+    return False, _WORDS.spans(
+        "disagree",
+        changes=rich(listing(changes)),
+        rest=_WORDS.text("rest" if len(off) < len(judged) else "no_rest", parameters=parameters),
+        same=same,
+    )
+
+
+def _same_recordings(judged: Sequence[ParameterRow]) -> Spans:
+    """Say of which parameters the two estimates are no two measurements."""
+    same = [row.name for row in judged if row.independent is False]
+    if not same:
+        return ()
+    if len(same) == len(judged):
+        return _WORDS.spans("all_same")
+    return _WORDS.spans("some_same", names=names_spans(same))
 
 
 def _undecided(analysis: Analysis) -> tuple[bool, Spans] | None:
@@ -243,27 +284,22 @@ def _checks(analysis: Analysis) -> tuple[bool, Spans] | None:
     checks = count(len(done), "check")
     if not failed:
         return True, _WORDS.spans("consistent", checks=checks)
-    # Initial against final and dry friction are told on their own; of each kind, the first.
-    kinds: dict[str, Check] = {}
-    for check in failed:
-        kind = check.id.partition(".")[0]
-        if check.id != SIGN and not kind.startswith(("initial_final", "decay")):
-            kinds.setdefault(kind, check)
-    told = list(kinds.values())[:_MOST_TOLD]
-    said = rich(clean("".join(f" {_sentence(check.message)}" for check in told)))
-    more = _WORDS.spans("all_checks") if len(failed) > len(told) else ()
-    return False, _WORDS.spans(
-        "inconsistent", failed=str(len(failed)), checks=checks, told=(*said, *more)
-    )
-
-
-def _sentence(text: str) -> str:
-    return text if text.endswith((".", "?", "!")) else f"{text}."
+    return False, _WORDS.spans("inconsistent", failed=str(len(failed)), checks=checks)
 
 
 def _friction(analysis: Analysis) -> tuple[bool, Spans] | None:
-    carts = sorted({d.cart for d in analysis.log_decrements if d.friction and d.friction.present})
-    return (False, _WORDS.spans("friction", carts=_carts(carts))) if carts else None
+    """Say which runs show dry friction: decays, or what rings after a step."""
+    shown = [d for d in analysis.log_decrements if d.friction and d.friction.present]
+    if not shown:
+        return None
+    said = []
+    for key in ("decays_of", "ringing_of"):
+        of_kind = [d for d in shown if (d.experiment in analysis.steps) == (key == "ringing_of")]
+        if of_kind:
+            carts = _carts(sorted({d.cart for d in of_kind}))
+            runs = listing(list(dict.fromkeys(d.experiment for d in of_kind)), most=_MOST_TOLD)
+            said.append(_WORDS.text(key, carts=carts, runs=clean(runs)))
+    return False, _WORDS.spans("friction", where=listing(said))
 
 
 def _design(analysis: Analysis) -> tuple[bool, Spans] | None:
@@ -320,66 +356,3 @@ def _skipped(analysis: Analysis) -> tuple[bool, Spans] | None:
 def _carts(carts: list[int]) -> str:
     word = "cart" if len(carts) == 1 else "carts"
     return f"{word} {listing([str(cart) for cart in carts])}"
-
-
-# ------------------------------------------------------------------------ next
-
-
-def _next(analysis: Analysis) -> Items:
-    if wrong := _wrong_sign(analysis):  # what else is odd may come from it
-        return bullet_list([spans(wrong), _WORDS.spans("next_again")])
-    return bullet_list(list(_advice(analysis)) or [_look_into(analysis)])
-
-
-def _advice(analysis: Analysis) -> Iterator[Spans]:
-    """Yield what to do about each thing that is not well."""
-    say, fit, design = _WORDS.spans, analysis.fit, analysis.feedback
-    unreadable, left_out = list(analysis.unreadable), [o.experiment for o in analysis.left_out]
-    for key, runs in (("next_unreadable", unreadable), ("next_left_out", left_out)):
-        if runs:
-            more = " …" if len(runs) > _MOST_TOLD else ""
-            yield say(key, runs=clean(listing(runs[:_MOST_TOLD])) + more)
-    if not (unreadable or left_out) and any(
-        c.id.startswith(_OF_DATA) for c in analysis.failed_checks
-    ):
-        yield say("next_recordings")
-    reasons: list[str] = []
-    if fit is None and not left_out:
-        reasons = [skip.reason for skip in analysis.skipped if skip.stage == "final estimates"]
-        yield (say("next_no_carts", reason=clean(reasons[-1])) if reasons else say("next_no_data"))
-    if off := [row.name for row in analysis.rows if row.consistent is False]:
-        yield say("next_off", names=names_spans(off))
-    if wrong := list(dict.fromkeys(reported_off(analysis))):
-        yield say("next_reported", names=names_spans(wrong))
-    if _may_lack_springs(analysis):
-        yield say("next_springs")
-    if short := sorted({point.experiment for point in analysis.sine_points if not point.settled}):
-        yield say("next_short", runs=clean(listing(short)))
-    if any(d.friction and d.friction.present for d in analysis.log_decrements):
-        yield say("next_friction")
-    doubted = {check.experiment for check in analysis.hardware if check.contradicted}
-    poor = [c for c in analysis.hardware if c.nrmse > limits.CLOSE and c.experiment not in doubted]
-    if poor or (fit is not None and not fit.explains_data):
-        yield say("next_left")
-    if design is not None and not any(r.kind == "closed_loop" for r in analysis.records):
-        yield say("next_run")
-    unread = {f"reading {name}" for name in analysis.unreadable}  # asked for above
-    stages = {skip.stage for skip in analysis.skipped} - unread
-    if stages and not left_out and not reasons:  # what follows the carts waits for them
-        yield say("next_skipped")
-    if design and not design.reachable:
-        yield say("next_goal", message=clean(design.message))
-
-
-def _may_lack_springs(analysis: Analysis) -> bool:
-    """Tell whether steps contradict a fit that leaves springs out, where dry friction does not."""
-    fit, dry = analysis.fit, any(d.friction and d.friction.present for d in analysis.log_decrements)
-    off = any(row.consistent is False and read_name(row.name).is_gain for row in analysis.rows)
-    return off and not dry and fit is not None and not (fit.explains_data or all(analysis.springs))
-
-
-def _look_into(analysis: Analysis) -> Spans:
-    """Return what is left to do where nothing asks for more."""
-    if analysis.failed_checks:
-        return _WORDS.spans("next_checks")
-    return _WORDS.spans("next_warnings" if analysis.warnings else "next_nothing")

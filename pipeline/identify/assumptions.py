@@ -1,0 +1,187 @@
+"""What all numbers rest on: springs, units, scales, sign, held carts; each with its support."""
+
+from collections.abc import Iterator, Sequence
+from typing import Literal
+
+import numpy as np
+
+from pipeline.checks.carts import VANISHING, physical_values
+from pipeline.ingest.columns import is_count
+from pipeline.ingest.read import DUTY_COUNT, Ingested
+from pipeline.names import listed
+from pipeline.results import SIGN, Assumption, ChainFit, Check, Record
+from pipeline.submission import Submission, System
+from pipeline.submission.load import spring_names
+
+Support = Literal["supported", "contradicted", "open"]
+
+
+def list_assumptions(
+    submission: Submission, *, data: Ingested, fit: ChainFit | None, checks: Sequence[Check]
+) -> tuple[Assumption, ...]:
+    """Return what was stated or taken of the bench, in the order of `submission.toml`."""
+    system, failed = submission.system, [c for c in checks if c.outcome == "fail"]
+    return (
+        *_springs(system, fit=fit, failed=failed),
+        *_units(system, data.records, failed=failed),
+        *_scales(submission, data.records),
+        *_sign(system, data, failed=failed),
+        *_free_carts(data.records, n=system.carts, failed=failed),
+    )
+
+
+def _springs(
+    system: System, *, fit: ChainFit | None, failed: Sequence[Check]
+) -> Iterator[Assumption]:
+    n, names = system.carts, spring_names(system.carts)
+    springs = [any(system.springs)] if n == 1 else system.springs
+    abouts = [" and ".join(names)] if n == 1 else names  # of one cart the sum is known
+    values = physical_values(fit.chain, springs=system.springs) if fit else {}
+    vanishing = {check.about for check in failed if check.kind == VANISHING}
+    unit = f"{system.input.unit}/{system.position.unit}"
+    for i, (about, present) in enumerate(zip(abouts, springs, strict=True), start=1):
+        name = f"k_{i}"
+        value = values.get(name)
+        std = fit.std.get(name) if fit and value is not None else None
+        support: Support = "open"
+        if fit is None or not fit.converged:
+            reason = "no carts were identified that tell it"
+        elif not present:
+            support = "supported" if fit.explains_data else "open"
+            explains = "explains the data" if fit.explains_data else "leaves more than the noise"
+            reason = f"the fit without it {explains}"
+        elif name in vanishing:
+            support = "contradicted"
+            reason = f"{_number(name, value, std, unit)}: it may as well not be there"
+        else:
+            support, reason = "supported", _number(name, value, std, unit)
+        yield Assumption(
+            key="system.springs",
+            about=about,
+            value=present,
+            origin="stated" if system.states_springs else "default",
+            support=support,
+            found=value,
+            found_std=std,
+            reason=reason,
+        )
+
+
+def _number(name: str, value: float | None, std: float | None, unit: str) -> str:
+    return f"{name} = {value:.3g}{f' ± {std:.1g}' if std else ''} {unit}"
+
+
+def _units(
+    system: System, records: Sequence[Record], *, failed: Sequence[Check]
+) -> Iterator[Assumption]:
+    doubts = {check.kind: check.message for check in failed}
+    for role, side in (("position", system.position), ("input", system.input)):
+        headed = [
+            record.id for record in records for one in record.heading_units
+            if one.role == role and one.converts
+        ]  # fmt: skip
+        headed = list(dict.fromkeys(headed))
+        support: Support = "open"
+        if doubt := doubts.get(f"{role}_unit") or doubts.get(f"{role}_scale"):
+            support, reason = "contradicted", doubt
+        elif headed:
+            support, reason = "supported", f"the headings of {listed(headed)} state a unit"
+        elif role == "position" and is_count(side.unit) and records:
+            support, reason = "supported", "the positions are whole numbers, as counts are"
+        else:
+            reason = "no heading states a unit"
+        yield Assumption(
+            key=f"system.{role}.unit",
+            value=side.unit,
+            origin="stated" if "unit" in side.model_fields_set else "default",
+            support=support,
+            experiments=tuple(headed),
+            reason=reason,
+        )
+
+
+def _scales(submission: Submission, records: Sequence[Record]) -> Iterator[Assumption]:
+    """Yield what a count is, where any recording holds counts that were converted."""
+    system = submission.system
+    own = {e.id: e.input.per_count for e in submission.experiments if e.input}
+    for role, stated, scales in (
+        ("position", system.position.per_count, {r.id: r.position_scale for r in records}),
+        ("input", system.input.per_count, {r.id: abs(r.input_scale) for r in records}),
+    ):
+        per_count = stated or (DUTY_COUNT if role == "input" else None)
+        used = [name for name, scale in scales.items() if scale == per_count and not own.get(name)]
+        if used and per_count is not None:
+            yield Assumption(
+                key=f"system.{role}.per_count",
+                value=per_count,
+                origin="stated" if stated else "default",
+                support="open",
+                experiments=tuple(used),
+                reason="no recording tells what a count is",
+            )
+
+
+def _sign(system: System, data: Ingested, *, failed: Sequence[Check]) -> Iterator[Assumption]:
+    driven = [r for r in data.records if r.u is not None and np.ptp(r.u) > 0]
+    if not driven:
+        return
+    stated = system.input.sign
+    usual = 1 if sum(1 if r.input_scale > 0 else -1 for r in driven) >= 0 else -1
+    sign = stated or usual
+    told = [name for name, found in data.signs.found.items() if found == sign]
+    others = [name for name, found in data.signs.found.items() if found == -sign]
+    wrong = next((check.message for check in failed if check.id == SIGN), "")
+    support: Support = "open"
+    if wrong:
+        support, reason = "contradicted", wrong
+    elif told:
+        but = f", but {listed(others)} {'count' if others[1:] else 'counts'} the other way"
+        support, reason = "supported", f"{listed(told)} tell it{but if others else ''}"
+    else:
+        reason = "no recording tells it"
+    yield Assumption(
+        key="system.input.sign",
+        value=float(sign),
+        origin="stated" if stated else "data" if told else "default",
+        support=support,
+        experiments=tuple(told),
+        reason=reason,
+    )
+
+
+def _free_carts(
+    records: Sequence[Record], *, n: int, failed: Sequence[Check]
+) -> Iterator[Assumption]:
+    """Yield which carts were free, for all recordings of which the same is said."""
+    if n == 1:
+        return
+    wrong = {check.about for check in failed if check.kind == "setup"}
+    for free in dict.fromkeys(record.free for record in records):
+        alike = [record for record in records if record.free == free]
+        names = tuple(record.id for record in alike)
+        held = [cart for cart in range(1, n + 1) if cart not in free]
+        unseen = [r.id for r in alike if not set(held or free) <= set(r.carts)]
+        still = [r.id for r in alike if any(_stands_still(r, c) for c in free if c in r.carts)]
+        support: Support = "open"
+        if contrary := [name for name in names if name in wrong]:
+            support, reason = "contradicted", f"in {listed(contrary)} another cart moves"
+        elif still:
+            reason = f"in {listed(still)} a cart said to be free stands still"
+        elif unseen:
+            what = "a held cart" if held else "a cart"
+            reason = f"in {listed(unseen)} {what} was not measured"
+        else:
+            support = "supported"
+            reason = "the held carts move little or not" if held else "all carts move"
+        yield Assumption(
+            key="experiments.carts",
+            value=free,
+            origin="stated" if held else "default",
+            support=support,
+            experiments=names,
+            reason=reason,
+        )
+
+
+def _stands_still(record: Record, cart: int) -> bool:
+    return float(np.ptp(record.position(cart))) == 0

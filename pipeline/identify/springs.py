@@ -1,0 +1,144 @@
+"""Which springs a new submission has, as far as its steps tell; what they do not is marked.
+
+Behind cart 1 the static force of the motor goes through every spring alike, so the static gains
+show their stiffnesses in ratios: k_(n+1) / k_n = K_(n-1) / K_n - 1. Without a spring at the far
+wall all carts move alike, and then a spring wall-1 holds them, if anything does.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.checks.limits import NEGLIGIBLE
+from pipeline.errors import DataError, SubmissionError
+from pipeline.identify import limits
+from pipeline.ingest.fill import (
+    Found,
+    fill_submission,
+    has_fractions,
+    mark_system,
+    system_doubts,
+    unit_doubt,
+    unsure,
+)
+from pipeline.ingest.read import read_data
+from pipeline.results import Record, StepGain
+from pipeline.stages.limits import SIGMA_LIMIT
+from pipeline.stages.step_gain import fit_step_gain
+from pipeline.submission import Submission, load_submission
+from pipeline.submission.load import NAME, spring_names
+
+
+@dataclass(frozen=True, kw_only=True)
+class Filled:
+    """What `fill` found: by file, and in the set-up what a person has to say."""
+
+    files: tuple[Found, ...]
+    doubts: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Springs:
+    """Which springs there are, why, and which of them nothing tells (numbers from 1)."""
+
+    present: tuple[bool, ...]
+    why: str
+    open: tuple[int, ...]
+
+
+def fill(folder: Path) -> Filled:
+    """Write the tables of the files in `data/`, and into a new file the springs.
+
+    Raises
+    ------
+    ConfigError, SubmissionError : as `fill_submission`.
+    """
+    new = not (folder / NAME).exists()
+    files = fill_submission(folder)
+    submission = load_submission(folder)
+    fractions = [found.file for found in files if has_fractions(found)]
+    doubt = unit_doubt(submission.system.position.unit, fractions=fractions)
+    if new:
+        _state_springs(submission)
+        if doubt:
+            mark_system(folder, "position", doubt=unsure(doubt))
+    said = system_doubts(folder)
+    if doubt and not any(one.startswith("position: ") for one in said):
+        said = (*said, f"position: {doubt}")
+    return Filled(files=files, doubts=said)
+
+
+def _state_springs(submission: Submission) -> None:
+    n = submission.system.carts
+    steps = tuple(one for one in submission.experiments if one.kind == "step")
+    try:
+        records = read_data(submission.model_copy(update={"experiments": steps})).records
+    except SubmissionError:  # there is none, or none that can be read
+        records = ()
+    found = decide_springs(records, n=n)
+    names = spring_names(n)
+    if found.open:
+        which = " or ".join(names[i - 1] for i in found.open)
+        comment = unsure(f"is there {which}? {found.why} ({', '.join(names)})")
+    else:
+        comment = f"{', '.join(names)}: {found.why}"
+    mark_system(submission.folder, "springs", doubt=comment, value=list(found.present))
+
+
+def decide_springs(records: Sequence[Record], *, n: int) -> Springs:
+    """Return the springs that n carts have by their steps; those between carts are taken as there.
+
+    Only steps in which all carts are free and measured tell.
+    """
+    every = (True,) * (n + 1)
+    steps = [r for r in records if r.kind == "step" and len(r.free) == len(r.carts) == n]
+    if not steps:
+        return Springs(present=every, why="no step of all carts", open=(1, n + 1))
+    if all(map(_stays_away, steps)):
+        inside = (False, *every[1:-1], False)
+        return Springs(present=inside, why="no cart comes back after a step", open=())
+    gains = [_gains(step) for step in steps]
+    if not any(gains):
+        return Springs(present=every, why="no cart settles after a step", open=(1, n + 1))
+    if n == 1:
+        return Springs(present=every, why="a step is held; only their sum can be known", open=())
+    ratios = [_ratio(*one[-2:]) for one in gains if one]
+    low, high = np.median(ratios, axis=0)
+    if low > NEGLIGIBLE:
+        return Springs(present=every, why="static gains cannot tell", open=(1,))
+    if high < limits.WEAKEST:
+        why = "static gains are equal, so none at the far wall"
+        return Springs(present=(*every[:-1], False), why=why, open=())
+    return Springs(present=every, why="static gains are too uncertain", open=(1, n + 1))
+
+
+def _stays_away(step: Record) -> bool:
+    """Whether the carts end a step far from where they began it, at the same input."""
+    u, moved = step.u, np.ptp(step.y, axis=1)
+    if u is None or not np.all(moved > 0) or abs(u[-1] - u[0]) > limits.SAME_LEVEL * np.ptp(u):
+        return False
+    return bool(np.all(np.abs(step.y[:, -1] - step.y[:, 0]) > limits.AWAY * moved))
+
+
+def _gains(step: Record) -> list[StepGain]:
+    """Return the static gains of all carts, [] where one does not settle."""
+    try:
+        return [fit_step_gain(step, cart=cart) for cart in sorted(step.carts)]
+    except DataError:
+        return []
+
+
+def _ratio(before: StepGain, last: StepGain) -> tuple[float, float]:
+    """Return the least and largest stiffness of the last spring over that of the one before."""
+    (near, far), (low, high) = _bounds(before), _bounds(last)
+    return near / high - 1, far / low - 1 if low > 0 else np.inf
+
+
+def _bounds(gain: StepGain) -> tuple[float, float]:
+    """Return the least and the largest static gain, in size, that a step allows."""
+    slack = SIGMA_LIMIT * gain.gain_std
+    ends = gain.interval or (gain.gain - slack, gain.gain + slack)
+    low, high = sorted(abs(end) for end in ends)
+    return low, high

@@ -1,0 +1,175 @@
+"""What to do next: about every failed check, the worst first, and what else there is to do."""
+
+from collections.abc import Iterator, Sequence
+
+from pipeline.names import read_name
+from pipeline.report import limits
+from pipeline.report.document import Items, Span, Spans, bullet_list, spans
+from pipeline.report.numbers import listing
+from pipeline.report.phrases import phrases
+from pipeline.report.sections.parameters import reported_off
+from pipeline.report.words import clean, names_spans, rich
+from pipeline.results import SIGN, Analysis, Check
+
+_WORDS = phrases("summary")
+_MOST_TOLD = 3  # messages of one kind
+# The checks, the worst failure first: what spoils every number, what spoils some, and what the
+# linear carts leave out. One that is not listed stands before the last group.
+_WORST_FIRST = (
+    SIGN,
+    "data",
+    "record",
+    "position_unit",
+    "input_unit",
+    "position_scale",
+    "input_scale",
+    "setup",
+    "dwells",
+    "late_channel",
+    "fit.identified",
+    "fit.converged",
+    "physical",
+    "vanishing",
+    "repeats",
+    "initial_final",
+    "hardware",
+    "feedback",
+)
+_LAST = ("fit.explains_data", "step", "decay")
+_AT_THE_TOP = (SIGN, "position_unit", "input_unit")  # what is wrong with every number
+_TOLD_ELSEWHERE = (*_AT_THE_TOP, "fit.identified")  # there, and by the first words of a summary
+_ALIKE = ("initial_final", "step", "decay")  # of these one message stands for all
+
+
+def next_steps(analysis: Analysis) -> Items:
+    """Name every failed check with what to do, the worst first; then what else there is to do."""
+    failed, advice = list(_failed(analysis)), list(_advice(analysis))
+    return bullet_list([*failed, *advice] or [_nothing_left(analysis)])
+
+
+def _failed(analysis: Analysis) -> Iterator[Spans]:
+    groups: dict[str, list[Check]] = {}
+    for check in analysis.failed_checks:
+        groups.setdefault(_group(check), []).append(check)
+    for group in sorted(groups, key=_place):
+        checks = sorted(groups[group], key=_excess, reverse=True)
+        told = checks[: 1 if group in _ALIKE else _MOST_TOLD]
+        told = () if group in _TOLD_ELSEWHERE else told
+        messages = dict.fromkeys(_sentence(clean(check.message)) for check in told)
+        yield _WORDS.spans(
+            "failed",
+            action=_action(group, checks, analysis),
+            told=rich("".join(f"{message} " for message in messages)),
+            names=_names(groups[group]),
+        )
+        if group == SIGN:
+            yield _WORDS.spans("next_again")
+
+
+def _group(check: Check) -> str:
+    """Return what one action is for: checks of a kind; those of the fit ask different things."""
+    return check.id if check.kind in ("fit", "input") else check.kind
+
+
+def _place(group: str) -> tuple[int, int]:
+    for part, groups in ((0, _WORST_FIRST), (2, _LAST)):
+        if group in groups:
+            return part, groups.index(group)
+    return 1, 0
+
+
+def _excess(check: Check) -> float:
+    """Return how far beyond its limit a check is, where that can be told."""
+    if check.value is None or not check.limit:
+        return 0.0
+    return abs(check.value / check.limit)
+
+
+def _action(group: str, checks: Sequence[Check], analysis: Analysis) -> Spans:
+    """Return what to do about the failed checks of a group."""
+    if group == "initial_final":
+        return _WORDS.spans("do_initial_final", names=names_spans([c.about for c in checks]))
+    if group == "fit.identified":
+        return _to_identify(analysis)
+    if group == "decay":
+        decays = {d.experiment for d in analysis.log_decrements} - analysis.steps
+        return _WORDS.spans("do_decay" if decays else "do_first_decay")
+    known = group in (*_WORST_FIRST, *_LAST)
+    return _WORDS.spans(_key("do_", group if known else "other"))
+
+
+def _key(what: str, group: str) -> str:
+    """Return where the sentence about a group of checks stands."""
+    return f"{what}{group.replace('.', '_')}"
+
+
+def _to_identify(analysis: Analysis) -> Spans:
+    """Return what lets the carts be identified, or why they cannot be."""
+    for skip in reversed(analysis.skipped):
+        if skip.stage == "final estimates":
+            if skip.missing:
+                return _WORDS.spans("do_record_for_fit", missing=skip.missing)
+            return _WORDS.spans("do_identify", reason=_sentence(clean(skip.reason)))
+    return _WORDS.spans("do_fit_identified")
+
+
+def _names(checks: Sequence[Check]) -> Spans:
+    """Return the names of failed checks of a group, as the report's table has them."""
+    abouts = [clean(check.about) for check in checks if check.about]
+    if len(checks) == 1 or len(abouts) < len(checks):
+        return spans(Span(", ".join(clean(check.id) for check in checks), "code"))
+    return spans(Span(f"{clean(checks[0].kind)}: {', '.join(abouts)}", "code"))
+
+
+def _sentence(text: str) -> str:
+    return text if text.endswith((".", "?", "!")) else f"{text}."
+
+
+def _advice(analysis: Analysis) -> Iterator[Spans]:
+    """Yield what else to do, that no failed check asks for."""
+    say, fit, design = _WORDS.spans, analysis.fit, analysis.feedback
+    asked = {_group(check) for check in analysis.failed_checks}
+    if wrong := list(dict.fromkeys(reported_off(analysis))):
+        yield say("next_reported", names=names_spans(wrong))
+    if _may_lack_springs(analysis):
+        yield say("next_springs")
+    if short := sorted({point.experiment for point in analysis.sine_points if not point.settled}):
+        yield say("next_short", runs=clean(listing(short)))
+    doubted = {check.experiment for check in analysis.hardware if check.contradicted}
+    poor = [c for c in analysis.hardware if c.nrmse > limits.CLOSE and c.experiment not in doubted]
+    left = poor or (fit is not None and not fit.explains_data)
+    if left and "fit.explains_data" not in asked:
+        yield say("do_fit_explains_data")
+    to_run = design is not None and not any(r.kind == "closed_loop" for r in analysis.records)
+    if to_run:
+        yield say("next_run")
+    # What follows the carts waits for them, and for the recordings that are to be fixed.
+    if fit is not None and not asked & {"data", "record"}:
+        lacking = [s for s in analysis.skipped if not (to_run and s.stage == "hardware check")]
+        missing = dict.fromkeys(skip.missing for skip in lacking if skip.missing)
+        if missing:
+            yield say("next_missing", missing=rich(clean(listing(list(missing)))))
+    if design and not design.reachable:
+        yield say("next_goal", message=clean(design.message))
+
+
+def _may_lack_springs(analysis: Analysis) -> bool:
+    """Tell whether steps contradict a fit that leaves springs out, where dry friction does not."""
+    fit, dry = analysis.fit, any(d.friction and d.friction.present for d in analysis.log_decrements)
+    off = any(row.consistent is False and read_name(row.name).is_gain for row in analysis.rows)
+    return off and not dry and fit is not None and not (fit.explains_data or all(analysis.springs))
+
+
+def _nothing_left(analysis: Analysis) -> Spans:
+    return _WORDS.spans("next_warnings" if analysis.warnings else "next_nothing")
+
+
+def set_up_in_doubt(analysis: Analysis) -> tuple[bool, Spans] | None:
+    """Everything that follows hangs on it, so it comes first."""
+    wrong = [check for check in analysis.failed_checks if _group(check) in _AT_THE_TOP]
+    if not wrong:
+        return None
+    said = (
+        _WORDS.spans(_key("top_", _group(c)), message=_sentence(clean(c.message))) for c in wrong
+    )
+    return False, tuple(span for one in said for span in (*one, Span(" ")))[:-1]

@@ -1,0 +1,118 @@
+"""Checks of the fitted carts: a mass, damper or spring that may as well not be there."""
+
+import shutil
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.checks.carts import check_vanishing
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.linear.presets import PRESETS
+from pipeline.resources import EXAMPLES
+from pipeline.results import ChainFit, Check
+from pipeline.submission import load_submission
+from pipeline.workflow import analyse
+from tests.helpers.examples import analysed
+from tests.helpers.places import REAL_DATA
+from tests.helpers.ucsd import write_two_cart_submission
+
+
+def fitted(
+    chain: Chain, *, relative: float = 1e-3, converged: bool = True, **std: float
+) -> ChainFit:
+    """Return a fit of a chain with so large errors."""
+    values = {f"m_{i}": v for i, v in enumerate(chain.m, 1)}
+    values |= {f"c_{i}": v for i, v in enumerate(chain.c, 1)}
+    values |= {f"k_{i}": v for i, v in enumerate(chain.k, 1) if v or f"k_{i}" in std}
+    errors = np.array([std.get(name, relative * value) for name, value in values.items()])
+    return ChainFit(
+        method="bode_fit",
+        chain=chain,
+        names=tuple(values),
+        covariance=np.diag(errors**2),
+        parameters={},
+        chi_square_per_dof=1.0,
+        dof=10,
+        n_points=20,
+        n_starts=1,
+        converged=converged,
+        message="",
+    )
+
+
+def vanishing(checks: tuple[Check, ...]) -> dict[str, str]:
+    """Return what is said of each parameter that may not be there."""
+    return {check.about: check.message for check in checks if check.kind == "vanishing"}
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "std", "found"),
+    [
+        ("k_1", 2e-6, 5e-6, "zero within its error"),
+        ("k_1", 1e-3, 2e-5, "0.78 % of k_2"),
+        ("k_1", 0.0, 5e-6, "ends at zero"),
+        ("c_2", 3e-5, 2e-5, "zero within its error"),
+        ("c_2", 5e-6, 1e-7, "0.75 % of c_1"),
+        ("m_2", 3e-6, 1e-7, "0.96 % of m_1"),
+    ],
+)
+def test_what_may_as_well_not_be_there_fails_with_its_question(name, value, std, found):
+    """Zero within its error, or next to nothing beside its neighbour: asked about, with a line."""
+    plant = PRESETS["throne-2dof"]
+    values = {"m": plant.m.copy(), "c": plant.c.copy(), "k": plant.k.copy()}
+    values["k"][0] = 0.1
+    symbol, _, number = name.partition("_")
+    values[symbol][int(number) - 1] = value
+    (check,) = check_vanishing(fitted(Chain(**values), **{name: std}), springs=(True,) * 3)
+    assert (check.id, check.outcome) == (f"vanishing.{name}", "fail")
+    assert found in check.message
+    assert "?" in check.message
+    lines = {"k": "springs = [false, true, true]", "c": 'kind = "decay"', "m": "carts = 1"}
+    assert lines[symbol] in check.message
+
+
+@pytest.mark.parametrize("preset", sorted(PRESETS))
+def test_a_spring_that_is_said_to_be_missing_is_not_asked_about(preset):
+    """The paper's plants have no spring wall-1; where it is declared so, all is well."""
+    chain = PRESETS[preset]
+    springs = [bool(k > 0) for k in chain.k]
+    assert check_vanishing(fitted(chain), springs=springs) == []
+    assert check_vanishing(fitted(chain, converged=False), springs=(True,) * len(springs)) == []
+    found = check_vanishing(fitted(chain), springs=(True,) * len(springs))
+    assert [check.id for check in found] == ([] if chain.n == 1 else ["vanishing.k_1"])
+
+
+def test_the_shipped_examples_pass():
+    """Nothing that they declare vanishes."""
+    for name in ("one-cart", "two-cart", "three-cart"):
+        assert vanishing(analysed(name).checks) == {}
+
+
+@pytest.mark.parametrize("name", ["two-cart", "three-cart"])
+def test_a_spring_too_many_is_found_on_the_examples(name, tmp_path):
+    """The line to change holds the springs that the example's bench has."""
+    shutil.copytree(EXAMPLES / name, tmp_path / "s")
+    toml = tmp_path / "s" / "submission.toml"
+    text = toml.read_text(encoding="utf-8")
+    right = next(line for line in text.splitlines() if line.startswith("springs = "))
+    toml.write_text(text.replace(right, right.replace("false", "true")), encoding="utf-8")
+    said = vanishing(analyse(load_submission(tmp_path / "s"), design=False).checks)
+    assert list(said) == ["k_1"]
+    assert "Is there a spring wall-1?" in said["k_1"]
+    assert right in said["k_1"]
+    assert tomllib.loads(right)["springs"][0] is False
+
+
+@pytest.mark.skipif(not (REAL_DATA / "ecp210-ucsd").is_dir(), reason="the recordings are not here")
+def test_a_far_spring_that_the_real_rig_has_not_is_asked_about(tmp_path):
+    """Declared, it takes 1 % of its neighbour, for dry friction has to be explained somehow."""
+    folder: Path = write_two_cart_submission(tmp_path / "s", REAL_DATA, steps=(1, 2, 3, 4, 5))
+    assert vanishing(analyse(load_submission(folder), design=False).checks) == {}
+    toml = folder / "submission.toml"
+    text = toml.read_text(encoding="utf-8")
+    toml.write_text(text.replace("[true, true, false]", "[true, true, true]"), encoding="utf-8")
+    said = vanishing(analyse(load_submission(folder), design=False).checks)
+    assert list(said) == ["k_3"]
+    assert "springs = [true, true, false]" in said["k_3"]

@@ -1,0 +1,125 @@
+"""What all numbers rest on: listed in one place, each with how the data support it."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from pipeline.report.draft.content import build_document
+from pipeline.report.sections.summary import terminal_summary
+from pipeline.resources import EXAMPLES
+from pipeline.results import Analysis, Assumption
+from pipeline.results_json import results_text
+from pipeline.schemas.results import Results
+from pipeline.submission import load_submission
+from pipeline.workflow import analyse
+from tests.helpers.examples import analysed
+from tests.helpers.places import REAL_DATA
+from tests.helpers.ucsd import write_two_cart_submission
+
+SPRINGS = "springs = [false, true, true]\n"
+UNITS = 'input = { unit = "V", sign = 1 }\nposition = { unit = "cm" }\n'
+
+
+def edited(folder: Path, *changes: tuple[str, str], head: str = "") -> Analysis:
+    """Return what comes of the two-cart example with another set-up; `head`: of its CSV files."""
+    shutil.copytree(EXAMPLES / "two-cart", folder)
+    toml = folder / "submission.toml"
+    text = toml.read_text(encoding="utf-8")
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    toml.write_text(text, encoding="utf-8")
+    for file in (folder / "data").glob("*.csv") if head else ():
+        lines = file.read_text(encoding="utf-8").split("\n", 1)
+        file.write_text(f"{head}\n{lines[1]}", encoding="utf-8")
+    return analyse(load_submission(folder), design=False)
+
+
+def by_key(analysis: Analysis) -> dict[str, Assumption]:
+    """Return the assumptions by key, and which one; of carts the free ones."""
+    return {
+        f"{a.key} {a.about or (a.value if isinstance(a.value, tuple) else '')}".rstrip(): a
+        for a in analysis.assumptions
+    }
+
+
+def test_what_an_example_states_is_listed_with_its_support():
+    """Every spring with its stiffness, units that no heading states, the sign, the held carts."""
+    found = by_key(analysed("two-cart"))
+    assert {key: (a.value, a.origin, a.support) for key, a in found.items()} == {
+        "system.springs wall-1": (False, "stated", "supported"),
+        "system.springs 1-2": (True, "stated", "supported"),
+        "system.springs 2-wall": (True, "stated", "supported"),
+        "system.position.unit": ("cm", "stated", "open"),
+        "system.input.unit": ("V", "stated", "open"),
+        "system.input.sign": (1.0, "stated", "supported"),
+        "experiments.carts (1,)": ((1,), "stated", "supported"),
+        "experiments.carts (2,)": ((2,), "stated", "supported"),
+        "experiments.carts (1, 2)": ((1, 2), "default", "supported"),
+    }
+    chain = analysed("two-cart").chain
+    assert chain is not None
+    assert found["system.springs 1-2"].found == chain.k[1]
+    assert found["system.springs 1-2"].found_std
+    assert "Assumed" not in terminal_summary(analysed("two-cart"))
+
+
+def test_what_nobody_states_is_a_default(tmp_path):
+    """Springs, unit and sign left out: taken, and said to be; a spring too many is contradicted."""
+    analysis = edited(tmp_path / "s", (SPRINGS, ""), (UNITS, ""))
+    found = by_key(analysis)
+    assert {key: (a.value, a.origin, a.support) for key, a in found.items()} == {
+        "system.springs wall-1": (True, "default", "contradicted"),
+        "system.springs 1-2": (True, "default", "supported"),
+        "system.springs 2-wall": (True, "default", "supported"),
+        "system.position.unit": ("count", "default", "contradicted"),
+        "system.input.unit": ("V", "default", "open"),
+        "system.input.sign": (1.0, "data", "supported"),
+        "experiments.carts (1,)": ((1,), "stated", "supported"),
+        "experiments.carts (2,)": ((2,), "stated", "supported"),
+        "experiments.carts (1, 2)": ((1, 2), "default", "supported"),
+    }
+    findings = [line for line in terminal_summary(analysis).splitlines() if line.startswith("- ")]
+    assert findings[0].startswith("- Unit of the positions: ")  # at the top
+    assert findings[1].startswith("- Assumed: system.input.unit (V)")
+    assert sum("springs = [false, true, true]. Failed: vanishing.k_1" in f for f in findings) == 1
+
+
+def test_headings_support_a_unit(tmp_path):
+    """Stated in the files and in submission.toml alike, whichever way they are converted."""
+    analysis = edited(tmp_path / "s", head="time,input [mV],x1 [mm],x2 [mm]")
+    found = by_key(analysis)
+    assert found["system.position.unit"].support == "supported"
+    assert found["system.input.unit"].support == "supported"
+    assert len(found["system.position.unit"].experiments) == len(analysis.records)
+
+
+def test_the_report_and_results_json_hold_them():
+    """One section, one row each; and structured values that the schema takes."""
+    analysis = analysed("two-cart")
+    document = build_document(analysis, progress=None)
+    (section,) = (s for s in document.sections if s.id == "assumptions")
+    (table,) = section.blocks
+    assert table.kind == "table"
+    assert len(table.rows) == len(analysis.assumptions)
+    raw = json.loads(results_text(analysis))
+    assert Results.model_validate(raw).assumptions[3].value == "cm"
+    assert raw["assumptions"][1]["found"] == pytest.approx(analysis.assumptions[1].found)
+    older = {key: value for key, value in raw.items() if key != "assumptions"}
+    assert Results.model_validate(older).assumptions == ()
+
+
+@pytest.mark.skipif(not (REAL_DATA / "ecp210-ucsd").is_dir(), reason="no real recordings here")
+def test_a_held_cart_that_was_not_measured_is_open(tmp_path):
+    """The real runs of one cart have no column for the other: nothing shows that it was held."""
+    folder = write_two_cart_submission(tmp_path / "s", REAL_DATA, steps=(1, 2, 3, 4, 5))
+    found = by_key(analyse(load_submission(folder), design=False))
+    assert found["experiments.carts (1,)"].support == "open"
+    assert "was not measured" in found["experiments.carts (1,)"].reason
+    assert found["system.position.unit"].support == "supported"
+    sign = found["system.input.sign"]
+    assert (sign.value, sign.origin, sign.support) == (-1.0, "data", "supported")
+    assert "pid" not in sign.experiments  # its log counts the other way
+    assert "but pid counts the other way" in sign.reason

@@ -1,0 +1,116 @@
+"""`fill` and the springs: decided where steps tell, marked where they do not."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from pipeline.cli import app
+from pipeline.identify.springs import decide_springs, fill
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.linear.simulate import simulate_linear
+from pipeline.resources import EXAMPLES
+from pipeline.results import Record
+from pipeline.submission import load_submission
+from tests.helpers.places import REAL_DATA
+
+STEP = 0.00227  # cm, of the encoder
+MASS, DAMPING, SPRING = 2.5e-4, 1.5e-3, 0.06
+
+
+def step(k: list[float], *, seconds: float = 8.0) -> Record:
+    """Return a step on and off of a bench with these springs, as an encoder reads it."""
+    n = len(k) - 1
+    chain = Chain(m=np.full(n, MASS), c=np.full(n, DAMPING), k=np.array(k))
+    t = np.arange(0.0, seconds, 0.00884)
+    u = np.where((t > 0.3) & (t < seconds / 2), 0.05, 0.0)
+    y = np.round(simulate_linear(chain, t, u) / STEP) * STEP
+    carts = tuple(range(1, n + 1))
+    resolution = np.full(n, STEP)
+    return Record(
+        id="step", kind="step", t=t, u=u, y=y, carts=carts, free=carts, resolution=resolution
+    )
+
+
+@pytest.mark.parametrize(
+    ("k", "present", "not_told"),
+    [
+        ([SPRING, 0], [True, True], ()),  # of one cart only the sum can be known
+        ([SPRING, SPRING, 0], [True, True, False], ()),
+        ([2 * SPRING, SPRING / 2, SPRING, 0], [True, True, True, False], ()),
+        ([0, SPRING, SPRING], [True, True, True], (1,)),
+        ([SPRING, SPRING, SPRING], [True, True, True], (1,)),
+        ([0, 2 * SPRING, SPRING, SPRING / 2], [True] * 4, (1,)),
+        ([SPRING, SPRING, SPRING / 5], [True] * 3, (1,)),
+        ([0, 0], [False, False], ()),
+        ([0, SPRING, 0], [False, True, False], ()),
+        ([0, SPRING, SPRING, 0], [False, True, True, False], ()),
+    ],
+)
+def test_steps_tell_the_far_spring_and_whether_any_holds_the_carts(k, present, not_told):
+    """Equal gains: none at the far wall; no way back: none at all; else wall-1 stays open."""
+    found = decide_springs([step(k)], n=len(k) - 1)
+    assert found.present == tuple(present)
+    assert found.open == not_told
+
+
+def test_without_a_step_of_all_carts_both_walls_are_open():
+    """Nothing is said of what nothing shows."""
+    assert decide_springs([], n=2).open == (1, 3)
+    short = step([0.0, SPRING, SPRING], seconds=0.7)
+    assert decide_springs([short], n=2).open == (1, 3)
+
+
+def folder_of(data: Path, folder: Path) -> Path:
+    """Return a folder with recordings, and nothing that says what they are."""
+    shutil.copytree(data, folder / "data")
+    return folder
+
+
+def test_fill_marks_what_the_files_do_not_tell(tmp_path):
+    """On the terminal, and behind the key, until somebody takes the mark out."""
+    folder = folder_of(EXAMPLES / "two-cart" / "data", tmp_path / "s")
+    done = CliRunner().invoke(app, ["fill", str(folder)], standalone_mode=False)
+    text = (folder / "submission.toml").read_text(encoding="utf-8")
+    springs, position = (
+        next(line for line in text.splitlines() if line.startswith(key))
+        for key in ("springs = ", "position = ")
+    )
+    assert "# unsure: is there wall-1?" in springs
+    assert "# unsure: a count has no fractions" in position
+    assert "springs: unsure: is there wall-1?" in done.stderr
+    assert "position: unsure: a count has no fractions" in done.stderr
+    assert "or an encoder that is stuck" not in done.stdout  # its table says that it is held
+    assert fill(folder).doubts == tuple(
+        line.removeprefix("cartlab: ") for line in done.stderr.splitlines() if "unsure: " in line
+    )
+    settled = text.replace(springs, "springs = [false, true, true]").replace(
+        position, 'position = { unit = "cm" }'
+    )
+    (folder / "submission.toml").write_text(settled, encoding="utf-8")
+    assert fill(folder).doubts == ()
+
+
+@pytest.mark.parametrize(("unit", "said"), [("furlong", "is not known"), ("count", "fractions")])
+def test_fill_speaks_of_a_unit_that_somebody_else_wrote(unit, said, tmp_path):
+    """In a file that was there nothing is marked, but it is said."""
+    folder = folder_of(EXAMPLES / "one-cart" / "data", tmp_path / "s")
+    text = f'version = 1\n[system]\ncarts = 1\nposition = {{ unit = "{unit}" }}\n'
+    (folder / "submission.toml").write_text(text, encoding="utf-8")
+    (doubt,) = fill(folder).doubts
+    assert doubt.startswith("position: ")
+    assert said in doubt
+    assert "unsure" not in (folder / "submission.toml").read_text(encoding="utf-8").split("[[")[0]
+
+
+@pytest.mark.skipif(not (REAL_DATA / "ecp210-ucsd").is_dir(), reason="no real recordings here")
+def test_the_real_rig_has_no_far_spring(tmp_path):
+    """Its static gains differ by what dry friction does, no more."""
+    folder = tmp_path / "s"
+    (folder / "data").mkdir(parents=True)
+    for file in (REAL_DATA / "ecp210-ucsd").glob("DOF*_test?.csv"):
+        shutil.copyfile(file, folder / "data" / file.name)
+    assert fill(folder).doubts == ()
+    assert load_submission(folder).system.springs == (True, True, False)

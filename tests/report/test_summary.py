@@ -1,0 +1,167 @@
+"""Sentences of the summary are made from the evidence; every failed check has its action."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import pytest
+
+from pipeline.report.document import Details, Table, plain
+from pipeline.report.sections.housekeeping import check_blocks
+from pipeline.report.sections.page import Page
+from pipeline.report.sections.parameters import parameter_blocks, parameter_table
+from pipeline.report.sections.questions import ask
+from pipeline.report.sections.summary import terminal_summary
+from pipeline.resources import EXAMPLES
+from pipeline.results import Analysis, Check
+from pipeline.submission import load_submission
+from pipeline.workflow import analyse
+from tests.helpers.analysis_factory import make_analysis
+from tests.helpers.examples import analysed
+from tests.helpers.places import REAL_DATA
+from tests.helpers.ucsd import write_one_cart_submission, write_two_cart_submission
+
+needs_real = pytest.mark.skipif(
+    not (REAL_DATA / "ecp210-ucsd").is_dir(), reason="no real recordings here"
+)
+
+
+def next_part(analysis: Analysis) -> list[str]:
+    """Return what to do next, a line each."""
+    _, _, advice = terminal_summary(analysis).partition("What to do next.")
+    return [line.removeprefix("- ") for line in advice.splitlines() if line]
+
+
+def every_failed_check_is_named(analysis: Analysis) -> bool:
+    """Whether the advice names each failed check."""
+    told = "\n".join(next_part(analysis))
+    return all((check.about or check.id) in told for check in analysis.failed_checks)
+
+
+@needs_real
+def test_only_steps_are_no_two_ways_and_no_decays(tmp_path):
+    """Five steps give both estimates, and no decay was recorded in which friction could show."""
+    analysis = analyse(load_submission(write_one_cart_submission(tmp_path / "s", REAL_DATA)))
+    text = terminal_summary(analysis)
+    assert "identified from 5 steps" in text
+    assert "The initial estimates come from the same recordings" in text
+    assert [row.independent for row in analysis.rows] == [False] * 3
+    assert "all 3 parameters estimated in two ways. Both ways use the same recordings" in text
+    assert "shows in the ringing of cart 1 after a step (step-1, step-3 and step-4)" in text
+    assert "decays of" not in text
+    assert not any("the decay of cart" in check.message for check in analysis.checks)
+    assert any(line.startswith("Record decays from two") for line in next_part(analysis))
+    sources = [plain(line[3].text) for line in parameter_table(Page.of(analysis)).rows]
+    assert sources == ["step", "ringing after a step", "ringing after a step"]
+    assert every_failed_check_is_named(analysis)
+    assert any("a [design] table" in line for line in next_part(analysis))
+    assert not any("experiments that the skipped" in line for line in next_part(analysis))
+
+
+@needs_real
+def test_the_steps_counted_are_those_of_the_fit(tmp_path):
+    """Of ten steps four were fitted: one was left out, and five were of one cart alone."""
+    folder = write_two_cart_submission(tmp_path / "s", REAL_DATA, steps=(1, 2, 3, 4, 5))
+    analysis = analyse(load_submission(folder))
+    assert analysis.fit is not None
+    assert analysis.fit.experiments == ("both-2", "both-3", "both-4", "both-5")
+    text = terminal_summary(analysis)
+    assert "identified from 4 steps, by a joint fit" in text
+    assert "from the same recordings, and from 5 decays and 5 steps." in text
+    assert "For K_1, K_2, ω_a and ω_b both ways use the same recordings." in text
+    assert every_failed_check_is_named(analysis)
+    advice = next_part(analysis)
+    assert advice[0].startswith("Fix what was left out")  # the worst first
+    assert "Failed: record.both-1" in advice[0]
+
+
+def test_an_independent_check_is_not_called_the_same():
+    """Decays and steps beside dwells are two ways; peaks read off the dwells are not."""
+    analysis = analysed("two-cart")
+    said = {row.name: row.independent for row in analysis.rows if row.independent is not None}
+    assert said == {
+        "K_1": True, "K_2": True, "omega_a": False, "omega_b": False,
+        "omega_1": True, "omega_2": True, "zeta_1": True, "zeta_2": True,
+    }  # fmt: skip
+    text = terminal_summary(analysis)
+    assert "identified from 23 sine dwells, by" in text
+    assert "sweep" not in text.splitlines()[0]  # no number rests on it
+    notes = plain_of(parameter_blocks(Page.of(analysis)))
+    assert "ω_a, ω_b: initial and final estimate rest on the same recordings" in notes
+
+
+def plain_of(blocks) -> str:
+    """Return the lists and paragraphs among blocks as text."""
+    found = []
+    for block in blocks:
+        if block.kind == "paragraph":
+            found.append(plain(block.text))
+        elif block.kind == "items":
+            found += [plain(inner.text) for item in block.items for inner in item]
+    return "\n".join(found)
+
+
+def test_the_sources_of_the_table_are_those_there_are():
+    """Without a decay no sentence speaks of one."""
+    analysis = make_analysis(1)
+    without = tuple(
+        replace(row, initial=None) if row.initial and row.initial.source == "log_decrement" else row
+        for row in analysis.rows
+    )
+    assert "free swing" in plain_of(parameter_blocks(Page.of(analysis)))
+    assert "free swing" not in plain_of(parameter_blocks(Page.of(replace(analysis, rows=without))))
+
+
+def test_a_check_that_nobody_foresaw_is_named_too():
+    """By its id and its message, before what the linear carts leave out."""
+    odd = Check.of("odd.run-1", False, "run-1: odd.", value=1.0, limit=0.5)
+    off = Check.of("fit.explains_data", False, "χ² is 9.", value=9.0, limit=2.0)
+    analysis = replace(make_analysis(1, repeats=1), checks=(off, odd), skipped=())
+    first, second, *_ = next_part(analysis)
+    assert first == "Look into this check. run-1: odd. Failed: odd.run-1"
+    assert second.endswith("Failed: fit.explains_data")
+
+
+@pytest.mark.parametrize("drop", ["step", "step sine sweep"])
+def test_without_runs_of_all_carts_the_advice_is_what_to_record(drop, tmp_path):
+    """Not the reason why nothing could be done, nor a table that nobody could give."""
+    shutil.copytree(EXAMPLES / "two-cart", tmp_path / "s")
+    toml = tmp_path / "s" / "submission.toml"
+    head, *tables = toml.read_text(encoding="utf-8").split("[[experiments]]")
+    kept = [
+        table
+        for table in tables
+        if not any(f"kind = {json.dumps(kind)}" in table for kind in drop.split())
+    ]
+    toml.write_text("[[experiments]]".join([head, *kept]), encoding="utf-8")
+    analysis = analyse(load_submission(tmp_path / "s"))
+    advice = "\n".join(next_part(analysis))
+    assert "No carts were identified" not in advice
+    if "sine" in drop:
+        assert analysis.fit is None
+        assert "Record sine dwells over the resonances, or a step or sweep with all" in advice
+    else:
+        assert "add a step with all carts free" in advice
+    assert every_failed_check_is_named(analysis)
+
+
+def test_nothing_failed_is_named_in_no_list():
+    """A good report has neither failed checks in its summary nor in its section."""
+    analysis = analysed("one-cart")
+    assert not any("Failed:" in line for line in next_part(analysis))
+    blocks = check_blocks(Page.of(analysis))
+    assert [type(block) for block in blocks] == [Details]
+    assert not any(isinstance(block, Table) for block in blocks)
+
+
+def test_a_question_about_one_recording_does_not_ask_of_two():
+    """Where both estimates use the same recordings no two methods saw two amplitudes."""
+    analysis = make_analysis(1)
+    rows = tuple(
+        replace(row, consistent=False, change_percent=80.0, independent=False)
+        if row.name == "zeta"
+        else row
+        for row in analysis.rows
+    )
+    (question,) = (q for q in ask(replace(analysis, rows=rows)) if q.id == "zeta")
+    assert "although both use the same recordings" in question.text
