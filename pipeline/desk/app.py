@@ -2,7 +2,7 @@
 
 import asyncio
 import socket
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from pathlib import Path
 from typing import Any, Self
 
@@ -33,6 +33,7 @@ from pipeline.web.server import Served
 from pipeline.web.strangers import Strangers, announced
 
 Handler = Callable[[Ask], Response]
+Listener = Callable[[Ask], Awaitable[Response]]
 _MOST_FIELDS = 5_000
 _FRAME = 0.2  # s between looks for news
 _ALIVE = 5.0  # s between signs of life where there is none
@@ -64,7 +65,6 @@ ROUTES: tuple[tuple[str, str, Handler], ...] = (
     ("/bench/{n:int}/weigh", "GET", bench.weigh),
     ("/bench/{n:int}/exploration.html", "GET", bench.diary),
     ("/bench/{n:int}/press", "POST", bench.press),
-    ("/bench/{n:int}/events", "GET", bench.events),
     ("/exercises/", "GET", instructor.show),
     ("/exercises/picture.svg", "GET", instructor.picture),
     ("/exercises/make", "POST", instructor.make),
@@ -93,7 +93,6 @@ ROUTES: tuple[tuple[str, str, Handler], ...] = (
 )  # fmt: skip
 # A Stop does not wait for one of the threads in which all others are answered.
 STOPS = frozenset([student_report.stop, bench.press, instructor.stop, whole.stop])
-EVENTS = {"/student/{n:int}/events": Ask.folder, "/grades/{n:int}/events": Ask.grades}
 
 
 class DeskServer:
@@ -159,7 +158,7 @@ def application(desk: Desk) -> Starlette:
         Route(path, _endpoint(desk, handler, room=_room(path)), methods=[method])
         for path, method, handler in ROUTES
     ]
-    events = [Route(path, _events(desk, place, room=_room(path))) for path, place in EVENTS.items()]
+    events = [Route(path, _events(desk, news, room=_room(path))) for path, news in EVENTS.items()]
     return Starlette(
         routes=[*routes, *events],
         exception_handlers={HTTPException: _wrong(desk), Exception: _wrong(desk)},
@@ -213,20 +212,26 @@ def _wrong(desk: Desk) -> Callable[[Request, Exception], Response]:
     return answer
 
 
-def _events(
-    desk: Desk, place: Callable[[Ask], Any], *, room: str
-) -> Callable[[Request], Awaitable[Response]]:
-    """Return what tells the stages of the work in a folder as they change, and its end."""
+def _events(desk: Desk, listen: Listener, *, room: str) -> Callable[[Request], Awaitable[Response]]:
+    """Return what tells news as they come, in the server's own loop."""
 
     async def answer(request: Request) -> Response:
         _admit(request.scope["user"], room)
         ask = Ask(desk=desk, user=request.scope["user"], request=request, form=FormData())
-        return StreamingResponse(_news(desk, place(ask)), media_type="text/event-stream")
+        return await listen(ask)
 
     return answer
 
 
-async def _news(desk: Desk, place: Path) -> AsyncIterator[str]:
+async def _work_in_folder(ask: Ask) -> Response:
+    return StreamingResponse(_news(ask.desk, ask.folder()), media_type="text/event-stream")
+
+
+async def _work_on_class(ask: Ask) -> Response:
+    return StreamingResponse(_news(ask.desk, ask.grades()), media_type="text/event-stream")
+
+
+async def _news(desk: Desk, place: Any) -> AsyncIterator[str]:
     """Send a line for every stage; one a person has not read is not kept for them."""
     seen, quiet = -1, 0.0
     while (job := desk.jobs.of(place)) is not None:
@@ -241,3 +246,11 @@ async def _news(desk: Desk, place: Path) -> AsyncIterator[str]:
         await asyncio.sleep(_FRAME)
         quiet += _FRAME
     yield "event: end\ndata: \n\n"
+
+
+# Streams of news take no thread: those in which pages are answered would soon be used up.
+EVENTS: Mapping[str, Listener] = {
+    "/student/{n:int}/events": _work_in_folder,
+    "/grades/{n:int}/events": _work_on_class,
+    "/bench/{n:int}/events": bench.events,
+}
