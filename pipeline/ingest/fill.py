@@ -22,6 +22,7 @@ from pipeline.ingest.formats.table import ENDINGS
 from pipeline.ingest.inspect import Inspection, data_files_in, format_not_read, inspect_file
 from pipeline.names import by_note
 from pipeline.results_of_runs import Kind
+from pipeline.submission.complaints import quote
 from pipeline.submission.edit import (
     append_experiment,
     comment_text,
@@ -37,7 +38,7 @@ from pipeline.submission.toml_file import Value, parse_toml
 _UNSURE = "unsure: "  # begins a comment below a table, which whoever knows better takes out
 _NO_NAME = re.compile(r"[^\w.-]+", re.ASCII)
 
-State = Literal["new", "completed", "there", "copy", "unknown", "broken", "missing"]
+State = Literal["new", "completed", "there", "copy", "unknown", "broken", "missing", "refused"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +49,8 @@ class Found:
     ----------
     file : below the submission's folder.
     state : its table is new, completed or was there; or there is none, for it is a copy of another
-        file, or nothing tells what it is; or it cannot be read, or has a table and is not there.
+        file, or nothing tells what it is; or it cannot be read, or has a table and is not there;
+        or no table can name it.
     experiment : the id of its table; "" without one.
     carts : that were free, as far as the file tells; () all.
     inspection : None where the file cannot be read.
@@ -71,12 +73,21 @@ class Found:
 
 def data_files(folder: Path) -> list[str]:
     """Return the recordings in `data/`, as they stand in `submission.toml`."""
-    found = data_files_in(folder / "data")
+    return [file for file, wrong in _named(folder) if wrong is None]
+
+
+def passed_over(folder: Path) -> list[Found]:
+    """Return the recordings in `data/` that no `submission.toml` can name, each with the reason."""
     return [
-        name
-        for path in found
-        if outside(folder, name := path.relative_to(folder).as_posix()) is None
+        Found(file=file, state="refused", remarks=(wrong,))
+        for file, wrong in _named(folder)
+        if wrong is not None
     ]
+
+
+def _named(folder: Path) -> list[tuple[str, str | None]]:
+    names = [path.relative_to(folder).as_posix() for path in data_files_in(folder / "data")]
+    return [(name, outside(folder, name)) for name in names]
 
 
 def look_at(folder: Path, file: str, *, columns: Mapping[str, str | int] = {}) -> Found:
@@ -163,9 +174,11 @@ def fill_submission(folder: Path) -> tuple[Found, ...]:
     looked = [
         look_at(folder, file, columns=stated_columns(document, file)) for file in data_files(folder)
     ]
+    passed = passed_over(folder)
     if not looked:
         raise ConfigError(
             f"{folder / 'data'}: no recording in it; "
+            + "".join(f"{remark}; " for one in passed for remark in one.remarks[:1])
             + (format_not_read(folder / "data") or f"copy yours there ({', '.join(ENDINGS)})")
         )
     if new:
@@ -181,7 +194,7 @@ def fill_submission(folder: Path) -> tuple[Found, ...]:
         found.extend(missing)
 
     edit_submission(folder, change)
-    return tuple(found)
+    return (*found, *passed)
 
 
 class _Filling:
@@ -344,7 +357,7 @@ def _state_units(document: tomlkit.TOMLDocument, looked: Sequence[Found]) -> Non
 def format_found(found: Sequence[Found]) -> str:
     """Return a table of one line a file, what is wrong or not sure below."""
     rows = [
-        (one.file, one.state, one.kind or "?", _carts_words(one), one.experiment or "-")
+        (_shown(one.file), one.state, one.kind or "?", _carts_words(one), one.experiment or "-")
         for one in found
     ]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -353,11 +366,15 @@ def format_found(found: Sequence[Found]) -> str:
         for row in rows
     ]
     said = by_note(
-        (one.file, remark)
+        (_shown(one.file), remark)
         for one in found
         for remark in (*one.remarks, *(_UNSURE + unsure for unsure in one.unsure))
     )
     return "\n".join([*lines, *(f"! {remark}" for remark in said)])
+
+
+def _shown(file: str) -> str:
+    return file if file.isprintable() else quote(file)
 
 
 def _carts_words(found: Found) -> str:

@@ -191,6 +191,28 @@ def test_a_recording_is_moved_aside_and_comes_back(filled):
     assert (folder / named).is_file()
 
 
+@pytest.mark.parametrize("packed", [True, False])
+def test_a_name_that_does_not_show_is_stored_under_one_that_does(room, packed):
+    """Blanks of all sorts and marks without a picture: replaced, said, and the file is used."""
+    visitor, folder = room
+    raw, marks = some_files()[0][1], "\u00a0\u200b\u202f\ufeff"
+    sent = [(f"a{mark}b.csv", raw + b"\n" * i) for i, mark in enumerate(marks)]
+    if packed:
+        archive = io.BytesIO()
+        with zipfile.ZipFile(archive, "w") as file:
+            for name, content in sent:
+                file.writestr(name, content)
+        sent = [("all.zip", archive.getvalue())]
+    assert visitor.upload(HERE + "files", sent).status == 303
+    page = unescape(visitor.get(HERE).text)
+    names = ["a-b.csv", "a-b-2.csv", "a-b-3.csv", "a-b-4.csv"]
+    assert sorted(path.name for path in (folder / "data").iterdir()) == sorted(names)
+    said = "'a\\xa0b.csv': taken as a-b.csv; no name may have characters that do not show"
+    assert said in page
+    assert {e.file for e in load_submission(folder).experiments} <= {f"data/{n}" for n in names}
+    assert all(f"{name}<small>" in page for name in names)
+
+
 @pytest.mark.parametrize("named", [True, False])
 def test_moving_aside_waits_its_turn_before_it_looks(filled, named):
     """Whether a table names it by then, or it is gone: one clear sentence, and nothing moves."""

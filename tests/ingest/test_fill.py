@@ -246,11 +246,31 @@ def test_a_table_without_its_file_is_told(tmp_path):
 
 
 def test_links_out_of_the_folder_are_not_followed(tmp_path):
-    """A link to somebody else's file is no file of the submission."""
+    """A link to somebody else's file is no file of the submission, and is named as refused."""
     put(tmp_path / "theirs", "a.csv", time=T, input=STEP, x1=RING)
     put(tmp_path / "mine", "b.csv", time=T, input=STEP, x1=RING)
     (tmp_path / "mine" / "data" / "a.csv").symlink_to(tmp_path / "theirs" / "data" / "a.csv")
-    assert list(states(tmp_path / "mine")) == ["data/b.csv"]
+    told = {one.file: one.state for one in fill_submission(tmp_path / "mine")}
+    assert told == {"data/b.csv": "new", "data/a.csv": "refused"}
+    listed = load_submission(tmp_path / "mine").experiments
+    assert [experiment.file for experiment in listed] == ["data/b.csv"]
+
+
+@pytest.mark.parametrize("mark", ["\u202f", "\u00a0", "\u200b", "\ufeff", "\u202e"])
+def test_a_name_that_does_not_show_is_named(mark, tmp_path):
+    """`fill` says which file it passes over and why, and exits with 1; the others are filled in."""
+    put(tmp_path, "b.csv", time=T, input=STEP, x1=RING)
+    put(tmp_path, f"step{mark}1.csv", time=T, input=STEP, x1=2 * RING)
+    done = cartlab_here("fill", str(tmp_path))
+    assert done.returncode == 1
+    assert mark not in done.stdout + done.stderr
+    (line,) = [line for line in done.stdout.splitlines() if line.startswith("! ")]
+    assert f"data/step{ascii(mark)[1:-1]}1.csv" in line
+    assert "a character that does not show: rename the file" in line
+    assert [e.file for e in load_submission(tmp_path).experiments] == ["data/b.csv"]
+    (tmp_path / "data" / "b.csv").unlink()
+    with pytest.raises(ConfigError, match="does not show: rename the file"):
+        fill_submission(tmp_path)
 
 
 def test_nothing_to_fill_in_is_one_line(tmp_path):

@@ -106,7 +106,8 @@ def _take(given: str, raw: bytes, folder: Path, *, room: _Room) -> str:
         return ""
     if PurePosixPath(last).suffix.casefold() not in ENDINGS:
         raise SubmissionError(f"a recording ends in {', '.join(ENDINGS)}")
-    name = _UNFIT.sub("-", last.encode(errors="ignore")[-_LONGEST:].decode(errors="ignore"))
+    seen = "".join(c if c.isprintable() else "-" for c in last)  # blanks of all sorts, marks
+    name = _UNFIT.sub("-", seen.encode(errors="ignore")[-_LONGEST:].decode(errors="ignore"))
     if _RESERVED.fullmatch(name):
         name = f"data-{name}"
     names = _names(own_folder(folder, "data") / name)
@@ -116,7 +117,8 @@ def _take(given: str, raw: bytes, folder: Path, *, room: _Room) -> str:
     room.check(raw)
     target.parent.mkdir(exist_ok=True)
     write_file(target, raw)
-    return f"{quote(last)}: taken as {target.name}" if target.name != last else ""
+    why = "" if seen == last else "; no name may have characters that do not show"
+    return f"{quote(last)}: taken as {target.name}{why}" if target.name != last else ""
 
 
 def _there(path: Path) -> bool:

@@ -116,8 +116,8 @@ def _filled(ask: Ask, folder: Path) -> list[str]:
         return [str(error)]
     new = [row["file"] for row in rows if row["state"] in ("new", "completed")]
     said = [f"{count(len(new), 'file')} written into {NAME}."] if new else []
-    copies = [row for row in rows if row["state"] == "copy"]
-    return said + by_note((row["file"], note) for row in copies for note in row["remarks"])
+    without = [row for row in rows if row["state"] in ("copy", "refused")]
+    return said + by_note((row["file"], note) for row in without for note in row["remarks"])
 
 
 def _room(
