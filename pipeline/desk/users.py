@@ -165,6 +165,9 @@ def _wrong(found: Users, root: Path) -> Iterator[str]:
 def place_name(place: Place) -> str:
     """Return what to call a place: of a database its name, never who opens it with which word."""
     if isinstance(place, str):
-        parts = urlsplit(place)
+        try:
+            parts = urlsplit(place)
+        except ValueError:  # a bracket that is not closed; to open it says what is wrong
+            return place.partition("://")[0]
         return parts.path.strip("/") or parts.hostname or parts.scheme
     return place.name or str(place)

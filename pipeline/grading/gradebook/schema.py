@@ -40,12 +40,21 @@ from sqlalchemy import (
 from sqlalchemy.exc import ArgumentError, NoSuchModuleError, SQLAlchemyError
 
 from pipeline.errors import ConfigError
+from pipeline.submission.complaints import quote
 
 FILE = "gradebook.sqlite"
 _SUFFIXES = (".sqlite", ".sqlite3", ".db")  # of files; anything else is a folder
 _VERSION = "1"
 _TURN = 0x6361_7274  # a number for PostgreSQL's lock that nobody else has
 _PATIENCE = 60.0  # s, for a lock that another process holds; a commit takes milliseconds
+
+
+# What SQLAlchemy and the drivers raise for an address that means nothing.
+_SENSELESS = (ArgumentError, ValueError, TypeError)
+_NO_ADDRESS = (
+    "the gradebook's address is no database URL: write postgresql://NAME@HOST/DATABASE or "
+    f"sqlite:////FOLDER/{FILE}"
+)
 
 
 class Words(TypeDecorator):
@@ -241,13 +250,17 @@ class Database:
     def __init__(self, place: str | Path, *, create: bool) -> None:
         self._engine = _engine(place, create=create)
         self._writer = self._engine.execution_options(writes=True)
-        with self._translated(), (self._writer if create else self._engine).begin() as connection:
-            if create:
-                _create(connection)
-            elif not self._engine.dialect.has_table(connection, settings.name):
-                raise ConfigError(f"{self.name}: holds no gradebook")
-            _check_version(connection, name=self.name)
-            whole = _is_whole(connection)
+        opened = self._writer if create else self._engine
+        try:
+            with self._translated(), opened.begin() as connection:
+                if create:
+                    _create(connection)
+                elif not self._engine.dialect.has_table(connection, settings.name):
+                    raise ConfigError(f"{self.name}: holds no gradebook")
+                _check_version(connection, name=self.name)
+                whole = _is_whole(connection)
+        except _SENSELESS as error:  # the driver reads the address when it first connects
+            raise ConfigError(_NO_ADDRESS) from error
         if not whole:  # of a version that had fewer tables
             with self.writing() as connection:
                 _create(connection)
@@ -320,17 +333,22 @@ def _engine(place: str | Path, *, create: bool) -> Engine:
         address = place
     try:
         url = make_url(address)
-    except ArgumentError as error:
-        raise ConfigError(f"the gradebook's address is no database URL: {error}") from error
+    except _SENSELESS as error:
+        raise ConfigError(_NO_ADDRESS) from error
     try:
         if url.drivername == "postgresql":  # what is called so depends on SQLAlchemy's version
             url = url.set(drivername="postgresql+psycopg")
         if url.get_backend_name() != "sqlite":
             return create_engine(url, pool_pre_ping=True)
+        file = url.database or ""
+        if not (create or file.startswith((":memory:", "file:")) or Path(file).is_file()):
+            raise ConfigError(f"{quote(file)}: there is no such gradebook")  # SQLite would make one
         engine = create_engine(url, connect_args={"timeout": _PATIENCE})
     except (NoSuchModuleError, ModuleNotFoundError) as error:
         shown = url.render_as_string(hide_password=True)
         raise ConfigError(f"{shown}: no driver for it is installed ({error})") from error
+    except _SENSELESS as error:
+        raise ConfigError(_NO_ADDRESS) from error
     event.listen(engine, "connect", _prepare_sqlite)
     event.listen(engine, "begin", _begin_sqlite)
     return engine
