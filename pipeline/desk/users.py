@@ -123,11 +123,8 @@ def read_users(path: Path) -> tuple[Proxy, dict[str, User]]:
     root = path.resolve().parent
     if wrong := next(_wrong(found, root), None):
         raise ConfigError(f"{path}: {wrong}")
-    if os.name == "posix" and path.stat().st_mode & stat.S_IROTH:
-        raise ConfigError(
-            f"{path}: everybody on this computer may read it, and the proxy's secret with it: "
-            "chmod o-r"
-        )
+    if os.name == "posix":
+        _refuse_open_to_all(path)
     return found.proxy, {
         user.name: User(
             name=user.name,
@@ -139,6 +136,26 @@ def read_users(path: Path) -> tuple[Proxy, dict[str, User]]:
         )
         for user in found.users
     }
+
+
+def _refuse_open_to_all(path: Path) -> None:
+    """Refuse a file that everybody may read, or change, or put another in the place of."""
+    if path.stat().st_mode & stat.S_IROTH:
+        raise ConfigError(
+            f"{path}: everybody on this computer may read it, and the proxy's secret with it: "
+            "chmod o-r"
+        )
+    if path.stat().st_mode & stat.S_IWOTH:
+        raise ConfigError(
+            f"{path}: everybody on this computer may write it, and give themselves any role: "
+            "chmod o-w"
+        )
+    folder = path.resolve().parent
+    mode = folder.stat().st_mode
+    if mode & stat.S_IWOTH and not mode & stat.S_ISVTX:  # in /tmp only the owner may
+        raise ConfigError(
+            f"{folder}: everybody on this computer may put another {path.name} there: chmod o-w"
+        )
 
 
 def _wrong(found: Users, root: Path) -> Iterator[str]:

@@ -361,6 +361,23 @@ def test_a_secret_that_everybody_may_read_is_none(tmp_path):
         read_users(path)
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has other rights")
+def test_a_list_that_everybody_may_change_is_none(tmp_path):
+    """Neither the file nor the folder in which another could be put in its place."""
+    folder = tmp_path / "desk"
+    folder.mkdir()
+    path = write_users(folder, '[[users]]\nname = "s1"\nrole = "student"\n')
+    path.chmod(0o602)
+    with pytest.raises(ConfigError, match=r"users.toml: everybody .* may write it.*chmod o-w"):
+        read_users(path)
+    path.chmod(0o600)
+    folder.chmod(0o777)
+    with pytest.raises(ConfigError, match=r"may put another users\.toml there"):
+        read_users(path)
+    folder.chmod(0o1777)  # there, as in /tmp, a file is only its owner's to replace
+    assert read_users(path)[0].header == "X-Remote-User"
+
+
 def test_a_stranger_s_clock_runs(server):
     """A connection that shows nothing ends by itself."""
     began = time.monotonic()

@@ -3,8 +3,12 @@
 import csv
 import io
 import json
+import os
 import re
+import sqlite3
+import stat
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -203,6 +207,40 @@ def test_an_anonymous_grading_names_nobody_on_stderr(run, tmp_path, monkeypatch)
     assert "not in this run, kept as they were: anon-" in said[1]
     for text in said:
         assert not [part for name in names for part in name.split("-") if part in text], text
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has other rights")
+def test_names_and_grades_are_for_their_owner_alone(run, tmp_path):
+    """Whatever the umask: the folder, the gradebook with its journal, the key; an older one too."""
+    (tmp_path / "c" / "team-1").mkdir(parents=True)
+    (tmp_path / "c" / "team-1" / "submission.toml").write_text("version = 1\n", encoding="utf-8")
+    out = tmp_path / "new" / "out"
+    words = ("grade", tmp_path / "c", "--rubric", "throne-1dof", "--out", out, "--jobs", 1,
+             "--anonymous", "--no-figures")  # fmt: skip
+
+    def modes(*names: str) -> list[str]:
+        return [oct(stat.S_IMODE((out / name).stat().st_mode)) for name in names]
+
+    before = os.umask(0)
+    try:
+        run(*words)
+        assert modes("", "gradebook.sqlite", "anonymous-key.csv") == ["0o700", "0o600", "0o600"]
+        with closing(sqlite3.connect(out / "gradebook.sqlite", isolation_level=None)) as book:
+            for journal, beside in (("DELETE", ["-journal"]), ("WAL", ["-wal", "-shm"])):
+                book.execute(f"PRAGMA journal_mode = {journal}")
+                book.execute("BEGIN IMMEDIATE")
+                book.execute("CREATE TABLE more (x)")
+                assert modes(*(f"gradebook.sqlite{end}" for end in beside)) == ["0o600"] * len(
+                    beside
+                )
+                book.execute("ROLLBACK")
+            book.execute("PRAGMA journal_mode = DELETE")
+        (out / "gradebook.sqlite").chmod(0o664)
+        (out / "anonymous-key.csv").chmod(0o664)
+        run(*words)
+        assert modes("gradebook.sqlite", "anonymous-key.csv") == ["0o660", "0o600"]
+    finally:
+        os.umask(before)
 
 
 def test_a_survey_is_told_on_stdout(run, tmp_path):

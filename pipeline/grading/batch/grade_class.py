@@ -29,7 +29,7 @@ from pipeline.grading.rubric_file import load_rubric
 from pipeline.grading.similarity.prints import fingerprint
 from pipeline.ingest.read import read_data
 from pipeline.lock import alone_in
-from pipeline.output import check_folder, own_folder
+from pipeline.output import OWNERS_FOLDER, check_folder, own_folder
 from pipeline.report.numbers import count, listing
 from pipeline.resources import EXAMPLES
 from pipeline.submission import load_submission
@@ -93,7 +93,7 @@ def grade_class(
     _refuse_submission(check_folder(out))
     if gradebook is None:
         _refuse_another_class(out, assignment=rubric_file.stem)
-    with alone_in(out), scratch_in(out) as scratch:
+    with alone_in(out, private=True), scratch_in(out) as scratch:
         known = _names_so_far(gradebook or out, assignment=rubric_file.stem)
         passed: list[str] = []
         found = find_hand_ins(paths, scratch=scratch, skip=[out], known=known, say=passed.append)
@@ -256,7 +256,7 @@ def scratch_in(out: Path) -> Iterator[Path]:
         if _SCRATCH.fullmatch(left.name) and left.is_dir() and not left.is_symlink():
             shutil.rmtree(left, ignore_errors=True)
     scratch = own_folder(out, f".scratch-{os.getpid()}")
-    scratch.mkdir(exist_ok=True)
+    scratch.mkdir(OWNERS_FOLDER, exist_ok=True)
     try:
         yield scratch
     finally:

@@ -5,9 +5,11 @@ has triggers (SQLite, PostgreSQL) it refuses to change or delete a row. The newe
 """
 
 import json
+import os
+import stat
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +42,7 @@ from sqlalchemy import (
 from sqlalchemy.exc import ArgumentError, NoSuchModuleError, SQLAlchemyError
 
 from pipeline.errors import ConfigError
+from pipeline.output import OWNER_ONLY
 from pipeline.submission.complaints import quote
 
 FILE = "gradebook.sqlite"
@@ -343,6 +346,8 @@ def _engine(place: str | Path, *, create: bool) -> Engine:
         file = url.database or ""
         if not (create or file.startswith((":memory:", "file:")) or Path(file).is_file()):
             raise ConfigError(f"{quote(file)}: there is no such gradebook")  # SQLite would make one
+        if create and file and not file.startswith((":memory:", "file:")):
+            _keep_private(Path(file))
         engine = create_engine(url, connect_args={"timeout": _PATIENCE})
     except (NoSuchModuleError, ModuleNotFoundError) as error:
         shown = url.render_as_string(hide_password=True)
@@ -352,6 +357,18 @@ def _engine(place: str | Path, *, create: bool) -> Engine:
     event.listen(engine, "connect", _prepare_sqlite)
     event.listen(engine, "begin", _begin_sqlite)
     return engine
+
+
+def _keep_private(file: Path) -> None:
+    """Make a gradebook's file for its owner alone; what SQLite puts beside it is so too.
+
+    One that is there keeps what its owner gave a group, and is closed to everybody else.
+    """
+    with suppress(OSError):  # SQLite says what is wrong with the place; a file may be another's
+        os.close(os.open(file, os.O_RDWR | os.O_CREAT, OWNER_ONLY))
+        mode = file.stat().st_mode
+        if mode & stat.S_IRWXO:
+            file.chmod(stat.S_IMODE(mode) & ~stat.S_IRWXO)
 
 
 def _prepare_sqlite(connection, _record) -> None:
