@@ -191,7 +191,8 @@ def _endpoint(
         except PipelineError as error:
             return plain_error(ask, str(error), status=422)
         except OSError as error:
-            where = f"{error.filename}: " if error.filename else ""
+            file = str(error.filename) if ask.user.owns else Path(str(error.filename)).name
+            where = f"{file}: " if error.filename else ""
             return plain_error(ask, f"{where}{error.strerror or error}", status=500)
         finally:
             await form.close()
@@ -224,20 +225,21 @@ def _events(desk: Desk, listen: Listener, *, room: str) -> Callable[[Request], A
 
 
 async def _work_in_folder(ask: Ask) -> Response:
-    return StreamingResponse(_news(ask.desk, ask.folder()), media_type="text/event-stream")
+    return StreamingResponse(_news(ask, ask.folder()), media_type="text/event-stream")
 
 
 async def _work_on_class(ask: Ask) -> Response:
-    return StreamingResponse(_news(ask.desk, ask.grades()), media_type="text/event-stream")
+    return StreamingResponse(_news(ask, ask.grades()), media_type="text/event-stream")
 
 
-async def _news(desk: Desk, place: Any) -> AsyncIterator[str]:
+async def _news(ask: Ask, place: Any) -> AsyncIterator[str]:
     """Send a line for every stage; one a person has not read is not kept for them."""
     seen, quiet = -1, 0.0
-    while (job := desk.jobs.of(place)) is not None:
+    while (job := ask.desk.jobs.of(place)) is not None:
         if job.news != seen:
             seen, quiet = job.news, 0.0
-            yield f"event: {'end' if job.over else 'stage'}\ndata: {' '.join(job.said.split())}\n\n"
+            said = " ".join(ask.user.told(job.said).split())
+            yield f"event: {'end' if job.over else 'stage'}\ndata: {said}\n\n"
         elif quiet > _ALIVE:
             quiet = 0.0
             yield ": still here\n\n"

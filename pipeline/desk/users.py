@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 from urllib.parse import urlsplit
 
+from markupsafe import escape
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
 from pipeline.errors import ConfigError
@@ -58,6 +59,22 @@ class User:
         needed = _NEEDS.get(room)
         listed = needed is None or self.owns or bool(getattr(self, needed))
         return room in _ROOMS[self.role] and listed
+
+    @property
+    def sees_places(self) -> bool:
+        """Whether they are told where on this computer a folder lies."""
+        return self.role not in ("student", "ta")
+
+    def told(self, text: str) -> str:
+        """Return a text as they may read it: students and TAs learn no folder of the server."""
+        if self.sees_places:
+            return text
+        places = [place for place in (*self.folders, *self.gradebooks) if isinstance(place, Path)]
+        above = {str(root) for place in places for root in (place.parent, place.resolve().parent)}
+        for root in sorted(above, key=len, reverse=True):
+            for written in (root, str(escape(root))):
+                text = text.replace(f"{written}{os.sep}", "")
+        return text
 
     @property
     def owns(self) -> bool:

@@ -215,6 +215,30 @@ def test_a_form_outlasts_what_a_class_saves_meanwhile(lab, root):
     assert (answer.status, rows) == (409, [("Mine", shown["title"])])
 
 
+def test_students_and_tas_are_told_no_folder_of_the_server(lab, root):
+    """On no page, in no refusal and in no news of their work; an instructor is told."""
+    plain = (root / "three" / "submission.toml").read_bytes()
+    (root / "three" / "report").symlink_to(root)  # a report there is refused
+    try:
+        said = [lab(name).get(path).text
+                for name, paths in (("s1", ("", "report")), ("s2", ("", "report")))
+                for path in (f"/student/0/{path}" for path in paths)]  # fmt: skip
+        said += [lab("s2").get("/").text, lab("t").get("/grades/0/").text, lab("t").get("/").text]
+        assert lab("s2").post("/student/1/make-report").status == 303
+        news = lab("s2").get("/student/1/events").text
+        assert "is a link" in news
+        said += [news, lab("s2").get("/student/1/").text]
+        (root / "three" / "submission.toml").write_bytes(b"x = [")
+        said += [lab("s2").get("/student/1/").text]
+        said += [lab("s2").post("/student/1/fill").text, lab("s2").get("/student/1/").text]
+    finally:
+        (root / "three" / "report").unlink()
+        (root / "three" / "submission.toml").write_bytes(plain)
+    assert not [text for text in said if str(root) in text or str(root.resolve()) in text]
+    assert '<p class="kicker">one</p>' in said[0]
+    assert str(root / "one") in lab("i").get("/student/0/").text
+
+
 def test_a_ta_sees_the_gradebooks_they_are_listed_for(lab):
     """And no student's room."""
     assert "team-07" in lab("t").get("/grades/0/").text
