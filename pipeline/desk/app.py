@@ -23,6 +23,7 @@ from pipeline.desk.home import enter, open_place, show_home
 from pipeline.desk.instructor import room as instructor
 from pipeline.desk.instructor import rubrics
 from pipeline.desk.pages import static_file
+from pipeline.desk.scratch import clear_scratch
 from pipeline.desk.state import Ask, Desk, plain_error, prepare_pages
 from pipeline.desk.student import report as student_report
 from pipeline.desk.student import room as student
@@ -135,6 +136,7 @@ class DeskServer:
             door = SecretDoor(owner, port=port, start=start)
             self.url = f"http://127.0.0.1:{port}/{door.secret}/"
         self._desk = Desk()
+        clear_scratch()
         prepare_pages()
         strangers = Strangers()
         guard = Guard(

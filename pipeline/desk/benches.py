@@ -108,18 +108,22 @@ class Session:
 
     def listen(self) -> None:
         """Take down what the process says until it ends."""
-        while True:
-            with suppress(queue.Empty):
-                line = self.process.line(timeout=_ANSWERS)
-                if not line:
-                    break
+        try:
+            while line := self._line():
                 told = json.loads(line)
                 self.url, self.said = told.get("url", self.url), told.get("over", self.said)
                 self.failed = told.get("failed", self.failed)
-        if not self.said:
-            self.said, self.failed = f"the process ended ({self.process.ending()})", True
-        self.process.close()
-        self.ended.set()
+            if not self.said:
+                self.said, self.failed = self.process.last_words(), True
+        finally:
+            self.process.close()
+            self.ended.set()
+
+    def _line(self) -> bytes:
+        """Wait for the next line of the process; b"" where it has ended."""
+        while True:
+            with suppress(queue.Empty):
+                return self.process.line(timeout=_ANSWERS)
 
 
 class Sessions:

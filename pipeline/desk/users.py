@@ -188,6 +188,9 @@ def _wrong(found: Users, root: Path) -> Iterator[str]:
         where = f"users: {user.name!r}"
         if names.count(user.name) > 1:
             yield f"{where} is there twice"
+        # A proxy may write a name in either; nobody is taken for another.
+        if (other := user.name.encode().decode("latin-1")) != user.name and other in names:
+            yield f"{where} in UTF-8 is {other!r} in Latin-1, which is there too"
         for key, room in _ROOM_OF.items():
             if getattr(user, key) and room not in _ROOMS[user.role]:
                 yield f"{where}: a {user.role} has no {key}; take it away, or give another role"

@@ -64,6 +64,16 @@ def test_nobody_gets_in_without_the_cookie(visitor, path):
         assert stranger.post(path).status == 403
 
 
+def test_another_cookie_of_the_same_name_locks_nobody_out(visitor):
+    """Any page of this computer may set one: before or behind the real one, it is let in."""
+    real = visitor.headers["Cookie"]
+    other = f"cartlab-{visitor.port}=guess"
+    for sent in (f"{other}; {real}", f"{real}; {other}", f"a=b; {other}; {other}x; {real}"):
+        assert Visitor(port=visitor.port, headers={"Cookie": sent}).get("/").status == 200
+    sent = f"{other}; {other}x"
+    assert Visitor(port=visitor.port, headers={"Cookie": sent}).get("/").status == 403
+
+
 def test_other_pages_cannot_ask(visitor):
     """A foreign name, an origin that is none of ours, a browser's word that it is another page."""
     port = visitor.port
@@ -183,6 +193,20 @@ def lab(root):
     with DeskServer(users=write_users(root, USERS)) as server:
         port = urlsplit(server.url).port or 0
         yield lambda name, **given: through_proxy(port, name, **given)
+
+
+@pytest.mark.parametrize("name", ["José Müller", "学生七"])
+def test_a_name_may_come_in_utf_8_or_in_latin_1(name, tmp_path):
+    """As the proxy writes it; a name that is not listed is let in by neither."""
+    a_submission(tmp_path / "one")
+    users = f'[[users]]\nname = "{name}"\nrole = "student"\nfolders = ["one"]\n'
+    with DeskServer(users=write_users(tmp_path, users)) as server:
+        port = urlsplit(server.url).port or 0
+        utf_8 = name.encode().decode("latin-1")
+        for sent in {utf_8, name} if name.isascii() or "é" in name else {utf_8}:
+            assert through_proxy(port, sent).get("/student/0/").status == 200
+        for other in (f"{utf_8}x", utf_8[:-1], "Jos\xc3", utf_8.encode().decode("latin-1")):
+            assert through_proxy(port, other).get("/student/0/").status == 403
 
 
 def test_everybody_sees_their_own(lab):
@@ -361,6 +385,10 @@ def test_forged_names_are_refused(lab):
         (PROXY + '[[users]]\nname = "t"\nrole = "ta"\nworkshop = "one"\n', "a ta has no workshop"),
         (PROXY + '[[users]]\nname = "s"\nrole = "student"\nports = ["COM3"]\n', "no ports"),
         ((PROXY + USERS).replace('"s2"', '"s1"'), "there twice"),
+        (
+            (PROXY + USERS).replace('"s1"', '"ü"').replace('"s2"', '"Ã¼"'),
+            "in UTF-8 is 'Ã¼' in Latin-1, which is there too",
+        ),
         ((PROXY + USERS).replace("folders", "folder", 1), "did you mean 'folders'"),
         ((PROXY + USERS).replace("https://Lab.example.edu", "lab"), "site"),
     ],
