@@ -149,6 +149,11 @@ class DeskServer:
             raise ConfigError("the desk could not be served")
         return self
 
+    @property
+    def runs(self) -> bool:
+        """Whether it is served."""
+        return self._served.runs
+
     def __exit__(self, *raised: object) -> None:
         self._served.stop()
         self._desk.close()
