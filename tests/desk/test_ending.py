@@ -150,8 +150,7 @@ def test_what_a_killed_desk_left_goes_with_the_next_start(tmp_path, monkeypatch)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     code = (
         "import sys, tempfile; tempfile.tempdir = sys.argv[1]\n"
-        "from pipeline.desk.app import DeskServer
-from pipeline.desk.scratch import scratch_folder\n"
+        "from pipeline.desk.scratch import scratch_folder\n"
         "with scratch_folder() as folder:\n"
         "    (folder / 'upload.zip').write_bytes(b'x'); print(folder, flush=True); input()"
     )
