@@ -25,6 +25,6 @@ def scratch_folder() -> Iterator[Path]:
 def clear_scratch() -> None:
     """Remove the scratch folders of processes that are gone."""
     for left in Path(tempfile.gettempdir()).glob(f"{_OWN}-*"):
-        found = re.fullmatch(rf"{_OWN}-(\d{1, 9})-\w+", left.name)
+        found = re.fullmatch(_OWN + r"-(\d{1,9})-\w+", left.name)
         if found and not psutil.pid_exists(int(found[1])) and not left.is_symlink():
             shutil.rmtree(left, ignore_errors=True)  # another user's stays: it cannot be removed
