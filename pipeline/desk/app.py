@@ -57,6 +57,8 @@ ROUTES: tuple[tuple[str, str, Handler], ...] = (
     ("/student/{n:int}/report", "GET", student_report.show),
     ("/student/{n:int}/report/{name:path}", "GET", student_report.report_file),
     ("/student/{n:int}/answer", "POST", student_report.answer),
+    ("/student/{n:int}/hand-in", "GET", student.show_hand_in),
+    ("/student/{n:int}/hand-in", "POST", student.start_hand_in),
     ("/student/{n:int}/hand-in.zip", "GET", student.packed),
     ("/bench/{n:int}/", "GET", bench.show),
     ("/bench/{n:int}/plan", "POST", bench.plan),

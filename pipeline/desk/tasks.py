@@ -12,6 +12,7 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.desk.class_tasks import publish, regrade
 from pipeline.desk.exercises import effect_svg, exercise, simulate, solution
+from pipeline.desk.student.last_report import ASKED, sources
 from pipeline.errors import ConfigError, SubmissionError
 from pipeline.ingest.columns import assign_columns
 from pipeline.ingest.fill import Found, data_files, fill_submission, look_at
@@ -23,8 +24,6 @@ from pipeline.submission import load_submission
 from pipeline.submission.load import leaves
 
 Progress = Callable[[str], None]
-ASKED = "questions.json"  # beside the report: what it asks, and what it said in one line
-
 _ACROSS, _HIGH = 120, 32  # of a thumbnail
 
 
@@ -54,6 +53,7 @@ def report(folder: str, *, progress: Progress) -> dict[str, Any]:
     from pipeline.report.draft.write import make_report
     from pipeline.report.sections.questions import ask
 
+    made_of = sources(Path(folder))  # before it is read: what changes meanwhile is not in it
     submission = load_submission(Path(folder))
     out = own_folder(submission.folder, "report")
 
@@ -71,6 +71,7 @@ def report(folder: str, *, progress: Progress) -> dict[str, Any]:
             "changes": changes_line(changes) if changes else "",
             "failed": [check.message for check in analysis.failed_checks],
             "unreadable": dict(analysis.unreadable),
+            "made_of": made_of,
         }
         write_file(out / ASKED, json.dumps(told, ensure_ascii=False))
     return told

@@ -14,7 +14,7 @@ from starlette.responses import Response
 
 from pipeline.desk.jobs import Failed
 from pipeline.desk.state import NOTHING_KNOWN, Ask
-from pipeline.desk.student import report
+from pipeline.desk.student import last_report
 from pipeline.desk.student.files import put_aside, take_uploads
 from pipeline.desk.student.form import (
     Field,
@@ -27,11 +27,11 @@ from pipeline.desk.student.form import (
     typed,
     with_errors,
 )
-from pipeline.desk.student.handin import BESIDE, beside, hand_in, missing
+from pipeline.desk.student.handin import hand_in, held, missing
 from pipeline.errors import SubmissionError
 from pipeline.lock import turn_in
 from pipeline.names import by_note
-from pipeline.report.numbers import count, listing
+from pipeline.report.numbers import count
 from pipeline.submission.edit import Outdated, edit_submission, submission_text, text_digest
 from pipeline.submission.load import (
     NAME,
@@ -88,6 +88,32 @@ def save_experiment(ask: Ask) -> Response:
     if ask.text("remove"):
         return _edited(ask, lambda document: remove_experiment(document, index), changed=[])
     return _save(ask, experiment_fields(_shown(ask), index))
+
+
+def start_hand_in(ask: Ask) -> Response:
+    """Have the report made anew where anything was changed since; show what is handed in."""
+    folder = ask.folder()
+    if last_report.state(folder) != "current":
+        ask.desk.jobs.start("report", title="The report", place=folder, folder=str(folder))
+    return ask.back(f"{ask.here}hand-in")
+
+
+def show_hand_in(ask: Ask) -> Response:
+    """Show what the zip holds, what is not answered, and what was assumed."""
+    folder = ask.folder()
+    keeps = _keeps(folder)
+    names = [] if keeps else held(folder)
+    return ask.page(
+        "handin",
+        title=f"Hand in {folder.name}",
+        keeps=keeps,
+        files=[(name, (folder / name).stat().st_size) for name in names],
+        job=ask.desk.jobs.of(folder),
+        report=last_report.state(folder),
+        unanswered=last_report.unanswered(folder),
+        assumed=last_report.assumed(folder),
+        said=ask.told(),
+    )
 
 
 def packed(ask: Ask) -> Response:
@@ -154,11 +180,10 @@ def _room(
         wrong=left,
         keeps=_keeps(folder) if text and error is None else [],
         sound=bool(text) and error is None,
-        holds=listing([NAME, "the files that it names", *(BESIDE[one] for one in beside(folder))]),
         job=ask.desk.jobs.of(folder),
-        report=report.state(folder),
-        told=report.told(folder),
-        unanswered=report.unanswered(folder),
+        report=last_report.state(folder),
+        told=last_report.told(folder),
+        unanswered=len(last_report.unanswered(folder)),
         gap=outside(folder, "gap/gap.html") is None,
         said=ask.told(),
     )
