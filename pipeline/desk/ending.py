@@ -19,8 +19,8 @@ from pipeline.desk import watch
 from pipeline.errors import PipelineError
 from pipeline.output import OWNERS_FOLDER
 
-_MOST_LOG = 1_000_000  # bytes; a longer one is begun anew
-# Those that end a program and that it may hear of: Ctrl-C, kill, a terminal or session that closes.
+_MOST_LOG = 1_000_000  # bytes; a longer log starts again from nothing
+# Signals that a program can catch: Ctrl-C, kill, a terminal or session that closes.
 _SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
 
 
@@ -55,7 +55,7 @@ class Ending:
         threading.excepthook = self._in_thread
         for name in _SIGNALS:
             number = getattr(signal, name, None)
-            # What nohup lets go by is let go by.
+            # nohup has a program ignore SIGHUP; it stays ignored.
             if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, self._signalled)
         self.note(f"begins: cartlab {__version__}, Python {platform.python_version()}")
@@ -77,7 +77,7 @@ class Ending:
     def note(self, text: str) -> None:
         """Write lines into the log."""
         lines = "".join(f"\t{line}\n" for line in text.splitlines())
-        with suppress(OSError, ValueError):  # whoever killed the watching process knows
+        with suppress(OSError, ValueError):  # the watching process was killed
             assert self._watch.stdin is not None
             self._watch.stdin.write(lines.encode(errors="replace"))
             self._watch.stdin.flush()

@@ -310,7 +310,7 @@ def test_what_is_handed_in_is_shown_before(filled):
     (folder / NAME).write_text(bare, encoding="utf-8")
     (folder / "notes.md").unlink(missing_ok=True)
     page = handed_in(visitor)
-    names = re.findall(r'<tr><th scope="row">(.*?)</th><td class="number">([\d,]+)</td>', page)
+    names = re.findall(r'<tr><th scope="row">(.*?)</th><td>([\d,]+)</td>', page)
     with zipped(visitor) as archive:
         held = {info.filename: f"{info.file_size:,}" for info in archive.infolist()}
     assert dict(names) == held

@@ -1,4 +1,4 @@
-"""What the last report said and asked, and whether it is of the folder as it is now."""
+"""The last report: what it said and asked, and whether anything changed since it was made."""
 
 import json
 import tomllib
@@ -62,7 +62,7 @@ def unanswered(folder: Path) -> list[dict[str, str]]:
 
 
 def written_notes(folder: Path) -> str:
-    """Return the text of `notes.md`, "" where there is none.
+    """Return the text of `notes.md`, "" if the file is missing.
 
     Raises
     ------
@@ -137,7 +137,7 @@ def _read_json(folder: Path, name: str, *, most: int) -> Any:
 
 def _document(folder: Path) -> dict[str, Any]:
     if outside(folder, NAME) is None:
-        with suppress(ValueError, RecursionError):  # what is wrong with it stands on the page
+        with suppress(ValueError, RecursionError):  # the page says what is wrong with it
             return tomllib.loads((folder / NAME).read_bytes().decode())
     return {}
 

@@ -105,7 +105,7 @@ def show_hand_in(ask: Ask) -> Response:
     names = [] if keeps else held(folder)
     return ask.page(
         "handin",
-        title=f"Hand in {folder.name}",
+        title=f"Hand in: {folder.name}",
         keeps=keeps,
         files=[(name, (folder / name).stat().st_size) for name in names],
         job=ask.desk.jobs.of(folder),
