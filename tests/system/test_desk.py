@@ -242,7 +242,7 @@ def test_without_scripts_it_works_too(show, tmp_path):
 
 
 def test_the_command_says_its_address_and_ends_with_a_signal(tmp_path):
-    """One line on stderr when ready, one where the port is taken; a signal ends it, status 0."""
+    """One line on stderr when ready, one where the port is taken; a signal, which it names, ends it, status 0."""
     command = [sys.executable, "-m", "pipeline", "desk", str(tmp_path / "team"), "--no-browser"]
     with started(command, stderr=subprocess.PIPE, encoding="utf-8") as desk:
         assert desk.stderr is not None
@@ -255,6 +255,7 @@ def test_the_command_says_its_address_and_ends_with_a_signal(tmp_path):
         )
         assert taken.returncode == 2
         assert len(taken.stderr.splitlines()) == 1
-        desk.send_signal(signal.SIGINT if sys.platform == "win32" else signal.SIGTERM)
+        number = signal.SIGINT if sys.platform == "win32" else signal.SIGTERM
+        desk.send_signal(number)
         assert desk.wait(PATIENCE) == 0
-        assert desk.stderr.read() == ""
+        assert desk.stderr.read() == f"cartlab: the desk ends: {number.name}\n"
