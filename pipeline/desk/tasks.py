@@ -12,7 +12,7 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.desk.class_tasks import publish, regrade
 from pipeline.desk.exercises import effect_svg, exercise, simulate, solution
-from pipeline.desk.student.last_report import ASKED, sources
+from pipeline.desk.last_report import ASKED, sources
 from pipeline.errors import ConfigError, SubmissionError
 from pipeline.ingest.columns import assign_columns
 from pipeline.ingest.fill import Found, data_files, fill_submission, look_at

@@ -18,10 +18,10 @@ import pytest
 
 from pipeline.desk.app import DeskServer
 from pipeline.desk.jobs import Failed, Hand
+from pipeline.desk.last_report import sources
 from pipeline.desk.state import Desk
 from pipeline.desk.student import files as uploads
 from pipeline.desk.student.files import take_uploads
-from pipeline.desk.student.last_report import sources
 from pipeline.errors import SubmissionError
 from pipeline.grading.intake.hand_ins import find_hand_ins
 from pipeline.lock import turn_in

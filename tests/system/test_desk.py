@@ -242,7 +242,7 @@ def test_without_scripts_it_works_too(show, tmp_path):
 
 
 def test_the_command_says_its_address_and_ends_with_a_signal(tmp_path):
-    """One line on stderr when ready, one where the port is taken; a signal, which it names, ends it, status 0."""
+    """One line when ready, one where the port is taken; a signal ends it by name, status 0."""
     command = [sys.executable, "-m", "pipeline", "desk", str(tmp_path / "team"), "--no-browser"]
     with started(command, stderr=subprocess.PIPE, encoding="utf-8") as desk:
         assert desk.stderr is not None

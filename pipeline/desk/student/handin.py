@@ -4,7 +4,7 @@ import io
 import zipfile
 from pathlib import Path
 
-from pipeline.desk.student.last_report import state
+from pipeline.desk.last_report import state
 from pipeline.submission import load_submission
 from pipeline.submission.load import NAME, outside
 

@@ -4,9 +4,9 @@ from collections.abc import Mapping
 
 from starlette.responses import Response
 
+from pipeline.desk.last_report import NOTES, told, written_notes
 from pipeline.desk.pages import served_file
 from pipeline.desk.state import Ask
-from pipeline.desk.student.last_report import NOTES, told, written_notes
 from pipeline.errors import SubmissionError
 from pipeline.lock import turn_in
 from pipeline.output import write_file

@@ -12,9 +12,9 @@ from starlette.datastructures import UploadFile
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
+from pipeline.desk import last_report
 from pipeline.desk.jobs import Failed
 from pipeline.desk.state import NOTHING_KNOWN, Ask
-from pipeline.desk.student import last_report
 from pipeline.desk.student.files import put_aside, take_uploads
 from pipeline.desk.student.form import (
     Field,
