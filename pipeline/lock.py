@@ -8,7 +8,7 @@ from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 from pipeline.errors import ConfigError
-from pipeline.output import LOCK, TURN
+from pipeline.output import LOCK, OWNERS_FOLDER, TURN
 
 _PATIENCE = 30.0  # s for a turn, which takes less than one
 _AGAIN = 0.02  # s until who waits asks again
@@ -19,17 +19,22 @@ _PROCESS = slice(60, 64)
 
 
 @contextmanager
-def alone_in(out: Path) -> Iterator[None]:
+def alone_in(out: Path, *, private: bool = False) -> Iterator[None]:
     """Make a folder and keep other runs out of it; it goes again where nothing came of it.
 
     The lock is SQLite's: it works on every system, and is gone with its process however that ends.
+
+    Parameters
+    ----------
+    private : nobody but its owner may enter a folder that is made here.
 
     Raises
     ------
     ConfigError : another run is under way in it.
     """
     new, lock = not out.exists(), out / LOCK
-    out.mkdir(parents=True, exist_ok=True)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.mkdir(OWNERS_FOLDER if private else 0o777, exist_ok=True)
     try:
         with _locked(lock):
             yield

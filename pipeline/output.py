@@ -3,6 +3,7 @@
 Tables are written so that a spreadsheet runs nothing that a student wrote.
 """
 
+import os
 import re
 import secrets
 import time
@@ -17,6 +18,7 @@ from pipeline.errors import ConfigError
 _PART = re.compile(r"\.[0-9a-f]{16}\.part")
 _FILES = (".html", ".pdf", ".json", ".csv", ".xlsx", ".zip", ".db", ".sqlite")
 _LEFT_OVER = 3600.0  # s: no write takes so long, and no two clocks are so far apart
+OWNER_ONLY, OWNERS_FOLDER = 0o600, 0o700  # modes of what names students
 LOCK, TURN = ".lock", ".turn"  # of `pipeline.lock`
 # What looks like the start of a formula and is none: a number, and the dash for nothing.
 _PLAIN = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?|-", re.ASCII)
@@ -75,21 +77,29 @@ def own_folder(parent: Path, name: str) -> Path:
     return check_folder(folder)
 
 
-def write_file(path: Path, content: str | bytes) -> None:
+def write_file(path: Path, content: str | bytes, *, private: bool = False) -> None:
     """Write a file whole or not at all; a link in its place is replaced, not followed.
 
     What a program that was killed while it wrote has left there goes, once in a process.
+
+    Parameters
+    ----------
+    private : nobody but its owner may read it, where the system knows owners.
     """
     raw = content.encode() if isinstance(content, str) else content
     _clear_left_over(path.parent)
     part = path.with_name(f".{secrets.token_hex(8)}.part")  # of this write alone
     try:
-        with part.open("xb") as file:
+        with open(part, "xb", opener=_for_the_owner if private else None) as file:
             file.write(raw)
         part.replace(path)
     except BaseException:
         part.unlink(missing_ok=True)
         raise
+
+
+def _for_the_owner(path: str, flags: int) -> int:
+    return os.open(path, flags, OWNER_ONLY)
 
 
 # Once a folder: to look through thousands of files takes as long as to write one.

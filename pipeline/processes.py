@@ -9,12 +9,15 @@ import subprocess
 import sys
 import tempfile
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
 import psutil
 
 _STDERR_SHOWN = 4_000  # characters
+_LAST_WORDS = 300  # characters of what a process said before it died
+_LUMP = 65_536  # bytes
 _ONE_THREAD = (
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
@@ -88,6 +91,11 @@ class LineProcess:
         self._stderr.seek(0)
         return self._stderr.read().decode(errors="replace")[-_STDERR_SHOWN:]
 
+    def last_words(self) -> str:
+        """Return how it ended and the last line that it wrote to stderr."""
+        words = self.said().strip().rpartition("\n")[2][-_LAST_WORDS:]
+        return f"the process ended ({self.ending()}) {words}".rstrip()
+
     def close(self) -> None:
         """End it."""
         self._process.kill()
@@ -106,6 +114,17 @@ class LineProcess:
             for line in lines:
                 self._lines.put(line)
         self._lines.put(b"")
+
+
+def lines_sent() -> Iterator[bytes]:
+    """Yield the lines that the parent sends, in such a process, until it is gone.
+
+    They are not read from `sys.stdin`: Python cannot end while a thread waits for that, and aborts.
+    """
+    rest = b""
+    while lump := os.read(0, _LUMP):
+        *lines, rest = (rest + lump).split(b"\n")
+        yield from lines
 
 
 def limit_memory(more: int) -> None:

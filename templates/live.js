@@ -241,7 +241,10 @@
     redraw();
   });
   news.addEventListener('ended', () => location.reload());  // at the desk: the page came too late to watch
-  news.addEventListener('error', () => tell('The connection is lost; trying again …', true));
+  news.addEventListener('error', () => {
+    const refused = news.readyState === EventSource.CLOSED;
+    tell(refused ? 'Too many pages show this session: close one of them, then reload this page.' : 'The connection is lost; trying again …', true);
+  });
   news.addEventListener('open', () => tell(state.waits));
   const press = async (wish, number) => {
     try {

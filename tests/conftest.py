@@ -1,10 +1,12 @@
 """Fixtures shared by the tests."""
 
+import atexit
 import gc
 import os
 import shutil
 import signal
 import sys
+import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -23,6 +25,10 @@ from tests.helpers.waiting import PATIENCE
 # programs that tests start would compile the package anew, and each worker all tests.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
+
+# Desks of tests write no log into the home of whoever runs them.
+os.environ["XDG_STATE_HOME"] = tempfile.mkdtemp(prefix="cartlab-tests-")
+atexit.register(shutil.rmtree, os.environ["XDG_STATE_HOME"], ignore_errors=True)
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # which shares the machine with others
     os.environ.setdefault("OMP_NUM_THREADS", "1")

@@ -1,7 +1,5 @@
 """The command `desk`: the local web page."""
 
-import signal
-import threading
 import webbrowser
 from pathlib import Path
 from typing import Annotated
@@ -10,6 +8,8 @@ import typer
 
 from pipeline.cli.common import app, say
 from pipeline.errors import ConfigError
+
+_GLANCE = 0.5  # s between looks whether it is still served
 
 
 @app.command()
@@ -33,17 +33,17 @@ def desk(
 ) -> None:
     """Open the desk, a page in the browser of this computer, for what the other commands do."""
     from pipeline.desk.app import DeskServer
+    from pipeline.desk.ending import Ending
 
     if (host is None) != (users is None):
         raise ConfigError("--host and --users go together: who listens to others asks who they are")
     if folder is not None and users is not None:
         raise ConfigError("with --users, the file says which folders there are")
-    with DeskServer(folder=folder, port=port, host=host or "127.0.0.1", users=users) as server:
-        stop = threading.Event()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: stop.set())
+    server = DeskServer(folder=folder, port=port, host=host or "127.0.0.1", users=users)
+    with Ending(say=say) as ending, server:
         say(f"ready: {server.url}")
         if browser and host is None:
             webbrowser.open(server.url)
-        while not stop.wait(0.5):
-            pass
+        while not ending.asked.wait(_GLANCE):
+            if not server.runs:
+                raise ConfigError(f"the desk's server ended by itself ({ending.log} says more)")

@@ -40,9 +40,10 @@ def emulate(
 ) -> None:
     """Run a virtual bench that speaks the serial protocol; its address is said on stderr."""
     from pipeline.bench.emulator.assemble import open_bench
-    from pipeline.synthesis.hidden import prepare_bench
+    from pipeline.synthesis.hidden import prepare_bench, refuse_endless
 
     bench = prepare_bench(preset=preset, model=model, hide=hide or ())
+    refuse_endless(bench)
     server = open_bench(
         bench,
         port=port,

@@ -101,7 +101,7 @@ def fill(folder: Folder, as_json: AsJson = False) -> None:
         typer.echo(json.dumps([f.to_dict() for f in found], indent=1, ensure_ascii=False))
     else:
         typer.echo(format_found(found))
-    left = [f for f in found if f.state in ("unknown", "broken", "missing")]
+    left = [f for f in found if f.state in ("unknown", "broken", "missing", "refused")]
     did = "nothing to add to" if toml.read_bytes() == before else "wrote"
     say(f"{did} {toml}: springs, units and what is marked unsure are yours")
     for message in (*filled.doubts, *format_passed_over(found)):

@@ -2,7 +2,7 @@
 
 import asyncio
 import socket
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from pathlib import Path
 from typing import Any, Self
 
@@ -23,6 +23,7 @@ from pipeline.desk.home import enter, open_place, show_home
 from pipeline.desk.instructor import room as instructor
 from pipeline.desk.instructor import rubrics
 from pipeline.desk.pages import static_file
+from pipeline.desk.scratch import clear_scratch
 from pipeline.desk.state import Ask, Desk, plain_error, prepare_pages
 from pipeline.desk.student import report as student_report
 from pipeline.desk.student import room as student
@@ -33,6 +34,7 @@ from pipeline.web.server import Served
 from pipeline.web.strangers import Strangers, announced
 
 Handler = Callable[[Ask], Response]
+Listener = Callable[[Ask], Awaitable[Response]]
 _MOST_FIELDS = 5_000
 _FRAME = 0.2  # s between looks for news
 _ALIVE = 5.0  # s between signs of life where there is none
@@ -55,6 +57,8 @@ ROUTES: tuple[tuple[str, str, Handler], ...] = (
     ("/student/{n:int}/report", "GET", student_report.show),
     ("/student/{n:int}/report/{name:path}", "GET", student_report.report_file),
     ("/student/{n:int}/answer", "POST", student_report.answer),
+    ("/student/{n:int}/hand-in", "GET", student.show_hand_in),
+    ("/student/{n:int}/hand-in", "POST", student.start_hand_in),
     ("/student/{n:int}/hand-in.zip", "GET", student.packed),
     ("/bench/{n:int}/", "GET", bench.show),
     ("/bench/{n:int}/plan", "POST", bench.plan),
@@ -64,7 +68,6 @@ ROUTES: tuple[tuple[str, str, Handler], ...] = (
     ("/bench/{n:int}/weigh", "GET", bench.weigh),
     ("/bench/{n:int}/exploration.html", "GET", bench.diary),
     ("/bench/{n:int}/press", "POST", bench.press),
-    ("/bench/{n:int}/events", "GET", bench.events),
     ("/exercises/", "GET", instructor.show),
     ("/exercises/picture.svg", "GET", instructor.picture),
     ("/exercises/make", "POST", instructor.make),
@@ -93,7 +96,6 @@ ROUTES: tuple[tuple[str, str, Handler], ...] = (
 )  # fmt: skip
 # A Stop does not wait for one of the threads in which all others are answered.
 STOPS = frozenset([student_report.stop, bench.press, instructor.stop, whole.stop])
-EVENTS = {"/student/{n:int}/events": Ask.folder, "/grades/{n:int}/events": Ask.grades}
 
 
 class DeskServer:
@@ -136,6 +138,7 @@ class DeskServer:
             door = SecretDoor(owner, port=port, start=start)
             self.url = f"http://127.0.0.1:{port}/{door.secret}/"
         self._desk = Desk()
+        clear_scratch()
         prepare_pages()
         strangers = Strangers()
         guard = Guard(
@@ -148,6 +151,11 @@ class DeskServer:
             raise ConfigError("the desk could not be served")
         return self
 
+    @property
+    def runs(self) -> bool:
+        """Whether it is served."""
+        return self._served.runs
+
     def __exit__(self, *raised: object) -> None:
         self._served.stop()
         self._desk.close()
@@ -159,7 +167,7 @@ def application(desk: Desk) -> Starlette:
         Route(path, _endpoint(desk, handler, room=_room(path)), methods=[method])
         for path, method, handler in ROUTES
     ]
-    events = [Route(path, _events(desk, place, room=_room(path))) for path, place in EVENTS.items()]
+    events = [Route(path, _events(desk, news, room=_room(path))) for path, news in EVENTS.items()]
     return Starlette(
         routes=[*routes, *events],
         exception_handlers={HTTPException: _wrong(desk), Exception: _wrong(desk)},
@@ -192,7 +200,8 @@ def _endpoint(
         except PipelineError as error:
             return plain_error(ask, str(error), status=422)
         except OSError as error:
-            where = f"{error.filename}: " if error.filename else ""
+            file = str(error.filename) if ask.user.owns else Path(str(error.filename)).name
+            where = f"{file}: " if error.filename else ""
             return plain_error(ask, f"{where}{error.strerror or error}", status=500)
         finally:
             await form.close()
@@ -213,26 +222,33 @@ def _wrong(desk: Desk) -> Callable[[Request, Exception], Response]:
     return answer
 
 
-def _events(
-    desk: Desk, place: Callable[[Ask], Any], *, room: str
-) -> Callable[[Request], Awaitable[Response]]:
-    """Return what tells the stages of the work in a folder as they change, and its end."""
+def _events(desk: Desk, listen: Listener, *, room: str) -> Callable[[Request], Awaitable[Response]]:
+    """Return what tells news as they come, in the server's own loop."""
 
     async def answer(request: Request) -> Response:
         _admit(request.scope["user"], room)
         ask = Ask(desk=desk, user=request.scope["user"], request=request, form=FormData())
-        return StreamingResponse(_news(desk, place(ask)), media_type="text/event-stream")
+        return await listen(ask)
 
     return answer
 
 
-async def _news(desk: Desk, place: Path) -> AsyncIterator[str]:
+async def _work_in_folder(ask: Ask) -> Response:
+    return StreamingResponse(_news(ask, ask.folder()), media_type="text/event-stream")
+
+
+async def _work_on_class(ask: Ask) -> Response:
+    return StreamingResponse(_news(ask, ask.grades()), media_type="text/event-stream")
+
+
+async def _news(ask: Ask, place: Any) -> AsyncIterator[str]:
     """Send a line for every stage; one a person has not read is not kept for them."""
     seen, quiet = -1, 0.0
-    while (job := desk.jobs.of(place)) is not None:
+    while (job := ask.desk.jobs.of(place)) is not None:
         if job.news != seen:
             seen, quiet = job.news, 0.0
-            yield f"event: {'end' if job.over else 'stage'}\ndata: {' '.join(job.said.split())}\n\n"
+            said = " ".join(ask.user.told(job.said).split())
+            yield f"event: {'end' if job.over else 'stage'}\ndata: {said}\n\n"
         elif quiet > _ALIVE:
             quiet = 0.0
             yield ": still here\n\n"
@@ -241,3 +257,11 @@ async def _news(desk: Desk, place: Path) -> AsyncIterator[str]:
         await asyncio.sleep(_FRAME)
         quiet += _FRAME
     yield "event: end\ndata: \n\n"
+
+
+# Streams of news take no thread: those in which pages are answered would soon be used up.
+EVENTS: Mapping[str, Listener] = {
+    "/student/{n:int}/events": _work_in_folder,
+    "/grades/{n:int}/events": _work_on_class,
+    "/bench/{n:int}/events": bench.events,
+}

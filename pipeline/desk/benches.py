@@ -1,12 +1,14 @@
 """Acquisitions that the desk has begun: each a process of its own, its live page behind ours."""
 
+import asyncio
 import json
 import queue
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import AsyncIterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
+from http import HTTPStatus
 from http.client import HTTPConnection, HTTPException, HTTPResponse
 from pathlib import Path
 from urllib.parse import urlencode, urlsplit
@@ -17,6 +19,8 @@ _PROCESS = "pipeline.desk.bench.process"
 _TO_STOP = 20.0  # s for the bench to be told and what came to be saved, on a busy machine
 _ANSWERS = 10.0  # s; the live page says that it is there every five
 _LUMP = 65_536  # bytes
+_LOOK = 0.1  # s between looks whether it has ended
+_FULL = HTTPStatus.SERVICE_UNAVAILABLE  # the live page has as many viewers as it takes
 
 
 @dataclass(kw_only=True, eq=False)
@@ -54,14 +58,41 @@ class Session:
         with suppress(OSError, ValueError):  # it has ended, its pipe is closed
             self.process.send(b"stop\n")
 
-    def events(self) -> Iterator[bytes]:
-        """Yield the news of its live page as they come, and that it has ended."""
-        with suppress(OSError, HTTPException):
-            connection, answer = self._ask("GET", "events")
-            with closing(connection):
-                while lump := answer.read1(_LUMP):
+    async def events(self) -> AsyncIterator[bytes] | None:
+        """Return the news of its live page as they come, and that it has ended.
+
+        None where the live page takes no more viewers. No thread is held, however many watch.
+        """
+        reader = writer = None
+        if self.url and not self.ended.is_set():
+            url = urlsplit(self.url)
+            # In HTTP/1.0 an answer ends with its connection: what comes is passed on as it is.
+            asked = f"GET {url.path}events HTTP/1.0\r\nHost: {url.netloc}\r\n\r\n"
+            with suppress(OSError):  # the page is gone: the session is about to end
+                reader, writer = await asyncio.open_connection(url.hostname, url.port)
+                writer.write(asked.encode("ascii"))
+        if reader is None or writer is None:
+            return self._passed_on(None, None)
+        status = await _status(reader)
+        if status == _FULL:
+            writer.close()
+            return None
+        return self._passed_on(reader if status == HTTPStatus.OK else None, writer)
+
+    async def _passed_on(
+        self, reader: asyncio.StreamReader | None, writer: asyncio.StreamWriter | None
+    ) -> AsyncIterator[bytes]:
+        try:
+            with suppress(OSError):
+                while reader is not None and (lump := await reader.read(_LUMP)):
                     yield lump
-        if self.ended.wait(_TO_STOP):
+        finally:
+            if writer is not None:
+                writer.close()
+        end = time.monotonic() + _TO_STOP
+        while not self.ended.is_set() and time.monotonic() < end:
+            await asyncio.sleep(_LOOK)
+        if self.ended.is_set():
             yield b"event: ended\ndata:\n\n"
 
     def _ask(
@@ -77,18 +108,22 @@ class Session:
 
     def listen(self) -> None:
         """Take down what the process says until it ends."""
-        while True:
-            with suppress(queue.Empty):
-                line = self.process.line(timeout=_ANSWERS)
-                if not line:
-                    break
+        try:
+            while line := self._line():
                 told = json.loads(line)
                 self.url, self.said = told.get("url", self.url), told.get("over", self.said)
                 self.failed = told.get("failed", self.failed)
-        if not self.said:
-            self.said, self.failed = f"the process ended ({self.process.ending()})", True
-        self.process.close()
-        self.ended.set()
+            if not self.said:
+                self.said, self.failed = self.process.last_words(), True
+        finally:
+            self.process.close()
+            self.ended.set()
+
+    def _line(self) -> bytes:
+        """Wait for the next line of the process; b"" where it has ended."""
+        while True:
+            with suppress(queue.Empty):
+                return self.process.line(timeout=_ANSWERS)
 
 
 class Sessions:
@@ -137,3 +172,11 @@ class Sessions:
         for session in self._sessions.values():
             if not session.ended.wait(max(0.0, end - time.monotonic())):
                 session.process.close()
+
+
+async def _status(reader: asyncio.StreamReader) -> int:
+    """Read the head of an answer and return its status, 0 where there is none in time."""
+    with suppress(OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
+        head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), _ANSWERS)
+        return int(head.split(None, 2)[1])
+    return 0

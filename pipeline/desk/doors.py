@@ -2,7 +2,8 @@
 
 import re
 import secrets
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from ipaddress import ip_address
 
@@ -47,15 +48,11 @@ class SecretDoor:
         """Tell whether the first bytes of a request hold the secret, or what came of it."""
         head = data[:_MOST_HEADER]
         path = head.split(b"/", 2)[1:2]
-        cookie = self._sent.search(head)
-        return (bool(path) and _same(path[0].split(b" ")[0], self.secret)) or (
-            cookie is not None and _same(cookie[1], self._session)
-        )
+        return (bool(path) and _same(path[0].split(b" ")[0], self.secret)) or self._knows(head)
 
     def enter(self, scope: Scope, headers: Headers) -> User | Response:
         """Return who asks, or the answer to who may not."""
-        found = self._sent.search(headers.get("cookie", "").encode("latin-1"))
-        known = found is not None and _same(found[1], self._session)
+        known = self._knows(headers.get("cookie", "").encode("latin-1"))
         if not _same(scope["path"].strip("/").encode(), self.secret):
             why = "the desk is opened by the address that cartlab printed when it started"
             return self._user if known else _refused(why)
@@ -67,6 +64,10 @@ class SecretDoor:
         )
         answer.set_cookie(self._cookie, self._session, httponly=True, samesite="strict")
         return answer
+
+    def _knows(self, sent: bytes) -> bool:
+        """Whether the cookie is among those sent: any page of this computer may set its like."""
+        return any([_same(found[1], self._session) for found in self._sent.finditer(sent)])
 
 
 class ProxyDoor:
@@ -90,9 +91,17 @@ class ProxyDoor:
         if not known or ip_address(scope["client"][0]) != ip_address(self._proxy.address):
             return _refused("ask by the address of the laboratory")
         names = headers.getlist(self._proxy.header)
-        if len(names) != 1 or names[0] not in self._users:
+        listed = [name for name in _readings(names[0]) if name in self._users] if names else []
+        if len(names) != 1 or not listed:
             return _refused("you are not on the list of this desk; ask your instructor")
-        return self._users[names[0]]
+        return self._users[listed[0]]
+
+
+def _readings(name: str) -> Iterator[str]:
+    """Yield what the bytes of a header may say: a proxy writes a name in UTF-8 or in Latin-1."""
+    with suppress(UnicodeDecodeError):
+        yield name.encode("latin-1").decode()
+    yield name
 
 
 def _same(sent: bytes, secret: str) -> bool:

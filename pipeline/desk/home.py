@@ -46,7 +46,10 @@ def enter(user: User, folder: Path) -> str:
         return _entered(folder, user.gradebooks, "grades")
     if not folder.parent.is_dir():
         raise ConfigError(f"{folder}: there is no folder {folder.parent} to make it in")
-    folder.mkdir(exist_ok=True)
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{folder}: cannot be made ({error.strerror})") from None
     return _entered(folder, user.folders, "student")
 
 

@@ -21,7 +21,6 @@ _LONGEST = 1800.0  # s of a job
 _SHORT = 180.0  # s of a short task, the start of its process on a busy machine included
 _HANDS = 3  # processes for short tasks, of 150 MB each
 _WAITING = 8  # requests about one folder; each keeps one of the server's 40 threads
-_LAST_WORDS = 300  # characters of what a process said before it died
 
 State = Literal["waiting", "running", "done", "failed", "stopped"]
 
@@ -129,6 +128,9 @@ class Jobs:
             job.tell("stopped" if job.stop.is_set() else "failed", str(error))
         except OSError as error:
             job.tell("failed", f"no process could be started for it ({error.strerror or error})")
+        except BaseException as error:  # who waits for it is told; the log has the rest
+            job.tell("failed", f"the desk itself failed ({type(error).__name__}: {error})")
+            raise
         finally:
             if process is not None:
                 process.close()
@@ -220,8 +222,7 @@ def _work(
                     raise _ended(process, "needed more memory than allowed") from None
                 continue
             if not line:
-                words = process.said().strip().rpartition("\n")[2][-_LAST_WORDS:]
-                raise _ended(process, f"the process ended ({process.ending()}) {words}".rstrip())
+                raise _ended(process, process.last_words())
             answer = json.loads(line)
             if "stage" in answer:
                 tell(answer["stage"])

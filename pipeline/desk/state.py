@@ -146,7 +146,7 @@ class Ask:
                 **context,
             )
         )
-        return HTMLResponse(text, status_code=status)
+        return HTMLResponse(self.user.told(text), status_code=status)
 
     def back(self, to: str, *said: str) -> Response:
         """Return to a page, which says this once."""

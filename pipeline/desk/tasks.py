@@ -12,6 +12,7 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.desk.class_tasks import publish, regrade
 from pipeline.desk.exercises import effect_svg, exercise, simulate, solution
+from pipeline.desk.last_report import ASKED, sources
 from pipeline.errors import ConfigError, SubmissionError
 from pipeline.identify.springs import fill as fill_folder
 from pipeline.ingest.columns import assign_columns
@@ -24,8 +25,6 @@ from pipeline.submission import load_submission
 from pipeline.submission.load import leaves
 
 Progress = Callable[[str], None]
-ASKED = "questions.json"  # beside the report: what it asks, and what it said in one line
-
 _ACROSS, _HIGH = 120, 32  # of a thumbnail
 
 
@@ -62,6 +61,7 @@ def report(folder: str, *, progress: Progress) -> dict[str, Any]:
     from pipeline.report.sections.questions import ask
     from pipeline.report.words import with_symbols
 
+    made_of = sources(Path(folder))  # before it is read: what changes meanwhile is not in it
     submission = load_submission(Path(folder))
     out = own_folder(submission.folder, "report")
 
@@ -81,6 +81,7 @@ def report(folder: str, *, progress: Progress) -> dict[str, Any]:
             "changes": with_symbols(changes_line(changes)) if changes else "",
             "failed": [with_symbols(check.message) for check in analysis.failed_checks],
             "unreadable": dict(analysis.unreadable),
+            "made_of": made_of,
         }
         write_file(out / ASKED, json.dumps(told, ensure_ascii=False))
     return told

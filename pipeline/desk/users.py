@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 from urllib.parse import urlsplit
 
+from markupsafe import escape
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
 from pipeline.errors import ConfigError
@@ -58,6 +59,22 @@ class User:
         needed = _NEEDS.get(room)
         listed = needed is None or self.owns or bool(getattr(self, needed))
         return room in _ROOMS[self.role] and listed
+
+    @property
+    def sees_places(self) -> bool:
+        """Whether they are told where on this computer a folder lies."""
+        return self.role not in ("student", "ta")
+
+    def told(self, text: str) -> str:
+        """Return a text as they may read it: students and TAs learn no folder of the server."""
+        if self.sees_places:
+            return text
+        places = [place for place in (*self.folders, *self.gradebooks) if isinstance(place, Path)]
+        above = {str(root) for place in places for root in (place.parent, place.resolve().parent)}
+        for root in sorted(above, key=len, reverse=True):
+            for written in (root, str(escape(root))):
+                text = text.replace(f"{written}{os.sep}", "")
+        return text
 
     @property
     def owns(self) -> bool:
@@ -123,11 +140,8 @@ def read_users(path: Path) -> tuple[Proxy, dict[str, User]]:
     root = path.resolve().parent
     if wrong := next(_wrong(found, root), None):
         raise ConfigError(f"{path}: {wrong}")
-    if os.name == "posix" and path.stat().st_mode & stat.S_IROTH:
-        raise ConfigError(
-            f"{path}: everybody on this computer may read it, and the proxy's secret with it: "
-            "chmod o-r"
-        )
+    if os.name == "posix":
+        _refuse_open_to_all(path)
     return found.proxy, {
         user.name: User(
             name=user.name,
@@ -139,6 +153,26 @@ def read_users(path: Path) -> tuple[Proxy, dict[str, User]]:
         )
         for user in found.users
     }
+
+
+def _refuse_open_to_all(path: Path) -> None:
+    """Refuse a file that everybody may read, or change, or put another in the place of."""
+    if path.stat().st_mode & stat.S_IROTH:
+        raise ConfigError(
+            f"{path}: everybody on this computer may read it, and the proxy's secret with it: "
+            "chmod o-r"
+        )
+    if path.stat().st_mode & stat.S_IWOTH:
+        raise ConfigError(
+            f"{path}: everybody on this computer may write it, and give themselves any role: "
+            "chmod o-w"
+        )
+    folder = path.resolve().parent
+    mode = folder.stat().st_mode
+    if mode & stat.S_IWOTH and not mode & stat.S_ISVTX:  # in /tmp only the owner may
+        raise ConfigError(
+            f"{folder}: everybody on this computer may put another {path.name} there: chmod o-w"
+        )
 
 
 def _wrong(found: Users, root: Path) -> Iterator[str]:
@@ -154,6 +188,9 @@ def _wrong(found: Users, root: Path) -> Iterator[str]:
         where = f"users: {user.name!r}"
         if names.count(user.name) > 1:
             yield f"{where} is there twice"
+        # A proxy may write a name in either; nobody is taken for another.
+        if (other := user.name.encode().decode("latin-1")) != user.name and other in names:
+            yield f"{where} in UTF-8 is {other!r} in Latin-1, which is there too"
         for key, room in _ROOM_OF.items():
             if getattr(user, key) and room not in _ROOMS[user.role]:
                 yield f"{where}: a {user.role} has no {key}; take it away, or give another role"
@@ -165,6 +202,9 @@ def _wrong(found: Users, root: Path) -> Iterator[str]:
 def place_name(place: Place) -> str:
     """Return what to call a place: of a database its name, never who opens it with which word."""
     if isinstance(place, str):
-        parts = urlsplit(place)
+        try:
+            parts = urlsplit(place)
+        except ValueError:  # a bracket that is not closed; to open it says what is wrong
+            return place.partition("://")[0]
         return parts.path.strip("/") or parts.hostname or parts.scheme
     return place.name or str(place)

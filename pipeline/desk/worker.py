@@ -9,6 +9,7 @@ import os
 import queue
 import sys
 import threading
+import traceback
 from collections.abc import Callable
 from typing import Any
 
@@ -16,7 +17,9 @@ from pipeline.desk.jobs import MEMORY
 from pipeline.desk.tasks import TASKS
 from pipeline.errors import PipelineError
 from pipeline.garbage import collect_seldom
-from pipeline.processes import limit_memory
+from pipeline.processes import limit_memory, lines_sent
+
+_LONGEST = 300  # characters of what is said of a fault
 
 
 def main() -> None:
@@ -48,10 +51,14 @@ def answer(task: bytes, say: Callable[..., None]) -> None:
         say(failed="needs more memory than allowed")
     except OSError as error:
         say(failed=f"{error.filename or ''}: {error.strerror or error}".lstrip(": "))
+    except Exception as error:  # a fault of our own costs this task, not the process
+        traceback.print_exc()
+        what = f"{type(error).__name__}: {error}"[:_LONGEST]
+        say(failed=f"cartlab itself failed ({what}); please report it")
 
 
 def _listen(tasks: "queue.SimpleQueue[bytes]") -> None:
-    for line in sys.stdin.buffer:
+    for line in lines_sent():
         tasks.put(line)
     os._exit(0)  # whatever is under way: files are written whole or not at all
 

@@ -50,7 +50,9 @@ _TO_STATE = {  # what a file does not tell
 }
 _NO_NAME = re.compile(r"[^\w.-]+", re.ASCII)
 
-State = Literal["new", "completed", "there", "copy", "unknown", "broken", "missing", "not_read"]
+State = Literal[
+    "new", "completed", "there", "copy", "unknown", "broken", "missing", "refused", "not_read"
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +64,8 @@ class Found:
     file : below the submission's folder.
     state : its table is new, completed or was there; or there is none, for it is a copy of another
         file, or nothing tells what it is; or it cannot be read, or has a table and is not there;
-        or it is not read, for it is no recording by its name, or lies beside `data/`.
+        or no table can name it; or it is not read, for it is no recording by its name, or lies
+        beside `data/`.
     experiment : the id of its table; "" without one.
     carts : that were free, as far as the file tells; () all.
     inspection : None where the file cannot be read.
@@ -88,24 +91,21 @@ class Found:
 def data_files(folder: Path) -> list[str]:
     """Return the recordings in `data/`, as they stand in `submission.toml`."""
     found = data_files_in(folder / "data")
-    return [
-        name
-        for path in found
-        if outside(folder, name := path.relative_to(folder).as_posix()) is None
-    ]
+    names = [path.relative_to(folder).as_posix() for path in found]
+    return [name for name in names if outside(folder, name) is None]
 
 
 def passed_over(folder: Path, *, named: Collection[str] = ()) -> list[Found]:
     """Return the files of a submission that are not looked into; those `named` have a table."""
     if problem := leaves(folder, "data"):  # what is there is nobody's business here
-        return [Found(file="data", state="broken", remarks=(problem,))]
+        return [Found(file="data", state="refused", remarks=(problem,))]
     names = [path.relative_to(folder).as_posix() for path in data_files_in(folder / "data")]
     closed = [one for name in names if name not in named and (one := refused(folder, name))]
     others = [
         *files_not_read(folder / "data", root=folder),
         *recordings_beside(folder, named=named),
     ]
-    listed: list[tuple[State, list[NotRead]]] = [("broken", closed), ("not_read", others)]
+    listed: list[tuple[State, list[NotRead]]] = [("refused", closed), ("not_read", others)]
     return [
         Found(file=one.file, state=state, remarks=(one.reason,), advice=one.advice)
         for state, ones in listed

@@ -63,12 +63,8 @@ def refused(root: Path, name: str) -> NotRead | None:
     problem = outside(root, name)
     if problem is None:
         return None
-    if (root / name).is_symlink():
-        advice = "put the file itself here in place of the link"
-    elif not name.isprintable():
-        advice = "rename it, in letters and digits"
-    else:
-        advice = ""
+    link = (root / name).is_symlink()
+    advice = "put the file itself here in place of the link" if link else ""
     shown = name if name.isprintable() else name.encode("unicode_escape").decode("ascii")
     return NotRead(file=shown, reason=problem, advice=advice)
 

@@ -3,6 +3,7 @@
 import errno
 import re
 import stat
+import unicodedata
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from decimal import Decimal
@@ -37,6 +38,7 @@ _MOST_DIGITS = 1_000
 _MOST_SHOWN = 30_000  # characters of the notes: fifteen pages
 _MOST_LOOKED_AT = 1_000  # files and folders, for the one that may be meant
 COMMENT = re.compile(r"<!--.*?(?:-->|\Z)", re.DOTALL)  # one left open runs to the end
+_HIDDEN = "it has a character that does not show: rename the file"
 _SYSTEM_COLUMNS = ("time", "input", "reference", "frequency")
 
 
@@ -330,7 +332,7 @@ def leaves(folder: Path, name: str) -> str | None:
     """Return why `name` stands for no file inside `folder`, or None; it need not be there."""
     shown = quote(name)
     if not name.strip() or not name.isprintable():
-        hint = "" if name.isprintable() else f"; {BACKSLASH}"
+        hint = "" if name.isprintable() else f"; {BACKSLASH if _typed(name) else _HIDDEN}"
         return f"expected a file name, found {shown}{hint}"
     windows, relative = PureWindowsPath(name), Path(posix(name))
     if windows.drive or windows.root or relative.is_absolute() or ".." in windows.parts:
@@ -341,6 +343,11 @@ def leaves(folder: Path, name: str) -> str | None:
         if linked and not steps[0].resolve().is_relative_to(folder.resolve()):
             return f"{shown} leaves the submission folder through a link"
     return None
+
+
+def _typed(name: str) -> bool:
+    """Whether its characters that do not show may be what a backslash in quotes makes."""
+    return all(c.isprintable() or unicodedata.category(c) == "Cc" for c in name)
 
 
 def _may_be_link(path: Path) -> bool:

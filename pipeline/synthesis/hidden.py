@@ -12,7 +12,13 @@ import numpy as np
 from pipeline.errors import ConfigError
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.simulate import simulate_linear
-from pipeline.plant.nonlinear.effects import Effect, Parameter, Term, find_effect
+from pipeline.plant.nonlinear.effects import (
+    AugmentedChain,
+    Effect,
+    Parameter,
+    Term,
+    find_effect,
+)
 from pipeline.plant.nonlinear.effects.base import Scales, chain_scales
 from pipeline.submission.complaints import nearest, quote
 from pipeline.submission.toml_file import read_text
@@ -23,7 +29,10 @@ _RING = 6.0  # periods of the slowest motion: the first swings are the largest
 _PER_CM = {"cm": 1.0, "mm": 10.0, "m": 0.01, "in": 1 / 2.54, "count": 1 / COUNT}
 _INPUT_LIMIT = 5.0  # input units
 _MOST_BYTES = 10_000_000  # of a file with a model
-_SLOWEST, _FASTEST = 0.01, 1e4  # rad/s of a model's slowest motion: ten minutes, a sample
+_SLOWEST, _FASTEST = 0.01, 1e4  # rad/s of a model's motions: ten minutes; far beyond any sampling
+# Sizes beyond any physical number in any unit, yet safe to multiply.
+_SMALLEST, _LARGEST = 1e-30, 1e30
+_SHORTEST_STEP = 1e-5  # s of the simulator: a session then takes half an hour to simulate
 _INPUT_RESERVE = 4.0  # times the input that holds a cart at its travel
 
 
@@ -79,7 +88,13 @@ def prepare_bench(
 
 
 def write_bench(folder: Path, bench: HiddenBench, *, seed: int, reported: bool = False) -> None:
-    """Write the submission of students who measured this bench; nothing in it names an effect."""
+    """Write the submission of students who measured this bench; nothing in it names an effect.
+
+    Raises
+    ------
+    ConfigError : the simulation would never end.
+    """
+    refuse_endless(bench)
     write_submission(
         folder,
         chain=bench.chain,
@@ -93,6 +108,21 @@ def write_bench(folder: Path, bench: HiddenBench, *, seed: int, reported: bool =
         input_limit=bench.input_limit,
         reported=reported,
     )
+
+
+def refuse_endless(bench: HiddenBench) -> None:
+    """Refuse effects so stiff, or masses so small, that no simulation of them would end."""
+    if not bench.effects:
+        return
+    from pipeline.plant.nonlinear.augmented import SteppedBench
+
+    model = AugmentedChain(chain=bench.chain, terms=bench.effects)
+    step = SteppedBench(model, x0=np.zeros(bench.chain.n)).shortest_step
+    if step < _SHORTEST_STEP:
+        raise ConfigError(
+            f"{bench.name}: with these effects a simulation needs steps of {step:.1g} s, and "
+            f"{_SHORTEST_STEP:g} s is the least: a stiffness is too large, or a mass too small"
+        )
 
 
 def usual_term(effect: Effect, chain: Chain, *, travel: float = 1.0) -> Term:
@@ -154,6 +184,10 @@ def _number(text: str, *, where: str) -> float:
         value = math.nan
     if not math.isfinite(value):
         raise ConfigError(f"{where} needs a number, found {quote(text)}")
+    if value and not _SMALLEST <= abs(value) <= _LARGEST:
+        raise ConfigError(
+            f"{where}: expected 0 or a size of {_SMALLEST:g} to {_LARGEST:g}, found {value:g}"
+        )
     return value
 
 
@@ -314,11 +348,16 @@ def _chain(entry: object, *, where: str) -> Chain:
     numbers = np.concatenate([chain.m, chain.c, chain.k])
     if not (np.all(np.isfinite(numbers)) and np.all(chain.m > 0) and np.all(numbers >= 0)):
         raise ConfigError(f"{where}: m must be positive, c and k at least zero")
-    with np.errstate(over="ignore"):  # what runs over is refused
-        slowest = float(np.abs(chain.poles).min())
-    if not _SLOWEST <= slowest <= _FASTEST:
+    sizes = numbers[numbers > 0]
+    if sizes.min() < _SMALLEST or sizes.max() > _LARGEST:
         raise ConfigError(
-            f"{where}: its slowest motion has {slowest:.3g} rad/s; "
+            f"{where}: expected sizes of {_SMALLEST:g} to {_LARGEST:g}, found {sizes.min():.3g} to "
+            f"{sizes.max():.3g}"
+        )
+    motions = np.abs(chain.poles)
+    if not _SLOWEST <= motions.min() <= motions.max() <= _FASTEST:
+        raise ConfigError(
+            f"{where}: its motions have {motions.min():.3g} to {motions.max():.3g} rad/s; "
             f"{_SLOWEST:g} to {_FASTEST:g} can be run on a bench"
         )
     return chain
@@ -345,6 +384,11 @@ def _stored_effect(entry: object, bench: HiddenBench, *, where: str) -> Term:
     at = _mapping(fields.get("where", {}), where=f"{where}.where").get(effect.place, 0)
     place = _place(effect, bench.chain, _number(str(at), where=f"{where}.where"), where=where)
     usual = default_values(effect, bench.chain, place=place, travel=bench.travel)
+    for parameter in effect.parameters:  # that the model has, not one that a fit cannot give
+        size = values.get(parameter.name, 1.0)
+        unsigned = not (parameter.signed or parameter.side)
+        if unsigned and (size < 0.0 or (size == 0.0 and parameter.lower > 0.0)):
+            raise ConfigError(f"{where}: {parameter.name} must be positive, found {size:g}")
     return _term(effect, place, usual | values)
 
 

@@ -33,8 +33,13 @@ class Served:
         )
         self._server = Server(config)
         self._thread = threading.Thread(
-            target=self._server.run, kwargs={"sockets": [listener]}, daemon=True
+            target=self._server.run, kwargs={"sockets": [listener]}, name="server", daemon=True
         )
+
+    @property
+    def runs(self) -> bool:
+        """Whether it serves."""
+        return self._thread.is_alive()
 
     def start(self) -> bool:
         """Serve; tell whether it does."""

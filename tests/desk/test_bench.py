@@ -1,11 +1,14 @@
 """The bench's room, over plain forms: a plan, a session, its buttons, its end."""
 
+import http.client
 import json
 import re
 import signal
 import subprocess
 import sys
 import threading
+from collections import Counter
+from contextlib import ExitStack
 from pathlib import Path
 from urllib.parse import urlencode
 
@@ -65,6 +68,27 @@ def test_a_plan_is_proposed_and_a_session_recorded_and_stopped(tmp_path, real):
     assert ended["ended"] == "stopped"
     assert (work / "data" / "long.partial.txt").exists()
     assert load_submission(work).experiments == ()
+
+
+def test_many_viewers_stop_nobody(tmp_path, real):
+    """Of sixty who watch, eight see the session and the others are told at once; pages open."""
+    work = write_work(tmp_path / "team", [sine("long", seconds=300)])
+    with DeskServer(folder=work) as server, ExitStack() as streams:
+        visitor = Visitor.of(server.url)
+        begun(visitor, work, "long", port=real.address)
+        until(lambda: 'id="positions"' in visitor.get("/bench/0/").text)
+        answers = []
+        for _ in range(60):
+            connection = http.client.HTTPConnection("127.0.0.1", visitor.port, timeout=PATIENCE)
+            streams.callback(connection.close)
+            connection.request("GET", "/bench/0/events", headers=visitor.headers)
+            answers.append(connection.getresponse())
+        assert visitor.get("/student/0/").status == 200
+        assert Counter(answer.status for answer in answers) == {200: 8, 503: 52}
+        watched = [answer for answer in answers if answer.status == 200]
+        assert all(answer.readline() == b"event: state\n" for answer in watched)
+        assert visitor.post("/bench/0/press", wish="stop", number="0").status == 204
+        assert all(b"event: ended\n" in answer.read() for answer in watched)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows ends no program so")

@@ -1,10 +1,12 @@
 """What `cartlab desk` cannot do is one line; what it opens by itself."""
 
+from urllib.parse import urlsplit
+
 import pytest
 
 from pipeline.desk.app import DeskServer
 from tests.helpers.commandline import cartlab_here
-from tests.helpers.desks import Visitor, a_submission
+from tests.helpers.desks import Visitor, a_submission, through_proxy, write_users
 
 USERS = '[proxy]\naddress = "127.0.0.1"\nheader = "X-Name"\nsite = "http://lab"\n'
 USERS += f'secret_header = "X-Secret"\nsecret = "{"s" * 24}"\n'
@@ -50,3 +52,37 @@ def test_what_is_opened_is_known_by_what_lies_in_it(tmp_path):
         home = visitor.get("/").text
         assert "/grades/0/" in home
         assert "/student/0/" in home
+
+
+ADDRESSES = (
+    "postgresql://[::1", "postgresql://[::1]:port/db", "postgresql://h:99999999/db", "mysql://[",
+    "postgresql://127.0.0.1:1/%00", "postgresql://127.0.0.1:1/x?options=%00", "http://x", "://",
+    "sqlite:///%00", "sqlite:///a\0b", "sqlite://[::1]", "sqlite://@@", "sqlite://h:port/db",
+    "sqlite:///nowhere.sqlite", "sqlite:///x?timeout=soon", "sqlite://", "sqlite:///:memory:",
+    "sqlite+:///x", "é://[::1", "/dev/null/x", "/proc/x", "\0", "~nobody-here/x", "x" * 5000,
+)  # fmt: skip
+
+
+def test_no_address_is_a_fault_of_the_desk(tmp_path, monkeypatch):
+    """One that makes no sense is refused with what to write, and leaves nothing behind."""
+    monkeypatch.chdir(tmp_path)
+    with DeskServer() as server:
+        visitor = Visitor.of(server.url)
+        for typed in ADDRESSES:
+            assert visitor.post("/open", folder=typed).status == 422, typed
+            assert visitor.get("/").status == 200, typed
+        page = visitor.post("/open", folder="postgresql://[::1").text
+        assert "write postgresql://NAME@HOST/DATABASE" in page
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_listed_address_that_makes_no_sense_shows_the_other_rooms(tmp_path):
+    """A TA sees the home page whatever their list says; the bad gradebook says what is wrong."""
+    (tmp_path / "grades").mkdir()
+    books = '["postgresql://[::1", "grades"]'
+    users = f'[[users]]\nname = "ta"\nrole = "ta"\ngradebooks = {books}\n'
+    file = write_users(tmp_path, users)
+    with DeskServer(host="127.0.0.1", users=file) as server:
+        visitor = through_proxy(urlsplit(server.url).port or 0, "ta")
+        assert "/grades/1/" in visitor.get("/").text
+        assert visitor.get("/grades/0/").status == 422

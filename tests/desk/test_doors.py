@@ -64,6 +64,16 @@ def test_nobody_gets_in_without_the_cookie(visitor, path):
         assert stranger.post(path).status == 403
 
 
+def test_another_cookie_of_the_same_name_locks_nobody_out(visitor):
+    """Any page of this computer may set one: before or behind the real one, it is let in."""
+    real = visitor.headers["Cookie"]
+    other = f"cartlab-{visitor.port}=guess"
+    for sent in (f"{other}; {real}", f"{real}; {other}", f"a=b; {other}; {other}x; {real}"):
+        assert Visitor(port=visitor.port, headers={"Cookie": sent}).get("/").status == 200
+    sent = f"{other}; {other}x"
+    assert Visitor(port=visitor.port, headers={"Cookie": sent}).get("/").status == 403
+
+
 def test_other_pages_cannot_ask(visitor):
     """A foreign name, an origin that is none of ours, a browser's word that it is another page."""
     port = visitor.port
@@ -185,6 +195,20 @@ def lab(root):
         yield lambda name, **given: through_proxy(port, name, **given)
 
 
+@pytest.mark.parametrize("name", ["José Müller", "学生七"])
+def test_a_name_may_come_in_utf_8_or_in_latin_1(name, tmp_path):
+    """As the proxy writes it; a name that is not listed is let in by neither."""
+    a_submission(tmp_path / "one")
+    users = f'[[users]]\nname = "{name}"\nrole = "student"\nfolders = ["one"]\n'
+    with DeskServer(users=write_users(tmp_path, users)) as server:
+        port = urlsplit(server.url).port or 0
+        utf_8 = name.encode().decode("latin-1")
+        for sent in {utf_8, name} if name.isascii() or "é" in name else {utf_8}:
+            assert through_proxy(port, sent).get("/student/0/").status == 200
+        for other in (f"{utf_8}x", utf_8[:-1], "Jos\xc3", utf_8.encode().decode("latin-1")):
+            assert through_proxy(port, other).get("/student/0/").status == 403
+
+
 def test_everybody_sees_their_own(lab):
     """A student's address of the same form is another folder; beyond their own there is none."""
     assert "one" in lab("s1").get("/student/0/").text
@@ -213,6 +237,30 @@ def test_a_form_outlasts_what_a_class_saves_meanwhile(lab, root):
     answer = lab("s1").post("/student/0/save", seen=seen, **shown | {"title": "Mine"})
     rows = re.findall(r'<tr><th scope="row">.*?<pre>(.*?)</pre>.*?<pre>(.*?)</pre>', answer.text)
     assert (answer.status, rows) == (409, [("Mine", shown["title"])])
+
+
+def test_students_and_tas_are_told_no_folder_of_the_server(lab, root):
+    """On no page, in no refusal and in no news of their work; an instructor is told."""
+    plain = (root / "three" / "submission.toml").read_bytes()
+    (root / "three" / "report").symlink_to(root)  # a report there is refused
+    try:
+        said = [lab(name).get(path).text
+                for name, paths in (("s1", ("", "report")), ("s2", ("", "report")))
+                for path in (f"/student/0/{path}" for path in paths)]  # fmt: skip
+        said += [lab("s2").get("/").text, lab("t").get("/grades/0/").text, lab("t").get("/").text]
+        assert lab("s2").post("/student/1/make-report").status == 303
+        news = lab("s2").get("/student/1/events").text
+        assert "is a link" in news
+        said += [news, lab("s2").get("/student/1/").text]
+        (root / "three" / "submission.toml").write_bytes(b"x = [")
+        said += [lab("s2").get("/student/1/").text]
+        said += [lab("s2").post("/student/1/fill").text, lab("s2").get("/student/1/").text]
+    finally:
+        (root / "three" / "report").unlink()
+        (root / "three" / "submission.toml").write_bytes(plain)
+    assert not [text for text in said if str(root) in text or str(root.resolve()) in text]
+    assert '<p class="kicker">one</p>' in said[0]
+    assert str(root / "one") in lab("i").get("/student/0/").text
 
 
 def test_a_ta_sees_the_gradebooks_they_are_listed_for(lab):
@@ -337,6 +385,10 @@ def test_forged_names_are_refused(lab):
         (PROXY + '[[users]]\nname = "t"\nrole = "ta"\nworkshop = "one"\n', "a ta has no workshop"),
         (PROXY + '[[users]]\nname = "s"\nrole = "student"\nports = ["COM3"]\n', "no ports"),
         ((PROXY + USERS).replace('"s2"', '"s1"'), "there twice"),
+        (
+            (PROXY + USERS).replace('"s1"', '"ü"').replace('"s2"', '"Ã¼"'),
+            "in UTF-8 is 'Ã¼' in Latin-1, which is there too",
+        ),
         ((PROXY + USERS).replace("folders", "folder", 1), "did you mean 'folders'"),
         ((PROXY + USERS).replace("https://Lab.example.edu", "lab"), "site"),
     ],
@@ -359,6 +411,23 @@ def test_a_secret_that_everybody_may_read_is_none(tmp_path):
     path.chmod(0o644)
     with pytest.raises(ConfigError, match="chmod o-r"):
         read_users(path)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has other rights")
+def test_a_list_that_everybody_may_change_is_none(tmp_path):
+    """Neither the file nor the folder in which another could be put in its place."""
+    folder = tmp_path / "desk"
+    folder.mkdir()
+    path = write_users(folder, '[[users]]\nname = "s1"\nrole = "student"\n')
+    path.chmod(0o602)
+    with pytest.raises(ConfigError, match=r"users.toml: everybody .* may write it.*chmod o-w"):
+        read_users(path)
+    path.chmod(0o600)
+    folder.chmod(0o777)
+    with pytest.raises(ConfigError, match=r"may put another users\.toml there"):
+        read_users(path)
+    folder.chmod(0o1777)  # there, as in /tmp, a file is only its owner's to replace
+    assert read_users(path)[0].header == "X-Remote-User"
 
 
 def test_a_stranger_s_clock_runs(server):

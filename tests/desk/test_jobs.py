@@ -11,8 +11,9 @@ import pytest
 
 from pipeline.desk.app import DeskServer
 from pipeline.desk.jobs import _HANDS, _WAITING, Busy, Failed, Hand, Jobs
+from pipeline.processes import LineProcess
 from tests.helpers.desks import Visitor, a_submission, some_files, wrongs
-from tests.helpers.waiting import until
+from tests.helpers.waiting import PATIENCE, until
 
 HERE = "/student/0/"
 
@@ -165,6 +166,54 @@ def test_a_file_that_ends_the_process_costs_its_own_row(tmp_path):
         assert len(rows) == 3
         (tmp_path / "data" / "large.csv").unlink()
         assert "the process ended" not in visitor.get(HERE).text
+
+
+def test_a_fault_costs_its_task_and_not_the_process(tmp_path):
+    """What went wrong is said, with its kind; the same process does the next task."""
+    hand = Hand()
+    with pytest.raises(Failed, match=r"cartlab itself failed \(TypeError: .*please report it"):
+        hand.do("plan", folder=str(tmp_path), stock=True, nonsense=1)
+    process = hand._free.get()
+    assert process is not None
+    assert "Traceback" in process.said()
+    hand._free.put(process)
+    assert hand.do("files", folder=str(tmp_path)) == []
+    assert process.runs
+    hand.close()
+
+
+@pytest.mark.parametrize(
+    ("module", "line"),
+    [
+        ("pipeline.desk.worker", b"no json\n"),
+        ("pipeline.desk.bench.process", b'{"folder": ".", "explore": [[], 7]}\n'),
+    ],
+)
+def test_who_dies_of_an_exception_got_no_signal(module, line):
+    """The words are those of the exception: Python ends while a thread waits for more to do."""
+    process = LineProcess(module)
+    try:
+        process.send(line)
+        while process.line(timeout=PATIENCE):
+            pass
+        said = process.last_words()
+    finally:
+        process.close()
+    assert re.match(r"the process ended \(exit status 1\) \S*Error", said), said
+
+
+def test_a_job_whose_thread_fails_is_over(jobs, monkeypatch, tmp_path):
+    """Nobody waits for ever for a job that could not be begun, whatever kept it."""
+
+    def no_more(module: str) -> LineProcess:
+        raise MemoryError("no more")
+
+    raised = []
+    monkeypatch.setattr(threading, "excepthook", raised.append)
+    monkeypatch.setattr("pipeline.desk.jobs.LineProcess", no_more)
+    job = jobs.start("report", title="The report", place=tmp_path, folder=str(tmp_path))
+    until(lambda: job.over and raised)
+    assert (job.state, job.said) == ("failed", "the desk itself failed (MemoryError: no more)")
 
 
 def test_who_serves_is_gone_and_so_is_the_work(tmp_path):

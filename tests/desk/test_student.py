@@ -18,6 +18,7 @@ import pytest
 
 from pipeline.desk.app import DeskServer
 from pipeline.desk.jobs import Failed, Hand
+from pipeline.desk.last_report import sources
 from pipeline.desk.state import Desk
 from pipeline.desk.student import files as uploads
 from pipeline.desk.student.files import take_uploads
@@ -66,12 +67,26 @@ def take_upload(name: str, content: io.BytesIO, folder: Path, *, hand: Hand) -> 
 
 def ask_for(folder: Path, *ids: str) -> tuple[str, ...]:
     """Leave a report that asks questions."""
-    (folder / "report").mkdir()
+    (folder / "report").mkdir(exist_ok=True)
     (folder / "report" / "report.html").write_text("<p>the report</p>", encoding="utf-8")
+    (folder / "report" / "report.pdf").write_bytes(b"%PDF")
     asked = [{"id": id_, "text": "Why?"} for id_ in ids]
-    told = json.dumps({"questions": asked, "failed": [], "changes": ""})
-    (folder / "report" / "questions.json").write_text(told, encoding="utf-8")
+    told = {"questions": asked, "failed": [], "changes": "", "made_of": sources(folder)}
+    (folder / "report" / "questions.json").write_text(json.dumps(told), encoding="utf-8")
     return ids
+
+
+def handed_in(visitor: Visitor) -> str:
+    """Press "Hand in", wait for the report; return the page that shows what is handed in."""
+    answer = visitor.post(HERE + "hand-in")
+    assert (answer.status, answer.headers["location"]) == (303, HERE + "hand-in")
+    until(lambda: "data-events" not in visitor.get(HERE + "hand-in").text)
+    return unescape(visitor.get(HERE + "hand-in").text)
+
+
+def zipped(visitor: Visitor) -> zipfile.ZipFile:
+    """Return the zip."""
+    return zipfile.ZipFile(io.BytesIO(visitor.get(HERE + "hand-in.zip").body))
 
 
 def test_from_an_empty_folder_to_the_zip(room):
@@ -113,7 +128,16 @@ def test_from_an_empty_folder_to_the_zip(room):
     assert (folder / "notes.md").read_text(encoding="utf-8").endswith("## zeta\n\nSo.\nAnd so.\n")
     assert "And so.</textarea>" in visitor.get(HERE + "report").text
 
+    before = visitor.get(HERE + "report/report.pdf").body
+    seen = visitor.get(HERE).value("seen")
+    assert visitor.post(HERE + "save", seen=seen, **{"reported.final.K": "29.13"}).status == 303
+    assert "The report is out of date" in visitor.get(HERE).text
+    assert "report/report.pdf" not in zipped(visitor).namelist()  # nobody hands in a stale one
+    assert "The report in the zip is of the files and answers as they are now" in handed_in(visitor)
+    assert "29.13" in visitor.get(HERE + "report/report.html").text
     packed = visitor.get(HERE + "hand-in.zip")
+    new = zipfile.ZipFile(io.BytesIO(packed.body)).read("report/report.pdf")
+    assert new == visitor.get(HERE + "report/report.pdf").body != before
     names = set(zipfile.ZipFile(io.BytesIO(packed.body)).namelist())
     files = {f"data/{name}" for name, _ in some_files()}
     assert names == files | {NAME, "notes.md", "report/report.pdf"}
@@ -208,6 +232,28 @@ def test_a_recording_is_moved_aside_and_comes_back(filled):
     assert (folder / named).is_file()
 
 
+@pytest.mark.parametrize("packed", [True, False])
+def test_a_name_that_does_not_show_is_stored_under_one_that_does(room, packed):
+    """Blanks of all sorts and marks without a picture: replaced, said, and the file is used."""
+    visitor, folder = room
+    raw, marks = some_files()[0][1], "\u00a0\u200b\u202f\ufeff"
+    sent = [(f"a{mark}b.csv", raw + b"\n" * i) for i, mark in enumerate(marks)]
+    if packed:
+        archive = io.BytesIO()
+        with zipfile.ZipFile(archive, "w") as file:
+            for name, content in sent:
+                file.writestr(name, content)
+        sent = [("all.zip", archive.getvalue())]
+    assert visitor.upload(HERE + "files", sent).status == 303
+    page = unescape(visitor.get(HERE).text)
+    names = ["a-b.csv", "a-b-2.csv", "a-b-3.csv", "a-b-4.csv"]
+    assert sorted(path.name for path in (folder / "data").iterdir()) == sorted(names)
+    said = "'a\\xa0b.csv': taken as a-b.csv; no name may have characters that do not show"
+    assert said in page
+    assert {e.file for e in load_submission(folder).experiments} <= {f"data/{n}" for n in names}
+    assert all(f"{name}<small>" in page for name in names)
+
+
 @pytest.mark.parametrize("named", [True, False])
 def test_moving_aside_waits_its_turn_before_it_looks(filled, named):
     """Whether a table names it by then, or it is gone: one clear sentence, and nothing moves."""
@@ -242,24 +288,88 @@ def test_handing_in_warns_of_open_questions(filled):
         page = visitor.get(HERE).text
         assert bool(re.search(r"have not answered", page)) == bool(open_)
         assert open_ in page
-        assert "hand-in.zip" in page
+        assert f'action="{HERE}hand-in"' in page
 
 
-def test_the_page_says_what_the_zip_holds(filled):
-    """A report and notes where there are any, and nothing else."""
+@pytest.mark.parametrize("change", ["number", "answer", "older", "gone", "gap", "nothing"])
+def test_handing_in_says_when_the_report_is_out_of_date(change, filled):
+    """Whatever was changed since, by whom and to what date; the zip goes without that report."""
     visitor, folder = filled
+    ask_for(folder, "zeta")
+    file = folder / load_submission(folder).experiments[0].file
+    if change == "number":
+        seen = visitor.get(HERE).value("seen")
+        visitor.post(HERE + "save", seen=seen, **{"reported.final.K": "1.25"})
+    elif change == "answer":
+        seen = visitor.get(HERE + "report").value("seen")
+        visitor.post(HERE + "answer", id="zeta", answer="So.", seen=seen)
+    elif change == "older":
+        file.write_bytes(file.read_bytes() + b"\n")
+        os.utime(file, (1e9, 1e9))
+    elif change == "gone":
+        (file.parent / "unlisted.csv").write_bytes(b"")
+        ask_for(folder, "zeta")
+        (file.parent / "unlisted.csv").unlink()
+    elif change == "gap":
+        (folder / "gap").mkdir()
+        (folder / "gap" / "gap.json").write_text("{}", encoding="utf-8")
+    for page in (visitor.get(HERE).text, visitor.get(HERE + "hand-in").text):
+        assert ("The report is out of date" in page) == (change != "nothing")
+    assert ("report/report.pdf" in zipped(visitor).namelist()) == (change == "nothing")
+
+
+def test_what_is_handed_in_is_shown_before(filled):
+    """What the zip holds, the questions without an answer, what was assumed; then the zip."""
+    visitor, folder = filled
+    text = (folder / NAME).read_text(encoding="utf-8")
+    bare = re.sub(r"(?m)^(springs|input|position) = .*\n", "", text)
+    (folder / NAME).write_text(bare, encoding="utf-8")
     (folder / "notes.md").unlink(missing_ok=True)
+    page = handed_in(visitor)
+    names = re.findall(r'<tr><th scope="row">(.*?)</th><td>([\d,]+)</td>', page)
+    with zipped(visitor) as archive:
+        held = {info.filename: f"{info.file_size:,}" for info in archive.infolist()}
+    assert dict(names) == held
+    assert "report/report.pdf" in held
+    taken = re.findall(r"<li><code>(.*?)</code>(.*?)</li>", page)
+    assert {key for key, _ in taken} >= {"system.springs", "system.position.unit",
+                                         "system.input.unit", "system.input.sign"}  # fmt: skip
+    assert dict(taken)["system.position.unit"].startswith(": count")
+    asked = json.loads((folder / "report" / "questions.json").read_bytes())["questions"]
+    assert page.count(f'href="{HERE}report#question-') == len(asked)
 
-    def said() -> str:
-        told = re.search(r"It holds [^<]*", visitor.get(HERE).text)
-        assert told
-        return told[0]
 
-    assert ("notes" in said(), "No report has been made yet." in said()) == (False, True)
+def test_what_the_results_list_as_assumed_is_shown(filled):
+    """With the reason; what was stated is not among it."""
+    visitor, folder = filled
     ask_for(folder)
-    (folder / "report" / "report.pdf").write_bytes(b"%PDF")
-    (folder / "notes.md").write_text("Short.", encoding="utf-8")
-    assert said() == f"It holds {NAME}, the files that it names, your notes and the report."
+    common = {"support": "open", "found": None, "found_std": None, "experiments": []}
+    listed = [
+        {"key": "system.springs", "about": "wall-1", "value": True, "origin": "default",
+         "reason": "no step tells", **common},
+        {"key": "system.input.sign", "about": "", "value": -1, "origin": "data",
+         "reason": "all steps go down", **common},
+        {"key": "system.position.unit", "about": "", "value": "cm", "origin": "stated",
+         "reason": "", **common},
+    ]  # fmt: skip
+    results = json.dumps({"assumptions": listed})
+    (folder / "report" / "results.json").write_text(results, encoding="utf-8")
+    page = visitor.get(HERE + "hand-in").text
+    taken = re.findall(r"<li><code>(.*?)</code>(.*?)</li>", page)
+    assert taken == [
+        ("system.springs", ", wall-1: there (no step tells)"),
+        ("system.input.sign", ": -1 (all steps go down)"),
+    ]
+
+
+def test_a_report_that_cannot_be_made_keeps_nobody_from_handing_in(filled):
+    """What went wrong is said; the zip goes without one."""
+    visitor, folder = filled
+    (folder / "report").symlink_to(folder.parent)
+    page = handed_in(visitor)
+    assert "is a link" in page
+    assert "No report has been made: the zip goes without one." in page
+    assert "report/report.pdf" not in zipped(visitor).namelist()
 
 
 def test_a_recording_dropped_under_two_names_is_said_to_be_a_copy(room):

@@ -3,7 +3,12 @@
 import csv
 import io
 import json
+import os
+import re
+import sqlite3
+import stat
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -184,6 +189,73 @@ def test_a_class_that_nobody_could_be_graded_of(run, tmp_path):
     status, _, err = run("grade", tmp_path / "c", "--rubric", "throne-2dof", "--out", inside)
     assert (status, inside.exists()) == (2, False)
     assert "is in a submission; name a folder outside of it" in err
+
+
+def test_an_anonymous_grading_names_nobody_on_stderr(run, tmp_path, monkeypatch):
+    """Neither while it works, nor in reasons, remarks or changes since the class list before."""
+    monkeypatch.setattr("pipeline.cli.common.FIRST_WORD", 0.001)
+    names = ["doe-jane", "roe-richard", "poe-anna", "moe-max"]
+    toml = 'version = 1\n[[authors]]\nid = "{name}"\n[system]\ncarts = {carts}\n'
+    for name, carts in zip(names, ("1", "1", '"two"', "1"), strict=True):
+        (tmp_path / "c" / name).mkdir(parents=True)
+        text = toml.format(name=name, carts=carts)
+        (tmp_path / "c" / name / "submission.toml").write_text(text, encoding="utf-8")
+    (tmp_path / "c" / "moe-max" / "submission.toml").unlink()
+    (tmp_path / "c" / "moe-max" / "feedback").mkdir()
+    (tmp_path / "c" / "moe-max" / "feedback" / ".made.json").write_text("{}", encoding="utf-8")
+    (tmp_path / "c" / "moe-max" / "class.html").write_text("", encoding="utf-8")
+    late, out = tmp_path / "late.csv", tmp_path / "out"
+    late.write_text("submission,days_late\ndoe-jane,2.5\nmoe-max,1\n", encoding="utf-8")
+    words = ("grade", tmp_path / "c", "--rubric", "throne-1dof", "--out", out, "--jobs", 1,
+             "--anonymous", "--no-figures", "--lateness", late)  # fmt: skip
+    said = [run(*words)[2]]
+    assert "1 folder passed over: they look like results of a grading" in said[0]
+    assert "late.csv: no such submission: 1 name" in said[0]
+    assert re.search(r"anon-\w+: anon-\w+/submission.toml: system.carts", said[0])
+    run("override", out, "roe-richard", "pieces", "1", "--why", "x", "--by", "Ada")
+    (tmp_path / "c" / "roe-richard").rename(tmp_path / "c" / "coe-richard")
+    text = toml.format(name="poe-anna", carts="1") + '[design]\nmethod = "place"\n'
+    (tmp_path / "c" / "poe-anna" / "submission.toml").write_text(text, encoding="utf-8")
+    (tmp_path / "c" / "doe-jane" / "submission.toml").unlink()
+    (tmp_path / "c" / "doe-jane").rmdir()
+    said.append(run(*words)[2])
+    assert "not in this run, kept as they were: anon-" in said[1]
+    for text in said:
+        assert not [part for name in names for part in name.split("-") if part in text], text
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has other rights")
+def test_names_and_grades_are_for_their_owner_alone(run, tmp_path):
+    """Whatever the umask: the folder, the gradebook with its journal, the key; an older one too."""
+    (tmp_path / "c" / "team-1").mkdir(parents=True)
+    (tmp_path / "c" / "team-1" / "submission.toml").write_text("version = 1\n", encoding="utf-8")
+    out = tmp_path / "new" / "out"
+    words = ("grade", tmp_path / "c", "--rubric", "throne-1dof", "--out", out, "--jobs", 1,
+             "--anonymous", "--no-figures")  # fmt: skip
+
+    def modes(*names: str) -> list[str]:
+        return [oct(stat.S_IMODE((out / name).stat().st_mode)) for name in names]
+
+    before = os.umask(0)
+    try:
+        run(*words)
+        assert modes("", "gradebook.sqlite", "anonymous-key.csv") == ["0o700", "0o600", "0o600"]
+        with closing(sqlite3.connect(out / "gradebook.sqlite", isolation_level=None)) as book:
+            for journal, beside in (("DELETE", ["-journal"]), ("WAL", ["-wal", "-shm"])):
+                book.execute(f"PRAGMA journal_mode = {journal}")
+                book.execute("BEGIN IMMEDIATE")
+                book.execute("CREATE TABLE more (x)")
+                assert modes(*(f"gradebook.sqlite{end}" for end in beside)) == ["0o600"] * len(
+                    beside
+                )
+                book.execute("ROLLBACK")
+            book.execute("PRAGMA journal_mode = DELETE")
+        (out / "gradebook.sqlite").chmod(0o664)
+        (out / "anonymous-key.csv").chmod(0o664)
+        run(*words)
+        assert modes("gradebook.sqlite", "anonymous-key.csv") == ["0o660", "0o600"]
+    finally:
+        os.umask(before)
 
 
 def test_a_survey_is_told_on_stdout(run, tmp_path):

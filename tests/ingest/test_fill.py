@@ -254,13 +254,13 @@ def test_a_table_without_its_file_is_told(tmp_path):
 
 
 def test_links_out_of_the_folder_are_not_followed(tmp_path):
-    """A link to somebody else's file is no file of the submission."""
+    """A link to somebody else's file is no file of the submission, and is named as refused."""
     put(tmp_path / "theirs", "a.csv", time=T, input=STEP, x1=RING)
     put(tmp_path / "mine", "b.csv", time=T, input=STEP, x1=RING)
     (tmp_path / "mine" / "data" / "a.csv").symlink_to(tmp_path / "theirs" / "data" / "a.csv")
     found = {one.file: one for one in fill_submission(tmp_path / "mine")}
     assert {file: one.state for file, one in found.items()} == {
-        "data/b.csv": "new", "data/a.csv": "broken",
+        "data/b.csv": "new", "data/a.csv": "refused",
     }  # fmt: skip
     refused = found["data/a.csv"]
     assert refused.inspection is None
@@ -278,6 +278,23 @@ def test_a_data_folder_that_is_a_link_tells_no_name_behind_it(tmp_path):
         fill_submission(tmp_path / "mine")
     assert "grades" not in str(told.value)
     assert "a.csv" not in str(told.value)
+
+
+@pytest.mark.parametrize("mark", ["\u202f", "\u00a0", "\u200b", "\ufeff", "\u202e"])
+def test_a_name_that_does_not_show_is_named(mark, tmp_path):
+    """`fill` says which file it passes over and why, and exits with 1; the others are filled in."""
+    put(tmp_path, "b.csv", time=T, input=STEP, x1=RING)
+    put(tmp_path, f"step{mark}1.csv", time=T, input=STEP, x1=2 * RING)
+    done = cartlab_here("fill", str(tmp_path))
+    assert done.returncode == 1
+    assert mark not in done.stdout + done.stderr
+    (line,) = [line for line in done.stdout.splitlines() if line.startswith("! ")]
+    assert f"data/step{ascii(mark)[1:-1]}1.csv" in line
+    assert "a character that does not show: rename the file" in line
+    assert [e.file for e in load_submission(tmp_path).experiments] == ["data/b.csv"]
+    (tmp_path / "data" / "b.csv").unlink()
+    with pytest.raises(ConfigError, match="does not show: rename the file"):
+        fill_submission(tmp_path)
 
 
 def test_nothing_to_fill_in_is_one_line(tmp_path):
@@ -440,7 +457,7 @@ def test_a_name_that_no_table_may_have_is_told(tmp_path, name):
         assert r"run\u" in done.stdout + done.stderr or r"run\x" in done.stdout + done.stderr
         assert "Traceback" not in done.stderr
     (other,) = [one for one in fill_submission(tmp_path) if one.file != "data/a.csv"]
-    assert (other.state, other.advice) == ("broken", "rename it, in letters and digits")
+    assert other.state == "refused"
     assert other.file.isprintable()
 
 

@@ -21,6 +21,7 @@ from pipeline.submission import load_submission
 from pipeline.synthesis import COUNT, SAMPLE_TIME, write_submission
 from pipeline.synthesis.hidden import prepare_bench, usual_term, write_bench
 from pipeline.synthesis.rig import Hand, Rig, Run
+from tests.helpers.commandline import cartlab_here
 from tests.truth.bench import Hidden, simulate_truth
 
 TWO = PRESETS["throne-2dof"]
@@ -392,6 +393,25 @@ def test_a_model_in_counts_moves_as_far(tmp_path):
     assert 300 < np.abs(sweep.y).max() < 700
 
 
+def with_backlash(**sizes):
+    """Return a model with backlash of these sizes."""
+    entry = {"effect": "backlash", "parameters": {"gap": 0.05, **sizes}}
+    return {"chain": {"m": [2e-4], "c": [5e-4], "k": [0.035, 0.0]}, "effects": [entry]}
+
+
+@pytest.mark.parametrize("command", ["simulate", "emulate"])
+@pytest.mark.parametrize("sizes", [{"contact_stiffness": 1e30}, {"motor_mass": 1e-30}])
+def test_a_model_too_stiff_to_simulate_is_one_line(command, sizes, tmp_path):
+    """What no simulation would get through is refused at once; nothing is written or served."""
+    file = tmp_path / "gap.json"
+    file.write_text(json.dumps(with_backlash(**sizes)), encoding="utf-8")
+    out = ["--out", str(tmp_path / "out")] if command == "simulate" else []
+    done = cartlab_here(command, "--model", str(file), *out)
+    assert done.returncode == 2
+    assert "a stiffness is too large, or a mass too small" in done.stderr.splitlines()[-1]
+    assert list(tmp_path.iterdir()) == [file]
+
+
 @pytest.mark.parametrize(
     ("document", "message"),
     [
@@ -402,6 +422,12 @@ def test_a_model_in_counts_moves_as_far(tmp_path):
         ({"chain": {"m": [1.0], "c": [0.1]}}, "chain: needs 'k'"),
         ({"chain": {"m": [1.0], "c": [0.1], "k": [1.0]}}, "k: expected shape"),
         ({"chain": {"m": [-1.0], "c": [0.1], "k": [1.0, 0.0]}}, "m must be positive"),
+        ({"chain": {"m": [1e-320], "c": [0.1], "k": [1.0, 0.0]}}, "expected sizes of 1e-30 to"),
+        ({"chain": {"m": [1e-29], "c": [0.1], "k": [1.0, 0.0]}}, "can be run on a bench"),
+        ({"chain": {"m": [1.0, 1.0], "c": [0.1, 0.1], "k": [1.7e308, 1.7e308, 1.0]}}, "1.7e[+]308"),
+        (with_backlash(gap=1e-320), "gap: expected 0 or a size of 1e-30 to .*, found 9.*e-321"),
+        (with_backlash(motor_mass=0.0), "motor_mass must be positive, found 0"),
+        (with_backlash(gap=-1.0), "gap must be positive, found -1"),
         ({"chain": {"m": [1.0], "c": [0.1], "k": [1.0, 0.0]}, "effects": [{"effect": "glue"}]},
          r"effects\[1\]: no effect 'glue'"),
     ],

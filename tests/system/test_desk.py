@@ -109,12 +109,19 @@ def test_a_student_goes_from_an_empty_folder_to_the_zip(show, tmp_path):
         expect(report.get_by_role("heading", level=1)).to_have_text("One <b>cart</b>")
         expect(report.locator("figure .tools").first).to_be_attached()  # its own script runs
         window.get_by_role("link", name="Back to the files").click()
+        window.get_by_label("Title of the report").fill("Two carts")
+        window.locator("#details").get_by_role("button", name="Save").click()
+        expect(window.get_by_text("The report is out of date")).to_be_visible()
+        window.get_by_role("button", name="Hand in", exact=True).click()
+        expect(window.get_by_text("The report in the zip is of the files")).to_be_visible()
+        assert "Two carts" in (folder / "report" / "report.html").read_text(encoding="utf-8")
+        assert fits(window)
         with window.expect_download() as download:
-            window.get_by_role("link", name="Hand in: the zip").click()
+            window.get_by_role("link", name="Download the zip").click()
         with zipfile.ZipFile(download.value.path()) as archive:
             assert {NAME, "notes.md", "report/report.pdf"} <= set(archive.namelist())
     submission = load_submission(folder)
-    assert submission.title == "One <b>cart</b>"
+    assert submission.title == "Two carts"
     assert "bumped" in next(e for e in submission.experiments if e.id == step.id).note
 
 
@@ -163,31 +170,36 @@ def test_what_is_made_of_the_file_waits_for_what_is_not_saved(show, tmp_path):
         title, held = window.get_by_label("Title of the report"), window.get_by_role("alert")
         title.fill("typed")
         for section, name, role in (
-            ("#hand-in", "Hand in: the zip", "link"),
+            ("#hand-in", "Hand in", "button"),
             ("#report", "Make the report", "button"),
             ("#report", "Look for what", "button"),
         ):
             within = window.locator(section)
             shown = within.get_by_role("alert").count()
-            within.get_by_role(role, name=name).click()
+            within.get_by_role(role, name=name).first.click()
             expect(within.get_by_role("alert")).to_have_count(shown + 1)
-        assert not {"hand-in.zip", "make-report", "make-gap"}.intersection(asked)
+        assert not {"hand-in", "make-report", "make-gap"}.intersection(asked)
         assert violations(window) == []
-        with window.expect_download() as download:  # all the same
-            window.get_by_role("link", name="hand in without it").click()
+        window.get_by_role("button", name="hand in without it").click()  # all the same
+        with window.expect_download() as download:
+            window.get_by_role("link", name="Download the zip").click()
         with zipfile.ZipFile(download.value.path()) as archive:
             assert "typed" not in archive.read(NAME).decode()
 
+        window.get_by_role("link", name="Back to the files").click()
+        title.fill("typed")
         window.locator("#details").get_by_role("button", name="Save").click()
         expect(window.get_by_text("Saved.")).to_be_visible()
         expect(held).to_have_count(0)
+        window.get_by_role("button", name="Hand in", exact=True).click()
         with window.expect_download() as download:
-            window.get_by_role("link", name="Hand in: the zip").click()
+            window.get_by_role("link", name="Download the zip").click()
         with zipfile.ZipFile(download.value.path()) as archive:
             assert 'title = "typed"' in archive.read(NAME).decode()
 
+        window.get_by_role("link", name="Back to the files").click()
         title.fill("typed again")
-        window.get_by_role("button", name="Make the report").click()
+        window.get_by_role("button", name="Make it anew").click()
         window.get_by_role("button", name="go on without it").click()
         expect(window.locator("[data-events]")).to_contain_text("The report")
         expect(title).to_have_value("typed again")
@@ -230,7 +242,7 @@ def test_without_scripts_it_works_too(show, tmp_path):
 
 
 def test_the_command_says_its_address_and_ends_with_a_signal(tmp_path):
-    """One line on stderr when ready, one where the port is taken; a signal ends it, status 0."""
+    """One line when ready, one where the port is taken; a signal ends it by name, status 0."""
     command = [sys.executable, "-m", "pipeline", "desk", str(tmp_path / "team"), "--no-browser"]
     with started(command, stderr=subprocess.PIPE, encoding="utf-8") as desk:
         assert desk.stderr is not None
@@ -243,6 +255,7 @@ def test_the_command_says_its_address_and_ends_with_a_signal(tmp_path):
         )
         assert taken.returncode == 2
         assert len(taken.stderr.splitlines()) == 1
-        desk.send_signal(signal.SIGINT if sys.platform == "win32" else signal.SIGTERM)
+        number = signal.SIGINT if sys.platform == "win32" else signal.SIGTERM
+        desk.send_signal(number)
         assert desk.wait(PATIENCE) == 0
-        assert desk.stderr.read() == ""
+        assert desk.stderr.read() == f"cartlab: the desk ends: {number.name}\n"

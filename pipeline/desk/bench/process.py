@@ -10,13 +10,14 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from pipeline.bench.host.acquire import acquire
 from pipeline.bench.live.page import LivePage
 from pipeline.errors import PipelineError
+from pipeline.processes import lines_sent
 
 _LOOK = 0.05  # s between looks whether there is news
 
@@ -30,11 +31,12 @@ def main() -> None:
         answers.write(json.dumps(line).encode() + b"\n")
         answers.flush()
 
-    given = json.loads(sys.stdin.buffer.readline())
+    sent = lines_sent()
+    given = json.loads(next(sent))
     folder = Path(given["folder"])
     try:
         with LivePage(folder) as page:
-            threading.Thread(target=_stop_on_word, args=(page,), daemon=True).start()
+            threading.Thread(target=_stop_on_word, args=(sent, page), daemon=True).start()
             threading.Thread(target=_say_where, args=(page, say), daemon=True).start()
             work = _explore if any(given["explore"]) else _acquire
             said = work(folder, given, page)
@@ -84,8 +86,8 @@ def _say_where(page: LivePage, say: Callable[..., None]) -> None:
         say(url=page.url)
 
 
-def _stop_on_word(page: LivePage) -> None:
-    sys.stdin.buffer.readline()
+def _stop_on_word(sent: Iterator[bytes], page: LivePage) -> None:
+    next(sent, b"")
     page.press("stop", turn=page.buttons.turn)
 
 

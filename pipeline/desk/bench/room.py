@@ -6,7 +6,7 @@ from typing import Any
 
 from markupsafe import Markup
 from starlette.exceptions import HTTPException
-from starlette.responses import Response, StreamingResponse
+from starlette.responses import PlainTextResponse, Response, StreamingResponse
 
 from pipeline.bench.design.goal import WORST
 from pipeline.bench.explore.wish import read_wish
@@ -108,9 +108,12 @@ def press(ask: Ask) -> Response:
     return ask.back(ask.here) if ask.text("plain") else Response(status_code=status)
 
 
-def events(ask: Ask) -> Response:
+async def events(ask: Ask) -> Response:
     """Pass on the news of the session; one that ended while its page was on the way says so."""
-    return StreamingResponse(_session(ask).events(), media_type="text/event-stream")
+    news = await _session(ask).events()
+    if news is None:
+        return PlainTextResponse("too many pages show this session", status_code=503)
+    return StreamingResponse(news, media_type="text/event-stream")
 
 
 def _room(

@@ -1,6 +1,5 @@
 """What is done with a whole class: graded again, written, changed from a table, exported."""
 
-import tempfile
 import zipfile
 from io import BytesIO
 from pathlib import Path
@@ -12,6 +11,7 @@ from starlette.responses import Response
 
 from pipeline.desk.grades.room import a_class
 from pipeline.desk.grades.team import signed
+from pipeline.desk.scratch import scratch_folder
 from pipeline.desk.state import Ask
 from pipeline.errors import ConfigError
 from pipeline.grading.gradebook.override import Wish, read_wishes
@@ -26,8 +26,8 @@ def take_table(ask: Ask) -> Response:
     """Change points as a table says, all of it or nothing."""
     shown = a_class(ask)
     by = signed(ask)
-    with tempfile.TemporaryDirectory(prefix="cartlab-") as scratch:
-        wishes = read_wishes(_uploaded(ask, "table", Path(scratch) / "the table"))
+    with scratch_folder() as scratch:
+        wishes = read_wishes(_uploaded(ask, "table", scratch / "the table"))
     teams = {name: team.submission for name, team in shown.teams.items()}
     meant = []
     for wish in wishes:
@@ -50,11 +50,9 @@ def export_class(ask: Ask) -> Response:
     platform = next((one for one in get_args(Platform) if one == ask.text("lms")), None)
     if platform is None:
         raise HTTPException(400, "there is no such platform")
-    with tempfile.TemporaryDirectory(prefix="cartlab-") as scratch:
-        own = (
-            _uploaded(ask, "roster", Path(scratch) / "roster.csv") if _sent(ask, "roster") else None
-        )
-        out = Path(scratch) / "export"
+    with scratch_folder() as scratch:
+        own = _uploaded(ask, "roster", scratch / "roster.csv") if _sent(ask, "roster") else None
+        out = scratch / "export"
         book = ask.desk.books.book(ask.grades())
         done = export(book, platform, out, title=ask.text("title") or None, roster=own)
         if len(done.files) == 1 and not done.remarks:

@@ -2,7 +2,6 @@
 
 import re
 import shutil
-import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from itertools import count
@@ -10,6 +9,7 @@ from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
 from pipeline.desk.jobs import Failed, Hand
+from pipeline.desk.scratch import scratch_folder
 from pipeline.desk.student.handin import BESIDE
 from pipeline.errors import SubmissionError
 from pipeline.grading.intake.unpack import HAND_IN, is_debris
@@ -37,14 +37,14 @@ _ASIDE = "set-aside"  # where recordings go that are not to be part of it
 def take_uploads(sent: Iterable[tuple[str, BinaryIO]], folder: Path, *, hand: Hand) -> list[str]:
     """Store uploaded files, and what is in archives; return what a person would not expect."""
     said: list[str] = []
-    with tempfile.TemporaryDirectory(prefix="cartlab-") as scratch:
+    with scratch_folder() as scratch:
         files: list[tuple[str, BinaryIO | Path]] = []
         for number, (name, content) in enumerate(sent):
             if PurePosixPath(name.replace("\\", "/")).suffix.lower() != ".zip":
                 files.append((name, content))
                 continue
             try:
-                files += _unpacked(content, Path(scratch) / str(number), hand=hand)
+                files += _unpacked(content, scratch / str(number), hand=hand)
             except (SubmissionError, Failed) as error:
                 said.append(f"{quote(name)}: not taken: {error}")
         with turn_in(folder):
@@ -106,7 +106,8 @@ def _take(given: str, raw: bytes, folder: Path, *, room: _Room) -> str:
         return ""
     if PurePosixPath(last).suffix.casefold() not in ENDINGS:
         raise SubmissionError(f"a recording ends in {', '.join(ENDINGS)}")
-    name = _UNFIT.sub("-", last.encode(errors="ignore")[-_LONGEST:].decode(errors="ignore"))
+    seen = "".join(c if c.isprintable() else "-" for c in last)  # blanks of all sorts, marks
+    name = _UNFIT.sub("-", seen.encode(errors="ignore")[-_LONGEST:].decode(errors="ignore"))
     if _RESERVED.fullmatch(name):
         name = f"data-{name}"
     names = _names(own_folder(folder, "data") / name)
@@ -116,7 +117,8 @@ def _take(given: str, raw: bytes, folder: Path, *, room: _Room) -> str:
     room.check(raw)
     target.parent.mkdir(exist_ok=True)
     write_file(target, raw)
-    return f"{quote(last)}: taken as {target.name}" if target.name != last else ""
+    why = "" if seen == last else "; no name may have characters that do not show"
+    return f"{quote(last)}: taken as {target.name}{why}" if target.name != last else ""
 
 
 def _there(path: Path) -> bool:

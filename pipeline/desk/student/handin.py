@@ -4,11 +4,13 @@ import io
 import zipfile
 from pathlib import Path
 
+from pipeline.desk.last_report import state
 from pipeline.submission import load_submission
 from pipeline.submission.load import NAME, outside
 
 _FIXED_TIME = (1980, 1, 1, 0, 0, 0)  # same files, same bytes
-BESIDE = {"notes.md": "your notes", "report/report.pdf": "the report"}  # as the page calls them
+_REPORT = "report/report.pdf"
+BESIDE = ("notes.md", _REPORT)
 
 
 def hand_in(folder: Path) -> bytes:
@@ -18,19 +20,29 @@ def hand_in(folder: Path) -> bytes:
     ------
     SubmissionError : it is not valid, or a file that it names is not there.
     """
-    submission = load_submission(folder)
-    names = dict.fromkeys([NAME, *(experiment.file for experiment in submission.experiments)])
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name in (*names, *beside(folder)):
+        for name in held(folder):
             info = zipfile.ZipInfo(name, _FIXED_TIME)
             archive.writestr(info, (folder / name).read_bytes(), zipfile.ZIP_DEFLATED)
     return buffer.getvalue()
 
 
+def held(folder: Path) -> list[str]:
+    """Return the files that the zip holds.
+
+    Raises
+    ------
+    SubmissionError : the submission is not valid.
+    """
+    files = [experiment.file for experiment in load_submission(folder).experiments]
+    return list(dict.fromkeys([NAME, *files, *beside(folder)]))
+
+
 def beside(folder: Path) -> list[str]:
-    """Return what goes with it: of `BESIDE`, what is there."""
-    return [name for name in BESIDE if outside(folder, name) is None]
+    """Return what goes with it: of `BESIDE`, what is there; no report of what was changed since."""
+    left_out = "" if state(folder) == "current" else _REPORT
+    return [name for name in BESIDE if name != left_out and outside(folder, name) is None]
 
 
 def missing(folder: Path) -> list[str]:

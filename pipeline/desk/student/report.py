@@ -1,13 +1,10 @@
 """The report in the student's room: made, shown, its questions answered in `notes.md`."""
 
-import json
 from collections.abc import Mapping
-from contextlib import suppress
-from pathlib import Path
-from typing import Any
 
 from starlette.responses import Response
 
+from pipeline.desk.last_report import NOTES, told, written_notes
 from pipeline.desk.pages import served_file
 from pipeline.desk.state import Ask
 from pipeline.errors import SubmissionError
@@ -15,12 +12,8 @@ from pipeline.lock import turn_in
 from pipeline.output import write_file
 from pipeline.report.sections.answers import with_answer, written_answer
 from pipeline.submission.edit import text_digest
-from pipeline.submission.load import MAX_NOTES_BYTES, NAME, outside
-from pipeline.submission.toml_file import read_text
+from pipeline.submission.load import MAX_NOTES_BYTES, outside
 
-_ASKED = "report/questions.json"
-_MOST_ASKED = 1_000_000  # bytes
-_NOTES = "notes.md"
 _GAP_BUDGET = 60.0  # s, as `cartlab gap` has by default
 
 
@@ -57,13 +50,13 @@ def answer(ask: Ask) -> Response:
     folder, id_, words = ask.folder(), ask.text("id"), ask.text("answer")
     try:
         with turn_in(folder):
-            notes = _notes(folder)
+            notes = written_notes(folder)
             if ask.text("seen") != text_digest(notes):
                 return ask.page(
                     "outdated",
                     status=409,
-                    title=f"{_NOTES} was changed meanwhile",
-                    name=_NOTES,
+                    title=f"{NOTES} was changed meanwhile",
+                    name=NOTES,
                     text=notes,
                     changed=[(f"Answer to {id_}", words, "")],
                     had="You typed",
@@ -73,8 +66,8 @@ def answer(ask: Ask) -> Response:
                 raise SubmissionError(f"the report asks nothing called {id_!r}")
             new = with_answer(notes, id_, words)
             if len(new.encode()) > MAX_NOTES_BYTES:
-                raise SubmissionError(f"{_NOTES} would have more than {MAX_NOTES_BYTES:,} bytes")
-            write_file(folder / _NOTES, new)
+                raise SubmissionError(f"{NOTES} would have more than {MAX_NOTES_BYTES:,} bytes")
+            write_file(folder / NOTES, new)
     except SubmissionError as error:
         return _page(ask, status=422, refused={id_: (words, str(error))})
     return ask.back(f"{ask.here}report#question-{id_}", "Written into notes.md.")
@@ -90,39 +83,6 @@ def gap_file(ask: Ask) -> Response:
     return served_file(ask.folder(), f"gap/{ask.request.path_params['name']}")
 
 
-def told(folder: Path) -> dict[str, Any]:
-    """Return what the last report said and asked, as far as its file can be read."""
-    read: Any = {}
-    if outside(folder, _ASKED) is None and (folder / _ASKED).stat().st_size < _MOST_ASKED:
-        with suppress(ValueError, RecursionError):
-            read = json.loads((folder / _ASKED).read_bytes())
-    try:
-        questions = [{"id": str(one["id"]), "text": str(one["text"])} for one in read["questions"]]
-        failed = [str(one) for one in read["failed"]]
-        return {"questions": questions, "failed": failed, "changes": str(read["changes"])}
-    except (KeyError, TypeError):
-        return {"questions": [], "failed": [], "changes": ""}
-
-
-def unanswered(folder: Path) -> int:
-    """Return how many questions of the last report have no answer yet."""
-    try:
-        notes = _notes(folder)
-    except SubmissionError:  # the report's page says what is wrong with them
-        notes = ""
-    return sum(not written_answer(notes, one["id"]).strip() for one in told(folder)["questions"])
-
-
-def state(folder: Path) -> str:
-    """Return "none", "current", or "older" than what it is made of."""
-    if outside(folder, "report/report.html") is not None:
-        return "none"
-    made = (folder / "report" / "report.html").stat().st_mtime_ns
-    sources = [folder / NAME, folder / _NOTES, *(folder / "data").rglob("*")]
-    newer = any(path.stat().st_mtime_ns > made for path in sources if path.is_file())
-    return "older" if newer else "current"
-
-
 def _page(ask: Ask, *, status: int = 200, refused: Mapping[str, tuple[str, str]] = {}) -> Response:
     """Show the report.
 
@@ -134,7 +94,7 @@ def _page(ask: Ask, *, status: int = 200, refused: Mapping[str, tuple[str, str]]
     said = told(folder)
     problems, notes = [why for _, why in refused.values()], ""
     try:
-        notes = _notes(folder)
+        notes = written_notes(folder)
     except SubmissionError as error:
         problems = [str(error)]
     questions, known = [], [one["id"] for one in said["questions"]]
@@ -153,12 +113,3 @@ def _page(ask: Ask, *, status: int = 200, refused: Mapping[str, tuple[str, str]]
         there=outside(folder, "report/report.html") is None,
         said=ask.told(),
     )
-
-
-def _notes(folder: Path) -> str:
-    if not (folder / _NOTES).exists():
-        return ""
-    if problem := outside(folder, _NOTES):
-        raise SubmissionError(problem)
-    where = f"{folder.name}/{_NOTES}"
-    return read_text(folder / _NOTES, where=where, limit=MAX_NOTES_BYTES, error=SubmissionError)

@@ -12,9 +12,9 @@ from starlette.datastructures import UploadFile
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
+from pipeline.desk import last_report
 from pipeline.desk.jobs import Failed
 from pipeline.desk.state import NOTHING_KNOWN, Ask
-from pipeline.desk.student import report
 from pipeline.desk.student.files import put_aside, take_uploads
 from pipeline.desk.student.form import (
     Field,
@@ -28,12 +28,12 @@ from pipeline.desk.student.form import (
     typed,
     with_errors,
 )
-from pipeline.desk.student.handin import BESIDE, beside, hand_in, missing
+from pipeline.desk.student.handin import hand_in, held, missing
 from pipeline.errors import SubmissionError
 from pipeline.ingest.inspect import NO_CLOCK
 from pipeline.lock import turn_in
 from pipeline.names import by_note
-from pipeline.report.numbers import count, listing
+from pipeline.report.numbers import count
 from pipeline.submission.edit import Outdated, edit_submission, submission_text, text_digest
 from pipeline.submission.load import (
     NAME,
@@ -92,6 +92,32 @@ def save_experiment(ask: Ask) -> Response:
     return _save(ask, experiment_fields(_shown(ask), index))
 
 
+def start_hand_in(ask: Ask) -> Response:
+    """Have the report made anew where anything was changed since; show what is handed in."""
+    folder = ask.folder()
+    if last_report.state(folder) != "current":
+        ask.desk.jobs.start("report", title="The report", place=folder, folder=str(folder))
+    return ask.back(f"{ask.here}hand-in")
+
+
+def show_hand_in(ask: Ask) -> Response:
+    """Show what the zip holds, what is not answered, and what was assumed."""
+    folder = ask.folder()
+    keeps = _keeps(folder)
+    names = [] if keeps else held(folder)
+    return ask.page(
+        "handin",
+        title=f"Hand in: {folder.name}",
+        keeps=keeps,
+        files=[(name, (folder / name).stat().st_size) for name in names],
+        job=ask.desk.jobs.of(folder),
+        report=last_report.state(folder),
+        unanswered=last_report.unanswered(folder),
+        assumed=last_report.assumed(folder),
+        said=ask.told(),
+    )
+
+
 def packed(ask: Ask) -> Response:
     """Return the zip."""
     name = f"{ask.folder().name}.zip"
@@ -118,8 +144,8 @@ def _filled(ask: Ask, folder: Path) -> list[str]:
         return [str(error)]
     new = [row["file"] for row in rows if row["state"] in ("new", "completed")]
     said = [f"{count(len(new), 'file')} written into {NAME}."] if new else []
-    copies = [row for row in rows if row["state"] == "copy"]
-    return said + by_note((row["file"], note) for row in copies for note in row["remarks"])
+    without = [row for row in rows if row["state"] in ("copy", "refused")]
+    return said + by_note((row["file"], note) for row in without for note in row["remarks"])
 
 
 def _room(
@@ -160,11 +186,10 @@ def _room(
         wrong=left,
         keeps=_keeps(folder) if text and error is None else [],
         sound=bool(text) and error is None,
-        holds=listing([NAME, "the files that it names", *(BESIDE[one] for one in beside(folder))]),
         job=ask.desk.jobs.of(folder),
-        report=report.state(folder),
-        told=report.told(folder),
-        unanswered=report.unanswered(folder),
+        report=last_report.state(folder),
+        told=last_report.told(folder),
+        unanswered=len(last_report.unanswered(folder)),
         gap=outside(folder, "gap/gap.html") is None,
         said=ask.told(),
     )

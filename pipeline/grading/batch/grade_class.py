@@ -3,9 +3,10 @@
 import os
 import re
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 from pipeline.errors import ConfigError, PipelineError
@@ -19,16 +20,17 @@ from pipeline.grading.batch.runner import (
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.class_lines import wrong_springs
 from pipeline.grading.gradings import Batch
-from pipeline.grading.intake.hand_ins import find_hand_ins
+from pipeline.grading.intake.hand_ins import HandIn, find_hand_ins
 from pipeline.grading.intake.late_table import read_late_table, settle_lateness
+from pipeline.grading.publish.anonymous import STRANGER, hidden_reason, pseudonyms_in
 from pipeline.grading.publish.outputs import write_outputs
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.grading.similarity.prints import fingerprint
 from pipeline.ingest.read import read_data
 from pipeline.lock import alone_in
-from pipeline.output import named_folder, own_folder
-from pipeline.report.numbers import listing
+from pipeline.output import OWNERS_FOLDER, named_folder, own_folder
+from pipeline.report.numbers import count, listing
 from pipeline.resources import EXAMPLES
 from pipeline.submission import load_submission
 from pipeline.submission.complaints import quote
@@ -91,15 +93,15 @@ def grade_class(
     _refuse_submission(named_folder(out))
     if gradebook is None:
         _refuse_another_class(out, assignment=rubric_file.stem)
-    with alone_in(out), scratch_in(out) as scratch:
+    with alone_in(out, private=True), scratch_in(out) as scratch:
         known = _names_so_far(gradebook or out, assignment=rubric_file.stem)
         passed: list[str] = []
         found = find_hand_ins(paths, scratch=scratch, skip=[out], known=known, say=passed.append)
         hand_ins, unknown = settle_lateness(found, late=rubric.late, table=late_table)
-        remarks = [f"{lateness.name}: {who}" for who in unknown] if lateness else []
+        hidden = rubric.anonymous or anonymous
         # The rubric's file says which assignment it is: its title may be mended on the way.
         with Gradebook(gradebook or out, assignment=rubric_file.stem, create=True) as book:
-            hidden = rubric.anonymous or anonymous
+            shown = _pseudonyms(book) if hidden else str
             batch = grade_batch(
                 hand_ins,
                 rubric=rubric,
@@ -109,16 +111,24 @@ def grade_class(
                 limits=limits,
                 figures=figures,
                 examples=lambda: list(_handed_out(rubric, folder=rubric_file.parent)),
-                progress=progress,
+                progress=_nameless(progress, hand_ins) if hidden else progress,
             )
-            changes = book.finish(batch, rubric=rubric.model_copy(update={"anonymous": hidden}))
-            remarks = [*passed, *remarks, *_told(batch, book)]
+            now = rubric.model_copy(update={"anonymous": hidden})
+            changes = book.finish(batch, rubric=now, shown=shown)
+            remarks = [
+                *_beside(passed, unknown, late_file=lateness, hidden=hidden),
+                *_told(batch, book, shown=shown),
+            ]
+            failed = [
+                (shown(name), hidden_reason(reason, name, shown(name)) if hidden else reason)
+                for name, reason in batch.failed
+            ]
             total = len(hand_ins)
             doubles = write_outputs(book, out, progress=lambda what: progress(total, total, what))
             remarks += [f"{double}: see class.html" for double in doubles]
     return Summary(
         total=len(hand_ins),
-        failed=batch.failed,
+        failed=tuple(sorted(failed)),  # the order of the names would tell
         sharing=len(batch.shared),
         remarks=tuple(remarks),
         changes=tuple(changes),
@@ -146,21 +156,49 @@ def _refuse_another_class(out: Path, *, assignment: str) -> None:
         )
 
 
-def _told(batch: Batch, book: Gradebook) -> Iterator[str]:
+def _pseudonyms(book: Gradebook) -> Callable[[str], str]:
+    """Return what calls submissions by other names; asked once the class list is made."""
+    names = cache(lambda: pseudonyms_in(book))
+    return lambda name: names().get(name, STRANGER)
+
+
+def _nameless(progress: Progress, hand_ins: Sequence[HandIn]) -> Progress:
+    """Return what shows how far it is, and of no submission that it is done."""
+    names = {hand_in.id for hand_in in hand_ins}
+    return lambda done, total, last: progress(done, total, "" if last in names else last)
+
+
+def _beside(
+    passed: Sequence[str], unknown: Sequence[str], *, late_file: Path | None, hidden: bool
+) -> Iterator[str]:
+    """Yield which folders were passed over, and who of the late table is not in the class."""
+    if not hidden:
+        yield from passed
+    elif passed:
+        yield f"{count(len(passed), 'folder')} passed over: they look like results of a grading"
+    if unknown and late_file:
+        who = count(len(unknown), "name") if hidden else ", ".join(unknown)
+        yield f"{late_file.name}: no such submission: {who}"
+
+
+def _told(batch: Batch, book: Gradebook, *, shown: Callable[[str], str]) -> Iterator[str]:
     """Yield whether the rubric's springs are the benches', and what became of the class before."""
     grades = (entry.grade for entry in book.entries())
     if asked := wrong_springs(grade.springs for grade in grades if grade.status == "graded"):
         yield asked
     hidden = book.rubric.anonymous
     for before, now in batch.moved.items():
-        yield f"{before} is now called {now}; the points it was given by hand go on"
+        yield f"{shown(before)} is now called {shown(now)}; the points it was given by hand go on"
     for name, before, now in batch.taken_over:
         whose = "" if hidden else f", {_people(now)} in place of {_people(before)}"
-        yield f"{name} is now by others{whose}: where both count, give one folder another name"
+        yield (
+            f"{shown(name)} is now by others{whose}: where both count, give one folder another name"
+        )
     if not batch.kept:
         return
-    yield f"not in this run, kept as they were: {_names(batch.kept)} (cartlab remove takes one off)"
-    if others := sorted(set(book.by_other_rubrics()) & set(batch.kept)):
+    kept = sorted(map(shown, batch.kept))
+    yield f"not in this run, kept as they were: {_names(kept)} (cartlab remove takes one off)"
+    if others := sorted(map(shown, set(book.by_other_rubrics()) & set(batch.kept))):
         yield f"graded by the rubric as it was before, grade them again: {_names(others)}"
 
 
@@ -218,7 +256,7 @@ def scratch_in(out: Path) -> Iterator[Path]:
         if _SCRATCH.fullmatch(left.name) and left.is_dir() and not left.is_symlink():
             shutil.rmtree(left, ignore_errors=True)
     scratch = own_folder(out, f".scratch-{os.getpid()}")
-    scratch.mkdir(exist_ok=True)
+    scratch.mkdir(OWNERS_FOLDER, exist_ok=True)
     try:
         yield scratch
     finally:

@@ -145,10 +145,16 @@ class Gradebook:
             lines = [] if last is None else lines_of(connection, last)
         return read_members(self._database, [line["grading_id"] for line in lines])
 
-    def finish(self, batch: Batch, *, rubric: Rubric) -> list[str]:
+    def finish(
+        self, batch: Batch, *, rubric: Rubric, shown: Callable[[str], str] = str
+    ) -> list[str]:
         """Make a batch that ran to its end the class list; one that changes nothing adds nothing.
 
         Returns what is another than in the class list before, a phrase each: the rubric first.
+
+        Parameters
+        ----------
+        shown : what to call a submission in these phrases; asked when the class list is made.
 
         Raises
         ------
@@ -183,7 +189,7 @@ class Gradebook:
             told = [f"rubric: {change}" for change in rubric_changes(last.rubric, text)]
             before = points_of(connection, last)
             before = {batch.moved.get(name, name): had for name, had in before.items()}
-            return told + points_changes(before, points, by_hand=by_hand)
+        return told + points_changes(before, points, by_hand=by_hand, shown=shown)
 
     # ---------------------------------------------------------------- what counts now
 

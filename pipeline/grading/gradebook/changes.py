@@ -1,6 +1,6 @@
 """What is another since the class list before: the rubric, and whose points."""
 
-from collections.abc import Container, Mapping
+from collections.abc import Callable, Container, Mapping
 from typing import Any
 
 from pydantic import ValidationError
@@ -32,17 +32,22 @@ def rubric_changes(before: str, now: str) -> list[str]:
 
 
 def points_changes(
-    before: Mapping[str, float], now: Mapping[str, float], *, by_hand: Container[str] = ()
+    before: Mapping[str, float],
+    now: Mapping[str, float],
+    *,
+    by_hand: Container[str] = (),
+    shown: Callable[[str], str] = str,
 ) -> list[str]:
-    """Return whose points are another, and who is new or gone."""
+    """Return whose points are another, and who is new or gone; `shown` says what to call them."""
+    in_order = sorted(now.items(), key=lambda one: shown(one[0]))
     changes = [
-        f"{name}: {points_text(before[name])} → {points_text(points)}"
+        f"{shown(name)}: {points_text(before[name])} → {points_text(points)}"
         + (" (with points given by hand)" if name in by_hand else "")
-        for name, points in now.items()
+        for name, points in in_order
         if name in before and points != before[name]
     ]
-    changes += [f"{name} is new" for name in now if name not in before]
-    return changes + [f"{name} is gone" for name in before if name not in now]
+    changes += [f"{shown(name)} is new" for name, _ in in_order if name not in before]
+    return changes + [f"{shown(name)} is gone" for name in before if name not in now]
 
 
 def _differing(before: Mapping[str, Any], now: Mapping[str, Any], at: str = "") -> list[str]:

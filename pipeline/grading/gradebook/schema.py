@@ -5,9 +5,11 @@ has triggers (SQLite, PostgreSQL) it refuses to change or delete a row. The newe
 """
 
 import json
+import os
+import stat
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -40,12 +42,22 @@ from sqlalchemy import (
 from sqlalchemy.exc import ArgumentError, NoSuchModuleError, SQLAlchemyError
 
 from pipeline.errors import ConfigError
+from pipeline.output import OWNER_ONLY
+from pipeline.submission.complaints import quote
 
 FILE = "gradebook.sqlite"
 _SUFFIXES = (".sqlite", ".sqlite3", ".db")  # of files; anything else is a folder
 _VERSION = "1"
 _TURN = 0x6361_7274  # a number for PostgreSQL's lock that nobody else has
 _PATIENCE = 60.0  # s, for a lock that another process holds; a commit takes milliseconds
+
+
+# What SQLAlchemy and the drivers raise for an address that means nothing.
+_SENSELESS = (ArgumentError, ValueError, TypeError)
+_NO_ADDRESS = (
+    "the gradebook's address is no database URL: write postgresql://NAME@HOST/DATABASE or "
+    f"sqlite:////FOLDER/{FILE}"
+)
 
 
 class Words(TypeDecorator):
@@ -241,13 +253,17 @@ class Database:
     def __init__(self, place: str | Path, *, create: bool) -> None:
         self._engine = _engine(place, create=create)
         self._writer = self._engine.execution_options(writes=True)
-        with self._translated(), (self._writer if create else self._engine).begin() as connection:
-            if create:
-                _create(connection)
-            elif not self._engine.dialect.has_table(connection, settings.name):
-                raise ConfigError(f"{self.name}: holds no gradebook")
-            _check_version(connection, name=self.name)
-            whole = _is_whole(connection)
+        opened = self._writer if create else self._engine
+        try:
+            with self._translated(), opened.begin() as connection:
+                if create:
+                    _create(connection)
+                elif not self._engine.dialect.has_table(connection, settings.name):
+                    raise ConfigError(f"{self.name}: holds no gradebook")
+                _check_version(connection, name=self.name)
+                whole = _is_whole(connection)
+        except _SENSELESS as error:  # the driver reads the address when it first connects
+            raise ConfigError(_NO_ADDRESS) from error
         if not whole:  # of a version that had fewer tables
             with self.writing() as connection:
                 _create(connection)
@@ -320,20 +336,39 @@ def _engine(place: str | Path, *, create: bool) -> Engine:
         address = place
     try:
         url = make_url(address)
-    except ArgumentError as error:
-        raise ConfigError(f"the gradebook's address is no database URL: {error}") from error
+    except _SENSELESS as error:
+        raise ConfigError(_NO_ADDRESS) from error
     try:
         if url.drivername == "postgresql":  # what is called so depends on SQLAlchemy's version
             url = url.set(drivername="postgresql+psycopg")
         if url.get_backend_name() != "sqlite":
             return create_engine(url, pool_pre_ping=True)
+        file = url.database or ""
+        if not (create or file.startswith((":memory:", "file:")) or Path(file).is_file()):
+            raise ConfigError(f"{quote(file)}: there is no such gradebook")  # SQLite would make one
+        if create and file and not file.startswith((":memory:", "file:")):
+            _keep_private(Path(file))
         engine = create_engine(url, connect_args={"timeout": _PATIENCE})
     except (NoSuchModuleError, ModuleNotFoundError) as error:
         shown = url.render_as_string(hide_password=True)
         raise ConfigError(f"{shown}: no driver for it is installed ({error})") from error
+    except _SENSELESS as error:
+        raise ConfigError(_NO_ADDRESS) from error
     event.listen(engine, "connect", _prepare_sqlite)
     event.listen(engine, "begin", _begin_sqlite)
     return engine
+
+
+def _keep_private(file: Path) -> None:
+    """Make a gradebook's file for its owner alone; what SQLite puts beside it is so too.
+
+    One that is there keeps what its owner gave a group, and is closed to everybody else.
+    """
+    with suppress(OSError):  # SQLite says what is wrong with the place; a file may be another's
+        os.close(os.open(file, os.O_RDWR | os.O_CREAT, OWNER_ONLY))
+        mode = file.stat().st_mode
+        if mode & stat.S_IRWXO:
+            file.chmod(stat.S_IMODE(mode) & ~stat.S_IRWXO)
 
 
 def _prepare_sqlite(connection, _record) -> None:

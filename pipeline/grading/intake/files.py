@@ -78,19 +78,25 @@ def open_submission(sources: Sequence[Path], into: Path, *, digest: str = "") ->
 
     Raises
     ------
-    SubmissionError : there is none, or more than one to choose from, or an archive is bad.
+    SubmissionError : there is none, or more than one to choose from, there are too many files, or
+        an archive is bad.
     OSError : a file cannot be read.
     Changed : the copy has another digest.
     """
     into.mkdir(parents=True, exist_ok=True)
     total = hashlib.sha256()
-    for name, path in _files(sources):
+    files = list(_files(sources))
+    for name, path in files:
         target = into / name
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(path, target)
         total.update(_line(name, target))
     if digest and total.hexdigest() != digest:
         raise Changed
+    if len(files) > HAND_IN.members:
+        raise SubmissionError(
+            f"more than {HAND_IN.members:,} files; hand in {NAME}, notes.md and the files they name"
+        )
     left = HAND_IN
     for _ in range(_ARCHIVES_IN_ARCHIVES):
         if _submissions(into):
@@ -112,9 +118,11 @@ def open_submission(sources: Sequence[Path], into: Path, *, digest: str = "") ->
 def _files(sources: Sequence[Path]) -> Iterator[tuple[str, Path]]:
     """Yield (name below the hand-in, path) of the files to grade, sorted by name, each once.
 
-    Of too many or too large files the smallest are taken: data files are small, films are not. A
-    recording that is only larger than may be is among them, so that it is refused, not missed.
-    Bytes that are no text in a name are replaced, here as on another machine.
+    Of too large files the smallest are taken: data files are small, films are not.
+    `submission.toml` comes first: without it nothing could be said of the others. Of too many files
+    one more than may be is taken, so that they are refused, here as on another machine. A recording
+    that is larger than may be is among them, so that it is refused, not missed. Bytes that are no
+    text in a name are replaced.
     """
     found: list[tuple[int, str, Path]] = []
     for source in sources:
@@ -125,7 +133,8 @@ def _files(sources: Sequence[Path]) -> Iterator[tuple[str, Path]]:
             name = upload.file if upload and upload.file else source.name
             found.append((info.st_size, PurePosixPath(name.replace("\\", "/")).name, source))
     chosen, left = {}, HAND_IN.total
-    for size, name, path in sorted(found, key=lambda one: one[:2])[: HAND_IN.members]:
+    found.sort(key=lambda one: (PurePosixPath(one[1]).name != NAME, *one[:2]))
+    for size, name, path in found[: HAND_IN.members + 1]:
         left -= size
         if left < 0:
             break

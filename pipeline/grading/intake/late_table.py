@@ -37,8 +37,8 @@ def read_late_table(path: Path) -> dict[str, float]:
             raise ConfigError(f"{path.name} line {line}: days_late: cannot read {quote(said)}")
         if days.get(who.casefold(), late) != late:
             raise ConfigError(
-                f"{path.name} line {line}: {quote(who)} is {late:g} days late here and "
-                f"{days[who.casefold()]:g} in a line before: leave one of them"
+                f"{path.name} line {line}: {late:g} days late here, and "
+                f"{days[who.casefold()]:g} in a line before of the same: leave one of them"
             )
         if who:
             days[who.casefold()] = late
@@ -48,7 +48,7 @@ def read_late_table(path: Path) -> dict[str, float]:
 def settle_lateness(
     hand_ins: Iterable[HandIn], *, late: Late, table: Mapping[str, float]
 ) -> tuple[list[HandIn], list[str]]:
-    """Return the hand-ins with their lateness, and what a person should know about the table.
+    """Return the hand-ins with their lateness, and who of the table is none of them.
 
     The table goes before the deadline, and that before the mark a platform makes.
     """
@@ -60,8 +60,7 @@ def settle_lateness(
             waited = datetime.fromisoformat(hand_in.handed_in) - late.due
             days = max(0.0, waited.total_seconds() / _DAY)
         settled.append(hand_in if days is None else replace(hand_in, days_late=days))
-    missing = [name for name in table if name not in known]
-    return settled, [f"no such submission: {', '.join(missing)}"] if missing else []
+    return settled, [name for name in table if name not in known]
 
 
 def _number(text: str) -> float | None:

@@ -39,6 +39,11 @@ def pseudonyms(first_keys: Mapping[str, str]) -> dict[str, str]:
     return {name: f"{_PREFIX}{code[:length]}" for name, code in hashes.items()}
 
 
+def pseudonyms_in(book: Gradebook) -> dict[str, str]:
+    """Return the name that stands in for each submission of a class list."""
+    return pseudonyms({entry.submission: entry.first_key for entry in book.entries()})
+
+
 def is_pseudonym(name: str) -> bool:
     """Whether a name looks like one that stands in for another."""
     return name.startswith(_PREFIX)
@@ -55,7 +60,7 @@ def anonymise(grade: Grade, names: Mapping[str, str]) -> Grade:
     hidden = {
         "submission": own,
         "authors": (),
-        "reason": _hidden_reason(grade.reason, grade.submission, own),
+        "reason": hidden_reason(grade.reason, grade.submission, own),
         "flags": tuple(
             _hidden(flag, names) if flag.code == "shared_data" else flag for flag in grade.flags
         ),
@@ -66,10 +71,11 @@ def anonymise(grade: Grade, names: Mapping[str, str]) -> Grade:
 def anonymous_line(line: Line, names: Mapping[str, str]) -> Line:
     """Return the line of an anonymised grade."""
     own = names[line.name]
-    return replace(line, name=own, authors=(), reason=_hidden_reason(line.reason, line.name, own))
+    return replace(line, name=own, authors=(), reason=hidden_reason(line.reason, line.name, own))
 
 
-def _hidden_reason(reason: str, submission: str, own: str) -> str:
+def hidden_reason(reason: str, submission: str, own: str) -> str:
+    """Return why a submission could not be graded, with `own` for its name."""
     if not reason:
         return ""
     name = re.escape(submission)
@@ -102,8 +108,7 @@ def meant(book: Gradebook, team: str) -> str:
     """Return the submission that a name stands in for; any other name as it is."""
     if not is_pseudonym(team):
         return team
-    names = pseudonyms({entry.submission: entry.first_key for entry in book.entries()})
-    return {shown: name for name, shown in names.items()}.get(team, team)
+    return {shown: name for name, shown in pseudonyms_in(book).items()}.get(team, team)
 
 
 def history_of(book: Gradebook, team: str) -> tuple[str, list[Event]]:
@@ -125,5 +130,5 @@ def renamed_events(events: Sequence[Event], name: str, shown: str) -> list[Event
 
 def _renamed(text: str, name: str, shown: str) -> str:
     if text.startswith(FAILED):
-        text = FAILED + _hidden_reason(text.removeprefix(FAILED), name, shown)
+        text = FAILED + hidden_reason(text.removeprefix(FAILED), name, shown)
     return text.replace(name, shown)

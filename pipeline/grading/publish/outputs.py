@@ -151,7 +151,7 @@ def _names(book: Gradebook, out: Path) -> dict[str, str]:
         authors[entry.submission] = entry.grade.authors
     names = pseudonyms(keys)
     out.mkdir(parents=True, exist_ok=True)
-    write_file(out / KEY_FILE, key_text(names, authors))
+    write_file(out / KEY_FILE, key_text(names, authors), private=True)
     return names
 
 

@@ -162,6 +162,11 @@ class SteppedBench:
             :, self._rows
         ].T.ravel()
 
+    @property
+    def shortest_step(self) -> float:
+        """The longest substep that it may take where it is stiffest, s."""
+        return min(self._step, self._contact_step)
+
     # ------------------------------------------------------------------ what moves it
 
     def step(self, u: float, *, following: float, interval: float) -> None:

@@ -14,7 +14,7 @@ from pipeline.grading.intake.files import digest, open_submission, packed, unpac
 from pipeline.grading.intake.hand_ins import find_hand_ins
 from pipeline.grading.intake.lms_names import parse_name
 from pipeline.grading.intake.unpack import HAND_IN
-from pipeline.submission.load import MAX_DATA_BYTES, outside
+from pipeline.submission.load import MAX_DATA_BYTES, NAME, outside
 
 TOML = "version = 1\n"
 
@@ -412,6 +412,22 @@ def test_a_recording_that_is_too_large_is_refused_and_not_missed(tmp_path):
     os.truncate(team / "data" / "long.csv", MAX_DATA_BYTES + 1)
     folder = open_submission([team], tmp_path / "opened")
     assert "100,000,001 bytes, the limit is 100,000,000" in str(outside(folder, "data/long.csv"))
+
+
+def test_too_many_files_are_said_to_be_too_many(tmp_path):
+    """Small files beside a submission do not hide it; on another machine it is told the same."""
+    team = tree(
+        tmp_path / "team", {NAME: TOML, **{f"junk/{i}": "" for i in range(HAND_IN.members)}}
+    )
+    (tmp_path / "there").mkdir()
+    unpacked(packed([team]), tmp_path / "there")
+    for folder in (team, tmp_path / "there"):
+        with pytest.raises(
+            SubmissionError, match=r"more than 2,000 files; hand in submission.toml"
+        ):
+            open_submission([folder], tmp_path / f"open-{folder.name}", digest=digest([team]))
+    (team / "junk" / "7").unlink()
+    assert open_submission([team], tmp_path / "again").joinpath(NAME).is_file()
 
 
 def test_a_hand_in_travels_whole(tmp_path):

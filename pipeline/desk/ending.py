@@ -1,0 +1,119 @@
+"""Whatever ends a desk, it says so on stderr, and the log keeps it."""
+
+import faulthandler
+import os
+import platform
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import traceback
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Self
+
+from pipeline import __version__
+from pipeline.desk import watch
+from pipeline.errors import PipelineError
+from pipeline.output import OWNERS_FOLDER
+
+_MOST_LOG = 1_000_000  # bytes; a longer log starts again from nothing
+# Signals that a program can catch: Ctrl-C, kill, a terminal or session that closes.
+_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
+
+
+class Ending:
+    """Hears of what ends the desk; a context, around all that is served.
+
+    Parameters
+    ----------
+    say : writes a line to stderr.
+
+    Attributes
+    ----------
+    asked : whether a signal asked the desk to end.
+    log : where it is kept what ended desks.
+    """
+
+    def __init__(self, *, say: Callable[[str], None]) -> None:
+        self.asked = threading.Event()
+        self.log = log_file()
+        self._say, self._why = say, "no reason was given"
+        # In a session of its own: what ends all of a terminal's programs does not end this one.
+        self._watch = subprocess.Popen(
+            [sys.executable, "-I", watch.__file__, str(self.log), str(os.getpid())],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+
+    def __enter__(self) -> Self:
+        assert self._watch.stdin is not None
+        faulthandler.enable(file=self._watch.stdin)
+        threading.excepthook = self._in_thread
+        for name in _SIGNALS:
+            number = getattr(signal, name, None)
+            # nohup has a program ignore SIGHUP; it stays ignored.
+            if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
+                signal.signal(number, self._signalled)
+        self.note(f"begins: cartlab {__version__}, Python {platform.python_version()}")
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: object, where: object) -> None:
+        if isinstance(error, BaseException):
+            self._why = _name(error)
+            self._note_traceback(error)
+        if not isinstance(error, PipelineError | OSError):  # whose text the command line says
+            self._say(f"cartlab: the desk ends: {self._why}")
+        faulthandler.disable()
+        self.note(f"{watch.SAID}{self._why}")
+        with suppress(OSError):
+            if self._watch.stdin is not None:
+                self._watch.stdin.close()
+        self._watch.wait()
+
+    def note(self, text: str) -> None:
+        """Write lines into the log."""
+        lines = "".join(f"\t{line}\n" for line in text.splitlines())
+        with suppress(OSError, ValueError):  # the watching process was killed
+            assert self._watch.stdin is not None
+            self._watch.stdin.write(lines.encode(errors="replace"))
+            self._watch.stdin.flush()
+
+    def _signalled(self, number: int, _: object) -> None:
+        self._why = signal.Signals(number).name
+        self.asked.set()
+
+    def _in_thread(self, raised: threading.ExceptHookArgs) -> None:
+        """Tell of an exception that a thread died of; the desk goes on as far as it can."""
+        if raised.exc_value is None or isinstance(raised.exc_value, SystemExit):
+            return
+        name = raised.thread.name if raised.thread else "?"
+        self._say(f"cartlab: the desk: {_name(raised.exc_value)} in thread {name}")
+        self.note(f"in thread {name}:")
+        self._note_traceback(raised.exc_value)
+
+    def _note_traceback(self, error: BaseException) -> None:
+        with suppress(MemoryError, RecursionError):
+            self.note("".join(traceback.format_exception(error)))
+
+
+def log_file() -> Path:
+    """Return the file in which it is kept what ended desks; its folder is made where it can be."""
+    defaults = {"win32": "~/AppData/Local", "darwin": "~/Library/Logs"}
+    root = os.environ.get("XDG_STATE_HOME") or defaults.get(sys.platform, "~/.local/state")
+    try:
+        log = Path(root).expanduser() / "cartlab" / "desk.log"
+    except RuntimeError:  # a user without a home
+        log = Path(tempfile.gettempdir()) / "cartlab-desk.log"
+    with suppress(OSError):  # a home that nobody may write to: stderr has what matters
+        log.parent.mkdir(OWNERS_FOLDER, parents=True, exist_ok=True)
+        if log.stat().st_size > _MOST_LOG:
+            log.unlink()
+    return log
+
+
+def _name(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}".rstrip(": ")

@@ -1,0 +1,171 @@
+"""Whatever ends a desk, it says so on stderr and the log keeps it; what it left goes later."""
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from pipeline.desk.app import DeskServer
+from pipeline.desk.scratch import clear_scratch, scratch_folder
+from tests.helpers.desks import Visitor
+from tests.helpers.waiting import PATIENCE, started
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no such signals")
+
+# A desk whose threads are interrupted as its stdin says: by an exception that comes at any moment.
+DESK = """
+import ctypes, os, sys, threading
+from pipeline.cli import main
+
+def interrupt():
+    how, name = sys.stdin.readline().split()
+    if how == "exit":
+        os._exit(3)
+    if how == "thread":
+        raise ValueError("boom")
+    (ident,) = [one.ident for one in threading.enumerate() if one.name == name]
+    raised = ctypes.py_object({"memory": MemoryError, "exit0": SystemExit}[how])
+    ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(ident), raised)
+
+threading.Thread(target=interrupt, name="other", daemon=True).start()
+sys.argv = ["cartlab", "desk", "--no-browser", *sys.argv[1:]]
+main()
+"""
+
+
+@contextmanager
+def a_desk(tmp_path: Path, *options: str) -> Iterator[tuple[subprocess.Popen, str, Callable]]:
+    """Run a desk; yield it, its address, and what tells its other lines and the log at its end."""
+    log = tmp_path / "state" / "cartlab" / "desk.log"
+    environment = {**os.environ, "XDG_STATE_HOME": str(tmp_path / "state")}
+    command = [sys.executable, "-c", DESK, *options]
+    pipes = {"stdin": subprocess.PIPE, "stderr": subprocess.PIPE, "encoding": "utf-8"}
+    with started(command, env=environment, **pipes) as desk:
+        assert desk.stderr is not None
+        url = desk.stderr.readline().split()[-1]
+
+        def ended() -> tuple[int, str, str]:
+            assert desk.stderr is not None
+            said = desk.stderr.read()  # until the watching process has ended, too
+            kept = log.read_text(encoding="utf-8") if log.exists() else ""
+            return desk.wait(PATIENCE), said, kept
+
+        yield desk, url, ended
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGINT", "SIGHUP"])
+def test_a_signal_that_ends_the_desk_is_named(name, tmp_path):
+    """On stderr and in the log, which tells when it began; nothing there holds the secret."""
+    with a_desk(tmp_path) as (desk, url, ended):
+        desk.send_signal(getattr(signal, name))
+        status, said, kept = ended()
+    assert (status, said) == (0, f"cartlab: the desk ends: {name}\n")
+    begins, ends = kept.splitlines()
+    assert f" {desk.pid} begins: cartlab " in begins
+    assert ends.endswith(f" {desk.pid} ends: {name}")
+    assert url.split("/")[3] not in kept
+
+
+@pytest.mark.parametrize(
+    ("number", "told"),
+    [
+        (signal.SIGKILL, "was killed: by kill -9"),
+        (signal.SIGSEGV, "Fatal Python error: Segmentation fault"),
+        (signal.SIGABRT, "Fatal Python error: Aborted"),
+    ],
+)
+def test_what_no_program_survives_is_told_all_the_same(number, told, tmp_path):
+    """By the process that watches; where a library crashed, with the lines that were running."""
+    with a_desk(tmp_path) as (desk, _, ended):
+        desk.send_signal(number)
+        status, said, kept = ended()
+    assert status == -number
+    assert told in said
+    assert told in kept
+    assert ("most recent call first" in kept) == (number != signal.SIGKILL)
+    assert f"The log: {tmp_path}" in said
+
+
+@pytest.mark.parametrize(
+    ("sent", "status", "told"),
+    [
+        ("memory MainThread", 1, "the desk ends: MemoryError"),
+        ("memory server", 2, "the desk's server ended by itself"),
+        ("exit0 server", 2, "the desk's server ended by itself"),
+        ("exit now", 3, "was killed: by kill -9"),
+    ],
+)
+def test_an_exception_or_an_exit_within_is_told(sent, status, told, tmp_path):
+    """In the thread that serves or in the one that waits; with its traceback in the log."""
+    with a_desk(tmp_path) as (desk, _, ended):
+        assert desk.stdin is not None
+        desk.stdin.write(f"{sent}\n")
+        desk.stdin.flush()
+        found, said, kept = ended()
+    assert found == status
+    assert told in said
+    assert told.removeprefix("the desk ") in kept
+    if sent.startswith("memory"):
+        assert "MemoryError" in said
+        assert "Traceback" in kept
+
+
+def test_an_exception_in_another_thread_is_told_and_the_desk_goes_on(tmp_path):
+    """Its traceback is in the log; pages are answered as before."""
+    with a_desk(tmp_path) as (desk, url, ended):
+        visitor = Visitor.of(url)
+        assert desk.stdin is not None
+        assert desk.stderr is not None
+        desk.stdin.write("thread other\n")
+        desk.stdin.flush()
+        assert desk.stderr.readline() == "cartlab: the desk: ValueError: boom in thread other\n"
+        assert visitor.get("/").status == 200
+        desk.terminate()
+        _, said, kept = ended()
+    assert said == "cartlab: the desk ends: SIGTERM\n"
+    assert 'raise ValueError("boom")' in kept or "ValueError: boom" in kept
+
+
+def test_a_closed_session_is_no_end_where_nohup_says_so(tmp_path):
+    """A desk that was started to outlive its terminal does."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # which a child inherits
+    try:
+        with a_desk(tmp_path) as (desk, url, ended):
+            desk.send_signal(signal.SIGHUP)
+            assert Visitor.of(url).get("/").status == 200
+            desk.terminate()
+            assert ended()[1] == "cartlab: the desk ends: SIGTERM\n"
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_what_a_killed_desk_left_goes_with_the_next_start(tmp_path, monkeypatch):
+    """The folders of those that run stay, and what is not a desk's."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    code = (
+        "import sys, tempfile; tempfile.tempdir = sys.argv[1]\n"
+        "from pipeline.desk.scratch import scratch_folder\n"
+        "with scratch_folder() as folder:\n"
+        "    (folder / 'upload.zip').write_bytes(b'x'); print(folder, flush=True); input()"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path)]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "encoding": "utf-8"}
+    (tmp_path / "cartlab-notes").mkdir()
+    with scratch_folder() as mine, started(command, **pipes) as other:
+        assert other.stdout is not None
+        theirs = Path(other.stdout.readline().strip())
+        clear_scratch()
+        assert mine.is_dir()
+        assert (theirs / "upload.zip").is_file()
+        other.kill()
+        other.wait()
+        with DeskServer():
+            assert not theirs.exists()
+        assert mine.is_dir()
+    assert [path.name for path in tmp_path.iterdir()] == ["cartlab-notes"]
