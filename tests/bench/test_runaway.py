@@ -198,31 +198,40 @@ def test_a_stop_that_is_not_heeded_is_sent_again(tmp_path):
 class Pulling(Notes):
     """A person who pulls a cart out, and is not done before the bench was told to stop."""
 
-    def __init__(self, bench: RunawayBench) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self._bench = bench
+        self.bench: RunawayBench | None = None
 
     def confirm(self, instruction: str) -> None:
         """Take one's time where the cart is to be pulled out."""
         super().confirm(instruction)
         if instruction.startswith("Pull"):
-            self._bench.pulled = True
-            until(lambda: self._bench.told is not None, "a stop")
+            bench = self.bench
+            assert bench is not None
+            until(lambda: bench.told is not None, "a stop")
+
+    def is_pulling(self, bench: RunawayBench) -> bool:
+        """Tell whether the cart is being pulled out."""
+        return any(instruction.startswith("Pull") for instruction in self.confirmed)
 
 
 def test_a_motor_that_comes_on_while_a_person_is_awaited_is_stopped(tmp_path):
     """However long somebody holds the cart: the stop does not wait for the Enter key."""
+    work, notes = write_work(tmp_path, [decay("decay")]), Pulling()
+    with RunawayBench(notes.is_pulling, duty=FULL, commands=BY_HANDS) as notes.bench:
+        (partial,), _ = session(work, notes.bench, notes=notes, only=["decay"])
+    assert_over(notes.bench)
+    assert partial.startswith("stopped: the bench drives its motor")
+    assert partial in notes.remarks  # at once, not after the key
+
+
+def test_a_motor_that_comes_on_while_a_virtual_hand_pulls_is_stopped(tmp_path):
+    """The hands of a virtual bench take their time as well."""
     work = write_work(tmp_path, [decay("decay")])
-
-    def pulled(bench: RunawayBench) -> bool:
-        return getattr(bench, "pulled", False)
-
-    with RunawayBench(pulled, duty=FULL, commands=BY_HANDS) as bench:
-        notes = Pulling(bench)
-        (partial,), _ = session(work, bench, notes=notes, only=["decay"])
+    with RunawayBench(lambda bench: bench.is_pulled, duty=FULL) as bench:
+        (partial,), _ = session(work, bench, only=["decay"])
     assert_over(bench)
     assert partial.startswith("stopped: the bench drives its motor")
-    assert any(remark == partial for remark in notes.remarks)  # at once, not after the key
 
 
 def test_a_motor_that_comes_on_in_a_decay_by_hand_is_stopped(tmp_path):

@@ -15,7 +15,9 @@ from pipeline.bench.protocol.command_reader import CommandReader
 from pipeline.bench.protocol.messages import (
     EXTENSIONS,
     STOCK_STOP,
+    Command,
     Description,
+    Hands,
     Reading,
     Signal,
     Start,
@@ -48,7 +50,6 @@ class RunawayBench(threading.Thread):
     wrong : asked at each ms; whether the bench misbehaves now.
     duty : of a motor that misbehaves; None: as told.
     out : counts that cart 1 is away from where it should be, where the bench misbehaves.
-    deaf : it carries out no stop while it misbehaves.
     mute : asked at each ms; whether nothing it says arrives.
 
     Attributes
@@ -57,6 +58,7 @@ class RunawayBench(threading.Thread):
     starts : all starts, but those that only stop a stock bench.
     resets, lines : how many it was told, and has sent.
     is_stopped : it was told to stop, and nothing since.
+    is_pulled : a hand of its own has taken a cart to pull it out.
     offence : ms of its clock at its first line that shows what is wrong; None: none yet.
     told : ms of its clock when it was told to stop after that.
     started_after : starts that it was told after that.
@@ -68,12 +70,11 @@ class RunawayBench(threading.Thread):
         *,
         duty: int | None = None,
         out: int = 0,
-        deaf: bool = False,
         mute: Callable[["RunawayBench"], bool] = lambda bench: False,
         commands: frozenset[str] = BENCH.commands,
     ) -> None:
         super().__init__(daemon=True)
-        self._wrong, self._duty, self._out, self._deaf, self._mute = wrong, duty, out, deaf, mute
+        self._wrong, self._duty, self._out, self._mute = wrong, duty, out, mute
         self._description = replace(BENCH, commands=commands)
         self._core = ReferenceCore(self._description)
         self._reader = CommandReader(encoders=2, extensions=commands)
@@ -83,7 +84,7 @@ class RunawayBench(threading.Thread):
         self.run_on: Start | None = None
         self.starts: list[Start] = []
         self.resets = self.lines = 0
-        self.is_stopped = False
+        self.is_stopped = self.is_pulled = False
         self.offence: int | None = None
         self.told: int | None = None
         self.started_after: list[Start] = []
@@ -125,14 +126,13 @@ class RunawayBench(threading.Thread):
         waiting = fcntl.ioctl(self._slave, termios.FIONREAD, b"\0" * 4)
         return int.from_bytes(waiting, "little")
 
-    def _hear(self, command) -> None:
+    def _hear(self, command: Command) -> None:
         is_stop = command in (Signal.STOP, Signal.RESET)
         if is_stop and self.offence is not None and self.told is None:
             self.told = self.ms
-        if is_stop and self._deaf and self._wrong(self):
-            return
         self.resets += command is Signal.RESET
         self.is_stopped = is_stop or (self.is_stopped and not isinstance(command, Start))
+        self.is_pulled |= isinstance(command, Hands) and command.released > 0
         if isinstance(command, Start):
             self.run_on = command
             if command != STOCK_STOP[0]:
