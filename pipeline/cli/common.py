@@ -4,6 +4,7 @@ Data goes to `--out` or stdout, talk to stderr. Exit 0 done, 1 done but checks f
 Everything heavy is imported by the command that needs it, so that `--help` answers at once.
 """
 
+import errno
 import sys
 import threading
 import time
@@ -17,7 +18,7 @@ import typer
 from typer.exceptions import TyperException
 
 from pipeline import __version__
-from pipeline.errors import PipelineError
+from pipeline.errors import PipelineError, lacks_room, lies_in_the_file
 from pipeline.garbage import collect_seldom
 
 app = typer.Typer(
@@ -60,7 +61,9 @@ def main() -> None:
         _fail(str(error))
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
-        _fail(f"{where}{error.strerror or error}: choose another place, for example with --out")
+        elsewhere = lacks_room(error) or lies_in_the_file(error) or error.errno == errno.EROFS
+        hint = ": choose another place, for example with --out" if elsewhere else ""
+        _fail(f"{where}{error.strerror or error}{hint}")
 
 
 def _misuse(error: TyperException) -> str:

@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from pydantic import ValidationError
 
-from pipeline.errors import SubmissionError
+from pipeline.errors import SubmissionError, lies_in_the_file
 from pipeline.names import parameter_names
 from pipeline.submission.complaints import (
     TOP_LEVEL,
@@ -359,6 +359,8 @@ def outside(folder: Path, name: str, *, taken: Collection[str] = ()) -> str | No
     except FileNotFoundError:
         return f"there is no file {shown}{_near_file(folder, posix(name), taken)}"
     except OSError as error:
+        if not lies_in_the_file(error):
+            raise
         why = "a loop of links" if error.errno == errno.ELOOP else error.strerror
         return f"{shown} cannot be read ({why})"
     if stat.S_ISDIR(info.st_mode):

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from pipeline.errors import PipelineError
+from pipeline.errors import PipelineError, lies_in_the_file
 from pipeline.submission.complaints import quote, takes_numbers
 
 Value: TypeAlias = "str | bool | int | float | Sequence[Value] | Mapping[str, Value]"
@@ -110,12 +110,15 @@ def read_text(path: Path, *, where: str, limit: int, error: type[PipelineError])
     Raises
     ------
     PipelineError : of the kind `error`, where it is too large or no such text; one line.
+    OSError : this computer cannot read it now, whatever is in it.
     """
     try:
         if (size := path.stat().st_size) > limit:
             raise error(_too_large(where, size, limit))
         raw = path.read_bytes()
     except OSError as wrong:
+        if not lies_in_the_file(wrong):
+            raise
         raise error(f"{where}: cannot be read ({wrong.strerror})") from None
     return decoded(raw, where=where, limit=limit, error=error)
 
