@@ -2,17 +2,22 @@
 
 import re
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from pipeline.errors import PipelineError, lies_in_the_file
-from pipeline.submission.complaints import quote, takes_numbers
+from pipeline.submission.complaints import Location, dotted, quote, takes_numbers
 
 Value: TypeAlias = "str | bool | int | float | Sequence[Value] | Mapping[str, Value]"
 _MAX_KEY_DEPTH = 30  # tomllib's time grows with the square of a dotted key's depth
 _DOTTED_KEY = re.compile(r"[\w\"'-]+(?:[ \t]*\.[ \t]*[\w\"'-]+)*")
 _LONGEST_LINE, _SHOWN = 300, 60  # characters of a line that are looked at, and shown
+_LARGEST = 30  # powers of ten: beyond any physical number in any unit, yet safe to multiply
+_MOST_DIGITS = 1_000
+_MOST_BITS = 100  # of a whole number: 1e30
+_MANY_DIGITS = re.compile(r"(?<![\w.])[-+]?\d[\d_]{4299,}")  # Python reads 4,300 at most
 _AT = re.compile(r" \(at line (\d+), column (\d+)\)$")
 _NUMBER = r"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?"
 
@@ -143,7 +148,7 @@ def parse_toml(
     *,
     where: str,
     error: type[PipelineError],
-    parse_float: Callable[[str], Any] = float,
+    as_typed: bool = False,
 ) -> dict[str, Any]:
     """Parse TOML that somebody typed.
 
@@ -151,17 +156,24 @@ def parse_toml(
     ----------
     where : what to call the file; a line's number is added.
     error : whose mistake it is.
+    as_typed : leave numbers with a point or an exponent as the decimals that were typed, whatever
+        their size: see `number_problem`. Else they are floats that can be reckoned with.
 
     Raises
     ------
-    PipelineError : of the kind `error`; one line with the line's number and what to write.
+    PipelineError : of the kind `error`; one line with the line's number, or the key, and what to
+        write.
     """
     for key in _DOTTED_KEY.finditer(text):
         if key.group().count(".") > _MAX_KEY_DEPTH:
             line = text.count("\n", 0, key.start()) + 1
             raise error(f"{where} line {line}: keys nest too deeply")
     try:
-        return tomllib.loads(text, parse_float=parse_float)
+        document = tomllib.loads(text, parse_float=_decimal)
+        try:
+            return document if as_typed else _with_floats(document, ())
+        except UnusableNumber as unusable:
+            raise error(f"{where}: {dotted(unusable.at, document)}: {unusable}") from None
     except tomllib.TOMLDecodeError as wrong:
         message = " ".join(str(wrong).split())
         at = _AT.search(message)
@@ -173,7 +185,75 @@ def parse_toml(
     except RecursionError:
         raise error(f"{where}: lists or tables nest too deeply") from None
     except ValueError:  # an integer of thousands of digits
-        raise error(f"{where}: a number has too many digits") from None
+        raise error(f"{where}{_long_number(text)}: a number has too many digits") from None
+
+
+class UnusableNumber(Exception):
+    """A number that nothing can be reckoned with; its text says why.
+
+    Attributes
+    ----------
+    at : where it stands.
+    """
+
+    def __init__(self, at: Location, why: str) -> None:
+        super().__init__(why)
+        self.at = at
+
+
+def check_number(value: float | Decimal, at: Location) -> None:
+    """Refuse a number of a size that no quantity has, or with digits that no instrument gives.
+
+    Raises
+    ------
+    UnusableNumber : it is one.
+    """
+    number = value if isinstance(value, int) else Decimal(value)
+    if isinstance(number, Decimal) and not number.is_finite():
+        raise UnusableNumber(at, "expected a finite number, found NaN or infinity")
+    # Nothing is worked out before the exponent is known to be small: some take for ever.
+    sound = (
+        number.bit_length() <= _MOST_BITS and abs(number) < 10**_LARGEST
+        if isinstance(number, int)
+        else -_LARGEST <= number.adjusted() < _LARGEST
+    )
+    if not sound:
+        raise UnusableNumber(
+            at, f"expected a number between 1e-{_LARGEST} and 1e+{_LARGEST} in size, or 0"
+        )
+    if isinstance(number, Decimal) and len(number.as_tuple().digits) > _MOST_DIGITS:
+        raise UnusableNumber(at, f"expected a number of at most {_MOST_DIGITS} digits")
+
+
+def _decimal(text: str) -> Decimal:
+    """Return a number as it was typed; for an exponent that no decimal holds, an unusable one."""
+    try:
+        return Decimal(text)
+    except InvalidOperation:
+        return Decimal((0, (1,), 10 * _LARGEST))
+
+
+def _with_floats(value: Any, at: tuple[int | str, ...]) -> Any:
+    """Return a document with floats for its decimals.
+
+    Raises
+    ------
+    UnusableNumber : one of its numbers can be no float.
+    """
+    if isinstance(value, dict):
+        return {key: _with_floats(item, (*at, key)) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_with_floats(item, (*at, i)) for i, item in enumerate(value)]
+    if isinstance(value, bool) or not isinstance(value, int | Decimal):
+        return value
+    check_number(value, at)
+    return float(value) if isinstance(value, Decimal) else value
+
+
+def _long_number(text: str) -> str:
+    """Return " line 7" for the first whole number that is too long to be read, or ""."""
+    found = _MANY_DIGITS.search(text)
+    return f" line {text.count(chr(10), 0, found.start()) + 1}" if found else ""
 
 
 def _words(line: str, message: str) -> str:
