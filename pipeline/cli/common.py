@@ -31,7 +31,6 @@ app = typer.Typer(
 )
 
 FIRST_WORD, _LAST_PAUSE = 2.0, 60.0  # s without a word, at first and at most
-INTERRUPTED = 130  # exit status, as of any program that Ctrl-C ends
 
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="A submission folder.")]
 Preset = Annotated[str | None, typer.Option(help="throne-1dof, throne-2dof or throne-3dof.")]
@@ -47,7 +46,7 @@ Hide = Annotated[
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
 
 
-def main() -> None:
+def run() -> None:
     """Run the command line; an error that a person can act on is one line and exit status 2."""
     collect_seldom()
     for stream in (sys.stdout, sys.stderr):

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pipeline.cli.common import INTERRUPTED, AsJson, app, said_now_and_then, say
+from pipeline.cli import INTERRUPTED
+from pipeline.cli.common import AsJson, app, said_now_and_then, say
 
 if TYPE_CHECKING:
     from rich.progress import Progress, ProgressColumn
