@@ -23,7 +23,7 @@ class LineWatch:
 
     Attributes
     ----------
-    is_astray : the motor was driven otherwise than the bench was told.
+    is_astray : the motor's duty was not what the order asks for.
     is_too_far : a cart was further from its zero than its limit.
     """
 

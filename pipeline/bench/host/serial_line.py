@@ -173,7 +173,7 @@ class SerialLine:
                     if not told:
                         tell(str(runaway))
                     told = True
-                except HardwareError:  # whoever uses the line next is told
+                except HardwareError:  # the next use of the line reports it
                     return
 
         thread = threading.Thread(target=watch, daemon=True)
@@ -304,7 +304,7 @@ class SerialLine:
     def _try_stock(self) -> None:
         """Have a stock bench stream for a moment, which tells how many encoders it has."""
         self.send(Start(wave=Wave.DELTA, frequency=1 / _TRIAL, amplitude=0))
-        self._in_run, self._is_cleared = False, True  # the motor is to be off in it
+        self._in_run, self._is_cleared = False, True  # in it the motor must be off
         heard, end = b"", time.monotonic() + FIRST_LINE
         while not heard and time.monotonic() < end:
             time.sleep(_LOOK)
@@ -333,7 +333,7 @@ class _Ear:
         self._tail, self._on = b"", False
 
     def hear(self, data: bytes) -> int:
-        """Return the duty counts that drive the motor, 0 where none do."""
+        """Return the duty counts that drive the motor; 0: it is off."""
         if not data:
             return 0
         *lines, self._tail = (self._tail + data).split(b"\n")

@@ -340,7 +340,7 @@ class Session:
     def _stop(self, *, always: bool) -> None:
         """Stop the bench; a stock one, which that zeroes, only if the run did not end by itself.
 
-        What it sends from then on, nothing asked for: the line is cleared to know that apart.
+        Then the line is cleared: a line of the stream that comes later is one that nothing asked for.
         """
         try:
             try:
@@ -353,7 +353,7 @@ class Session:
             guard = "" if self._line.knows("k") else "; the motor may be on: switch it off"
             self._observer.remark(f"the stop could not be sent: {error}{guard}")
             return
-        with suppress(HardwareError):  # whoever starts the next run is told
+        with suppress(HardwareError):  # the next start reports it
             self._line.clear(queries=1)
 
     @_no_collection()
