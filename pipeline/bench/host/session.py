@@ -340,7 +340,7 @@ class Session:
     def _stop(self, *, always: bool) -> None:
         """Stop the bench; a stock one, which that zeroes, only if the run did not end by itself.
 
-        Then the line is cleared: a line of the stream that comes later is one that nothing asked for.
+        Then the line is cleared: nothing asked for what the bench streams after that.
         """
         try:
             try:
