@@ -9,12 +9,15 @@ import pytest
 from pipeline.bench.explore.at_bench import explore_bench
 from pipeline.bench.explore.wish import Wish
 from pipeline.bench.host.acquire import acquire
+from pipeline.bench.host.run_watch import LineWatch
+from pipeline.bench.planning.gains import Scales
+from pipeline.bench.planning.orders import make_order
 from pipeline.bench.planning.plan import Limits, Recording
-from pipeline.bench.protocol.messages import EXTENSIONS
+from pipeline.bench.protocol.messages import EXTENSIONS, Reading
 from pipeline.errors import HardwareError
-from pipeline.submission import load_submission
+from pipeline.submission import System, load_submission
 from tests.helpers.acquisitions import Notes, sine, write_work
-from tests.helpers.runaway import PER_COUNT, RunawayBench
+from tests.helpers.runaway import BENCH, PER_COUNT, RunawayBench
 from tests.helpers.waiting import until
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
@@ -193,6 +196,23 @@ def test_a_stop_that_is_not_heeded_is_sent_again(tmp_path):
     assert_over(bench)
     assert partial.startswith("stopped: cart 2 was ")
     assert error.startswith("stopped: the bench drives its motor with 4096 duty counts while it")
+
+
+@pytest.mark.parametrize("period", [1, 2, 5, 10])
+def test_a_bench_of_few_lines_is_stopped_as_soon(period):
+    """What lasts is told in ms, not in lines: two of them do where they are far apart."""
+    order = make_order(
+        plan()[0],
+        limits=Limits(input=0.5, travel=2.5),
+        scales=Scales(input=BENCH.input_per_count, position=PER_COUNT),
+        system=System(carts=2, springs=(True,) * 3),
+        bench=BENCH,
+    )
+    watch = LineWatch(order.rest(), carts=0, period=period)
+    lines = [Reading(counts=(0, 0), target=0, duty=9, ms=ms) for ms in range(0, 100, period)]
+    told = next(line.ms for line in lines if watch.check([line]))
+    assert told <= AT_ONCE / 2
+    assert watch.is_astray
 
 
 class Pulling(Notes):
