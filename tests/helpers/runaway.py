@@ -1,7 +1,8 @@
 """A bench on a pseudo-terminal that does in one state of a session what nothing told it to.
 
 Its clock is its own: it goes on by a millisecond at a time, and waits while the host has a few
-lines still to read. So what the host takes to react is told in ms of the bench, on any machine.
+lines still to read, which are counted where the host reads them. So how long the host takes to
+react is measured in ms of the bench, on any machine.
 """
 
 import os
@@ -9,8 +10,10 @@ import select
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from unittest.mock import patch
 
 from pipeline.bench.emulator.core import ReferenceCore
+from pipeline.bench.host.serial_line import SerialLine
 from pipeline.bench.protocol.command_reader import CommandReader
 from pipeline.bench.protocol.messages import (
     EXTENSIONS,
@@ -80,6 +83,7 @@ class RunawayBench(threading.Thread):
         self._reader = CommandReader(encoders=2, extensions=commands)
         self._over = threading.Event()
         self._held = 0  # duty that acts
+        self._unread = 0  # bytes that the host has still to read
         self.ms = 0
         self.run_on: Start | None = None
         self.starts: list[Start] = []
@@ -96,12 +100,25 @@ class RunawayBench(threading.Thread):
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
         self.address = os.ttyname(self._slave)
+        self._meter = patch.object(SerialLine, "receive", self._metered(SerialLine.receive))
+        self._meter.start()
         self.start()
         return self
+
+    def _metered(self, receive: Callable[[SerialLine], bytes]) -> Callable[[SerialLine], bytes]:
+        """Return what reads as the host does, and counts what it has read."""
+
+        def metered(line: SerialLine) -> bytes:
+            data = receive(line)
+            self._unread = max(0, self._unread - len(data))
+            return data
+
+        return metered
 
     def __exit__(self, *error: object) -> None:
         self._over.set()
         self.join()
+        self._meter.stop()
         os.close(self._master)
         os.close(self._slave)
 
@@ -109,7 +126,7 @@ class RunawayBench(threading.Thread):
         """Go on by one ms after the other until the block is over."""
         while not self._over.wait(_PAUSE):
             self._listen()
-            if self._unread() < _MOST_UNREAD:
+            if self._unread < _MOST_UNREAD:
                 self._tick()
         self._listen()
 
@@ -117,14 +134,6 @@ class RunawayBench(threading.Thread):
         while select.select([self._master], [], [], 0)[0]:
             for command in self._reader.feed(os.read(self._master, 4096)):
                 self._hear(command)
-
-    def _unread(self) -> int:
-        """Return how many bytes the host has still to read."""
-        import fcntl  # not on Windows
-        import termios
-
-        waiting = fcntl.ioctl(self._slave, termios.FIONREAD, b"\0" * 4)
-        return int.from_bytes(waiting, "little")
 
     def _hear(self, command: Command) -> None:
         is_stop = command in (Signal.STOP, Signal.RESET)
@@ -135,7 +144,9 @@ class RunawayBench(threading.Thread):
         self.is_pulled |= isinstance(command, Hands) and command.released > 0
         if isinstance(command, Start):
             self.run_on = command
-            if command != STOCK_STOP[0]:
+            if command == STOCK_STOP[0]:  # of a line just opened: what was unread is gone
+                self._unread = 0
+            else:
                 self.starts.append(command)
                 if self.offence is not None:
                     self.started_after.append(command)
@@ -156,6 +167,7 @@ class RunawayBench(threading.Thread):
         out = b"".join(line for line in said if line.startswith(b"?"))
         out += b"".join(map(format_reading, readings))
         if out and not self._mute(self):
+            self._unread += len(out)
             os.write(self._master, out)
         self.ms += 1
 
