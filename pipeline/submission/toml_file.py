@@ -210,7 +210,7 @@ def check_number(value: float | Decimal, at: Location) -> None:
     """
     number = value if isinstance(value, int) else Decimal(value)
     if isinstance(number, Decimal) and not number.is_finite():
-        raise UnusableNumber(at, f"expected a finite number, found {float(number)}")
+        raise UnusableNumber(at, f"expected a finite number, found {number}")
     # Nothing is worked out before the exponent is known to be small: some take for ever.
     sound = (
         number.bit_length() <= _MOST_BITS and abs(number) < 10**_LARGEST
