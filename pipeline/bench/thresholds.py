@@ -21,7 +21,7 @@ UNREADABLE = 0.25  # s of bytes that are no lines: the motor may be on, and nobo
 NEARLY = 100.0  # ms before the end at which silence is the end; after it lines are too many
 STILL = 4  # counts a cart at rest may flicker; a run in which no free cart moves more is none
 REST_WINDOW = 500.0  # ms at the end of a rest over which it is judged
-ASTRAY = 5  # lines in a row of another target; a garbled line is alone
+ASTRAY = 4  # ms of lines in a row of another target or duty: five at 1 kHz, else two at least
 ENOUGH = 1000  # lines that tell a clock's period
 TRIES = 3  # of one recording; a fault that strikes three times is not chance
 

@@ -1,11 +1,32 @@
-"""The `cartlab` command: parse, call one function, write, exit code."""
+"""The `cartlab` command: parse, call one function, write, exit code.
 
-# isort: off
-# In this order `cartlab --help` lists the commands: as a lab needs them.
-from pipeline.cli.common import app, main
-from pipeline.cli import reports, models, plan, acquire, explore, emulate, grading, desk, demo
+The commands are loaded when the first is run, so that Ctrl-C while they load ends it quietly. What
+is imported here is there before anybody can press it.
+"""
 
-__all__ = [
-    "acquire", "app", "demo", "desk", "emulate", "explore", "grading", "main", "models", "plan",
-    "reports",
-]  # fmt: skip
+import sys
+
+TYPE_CHECKING = False  # as that of typing, which takes its time to load
+if TYPE_CHECKING:
+    from pipeline.cli.common import app as app
+
+INTERRUPTED = 130  # exit status, as of any program that Ctrl-C ends
+
+
+def __getattr__(name: str) -> object:
+    """Load the application when it is asked for."""
+    if name == "app":
+        from pipeline.cli.commands import app
+
+        return app
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def main() -> None:
+    """Run the command line."""
+    try:
+        from pipeline.cli.commands import run
+
+        run()
+    except KeyboardInterrupt:  # nothing has begun yet, or it has been said what became of it
+        sys.exit(INTERRUPTED)

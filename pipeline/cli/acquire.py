@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pipeline.cli.common import INTERRUPTED, Folder, app
+from pipeline.cli import INTERRUPTED
+from pipeline.cli.common import Folder, app
 from pipeline.errors import ConfigError
 
 if TYPE_CHECKING:

@@ -4,6 +4,7 @@ Data goes to `--out` or stdout, talk to stderr. Exit 0 done, 1 done but checks f
 Everything heavy is imported by the command that needs it, so that `--help` answers at once.
 """
 
+import errno
 import sys
 import threading
 import time
@@ -17,7 +18,7 @@ import typer
 from typer.exceptions import TyperException
 
 from pipeline import __version__
-from pipeline.errors import PipelineError
+from pipeline.errors import PipelineError, lacks_room, lies_in_the_file
 from pipeline.garbage import collect_seldom
 
 app = typer.Typer(
@@ -30,7 +31,6 @@ app = typer.Typer(
 )
 
 FIRST_WORD, _LAST_PAUSE = 2.0, 60.0  # s without a word, at first and at most
-INTERRUPTED = 130  # exit status, as of any program that Ctrl-C ends
 
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="A submission folder.")]
 Preset = Annotated[str | None, typer.Option(help="throne-1dof, throne-2dof or throne-3dof.")]
@@ -46,7 +46,7 @@ Hide = Annotated[
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
 
 
-def main() -> None:
+def run() -> None:
     """Run the command line; an error that a person can act on is one line and exit status 2."""
     collect_seldom()
     for stream in (sys.stdout, sys.stderr):
@@ -60,7 +60,9 @@ def main() -> None:
         _fail(str(error))
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
-        _fail(f"{where}{error.strerror or error}: choose another place, for example with --out")
+        elsewhere = lacks_room(error) or lies_in_the_file(error) or error.errno == errno.EROFS
+        hint = ": choose another place, for example with --out" if elsewhere else ""
+        _fail(f"{where}{error.strerror or error}{hint}")
 
 
 def _misuse(error: TyperException) -> str:

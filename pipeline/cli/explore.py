@@ -5,8 +5,9 @@ from typing import Annotated
 
 import typer
 
+from pipeline.cli import INTERRUPTED
 from pipeline.cli.acquire import saying_where, watching
-from pipeline.cli.common import INTERRUPTED, Folder, app
+from pipeline.cli.common import Folder, app
 from pipeline.errors import ConfigError
 
 

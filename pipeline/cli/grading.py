@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pipeline.cli.common import INTERRUPTED, AsJson, app, said_now_and_then, say
+from pipeline.cli import INTERRUPTED
+from pipeline.cli.common import AsJson, app, said_now_and_then, say
 
 if TYPE_CHECKING:
     from rich.progress import Progress, ProgressColumn
@@ -80,7 +81,12 @@ def grade(
             say(f"  and {more} more; cartlab history tells each")
     for submission, reason in done.failed:
         say(f"{submission}: {reason}")
-    if len(done.failed) == done.total > 1:
+    if done.lacks_room:
+        say(
+            f"the disk is full: for {done.lacks_room} of {done.total} there was no room to unpack "
+            f"them in {out}; make room there, then the same command grades them"
+        )
+    if len(done.failed) == done.total > 1 and not done.unsettled:
         say(f"not one could be graded: is {rubric} the rubric for these submissions?")
     say(f"{done.counted}; wrote {out}")
     if done.failed:

@@ -14,6 +14,7 @@ from pipeline.errors import PipelineError
 if TYPE_CHECKING:
     from pipeline.report.draft.changes import DraftChanges
     from pipeline.results import Analysis
+    from pipeline.submission import Submission
 
 
 @app.command()
@@ -154,7 +155,7 @@ def run_report(
 
     submission = load_submission(folder)
     out = named_folder(out) if out else own_folder(submission.folder, "report")
-    compared = _comparison(compare)
+    compared = _comparison(compare, submission)
     with progress_line() as progress:
         analysis, changes = make_report(
             submission, out, compared=compared, pdf=pdf, tables=tables, progress=progress
@@ -170,13 +171,25 @@ def _unreadable(analysis: "Analysis") -> list[str]:
     return [f"cartlab: {name}: {reason}" for name, reason in analysis.unreadable.items()]
 
 
-def _comparison(earlier: Path | None) -> "Callable[[Analysis], DraftChanges | None]":
-    """Return what compares an analysis with an earlier draft, which is read at once."""
+def _comparison(
+    earlier: Path | None, submission: "Submission"
+) -> "Callable[[Analysis], DraftChanges | None]":
+    """Return what compares an analysis with an earlier draft.
+
+    The draft is read at once; one that cannot be compared is refused before anything is analysed.
+    """
     if earlier is None:
         return lambda analysis: None
-    from pipeline.report.draft.changes import compare_drafts, read_results
+    from pipeline.report.draft.changes import check_comparable, compare_drafts, read_results
 
-    return partial(compare_drafts, read_results(earlier))
+    before, system = read_results(earlier), submission.system
+    check_comparable(
+        before,
+        carts=system.carts,
+        position_unit=system.position.unit,
+        input_unit=system.input.unit,
+    )
+    return partial(compare_drafts, before)
 
 
 @app.command()

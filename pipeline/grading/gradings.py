@@ -25,6 +25,7 @@ class Grading:
     figures : (file name, SVG) for the feedback.
     owner : who handed it in, as the learning platform calls them, or "".
     detail : for whoever mends the grader: the traceback of an error of its own, or "".
+    lacks_room : the disk was full. It concerns this run alone: the gradebook does not keep it.
     """
 
     submission: str
@@ -39,6 +40,7 @@ class Grading:
     figures: tuple[tuple[str, str], ...] = ()
     owner: str = ""
     detail: str = ""
+    lacks_room: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,12 +97,16 @@ class Batch:
     keys : of the gradings, in the order of the submissions' ids.
     shared : by submission, the flag for recordings that stand in another submission too.
     failed : (submission, reason) of those that could not be graded.
+    unsettled : those of them that the next run tries again; lacks_room : for which the disk was
+        full.
     kept, moved, taken_over : what became of the class list before, see `so_far.SoFar`.
     """
 
     keys: tuple[str, ...]
     shared: Mapping[str, Flag]
     failed: tuple[tuple[str, str], ...] = ()
+    unsettled: frozenset[str] = frozenset()
+    lacks_room: frozenset[str] = frozenset()
     kept: tuple[str, ...] = ()
     moved: Mapping[str, str] = field(default_factory=dict)
     taken_over: tuple[tuple[str, tuple[str, ...], tuple[str, ...]], ...] = ()

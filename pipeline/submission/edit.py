@@ -80,6 +80,9 @@ def edit_submission(
             new = _MANY_BLANKS.sub("\n\n", tomlkit.dumps(document)).rstrip() + "\n"
         except (TOMLKitError, RecursionError) as error:
             raise SubmissionError(f"{where}: cannot be changed by a program ({error})") from None
+        except ValueError:  # an integer of thousands of digits
+            parse_submission(text, folder=folder, where=where)  # in the file as it was?
+            raise SubmissionError(f"{where}: a number has too many digits") from None
         except (TypeError, AttributeError, LookupError):
             parse_submission(text, folder=folder, where=where)  # no table where one was?
             raise

@@ -12,7 +12,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from pydantic import ValidationError
 
-from pipeline.errors import SubmissionError
+from pipeline.errors import SubmissionError, lies_in_the_file
 from pipeline.names import parameter_names
 from pipeline.submission.complaints import (
     MOST_TOLD,
@@ -27,14 +27,18 @@ from pipeline.submission.complaints import (
     without_tag,
 )
 from pipeline.submission.models import Experiment, Reported, StateFeedback, Submission
-from pipeline.submission.toml_file import BACKSLASH, parse_toml, read_text
+from pipeline.submission.toml_file import (
+    BACKSLASH,
+    UnusableNumber,
+    check_number,
+    parse_toml,
+    read_text,
+)
 
 NAME = "submission.toml"
 MAX_TOML_BYTES = 1_000_000  # a full class section's worth of experiments needs a tenth of it
 MAX_NOTES_BYTES = 1_000_000
 MAX_DATA_BYTES = 100_000_000  # over half an hour at 1 kHz
-_LARGEST = Decimal("1e30")  # beyond any physical number in any unit, yet safe to multiply
-_MOST_DIGITS = 1_000
 _MOST_SHOWN = 30_000  # characters of the notes: fifteen pages
 _MOST_LOOKED_AT = 1_000  # files and folders, for the one that may be meant
 COMMENT = re.compile(r"<!--.*?(?:-->|\Z)", re.DOTALL)  # one left open runs to the end
@@ -97,7 +101,7 @@ def parse_submission(text: str, *, folder: Path, where: str = NAME) -> Submissio
     SubmissionError : no TOML; InvalidSubmission, with every problem, where it is.
     """
     # Decimals stay so: no typed digit is lost.
-    document = parse_toml(text, where=where, error=SubmissionError, parse_float=Decimal)
+    document = parse_toml(text, where=where, error=SubmissionError, as_typed=True)
     submission = _validate(document, where=where)
     if found := list(_problems(submission, folder)):
         worded = [(at, f"{dotted(at, document)}: {what}") for at, what in found]
@@ -128,9 +132,9 @@ def _validate(document: dict, *, where: str) -> Submission:
     document = {key: value for key, value in document.items() if key in TOP_LEVEL}
     try:
         plain = {key: _plain(value, (key,)) for key, value in document.items()}
-    except _Unusable as error:
-        at, what = error.args
-        raise InvalidSubmission(where, [(at, f"{dotted(at, document)}: {what}")]) from None
+    except UnusableNumber as error:
+        what = f"{dotted(error.at, document)}: {error}"
+        raise InvalidSubmission(where, [(error.at, what)]) from None
     except RecursionError:
         raise SubmissionError(f"{where}: lists or tables nest too deeply") from None
     try:
@@ -146,10 +150,6 @@ def _validate(document: dict, *, where: str) -> Submission:
     return submission
 
 
-class _Unusable(Exception):
-    """A number that cannot be used: its location and why."""
-
-
 def _plain(value: object, at: tuple[int | str, ...]) -> object:
     """Return lists as tuples and decimals as floats, but under `reported` all as decimals."""
     if isinstance(value, dict):
@@ -158,14 +158,7 @@ def _plain(value: object, at: tuple[int | str, ...]) -> object:
         return tuple(_plain(item, (*at, i)) for i, item in enumerate(value))
     if isinstance(value, bool) or not isinstance(value, int | Decimal):
         return value
-    if isinstance(value, Decimal) and not value.is_finite():
-        raise _Unusable(at, "expected a finite number, found NaN or infinity")
-    if abs(value) >= _LARGEST or (value and abs(Decimal(value)) <= 1 / _LARGEST):
-        raise _Unusable(
-            at, f"expected a number between {1 / _LARGEST:.0e} and {_LARGEST:.0e} in size"
-        )
-    if len(Decimal(value).as_tuple().digits) > _MOST_DIGITS:
-        raise _Unusable(at, f"expected a number of at most {_MOST_DIGITS} digits")
+    check_number(value, at)
     if at[0] == "reported":
         return Decimal(value)
     return float(value) if isinstance(value, Decimal) else value
@@ -371,6 +364,8 @@ def outside(folder: Path, name: str, *, taken: Collection[str] = ()) -> str | No
     except FileNotFoundError:
         return f"there is no file {shown}{_near_file(folder, posix(name), taken)}"
     except OSError as error:
+        if not lies_in_the_file(error):
+            raise
         why = "a loop of links" if error.errno == errno.ELOOP else error.strerror
         return f"{shown} cannot be read ({why})"
     if stat.S_ISDIR(info.st_mode):

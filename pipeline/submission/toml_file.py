@@ -2,15 +2,16 @@
 
 import re
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from pydantic import BaseModel
 
-from pipeline.errors import PipelineError
-from pipeline.submission.complaints import quote, takes_numbers
+from pipeline.errors import PipelineError, lies_in_the_file
+from pipeline.submission.complaints import Location, dotted, quote, takes_numbers
 
 Tables: TypeAlias = Mapping[str, type[BaseModel]]
 Value: TypeAlias = "str | bool | int | float | Sequence[Value] | Mapping[str, Value]"
@@ -19,6 +20,10 @@ _DOTTED_KEY = re.compile(r"[\w\"'-]+(?:[ \t]*\.[ \t]*[\w\"'-]+)*")
 _LONGEST_LINE, _SHOWN = 300, 60  # characters of a line that are looked at, and shown
 _LONGEST_MENDED, _MOST_PASSES = 50_000, 30  # characters that are read again after a slip; times
 _BEGINS = re.compile(r"\s*(#|\[|[\w\"'.-]+\s*=)")  # a line that is no rest of the one before
+_LARGEST = 30  # powers of ten: beyond any physical number in any unit, yet safe to multiply
+_MOST_DIGITS = 1_000
+_MOST_BITS = 100  # of a whole number: 1e30
+_MANY_DIGITS = re.compile(r"(?<![\w.])[-+]?\d[\d_]{4299,}")  # Python reads 4,300 at most
 _AT = re.compile(r" \(at line (\d+), column (\d+)\)$")
 _NUMBER = r"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?"
 
@@ -116,12 +121,15 @@ def read_text(path: Path, *, where: str, limit: int, error: type[PipelineError])
     Raises
     ------
     PipelineError : of the kind `error`, where it is too large or no such text; one line.
+    OSError : this computer cannot read it now, whatever is in it.
     """
     try:
         if (size := path.stat().st_size) > limit:
             raise error(_too_large(where, size, limit))
         raw = path.read_bytes()
     except OSError as wrong:
+        if not lies_in_the_file(wrong):
+            raise
         raise error(f"{where}: cannot be read ({wrong.strerror})") from None
     return decoded(raw, where=where, limit=limit, error=error)
 
@@ -162,7 +170,7 @@ def parse_toml(
     *,
     where: str,
     error: type[PipelineError],
-    parse_float: Callable[[str], Any] = float,
+    as_typed: bool = False,
     tables: Tables | None = None,
 ) -> dict[str, Any]:
     """Parse TOML that somebody typed.
@@ -171,13 +179,16 @@ def parse_toml(
     ----------
     where : what to call the file; a line's number is added.
     error : whose mistake it is.
+    as_typed : leave numbers with a point or an exponent as the decimals that were typed, whatever
+        their size: see `check_number`. Else they are floats that can be reckoned with.
     tables : the models of the format, by default those of a submission.
 
     Raises
     ------
-    PipelineError : of the kind `error`; for each slip a line with its number and what to write.
+    PipelineError : of the kind `error`; for each slip a line with its number, or the key, and what
+        to write.
     """
-    read = read_toml(text, parse_float=parse_float, tables=tables)
+    read = read_toml(text, as_typed=as_typed, tables=tables)
     if read.slips:
         raise error("\n".join(at_line(where, line, what) for line, what in read.slips))
     return read.document
@@ -191,7 +202,7 @@ def at_line(where: str, line: int, what: str) -> str:
 def read_toml(
     text: str,
     *,
-    parse_float: Callable[[str], Any] = float,
+    as_typed: bool = False,
     tables: Tables | None = None,
 ) -> Toml:
     """Read what can be read of TOML that somebody typed: a slip hides nothing in other lines."""
@@ -203,7 +214,9 @@ def read_toml(
     lines, emptied = list(typed), 0
     for _ in range(_MOST_PASSES if len(text) <= _LONGEST_MENDED else 1):
         try:
-            document = tomllib.loads("\n".join(lines), parse_float=parse_float)
+            document = tomllib.loads("\n".join(lines), parse_float=_decimal)
+            if not as_typed:
+                document = _with_floats(document, (), slips)
             return Toml(document=document, text="\n".join(lines), slips=tuple(slips))
         except tomllib.TOMLDecodeError as wrong:
             message = " ".join(str(wrong).split())
@@ -223,9 +236,76 @@ def read_toml(
             slips.append((0, "lists or tables nest too deeply"))
             break
         except ValueError:  # an integer of thousands of digits
-            slips.append((0, "a number has too many digits"))
+            slips.append((_long_number(text), "a number has too many digits"))
             break
     return Toml(document={}, text="", slips=tuple(slips))
+
+
+class UnusableNumber(Exception):
+    """A number that nothing can be reckoned with; its text says why.
+
+    Attributes
+    ----------
+    at : where it stands.
+    """
+
+    def __init__(self, at: Location, why: str) -> None:
+        super().__init__(why)
+        self.at = at
+
+
+def check_number(value: float | Decimal, at: Location) -> None:
+    """Refuse a number of a size that no quantity has, or with digits that no instrument gives.
+
+    Raises
+    ------
+    UnusableNumber : it is one.
+    """
+    number = value if isinstance(value, int) else Decimal(value)
+    if isinstance(number, Decimal) and not number.is_finite():
+        raise UnusableNumber(at, f"expected a finite number, found {number}")
+    # Nothing is worked out before the exponent is known to be small: some take for ever.
+    sound = (
+        number.bit_length() <= _MOST_BITS and abs(number) < 10**_LARGEST
+        if isinstance(number, int)
+        else -_LARGEST <= number.adjusted() < _LARGEST
+    )
+    if not sound:
+        raise UnusableNumber(
+            at, f"expected a number between 1e-{_LARGEST} and 1e+{_LARGEST} in size, or 0"
+        )
+    if isinstance(number, Decimal) and len(number.as_tuple().digits) > _MOST_DIGITS:
+        raise UnusableNumber(at, f"expected a number of at most {_MOST_DIGITS} digits")
+
+
+def _decimal(text: str) -> Decimal:
+    """Return a number as it was typed; for an exponent that no decimal holds, an unusable one."""
+    try:
+        return Decimal(text)
+    except InvalidOperation:
+        return Decimal((0, (1,), 10 * _LARGEST))
+
+
+def _with_floats(value: Any, at: tuple[int | str, ...], slips: list[tuple[int, str]]) -> Any:
+    """Return a document with floats for its decimals; what can be no float is a slip, and 1."""
+    if isinstance(value, dict):
+        return {key: _with_floats(item, (*at, key), slips) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_with_floats(item, (*at, i), slips) for i, item in enumerate(value)]
+    if isinstance(value, bool) or not isinstance(value, int | Decimal):
+        return value
+    try:
+        check_number(value, at)
+    except UnusableNumber as unusable:
+        slips.append((0, f"{dotted(unusable.at, {})}: {unusable}"))
+        return 1
+    return float(value) if isinstance(value, Decimal) else value
+
+
+def _long_number(text: str) -> int:
+    """Return the line of the first whole number that is too long to be read, 0 without one."""
+    found = _MANY_DIGITS.search(text)
+    return text.count("\n", 0, found.start()) + 1 if found else 0
 
 
 def _spoilt(lines: Sequence[str], line: int, words: str) -> tuple[int, int]:

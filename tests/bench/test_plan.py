@@ -371,7 +371,7 @@ def with_run(**changes) -> str:
         ("version = 1\n[limit]\n", r"limit: unknown key; did you mean 'limits'\?"),
         ("version = 1\n[limits]\ninput = 5\ntravl = 2", r"travl: unknown key; .*'travel'"),
         ("version = 1\n[limits]\ninput = 0\ntravel = 2", r"limits.input: expected more than 0"),
-        ("version = 1\n[limits]\ninput = nan\ntravel = 2", r"limits.input: .*finite.*found nan"),
+        ("version = 1\n[limits]\ninput = nan\ntravel = 2", r"limits.input: .*finite.*found NaN"),
         ("version = 2\n[limits]\ninput = 1\ntravel = 2", r"version: expected 1, found 2"),
         ("version = 1\nlimits = [", "not valid TOML"),
         (with_run(kind="steps"), r"recordings\[1\]\.kind \(run\): expected .*'step'\?"),

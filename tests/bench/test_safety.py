@@ -232,8 +232,9 @@ def test_a_new_line_is_zeroed_once_the_carts_rest(tmp_path, real):
         until(away, "a swing")  # it is on after one second
         line.send(Signal.RESET)  # as whoever opens the line again does
         line.drain()
-        assert session.prepare(recording) == ""
-        session.record(make_order(recording, **ask), tmp_path / "dwell-1.raw")
+        order = make_order(recording, **ask)
+        assert session.prepare(order) == ""
+        session.record(order, tmp_path / "dwell-1.raw")
     assert max(map(abs, notes.readings_seen[0].counts)) <= 4  # which a cart at rest may flicker
 
 

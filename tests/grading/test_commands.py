@@ -112,6 +112,30 @@ def test_a_name_writes_nothing_over_what_is_said(run, tmp_path):
     assert status == 1  # who has points has none in the table
 
 
+@pytest.mark.parametrize("lms", ["canvas", "moodle", "gradescope"])
+@pytest.mark.parametrize("listed", [False, True])
+def test_who_is_in_two_submissions_makes_every_export_end_so(run, tmp_path, lms, listed):
+    """Left out of the platform's own table or of ours: the exit status is 1, and why is said."""
+    outcomes = [make_outcome(make_grade(name, share=1 / n, authors=("s1",)))
+                for n, name in ((1, "a"), (2, "b"))]  # fmt: skip
+    with Gradebook(tmp_path, assignment="lab", create=True) as book:
+        for outcome in outcomes:
+            book.put(outcome)
+        book.finish(Batch(keys=tuple(o.key for o in outcomes), shared={}), rubric=two_cart_rubric())
+    roster = tmp_path / "roster.csv"
+    roster.write_text(
+        {
+            "canvas": "Student,ID,SIS User ID,Section\nDoe,7,s1,A\n",
+            "moodle": "Identifier,Full name,ID number,Grade\nParticipant 7,Doe,s1,\n",
+            "gradescope": "First Name,Last Name,SID,Email,Total Score\nJane,Doe,s1,,\n",
+        }[lms],
+        encoding="utf-8",
+    )
+    status, _, err = run("export", tmp_path, "--lms", lms, *(["--roster", roster] * listed))
+    assert "s1 is in a (20) and b (10): left out" in err
+    assert status == 1
+
+
 def test_a_console_of_few_letters_is_no_error(grades, monkeypatch):
     """What it has no letter for is shown by its number; the JSON stays valid."""
     raw = io.BytesIO()

@@ -132,6 +132,28 @@ def test_other_benches_are_not_compared():
         compare_drafts(draft_of(make_analysis(2)), make_analysis(3))
 
 
+@pytest.mark.parametrize(
+    ("key", "other"),
+    [("carts", 3), ("units", {"position": "mm", "input": "V"})],
+)
+def test_what_cannot_be_compared_is_refused_before_the_analysis(tmp_path, monkeypatch, key, other):
+    """The units and carts stand in submission.toml: nobody waits for an analysis to hear it."""
+
+    def analysed_after_all(*_, **__):
+        pytest.fail("the analysis ran")
+
+    monkeypatch.setattr("pipeline.report.draft.write.analyse", analysed_after_all)
+    earlier = json.loads(results_text(analysed("one-cart")))
+    earlier["submission"][key] = other
+    path = tmp_path / "earlier.json"
+    path.write_text(json.dumps(earlier), encoding="utf-8")
+    out = tmp_path / "out"
+    done = cartlab_here("report", EXAMPLES / "one-cart", "--out", out, "--compare", path)
+    assert done.returncode == 2
+    assert "they cannot be compared" in done.stderr
+    assert not out.exists()
+
+
 def test_the_command_tells_the_change_in_one_line_of_stderr(tmp_path):
     """`--compare` with a results.json whose gain was edited says so, in the page and on stderr."""
     earlier = json.loads(results_text(analysed("one-cart")))

@@ -130,6 +130,10 @@ class Faults:
         end, self._open = b"\n" * self._open, False
         return self._hold(end, clock=clock)
 
+    def behind(self, data: bytes, *, clock: float) -> bytes:
+        """Return what goes out of what is no line of the stream: it overtakes none of them."""
+        return self._hold(data, clock=clock)
+
     def _hold(self, data: bytes, *, clock: float) -> bytes:
         """Return what goes out now: this and what was held back, or nothing yet."""
         self._held += data

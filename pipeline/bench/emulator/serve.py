@@ -145,7 +145,8 @@ class Server:
         duty = self._core.tick(self._carts.counts(), stamp=int(1e3 * self._clock), now=now)
         said = self._core.take().splitlines(keepends=True)
         readings = [line for line in said if not line.startswith(b"?")]
-        out = b"".join(line for line in said if line.startswith(b"?"))
+        answers = b"".join(line for line in said if line.startswith(b"?"))
+        out = self._faults.behind(answers, clock=self._clock)
         for line in readings if self._connected else ():
             struck, kind = self._faults.strike(line, clock=self._clock)
             out += struck

@@ -6,6 +6,7 @@ from pathlib import Path
 from pipeline.bench.explore.explore import Recorded, explore
 from pipeline.bench.explore.wish import Wish
 from pipeline.bench.host.acquire import acquire, ensure_plan
+from pipeline.bench.host.serial_line import Runaway
 from pipeline.bench.host.session import BY_HAND
 from pipeline.bench.host.signals import Stopped
 from pipeline.bench.live.observer import Buttons, Observer, Observers
@@ -43,6 +44,8 @@ def explore_bench(
 
     def record(ids: Sequence[str]) -> Recorded:
         outcomes = acquire(folder, port=port, observers=observers, only=ids, buttons=buttons)
+        if astray := [o.partial for o in outcomes if o.is_astray]:
+            raise Runaway(f"{astray[-1]}; the exploration ends here")
         made = tuple(o.recording.id for o in outcomes if not o.partial)
         tried = [o.recording for o in outcomes if o.lines]
         skipped = any(o.partial.endswith(BY_HAND["skip"]) for o in outcomes)

@@ -16,7 +16,7 @@ from pipeline.bench.host.experiments import (
 from pipeline.bench.host.raw import free_raw_path
 from pipeline.bench.host.record import save_left_over, save_record
 from pipeline.bench.host.run_watch import STOPPED
-from pipeline.bench.host.serial_line import SerialLine, open_line
+from pipeline.bench.host.serial_line import Runaway, SerialLine, open_line
 from pipeline.bench.host.session import Session
 from pipeline.bench.host.signals import Stopped, signals_held, stopping_on_signals
 from pipeline.bench.live.observer import Buttons, Observer, Observers, RunOutcome, Wish
@@ -58,7 +58,7 @@ def acquire(
     Raises
     ------
     Stopped : a signal or a button ended the session; the same call goes on where it was.
-    HardwareError : there is no bench.
+    HardwareError : there is no bench; Runaway : its motor was on while no run was.
     ConfigError : another session writes there; or the plan as a whole or the submission does not
         fit the bench; of one recording that does not, its outcome says why, and the others go on.
     """
@@ -108,7 +108,8 @@ class _Acquisition:
         lost = True
         while lost:
             with open_line(self._port, baud=self._baud()) as line:
-                lost = yield from self._on_line(line)
+                with line.watched(self._observer.remark):
+                    lost = yield from self._on_line(line)
 
     def _baud(self) -> int:
         if not (self._folder / NAME).exists():
@@ -151,18 +152,30 @@ class _Acquisition:
             if recording is None:
                 longer = plan if self._only else self._extended(plan, submission, line)
                 if longer is plan:
+                    line.part()
                     return False
                 plan = longer
                 self._observer.planned(plan, _done(submission))
                 continue
             run = self._record(recording, plan, submission, session, line)
             yield run.outcome
+            if run.outcome.is_astray:
+                self._say_astray(run)
+                return False
             if run.outcome.partial:
                 if self._wish(run) == "keep":
                     yield self._keep(run)
                 if _is_lost(line):
                     return True
             submission = load_submission(self._folder)
+
+    def _say_astray(self, run: "_Run") -> None:
+        if run.file:
+            self._observer.remark(f"{run.file} is partial; it is not in {NAME}")
+        self._observer.remark(
+            "the session ends here: a bench that does what nothing told it to is not started "
+            "again; switch its motor off and find out why"
+        )
 
     def _heed_stop(self) -> None:
         if self._buttons.pressed == "stop":
@@ -279,7 +292,7 @@ class _Acquisition:
             self._failed[recording.id] = TRIES
             return self._refused(recording, path, str(error))
         try:
-            restless = session.prepare(recording)
+            restless = session.prepare(order)
             with signals_held() as let_in:  # what is complete is noted before the program ends
                 outcome = self._run(session, order, path, submission, let_in)
                 remarks = [restless] if restless else []
@@ -295,7 +308,7 @@ class _Acquisition:
                     self._note(run)
                 self._observer.finished(run.outcome)
         except HardwareError as error:
-            return self._refused(recording, path, str(error))
+            return self._refused(recording, path, str(error), astray=isinstance(error, Runaway))
         return run
 
     def _run(
@@ -313,9 +326,11 @@ class _Acquisition:
                 self._observer.remark(f"{file} is partial (stopped by hand); it is not in {NAME}")
             raise
 
-    def _refused(self, recording: Recording, path: Path, why: str) -> "_Run":
+    def _refused(
+        self, recording: Recording, path: Path, why: str, *, astray: bool = False
+    ) -> "_Run":
         """Tell of a recording that did not begin."""
-        outcome = RunOutcome(recording=recording, lines=0, partial=why)
+        outcome = RunOutcome(recording=recording, lines=0, partial=why, is_astray=astray)
         self._observer.finished(outcome)
         return _Run(outcome=outcome, path=path)
 
@@ -359,6 +374,8 @@ def _is_lost(line: SerialLine) -> bool:
     try:
         line.stop()
         line.clear()
+    except Runaway:
+        raise  # a line opened anew would start it again
     except HardwareError:
         return True
     return False

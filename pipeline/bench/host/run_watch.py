@@ -1,4 +1,4 @@
-"""What is looked at while lines come: the limits and the wave of a run, the end of a rest."""
+"""What is looked at while lines come: the limits and the wave, in a run and in the rest before."""
 
 import time
 from collections.abc import Sequence
@@ -13,22 +13,83 @@ STOPPED = "stopped: "  # begins why a run was ended that was not safe to go on w
 _FORWARD = 0.05  # s between batches handed to the observers
 
 
-class RunWatch:
-    """Checks each line against the limits and the wave, and hands them on in batches.
+class LineWatch:
+    """Checks each line against the limits and the wave of an order.
 
     Parameters
     ----------
+    carts : whose travel is watched; 0 where they have no true zero yet.
     period : ms from line to line; None of a stock bench, whose waves nobody knows to the ms.
+
+    Attributes
+    ----------
+    is_astray : the motor's duty was not what the order asks for.
+    is_too_far : a cart was further from its zero than its limit.
     """
+
+    def __init__(self, order: Order, *, carts: int, period: float | None) -> None:
+        self._order = order
+        self._carts = carts
+        self._period = period
+        self._strays, self._drives_off = _InARow(), _InARow()
+        self._before: Reading | None = None
+        self.is_astray = self.is_too_far = False
+
+    def check(self, batch: Sequence[Reading]) -> str:
+        """Return why the run must stop, or ""."""
+        for reading in batch:
+            if trouble := self._trouble(reading):
+                return trouble
+        return ""
+
+    def _trouble(self, reading: Reading) -> str:
+        order = self._order
+        off = order.drives_off(reading, before=self._before or reading)
+        self._before = reading
+        if passed := order.passed(reading, carts=self._carts):
+            self.is_too_far = bool(order.too_far(reading, carts=self._carts))
+            self.is_astray = off
+            return f"{STOPPED}{passed}"
+        if self._period is not None:
+            strays = order.strays(reading, period=self._period)
+            if self._strays.lasts(strays, ms=reading.ms):
+                return (
+                    f"the bench follows another wave than it was sent, {reading.target} counts "
+                    f"at {1e-3 * reading.ms:.3f} s: the line changed a digit"
+                )
+        if self._drives_off.lasts(off, ms=reading.ms):
+            self.is_astray = True
+            return (
+                f"{STOPPED}the bench drives its motor with {reading.duty} duty counts where it "
+                f"was told {reading.target}, at {1e-3 * reading.ms:.3f} s"
+            )
+        return ""
+
+
+class _InARow:
+    """Tells what line after line shows, two or more, from a garbled line, which is alone."""
+
+    def __init__(self) -> None:
+        self._since: int | None = None  # ms of the first of these lines
+
+    def lasts(self, shows: bool, *, ms: int) -> bool:
+        """Return whether it has lasted; `ms`: the stamp of this line."""
+        if not shows:
+            self._since = None
+        elif self._since is None:
+            self._since = ms
+        else:
+            return ms - self._since >= ASTRAY
+        return False
+
+
+class RunWatch(LineWatch):
+    """Checks the lines of a run, and hands them on in batches."""
 
     def __init__(
         self, order: Order, *, carts: int, period: float | None, stream: Stream, observer: Observer
     ) -> None:
-        self._order = order
-        self._carts = carts
-        self._period = period
-        self._astray = self._off = 0  # lines in a row
-        self._before: Reading | None = None
+        super().__init__(order, carts=carts, period=period)
         self._stream = stream
         self._observer = observer
         self._batch: list[Reading] = []
@@ -37,24 +98,8 @@ class RunWatch:
     def check(self, batch: Sequence[Reading]) -> str:
         """Return why the run must stop, or ""."""
         self._batch += batch
-        for reading in batch:
-            if passed := self._order.passed(reading, carts=self._carts):
-                return f"{STOPPED}{passed}"  # before anybody is told: the stop goes out first
-            if self._period is not None:
-                strays = self._order.strays(reading, period=self._period)
-                self._astray = self._astray + 1 if strays else 0
-                if self._astray == ASTRAY:
-                    return (
-                        f"the bench follows another wave than it was sent, {reading.target} counts "
-                        f"at {1e-3 * reading.ms:.3f} s: the line changed a digit"
-                    )
-            off = self._order.drives_off(reading, before=self._before or reading)
-            self._off, self._before = self._off + 1 if off else 0, reading
-            if self._off == ASTRAY:
-                return (
-                    f"{STOPPED}the bench drives its motor with {reading.duty} duty counts where it "
-                    f"was told {reading.target}, at {1e-3 * reading.ms:.3f} s"
-                )
+        if trouble := super().check(batch):
+            return trouble  # before anybody is told: the stop goes out first
         now = time.monotonic()
         if now - self._forwarded > _FORWARD:
             self._forwarded = now
@@ -68,17 +113,28 @@ class RunWatch:
             self._observer.readings(waiting, self._stream.anomalies())
 
 
-class RestTail:
-    """The last lines of a rest."""
+class RestWatch(LineWatch):
+    """Checks the lines of a rest, and keeps the last ones.
 
-    def __init__(self, *, since: float) -> None:
+    Parameters
+    ----------
+    since : ms from which the lines are kept.
+    """
+
+    def __init__(self, order: Order, *, carts: int, period: float | None, since: float) -> None:
+        super().__init__(order, carts=carts, period=period)
         self._since = since
         self._readings: list[Reading] = []
 
-    def keep(self, batch: Sequence[Reading]) -> str:
-        """Keep what is late enough; nothing is wrong with it."""
+    def check(self, batch: Sequence[Reading]) -> str:
+        """Return why the rest must stop, or ""."""
         self._readings += [reading for reading in batch if reading.ms >= self._since]
-        return ""
+        return super().check(batch)
+
+    @property
+    def last(self) -> Reading | None:
+        """The last line that was kept."""
+        return self._readings[-1] if self._readings else None
 
     @property
     def swings(self) -> list[int]:

@@ -1,8 +1,14 @@
-"""The serial line to a bench: open it, shake hands, send, receive. Nobody else touches a port."""
+"""The serial line to a bench: open it, shake hands, send, receive. Nobody else touches a port.
+
+Every line that comes is looked at. In a run the session does it; at any other time the line does it
+itself, in `overhear`: the motor must be off then.
+"""
 
 import re
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from typing import Self
 
 import serial
@@ -30,6 +36,11 @@ FIRST_LINE = 2.0  # s a bench may take to begin
 _TRIAL = 0.1  # s of a run that does nothing, to see whether a stock bench is there at all
 _NETWORK = re.compile(r"[\w.-]+:\d+|\d+|\[.*\]:\d+")  # a host and a port, or a port, alone
 _QUIET = 0.05  # s without a byte: what was under way has arrived
+_LONGEST_LINE = 512  # bytes; more without an end is noise
+
+
+class Runaway(HardwareError):
+    """The bench did what nothing told it to; nothing more may be asked of it."""
 
 
 class SerialLine:
@@ -38,6 +49,7 @@ class SerialLine:
     Attributes
     ----------
     bench : as it describes itself, or a stock bench.
+    resets : how many were sent; each made the counts of that moment zero.
     """
 
     def __init__(self, port: "serial.SerialBase", *, name: str) -> None:
@@ -46,6 +58,12 @@ class SerialLine:
         self.bench = Description(name="stock", encoders=2, carts=2)
         self._described = b""  # the line in which it describes itself; b"": a stock bench does not
         self._asked = 0  # queries whose answers may still be under way
+        self.resets = 0
+        self._lock = threading.RLock()  # of the port; `watched` looks at it in a thread
+        self._in_run = False
+        self._is_cleared = False  # what comes now was sent while no run was on
+        self._ear = _Ear()
+        self._runaway: Runaway | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -70,12 +88,26 @@ class SerialLine:
         Raises
         ------
         HardwareError : the line is gone.
+        Runaway : a run is to start, and the bench has run away before.
         """
+        if self._runaway is not None and any(isinstance(c, Start) for c in commands):
+            raise self._runaway
+        self._write(commands)
+
+    def _write(self, commands: Sequence[Command]) -> None:
         data = b"".join(map(encode, commands))
-        try:
-            self._port.write(data)
-        except (serial.SerialException, OSError) as error:
-            raise self._gone(error) from None
+        with self._lock:
+            for command in commands:
+                if isinstance(command, Start):
+                    self._in_run, self._ear = True, _Ear()
+                elif command in (Signal.STOP, Signal.RESET):
+                    self._in_run = False
+                    self.resets += command is Signal.RESET
+                self._is_cleared &= not self._in_run
+            try:
+                self._port.write(data)
+            except (serial.SerialException, OSError) as error:
+                raise self._gone(error) from None
 
     def receive(self) -> bytes:
         """Return what has arrived; b"" where nothing has.
@@ -84,11 +116,89 @@ class SerialLine:
         ------
         HardwareError : the line is gone.
         """
+        with self._lock:
+            try:
+                return self._port.read(LUMP)
+            except (serial.SerialException, OSError, TypeError) as error:
+                # pyserial's POSIX port, closed under a read, raises a TypeError.
+                raise self._gone(error) from None
+
+    def overhear(self) -> bytes:
+        """Return what has arrived while no run is on; where the motor is on, stop it.
+
+        Lines of the last run may still be under way, and a stop may have been lost: until `clear`
+        the bench is only told to stop again.
+
+        Raises
+        ------
+        HardwareError : the line is gone.
+        Runaway : the motor is on although no run is.
+        """
+        with self._lock:
+            data = self.receive()
+            if self._in_run or not (duty := self._ear.hear(data)):
+                return data
+            proven = self._is_cleared
+            self.stop()
+            if proven:
+                self._run_away(f"drives its motor with {duty} duty counts while it should rest")
+            return data
+
+    def _run_away(self, why: str) -> None:
+        """Remember, and raise, that the bench did what nothing told it to."""
+        self._runaway = Runaway(f"stopped: the bench {why}; switch its motor off and find out why")
+        raise self._runaway
+
+    @contextmanager
+    def watched(self, tell: Callable[[str], None]) -> Iterator[None]:
+        """Look at the line in a thread whenever no run is on: people and computing take their time.
+
+        The thread sends no heartbeat: a run that hangs is still cut by the bench. At the end the
+        bench is told to stop once more.
+
+        Parameters
+        ----------
+        tell : called from the thread, once, where the bench runs away.
+        """
+        over = threading.Event()
+
+        def watch() -> None:
+            told = False
+            while not over.wait(_LOOK):
+                try:
+                    with self._lock:
+                        if not self._in_run:
+                            self.overhear()
+                except Runaway as runaway:
+                    if not told:
+                        tell(str(runaway))
+                    told = True
+                except HardwareError:  # the next use of the line reports it
+                    return
+
+        thread = threading.Thread(target=watch, daemon=True)
+        thread.start()
         try:
-            return self._port.read(LUMP)
-        except (serial.SerialException, OSError, TypeError) as error:
-            # pyserial's POSIX port, closed under a read, raises a TypeError.
-            raise self._gone(error) from None
+            yield
+        finally:
+            over.set()
+            thread.join()
+            with suppress(HardwareError):
+                self.stop()
+
+    def part(self) -> None:
+        """Stop the bench for good, and see that it does.
+
+        Raises
+        ------
+        HardwareError : the bench is gone.
+        Runaway : it drives its motor, or has done so since its last run.
+        """
+        self.stop()
+        self.clear()
+        self.drain()
+        if self._runaway is not None:
+            raise self._runaway
 
     def stop(self) -> None:
         """Stop whatever the bench does.
@@ -97,14 +207,14 @@ class SerialLine:
         ------
         HardwareError : the line is gone.
         """
-        self.send(*([Signal.STOP] if self.knows("s") else STOCK_STOP))
+        self._write([Signal.STOP] if self.knows("s") else STOCK_STOP)
 
     def drain(self, *, longest: float = 1.0) -> bytes:
         """Return what still comes until the line is quiet, s."""
         heard, end = bytearray(), time.monotonic() + longest
         quiet_at = time.monotonic() + _QUIET
         while True:
-            data, now = self.receive(), time.monotonic()
+            data, now = self.overhear(), time.monotonic()
             if data:
                 heard += data
                 quiet_at = now + _QUIET
@@ -112,7 +222,7 @@ class SerialLine:
                 return bytes(heard)
             time.sleep(_LOOK)
 
-    def clear(self) -> None:
+    def clear(self, *, queries: int = _QUERIES) -> None:
         """Read away all that the bench has sent: what comes from now on answers what is sent next.
 
         Silence tells nothing, for a busy computer keeps bytes for any while; but what comes behind
@@ -121,14 +231,17 @@ class SerialLine:
         Raises
         ------
         HardwareError : the line or the bench is gone.
+        Runaway : the motor is on although no run is.
         """
-        if not self._described:
-            self.drain()
-            return
-        for _ in range(_QUERIES):
-            if self._answer(self._described) is not None:
-                return
-        raise HardwareError(f"{self._name}: the bench answers no more; is it still switched on?")
+        with self._lock:
+            self._in_run = False
+            if not self._described:
+                self.drain()
+            elif all(self._answer(self._described) is None for _ in range(queries)):
+                raise HardwareError(
+                    f"{self._name}: the bench answers no more; is it still switched on?"
+                )
+            self._is_cleared = True
 
     def shake_hands(self) -> None:
         """Stop and zero the bench, and find out what it is.
@@ -136,6 +249,7 @@ class SerialLine:
         Raises
         ------
         HardwareError : nothing there speaks this protocol.
+        Runaway : the motor is on although no run is.
         """
         self.send(*STOCK_STOP)
         before: bytes | None = None
@@ -143,6 +257,7 @@ class SerialLine:
             self.drain()
             if (answer := self._answer()) is None:
                 continue
+            self._is_cleared = True
             if answer == before:  # a changed digit of a scale would move every limit
                 self._believe(answer)
                 return
@@ -173,7 +288,7 @@ class SerialLine:
         heard, answers, end = b"", [], time.monotonic() + _ANSWER
         while len(answers) < self._asked:
             now = time.monotonic()
-            heard += self.receive()
+            heard += self.overhear()
             lines = [line for line in heard.split(b"\n")[:-1] if line.startswith(beginning)]
             if len(lines) > len(answers):
                 answers, end = lines, now + _ANSWER
@@ -189,10 +304,11 @@ class SerialLine:
     def _try_stock(self) -> None:
         """Have a stock bench stream for a moment, which tells how many encoders it has."""
         self.send(Start(wave=Wave.DELTA, frequency=1 / _TRIAL, amplitude=0))
+        self._in_run, self._is_cleared = False, True  # in it the motor must be off
         heard, end = b"", time.monotonic() + FIRST_LINE
         while not heard and time.monotonic() < end:
             time.sleep(_LOOK)
-            heard = self.receive()
+            heard = self.overhear()
         heard += self.drain()
         self.send(Signal.RESET)
         readings = [parse_reading(line) for line in heard.split(b"\n")]
@@ -208,6 +324,25 @@ class SerialLine:
 
     def _gone(self, error: Exception) -> HardwareError:
         return HardwareError(f"{self._name}: the line to the bench is gone ({_plain(error)})")
+
+
+class _Ear:
+    """Hears that the motor is on, from two lines in a row: a garbled one is alone."""
+
+    def __init__(self) -> None:
+        self._tail, self._on = b"", False
+
+    def hear(self, data: bytes) -> int:
+        """Return the duty counts that drive the motor; 0: it is off."""
+        if not data:
+            return 0
+        *lines, self._tail = (self._tail + data).split(b"\n")
+        self._tail = self._tail[-_LONGEST_LINE:]
+        for reading in filter(None, map(parse_reading, lines)):
+            before, self._on = self._on, reading.duty != 0
+            if before and self._on:
+                return reading.duty
+        return 0
 
 
 def open_line(port: str, *, baud: int) -> SerialLine:

@@ -1,20 +1,20 @@
 """Runs on the bench, one at a time: rest, start, watch every line, stop; whatever happens, stop.
 
 A run is watched by one loop that looks at the port every few milliseconds, writes what came to the
-raw file, keeps the bench's watchdog awake and checks the limits. There is no thread: if this loop
-hangs, the heartbeat ends and the bench cuts its motor itself.
+raw file, keeps the bench's watchdog awake and checks the limits. So is the rest before it. The loop
+is in no thread of its own: if it hangs, the heartbeat ends and the bench cuts its motor itself.
 """
 
 import gc
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 
 from pipeline.bench.host.raw import RawHeader, RawWriter
-from pipeline.bench.host.run_watch import STOPPED, RestTail, RunWatch
-from pipeline.bench.host.serial_line import FIRST_LINE, LUMP, SerialLine
+from pipeline.bench.host.run_watch import STOPPED, LineWatch, RestWatch, RunWatch
+from pipeline.bench.host.serial_line import FIRST_LINE, LUMP, Runaway, SerialLine
 from pipeline.bench.host.signals import Stopped
 from pipeline.bench.host.stream import Stream
 from pipeline.bench.live.observer import Buttons, Observer, RunOutcome, Wish
@@ -28,8 +28,6 @@ from pipeline.bench.protocol.messages import (
     Hands,
     Reading,
     Signal,
-    Start,
-    Wave,
     encode,
 )
 from pipeline.bench.thresholds import (
@@ -97,13 +95,21 @@ class Session:
         self._observer = observer
         self._moving = max(carts, line.bench.carts) if line.bench.commands else carts
         self._period = 1e3 * line.bench.period
-        self._is_zeroed = False  # with the carts at rest, on this line
+        self._zeroed_at = -1  # resets of the line when the carts were zeroed at rest
+        self._swings_out = False  # the last run took a cart past its travel
         self._free: tuple[int, ...] | None = None  # as a person was last told
         self._beat = float("-inf")
         self._latest_beat = 0.0  # s, the longest without a heartbeat in this run
 
-    def prepare(self, recording: Recording) -> str:
-        """Have the carts held or freed and at rest; return what is to be said of it, or ""."""
+    def prepare(self, order: Order) -> str:
+        """Have the carts held or freed and at rest; return what is to be said of it, or "".
+
+        Raises
+        ------
+        HardwareError : the carts cannot come to rest, or nobody could see that they do.
+        Runaway : the motor is on, or a cart is past its travel, where the bench is to do nothing.
+        """
+        recording = order.recording
         self._buttons.offer("skip")
         held = tuple(cart for cart in range(1, self._carts + 1) if cart not in recording.carts)
         if self._line.knows("h"):
@@ -112,7 +118,7 @@ class Session:
             words = hold_words(recording.carts, n=self._carts)
             self._observer.confirm(words[0].upper() + words[1:])
             self._free = recording.carts
-        restless = self._rest(recording)
+        restless = self._rest(order)
         if self._line.knows("h"):
             if recording.release:
                 self._line.send(Hands(held=held, released=recording.release))
@@ -143,30 +149,31 @@ class Session:
         recording = order.recording
         stream = self._stream(recording.carts, closed=recording.controller is not None)
         watch = RunWatch(
-            order,
-            carts=self._moving,
-            period=self._period if self._line.bench.commands else None,
-            stream=stream,
-            observer=self._observer,
+            order, carts=self._moving, period=self._stated, stream=stream, observer=self._observer
         )
+
+        def begin() -> None:
+            self._buttons.offer("skip", "keep", "repeat")
+            self._observer.started(recording)
 
         def check(lines: Sequence[Reading]) -> str:
             let_in()
             return watch.check(lines)
 
-        partial = "stopped"
         with RawWriter(path, header) as raw:
             try:
-                self._start(order.commands)
-                self._buttons.offer("skip", "keep", "repeat")
-                self._observer.started(order.recording)
-                partial = self._listen(
-                    stream, seconds=order.recording.duration, arrived=raw.write, check=check
+                partial = self._carry_out(
+                    order,
+                    stream,
+                    seconds=recording.duration,
+                    begin=begin,
+                    arrived=raw.write,
+                    check=check,
                 )
             except HardwareError as error:
                 partial = str(error)
-            finally:
-                self._stop(always=bool(partial))
+                watch.is_astray |= isinstance(error, Runaway)
+        self._swings_out = watch.is_too_far
         watch.forward(stream.finish())
         if not partial and recording.controller is None and stream.widest <= STILL:
             partial = _NOTHING_MOVED
@@ -179,7 +186,13 @@ class Session:
             lines=stream.lines,
             anomalies=stream.anomalies(fit),
             partial=partial,
+            is_astray=watch.is_astray,
         )
+
+    @property
+    def _stated(self) -> float | None:
+        """The ms from line to line, of a bench whose waves are known to the ms."""
+        return self._period if self._line.bench.commands else None
 
     def _say_other_period(self, period: float) -> None:
         """Say once that the bench does not keep to the period (ms) that it stated."""
@@ -204,28 +217,53 @@ class Session:
             closed=closed,
         )
 
-    def _rest(self, recording: Recording) -> str:
+    def _rest(self, order: Order) -> str:
         """Wait, in a run that does nothing, until the carts have come to rest."""
+        recording = order.recording
         if recording.settle <= 0:
             return ""
-        moving: dict[int, int] = {}
+        nothing, moving = order.rest(), dict[int, int]()
         for _ in range(_REST_TRIES):
             self._observer.settling(recording, recording.settle)
-            last = RestTail(since=1e3 * recording.settle - REST_WINDOW)
-            self._start([Start(wave=Wave.DELTA, frequency=1 / recording.settle, amplitude=0)])
-            trouble = self._listen(self._stream(()), seconds=recording.settle, check=last.keep)
-            if trouble:
-                raise HardwareError(f"while the carts came to rest, {trouble}")
+            watch = RestWatch(
+                nothing,
+                # Carts that a run took too far swing back by themselves.
+                carts=0 if self._swings_out else self._zeroed,
+                period=self._stated,
+                since=1e3 * recording.settle - REST_WINDOW,
+            )
+            self._look_on(nothing, watch)
+            self._swings_out = False
             moving = {
                 cart: swing
-                for cart, swing in enumerate(last.swings[: self._carts], start=1)
+                for cart, swing in enumerate(watch.swings[: self._carts], start=1)
                 if swing > STILL
             }
             if not moving:
+                if watch.last and (why := order.too_far(watch.last, carts=self._zeroed)):
+                    raise Runaway(f"{STOPPED}at rest, {why}")
                 self._zero_at_rest(recording)
                 return ""
         swings = ", ".join(f"cart {cart} by {swing} counts" for cart, swing in moving.items())
         return f"not at rest when the run began: {swings} within half a second"
+
+    def _look_on(self, nothing: Order, watch: LineWatch) -> None:
+        """Carry out an order to do nothing.
+
+        Raises
+        ------
+        HardwareError : it did not go on to its end; Runaway : because something was done.
+        """
+        settle = nothing.recording.settle
+        trouble = self._carry_out(nothing, self._stream(()), seconds=settle, check=watch.check)
+        if trouble:
+            kind = Runaway if watch.is_astray or watch.is_too_far else HardwareError
+            raise kind(f"while the carts came to rest, {trouble}")
+
+    @property
+    def _zeroed(self) -> int:
+        """How many carts have a true zero: all or none."""
+        return self._moving if self._line.resets == self._zeroed_at else 0
 
     def _zero_at_rest(self, recording: Recording) -> None:
         """Zero the bench before the motor's first run on this line: it was opened at any time.
@@ -233,12 +271,12 @@ class Session:
         After a line that was lost the carts still swing; where they were then is no zero for the
         travel limit. A hand's run waits with the zero: what is held by hand is never quite at rest.
         """
-        if self._is_zeroed or not recording.amplitude:
+        if self._zeroed or not recording.amplitude:
             return
         self._line.send(Signal.RESET)
         self._line.drain()
         self._beat = float("-inf")  # a reset disarms the watchdog
-        self._is_zeroed = True
+        self._zeroed_at = self._line.resets
 
     def _by_hand(self) -> str:
         """Return why somebody wants this run to end, or "".
@@ -251,6 +289,29 @@ class Session:
         if wish == "stop":
             raise Stopped("by hand")
         return BY_HAND[wish] if wish else ""
+
+    def _carry_out(
+        self,
+        order: Order,
+        stream: Stream,
+        *,
+        seconds: float,
+        check: Callable[[Sequence[Reading]], str],
+        begin: Callable[[], None] = lambda: None,
+        arrived: Callable[[bytes], None] = lambda data: None,
+    ) -> str:
+        """Start what an order asks for and listen to its end; return why it ended early, or "".
+
+        Whatever ends it, the bench is told to stop.
+        """
+        partial = "stopped"
+        try:
+            self._start(order.commands)
+            begin()
+            partial = self._listen(stream, seconds=seconds, arrived=arrived, check=check)
+        finally:
+            self._stop(always=bool(partial))
+        return partial
 
     def _start(self, commands: Sequence[Command]) -> None:
         if why := self._by_hand():
@@ -277,18 +338,23 @@ class Session:
         )
 
     def _stop(self, *, always: bool) -> None:
-        """Stop the bench; a stock one, which that zeroes, only if the run did not end by itself."""
-        if not always and not self._line.knows("s"):
-            return
+        """Stop the bench; a stock one, which that zeroes, only if the run did not end by itself.
+
+        Then the line is cleared: nothing asked for what the bench streams after that.
+        """
         try:
             try:
-                self._line.stop()
+                if always or self._line.knows("s"):
+                    self._line.stop()
             except KeyboardInterrupt:  # pressed twice: the stop still comes first
                 self._line.stop()
                 raise
         except HardwareError as error:
             guard = "" if self._line.knows("k") else "; the motor may be on: switch it off"
             self._observer.remark(f"the stop could not be sent: {error}{guard}")
+            return
+        with suppress(HardwareError):  # the next start reports it
+            self._line.clear(queries=1)
 
     @_no_collection()
     def _listen(

@@ -52,6 +52,7 @@ class RunOutcome:
     lines : valid lines kept.
     partial : why it ended early; "": it did not.
     remarks : what a person should know, a sentence each.
+    is_astray : the bench did what nothing told it to: nothing more is asked of it.
     """
 
     recording: Recording
@@ -59,6 +60,7 @@ class RunOutcome:
     anomalies: Anomalies = Anomalies()
     partial: str = ""
     remarks: tuple[str, ...] = field(default=())
+    is_astray: bool = False
 
 
 class Observer(Protocol):

@@ -1,6 +1,6 @@
 """What a recording asks of the bench: commands and limits in the bench's own counts."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from pipeline.bench.planning.gains import Scales, Table, bench_gains, bench_scales, controller_table
 from pipeline.bench.planning.plan import Limits, Plan, Recording
@@ -41,6 +41,15 @@ class Order:
     most_duty: float
     most_counts: float
 
+    def rest(self) -> "Order":
+        """Return the order to do nothing while the carts settle, with the limits of this one."""
+        settle = self.recording.settle
+        return replace(
+            self,
+            recording=self.recording.model_copy(update={"controller": None}),
+            commands=(Start(wave=Wave.DELTA, frequency=1 / settle, amplitude=0),),
+        )
+
     def strays(self, reading: Reading, *, period: float) -> bool:
         """Tell whether the bench follows another target than it was told, as after a changed digit.
 
@@ -74,6 +83,10 @@ class Order:
         if abs(reading.duty) > self.most_duty:
             found, most = (abs(self.scales.input) * n for n in (reading.duty, self.most_duty))
             return f"the input was {found:.4g} {self.input_unit}, the limit is {most:.4g}"
+        return self.too_far(reading, carts=carts)
+
+    def too_far(self, reading: Reading, *, carts: int) -> str:
+        """Return which cart is further from its zero than the limit, or ""."""
         for cart, count in enumerate(reading.counts[:carts], start=1):
             if abs(count) > self.most_counts:
                 found, most = (self.scales.position * n for n in (count, self.most_counts))

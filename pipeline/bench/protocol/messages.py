@@ -7,9 +7,10 @@ which others it knows.
 
 import math
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 from pipeline.errors import DataError
 
@@ -24,6 +25,7 @@ EXTENSIONS = frozenset("cfhkms")  # the commands, `?` aside, that the stock benc
 
 # What firmware can hold in 32 bits, and no bench needs more.
 MOST_TONES = 64  # of a multisine
+_Read = TypeVar("_Read")
 _LONGEST_COUNT = 10  # digits of a field of a line
 
 _LINE = re.compile(rf"(?:-?\d{{1,{_LONGEST_COUNT}}}:){{4,5}}\d{{1,{_LONGEST_COUNT}}}", re.ASCII)
@@ -257,23 +259,28 @@ def parse_description(line: bytes) -> Description:
     entries = {key: value for key, _, value in (word.partition("=") for word in words)}
     if head != "?cartlab/1":
         raise DataError(f"the bench answers {text[:60]!r}, which is no description of a bench")
-    try:
-        input_per_count, input_unit = _scaled(entries["input"])
-        position_per_count, position_unit = _scaled(entries["position"])
-        return Description(
-            name=entries["name"],
-            encoders={"2": 2, "3": 3}[entries["encoders"]],
-            carts={"1": 1, "2": 2, "3": 3}[entries["carts"]],
-            period=abs(_scaled(entries["period"])[0]),
-            baud=int(entries["baud"]),
-            commands=frozenset(entries["commands"]),
-            input_unit=input_unit,
-            input_per_count=input_per_count,
-            position_unit=position_unit,
-            position_per_count=position_per_count,
-        )
-    except (KeyError, ValueError) as error:
-        raise DataError(f"the bench describes itself as {text[:200]!r}: {error} is wrong") from None
+
+    def read(key: str, kind: Callable[[str], _Read]) -> _Read:
+        try:
+            return kind(entries[key])
+        except (KeyError, ValueError) as error:
+            why = f"{key}: {str(error)[:60]} is wrong"
+            raise DataError(f"the bench describes itself as {text[:200]!r}: {why}") from None
+
+    input_per_count, input_unit = read("input", _scaled)
+    position_per_count, position_unit = read("position", _scaled)
+    return Description(
+        name=read("name", str),
+        encoders=read("encoders", {"2": 2, "3": 3}.__getitem__),
+        carts=read("carts", {"1": 1, "2": 2, "3": 3}.__getitem__),
+        period=abs(read("period", _scaled)[0]),
+        baud=read("baud", int),
+        commands=read("commands", frozenset),
+        input_unit=input_unit,
+        input_per_count=input_per_count,
+        position_unit=position_unit,
+        position_per_count=position_per_count,
+    )
 
 
 def _scaled(text: str) -> tuple[float, str]:

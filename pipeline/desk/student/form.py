@@ -243,18 +243,24 @@ def _text(field: Field, value: Any) -> str:
     if field.kind == "authors" and isinstance(value, list):
         people = [one for one in value if isinstance(one, dict)]
         lines = (
-            ", ".join(filter(None, (str(p.get("id", "")), str(p.get("name", ""))))) for p in people
+            ", ".join(filter(None, (_row(p.get("id", "")), _row(p.get("name", "")))))
+            for p in people
         )
         return "\n".join(lines)
     if field.kind == "columns" and isinstance(value, dict):
-        return "\n".join(f"{role} = {column}" for role, column in value.items())
+        return "\n".join(f"{role} = {_row(column)}" for role, column in value.items())
     if field.kind == "rows" and isinstance(value, list):
         return "\n".join(_row(row) for row in value)
     return _row(value)
 
 
 def _row(value: Any) -> str:
-    return ", ".join(map(_row, value)) if isinstance(value, list) else str(value)
+    if isinstance(value, list):
+        return ", ".join(map(_row, value))
+    try:
+        return str(value)
+    except ValueError:  # a whole number of thousands of digits, which only fits one typed in hex
+        return hex(value)
 
 
 def _item(field: Field) -> Any:

@@ -15,7 +15,7 @@ from uuid import uuid4
 from distributed import Client, Security, WorkerPlugin, as_completed, get_worker
 from distributed.worker import Worker as DaskWorker
 
-from pipeline.errors import ConfigError
+from pipeline.errors import ConfigError, lacks_room
 from pipeline.grading.batch.runner import Executor, code_version
 from pipeline.grading.batch.worker import Setup, Task, failed, grading_line, read_grading
 from pipeline.grading.batch.worker_process import Worker
@@ -133,11 +133,18 @@ def _through(
         room = max(1, _AHEAD * _threads(client))
         while waiting and len(under_way) < room:
             task = waiting.pop()
-            archive = packed([Path(source) for source in task.sources])
+            try:
+                archive = packed([Path(source) for source in task.sources])
+            except OSError as error:
+                reason = f"cannot be read ({error.strerror or error}); the next run tries again"
+                yield failed(task, reason, out_of=out_of, settled=False)
+                continue
             key = f"{graders}-{task.key}"
             future = client.submit(_grade, task, archive, graders, key=key, pure=False)
             under_way[str(future.key)] = task
             answers.add(future)
+        if not under_way:
+            continue
         future = next(answers)
         task = under_way.pop(str(future.key))
         if future.status == "finished":
@@ -146,4 +153,5 @@ def _through(
             raise error
         else:
             reason = f"the cluster gave up on it: {error}"
-            yield failed(task, reason, out_of=out_of, settled=False)
+            outcome = failed(task, reason, out_of=out_of, settled=False)
+            yield replace(outcome, lacks_room=isinstance(error, OSError) and lacks_room(error))

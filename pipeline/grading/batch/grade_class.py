@@ -44,13 +44,16 @@ _NAMED = 8  # submissions in a remark
 class Summary:
     """How many there were, which could not be graded (id, reason), how many share recordings.
 
-    `remarks` are what the person at the command line should know besides, `changes` what is
-    another than in the class list before.
+    Of those that failed the next run tries `unsettled` again; for `lacks_room` of them the disk
+    was full. `remarks` are what the person at the command line should know besides, `changes` what
+    is another than in the class list before.
     """
 
     total: int
     failed: tuple[tuple[str, str], ...]
     sharing: int
+    unsettled: int = 0
+    lacks_room: int = 0
     remarks: tuple[str, ...] = ()
     changes: tuple[str, ...] = ()
 
@@ -130,6 +133,8 @@ def grade_class(
         total=len(hand_ins),
         failed=tuple(sorted(failed)),  # the order of the names would tell
         sharing=len(batch.shared),
+        unsettled=len(batch.unsettled),
+        lacks_room=len(batch.lacks_room),
         remarks=tuple(remarks),
         changes=tuple(changes),
     )

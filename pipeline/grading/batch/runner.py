@@ -72,6 +72,7 @@ def grade_batch(
     limits = limits or Limits()
     code, text = code_version(), rubric.model_dump_json()
     rows: dict[str, Member] = {}
+    unsettled, no_room = set[str](), set[str]()
     new = []
     for hand_in in hand_ins:
         task = _task(hand_in, basis=(code, text, figures))
@@ -96,6 +97,10 @@ def grade_batch(
         for outcome in execute(new, setup, rubric.out_of):
             book.put(outcome)
             rows[outcome.submission] = Member.of(outcome)
+            if outcome.status == "failed" and not outcome.settled:
+                unsettled.add(outcome.submission)
+            if outcome.lacks_room:
+                no_room.add(outcome.submission)
             progress(len(rows), total, outcome.submission)
     progress(total, total, "comparing the recordings")
     before = class_so_far(rows, book)
@@ -105,6 +110,8 @@ def grade_batch(
         keys=tuple(row.key for row in in_order),
         shared=_shared(in_order, book, examples=examples),
         failed=tuple((row.submission, row.reason) for row in in_order if row.reason),
+        unsettled=frozenset(unsettled),
+        lacks_room=frozenset(no_room),
         kept=tuple(before.kept),
         moved=before.moved,
         taken_over=before.taken_over,

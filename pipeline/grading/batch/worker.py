@@ -13,10 +13,10 @@ import sys
 import tempfile
 import traceback
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from pipeline.errors import PipelineError
+from pipeline.errors import PipelineError, lacks_room
 from pipeline.garbage import collect_seldom
 from pipeline.grading.gradings import Grading
 from pipeline.grading.intake.files import Changed, open_submission
@@ -74,7 +74,7 @@ def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = Fal
     """Open, analyse and grade one hand-in; whatever is wrong with it is the outcome's reason."""
     authors: tuple[str, ...] = ()
     reason = detail = ""
-    settled = True
+    settled, no_room = True, False
     try:
         with tempfile.TemporaryDirectory(
             dir=scratch, prefix="open-", ignore_cleanup_errors=True
@@ -108,15 +108,17 @@ def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = Fal
     except PipelineError as error:
         reason = str(error)
     except OSError as error:  # a full disk, a folder gone: perhaps not the hand-in's fault
-        reason, settled = f"cannot be read ({error.strerror or error})", False
+        reason = f"cannot be read ({error.strerror or error}); the next run tries again"
+        settled, no_room = False, lacks_room(error)
     except MemoryError:
         reason, settled = OUT_OF_MEMORY, False
     except Exception as error:  # of ours, or of a library: a mended one is to have its try
         reason = f"the grader failed: {type(error).__name__}: {quote(str(error))}"
         detail, settled = _traceback(), False
-    return failed(
+    outcome = failed(
         task, reason, authors=authors, out_of=rubric.out_of, settled=settled, detail=detail
     )
+    return replace(outcome, lacks_room=no_room)
 
 
 def named_authors(folder: Path) -> tuple[str, ...]:

@@ -80,7 +80,7 @@ def open_submission(sources: Sequence[Path], into: Path, *, digest: str = "") ->
     ------
     SubmissionError : there is none, or more than one to choose from, there are too many files, or
         an archive is bad.
-    OSError : a file cannot be read.
+    OSError : this computer cannot read or copy a file.
     Changed : the copy has another digest.
     """
     into.mkdir(parents=True, exist_ok=True)
@@ -158,19 +158,35 @@ def _walk(folder: Path, below: PurePosixPath) -> Iterator[tuple[int, str, Path]]
 
 def _less(limits: Limits, folder: Path) -> Limits:
     """Return what is left of the limits beside what is in a folder."""
-    sizes = [path.stat().st_size for path in folder.rglob("*") if path.is_file()]
+    sizes = [path.stat().st_size for path in _below(folder)]
     return replace(limits, members=limits.members - 1 - len(sizes), total=limits.total - sum(sizes))
+
+
+def _below(folder: Path) -> list[Path]:
+    """Return the files in a folder and below, sorted.
+
+    Raises
+    ------
+    OSError : a folder cannot be read; `rglob` would take it for empty.
+    """
+
+    def refuse(error: OSError) -> None:
+        raise error
+
+    return sorted(
+        Path(at) / name for at, _, names in os.walk(folder, onerror=refuse) for name in names
+    )
 
 
 def _submissions(folder: Path) -> list[Path]:
     """Return the submission files at the least depth, that of a wrapping folder not counted."""
-    tomls = sorted(path for path in folder.rglob(NAME) if path.is_file())
+    tomls = [path for path in _below(folder) if path.name == NAME]
     depth = min((len(path.parts) for path in tomls), default=0)
     return [path for path in tomls if len(path.parts) == depth]
 
 
 def _archives(folder: Path) -> list[Path]:
-    return sorted(p for p in folder.rglob("*") if p.suffix.lower() == ".zip" and p.is_file())
+    return [path for path in _below(folder) if path.suffix.lower() == ".zip"]
 
 
 def _the_one(tomls: Sequence[Path], into: Path) -> Path:
@@ -182,7 +198,7 @@ def _the_one(tomls: Sequence[Path], into: Path) -> Path:
 
 
 def _nothing_in(into: Path) -> str:
-    files = [path for path in sorted(into.rglob("*")) if path.is_file()]
+    files = _below(into)
     if not files:
         return f"no {NAME} in it: it is empty"
     named = first_few([quote(path.name) for path in files], 3)

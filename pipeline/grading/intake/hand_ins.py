@@ -263,9 +263,13 @@ def _archive(path: Path) -> HandIn:
 def _folder_inside(archive: Path) -> str:
     """Return the name of the folder in an archive that is the submission.
 
-    "" for its top, and where several could be: which is meant nobody knows.
+    "" for its top, and where several could be: which is meant nobody knows. Where this computer
+    cannot read it now, its row will say so.
     """
-    tomls = [path for path in member_names(archive) if path.name == NAME]
+    try:
+        tomls = [path for path in member_names(archive) if path.name == NAME]
+    except OSError:
+        return ""
     depth = min((len(path.parts) for path in tomls), default=0)
     top = [path.parent.name for path in tomls if len(path.parts) == depth]
     return top[0] if len(top) == 1 else ""

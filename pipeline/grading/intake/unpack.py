@@ -17,7 +17,7 @@ from mmap import ACCESS_READ, mmap
 from pathlib import Path, PurePosixPath
 from typing import IO
 
-from pipeline.errors import SubmissionError
+from pipeline.errors import SubmissionError, lies_in_the_name
 from pipeline.submission.complaints import quote
 
 _CHUNK = 1 << 16
@@ -93,6 +93,7 @@ def unpack(archive: Path, into: Path, *, limits: Limits) -> dict[PurePosixPath, 
     Raises
     ------
     SubmissionError : not a zip archive, broken, encrypted, or larger than the limits; one line.
+    OSError : this computer cannot read or write, whatever is in the archive: its disk is full, say.
     """
     shown = quote(archive.name)
     if archive.is_file() and not archive.stat().st_size:
@@ -102,18 +103,25 @@ def unpack(archive: Path, into: Path, *, limits: Limits) -> dict[PurePosixPath, 
         with _opened(archive, limits=limits) as opened:
             return _extract(opened, into, budget=_Budget(limits=limits))
     except _TROUBLE as error:
+        _let_through(error)
         again = _AGAIN if isinstance(error, zipfile.BadZipFile) else ""
         raise SubmissionError(f"{shown}: {_why(error)}{again}") from None
 
 
 def member_names(archive: Path, *, limits: Limits = HAND_IN) -> list[PurePosixPath]:
-    """Return the files that may be unpacked and are no debris; none where it is no archive."""
+    """Return the files that may be unpacked and are no debris; none where it is no archive.
+
+    Raises
+    ------
+    OSError : this computer cannot read it now.
+    """
     if not archive.is_file():  # a pipe would be waited for
         return []
     try:
         with _opened(archive, limits=limits) as opened:
             infos = [info for info in opened.infolist() if not info.is_dir()]
-    except _TROUBLE:
+    except _TROUBLE as error:
+        _let_through(error)
         return []
     paths = []
     for info in infos:
@@ -156,6 +164,12 @@ _TROUBLE = (
     ValueError,
     RuntimeError,
 )
+
+
+def _let_through(error: Exception) -> None:
+    """Raise what no archive can cause."""
+    if isinstance(error, OSError) and not lies_in_the_name(error):
+        raise error
 
 
 def _why(error: Exception) -> str:
@@ -240,6 +254,7 @@ def _extract(opened: zipfile.ZipFile, into: Path, *, budget: _Budget) -> dict[Pu
         except _TooLarge:
             raise
         except OSError as error:  # a file where a folder should be, a name that is too long
+            _let_through(error)
             reason = f"{quote(str(path))} cannot be written ({error.strerror or _line(error)})"
             refused.setdefault(path, reason)
         except _TROUBLE as error:

@@ -123,6 +123,20 @@ class Roster:
         strangers = [s for s in unmatched if s not in twice]
         open_ = [s.undecided for s in settled.values() if s.undecided and s not in students]
         remarks = [Remark(text=text, left_out=True) for text in open_]
+        passed_over = [
+            s
+            for at, s in matched
+            if at is not None and s.points and index.get(_id_of(s), at) not in found
+        ]
+        if passed_over:
+            named = ", ".join(f"{s.called} ({s.grade.submission})" for s in passed_over)
+            remarks.append(
+                Remark(
+                    text="has no points, since another's account handed it in and got them: "
+                    f"{named}",
+                    left_out=True,
+                )
+            )
         if twice:
             remarks.append(not_exported(f"in several rows of {self.file}", twice))
         if strangers:
@@ -191,9 +205,13 @@ def _words(student: Student) -> tuple[tuple[str, str], ...]:
     """Return by what a student may be found, the surest first."""
     return (
         ("number", student.number),
-        ("id", student.id.casefold()),
+        _id_of(student),
         ("name", _letters(student.name)),
     )
+
+
+def _id_of(student: Student) -> tuple[str, str]:
+    return "id", student.id.casefold()
 
 
 def _number(text: str) -> float | None:

@@ -4,7 +4,7 @@ import hashlib
 from collections.abc import Collection
 from pathlib import Path
 
-from pipeline.errors import SubmissionError
+from pipeline.errors import SubmissionError, lies_in_the_file
 from pipeline.ingest.formats.mat import is_mat, read_mat
 from pipeline.ingest.formats.table import Table
 from pipeline.ingest.formats.text import read_text
@@ -33,6 +33,7 @@ def read_table(
     Raises
     ------
     SubmissionError : outside the folder, missing, of no known form or broken; names the line.
+    OSError : this computer cannot read it now, whatever is in it.
     """
     if (problem := outside(folder, name, taken=taken)) is not None:
         raise SubmissionError(problem if shown is None else f"{shown}: {problem}")
@@ -40,6 +41,8 @@ def read_table(
     try:
         raw = (folder / name).read_bytes()
     except OSError as error:
+        if not lies_in_the_file(error):
+            raise
         raise SubmissionError(f"{source}: cannot be read ({error.strerror})") from None
     return parse_table(raw, source=source), hashlib.sha256(raw).hexdigest()
 

@@ -109,21 +109,36 @@ def read_results(path: Path) -> Results:
         raise ConfigError(f"{path}: no results.json of cartlab ({what})") from None
 
 
-def compare_drafts(before: Results, analysis: Analysis) -> DraftChanges:
-    """Return what changed from an earlier draft to an analysis.
+def check_comparable(before: Results, *, carts: int, position_unit: str, input_unit: str) -> None:
+    """Refuse what has no number in common with an earlier draft.
 
     Raises
     ------
     ConfigError : the earlier draft is of another number of carts or in other units.
     """
-    after = Results.model_validate(plain_json(results_dict(analysis)))
-    then, now = before.submission, after.submission
-    if (then.carts, then.units) != (now.carts, now.units):
+    then, units = before.submission, before.submission.units
+    if (then.carts, units.position, units.input) != (carts, position_unit, input_unit):
         raise ConfigError(
-            f"the earlier draft is of {count(then.carts, 'cart')} in {then.units.position} and "
-            f"{then.units.input}, this one of {now.carts} in {now.units.position} and "
-            f"{now.units.input}: they cannot be compared"
+            f"the earlier draft is of {count(then.carts, 'cart')} in {units.position} and "
+            f"{units.input}, this one of {carts} in {position_unit} and {input_unit}: they cannot "
+            "be compared"
         )
+
+
+def compare_drafts(before: Results, analysis: Analysis) -> DraftChanges:
+    """Return what changed from an earlier draft to an analysis.
+
+    Raises
+    ------
+    ConfigError : see `check_comparable`.
+    """
+    check_comparable(
+        before,
+        carts=analysis.carts,
+        position_unit=analysis.position_unit,
+        input_unit=analysis.input_unit,
+    )
+    after = Results.model_validate(plain_json(results_dict(analysis)))
     warned, warns = before.warnings, after.warnings
     skipped, skips = ([skip.stage for skip in draft.skipped] for draft in (before, after))
     changes = (*_estimates(before, after), *_feedback(before, after), *_hardware(before, after))

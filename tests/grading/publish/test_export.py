@@ -319,6 +319,32 @@ def test_the_number_of_who_handed_in_decides_nothing(tmp_path):
     ]
 
 
+@pytest.mark.parametrize("own", [False, True])
+def test_an_author_whose_points_another_account_got_is_named(tmp_path, own):
+    """The number of who handed it in goes first; the author, with a row of their own, has none.
+
+    With a hand-in of their `own` that could not be graded they are in two submissions.
+    """
+    roster = 'Student,ID,SIS User ID,Section,Lab 3\n"Doe, Jane",1001,s1,A,\n"Roe, Jo",1002,s2,A,\n'
+    broken = failed_grade("a", "no TOML").model_copy(update={"authors": ("s1",)})
+    outcomes = [make_outcome(broken, owner="doejane (canvas 1001)")] * own
+    outcomes.append(
+        make_outcome(make_grade("b", share=0.5, authors=("s1",)), owner="roejo (canvas 1002)")
+    )
+    with Gradebook(tmp_path, assignment="lab", create=True) as book:
+        for outcome in outcomes:
+            book.put(outcome)
+        book.finish(Batch(keys=tuple(o.key for o in outcomes), shared={}), rubric=RUBRIC)
+        (tmp_path / "roster.csv").write_text(roster, encoding="utf-8")
+        done = export(
+            book, "canvas", tmp_path / "out", title="Lab 3", roster=tmp_path / "roster.csv"
+        )
+    (remark,) = [remark for remark in done.remarks if remark.left_out]
+    assert remark.text == (
+        "has no points, since another's account handed it in and got them: s1 (b)"
+    )
+
+
 @pytest.mark.parametrize("platform", ["canvas", "moodle", "gradescope"])
 def test_points_by_hand_of_a_submission_without_names_are_exported(tmp_path, platform):
     """As who its folder is called, which is said; or as those it named before it broke."""

@@ -1,0 +1,11 @@
+"""All commands, loaded."""
+
+# isort: off
+# In this order `cartlab --help` lists the commands: as a lab needs them.
+from pipeline.cli.common import app, run
+from pipeline.cli import reports, models, plan, acquire, explore, emulate, grading, desk, demo
+
+__all__ = [
+    "acquire", "app", "demo", "desk", "emulate", "explore", "grading", "models", "plan", "reports",
+    "run",
+]  # fmt: skip

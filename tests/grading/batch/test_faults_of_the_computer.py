@@ -1,0 +1,178 @@
+"""What this computer fails at costs nobody a grade: the next run tries again."""
+
+import io
+import json
+import shutil
+import subprocess
+import sys
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from pipeline.grading.batch.worker import Task, grade_task
+from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.intake.unpack import HAND_IN, unpack
+from pipeline.grading.rubric_file import load_rubric
+from pipeline.synthesis import write_submission
+from tests.helpers.places import ROOT
+
+RUBRIC = load_rubric(Path("throne-1dof"))
+POSIX = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such limits")
+_MEMBER = 3_000_000  # bytes of a file that packs to a tenth
+
+
+@pytest.fixture(scope="module")
+def teams(tmp_path_factory) -> Path:
+    """Two teams with a step in common, of which each zip is small and what is in it is not."""
+    folder = tmp_path_factory.mktemp("teams")
+    for number in (0, 2):
+        write_submission(
+            folder / f"team-{number}",
+            chain="throne-1dof",
+            seed=number,
+            authors=(f"s{number}",),
+            compact=True,
+            reported=True,
+        )
+        lines = "".join(f"{i / 1000:.3f},{i % 97}\n" for i in range(_MEMBER // 10))
+        (folder / f"team-{number}" / "data" / "all.txt").write_text(lines, encoding="utf-8")
+    step = (folder / "team-0" / "data" / "step-1.csv").read_bytes()
+    (folder / "team-2" / "data" / "step-2.csv").write_bytes(step)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def zips(teams, tmp_path_factory) -> Path:
+    """The two teams, packed."""
+    folder = tmp_path_factory.mktemp("zips")
+    for team in teams.iterdir():
+        shutil.make_archive(str(folder / team.name), "zip", teams, team.name)
+    return folder
+
+
+@contextmanager
+def small_disk(at: Path, *, size: str) -> Iterator[None]:
+    """Have a disk of that size at a folder; skip where nobody may make one."""
+    at.mkdir()
+    words = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(at)]
+    if shutil.which("mount") is None or subprocess.run(words, check=False).returncode:
+        pytest.skip("only root may mount a small disk")
+    try:
+        yield
+    finally:
+        subprocess.run(["umount", str(at)], check=True)
+
+
+def grade(zips: Path, out: Path) -> subprocess.CompletedProcess[str]:
+    """Grade the class in a process of its own."""
+    command = [sys.executable, "-m", "pipeline", "grade", zips, "--rubric", "throne-1dof",
+               "--no-figures", "--jobs", "1", "--out", out]  # fmt: skip
+    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a small disk is made of memory")
+def test_a_full_disk_costs_nobody_a_grade(zips, tmp_path):
+    """The run says that there is no room, not that the rubric is wrong; the next one grades all."""
+    disk = tmp_path / "disk"
+    with small_disk(disk, size="1200k"):
+        full = grade(zips, disk / "out")
+        assert full.returncode == 1
+        assert "team-0: cannot be read (No space left on device); the next run tries again" in (
+            full.stderr
+        )
+        assert "the disk is full: for 2 of 2 there was no room to unpack them in" in full.stderr
+        assert "is throne-1dof the rubric" not in full.stderr
+        subprocess.run(["mount", "-o", "remount,size=60m", disk], check=True)
+        again = grade(zips, disk / "out")
+        assert again.returncode == 0, again.stderr
+        with Gradebook(disk / "out") as book:
+            grades = [entry.grade for entry in book.entries()]
+    assert [grade.status for grade in grades] == ["graded", "graded"]
+    assert all("shared_data" in [flag.code for flag in grade.flags] for grade in grades)
+
+
+def test_a_name_that_cannot_be_is_still_the_archives_own(tmp_path):
+    """A file where a folder should be, and a name too long, are refused: trying again is no use."""
+    archive = tmp_path / "odd.zip"
+    with zipfile.ZipFile(archive, "w") as packed:
+        packed.writestr("a", "a file")
+        packed.writestr("a/b", "in it")
+        packed.writestr("n" * 300, "too long")
+    refused = unpack(archive, tmp_path / "out", limits=HAND_IN)
+    assert [len(path.name) for path in refused] == [1, 300]
+
+
+_STARVED = """
+import json, resource, sys
+from pathlib import Path
+from pipeline.grading.batch.worker import Task, grade_task
+from pipeline.grading.rubric_file import load_rubric
+
+source, scratch, limit, *soft = sys.argv[1:]
+task = Task(id="team", key="k", sources=(source,))
+rubric = load_rubric(Path("throne-1dof"))
+which = getattr(resource, limit)
+hard = resource.getrlimit(which)[1]
+
+def grade():
+    outcome = grade_task(task, rubric=rubric, scratch=Path(scratch))
+    return [outcome.settled, outcome.lacks_room, outcome.reason, outcome.grade]
+
+told = [grade()]
+for most in map(int, soft):
+    resource.setrlimit(which, (most, hard))
+    told.append(grade())
+    resource.setrlimit(which, (hard, hard))
+print(json.dumps(told))
+"""
+
+
+def starved(source: Path, scratch: Path, limit: str, soft: range) -> list[list]:
+    """Grade without a limit, then with each: settled, without room, why not, the grade."""
+    scratch.mkdir()
+    words = [sys.executable, "-c", _STARVED, source, scratch, limit, *soft]
+    done = subprocess.run(
+        list(map(str, words)), capture_output=True, text=True, check=True, cwd=ROOT
+    )
+    return json.loads(done.stdout)
+
+
+@POSIX
+def test_a_file_that_may_not_grow_costs_nobody_a_grade(zips, teams, tmp_path):
+    """A limit on the size of files is met while a zip is unpacked, or a folder is copied."""
+    for number, source in enumerate((zips / "team-0.zip", teams / "team-0")):
+        size = range(_MEMBER // 2, _MEMBER // 2 + 1)
+        _, (settled, no_room, why, _) = starved(
+            source, tmp_path / str(number), "RLIMIT_FSIZE", size
+        )
+        assert (settled, no_room) == (False, True)
+        assert why == "cannot be read (File too large); the next run tries again"
+
+
+@POSIX
+@pytest.mark.parametrize("packed", [True, False])
+def test_too_few_files_at_a_time_cost_nobody_a_point(zips, teams, tmp_path, packed):
+    """However early files run out: the grade is the same, or there is none yet."""
+    source = zips / "team-0.zip" if packed else teams / "team-0"
+    few = range(3, 12)  # open as it begins are three, and a few of the libraries'
+    (_, _, _, whole), *others = starved(source, tmp_path / "s", "RLIMIT_NOFILE", few)
+    assert any(not settled for settled, *_ in others)
+    assert {grade for settled, _, _, grade in others if settled} <= {whole}
+
+
+def test_the_faults_of_a_decoder_are_the_archives(tmp_path):
+    """An error without a number comes from what is read, so the archive is refused for good."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_BZIP2) as packed:
+        packed.writestr("submission.toml", "version = 1\n" * 1000)
+    content = bytearray(buffer.getvalue())
+    content[60:70] = b"\xff" * 10  # in the packed bytes
+    archive = tmp_path / "broken.zip"
+    archive.write_bytes(content)
+    outcome = grade_task(
+        Task(id="team", key="k", sources=(str(archive),)), rubric=RUBRIC, scratch=tmp_path
+    )
+    assert (outcome.status, outcome.settled) == ("failed", True)

@@ -1,0 +1,187 @@
+"""A bench on a pseudo-terminal that does in one state of a session what nothing told it to.
+
+Its clock is its own: it goes on by a millisecond at a time, and waits while the host has a few
+lines still to read, which are counted where the host reads them. So how long the host takes to
+react is measured in ms of the bench, on any machine.
+"""
+
+import os
+import select
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from unittest.mock import patch
+
+from pipeline.bench.emulator.core import ReferenceCore
+from pipeline.bench.host.serial_line import SerialLine
+from pipeline.bench.protocol.command_reader import CommandReader
+from pipeline.bench.protocol.messages import (
+    EXTENSIONS,
+    STOCK_STOP,
+    Command,
+    Description,
+    Hands,
+    Reading,
+    Signal,
+    Start,
+    encode,
+    format_reading,
+    parse_reading,
+)
+
+PER_COUNT = 0.002  # cm
+BENCH = Description(
+    name="runaway",
+    encoders=2,
+    carts=2,
+    commands=EXTENSIONS,
+    input_per_count=0.5 / 4096,
+    position_unit="cm",
+    position_per_count=PER_COUNT,
+)
+_MOST_UNREAD = 64  # bytes: four lines, as many as come between two looks of a host
+_PAUSE = 0.001  # s
+
+
+class RunawayBench(threading.Thread):
+    """Keeps to the protocol but where `wrong` says otherwise; a context.
+
+    Its carts stand where the duty of that moment holds them: 5 and 2 duty counts a count.
+
+    Parameters
+    ----------
+    wrong : asked at each ms; whether the bench misbehaves now.
+    duty : of a motor that misbehaves; None: as told.
+    out : counts that cart 1 is away from where it should be, where the bench misbehaves.
+    mute : asked at each ms; whether nothing it says arrives.
+
+    Attributes
+    ----------
+    run_on : the start that is carried out; None: no run is on.
+    starts : all starts, but those that only stop a stock bench.
+    resets, lines : how many it was told, and has sent.
+    is_stopped : it was told to stop, and nothing since.
+    is_pulled : a hand of its own has taken a cart to pull it out.
+    offence : ms of its clock at its first line that shows what is wrong; None: none yet.
+    told : ms of its clock when it was told to stop after that.
+    started_after : starts that it was told after that.
+    """
+
+    def __init__(
+        self,
+        wrong: Callable[["RunawayBench"], bool],
+        *,
+        duty: int | None = None,
+        out: int = 0,
+        mute: Callable[["RunawayBench"], bool] = lambda bench: False,
+        commands: frozenset[str] = BENCH.commands,
+    ) -> None:
+        super().__init__(daemon=True)
+        self._wrong, self._duty, self._out, self._mute = wrong, duty, out, mute
+        self._description = replace(BENCH, commands=commands)
+        self._core = ReferenceCore(self._description)
+        self._reader = CommandReader(encoders=2, extensions=commands)
+        self._over = threading.Event()
+        self._held = 0  # duty that acts
+        self._unread = 0  # bytes that the host has still to read
+        self.ms = 0
+        self.run_on: Start | None = None
+        self.starts: list[Start] = []
+        self.resets = self.lines = 0
+        self.is_stopped = self.is_pulled = False
+        self.offence: int | None = None
+        self.told: int | None = None
+        self.started_after: list[Start] = []
+
+    def __enter__(self) -> "RunawayBench":
+        import tty  # not on Windows
+
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self.address = os.ttyname(self._slave)
+        self._meter = patch.object(SerialLine, "receive", self._metered(SerialLine.receive))
+        self._meter.start()
+        self.start()
+        return self
+
+    def _metered(self, receive: Callable[[SerialLine], bytes]) -> Callable[[SerialLine], bytes]:
+        """Return what reads as the host does, and counts what it has read."""
+
+        def metered(line: SerialLine) -> bytes:
+            data = receive(line)
+            self._unread = max(0, self._unread - len(data))
+            return data
+
+        return metered
+
+    def __exit__(self, *error: object) -> None:
+        self._over.set()
+        self.join()
+        self._meter.stop()
+        os.close(self._master)
+        os.close(self._slave)
+
+    def run(self) -> None:
+        """Go on by one ms after the other until the block is over."""
+        while not self._over.wait(_PAUSE):
+            self._listen()
+            if self._unread < _MOST_UNREAD:
+                self._tick()
+        self._listen()
+
+    def _listen(self) -> None:
+        while select.select([self._master], [], [], 0)[0]:
+            for command in self._reader.feed(os.read(self._master, 4096)):
+                self._hear(command)
+
+    def _hear(self, command: Command) -> None:
+        is_stop = command in (Signal.STOP, Signal.RESET)
+        if is_stop and self.offence is not None and self.told is None:
+            self.told = self.ms
+        self.resets += command is Signal.RESET
+        self.is_stopped = is_stop or (self.is_stopped and not isinstance(command, Start))
+        self.is_pulled |= isinstance(command, Hands) and command.released > 0
+        if isinstance(command, Start):
+            self.run_on = command
+            if command == STOCK_STOP[0]:  # of a line just opened: what was unread is gone
+                self._unread = 0
+            else:
+                self.starts.append(command)
+                if self.offence is not None:
+                    self.started_after.append(command)
+        elif is_stop:
+            self.run_on = None
+        self._core.receive(encode(command))
+
+    def _tick(self) -> None:
+        counts = (self._held // 5, self._held // 2)
+        self._held = self._core.tick(counts, stamp=self.ms, now=0)
+        said = self._core.take().splitlines(keepends=True)
+        readings = [reading for line in said if (reading := parse_reading(line))]
+        if not readings:
+            self.run_on = None
+        if self._wrong(self):
+            readings = self._spoilt(readings)
+        self.lines += len(readings)
+        out = b"".join(line for line in said if line.startswith(b"?"))
+        out += b"".join(map(format_reading, readings))
+        if out and not self._mute(self):
+            self._unread += len(out)
+            os.write(self._master, out)
+        self.ms += 1
+
+    def _spoilt(self, readings: Sequence[Reading]) -> list[Reading]:
+        """Return lines as the bench that misbehaves sends them; without a run it sends some too."""
+        if not readings and (self._duty is not None):
+            readings = [Reading(counts=(0, 0), target=0, duty=0, ms=self.ms)]
+        if readings and self.offence is None:
+            self.offence = self.ms
+        return [
+            replace(
+                reading,
+                duty=reading.duty if self._duty is None else self._duty,
+                counts=(reading.counts[0] + self._out, *reading.counts[1:]),
+            )
+            for reading in readings
+        ]
