@@ -81,8 +81,9 @@ def without_lone_factors(
             ]
             misread = factors[sharing[0].id]
             shared = len(sharing) >= limits.WITNESSES and not contrary
-            if misread.scale is not None and shared and not _may_be_a_limit(sharing, records, fits):
-                kept |= {r.id: misread for r in sharing}
+            if misread.scale is not None and shared:
+                limited = misread.scale < 1 and _may_be_a_limit(sharing, records, fits)
+                kept |= {} if limited else {r.id: misread for r in sharing}
             if misread.clock is not None:
                 kept |= {
                     r.id: misread
