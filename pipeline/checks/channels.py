@@ -7,7 +7,6 @@ import numpy as np
 
 from pipeline.checks import limits
 from pipeline.estimation.chain.channel_delay import ChannelDelay, find_channel_delays
-from pipeline.estimation.limits import BETTER
 from pipeline.names import listed
 from pipeline.results import Check, LateChannel, Record
 
@@ -71,7 +70,7 @@ def _limit(link: ChannelDelay, *, sample: float) -> float:
 
 
 def _shows(link: ChannelDelay, *, sample: float) -> bool:
-    return link.better >= BETTER and abs(link.delay) > _limit(link, sample=sample)
+    return link.better >= limits.LATE_BETTER and abs(link.delay) > _limit(link, sample=sample)
 
 
 def check_channels(late: Sequence[LateChannel]) -> list[Check]:

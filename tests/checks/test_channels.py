@@ -1,11 +1,13 @@
 """A channel that is logged later than the others is told; carts with friction are not."""
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from pipeline.arrays import Array
 from pipeline.checks.channels import (
     LATE_CHANNEL,
     check_channels,
@@ -15,14 +17,17 @@ from pipeline.checks.channels import (
 from pipeline.grading.judge.run import grade_submission
 from pipeline.grading.mistakes.recordings import bad_runs
 from pipeline.grading.rubric_file import load_rubric
+from pipeline.ingest.read import read_data
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.plant.linear.simulate import propagate, simulate_linear
 from pipeline.resources import RUBRICS
 from pipeline.results import Record
+from pipeline.results_of_runs import Kind
 from pipeline.submission import load_submission
 from pipeline.synthesis import write_submission
 from pipeline.synthesis.hidden import prepare_bench
 from pipeline.workflow import analyse
+from tests.helpers.ucsd import write_two_cart_submission
 
 SAMPLE, COUNT = 0.00884, 0.00227  # s, cm
 LATE = 5  # samples
@@ -86,10 +91,30 @@ def test_a_channel_that_is_late_in_the_sweep_alone_is_told_of_it_alone():
     assert "in the sweeps" in check.message
 
 
-def motions(kinds: tuple[str, ...], *, late: int = 0) -> list[Record]:
+@pytest.mark.parametrize(("late", "told"), [(0, []), (LATE, [2])])
+def test_the_channels_of_a_real_bench_are_of_one_moment(late, told, real_data, tmp_path):
+    """Steps with much dry friction: nothing is said of them, unless cart 2 is read late."""
+    folder = write_two_cart_submission(tmp_path / "real", real_data, steps=(1, 2, 3, 4, 5))
+    records = [
+        replace(record, y=np.array([record.y[0], delayed(record.y[1], late)]))
+        if set(record.carts) == {1, 2}
+        else record
+        for record in read_data(load_submission(folder)).records
+    ]
+    found = find_late_channels(records, carts=2)
+    assert [one.cart for one in found] == told
+    assert all(one.kind == "step" for one in found)
+
+
+def delayed(x: Array, samples: int) -> Array:
+    """Return a channel read so many samples later."""
+    return np.concatenate([np.repeat(x[:1], samples), x[: x.size - samples]])
+
+
+def motions(kinds: tuple[Kind, ...], *, late: int = 0) -> list[Record]:
     """Return motions of three carts, as encoders of 0.00227 cm read them, one of them late."""
     chain, rng = PRESETS["throne-3dof"], np.random.default_rng(5)
-    t = SAMPLE * np.arange(1400)
+    t = np.linspace(0.0, 1399 * SAMPLE, 1400)
     hold = 1.0 / float(np.max(chain.static_gains()))
     inputs = {
         "step": [size * hold * ((t > 0.5) & (t < 6.0)) for size in (0.5, 0.9)],
@@ -107,9 +132,7 @@ def motions(kinds: tuple[str, ...], *, late: int = 0) -> list[Record]:
                 y = simulate_linear(chain, t, u)
             y = COUNT * np.round((y + 0.2 * COUNT * rng.standard_normal(y.shape)) / COUNT)
             if late:
-                y[late - 1] = np.concatenate(
-                    [np.repeat(y[late - 1, :1], LATE), y[late - 1, :-LATE]]
-                )
+                y[late - 1] = delayed(y[late - 1], LATE)
             records.append(
                 Record(
                     id=kind if len(inputs[kind]) == 1 else f"{kind}-{number}",

@@ -17,7 +17,7 @@ TURNED = Misread(words="x1 turned")
 
 
 def record(name: str, *, size: float = 1.0, step: float = 0.01) -> Record:
-    t = step * np.arange(100)
+    t = np.linspace(0.0, 99 * step, 100)
     return Record(
         id=name,
         kind="step" if name.startswith("step") else "sine",
@@ -64,7 +64,7 @@ def test_one_record_with_another_clock_is_sampled_otherwise():
     """A dwell at the sampling of the others has their clock, whatever it follows."""
     others = [record("sine-2"), record("sine-3")]
     assert kept({"sine-1": SLOW}, *others, sizes={"sine-1": 1.0}) == set()
-    slow = replace(record("sine-1"), t=0.02 * np.arange(100))
+    slow = replace(record("sine-1"), t=np.linspace(0.0, 1.98, 100))
     fits = {
         name: Followed(lost={1: lost}, missed={}, reach={1: 1.0}, friction={})
         for name, lost in (("sine-1", 1.0), ("sine-2", 0.0), ("sine-3", 0.0))

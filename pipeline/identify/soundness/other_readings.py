@@ -74,7 +74,7 @@ def without_lone_factors(
     kept = {name: m for name, m in found.items() if m.scale is None and m.clock is None}
     for alike in _by_kind(records):
         factors = {r.id: found[r.id] for r in alike if r.id in found and r.id not in kept}
-        for words in {misread.words for misread in factors.values()}:
+        for words in dict.fromkeys(misread.words for misread in factors.values()):
             sharing = [r for r in alike if r.id in factors and factors[r.id].words == words]
             contrary = [
                 r for r in alike if r not in sharing and (r.id in found or fits[r.id].belongs)
@@ -90,7 +90,7 @@ def without_lone_factors(
                     for r in sharing
                     if shared or _is_sampled_so(r, records, factor=misread.clock)
                 }
-    return kept
+    return {name: misread for name, misread in found.items() if name in kept}
 
 
 def _by_kind(records: Sequence[Record]) -> list[list[Record]]:
