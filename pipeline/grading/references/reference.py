@@ -1,6 +1,6 @@
 """What the student's own recordings say each parameter is, and what an honest reading may give."""
 
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -200,28 +200,22 @@ def in_doubt(references: References, *, analysis: Analysis) -> References:
     """Return the references as far as they may be held against a student.
 
     Of recordings that no linear carts move like, first estimates are those of the runs they were
-    read off, and a fit of the students' own may go astray where the pipeline's does.
+    read off; a fit, ours or the students', is one to nothing.
     """
     if is_linear(analysis):
         return references
-    trusted = trusted_chain(analysis) is not None
-    fitted = {row.name for row in analysis.rows if trusted and row.final is not None}
 
-    def widened(table: Mapping[str, Reference], told: Container[str]) -> dict[str, Reference]:
-        factors = {
-            name: limits.BEYOND_BELIEF if name in told else limits.FITTED_TO_NOTHING
-            for name in table
-        } | {name: limits.BEYOND_BELIEF_DAMPING for name in table if is_damping(name)}
+    def widened(table: Mapping[str, Reference], factor: float) -> dict[str, Reference]:
         return {
-            name: one.widened(factors[name])
+            name: one.widened(limits.BEYOND_BELIEF_DAMPING if is_damping(name) else factor)
             for name, one in table.items()
             # Resonances of no linear carts are no numbers of any, nor is what rests on them.
             if one.source != "frequency_response"
         }
 
     return References(
-        initial=widened(references.initial, references.initial.keys()),
-        final=widened(references.final, fitted),
+        initial=widened(references.initial, limits.BEYOND_BELIEF),
+        final=widened(references.final, limits.FITTED_TO_NOTHING),
     )
 
 
