@@ -319,6 +319,21 @@ class Assumption:
     reason: str
 
 
+@dataclass(frozen=True, kw_only=True)
+class LateChannel:
+    """A cart whose channel is read later than another's, in the experiments of one kind.
+
+    `delay` : s, negative where it is read earlier, against `limit`; `than` is the other cart.
+    """
+
+    cart: int
+    than: int
+    kind: str
+    delay: float
+    limit: float
+    experiments: tuple[str, ...]
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Analysis:
     """All results of one submission, in pipeline order.
@@ -356,6 +371,7 @@ class Analysis:
     unexplained: dict[str, float] = field(default_factory=dict)
     discussion: str | None  # notes.md, without its comments
     left_out: tuple[LeftOut, ...] = ()
+    late_channels: tuple[LateChannel, ...] = ()
     reported: Mapping[str, Mapping[str, Decimal]] = field(default_factory=dict)
     assumptions: tuple[Assumption, ...] = ()
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from pipeline.checks.carts import check_carts
-from pipeline.checks.channels import check_channels
+from pipeline.checks.channels import check_channels, find_late_channels
 from pipeline.checks.estimates import check_decays, check_rows, check_steps
 from pipeline.checks.loops import check_loops, design_margins, verify_design
 from pipeline.checks.recordings import (
@@ -78,6 +78,7 @@ def analyse(
         input_unit=drive,
         fitted_to=fit.experiments if fit else (),
     )
+    late = find_late_channels(sound, carts=system.carts)
     signs = check_signs(data.signs, without=wrong)
     checks = [
         *signs,
@@ -87,7 +88,7 @@ def analyse(
         *check_left_out(left_out, records=data.records),
         *check_setup(data.records),
         *check_dwells(data.records, found.sines),
-        *check_channels(found.responses, fit, records=sound),
+        *check_channels(late),
         *found.repeats.checks,
         *check_rows(rows),
         *check_decays(found.decays, records=data.records, position_unit=position),
@@ -134,6 +135,7 @@ def analyse(
         unexplained={name: one.share for name, one in found.fitted.fits.items()},
         discussion=submission.discussion,
         left_out=tuple(left_out),
+        late_channels=late,
         reported=submission.typed,
         assumptions=list_assumptions(submission, data=data, fit=fit, checks=checks),
     )

@@ -7,10 +7,11 @@ LONGEST_WHOLE = 0.5  # … for one that is read to whole numbers alone, as count
 LARGEST = 100.0  # V: no amplifier at a bench gives as much
 HELD_SHARE = 0.2  # of a held cart's swing: a free one that moves less is not the free one
 OTHER_DWELL = 0.1  # relative: a dwell stated so far off is another one
-# Samples, and so many times the scatter of the dwells: a cart that friction holds seems late by
-# half a sample at most, in the median of the dwells, on benches all over what a lab may have.
-LATE, LATE_SURE = 2.0, 4.0
-FEWEST_DWELLS = 5  # a median of fewer is one of them
+LATE, LATE_SURE = 2.0, 4.0  # samples, and standard errors, that a channel is late by at least
+# With its delay the carts' own law must leave so many times less. Friction, stops and stiff springs
+# on benches all over what a lab may have look like delays that leave 1.7 times less at most; 44 ms
+# leave 8 times on a bench with much friction, and thousands on one without.
+LATE_BETTER = 5.0
 
 # ------------------------------------------------------------------------- carts and loops
 

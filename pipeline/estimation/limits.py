@@ -11,6 +11,7 @@ DOUBTFUL, BETTER = 0.005, 10.0
 TURNED = 0.02  # what a record that counts the other way leaves at most; a long delay leaves more
 SAME_SCALE = 0.1  # relative, of a unit's factor: the known ones lie 2.5 times apart
 UNMISTAKABLE = 10.0  # an amplifier at its limit makes less of the input by a factor of 2 or 3
+DELAY_COUNTS = 20.0  # encoder steps of motion from which on a channel's delay shows
 SEEN_STEPS = 5.0  # encoder steps of motion: rounding changes a smaller one by any factor
 # A spring that stiffens, or an input that is late, shifts resonances by some percent.
 DETUNED = np.linspace(0.85, 1.15, 13)

@@ -8,6 +8,7 @@ import numpy as np
 from pipeline.estimation.chain.follow import Followed, find_misread, follow, most_follow, near
 from pipeline.identify.limits import CONTRARY
 from pipeline.identify.log import Log
+from pipeline.identify.soundness.other_readings import without_lone_factors
 from pipeline.names import own_zeta
 from pipeline.results import ChainFit, Estimate, FrequencyResponse, LeftOut, Record
 from pipeline.stages.bode_fit import fit_bode
@@ -185,14 +186,16 @@ def _conflict(
     assert fitted.fit is not None
     chain, ids = fitted.fit.chain, _by_kind(records, fitted)
     others = [r for r in records if r.id in fitted.fits and r.kind in theirs - mine]
-    found = [(r.id, m.words) for r in others if (m := find_misread(r, chain, fitted.fits[r.id]))]
+    misread = {r.id: m for r in others if (m := find_misread(r, chain, fitted.fits[r.id]))}
+    held = [record for record in records if record.id in fitted.fits]
+    found = without_lone_factors(misread, held, fits=fitted.fits)
     if 2 * len(found) <= len(others):
         return {}
-    example, words = found[0]
+    example, misread = next(iter(found.items()))
     of_mine, of_theirs = (" and ".join(sorted(kinds)) for kinds in (mine - theirs, theirs - mine))
     reason = (
         f"the {of_mine} and the {of_theirs} records contradict one another, and nothing tells "
-        f"which are right (of {example}, if the former are: {words})"
+        f"which are right (of {example}, if the former are: {misread.words})"
     )
     return {
         name: LeftOut(experiment=name, reason=reason, is_wrong=True)

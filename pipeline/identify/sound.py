@@ -54,7 +54,9 @@ def identify_from_sound(
         # Most repeats may be the wrong ones: who is odd shows among the others.
         sound = [record for record in driven if record.id not in faults]
         odd = find_outlier_repeats(sound, unit=unit)
-        left_out = {**odd, **shown, **faults}
+        # What says how a record is wrong stands before what says that it is odd.
+        doubted = {name: one for name, one in faults.items() if not one.is_wrong}
+        left_out = {**odd, **doubted, **shown, **{n: f for n, f in faults.items() if f.is_wrong}}
         if left_out.keys() == without:
             break
         without = left_out.keys()

@@ -246,10 +246,10 @@ def report(team: Team) -> Team:
         # From what they have found, or from what they have typed of it; in one way or the other.
         values = final if rng.random() < 0.5 else {x: float(v) for x, v in table.items()}
         own = own_chain(values, n=n)
-        if own is not None and _is_real(own):
+        if own is not None and is_real(own):
             rows = own.state_space()[:2] if rng.random() < 0.5 else from_statics(values, n)
             space = state_space(*rows, digits=digits)
-            feedback = _designed(team, own) or feedback
+            feedback = designed(team.submission, own) or feedback
     reported = Reported(
         initial={x: written(v, digits) for x, v in first.items()},
         final=table,
@@ -295,7 +295,8 @@ def from_statics(p: Mapping[str, float], n: int) -> tuple[Array, Array]:
     return A, B
 
 
-def _is_real(chain: Chain) -> bool:
+def is_real(chain: Chain) -> bool:
+    """Whether a chain could be one of carts."""
     return bool(np.all(chain.c > 0) and np.all(np.linalg.eigvalsh(chain.stiffness) > 0))
 
 
@@ -346,9 +347,9 @@ def state_space(A: Array, B: Array, *, digits: int) -> StateSpace:
     )
 
 
-def _designed(team: Team, chain: Chain) -> Feedback | None:
-    """Return a controller made for the team's own carts, as typed."""
-    task = team.submission.design or Design(cart=chain.n)
+def designed(submission: Submission, chain: Chain) -> Feedback | None:
+    """Return a controller made for a team's own carts, as typed."""
+    task = submission.design or Design(cart=chain.n)
     try:
         design = design_feedback(chain, **dict(task))
     except DataError:

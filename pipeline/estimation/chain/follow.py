@@ -56,12 +56,16 @@ class Followed:
 class Misread:
     """What makes a record follow: `words` say it; a `legal` one need not be a mistake.
 
-    `remedy` : what mends it where all records of a bench are so.
+    `remedy` : what mends it where all records of a bench are so. `scale` : how far it moves over
+    how far its input moves the carts, where only that differs. `clock` : its time over the true
+    one, where only that differs.
     """
 
     words: str
     remedy: str = "mend it in the files"
     legal: bool = False
+    scale: float | None = None
+    clock: float | None = None
 
 
 def is_driven(record: Record) -> bool:
@@ -131,7 +135,7 @@ def _readings(record: Record, modes: _ModesOf) -> Iterator[tuple[Misread, Record
         yield Misread(words=words, remedy=remedy), other
     for factor, words in TIME_FACTORS.items():
         if record.sample_time >= factor * FASTEST:  # too short a time is any short curve
-            yield Misread(words=words), replace(record, t=record.t / factor)
+            yield Misread(words=words, clock=factor), replace(record, t=record.t / factor)
     try:
         window = open_window(record)
     except DataError:
@@ -172,7 +176,7 @@ def _say(carts: Sequence[int], weights: Array) -> tuple[Misread, Array] | None:
                 "its positions or its input look to be in another unit: they move "
                 f"{scale:.3g} times as far as its input moves the carts"
             )
-            return Misread(words=words), sign / scale
+            return Misread(words=words, scale=scale), sign / scale
     turned = [f"x{cart}" for cart, s in zip(carts, sign, strict=True) if s < 0]
     if len(turned) == len(carts):
         return Misread(words="its input looks to count the other way", legal=True), sign

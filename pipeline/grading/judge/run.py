@@ -9,11 +9,18 @@ from pipeline.grading.judge.checks import judge
 from pipeline.grading.judge.costs import charge
 from pipeline.grading.judge.work import Verdict, Work, missing_flag
 from pipeline.grading.mistakes.controller import diagnose_controller, reported_controller
+from pipeline.grading.mistakes.no_fit import copied_final
 from pipeline.grading.mistakes.recordings import bad_runs, data_flag
 from pipeline.grading.mistakes.reduced import diagnose_reduced
 from pipeline.grading.mistakes.state_model import diagnose_state_space, state_models
 from pipeline.grading.mistakes.tables import diagnose_tables
-from pipeline.grading.references.reference import in_scale, recompute, trusted_chain
+from pipeline.grading.references.reference import (
+    in_doubt,
+    in_scale,
+    is_linear,
+    recompute,
+    trusted_chain,
+)
 from pipeline.grading.references.signs import turned_round
 from pipeline.grading.references.springs import with_all_springs
 from pipeline.grading.references.tolerance import exact, late_deduction, rounding, to_step
@@ -91,13 +98,19 @@ def grade_analysis(
     """
     reported, signed = turned_round(submission.reported or Reported(), analysis.records)
     submission, n = submission.model_copy(update={"reported": reported}), rubric.system.carts
-    references, chain = in_scale(
+    measured, chain = in_scale(
         recompute(analysis),
-        trusted_chain(analysis),
+        trusted_chain(analysis) if is_linear(analysis) else None,
         analysis=analysis,
         per_count=submission.system.position.per_count,
     )
-    diagnosis = diagnose_tables(reported, references=references, analysis=analysis)
+    references = in_doubt(measured, analysis=analysis)
+    diagnosis = diagnose_tables(
+        reported,
+        references=references,
+        analysis=analysis,
+        copied=copied_final(reported, references=measured),
+    )
     tables = [{name: float(typed) for name, typed in reported.final.items() if typed > 0}]
     if diagnosis.corrected != tables[0]:
         tables.append(diagnosis.corrected)
@@ -232,12 +245,17 @@ def _outcome(share: Fraction | None, points: Fraction, *, out_of: Fraction) -> O
 
 
 def _flags(work: Work) -> list[Flag]:
-    """Return the flags beside those of the parameter tables."""
-    flags, space = [], work.reported.state_space
+    """Return the flags beside those of the parameter tables.
+
+    A table of a bench that is not linear is of no one chain: what is made of it one way is not
+    what is made of it another, and only what no chain can have is wrong.
+    """
+    flags, space, linear = [], work.reported.state_space, is_linear(work.analysis)
     if space is not None and space.A:
         n = work.rubric.system.carts
-        flags += diagnose_state_space(space, work.entries, models=work.state_models, n=n)
-    if work.controller is not None:
+        entries = [entry for entry in work.entries if linear or entry.kind == "exact"]
+        flags += diagnose_state_space(space, entries, models=work.state_models, n=n)
+    if work.controller is not None and linear:
         flags += diagnose_controller(work.controller)
     flags += diagnose_reduced(work.analysis)
     if work.missing:

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from pipeline.checks.channels import LATE_CHANNEL
+from pipeline.checks.channels import late_experiments
 from pipeline.checks.recordings import SCALES, why_other_frequency
 from pipeline.grading import limits
 from pipeline.grading.references.reference import is_explained
@@ -23,17 +23,13 @@ def bad_runs(analysis: Analysis) -> dict[str, str]:
         for check in analysis.checks
         if check.id.partition(".")[0] in ("setup", *SCALES) and check.outcome == "fail"
     }
-    late = {
-        int(check.id.rpartition("-")[2]): check.message
-        for check in analysis.checks
-        if check.id.partition(".")[0] == LATE_CHANNEL
-    }
+    late = late_experiments(analysis.late_channels)
     sticky = not is_explained(analysis)
     for record in analysis.records:
         if record.id in setups:
             found[record.id] = setups[record.id]
             continue
-        here = [late[cart] for cart in late if record.omega and cart in record.free]
+        here = [late[record.id]] if record.id in late else []
         for problem in (*_problems(record, sticky=sticky), *here):
             found.setdefault(record.id, problem)
     return found

@@ -12,7 +12,7 @@ from pipeline.grading.rubric import is_damping
 from pipeline.names import read_name
 from pipeline.plant.linear.chain import Chain
 from pipeline.results import Analysis, Estimate, ParameterRow
-from pipeline.results_of_runs import StepEdge
+from pipeline.results_of_runs import StepEdge, StepGain
 from pipeline.stages.limits import GAIN_AND_FREQUENCY_LIMIT
 
 OFF_SCALE = "the recordings are not in the units stated, see the data"
@@ -187,6 +187,38 @@ def is_followed(analysis: Analysis) -> bool:
     )
 
 
+def is_linear(analysis: Analysis) -> bool:
+    """Whether the recordings are those of some linear carts, near enough.
+
+    Else every number depends on how far the carts moved and on how it is found, and two honest
+    students find two.
+    """
+    return is_explained(analysis) or is_followed(analysis)
+
+
+def in_doubt(references: References, *, analysis: Analysis) -> References:
+    """Return the references as far as they may be held against a student.
+
+    Of recordings that no linear carts move like, first estimates are those of the runs they were
+    read off; a fit, ours or the students', is one to nothing.
+    """
+    if is_linear(analysis):
+        return references
+
+    def widened(table: Mapping[str, Reference], factor: float) -> dict[str, Reference]:
+        return {
+            name: one.widened(limits.BEYOND_BELIEF_DAMPING if is_damping(name) else factor)
+            for name, one in table.items()
+            # Resonances of no linear carts are no numbers of any, nor is what rests on them.
+            if one.source != "frequency_response"
+        }
+
+    return References(
+        initial=widened(references.initial, limits.BEYOND_BELIEF),
+        final=widened(references.final, limits.FITTED_TO_NOTHING),
+    )
+
+
 def _final(
     row: ParameterRow, analysis: Analysis, tables: Sequence[Mapping[str, float]]
 ) -> Reference | None:
@@ -195,11 +227,11 @@ def _final(
     A fit that holds a damping at zero, its bound, tells of no damping; one that neither explains
     the points nor is followed by the records tells of no number that nothing else measures.
     """
-    fitted = row.final
+    fitted, read_off = row.final, _readings(row.name, analysis)
     if is_damping(row.name):
         measured = [table[row.name] for table in tables]
     else:
-        measured = _readings(row.name, analysis)
+        measured = list(read_off)
         if row.initial and (measured or not is_explained(analysis)):
             spread = limits.READ_BY_EYE if row.initial.source == "frequency_response" else 1.0
             measured += [row.initial.value / spread, row.initial.value * spread]
@@ -208,6 +240,7 @@ def _final(
     # decays, and where those are few the fit explains them all the same.
     if fitted and told and not is_damping(row.name) and is_explained(analysis):
         measured = [value for value in measured if _agrees(value, fitted)]
+    read = row.initial.source if row.initial and not read_off else "log_decrement"
     if not measured and not (told and (is_explained(analysis) or is_followed(analysis))):
         return None
     bounds = [*measured, *([fitted.value] if fitted and told else [])]
@@ -216,7 +249,7 @@ def _final(
         low=min(bounds),
         high=max(bounds),
         std=(fitted.std or 0.0) if fitted and told else 0.0,
-        source=fitted.source if fitted and told else "log_decrement",
+        source=fitted.source if fitted and told else read,
     )
 
 
@@ -288,6 +321,7 @@ def _readings(name: str, analysis: Analysis) -> list[float]:
             if step.cart == cart:
                 readings += [step.gain, *(step.interval or ())]
                 readings += [_shortest(edge, held=held) for edge in step.edges if held]
+        readings += _by_size([step for step in analysis.step_gains if step.cart == cart])
     for decay in analysis.log_decrements:
         if decay.cart == cart and read.is_frequency:
             readings.append(decay.omega_n)
@@ -295,6 +329,27 @@ def _readings(name: str, analysis: Analysis) -> list[float]:
             without = decay.friction.zeta if decay.friction else decay.zeta
             readings += [zeta for zeta in (decay.zeta, without) if zeta > 0]
     return readings
+
+
+def _by_size(steps: Sequence[StepGain]) -> list[float]:
+    """Return the gain from small steps to large ones, where the two have different ones.
+
+    A dead zone, or an amplifier that starts late, takes as much off each.
+    """
+    edges = sorted(
+        (abs(e.u_after - e.u_before), abs(e.level_after - e.level_before))
+        for step in steps
+        for e in step.edges
+    )
+    if not edges:
+        return []
+    size, far = np.array(edges).T
+    small, large = size < size.mean(), size >= size.mean()
+    if not np.any(small) or size[small].max() > (1 - limits.SAME_STEP) * size[large].min():
+        return []
+    (u, x), (v, y) = ((size[at].mean(), far[at].mean()) for at in (small, large))
+    slope = float((y - x) / (v - u))
+    return [slope] if y / v > limits.BY_SIZE * x / u else []
 
 
 def _held(cart: int, analysis: Analysis) -> float:

@@ -12,7 +12,6 @@ import numpy as np
 from pipeline.estimation.chain.follow import (
     Followed,
     Misread,
-    find_misread,
     force_on,
     is_driven,
     measured,
@@ -22,6 +21,7 @@ from pipeline.estimation.chain.follow import (
 from pipeline.estimation.limits import FOLLOWED
 from pipeline.estimation.units_and_clocks import FASTEST, TIME_FACTORS
 from pipeline.identify import limits
+from pipeline.identify.soundness.other_readings import find_other_readings
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.simulate import simulate_linear
 from pipeline.results import LeftOut, Record, StepGain
@@ -47,7 +47,8 @@ def find_faults(
         not be: then only what no carts could do is found.
     fits : how the records follow it, as `follow` has it.
     """
-    misread = _misread(records, chain=chain, fits=fits)
+    readings = find_other_readings(records, chain=chain, fits=fits)
+    misread = readings.mistaken
     everywhere = len({m.words for m in misread.values()}) == 1 and misread.keys() == fits.keys()
     copied = _copies(records)
     steps: dict[int, float] = {}  # a dead channel shows none
@@ -83,6 +84,8 @@ def find_faults(
             legal = record.id in misread and misread[record.id].legal
             fault = LeftOut(experiment=record.id, reason=problem, is_wrong=not legal)
             found.setdefault(record.id, fault)
+    for name, one in readings.odd.items():
+        found.setdefault(name, one)
     for name, reason in _strays(records, chain=chain, fits=fits):
         found.setdefault(name, LeftOut(experiment=name, reason=reason, is_wrong=False))
     return found
@@ -255,33 +258,6 @@ def _wrong_clock(record: Record, *, usual: float) -> Iterator[str]:
 
 
 # ------------------------------------------------------- records that follow no carts
-
-
-def _misread(
-    records: Sequence[Record], *, chain: Chain | None, fits: Mapping[str, Followed]
-) -> dict[str, Misread]:
-    """Return the records that follow the chain only if they are read otherwise, and how.
-
-    Where this is so of most of a kind, it is of those of the kind that tell it less clearly.
-    """
-    if chain is None:
-        return {}
-    found: dict[str, Misread] = {}
-    kinds = {record.kind for record in records if record.id in fits}
-    for alike in ([r for r in records if r.kind == kind and r.id in fits] for kind in kinds):
-        sure = {r.id: m for r in alike if (m := find_misread(r, chain, fits[r.id]))}
-        if 2 * len(sure) > len(alike):
-            sure |= {
-                r.id: m
-                for r in alike
-                if r.id not in sure and (m := find_misread(r, chain, fits[r.id], better=1.0))
-            }
-        found |= sure
-    legal = {name for name, misread in found.items() if misread.legal}
-    if 2 * len(legal) > len(fits):  # then the bench counts so
-        found = {name: misread for name, misread in found.items() if name not in legal}
-    agreeing = sum(fit.belongs for name, fit in fits.items() if name not in found) + len(found)
-    return found if agreeing >= limits.WITNESSES else {}
 
 
 def _so_read(misread: Misread, everywhere: bool) -> str:

@@ -85,7 +85,8 @@ def compare_repeats(
                 others = "the others give" if right[name] else "the dwells ask for"
                 off = f"{name} = {of_run[run][name]:.3g} where {others} {value:.3g}"
                 reason = f"{off}: {said}" if said else off
-                wrong = bool(said or not right[name]) and not _is_reversed(of_run[run], usual)
+                wrong = said or (not right[name] and _differ_in_size(readings[name]))
+                wrong = bool(wrong) and not _is_reversed(of_run[run], usual)
                 odd[run] = LeftOut(experiment=run, reason=reason, is_wrong=wrong)
     undecided = tuple(name for name in readings if name not in usual and name not in by_size)
     return Repeats(
@@ -155,6 +156,12 @@ def _only_by_size(readings: Sequence[_Reading]) -> bool:
     size = np.array([reading.size for reading in readings])
     alike = np.abs(size[:, None] - size) <= limits.SAME_SIZE * np.maximum(size[:, None], size)
     return not np.any(_contradictions(readings) & alike)
+
+
+def _differ_in_size(readings: Sequence[_Reading]) -> bool:
+    """Whether steps are of several sizes, of which a limit or friction makes several gains."""
+    size = np.array([reading.size for reading in readings])
+    return bool(size.min() < (1 - limits.SAME_SIZE) * size.max())
 
 
 def _right_ones(readings: Sequence[_Reading], fitted: Estimate | None) -> list[_Reading]:

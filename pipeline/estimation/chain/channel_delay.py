@@ -1,0 +1,201 @@
+"""By how much one channel is read later than its neighbour's, from the carts' own law of motion.
+
+A cart that no motor drives is moved by its neighbours alone, whatever the input is and however
+late it comes:
+
+    k_i x_{i-1} = m_i x_i'' + c_i x_i' + (k_i + k_{i+1}) x_i - k_{i+1} x_{i+1}
+
+So each cart's channel has one delay against that of the cart before it with which its own law
+holds best. No derivative is taken: both sides are weighed with a smooth bump that slides along
+the records, and the derivatives fall on the bump (modulating functions). The weights are free in
+sign and size, so a cart in another unit, or turned, has the same delay.
+
+Reference: H. A. Preisig & D. W. T. Rippin, Theory and application of the modulating function
+method, Computers & Chemical Engineering 17, 1993.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from pipeline.arrays import Array
+from pipeline.estimation import limits
+from pipeline.results import Record
+
+_BUMP = np.polynomial.Polynomial.fromroots([0.0] * 4 + [1.0] * 4)  # t⁴ (1 - t)⁴
+_WIDTH = 0.25  # of the motion's period: wider ones weigh the fast motions, which tell most, away
+_NARROWEST = 16  # samples under a bump: fewer, and the encoder's steps are all it sees
+_OVERLAP = 6  # steps in which a bump slides on by its width
+_MOST_PLACES = 400  # of the bump in a record
+_FEWEST_PLACES = 30
+_MOST_LATE = 15  # steps of the grid that are tried, either way
+_PER_PERIOD = 240  # steps of the grid in a period of the motion, where it is sampled more often
+_PARTS = 8  # that the error is found from, at least: records, or parts of them
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChannelDelay:
+    """The delay of one cart's channel against that of the cart before it.
+
+    Attributes
+    ----------
+    delay, std : s; positive where it is read later; the standard error by jackknife over records.
+    better : how many times less of the motion the carts' law leaves with this delay than with
+        none: friction, play and stops look like a small delay, but none takes them away.
+    experiments : the records it was found from.
+    """
+
+    cart: int
+    delay: float
+    std: float
+    better: float
+    experiments: tuple[str, ...]
+
+
+def find_channel_delays(records: Sequence[Record], *, n: int) -> dict[int, ChannelDelay]:
+    """Return by cart the delay of its channel against that of the cart before, where it shows.
+
+    The last cart comes first: the law of one before it needs to know when the next one was read.
+    """
+    found: dict[int, ChannelDelay] = {}
+    for cart in range(n, 1, -1):
+        after = found[cart + 1].delay if cart + 1 in found else 0.0
+        one = _channel_delay(records, cart, after=after)
+        if one is not None:
+            found[cart] = one
+    return found
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Normal:
+    """Normal equations of the law in a part of a record, for every delay that is tried.
+
+    Attributes
+    ----------
+    power : (n_d,) of the left side; cross : (n_d, 4) with the right; square : (4, 4) of the right.
+    """
+
+    power: Array
+    cross: Array
+    square: Array
+
+    def without(self, other: "_Normal") -> "_Normal":
+        """Return the equations of what is left without a part."""
+        return _Normal(
+            power=self.power - other.power,
+            cross=self.cross - other.cross,
+            square=self.square - other.square,
+        )
+
+    def left(self) -> Array:
+        """Return the power (n_d,) that the law leaves of the left side at its best."""
+        used = np.diag(self.square) > 0
+        size = np.sqrt(np.diag(self.square)[used])
+        cross = self.cross[:, used] / size
+        square = self.square[np.ix_(used, used)] / size / size[:, None]
+        weights = np.linalg.lstsq(square, cross.T, rcond=None)[0]
+        return self.power - np.sum(cross * weights.T, axis=1)
+
+
+def _channel_delay(records: Sequence[Record], cart: int, *, after: float) -> ChannelDelay | None:
+    usable = [record for record in records if _tells(record, cart)]
+    periods = [_period(record.position(cart), record.sample_time) for record in usable]
+    if not usable:
+        return None
+    finest = float(np.median(periods)) / _PER_PERIOD
+    step = max(float(np.median([record.sample_time for record in usable])), finest)
+    parts = -(-_PARTS // len(usable))
+    equations: list[_Normal] = []
+    experiments: list[str] = []
+    for record, period in zip(usable, periods, strict=True):
+        if found := _equations(record, cart, after=after, step=step, period=period, parts=parts):
+            equations += found
+            experiments.append(record.id)
+    if len(equations) < _PARTS:
+        return None
+    total = _Normal(
+        power=np.sum([one.power for one in equations], axis=0),
+        cross=np.sum([one.cross for one in equations], axis=0),
+        square=np.sum([one.square for one in equations], axis=0),
+    )
+    left = total.left()
+    best, least = _lowest(left)
+    if abs(best) >= _MOST_LATE:  # the longer the better: no delay, but motion that is not the law's
+        return None
+    others = np.array([_lowest(total.without(one).left())[0] for one in equations])
+    spread = float(np.sum((others - others.mean()) ** 2))
+    return ChannelDelay(
+        cart=cart,
+        delay=best * step,
+        std=step * float(np.sqrt(spread * (others.size - 1) / others.size)),
+        better=float(left[_MOST_LATE]) / max(least, np.finfo(float).tiny),
+        experiments=tuple(experiments),
+    )
+
+
+def _tells(record: Record, cart: int) -> bool:
+    """Whether all that moves a cart was measured, and both it and the one before move far."""
+    if any(c not in record.carts or c not in record.free for c in (cart - 1, cart)):
+        return False
+    if cart + 1 in record.free and cart + 1 not in record.carts:
+        return False
+    return all(
+        np.ptp(record.position(c)) > limits.DELAY_COUNTS * record.encoder_step(c)
+        for c in (cart - 1, cart)
+    )
+
+
+def _period(x: Array, sample_time: float) -> float:
+    """Return the period of a sine with the speed of this motion, s."""
+    return float(2 * np.pi * np.std(x) / np.sqrt(np.mean(np.diff(x) ** 2)) * sample_time)
+
+
+def _equations(
+    record: Record, cart: int, *, after: float, step: float, period: float, parts: int
+) -> list[_Normal]:
+    """Return the equations of each part of a record; none where it is too short."""
+    t = np.arange(record.t[0], record.t[-1], step)
+    width = max(round(_WIDTH * period / step), _NARROWEST)
+    first, last = _MOST_LATE, t.size - width - _MOST_LATE
+    places = np.arange(first, last, max(width // _OVERLAP, (last - first) // _MOST_PLACES, 1))
+    if places.size < max(_FEWEST_PLACES, parts):
+        return []
+    at = (np.arange(width) + 0.5) / width
+    bumps = [_BUMP.deriv(order)(at) / width**order for order in (2, 1, 0)]
+
+    def under(cart: int, *, late: float = 0.0) -> Array:
+        return sliding_window_view(np.interp(t + late, record.t, record.position(cart)), width)
+
+    own = under(cart)[places]
+    right = [own @ bumps[0], -(own @ bumps[1]), own @ bumps[2], np.zeros(places.size)]
+    if cart + 1 in record.free:
+        right[3] = under(cart + 1, late=after)[places] @ bumps[2]
+    before = under(cart - 1)
+    shifts = range(-_MOST_LATE, _MOST_LATE + 1)
+    left = np.array([before[places - shift] @ bumps[2] for shift in shifts])
+    # Zeros of encoders drop out; each record weighs the same.
+    left = left - left.mean(axis=1, keepdims=True)
+    size = float(np.linalg.norm(left[_MOST_LATE]))
+    if size == 0:
+        return []
+    a = left / size
+    b = (np.array(right) - np.mean(right, axis=1)[:, None]) / size
+    return [
+        _Normal(
+            power=np.sum(a[:, part] ** 2, axis=1),
+            cross=a[:, part] @ b[:, part].T,
+            square=b[:, part] @ b[:, part].T,
+        )
+        for part in np.array_split(np.arange(places.size), parts)
+    ]
+
+
+def _lowest(left: Array) -> tuple[float, float]:
+    """Return for how many steps of delay least is left, between the steps too, and how much."""
+    i = int(np.argmin(left))
+    between = 0.0
+    if 0 < i < left.size - 1 and (bend := left[i - 1] - 2 * left[i] + left[i + 1]) > 0:
+        between = 0.5 * float((left[i - 1] - left[i + 1]) / bend)
+    return i + between - _MOST_LATE, float(left[i])

@@ -1,0 +1,38 @@
+"""Honest teams on benches that are not linear: nobody's recordings or numbers are accused."""
+
+import pytest
+
+from tests.helpers.honest_benches import grade_honest_team
+
+PRESETS = ("throne-1dof", "throne-2dof", "throne-3dof")
+
+# Of effects that once had a unit, a clock or a mistake made of them, one bench each: a dead zone,
+# stiction, a stop and an amplifier at its limit.
+ONCE_ACCUSED = [
+    ("throne-2dof", 10),
+    ("throne-2dof", 15),
+    ("throne-2dof", 1),
+    ("throne-3dof", 34),
+]
+STARTS = range(0, 40, 10)
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+@pytest.mark.parametrize(("preset", "seed"), ONCE_ACCUSED)
+def test_benches_that_once_were_accused_are_not(preset, seed, tmp_path):
+    """No flag of any kind, and no record that is called wrong."""
+    grade, analysis, term = grade_honest_team(tmp_path, preset=preset, seed=seed)
+    assert [flag.message for flag in grade.flags] == [], term
+    assert not any(one.is_wrong for one in analysis.left_out)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("start", STARTS)
+def test_no_honest_recording_is_accused(preset, start, tmp_path):
+    """Every effect of the catalogue, at up to three times its size: no record is called wrong."""
+    for seed in range(start, start + 10):
+        grade, analysis, term = grade_honest_team(tmp_path / f"{seed}", preset=preset, seed=seed)
+        assert not any(one.is_wrong for one in analysis.left_out), (seed, term)
+        assert "data_problem" not in [flag.code for flag in grade.flags], (seed, term)
