@@ -211,7 +211,7 @@ def read_toml(
             line = text.count("\n", 0, key.start()) + 1
             return Toml(document={}, text="", slips=((line, "keys nest too deeply"),))
     typed, slips = text.split("\n"), list[tuple[int, str]]()
-    lines, emptied = list(typed), 0
+    lines, emptied = list(typed), -1  # the last line of the slip before
     for _ in range(_MOST_PASSES if len(text) <= _LONGEST_MENDED else 1):
         try:
             document = tomllib.loads("\n".join(lines), parse_float=_decimal)

@@ -378,7 +378,7 @@ def test_the_command_adds_what_it_chose_to_the_plan(work):
     done = cartlab_here("plan", work, "--next", 2, "--for", "zeta", "--json")
     data = json.loads(done.stdout)
     assert data["next"]["errors"] == sorted(data["next"]["errors"], reverse=True)
-    assert "zeta: ± " in done.stderr
+    assert "ζ: ± " in done.stderr
     submission = load_submission(work)
     plan = load_plan(submission)
     chosen = [r for r in plan.recordings if r.aim]

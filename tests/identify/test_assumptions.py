@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.report.document import Table
 from pipeline.report.draft.content import build_document
 from pipeline.report.sections.summary import terminal_summary
 from pipeline.resources import EXAMPLES
@@ -102,7 +103,7 @@ def test_the_report_and_results_json_hold_them():
     document = build_document(analysis, progress=None)
     (section,) = (s for s in document.sections if s.id == "assumptions")
     (table,) = section.blocks
-    assert table.kind == "table"
+    assert isinstance(table, Table)
     assert len(table.rows) == len(analysis.assumptions)
     raw = json.loads(results_text(analysis))
     assert Results.model_validate(raw).assumptions[3].value == "cm"

@@ -131,7 +131,7 @@ def test_a_rubric_is_edited_with_its_mistakes_beside_it(show, tmp_path):
             window.get_by_role("button", name="Open").click()
         text = window.locator("#text")
         good = text.input_value()
-        text.fill(good.replace("points", "pionts", 1))
+        text.fill(good.replace("\npoints", "\npionts", 1))
         wrong = window.locator("#problems td.wrong").filter(has_text="unknown key; did you mean")
         expect(wrong.first).to_be_visible()
         assert fits(window)

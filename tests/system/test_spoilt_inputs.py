@@ -30,7 +30,7 @@ from tests.grading.publish.test_survey import write_paper
 from tests.helpers.acquisitions import Notes, write_work
 from tests.helpers.grades import make_grade
 from tests.helpers.poison import damaged, poisoned_json, poisoned_table, poisoned_toml
-from tests.ingest.test_spoilt_files import FILES, one_line_at_most
+from tests.ingest.test_spoilt_files import FILES, few_lines_at_most
 from tests.report.test_gap import make_gap, two_cart_analysis
 
 ROSTERS: dict[Platform, str] = {
@@ -131,7 +131,7 @@ def try_seed(name: str, seed: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / name
         path.write_bytes(spoilt(name, Random(f"{name} {seed}")))
-        with one_line_at_most() if name != "rubric.toml" else suppress(ConfigError):
+        with few_lines_at_most() if name != "rubric.toml" else suppress(ConfigError):
             use(name, path)
 
 

@@ -36,8 +36,8 @@ _LISTED = 4  # runs; of more the first
 
 
 Kind = Literal[
-    "sign", "damping", "signs_differ", "gain", "frequency", "assumed", "friction", "sticking",
-    "misfit", "level", "overshoot", "hardware",
+    "sign", "damping", "damping_same", "signs_differ", "gain", "frequency", "response", "assumed",
+    "friction", "sticking", "misfit", "level", "overshoot", "hardware",
 ]  # fmt: skip
 
 
@@ -90,7 +90,7 @@ def _damping(analysis: Analysis) -> Iterator[Asked]:
     if off:
         row, *others = off
         also = listing([f"{other.name} by {_change(other)}" for other in others])
-        key = "damping_same" if row.independent is False else "damping"
+        key: Kind = "damping_same" if row.independent is False else "damping"
         yield _of_row(row, analysis, key, also=f" ({also})" if also else "")
 
 
@@ -99,6 +99,7 @@ def _gains_and_frequencies(analysis: Analysis) -> Iterator[Asked]:
         name = read_name(row.name)
         if name.is_ratio or row.initial is None or row.final is None:
             continue
+        key: Kind
         if row.initial.value * row.final.value < 0:
             key = "signs_differ"
         elif row.initial.source == "frequency_response":
