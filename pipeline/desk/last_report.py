@@ -2,21 +2,19 @@
 
 import json
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from pipeline.errors import SubmissionError
 from pipeline.report.sections.answers import written_answer
-from pipeline.submission.load import MAX_NOTES_BYTES, NAME, outside, spring_names
-from pipeline.submission.models import MOST_CARTS, Input, Position
+from pipeline.submission.load import MAX_NOTES_BYTES, NAME, outside
 from pipeline.submission.toml_file import read_text
 
-ASKED = "questions.json"  # beside the report: what it asks, said in one line, and is made of
+ASKED = "questions.json"  # beside the report: what it asks, assumed, found, and is made of
 NOTES = "notes.md"
-_RESULTS = "report/results.json"
-_MOST_ASKED, _MOST_RESULTS = 1_000_000, 30_000_000  # bytes
+_MOST_ASKED = 1_000_000  # bytes
 
 
 def sources(folder: Path) -> dict[str, list[int]]:
@@ -40,14 +38,21 @@ def state(folder: Path) -> str:
 
 
 def told(folder: Path) -> dict[str, Any]:
-    """Return what the last report said and asked, as far as its file can be read."""
+    """Return what the last report said, asked and assumed, as far as its file can be read."""
     read = _read_asked(folder)
     try:
-        questions = [{"id": str(one["id"]), "text": str(one["text"])} for one in read["questions"]]
-        failed = [str(one) for one in read["failed"]]
-        return {"questions": questions, "failed": failed, "changes": str(read["changes"])}
+        return {
+            "questions": _texts(read["questions"], ("id", "text")),
+            "assumed": _texts(read.get("assumed", []), ("key", "about", "taken", "why")),
+            "failed": [str(one) for one in read["failed"]],
+            "changes": str(read["changes"]),
+        }
     except (KeyError, TypeError):
-        return {"questions": [], "failed": [], "changes": ""}
+        return {"questions": [], "assumed": [], "failed": [], "changes": ""}
+
+
+def _texts(found: Iterable[Mapping[str, Any]], keys: Sequence[str]) -> list[dict[str, str]]:
+    return [{key: str(one[key]) for key in keys} for one in found]
 
 
 def unanswered(folder: Path) -> list[dict[str, str]]:
@@ -76,63 +81,13 @@ def written_notes(folder: Path) -> str:
     return read_text(folder / NOTES, where=where, limit=MAX_NOTES_BYTES, error=SubmissionError)
 
 
-def assumed(folder: Path) -> list[dict[str, str]]:
-    """Return what is taken of the bench without being stated: key, about what, taken as, why.
-
-    As the results of the last report list it; without a list there, what `submission.toml` lacks.
-    """
-    with suppress(ValueError, RecursionError, KeyError, TypeError, AttributeError):
-        listed = _read_json(folder, _RESULTS, most=_MOST_RESULTS)["assumptions"]
-        return [
-            {
-                "key": str(one["key"]),
-                "about": str(one["about"]),
-                "taken": _taken(one["value"]),
-                "why": str(one["reason"]),
-            }
-            for one in listed
-            if one["origin"] != "stated"
-        ]
-    return list(_not_stated(_document(folder)))
-
-
-def _not_stated(document: Mapping[str, Any]) -> Iterator[dict[str, str]]:
-    system = document.get("system")
-    if not isinstance(system, dict):
-        return
-    carts = system.get("carts")
-    if "springs" not in system and isinstance(carts, int) and 1 <= carts <= MOST_CARTS:
-        for name in spring_names(carts):
-            yield {"key": "system.springs", "about": name, "taken": "there", "why": ""}
-    for key, unit in (("position", Position().unit), ("input", Input().unit)):
-        table = system.get(key)
-        if not isinstance(table, dict) or "unit" not in table:
-            yield {"key": f"system.{key}.unit", "about": "", "taken": unit, "why": ""}
-    table = system.get("input")
-    if not isinstance(table, dict) or "sign" not in table:
-        taken = "found from the data"
-        yield {"key": "system.input.sign", "about": "", "taken": taken, "why": ""}
-
-
-def _taken(value: object) -> str:
-    if isinstance(value, bool):
-        return "there" if value else "not there"
-    if isinstance(value, list):
-        return f"free: {', '.join(map(str, value))}"
-    return f"{value:g}" if isinstance(value, float | int) else str(value)
-
-
 def _read_asked(folder: Path) -> dict[str, Any]:
-    with suppress(ValueError, RecursionError):
-        read = _read_json(folder, f"report/{ASKED}", most=_MOST_ASKED)
-        return read if isinstance(read, dict) else {}
+    name = f"report/{ASKED}"
+    if outside(folder, name) is None and (folder / name).stat().st_size <= _MOST_ASKED:
+        with suppress(ValueError, RecursionError):
+            read = json.loads((folder / name).read_bytes())
+            return read if isinstance(read, dict) else {}
     return {}
-
-
-def _read_json(folder: Path, name: str, *, most: int) -> Any:
-    if outside(folder, name) is not None or (folder / name).stat().st_size > most:
-        return {}
-    return json.loads((folder / name).read_bytes())
 
 
 def _document(folder: Path) -> dict[str, Any]:

@@ -58,6 +58,7 @@ def report(folder: str, *, progress: Progress) -> dict[str, Any]:
     """Write the report into the submission's own folder, compared with the one that was there."""
     from pipeline.report.draft.changes import changes_line, compare_drafts, read_results
     from pipeline.report.draft.write import make_report
+    from pipeline.report.sections.housekeeping import taken_text
     from pipeline.report.sections.questions import ask
     from pipeline.report.words import with_symbols
 
@@ -78,6 +79,16 @@ def report(folder: str, *, progress: Progress) -> dict[str, Any]:
         ]
         told = {
             "questions": asked,
+            "assumed": [
+                {
+                    "key": one.key,
+                    "about": one.about,
+                    "taken": taken_text(one),
+                    "why": with_symbols(one.reason),
+                }
+                for one in analysis.assumptions
+                if one.origin != "stated"
+            ],
             "changes": with_symbols(changes_line(changes)) if changes else "",
             "failed": [with_symbols(check.message) for check in analysis.failed_checks],
             "unreadable": dict(analysis.unreadable),

@@ -17,8 +17,9 @@ _CRASHED = "crashed: the lines above say where"
 
 def main() -> None:
     """Write what comes, until the desk is gone."""
-    for number in (signal.SIGINT, signal.SIGTERM):  # who stops the desk often stops all it began
-        signal.signal(number, signal.SIG_IGN)
+    for name in ("SIGINT", "SIGTERM", "SIGBREAK"):  # who stops the desk often stops all it began
+        if (number := getattr(signal, name, None)) is not None:
+            signal.signal(number, signal.SIG_IGN)
     path, process = sys.argv[1:]
     said = crashed = False
     for raw in sys.stdin.buffer:

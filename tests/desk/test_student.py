@@ -339,27 +339,26 @@ def test_what_is_handed_in_is_shown_before(filled):
     assert page.count(f'href="{HERE}report#question-') == len(asked)
 
 
-def test_what_the_results_list_as_assumed_is_shown(filled):
-    """With the reason; what was stated is not among it."""
+def test_only_a_report_of_these_files_says_what_was_assumed(filled):
+    """Each with the reason; once a file has changed, the page no longer speaks for the report."""
     visitor, folder = filled
     ask_for(folder)
-    common = {"support": "open", "found": None, "found_std": None, "experiments": []}
-    listed = [
-        {"key": "system.springs", "about": "wall-1", "value": True, "origin": "default",
-         "reason": "no step tells", **common},
-        {"key": "system.input.sign", "about": "", "value": -1, "origin": "data",
-         "reason": "all steps go down", **common},
-        {"key": "system.position.unit", "about": "", "value": "cm", "origin": "stated",
-         "reason": "", **common},
-    ]  # fmt: skip
-    results = json.dumps({"assumptions": listed})
-    (folder / "report" / "results.json").write_text(results, encoding="utf-8")
-    page = visitor.get(HERE + "hand-in").text
-    taken = re.findall(r"<li><code>(.*?)</code>(.*?)</li>", page)
+    asked = folder / "report" / "questions.json"
+    assumed = [
+        {"key": "system.springs", "about": "wall-1", "taken": "there", "why": "no step tells"},
+        {"key": "system.input.sign", "about": "", "taken": "-1", "why": "all steps go down"},
+    ]
+    told = json.loads(asked.read_bytes()) | {"assumed": assumed}
+    asked.write_text(json.dumps(told), encoding="utf-8")
+    taken = re.findall(r"<li><code>(.*?)</code>(.*?)</li>", visitor.get(HERE + "hand-in").text)
     assert taken == [
         ("system.springs", ", wall-1: there (no step tells)"),
         ("system.input.sign", ": -1 (all steps go down)"),
     ]
+    (folder / "notes.md").write_text("# Discussion\n", encoding="utf-8")
+    page = visitor.get(HERE + "hand-in").text
+    assert "system.springs" not in page
+    assert page.count("No report of these files says it.") == 2
 
 
 def test_a_report_that_cannot_be_made_keeps_nobody_from_handing_in(filled):
@@ -369,6 +368,7 @@ def test_a_report_that_cannot_be_made_keeps_nobody_from_handing_in(filled):
     page = handed_in(visitor)
     assert "is a link" in page
     assert "No report has been made: the zip goes without one." in page
+    assert page.count("No report of these files says it.") == 2  # not: none, nothing
     assert "report/report.pdf" not in zipped(visitor).namelist()
 
 

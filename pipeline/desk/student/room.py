@@ -113,7 +113,7 @@ def show_hand_in(ask: Ask) -> Response:
         job=ask.desk.jobs.of(folder),
         report=last_report.state(folder),
         unanswered=last_report.unanswered(folder),
-        assumed=last_report.assumed(folder),
+        assumed=last_report.told(folder)["assumed"],
         said=ask.told(),
     )
 

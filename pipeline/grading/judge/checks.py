@@ -17,7 +17,7 @@ from pipeline.grading.judge.laws import MOST_WIDENING, judge_laws
 from pipeline.grading.judge.work import ALL, NONE, Verdict, Work, asked_pieces, mean_share
 from pipeline.grading.mistakes.impossible import not_positive
 from pipeline.grading.mistakes.state_model import model_harm
-from pipeline.grading.references.reference import OFF_SCALE, Reference, off_scale
+from pipeline.grading.references.reference import OFF_SCALE, Reference, is_linear, off_scale
 from pipeline.grading.references.tolerance import NO_CREDIT, as_typed, credit, percent_off, rounding
 from pipeline.grading.rubric import is_damping, matching
 from pipeline.grading.words import WORDS
@@ -102,10 +102,13 @@ def _parameters(criterion: asked.Parameters, work: Work) -> Verdict:
         if guessed and criterion.check == "final"
         else ""
     )
-    message = f"{'; '.join(off[:_NAMED])}." if off else "As your own recordings say."
+    loose = any(n in known for n in judged) and not is_linear(work.analysis)
+    right = WORDS.text("agrees_loosely" if loose else "agrees")
+    message = f"{'; '.join(off[:_NAMED])}." if off else right
+    look = f" {WORDS.text('judged_loosely')}" if loose else ""
     return Verdict(
         share=mean_share(shares),
-        message=message + left,
+        message=message + left + look,
         explained=bool(wrong) and wrong <= work.named[criterion.check],
         expected={n: known[n].value for n in judged if n in known},
         found={n: float(table[n]) for n in judged if n in table},

@@ -8,7 +8,7 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.errors import ConfigError
 from pipeline.grading import rubric as asked
-from pipeline.grading.references.reference import recompute
+from pipeline.grading.references.reference import in_doubt, recompute
 from pipeline.grading.rubric import Rubric, matching
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.names import read_name
@@ -92,7 +92,7 @@ def check_carts(rubric: Rubric, *, carts: int) -> None:
 
 def expected_parameters(analysis: Analysis, rubric: Rubric) -> tuple[Expected, ...]:
     """Return the final estimates with what the rubric accepts, by the grading's own reference."""
-    known, found = recompute(analysis).final, []
+    known, found = in_doubt(recompute(analysis), analysis=analysis).final, []
     for row in analysis.rows:
         if row.final is None:
             continue

@@ -306,3 +306,13 @@ def test_further_flags_keep_the_order_of_the_codes():
     data = Flag(code="data_problem", parameters=("step-1",), message="…", evidence={})
     codes = [f.code for f in graded.with_flags(data, flag).flags]
     assert codes == sorted(codes, key=CODES.index) == ["missing", "shared_data", "data_problem"]
+
+
+@pytest.mark.parametrize(("hide", "loosely"), [((), False), (("dead_zone",), True)])
+def test_numbers_that_are_judged_loosely_are_said_to_be(hide, loosely):
+    """No linear carts move like the recordings: the grader does not vouch for what it lets pass."""
+    criteria = {c.id: c for c in student(1, hide=hide).grade().criteria}
+    for name in ("final-gains", "final-frequencies", "final-dampings"):
+        message = criteria[name].message
+        assert ("a person should look at these numbers" in message) is loosely
+        assert ("As your own recordings say." in message) is not loosely
