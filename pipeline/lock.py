@@ -33,8 +33,7 @@ def alone_in(out: Path, *, private: bool = False) -> Iterator[None]:
     ConfigError : another run is under way in it.
     """
     new, lock = not out.exists(), out / LOCK
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.mkdir(OWNERS_FOLDER if private else 0o777, exist_ok=True)
+    out.mkdir(OWNERS_FOLDER if private else 0o777, parents=True, exist_ok=True)
     try:
         with _locked(lock):
             yield
