@@ -9,7 +9,7 @@ import json
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -22,10 +22,11 @@ from pipeline.results import Record
 # moves below 12 Hz. A Kaiser window of 7 lets less than 1e-3 of the motion through.
 PASSED = 0.6  # of the band
 _TAPS, _WINDOW = 41, 7.0
+_INPUT = "input"
 MARGIN = _TAPS // 2  # samples lost at either end
 
-_LEVELS = 5  # a residual is kept as -5 … 5, in steps of two thirds of a standard deviation
-_STEPS_PER_SIGMA = 1.5
+STEPS_PER_SIGMA = 100.0  # fine enough to see a sensor's noise beside knocks that repeat
+_MOST_STEPS = np.iinfo(np.int16).max
 _KINK = 4.5  # standard deviations: more is the motion's own kink (a step, a stop), not noise
 _JUMP = 30.0  # standard deviations: no cart kinks so, but the input where the reference steps
 _NOTHING = 1e-7  # of the travel: rounding in the filter
@@ -35,7 +36,6 @@ _FEW_TURNS, _PARTS = 5, (0.5, 0.3, 0.7)  # of a swing, where there are few of th
 _MOST_ANCHORS = 12  # in the motion
 _NOISE_ANCHORS, _APART = 6, 5  # samples
 _FEWEST_SAMPLES = 60
-_FINE = 80.0  # residual steps that a cart swings: a dozen encoder steps, where those are the noise
 _MOST_SAMPLES = 8192  # of one record; more does not make it surer
 _MOST_VALUES = 2_000_000  # of one submission: sixty such records of four carts
 
@@ -47,9 +47,9 @@ class Print:
     Attributes
     ----------
     group : what was done: only recordings of the same kind of run are compared.
-    residual : (n_rows, n) whole numbers -5 … 5; 0 also where the motion has a kink. A row for each
-        free cart, or one for the input.
+    residual : (n_rows, n) whole numbers. A row for each free cart, or one for the input.
     step : (n_rows,) what 1 stands for, in the record's position unit, or input unit.
+    start, interval : s; the time of the first sample, and from one to the next.
     anchors : (n_anchors,) samples that are found again in a copy, the surest first, and so tell
         how it is shifted: where the motion passes the middle between two extrema (they stand
         much noise), in turn with where the noise is loudest (they stand any cut).
@@ -63,11 +63,25 @@ class Print:
     step: Array
     anchors: np.ndarray
     swing: Array
+    start: float
+    interval: float
 
     @property
-    def is_coarse(self) -> bool:
-        """Whether the motion is so few encoder steps that it alone says when each is passed."""
-        return bool(np.max(np.abs(self.swing), initial=0.0) < _FINE * self.step[0])
+    def is_measured(self) -> bool:
+        """Whether it is of positions, and not of what a controller has computed from them."""
+        return not self.group.endswith(_INPUT)
+
+    @cached_property
+    def telling(self) -> np.ndarray:
+        """Where (n_rows, n) the residual is not a kink, nor the ringing of an input's jump."""
+        sigmas = np.abs(self.residual) / STEPS_PER_SIGMA
+        rings = [np.convolve(row > _JUMP, np.ones(_TAPS), "same") > 0 for row in sigmas]
+        return (sigmas < _KINK) & ~np.array(rings)
+
+    @cached_property
+    def noise(self) -> np.ndarray:
+        """The residual (n_rows, n) in standard deviations, without its kinks."""
+        return np.where(self.telling, self.residual / STEPS_PER_SIGMA, 0.0).astype(np.float32)
 
 
 def fingerprint(records: Sequence[Record]) -> bytes:
@@ -83,6 +97,8 @@ def fingerprint(records: Sequence[Record]) -> bytes:
             "group": one.group,
             "shape": one.residual.shape,
             "step": one.step.tolist(),
+            "start": one.start,
+            "interval": one.interval,
             "anchors": one.anchors.tolist(),
             "swing": one.swing.tolist(),
         }
@@ -100,8 +116,8 @@ def unpack(packed: bytes) -> tuple[Print, ...]:
     prints, at = [], 0
     for entry in json.loads(head):
         rows, columns = entry["shape"]
-        residual = np.frombuffer(body, np.int8, rows * columns, at).reshape(rows, columns)
-        at += residual.size
+        residual = np.frombuffer(body, np.int16, rows * columns, at).reshape(rows, columns)
+        at += residual.nbytes
         prints.append(
             Print(
                 experiment=entry["experiment"],
@@ -110,6 +126,8 @@ def unpack(packed: bytes) -> tuple[Print, ...]:
                 step=np.array(entry["step"]),
                 anchors=np.array(entry["anchors"], dtype=np.int64),
                 swing=np.array(entry["swing"]),
+                start=entry["start"],
+                interval=entry["interval"],
             )
         )
     return tuple(prints)
@@ -129,7 +147,7 @@ def _prints(record: Record, *, most: int) -> Iterator[Print]:
     positions = [record.position(cart) for cart in carts]
     yield from _print(record, positions, group=group, most=most)
     if record.kind == "closed_loop" and record.u is not None:
-        yield from _print(record, [record.u], group=f"{group}input", most=most)
+        yield from _print(record, [record.u], group=group + _INPUT, most=most)
 
 
 def _print(record: Record, signals: Sequence[Array], *, group: str, most: int) -> Iterator[Print]:
@@ -142,21 +160,20 @@ def _print(record: Record, signals: Sequence[Array], *, group: str, most: int) -
     if not np.all(sigma > 0):
         return
     sigmas = noise / sigma[:, None]
-    # Every run has the jump of an input, and what of it rings in the filter.
-    rings = [np.convolve(np.abs(row) > _JUMP, np.ones(_TAPS), "same") > 0 for row in sigmas]
-    telling = (np.abs(sigmas) < _KINK) & ~np.array(rings)
     anchors, swing = _in_turn(
         _motion_anchors(y[0, MARGIN:-MARGIN] - noise[0]),
         _noise_anchors(np.abs(sigmas).sum(axis=0)),
     )
-    levels = np.clip(np.round(_STEPS_PER_SIGMA * sigmas), -_LEVELS, _LEVELS)
+    steps = np.clip(np.round(STEPS_PER_SIGMA * sigmas), -_MOST_STEPS, _MOST_STEPS)
     yield Print(
         experiment=record.id,
         group=group,
-        residual=np.where(telling, levels, 0).astype(np.int8),
-        step=sigma / _STEPS_PER_SIGMA,
+        residual=steps.astype(np.int16),
+        step=sigma / STEPS_PER_SIGMA,
         anchors=anchors,
         swing=swing,
+        start=float(record.t[MARGIN]),
+        interval=record.sample_time,
     )
 
 

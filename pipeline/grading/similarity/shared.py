@@ -1,10 +1,7 @@
 """Recordings that stand in two submissions: found by their noise, named on both sides.
 
-A copy has the noise of its original, whatever noise was added on top: the regression of one
-residual on the other, brought to one scale, has slope one. Two honest runs share at most what the
-motion and the encoder's rounding leave in the residuals: with noise a slope well below a half.
-Without noise, on a bench that repeats its motion to within a count, it is whatever their zeros
-make of it, and the recordings that agree only in part, or disagree, show that this is so.
+Noise convicts where it agrees wholly, and nobody's in the class agrees in part; equal rows do
+whatever else is found. With fewer than four teams to compare only equal rows do.
 """
 
 from collections import Counter, defaultdict
@@ -12,10 +9,17 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.fft import next_fast_len
 
 from pipeline.grading.gradings import Member
 from pipeline.grading.intake.lms_names import same_number
+from pipeline.grading.similarity.likeness import (
+    LEAST_OVERLAP,
+    LEAST_SLOPE,
+    Likeness,
+    align,
+    compare,
+    equal_rows,
+)
 from pipeline.grading.similarity.prints import PASSED, Print, unpack
 from pipeline.names import first_few
 from pipeline.schemas.grade import Flag
@@ -30,34 +34,63 @@ _WORTH_A_LOOK = 3.2  # sigmas at first sight: one in a thousand by chance
 # that kind each a tenth of what is compared at most.
 _MOST_ALIKE = 16  # first anchors looked at for one anchor, the most alike; and what was handed out
 _MOST_COMPARED = 10  # times the recordings that two submissions have of one kind
-_LEAST_OVERLAP = 80  # samples that say something in both
-_LEAST_SLOPE = 0.5
-# Read from zeros δ counts apart, one motion without noise is rounded to a slope of 1 - 6 δ + 6 δ²:
-# one in five has 0.5 and more, one in two is in these bounds. With noise of 0.2 counts ± 0.09 is
-# left of it, and none.
-_LEAST_IN_PART, _MOST_IN_PART = 0.2, 0.4  # or below minus the least
-_MATCHES_TO_IN_PART = 10  # no chance, if that many agree wholly for each pair that does in part
-_NEARBY = 50  # shifts to either side that show how well chance does here
-_OWN_WIDTH = 2  # shifts next to the right one see the same match
 _COUNTS = 4.5  # sigmas of a recording that counts with others
 _ALONE = 6.5  # … by itself: a class of 200 offers 1e9 comparisons, chance reaches 6.1 in them
 _TOGETHER = 7.5  # root of the summed squares of several
+# The reference of two recordings is one third of a class away from them: copies in a third of the
+# class are so told from the bench.
+_MOST_ALIGNED = 60  # recordings of others that are looked at
+_MOST_OTHERS = 24  # of them that explain
+_FEWEST_OTHERS = 2
+_COPIES = 1 / 3  # of the other teams, the most alike: they may have the same copy
 
 
 @dataclass(frozen=True, kw_only=True)
 class SharedRecord:
     """A recording of one submission that is one of another's, too.
 
-    `sigmas` says how far above chance they agree.
+    Attributes
+    ----------
+    sigmas : how far above chance their noise agrees.
+    equal_rows : how many rows in turn are equal, but for one factor a column; 0 where not all are.
+    time, other_time : s, from and to, where they are equal or agree.
     """
 
     experiment: str
     other: str
     other_experiment: str
     sigmas: float
+    equal_rows: int
+    time: tuple[float, float]
+    other_time: tuple[float, float]
 
 
-_Match = tuple[float, str, str]  # sigmas, the experiment in the one and in the other submission
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Match:
+    """Two recordings that agree: `a` is of the submission with the lower number."""
+
+    a: Print
+    b: Print
+    shift: int
+    likeness: Likeness
+
+    def told(self, *, other: str, swapped: bool) -> SharedRecord:
+        """Return what one of the two submissions is told."""
+        times = [
+            tuple(round(one.start + (row + s) * one.interval, 3) for row in self.likeness.rows)
+            for one, s in ((self.a, 0), (self.b, self.shift))
+        ]
+        names = [self.a.experiment, self.b.experiment]
+        mine, theirs = (1, 0) if swapped else (0, 1)
+        return SharedRecord(
+            experiment=names[mine],
+            other=other,
+            other_experiment=names[theirs],
+            sigmas=self.likeness.sigmas,
+            equal_rows=self.likeness.equal,
+            time=times[mine],
+            other_time=times[theirs],
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -96,32 +129,31 @@ def find_shared(
             groups[one.group].append(_Entry(owner=owner, print=one))
     matches: dict[tuple[int, int], list[_Match]] = defaultdict(list)
     for _, entries in sorted(groups.items()):
-        for a, b, sigmas in _matches(
+        for pair, match in _matches(
             entries, first_batch=len(batch), everyone=len(everyone), owners=owners
         ):
-            matches[a.owner, b.owner].append((sigmas, a.print.experiment, b.print.experiment))
+            matches[pair].append(match)
     given = {
-        (a, experiment)
+        (a, match.a.experiment)
         for (a, b), found in matches.items()
         if b >= len(everyone)
-        for sigmas, experiment, _ in found
-        if sigmas >= _ALONE
+        for match in found
+        if match.likeness.sigmas >= _ALONE
     }
     shared: dict[str, list[SharedRecord]] = defaultdict(list)
     for (a, b), found in sorted(matches.items()):
         if b >= len(everyone):
             continue
-        own = [m for m in found if (a, m[1]) not in given and (b, m[2]) not in given]
-        for sigmas, in_a, in_b in _decisive(own):
-            for owner, other, mine, theirs in ((a, b, in_a, in_b), (b, a, in_b, in_a)):
+        own = [
+            match
+            for match in found
+            if (a, match.a.experiment) not in given and (b, match.b.experiment) not in given
+        ]
+        for match in _decisive(own):
+            for owner, other in ((a, b), (b, a)):
                 if owner < len(batch):
-                    record = SharedRecord(
-                        experiment=mine,
-                        other=names[other],
-                        other_experiment=theirs,
-                        sigmas=sigmas,
-                    )
-                    shared[names[owner]].append(record)
+                    told = match.told(other=names[other], swapped=owner == b)
+                    shared[names[owner]].append(told)
     return {
         submission: tuple(sorted(found, key=lambda r: (r.other, r.experiment, r.other_experiment)))
         for submission, found in sorted(shared.items())
@@ -148,6 +180,9 @@ def shared_flag(records: Sequence[SharedRecord]) -> Flag:
                     "submission": record.other,
                     "other_experiment": record.other_experiment,
                     "sigmas": round(record.sigmas, 1),
+                    "equal_rows": record.equal_rows,
+                    "time": list(record.time),
+                    "other_time": list(record.other_time),
                 }
                 for record in records
             ],
@@ -192,20 +227,15 @@ def same_recordings(a: Member, b: Member) -> bool:
 
 
 def _decisive(found: Sequence[_Match]) -> list[_Match]:
-    """Return the matches of one pair of submissions, one for each recording, if they suffice.
-
-    They do not where further recordings agree in part: the bench then repeats its motion to
-    within a count, with little noise, and that some are rounded alike is a matter of the zeros.
-    """
-    chosen: list[_Match] = []
-    for match in sorted(found, key=lambda m: (-m[0], m[1:])):
-        if match[0] > 0 and all(match[1] != c[1] and match[2] != c[2] for c in chosen):
-            chosen.append(match)
-    if len(chosen) <= _MATCHES_TO_IN_PART * sum(sigmas < 0 for sigmas, _, _ in found):
-        return []
-    together = float(np.sqrt(sum(sigmas**2 for sigmas, _, _ in chosen)))
-    enough = chosen and (chosen[0][0] >= _ALONE or together >= _TOGETHER)
-    return chosen if enough else []
+    """Return the matches of one pair of submissions, one for each recording, if they suffice."""
+    chosen: dict[tuple[str, str], _Match] = {}
+    for match in sorted(found, key=lambda m: -m.likeness.sigmas):
+        names = (match.a.experiment, match.b.experiment)
+        if all(names[0] != a and names[1] != b for a, b in chosen):
+            chosen[names] = match
+    sigmas = [match.likeness.sigmas for match in chosen.values()]
+    enough = max(sigmas, default=0.0) >= _ALONE or np.linalg.norm(sigmas) >= _TOGETHER
+    return list(chosen.values()) if enough else []
 
 
 # ------------------------------------------------------------------- candidates
@@ -213,17 +243,19 @@ def _decisive(found: Sequence[_Match]) -> list[_Match]:
 
 def _matches(
     entries: Sequence[_Entry], *, first_batch: int, everyone: int, owners: Sequence[Member]
-) -> Iterator[tuple[_Entry, _Entry, float]]:
-    """Yield pairs of recordings of different teams that share their noise, with the sigmas.
+) -> Iterator[tuple[tuple[int, int], _Match]]:
+    """Yield pairs of recordings of different teams that one of them copied, with their owners.
 
-    Those that share only a part of it, as one motion's rounding does, have negative ones.
+    Where the noise of some agrees in part, the bench or its encoder makes it do so, and says
+    nothing of those that agree wholly; equal rows then still do.
     """
-    best: dict[tuple[int, int], float] = {}
+    best: dict[tuple[int, int], _Match] = {}
     seen: set[tuple[int, int, int]] = set()
     apart: dict[tuple[int, int], bool] = {}
     partner: dict[tuple[int, int], int] = {}  # of a recording, in a submission: surely a copy
     compared: Counter[tuple[int, int]] = Counter()
     recordings = Counter(entry.owner for entry in entries)
+    others = _Others(entries, owners)
     for i, anchor_i, j, anchor_j in _candidates(entries, everyone=everyone):
         a, b = entries[i], entries[j]
         if a.owner > b.owner:
@@ -242,13 +274,55 @@ def _matches(
             continue
         in_a, in_b = a.print.swing[anchor_i], b.print.swing[anchor_j]
         scale = float(in_b / in_a) if in_a and in_b else None
-        sigmas = _agreement(a.print, b.print, shift=shift, scale=scale)
-        if abs(sigmas) >= _COUNTS:
-            best[i, j] = max(sigmas, best.get((i, j), sigmas))
-        if sigmas >= _ALONE:
+        likeness = compare(a.print, b.print, shift=shift, scale=scale)
+        if not (likeness.sigmas >= _COUNTS and likeness.slope >= LEAST_SLOPE):
+            continue
+        likeness = equal_rows(a.print, b.print, shift=shift)
+        if likeness is None:
+            beside = others.of(i, b.owner)
+            if len(beside) < _FEWEST_OTHERS:
+                continue
+            likeness = compare(a.print, b.print, shift=shift, scale=scale, others=beside)
+        match = _Match(a=a.print, b=b.print, shift=shift, likeness=likeness)
+        if (i, j) not in best or best[i, j].likeness.sigmas < likeness.sigmas:
+            best[i, j] = match
+        if likeness.equal or (likeness.is_whole and likeness.sigmas >= _ALONE):
             partner[i, b.owner], partner[j, a.owner] = j, i
-    for (i, j), sigmas in sorted(best.items()):
-        yield entries[i], entries[j], sigmas
+    in_part = any(match.likeness.is_in_part for match in best.values())
+    for (i, j), match in sorted(best.items(), key=lambda one: one[0]):
+        if match.likeness.equal or (match.likeness.is_whole and not in_part):
+            yield (entries[i].owner, entries[j].owner), match
+
+
+class _Others:
+    """The recordings that are held beside one, the most alike first: what they share is no one's."""
+
+    def __init__(self, entries: Sequence[_Entry], owners: Sequence[Member]) -> None:
+        self._entries, self._owners = entries, owners
+        self._aligned: dict[int, list[tuple[float, int, int]]] = {}
+
+    def of(self, i: int, other: int) -> list[tuple[Print, int]]:
+        """Return the others for recording i and one of another submission, with their shifts."""
+        mine = self._entries[i].owner
+        if i not in self._aligned:
+            rest = [j for j, one in enumerate(self._entries) if one.owner != mine]
+            some = rest[:: max(1, len(rest) // _MOST_ALIGNED)]
+            mine_print = self._entries[i].print
+            self._aligned[i] = sorted(
+                ((*align(mine_print, self._entries[j].print), j) for j in some), reverse=True
+            )
+        teams = {
+            owner: None
+            for owner in (self._entries[j].owner for _, _, j in self._aligned[i])
+            if not any(same_team(self._owners[owner], self._owners[o]) for o in (mine, other))
+        }
+        kept = set(list(teams)[int(len(teams) * _COPIES) :])
+        found = [
+            (self._entries[j].print, shift)
+            for _, shift, j in self._aligned[i]
+            if self._entries[j].owner in kept
+        ]
+        return found[:_MOST_OTHERS]
 
 
 def _candidates(entries: Sequence[_Entry], *, everyone: int) -> Iterator[tuple[int, int, int, int]]:
@@ -293,58 +367,11 @@ def _windows(entries: Sequence[_Entry], places: Sequence[tuple[int, int]]) -> np
     n_free = entries[0].print.residual.shape[0]
     windows = np.zeros((len(places), n_free, _WIDTH), dtype=np.float32)
     for window, (i, k) in zip(windows, places, strict=True):
-        residual, start = entries[i].print.residual, int(entries[i].print.anchors[k]) - _BEFORE
+        residual, start = entries[i].print.noise, int(entries[i].print.anchors[k]) - _BEFORE
         part = residual[:, max(start, 0) : start + _WIDTH]
         window[:, max(-start, 0) : max(-start, 0) + part.shape[1]] = part
     flat = windows.reshape(len(places), -1)
     counts = np.count_nonzero(flat, axis=1)
     power = np.einsum("ij,ij->i", flat, flat)
     factor = (PASSED * counts) ** 0.25 / np.sqrt(np.maximum(power, 1.0))
-    return flat * np.where(counts >= _LEAST_OVERLAP, factor, 0.0).astype(np.float32)[:, None]
-
-
-# ----------------------------------------------------------------------- verdict
-
-
-def _agreement(a: Print, b: Print, *, shift: int, scale: float | None) -> float:
-    """Return by how many sigmas the noise of two recordings agrees; 0 where it is not one's own.
-
-    Where it agrees or disagrees in part, as the noise of no two runs and of no copy does, the
-    sigmas are negative.
-
-    Sample i of `a` is sample i + shift of `b`, `scale` times as large. Where the motion does not
-    tell the scale, that of the noise itself is taken: less further noise is then seen through.
-    """
-    first, last = max(0, -shift), min(a.residual.shape[1], b.residual.shape[1] - shift)
-    if last - first < _LEAST_OVERLAP:
-        return 0.0
-    # In units of b's noise, so that every cart has its say.
-    factor = np.ones(b.step.size) if scale is None else scale * a.step / b.step
-    in_a = a.residual[:, first:last] * factor[:, None]
-    in_b = b.residual[:, first + shift : last + shift].astype(np.float64)
-    in_b, in_a = in_b * (in_a != 0), in_a * (in_b != 0)
-    common = np.count_nonzero(in_a)
-    power_a, power_b = float(np.sum(in_a**2)), float(np.sum(in_b**2))
-    if common < _LEAST_OVERLAP:
-        return 0.0
-    product = float(np.sum(in_a * in_b))
-    slope = (abs(product) if scale is None else product) / min(power_a, power_b)
-    in_part = slope <= -_LEAST_IN_PART or _LEAST_IN_PART <= slope <= _MOST_IN_PART
-    chance = float(np.sqrt(power_a * power_b / (PASSED * common)))
-    whole = slope >= _LEAST_SLOPE and not (a.is_coarse and b.is_coarse)
-    if not (whole or in_part) or abs(product) < _COUNTS * chance:
-        return 0.0
-    sigmas = abs(product) / max(chance, _chance_nearby(in_a, in_b))
-    return -sigmas if in_part else sigmas
-
-
-def _chance_nearby(in_a: np.ndarray, in_b: np.ndarray) -> float:
-    """Return the root-mean-square product at other shifts: rounding repeats where motion does."""
-    n = in_a.shape[1]
-    shifts = np.arange(_OWN_WIDTH + 1, min(_NEARBY + 1, n // 2))
-    if not shifts.size:
-        return 0.0
-    length = next_fast_len(n + _NEARBY, real=True)
-    spectrum = np.fft.rfft(in_a, length) * np.conj(np.fft.rfft(in_b, length))
-    products = np.fft.irfft(spectrum.sum(axis=0), length)[np.concatenate([shifts, -shifts])]
-    return float(np.sqrt(np.mean(np.square(products))))
+    return flat * np.where(counts >= LEAST_OVERLAP, factor, 0.0).astype(np.float32)[:, None]

@@ -1,0 +1,154 @@
+"""How alike two recordings are: in their noise, row by row, and beyond what a class shares.
+
+A copy has the noise of its original, whatever noise was added on top: the regression of one
+residual on the other, brought to one scale, has slope one. Honest runs share the bench: its knocks
+and limits are as sharp as noise and the same in every run, and an encoder with little noise of its
+own rounds one motion alike. So a class is its own reference: what the recordings of others explain
+of both is taken off, and slope and chance are told of the rest.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.fft import next_fast_len
+
+from pipeline.grading.similarity.prints import PASSED, STEPS_PER_SIGMA, Print
+
+LEAST_OVERLAP = 80  # samples that say something in both
+LEAST_SLOPE = 0.5
+_LEAST_SIGMAS = 4.5
+_SPREAD = 2.5  # standard deviations that the slope of a copy may be off one
+_SAMPLES_EACH = 10  # of a recording for each other one that is to explain it
+_RIDGE = 1e-6  # of a recording's power: recordings of others may be copies of one another
+_LEAST_PART = 1e-9  # of a recording's power that others leave
+_LEAST_NOISE = 0.5 * STEPS_PER_SIGMA  # where the scale of two recordings is read off
+# A residual is kept to half a step.
+_SAME_STEPS, _SAME_PART = 1.0, 0.003
+# Where noise of 0.04 counts meets the very same motion and zero, one sample in 22 of a moving cart
+# is rounded otherwise. A class of 300 compares a million recordings.
+_EQUAL_ROWS = 300
+
+
+@dataclass(frozen=True, kw_only=True)
+class Likeness:
+    """How alike two recordings are.
+
+    Attributes
+    ----------
+    slope : of the one's noise on the other's, of what the class does not explain.
+    sigmas : how far that is above chance.
+    rows : samples of the first, from and up to, that are compared or equal.
+    equal : how many different rows in turn are equal but for one factor, 0 where too few.
+    """
+
+    slope: float
+    sigmas: float
+    rows: tuple[int, int]
+    equal: int = 0
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether a copy would be so alike."""
+        sure = self.sigmas >= _LEAST_SIGMAS and self.slope >= LEAST_SLOPE
+        return bool(self.equal) or (sure and (1 - self.slope) * self.sigmas <= _SPREAD * self.slope)
+
+    @property
+    def is_in_part(self) -> bool:
+        """Whether neither a copy would be so alike nor two runs with noise of their own."""
+        sure = self.sigmas >= _LEAST_SIGMAS and self.slope >= LEAST_SLOPE
+        return sure and not self.is_whole
+
+
+def compare(
+    a: Print, b: Print, *, shift: int, scale: float | None, others: Sequence[tuple[Print, int]] = ()
+) -> Likeness:
+    """Return how alike the noise of two recordings is, beyond what others' have of it.
+
+    Sample i of `a` is sample i + shift of `b`, `scale` times as large. Where the motion does not
+    tell the scale, that of the noise itself is taken: less further noise is then seen through.
+    Of each of the others sample i + its shift is beside sample i of `a`.
+    """
+    first, last = max(0, -shift), min(a.residual.shape[1], b.residual.shape[1] - shift)
+    # In units of b's noise, so that every cart has its say.
+    factor = np.ones(b.step.size) if scale is None else scale * a.step / b.step
+    product = power_a = power_b = free = 0.0
+    for row in range(b.step.size if last - first >= LEAST_OVERLAP else 0):
+        telling = a.telling[row, first:last] & b.telling[row, first + shift : last + shift]
+        n = int(np.count_nonzero(telling))
+        beside = [(a, 0), (b, shift), *others[: n // _SAMPLES_EACH]]
+        x = np.array([_part(c, row, first + s, last + s)[telling] for c, s in beside])
+        in_a, in_b = x[:2] = x[:2] * [[factor[row]], [1.0]]
+        counted = int(np.count_nonzero(in_a * in_b))
+        left = _left(x)
+        if left[1, 1] > _LEAST_PART * float(in_b @ in_b):
+            left *= counted / left[1, 1] if others else 1.0
+            product += left[0, 1]
+            power_a, power_b = power_a + left[0, 0], power_b + left[1, 1]
+            free += counted - (len(x) - 2)
+    if free < LEAST_OVERLAP or not power_a * power_b > 0:
+        return Likeness(slope=0.0, sigmas=0.0, rows=(first, last))
+    product = abs(product) if scale is None else product
+    return Likeness(
+        slope=product / min(power_a, power_b),
+        sigmas=product / float(np.sqrt(power_a * power_b / (PASSED * free))),
+        rows=(first, last),
+    )
+
+
+def _part(one: Print, row: int, first: int, last: int) -> np.ndarray:
+    """Return a row's noise from one sample to another, 0 where there is none."""
+    part = np.zeros(last - first)
+    start, stop = max(first, 0), min(last, one.noise.shape[1])
+    if start < stop:
+        part[start - first : stop - first] = one.noise[row, start:stop]
+    return part
+
+
+def _left(x: np.ndarray) -> np.ndarray:
+    """Return the products (2, 2) of the first two rows, less what the further rows explain."""
+    products = x @ x.T
+    size = np.sqrt(np.maximum(np.diag(products), 1.0))
+    products /= np.outer(size, size)
+    of_others = products[2:, 2:] + _RIDGE * np.eye(len(x) - 2)
+    explained = products[:2, 2:] @ np.linalg.solve(of_others, products[2:, :2])
+    return (products[:2, :2] - explained) * np.outer(size[:2], size[:2])
+
+
+def equal_rows(a: Print, b: Print, *, shift: int) -> Likeness | None:
+    """Return the longest stretch in which two recordings are equal but for one factor a row.
+
+    None where that says too little: rows that repeat, as a cart at rest makes them, are one.
+    """
+    first, last = max(0, -shift), min(a.residual.shape[1], b.residual.shape[1] - shift)
+    if last - first < _EQUAL_ROWS or not a.is_measured:
+        return None
+    in_a = a.residual[:, first:last].astype(np.float64)
+    in_b = b.residual[:, first + shift : last + shift].astype(np.float64)
+    equal = np.ones(last - first, dtype=bool)
+    for of_a, of_b in zip(in_a, in_b, strict=True):
+        loud = np.abs(of_a) >= _LEAST_NOISE
+        factor = float(np.median(of_b[loud] / of_a[loud])) if np.any(loud) else 0.0
+        most = _SAME_STEPS * (1 + abs(factor)) + _SAME_PART * np.abs(of_b)
+        equal &= np.abs(of_b - factor * of_a) <= most
+    ends = np.flatnonzero(np.diff(equal, prepend=False, append=False)).reshape(-1, 2)
+    if not ends.size:
+        return None
+    start, stop = ends[np.argmax(ends[:, 1] - ends[:, 0])].tolist()
+    rows = np.round(in_b[:, start:stop].T / 4)
+    different = len(np.unique(np.hstack([rows[:-1], rows[1:]]), axis=0))
+    if different < _EQUAL_ROWS:
+        return None
+    whole = (first + start, first + stop)
+    return Likeness(slope=1.0, sigmas=float(np.sqrt(PASSED * different)), rows=whole, equal=stop - start)
+
+
+def align(a: Print, b: Print) -> tuple[float, int]:
+    """Return how well the noise of two recordings agrees where it does best, and at what shift."""
+    n = a.residual.shape[1] + b.residual.shape[1]
+    length = next_fast_len(n, real=True)
+    spectrum = np.conj(np.fft.rfft(a.noise, length)) * np.fft.rfft(b.noise, length)
+    products = np.abs(np.fft.irfft(spectrum.sum(axis=0), length))
+    shift = int(np.argmax(products))
+    alike = float(products[shift]) / max(float(np.linalg.norm(b.noise)), 1.0)
+    return alike, shift if shift < b.residual.shape[1] else shift - length
