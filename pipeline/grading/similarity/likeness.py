@@ -26,8 +26,9 @@ _LEAST_NOISE = 0.5 * STEPS_PER_SIGMA  # where the scale of two recordings is rea
 # A residual is kept to half a step.
 _SAME_STEPS, _SAME_PART = 1.0, 0.003
 # Where noise of 0.04 counts meets the very same motion and zero, one sample in 22 of a moving cart
-# is rounded otherwise. A class of 300 compares a million recordings.
-_EQUAL_ROWS = 300
+# is rounded otherwise.
+_EQUAL_READINGS = 120
+_DIFFERENT_STEPS = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,13 +40,15 @@ class Likeness:
     slope : of the one's noise on the other's, of what the class does not explain.
     sigmas : how far that is above chance.
     rows : samples of the first, from and up to, that are compared or equal.
-    equal : how many different rows in turn are equal but for one factor, 0 where too few.
+    equal : how many rows in turn are equal but for one factor, 0 where they say too little.
+    different : how many readings of them differ from one another.
     """
 
     slope: float
     sigmas: float
     rows: tuple[int, int]
     equal: int = 0
+    different: int = 0
 
     @property
     def is_whole(self) -> bool:
@@ -70,8 +73,10 @@ def compare(
     Of each of the others sample i + its shift is beside sample i of `a`.
     """
     first, last = max(0, -shift), min(a.residual.shape[1], b.residual.shape[1] - shift)
-    # In units of b's noise, so that every cart has its say.
-    factor = np.ones(b.step.size) if scale is None else scale * a.step / b.step
+    # In units of b's noise, so that every cart has its say; an input has a scale of its own.
+    factor = np.ones(b.step.size)
+    if scale is not None:
+        factor[: len(a.measured)] = (scale * a.step / b.step)[: len(a.measured)]
     product = power_a = power_b = free = 0.0
     for row in range(b.step.size if last - first >= LEAST_OVERLAP else 0):
         telling = a.telling[row, first:last] & b.telling[row, first + shift : last + shift]
@@ -83,7 +88,7 @@ def compare(
         left = _left(x)
         if left[1, 1] > _LEAST_PART * float(in_b @ in_b):
             left *= counted / left[1, 1] if others else 1.0
-            product += left[0, 1]
+            product += left[0, 1] if row < len(a.measured) else abs(left[0, 1])
             power_a, power_b = power_a + left[0, 0], power_b + left[1, 1]
             free += counted - (len(x) - 2)
     if free < LEAST_OVERLAP or not power_a * power_b > 0:
@@ -121,10 +126,10 @@ def equal_rows(a: Print, b: Print, *, shift: int) -> Likeness | None:
     None where that says too little: rows that repeat, as a cart at rest makes them, are one.
     """
     first, last = max(0, -shift), min(a.residual.shape[1], b.residual.shape[1] - shift)
-    if last - first < _EQUAL_ROWS or not a.is_measured:
+    if last - first < LEAST_OVERLAP:
         return None
-    in_a = a.residual[:, first:last].astype(np.float64)
-    in_b = b.residual[:, first + shift : last + shift].astype(np.float64)
+    in_a = a.measured[:, first:last].astype(np.float64)
+    in_b = b.measured[:, first + shift : last + shift].astype(np.float64)
     equal = np.ones(last - first, dtype=bool)
     for of_a, of_b in zip(in_a, in_b, strict=True):
         loud = np.abs(of_a) >= _LEAST_NOISE
@@ -135,12 +140,17 @@ def equal_rows(a: Print, b: Print, *, shift: int) -> Likeness | None:
     if not ends.size:
         return None
     start, stop = ends[np.argmax(ends[:, 1] - ends[:, 0])].tolist()
-    rows = np.round(in_b[:, start:stop].T / 4)
-    different = len(np.unique(np.hstack([rows[:-1], rows[1:]]), axis=0))
-    if different < _EQUAL_ROWS:
+    rows = np.round(in_b[:, start:stop].T / _DIFFERENT_STEPS)
+    different = len(np.unique(np.hstack([rows[:-1], rows[1:]]), axis=0)) * len(in_b)
+    if different < _EQUAL_READINGS:
         return None
-    whole = (first + start, first + stop)
-    return Likeness(slope=1.0, sigmas=float(np.sqrt(PASSED * different)), rows=whole, equal=stop - start)
+    return Likeness(
+        slope=1.0,
+        sigmas=float(np.sqrt(PASSED * different)),
+        rows=(first + start, first + stop),
+        equal=stop - start,
+        different=different,
+    )
 
 
 def align(a: Print, b: Print) -> tuple[float, int]:

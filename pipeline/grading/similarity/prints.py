@@ -22,7 +22,6 @@ from pipeline.results import Record
 # moves below 12 Hz. A Kaiser window of 7 lets less than 1e-3 of the motion through.
 PASSED = 0.6  # of the band
 _TAPS, _WINDOW = 41, 7.0
-_INPUT = "input"
 MARGIN = _TAPS // 2  # samples lost at either end
 
 STEPS_PER_SIGMA = 100.0  # fine enough to see a sensor's noise beside knocks that repeat
@@ -47,7 +46,8 @@ class Print:
     Attributes
     ----------
     group : what was done: only recordings of the same kind of run are compared.
-    residual : (n_rows, n) whole numbers. A row for each free cart, or one for the input.
+    residual : (n_rows, n) whole numbers. A row for each free cart, and one for the
+        input of a closed loop.
     step : (n_rows,) what 1 stands for, in the record's position unit, or input unit.
     start, interval : s; the time of the first sample, and from one to the next.
     anchors : (n_anchors,) samples that are found again in a copy, the surest first, and so tell
@@ -67,9 +67,9 @@ class Print:
     interval: float
 
     @property
-    def is_measured(self) -> bool:
-        """Whether it is of positions, and not of what a controller has computed from them."""
-        return not self.group.endswith(_INPUT)
+    def measured(self) -> np.ndarray:
+        """The residual's rows of positions: the input is computed from them, not measured."""
+        return self.residual[: -1 if self.group.startswith("closed_loop") else None]
 
     @cached_property
     def telling(self) -> np.ndarray:
@@ -134,31 +134,26 @@ def unpack(packed: bytes) -> tuple[Print, ...]:
 
 
 def _prints(record: Record, *, most: int) -> Iterator[Print]:
-    """Yield the fingerprints of a recording: of its motion, and of an input made of its noise.
+    """Yield the fingerprint of a recording; none where a cart does not move or it is too short.
 
-    None where nothing moves or it is too short. Under feedback the controller puts the noise of
-    the measured positions into the input, where noise added to the positions does not reach it.
+    Under feedback the controller puts the noise of the measured positions into the input, where
+    noise added to the positions does not reach it.
     """
     carts = [cart for cart in record.free if cart in record.carts]
     if not carts or record.t.size < _FEWEST_SAMPLES + 2 * MARGIN:
         return
     frequency = "" if record.omega is None else f"{record.omega / (2 * np.pi):.3g} Hz"
-    group = f"{record.kind} {','.join(map(str, carts))} {frequency}"
-    positions = [record.position(cart) for cart in carts]
-    yield from _print(record, positions, group=group, most=most)
-    if record.kind == "closed_loop" and record.u is not None:
-        yield from _print(record, [record.u], group=group + _INPUT, most=most)
-
-
-def _print(record: Record, signals: Sequence[Array], *, group: str, most: int) -> Iterator[Print]:
-    """Yield the fingerprint of some signals of a recording; none where one has no noise."""
+    signals = [record.position(cart) for cart in carts]
+    if record.kind == "closed_loop":
+        signals.append(np.zeros_like(record.t) if record.u is None else record.u)
     y = np.array(signals)[:, : most + 2 * MARGIN]
     noise = np.array([np.convolve(row, _high_pass(), "valid") for row in y])
     sigma = np.array(
         [_sigma(one, travel=float(np.ptp(row))) for one, row in zip(noise, y, strict=True)]
     )
-    if not np.all(sigma > 0):
+    if not np.all(sigma[: len(carts)] > 0):
         return
+    noise[sigma == 0], sigma[sigma == 0] = 0.0, 1.0
     sigmas = noise / sigma[:, None]
     anchors, swing = _in_turn(
         _motion_anchors(y[0, MARGIN:-MARGIN] - noise[0]),
@@ -167,7 +162,7 @@ def _print(record: Record, signals: Sequence[Array], *, group: str, most: int) -
     steps = np.clip(np.round(STEPS_PER_SIGMA * sigmas), -_MOST_STEPS, _MOST_STEPS)
     yield Print(
         experiment=record.id,
-        group=group,
+        group=f"{record.kind} {','.join(map(str, carts))} {frequency}",
         residual=steps.astype(np.int16),
         step=sigma / STEPS_PER_SIGMA,
         anchors=anchors,

@@ -5,7 +5,7 @@ whatever else is found. With fewer than four teams to compare only equal rows do
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,12 +37,15 @@ _MOST_COMPARED = 10  # times the recordings that two submissions have of one kin
 _COUNTS = 4.5  # sigmas of a recording that counts with others
 _ALONE = 6.5  # … by itself: a class of 200 offers 1e9 comparisons, chance reaches 6.1 in them
 _TOGETHER = 7.5  # root of the summed squares of several
+_EQUAL_READINGS = 300  # of different rows, of all recordings: see `equal_rows`
 # The reference of two recordings is one third of a class away from them: copies in a third of the
 # class are so told from the bench.
 _MOST_ALIGNED = 60  # recordings of others that are looked at
 _MOST_OTHERS = 24  # of them that explain
-_FEWEST_OTHERS = 2
+_FEWEST_TEAMS = 3  # that explain
 _COPIES = 1 / 3  # of the other teams, the most alike: they may have the same copy
+_MOST_IN_PART = 1  # pair of a class whose noise agrees in part: two knocks may meet once
+_MATCHES_TO_IN_PART = 10  # no chance, if that many agree wholly for each pair that does in part
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,12 +136,13 @@ def find_shared(
             entries, first_batch=len(batch), everyone=len(everyone), owners=owners
         ):
             matches[pair].append(match)
+    convicts = _convicting([match.likeness for found in matches.values() for match in found])
     given = {
         (a, match.a.experiment)
         for (a, b), found in matches.items()
         if b >= len(everyone)
         for match in found
-        if match.likeness.sigmas >= _ALONE
+        if convicts(match.likeness) and match.likeness.sigmas >= _ALONE
     }
     shared: dict[str, list[SharedRecord]] = defaultdict(list)
     for (a, b), found in sorted(matches.items()):
@@ -147,7 +151,9 @@ def find_shared(
         own = [
             match
             for match in found
-            if (a, match.a.experiment) not in given and (b, match.b.experiment) not in given
+            if convicts(match.likeness)
+            and (a, match.a.experiment) not in given
+            and (b, match.b.experiment) not in given
         ]
         for match in _decisive(own):
             for owner, other in ((a, b), (b, a)):
@@ -226,6 +232,18 @@ def same_recordings(a: Member, b: Member) -> bool:
     return of_a <= of_b or of_b <= of_a
 
 
+def _convicting(found: Sequence[Likeness]) -> Callable[[Likeness], bool]:
+    """Return what tells a copy, given all pairs of a class that look alike.
+
+    Where the noise of several agrees in part, the bench or its encoder makes it do so, and says
+    nothing of those that agree wholly. Equal rows are a copy whatever else is found.
+    """
+    in_part = sum(one.is_in_part for one in found)
+    whole = sum(one.is_whole for one in found)
+    by_noise = in_part <= max(_MOST_IN_PART, whole // _MATCHES_TO_IN_PART)
+    return lambda one: one.equal > 0 or (by_noise and one.is_whole)
+
+
 def _decisive(found: Sequence[_Match]) -> list[_Match]:
     """Return the matches of one pair of submissions, one for each recording, if they suffice."""
     chosen: dict[tuple[str, str], _Match] = {}
@@ -233,9 +251,10 @@ def _decisive(found: Sequence[_Match]) -> list[_Match]:
         names = (match.a.experiment, match.b.experiment)
         if all(names[0] != a and names[1] != b for a, b in chosen):
             chosen[names] = match
-    sigmas = [match.likeness.sigmas for match in chosen.values()]
-    enough = max(sigmas, default=0.0) >= _ALONE or np.linalg.norm(sigmas) >= _TOGETHER
-    return list(chosen.values()) if enough else []
+    by_noise = [m.likeness.sigmas for m in chosen.values() if not m.likeness.equal]
+    equal = sum(match.likeness.different for match in chosen.values()) >= _EQUAL_READINGS
+    enough = max(by_noise, default=0.0) >= _ALONE or np.linalg.norm(by_noise) >= _TOGETHER
+    return list(chosen.values()) if equal or enough else []
 
 
 # ------------------------------------------------------------------- candidates
@@ -244,12 +263,9 @@ def _decisive(found: Sequence[_Match]) -> list[_Match]:
 def _matches(
     entries: Sequence[_Entry], *, first_batch: int, everyone: int, owners: Sequence[Member]
 ) -> Iterator[tuple[tuple[int, int], _Match]]:
-    """Yield pairs of recordings of different teams that one of them copied, with their owners.
-
-    Where the noise of some agrees in part, the bench or its encoder makes it do so, and says
-    nothing of those that agree wholly; equal rows then still do.
-    """
+    """Yield pairs of recordings of different teams that look alike, with their owners."""
     best: dict[tuple[int, int], _Match] = {}
+    alike: dict[tuple[int, int], float] = defaultdict(lambda: _COUNTS)  # at first comparison
     seen: set[tuple[int, int, int]] = set()
     apart: dict[tuple[int, int], bool] = {}
     partner: dict[tuple[int, int], int] = {}  # of a recording, in a submission: surely a copy
@@ -275,23 +291,21 @@ def _matches(
         in_a, in_b = a.print.swing[anchor_i], b.print.swing[anchor_j]
         scale = float(in_b / in_a) if in_a and in_b else None
         likeness = compare(a.print, b.print, shift=shift, scale=scale)
-        if not (likeness.sigmas >= _COUNTS and likeness.slope >= LEAST_SLOPE):
+        if likeness.slope < LEAST_SLOPE or likeness.sigmas <= alike[i, j]:
             continue
+        alike[i, j] = likeness.sigmas
         likeness = equal_rows(a.print, b.print, shift=shift)
         if likeness is None:
             beside = others.of(i, b.owner)
-            if len(beside) < _FEWEST_OTHERS:
+            if not beside:
                 continue
             likeness = compare(a.print, b.print, shift=shift, scale=scale, others=beside)
         match = _Match(a=a.print, b=b.print, shift=shift, likeness=likeness)
-        if (i, j) not in best or best[i, j].likeness.sigmas < likeness.sigmas:
-            best[i, j] = match
+        best[i, j] = match
         if likeness.equal or (likeness.is_whole and likeness.sigmas >= _ALONE):
             partner[i, b.owner], partner[j, a.owner] = j, i
-    in_part = any(match.likeness.is_in_part for match in best.values())
     for (i, j), match in sorted(best.items(), key=lambda one: one[0]):
-        if match.likeness.equal or (match.likeness.is_whole and not in_part):
-            yield (entries[i].owner, entries[j].owner), match
+        yield (entries[i].owner, entries[j].owner), match
 
 
 class _Others:
@@ -316,7 +330,8 @@ class _Others:
             for owner in (self._entries[j].owner for _, _, j in self._aligned[i])
             if not any(same_team(self._owners[owner], self._owners[o]) for o in (mine, other))
         }
-        kept = set(list(teams)[int(len(teams) * _COPIES) :])
+        dropped = max(min(int(len(teams) * _COPIES), len(teams) - _FEWEST_TEAMS), 0)
+        kept = set(list(teams)[dropped:] if len(teams) >= _FEWEST_TEAMS else ())
         found = [
             (self._entries[j].print, shift)
             for _, shift, j in self._aligned[i]
