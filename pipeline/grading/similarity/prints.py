@@ -25,7 +25,8 @@ _TAPS, _WINDOW = 41, 7.0
 MARGIN = _TAPS // 2  # samples lost at either end
 
 STEPS_PER_SIGMA = 100.0  # fine enough to see a sensor's noise beside knocks that repeat
-_MOST_STEPS = np.iinfo(np.int16).max
+_STORED = np.dtype("<i2")
+_MOST_STEPS = np.iinfo(_STORED).max
 _KINK = 4.5  # standard deviations: more is the motion's own kink (a step, a stop), not noise
 _JUMP = 30.0  # standard deviations: no cart kinks so, but the input where the reference steps
 _NOTHING = 1e-7  # of the travel: rounding in the filter
@@ -109,14 +110,16 @@ def fingerprint(records: Sequence[Record]) -> bytes:
 
 
 def unpack(packed: bytes) -> tuple[Print, ...]:
-    """Return the fingerprints that `fingerprint` packed."""
+    """Return the fingerprints that `fingerprint` packed; none where an older version packed them."""
     if not packed:
         return ()
     head, _, body = zlib.decompress(packed).partition(b"\0")
     prints, at = [], 0
     for entry in json.loads(head):
+        if "interval" not in entry:
+            return ()
         rows, columns = entry["shape"]
-        residual = np.frombuffer(body, np.int16, rows * columns, at).reshape(rows, columns)
+        residual = np.frombuffer(body, _STORED, rows * columns, at).reshape(rows, columns)
         at += residual.nbytes
         prints.append(
             Print(
@@ -153,17 +156,18 @@ def _prints(record: Record, *, most: int) -> Iterator[Print]:
     )
     if not np.all(sigma[: len(carts)] > 0):
         return
+    steered = len(signals) > len(carts) and sigma[-1] > 0
     noise[sigma == 0], sigma[sigma == 0] = 0.0, 1.0
     sigmas = noise / sigma[:, None]
     anchors, swing = _in_turn(
         _motion_anchors(y[0, MARGIN:-MARGIN] - noise[0]),
-        _noise_anchors(np.abs(sigmas).sum(axis=0)),
+        _noise_anchors(np.abs(sigmas[len(carts) :] if steered else sigmas).sum(axis=0)),
     )
     steps = np.clip(np.round(STEPS_PER_SIGMA * sigmas), -_MOST_STEPS, _MOST_STEPS)
     yield Print(
         experiment=record.id,
         group=f"{record.kind} {','.join(map(str, carts))} {frequency}",
-        residual=steps.astype(np.int16),
+        residual=steps.astype(_STORED),
         step=sigma / STEPS_PER_SIGMA,
         anchors=anchors,
         swing=swing,

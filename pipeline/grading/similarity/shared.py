@@ -5,8 +5,9 @@ whatever else is found. With fewer than four teams to compare only equal rows do
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -172,37 +173,42 @@ def _handed_out(packed: bytes) -> Member:
 
 def shared_flag(records: Sequence[SharedRecord]) -> Flag:
     """Return the flag of one submission: which recordings, and where else they stand."""
-    experiments = tuple(dict.fromkeys(record.experiment for record in records))
+    recordings = [
+        {
+            "experiment": record.experiment,
+            "submission": record.other,
+            "other_experiment": record.other_experiment,
+            "sigmas": round(record.sigmas, 1),
+            "equal_rows": record.equal_rows,
+            "time": list(record.time),
+            "other_time": list(record.other_time),
+        }
+        for record in records
+    ]
     others = list(dict.fromkeys(record.other for record in records))
     return Flag(
         code="shared_data",
-        parameters=experiments,
-        message=shared_message(experiments, others),
-        evidence={
-            "submissions": others,
-            "recordings": [
-                {
-                    "experiment": record.experiment,
-                    "submission": record.other,
-                    "other_experiment": record.other_experiment,
-                    "sigmas": round(record.sigmas, 1),
-                    "equal_rows": record.equal_rows,
-                    "time": list(record.time),
-                    "other_time": list(record.other_time),
-                }
-                for record in records
-            ],
-        },
+        parameters=tuple(dict.fromkeys(record.experiment for record in records)),
+        message=shared_message(recordings, others),
+        evidence={"submissions": others, "recordings": recordings},
     )
 
 
-def shared_message(experiments: Sequence[str], others: Iterable[str]) -> str:
-    """Return the sentence for recordings that stand in other submissions."""
+def shared_message(recordings: Sequence[Mapping[str, Any]], others: Iterable[str]) -> str:
+    """Return the sentence for recordings that stand in other submissions, with the best evidence.
+
+    `recordings` as in the evidence of a flag; a gradebook may hold some without times.
+    """
+    experiments = list(dict.fromkeys(one["experiment"] for one in recordings))
     stand = "stands" if len(experiments) == 1 else "stand"
+    best = max(recordings, key=lambda one: (one.get("equal_rows", 0), one["sigmas"]))
+    when = "of {0:g} s to {1:g} s".format(*best["time"]) if "time" in best else "there"
+    rows = best.get("equal_rows", 0)
+    same = f"{rows} rows in turn are equal" if rows else "the noise is the same"
     return (
-        f"{first_few(experiments, 4)} also {stand} in {', '.join(others)}: the noise of the "
-        "recordings is the same. That does not say whose they are; if they were shared for a "
-        "reason, say so."
+        f"{first_few(experiments, 4)} also {stand} in {', '.join(others)}: "
+        f"{same}, those {when} in {best['experiment']}. "
+        "That does not say whose they are; if they were shared for a reason, say so."
     )
 
 
@@ -210,7 +216,7 @@ def told(flag: Flag) -> str:
     """Return what a student reads of a flag: whose the other submission is, the instructor says."""
     if flag.code != "shared_data":
         return flag.message
-    return shared_message(flag.parameters, ["another submission"])
+    return shared_message(flag.evidence["recordings"], ["another submission"])
 
 
 def same_team(a: Member, b: Member) -> bool:
@@ -229,7 +235,7 @@ def same_team(a: Member, b: Member) -> bool:
 def same_recordings(a: Member, b: Member) -> bool:
     """Tell whether one of two submissions has all recordings of the other, untouched."""
     of_a, of_b = ({one.residual.tobytes() for one in unpack(p.fingerprints)} for p in (a, b))
-    return of_a <= of_b or of_b <= of_a
+    return bool(of_a and of_b) and (of_a <= of_b or of_b <= of_a)
 
 
 def _convicting(found: Sequence[Likeness]) -> Callable[[Likeness], bool]:
