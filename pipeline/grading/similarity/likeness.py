@@ -26,9 +26,10 @@ _LEAST_NOISE = 0.5 * STEPS_PER_SIGMA  # where the scale of two recordings is rea
 # A residual is kept to half a step.
 _SAME_STEPS, _SAME_PART = 1.0, 0.003
 # Where noise of 0.04 counts meets the very same motion and zero, one sample in 22 of a moving cart
-# is rounded otherwise.
+# is rounded otherwise: two honest runs are equal for some seconds, and no more.
+_EQUAL_PART = 0.5  # of the shorter recording
 _EQUAL_READINGS = 120
-_DIFFERENT_STEPS = 4
+_DIFFERENT_STEPS = 4  # that tell one reading from another
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,36 +65,39 @@ class Likeness:
 
 
 def compare(
-    a: Print, b: Print, *, shift: int, scale: float | None, others: Sequence[tuple[Print, int]] = ()
+    a: Print, b: Print, *, shift: int, others: Sequence[tuple[Print, int]] = ()
 ) -> Likeness:
     """Return how alike the noise of two recordings is, beyond what others' have of it.
 
-    Sample i of `a` is sample i + shift of `b`, `scale` times as large. Where the motion does not
-    tell the scale, that of the noise itself is taken: less further noise is then seen through.
-    Of each of the others sample i + its shift is beside sample i of `a`.
+    Sample i of `a` is sample i + shift of `b`, and of each of the others i + its shift.
     """
     first, last = max(0, -shift), min(a.residual.shape[1], b.residual.shape[1] - shift)
-    # In units of b's noise, so that every cart has its say; an input has a scale of its own.
-    factor = np.ones(b.step.size)
-    if scale is not None:
+    by_carts = by_input = power_a = power_b = free = 0.0
+    if last - first >= LEAST_OVERLAP:
+        # In units of b's noise, so that every cart has its say; an input has a scale of its own.
+        factor = np.ones(len(a.residual))
+        scale = b.spread(first + shift, last + shift) / max(a.spread(first, last), 1e-300)
         factor[: len(a.measured)] = (scale * a.step / b.step)[: len(a.measured)]
-    product = power_a = power_b = free = 0.0
-    for row in range(b.step.size if last - first >= LEAST_OVERLAP else 0):
-        telling = a.telling[row, first:last] & b.telling[row, first + shift : last + shift]
-        n = int(np.count_nonzero(telling))
-        beside = [(a, 0), (b, shift), *others[: n // _SAMPLES_EACH]]
-        x = np.array([_part(c, row, first + s, last + s)[telling] for c, s in beside])
-        in_a, in_b = x[:2] = x[:2] * [[factor[row]], [1.0]]
-        counted = int(np.count_nonzero(in_a * in_b))
-        left = _left(x)
-        if left[1, 1] > _LEAST_PART * float(in_b @ in_b):
-            left *= counted / left[1, 1] if others else 1.0
-            product += left[0, 1] if row < len(a.measured) else abs(left[0, 1])
-            power_a, power_b = power_a + left[0, 0], power_b + left[1, 1]
-            free += counted - (len(x) - 2)
+        for row, unit in enumerate(factor):
+            in_a, in_b = (
+                _part(a, row, first, last) * unit,
+                _part(b, row, first + shift, last + shift),
+            )
+            both = in_a * in_b != 0
+            n = int(np.count_nonzero(both))
+            beside = [_part(c, row, first + s, last + s) for c, s in others[: n // _SAMPLES_EACH]]
+            left = _left(np.array([in_a, in_b, *beside])[:, both])
+            if n and left[1, 1] > _LEAST_PART * n:
+                left *= n / left[1, 1] if others else 1.0
+                if row < len(a.measured):
+                    by_carts += left[0, 1]
+                else:
+                    by_input += left[0, 1]
+                power_a, power_b = power_a + left[0, 0], power_b + left[1, 1]
+                free += n - len(beside)
     if free < LEAST_OVERLAP or not power_a * power_b > 0:
         return Likeness(slope=0.0, sigmas=0.0, rows=(first, last))
-    product = abs(product) if scale is None else product
+    product = float(abs(by_carts) + abs(by_input))  # the sign of each may have been turned
     return Likeness(
         slope=product / min(power_a, power_b),
         sigmas=product / float(np.sqrt(power_a * power_b / (PASSED * free))),
@@ -142,7 +146,8 @@ def equal_rows(a: Print, b: Print, *, shift: int) -> Likeness | None:
     start, stop = ends[np.argmax(ends[:, 1] - ends[:, 0])].tolist()
     rows = np.round(in_b[:, start:stop].T / _DIFFERENT_STEPS)
     different = len(np.unique(np.hstack([rows[:-1], rows[1:]]), axis=0)) * len(in_b)
-    if different < _EQUAL_READINGS:
+    shorter = min(a.residual.shape[1], b.residual.shape[1])
+    if different < _EQUAL_READINGS or stop - start < _EQUAL_PART * shorter:
         return None
     return Likeness(
         slope=1.0,

@@ -36,6 +36,7 @@ _FEW_TURNS, _PARTS = 5, (0.5, 0.3, 0.7)  # of a swing, where there are few of th
 _MOST_ANCHORS = 12  # in the motion
 _NOISE_ANCHORS, _APART = 6, 5  # samples
 _FEWEST_SAMPLES = 60
+_EVERY = 8  # samples, of which the motion is kept
 _MOST_SAMPLES = 8192  # of one record; more does not make it surer
 _MOST_VALUES = 2_000_000  # of one submission: sixty such records of four carts
 
@@ -50,20 +51,19 @@ class Print:
     residual : (n_rows, n) whole numbers. A row for each free cart, and one for the
         input of a closed loop.
     step : (n_rows,) what 1 stands for, in the record's position unit, or input unit.
+    anchors : two lists of samples that are found again in a copy, the surest first, and so tell how
+        it is shifted: where the motion passes the middle between two extrema (they stand much
+        noise), and where the noise is loudest (they stand any cut).
+    motion : of the first cart, every so many samples: it tells how two recordings are scaled.
     start, interval : s; the time of the first sample, and from one to the next.
-    anchors : (n_anchors,) samples that are found again in a copy, the surest first, and so tell
-        how it is shifted: where the motion passes the middle between two extrema (they stand
-        much noise), in turn with where the noise is loudest (they stand any cut).
-    swing : (n_anchors,) from extremum to extremum, signed: it tells how two recordings are
-        scaled; 0 for an anchor in the noise.
     """
 
     experiment: str
     group: str
     residual: np.ndarray
     step: Array
-    anchors: np.ndarray
-    swing: Array
+    anchors: tuple[list[int], list[int]]
+    motion: Array
     start: float
     interval: float
 
@@ -73,16 +73,17 @@ class Print:
         return self.residual[: -1 if self.group.startswith("closed_loop") else None]
 
     @cached_property
-    def telling(self) -> np.ndarray:
-        """Where (n_rows, n) the residual is not a kink, nor the ringing of an input's jump."""
-        sigmas = np.abs(self.residual) / STEPS_PER_SIGMA
-        rings = [np.convolve(row > _JUMP, np.ones(_TAPS), "same") > 0 for row in sigmas]
-        return (sigmas < _KINK) & ~np.array(rings)
-
-    @cached_property
     def noise(self) -> np.ndarray:
-        """The residual (n_rows, n) in standard deviations, without its kinks."""
-        return np.where(self.telling, self.residual / STEPS_PER_SIGMA, 0.0).astype(np.float32)
+        """The residual (n_rows, n) in standard deviations, 0 where a kink or a jump rings in it."""
+        sigmas = self.residual.astype(np.float32) / STEPS_PER_SIGMA
+        for row in sigmas:
+            rings = np.convolve(np.abs(row) > _JUMP, np.ones(_TAPS), "same") > 0
+            row[rings | (np.abs(row) >= _KINK)] = 0.0
+        return sigmas
+
+    def spread(self, first: int, last: int) -> float:
+        """Return the standard deviation of the motion from one sample to another."""
+        return float(np.std(self.motion[first // _EVERY : last // _EVERY + 1]))
 
 
 def fingerprint(records: Sequence[Record]) -> bytes:
@@ -100,8 +101,8 @@ def fingerprint(records: Sequence[Record]) -> bytes:
             "step": one.step.tolist(),
             "start": one.start,
             "interval": one.interval,
-            "anchors": one.anchors.tolist(),
-            "swing": one.swing.tolist(),
+            "anchors": one.anchors,
+            "motion": [float(f"{x:.5g}") for x in one.motion],
         }
         for one in prints
     ]
@@ -127,8 +128,8 @@ def unpack(packed: bytes) -> tuple[Print, ...]:
                 group=entry["group"],
                 residual=residual,
                 step=np.array(entry["step"]),
-                anchors=np.array(entry["anchors"], dtype=np.int64),
-                swing=np.array(entry["swing"]),
+                anchors=tuple(entry["anchors"]),
+                motion=np.array(entry["motion"]),
                 start=entry["start"],
                 interval=entry["interval"],
             )
@@ -159,18 +160,16 @@ def _prints(record: Record, *, most: int) -> Iterator[Print]:
     steered = len(signals) > len(carts) and sigma[-1] > 0
     noise[sigma == 0], sigma[sigma == 0] = 0.0, 1.0
     sigmas = noise / sigma[:, None]
-    anchors, swing = _in_turn(
-        _motion_anchors(y[0, MARGIN:-MARGIN] - noise[0]),
-        _noise_anchors(np.abs(sigmas[len(carts) :] if steered else sigmas).sum(axis=0)),
-    )
+    motion = y[0, MARGIN:-MARGIN] - noise[0]
+    loudness = np.abs(sigmas[len(carts) :] if steered else sigmas).sum(axis=0)
     steps = np.clip(np.round(STEPS_PER_SIGMA * sigmas), -_MOST_STEPS, _MOST_STEPS)
     yield Print(
         experiment=record.id,
         group=f"{record.kind} {','.join(map(str, carts))} {frequency}",
         residual=steps.astype(_STORED),
         step=sigma / STEPS_PER_SIGMA,
-        anchors=anchors,
-        swing=swing,
+        anchors=(_motion_anchors(motion), _noise_anchors(loudness)),
+        motion=motion[::_EVERY],
         start=float(record.t[MARGIN]),
         interval=record.sample_time,
     )
@@ -195,37 +194,23 @@ def _high_pass() -> Array:
     return taps - taps.mean()
 
 
-def _in_turn(
-    first: tuple[np.ndarray, Array], second: tuple[np.ndarray, Array]
-) -> tuple[np.ndarray, Array]:
-    """Return two lists of anchors and swings as one, taking from them in turn."""
-    rank = np.concatenate([np.arange(anchors.size) for anchors, _ in (first, second)])
-    order = np.argsort(rank, kind="stable")
-    return np.concatenate([first[0], second[0]])[order], np.concatenate([first[1], second[1]])[
-        order
-    ]
-
-
-def _noise_anchors(loudness: Array) -> tuple[np.ndarray, Array]:
+def _noise_anchors(loudness: Array) -> list[int]:
     """Return the samples where the residual (n,) is loudest, a kink of the motion included."""
     peak = np.max(np.lib.stride_tricks.sliding_window_view(loudness, 2 * _APART + 1), axis=1)
     peaks = _APART + np.flatnonzero(loudness[_APART:-_APART] == peak)
-    loudest = peaks[np.argsort(-loudness[peaks], kind="stable")[:_NOISE_ANCHORS]]
-    return loudest, np.zeros(loudest.size)
+    return peaks[np.argsort(-loudness[peaks], kind="stable")[:_NOISE_ANCHORS]].tolist()
 
 
-def _motion_anchors(motion: Array) -> tuple[np.ndarray, Array]:
-    """Return where the motion (n,) passes through its larger swings, and those swings."""
+def _motion_anchors(motion: Array) -> list[int]:
+    """Return where the motion (n,) passes through its larger swings."""
     turns = _turning_points(motion, least=_LEAST_SWING * float(np.ptp(motion)))
     parts = (0.5,) if turns.size > _FEW_TURNS else _PARTS
-    places, swings = [], []
+    places = []
     for start, end in pairwise(turns.tolist()):
         swing = float(motion[end] - motion[start])
         done = (motion[start : end + 1] - motion[start]) / swing
-        places += [start + int(np.argmax(done >= part)) for part in parts]
-        swings += [swing] * len(parts)
-    largest = np.argsort(-np.abs(swings), kind="stable")[:_MOST_ANCHORS]
-    return np.array(places, dtype=np.int64)[largest], np.array(swings)[largest]
+        places += [(-abs(swing), start + int(np.argmax(done >= part))) for part in parts]
+    return [at for _, at in sorted(places, key=lambda one: one[0])[:_MOST_ANCHORS]]
 
 
 def _turning_points(motion: Array, *, least: float) -> np.ndarray:

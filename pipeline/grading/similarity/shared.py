@@ -285,7 +285,7 @@ def _matches(
         pair = (a.owner, b.owner)
         if pair not in apart:
             apart[pair] = pair[0] < first_batch and not same_team(*(owners[o] for o in pair))
-        shift = int(b.print.anchors[anchor_j] - a.print.anchors[anchor_i])
+        shift = anchor_j - anchor_i
         if not apart[pair] or (i, j, shift) in seen:
             continue
         seen.add((i, j, shift))
@@ -294,9 +294,7 @@ def _matches(
         compared[pair] += 1
         if compared[pair] > _MOST_COMPARED * (recordings[a.owner] + recordings[b.owner]):
             continue
-        in_a, in_b = a.print.swing[anchor_i], b.print.swing[anchor_j]
-        scale = float(in_b / in_a) if in_a and in_b else None
-        likeness = compare(a.print, b.print, shift=shift, scale=scale)
+        likeness = compare(a.print, b.print, shift=shift)
         if likeness.slope < LEAST_SLOPE or likeness.sigmas <= alike[i, j]:
             continue
         alike[i, j] = likeness.sigmas
@@ -305,7 +303,7 @@ def _matches(
             beside = others.of(i, b.owner)
             if not beside:
                 continue
-            likeness = compare(a.print, b.print, shift=shift, scale=scale, others=beside)
+            likeness = compare(a.print, b.print, shift=shift, others=beside)
         match = _Match(a=a.print, b=b.print, shift=shift, likeness=likeness)
         best[i, j] = match
         if likeness.equal or (likeness.is_whole and likeness.sigmas >= _ALONE):
@@ -355,12 +353,10 @@ def _candidates(entries: Sequence[_Entry], *, everyone: int) -> Iterator[tuple[i
     What was handed out, by owners beyond `everyone`, is never crowded out by those who used it.
     """
     owners = np.array([entry.owner for entry in entries])
-    for in_motion, n_first in ((True, _FIRST_IN_MOTION), (False, _FIRST_IN_NOISE)):
-        places, first = [], []
-        for i, entry in enumerate(entries):
-            anchors = np.flatnonzero((entry.print.swing != 0) == in_motion).tolist()
-            places += [(i, k) for k in anchors]
-            first += [(i, k) for k in anchors[:n_first]]
+    for kind, n_first in enumerate((_FIRST_IN_MOTION, _FIRST_IN_NOISE)):
+        anchors = [one.print.anchors[kind] for one in entries]
+        places = [(i, at) for i, own in enumerate(anchors) for at in own]
+        first = [(i, at) for i, own in enumerate(anchors) for at in own[:n_first]]
         if not places:
             continue
         columns = _windows(entries, first).T
@@ -387,8 +383,8 @@ def _windows(entries: Sequence[_Entry], places: Sequence[tuple[int, int]]) -> np
     """
     n_free = entries[0].print.residual.shape[0]
     windows = np.zeros((len(places), n_free, _WIDTH), dtype=np.float32)
-    for window, (i, k) in zip(windows, places, strict=True):
-        residual, start = entries[i].print.noise, int(entries[i].print.anchors[k]) - _BEFORE
+    for window, (i, at) in zip(windows, places, strict=True):
+        residual, start = entries[i].print.noise, at - _BEFORE
         part = residual[:, max(start, 0) : start + _WIDTH]
         window[:, max(-start, 0) : max(-start, 0) + part.shape[1]] = part
     flat = windows.reshape(len(places), -1)
