@@ -8,7 +8,7 @@ of both is taken off, and slope and chance are told of the rest.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.fft import next_fast_len
@@ -40,22 +40,25 @@ class Likeness:
     ----------
     slope : of the one's noise on the other's, of what the class does not explain.
     sigmas : how far that is above chance.
-    rows : samples of the first, from and up to, that are compared or equal.
-    equal : how many rows in turn are equal but for one factor, 0 where they say too little.
+    experiments, times : of both; s, from and to, what is compared or equal.
+    equal_rows : how many rows in turn are equal but for one factor, 0 where they say too little.
     different : how many readings of them differ from one another.
     """
 
-    slope: float
-    sigmas: float
-    rows: tuple[int, int]
-    equal: int = 0
+    experiments: tuple[str, str]
+    times: tuple[tuple[float, float], tuple[float, float]]
+    slope: float = 0.0
+    sigmas: float = 0.0
+    equal_rows: int = 0
     different: int = 0
 
     @property
     def is_whole(self) -> bool:
         """Whether a copy would be so alike."""
         sure = self.sigmas >= _LEAST_SIGMAS and self.slope >= LEAST_SLOPE
-        return bool(self.equal) or (sure and (1 - self.slope) * self.sigmas <= _SPREAD * self.slope)
+        return self.equal_rows > 0 or (
+            sure and (1 - self.slope) * self.sigmas <= _SPREAD * self.slope
+        )
 
     @property
     def is_in_part(self) -> bool:
@@ -72,36 +75,37 @@ def compare(
     Sample i of `a` is sample i + shift of `b`, and of each of the others i + its shift.
     """
     first, last = max(0, -shift), min(a.residual.shape[1], b.residual.shape[1] - shift)
-    by_carts = by_input = power_a = power_b = free = 0.0
-    if last - first >= LEAST_OVERLAP:
-        # In units of b's noise, so that every cart has its say; an input has a scale of its own.
-        factor = np.ones(len(a.residual))
-        scale = b.spread(first + shift, last + shift) / max(a.spread(first, last), 1e-300)
-        factor[: len(a.measured)] = (scale * a.step / b.step)[: len(a.measured)]
-        for row, unit in enumerate(factor):
-            in_a, in_b = (
-                _part(a, row, first, last) * unit,
-                _part(b, row, first + shift, last + shift),
-            )
-            both = in_a * in_b != 0
-            n = int(np.count_nonzero(both))
-            beside = [_part(c, row, first + s, last + s) for c, s in others[: n // _SAMPLES_EACH]]
-            left = _left(np.array([in_a, in_b, *beside])[:, both])
-            if n and left[1, 1] > _LEAST_PART * n:
-                left *= n / left[1, 1] if others else 1.0
-                if row < len(a.measured):
-                    by_carts += left[0, 1]
-                else:
-                    by_input += left[0, 1]
-                power_a, power_b = power_a + left[0, 0], power_b + left[1, 1]
-                free += n - len(beside)
-    if free < LEAST_OVERLAP or not power_a * power_b > 0:
-        return Likeness(slope=0.0, sigmas=0.0, rows=(first, last))
-    product = float(abs(by_carts) + abs(by_input))  # the sign of each may have been turned
+    found = _between(a, b, shift=shift, first=first, last=last)
+    if last - first < LEAST_OVERLAP:
+        return found
+    # In units of b's noise, so that every cart has its say; an input has a scale of its own.
+    scale = b.spread(first + shift, last + shift) / max(a.spread(first, last), 1e-300)
+    factor = scale * a.step / b.step
+    factor[len(a.measured) :] = 1.0
+    products, free = np.zeros((2, 2, 2)), 0  # of carts and of the input, whose signs may be turned
+    for row, unit in enumerate(factor):
+        in_a = _part(a, row, first, last) * unit
+        in_b = _part(b, row, first + shift, last + shift)
+        both = in_a * in_b != 0
+        n = int(np.count_nonzero(both))
+        beside = [_part(c, row, first + s, last + s) for c, s in others[: n // _SAMPLES_EACH]]
+        left = _left(np.array([in_a, in_b, *beside])[:, both])
+        if n and left[1, 1] > _LEAST_PART * n:
+            products[row // len(a.measured)] += left * (n / left[1, 1] if others else 1.0)
+            free += n - len(beside)
+    of_a, of_b = np.diag(products.sum(axis=0)).tolist()
+    if free < LEAST_OVERLAP or not of_a * of_b > 0:
+        return found
+    product = float(np.abs(products[:, 0, 1]).sum())
+    chance = float(np.sqrt(of_a * of_b / (PASSED * free)))
+    return replace(found, slope=product / min(of_a, of_b), sigmas=product / chance)
+
+
+def _between(a: Print, b: Print, *, shift: int, first: int, last: int) -> Likeness:
+    """Return two recordings' likeness, of which nothing is known but from where to where in `a`."""
     return Likeness(
-        slope=product / min(power_a, power_b),
-        sigmas=product / float(np.sqrt(power_a * power_b / (PASSED * free))),
-        rows=(first, last),
+        experiments=(a.experiment, b.experiment),
+        times=(a.times(first, last), b.times(first + shift, last + shift)),
     )
 
 
@@ -117,6 +121,8 @@ def _part(one: Print, row: int, first: int, last: int) -> np.ndarray:
 def _left(x: np.ndarray) -> np.ndarray:
     """Return the products (2, 2) of the first two rows, less what the further rows explain."""
     products = x @ x.T
+    if len(x) == 2:
+        return products
     size = np.sqrt(np.maximum(np.diag(products), 1.0))
     products /= np.outer(size, size)
     of_others = products[2:, 2:] + _RIDGE * np.eye(len(x) - 2)
@@ -149,11 +155,11 @@ def equal_rows(a: Print, b: Print, *, shift: int) -> Likeness | None:
     shorter = min(a.residual.shape[1], b.residual.shape[1])
     if different < _EQUAL_READINGS or stop - start < _EQUAL_PART * shorter:
         return None
-    return Likeness(
+    return replace(
+        _between(a, b, shift=shift, first=first + start, last=first + stop),
         slope=1.0,
         sigmas=float(np.sqrt(PASSED * different)),
-        rows=(first + start, first + stop),
-        equal=stop - start,
+        equal_rows=stop - start,
         different=different,
     )
 
@@ -166,4 +172,4 @@ def align(a: Print, b: Print) -> tuple[float, int]:
     products = np.abs(np.fft.irfft(spectrum.sum(axis=0), length))
     shift = int(np.argmax(products))
     alike = float(products[shift]) / max(float(np.linalg.norm(b.noise)), 1.0)
-    return alike, shift if shift < b.residual.shape[1] else shift - length
+    return alike, shift if shift < b.residual.shape[1] else shift - products.size

@@ -81,6 +81,11 @@ class Print:
             row[rings | (np.abs(row) >= _KINK)] = 0.0
         return sigmas
 
+    def times(self, first: int, last: int) -> tuple[float, float]:
+        """Return the times of one sample and of another, s."""
+        start, end = (round(self.start + at * self.interval, 3) for at in (first, last - 1))
+        return start, end
+
     def spread(self, first: int, last: int) -> float:
         """Return the standard deviation of the motion from one sample to another."""
         return float(np.std(self.motion[first // _EVERY : last // _EVERY + 1]))
@@ -102,7 +107,7 @@ def fingerprint(records: Sequence[Record]) -> bytes:
             "start": one.start,
             "interval": one.interval,
             "anchors": one.anchors,
-            "motion": [float(f"{x:.5g}") for x in one.motion],
+            "motion": [float(f"{x:.3g}") for x in one.motion],
         }
         for one in prints
     ]
@@ -111,7 +116,7 @@ def fingerprint(records: Sequence[Record]) -> bytes:
 
 
 def unpack(packed: bytes) -> tuple[Print, ...]:
-    """Return the fingerprints that `fingerprint` packed; none where an older version packed them."""
+    """Return the fingerprints that `fingerprint` packed, none of those of an older version."""
     if not packed:
         return ()
     head, _, body = zlib.decompress(packed).partition(b"\0")

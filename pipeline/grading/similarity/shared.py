@@ -1,12 +1,13 @@
 """Recordings that stand in two submissions: found by their noise, named on both sides.
 
-Noise convicts where it agrees wholly, and nobody's in the class agrees in part; equal rows do
-whatever else is found. With fewer than four teams to compare only equal rows do.
+Noise convicts where it agrees wholly beyond what the class shares, and nobody's agrees in part;
+equal rows convict whatever else is found. In a class of less than five teams only they do.
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -39,11 +40,9 @@ _COUNTS = 4.5  # sigmas of a recording that counts with others
 _ALONE = 6.5  # … by itself: a class of 200 offers 1e9 comparisons, chance reaches 6.1 in them
 _TOGETHER = 7.5  # root of the summed squares of several
 _EQUAL_READINGS = 300  # of different rows, of all recordings: see `equal_rows`
-# The reference of two recordings is one third of a class away from them: copies in a third of the
-# class are so told from the bench.
 _MOST_ALIGNED = 60  # recordings of others that are looked at
 _MOST_OTHERS = 24  # of them that explain
-_FEWEST_TEAMS = 3  # that explain
+_FEWEST_TEAMS = 3  # of them
 _COPIES = 1 / 3  # of the other teams, the most alike: they may have the same copy
 _MOST_IN_PART = 1  # pair of a class whose noise agrees in part: two knocks may meet once
 _MATCHES_TO_IN_PART = 10  # no chance, if that many agree wholly for each pair that does in part
@@ -55,13 +54,15 @@ class SharedRecord:
 
     Attributes
     ----------
+    submission : the other one.
     sigmas : how far above chance their noise agrees.
-    equal_rows : how many rows in turn are equal, but for one factor a column; 0 where not all are.
+    equal_rows : how many rows in turn are equal, but for one factor a column; 0 where that is not
+        the evidence.
     time, other_time : s, from and to, where they are equal or agree.
     """
 
     experiment: str
-    other: str
+    submission: str
     other_experiment: str
     sigmas: float
     equal_rows: int
@@ -70,39 +71,15 @@ class SharedRecord:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Match:
-    """Two recordings that agree: `a` is of the submission with the lower number."""
-
-    a: Print
-    b: Print
-    shift: int
-    likeness: Likeness
-
-    def told(self, *, other: str, swapped: bool) -> SharedRecord:
-        """Return what one of the two submissions is told."""
-        times = [
-            tuple(round(one.start + (row + s) * one.interval, 3) for row in self.likeness.rows)
-            for one, s in ((self.a, 0), (self.b, self.shift))
-        ]
-        names = [self.a.experiment, self.b.experiment]
-        mine, theirs = (1, 0) if swapped else (0, 1)
-        return SharedRecord(
-            experiment=names[mine],
-            other=other,
-            other_experiment=names[theirs],
-            sigmas=self.likeness.sigmas,
-            equal_rows=self.likeness.equal,
-            time=times[mine],
-            other_time=times[theirs],
-        )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class _Entry:
     """A fingerprint and the submission (by number) it is of."""
 
     owner: int
     print: Print
+
+
+# How alike, whose, the recording, and how it is shifted.
+_Aligned = tuple[float, int, Print, int]
 
 
 def find_shared(
@@ -131,39 +108,39 @@ def find_shared(
             once.setdefault((one.group, one.residual.tobytes()), one)
         for one in once.values():
             groups[one.group].append(_Entry(owner=owner, print=one))
-    matches: dict[tuple[int, int], list[_Match]] = defaultdict(list)
+    matches: dict[tuple[int, int], list[Likeness]] = defaultdict(list)
     for _, entries in sorted(groups.items()):
-        for pair, match in _matches(
+        for pair, likeness in _matches(
             entries, first_batch=len(batch), everyone=len(everyone), owners=owners
         ):
-            matches[pair].append(match)
-    convicts = _convicting([match.likeness for found in matches.values() for match in found])
+            matches[pair].append(likeness)
+    matches = _telling(matches)
     given = {
-        (a, match.a.experiment)
+        (a, one.experiments[0])
         for (a, b), found in matches.items()
         if b >= len(everyone)
-        for match in found
-        if convicts(match.likeness) and match.likeness.sigmas >= _ALONE
+        for one in found
+        if one.sigmas >= _ALONE
     }
     shared: dict[str, list[SharedRecord]] = defaultdict(list)
-    for (a, b), found in sorted(matches.items()):
-        if b >= len(everyone):
-            continue
-        own = [
-            match
-            for match in found
-            if convicts(match.likeness)
-            and (a, match.a.experiment) not in given
-            and (b, match.b.experiment) not in given
-        ]
-        for match in _decisive(own):
-            for owner, other in ((a, b), (b, a)):
-                if owner < len(batch):
-                    told = match.told(other=names[other], swapped=owner == b)
-                    shared[names[owner]].append(told)
+    for pair, found in sorted(matches.items()):
+        own = [one for one in found if given.isdisjoint(zip(pair, one.experiments, strict=True))]
+        for one in _decisive(own) if pair[1] < len(everyone) else ():
+            for mine, other in ((0, 1), (1, 0)):
+                if pair[mine] < len(batch):
+                    record = SharedRecord(
+                        experiment=one.experiments[mine],
+                        submission=names[pair[other]],
+                        other_experiment=one.experiments[other],
+                        sigmas=round(one.sigmas, 1),
+                        equal_rows=one.equal_rows,
+                        time=one.times[mine],
+                        other_time=one.times[other],
+                    )
+                    shared[names[pair[mine]]].append(record)
     return {
-        submission: tuple(sorted(found, key=lambda r: (r.other, r.experiment, r.other_experiment)))
-        for submission, found in sorted(shared.items())
+        name: tuple(sorted(found, key=lambda r: (r.submission, r.experiment, r.other_experiment)))
+        for name, found in sorted(shared.items())
     }
 
 
@@ -173,19 +150,8 @@ def _handed_out(packed: bytes) -> Member:
 
 def shared_flag(records: Sequence[SharedRecord]) -> Flag:
     """Return the flag of one submission: which recordings, and where else they stand."""
-    recordings = [
-        {
-            "experiment": record.experiment,
-            "submission": record.other,
-            "other_experiment": record.other_experiment,
-            "sigmas": round(record.sigmas, 1),
-            "equal_rows": record.equal_rows,
-            "time": list(record.time),
-            "other_time": list(record.other_time),
-        }
-        for record in records
-    ]
-    others = list(dict.fromkeys(record.other for record in records))
+    recordings = [asdict(record) for record in records]
+    others = list(dict.fromkeys(record.submission for record in records))
     return Flag(
         code="shared_data",
         parameters=tuple(dict.fromkeys(record.experiment for record in records)),
@@ -202,7 +168,7 @@ def shared_message(recordings: Sequence[Mapping[str, Any]], others: Iterable[str
     experiments = list(dict.fromkeys(one["experiment"] for one in recordings))
     stand = "stands" if len(experiments) == 1 else "stand"
     best = max(recordings, key=lambda one: (one.get("equal_rows", 0), one["sigmas"]))
-    when = "of {0:g} s to {1:g} s".format(*best["time"]) if "time" in best else "there"
+    when = "of {:g} s to {:g} s".format(*best["time"]) if "time" in best else "there"
     rows = best.get("equal_rows", 0)
     same = f"{rows} rows in turn are equal" if rows else "the noise is the same"
     return (
@@ -238,29 +204,34 @@ def same_recordings(a: Member, b: Member) -> bool:
     return bool(of_a and of_b) and (of_a <= of_b or of_b <= of_a)
 
 
-def _convicting(found: Sequence[Likeness]) -> Callable[[Likeness], bool]:
-    """Return what tells a copy, given all pairs of a class that look alike.
+def _telling(
+    matches: Mapping[tuple[int, int], Sequence[Likeness]],
+) -> dict[tuple[int, int], list[Likeness]]:
+    """Return what tells a copy, of all that looks alike in a class, by pair of submissions.
 
     Where the noise of several agrees in part, the bench or its encoder makes it do so, and says
     nothing of those that agree wholly. Equal rows are a copy whatever else is found.
     """
-    in_part = sum(one.is_in_part for one in found)
-    whole = sum(one.is_whole for one in found)
-    by_noise = in_part <= max(_MOST_IN_PART, whole // _MATCHES_TO_IN_PART)
-    return lambda one: one.equal > 0 or (by_noise and one.is_whole)
+    every = [one for found in matches.values() for one in found]
+    whole, in_part = sum(one.is_whole for one in every), sum(one.is_in_part for one in every)
+    noise = in_part <= max(_MOST_IN_PART, whole // _MATCHES_TO_IN_PART)
+    return {
+        pair: [one for one in found if one.equal_rows or (noise and one.is_whole)]
+        for pair, found in matches.items()
+    }
 
 
-def _decisive(found: Sequence[_Match]) -> list[_Match]:
+def _decisive(found: Sequence[Likeness]) -> list[Likeness]:
     """Return the matches of one pair of submissions, one for each recording, if they suffice."""
-    chosen: dict[tuple[str, str], _Match] = {}
-    for match in sorted(found, key=lambda m: -m.likeness.sigmas):
-        names = (match.a.experiment, match.b.experiment)
-        if all(names[0] != a and names[1] != b for a, b in chosen):
-            chosen[names] = match
-    by_noise = [m.likeness.sigmas for m in chosen.values() if not m.likeness.equal]
-    equal = sum(match.likeness.different for match in chosen.values()) >= _EQUAL_READINGS
-    enough = max(by_noise, default=0.0) >= _ALONE or np.linalg.norm(by_noise) >= _TOGETHER
-    return list(chosen.values()) if equal or enough else []
+    chosen: list[Likeness] = []
+    for one in sorted(found, key=lambda one: (-one.sigmas, one.experiments)):
+        a, b = one.experiments
+        if all(a != c.experiments[0] and b != c.experiments[1] for c in chosen):
+            chosen.append(one)
+    sigmas = [one.sigmas for one in chosen if not one.equal_rows]
+    noise = max(sigmas, default=0.0) >= _ALONE or np.linalg.norm(sigmas) >= _TOGETHER
+    equal = sum(one.different for one in chosen) >= _EQUAL_READINGS
+    return chosen if noise or equal else []
 
 
 # ------------------------------------------------------------------- candidates
@@ -268,25 +239,27 @@ def _decisive(found: Sequence[_Match]) -> list[_Match]:
 
 def _matches(
     entries: Sequence[_Entry], *, first_batch: int, everyone: int, owners: Sequence[Member]
-) -> Iterator[tuple[tuple[int, int], _Match]]:
+) -> Iterator[tuple[tuple[int, int], Likeness]]:
     """Yield pairs of recordings of different teams that look alike, with their owners."""
-    best: dict[tuple[int, int], _Match] = {}
+    best: dict[tuple[int, int], Likeness] = {}
     alike: dict[tuple[int, int], float] = defaultdict(lambda: _COUNTS)  # at first comparison
     seen: set[tuple[int, int, int]] = set()
-    apart: dict[tuple[int, int], bool] = {}
+    aligned: dict[int, list[_Aligned]] = {}
+
+    @cache
+    def same(a: int, b: int) -> bool:
+        return same_team(owners[a], owners[b])
+
     partner: dict[tuple[int, int], int] = {}  # of a recording, in a submission: surely a copy
     compared: Counter[tuple[int, int]] = Counter()
     recordings = Counter(entry.owner for entry in entries)
-    others = _Others(entries, owners)
     for i, anchor_i, j, anchor_j in _candidates(entries, everyone=everyone):
         a, b = entries[i], entries[j]
         if a.owner > b.owner:
             i, anchor_i, j, anchor_j, a, b = j, anchor_j, i, anchor_i, b, a
         pair = (a.owner, b.owner)
-        if pair not in apart:
-            apart[pair] = pair[0] < first_batch and not same_team(*(owners[o] for o in pair))
         shift = anchor_j - anchor_i
-        if not apart[pair] or (i, j, shift) in seen:
+        if pair[0] >= first_batch or same(*pair) or (i, j, shift) in seen:
             continue
         seen.add((i, j, shift))
         if partner.get((i, b.owner), j) != j or partner.get((j, a.owner), i) != i:
@@ -300,48 +273,40 @@ def _matches(
         alike[i, j] = likeness.sigmas
         likeness = equal_rows(a.print, b.print, shift=shift)
         if likeness is None:
-            beside = others.of(i, b.owner)
-            if not beside:
+            if i not in aligned:
+                aligned[i] = _aligned(entries, i)
+            teams = {o for _, o, _, _ in aligned[i] if not any(same(o, own) for own in pair)}
+            others = _others([one for one in aligned[i] if one[1] in teams])
+            if not others:
                 continue
-            likeness = compare(a.print, b.print, shift=shift, others=beside)
-        match = _Match(a=a.print, b=b.print, shift=shift, likeness=likeness)
-        best[i, j] = match
-        if likeness.equal or (likeness.is_whole and likeness.sigmas >= _ALONE):
+            likeness = compare(a.print, b.print, shift=shift, others=others)
+        best[i, j] = likeness
+        if likeness.equal_rows or (likeness.is_whole and likeness.sigmas >= _ALONE):
             partner[i, b.owner], partner[j, a.owner] = j, i
-    for (i, j), match in sorted(best.items(), key=lambda one: one[0]):
-        yield (entries[i].owner, entries[j].owner), match
+    for (i, j), likeness in sorted(best.items(), key=lambda one: one[0]):
+        yield (entries[i].owner, entries[j].owner), likeness
 
 
-class _Others:
-    """The recordings that are held beside one, the most alike first: what they share is no one's."""
+def _aligned(entries: Sequence[_Entry], i: int) -> list[_Aligned]:
+    """Return recordings of others beside one of them, the most alike first."""
+    rest = [one for one in entries if one.owner != entries[i].owner]
+    found = []
+    for one in rest[:: max(1, len(rest) // _MOST_ALIGNED)]:
+        alike, shift = align(entries[i].print, one.print)
+        found.append((alike, one.owner, one.print, shift))
+    return sorted(found, key=lambda one: -one[0])
 
-    def __init__(self, entries: Sequence[_Entry], owners: Sequence[Member]) -> None:
-        self._entries, self._owners = entries, owners
-        self._aligned: dict[int, list[tuple[float, int, int]]] = {}
 
-    def of(self, i: int, other: int) -> list[tuple[Print, int]]:
-        """Return the others for recording i and one of another submission, with their shifts."""
-        mine = self._entries[i].owner
-        if i not in self._aligned:
-            rest = [j for j, one in enumerate(self._entries) if one.owner != mine]
-            some = rest[:: max(1, len(rest) // _MOST_ALIGNED)]
-            mine_print = self._entries[i].print
-            self._aligned[i] = sorted(
-                ((*align(mine_print, self._entries[j].print), j) for j in some), reverse=True
-            )
-        teams = {
-            owner: None
-            for owner in (self._entries[j].owner for _, _, j in self._aligned[i])
-            if not any(same_team(self._owners[owner], self._owners[o]) for o in (mine, other))
-        }
-        dropped = max(min(int(len(teams) * _COPIES), len(teams) - _FEWEST_TEAMS), 0)
-        kept = set(list(teams)[dropped:] if len(teams) >= _FEWEST_TEAMS else ())
-        found = [
-            (self._entries[j].print, shift)
-            for _, shift, j in self._aligned[i]
-            if self._entries[j].owner in kept
-        ]
-        return found[:_MOST_OTHERS]
+def _others(aligned: Sequence[_Aligned]) -> list[tuple[Print, int]]:
+    """Return the recordings that say what a class shares, with their shifts; none of a small one.
+
+    The most alike may be of teams that have the same copy, and are left out.
+    """
+    teams = list(dict.fromkeys(owner for _, owner, _, _ in aligned))
+    if len(teams) < _FEWEST_TEAMS:
+        return []
+    kept = teams[min(int(len(teams) * _COPIES), len(teams) - _FEWEST_TEAMS) :]
+    return [(one, shift) for _, owner, one, shift in aligned if owner in kept][:_MOST_OTHERS]
 
 
 def _candidates(entries: Sequence[_Entry], *, everyone: int) -> Iterator[tuple[int, int, int, int]]:

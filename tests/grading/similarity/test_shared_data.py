@@ -141,8 +141,8 @@ def test_one_copied_recording_is_found_however_disguised(teams, others, kind, di
     copied = disguised(of_kind(teams[0], kind), rng, **disguise)
     found = find_shared([prints("a", teams[0]), prints("b", [*teams[1], copied]), *others])
     (mine,), (theirs,) = found["b"], found["a"]
-    assert (mine.other, mine.other_experiment) == ("a", theirs.experiment)
-    assert (theirs.other, theirs.other_experiment) == ("b", mine.experiment)
+    assert (mine.submission, mine.other_experiment) == ("a", theirs.experiment)
+    assert (theirs.submission, theirs.other_experiment) == ("b", mine.experiment)
     assert mine.experiment == copied.id
 
 
@@ -172,7 +172,7 @@ def test_a_whole_copy_is_found_under_much_noise(teams, others):
     copied = [disguised(r, rng, noise=1.5, scale=0.9, keep=0.8) for r in teams[0]]
     found = find_shared([prints("a", teams[0]), prints("b", copied), *others])
     assert set(found) == {"a", "b"}
-    assert {record.other for record in found["a"]} == {"b"}
+    assert {record.submission for record in found["a"]} == {"b"}
 
 
 def test_teammates_and_repeats_do_not_count(teams):
@@ -211,7 +211,7 @@ def test_earlier_batches_count(teams):
     old = [prints("x", teams[0]), prints("y", teams[0])]
     found = find_shared([prints("a", teams[0][:4])], earlier=old)
     assert set(found) == {"a"}
-    assert {r.other for r in found["a"]} == {"x (an earlier batch)", "y (an earlier batch)"}
+    assert {r.submission for r in found["a"]} == {"x (an earlier batch)", "y (an earlier batch)"}
     flag = shared_flag(found["a"])
     assert flag.parameters == tuple(r.id for r in teams[0][:4])
     assert "does not say whose" in flag.message
@@ -266,7 +266,7 @@ def test_real_repeats_on_one_bench_are_not_shared(real_data, tmp_path, kind):
     assert find_shared(teams) == {}
     copy = disguised(records[2], np.random.default_rng(3), scale=0.5, keep=0.8)
     found = find_shared([*teams, prints("copy", [copy])])
-    assert {r.other for r in found["copy"]} == {"2"}
+    assert {r.submission for r in found["copy"]} == {"2"}
 
 
 def test_still_or_short_recordings_have_no_fingerprint(teams):
