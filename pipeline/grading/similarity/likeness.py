@@ -79,25 +79,32 @@ def compare(
     if last - first < LEAST_OVERLAP:
         return found
     # In units of b's noise, so that every cart has its say; an input has a scale of its own.
-    scale = b.spread(first + shift, last + shift) / max(a.spread(first, last), 1e-300)
-    factor = scale * a.step / b.step
+    of_a, of_b = a.spread(first, last), b.spread(first + shift, last + shift)
+    factor = (of_b / of_a if of_a > 0 else 1.0) * a.step / b.step
     factor[len(a.measured) :] = 1.0
-    products, free = np.zeros((2, 2, 2)), 0  # of carts and of the input, whose signs may be turned
-    for row, unit in enumerate(factor):
-        in_a = _part(a, row, first, last) * unit
-        in_b = _part(b, row, first + shift, last + shift)
-        both = in_a * in_b != 0
-        n = int(np.count_nonzero(both))
-        beside = [_part(c, row, first + s, last + s) for c, s in others[: n // _SAMPLES_EACH]]
-        left = _left(np.array([in_a, in_b, *beside])[:, both])
-        if n and left[1, 1] > _LEAST_PART * n:
-            products[row // len(a.measured)] += left * (n / left[1, 1] if others else 1.0)
-            free += n - len(beside)
-    of_a, of_b = np.diag(products.sum(axis=0)).tolist()
-    if free < LEAST_OVERLAP or not of_a * of_b > 0:
+    in_a = a.noise[:, first:last] * factor[:, None]
+    in_b = b.noise[:, first + shift : last + shift]
+    both = in_a * in_b != 0
+    n = np.count_nonzero(both, axis=1)
+    if n.sum() < LEAST_OVERLAP:
         return found
-    product = float(np.abs(products[:, 0, 1]).sum())
-    chance = float(np.sqrt(of_a * of_b / (PASSED * free)))
+    in_a, in_b = in_a * both, in_b * both
+    x = np.stack([in_a, in_b], axis=1)
+    left = x @ x.transpose(0, 2, 1)
+    if others:
+        for row in np.flatnonzero(n):
+            beside = [
+                _part(c, row, first + s, last + s) for c, s in others[: n[row] // _SAMPLES_EACH]
+            ]
+            rest = _left(np.array([*x[row], *beside])[:, both[row]])
+            left[row] = rest * (n[row] / rest[1, 1] if rest[1, 1] > _LEAST_PART * n[row] else 0.0)
+            n[row] -= len(beside)
+    # The signs of carts and of the input may be turned.
+    product = sum(abs(float(part[:, 0, 1].sum())) for part in np.split(left, [len(a.measured)]))
+    of_a, of_b = np.diag(left.sum(axis=0)).tolist()
+    if not of_a * of_b > 0:
+        return found
+    chance = float(np.sqrt(of_a * of_b / (PASSED * n.sum())))
     return replace(found, slope=product / min(of_a, of_b), sigmas=product / chance)
 
 
@@ -111,7 +118,7 @@ def _between(a: Print, b: Print, *, shift: int, first: int, last: int) -> Likene
 
 def _part(one: Print, row: int, first: int, last: int) -> np.ndarray:
     """Return a row's noise from one sample to another, 0 where there is none."""
-    part = np.zeros(last - first)
+    part = np.zeros(last - first, dtype=np.float32)
     start, stop = max(first, 0), min(last, one.noise.shape[1])
     if start < stop:
         part[start - first : stop - first] = one.noise[row, start:stop]
@@ -120,9 +127,7 @@ def _part(one: Print, row: int, first: int, last: int) -> np.ndarray:
 
 def _left(x: np.ndarray) -> np.ndarray:
     """Return the products (2, 2) of the first two rows, less what the further rows explain."""
-    products = x @ x.T
-    if len(x) == 2:
-        return products
+    products = x.astype(np.float64) @ x.T
     size = np.sqrt(np.maximum(np.diag(products), 1.0))
     products /= np.outer(size, size)
     of_others = products[2:, 2:] + _RIDGE * np.eye(len(x) - 2)

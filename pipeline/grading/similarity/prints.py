@@ -88,7 +88,8 @@ class Print:
 
     def spread(self, first: int, last: int) -> float:
         """Return the standard deviation of the motion from one sample to another."""
-        return float(np.std(self.motion[first // _EVERY : last // _EVERY + 1]))
+        part = self.motion[first // _EVERY : last // _EVERY + 1]
+        return float(np.linalg.norm(part - part.mean())) / part.size**0.5
 
 
 def fingerprint(records: Sequence[Record]) -> bytes:
