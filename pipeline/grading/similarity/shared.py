@@ -29,6 +29,7 @@ from pipeline.schemas.grade import Flag
 _WIDTH = 512  # samples around an anchor that are compared at first
 _BEFORE = 128  # of them before it
 _FIRST_IN_MOTION, _FIRST_IN_NOISE = 2, 1  # anchors that all of the others are held against
+_PER_SIGMA, _LEVELS = 1.5, 5.0  # noise at first sight: in finer levels rounding looks alike
 _BLOCK = 2048  # anchors compared in one product
 _WORTH_A_LOOK = 3.2  # sigmas at first sight: one in a thousand by chance
 # The rest of the work grows with the number of recordings, not with its square. Chance offers so
@@ -352,7 +353,7 @@ def _windows(entries: Sequence[_Entry], places: Sequence[tuple[int, int]]) -> np
         residual, start = entries[i].print.noise, at - _BEFORE
         part = residual[:, max(start, 0) : start + _WIDTH]
         window[:, max(-start, 0) : max(-start, 0) + part.shape[1]] = part
-    flat = windows.reshape(len(places), -1)
+    flat = np.clip(np.round(_PER_SIGMA * windows.reshape(len(places), -1)), -_LEVELS, _LEVELS)
     counts = np.count_nonzero(flat, axis=1)
     power = np.einsum("ij,ij->i", flat, flat)
     factor = (PASSED * counts) ** 0.25 / np.sqrt(np.maximum(power, 1.0))
