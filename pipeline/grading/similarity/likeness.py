@@ -25,10 +25,7 @@ _LEAST_PART = 1e-9  # of a recording's power that others leave
 _LEAST_NOISE = 0.5 * STEPS_PER_SIGMA  # where the scale of two recordings is read off
 # A residual is kept to half a step.
 _SAME_STEPS, _SAME_PART = 1.0, 0.003
-# Where noise of 0.04 counts meets the very same motion and zero, one sample in 22 of a moving cart
-# is rounded otherwise: two honest runs are equal for some seconds, and no more.
 _EQUAL_PART = 0.5  # of the shorter recording
-_EQUAL_READINGS = 120
 _DIFFERENT_STEPS = 4  # that tell one reading from another
 
 
@@ -53,18 +50,14 @@ class Likeness:
     different: int = 0
 
     @property
-    def is_whole(self) -> bool:
-        """Whether a copy would be so alike."""
-        sure = self.sigmas >= _LEAST_SIGMAS and self.slope >= LEAST_SLOPE
-        return self.equal_rows > 0 or (
-            sure and (1 - self.slope) * self.sigmas <= _SPREAD * self.slope
-        )
+    def is_sure(self) -> bool:
+        """Whether chance and the class do not explain it."""
+        return self.sigmas >= _LEAST_SIGMAS and self.slope >= LEAST_SLOPE
 
     @property
-    def is_in_part(self) -> bool:
-        """Whether neither a copy would be so alike nor two runs with noise of their own."""
-        sure = self.sigmas >= _LEAST_SIGMAS and self.slope >= LEAST_SLOPE
-        return sure and not self.is_whole
+    def is_whole(self) -> bool:
+        """Whether it is sure, and a copy would be so alike."""
+        return self.is_sure and (1 - self.slope) * self.sigmas <= _SPREAD * self.slope
 
 
 def compare(
@@ -92,7 +85,7 @@ def compare(
     x = np.stack([in_a, in_b], axis=1)
     left = x @ x.transpose(0, 2, 1)
     if others:
-        for row in np.flatnonzero(n):
+        for row in np.flatnonzero(n).tolist():
             beside = [
                 _part(c, row, first + s, last + s) for c, s in others[: n[row] // _SAMPLES_EACH]
             ]
@@ -158,12 +151,10 @@ def equal_rows(a: Print, b: Print, *, shift: int) -> Likeness | None:
     rows = np.round(in_b[:, start:stop].T / _DIFFERENT_STEPS)
     different = len(np.unique(np.hstack([rows[:-1], rows[1:]]), axis=0)) * len(in_b)
     shorter = min(a.residual.shape[1], b.residual.shape[1])
-    if different < _EQUAL_READINGS or stop - start < _EQUAL_PART * shorter:
+    if different < LEAST_OVERLAP or stop - start < _EQUAL_PART * shorter:
         return None
     return replace(
         _between(a, b, shift=shift, first=first + start, last=first + stop),
-        slope=1.0,
-        sigmas=float(np.sqrt(PASSED * different)),
         equal_rows=stop - start,
         different=different,
     )

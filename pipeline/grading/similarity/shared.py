@@ -6,7 +6,7 @@ equal rows convict whatever else is found. In a class of less than five teams on
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -40,7 +40,9 @@ _MOST_COMPARED = 10  # times the recordings that two submissions have of one kin
 _COUNTS = 4.5  # sigmas of a recording that counts with others
 _ALONE = 6.5  # … by itself: a class of 200 offers 1e9 comparisons, chance reaches 6.1 in them
 _TOGETHER = 7.5  # root of the summed squares of several
-_EQUAL_READINGS = 300  # of different rows, of all recordings: see `equal_rows`
+# Where noise of a twenty-fifth of a count meets the very same motion and zero, one reading in so
+# many is rounded otherwise: chance e^-1 for as many equal ones, in each pair of recordings.
+_TO_A_ROUNDING = 22
 _MOST_ALIGNED = 60  # recordings of others that are looked at
 _MOST_OTHERS = 24  # of them that explain
 _FEWEST_TEAMS = 3  # of them
@@ -116,17 +118,18 @@ def find_shared(
         ):
             matches[pair].append(likeness)
     matches = _telling(matches)
+    compared = sum(len(entries) ** 2 for entries in groups.values())
     given = {
         (a, one.experiments[0])
         for (a, b), found in matches.items()
         if b >= len(everyone)
         for one in found
-        if one.sigmas >= _ALONE
+        if one.equal_rows or one.sigmas >= _ALONE
     }
     shared: dict[str, list[SharedRecord]] = defaultdict(list)
     for pair, found in sorted(matches.items()):
         own = [one for one in found if given.isdisjoint(zip(pair, one.experiments, strict=True))]
-        for one in _decisive(own) if pair[1] < len(everyone) else ():
+        for one in _decisive(own, compared=compared) if pair[1] < len(everyone) else ():
             for mine, other in ((0, 1), (1, 0)):
                 if pair[mine] < len(batch):
                     record = SharedRecord(
@@ -213,25 +216,29 @@ def _telling(
     Where the noise of several agrees in part, the bench or its encoder makes it do so, and says
     nothing of those that agree wholly. Equal rows are a copy whatever else is found.
     """
-    every = [one for found in matches.values() for one in found]
-    whole, in_part = sum(one.is_whole for one in every), sum(one.is_in_part for one in every)
-    noise = in_part <= max(_MOST_IN_PART, whole // _MATCHES_TO_IN_PART)
+    sure = [one for found in matches.values() for one in found if one.is_sure]
+    whole = sum(one.is_whole for one in sure)
+    if len(sure) - whole > max(_MOST_IN_PART, whole // _MATCHES_TO_IN_PART):
+        matches = {pair: [replace(o, slope=0.0) for o in found] for pair, found in matches.items()}
     return {
-        pair: [one for one in found if one.equal_rows or (noise and one.is_whole)]
+        pair: [one for one in found if one.equal_rows or one.is_whole]
         for pair, found in matches.items()
     }
 
 
-def _decisive(found: Sequence[Likeness]) -> list[Likeness]:
-    """Return the matches of one pair of submissions, one for each recording, if they suffice."""
+def _decisive(found: Sequence[Likeness], *, compared: int) -> list[Likeness]:
+    """Return the matches of one pair of submissions, one for each recording, if they suffice.
+
+    `compared` is how many pairs of recordings there are in which chance may have had its way.
+    """
     chosen: list[Likeness] = []
-    for one in sorted(found, key=lambda one: (-one.sigmas, one.experiments)):
+    for one in sorted(found, key=lambda one: (-one.different, -one.sigmas, one.experiments)):
         a, b = one.experiments
         if all(a != c.experiments[0] and b != c.experiments[1] for c in chosen):
             chosen.append(one)
-    sigmas = [one.sigmas for one in chosen if not one.equal_rows]
+    sigmas = [one.sigmas for one in chosen if one.is_whole]
     noise = max(sigmas, default=0.0) >= _ALONE or np.linalg.norm(sigmas) >= _TOGETHER
-    equal = sum(one.different for one in chosen) >= _EQUAL_READINGS
+    equal = sum(one.different for one in chosen) >= _TO_A_ROUNDING * np.log(max(compared, 2))
     return chosen if noise or equal else []
 
 
@@ -272,15 +279,16 @@ def _matches(
         if likeness.slope < LEAST_SLOPE or likeness.sigmas <= alike[i, j]:
             continue
         alike[i, j] = likeness.sigmas
-        likeness = equal_rows(a.print, b.print, shift=shift)
-        if likeness is None:
-            if i not in aligned:
-                aligned[i] = _aligned(entries, i)
-            teams = {o for _, o, _, _ in aligned[i] if not any(same(o, own) for own in pair)}
-            others = _others([one for one in aligned[i] if one[1] in teams])
-            if not others:
-                continue
+        equal = equal_rows(a.print, b.print, shift=shift)
+        if i not in aligned:
+            aligned[i] = _aligned(entries, i)
+        teams = {o for _, o, _, _ in aligned[i] if not any(same(o, own) for own in pair)}
+        if others := _others([one for one in aligned[i] if one[1] in teams]):
             likeness = compare(a.print, b.print, shift=shift, others=others)
+        else:
+            likeness = replace(likeness, slope=0.0)
+        if equal:
+            likeness = replace(equal, slope=likeness.slope, sigmas=likeness.sigmas)
         best[i, j] = likeness
         if likeness.equal_rows or (likeness.is_whole and likeness.sigmas >= _ALONE):
             partner[i, b.owner], partner[j, a.owner] = j, i
