@@ -1,5 +1,7 @@
 """Shared recordings: found however disguised, and never where two teams only used one bench."""
 
+import json
+import zlib
 from dataclasses import replace
 
 import numpy as np
@@ -8,10 +10,11 @@ import pytest
 from pipeline.grading.gradings import Member
 from pipeline.grading.similarity import shared
 from pipeline.grading.similarity.prints import fingerprint, unpack
-from pipeline.grading.similarity.shared import find_shared, shared_flag
+from pipeline.grading.similarity.shared import find_shared, same_recordings, shared_flag
 from pipeline.ingest.read import read_data
 from pipeline.submission import load_submission
 from pipeline.synthesis import COUNT, write_submission
+from tests.helpers.bench_classes import move_class, read_class
 from tests.helpers.ucsd import write_two_cart_submission
 
 
@@ -267,6 +270,77 @@ def test_real_repeats_on_one_bench_are_not_shared(real_data, tmp_path, kind):
     copy = disguised(records[2], np.random.default_rng(3), scale=0.5, keep=0.8)
     found = find_shared([*teams, prints("copy", [copy])])
     assert {r.submission for r in found["copy"]} == {"2"}
+
+
+@pytest.fixture(scope="module")
+def knocking():
+    """Eight teams on a bench with backlash, whose knocks are as sharp as noise."""
+    moved = move_class("throne-1dof", "backlash", seeds=range(8), dwells=4)
+    return read_class(moved, seed=3)
+
+
+def test_the_knocks_of_a_bench_are_nobodys(knocking):
+    """Honest runs share them; a recording under noise is told from them as a copy all the same."""
+    honest = [prints(str(number), records) for number, records in enumerate(knocking)]
+    assert find_shared(honest) == {}
+    rng = np.random.default_rng(1)
+    copied = disguised(of_kind(knocking[0], "sweep"), rng, noise=0.5, keep=0.8)
+    found = find_shared([honest[0], prints("1", [*knocking[1], copied]), *honest[2:]])
+    assert set(found) == {"0", "1"}
+    assert [r.experiment for r in found["1"]] == [copied.id]
+
+
+@pytest.mark.parametrize("members", [2, 3])
+def test_a_small_class_is_told_of_equal_rows_only(teams, members):
+    """Two or three teams are no reference: the same noise under more of it could be the bench's."""
+    rng = np.random.default_rng(2)
+    record = of_kind(teams[0], "step")
+    others = [prints(str(number), teams[number]) for number in range(2, members)]
+    for noise, told in ((0.0, {"a", "b"}), (0.4, set())):
+        copied = disguised(record, rng, noise=noise, keep=0.8, later=2.0)
+        b = prints("b", [*teams[1], copied])
+        assert set(find_shared([prints("a", teams[0]), b, *others])) == told
+
+
+def test_three_of_six_may_have_the_same_copy(teams):
+    """Whoever has a copy, too, is no reference for the bench."""
+    record = of_kind(teams[0], "step")
+    rest = [prints(str(number), teams[number]) for number in range(3, 6)]
+    rng = np.random.default_rng(4)
+    copies = [
+        prints(f"copy-{number}", [*teams[number], disguised(record, rng, noise=0.0)])
+        for number in (1, 2)
+    ]
+    found = find_shared([prints("a", teams[0]), *copies, *rest])
+    assert {name: len(records) for name, records in found.items()} == {
+        "a": 2,
+        "copy-1": 2,
+        "copy-2": 2,
+    }
+
+
+def test_a_flag_names_what_can_be_checked(teams):
+    """Which rows of which times are equal stands in the evidence, and in the sentence."""
+    copied = disguised(of_kind(teams[0], "step"), np.random.default_rng(6), scale=10.0, later=3.0)
+    (record,) = find_shared([prints("a", teams[0]), prints("b", [copied])])["b"]
+    (evidence,) = shared_flag([record]).evidence["recordings"]
+    first, last = evidence["time"]
+    rows = (copied.t >= first - 0.001) & (copied.t <= last + 0.001)
+    assert evidence["equal_rows"] == np.count_nonzero(rows)
+    assert evidence["other_time"] == pytest.approx((first - 3.0, last - 3.0))
+    said = shared_flag([record]).message
+    assert f"{evidence['equal_rows']} rows in turn are equal" in said
+    assert f"{first:g} s to {last:g} s" in said
+
+
+def test_fingerprints_of_an_older_version_are_not_compared(teams):
+    """They lack what is compared; that they are there harms nobody."""
+    head = {"experiment": "step-1", "group": "step 1,2 ", "shape": [2, 3], "step": [1, 1]}
+    old = zlib.compress(json.dumps([head | {"anchors": [], "swing": []}]).encode() + bytes(7))
+    assert unpack(old) == ()
+    before = Member(submission="a", authors=("ann",), fingerprints=old)
+    assert not same_recordings(before, prints("a", teams[0][:1]))
+    assert find_shared([prints("a", teams[0][:1])], earlier=[before]) == {}
 
 
 def test_still_or_short_recordings_have_no_fingerprint(teams):
