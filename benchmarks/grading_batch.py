@@ -49,6 +49,7 @@ DISGUISES = {
     "noise 1, cut, rescaled": {"noise": 1.0, "keep": 0.8, "scale": 1.3},
     "noise 2": {"noise": 2.0},
 }
+IN_CLASS = 10  # honest teams beside the two
 COPIED_KINDS = ("decay", "step", "sweep", "closed_loop")
 
 
@@ -207,12 +208,13 @@ def copies(base: Path, *, teams: int) -> Table:
         hits: dict[str, list[bool]] = defaultdict(list)
         for number in range(min(teams - 1, 20)):
             own, other = records[number], records[number + 1]
+            rest = [*honest[number + 2 :], *honest[:number]][:IN_CLASS]
             whole = tuple(disguised(r, rng, **options) for r in own)
-            hits["whole"].append(bool(find_shared([honest[number], prints("w", whole)])))
+            hits["whole"].append("w" in find_shared([honest[number], prints("w", whole), *rest]))
             for kind in COPIED_KINDS:
                 one = disguised(next(r for r in own if r.kind == kind), rng, **options)
                 mixed = prints("m", (*other[:6], one))
-                hits[kind].append("m" in find_shared([honest[number], mixed]))
+                hits[kind].append("m" in find_shared([honest[number], mixed, *rest]))
         rows.append([name, *(f"{100 * np.mean(found):.0f} %" for found in hits.values())])
     return Table(
         title="Copied recordings",
@@ -221,7 +223,8 @@ def copies(base: Path, *, teams: int) -> Table:
         note=f"""
 {teams} honest teams on one bench of two carts, every third with friction hidden in it: {false}
 false pairs of {pairs}. Then copies of {min(teams - 1, 20)} of them, all recordings or one among six
-of another team's own. Noise is in encoder counts, added to what was read.
+of another team's own, in a class of {min(teams, IN_CLASS + 2)}. Noise is in encoder counts, added
+to what was read.
 """,
     )
 

@@ -93,7 +93,7 @@ def _hidden(flag: Flag, names: Mapping[str, str]) -> Flag:
     return Flag(
         code=flag.code,
         parameters=flag.parameters,
-        message=shared_message(flag.parameters, others),
+        message=shared_message(recordings, others),
         evidence={"submissions": others, "recordings": recordings},
     )
 

@@ -72,8 +72,8 @@ def with_recordings(doubles: Iterable[Double], prints: Iterable[Member]) -> list
         replace(
             double,
             recordings=max(
-                len({r.experiment for r in shared.get(name, ()) if r.other in double.submissions})
-                for name in double.submissions
+                len({r.experiment for r in shared.get(a, ()) if r.submission in double.submissions})
+                for a in double.submissions
             ),
             compared=read.issuperset(double.submissions),
         )

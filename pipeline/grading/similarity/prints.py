@@ -9,7 +9,7 @@ import json
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -24,8 +24,9 @@ PASSED = 0.6  # of the band
 _TAPS, _WINDOW = 41, 7.0
 MARGIN = _TAPS // 2  # samples lost at either end
 
-_LEVELS = 5  # a residual is kept as -5 … 5, in steps of two thirds of a standard deviation
-_STEPS_PER_SIGMA = 1.5
+STEPS_PER_SIGMA = 100.0  # fine enough to see a sensor's noise beside knocks that repeat
+_STORED = np.dtype("<i2")
+_MOST_STEPS = np.iinfo(_STORED).max
 _KINK = 4.5  # standard deviations: more is the motion's own kink (a step, a stop), not noise
 _JUMP = 30.0  # standard deviations: no cart kinks so, but the input where the reference steps
 _NOTHING = 1e-7  # of the travel: rounding in the filter
@@ -35,7 +36,7 @@ _FEW_TURNS, _PARTS = 5, (0.5, 0.3, 0.7)  # of a swing, where there are few of th
 _MOST_ANCHORS = 12  # in the motion
 _NOISE_ANCHORS, _APART = 6, 5  # samples
 _FEWEST_SAMPLES = 60
-_FINE = 80.0  # residual steps that a cart swings: a dozen encoder steps, where those are the noise
+_EVERY = 8  # samples, of which the motion is kept
 _MOST_SAMPLES = 8192  # of one record; more does not make it surer
 _MOST_VALUES = 2_000_000  # of one submission: sixty such records of four carts
 
@@ -47,27 +48,48 @@ class Print:
     Attributes
     ----------
     group : what was done: only recordings of the same kind of run are compared.
-    residual : (n_rows, n) whole numbers -5 … 5; 0 also where the motion has a kink. A row for each
-        free cart, or one for the input.
+    residual : (n_rows, n) whole numbers. A row for each free cart, and one for the
+        input of a closed loop.
     step : (n_rows,) what 1 stands for, in the record's position unit, or input unit.
-    anchors : (n_anchors,) samples that are found again in a copy, the surest first, and so tell
-        how it is shifted: where the motion passes the middle between two extrema (they stand
-        much noise), in turn with where the noise is loudest (they stand any cut).
-    swing : (n_anchors,) from extremum to extremum, signed: it tells how two recordings are
-        scaled; 0 for an anchor in the noise.
+    anchors : two lists of samples that are found again in a copy, the surest first, and so tell how
+        it is shifted: where the motion passes the middle between two extrema (they stand much
+        noise), and where the noise is loudest (they stand any cut).
+    motion : of the first cart, every so many samples: it tells how two recordings are scaled.
+    start, interval : s; the time of the first sample, and from one to the next.
     """
 
     experiment: str
     group: str
     residual: np.ndarray
     step: Array
-    anchors: np.ndarray
-    swing: Array
+    anchors: tuple[list[int], list[int]]
+    motion: Array
+    start: float
+    interval: float
 
     @property
-    def is_coarse(self) -> bool:
-        """Whether the motion is so few encoder steps that it alone says when each is passed."""
-        return bool(np.max(np.abs(self.swing), initial=0.0) < _FINE * self.step[0])
+    def measured(self) -> np.ndarray:
+        """The residual's rows of positions: the input is computed from them, not measured."""
+        return self.residual[: -1 if self.group.startswith("closed_loop") else None]
+
+    @cached_property
+    def noise(self) -> np.ndarray:
+        """The residual (n_rows, n) in standard deviations, 0 where a kink or a jump rings in it."""
+        sigmas = self.residual.astype(np.float32) / STEPS_PER_SIGMA
+        for row in sigmas:
+            rings = np.convolve(np.abs(row) > _JUMP, np.ones(_TAPS), "same") > 0
+            row[rings | (np.abs(row) >= _KINK)] = 0.0
+        return sigmas
+
+    def times(self, first: int, last: int) -> tuple[float, float]:
+        """Return the times of one sample and of another, s."""
+        start, end = (round(self.start + at * self.interval, 3) for at in (first, last - 1))
+        return start, end
+
+    def spread(self, first: int, last: int) -> float:
+        """Return the standard deviation of the motion from one sample to another."""
+        part = self.motion[first // _EVERY : last // _EVERY + 1]
+        return float(np.linalg.norm(part - part.mean())) / part.size**0.5
 
 
 def fingerprint(records: Sequence[Record]) -> bytes:
@@ -83,8 +105,10 @@ def fingerprint(records: Sequence[Record]) -> bytes:
             "group": one.group,
             "shape": one.residual.shape,
             "step": one.step.tolist(),
-            "anchors": one.anchors.tolist(),
-            "swing": one.swing.tolist(),
+            "start": one.start,
+            "interval": one.interval,
+            "anchors": one.anchors,
+            "motion": [float(f"{x:.3g}") for x in one.motion],
         }
         for one in prints
     ]
@@ -93,70 +117,67 @@ def fingerprint(records: Sequence[Record]) -> bytes:
 
 
 def unpack(packed: bytes) -> tuple[Print, ...]:
-    """Return the fingerprints that `fingerprint` packed."""
+    """Return the fingerprints that `fingerprint` packed, none of those of an older version."""
     if not packed:
         return ()
     head, _, body = zlib.decompress(packed).partition(b"\0")
     prints, at = [], 0
     for entry in json.loads(head):
+        if "interval" not in entry:
+            return ()
         rows, columns = entry["shape"]
-        residual = np.frombuffer(body, np.int8, rows * columns, at).reshape(rows, columns)
-        at += residual.size
+        residual = np.frombuffer(body, _STORED, rows * columns, at).reshape(rows, columns)
+        at += residual.nbytes
         prints.append(
             Print(
                 experiment=entry["experiment"],
                 group=entry["group"],
                 residual=residual,
                 step=np.array(entry["step"]),
-                anchors=np.array(entry["anchors"], dtype=np.int64),
-                swing=np.array(entry["swing"]),
+                anchors=tuple(entry["anchors"]),
+                motion=np.array(entry["motion"]),
+                start=entry["start"],
+                interval=entry["interval"],
             )
         )
     return tuple(prints)
 
 
 def _prints(record: Record, *, most: int) -> Iterator[Print]:
-    """Yield the fingerprints of a recording: of its motion, and of an input made of its noise.
+    """Yield the fingerprint of a recording; none where a cart does not move or it is too short.
 
-    None where nothing moves or it is too short. Under feedback the controller puts the noise of
-    the measured positions into the input, where noise added to the positions does not reach it.
+    Under feedback the controller puts the noise of the measured positions into the input, where
+    noise added to the positions does not reach it.
     """
     carts = [cart for cart in record.free if cart in record.carts]
     if not carts or record.t.size < _FEWEST_SAMPLES + 2 * MARGIN:
         return
     frequency = "" if record.omega is None else f"{record.omega / (2 * np.pi):.3g} Hz"
-    group = f"{record.kind} {','.join(map(str, carts))} {frequency}"
-    positions = [record.position(cart) for cart in carts]
-    yield from _print(record, positions, group=group, most=most)
-    if record.kind == "closed_loop" and record.u is not None:
-        yield from _print(record, [record.u], group=f"{group}input", most=most)
-
-
-def _print(record: Record, signals: Sequence[Array], *, group: str, most: int) -> Iterator[Print]:
-    """Yield the fingerprint of some signals of a recording; none where one has no noise."""
+    signals = [record.position(cart) for cart in carts]
+    if record.kind == "closed_loop":
+        signals.append(np.zeros_like(record.t) if record.u is None else record.u)
     y = np.array(signals)[:, : most + 2 * MARGIN]
     noise = np.array([np.convolve(row, _high_pass(), "valid") for row in y])
     sigma = np.array(
         [_sigma(one, travel=float(np.ptp(row))) for one, row in zip(noise, y, strict=True)]
     )
-    if not np.all(sigma > 0):
+    if not np.all(sigma[: len(carts)] > 0):
         return
+    steered = len(signals) > len(carts) and sigma[-1] > 0
+    noise[sigma == 0], sigma[sigma == 0] = 0.0, 1.0
     sigmas = noise / sigma[:, None]
-    # Every run has the jump of an input, and what of it rings in the filter.
-    rings = [np.convolve(np.abs(row) > _JUMP, np.ones(_TAPS), "same") > 0 for row in sigmas]
-    telling = (np.abs(sigmas) < _KINK) & ~np.array(rings)
-    anchors, swing = _in_turn(
-        _motion_anchors(y[0, MARGIN:-MARGIN] - noise[0]),
-        _noise_anchors(np.abs(sigmas).sum(axis=0)),
-    )
-    levels = np.clip(np.round(_STEPS_PER_SIGMA * sigmas), -_LEVELS, _LEVELS)
+    motion = y[0, MARGIN:-MARGIN] - noise[0]
+    loudness = np.abs(sigmas[len(carts) :] if steered else sigmas).sum(axis=0)
+    steps = np.clip(np.round(STEPS_PER_SIGMA * sigmas), -_MOST_STEPS, _MOST_STEPS)
     yield Print(
         experiment=record.id,
-        group=group,
-        residual=np.where(telling, levels, 0).astype(np.int8),
-        step=sigma / _STEPS_PER_SIGMA,
-        anchors=anchors,
-        swing=swing,
+        group=f"{record.kind} {','.join(map(str, carts))} {frequency}",
+        residual=steps.astype(_STORED),
+        step=sigma / STEPS_PER_SIGMA,
+        anchors=(_motion_anchors(motion), _noise_anchors(loudness)),
+        motion=motion[::_EVERY],
+        start=float(record.t[MARGIN]),
+        interval=record.sample_time,
     )
 
 
@@ -179,37 +200,23 @@ def _high_pass() -> Array:
     return taps - taps.mean()
 
 
-def _in_turn(
-    first: tuple[np.ndarray, Array], second: tuple[np.ndarray, Array]
-) -> tuple[np.ndarray, Array]:
-    """Return two lists of anchors and swings as one, taking from them in turn."""
-    rank = np.concatenate([np.arange(anchors.size) for anchors, _ in (first, second)])
-    order = np.argsort(rank, kind="stable")
-    return np.concatenate([first[0], second[0]])[order], np.concatenate([first[1], second[1]])[
-        order
-    ]
-
-
-def _noise_anchors(loudness: Array) -> tuple[np.ndarray, Array]:
+def _noise_anchors(loudness: Array) -> list[int]:
     """Return the samples where the residual (n,) is loudest, a kink of the motion included."""
     peak = np.max(np.lib.stride_tricks.sliding_window_view(loudness, 2 * _APART + 1), axis=1)
     peaks = _APART + np.flatnonzero(loudness[_APART:-_APART] == peak)
-    loudest = peaks[np.argsort(-loudness[peaks], kind="stable")[:_NOISE_ANCHORS]]
-    return loudest, np.zeros(loudest.size)
+    return peaks[np.argsort(-loudness[peaks], kind="stable")[:_NOISE_ANCHORS]].tolist()
 
 
-def _motion_anchors(motion: Array) -> tuple[np.ndarray, Array]:
-    """Return where the motion (n,) passes through its larger swings, and those swings."""
+def _motion_anchors(motion: Array) -> list[int]:
+    """Return where the motion (n,) passes through its larger swings."""
     turns = _turning_points(motion, least=_LEAST_SWING * float(np.ptp(motion)))
     parts = (0.5,) if turns.size > _FEW_TURNS else _PARTS
-    places, swings = [], []
+    places = []
     for start, end in pairwise(turns.tolist()):
         swing = float(motion[end] - motion[start])
         done = (motion[start : end + 1] - motion[start]) / swing
-        places += [start + int(np.argmax(done >= part)) for part in parts]
-        swings += [swing] * len(parts)
-    largest = np.argsort(-np.abs(swings), kind="stable")[:_MOST_ANCHORS]
-    return np.array(places, dtype=np.int64)[largest], np.array(swings)[largest]
+        places += [(-abs(swing), start + int(np.argmax(done >= part))) for part in parts]
+    return [at for _, at in sorted(places, key=lambda one: one[0])[:_MOST_ANCHORS]]
 
 
 def _turning_points(motion: Array, *, least: float) -> np.ndarray:

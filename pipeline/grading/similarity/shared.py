@@ -1,21 +1,27 @@
 """Recordings that stand in two submissions: found by their noise, named on both sides.
 
-A copy has the noise of its original, whatever noise was added on top: the regression of one
-residual on the other, brought to one scale, has slope one. Two honest runs share at most what the
-motion and the encoder's rounding leave in the residuals: with noise a slope well below a half.
-Without noise, on a bench that repeats its motion to within a count, it is whatever their zeros
-make of it, and the recordings that agree only in part, or disagree, show that this is so.
+Noise convicts where it agrees wholly beyond what the class shares, and nobody's agrees in part;
+equal rows convict whatever else is found. In a class of less than five teams only they do.
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cache
+from typing import Any
 
 import numpy as np
-from scipy.fft import next_fast_len
 
 from pipeline.grading.gradings import Member
 from pipeline.grading.intake.lms_names import same_number
+from pipeline.grading.similarity.likeness import (
+    LEAST_OVERLAP,
+    LEAST_SLOPE,
+    Likeness,
+    align,
+    compare,
+    equal_rows,
+)
 from pipeline.grading.similarity.prints import PASSED, Print, unpack
 from pipeline.names import first_few
 from pipeline.schemas.grade import Flag
@@ -23,6 +29,7 @@ from pipeline.schemas.grade import Flag
 _WIDTH = 512  # samples around an anchor that are compared at first
 _BEFORE = 128  # of them before it
 _FIRST_IN_MOTION, _FIRST_IN_NOISE = 2, 1  # anchors that all of the others are held against
+_PER_SIGMA, _LEVELS = 1.5, 5.0  # noise at first sight: in finer levels rounding looks alike
 _BLOCK = 2048  # anchors compared in one product
 _WORTH_A_LOOK = 3.2  # sigmas at first sight: one in a thousand by chance
 # The rest of the work grows with the number of recordings, not with its square. Chance offers so
@@ -30,34 +37,40 @@ _WORTH_A_LOOK = 3.2  # sigmas at first sight: one in a thousand by chance
 # that kind each a tenth of what is compared at most.
 _MOST_ALIKE = 16  # first anchors looked at for one anchor, the most alike; and what was handed out
 _MOST_COMPARED = 10  # times the recordings that two submissions have of one kind
-_LEAST_OVERLAP = 80  # samples that say something in both
-_LEAST_SLOPE = 0.5
-# Read from zeros δ counts apart, one motion without noise is rounded to a slope of 1 - 6 δ + 6 δ²:
-# one in five has 0.5 and more, one in two is in these bounds. With noise of 0.2 counts ± 0.09 is
-# left of it, and none.
-_LEAST_IN_PART, _MOST_IN_PART = 0.2, 0.4  # or below minus the least
-_MATCHES_TO_IN_PART = 10  # no chance, if that many agree wholly for each pair that does in part
-_NEARBY = 50  # shifts to either side that show how well chance does here
-_OWN_WIDTH = 2  # shifts next to the right one see the same match
 _COUNTS = 4.5  # sigmas of a recording that counts with others
 _ALONE = 6.5  # … by itself: a class of 200 offers 1e9 comparisons, chance reaches 6.1 in them
 _TOGETHER = 7.5  # root of the summed squares of several
+# Where noise of a twenty-fifth of a count meets the very same motion and zero, one reading in so
+# many is rounded otherwise: chance e^-1 for as many equal ones, in each pair of recordings.
+_TO_A_ROUNDING = 22
+_MOST_ALIGNED = 60  # recordings of others that are looked at
+_MOST_OTHERS = 24  # of them that explain
+_FEWEST_TEAMS = 3  # of them
+_COPIES = 1 / 3  # of the other teams, the most alike: they may have the same copy
+_MOST_IN_PART = 1  # pair of a class whose noise agrees in part: two knocks may meet once
+_MATCHES_TO_IN_PART = 10  # no chance, if that many agree wholly for each pair that does in part
 
 
 @dataclass(frozen=True, kw_only=True)
 class SharedRecord:
     """A recording of one submission that is one of another's, too.
 
-    `sigmas` says how far above chance they agree.
+    Attributes
+    ----------
+    submission : the other one.
+    sigmas : how far above chance their noise agrees.
+    equal_rows : how many rows in turn are equal, but for one factor a column; 0 where that is not
+        the evidence.
+    time, other_time : s, from and to, where they are equal or agree.
     """
 
     experiment: str
-    other: str
+    submission: str
     other_experiment: str
     sigmas: float
-
-
-_Match = tuple[float, str, str]  # sigmas, the experiment in the one and in the other submission
+    equal_rows: int
+    time: tuple[float, float]
+    other_time: tuple[float, float]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -66,6 +79,10 @@ class _Entry:
 
     owner: int
     print: Print
+
+
+# How alike, whose, the recording, and how it is shifted.
+_Aligned = tuple[float, int, Print, int]
 
 
 def find_shared(
@@ -94,37 +111,40 @@ def find_shared(
             once.setdefault((one.group, one.residual.tobytes()), one)
         for one in once.values():
             groups[one.group].append(_Entry(owner=owner, print=one))
-    matches: dict[tuple[int, int], list[_Match]] = defaultdict(list)
+    matches: dict[tuple[int, int], list[Likeness]] = defaultdict(list)
     for _, entries in sorted(groups.items()):
-        for a, b, sigmas in _matches(
+        for pair, likeness in _matches(
             entries, first_batch=len(batch), everyone=len(everyone), owners=owners
         ):
-            matches[a.owner, b.owner].append((sigmas, a.print.experiment, b.print.experiment))
+            matches[pair].append(likeness)
+    matches = _telling(matches)
+    compared = sum(len(entries) ** 2 for entries in groups.values())
     given = {
-        (a, experiment)
+        (a, one.experiments[0])
         for (a, b), found in matches.items()
         if b >= len(everyone)
-        for sigmas, experiment, _ in found
-        if sigmas >= _ALONE
+        for one in found
+        if one.equal_rows or one.sigmas >= _ALONE
     }
     shared: dict[str, list[SharedRecord]] = defaultdict(list)
-    for (a, b), found in sorted(matches.items()):
-        if b >= len(everyone):
-            continue
-        own = [m for m in found if (a, m[1]) not in given and (b, m[2]) not in given]
-        for sigmas, in_a, in_b in _decisive(own):
-            for owner, other, mine, theirs in ((a, b, in_a, in_b), (b, a, in_b, in_a)):
-                if owner < len(batch):
+    for pair, found in sorted(matches.items()):
+        own = [one for one in found if given.isdisjoint(zip(pair, one.experiments, strict=True))]
+        for one in _decisive(own, compared=compared) if pair[1] < len(everyone) else ():
+            for mine, other in ((0, 1), (1, 0)):
+                if pair[mine] < len(batch):
                     record = SharedRecord(
-                        experiment=mine,
-                        other=names[other],
-                        other_experiment=theirs,
-                        sigmas=sigmas,
+                        experiment=one.experiments[mine],
+                        submission=names[pair[other]],
+                        other_experiment=one.experiments[other],
+                        sigmas=round(one.sigmas, 1),
+                        equal_rows=one.equal_rows,
+                        time=one.times[mine],
+                        other_time=one.times[other],
                     )
-                    shared[names[owner]].append(record)
+                    shared[names[pair[mine]]].append(record)
     return {
-        submission: tuple(sorted(found, key=lambda r: (r.other, r.experiment, r.other_experiment)))
-        for submission, found in sorted(shared.items())
+        name: tuple(sorted(found, key=lambda r: (r.submission, r.experiment, r.other_experiment)))
+        for name, found in sorted(shared.items())
     }
 
 
@@ -134,34 +154,31 @@ def _handed_out(packed: bytes) -> Member:
 
 def shared_flag(records: Sequence[SharedRecord]) -> Flag:
     """Return the flag of one submission: which recordings, and where else they stand."""
-    experiments = tuple(dict.fromkeys(record.experiment for record in records))
-    others = list(dict.fromkeys(record.other for record in records))
+    recordings = [asdict(record) for record in records]
+    others = list(dict.fromkeys(record.submission for record in records))
     return Flag(
         code="shared_data",
-        parameters=experiments,
-        message=shared_message(experiments, others),
-        evidence={
-            "submissions": others,
-            "recordings": [
-                {
-                    "experiment": record.experiment,
-                    "submission": record.other,
-                    "other_experiment": record.other_experiment,
-                    "sigmas": round(record.sigmas, 1),
-                }
-                for record in records
-            ],
-        },
+        parameters=tuple(dict.fromkeys(record.experiment for record in records)),
+        message=shared_message(recordings, others),
+        evidence={"submissions": others, "recordings": recordings},
     )
 
 
-def shared_message(experiments: Sequence[str], others: Iterable[str]) -> str:
-    """Return the sentence for recordings that stand in other submissions."""
+def shared_message(recordings: Sequence[Mapping[str, Any]], others: Iterable[str]) -> str:
+    """Return the sentence for recordings that stand in other submissions, with the best evidence.
+
+    `recordings` as in the evidence of a flag; a gradebook may hold some without times.
+    """
+    experiments = list(dict.fromkeys(one["experiment"] for one in recordings))
     stand = "stands" if len(experiments) == 1 else "stand"
+    best = max(recordings, key=lambda one: (one.get("equal_rows", 0), one["sigmas"]))
+    when = "of {:g} s to {:g} s".format(*best["time"]) if "time" in best else "there"
+    rows = best.get("equal_rows", 0)
+    same = f"{rows} rows in turn are equal" if rows else "the noise is the same"
     return (
-        f"{first_few(experiments, 4)} also {stand} in {', '.join(others)}: the noise of the "
-        "recordings is the same. That does not say whose they are; if they were shared for a "
-        "reason, say so."
+        f"{first_few(experiments, 4)} also {stand} in {', '.join(others)}: "
+        f"{same}, those {when} in {best['experiment']}. "
+        "That does not say whose they are; if they were shared for a reason, say so."
     )
 
 
@@ -169,7 +186,7 @@ def told(flag: Flag) -> str:
     """Return what a student reads of a flag: whose the other submission is, the instructor says."""
     if flag.code != "shared_data":
         return flag.message
-    return shared_message(flag.parameters, ["another submission"])
+    return shared_message(flag.evidence["recordings"], ["another submission"])
 
 
 def same_team(a: Member, b: Member) -> bool:
@@ -188,24 +205,41 @@ def same_team(a: Member, b: Member) -> bool:
 def same_recordings(a: Member, b: Member) -> bool:
     """Tell whether one of two submissions has all recordings of the other, untouched."""
     of_a, of_b = ({one.residual.tobytes() for one in unpack(p.fingerprints)} for p in (a, b))
-    return of_a <= of_b or of_b <= of_a
+    return bool(of_a and of_b) and (of_a <= of_b or of_b <= of_a)
 
 
-def _decisive(found: Sequence[_Match]) -> list[_Match]:
+def _telling(
+    matches: Mapping[tuple[int, int], Sequence[Likeness]],
+) -> dict[tuple[int, int], list[Likeness]]:
+    """Return what tells a copy, of all that looks alike in a class, by pair of submissions.
+
+    Where the noise of several agrees in part, the bench or its encoder makes it do so, and says
+    nothing of those that agree wholly. Equal rows are a copy whatever else is found.
+    """
+    sure = [one for found in matches.values() for one in found if one.is_sure]
+    whole = sum(one.is_whole for one in sure)
+    if len(sure) - whole > max(_MOST_IN_PART, whole // _MATCHES_TO_IN_PART):
+        matches = {pair: [replace(o, slope=0.0) for o in found] for pair, found in matches.items()}
+    return {
+        pair: [one for one in found if one.equal_rows or one.is_whole]
+        for pair, found in matches.items()
+    }
+
+
+def _decisive(found: Sequence[Likeness], *, compared: int) -> list[Likeness]:
     """Return the matches of one pair of submissions, one for each recording, if they suffice.
 
-    They do not where further recordings agree in part: the bench then repeats its motion to
-    within a count, with little noise, and that some are rounded alike is a matter of the zeros.
+    `compared` is how many pairs of recordings there are in which chance may have had its way.
     """
-    chosen: list[_Match] = []
-    for match in sorted(found, key=lambda m: (-m[0], m[1:])):
-        if match[0] > 0 and all(match[1] != c[1] and match[2] != c[2] for c in chosen):
-            chosen.append(match)
-    if len(chosen) <= _MATCHES_TO_IN_PART * sum(sigmas < 0 for sigmas, _, _ in found):
-        return []
-    together = float(np.sqrt(sum(sigmas**2 for sigmas, _, _ in chosen)))
-    enough = chosen and (chosen[0][0] >= _ALONE or together >= _TOGETHER)
-    return chosen if enough else []
+    chosen: list[Likeness] = []
+    for one in sorted(found, key=lambda one: (-one.different, -one.sigmas, one.experiments)):
+        a, b = one.experiments
+        if all(a != c.experiments[0] and b != c.experiments[1] for c in chosen):
+            chosen.append(one)
+    sigmas = [one.sigmas for one in chosen if one.is_whole]
+    noise = max(sigmas, default=0.0) >= _ALONE or np.linalg.norm(sigmas) >= _TOGETHER
+    equal = sum(one.different for one in chosen) >= _TO_A_ROUNDING * np.log(max(compared, 2))
+    return chosen if noise or equal else []
 
 
 # ------------------------------------------------------------------- candidates
@@ -213,14 +247,17 @@ def _decisive(found: Sequence[_Match]) -> list[_Match]:
 
 def _matches(
     entries: Sequence[_Entry], *, first_batch: int, everyone: int, owners: Sequence[Member]
-) -> Iterator[tuple[_Entry, _Entry, float]]:
-    """Yield pairs of recordings of different teams that share their noise, with the sigmas.
-
-    Those that share only a part of it, as one motion's rounding does, have negative ones.
-    """
-    best: dict[tuple[int, int], float] = {}
+) -> Iterator[tuple[tuple[int, int], Likeness]]:
+    """Yield pairs of recordings of different teams that look alike, with their owners."""
+    best: dict[tuple[int, int], Likeness] = {}
+    alike: dict[tuple[int, int], float] = defaultdict(lambda: _COUNTS)  # at first comparison
     seen: set[tuple[int, int, int]] = set()
-    apart: dict[tuple[int, int], bool] = {}
+    aligned: dict[int, list[_Aligned]] = {}
+
+    @cache
+    def same(a: int, b: int) -> bool:
+        return same_team(owners[a], owners[b])
+
     partner: dict[tuple[int, int], int] = {}  # of a recording, in a submission: surely a copy
     compared: Counter[tuple[int, int]] = Counter()
     recordings = Counter(entry.owner for entry in entries)
@@ -229,10 +266,8 @@ def _matches(
         if a.owner > b.owner:
             i, anchor_i, j, anchor_j, a, b = j, anchor_j, i, anchor_i, b, a
         pair = (a.owner, b.owner)
-        if pair not in apart:
-            apart[pair] = pair[0] < first_batch and not same_team(*(owners[o] for o in pair))
-        shift = int(b.print.anchors[anchor_j] - a.print.anchors[anchor_i])
-        if not apart[pair] or (i, j, shift) in seen:
+        shift = anchor_j - anchor_i
+        if pair[0] >= first_batch or same(*pair) or (i, j, shift) in seen:
             continue
         seen.add((i, j, shift))
         if partner.get((i, b.owner), j) != j or partner.get((j, a.owner), i) != i:
@@ -240,15 +275,47 @@ def _matches(
         compared[pair] += 1
         if compared[pair] > _MOST_COMPARED * (recordings[a.owner] + recordings[b.owner]):
             continue
-        in_a, in_b = a.print.swing[anchor_i], b.print.swing[anchor_j]
-        scale = float(in_b / in_a) if in_a and in_b else None
-        sigmas = _agreement(a.print, b.print, shift=shift, scale=scale)
-        if abs(sigmas) >= _COUNTS:
-            best[i, j] = max(sigmas, best.get((i, j), sigmas))
-        if sigmas >= _ALONE:
+        likeness = compare(a.print, b.print, shift=shift)
+        if likeness.slope < LEAST_SLOPE or likeness.sigmas <= alike[i, j]:
+            continue
+        alike[i, j] = likeness.sigmas
+        equal = equal_rows(a.print, b.print, shift=shift)
+        if i not in aligned:
+            aligned[i] = _aligned(entries, i)
+        teams = {o for _, o, _, _ in aligned[i] if not any(same(o, own) for own in pair)}
+        if others := _others([one for one in aligned[i] if one[1] in teams]):
+            likeness = compare(a.print, b.print, shift=shift, others=others)
+        else:
+            likeness = replace(likeness, slope=0.0)
+        if equal:
+            likeness = replace(equal, slope=likeness.slope, sigmas=likeness.sigmas)
+        best[i, j] = likeness
+        if likeness.equal_rows or (likeness.is_whole and likeness.sigmas >= _ALONE):
             partner[i, b.owner], partner[j, a.owner] = j, i
-    for (i, j), sigmas in sorted(best.items()):
-        yield entries[i], entries[j], sigmas
+    for (i, j), likeness in sorted(best.items(), key=lambda one: one[0]):
+        yield (entries[i].owner, entries[j].owner), likeness
+
+
+def _aligned(entries: Sequence[_Entry], i: int) -> list[_Aligned]:
+    """Return recordings of others beside one of them, the most alike first."""
+    rest = [one for one in entries if one.owner != entries[i].owner]
+    found = []
+    for one in rest[:: max(1, len(rest) // _MOST_ALIGNED)]:
+        alike, shift = align(entries[i].print, one.print)
+        found.append((alike, one.owner, one.print, shift))
+    return sorted(found, key=lambda one: -one[0])
+
+
+def _others(aligned: Sequence[_Aligned]) -> list[tuple[Print, int]]:
+    """Return the recordings that say what a class shares, with their shifts; none of a small one.
+
+    The most alike may be of teams that have the same copy, and are left out.
+    """
+    teams = list(dict.fromkeys(owner for _, owner, _, _ in aligned))
+    if len(teams) < _FEWEST_TEAMS:
+        return []
+    kept = teams[min(int(len(teams) * _COPIES), len(teams) - _FEWEST_TEAMS) :]
+    return [(one, shift) for _, owner, one, shift in aligned if owner in kept][:_MOST_OTHERS]
 
 
 def _candidates(entries: Sequence[_Entry], *, everyone: int) -> Iterator[tuple[int, int, int, int]]:
@@ -260,12 +327,10 @@ def _candidates(entries: Sequence[_Entry], *, everyone: int) -> Iterator[tuple[i
     What was handed out, by owners beyond `everyone`, is never crowded out by those who used it.
     """
     owners = np.array([entry.owner for entry in entries])
-    for in_motion, n_first in ((True, _FIRST_IN_MOTION), (False, _FIRST_IN_NOISE)):
-        places, first = [], []
-        for i, entry in enumerate(entries):
-            anchors = np.flatnonzero((entry.print.swing != 0) == in_motion).tolist()
-            places += [(i, k) for k in anchors]
-            first += [(i, k) for k in anchors[:n_first]]
+    for kind, n_first in enumerate((_FIRST_IN_MOTION, _FIRST_IN_NOISE)):
+        anchors = [one.print.anchors[kind] for one in entries]
+        places = [(i, at) for i, own in enumerate(anchors) for at in own]
+        first = [(i, at) for i, own in enumerate(anchors) for at in own[:n_first]]
         if not places:
             continue
         columns = _windows(entries, first).T
@@ -292,59 +357,12 @@ def _windows(entries: Sequence[_Entry], places: Sequence[tuple[int, int]]) -> np
     """
     n_free = entries[0].print.residual.shape[0]
     windows = np.zeros((len(places), n_free, _WIDTH), dtype=np.float32)
-    for window, (i, k) in zip(windows, places, strict=True):
-        residual, start = entries[i].print.residual, int(entries[i].print.anchors[k]) - _BEFORE
+    for window, (i, at) in zip(windows, places, strict=True):
+        residual, start = entries[i].print.noise, at - _BEFORE
         part = residual[:, max(start, 0) : start + _WIDTH]
         window[:, max(-start, 0) : max(-start, 0) + part.shape[1]] = part
-    flat = windows.reshape(len(places), -1)
+    flat = np.clip(np.round(_PER_SIGMA * windows.reshape(len(places), -1)), -_LEVELS, _LEVELS)
     counts = np.count_nonzero(flat, axis=1)
     power = np.einsum("ij,ij->i", flat, flat)
     factor = (PASSED * counts) ** 0.25 / np.sqrt(np.maximum(power, 1.0))
-    return flat * np.where(counts >= _LEAST_OVERLAP, factor, 0.0).astype(np.float32)[:, None]
-
-
-# ----------------------------------------------------------------------- verdict
-
-
-def _agreement(a: Print, b: Print, *, shift: int, scale: float | None) -> float:
-    """Return by how many sigmas the noise of two recordings agrees; 0 where it is not one's own.
-
-    Where it agrees or disagrees in part, as the noise of no two runs and of no copy does, the
-    sigmas are negative.
-
-    Sample i of `a` is sample i + shift of `b`, `scale` times as large. Where the motion does not
-    tell the scale, that of the noise itself is taken: less further noise is then seen through.
-    """
-    first, last = max(0, -shift), min(a.residual.shape[1], b.residual.shape[1] - shift)
-    if last - first < _LEAST_OVERLAP:
-        return 0.0
-    # In units of b's noise, so that every cart has its say.
-    factor = np.ones(b.step.size) if scale is None else scale * a.step / b.step
-    in_a = a.residual[:, first:last] * factor[:, None]
-    in_b = b.residual[:, first + shift : last + shift].astype(np.float64)
-    in_b, in_a = in_b * (in_a != 0), in_a * (in_b != 0)
-    common = np.count_nonzero(in_a)
-    power_a, power_b = float(np.sum(in_a**2)), float(np.sum(in_b**2))
-    if common < _LEAST_OVERLAP:
-        return 0.0
-    product = float(np.sum(in_a * in_b))
-    slope = (abs(product) if scale is None else product) / min(power_a, power_b)
-    in_part = slope <= -_LEAST_IN_PART or _LEAST_IN_PART <= slope <= _MOST_IN_PART
-    chance = float(np.sqrt(power_a * power_b / (PASSED * common)))
-    whole = slope >= _LEAST_SLOPE and not (a.is_coarse and b.is_coarse)
-    if not (whole or in_part) or abs(product) < _COUNTS * chance:
-        return 0.0
-    sigmas = abs(product) / max(chance, _chance_nearby(in_a, in_b))
-    return -sigmas if in_part else sigmas
-
-
-def _chance_nearby(in_a: np.ndarray, in_b: np.ndarray) -> float:
-    """Return the root-mean-square product at other shifts: rounding repeats where motion does."""
-    n = in_a.shape[1]
-    shifts = np.arange(_OWN_WIDTH + 1, min(_NEARBY + 1, n // 2))
-    if not shifts.size:
-        return 0.0
-    length = next_fast_len(n + _NEARBY, real=True)
-    spectrum = np.fft.rfft(in_a, length) * np.conj(np.fft.rfft(in_b, length))
-    products = np.fft.irfft(spectrum.sum(axis=0), length)[np.concatenate([shifts, -shifts])]
-    return float(np.sqrt(np.mean(np.square(products))))
+    return flat * np.where(counts >= LEAST_OVERLAP, factor, 0.0).astype(np.float32)[:, None]

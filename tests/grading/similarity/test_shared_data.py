@@ -1,5 +1,7 @@
 """Shared recordings: found however disguised, and never where two teams only used one bench."""
 
+import json
+import zlib
 from dataclasses import replace
 
 import numpy as np
@@ -8,20 +10,27 @@ import pytest
 from pipeline.grading.gradings import Member
 from pipeline.grading.similarity import shared
 from pipeline.grading.similarity.prints import fingerprint, unpack
-from pipeline.grading.similarity.shared import find_shared, shared_flag
+from pipeline.grading.similarity.shared import find_shared, same_recordings, shared_flag
 from pipeline.ingest.read import read_data
 from pipeline.submission import load_submission
 from pipeline.synthesis import COUNT, write_submission
+from tests.helpers.bench_classes import move_class, read_class
 from tests.helpers.ucsd import write_two_cart_submission
 
 
 @pytest.fixture(scope="module")
 def teams(tmp_path_factory):
-    """The recordings of four teams that used the same bench in the same way."""
+    """The recordings of six teams that used the same bench in the same way."""
     folder = tmp_path_factory.mktemp("teams")
-    for seed in range(4):
+    for seed in range(6):
         write_submission(folder / str(seed), chain="throne-2dof", seed=seed, compact=True)
-    return [read_data(load_submission(folder / str(seed))).records for seed in range(4)]
+    return [read_data(load_submission(folder / str(seed))).records for seed in range(6)]
+
+
+@pytest.fixture(scope="module")
+def others(teams):
+    """Four teams of the class with whom nobody shares anything."""
+    return [prints(f"other-{number}", records) for number, records in enumerate(teams[2:])]
 
 
 def prints(name, records, authors=None):
@@ -129,18 +138,18 @@ def test_honest_teams_with_coarse_encoders_share_nothing(tmp_path, per_cm):
     ],
     ids=str,
 )
-def test_one_copied_recording_is_found_however_disguised(teams, kind, disguise):
+def test_one_copied_recording_is_found_however_disguised(teams, others, kind, disguise):
     """A single recording among honest ones is found, and named on both sides."""
     rng = np.random.default_rng(7)
     copied = disguised(of_kind(teams[0], kind), rng, **disguise)
-    found = find_shared([prints("a", teams[0]), prints("b", [*teams[1], copied])])
+    found = find_shared([prints("a", teams[0]), prints("b", [*teams[1], copied]), *others])
     (mine,), (theirs,) = found["b"], found["a"]
-    assert (mine.other, mine.other_experiment) == ("a", theirs.experiment)
-    assert (theirs.other, theirs.other_experiment) == ("b", mine.experiment)
+    assert (mine.submission, mine.other_experiment) == ("a", theirs.experiment)
+    assert (theirs.submission, theirs.other_experiment) == ("b", mine.experiment)
     assert mine.experiment == copied.id
 
 
-def test_under_feedback_the_input_gives_a_copy_away(teams):
+def test_under_feedback_the_input_gives_a_copy_away(teams, others):
     """The controller has made the input of the carts' noise: further noise in the carts is no veil.
 
     The start, where the reference steps, is cut off as well.
@@ -155,21 +164,18 @@ def test_under_feedback_the_input_gives_a_copy_away(teams):
         y=record.y[:, n:],
         reference=record.reference[n:],
     )
-    found = find_shared(
-        [prints("a", teams[0]), prints("b", [*teams[1], disguised(cut, rng, noise=1.0, scale=2.0)])]
-    )
+    copied = prints("b", [*teams[1], disguised(cut, rng, noise=1.0, scale=2.0)])
+    found = find_shared([prints("a", teams[0]), copied, *others])
     assert {r.experiment for r in found["a"]} == {record.id}
 
 
-def test_a_whole_copy_is_found_under_much_noise(teams):
+def test_a_whole_copy_is_found_under_much_noise(teams, others):
     """Noise of six times the encoder's own hides single recordings, not all of them."""
     rng = np.random.default_rng(8)
     copied = [disguised(r, rng, noise=1.5, scale=0.9, keep=0.8) for r in teams[0]]
-    found = find_shared(
-        [prints("a", teams[0]), prints("b", copied), *(prints(str(i), teams[i]) for i in (1, 2))]
-    )
+    found = find_shared([prints("a", teams[0]), prints("b", copied), *others])
     assert set(found) == {"a", "b"}
-    assert {record.other for record in found["a"]} == {"b"}
+    assert {record.submission for record in found["a"]} == {"b"}
 
 
 def test_teammates_and_repeats_do_not_count(teams):
@@ -197,7 +203,7 @@ def test_what_was_handed_out_may_be_used_by_all(teams):
 def test_what_was_handed_out_may_be_used_by_a_whole_class(teams):
     """However many hold the same recording, each is held against what was handed out."""
     rng = np.random.default_rng(11)
-    copies = [[disguised(r, rng, noise=0.1) for r in teams[0][:2]] for _ in range(40)]
+    copies = [[disguised(r, rng, scale=2.0, later=1.0) for r in teams[0][:2]] for _ in range(40)]
     batch = [prints(f"t{number:02d}", records) for number, records in enumerate(copies)]
     assert len(find_shared(batch)) == 40
     assert find_shared(batch, examples=[fingerprint(teams[0][:2])]) == {}
@@ -208,7 +214,7 @@ def test_earlier_batches_count(teams):
     old = [prints("x", teams[0]), prints("y", teams[0])]
     found = find_shared([prints("a", teams[0][:4])], earlier=old)
     assert set(found) == {"a"}
-    assert {r.other for r in found["a"]} == {"x (an earlier batch)", "y (an earlier batch)"}
+    assert {r.submission for r in found["a"]} == {"x (an earlier batch)", "y (an earlier batch)"}
     flag = shared_flag(found["a"])
     assert flag.parameters == tuple(r.id for r in teams[0][:4])
     assert "does not say whose" in flag.message
@@ -217,13 +223,13 @@ def test_earlier_batches_count(teams):
 @pytest.fixture
 def compared(monkeypatch):
     """Every two recordings that are compared sample by sample, at each shift anew."""
-    pairs, agreement = [], shared._agreement
+    pairs, compare = [], shared.compare
 
     def counted(a, b, **how):
         pairs.append((a.experiment, b.experiment))
-        return agreement(a, b, **how)
+        return compare(a, b, **how)
 
-    monkeypatch.setattr(shared, "_agreement", counted)
+    monkeypatch.setattr(shared, "compare", counted)
     return pairs
 
 
@@ -263,7 +269,78 @@ def test_real_repeats_on_one_bench_are_not_shared(real_data, tmp_path, kind):
     assert find_shared(teams) == {}
     copy = disguised(records[2], np.random.default_rng(3), scale=0.5, keep=0.8)
     found = find_shared([*teams, prints("copy", [copy])])
-    assert {r.other for r in found["copy"]} == {"2"}
+    assert {r.submission for r in found["copy"]} == {"2"}
+
+
+@pytest.fixture(scope="module")
+def knocking():
+    """Eight teams on a bench with backlash, whose knocks are as sharp as noise."""
+    moved = move_class("throne-1dof", "backlash", seeds=range(8), dwells=4)
+    return read_class(moved, seed=3)
+
+
+def test_the_knocks_of_a_bench_are_nobodys(knocking):
+    """Honest runs share them; a recording under noise is told from them as a copy all the same."""
+    honest = [prints(str(number), records) for number, records in enumerate(knocking)]
+    assert find_shared(honest) == {}
+    rng = np.random.default_rng(1)
+    copied = disguised(of_kind(knocking[0], "sweep"), rng, noise=0.5, keep=0.8)
+    found = find_shared([honest[0], prints("1", [*knocking[1], copied]), *honest[2:]])
+    assert set(found) == {"0", "1"}
+    assert [r.experiment for r in found["1"]] == [copied.id]
+
+
+@pytest.mark.parametrize("members", [2, 3])
+def test_a_small_class_is_told_of_equal_rows_only(teams, members):
+    """Two or three teams are no reference: the same noise under more of it could be the bench's."""
+    rng = np.random.default_rng(2)
+    record = of_kind(teams[0], "step")
+    others = [prints(str(number), teams[number]) for number in range(2, members)]
+    for noise, told in ((0.0, {"a", "b"}), (0.4, set())):
+        copied = disguised(record, rng, noise=noise, keep=0.8, later=2.0)
+        b = prints("b", [*teams[1], copied])
+        assert set(find_shared([prints("a", teams[0]), b, *others])) == told
+
+
+def test_three_of_six_may_have_the_same_copy(teams):
+    """Whoever has a copy, too, is no reference for the bench."""
+    record = of_kind(teams[0], "step")
+    rest = [prints(str(number), teams[number]) for number in range(3, 6)]
+    rng = np.random.default_rng(4)
+    copies = [
+        prints(f"copy-{number}", [*teams[number], disguised(record, rng, noise=0.0)])
+        for number in (1, 2)
+    ]
+    found = find_shared([prints("a", teams[0]), *copies, *rest])
+    assert {name: len(records) for name, records in found.items()} == {
+        "a": 2,
+        "copy-1": 2,
+        "copy-2": 2,
+    }
+
+
+def test_a_flag_names_what_can_be_checked(teams):
+    """Which rows of which times are equal stands in the evidence, and in the sentence."""
+    copied = disguised(of_kind(teams[0], "step"), np.random.default_rng(6), scale=10.0, later=3.0)
+    (record,) = find_shared([prints("a", teams[0]), prints("b", [copied])])["b"]
+    (evidence,) = shared_flag([record]).evidence["recordings"]
+    first, last = evidence["time"]
+    rows = (copied.t >= first - 0.001) & (copied.t <= last + 0.001)
+    assert evidence["equal_rows"] == np.count_nonzero(rows)
+    assert evidence["other_time"] == pytest.approx((first - 3.0, last - 3.0))
+    said = shared_flag([record]).message
+    assert f"{evidence['equal_rows']} rows in turn are equal" in said
+    assert f"{first:g} s to {last:g} s" in said
+
+
+def test_fingerprints_of_an_older_version_are_not_compared(teams):
+    """They lack what is compared; that they are there harms nobody."""
+    head = {"experiment": "step-1", "group": "step 1,2 ", "shape": [2, 3], "step": [1, 1]}
+    old = zlib.compress(json.dumps([head | {"anchors": [], "swing": []}]).encode() + bytes(7))
+    assert unpack(old) == ()
+    before = Member(submission="a", authors=("ann",), fingerprints=old)
+    assert not same_recordings(before, prints("a", teams[0][:1]))
+    assert find_shared([prints("a", teams[0][:1])], earlier=[before]) == {}
 
 
 def test_still_or_short_recordings_have_no_fingerprint(teams):
@@ -274,4 +351,4 @@ def test_still_or_short_recordings_have_no_fingerprint(teams):
     assert fingerprint([still, short]) == b""
     (kept,) = unpack(fingerprint([still, record]))
     assert kept.experiment == record.id
-    assert np.abs(kept.residual).max() <= 5
+    assert kept.residual.shape == (2, record.t.size - 40)

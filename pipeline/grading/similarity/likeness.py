@@ -1,0 +1,171 @@
+"""How alike two recordings are: in their noise, row by row, and beyond what a class shares.
+
+A copy has the noise of its original, whatever noise was added on top: the regression of one
+residual on the other, brought to one scale, has slope one. Honest runs share the bench: its knocks
+and limits are as sharp as noise and the same in every run, and an encoder with little noise of its
+own rounds one motion alike. So a class is its own reference: what the recordings of others explain
+of both is taken off, and slope and chance are told of the rest.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.fft import next_fast_len
+
+from pipeline.grading.similarity.prints import PASSED, STEPS_PER_SIGMA, Print
+
+LEAST_OVERLAP = 80  # samples that say something in both
+LEAST_SLOPE = 0.5
+_LEAST_SIGMAS = 4.5
+_SPREAD = 2.5  # standard deviations that the slope of a copy may be off one
+_SAMPLES_EACH = 10  # of a recording for each other one that is to explain it
+_RIDGE = 1e-6  # of a recording's power: recordings of others may be copies of one another
+_LEAST_PART = 1e-9  # of a recording's power that others leave
+_LEAST_NOISE = 0.5 * STEPS_PER_SIGMA  # where the scale of two recordings is read off
+# A residual is kept to half a step.
+_SAME_STEPS, _SAME_PART = 1.0, 0.003
+_EQUAL_PART = 0.5  # of the shorter recording
+_DIFFERENT_STEPS = 4  # that tell one reading from another
+
+
+@dataclass(frozen=True, kw_only=True)
+class Likeness:
+    """How alike two recordings are.
+
+    Attributes
+    ----------
+    slope : of the one's noise on the other's, of what the class does not explain.
+    sigmas : how far that is above chance.
+    experiments, times : of both; s, from and to, what is compared or equal.
+    equal_rows : how many rows in turn are equal but for one factor, 0 where they say too little.
+    different : how many readings of them differ from one another.
+    """
+
+    experiments: tuple[str, str]
+    times: tuple[tuple[float, float], tuple[float, float]]
+    slope: float = 0.0
+    sigmas: float = 0.0
+    equal_rows: int = 0
+    different: int = 0
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether chance and the class do not explain it."""
+        return self.sigmas >= _LEAST_SIGMAS and self.slope >= LEAST_SLOPE
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether it is sure, and a copy would be so alike."""
+        return self.is_sure and (1 - self.slope) * self.sigmas <= _SPREAD * self.slope
+
+
+def compare(
+    a: Print, b: Print, *, shift: int, others: Sequence[tuple[Print, int]] = ()
+) -> Likeness:
+    """Return how alike the noise of two recordings is, beyond what others' have of it.
+
+    Sample i of `a` is sample i + shift of `b`, and of each of the others i + its shift.
+    """
+    first, last = max(0, -shift), min(a.residual.shape[1], b.residual.shape[1] - shift)
+    found = _between(a, b, shift=shift, first=first, last=last)
+    if last - first < LEAST_OVERLAP:
+        return found
+    # In units of b's noise, so that every cart has its say; an input has a scale of its own.
+    of_a, of_b = a.spread(first, last), b.spread(first + shift, last + shift)
+    factor = (of_b / of_a if of_a > 0 else 1.0) * a.step / b.step
+    factor[len(a.measured) :] = 1.0
+    in_a = a.noise[:, first:last] * factor[:, None]
+    in_b = b.noise[:, first + shift : last + shift]
+    both = in_a * in_b != 0
+    n = np.count_nonzero(both, axis=1)
+    if n.sum() < LEAST_OVERLAP:
+        return found
+    in_a, in_b = in_a * both, in_b * both
+    x = np.stack([in_a, in_b], axis=1)
+    left = x @ x.transpose(0, 2, 1)
+    if others:
+        for row in np.flatnonzero(n).tolist():
+            beside = [
+                _part(c, row, first + s, last + s) for c, s in others[: n[row] // _SAMPLES_EACH]
+            ]
+            rest = _left(np.array([*x[row], *beside])[:, both[row]])
+            left[row] = rest * (n[row] / rest[1, 1] if rest[1, 1] > _LEAST_PART * n[row] else 0.0)
+            n[row] -= len(beside)
+    # The signs of carts and of the input may be turned.
+    product = sum(abs(float(part[:, 0, 1].sum())) for part in np.split(left, [len(a.measured)]))
+    of_a, of_b = np.diag(left.sum(axis=0)).tolist()
+    if not of_a * of_b > 0:
+        return found
+    chance = float(np.sqrt(of_a * of_b / (PASSED * n.sum())))
+    return replace(found, slope=product / min(of_a, of_b), sigmas=product / chance)
+
+
+def _between(a: Print, b: Print, *, shift: int, first: int, last: int) -> Likeness:
+    """Return two recordings' likeness, of which nothing is known but from where to where in `a`."""
+    return Likeness(
+        experiments=(a.experiment, b.experiment),
+        times=(a.times(first, last), b.times(first + shift, last + shift)),
+    )
+
+
+def _part(one: Print, row: int, first: int, last: int) -> np.ndarray:
+    """Return a row's noise from one sample to another, 0 where there is none."""
+    part = np.zeros(last - first, dtype=np.float32)
+    start, stop = max(first, 0), min(last, one.noise.shape[1])
+    if start < stop:
+        part[start - first : stop - first] = one.noise[row, start:stop]
+    return part
+
+
+def _left(x: np.ndarray) -> np.ndarray:
+    """Return the products (2, 2) of the first two rows, less what the further rows explain."""
+    products = x.astype(np.float64) @ x.T
+    size = np.sqrt(np.maximum(np.diag(products), 1.0))
+    products /= np.outer(size, size)
+    of_others = products[2:, 2:] + _RIDGE * np.eye(len(x) - 2)
+    explained = products[:2, 2:] @ np.linalg.solve(of_others, products[2:, :2])
+    return (products[:2, :2] - explained) * np.outer(size[:2], size[:2])
+
+
+def equal_rows(a: Print, b: Print, *, shift: int) -> Likeness | None:
+    """Return the longest stretch in which two recordings are equal but for one factor a row.
+
+    None where that says too little: rows that repeat, as a cart at rest makes them, are one.
+    """
+    first, last = max(0, -shift), min(a.residual.shape[1], b.residual.shape[1] - shift)
+    if last - first < LEAST_OVERLAP:
+        return None
+    in_a = a.measured[:, first:last].astype(np.float64)
+    in_b = b.measured[:, first + shift : last + shift].astype(np.float64)
+    equal = np.ones(last - first, dtype=bool)
+    for of_a, of_b in zip(in_a, in_b, strict=True):
+        loud = np.abs(of_a) >= _LEAST_NOISE
+        factor = float(np.median(of_b[loud] / of_a[loud])) if np.any(loud) else 0.0
+        most = _SAME_STEPS * (1 + abs(factor)) + _SAME_PART * np.abs(of_b)
+        equal &= np.abs(of_b - factor * of_a) <= most
+    ends = np.flatnonzero(np.diff(equal, prepend=False, append=False)).reshape(-1, 2)
+    if not ends.size:
+        return None
+    start, stop = ends[np.argmax(ends[:, 1] - ends[:, 0])].tolist()
+    rows = np.round(in_b[:, start:stop].T / _DIFFERENT_STEPS)
+    different = len(np.unique(np.hstack([rows[:-1], rows[1:]]), axis=0)) * len(in_b)
+    shorter = min(a.residual.shape[1], b.residual.shape[1])
+    if different < LEAST_OVERLAP or stop - start < _EQUAL_PART * shorter:
+        return None
+    return replace(
+        _between(a, b, shift=shift, first=first + start, last=first + stop),
+        equal_rows=stop - start,
+        different=different,
+    )
+
+
+def align(a: Print, b: Print) -> tuple[float, int]:
+    """Return how well the noise of two recordings agrees where it does best, and at what shift."""
+    n = a.residual.shape[1] + b.residual.shape[1]
+    length = next_fast_len(n, real=True)
+    spectrum = np.conj(np.fft.rfft(a.noise, length)) * np.fft.rfft(b.noise, length)
+    products = np.abs(np.fft.irfft(spectrum.sum(axis=0), length))
+    shift = int(np.argmax(products))
+    alike = float(products[shift]) / max(float(np.linalg.norm(b.noise)), 1.0)
+    return alike, shift if shift < b.residual.shape[1] else shift - products.size

@@ -1,0 +1,56 @@
+"""Classes on one bench each, whatever it does: nobody honest is accused, copied files are told."""
+
+from dataclasses import replace
+
+import pytest
+
+from pipeline.grading.gradings import Member
+from pipeline.grading.similarity.prints import fingerprint
+from pipeline.grading.similarity.shared import find_shared
+from pipeline.synthesis import COUNT
+from tests.helpers.bench_classes import BENCHES, USUAL_NOISE, move_class, read_class
+
+COPIED = ("decay-1a", "step-2", "sine-04", "sweep")
+COUNTS = (1 / 20, 1 / 50, 1 / 150, COUNT, 1 / 500)  # cm
+LONG = [pytest.mark.slow, pytest.mark.sample]
+SAMPLE = {
+    ("throne-1dof", "saturation"),
+    ("throne-2dof", "saturation"),
+    ("throne-2dof", "backlash"),
+    ("throne-3dof", "saturation"),
+}
+
+
+def member(name, records):
+    return Member(submission=name, authors=(f"s-{name}",), fingerprints=fingerprint(records))
+
+
+@pytest.mark.parametrize(
+    ("number", "bench"),
+    [
+        pytest.param(number, bench, marks=LONG if bench in SAMPLE else pytest.mark.slow)
+        for number, bench in enumerate(BENCHES)
+    ],
+    ids=lambda x: "-".join(x) if isinstance(x, tuple) else "",
+)
+def test_the_bench_is_no_copy_and_a_copy_is_no_bench(number, bench):
+    """Twelve honest teams are accused of nothing; four copied files are told, as equal.
+
+    One of them may have moved too little to tell.
+    """
+    preset, effect = bench
+    count = COUNT if bench in SAMPLE else COUNTS[number % len(COUNTS)]
+    seeds = range(100 * number, 100 * number + 12)
+    moved = move_class(preset, effect, seeds=seeds, count=count)
+    for noise in (USUAL_NOISE, USUAL_NOISE / 5):
+        teams = read_class(moved, seed=number, noise=noise)
+        honest = [member(str(i), records) for i, records in enumerate(teams)]
+        assert find_shared(honest) == {}
+
+        copied = [replace(r, id=f"{r.id} mine") for r in teams[0] if r.id in COPIED]
+        mixed = [*(r for r in teams[1] if r.id not in COPIED), *copied]
+        found = find_shared([honest[0], member("1", mixed), *honest[2:]])
+        assert set(found) == {"0", "1"}
+        assert len(found["1"]) >= len(COPIED) - 1
+        assert all(r.experiment == f"{r.other_experiment} mine" for r in found["1"])
+        assert all(r.equal_rows > 0 for r in found["1"])
