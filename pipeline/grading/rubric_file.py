@@ -260,7 +260,7 @@ def _contradictions(
     for table in ("initial", "final"):
         for pattern in getattr(found.required, table):
             if not matching((pattern,), names):
-                yield ("required", table), f"no parameter {pattern!r}{nearest(pattern, names)}"
+                yield ("required", table), f"no parameter {pattern!r}{_nearest(pattern, names)}"
     seen: set[object] = set()
     known_ids = [id_ for id_ in ids if isinstance(id_, str)]
     for i, (id_, criterion) in enumerate(zip(ids, found.criteria, strict=True)):
@@ -280,7 +280,7 @@ def _contradictions(
         if isinstance(criterion, Parameters | InitialFinal):
             for pattern in criterion.parameters:
                 if not matching((pattern,), names):
-                    known = nearest(pattern, names)
+                    known = _nearest(pattern, names)
                     yield ("criteria", i, "parameters"), f"no parameter {pattern!r}{known}"
         for full in (name for name in type(criterion).model_fields if "full" in name):
             none = full.replace("full", "none")
@@ -289,6 +289,12 @@ def _contradictions(
 
 
 # --------------------------------------------------------------------------- lines
+
+
+def _nearest(pattern: str, names: Sequence[str]) -> str:
+    """Return what may be meant: a pattern where one was typed, else a parameter."""
+    patterns = [f"{name.partition('_')[0]}_*" for name in names if "_" in name]
+    return nearest(pattern, list(dict.fromkeys(patterns)) if "*" in pattern else names)
 
 
 def _line_of(text: str, at: Location) -> int:

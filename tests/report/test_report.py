@@ -493,6 +493,9 @@ def test_a_poor_result_is_called_so(tmp_path):
     hardware = tuple(replace(check, nrmse=0.4) for check in analysis.hardware)
     text = terminal_summary(replace(analysis, fit=fit, rows=rows, hardware=hardware))
     assert "The fit did not converge: k_1 at its bound" in text
+    assert text.startswith("No trustworthy model of the chain of 2 carts was found")
+    assert "The fit that failed ended at K_1" in text
+    assert "It has" not in text
     assert "more than the stated noise is left" in text
     assert "±" in terminal_summary(analysis)  # which rests on noise alone being left
     assert "±" not in text

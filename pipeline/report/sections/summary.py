@@ -71,7 +71,9 @@ def terminal_summary(analysis: Analysis) -> str:
         for tile in _numbers_board(analysis, error="share")
     ]
     only = f" {_WORDS.text('statistical_only')}" if any("±" in text for text in numbers) else ""
-    it_has = [paragraph(f"It has {'; '.join(numbers)}.{only}")] if numbers else []
+    failed = analysis.fit is not None and not analysis.fit.converged
+    has = "The fit that failed ended at" if failed else "It has"
+    it_has = [paragraph(f"{has} {'; '.join(numbers)}.{only}")] if numbers else []
     told = bullet_list(text for _, text in _findings(analysis))
     next_ = [paragraph(f"{_WORDS.text('next')}."), next_steps(analysis)]
     return plain_lines([_identified(analysis), *it_has, told, *next_])
@@ -108,7 +110,7 @@ def _identified(analysis: Analysis) -> Block:
     failed = "" if fit.converged else _WORDS.text("not_converged", message=clean(fit.message))
     return paragraph(
         _WORDS.spans(
-            "identified",
+            "identified" if fit.converged else "fit_failed",
             carts=carts,
             source=_WORDS.text("from_runs" if used else "from_data", runs=used),
             fit=_WORDS.text("one_fit" if single else "joint_fit"),
