@@ -141,24 +141,23 @@ def _ask_if_there(name: str, *, springs: Sequence[bool]) -> str:
     if read.symbol == "m":
         fewer = f"carts = {n - 1}, or " if n > 1 else ""
         return (
-            f"Is there a cart {i}, and does its column hold its position? If not, change in "
-            f"submission.toml {fewer}columns = {{ x{i} = … }}."
+            f"Is there a cart {i}, and does its column hold its position? If not, write "
+            f"{fewer}columns = {{ x{i} = … }} in submission.toml."
         )
     if n == 1:
         return (
-            "Is there a spring at all? If not, change in submission.toml "
-            f"springs = {toml_flags([False, False])}."
+            "Is there a spring at all? If not, write "
+            f"springs = {toml_flags([False, False])} in submission.toml."
         )
     if 1 < i <= n:
         return (
             f"Does a spring tie cart {i} to cart {i - 1}? If not, the motor does not move cart "
-            f"{i}: change in submission.toml carts = {i - 1}."
+            f"{i}: write carts = {i - 1} in submission.toml."
         )
     ends = f"wall-{i}" if i == 1 else f"{n}-wall"
     fewer = [flag and j != i for j, flag in enumerate(springs, start=1)]
     return (
-        f"Is there a spring {ends}? If not, change in submission.toml "
-        f"springs = {toml_flags(fewer)}."
+        f"Is there a spring {ends}? If not, write springs = {toml_flags(fewer)} in submission.toml."
     )
 
 

@@ -84,8 +84,8 @@ def check_decays(
             f"±{test.drop:.3g} {position_unit} of its rest. The envelope's ζ = {decay.zeta:.3g} is "
             f"biased; ζ = {test.zeta:.3g} once friction is taken out."
             if test.present
-            else "is as exponential as its noise lets one see "
-            f"(F = {test.f_statistic:.1f}, dry friction from {test.threshold:.1f} on)."
+            else "is exponential as far as its noise can show "
+            f"(F = {test.f_statistic:.1f}; dry friction would show above {test.threshold:.1f})."
         )
         what = f"the decay of cart {decay.cart}"
         if kinds.get(decay.experiment) == "step":

@@ -77,7 +77,7 @@ def check_units(records: Sequence[Record], *, system: System) -> list[Check]:
                     role,
                     f"{listed(fractions)}: the positions hold fractions, and a count has none. In "
                     "which unit are they? No heading says it, so every static gain is said to be "
-                    f"in {position}/{drive}. If they are in cm, change in submission.toml "
+                    f"in {position}/{drive}. If they are in cm, write in submission.toml "
                     'position = { unit = "cm" }.',
                     n=len(fractions),
                 )
@@ -96,7 +96,7 @@ def _unknown(unit: str, *, role: str, known: Sequence[str]) -> str:
     hint = f"did you mean {meant!r}?" if meant else f"known: {', '.join(known)}"
     return (
         f"The {role} unit {unit!r} is not known ({hint}), and every static gain is in it. Is it "
-        f"right? If not, change in submission.toml {role} = {{ unit = … }}."
+        f"right? If not, write {role} = {{ unit = … }} in submission.toml."
     )
 
 

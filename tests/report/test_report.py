@@ -541,7 +541,7 @@ def test_what_was_not_used_is_not_said_to_be():
     assert f"{len(dwells)} sine dwells" in whole
     assert f"{len(dwells) - 1} sine dwells" in text
     assert "Give a file that can be read, or its right name. step-9 could not be read" in text
-    assert "Fix what was left out, record it again or take it out." in text
+    assert "Fix the recordings that were left out, record them again, or remove them." in text
     assert f"is {dwells[0]}: froze" in text
 
 

@@ -71,7 +71,7 @@ def test_the_steps_counted_are_those_of_the_fit(tmp_path):
     assert "For K_1, K_2, ω_a and ω_b both ways use the same recordings." in text
     assert every_failed_check_is_named(analysis)
     advice = next_part(analysis)
-    assert advice[0].startswith("Fix what was left out")  # the worst first
+    assert advice[0].startswith("Fix the recordings that were left out")  # the worst first
     assert "Failed: record.both-1" in advice[0]
 
 

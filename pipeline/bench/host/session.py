@@ -333,8 +333,8 @@ class Session:
         if self._latest_beat < WATCHDOG:
             return ""
         return (
-            f": this computer was too busy, it sent no heartbeat for {1e3 * self._latest_beat:.0f} "
-            "ms, upon which the bench cuts its motor; close other programs"
+            f": this computer was too busy and sent no heartbeat for {1e3 * self._latest_beat:.0f} "
+            "ms, so the bench cut its motor; close other programs"
         )
 
     def _stop(self, *, always: bool) -> None:

@@ -205,17 +205,22 @@ def in_doubt(references: References, *, analysis: Analysis) -> References:
     if is_linear(analysis):
         return references
 
-    def widened(table: Mapping[str, Reference], factor: float) -> dict[str, Reference]:
+    def factor(name: str, *, of_gains: float) -> float:
+        if is_damping(name):
+            return limits.BEYOND_BELIEF_DAMPING
+        return of_gains if read_name(name).is_gain else limits.BEYOND_BELIEF
+
+    def widened(table: Mapping[str, Reference], *, of_gains: float) -> dict[str, Reference]:
         return {
-            name: one.widened(limits.BEYOND_BELIEF_DAMPING if is_damping(name) else factor)
+            name: one.widened(factor(name, of_gains=of_gains))
             for name, one in table.items()
             # Resonances of no linear carts are no numbers of any, nor is what rests on them.
             if one.source != "frequency_response"
         }
 
     return References(
-        initial=widened(references.initial, limits.BEYOND_BELIEF),
-        final=widened(references.final, limits.FITTED_TO_NOTHING),
+        initial=widened(references.initial, of_gains=limits.BEYOND_BELIEF),
+        final=widened(references.final, of_gains=limits.FITTED_TO_NOTHING),
     )
 
 
