@@ -19,7 +19,7 @@ ONE_NUMBER = 1.03  # factor: bounds that near each other are one number to a rea
 # Factors: a fit so far off leads no student astray; and where no linear carts move like the
 # recordings, a number so far off comes of no way to find it. A damping is then anything.
 BEYOND_BELIEF, BEYOND_BELIEF_DAMPING = 2.5, 20.0
-FITTED_TO_NOTHING = 10.0  # factor: … of a final number, which is fitted to what has no fit
+FITTED_TO_NOTHING = 10.0  # factor: … of a final gain, which is fitted to what has no fit
 SAME_STEP = 0.2  # relative: two steps that a bench treats alike
 BY_SIZE = 1.1  # factor: gains of steps of two sizes that differ so much are told by the size
 READ_BY_EYE = 1.1  # factor: a resonance or null read off the dwells
