@@ -71,10 +71,9 @@ def compare(
     found = _between(a, b, shift=shift, first=first, last=last)
     if last - first < LEAST_OVERLAP:
         return found
-    # In units of b's noise, so that every cart has its say; an input has a scale of its own.
+    # In units of b's noise, so that every cart has its say.
     of_a, of_b = a.spread(first, last), b.spread(first + shift, last + shift)
-    factor = (of_b / of_a if of_a > 0 else 1.0) * a.step / b.step
-    factor[len(a.measured) :] = 1.0
+    factor = of_b / of_a * a.step / b.step if of_a * of_b > 0 else np.ones(len(a.step))
     in_a = a.noise[:, first:last] * factor[:, None]
     in_b = b.noise[:, first + shift : last + shift]
     both = in_a * in_b != 0
@@ -82,6 +81,8 @@ def compare(
     if n.sum() < LEAST_OVERLAP:
         return found
     in_a, in_b = in_a * both, in_b * both
+    for row in range(len(a.measured), len(n)):  # an input has a scale of its own
+        in_a[row] *= np.linalg.norm(in_b[row]) / max(np.linalg.norm(in_a[row]), 1e-30)
     x = np.stack([in_a, in_b], axis=1)
     left = x @ x.transpose(0, 2, 1)
     if others:

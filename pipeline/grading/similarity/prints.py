@@ -34,7 +34,7 @@ _NOTHING = 1e-7  # of the travel: rounding in the filter
 _LEAST_SWING = 0.25  # of the largest: smaller swings move with the noise
 _FEW_TURNS, _PARTS = 5, (0.5, 0.3, 0.7)  # of a swing, where there are few of them
 _MOST_ANCHORS = 12  # in the motion
-_NOISE_ANCHORS, _APART = 6, 5  # samples
+_NOISE_ANCHORS, _APART = 12, 5  # samples
 _FEWEST_SAMPLES = 60
 _EVERY = 8  # samples, of which the motion is kept
 _MOST_SAMPLES = 8192  # of one record; more does not make it surer
@@ -51,9 +51,9 @@ class Print:
     residual : (n_rows, n) whole numbers. A row for each free cart, and one for the
         input of a closed loop.
     step : (n_rows,) what 1 stands for, in the record's position unit, or input unit.
-    anchors : two lists of samples that are found again in a copy, the surest first, and so tell how
-        it is shifted: where the motion passes the middle between two extrema (they stand much
-        noise), and where the noise is loudest (they stand any cut).
+    anchors : lists of samples that are found again in a copy, the surest first, and so tell how it
+        is shifted: where the motion passes the middle between two extrema (they stand much noise),
+        and where the noise of the carts and of the input is loudest (they stand any cut).
     motion : of the first cart, every so many samples: it tells how two recordings are scaled.
     start, interval : s; the time of the first sample, and from one to the next.
     """
@@ -62,7 +62,7 @@ class Print:
     group: str
     residual: np.ndarray
     step: Array
-    anchors: tuple[list[int], list[int]]
+    anchors: list[list[int]]
     motion: Array
     start: float
     interval: float
@@ -87,9 +87,11 @@ class Print:
         return start, end
 
     def spread(self, first: int, last: int) -> float:
-        """Return the standard deviation of the motion from one sample to another."""
+        """Return the standard deviation of the motion in some samples, 0 where noise hides it."""
         part = self.motion[first // _EVERY : last // _EVERY + 1]
-        return float(np.linalg.norm(part - part.mean())) / part.size**0.5
+        noise = (STEPS_PER_SIGMA * self.step[0]) ** 2
+        spread = float(np.mean((part - part.mean()) ** 2)) - (1 / PASSED - 1) * noise
+        return spread**0.5 if spread > noise else 0.0
 
 
 def fingerprint(records: Sequence[Record]) -> bytes:
@@ -134,7 +136,7 @@ def unpack(packed: bytes) -> tuple[Print, ...]:
                 group=entry["group"],
                 residual=residual,
                 step=np.array(entry["step"]),
-                anchors=tuple(entry["anchors"]),
+                anchors=entry["anchors"],
                 motion=np.array(entry["motion"]),
                 start=entry["start"],
                 interval=entry["interval"],
@@ -163,18 +165,20 @@ def _prints(record: Record, *, most: int) -> Iterator[Print]:
     )
     if not np.all(sigma[: len(carts)] > 0):
         return
-    steered = len(signals) > len(carts) and sigma[-1] > 0
     noise[sigma == 0], sigma[sigma == 0] = 0.0, 1.0
     sigmas = noise / sigma[:, None]
     motion = y[0, MARGIN:-MARGIN] - noise[0]
-    loudness = np.abs(sigmas[len(carts) :] if steered else sigmas).sum(axis=0)
+    parts = np.split(np.abs(sigmas), [len(carts)])
     steps = np.clip(np.round(STEPS_PER_SIGMA * sigmas), -_MOST_STEPS, _MOST_STEPS)
     yield Print(
         experiment=record.id,
         group=f"{record.kind} {','.join(map(str, carts))} {frequency}",
         residual=steps.astype(_STORED),
         step=sigma / STEPS_PER_SIGMA,
-        anchors=(_motion_anchors(motion), _noise_anchors(loudness)),
+        anchors=[
+            _motion_anchors(motion),
+            *(_noise_anchors(x.sum(axis=0)) for x in parts if x.any()),
+        ],
         motion=motion[::_EVERY],
         start=float(record.t[MARGIN]),
         interval=record.sample_time,

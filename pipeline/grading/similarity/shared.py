@@ -8,6 +8,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -327,8 +328,8 @@ def _candidates(entries: Sequence[_Entry], *, everyone: int) -> Iterator[tuple[i
     What was handed out, by owners beyond `everyone`, is never crowded out by those who used it.
     """
     owners = np.array([entry.owner for entry in entries])
-    for kind, n_first in enumerate((_FIRST_IN_MOTION, _FIRST_IN_NOISE)):
-        anchors = [one.print.anchors[kind] for one in entries]
+    kinds = zip_longest(*(one.print.anchors for one in entries), fillvalue=())
+    for anchors, n_first in zip(kinds, (_FIRST_IN_MOTION, *2 * (_FIRST_IN_NOISE,)), strict=False):
         places = [(i, at) for i, own in enumerate(anchors) for at in own]
         first = [(i, at) for i, own in enumerate(anchors) for at in own[:n_first]]
         if not places:
