@@ -85,7 +85,13 @@ def test_what_nobody_states_is_a_default(tmp_path):
     findings = [line for line in terminal_summary(analysis).splitlines() if line.startswith("- ")]
     assert findings[0].startswith("- Unit of the positions: ")  # at the top
     assert findings[1].startswith("- Assumed: system.input.unit (V)")
-    assert sum("springs = [false, true, true]. Failed: vanishing.k_1" in f for f in findings) == 1
+    assert (
+        sum(
+            "springs = [false, true, true] in submission.toml. Failed: vanishing.k_1" in f
+            for f in findings
+        )
+        == 1
+    )
 
 
 def test_headings_support_a_unit(tmp_path):
