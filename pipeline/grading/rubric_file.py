@@ -176,7 +176,7 @@ def _try(document: dict) -> tuple[Rubric | None, list[ErrorDetails]]:
 
 def _with_check(own: Any, i: int, document: dict, complaints: list[_Complaint]) -> Any:
     """Return a criterion with a known check, so that its other keys can be checked too."""
-    if not isinstance(own, dict) or own.get("check") in _CHECKS:
+    if not isinstance(own, dict) or own.get("check") in list(_CHECKS):  # also {}
         return own
     at: Location = ("criteria", i, "check")
     meant = get_close_matches("check", [key for key in own if key not in _OF_CRITERIA], n=1)

@@ -82,7 +82,7 @@ def test_a_busy_computer_is_named_where_the_watchdog_bites(tmp_path):
     with emulator(watchdog=WATCHDOG) as bench:
         outcome, *_ = acquire(work, port=bench.address, observers=[notes], only=["dwell"])
     assert "fell silent" in outcome.partial
-    late = re.search(r"too busy, it sent no heartbeat for (\d+) ms", outcome.partial)
+    late = re.search(r"too busy and sent no heartbeat for (\d+) ms", outcome.partial)
     assert late is not None
     assert int(late[1]) >= 1e3 * WATCHDOG
 

@@ -25,6 +25,7 @@ from pipeline.report.gap.words import terminal_verdict
 from pipeline.resources import RUBRICS
 from pipeline.results_json import results_text
 from pipeline.submission import load_submission
+from pipeline.submission.complaints import MOST_TOLD
 from pipeline.synthesis.hidden import prepare_bench
 from tests.grading.publish.test_survey import write_paper
 from tests.helpers.acquisitions import Notes, write_work
@@ -127,11 +128,12 @@ def use(name: str, path: Path) -> None:
 
 
 def try_seed(name: str, seed: int) -> None:
-    """Spoil a file and read it: one line of complaint (a rubric's: one a mistake), or none."""
+    """Spoil a file and read it: one line of complaint (one a mistake in TOML), or none."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / name
         path.write_bytes(spoilt(name, Random(f"{name} {seed}")))
-        with few_lines_at_most() if name != "rubric.toml" else suppress(ConfigError):
+        most = MOST_TOLD + 1 if name == "plan.toml" else 1
+        with few_lines_at_most(most) if name != "rubric.toml" else suppress(ConfigError):
             use(name, path)
 
 
