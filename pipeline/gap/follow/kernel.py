@@ -1,0 +1,384 @@
+"""Simulate a chain with many laws while it follows a record: compiled, with all derivatives.
+
+At every sample the simulated state is corrected by a share `gain` of the error,
+
+    e = y - x,   x <- x + gain e,   v <- v + 0.3 gain² e / Δt,
+
+and then moves on freely to the next. A model that follows is never far from the data, so the
+errors have one valley where a free run has many; with `gain` 0 it is the free run. Derivatives by
+all parameters are carried beside the state: those of the numerical map itself.
+
+Steps are those of the leapfrog; dry friction is set-valued, and a cart that turns inside a step
+turns at the instant at which it does.
+
+References: H. Abarbanel, D. Creveling, R. Farsian, M. Kostuk, SIAM J. Applied Dynamical Systems 8
+(2009) 1341-1381; L. Ljung, System Identification, 2nd ed., chapter 7 (fixed-gain predictors).
+"""
+
+from math import ceil, cos, exp, pi, sin
+
+import numpy as np
+
+from pipeline.plant.nonlinear.simulator.state import jit
+
+# Laws, in the order of `SIZES`: how many parameters each has.
+COULOMB, LOAD, DRAG, OFFSET, CUBIC, SLACK, COUPLING, BRAKING, STOP, STRIBECK, DAHL, HIDDEN = range(12)
+COGGING, GAIN = 12, 13
+SIZES = (1, 1, 1, 1, 1, 2, 1, 1, 3, 2, 2, 3, 3, 1)
+DRIVE = 4  # parameters of the drive: dead zone, limit, delay, lag
+VELOCITY_GAIN = 0.3  # of the square of the position's: a little over critical
+_BLOWN_UP = 1e6  # times the record's span
+
+
+@jit
+def _tie(M, j, n, value):
+    if j < n:
+        M[j, j] += value
+    if j > 0:
+        M[j - 1, j - 1] += value
+    if 0 < j < n:
+        M[j, j - 1] -= value
+        M[j - 1, j] -= value
+
+
+@jit
+def _pull(f, j, n, value):
+    """Add the tension of spring j to the forces on its two ends."""
+    if j < n:
+        f[j] -= value
+    if j > 0:
+        f[j - 1] += value
+
+
+@jit
+def _pull_lane(DF, lane, j, n, value):
+    if j < n:
+        DF[j, lane] -= value
+    if j > 0:
+        DF[j - 1, lane] += value
+
+
+@jit
+def follow_run(
+    p, n, kinds, places, first, free, seen, t, y, knots, held, command, gain, zero, factor,
+    longest, derive, E, J, x, v, aux, DX, DV, DF, DR, DA, work,
+):  # fmt: skip
+    """Fill the errors E (samples, n) and, where `derive`, J (lanes, samples, n); False: diverged.
+
+    `p` holds masses, dampings, springs (n + 1), the drive (4) and the laws' parameters; behind
+    them the lanes of the run's own: zeros, starts, velocities, factors on dry friction (n each).
+    `held` (3, 2, knots) is the shaped input and its derivatives by dead zone and limit, with
+    their integrals. `x`, `v` (n,) start and are used up; `aux` (laws, 2) starts at zero.
+    """
+    own = p.size  # where the lanes of the run begin
+    lanes = DX.shape[1]
+    drive, L = 3 * n + 1, kinds.size
+    delay, lag = p[drive + 2], max(p[drive + 3], 1e-7)
+    xm, f, R, Rv = work[0], work[1], work[2], work[3]
+    K, C = work[4 : 4 + n], work[4 + n : 4 + 2 * n]
+    lagged, dlag = held[0, 0, 0], work[4 + 2 * n]
+    for q in range(DRIVE):
+        dlag[q] = 0.0
+    position = 0
+    on = 0
+    past, past_w, past_l, u_past = 0.0, 0.0, 0.0, held[0, 0, 0]
+    for sample in range(t.size):
+        step = t[min(sample + 1, t.size - 1)] - t[min(sample, t.size - 2)]
+        for i in range(n):
+            if not seen[i]:
+                continue
+            scale = 1.0
+            lane_gain = -1
+            for law in range(L):
+                if kinds[law] == GAIN and places[law] == i:
+                    lane_gain = first[law]
+                    scale += p[lane_gain]
+            e = y[sample, i] - scale * x[i] - zero[i]
+            E[sample, i] = e
+            if derive:
+                for q in range(lanes):
+                    J[q, sample, i] = scale * DX[i, q]
+                J[own + i, sample, i] += 1.0
+                if lane_gain >= 0:
+                    J[lane_gain, sample, i] += x[i]
+            if gain > 0.0:
+                # Whoever is a little off may rest where dry friction holds it: no jolt then.
+                x[i] += gain * e
+                kick = VELOCITY_GAIN * gain * gain / step
+                v[i] += kick * e
+                if derive:
+                    for q in range(lanes):
+                        DX[i, q] -= gain * J[q, sample, i]
+                        DV[i, q] -= kick * J[q, sample, i]
+            if not abs(x[i]) < _BLOWN_UP:
+                return False
+        if sample == t.size - 1:
+            break
+        count = ceil(step / longest - 1e-9)
+        h = step / count
+        for sub in range(count):
+            now = t[sample] + sub * h
+            # ------------------------------------------------ the input, its mean over the step
+            end = now + h - delay
+            if sample == 0 and sub == 0:
+                begin = now - delay
+                while position < knots.size - 1 and knots[position + 1] <= begin:
+                    position += 1
+                since = begin - knots[position]
+                past = held[0, 1, position] + held[0, 0, position] * since
+                past_w = held[1, 1, position] + held[1, 0, position] * since
+                past_l = held[2, 1, position] + held[2, 0, position] * since
+                u_past = held[0, 0, position]
+                lagged = u_past
+            while position < knots.size - 1 and knots[position + 1] <= end:
+                position += 1
+            since = end - knots[position]
+            upto = held[0, 1, position] + held[0, 0, position] * since
+            upto_w = held[1, 1, position] + held[1, 0, position] * since
+            upto_l = held[2, 1, position] + held[2, 0, position] * since
+            u, u_w, u_l = (upto - past) / h, (upto_w - past_w) / h, (upto_l - past_l) / h
+            u_t = -(held[0, 0, position] - u_past) / h
+            past, past_w, past_l, u_past = upto, upto_w, upto_l, held[0, 0, position]
+            decay = exp(-h / lag)
+            share = lag / h * (1.0 - decay)
+            mean = u + (lagged - u) * share
+            by_lag = (lagged - u) * ((1.0 - decay) / h - decay / lag)
+            du = work[5 + 2 * n]
+            du[0] = u_w * (1.0 - share) + dlag[0] * share
+            du[1] = u_l * (1.0 - share) + dlag[1] * share
+            du[2] = u_t * (1.0 - share) + dlag[2] * share
+            du[3] = by_lag + dlag[3] * share
+            dlag[0] = u_w + (dlag[0] - u_w) * decay
+            dlag[1] = u_l + (dlag[1] - u_l) * decay
+            dlag[2] = u_t + (dlag[2] - u_t) * decay
+            dlag[3] = dlag[3] * decay + (lagged - u) * decay * h / (lag * lag)
+            lagged = u + (lagged - u) * decay
+            u = mean
+            while on < knots.size - 1 and knots[on + 1] <= now + 0.5 * h:
+                on += 1
+            braking = 1.0 if command[on] != 0.0 else 0.0
+            # ------------------------------------------------ forces in the middle of the step
+            for i in range(n):
+                xm[i] = x[i] + 0.5 * h * v[i]
+                f[i] = R[i] = Rv[i] = 0.0
+                for j in range(n):
+                    K[i, j] = C[i, j] = 0.0
+                if derive:
+                    for q in range(lanes):
+                        DX[i, q] += 0.5 * h * DV[i, q]
+                        DR[i, q] = 0.0
+            f[0] += u
+            for j in range(n + 1):
+                k = p[2 * n + j]
+                d = (xm[j] if j < n else 0.0) - (xm[j - 1] if j > 0 else 0.0)
+                _pull(f, j, n, k * d)
+                _tie(K, j, n, k)
+            for law in range(L):
+                kind, at, o = kinds[law], places[law], first[law]
+                a = p[o]
+                if kind == COULOMB:
+                    R[at] += a
+                elif kind == LOAD:
+                    R[at] += a * abs(u)
+                elif kind == DRAG:
+                    f[at] -= a * v[at] * abs(v[at])
+                    C[at, at] += 2.0 * a * abs(v[at])
+                elif kind == OFFSET:
+                    f[at] += a
+                elif kind == CUBIC or kind == SLACK or kind == COUPLING:
+                    d = (xm[at] if at < n else 0.0) - (xm[at - 1] if at > 0 else 0.0)
+                    if kind == CUBIC:
+                        _pull(f, at, n, a * d * d * d)
+                        _tie(K, at, n, 3.0 * a * d * d)
+                    elif kind == COUPLING:
+                        rate = (v[at] if at < n else 0.0) - (v[at - 1] if at > 0 else 0.0)
+                        _pull(f, at, n, a * rate)
+                        _tie(C, at, n, a)
+                    elif (d - p[o + 1]) * p[o + 1] > 0.0:
+                        _pull(f, at, n, a * (d - p[o + 1]))
+                        _tie(K, at, n, a)
+                elif kind == BRAKING:
+                    f[0] -= a * braking * v[0]
+                    C[0, 0] += a * braking
+                elif kind == STOP:
+                    side = 1.0 if p[o + 1] > 0.0 else -1.0
+                    depth = side * (xm[at] - p[o + 1])
+                    aux[law, 0] = 0.0
+                    if depth > 0.0:
+                        push = a * depth + p[o + 2] * side * v[at]
+                        if push > 0.0 or (a == 0.0 and p[o + 2] == 0.0):
+                            aux[law, 0] = 1.0
+                            f[at] -= side * push
+                            K[at, at] += a
+                            C[at, at] += p[o + 2]
+                elif kind == STRIBECK:
+                    ratio = v[at] / p[o + 1]
+                    drop = exp(-ratio * ratio)
+                    R[at] += a * drop
+                    Rv[at] -= 2.0 * a * drop * ratio / p[o + 1]
+                elif kind == DAHL:
+                    side = 1.0 if v[at] > 0.0 else -1.0
+                    half = exp(-0.5 * abs(v[at]) * h / p[o + 1])
+                    aux[law, 1] = side + (aux[law, 0] - side) * half
+                    f[at] -= factor[at] * a * aux[law, 1]
+                elif kind == HIDDEN:
+                    rise = p[o + 1] * (aux[law, 0] + 0.5 * h * aux[law, 1] - xm[at])
+                    rise += p[o + 2] * (aux[law, 1] - v[at])
+                    f[at] += a * rise
+                    K[at, at] += a * p[o + 1]
+                    C[at, at] += a * p[o + 2]
+                elif kind == COGGING:
+                    turn = 2.0 * pi / p[o + 2]
+                    s, c = sin(turn * xm[0]), cos(turn * xm[0])
+                    f[0] += a * s + p[o + 1] * c
+                    K[0, 0] -= turn * (a * c - p[o + 1] * s)
+            # ------------------------------------------------ what they are by each parameter
+            if derive:
+                for i in range(n):
+                    for q in range(lanes):
+                        DF[i, q] = 0.0
+                    for j in range(n):
+                        if K[i, j] != 0.0 or C[i, j] != 0.0:
+                            kij, cij = K[i, j], C[i, j]
+                            for q in range(lanes):
+                                DF[i, q] -= kij * DX[j, q] + cij * DV[j, q]
+                for q in range(DRIVE):
+                    DF[0, drive + q] += du[q]
+                for j in range(n + 1):
+                    d = (xm[j] if j < n else 0.0) - (xm[j - 1] if j > 0 else 0.0)
+                    _pull_lane(DF, 2 * n + j, j, n, d)
+                for i in range(n):
+                    DR[i, own + 3 * n + i] = R[i]
+                for law in range(L):
+                    kind, at, o = kinds[law], places[law], first[law]
+                    a = p[o]
+                    if kind == COULOMB:
+                        DR[at, o] += factor[at]
+                    elif kind == LOAD:
+                        DR[at, o] += factor[at] * abs(u)
+                        side = 1.0 if u > 0.0 else -1.0
+                        for q in range(DRIVE):
+                            DR[at, drive + q] += factor[at] * a * side * du[q]
+                    elif kind == DRAG:
+                        DF[at, o] -= v[at] * abs(v[at])
+                    elif kind == OFFSET:
+                        DF[at, o] += 1.0
+                    elif kind == CUBIC or kind == SLACK or kind == COUPLING:
+                        d = (xm[at] if at < n else 0.0) - (xm[at - 1] if at > 0 else 0.0)
+                        if kind == CUBIC:
+                            _pull_lane(DF, o, at, n, d * d * d)
+                        elif kind == COUPLING:
+                            rate = (v[at] if at < n else 0.0) - (v[at - 1] if at > 0 else 0.0)
+                            _pull_lane(DF, o, at, n, rate)
+                        elif (d - p[o + 1]) * p[o + 1] > 0.0:
+                            _pull_lane(DF, o, at, n, d - p[o + 1])
+                            _pull_lane(DF, o + 1, at, n, -a)
+                    elif kind == BRAKING:
+                        DF[0, o] -= braking * v[0]
+                    elif kind == STOP:
+                        if aux[law, 0] != 0.0:
+                            DF[at, o] -= xm[at] - p[o + 1]
+                            DF[at, o + 1] += a
+                            DF[at, o + 2] -= v[at]
+                    elif kind == STRIBECK:
+                        ratio = v[at] / p[o + 1]
+                        drop = exp(-ratio * ratio)
+                        DR[at, o] += factor[at] * drop
+                        DR[at, o + 1] += factor[at] * a * drop * 2.0 * ratio * ratio / p[o + 1]
+                        for q in range(lanes):
+                            DR[at, q] += factor[at] * Rv[at] * DV[at, q]
+                    elif kind == DAHL:
+                        side = 1.0 if v[at] > 0.0 else -1.0
+                        half = exp(-0.5 * abs(v[at]) * h / p[o + 1])
+                        slope = (aux[law, 0] - side) * half
+                        by_v = -slope * side * 0.5 * h / p[o + 1]
+                        fa = factor[at] * a
+                        for q in range(lanes):
+                            DF[at, q] -= fa * (half * DA[2 * law, q] + by_v * DV[at, q])
+                        DF[at, o] -= factor[at] * aux[law, 1]
+                        DF[at, o + 1] -= fa * slope * 0.5 * abs(v[at]) * h / p[o + 1] ** 2
+                        DF[at, own + 3 * n + at] -= a * aux[law, 1]
+                    elif kind == HIDDEN:
+                        apart = aux[law, 0] + 0.5 * h * aux[law, 1] - xm[at]
+                        rate = aux[law, 1] - v[at]
+                        for q in range(lanes):
+                            DA[2 * law, q] += 0.5 * h * DA[2 * law + 1, q]
+                            DF[at, q] += a * (
+                                p[o + 1] * DA[2 * law, q] + p[o + 2] * DA[2 * law + 1, q]
+                            )
+                        DF[at, o] += p[o + 1] * apart + p[o + 2] * rate
+                        DF[at, o + 1] += a * apart
+                        DF[at, o + 2] += a * rate
+                        for q in range(lanes):
+                            DA[2 * law + 1, q] -= h * (
+                                p[o + 1] * (DA[2 * law, q] - DX[at, q])
+                                + p[o + 2] * (DA[2 * law + 1, q] - DV[at, q])
+                            )
+                        DA[2 * law + 1, o + 1] -= h * apart
+                        DA[2 * law + 1, o + 2] -= h * rate
+                        for q in range(lanes):
+                            DA[2 * law, q] += 0.5 * h * DA[2 * law + 1, q]
+                    elif kind == COGGING:
+                        turn = 2.0 * pi / p[o + 2]
+                        s, c = sin(turn * xm[0]), cos(turn * xm[0])
+                        DF[0, o] += s
+                        DF[0, o + 1] += c
+                        DF[0, o + 2] -= turn / p[o + 2] * xm[0] * (a * c - p[o + 1] * s)
+            for law in range(L):
+                if kinds[law] == HIDDEN:
+                    at, o = places[law], first[law]
+                    aux[law, 0] += 0.5 * h * aux[law, 1]
+                    rise = p[o + 1] * (aux[law, 0] - xm[at]) + p[o + 2] * (aux[law, 1] - v[at])
+                    aux[law, 1] -= h * rise
+                    aux[law, 0] += 0.5 * h * aux[law, 1]
+            # ------------------------------------------------ the velocities, dry friction last
+            for i in range(n):
+                if not free[i]:
+                    continue
+                half_c = 0.5 * h * p[n + i]
+                whole = p[i] + half_c
+                pushed = h * f[i] / whole
+                rub = h * factor[i] * R[i] / whole
+                target = v[i] * (p[i] - half_c) / whole + pushed
+                side = 1.0 if (v[i] if v[i] != 0.0 else pushed) > 0.0 else -1.0
+                after = target - side * rub
+                ratio = 1.0
+                if rub > 0.0:
+                    if v[i] == 0.0:
+                        if abs(pushed) <= rub:
+                            after = ratio = 0.0
+                    elif side * after < 0.0:
+                        beyond = pushed + side * rub
+                        ratio = beyond / (after - v[i]) if side * beyond < 0.0 else 0.0
+                        after *= ratio
+                elif v[i] == 0.0 and pushed == 0.0:
+                    side = 0.0
+                if derive:
+                    if ratio == 0.0:
+                        for q in range(lanes):
+                            DV[i, q] = 0.0
+                    else:
+                        keep, kick = ratio * (p[i] - half_c) / whole, ratio * h / whole
+                        rubbed = kick * side
+                        for q in range(lanes):
+                            DV[i, q] = keep * DV[i, q] + kick * DF[i, q] - rubbed * DR[i, q]
+                        DV[i, i] += ratio * (v[i] - after) / whole
+                        DV[i, n + i] -= ratio * 0.5 * h * (v[i] + after) / whole
+                v[i] = after
+                x[i] = xm[i] + 0.5 * h * after
+                if derive:
+                    for q in range(lanes):
+                        DX[i, q] += 0.5 * h * DV[i, q]
+            for law in range(L):
+                if kinds[law] == DAHL:
+                    at, o = places[law], first[law]
+                    side = 1.0 if v[at] > 0.0 else -1.0
+                    whole = exp(-abs(v[at]) * h / p[o + 1])
+                    slope = (aux[law, 0] - side) * whole
+                    if derive:
+                        by_v = -slope * side * h / p[o + 1]
+                        for q in range(lanes):
+                            DA[2 * law, q] = whole * DA[2 * law, q] + by_v * DV[at, q]
+                        DA[2 * law, o + 1] += slope * abs(v[at]) * h / p[o + 1] ** 2
+                    aux[law, 0] = side + slope
+    return True

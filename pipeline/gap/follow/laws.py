@@ -1,0 +1,228 @@
+"""Which laws a following model has, and its parameters as one vector in physical units."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from pipeline.arrays import Array
+from pipeline.gap.follow import kernel
+from pipeline.plant.linear.chain import Chain
+
+_CHAIN = (0.2, 5.0)  # times the first estimate: how far masses and springs may go
+_REACH = 0.3  # of a mass or spring, in one step
+_DELAY = (-0.05, 0.1)  # s
+_LONGEST_LAG = 0.3  # s
+_LEAST_LIMIT = 0.2  # of the largest input
+_SHORT = 0.01  # s: how far a delay or lag may go in one step
+_SLACK = 0.95  # of a spring that goes slack, at most
+# Parameters that are a force or a share of one, and vanish with the effect; the others are shape.
+COEFFICIENTS = ((0,), (0,), (0,), (0,), (0,), (0,), (0,), (0,), (0, 2), (0,), (0,), (0,), (0, 1), (0,))
+_POSITIVE = {kernel.COULOMB, kernel.LOAD, kernel.DRAG, kernel.COUPLING, kernel.STOP,
+             kernel.STRIBECK, kernel.DAHL, kernel.HIDDEN}  # fmt: skip
+DRY = (kernel.COULOMB, kernel.LOAD, kernel.STRIBECK, kernel.DAHL)
+ON_SPRING = (kernel.CUBIC, kernel.SLACK, kernel.COUPLING)
+DEAD_ZONE, LIMIT, DELAY, LAG = range(kernel.DRIVE)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Law:
+    """A law at a cart or spring (from 0), with the values of its parameters.
+
+    The four laws of the drive have the kinds -1 to -4 (`drive`).
+    """
+
+    kind: int
+    place: int
+    values: tuple[float, ...]
+
+    @property
+    def key(self) -> tuple[int, int]:
+        """Kind and place."""
+        return self.kind, self.place
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Bench:
+    """What bounds the laws on one bench: the first chain, and the largest input."""
+
+    chain: Chain
+    springs: tuple[bool, ...]
+    largest: float
+    pinned: int | None = None  # the mass that sets the scale where no input does
+
+    @property
+    def n(self) -> int:
+        """Number of carts."""
+        return self.chain.n
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Laws:
+    """Which laws act: the shape of the vector `p`.
+
+    It holds masses, dampings, springs (n + 1), the four values of the drive, then each law's.
+    """
+
+    bench: Bench
+    keys: tuple[tuple[int, int], ...]
+    drive: tuple[bool, bool, bool, bool]  # which of its laws are free
+
+    @cached_property
+    def kinds(self) -> np.ndarray:
+        return np.array([kind for kind, _ in self.keys], dtype=np.int64)
+
+    @cached_property
+    def places(self) -> np.ndarray:
+        return np.array([place for _, place in self.keys], dtype=np.int64)
+
+    @cached_property
+    def base(self) -> int:
+        """Parameters of chain and drive."""
+        return 3 * self.bench.n + 1 + kernel.DRIVE
+
+    @cached_property
+    def first(self) -> np.ndarray:
+        sizes = [kernel.SIZES[kind] for kind, _ in self.keys]
+        return self.base + np.cumsum([0, *sizes])[:-1].astype(np.int64)
+
+    @cached_property
+    def size(self) -> int:
+        return self.base + sum(kernel.SIZES[kind] for kind, _ in self.keys)
+
+    @cached_property
+    def dry(self) -> np.ndarray:
+        """(n,) on which carts dry friction acts."""
+        there = {place for kind, place in self.keys if kind in DRY}
+        return np.array([i in there for i in range(self.bench.n)])
+
+    @property
+    def drive_at(self) -> int:
+        return 3 * self.bench.n + 1
+
+    def neutral_drive(self) -> Array:
+        return np.array([0.0, self.bench.largest, 0.0, 0.0])
+
+    def start(self, chain: Chain) -> Array:
+        """Return the vector of a chain without any law."""
+        p = np.zeros(self.size)
+        n = self.bench.n
+        p[:n], p[n : 2 * n], p[2 * n : 3 * n + 1] = chain.m, chain.c, chain.k
+        p[self.drive_at : self.base] = self.neutral_drive()
+        return p
+
+    def chain(self, p: Array) -> Chain:
+        n = self.bench.n
+        return Chain(m=p[:n].copy(), c=np.maximum(p[n : 2 * n], 0.0), k=p[2 * n : 3 * n + 1].copy())
+
+    def bounds(self) -> tuple[Array, Array, Array]:
+        """Return lower and upper bounds, and the largest steps."""
+        n, chain = self.bench.n, self.bench.chain
+        low, high = np.full(self.size, -np.inf), np.full(self.size, np.inf)
+        reach = np.full(self.size, np.inf)
+        for at, value in ((slice(0, n), chain.m), (slice(2 * n, 3 * n + 1), chain.k)):
+            low[at], high[at], reach[at] = _CHAIN[0] * value, _CHAIN[1] * value, _REACH * value
+        if self.bench.pinned is not None:
+            low[self.bench.pinned] = high[self.bench.pinned] = chain.m[self.bench.pinned]
+        if n == 1:  # both wall springs act as one
+            at = 2 * n + int(not self.bench.springs[0])
+            for j in (2 * n, 2 * n + 1):
+                if j != at:
+                    low[j] = high[j] = chain.k[j - 2 * n]
+        low[n : 2 * n] = 0.0
+        d, largest = self.drive_at, max(self.bench.largest, 1e-12)
+        low[d : d + 4] = (0.0, _LEAST_LIMIT * largest, _DELAY[0], 0.0)
+        high[d : d + 4] = (0.9 * largest, largest, _DELAY[1], _LONGEST_LAG)
+        reach[d : d + 4] = (0.1 * largest, 0.1 * largest, _SHORT, _SHORT)
+        neutral = self.neutral_drive()
+        for q, free in enumerate(self.drive):
+            if not free:
+                low[d + q] = high[d + q] = neutral[q]
+        for (kind, place), o in zip(self.keys, self.first, strict=True):
+            if kind in _POSITIVE:
+                low[o] = 0.0
+            if kind == kernel.STOP:
+                low[o + 2] = 0.0
+            elif kind == kernel.SLACK:
+                low[o] = -_SLACK * max(chain.k[place], 1e-12)
+            elif kind == kernel.GAIN:
+                low[o], high[o] = -0.5, 0.5
+        return low, high, reach
+
+    def steps_of_shape(self, p: Array) -> tuple[Array, Array, Array]:
+        """Return bounds and steps with the shapes of the laws kept near where they are."""
+        low, high, reach = self.bounds()
+        for (kind, _), o in zip(self.keys, self.first, strict=True):
+            for q in range(kernel.SIZES[kind]):
+                if q in COEFFICIENTS[kind]:
+                    continue
+                value = abs(p[o + q])
+                reach[o + q] = 0.15 * value
+                side = 1.0 if p[o + q] >= 0 else -1.0
+                low[o + q], high[o + q] = sorted((side * 0.02 * value, side * 50.0 * value))
+        return low, high, reach
+
+    def with_laws(self, p: Array, extra: Sequence[Law]) -> tuple["Laws", Array]:
+        """Return the laws and vector with more of them."""
+        laws = Laws(
+            bench=self.bench, keys=(*self.keys, *(law.key for law in extra)), drive=self.drive
+        )
+        return laws, np.concatenate([p, *(law.values for law in extra)])
+
+    def without(self, p: Array, groups: Sequence[int]) -> tuple["Laws", Array]:
+        """Return the laws and vector without some groups: laws by index, drive from -1 to -4."""
+        kept = [i for i in range(len(self.keys)) if i not in groups]
+        drive = tuple(free and -1 - q not in groups for q, free in enumerate(self.drive))
+        laws = Laws(bench=self.bench, keys=tuple(self.keys[i] for i in kept), drive=drive)
+        base = p[: self.base].copy()
+        for q, value in enumerate(self.neutral_drive()):
+            if not drive[q]:
+                base[self.drive_at + q] = value
+        parts = [p[self.first[i] : self.first[i] + kernel.SIZES[self.keys[i][0]]] for i in kept]
+        return laws, np.concatenate([base, *parts])
+
+    def groups(self) -> dict[int, np.ndarray]:
+        """Return what may be dropped: by its number the indices of its coefficients."""
+        out = {-1 - q: np.array([self.drive_at + q]) for q, free in enumerate(self.drive) if free}
+        for i, ((kind, _), o) in enumerate(zip(self.keys, self.first, strict=True)):
+            out[i] = np.array([o + q for q in COEFFICIENTS[kind]])
+        return out
+
+    def whole_group(self, group: int) -> np.ndarray:
+        """Return the indices of all parameters of a group."""
+        if group < 0:
+            return np.array([self.drive_at - 1 - group])
+        o = self.first[group]
+        return np.arange(o, o + kernel.SIZES[self.keys[group][0]])
+
+    def neutral(self) -> Array:
+        """Return the vector's neutral values (0 but for the limit)."""
+        out = np.zeros(self.size)
+        out[self.drive_at + LIMIT] = self.bench.largest
+        return out
+
+
+def smooth_laws(bench: Bench, *, driven: bool, shown: Sequence[bool]) -> Laws:
+    """Return every law that needs no shape, at every place: all to start from nothing.
+
+    `shown` (n,) tells which carts move in any run.
+    """
+    n = bench.n
+    keys: list[tuple[int, int]] = []
+    for i in range(n):
+        if shown[i]:
+            keys += [(kernel.COULOMB, i), (kernel.DRAG, i)]
+            keys += [(kernel.LOAD, i)] if driven else []
+    rows = [j for j, there in enumerate(bench.springs) if there]
+    rows = rows[:1] if n == 1 else rows
+    for j in rows:
+        if (j < n and shown[j]) or (j > 0 and shown[j - 1]):
+            keys.append((kernel.CUBIC, j))
+        if 0 < j < n and (shown[j] or shown[j - 1]):
+            keys.append((kernel.COUPLING, j))
+    if driven:
+        keys.append((kernel.BRAKING, 0))
+    if not any(bench.springs):
+        keys += [(kernel.OFFSET, i) for i in range(n) if shown[i]]
+    return Laws(bench=bench, keys=tuple(keys), drive=(driven,) * 4)
