@@ -1,0 +1,310 @@
+"""Choose the laws: all at once from nothing, then those of a shape, then drop what is nothing."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.arrays import Array
+from pipeline.gap import limits
+from pipeline.gap.follow import kernel
+from pipeline.gap.follow.fit import Follow, fit_follow, slope_of, start_follow, weigh
+from pipeline.gap.follow.laws import COEFFICIENTS, Bench, Law, Laws, smooth_laws
+from pipeline.gap.follow.track import Track
+from pipeline.plant.linear.chain import Chain
+
+CLOSE, LOOSE, FREE = 0.5, 0.1, 0.0  # gains
+_NEAR_FREE = 0.02
+_INDEPENDENT = 4.0  # readings of a track that tell as much as one independent
+_RIDGE = 1e-10  # of the diagonal
+_SHORT_LIST = 4  # of laws with a shape, refitted
+_ROUNDS = 3  # of adding one of them
+
+
+def independent(follow: Follow) -> float:
+    """Return how many independent readings there are."""
+    return follow.points / _INDEPENDENT
+
+
+def criterion(follow: Follow) -> float:
+    """Return the Bayesian criterion, what each effect costs included."""
+    count = independent(follow)
+    bounds = follow.laws.bounds()
+    size = int(np.sum(bounds[0] < bounds[1]))
+    effects = len(follow.laws.groups())
+    return (
+        count * float(np.log(max(follow.total, 1e-300) / follow.points))
+        + size * float(np.log(count))
+        + effects * limits.BIC_DROP
+    )
+
+
+# ------------------------------------------------------------------ dropping what is nothing
+
+
+def drop_needless(follow: Follow, tracks: Sequence[Track]) -> Follow:
+    """Drop every law whose loss the criterion does not feel, the least first; refit the rest."""
+    while follow.laws.groups():
+        order = _needless(follow, tracks)
+        if not order:
+            break
+        here = criterion(follow)
+        while order:
+            laws, p = follow.laws.without(follow.p, order)
+            trial = weigh(replace(follow, laws=laws, p=p), tracks)
+            trial = fit_follow(trial, tracks)
+            if criterion(trial) < here:
+                follow = trial
+                break
+            if len(order) == 1:
+                return follow
+            order = order[: len(order) // 2]
+        else:
+            break
+    return follow
+
+
+def _needless(follow: Follow, tracks: Sequence[Track]) -> list[int]:
+    """Return the groups that may go, in order, judged by the quadratic form about the fit."""
+    slope = slope_of(follow, tracks, factors=False)
+    groups = dict(follow.laws.groups())
+    off = follow.p - follow.laws.neutral()
+    low, high, _ = follow.laws.bounds()
+    power = np.maximum(np.diag(slope.H), 0.0)
+    usable = (power > 1e-20 * power.max()) & (low < high)
+    order = [g for g, at in groups.items() if not np.any(np.abs(off[at]) > 0.0)]
+    for g in order:
+        usable[follow.laws.whole_group(g)] = False
+        del groups[g]
+    for g in [g for g, at in groups.items() if not usable[at].all()]:
+        if not usable[groups[g]].any():
+            order.append(g)
+            del groups[g]
+    count, cost = independent(follow), follow.total
+    active = np.flatnonzero(usable)
+    while groups:
+        size = np.sqrt(power[active])
+        A = slope.H[np.ix_(active, active)] / np.outer(size, size)
+        inverse = np.linalg.inv(A + _RIDGE * np.eye(active.size)) / np.outer(size, size)
+        where = {index: at for at, index in enumerate(active.tolist())}
+        best: tuple[float, int, list[int]] | None = None
+        for g, at in groups.items():
+            mine = [where[i] for i in at.tolist() if i in where]
+            d = off[active[mine]]
+            rise = float(d @ np.linalg.solve(inverse[np.ix_(mine, mine)], d))
+            price = limits.BIC_DROP + len(follow.laws.whole_group(g)) * np.log(count)
+            excess = count * float(np.log1p(max(rise, 0.0) / cost)) - price
+            if best is None or excess < best[0]:
+                best = excess, g, mine
+                least = rise
+        assert best is not None
+        excess, g, mine = best
+        if excess > 0.0:
+            break
+        d = off[active[mine]]
+        off[active] -= inverse[:, mine] @ np.linalg.solve(inverse[np.ix_(mine, mine)], d)
+        cost += max(least, 0.0)
+        order.append(g)
+        gone = set(follow.laws.whole_group(g).tolist())
+        active = np.array([i for i in active.tolist() if i not in gone])
+        del groups[g]
+    return order
+
+
+# ------------------------------------------------------------------ laws with a shape
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scored:
+    """A law with the values the data ask for, and by how much it would lower the cost."""
+
+    law: Law
+    drop: float
+
+
+def score(follow: Follow, tracks: Sequence[Track], trials: Sequence[Law]) -> list[Scored]:
+    """Return the trials that would help, each beside all laws of the model, the best first."""
+    laws, p = follow.laws.with_laws(follow.p, trials)
+    wide = replace(follow, laws=laws, p=p)
+    slope = slope_of(wide, tracks)
+    if not np.all(np.isfinite(slope.H)):
+        return []
+    low, high, _ = follow.laws.bounds()
+    power = np.maximum(np.diag(slope.H), 0.0)
+    base = np.arange(follow.p.size)
+    at_bound = (follow.p <= low) | (follow.p >= high)
+    base = base[(power[base] > 1e-20 * power.max()) & (low < high) & ~at_bound]
+    size = np.sqrt(power[base])
+    A = slope.H[np.ix_(base, base)] / np.outer(size, size) + _RIDGE * np.eye(base.size)
+    out = []
+    first = len(follow.laws.keys)
+    for index, law in enumerate(trials, start=first):
+        o = laws.first[index]
+        mine = np.array([o + q for q in COEFFICIENTS[law.kind]])
+        mine = mine[power[mine] > 0.0]
+        if not mine.size:
+            continue
+        across = slope.H[np.ix_(base, mine)] / size[:, None]
+        taken = np.linalg.solve(A, np.column_stack([across, slope.b[base] / size]))
+        S = slope.H[np.ix_(mine, mine)] - across.T @ taken[:, :-1]
+        b = slope.b[mine] - across.T @ taken[:, -1]
+        own = np.sqrt(np.diag(slope.H)[mine])
+        S = S + 1e-9 * np.diag(own**2)
+        found = np.linalg.solve(S, b)
+        mask = np.ones(mine.size, dtype=bool)
+        if law.kind in (kernel.STOP, kernel.DAHL, kernel.STRIBECK, kernel.HIDDEN):
+            if found[0] <= 0.0:
+                continue
+            if np.any(found < 0.0):
+                mask = found > 0.0
+                found = np.where(mask, 0.0, 0.0)
+                found[0] = b[0] / S[0, 0]
+                mask = np.arange(mine.size) == 0
+                if found[0] <= 0.0:
+                    continue
+        drop = float(2 * found @ b - found @ S @ found)
+        values = list(law.values)
+        for i, value in zip(mine, found, strict=True):
+            values[i - o] = float(value)
+        out.append(Scored(law=replace(law, values=tuple(values)), drop=drop))
+    return sorted(out, key=lambda one: -one.drop)
+
+
+def shaped_laws(follow: Follow, tracks: Sequence[Track]) -> list[Law]:
+    """Return laws that need a shape, at trial shapes, without effect."""
+    bench = follow.laws.bench
+    n = bench.n
+    chain = follow.laws.chain(follow.p)
+    diagonal = np.diag(chain.stiffness)
+    position = np.zeros((2, n))
+    stretch = np.zeros((2, n + 1))
+    speed = np.zeros(n)
+    for track, own in zip(tracks, follow.own, strict=True):
+        x = np.where(track.free, track.y - own.zero, 0.0)
+        position = np.maximum(position, [x.max(0), -x.min(0)])
+        d = np.diff(np.pad(x, ((0, 0), (1, 1))), axis=1)
+        stretch = np.maximum(stretch, [d.max(0), -d.min(0)])
+        v = np.gradient(x, track.t, axis=0)
+        speed = np.maximum(speed, np.quantile(np.abs(v), 0.98, axis=0))
+    taken = set(follow.laws.keys)
+    out = []
+    for i in range(n):
+        reach = position[:, i].max()
+        if reach <= 0.0:
+            continue
+        for side, most in ((1.0, position[0, i]), (-1.0, position[1, i])):
+            for part in (0.2, 0.4, 0.55, 0.7, 0.8, 0.87, 0.93, 0.97):
+                if most > 0.1 * reach:
+                    out.append(Law(kind=kernel.STOP, place=i, values=(0.0, side * part * most, 0.0)))
+        if (kernel.DAHL, i) not in taken:
+            for part in (0.004, 0.012, 0.035):
+                out.append(Law(kind=kernel.DAHL, place=i, values=(0.0, part * reach)))
+        if (kernel.STRIBECK, i) not in taken:
+            for part in (0.02, 0.06, 0.15):
+                out.append(Law(kind=kernel.STRIBECK, place=i, values=(0.0, part * speed[i])))
+        if (kernel.HIDDEN, i) not in taken:
+            omega = np.sqrt(max(diagonal[i], 1e-12) / chain.m[i])
+            for part in (0.45, 0.6, 0.75, 0.9, 1.05, 1.2, 1.4, 1.7, 2.3):
+                rate = part * omega
+                out.append(Law(kind=kernel.HIDDEN, place=i, values=(0.0, rate**2, 0.06 * rate)))
+        if n > 1 and (kernel.GAIN, i) not in taken:
+            out.append(Law(kind=kernel.GAIN, place=i, values=(0.0,)))
+    rows = [j for j, there in enumerate(bench.springs) if there]
+    for j in rows[:1] if n == 1 else rows:
+        for side, most in ((1.0, stretch[0, j]), (-1.0, stretch[1, j])):
+            for part in (0.08, 0.2, 0.35, 0.5, 0.65, 0.8):
+                if most > 0.1 * stretch[:, j].max():
+                    out.append(Law(kind=kernel.SLACK, place=j, values=(0.0, side * part * most)))
+    return out
+
+
+def cogging_laws(follow: Follow, tracks: Sequence[Track]) -> list[Law]:
+    """Return cogging at trial pitches, close enough for its phase over the whole travel."""
+    span = 0.0
+    for track, own in zip(tracks, follow.own, strict=True):
+        if track.free[0]:
+            span = max(span, float(np.ptp(track.y[:, 0] - own.zero[0])))
+    if span == 0.0 or (kernel.COGGING, 0) in follow.laws.keys:
+        return []
+    return [
+        Law(kind=kernel.COGGING, place=0, values=(0.0, 0.0, span / count))
+        for count in np.arange(1.5, 25.0, 0.4)
+    ]
+
+
+def add_shaped(follow: Follow, tracks: Sequence[Track]) -> Follow | None:
+    """Return the model with one more law that has a shape, or None where none helps."""
+    trials = score(follow, tracks, shaped_laws(follow, tracks))
+    moving = [track for track in tracks if track.free[0] and np.any(track.command)]
+    if moving:
+        part = replace(
+            follow, own=tuple(o for t, o in zip(tracks, follow.own, strict=True) if t in moving)
+        )
+        trials += score(part, moving, cogging_laws(part, moving))
+    trials.sort(key=lambda one: -one.drop)
+    chosen: dict[tuple, Law] = {}
+    for one in trials:
+        side = np.sign(one.law.values[1]) if one.law.kind in (kernel.STOP, kernel.SLACK) else 0.0
+        if one.drop <= 0.0:
+            break
+        chosen.setdefault((one.law.kind, one.law.place, side), one.law)
+        if len(chosen) == _SHORT_LIST:
+            break
+    best: Follow | None = None
+    for law in chosen.values():
+        laws, p = follow.laws.with_laws(follow.p, [law])
+        trial = fit_follow(weigh(replace(follow, laws=laws, p=p), tracks), tracks, iterations=8)
+        if best is None or trial.total < best.total:
+            best = trial
+    if best is None or criterion(best) > criterion(follow):
+        return None
+    return best
+
+
+# ------------------------------------------------------------------ the whole way
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Choice:
+    """The laws that are left, fitted near to free, and on the way all of them."""
+
+    lean: Follow
+    full: Follow
+
+
+def choose_laws(
+    tracks: Sequence[Track], *, springs: Sequence[bool], chain: Chain, tell=lambda text: None
+) -> Choice:
+    """Return the model that following finds."""
+    driven = any(np.any(track.command) for track in tracks)
+    largest = max(float(np.abs(track.command).max()) for track in tracks)
+    shown = np.any([track.free for track in tracks], axis=0)
+    pinned = None if driven else int(np.argmax(shown))
+    bench = Bench(chain=chain, springs=tuple(springs), largest=largest, pinned=pinned)
+    laws = smooth_laws(bench, driven=driven, shown=shown.tolist())
+    full = start_follow(laws, laws.start(chain), tracks, gain=CLOSE)
+    full = fit_follow(full, tracks)
+    full = fit_follow(full, tracks, gain=LOOSE)
+    lean = _let_go(full, tracks)
+    tell(f"all at once: {full.chi:.3f}, let go: {lean.chi:.3f}")
+    for _ in range(_ROUNDS):
+        if lean.chi < limits.AT_FLOOR:
+            break
+        more = add_shaped(full, tracks)
+        if more is None:
+            break
+        leaner = _let_go(more, tracks)
+        tell(f"with {more.laws.keys[-1]}: {more.chi:.3f}, let go: {leaner.chi:.3f}")
+        full = more
+        if criterion(leaner) < criterion(lean):
+            lean = leaner
+    return Choice(lean=lean, full=full)
+
+
+def _let_go(full: Follow, tracks: Sequence[Track]) -> Follow:
+    """Drop what is nothing, then loosen the gain to none, dropping again."""
+    lean = drop_needless(full, tracks)
+    for gain in (_NEAR_FREE, FREE):
+        loose = fit_follow(lean, tracks, gain=gain)
+        lean = drop_needless(loose, tracks)
+    return lean
