@@ -1,6 +1,6 @@
 """Choose the laws: all at once from nothing, then those of a shape, then drop what is nothing."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,8 +8,19 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.gap import limits
 from pipeline.gap.follow import kernel
-from pipeline.gap.follow.fit import Follow, fit_follow, slope_of, start_follow, weigh
-from pipeline.gap.follow.laws import COEFFICIENTS, Bench, Law, Laws, smooth_laws
+from pipeline.gap.fit.levenberg_marquardt import Mapper
+from pipeline.gap.follow.fit import Follow, Slope, fit_follow, slope_of, start_follow
+from pipeline.gap.follow.laws import (
+    COEFFICIENTS,
+    COLUMNS,
+    SIDED,
+    Bench,
+    Column,
+    Law,
+    Laws,
+    column_set,
+    smooth_laws,
+)
 from pipeline.gap.follow.track import Track
 from pipeline.plant.linear.chain import Chain
 
@@ -19,6 +30,31 @@ _INDEPENDENT = 4.0  # readings of a track that tell as much as one independent
 _RIDGE = 1e-10  # of the diagonal
 _SHORT_LIST = 4  # of laws with a shape, refitted
 _ROUNDS = 3  # of adding one of them
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Records:
+    """What is followed, how work on it is shared out, and which columns laws may fill."""
+
+    tracks: tuple[Track, ...]
+    mapper: Mapper
+    columns: frozenset[Column]
+
+    def fit(self, start: Follow, **options) -> Follow:
+        """Fit a model from a start, see `fit_follow`."""
+        return fit_follow(start, self.tracks, mapper=self.mapper, **options)
+
+    def refit(self, follow: Follow, laws: Laws, p: Array, **options) -> Follow:
+        """Fit a model with other laws, the runs' own parameters as they are."""
+        return self.fit(replace(follow, laws=laws, p=p), **options)
+
+    def slope(self, follow: Follow, *, factors: bool = True) -> Slope:
+        """Return the normal equations, see `slope_of`."""
+        return slope_of(follow, self.tracks, factors=factors, mapper=self.mapper)
+
+    def allows(self, law: Law) -> bool:
+        """Whether the catalogue has an effect that fills the columns of a law."""
+        return column_set(COLUMNS[law.kind]) <= self.columns
 
 
 def independent(follow: Follow) -> float:
@@ -42,17 +78,16 @@ def criterion(follow: Follow) -> float:
 # ------------------------------------------------------------------ dropping what is nothing
 
 
-def drop_needless(follow: Follow, tracks: Sequence[Track]) -> Follow:
+def drop_needless(follow: Follow, records: Records) -> Follow:
     """Drop every law whose loss the criterion does not feel, the least first; refit the rest."""
     while follow.laws.groups():
-        order = _needless(follow, tracks)
+        order = _needless(follow, records)
         if not order:
             break
         here = criterion(follow)
         while order:
             laws, p = follow.laws.without(follow.p, order)
-            trial = weigh(replace(follow, laws=laws, p=p), tracks)
-            trial = fit_follow(trial, tracks)
+            trial = records.refit(follow, laws, p)
             if criterion(trial) < here:
                 follow = trial
                 break
@@ -64,9 +99,9 @@ def drop_needless(follow: Follow, tracks: Sequence[Track]) -> Follow:
     return follow
 
 
-def _needless(follow: Follow, tracks: Sequence[Track]) -> list[int]:
+def _needless(follow: Follow, records: Records) -> list[int]:
     """Return the groups that may go, in order, judged by the quadratic form about the fit."""
-    slope = slope_of(follow, tracks, factors=False)
+    slope = records.slope(follow, factors=False)
     groups = dict(follow.laws.groups())
     off = follow.p - follow.laws.neutral()
     low, high, _ = follow.laws.bounds()
@@ -122,11 +157,11 @@ class Scored:
     drop: float
 
 
-def score(follow: Follow, tracks: Sequence[Track], trials: Sequence[Law]) -> list[Scored]:
+def score(follow: Follow, records: Records, trials: Sequence[Law]) -> list[Scored]:
     """Return the trials that would help, each beside all laws of the model, the best first."""
     laws, p = follow.laws.with_laws(follow.p, trials)
     wide = replace(follow, laws=laws, p=p)
-    slope = slope_of(wide, tracks)
+    slope = records.slope(wide)
     if not np.all(np.isfinite(slope.H)):
         return []
     low, high, _ = follow.laws.bounds()
@@ -170,7 +205,7 @@ def score(follow: Follow, tracks: Sequence[Track], trials: Sequence[Law]) -> lis
     return sorted(out, key=lambda one: -one.drop)
 
 
-def shaped_laws(follow: Follow, tracks: Sequence[Track]) -> list[Law]:
+def shaped_laws(follow: Follow, records: Records) -> list[Law]:
     """Return laws that need a shape, at trial shapes, without effect."""
     bench = follow.laws.bench
     n = bench.n
@@ -179,7 +214,7 @@ def shaped_laws(follow: Follow, tracks: Sequence[Track]) -> list[Law]:
     position = np.zeros((2, n))
     stretch = np.zeros((2, n + 1))
     speed = np.zeros(n)
-    for track, own in zip(tracks, follow.own, strict=True):
+    for track, own in zip(records.tracks, follow.own, strict=True):
         x = np.where(track.free, track.y - own.zero, 0.0)
         position = np.maximum(position, [x.max(0), -x.min(0)])
         d = np.diff(np.pad(x, ((0, 0), (1, 1))), axis=1)
@@ -215,13 +250,13 @@ def shaped_laws(follow: Follow, tracks: Sequence[Track]) -> list[Law]:
             for part in (0.08, 0.2, 0.35, 0.5, 0.65, 0.8):
                 if most > 0.1 * stretch[:, j].max():
                     out.append(Law(kind=kernel.SLACK, place=j, values=(0.0, side * part * most)))
-    return out
+    return [law for law in out if records.allows(law)]
 
 
-def cogging_laws(follow: Follow, tracks: Sequence[Track]) -> list[Law]:
+def cogging_laws(follow: Follow, records: Records) -> list[Law]:
     """Return cogging at trial pitches, close enough for its phase over the whole travel."""
     span = 0.0
-    for track, own in zip(tracks, follow.own, strict=True):
+    for track, own in zip(records.tracks, follow.own, strict=True):
         if track.free[0]:
             span = max(span, float(np.ptp(track.y[:, 0] - own.zero[0])))
     if span == 0.0 or (kernel.COGGING, 0) in follow.laws.keys:
@@ -232,28 +267,31 @@ def cogging_laws(follow: Follow, tracks: Sequence[Track]) -> list[Law]:
     ]
 
 
-def add_shaped(follow: Follow, tracks: Sequence[Track]) -> Follow | None:
+def shaped_trials(follow: Follow, records: Records) -> list[Scored]:
+    """Return the laws with a shape that would help beside those of the model, the best first.
+
+    Of each law at each place and side the best shape.
+    """
+    trials = score(follow, records, shaped_laws(follow, records))
+    moving = [i for i, t in enumerate(records.tracks) if t.free[0] and np.any(t.command)]
+    cogging = cogging_laws(follow, records) if moving else []
+    if cogging and records.allows(cogging[0]):
+        part = replace(records, tracks=tuple(records.tracks[i] for i in moving))
+        own = tuple(follow.own[i] for i in moving)
+        trials += score(replace(follow, own=own), part, cogging)
+    best: dict[tuple, Scored] = {}
+    for one in sorted(trials, key=lambda one: -one.drop):
+        if one.drop > 0.0:
+            best.setdefault(one.law.sided, one)
+    return list(best.values())
+
+
+def add_shaped(follow: Follow, records: Records) -> Follow | None:
     """Return the model with one more law that has a shape, or None where none helps."""
-    trials = score(follow, tracks, shaped_laws(follow, tracks))
-    moving = [track for track in tracks if track.free[0] and np.any(track.command)]
-    if moving:
-        part = replace(
-            follow, own=tuple(o for t, o in zip(tracks, follow.own, strict=True) if t in moving)
-        )
-        trials += score(part, moving, cogging_laws(part, moving))
-    trials.sort(key=lambda one: -one.drop)
-    chosen: dict[tuple, Law] = {}
-    for one in trials:
-        side = np.sign(one.law.values[1]) if one.law.kind in (kernel.STOP, kernel.SLACK) else 0.0
-        if one.drop <= 0.0:
-            break
-        chosen.setdefault((one.law.kind, one.law.place, side), one.law)
-        if len(chosen) == _SHORT_LIST:
-            break
     best: Follow | None = None
-    for law in chosen.values():
-        laws, p = follow.laws.with_laws(follow.p, [law])
-        trial = fit_follow(weigh(replace(follow, laws=laws, p=p), tracks), tracks, iterations=8)
+    for one in shaped_trials(follow, records)[:_SHORT_LIST]:
+        laws, p = follow.laws.with_laws(follow.p, [one.law])
+        trial = records.refit(follow, laws, p, iterations=8)
         if best is None or trial.total < best.total:
             best = trial
     if best is None or criterion(best) > criterion(follow):
@@ -264,47 +302,108 @@ def add_shaped(follow: Follow, tracks: Sequence[Track]) -> Follow | None:
 # ------------------------------------------------------------------ the whole way
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Choice:
-    """The laws that are left, fitted near to free, and on the way all of them."""
+def start_all(
+    records: Records, *, springs: Sequence[bool], chains: Sequence[Chain]
+) -> Follow:
+    """Return the model with all laws that need no shape, fitted from nothing.
 
-    lean: Follow
-    full: Follow
-
-
-def choose_laws(
-    tracks: Sequence[Track], *, springs: Sequence[bool], chain: Chain, tell=lambda text: None
-) -> Choice:
-    """Return the model that following finds."""
+    It starts from the one of the `chains` that is nearest to the records.
+    """
+    tracks = records.tracks
     driven = any(np.any(track.command) for track in tracks)
     largest = max(float(np.abs(track.command).max()) for track in tracks)
     shown = np.any([track.free for track in tracks], axis=0)
     pinned = None if driven else int(np.argmax(shown))
-    bench = Bench(chain=chain, springs=tuple(springs), largest=largest, pinned=pinned)
-    laws = smooth_laws(bench, driven=driven, shown=shown.tolist())
-    full = start_follow(laws, laws.start(chain), tracks, gain=CLOSE)
-    full = fit_follow(full, tracks)
-    full = fit_follow(full, tracks, gain=LOOSE)
-    lean = _let_go(full, tracks)
+    starts = []
+    for chain in chains:
+        bench = Bench(chain=chain, springs=tuple(springs), largest=largest, pinned=pinned)
+        laws = smooth_laws(bench, driven=driven, shown=shown.tolist(), columns=records.columns)
+        starts.append(
+            start_follow(laws, laws.start(chain), tracks, gain=CLOSE, mapper=records.mapper)
+        )
+    full = records.fit(min(starts, key=lambda follow: follow.cost))
+    return records.fit(full, gain=LOOSE)
+
+
+def choose_laws(
+    records: Records,
+    *,
+    springs: Sequence[bool],
+    chains: Sequence[Chain],
+    tell: Callable[[str], None] = lambda text: None,
+) -> Follow:
+    """Return the model that following finds: the laws that are left, fitted to free runs."""
+    full = start_all(records, springs=springs, chains=chains)
+    lean = let_go(full, records)
     tell(f"all at once: {full.chi:.3f}, let go: {lean.chi:.3f}")
     for _ in range(_ROUNDS):
         if lean.chi < limits.AT_FLOOR:
             break
-        more = add_shaped(full, tracks)
+        more = add_shaped(full, records)
         if more is None:
             break
-        leaner = _let_go(more, tracks)
+        leaner = let_go(more, records)
         tell(f"with {more.laws.keys[-1]}: {more.chi:.3f}, let go: {leaner.chi:.3f}")
         full = more
         if criterion(leaner) < criterion(lean):
             lean = leaner
-    return Choice(lean=lean, full=full)
-
-
-def _let_go(full: Follow, tracks: Sequence[Track]) -> Follow:
-    """Drop what is nothing, then loosen the gain to none, dropping again."""
-    lean = drop_needless(full, tracks)
-    for gain in (_NEAR_FREE, FREE):
-        loose = fit_follow(lean, tracks, gain=gain)
-        lean = drop_needless(loose, tracks)
     return lean
+
+
+def let_go(full: Follow, records: Records) -> Follow:
+    """Drop what is nothing, then loosen the gain to none, dropping again."""
+    lean = _one_friction(drop_needless(full, records), records)
+    for gain in (_NEAR_FREE, FREE):
+        lean = drop_needless(records.fit(lean, gain=gain), records)
+    return lean
+
+
+def _one_friction(follow: Follow, records: Records) -> Follow:
+    """Leave each cart one law of dry friction where it has two that exclude each other."""
+    for place in range(follow.laws.bench.n):
+        here = [i for i, key in enumerate(follow.laws.keys) if key[1] == place]
+        sides = [
+            [i for i in here if follow.laws.keys[i][0] in kinds]
+            for kinds in ((kernel.COULOMB, kernel.STRIBECK), (kernel.DAHL,))
+        ]
+        if all(sides):
+            trials = [
+                records.refit(follow, *follow.laws.without(follow.p, groups)) for groups in sides
+            ]
+            follow = min(trials, key=lambda one: one.total)
+    return follow
+
+
+def rivals_of(lean: Follow, records: Records) -> list[Follow]:
+    """Return models with one law exchanged for another, fitted as fully, the best first."""
+    out: list[Follow] = []
+    for group in lean.laws.groups():
+        laws, p = lean.laws.without(lean.p, [group])
+        bare = records.refit(lean, laws, p, gain=LOOSE, iterations=6)
+        keys = {key for key in laws.keys if key[0] not in SIDED}
+        everything = smooth_laws(
+            laws.bench,
+            driven=any(np.any(track.command) for track in records.tracks),
+            shown=np.any([track.free for track in records.tracks], axis=0).tolist(),
+            columns=records.columns,
+        )
+        gone = lean.laws.keys[group] if group >= 0 else None
+        plain = [
+            Law(kind=kind, place=place, values=(0.0,))
+            for kind, place in everything.keys
+            if (kind, place) not in keys and (kind, place) != gone
+        ]
+        trials = score(bare, records, plain)
+        trials += [one for one in shaped_trials(bare, records) if one.law.key != gone]
+        for q in range(kernel.DRIVE):
+            if everything.drive[q] and not laws.drive[q] and group != -1 - q:
+                opened = replace(laws, drive=tuple(f or i == q for i, f in enumerate(laws.drive)))
+                trials.append(Scored(law=Law(kind=-1 - q, place=0, values=()), drop=0.0))
+                out.append(records.refit(bare, opened, bare.p, iterations=6))
+        trials.sort(key=lambda one: -one.drop)
+        for one in trials[:_SHORT_LIST]:
+            if one.law.kind >= 0:
+                out.append(records.refit(bare, *laws.with_laws(bare.p, [one.law]), iterations=6))
+    near = [one for one in out if np.isfinite(one.cost)]
+    near.sort(key=lambda one: one.total)
+    return [records.fit(one, gain=FREE) for one in near[:_SHORT_LIST]]

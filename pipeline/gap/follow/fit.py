@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.arrays import Array
+from pipeline.gap.fit.levenberg_marquardt import Mapper
 from pipeline.gap.follow.laws import Laws
 from pipeline.gap.follow.track import Own, Track, errors_of
 
@@ -45,46 +46,64 @@ class Follow:
         return self.cost + self.inflate**2 * self.prior
 
 
-def start_follow(laws: Laws, p: Array, tracks: Sequence[Track], *, gain: float) -> Follow:
+def start_follow(
+    laws: Laws, p: Array, tracks: Sequence[Track], *, gain: float, mapper: Mapper = map
+) -> Follow:
     """Return a model before any fit."""
     own = tuple(track.fresh() for track in tracks)
-    return weigh(Follow(laws=laws, p=p, own=own, gain=gain, cost=np.inf, points=1.0), tracks)
+    bare = Follow(laws=laws, p=p, own=own, gain=gain, cost=np.inf, points=1.0)
+    return weigh(bare, tracks, mapper=mapper)
 
 
-def weigh(follow: Follow, tracks: Sequence[Track]) -> Follow:
-    """Return it with its cost."""
-    cost = prior = 0.0
-    dry = follow.laws.dry
-    for track, own in zip(tracks, follow.own, strict=True):
-        run = errors_of(follow.laws, follow.p, track, own, gain=follow.gain, derive=False)
+def weigh(follow: Follow, tracks: Sequence[Track], *, mapper: Mapper = map) -> Follow:
+    """Return it with its cost: infinite where the model runs away."""
+    laws, dry = follow.laws, follow.laws.dry
+
+    def one(pair: tuple[Track, Own]) -> tuple[float, float]:
+        track, own = pair
+        run = errors_of(laws, follow.p, track, own, gain=follow.gain, derive=False)
         if run is None:
-            cost = np.inf
-            break
-        cost += float(((run[0] * track.weight) ** 2).sum())
-        prior += float((track.prior(own, dry)[1] ** 2).sum())
+            return np.inf, np.inf
+        prior = track.prior(own, dry)[1]
+        return float(((run[0] * track.weight) ** 2).sum()), float((prior**2).sum())
+
+    costs = np.array(list(mapper(one, zip(tracks, follow.own, strict=True))))
     points = sum(track.points for track in tracks)
-    return replace(follow, cost=cost, points=points, prior=prior)
+    return replace(
+        follow, cost=float(costs[:, 0].sum()), points=points, prior=float(costs[:, 1].sum())
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Slope:
-    """The normal equations of a step: H and b of the vector, each run's own eliminated."""
+    """The normal equations of a step: H and b of the vector, each run's own eliminated.
+
+    `back` leads from a step of the vector to those of the runs' own.
+    """
 
     H: Array
     b: Array
     back: tuple[Array, ...]
 
+    @property
+    def sound(self) -> bool:
+        """Whether the model runs away nowhere."""
+        return bool(np.all(np.isfinite(self.H)))
 
-def slope_of(follow: Follow, tracks: Sequence[Track], *, factors: bool = True) -> Slope:
+
+def slope_of(
+    follow: Follow, tracks: Sequence[Track], *, factors: bool = True, mapper: Mapper = map
+) -> Slope:
     """Return the normal equations; without `factors` dry friction is of one size in all runs."""
-    size = follow.p.size
-    H, b, back = np.zeros((size, size)), np.zeros(size), []
-    dry = follow.laws.dry & factors
-    inflate = follow.inflate
-    for track, own in zip(tracks, follow.own, strict=True):
-        run = errors_of(follow.laws, follow.p, track, own, gain=follow.gain, derive=True)
+    laws, size, inflate = follow.laws, follow.p.size, follow.inflate
+    dry = laws.dry & factors
+
+    def one(pair: tuple[Track, Own]) -> tuple[Array, Array, Array]:
+        track, own = pair
+        run = errors_of(laws, follow.p, track, own, gain=follow.gain, derive=True)
         if run is None:
-            return Slope(H=np.full_like(H, np.nan), b=b, back=())
+            nothing = np.full((size, size), np.nan)
+            return nothing, nothing[0], nothing
         E, J = run
         weight = track.weight[:, track.seen]
         J = (J[:, :, track.seen] * weight).reshape(len(J), -1)
@@ -93,10 +112,11 @@ def slope_of(follow: Follow, tracks: Sequence[Track], *, factors: bool = True) -
         mine = A[size:, size:] + np.diag((inflate * hold) ** 2)
         right = np.column_stack([A[size:, :size], r[size:] + inflate**2 * hold * off])
         taken = np.linalg.solve(mine, right)
-        H += A[:size, :size] - A[:size, size:] @ taken[:, :size]
-        b += r[:size] - A[:size, size:] @ taken[:, size]
-        back.append(taken)
-    return Slope(H=H, b=b, back=tuple(back))
+        H = A[:size, :size] - A[:size, size:] @ taken[:, :size]
+        return H, r[:size] - A[:size, size:] @ taken[:, size], taken
+
+    H, b, back = zip(*mapper(one, zip(tracks, follow.own, strict=True)), strict=True)
+    return Slope(H=np.sum(H, axis=0), b=np.sum(b, axis=0), back=back)
 
 
 def fit_follow(
@@ -106,18 +126,18 @@ def fit_follow(
     gain: float | None = None,
     iterations: int = 12,
     tolerance: float = 1e-3,
+    mapper: Mapper = map,
 ) -> Follow:
     """Fit from a start, at a gain of its own or another."""
     best = start if gain is None else replace(start, gain=gain)
-    best = weigh(best, tracks)
+    best = weigh(best, tracks, mapper=mapper)
     low, high, reach = best.laws.steps_of_shape(best.p)
-    dry = best.laws.dry
     damp = _DAMP
     for _ in range(iterations):
         if not np.isfinite(best.cost):
             break
-        slope = slope_of(best, tracks)
-        if not np.all(np.isfinite(slope.H)):
+        slope = slope_of(best, tracks, mapper=mapper)
+        if not slope.sound:
             break
         for _attempt in range(_ATTEMPTS):
             delta = _step(slope, best.p, low, high, reach, damp)
@@ -125,7 +145,7 @@ def fit_follow(
                 track.moved(one, taken[:, -1] - taken[:, :-1] @ delta)
                 for track, one, taken in zip(tracks, best.own, slope.back, strict=True)
             )
-            trial = weigh(replace(best, p=best.p + delta, own=own), tracks)
+            trial = weigh(replace(best, p=best.p + delta, own=own), tracks, mapper=mapper)
             if trial.cost + best.inflate**2 * trial.prior < best.total:
                 break
             damp = max(damp * _CHANGE, _DAMP)
@@ -135,7 +155,6 @@ def fit_follow(
         best, damp = trial, max(damp / _CHANGE, _LEAST_DAMP)
         if fall < tolerance:
             break
-    assert dry is not None
     return best
 
 

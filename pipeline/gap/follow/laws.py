@@ -1,7 +1,8 @@
 """Which laws a following model has, and its parameters as one vector in physical units."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
 from functools import cached_property
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.gap.follow import kernel
 from pipeline.plant.linear.chain import Chain
+from pipeline.plant.nonlinear.tables import Cart, Drive, Spring
 
 _CHAIN = (0.2, 5.0)  # times the first estimate: how far masses and springs may go
 _REACH = 0.3  # of a mass or spring, in one step
@@ -22,16 +24,37 @@ COEFFICIENTS = ((0,), (0,), (0,), (0,), (0,), (0,), (0,), (0,), (0, 2), (0,), (0
 _POSITIVE = {kernel.COULOMB, kernel.LOAD, kernel.DRAG, kernel.COUPLING, kernel.STOP,
              kernel.STRIBECK, kernel.DAHL, kernel.HIDDEN}  # fmt: skip
 DRY = (kernel.COULOMB, kernel.LOAD, kernel.STRIBECK, kernel.DAHL)
-ON_SPRING = (kernel.CUBIC, kernel.SLACK, kernel.COUPLING)
+SIDED = (kernel.STOP, kernel.SLACK)  # with a position whose sign is the side
+# The columns of the simulator's tables that the laws fill, in the order of `kernel`.
+COLUMNS: tuple[tuple[IntEnum, ...], ...] = (
+    (Cart.COULOMB,),
+    (Cart.LOAD,),
+    (Cart.DRAG,),
+    (Cart.OFFSET,),
+    (Spring.CUBIC,),
+    (Spring.CHANGE, Spring.STRETCH),
+    (Spring.COUPLING,),
+    (Drive.DAMPING,),
+    (Cart.STOP_STIFFNESS, Cart.STOP, Cart.STOP_DAMPING),
+    (Cart.STATIC, Cart.STRIBECK),
+    (Cart.DAHL, Cart.DISTANCE),
+    (Cart.HIDDEN_MASS, Cart.HIDDEN_STIFFNESS, Cart.HIDDEN_DAMPING),
+    (Drive.COGGING, Drive.PHASE, Drive.PITCH),
+    (Cart.GAIN,),
+)
+Column = tuple[type[IntEnum], int]  # columns of different tables are equal as numbers
+DRIVE_COLUMNS = (Drive.DEAD_ZONE, Drive.LIMIT, Drive.DELAY, Drive.LAG)
 DEAD_ZONE, LIMIT, DELAY, LAG = range(kernel.DRIVE)
+
+
+def column_set(columns: Iterable[IntEnum]) -> frozenset[Column]:
+    """Return columns as a set, each with its table."""
+    return frozenset((type(column), int(column)) for column in columns)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Law:
-    """A law at a cart or spring (from 0), with the values of its parameters.
-
-    The four laws of the drive have the kinds -1 to -4 (`drive`).
-    """
+    """A law at a cart or spring (from 0), with the values of its parameters."""
 
     kind: int
     place: int
@@ -41,6 +64,11 @@ class Law:
     def key(self) -> tuple[int, int]:
         """Kind and place."""
         return self.kind, self.place
+
+    @property
+    def sided(self) -> tuple[int, int, float]:
+        """Kind, place and, where it has one, side."""
+        return self.kind, self.place, float(np.sign(self.values[1]) if self.kind in SIDED else 0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -67,7 +95,7 @@ class Laws:
 
     bench: Bench
     keys: tuple[tuple[int, int], ...]
-    drive: tuple[bool, bool, bool, bool]  # which of its laws are free
+    drive: tuple[bool, ...]  # which of its laws are free
 
     @cached_property
     def kinds(self) -> np.ndarray:
@@ -203,10 +231,36 @@ class Laws:
         return out
 
 
-def smooth_laws(bench: Bench, *, driven: bool, shown: Sequence[bool]) -> Laws:
+    def columns(self, p: Array) -> dict[tuple[type[IntEnum], int], dict[IntEnum, float]]:
+        """Return what the laws fill of the simulator's tables: by table and row (0 for a drive)."""
+        n = self.bench.n
+        out: dict[tuple[type[IntEnum], int], dict[IntEnum, float]] = {}
+        for q, column in enumerate(DRIVE_COLUMNS):
+            if self.drive[q]:
+                out.setdefault((Drive, 0), {})[column] = float(p[self.drive_at + q])
+        for (kind, place), o in zip(self.keys, self.first, strict=True):
+            values = [float(v) for v in p[o : o + kernel.SIZES[kind]]]
+            if kind == kernel.SLACK:
+                values[0] /= p[2 * n + place]
+            elif kind == kernel.HIDDEN:
+                values[1:] = [values[0] * v for v in values[1:]]
+            elif kind == kernel.COGGING:
+                a, b, pitch = values
+                values = [float(np.hypot(a, b)), float(np.arctan2(b, a)), pitch]
+            elif kind == kernel.GAIN:
+                values[0] += 1.0
+            table = type(COLUMNS[kind][0])
+            row = out.setdefault((table, 0 if table is Drive else place), {})
+            row.update(zip(COLUMNS[kind], values, strict=True))
+        return out
+
+
+def smooth_laws(
+    bench: Bench, *, driven: bool, shown: Sequence[bool], columns: frozenset[Column]
+) -> Laws:
     """Return every law that needs no shape, at every place: all to start from nothing.
 
-    `shown` (n,) tells which carts move in any run.
+    `shown` (n,) tells which carts move in any run; `columns` are those that effects may fill.
     """
     n = bench.n
     keys: list[tuple[int, int]] = []
@@ -215,14 +269,14 @@ def smooth_laws(bench: Bench, *, driven: bool, shown: Sequence[bool]) -> Laws:
             keys += [(kernel.COULOMB, i), (kernel.DRAG, i)]
             keys += [(kernel.LOAD, i)] if driven else []
     rows = [j for j, there in enumerate(bench.springs) if there]
-    rows = rows[:1] if n == 1 else rows
-    for j in rows:
+    for j in rows[:1] if n == 1 else rows:
         if (j < n and shown[j]) or (j > 0 and shown[j - 1]):
             keys.append((kernel.CUBIC, j))
-        if 0 < j < n and (shown[j] or shown[j - 1]):
-            keys.append((kernel.COUPLING, j))
+            keys += [(kernel.COUPLING, j)] if 0 < j < n else []
     if driven:
         keys.append((kernel.BRAKING, 0))
     if not any(bench.springs):
         keys += [(kernel.OFFSET, i) for i in range(n) if shown[i]]
-    return Laws(bench=bench, keys=tuple(keys), drive=(driven,) * 4)
+    kept = tuple(key for key in keys if column_set(COLUMNS[key[0]]) <= columns)
+    drive = tuple(driven and (Drive, int(column)) in columns for column in DRIVE_COLUMNS)
+    return Laws(bench=bench, keys=kept, drive=drive)
