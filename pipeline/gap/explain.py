@@ -16,10 +16,9 @@ from pipeline.gap.fit.levenberg_marquardt import Fit, fit_model
 from pipeline.gap.fit.restart import holding_force
 from pipeline.gap.fit.structure import Candidate
 from pipeline.gap.fit.uncertainty import covariance
-from pipeline.gap.search.beam import choose, prune, search, steps_to
 from pipeline.gap.search.deadline import Deadline, OutOfTime
-from pipeline.gap.search.grow import fit_whole
 from pipeline.gap.search.hypothesis import Hypothesis, Study, judge
+from pipeline.gap.search.search import fit_whole, search, steps_to
 from pipeline.gap.types import FoundEffect, Gap
 from pipeline.gap.verdict.account import (
     chain_covariance,
@@ -247,8 +246,7 @@ def _investigate(fit: Fit, study: Study, deadline: Deadline) -> tuple[Hypothesis
         return baseline, [baseline]
     study.tell(f"linear model: error {baseline.error:.1%} of the motion on held-out runs")
     timed = replace(study, mapper=deadline.map)
-    found = search(baseline, timed)
-    return prune(choose(found, baseline, study), timed), found
+    return search(baseline, timed)
 
 
 def _with_offset(

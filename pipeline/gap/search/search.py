@@ -1,0 +1,145 @@
+"""Search the catalogue: laws chosen while the model follows, then fitted to free runs, judged.
+
+Nothing is tried one by one: all laws at all places are fitted together from nothing to a model
+that follows the measurement, and those that are nothing are dropped (`gap.follow`). What is left
+is fitted to whole runs, each effect must be worth it on runs the fit has not seen, and rivals
+come from the same fit with one law exchanged.
+"""
+
+from collections.abc import Sequence
+from contextlib import suppress
+
+import numpy as np
+
+from pipeline.gap.fit.baseline import first_chain
+from pipeline.gap.fit.levenberg_marquardt import Fit, fit_model
+from pipeline.gap.fit.restart import restart_runs
+from pipeline.gap.fit.structure import Candidate, Model
+from pipeline.gap.follow.choose import Records, choose_laws, rivals_of
+from pipeline.gap.follow.fit import Follow
+from pipeline.gap.follow.track import make_track
+from pipeline.gap.limits import AT_FLOOR
+from pipeline.gap.search.deadline import OutOfTime
+from pipeline.gap.search.hypothesis import Hypothesis, Study, judge, worth_it
+from pipeline.gap.search.translate import as_model, filled, make_candidate
+from pipeline.plant.nonlinear.effects import find_effect
+
+_FRICTION_ROUNDS = 2  # of run-by-run friction, the worst runs started anew before each
+_NEARLY_RIGHT = 6.0  # chi-square of the better runs, below which the bad ones are worth a new start
+_IN_THE_RUNNING = 3.0  # times the chosen model's misfit while following: a rival that may still win
+
+
+def search(baseline: Hypothesis, study: Study) -> tuple[Hypothesis, list[Hypothesis]]:
+    """Return the hypothesis chosen and all that were judged, the baseline first.
+
+    Past the time allowed, the best of those so far.
+    """
+    found = [baseline]
+    with suppress(OutOfTime):
+        records = Records(
+            tracks=tuple(make_track(run) for run in study.training),
+            mapper=study.mapper,
+            columns=frozenset().union(*(filled(effect) for effect in study.catalogue)),
+        )
+        chain = baseline.fit.structure.chain(baseline.fit.theta)
+        own = first_chain(study.training, springs=study.springs)
+        lean = choose_laws(records, springs=study.springs, chains=[chain, own], tell=study.tell)
+        if not lean.laws.groups():
+            return baseline, found
+        found.append(_judged(lean, study))
+        study.tell(f"{found[-1].size} laws are left: error {found[-1].error:.1%}")
+        for rival in rivals_of(lean, records):
+            close = rival.total < _IN_THE_RUNNING * lean.total
+            found.append(_judged(rival, study, finish=close))
+        found[1:] = [h for h in found[1:] if np.isfinite(h.error) and h.key]
+        leading = min((h for h in found[1:] if h.sound), key=lambda h: h.bic, default=baseline)
+        return prune(leading, study, found), found
+    worth = [h for h in found if h.sound and worth_it(h, baseline, study)]
+    return min(worth, key=lambda h: h.bic, default=baseline), found
+
+
+def _judged(follow: Follow, study: Study, *, finish: bool = True) -> Hypothesis:
+    """Return what a following model says, fitted to whole runs: to the end, or by a few steps."""
+    start = as_model(
+        follow, springs=study.springs, catalogue=study.catalogue, runs=study.training
+    )
+    if finish:
+        return judge(fit_whole(start, study), study)
+    fit = fit_model(start, study.training, iterations=4, scatter_free=False, mapper=study.mapper)
+    return judge(fit, study)
+
+
+def fit_whole(start: Model, study: Study) -> Fit:
+    """Fit whole runs; friction first with one size for all runs, then run by run."""
+    whole, structure = study.training, start.structure
+    iterations = 25 if structure.has_contact else 12
+    fit = fit_model(
+        start, whole, iterations=iterations, scatter_free=False, mapper=study.mapper
+    )
+    for attempt in range(_FRICTION_ROUNDS):
+        if not structure.many_rests or fit.chi < AT_FLOOR:
+            break
+        if np.quantile(fit.run_chi, 0.25) < _NEARLY_RIGHT:
+            fit = restart_runs(fit, whole, mapper=study.mapper)
+        elif attempt:
+            break
+        fit = fit_model(
+            fit,
+            whole,
+            nuisance=fit.nuisance,
+            spread=fit.spread,
+            iterations=12,
+            learn_spread=True,
+            mapper=study.mapper,
+        )
+    return fit
+
+
+def prune(chosen: Hypothesis, study: Study, found: list[Hypothesis]) -> Hypothesis:
+    """Drop effects, and richer laws, that the others have made needless; all tried are `found`."""
+    while chosen.key:
+        effects = chosen.fit.structure.effects
+        if len(effects) == 1:
+            trials = [found[0]]
+        else:
+            trials = [_without(chosen, c, study) for c in effects]
+            found += trials
+        as_good = [h for h in trials if (h.sound or not h.key) and not worth_it(chosen, h, study)]
+        plainer = [_plainer(chosen, c, study) for c in effects if c.effect.grows_from]
+        found += plainer
+        as_good += [h for h in plainer if h.sound and h.bic < chosen.bic]
+        if not as_good:
+            break
+        chosen = min(as_good, key=lambda h: h.bic)
+    return chosen
+
+
+def _without(hypothesis: Hypothesis, effect: Candidate, study: Study) -> Hypothesis:
+    index = hypothesis.fit.structure.effects.index(effect)
+    fit = fit_whole(hypothesis.fit.without(index), study)
+    return judge(fit, study)
+
+
+def _plainer(hypothesis: Hypothesis, rich: Candidate, study: Study) -> Hypothesis:
+    """Return the hypothesis with the law in place of a richer one that grew from it."""
+    index = hypothesis.fit.structure.effects.index(rich)
+    effect = find_effect(rich.effect.grows_from or rich.effect.key)
+    values = [hypothesis.fit.terms[index].values[rich.effect.names.index(name)]
+              for name in effect.names]  # fmt: skip
+    chain = hypothesis.fit.structure.chain(hypothesis.fit.theta)
+    plain = make_candidate(effect, rich.place, values, runs=study.training, chain=chain)
+    fit = fit_whole(hypothesis.fit.without(index).with_effect(plain, values), study)
+    return judge(fit, study)
+
+
+def steps_to(
+    chosen: Hypothesis, found: Sequence[Hypothesis], study: Study
+) -> tuple[Hypothesis, ...]:
+    """Return the linear model, one effect, … chosen: what helps most by itself comes first."""
+    steps = [chosen]
+    while effects := steps[0].fit.structure.effects:
+        key = steps[0].key
+        smaller = [h for h in found if h.key < key and len(h.key) == len(key) - 1]
+        smaller = smaller or [_without(steps[0], effects[-1], study)]
+        steps.insert(0, min(smaller, key=lambda h: h.error))
+    return tuple(steps)
