@@ -29,6 +29,7 @@ _NEAR_FREE = 0.02
 _INDEPENDENT = 4.0  # readings of a track that tell as much as one independent
 _RIDGE = 1e-10  # of the diagonal
 _SHORT_LIST = 4  # of laws with a shape, refitted
+_PLAY, _MOTOR = 0.03, 0.15  # of the travel and of cart 1's mass: where a play starts
 _ROUNDS = 3  # of adding one of them
 
 
@@ -267,6 +268,20 @@ def cogging_laws(follow: Follow, records: Records) -> list[Law]:
     ]
 
 
+def backlash_laws(follow: Follow, records: Records) -> list[Law]:
+    """Return a play between motor and cart 1, which no trial from nothing can show."""
+    spans = [
+        float(np.ptp(track.y[:, 0]))
+        for track in records.tracks
+        if track.free[0] and track.seen[0] and np.any(track.command)
+    ]
+    if not spans or (kernel.BACKLASH, 0) in follow.laws.keys:
+        return []
+    values = _PLAY * max(spans), _MOTOR * float(follow.p[0])
+    law = Law(kind=kernel.BACKLASH, place=0, values=values)
+    return [law] if records.allows(law) else []
+
+
 def shaped_trials(follow: Follow, records: Records) -> list[Scored]:
     """Return the laws with a shape that would help beside those of the model, the best first.
 
@@ -289,8 +304,9 @@ def shaped_trials(follow: Follow, records: Records) -> list[Scored]:
 def add_shaped(follow: Follow, records: Records) -> Follow | None:
     """Return the model with one more law that has a shape, or None where none helps."""
     best: Follow | None = None
-    for one in shaped_trials(follow, records)[:_SHORT_LIST]:
-        laws, p = follow.laws.with_laws(follow.p, [one.law])
+    trials = [one.law for one in shaped_trials(follow, records)[:_SHORT_LIST]]
+    for law in (*trials, *backlash_laws(follow, records)):
+        laws, p = follow.laws.with_laws(follow.p, [law])
         trial = records.refit(follow, laws, p, iterations=8)
         if best is None or trial.total < best.total:
             best = trial

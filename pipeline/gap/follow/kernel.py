@@ -23,10 +23,11 @@ from pipeline.plant.nonlinear.simulator.state import jit
 
 # Laws, in the order of `SIZES`: how many parameters each has.
 COULOMB, LOAD, DRAG, OFFSET, CUBIC, SLACK, COUPLING, BRAKING, STOP, STRIBECK, DAHL, HIDDEN = range(12)
-COGGING, GAIN = 12, 13
-SIZES = (1, 1, 1, 1, 1, 2, 1, 1, 3, 2, 2, 3, 3, 1)
+COGGING, GAIN, BACKLASH = 12, 13, 14
+SIZES = (1, 1, 1, 1, 1, 2, 1, 1, 3, 2, 2, 3, 3, 1, 2)
 DRIVE = 4  # parameters of the drive: dead zone, limit, delay, lag
 VELOCITY_GAIN = 0.3  # of the square of the position's: a little over critical
+_LEAST_SHARE = 0.02  # of cart 1's mass: what is left of it without the motor's
 _BLOWN_UP = 1e6  # times the record's span
 
 
@@ -81,6 +82,13 @@ def follow_run(
         dlag[q] = 0.0
     position = 0
     on = 0
+    # A play: the motor is a body of its own while it crosses it; touching, it is one with cart 1.
+    play, side_of = -1, 0.0
+    for law in range(L):
+        if kinds[law] == BACKLASH:
+            play = law
+    gap = p[first[play]] if play >= 0 else 0.0
+    motor = p[first[play] + 1] if play >= 0 else 0.0
     past, past_w, past_l, u_past = 0.0, 0.0, 0.0, held[0, 0, 0]
     for sample in range(t.size):
         step = t[min(sample + 1, t.size - 1)] - t[min(sample, t.size - 2)]
@@ -110,6 +118,14 @@ def follow_run(
                     for q in range(lanes):
                         DX[i, q] -= gain * J[q, sample, i]
                         DV[i, q] -= kick * J[q, sample, i]
+                if i == 0 and play >= 0:
+                    # The motor with it: a cart corrected alone would knock on it.
+                    aux[play, 0] += gain * e
+                    aux[play, 1] += kick * e
+                    if derive:
+                        for q in range(lanes):
+                            DA[2 * play, q] -= gain * J[q, sample, 0]
+                            DA[2 * play + 1, q] -= kick * J[q, sample, 0]
             if not abs(x[i]) < _BLOWN_UP:
                 return False
         if sample == t.size - 1:
@@ -167,7 +183,10 @@ def follow_run(
                     for q in range(lanes):
                         DX[i, q] += 0.5 * h * DV[i, q]
                         DR[i, q] = 0.0
-            f[0] += u
+            crossing = play >= 0 and side_of == 0.0
+            if not crossing:
+                f[0] += u
+            before = v[0]
             for j in range(n + 1):
                 k = p[2 * n + j]
                 d = (xm[j] if j < n else 0.0) - (xm[j - 1] if j > 0 else 0.0)
@@ -242,8 +261,9 @@ def follow_run(
                             kij, cij = K[i, j], C[i, j]
                             for q in range(lanes):
                                 DF[i, q] -= kij * DX[j, q] + cij * DV[j, q]
-                for q in range(DRIVE):
-                    DF[0, drive + q] += du[q]
+                if not crossing:
+                    for q in range(DRIVE):
+                        DF[0, drive + q] += du[q]
                 for j in range(n + 1):
                     d = (xm[j] if j < n else 0.0) - (xm[j - 1] if j > 0 else 0.0)
                     _pull_lane(DF, 2 * n + j, j, n, d)
@@ -336,10 +356,13 @@ def follow_run(
                 if not free[i]:
                     continue
                 half_c = 0.5 * h * p[n + i]
-                whole = p[i] + half_c
+                mass = p[i]
+                if i == 0 and crossing:
+                    mass = max(mass - motor, _LEAST_SHARE * mass)
+                whole = mass + half_c
                 pushed = h * f[i] / whole
                 rub = h * factor[i] * R[i] / whole
-                target = v[i] * (p[i] - half_c) / whole + pushed
+                target = v[i] * (mass - half_c) / whole + pushed
                 side = 1.0 if (v[i] if v[i] != 0.0 else pushed) > 0.0 else -1.0
                 after = target - side * rub
                 ratio = 1.0
@@ -358,17 +381,62 @@ def follow_run(
                         for q in range(lanes):
                             DV[i, q] = 0.0
                     else:
-                        keep, kick = ratio * (p[i] - half_c) / whole, ratio * h / whole
+                        keep, kick = ratio * (mass - half_c) / whole, ratio * h / whole
                         rubbed = kick * side
                         for q in range(lanes):
                             DV[i, q] = keep * DV[i, q] + kick * DF[i, q] - rubbed * DR[i, q]
-                        DV[i, i] += ratio * (v[i] - after) / whole
+                        by_mass = ratio * (v[i] - after) / whole
+                        DV[i, i] += by_mass
+                        if i == 0 and crossing:
+                            DV[i, first[play] + 1] -= by_mass
                         DV[i, n + i] -= ratio * 0.5 * h * (v[i] + after) / whole
                 v[i] = after
                 x[i] = xm[i] + 0.5 * h * after
                 if derive:
                     for q in range(lanes):
                         DX[i, q] += 0.5 * h * DV[i, q]
+            if play >= 0 and free[0]:
+                o, at, vat = first[play], 2 * play, 2 * play + 1
+                if crossing:
+                    push = h * u / motor
+                    aux[play, 0] += h * (aux[play, 1] + 0.5 * push)
+                    aux[play, 1] += push
+                    if derive:
+                        for q in range(lanes):
+                            DA[at, q] += h * DA[vat, q]
+                        for q in range(DRIVE):
+                            kick = h * du[q] / motor
+                            DA[at, drive + q] += 0.5 * h * kick
+                            DA[vat, drive + q] += kick
+                        DA[at, o + 1] -= 0.5 * h * push / motor
+                        DA[vat, o + 1] -= push / motor
+                    apart = aux[play, 0] - x[0]
+                    rate = aux[play, 1] - v[0]
+                    if abs(apart) > 0.5 * gap and apart * rate > 0.0:
+                        side_of = 1.0 if apart > 0.0 else -1.0
+                        late = min((abs(apart) - 0.5 * gap) / abs(rate), h)
+                        share = min(motor / p[0], 1.0 - _LEAST_SHARE)
+                        together = v[0] + share * rate
+                        if derive:
+                            for q in range(lanes):
+                                off = DA[at, q] - DX[0, q]
+                                if q == o:
+                                    off -= 0.5 * side_of
+                                # The instant moves with the parameter.
+                                DX[0, q] += (together - v[0]) * off / rate
+                                DV[0, q] += share * (DA[vat, q] - DV[0, q])
+                            DV[0, o + 1] += rate / p[0]
+                            DV[0, 0] -= rate * share / p[0]
+                        x[0] += (together - v[0]) * late
+                        v[0] = together
+                elif (u - motor * (v[0] - before) / h) * side_of < 0.0:
+                    aux[play, 0] = x[0] + 0.5 * side_of * gap
+                    aux[play, 1] = v[0]
+                    if derive:
+                        for q in range(lanes):
+                            DA[at, q], DA[vat, q] = DX[0, q], DV[0, q]
+                        DA[at, o] += 0.5 * side_of
+                    side_of = 0.0
             for law in range(L):
                 if kinds[law] == DAHL:
                     at, o = places[law], first[law]

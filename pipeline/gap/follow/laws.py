@@ -18,11 +18,12 @@ _DELAY = (-0.05, 0.1)  # s
 _LONGEST_LAG = 0.3  # s
 _LEAST_LIMIT = 0.2  # of the largest input
 _SHORT = 0.01  # s: how far a delay or lag may go in one step
+_CONTACT, _CONTACT_DAMPING = 40.0, 0.5  # of cart 1's springs, and of critical damping
 _SLACK = 0.95  # of a spring that goes slack, at most
 # Parameters that are a force or a share of one, and vanish with the effect; the others are shape.
-COEFFICIENTS = ((0,), (0,), (0,), (0,), (0,), (0,), (0,), (0,), (0, 2), (0,), (0,), (0,), (0, 1), (0,))
+COEFFICIENTS = ((0,), (0,), (0,), (0,), (0,), (0,), (0,), (0,), (0, 2), (0,), (0,), (0,), (0, 1), (0,), (0,))
 _POSITIVE = {kernel.COULOMB, kernel.LOAD, kernel.DRAG, kernel.COUPLING, kernel.STOP,
-             kernel.STRIBECK, kernel.DAHL, kernel.HIDDEN}  # fmt: skip
+             kernel.STRIBECK, kernel.DAHL, kernel.HIDDEN, kernel.BACKLASH}  # fmt: skip
 DRY = (kernel.COULOMB, kernel.LOAD, kernel.STRIBECK, kernel.DAHL)
 SIDED = (kernel.STOP, kernel.SLACK)  # with a position whose sign is the side
 # The columns of the simulator's tables that the laws fill, in the order of `kernel`.
@@ -41,6 +42,7 @@ COLUMNS: tuple[tuple[IntEnum, ...], ...] = (
     (Cart.HIDDEN_MASS, Cart.HIDDEN_STIFFNESS, Cart.HIDDEN_DAMPING),
     (Drive.COGGING, Drive.PHASE, Drive.PITCH),
     (Cart.GAIN,),
+    (Drive.BACKLASH, Drive.MOTOR_MASS),
 )
 Column = tuple[type[IntEnum], int]  # columns of different tables are equal as numbers
 DRIVE_COLUMNS = (Drive.DEAD_ZONE, Drive.LIMIT, Drive.DELAY, Drive.LAG)
@@ -252,6 +254,11 @@ class Laws:
             table = type(COLUMNS[kind][0])
             row = out.setdefault((table, 0 if table is Drive else place), {})
             row.update(zip(COLUMNS[kind], values, strict=True))
+            if kind == kernel.BACKLASH:
+                # What follows is rigid; a bench is not quite.
+                firm = _CONTACT * float(p[2 * n] + p[2 * n + 1])
+                row[Drive.CONTACT_STIFFNESS] = firm
+                row[Drive.CONTACT_DAMPING] = _CONTACT_DAMPING * float(np.sqrt(firm * values[1]))
         return out
 
 

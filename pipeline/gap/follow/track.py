@@ -12,6 +12,7 @@ from pipeline.gap.follow.laws import DEAD_ZONE, LIMIT, Laws
 _RATE = 100.0  # Hz, at the usual pace: some twenty readings in a swing
 _LONGEST = 2.5e-3  # s, of a step, at the usual pace …
 _FREELY = 0.4  # … times this where the model runs on, and the errors of the steps add up
+_KNOCK = 0.25  # … or this where bodies meet in between
 _FOLLOWS = 0.05  # the gain from which on it does not
 _SURE = 1e6  # weight of what is known
 _START = 0.3  # of the swing: how far a release may be from its first readings
@@ -132,11 +133,13 @@ def errors_of(
     count = len(laws.keys)
     aux, DA = np.zeros((count, 2)), np.zeros((2 * count, lanes))
     for law, (kind, place) in enumerate(laws.keys):
-        if kind == kernel.HIDDEN:
+        if kind in (kernel.HIDDEN, kernel.BACKLASH):
             aux[law] = x[place], own.v0[place]
             DA[2 * law], DA[2 * law + 1] = DX[place], DV[place]
     room = np.zeros((n, lanes)), np.zeros((n, lanes)), DA, np.zeros((6 + 2 * n, max(n, 4)))
     longest = track.longest * (1.0 if gain > _FOLLOWS else _FREELY)
+    if kernel.BACKLASH in laws.kinds:
+        longest = min(longest, _KNOCK * track.longest)
     fine = kernel.follow_run(
         p, n, laws.kinds, laws.places, laws.first, track.free, track.seen, track.t, track.y,
         track.knots, held, track.command, float(gain), own.zero, own.factor, longest, derive,
