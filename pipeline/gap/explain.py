@@ -18,7 +18,8 @@ from pipeline.gap.fit.structure import Candidate
 from pipeline.gap.fit.uncertainty import covariance
 from pipeline.gap.search.deadline import Deadline, OutOfTime
 from pipeline.gap.search.hypothesis import Hypothesis, Study, judge
-from pipeline.gap.search.search import fit_whole, search, steps_to
+from pipeline.gap.search.search import search, steps_to
+from pipeline.gap.search.whole import fit_whole
 from pipeline.gap.types import FoundEffect, Gap
 from pipeline.gap.verdict.account import (
     chain_covariance,

@@ -12,20 +12,17 @@ from contextlib import suppress
 import numpy as np
 
 from pipeline.gap.fit.baseline import first_chain
-from pipeline.gap.fit.levenberg_marquardt import Fit, fit_model
-from pipeline.gap.fit.restart import restart_runs
-from pipeline.gap.fit.structure import Candidate, Model
+from pipeline.gap.fit.levenberg_marquardt import fit_model
+from pipeline.gap.fit.structure import Candidate
 from pipeline.gap.follow.choose import Records, choose_laws, rivals_of
 from pipeline.gap.follow.fit import Follow
 from pipeline.gap.follow.track import make_track
-from pipeline.gap.limits import AT_FLOOR
 from pipeline.gap.search.deadline import OutOfTime
 from pipeline.gap.search.hypothesis import Hypothesis, Study, judge, worth_it
 from pipeline.gap.search.translate import as_model, filled, make_candidate
+from pipeline.gap.search.whole import fit_whole
 from pipeline.plant.nonlinear.effects import find_effect
 
-_FRICTION_ROUNDS = 2  # of run-by-run friction, the worst runs started anew before each
-_NEARLY_RIGHT = 6.0  # chi-square of the better runs, below which the bad ones are worth a new start
 _IN_THE_RUNNING = 3.0  # times the chosen model's misfit while following: a rival that may still win
 
 
@@ -67,32 +64,6 @@ def _judged(follow: Follow, study: Study, *, finish: bool = True) -> Hypothesis:
         return judge(fit_whole(start, study), study)
     fit = fit_model(start, study.training, iterations=4, scatter_free=False, mapper=study.mapper)
     return judge(fit, study)
-
-
-def fit_whole(start: Model, study: Study) -> Fit:
-    """Fit whole runs; friction first with one size for all runs, then run by run."""
-    whole, structure = study.training, start.structure
-    iterations = 25 if structure.has_contact else 12
-    fit = fit_model(
-        start, whole, iterations=iterations, scatter_free=False, mapper=study.mapper
-    )
-    for attempt in range(_FRICTION_ROUNDS):
-        if not structure.many_rests or fit.chi < AT_FLOOR:
-            break
-        if np.quantile(fit.run_chi, 0.25) < _NEARLY_RIGHT:
-            fit = restart_runs(fit, whole, mapper=study.mapper)
-        elif attempt:
-            break
-        fit = fit_model(
-            fit,
-            whole,
-            nuisance=fit.nuisance,
-            spread=fit.spread,
-            iterations=12,
-            learn_spread=True,
-            mapper=study.mapper,
-        )
-    return fit
 
 
 def prune(chosen: Hypothesis, study: Study, found: list[Hypothesis]) -> Hypothesis:
