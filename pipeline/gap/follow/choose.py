@@ -24,11 +24,13 @@ from pipeline.gap.follow.laws import (
 from pipeline.gap.follow.track import Track
 from pipeline.plant.linear.chain import Chain
 
+CONTACTS = {kernel.STOP, kernel.BACKLASH}
 CLOSE, LOOSE, FREE = 0.5, 0.1, 0.0  # gains
 _NEAR_FREE = 0.02
 _INDEPENDENT = 4.0  # readings of a track that tell as much as one independent
 _RIDGE = 1e-10  # of the diagonal
 _SHORT_LIST = 4  # of laws with a shape, refitted
+_HOLDS = 1.5  # times what a closer model leaves: a looser one that leaves more lacks something
 _PLAY, _MOTOR = 0.03, 0.15  # of the travel and of cart 1's mass: where a play starts
 _ROUNDS = 3  # of adding one of them
 
@@ -85,11 +87,11 @@ def drop_needless(follow: Follow, records: Records) -> Follow:
         order = _needless(follow, records)
         if not order:
             break
-        here = criterion(follow)
+        here, rough = criterion(follow), _rough_contact(follow)
         while order:
             laws, p = follow.laws.without(follow.p, order)
             trial = records.refit(follow, laws, p)
-            if criterion(trial) < here:
+            if rough or criterion(trial) < here:
                 follow = trial
                 break
             if len(order) == 1:
@@ -116,7 +118,7 @@ def _needless(follow: Follow, records: Records) -> list[int]:
         if not usable[groups[g]].any():
             order.append(g)
             del groups[g]
-    count, cost = independent(follow), follow.total
+    count, cost, rough = independent(follow), follow.total, _rough_contact(follow)
     active = np.flatnonzero(usable)
     while groups:
         size = np.sqrt(power[active])
@@ -129,6 +131,8 @@ def _needless(follow: Follow, records: Records) -> list[int]:
             d = off[active[mine]]
             rise = float(d @ np.linalg.solve(inverse[np.ix_(mine, mine)], d))
             price = limits.BIC_DROP + len(follow.laws.whole_group(g)) * np.log(count)
+            if rough and (g < 0 or follow.laws.keys[g][0] not in CONTACTS):
+                price = max(price, -count * float(np.log(limits.CONTACT_GAIN)))
             excess = count * float(np.log1p(max(rise, 0.0) / cost)) - price
             if best is None or excess < best[0]:
                 best = excess, g, mine
@@ -312,7 +316,16 @@ def add_shaped(follow: Follow, records: Records) -> Follow | None:
             best = trial
     if best is None or criterion(best) > criterion(follow):
         return None
+    # Behind a contact, whose own law is known to a factor, another would mop up the rest of it.
+    if _rough_contact(follow) and best.total > limits.CONTACT_GAIN * follow.total:
+        return None
     return best
+
+
+def _rough_contact(follow: Follow) -> bool:
+    """Whether bodies meet in a way that is not fully described."""
+    meets = CONTACTS & {kind for kind, _ in follow.laws.keys}
+    return bool(meets) and follow.chi > limits.AT_FLOOR
 
 
 # ------------------------------------------------------------------ the whole way
@@ -353,7 +366,7 @@ def choose_laws(
     lean = let_go(full, records)
     tell(f"all at once: {full.chi:.3f}, let go: {lean.chi:.3f}")
     for _ in range(_ROUNDS):
-        if lean.chi < limits.AT_FLOOR:
+        if lean.gain == FREE and lean.chi < limits.AT_FLOOR:
             break
         more = add_shaped(full, records)
         if more is None:
@@ -361,16 +374,23 @@ def choose_laws(
         leaner = let_go(more, records)
         tell(f"with {more.laws.keys[-1]}: {more.chi:.3f}, let go: {leaner.chi:.3f}")
         full = more
-        if criterion(leaner) < criterion(lean):
+        if leaner.gain < lean.gain or criterion(leaner) < criterion(lean):
             lean = leaner
     return lean
 
 
 def let_go(full: Follow, records: Records) -> Follow:
-    """Drop what is nothing, then loosen the gain to none, dropping again."""
+    """Drop what is nothing, then loosen the gain to none, dropping again.
+
+    Where a looser model leaves more, something is missing: what it leaves then swings with the
+    carts, and would ask for laws that are not there.
+    """
     lean = _one_friction(drop_needless(full, records), records)
     for gain in (_NEAR_FREE, FREE):
-        lean = drop_needless(records.fit(lean, gain=gain), records)
+        loose = records.fit(lean, gain=gain)
+        if not loose.chi < _HOLDS * max(lean.chi, limits.AT_FLOOR):
+            break
+        lean = drop_needless(loose, records)
     return lean
 
 
@@ -422,4 +442,4 @@ def rivals_of(lean: Follow, records: Records) -> list[Follow]:
                 out.append(records.refit(bare, *laws.with_laws(bare.p, [one.law]), iterations=6))
     near = [one for one in out if np.isfinite(one.cost)]
     near.sort(key=lambda one: one.total)
-    return [records.fit(one, gain=FREE) for one in near[:_SHORT_LIST]]
+    return [records.fit(one, gain=lean.gain) for one in near[:_SHORT_LIST]]

@@ -87,7 +87,7 @@ def prune(chosen: Hypothesis, study: Study, found: list[Hypothesis]) -> Hypothes
 
 def _without(hypothesis: Hypothesis, effect: Candidate, study: Study) -> Hypothesis:
     index = hypothesis.fit.structure.effects.index(effect)
-    fit = fit_whole(hypothesis.fit.without(index), study)
+    fit = fit_whole(hypothesis.fit.without(index), study, near=True)
     return judge(fit, study)
 
 

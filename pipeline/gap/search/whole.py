@@ -17,11 +17,14 @@ _VARIED = (0.85, 1.0, 1.2, 1.4)  # times the size of a contact: what follows is 
 _KEPT = 2  # of them
 
 
-def fit_whole(start: Model, study: Study) -> Fit:
-    """Fit whole runs; friction first with one size for all runs, then run by run."""
+def fit_whole(start: Model, study: Study, *, near: bool = False) -> Fit:
+    """Fit whole runs; friction first with one size for all runs, then run by run.
+
+    `near`: a contact is already where whole runs have it.
+    """
     whole, structure = study.training, start.structure
     fit = fit_model(start, whole, scatter_free=False, mapper=study.mapper)
-    if structure.has_contact and fit.chi > AT_FLOOR:
+    if structure.has_contact and not near and fit.chi > AT_FLOOR:
         fit = min(fit, _grown_contact(start, study), key=lambda one: one.cost)
     for attempt in range(_FRICTION_ROUNDS):
         if not structure.many_rests or fit.chi < AT_FLOOR:
