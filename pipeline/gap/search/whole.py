@@ -13,7 +13,8 @@ from pipeline.gap.search.hypothesis import Study
 _FRICTION_ROUNDS = 2  # of run-by-run friction, the worst runs started anew before each
 _NEARLY_RIGHT = 6.0  # chi-square of the better runs, below which the bad ones are worth a new start
 _LENGTHS = (0.3, 0.6, 1.2, 2.4)  # s of a piece: behind a contact the misfit of whole runs is rugged
-_VARIED = (0.85, 1.0, 1.2, 1.4)  # times the size of a contact: what follows is rigid, it is not
+# Times a contact's size and its damping: what follows is rigid, a bench is not quite.
+_VARIED = ((1.0, 1.0), (1.2, 1.0), (1.0, 0.65), (1.2, 0.65))
 _KEPT = 2  # of them
 
 
@@ -50,9 +51,7 @@ def fit_whole(start: Model, study: Study, *, near: bool = False) -> Fit:
 def _grown_contact(start: Model, study: Study) -> Fit:
     """Fit a contact to pieces that grow into whole runs, from several sizes of it."""
     structure = start.structure
-    first = [
-        structure.span(i).start for i, c in enumerate(structure.effects) if c.effect.contact
-    ]
+    spans = [structure.span(i) for i, c in enumerate(structure.effects) if c.effect.contact]
 
     def on_pieces(model: Model, length: float, iterations: int) -> Fit:
         pieces = [cut_shots(run, length=length) for run in study.training]
@@ -61,9 +60,10 @@ def _grown_contact(start: Model, study: Study) -> Fit:
         )
 
     fits = []
-    for factor in _VARIED:
+    for size, damping in _VARIED:
         theta: Array = start.theta.copy()
-        theta[first] += np.log(factor)
+        theta[[span.start for span in spans]] += np.log(size)
+        theta[[span.stop - 1 for span in spans]] += np.log(damping)
         fits.append(on_pieces(Model(structure=structure, theta=theta), _LENGTHS[0], 6))
     grown = []
     for fit in sorted(fits, key=lambda one: one.cost)[:_KEPT]:
