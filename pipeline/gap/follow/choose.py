@@ -29,6 +29,7 @@ CLOSE, LOOSE, FREE = 0.5, 0.1, 0.0  # gains
 _NEAR_FREE = 0.02
 _INDEPENDENT = 4.0  # readings of a track that tell as much as one independent
 _RIDGE = 1e-10  # of the diagonal
+_FIRST = 25  # iterations of the first fit, from a chain that may be far off
 _SHORT_LIST = 4  # of laws with a shape, refitted
 _HOLDS = 1.5  # times what a closer model leaves: a looser one that leaves more lacks something
 _PLAY, _MOTOR = 0.03, 0.15  # of the travel and of cart 1's mass: where a play starts
@@ -336,7 +337,7 @@ def start_all(
 ) -> Follow:
     """Return the model with all laws that need no shape, fitted from nothing.
 
-    It starts from the one of the `chains` that is nearest to the records.
+    It starts from each of the `chains`.
     """
     tracks = records.tracks
     driven = any(np.any(track.command) for track in tracks)
@@ -350,8 +351,8 @@ def start_all(
         starts.append(
             start_follow(laws, laws.start(chain), tracks, gain=CLOSE, mapper=records.mapper)
         )
-    full = records.fit(min(starts, key=lambda follow: follow.cost))
-    return records.fit(full, gain=LOOSE)
+    fits = [records.fit(start, iterations=_FIRST) for start in starts]
+    return records.fit(min(fits, key=lambda follow: follow.total), gain=LOOSE)
 
 
 def choose_laws(

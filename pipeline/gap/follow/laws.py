@@ -12,8 +12,9 @@ from pipeline.gap.follow import kernel
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.tables import Cart, Drive, Spring
 
-_CHAIN = (0.2, 5.0)  # times the first estimate: how far masses and springs may go
-_REACH = 0.3  # of a mass or spring, in one step
+_CHAIN = (0.005, 20.0)  # times the largest first estimate: how far masses and springs may go
+_REACH = 0.3  # of a mass or spring, in one step, …
+_SMALL = 0.1  # … or of this share of the largest, from which on a first estimate is believed
 _DELAY = (-0.05, 0.1)  # s
 _LONGEST_LAG = 0.3  # s
 _LEAST_LIMIT = 0.2  # of the largest input
@@ -135,10 +136,13 @@ class Laws:
         return np.array([0.0, self.bench.largest, 0.0, 0.0])
 
     def start(self, chain: Chain) -> Array:
-        """Return the vector of a chain without any law."""
+        """Return the vector of a chain without any law, no mass or spring next to nothing."""
         p = np.zeros(self.size)
         n = self.bench.n
-        p[:n], p[n : 2 * n], p[2 * n : 3 * n + 1] = chain.m, chain.c, chain.k
+        p[:n] = np.maximum(chain.m, _SMALL * chain.m.max())
+        p[n : 2 * n] = chain.c
+        p[2 * n : 3 * n + 1] = np.maximum(chain.k, _SMALL * chain.k.max())
+        p[2 * n + np.flatnonzero(~np.array(self.bench.springs))] = 0.0
         p[self.drive_at : self.base] = self.neutral_drive()
         return p
 
@@ -152,14 +156,15 @@ class Laws:
         low, high = np.full(self.size, -np.inf), np.full(self.size, np.inf)
         reach = np.full(self.size, np.inf)
         for at, value in ((slice(0, n), chain.m), (slice(2 * n, 3 * n + 1), chain.k)):
-            low[at], high[at], reach[at] = _CHAIN[0] * value, _CHAIN[1] * value, _REACH * value
+            most = value.max()
+            low[at], high[at] = _CHAIN[0] * most, _CHAIN[1] * most
+            reach[at] = _REACH * np.maximum(value, _SMALL * most)
+        missing = 2 * n + np.flatnonzero(~np.array(self.bench.springs))
+        low[missing] = high[missing] = 0.0
         if self.bench.pinned is not None:
             low[self.bench.pinned] = high[self.bench.pinned] = chain.m[self.bench.pinned]
-        if n == 1:  # both wall springs act as one
-            at = 2 * n + int(not self.bench.springs[0])
-            for j in (2 * n, 2 * n + 1):
-                if j != at:
-                    low[j] = high[j] = chain.k[j - 2 * n]
+        if n == 1 and all(self.bench.springs):  # both wall springs act as one
+            low[3] = high[3] = chain.k[1]
         low[n : 2 * n] = 0.0
         d, largest = self.drive_at, max(self.bench.largest, 1e-12)
         low[d : d + 4] = (0.0, _LEAST_LIMIT * largest, _DELAY[0], 0.0)
@@ -175,7 +180,7 @@ class Laws:
             if kind == kernel.STOP:
                 low[o + 2] = 0.0
             elif kind == kernel.SLACK:
-                low[o] = -_SLACK * max(chain.k[place], 1e-12)
+                low[o] = -_SLACK * max(chain.k[place], _SMALL * chain.k.max())
             elif kind == kernel.GAIN:
                 low[o], high[o] = -0.5, 0.5
         return low, high, reach
