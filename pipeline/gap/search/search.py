@@ -48,10 +48,10 @@ def search(baseline: Hypothesis, study: Study) -> tuple[Hypothesis, list[Hypothe
         for rival in rivals_of(lean, records):
             close = rival.total < _IN_THE_RUNNING * lean.total
             found.append(_judged(rival, study, finish=close))
-        found[1:] = [h for h in found[1:] if np.isfinite(h.error) and h.key]
-        leading = min((h for h in found[1:] if h.sound), key=lambda h: h.bic, default=baseline)
-        return prune(leading, study, found), found
-    worth = [h for h in found if h.sound and worth_it(h, baseline, study)]
+        found[1:] = [h for h in found[1:] if np.isfinite(h.error) and h.sound]
+        leading = min(found[1:], key=lambda h: h.bic, default=baseline)
+        return prune(leading, study, found), [h for h in found if h.sound]
+    worth = [h for h in found if worth_it(h, baseline, study)]
     return min(worth, key=lambda h: h.bic, default=baseline), found
 
 
