@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 from pipeline.gap.explain import explain_gap
+from pipeline.gap.follow.track import compile_follower
 from pipeline.gap.types import Gap
 from pipeline.plant.nonlinear.augmented import compile_simulator
 from pipeline.results import Analysis
@@ -22,6 +23,7 @@ def investigate(
     """
     progress("preparing the simulator; once on each machine it is compiled, which takes a while")
     compile_simulator()
+    compile_follower()
     wrong = {one.experiment for one in analysis.left_out if one.is_wrong}
     return explain_gap(
         [record for record in analysis.records if record.id not in wrong],

@@ -113,7 +113,7 @@ def slope_of(
         right = np.column_stack([A[size:, :size], r[size:] + inflate**2 * hold * off])
         taken = np.linalg.solve(mine, right)
         H = A[:size, :size] - A[:size, size:] @ taken[:, :size]
-        return H, r[:size] - A[:size, size:] @ taken[:, size], taken
+        return H, r[:size] - A[:size, size:] @ taken[:, size], np.asarray(taken, dtype=np.float64)
 
     H, b, back = zip(*mapper(one, zip(tracks, follow.own, strict=True)), strict=True)
     return Slope(H=np.sum(H, axis=0), b=np.sum(b, axis=0), back=back)

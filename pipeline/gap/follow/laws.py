@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.gap.follow import kernel
+from pipeline.gap.follow import forces
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.tables import Cart, Drive, Spring
 
@@ -21,13 +21,24 @@ _LEAST_LIMIT = 0.2  # of the largest input
 _SHORT = 0.01  # s: how far a delay or lag may go in one step
 _CONTACT, _CONTACT_DAMPING = 40.0, 0.5  # of cart 1's springs, and of critical damping
 _SLACK = 0.95  # of a spring that goes slack, at most
-# Parameters that are a force or a share of one, and vanish with the effect; the others are shape.
-COEFFICIENTS = ((0,), (0,), (0,), (0,), (0,), (0,), (0,), (0,), (0, 2), (0,), (0,), (0,), (0, 1), (0,), (0,))
-_POSITIVE = {kernel.COULOMB, kernel.LOAD, kernel.DRAG, kernel.COUPLING, kernel.STOP,
-             kernel.STRIBECK, kernel.DAHL, kernel.HIDDEN, kernel.BACKLASH}  # fmt: skip
-DRY = (kernel.COULOMB, kernel.LOAD, kernel.STRIBECK, kernel.DAHL)
-SIDED = (kernel.STOP, kernel.SLACK)  # with a position whose sign is the side
-# The columns of the simulator's tables that the laws fill, in the order of `kernel`.
+# Other parameters than the first that are a force or a share of one, and vanish with the effect;
+# what is left is its shape.
+_MORE = {forces.STOP: (0, 2), forces.COGGING: (0, 1)}
+COEFFICIENTS = tuple(_MORE.get(kind, (0,)) for kind in range(len(forces.SIZES)))
+POSITIVE = {
+    forces.COULOMB,
+    forces.LOAD,
+    forces.DRAG,
+    forces.COUPLING,
+    forces.STOP,
+    forces.STRIBECK,
+    forces.DAHL,
+    forces.HIDDEN,
+    forces.BACKLASH,
+}
+DRY = (forces.COULOMB, forces.LOAD, forces.STRIBECK, forces.DAHL)
+SIDED = (forces.STOP, forces.SLACK)  # with a position whose sign is the side
+# The columns of the simulator's tables that the laws fill, in the order of `forces`.
 COLUMNS: tuple[tuple[IntEnum, ...], ...] = (
     (Cart.COULOMB,),
     (Cart.LOAD,),
@@ -47,7 +58,7 @@ COLUMNS: tuple[tuple[IntEnum, ...], ...] = (
 )
 Column = tuple[type[IntEnum], int]  # columns of different tables are equal as numbers
 DRIVE_COLUMNS = (Drive.DEAD_ZONE, Drive.LIMIT, Drive.DELAY, Drive.LAG)
-DEAD_ZONE, LIMIT, DELAY, LAG = range(kernel.DRIVE)
+DEAD_ZONE, LIMIT, DELAY, LAG = range(forces.DRIVE)
 
 
 def column_set(columns: Iterable[IntEnum]) -> frozenset[Column]:
@@ -102,25 +113,29 @@ class Laws:
 
     @cached_property
     def kinds(self) -> np.ndarray:
+        """(laws,) the kind of each."""
         return np.array([kind for kind, _ in self.keys], dtype=np.int64)
 
     @cached_property
     def places(self) -> np.ndarray:
+        """(laws,) the cart or spring of each, from 0."""
         return np.array([place for _, place in self.keys], dtype=np.int64)
 
     @cached_property
     def base(self) -> int:
         """Parameters of chain and drive."""
-        return 3 * self.bench.n + 1 + kernel.DRIVE
+        return 3 * self.bench.n + 1 + forces.DRIVE
 
     @cached_property
     def first(self) -> np.ndarray:
-        sizes = [kernel.SIZES[kind] for kind, _ in self.keys]
+        """(laws,) where the parameters of each begin."""
+        sizes = [forces.SIZES[kind] for kind, _ in self.keys]
         return self.base + np.cumsum([0, *sizes])[:-1].astype(np.int64)
 
     @cached_property
     def size(self) -> int:
-        return self.base + sum(kernel.SIZES[kind] for kind, _ in self.keys)
+        """How long the vector is."""
+        return self.base + sum(forces.SIZES[kind] for kind, _ in self.keys)
 
     @cached_property
     def dry(self) -> np.ndarray:
@@ -130,9 +145,11 @@ class Laws:
 
     @property
     def drive_at(self) -> int:
+        """Where the values of the drive begin."""
         return 3 * self.bench.n + 1
 
     def neutral_drive(self) -> Array:
+        """Return the values of a drive without any law."""
         return np.array([0.0, self.bench.largest, 0.0, 0.0])
 
     def start(self, chain: Chain) -> Array:
@@ -147,8 +164,10 @@ class Laws:
         return p
 
     def chain(self, p: Array) -> Chain:
+        """Return the chain in a vector."""
         n = self.bench.n
-        return Chain(m=p[:n].copy(), c=np.maximum(p[n : 2 * n], 0.0), k=p[2 * n : 3 * n + 1].copy())
+        k = p[2 * n : 3 * n + 1].copy()
+        return Chain(m=p[:n].copy(), c=np.maximum(p[n : 2 * n], 0.0), k=k)
 
     def bounds(self) -> tuple[Array, Array, Array]:
         """Return lower and upper bounds, and the largest steps."""
@@ -175,13 +194,13 @@ class Laws:
             if not free:
                 low[d + q] = high[d + q] = neutral[q]
         for (kind, place), o in zip(self.keys, self.first, strict=True):
-            if kind in _POSITIVE:
+            if kind in POSITIVE:
                 low[o] = 0.0
-            if kind == kernel.STOP:
+            if kind == forces.STOP:
                 low[o + 2] = 0.0
-            elif kind == kernel.SLACK:
+            elif kind == forces.SLACK:
                 low[o] = -_SLACK * max(chain.k[place], _SMALL * chain.k.max())
-            elif kind == kernel.GAIN:
+            elif kind == forces.GAIN:
                 low[o], high[o] = -0.5, 0.5
         return low, high, reach
 
@@ -189,7 +208,7 @@ class Laws:
         """Return bounds and steps with the shapes of the laws kept near where they are."""
         low, high, reach = self.bounds()
         for (kind, _), o in zip(self.keys, self.first, strict=True):
-            for q in range(kernel.SIZES[kind]):
+            for q in range(forces.SIZES[kind]):
                 if q in COEFFICIENTS[kind]:
                     continue
                 value = abs(p[o + q])
@@ -214,7 +233,7 @@ class Laws:
         for q, value in enumerate(self.neutral_drive()):
             if not drive[q]:
                 base[self.drive_at + q] = value
-        parts = [p[self.first[i] : self.first[i] + kernel.SIZES[self.keys[i][0]]] for i in kept]
+        parts = [p[self.first[i] : self.first[i] + forces.SIZES[self.keys[i][0]]] for i in kept]
         return laws, np.concatenate([base, *parts])
 
     def groups(self) -> dict[int, np.ndarray]:
@@ -229,14 +248,13 @@ class Laws:
         if group < 0:
             return np.array([self.drive_at - 1 - group])
         o = self.first[group]
-        return np.arange(o, o + kernel.SIZES[self.keys[group][0]])
+        return np.arange(o, o + forces.SIZES[self.keys[group][0]])
 
     def neutral(self) -> Array:
         """Return the vector's neutral values (0 but for the limit)."""
         out = np.zeros(self.size)
         out[self.drive_at + LIMIT] = self.bench.largest
         return out
-
 
     def columns(self, p: Array) -> dict[tuple[type[IntEnum], int], dict[IntEnum, float]]:
         """Return what the laws fill of the simulator's tables: by table and row (0 for a drive)."""
@@ -246,20 +264,20 @@ class Laws:
             if self.drive[q]:
                 out.setdefault((Drive, 0), {})[column] = float(p[self.drive_at + q])
         for (kind, place), o in zip(self.keys, self.first, strict=True):
-            values = [float(v) for v in p[o : o + kernel.SIZES[kind]]]
-            if kind == kernel.SLACK:
+            values = [float(v) for v in p[o : o + forces.SIZES[kind]]]
+            if kind == forces.SLACK:
                 values[0] /= p[2 * n + place]
-            elif kind == kernel.HIDDEN:
+            elif kind == forces.HIDDEN:
                 values[1:] = [values[0] * v for v in values[1:]]
-            elif kind == kernel.COGGING:
+            elif kind == forces.COGGING:
                 a, b, pitch = values
                 values = [float(np.hypot(a, b)), float(np.arctan2(b, a)), pitch]
-            elif kind == kernel.GAIN:
+            elif kind == forces.GAIN:
                 values[0] += 1.0
             table = type(COLUMNS[kind][0])
             row = out.setdefault((table, 0 if table is Drive else place), {})
             row.update(zip(COLUMNS[kind], values, strict=True))
-            if kind == kernel.BACKLASH:
+            if kind == forces.BACKLASH:
                 # What follows is rigid; a bench is not quite.
                 firm = _CONTACT * float(p[2 * n] + p[2 * n + 1])
                 row[Drive.CONTACT_STIFFNESS] = firm
@@ -278,17 +296,17 @@ def smooth_laws(
     keys: list[tuple[int, int]] = []
     for i in range(n):
         if shown[i]:
-            keys += [(kernel.COULOMB, i), (kernel.DRAG, i)]
-            keys += [(kernel.LOAD, i)] if driven else []
+            keys += [(forces.COULOMB, i), (forces.DRAG, i)]
+            keys += [(forces.LOAD, i)] if driven else []
     rows = [j for j, there in enumerate(bench.springs) if there]
     for j in rows[:1] if n == 1 else rows:
         if (j < n and shown[j]) or (j > 0 and shown[j - 1]):
-            keys.append((kernel.CUBIC, j))
-            keys += [(kernel.COUPLING, j)] if 0 < j < n else []
+            keys.append((forces.CUBIC, j))
+            keys += [(forces.COUPLING, j)] if 0 < j < n else []
     if driven:
-        keys.append((kernel.BRAKING, 0))
+        keys.append((forces.BRAKING, 0))
     if not any(bench.springs):
-        keys += [(kernel.OFFSET, i) for i in range(n) if shown[i]]
+        keys += [(forces.OFFSET, i) for i in range(n) if shown[i]]
     kept = tuple(key for key in keys if column_set(COLUMNS[key[0]]) <= columns)
     drive = tuple(driven and (Drive, int(column)) in columns for column in DRIVE_COLUMNS)
     return Laws(bench=bench, keys=kept, drive=drive)

@@ -6,8 +6,9 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.gap.data.runs import Run
-from pipeline.gap.follow import kernel
-from pipeline.gap.follow.laws import DEAD_ZONE, LIMIT, Laws
+from pipeline.gap.follow import forces, kernel
+from pipeline.gap.follow.laws import DEAD_ZONE, LIMIT, Bench, Laws
+from pipeline.plant.linear.chain import Chain
 
 _RATE = 100.0  # Hz, at the usual pace: some twenty readings in a swing
 _LONGEST = 2.5e-3  # s, of a step, at the usual pace …
@@ -133,12 +134,12 @@ def errors_of(
     count = len(laws.keys)
     aux, DA = np.zeros((count, 2)), np.zeros((2 * count, lanes))
     for law, (kind, place) in enumerate(laws.keys):
-        if kind in (kernel.HIDDEN, kernel.BACKLASH):
+        if kind in (forces.HIDDEN, forces.BACKLASH):
             aux[law] = x[place], own.v0[place]
             DA[2 * law], DA[2 * law + 1] = DX[place], DV[place]
     room = np.zeros((n, lanes)), np.zeros((n, lanes)), DA, np.zeros((6 + 2 * n, max(n, 4)))
     longest = track.longest * (1.0 if gain > _FOLLOWS else _FREELY)
-    if kernel.BACKLASH in laws.kinds:
+    if forces.BACKLASH in laws.kinds:
         longest = min(longest, _KNOCK * track.longest)
     fine = kernel.follow_run(
         p, n, laws.kinds, laws.places, laws.first, track.free, track.seen, track.t, track.y,
@@ -162,3 +163,17 @@ def _shaped(track: Track, dead: float, limit: float) -> Array:
     out[2, 0] = np.where(full, sign, 0.0)
     out[:, 1, 1:] = np.cumsum(out[:, 0, :-1] * np.diff(track.knots), axis=1)
     return out
+
+
+def compile_follower() -> None:
+    """Follow a record of two readings once, so that it is compiled: seconds, where nobody has."""
+    one, two = np.ones(1), np.array([0.0, 0.01])
+    track = Track(
+        t=two, y=np.zeros((2, 1)), weight=np.ones((2, 1)), free=one > 0.0, seen=one > 0.0,
+        knots=two, command=np.zeros(2), start=np.zeros(1), slope=np.zeros(1), zero=np.zeros(1),
+        zero_std=one, at_rest=True, longest=_LONGEST, swing=1.0,
+    )  # fmt: skip
+    chain = Chain(m=one, c=one, k=np.array([1.0, 0.0]))
+    bench = Bench(chain=chain, springs=(True, False), largest=1.0)
+    laws = Laws(bench=bench, keys=(), drive=(True,) * forces.DRIVE)
+    errors_of(laws, laws.start(chain), track, track.fresh(), gain=0.0, derive=True)

@@ -57,9 +57,7 @@ def search(baseline: Hypothesis, study: Study) -> tuple[Hypothesis, list[Hypothe
 
 def _judged(follow: Follow, study: Study, *, finish: bool = True) -> Hypothesis:
     """Return what a following model says, fitted to whole runs: to the end, or by a few steps."""
-    start = as_model(
-        follow, springs=study.springs, catalogue=study.catalogue, runs=study.training
-    )
+    start = as_model(follow, springs=study.springs, catalogue=study.catalogue, runs=study.training)
     if finish:
         return judge(fit_whole(start, study), study)
     fit = fit_model(start, study.training, iterations=4, scatter_free=False, mapper=study.mapper)

@@ -28,7 +28,8 @@ def values_of(effect: Effect, columns: Mapping[IntEnum, float]) -> tuple[float, 
     """
     order = list(effect.columns(dict.fromkeys(effect.names, 1.0)))
     base = np.arange(1.0, 1.0 + len(effect.names))
-    at = [effect.columns(effect.named(base + step)) for step in (0.0, *np.eye(base.size))]
+    points = [base, *(base + unit for unit in np.eye(base.size))]
+    at = [effect.columns(effect.named(point.tolist())) for point in points]
     table = np.array([[one[column] for column in order] for one in at])
     J = (table[1:] - table[0]).T
     wanted = np.array([columns[column] for column in order])

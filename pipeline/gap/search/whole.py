@@ -46,8 +46,6 @@ def fit_whole(start: Model, study: Study, *, near: bool = False) -> Fit:
     return fit
 
 
-
-
 def _grown_contact(start: Model, study: Study) -> Fit:
     """Fit a contact to pieces that grow into whole runs, from several sizes of it."""
     structure = start.structure
@@ -70,8 +68,6 @@ def _grown_contact(start: Model, study: Study) -> Fit:
         for length in _LENGTHS[1:]:
             fit = on_pieces(fit, length, 8)
         grown.append(
-            fit_model(
-                fit, study.training, iterations=15, scatter_free=False, mapper=study.mapper
-            )
+            fit_model(fit, study.training, iterations=15, scatter_free=False, mapper=study.mapper)
         )
     return min(grown, key=lambda one: one.cost)
