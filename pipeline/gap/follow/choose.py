@@ -11,12 +11,13 @@ from pipeline.gap.follow.drop import criterion, drop_needless, is_rough
 from pipeline.gap.follow.fit import Follow, start_follow
 from pipeline.gap.follow.laws import SIDED, Bench, Law, smooth_laws
 from pipeline.gap.follow.records import Records
-from pipeline.gap.follow.score import Scored, backlash_laws, score, shaped_trials
+from pipeline.gap.follow.score import backlash_laws, score, shaped_trials
 from pipeline.plant.linear.chain import Chain
 
 CLOSE, LOOSE, FREE = 0.5, 0.1, 0.0  # gains
 _NEAR_FREE = 0.02
 _FIRST = 25  # iterations of the first fit, from a chain that may be far off
+_FEW = 6  # … and of one that shows whether a rival comes near
 _SHORT_LIST = 4  # of laws with a shape, refitted
 _HOLDS = 1.5  # times what a closer model leaves: a looser one that leaves more lacks something
 _ROUNDS = 3  # of adding one of them
@@ -28,14 +29,15 @@ def start_all(records: Records, *, springs: Sequence[bool], chains: Sequence[Cha
     It starts from each of the `chains`.
     """
     tracks = records.tracks
-    driven = any(np.any(track.command) for track in tracks)
     largest = max(float(np.abs(track.command).max()) for track in tracks)
-    shown = np.any([track.free for track in tracks], axis=0)
-    pinned = None if driven else int(np.argmax(shown))
+    free = tuple(tuple(track.free.tolist()) for track in tracks)
+    pinned = int(np.argmax(np.any(free, axis=0))) if largest == 0.0 else None
     starts = []
     for chain in chains:
-        bench = Bench(chain=chain, springs=tuple(springs), largest=largest, pinned=pinned)
-        laws = smooth_laws(bench, driven=driven, shown=shown.tolist(), columns=records.columns)
+        bench = Bench(
+            chain=chain, springs=tuple(springs), largest=largest, free=free, pinned=pinned
+        )
+        laws = smooth_laws(bench, columns=records.columns)
         starts.append(
             start_follow(laws, laws.start(chain), tracks, gain=CLOSE, mapper=records.mapper)
         )
@@ -118,34 +120,23 @@ def _one_friction(follow: Follow, records: Records) -> Follow:
 
 def rivals_of(lean: Follow, records: Records) -> list[Follow]:
     """Return models with one law exchanged for another, fitted as fully, the best first."""
+    everything = smooth_laws(lean.laws.bench, columns=records.columns)
     out: list[Follow] = []
     for group in lean.laws.groups():
         laws, p = lean.laws.without(lean.p, [group])
-        bare = records.refit(lean, laws, p, gain=LOOSE, iterations=6)
-        keys = {key for key in laws.keys if key[0] not in SIDED}
-        everything = smooth_laws(
-            laws.bench,
-            driven=any(np.any(track.command) for track in records.tracks),
-            shown=np.any([track.free for track in records.tracks], axis=0).tolist(),
-            columns=records.columns,
-        )
+        bare = records.refit(lean, laws, p, gain=LOOSE, iterations=_FEW)
         gone = lean.laws.keys[group] if group >= 0 else None
-        plain = [
-            Law(kind=kind, place=place, values=(0.0,))
-            for kind, place in everything.keys
-            if (kind, place) not in keys and (kind, place) != gone
-        ]
-        trials = score(bare, records, plain)
-        trials += [one for one in shaped_trials(bare, records) if one.law.key != gone]
-        for q in range(forces.DRIVE):
-            if everything.drive[q] and not laws.drive[q] and group != -1 - q:
-                opened = replace(laws, drive=tuple(f or i == q for i, f in enumerate(laws.drive)))
-                trials.append(Scored(law=Law(kind=-1 - q, place=0, values=()), drop=0.0))
-                out.append(records.refit(bare, opened, bare.p, iterations=6))
-        trials.sort(key=lambda one: -one.drop)
-        for one in trials[:_SHORT_LIST]:
-            if one.law.kind >= 0:
-                out.append(records.refit(bare, *laws.with_laws(bare.p, [one.law]), iterations=6))
-    near = [one for one in out if np.isfinite(one.cost)]
-    near.sort(key=lambda one: one.total)
+        taken = {gone, *(key for key in laws.keys if key[0] not in SIDED)}
+        plain = [Law(kind=kind, place=place, values=(0.0,)) for kind, place in everything.keys]
+        trials = [*score(bare, records, plain), *shaped_trials(bare, records)]
+        trials = sorted(
+            (one for one in trials if one.law.key not in taken), key=lambda one: -one.drop
+        )
+        exchanged = [laws.with_laws(bare.p, [one.law]) for one in trials[:_SHORT_LIST]]
+        for q, free in enumerate(everything.drive):
+            if free and not laws.drive[q] and group != -1 - q:
+                drive = tuple(f or i == q for i, f in enumerate(laws.drive))
+                exchanged.append((replace(laws, drive=drive), bare.p))
+        out += [records.refit(bare, *model, iterations=_FEW) for model in exchanged]
+    near = sorted((one for one in out if np.isfinite(one.cost)), key=lambda one: one.total)
     return [records.fit(one, gain=lean.gain) for one in near[:_SHORT_LIST]]

@@ -87,12 +87,37 @@ class Law:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Bench:
-    """What bounds the laws on one bench: the first chain, and the largest input."""
+    """What bounds the laws on one bench.
+
+    Attributes
+    ----------
+    chain : the first estimate; springs (n + 1,) which there are.
+    largest : of the input, 0 where there is none.
+    free : which carts move, by run.
+    pinned : the mass that sets the scale where no input does.
+    """
 
     chain: Chain
     springs: tuple[bool, ...]
     largest: float
-    pinned: int | None = None  # the mass that sets the scale where no input does
+    free: tuple[tuple[bool, ...], ...]
+    pinned: int | None = None
+
+    @cached_property
+    def shown(self) -> tuple[bool, ...]:
+        """(n,) which carts move in any run."""
+        return tuple(any(moves) for moves in zip(*self.free, strict=True))
+
+    @cached_property
+    def rows(self) -> tuple[int, ...]:
+        """The springs that any run shows; of those that always stretch alike, one."""
+        shown: dict[tuple, int] = {}
+        for j in (j for j, there in enumerate(self.springs) if there):
+            ends = [i for i in (j - 1, j) if 0 <= i < self.n]
+            moving = tuple(tuple(i for i in ends if run[i]) for run in self.free)
+            if any(moving):
+                shown.setdefault(moving, j)
+        return tuple(shown.values())
 
     @property
     def n(self) -> int:
@@ -285,28 +310,22 @@ class Laws:
         return out
 
 
-def smooth_laws(
-    bench: Bench, *, driven: bool, shown: Sequence[bool], columns: frozenset[Column]
-) -> Laws:
+def smooth_laws(bench: Bench, *, columns: frozenset[Column]) -> Laws:
     """Return every law that needs no shape, at every place: all to start from nothing.
 
-    `shown` (n,) tells which carts move in any run; `columns` are those that effects may fill.
+    `columns` are those that effects may fill.
     """
-    n = bench.n
+    n, driven = bench.n, bench.largest > 0.0
     keys: list[tuple[int, int]] = []
     for i in range(n):
-        if shown[i]:
+        if bench.shown[i]:
             keys += [(forces.COULOMB, i), (forces.DRAG, i)]
             keys += [(forces.LOAD, i)] if driven else []
-    rows = [j for j, there in enumerate(bench.springs) if there]
-    for j in rows[:1] if n == 1 else rows:
-        if (j < n and shown[j]) or (j > 0 and shown[j - 1]):
-            keys.append((forces.CUBIC, j))
-            keys += [(forces.COUPLING, j)] if 0 < j < n else []
-    if driven:
-        keys.append((forces.BRAKING, 0))
-    if not any(bench.springs):
-        keys += [(forces.OFFSET, i) for i in range(n) if shown[i]]
+            keys += [] if any(bench.springs) else [(forces.OFFSET, i)]
+    for j in bench.rows:
+        keys.append((forces.CUBIC, j))
+        keys += [(forces.COUPLING, j)] if 0 < j < n else []
+    keys += [(forces.BRAKING, 0)] if driven else []
     kept = tuple(key for key in keys if column_set(COLUMNS[key[0]]) <= columns)
     drive = tuple(driven and (Drive, int(column)) in columns for column in DRIVE_COLUMNS)
     return Laws(bench=bench, keys=kept, drive=drive)

@@ -120,8 +120,7 @@ def shaped_laws(follow: Follow, records: Records) -> list[Law]:
                 out.append(Law(kind=forces.HIDDEN, place=i, values=(0.0, rate**2, _RING * rate)))
         if n > 1 and (forces.GAIN, i) not in taken:
             out.append(Law(kind=forces.GAIN, place=i, values=(0.0,)))
-    rows = [j for j, there in enumerate(bench.springs) if there]
-    for j in rows[:1] if n == 1 else rows:
+    for j in bench.rows:
         for side, most in ((1.0, stretch[0, j]), (-1.0, stretch[1, j])):
             for part in _STRETCHES if most > _LITTLE * stretch[:, j].max() else ():
                 out.append(Law(kind=forces.SLACK, place=j, values=(0.0, side * part * most)))

@@ -174,6 +174,6 @@ def compile_follower() -> None:
         zero_std=one, at_rest=True, longest=_LONGEST, swing=1.0,
     )  # fmt: skip
     chain = Chain(m=one, c=one, k=np.array([1.0, 0.0]))
-    bench = Bench(chain=chain, springs=(True, False), largest=1.0)
+    bench = Bench(chain=chain, springs=(True, False), largest=1.0, free=((True,),))
     laws = Laws(bench=bench, keys=(), drive=(True,) * forces.DRIVE)
     errors_of(laws, laws.start(chain), track, track.fresh(), gain=0.0, derive=True)

@@ -12,11 +12,13 @@ from contextlib import suppress
 import numpy as np
 
 from pipeline.gap.fit.baseline import first_chain
-from pipeline.gap.fit.levenberg_marquardt import fit_model
+from pipeline.gap.fit.levenberg_marquardt import Fit, fit_model
 from pipeline.gap.fit.structure import Candidate
+from pipeline.gap.fit.uncertainty import covariance
 from pipeline.gap.follow.choose import Records, choose_laws, rivals_of
 from pipeline.gap.follow.fit import Follow
 from pipeline.gap.follow.track import make_track
+from pipeline.gap.limits import SURE
 from pipeline.gap.search.deadline import OutOfTime
 from pipeline.gap.search.hypothesis import Hypothesis, Study, judge, worth_it
 from pipeline.gap.search.translate import as_model, filled, make_candidate
@@ -65,22 +67,47 @@ def _judged(follow: Follow, study: Study, *, finish: bool = True) -> Hypothesis:
 
 
 def prune(chosen: Hypothesis, study: Study, found: list[Hypothesis]) -> Hypothesis:
-    """Drop effects, and richer laws, that the others have made needless; all tried are `found`."""
+    """Drop effects, and richer laws, that the others have made needless; all tried are `found`.
+
+    And those that are nothing within their error.
+    """
     while chosen.key:
         effects = chosen.fit.structure.effects
-        if len(effects) == 1:
-            trials = [found[0]]
-        else:
-            trials = [_without(chosen, c, study) for c in effects]
-            found += trials
-        as_good = [h for h in trials if (h.sound or not h.key) and not worth_it(chosen, h, study)]
         plainer = [_plainer(chosen, c, study) for c in effects if c.effect.grows_from]
+        if len(effects) == 1:
+            without = [found[0]]
+        else:
+            without = [_without(chosen, c, study) for c in effects]
+            found += without
         found += plainer
-        as_good += [h for h in plainer if h.sound and h.bic < chosen.bic]
+        as_good = [h for h in without if not worth_it(chosen, h, study)]
+        as_good += [h for h in plainer if h.bic < chosen.bic]
+        as_good = [h for h in as_good if h.sound]
+        if not as_good:
+            nothing = is_nothing(covariance(chosen.fit, study.training, mapper=study.mapper))
+            as_good = [h for h, none in zip(without, nothing, strict=True) if none and h.sound]
         if not as_good:
             break
         chosen = min(as_good, key=lambda h: h.bic)
     return chosen
+
+
+def is_nothing(fit: Fit) -> list[bool]:
+    """Return which effects have a parameter that is nothing within its standard errors."""
+    structure = fit.structure
+    if fit.covariance is None:
+        return [False] * len(structure.effects)
+    std = np.sqrt(np.diag(fit.covariance)) * structure.physical_derivative(fit.theta)
+    return [
+        any(
+            abs(value - p.neutral) < SURE * error
+            for p, value, error in zip(
+                term.effect.parameters, term.values, std[structure.span(index)], strict=True
+            )
+            if p.neutral is not None and p.reported
+        )
+        for index, term in enumerate(fit.terms)
+    ]
 
 
 def _without(hypothesis: Hypothesis, effect: Candidate, study: Study) -> Hypothesis:
