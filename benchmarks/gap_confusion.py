@@ -24,9 +24,9 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 DEVELOPMENT, REPORT = 10_000, 900_000
-SUITES = (
-    "singles small tiny weak dirt pairs clean clean-dirt wide wide-pairs".split()
-)  # seeds hang on their order
+SUITES = [
+    "singles", "small", "tiny", "weak", "dirt", "pairs", "clean", "clean-dirt", "wide", "wide-pairs"
+]  # fmt: skip
 SEVERITY = {"small": 0.3, "weak": 0.2, "tiny": 0.05}
 # Two of these on one cart would be one friction law: never a pair.
 DRY = ("coulomb_friction", "stiction", "presliding_friction")

@@ -204,7 +204,7 @@ def _settled(hypothesis: Hypothesis, study: Study) -> Hypothesis:
         tolerance=_SETTLED / fit.n_points,
         mapper=study.mapper,
     )
-    return replace(judge(fit, study, added=hypothesis.added), bic=hypothesis.bic)
+    return replace(judge(fit, study), bic=hypothesis.bic)
 
 
 def _learnt_spread(fit: Fit) -> dict[int, float]:
@@ -281,9 +281,9 @@ def _with_offset(
     candidate = Candidate(
         effect=effect, place=offset.cart, signs=(1.0,), scales=(abs(offset.force),)
     )
-    without = tuple(judge(fit_whole(h.fit, pinned), pinned, added=h.added) for h in path)
+    without = tuple(judge(fit_whole(h.fit, pinned), pinned) for h in path)
     fit = fit_whole(chosen.fit.with_effect(candidate, (offset.force,)), loose)
-    final = judge(fit, loose, added=(candidate,))
+    final = judge(fit, loose)
     if final.error > min(
         limits.OFFSET_GAIN * without[-1].error, limits.OFFSET_AS_FREE * chosen.error
     ):

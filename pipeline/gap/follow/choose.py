@@ -99,7 +99,18 @@ def let_go(full: Follow, records: Records) -> Follow:
         if not loose.chi < _HOLDS * max(lean.chi, limits.AT_FLOOR):
             break
         lean = drop_needless(loose, records)
-    return lean
+    return _look_again(lean, records) if lean.gain == FREE else lean
+
+
+def _look_again(lean: Follow, records: Records) -> Follow:
+    """Fit all laws once more, now that a free run shows what adds up; drop what is nothing."""
+    everything = smooth_laws(lean.laws.bench, columns=records.columns)
+    missing = [key for key in everything.keys if key not in lean.laws.keys]
+    extra = [Law(kind=kind, place=place, values=(0.0,)) for kind, place in missing]
+    laws, p = replace(lean.laws, drive=everything.drive).with_laws(lean.p, extra)
+    again = records.refit(lean, laws, p, iterations=_FEW)
+    again = _one_friction(drop_needless(again, records), records)
+    return again if criterion(again) < criterion(lean) else lean
 
 
 def _one_friction(follow: Follow, records: Records) -> Follow:
