@@ -21,7 +21,6 @@ from pipeline.submission.toml_file import read_text
 _ASKED = "report/questions.json"
 _MOST_ASKED = 1_000_000  # bytes
 _NOTES = "notes.md"
-_GAP_BUDGET = 60.0  # s, as `cartlab gap` has by default
 
 
 def start_report(ask: Ask) -> Response:
@@ -35,7 +34,7 @@ def start_gap(ask: Ask) -> Response:
     """Have the data asked what the linear model leaves out."""
     folder = ask.folder()
     ask.desk.jobs.start(
-        "gap", title="The gap", place=folder, folder=str(folder), budget=_GAP_BUDGET
+        "gap", title="The gap", place=folder, folder=str(folder)
     )
     return ask.back(ask.here + "#report")
 
