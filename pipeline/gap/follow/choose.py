@@ -20,7 +20,7 @@ _FIRST = 25  # iterations of the first fit, from a chain that may be far off
 _FEW = 6  # … and of one that shows whether a rival comes near
 _SHORT_LIST = 4  # of laws with a shape, refitted
 _HOLDS = 1.5  # times what a closer model leaves: a looser one that leaves more lacks something
-_ROUNDS = 3  # of adding one of them
+_ROUNDS = 6  # of adding one of them: a real bench has several
 
 
 def start_all(records: Records, *, springs: Sequence[bool], chains: Sequence[Chain]) -> Follow:
@@ -148,6 +148,9 @@ def rivals_of(lean: Follow, records: Records) -> list[Follow]:
             if free and not laws.drive[q] and group != -1 - q:
                 drive = tuple(f or i == q for i, f in enumerate(laws.drive))
                 exchanged.append((replace(laws, drive=drive), bare.p))
-        out += [records.refit(bare, *model, iterations=_FEW) for model in exchanged]
+        out += [
+            _one_friction(records.refit(bare, *model, iterations=_FEW), records)
+            for model in exchanged
+        ]
     near = sorted((one for one in out if np.isfinite(one.cost)), key=lambda one: one.total)
     return [records.fit(one, gain=lean.gain) for one in near[:_SHORT_LIST]]
