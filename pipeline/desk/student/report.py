@@ -33,9 +33,7 @@ def start_report(ask: Ask) -> Response:
 def start_gap(ask: Ask) -> Response:
     """Have the data asked what the linear model leaves out."""
     folder = ask.folder()
-    ask.desk.jobs.start(
-        "gap", title="The gap", place=folder, folder=str(folder)
-    )
+    ask.desk.jobs.start("gap", title="The gap", place=folder, folder=str(folder))
     return ask.back(ask.here + "#report")
 
 

@@ -9,7 +9,7 @@ from pipeline.gap import limits
 from pipeline.gap.follow import forces
 from pipeline.gap.follow.drop import criterion, drop_needless, is_rough
 from pipeline.gap.follow.fit import Follow, start_follow
-from pipeline.gap.follow.laws import SIDED, Bench, Law, smooth_laws
+from pipeline.gap.follow.laws import Bench, Law, smooth_laws
 from pipeline.gap.follow.records import Records
 from pipeline.gap.follow.score import backlash_laws, score, shaped_trials
 from pipeline.plant.linear.chain import Chain
@@ -77,7 +77,7 @@ def add_shaped(follow: Follow, records: Records) -> Follow | None:
     for law in (*trials, *backlash_laws(follow, records)):
         laws, p = follow.laws.with_laws(follow.p, [law])
         trial = records.refit(follow, laws, p, iterations=8)
-        if best is None or trial.total < best.total:
+        if best is None or criterion(trial) < criterion(best):
             best = trial
     if best is None or criterion(best) > criterion(follow):
         return None
@@ -137,7 +137,7 @@ def rivals_of(lean: Follow, records: Records) -> list[Follow]:
         laws, p = lean.laws.without(lean.p, [group])
         bare = records.refit(lean, laws, p, gain=LOOSE, iterations=_FEW)
         gone = lean.laws.keys[group] if group >= 0 else None
-        taken = {gone, *(key for key in laws.keys if key[0] not in SIDED)}
+        taken = {gone, *laws.keys}
         plain = [Law(kind=kind, place=place, values=(0.0,)) for kind, place in everything.keys]
         trials = [*score(bare, records, plain), *shaped_trials(bare, records)]
         trials = sorted(

@@ -103,7 +103,8 @@ def shaped_laws(follow: Follow, records: Records) -> list[Law]:
         reach = position[:, i].max()
         if reach <= 0.0:
             continue
-        for side, most in ((1.0, position[0, i]), (-1.0, position[1, i])):
+        stop = () if (forces.STOP, i) in taken else ((1.0, position[0, i]), (-1.0, position[1, i]))
+        for side, most in stop:
             for part in _STOPS if most > _LITTLE * reach else ():
                 at = side * part * most
                 out.append(Law(kind=forces.STOP, place=i, values=(0.0, at, 0.0)))
@@ -120,7 +121,7 @@ def shaped_laws(follow: Follow, records: Records) -> list[Law]:
                 out.append(Law(kind=forces.HIDDEN, place=i, values=(0.0, rate**2, _RING * rate)))
         if n > 1 and (forces.GAIN, i) not in taken:
             out.append(Law(kind=forces.GAIN, place=i, values=(0.0,)))
-    for j in bench.rows:
+    for j in (j for j in bench.rows if (forces.SLACK, j) not in taken):
         for side, most in ((1.0, stretch[0, j]), (-1.0, stretch[1, j])):
             for part in _STRETCHES if most > _LITTLE * stretch[:, j].max() else ():
                 out.append(Law(kind=forces.SLACK, place=j, values=(0.0, side * part * most)))
