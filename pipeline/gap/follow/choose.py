@@ -82,9 +82,14 @@ def add_shaped(follow: Follow, records: Records) -> Follow | None:
     if best is None or criterion(best) > criterion(follow):
         return None
     # Behind a contact, whose own law is known to a factor, another would mop up the rest of it.
-    if is_rough(follow) and best.total > limits.CONTACT_GAIN * follow.total:
+    if is_rough(follow) and best.total > _half_way(follow):
         return None
     return best
+
+
+def _half_way(follow: Follow) -> float:
+    """Return the cost that leaves half of what is beyond the noise."""
+    return follow.points + limits.CONTACT_GAIN * max(follow.total - follow.points, 0.0)
 
 
 def let_go(full: Follow, records: Records) -> Follow:

@@ -88,7 +88,9 @@ def _needless(follow: Follow, records: Records) -> list[int]:
             rise = float(d @ np.linalg.solve(inverse[np.ix_(mine, mine)], d))
             price = limits.BIC_DROP + len(follow.laws.whole_group(g)) * np.log(count)
             if rough and (g < 0 or follow.laws.keys[g][0] not in _CONTACTS):
-                price = max(price, -count * float(np.log(limits.CONTACT_GAIN)))
+                # Without it, twice of what is now beyond the noise would be left, at least.
+                beyond = max(cost - follow.points, 0.0) * (1.0 / limits.CONTACT_GAIN - 1.0)
+                price = max(price, count * float(np.log1p(beyond / cost)))
             excess = count * float(np.log1p(max(rise, 0.0) / cost)) - price
             found.append((excess, g, mine, max(rise, 0.0)))
         excess, g, mine, rise = min(found)
