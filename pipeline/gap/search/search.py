@@ -18,7 +18,7 @@ from pipeline.gap.fit.uncertainty import covariance
 from pipeline.gap.follow.choose import Records, choose_laws, rivals_of
 from pipeline.gap.follow.fit import Follow
 from pipeline.gap.follow.track import make_track
-from pipeline.gap.limits import BIC_DROP, SURE
+from pipeline.gap.limits import SURE
 from pipeline.gap.search.deadline import OutOfTime
 from pipeline.gap.search.hypothesis import Hypothesis, Study, judge, lowers_error, worth_it
 from pipeline.gap.search.translate import as_model, filled, make_candidate
@@ -81,7 +81,7 @@ def prune(chosen: Hypothesis, study: Study, found: list[Hypothesis]) -> Hypothes
             found += without
         found += plainer
         as_good = [h for h in without if _as_good(h, chosen, study)]
-        as_good += [h for h in plainer if h.bic < chosen.bic + BIC_DROP]
+        as_good += [h for h in plainer if h.bic < chosen.bic]
         as_good = [h for h in as_good if h.sound]
         if not as_good:
             nothing = is_nothing(covariance(chosen.fit, study.training, mapper=study.mapper))
