@@ -61,6 +61,8 @@ def drop_needless(follow: Follow, records: Records) -> Follow:
 def _needless(follow: Follow, records: Records) -> list[int]:
     """Return the groups that may go, in order, judged by the quadratic form about the fit."""
     slope = records.slope(follow, factors=False)
+    if not slope.sound:
+        return []
     groups = dict(follow.laws.groups())
     off = follow.p - follow.laws.neutral()
     low, high, _ = follow.laws.bounds()

@@ -12,6 +12,8 @@ from pipeline.gap.follow.track import Own, Track, errors_of
 
 _DAMP, _CHANGE, _LEAST_DAMP = 1e-4, 8.0, 1e-9
 _ATTEMPTS, _RELEASES = 6, 12
+_HUGE = 1e100
+_RIDGE = 1e-12  # of the diagonal of what a run alone has
 _DEAD = 1e-24  # of the strongest, squared
 
 
@@ -101,7 +103,8 @@ def slope_of(
     def one(pair: tuple[Track, Own]) -> tuple[Array, Array, Array]:
         track, own = pair
         run = errors_of(laws, follow.p, track, own, gain=follow.gain, derive=True)
-        if run is None:
+        # A slope that is next to infinite has no square.
+        if run is None or not np.all(np.abs(run[1]) < _HUGE):
             nothing = np.full((size, size), np.nan)
             return nothing, nothing[0], nothing
         E, J = run
@@ -110,6 +113,7 @@ def slope_of(
         A, r = J @ J.T, J @ (E[:, track.seen] * weight).ravel()
         hold, off = track.prior(own, dry)
         mine = A[size:, size:] + np.diag((inflate * hold) ** 2)
+        mine += _RIDGE * np.diag(np.diag(mine))
         right = np.column_stack([A[size:, :size], r[size:] + inflate**2 * hold * off])
         taken = np.linalg.solve(mine, right)
         H = A[:size, :size] - A[:size, size:] @ taken[:, :size]
