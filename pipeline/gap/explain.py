@@ -20,6 +20,7 @@ from pipeline.gap.search.beam import choose, prune, search, steps_to
 from pipeline.gap.search.deadline import Deadline, OutOfTime
 from pipeline.gap.search.grow import fit_whole
 from pipeline.gap.search.hypothesis import Hypothesis, Study, judge
+from pipeline.gap.search.propose import best_of_each, propose
 from pipeline.gap.types import FoundEffect, Gap
 from pipeline.gap.verdict.account import (
     chain_covariance,
@@ -241,13 +242,19 @@ def _with_noise(run: Run, sigma: dict[int, float]) -> Run:
 
 
 def _investigate(fit: Fit, study: Study, deadline: Deadline) -> tuple[Hypothesis, list[Hypothesis]]:
-    """Return the hypothesis chosen and all that were judged in time, the linear one first."""
+    """Return the hypothesis chosen and all that were judged in time, the linear one first.
+
+    A following model proposes; only where something is left of its proposal is there a search.
+    """
     baseline = judge(fit, study)
     if baseline.at_floor or baseline.error < limits.AS_REPEATS * study.repeatability:
         return baseline, [baseline]
     study.tell(f"linear model: error {baseline.error:.1%} of the motion on held-out runs")
     timed = replace(study, mapper=deadline.map)
-    found = search(baseline, timed)
+    settled, proposed = propose(baseline, timed)
+    if settled is not None:
+        return settled, [baseline, *proposed]
+    found = best_of_each([*search(baseline, timed), *proposed])
     return prune(choose(found, baseline, study), timed), found
 
 
