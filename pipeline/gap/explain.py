@@ -253,7 +253,9 @@ def _investigate(fit: Fit, study: Study, deadline: Deadline) -> tuple[Hypothesis
     timed = replace(study, mapper=deadline.map)
     settled, proposed = propose(baseline, timed)
     if settled is not None:
+        study.tell("a model that follows the measurement leaves nothing but noise")
         return settled, [baseline, *proposed]
+    study.tell("a model that follows the measurement leaves more than noise: searching")
     found = best_of_each([*search(baseline, timed), *proposed])
     return prune(choose(found, baseline, study), timed), found
 
