@@ -31,6 +31,7 @@ LEVELS = (
     ("workflow", "synthesis", "results_json"),
     ("gap.types", "gap.limits", "gap.data"),
     ("gap.fit",),
+    ("gap.follow",),
     ("gap.search",),
     ("gap.verdict",),
     ("gap",),

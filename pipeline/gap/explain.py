@@ -16,10 +16,10 @@ from pipeline.gap.fit.levenberg_marquardt import Fit, fit_model
 from pipeline.gap.fit.restart import holding_force
 from pipeline.gap.fit.structure import Candidate
 from pipeline.gap.fit.uncertainty import covariance
-from pipeline.gap.search.beam import choose, prune, search, steps_to
 from pipeline.gap.search.deadline import Deadline, OutOfTime
-from pipeline.gap.search.grow import fit_whole
 from pipeline.gap.search.hypothesis import Hypothesis, Study, judge
+from pipeline.gap.search.search import search, steps_to
+from pipeline.gap.search.whole import fit_whole
 from pipeline.gap.types import FoundEffect, Gap
 from pipeline.gap.verdict.account import (
     chain_covariance,
@@ -204,7 +204,7 @@ def _settled(hypothesis: Hypothesis, study: Study) -> Hypothesis:
         tolerance=_SETTLED / fit.n_points,
         mapper=study.mapper,
     )
-    return replace(judge(fit, study, added=hypothesis.added), bic=hypothesis.bic)
+    return replace(judge(fit, study), bic=hypothesis.bic)
 
 
 def _learnt_spread(fit: Fit) -> dict[int, float]:
@@ -247,8 +247,7 @@ def _investigate(fit: Fit, study: Study, deadline: Deadline) -> tuple[Hypothesis
         return baseline, [baseline]
     study.tell(f"linear model: error {baseline.error:.1%} of the motion on held-out runs")
     timed = replace(study, mapper=deadline.map)
-    found = search(baseline, timed)
-    return prune(choose(found, baseline, study), timed), found
+    return search(baseline, timed)
 
 
 def _with_offset(
@@ -282,9 +281,9 @@ def _with_offset(
     candidate = Candidate(
         effect=effect, place=offset.cart, signs=(1.0,), scales=(abs(offset.force),)
     )
-    without = tuple(judge(fit_whole(h.fit, pinned), pinned, added=h.added) for h in path)
+    without = tuple(judge(fit_whole(h.fit, pinned), pinned) for h in path)
     fit = fit_whole(chosen.fit.with_effect(candidate, (offset.force,)), loose)
-    final = judge(fit, loose, added=(candidate,))
+    final = judge(fit, loose)
     if final.error > min(
         limits.OFFSET_GAIN * without[-1].error, limits.OFFSET_AS_FREE * chosen.error
     ):

@@ -12,10 +12,9 @@ from pipeline.errors import DataError
 from pipeline.gap.data.runs import make_run
 from pipeline.gap.document import gap_json
 from pipeline.gap.explain import _may_be_half, explain_gap
-from pipeline.gap.fit.levenberg_marquardt import fit_model, project
+from pipeline.gap.fit.levenberg_marquardt import fit_model
 from pipeline.gap.fit.linearise import linearise
 from pipeline.gap.fit.structure import Structure
-from pipeline.gap.search.screen import candidates_at, find_teams
 from pipeline.gap.types import Gap
 from pipeline.gap.verdict.account import repeatability
 from pipeline.plant.linear.chain import Chain
@@ -151,77 +150,6 @@ def test_repeats_are_compared_by_the_edge_of_their_input():
     assert repeatability(runs) == pytest.approx(0.0, abs=1e-3)
     assert repeatability([runs[0], make_run(replace(later, u=0.5 * u), n=1)]) is None
     assert repeatability([runs[0], replace(runs[1], id=runs[0].id)]) is None  # of one record
-
-
-def test_effects_that_only_together_explain_are_found_together():
-    """Of three directions two, each of which explains little alone, add up to the residual."""
-    case = make_case(seed=44, n=2, rate=113.1)
-    structure = Structure(springs=case.springs)
-    true = Chain(m=np.array(case.m), c=np.array(case.c), k=np.array(case.k))
-    chain = structure.chain(structure.start(true).theta)
-    runs = [make_run(record, n=2) for record in case.records]
-    trials = [
-        candidates_at(find_effect(key), 1, runs=runs, chain=chain)[0]
-        for key in ("quadratic_drag", "cubic_spring", "load_friction")
-    ]
-    directions = np.array([[1.0, 0.0, 0.0], [-0.9, 0.3, 0.0], [0.3, 0.1, 1.0]]).T
-    residual = directions[:, 0] + directions[:, 1]
-
-    (team,) = find_teams(trials, directions, residual)
-
-    assert [c.effect.key for c in team.candidates] == ["quadratic_drag", "cubic_spring"]
-    assert team.share == pytest.approx(1.0)
-
-
-def test_friction_on_all_carts_is_tried_beside_another_effect():
-    """Two frictions and a braking motor add up to the residual, and no two of them do."""
-    case = make_case(seed=44, n=2, rate=113.1)
-    structure = Structure(springs=case.springs)
-    true = Chain(m=np.array(case.m), c=np.array(case.c), k=np.array(case.k))
-    chain = structure.chain(structure.start(true).theta)
-    runs = [make_run(record, n=2) for record in case.records]
-    trials = [
-        candidates_at(find_effect(key), place, runs=runs, chain=chain)[0]
-        for key, place in (("coulomb_friction", 1), ("drive_damping", 0), ("coulomb_friction", 2))
-    ]
-    residual = np.ones(3)
-
-    family, pair, three = find_teams(trials, np.eye(3), residual)
-
-    assert family.family
-    assert family.share == pytest.approx(pair.share) == pytest.approx(2 / 3)
-    assert {c.key for c in three.candidates} == {candidate.key for candidate, _ in trials}
-    assert three.share == pytest.approx(1.0)
-
-
-def test_what_no_run_shows_absorbs_nothing():
-    """A held cart's mass and the share of two springs that act as one project nothing off."""
-    m, c, k = np.array([3e-4]), np.array([6e-4]), 0.08
-    t = np.asarray(np.arange(400) / 113.1, dtype=np.float64)
-    u = np.where(t > 0.05, 0.1, 0.0)
-    y = simulate_truth(m=m, c=c, k=[k, 0.0], hidden=[], t=t, u=u, free=(1,))
-    one = Record(
-        id="a", kind="step", t=t, u=u, y=y, carts=(1,), free=(1,), resolution=np.array([COUNT])
-    )
-    two = replace(one, y=np.vstack([y, 0 * t]), carts=(1, 2), resolution=np.full(2, COUNT))
-    chains = (
-        (one, Chain(m=1.1 * m, c=c, k=np.array([k, 0.0])), (True, False)),
-        (
-            two,
-            Chain(m=np.append(1.1 * m, m), c=np.append(c, c), k=np.array([k - 0.03, 0.03, 0.01])),
-            (True,) * 3,
-        ),
-    )
-    left = []
-    for record, chain, springs in chains:
-        structure = Structure(springs=springs)
-        run = make_run(record, n=len(springs) - 1)
-        fit = fit_model(structure.start(chain), [run], iterations=0)
-        wave = np.sign(np.sin(7.0 * t))[None, None]
-        directions, residual = project(fit, [run], [wave])
-        left.append((float((directions**2).sum()), float((residual**2).sum())))
-
-    assert left[1] == pytest.approx(left[0], rel=1e-3)
 
 
 @pytest.mark.parametrize("said", [(1,), (1, 2)])

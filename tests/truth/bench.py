@@ -224,7 +224,7 @@ def _hide(effect: Hidden, cart: np.ndarray, spring: np.ndarray, drive: np.ndarra
             cart[i, 9] = p["force"]
         case "end_stop":
             # Its own contact law: a fifth of critical damping on the contact spring.
-            damping = 0.4 * np.sqrt(p["stiffness"] * cart[i, 0])
+            damping = p.get("damping", 0.4 * np.sqrt(p["stiffness"] * cart[i, 0]))
             cart[i, 10:13] = p["position"], p["stiffness"], damping
         case "sensor_gain":
             cart[i, 13] = p["gain"]
@@ -249,8 +249,8 @@ def _hide(effect: Hidden, cart: np.ndarray, spring: np.ndarray, drive: np.ndarra
         case "cogging":
             drive[9:12] = p["force"], p["pitch"], p["phase"]
         case "backlash":
-            motor = 0.15 * cart[0, 0]
-            contact = 60.0 * float(spring[:2, 0].sum())
+            motor = p.get("motor", 0.15) * cart[0, 0]
+            contact = p.get("contact", 60.0) * float(spring[:2, 0].sum())
             drive[5:9] = p["gap"], motor, contact, 0.3 * np.sqrt(contact * motor)
         case other:
             raise ValueError(f"the truth knows no {other}")

@@ -63,9 +63,13 @@ def make_case(
     effects: Sequence[str | Hidden] = (),
     severity: float = 1.0,
     dirt: bool = False,
+    wide: bool = False,
     rate: float | None = None,
 ) -> Case:
     """Make a bench with the named effects at random places and sizes, or with those given.
+
+    `wide` draws sizes over a decade, soft and hard contacts of any damping, and motors of any
+    mass: what makes an effect hard to tell, or to fit, is then among the cases.
 
     `dirt` adds what real benches do: friction that varies by 4 % from run to run, encoders
     zeroed where the cart happens to rest, time stamps rounded to a tenth of a millisecond.
@@ -88,7 +92,7 @@ def make_case(
     hidden = tuple(
         effect
         if isinstance(effect, Hidden)
-        else _draw(effect, n, m, c, k, stiffness, large, rate, linear, severity, rng)
+        else _draw(effect, n, m, c, k, stiffness, large, rate, linear, severity, rng, wide)
         for effect in effects
     )
     records = []
@@ -243,9 +247,9 @@ def _plan(n, large, rng, rate):
     return plan
 
 
-def _draw(name, n, m, c, k, stiffness, large, rate, linear, severity, rng) -> Hidden:
+def _draw(name, n, m, c, k, stiffness, large, rate, linear, severity, rng, wide=False) -> Hidden:
     """Draw a place and sizes; `severity` scales how far the effect departs from the linear."""
-    s = severity
+    s = severity * float(np.exp(rng.uniform(np.log(0.3), np.log(1.5)))) if wide else severity
     i = int(rng.integers(n))
     present = [j for j in range(n + 1) if k[j] > 0]
     j = int(rng.choice(present))
@@ -283,7 +287,7 @@ def _draw(name, n, m, c, k, stiffness, large, rate, linear, severity, rng) -> Hi
                 parameters={"force": s * sign * draw(0.05, 0.2) * stiffness[i, i]},
             )
         case "cubic_spring":
-            size = draw(0.08, 0.3) if sign > 0 else draw(0.04, 0.12)
+            size = draw(0.08, 0.9 if wide else 0.3) if sign > 0 else draw(0.04, 0.12)
             a = s * sign * size * k[j] / stretch**2
             return Hidden(effect=name, place=j + 1, parameters={"coefficient": a})
         case "slack_spring":
@@ -310,6 +314,15 @@ def _draw(name, n, m, c, k, stiffness, large, rate, linear, severity, rng) -> Hi
             return Hidden(effect=name, parameters={"delay": s * draw(0.006, 0.03)})
         case "actuator_lag":
             return Hidden(effect=name, parameters={"time_constant": s * draw(0.01, 0.04)})
+        case "backlash" if wide:
+            return Hidden(
+                effect=name,
+                parameters={
+                    "gap": draw(0.05, 0.3),
+                    "motor": draw(0.08, 0.4),
+                    "contact": draw(20.0, 100.0),
+                },
+            )
         case "backlash":
             return Hidden(effect=name, parameters={"gap": s * draw(0.03, 0.12)})
         case "cogging":
@@ -324,6 +337,10 @@ def _draw(name, n, m, c, k, stiffness, large, rate, linear, severity, rng) -> Hi
                 "position": side * (1 - s * draw(0.1, 0.35)) * steps,
                 "stiffness": draw(10.0, 40.0) * stiffness[i, i],
             }
+            if wide:
+                hard = float(np.exp(draw(np.log(1.5), np.log(30.0)))) * stiffness[i, i]
+                damping = draw(0.05, 0.8) * np.sqrt(hard * m[i])
+                parameters |= {"stiffness": hard, "damping": damping}
             return Hidden(effect=name, place=i + 1, parameters=parameters)
         case "sensor_gain":
             return Hidden(

@@ -182,17 +182,15 @@ def linearise(
     spread: Array,
     scatter_free: bool,
     shared: bool = True,
-    extras: Array | None = None,
 ) -> Linear:
     """Return a run's residual and its Jacobian, with its nuisance parameters eliminated.
 
     `inflate` widens the noise to the misfit of a model that is still wrong, as far as priors are
-    concerned; without `shared` only the nuisance parameters move; `extras` (k, rows, samples of
-    `run.thin`) are further columns to project.
+    concerned; without `shared` only the nuisance parameters move.
     """
     run = run.thin
     layout = layout_of(model.structure, run, scatter_free=scatter_free)
-    columns = columns_of(model, run, nuisance, layout, shared=shared, extras=extras)
+    columns = columns_of(model, run, nuisance, layout, shared=shared)
     prior = start_prior(layout, run, usual_sizes(model, run), inflate=inflate)
     starts = prior.shape[1]
     shots = _eliminate_starts(_by_shot(columns / run.sigma[:, None], run), prior)
@@ -211,19 +209,17 @@ def columns_of(
     layout: Layout,
     *,
     shared: bool,
-    extras: Array | None,
 ) -> Array:
     """Return (., rows, samples) Jacobian by the starts, friction factors, zeros and shared …
 
-    … parameters, the further columns, and the residual last.
+    … parameters, and the residual last.
     """
     derive = _differences if model.structure.has_contact else _derivatives
     y, by_nuisance, by_shared = derive(model, run, nuisance, layout, shared=shared)
     residual = run.y - y - nuisance.zero[list(run.rows)][:, None]
     by_zero = np.zeros((len(layout.zero), *residual.shape))
     by_zero[range(len(layout.zero)), [run.rows.index(i) for i in layout.zero]] = 1.0
-    further = [] if extras is None else [extras]
-    return np.concatenate([by_nuisance, by_zero, by_shared, *further, residual[None]])
+    return np.concatenate([by_nuisance, by_zero, by_shared, residual[None]])
 
 
 def _eliminate_starts(points: Array, prior: Array) -> Array:

@@ -27,11 +27,6 @@ class Candidate:
     scales: tuple[float, ...]
 
     @property
-    def label(self) -> str:
-        """Effect and place, for messages."""
-        return self.effect.key + (f"@{self.place}" if self.place else "")
-
-    @property
     def key(self) -> tuple[str, int]:
         """Effect and place."""
         return self.effect.key, self.place
@@ -53,11 +48,6 @@ class Candidate:
                 for p, v, scale in zip(self.effect.parameters, values, self.scales, strict=True)
             ]
         )
-
-    def has_signs_of(self, values: Sequence[float]) -> bool:
-        """Whether values are on the sides that the candidate keeps."""
-        sided = zip(self.effect.parameters, self.signs, values, strict=True)
-        return all(sign * value > 0.0 for p, sign, value in sided if p.side)
 
 
 @dataclass(frozen=True, kw_only=True)

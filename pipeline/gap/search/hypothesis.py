@@ -1,6 +1,6 @@
 """A hypothesis: effects at places, fitted, and judged on runs the fit has not seen."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +10,6 @@ from pipeline.gap.data.runs import Run
 from pipeline.gap.fit.baseline import fit_nuisance
 from pipeline.gap.fit.levenberg_marquardt import Fit, Mapper
 from pipeline.gap.fit.linearise import simulate_run
-from pipeline.gap.fit.structure import Candidate
 from pipeline.plant.nonlinear.effects import find_effect
 from pipeline.plant.nonlinear.effects.base import Effect
 
@@ -21,8 +20,7 @@ _BOUND_MARGIN = 0.01  # in logarithms, or in scales
 class Hypothesis:
     """A model with its fit on training runs and what it leaves on held-out ones.
 
-    `at_floor`: nothing is left but noise, on training and on held-out runs. `added` are
-    the effects added last.
+    `at_floor`: nothing is left but noise, on training and on held-out runs.
     """
 
     fit: Fit
@@ -30,7 +28,6 @@ class Hypothesis:
     error: float
     bic: float
     at_floor: bool
-    added: tuple[Candidate, ...] = ()
 
     @property
     def key(self) -> frozenset[tuple[str, int]]:
@@ -107,7 +104,7 @@ class Study:
         return hypothesis.at_floor or quiet or as_repeats
 
 
-def judge(fit: Fit, study: Study, *, added: Sequence[Candidate] = ()) -> Hypothesis:
+def judge(fit: Fit, study: Study) -> Hypothesis:
     """Return the hypothesis a fit stands for."""
     held = fit_nuisance(fit, study.held_out, mapper=study.mapper)
     errors, sizes = [], []
@@ -124,7 +121,6 @@ def judge(fit: Fit, study: Study, *, added: Sequence[Candidate] = ()) -> Hypothe
         error=error,
         bic=float(bic),
         at_floor=fit.chi < limits.AT_FLOOR and held.chi < limits.AT_FLOOR,
-        added=tuple(added),
     )
 
 

@@ -6,8 +6,8 @@ import numpy as np
 
 from pipeline.gap import limits
 from pipeline.gap.fit.linearise import simulate_run
-from pipeline.gap.search.beam import steps_to
 from pipeline.gap.search.hypothesis import Hypothesis, Study, lowers_error
+from pipeline.gap.search.search import steps_to
 from pipeline.gap.types import GapWindow, Verdict
 from pipeline.plant.nonlinear.effects import find_effect
 

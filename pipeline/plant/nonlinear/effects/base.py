@@ -87,13 +87,10 @@ class Effect:
     fewest_carts : with fewer it is part of the linear chain.
     family : effects of one family exclude each other at one place; on several carts they are one.
     grows_from : the simpler effect whose fit is the start of this one's.
-    grown : the values that the simpler effect's tell of this one's; the others are tried.
-    rugged : its misfit has many valleys, so that a fit needs several starts.
     only_rest : shows in nothing but where the carts rest, like an encoder's zero; found from those.
     equivalent : what the data cannot tell from it, and why.
     same_as, same_below : the key of an effect that provably cannot be told from it while its first
         parameter is below this many sample times.
-    lookalike : another effect that the values at a place of a chain hint at, to be fitted beside.
     genuine : False where the values have degenerated into another law.
     """
 
@@ -113,15 +110,10 @@ class Effect:
     between_carts: bool = False
     fewest_carts: int = 1
     grows_from: str | None = None
-    grown: Callable[[Mapping[str, float]], dict[str, float]] = lambda p: {}
-    rugged: bool = False
     only_rest: bool = False
     equivalent: str = ""
     same_as: str = ""
     same_below: float = np.inf
-    lookalike: "Callable[[Mapping[str, float], int, Chain], Lookalike | None]" = (
-        lambda p, place, chain: None
-    )
     genuine: Callable[[Mapping[str, float]], bool] = lambda p: True
 
     @property
@@ -202,15 +194,6 @@ class Effect:
                 cart[place - 1, column] = value
             else:
                 spring[place - 1, column] = value
-
-
-@dataclass(frozen=True, kw_only=True)
-class Lookalike:
-    """An effect at a place, with those of its values that are known."""
-
-    effect: Effect
-    place: int
-    values: dict[str, float]
 
 
 @dataclass(frozen=True, kw_only=True)

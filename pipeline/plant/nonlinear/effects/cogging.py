@@ -37,7 +37,6 @@ COGGING = Effect(
         ),
     ),
     columns=lambda p: {Drive.COGGING: p["force"], Drive.PITCH: p["pitch"], Drive.PHASE: p["phase"]},
-    rugged=True,
     fingerprint="The cart rests at some positions rather than at others, evenly apart; the "
     "residual force is a wave over the position, alike in both directions.",
     deciding_run="A slow ramp of the input, up and down: the cart moves in even steps, at the same "

@@ -4,8 +4,6 @@ from pipeline.plant.limits import LEAST_SLIDING
 from pipeline.plant.nonlinear.effects.base import Effect, Parameter, Scales
 from pipeline.plant.nonlinear.tables import Cart
 
-_BREAKAWAY = 1.5  # times the sliding force: a start in the middle of what dry surfaces show
-
 
 def _spring_force(s: Scales) -> float:
     return s.stiffness * s.position
@@ -56,7 +54,6 @@ STICTION = Effect(
     axis="velocity",
     family="dry friction",
     grows_from="coulomb_friction",
-    grown=lambda p: {"force": p["force"], "static_force": _BREAKAWAY * p["force"]},
     # Without a drop it is Coulomb's law; without sliding friction no dry surface behaves like it.
     genuine=lambda p: LEAST_SLIDING * p["static_force"] < p["force"] < p["static_force"],
 )
@@ -81,7 +78,6 @@ PRESLIDING = Effect(
     axis="velocity",
     family="dry friction",
     grows_from="coulomb_friction",
-    grown=lambda p: {"force": p["force"]},
 )
 
 LOAD = Effect(

@@ -1,30 +1,7 @@
 """Springs that are not straight, and dampers between carts."""
 
-from collections.abc import Mapping
-
-from pipeline.plant.limits import HARD
-from pipeline.plant.linear.chain import Chain
-from pipeline.plant.nonlinear.effects.base import Effect, Lookalike, Parameter
-from pipeline.plant.nonlinear.effects.structure import END_STOP
+from pipeline.plant.nonlinear.effects.base import Effect, Parameter
 from pipeline.plant.nonlinear.tables import Spring
-
-
-def _stop(p: Mapping[str, float], spring: int, chain: Chain) -> Lookalike | None:
-    """Return the end stop that a wall spring, hard past its stretch, may be."""
-    # A spring's stretch is its right end's position, or minus its left end's.
-    ends = [
-        (cart, side) for cart, side in ((spring, 1.0), (spring - 1, -1.0)) if 0 < cart <= chain.n
-    ]
-    if p["stiffness_change"] < HARD or len(ends) > 1:
-        return None
-    ((cart, side),) = ends
-    stiffness = p["stiffness_change"] * float(chain.k[spring - 1])
-    return Lookalike(
-        effect=END_STOP,
-        place=cart,
-        values={"position": side * p["stretch"], "stiffness": stiffness},
-    )
-
 
 CUBIC = Effect(
     key="cubic_spring",
@@ -79,8 +56,6 @@ SLACK = Effect(
             side=True,
         ),
     ),
-    rugged=True,
-    lookalike=_stop,
     columns=lambda p: {Spring.CHANGE: p["stiffness_change"], Spring.STRETCH: p["stretch"]},
     fingerprint="The swing is of a different shape on one side, beyond one position.",
     deciding_run="Static steps of both signs and several sizes: the gain has a corner.",

@@ -1,6 +1,5 @@
 """Things on the bench that the chain leaves out: end stops, hidden masses, a sensor's scale."""
 
-from pipeline.plant.limits import HARD
 from pipeline.plant.nonlinear.effects.base import Effect, Parameter
 from pipeline.plant.nonlinear.tables import Cart
 
@@ -25,7 +24,7 @@ END_STOP = Effect(
             "input/position",
             scale=lambda s: s.stiffness,
             trials=(20.0,),
-            lower=HARD,  # what is softer is a spring that changes
+            lower=0.05,
             upper=3000.0,
             neutral=0.0,
         ),
@@ -102,5 +101,4 @@ EXTRA_MODE = Effect(
     deciding_run="A sweep through the extra resonance; then hold the suspect part by hand.",
     reference="J. P. Den Hartog, Mechanical Vibrations, section 3.2",
     axis="frequency",
-    rugged=True,
 )
