@@ -147,8 +147,8 @@ def steps_to(
     """Return the linear model, one effect, … chosen: what helps most by itself comes first."""
     steps = [chosen]
     while effects := steps[0].fit.structure.effects:
-        key = steps[0].key
-        smaller = [h for h in found if h.key < key and len(h.key) == len(key) - 1]
-        smaller = smaller or [_without(steps[0], effects[-1], study)]
+        known = {h.key: h for h in found}
+        rest = [(steps[0].key - {effect.key}, effect) for effect in effects]
+        smaller = [known.get(key) or _without(steps[0], effect, study) for key, effect in rest]
         steps.insert(0, min(smaller, key=lambda h: h.error))
     return tuple(steps)
