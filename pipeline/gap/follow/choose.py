@@ -7,7 +7,7 @@ import numpy as np
 
 from pipeline.gap import limits
 from pipeline.gap.follow import forces
-from pipeline.gap.follow.drop import criterion, drop_needless, is_rough
+from pipeline.gap.follow.drop import criterion, drop_needless, is_better
 from pipeline.gap.follow.fit import Follow, start_follow
 from pipeline.gap.follow.laws import Bench, Law, smooth_laws
 from pipeline.gap.follow.records import Records
@@ -55,7 +55,7 @@ def choose_laws(
     """Return the model that following finds: the laws that are left, fitted to free runs."""
     full = start_all(records, springs=springs, chains=chains)
     lean = let_go(full, records)
-    tell(f"all at once: {full.chi:.3f}, let go: {lean.chi:.3f}")
+    tell(f"all at once: {full.chi:.3f}, let go: {lean.chi:.3f} at {lean.gain}")
     for _ in range(_ROUNDS):
         if lean.gain == FREE and lean.chi < limits.AT_FLOOR:
             break
@@ -63,9 +63,9 @@ def choose_laws(
         if more is None:
             break
         leaner = let_go(more, records)
-        tell(f"with {more.laws.keys[-1]}: {more.chi:.3f}, let go: {leaner.chi:.3f}")
+        tell(f"with {more.laws.keys[-1]}: {more.chi:.3f}, let go: {leaner.chi:.3f} at {leaner.gain} {leaner.laws.keys}")
         full = more
-        if leaner.gain < lean.gain or criterion(leaner) < criterion(lean):
+        if leaner.gain < lean.gain or is_better(leaner, lean):
             lean = leaner
     return lean
 
@@ -77,19 +77,11 @@ def add_shaped(follow: Follow, records: Records) -> Follow | None:
     for law in (*trials, *backlash_laws(follow, records)):
         laws, p = follow.laws.with_laws(follow.p, [law])
         trial = records.refit(follow, laws, p, iterations=8)
-        if best is None or criterion(trial) < criterion(best):
+        if best is None or criterion(trial, follow.news) < criterion(best, follow.news):
             best = trial
-    if best is None or criterion(best) > criterion(follow):
-        return None
-    # Behind a contact, whose own law is known to a factor, another would mop up the rest of it.
-    if is_rough(follow) and best.total > _half_way(follow):
+    if best is None or not is_better(best, follow):
         return None
     return best
-
-
-def _half_way(follow: Follow) -> float:
-    """Return the cost that leaves half of what is beyond the noise."""
-    return follow.points + limits.CONTACT_GAIN * max(follow.total - follow.points, 0.0)
 
 
 def let_go(full: Follow, records: Records) -> Follow:
@@ -115,7 +107,7 @@ def _look_again(lean: Follow, records: Records) -> Follow:
     laws, p = replace(lean.laws, drive=everything.drive).with_laws(lean.p, extra)
     again = records.refit(lean, laws, p, iterations=_FEW)
     again = _one_friction(drop_needless(again, records), records)
-    return again if criterion(again) < criterion(lean) else lean
+    return again if is_better(again, lean) else lean
 
 
 def _one_friction(follow: Follow, records: Records) -> Follow:

@@ -3,58 +3,45 @@
 import numpy as np
 
 from pipeline.gap import limits
-from pipeline.gap.follow import forces
 from pipeline.gap.follow.fit import Follow
 from pipeline.gap.follow.records import Records
 
-_INDEPENDENT = 4.0  # readings of a track that tell as much as one independent
 _RIDGE = 1e-10  # of the diagonal
 _SHOWN = 1e-20  # of the strongest parameter's power: a weaker one is not shown
-_CONTACTS = {forces.STOP, forces.BACKLASH}
 
 
-def independent(follow: Follow) -> float:
-    """Return how many independent readings there are."""
-    return follow.points / _INDEPENDENT
+def criterion(follow: Follow, news: float) -> float:
+    """Return the Bayesian criterion of `news` independent readings, each effect's price included.
 
-
-def criterion(follow: Follow) -> float:
-    """Return the Bayesian criterion, what each effect costs included."""
-    count = independent(follow)
-    bounds = follow.laws.bounds()
-    size = int(np.sum(bounds[0] < bounds[1]))
-    effects = len(follow.laws.groups())
+    Compared are models by the news of the fuller one: only what it leaves counts as chance.
+    """
+    low, high, _ = follow.laws.bounds()
+    size = int(np.sum(low < high))
     return (
-        count * float(np.log(max(follow.total, 1e-300) / follow.points))
-        + size * float(np.log(count))
-        + effects * limits.BIC_DROP
+        news * float(np.log(max(follow.total, 1e-300) / follow.points))
+        + size * float(np.log(news))
+        + len(follow.laws.groups()) * limits.BIC_DROP
     )
 
 
-def is_rough(follow: Follow) -> bool:
-    """Whether bodies meet in a way that is not fully described."""
-    meets = _CONTACTS & {kind for kind, _ in follow.laws.keys}
-    return bool(meets) and follow.chi > limits.AT_FLOOR
+def is_better(fuller: Follow, other: Follow) -> bool:
+    """Whether the criterion is for the fuller of two models."""
+    return criterion(fuller, fuller.news) < criterion(other, fuller.news)
 
 
 def drop_needless(follow: Follow, records: Records) -> Follow:
     """Drop every law whose loss the criterion does not feel, the least first; refit the rest."""
-    while follow.laws.groups():
-        order = _needless(follow, records)
-        if not order:
-            break
-        here, rough = criterion(follow), is_rough(follow)
+    while order := _needless(follow, records):
+        here = criterion(follow, follow.news)
         while order:
             laws, p = follow.laws.without(follow.p, order)
             trial = records.refit(follow, laws, p)
-            if rough or criterion(trial) < here:
+            if criterion(trial, follow.news) < here:
                 follow = trial
                 break
             if len(order) == 1:
                 return follow
             order = order[: len(order) // 2]
-        else:
-            break
     return follow
 
 
@@ -76,7 +63,7 @@ def _needless(follow: Follow, records: Records) -> list[int]:
         if not usable[groups[g]].any():
             order.append(g)
             del groups[g]
-    count, cost, rough = independent(follow), follow.total, is_rough(follow)
+    count, cost = follow.news, follow.total
     active = np.flatnonzero(usable)
     while groups:
         size = np.sqrt(power[active])
@@ -89,10 +76,6 @@ def _needless(follow: Follow, records: Records) -> list[int]:
             d = off[active[mine]]
             rise = float(d @ np.linalg.solve(inverse[np.ix_(mine, mine)], d))
             price = limits.BIC_DROP + len(follow.laws.whole_group(g)) * np.log(count)
-            if rough and (g < 0 or follow.laws.keys[g][0] not in _CONTACTS):
-                # Without it, twice of what is now beyond the noise would be left, at least.
-                beyond = max(cost - follow.points, 0.0) * (1.0 / limits.CONTACT_GAIN - 1.0)
-                price = max(price, count * float(np.log1p(beyond / cost)))
             excess = count * float(np.log1p(max(rise, 0.0) / cost)) - price
             found.append((excess, g, mine, max(rise, 0.0)))
         excess, g, mine, rise = min(found)

@@ -9,11 +9,13 @@ from pipeline.arrays import Array
 from pipeline.gap.fit.levenberg_marquardt import Mapper
 from pipeline.gap.follow.laws import Laws
 from pipeline.gap.follow.track import Own, Track, errors_of
+from pipeline.gap.independent import independent
 
 _DAMP, _CHANGE, _LEAST_DAMP = 1e-4, 8.0, 1e-9
 _ATTEMPTS, _RELEASES = 6, 12
 _HUGE = 1e100
 _RIDGE = 1e-12  # of the diagonal of what a run alone has
+_INDEPENDENT = 4.0  # readings of a track that tell as much as one independent, or more
 _DEAD = 1e-24  # of the strongest, squared
 
 
@@ -21,7 +23,8 @@ _DEAD = 1e-24  # of the strongest, squared
 class Follow:
     """A model that follows: its laws and vector, every run's own parameters, what it leaves.
 
-    `cost` is the sum of squared errors over their noise; `points` how many they are.
+    `cost` is the sum of squared errors over their noise; `points` how many they are, `news` how
+    many of them are independent.
     """
 
     laws: Laws
@@ -30,6 +33,7 @@ class Follow:
     gain: float
     cost: float
     points: float
+    news: float = 1.0
     prior: float = 0.0
 
     @property
@@ -61,18 +65,21 @@ def weigh(follow: Follow, tracks: Sequence[Track], *, mapper: Mapper = map) -> F
     """Return it with its cost: infinite where the model runs away."""
     laws, dry = follow.laws, follow.laws.dry
 
-    def one(pair: tuple[Track, Own]) -> tuple[float, float]:
+    def one(pair: tuple[Track, Own]) -> tuple[float, float, float]:
         track, own = pair
         run = errors_of(laws, follow.p, track, own, gain=follow.gain, derive=False)
         if run is None:
-            return np.inf, np.inf
+            return np.inf, np.inf, 1.0
+        left = run[0] * track.weight
         prior = track.prior(own, dry)[1]
-        return float(((run[0] * track.weight) ** 2).sum()), float((prior**2).sum())
+        news = sum(independent(row) for row in left[:, track.seen].T)
+        return float((left**2).sum()), float((prior**2).sum()), news
 
     costs = np.array(list(mapper(one, zip(tracks, follow.own, strict=True))))
     points = sum(track.points for track in tracks)
+    cost, prior, news = costs.sum(axis=0).tolist()
     return replace(
-        follow, cost=float(costs[:, 0].sum()), points=points, prior=float(costs[:, 1].sum())
+        follow, cost=cost, points=points, prior=prior, news=min(news, points / _INDEPENDENT)
     )
 
 
