@@ -13,7 +13,7 @@ from pipeline.gap.fit.baseline import fit_baseline
 from pipeline.gap.fit.levenberg_marquardt import Fit
 from pipeline.gap.limits import BIC_DROP
 from pipeline.gap.search.hypothesis import Hypothesis, Study, judge, worth_it
-from pipeline.gap.search.search import is_nothing, prune, search
+from pipeline.gap.search.search import SURE, prune, search, sureness
 from pipeline.gap.search.translate import make_candidate
 from pipeline.gap.search.whole import fit_whole
 from pipeline.plant.nonlinear.effects import CATALOGUE, find_effect
@@ -90,8 +90,9 @@ def test_what_is_nothing_within_its_error_is_told(value, nothing):
     known = replace(fit, structure=model.structure, theta=model.theta)
     sure = np.diag(np.full(model.theta.size, (1e-3 / delay.scales[0]) ** 2))
 
-    assert is_nothing(replace(known, covariance=sure)) == [nothing]
-    assert is_nothing(known) == [False]  # without an error nothing is said
+    (found,) = sureness(replace(known, covariance=sure))
+    assert (found < SURE) == nothing
+    assert sureness(known) == [np.inf]  # without an error nothing is said
 
 
 def judged(*keys: tuple[str, int], chi: float, held: float, bic: float) -> Hypothesis:

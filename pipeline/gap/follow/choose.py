@@ -55,7 +55,7 @@ def choose_laws(
     """Return the model that following finds: the laws that are left, fitted to free runs."""
     full = start_all(records, springs=springs, chains=chains)
     lean = let_go(full, records)
-    tell(f"all at once: {full.chi:.3f}, let go: {lean.chi:.3f} at {lean.gain}")
+    tell(f"all at once: {full.chi:.3f}, let go: {lean.chi:.3f}")
     for _ in range(_ROUNDS):
         if lean.gain == FREE and lean.chi < limits.AT_FLOOR:
             break
@@ -63,7 +63,9 @@ def choose_laws(
         if more is None:
             break
         leaner = let_go(more, records)
-        tell(f"with {more.laws.keys[-1]}: {more.chi:.3f}, let go: {leaner.chi:.3f} at {leaner.gain} {leaner.laws.keys}")
+        tell(
+            f"with {more.laws.keys[-1]}: {more.chi:.3f}, let go: {leaner.chi:.3f} at {leaner.gain} {leaner.laws.keys}"
+        )
         full = more
         if leaner.gain < lean.gain or is_better(leaner, lean):
             lean = leaner

@@ -69,26 +69,24 @@ def _judged(follow: Follow, study: Study, *, finish: bool = True) -> Hypothesis:
 def prune(chosen: Hypothesis, study: Study, found: list[Hypothesis]) -> Hypothesis:
     """Drop effects, and richer laws, that the others have made needless; all tried are `found`.
 
-    And those that are nothing within their error.
+    And those that are nothing within their error. The least sure goes first.
     """
     while chosen.key:
         effects = chosen.fit.structure.effects
-        plainer = [_plainer(chosen, c, study) for c in effects if c.effect.grows_from]
-        if len(effects) == 1:
-            without = [found[0]]
+        sure = sureness(covariance(chosen.fit, study.training, mapper=study.mapper))
+        for index in np.argsort(sure, kind="stable").tolist():
+            plainer = _plainer(chosen, effects[index], study)
+            without = found[0] if len(effects) == 1 else _without(chosen, effects[index], study)
+            found += [h for h in (plainer, without) if h is not None and h is not found[0]]
+            if plainer is not None and plainer.sound and plainer.bic < chosen.bic:
+                chosen = plainer
+                break
+            needless = _as_good(without, chosen, study) or sure[index] < SURE
+            if needless and without.sound:
+                chosen = without
+                break
         else:
-            without = [_without(chosen, c, study) for c in effects]
-            found += without
-        found += plainer
-        as_good = [h for h in without if _as_good(h, chosen, study)]
-        as_good += [h for h in plainer if h.bic < chosen.bic]
-        as_good = [h for h in as_good if h.sound]
-        if not as_good:
-            nothing = is_nothing(covariance(chosen.fit, study.training, mapper=study.mapper))
-            as_good = [h for h, none in zip(without, nothing, strict=True) if none and h.sound]
-        if not as_good:
             break
-        chosen = min(as_good, key=lambda h: h.bic)
     return chosen
 
 
@@ -105,19 +103,22 @@ def _as_good(without: Hypothesis, chosen: Hypothesis, study: Study) -> bool:
     return without.bic < chosen.bic or not lowers_error(chosen, without, study)
 
 
-def is_nothing(fit: Fit) -> list[bool]:
-    """Return which effects have a parameter that is nothing within its standard errors."""
+def sureness(fit: Fit) -> list[float]:
+    """Return how many standard errors each effect is from nothing, by its least sure parameter."""
     structure = fit.structure
     if fit.covariance is None:
-        return [False] * len(structure.effects)
+        return [np.inf] * len(structure.effects)
     std = np.sqrt(np.diag(fit.covariance)) * structure.physical_derivative(fit.theta)
     return [
-        any(
-            abs(value - p.neutral) < SURE * error
-            for p, value, error in zip(
-                term.effect.parameters, term.values, std[structure.span(index)], strict=True
-            )
-            if p.neutral is not None and p.reported
+        min(
+            (
+                abs(value - p.neutral) / error
+                for p, value, error in zip(
+                    term.effect.parameters, term.values, std[structure.span(index)], strict=True
+                )
+                if p.neutral is not None and p.reported
+            ),
+            default=np.inf,
         )
         for index, term in enumerate(fit.terms)
     ]
@@ -129,10 +130,12 @@ def _without(hypothesis: Hypothesis, effect: Candidate, study: Study) -> Hypothe
     return judge(fit, study)
 
 
-def _plainer(hypothesis: Hypothesis, rich: Candidate, study: Study) -> Hypothesis:
-    """Return the hypothesis with the law in place of a richer one that grew from it."""
+def _plainer(hypothesis: Hypothesis, rich: Candidate, study: Study) -> Hypothesis | None:
+    """Return the hypothesis with the law that a richer one grew from in its place."""
+    if rich.effect.grows_from is None:
+        return None
     index = hypothesis.fit.structure.effects.index(rich)
-    effect = find_effect(rich.effect.grows_from or rich.effect.key)
+    effect = find_effect(rich.effect.grows_from)
     values = [hypothesis.fit.terms[index].values[rich.effect.names.index(name)]
               for name in effect.names]  # fmt: skip
     chain = hypothesis.fit.structure.chain(hypothesis.fit.theta)
