@@ -63,9 +63,7 @@ def choose_laws(
         if more is None:
             break
         leaner = let_go(more, records)
-        tell(
-            f"with {more.laws.keys[-1]}: {more.chi:.3f}, let go: {leaner.chi:.3f} at {leaner.gain} {leaner.laws.keys}"
-        )
+        tell(f"with {more.laws.keys[-1]}: {more.chi:.3f}, let go: {leaner.chi:.3f}")
         full = more
         if leaner.gain < lean.gain or is_better(leaner, lean):
             lean = leaner
