@@ -9,7 +9,7 @@ COULOMB, LOAD, DRAG, OFFSET, CUBIC, SLACK, COUPLING, BRAKING, STOP, STRIBECK, DA
     12
 )
 COGGING, GAIN, BACKLASH = 12, 13, 14
-SIZES = (1, 1, 1, 1, 1, 2, 1, 1, 3, 2, 2, 3, 3, 1, 2)
+SIZES = (1, 1, 1, 1, 1, 2, 1, 1, 3, 2, 2, 3, 3, 1, 3)
 DRIVE = 4  # parameters of the drive: dead zone, limit, delay, lag
 
 

@@ -245,22 +245,36 @@ def follow_run(
                     apart = aux[play, 0] - x[0]
                     rate = aux[play, 1] - v[0]
                     if abs(apart) > 0.5 * gap and apart * rate > 0.0:
-                        side_of = 1.0 if apart > 0.0 else -1.0
+                        side = 1.0 if apart > 0.0 else -1.0
                         late = min((abs(apart) - 0.5 * gap) / abs(rate), h)
                         share = min(motor / p[0], 1.0 - _LEAST_SHARE)
-                        together = v[0] + share * rate
+                        # What is pushed together again within the step does not part.
+                        bounce = p[o + 2]
+                        if 2.0 * bounce * abs(rate) < side * (push - v[0] + before):
+                            bounce = 0.0
+                            side_of = side
+                        whole = (1.0 + bounce) * rate
                         if derive:
                             for q in range(lanes):
                                 off = DA[at, q] - DX[0, q]
                                 if q == o:
-                                    off -= 0.5 * side_of
+                                    off -= 0.5 * side
                                 # The instant moves with the parameter.
-                                DX[0, q] += (together - v[0]) * off / rate
-                                DV[0, q] += share * (DA[vat, q] - DV[0, q])
-                            DV[0, o + 1] += rate / p[0]
-                            DV[0, 0] -= rate * share / p[0]
-                        x[0] += (together - v[0]) * late
-                        v[0] = together
+                                DX[0, q] += share * whole * off / rate
+                                DA[at, q] += (share - 1.0) * whole * off / rate
+                                off = (1.0 + bounce) * (DA[vat, q] - DV[0, q])
+                                DV[0, q] += share * off
+                                DA[vat, q] += (share - 1.0) * off
+                            for q, by in ((o + 1, whole / p[0]), (0, -whole * share / p[0])):
+                                DV[0, q] += by
+                                DA[vat, q] += by
+                            if bounce > 0.0:
+                                DV[0, o + 2] += share * rate
+                                DA[vat, o + 2] += (share - 1.0) * rate
+                        x[0] += share * whole * late
+                        v[0] += share * whole
+                        aux[play, 0] += (share - 1.0) * whole * late
+                        aux[play, 1] += (share - 1.0) * whole
                 elif (u - motor * (v[0] - before) / h) * side_of < 0.0:
                     aux[play, 0] = x[0] + 0.5 * side_of * gap
                     aux[play, 1] = v[0]

@@ -19,7 +19,8 @@ _DELAY = (-0.05, 0.1)  # s
 _LONGEST_LAG = 0.3  # s
 _LEAST_LIMIT = 0.2  # of the largest input
 _SHORT = 0.01  # s: how far a delay or lag may go in one step
-_CONTACT, _CONTACT_DAMPING = 40.0, 0.5  # of cart 1's springs, and of critical damping
+_CONTACT = 40.0  # of cart 1's springs
+_BOUNCE = (0.02, 0.9)  # of the speed, behind a contact
 _SLACK = 0.95  # of a spring that goes slack, at most
 # Other parameters than the first that are a force or a share of one, and vanish with the effect;
 # what is left is its shape.
@@ -54,7 +55,7 @@ COLUMNS: tuple[tuple[IntEnum, ...], ...] = (
     (Cart.HIDDEN_MASS, Cart.HIDDEN_STIFFNESS, Cart.HIDDEN_DAMPING),
     (Drive.COGGING, Drive.PHASE, Drive.PITCH),
     (Cart.GAIN,),
-    (Drive.BACKLASH, Drive.MOTOR_MASS),
+    (Drive.BACKLASH, Drive.MOTOR_MASS, Drive.CONTACT_STIFFNESS, Drive.CONTACT_DAMPING),
 )
 Column = tuple[type[IntEnum], int]  # columns of different tables are equal as numbers
 DRIVE_COLUMNS = (Drive.DEAD_ZONE, Drive.LIMIT, Drive.DELAY, Drive.LAG)
@@ -299,15 +300,22 @@ class Laws:
                 values = [float(np.hypot(a, b)), float(np.arctan2(b, a)), pitch]
             elif kind == forces.GAIN:
                 values[0] += 1.0
+            elif kind == forces.BACKLASH:
+                values[2:] = self._contact(p, motor=values[1], bounce=values[2])
             table = type(COLUMNS[kind][0])
             row = out.setdefault((table, 0 if table is Drive else place), {})
             row.update(zip(COLUMNS[kind], values, strict=True))
-            if kind == forces.BACKLASH:
-                # What follows is rigid; a bench is not quite.
-                firm = _CONTACT * float(p[2 * n] + p[2 * n + 1])
-                row[Drive.CONTACT_STIFFNESS] = firm
-                row[Drive.CONTACT_DAMPING] = _CONTACT_DAMPING * float(np.sqrt(firm * values[1]))
         return out
+
+    def _contact(self, p: Array, *, motor: float, bounce: float) -> tuple[float, float]:
+        """Return stiffness and damping of a contact from which bodies part as they should.
+
+        What follows is rigid; a bench is not quite. W. Goldsmith, Impact (1960), chapter 4.
+        """
+        firm = _CONTACT * float(p[2 * self.bench.n] + p[2 * self.bench.n + 1])
+        fall = -float(np.log(np.clip(bounce, *_BOUNCE)))
+        both = motor * max(1.0 - motor / float(p[0]), 0.0)
+        return firm, 2.0 * fall / float(np.hypot(np.pi, fall)) * float(np.sqrt(firm * both))
 
 
 def smooth_laws(bench: Bench, *, columns: frozenset[Column]) -> Laws:

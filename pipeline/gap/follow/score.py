@@ -29,7 +29,7 @@ _RATES, _RING = (0.45, 0.6, 0.75, 0.9, 1.05, 1.2, 1.4, 1.7, 2.3), 0.06
 _PITCHES = tuple(np.arange(1.5, 25.0, 0.4).tolist())
 _FAST = 0.98  # of the speeds, below which the usual ones are
 _LITTLE = 0.1  # of the motion to the other side: on this side hardly any
-_PLAY, _MOTOR = 0.03, 0.15  # of the travel and of cart 1's mass: where a play starts
+_PLAY, _MOTOR, _BOUNCE = 0.03, 0.15, 0.4  # of travel, cart 1's mass, speed: where a play starts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,7 +150,7 @@ def backlash_laws(follow: Follow, records: Records) -> list[Law]:
     ]
     if not spans or (forces.BACKLASH, 0) in follow.laws.keys:
         return []
-    values = _PLAY * max(spans), _MOTOR * float(follow.p[0])
+    values = _PLAY * max(spans), _MOTOR * float(follow.p[0]), _BOUNCE
     law = Law(kind=forces.BACKLASH, place=0, values=values)
     return [law] if records.allows(law) else []
 
