@@ -28,7 +28,7 @@ SIZES = {
     forces.HIDDEN: lambda u, x, m, k: (0.1 * m, 900.0, 2.0),
     forces.COGGING: lambda u, x, m, k: (0.02 * u, 0.01 * u, 0.3 * x),
     forces.GAIN: lambda u, x, m, k: (0.03,),
-    forces.BACKLASH: lambda u, x, m, k: (0.03 * x, 0.15 * m, 0.5),
+    forces.BACKLASH: lambda u, x, m, k: (0.1 * x, 0.3 * m, 0.6),
 }
 DRIVEN = (forces.BRAKING, forces.COGGING, forces.BACKLASH)
 # Whether a cart turns, or bodies meet, before a reading or after it is a jump in its error.

@@ -7,7 +7,7 @@ import numpy as np
 
 from pipeline.gap import limits
 from pipeline.gap.follow import forces
-from pipeline.gap.follow.drop import criterion, drop_needless, is_better
+from pipeline.gap.follow.drop import criterion, drop_needless, is_better, is_rough
 from pipeline.gap.follow.fit import Follow, start_follow
 from pipeline.gap.follow.laws import Bench, Law, smooth_laws
 from pipeline.gap.follow.records import Records
@@ -81,7 +81,15 @@ def add_shaped(follow: Follow, records: Records) -> Follow | None:
             best = trial
     if best is None or not is_better(best, follow):
         return None
+    # Behind a contact, whose own law is known to a factor, another would mop up the rest of it.
+    if is_rough(follow) and best.total > _half_way(follow):
+        return None
     return best
+
+
+def _half_way(follow: Follow) -> float:
+    """Return the cost that leaves half of what is beyond the noise."""
+    return follow.points + limits.CONTACT_GAIN * max(follow.total - follow.points, 0.0)
 
 
 def let_go(full: Follow, records: Records) -> Follow:

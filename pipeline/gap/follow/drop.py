@@ -3,11 +3,19 @@
 import numpy as np
 
 from pipeline.gap import limits
+from pipeline.gap.follow import forces
 from pipeline.gap.follow.fit import Follow
 from pipeline.gap.follow.records import Records
 
 _RIDGE = 1e-10  # of the diagonal
 _SHOWN = 1e-20  # of the strongest parameter's power: a weaker one is not shown
+_CONTACTS = {forces.STOP, forces.BACKLASH}
+
+
+def is_rough(follow: Follow) -> bool:
+    """Whether bodies meet in a way that is not fully described."""
+    meets = _CONTACTS & {kind for kind, _ in follow.laws.keys}
+    return bool(meets) and follow.chi > limits.AT_FLOOR
 
 
 def criterion(follow: Follow, news: float) -> float:
@@ -32,11 +40,11 @@ def is_better(fuller: Follow, other: Follow) -> bool:
 def drop_needless(follow: Follow, records: Records) -> Follow:
     """Drop every law whose loss the criterion does not feel, the least first; refit the rest."""
     while order := _needless(follow, records):
-        here = criterion(follow, follow.news)
+        here, rough = criterion(follow, follow.news), is_rough(follow)
         while order:
             laws, p = follow.laws.without(follow.p, order)
             trial = records.refit(follow, laws, p)
-            if criterion(trial, follow.news) < here:
+            if rough or criterion(trial, follow.news) < here:
                 follow = trial
                 break
             if len(order) == 1:
@@ -63,7 +71,7 @@ def _needless(follow: Follow, records: Records) -> list[int]:
         if not usable[groups[g]].any():
             order.append(g)
             del groups[g]
-    count, cost = follow.news, follow.total
+    count, cost, rough = follow.news, follow.total, is_rough(follow)
     active = np.flatnonzero(usable)
     while groups:
         size = np.sqrt(power[active])
@@ -76,6 +84,10 @@ def _needless(follow: Follow, records: Records) -> list[int]:
             d = off[active[mine]]
             rise = float(d @ np.linalg.solve(inverse[np.ix_(mine, mine)], d))
             price = limits.BIC_DROP + len(follow.laws.whole_group(g)) * np.log(count)
+            if rough and (g < 0 or follow.laws.keys[g][0] not in _CONTACTS):
+                # Without it, twice of what is now beyond the noise would be left, at least.
+                beyond = max(cost - follow.points, 0.0) * (1.0 / limits.CONTACT_GAIN - 1.0)
+                price = max(price, count * float(np.log1p(beyond / cost)))
             excess = count * float(np.log1p(max(rise, 0.0) / cost)) - price
             found.append((excess, g, mine, max(rise, 0.0)))
         excess, g, mine, rise = min(found)
