@@ -85,6 +85,26 @@ class Record:
         return float((self.t[-1] - self.t[0]) / (self.t.size - 1))
 
 
+@dataclass(frozen=True, kw_only=True)
+class Intervention:
+    """A stretch of a record, `start` to `end` in s, in which a force that was not measured acts.
+
+    A hand, most likely. `held` : it keeps the cart at rest, away from where it would rest; else
+    it moves it.
+    """
+
+    experiment: str
+    cart: int
+    start: float
+    end: float
+    held: bool
+
+    @property
+    def what(self) -> str:
+        """What the force does, in words."""
+        return "held away from its rest" if self.held else "moved by a force that was not measured"
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SinePoint:
     """Sinusoidal steady state of one cart in one dwell.

@@ -7,7 +7,7 @@ hand where it lasts, where it moves the cart, and in a state in which elsewhere 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -17,27 +17,18 @@ from scipy.ndimage import label, maximum_filter1d
 from pipeline.arrays import Array
 from pipeline.estimation.law_of_motion import HOP, ForceLeft, forces_left
 from pipeline.estimation.noise import MEDIAN_TO_SIGMA
-from pipeline.results_of_runs import Record
+from pipeline.results_of_runs import Intervention, Record
 
 _BULK = 2.0  # standard deviations, as in the law's fit
 _FAR, _BEGINS = 4.0, 1.5  # times the bulk: of a burst, and where it begins and ends
 _SHARE, _TYPICAL = 0.3, 3.0  # of what acts on the cart; times what the law leaves elsewhere
 _AROUND = 0.15  # s, before and after: what acts at that time
+_REACH = 0.02  # s to each side of its middle: what a window sees most of
 _GAP = 0.1  # s: nearer bursts are one
 _LASTS = 0.06  # s above half its peak; a knock has 0.04, the width of a window
 _KNOWN = 0.03  # s of a burst in a state that is known
 _SWINGS = 3  # times that the force of a hand changes sides: an effect's does so all the time
 _BINS, _MOST, _VISITS = 20, 0.5, 5  # of a state's range; share, and number, of its quiet windows
-
-
-@dataclass(frozen=True, kw_only=True)
-class Intervention:
-    """A stretch of a record, from `start` to `end` in s, in which a hand moves or holds a cart."""
-
-    experiment: str
-    cart: int
-    start: float
-    end: float
 
 
 def find_interventions(records: Sequence[Record]) -> tuple[Intervention, ...]:
@@ -50,6 +41,29 @@ def find_interventions(records: Sequence[Record]) -> tuple[Intervention, ...]:
     found = [one for cart in carts for one in _bursts(cart, open_loop)]
     order = [record.id for record in open_loop]
     return tuple(sorted(found, key=lambda one: (order.index(one.experiment), one.cart, one.start)))
+
+
+def between(record: Record, interventions: Sequence[Intervention]) -> list[Record]:
+    """Return what a record shows before, between and after the interventions, piece by piece."""
+    touched = np.zeros(record.t.size, dtype=np.bool_)
+    for one in interventions:
+        if one.experiment == record.id:
+            touched |= (record.t >= one.start) & (record.t <= one.end)
+    if not touched.any():
+        return [record]
+    pieces = []
+    for first, last in _runs(~touched):
+        part = slice(first, last + 1)
+        pieces.append(
+            replace(
+                record,
+                t=record.t[part],
+                u=None if record.u is None else record.u[part],
+                y=record.y[:, part],
+                reference=None if record.reference is None else record.reference[part],
+            )
+        )
+    return pieces
 
 
 def _bursts(cart: int, records: Sequence[Record]) -> list[Intervention]:
@@ -76,8 +90,9 @@ def _bursts(cart: int, records: Sequence[Record]) -> list[Intervention]:
                     Intervention(
                         experiment=force.record.id,
                         cart=cart,
-                        start=float(force.t[first]),
-                        end=float(force.t[last]),
+                        start=max(float(force.t[first]) - _REACH, float(force.record.t[0])),
+                        end=min(float(force.t[last]) + _REACH, float(force.record.t[-1])),
+                        held=bool(np.mean(force.idle[inside]) > _MOST),
                     )
                 )
     return found

@@ -59,11 +59,12 @@ def residual_forces(gap: Gap, *, free: Mapping[str, Sequence[int]]) -> tuple[Res
 
     `free` tells which carts move in each run.
     """
-    runs: dict[tuple[str, bool], dict[int, Trace]] = {}
+    runs: dict[tuple[str, bool, float], dict[int, Trace]] = {}
     for trace in gap.traces:
-        runs.setdefault((trace.experiment, trace.held_out), {})[trace.cart] = trace
+        run = trace.experiment, trace.held_out, float(trace.t[0])
+        runs.setdefault(run, {})[trace.cart] = trace
     found: list[ResidualForce | None] = []
-    for (experiment, _), carts in runs.items():
+    for (experiment, *_), carts in runs.items():
         moving = set(free[experiment])
         for cart in carts:
             if moving & {cart - 1, cart + 1} <= set(carts):
