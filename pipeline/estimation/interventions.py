@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import label, maximum_filter1d
+from scipy.ndimage import maximum_filter1d
 
 from pipeline.arrays import Array
 from pipeline.estimation.law_of_motion import HOP, ForceLeft, forces_left
@@ -82,6 +82,7 @@ def _bursts(cart: int, records: Sequence[Record]) -> list[Intervention]:
             bulk = max(size, own)
         strong = (left > _FAR * bulk) & (share > least) & ~force.jumps
         above = left > _BEGINS * bulk
+        times = np.concatenate([force.record.t[:1], force.t[1:-1], force.record.t[-1:]])
         for first, last in _stretches(above, force.t):
             inside = slice(first, last + 1)
             beyond = np.where(above[inside], force.left[inside], 0.0)
@@ -90,8 +91,8 @@ def _bursts(cart: int, records: Sequence[Record]) -> list[Intervention]:
                     Intervention(
                         experiment=force.record.id,
                         cart=cart,
-                        start=max(float(force.t[first]) - _REACH, float(force.record.t[0])),
-                        end=min(float(force.t[last]) + _REACH, float(force.record.t[-1])),
+                        start=max(float(times[first]) - _REACH, float(times[0])),
+                        end=min(float(times[last]) + _REACH, float(times[-1])),
                         held=bool(np.mean(force.idle[inside]) > _MOST),
                     )
                 )
@@ -142,9 +143,9 @@ def _stretches(above: NDArray[np.bool_], t: Array) -> list[tuple[int, int]]:
 
 
 def _runs(above: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    labels, count = label(above)
-    places = [np.flatnonzero(labels == one) for one in range(1, count + 1)]
-    return [(int(place[0]), int(place[-1])) for place in places]
+    """Return the first and the last of each run of what holds."""
+    edges = np.flatnonzero(np.diff(np.pad(above.astype(int), 1))).tolist()
+    return [(first, behind - 1) for first, behind in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def _is_hand(left: Array, *, strong: NDArray[np.bool_], known: NDArray[np.bool_]) -> bool:
@@ -155,4 +156,4 @@ def _is_hand(left: Array, *, strong: NDArray[np.bool_], known: NDArray[np.bool_]
         burst = np.abs(left[first : last + 1])
         lasts += np.count_nonzero(burst > 0.5 * burst.max())
         understood += np.count_nonzero(known[first : last + 1])
-    return swings <= _SWINGS and lasts * HOP >= _LASTS and understood * HOP >= _KNOWN
+    return bool(swings <= _SWINGS and lasts * HOP >= _LASTS and understood * HOP >= _KNOWN)

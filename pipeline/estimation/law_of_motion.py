@@ -162,7 +162,7 @@ def _cut(record: Record, cart: int) -> _Windows | None:
     step = grain(t, y, step=record.encoder_step(cart))
     reach = round(_LAGS[-1] / interval) + 1
     jump = np.abs(np.diff(u, prepend=u[0])) > _JUMP * np.ptp(u)
-    lately = maximum_filter1d(jump, width + reach, origin=(width + reach - 1) // 2)
+    lately = maximum_filter1d(jump.astype(int), width + reach, origin=(width + reach - 1) // 2)
     return _Windows(
         record=record,
         t=(w * local).sum(1),
@@ -173,7 +173,7 @@ def _cut(record: Record, cart: int) -> _Windows | None:
         on=(held * (u != 0.0)[at[:, :-1]]).sum(1),
         noise=float(np.median(np.linalg.norm(w2, axis=1))) * step / np.sqrt(12.0),
         moves=np.ptp(y[at], axis=1) > _MOVES * step,
-        jumps=lately[at[:, -1]],
+        jumps=np.array(lately[at[:, -1]] > 0, dtype=np.bool_),
     )
 
 
