@@ -5,6 +5,7 @@ from typing import Any
 from pipeline.gap.types import FoundEffect, Gap, GapWindow, NamedValue, Rival
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.effects.base import AugmentedChain
+from pipeline.results_of_runs import Intervention
 from pipeline.schemas import gap as schema
 from pipeline.schemas.base import fields_of
 
@@ -31,6 +32,7 @@ def gap_json(gap: Gap, *, position_unit: str = "cm", input_unit: str = "V") -> d
         "training": list(gap.training),
         "held_out": list(gap.held_out),
         "left_out": [fields_of(schema.LeftOut, one) for one in gap.left_out],
+        "interventions": [_intervention(one) for one in gap.interventions],
         "friction_spread": {str(cart): spread for cart, spread in gap.spread.items()},
         "units": {"position": position_unit, "input": input_unit},
         "linear": _chain(gap.linear.chain),
@@ -71,6 +73,10 @@ def _values(values: dict[str, NamedValue]) -> dict[str, Any]:
 
 def _window(window: GapWindow) -> dict[str, Any]:
     return fields_of(schema.Window, window, from_=window.start, to=window.end)
+
+
+def _intervention(one: Intervention) -> dict[str, Any]:
+    return fields_of(schema.Intervention, one, from_=one.start, to=one.end)
 
 
 def _rival(rival: Rival) -> dict[str, Any]:

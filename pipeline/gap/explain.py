@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from pipeline.estimation.interventions import find_interventions
 from pipeline.gap import limits
 from pipeline.gap.data.runs import Run
 from pipeline.gap.data.sides import prepare, take_sides
@@ -75,7 +76,8 @@ def explain_gap(
     DataError : no usable record.
     """
     notes: list[str] = []
-    runs = prepare(records, springs=tuple(springs), notes=notes)
+    interventions = find_interventions(records)
+    runs = prepare(records, springs=tuple(springs), interventions=interventions, notes=notes)
     training, held_out = take_sides(runs, notes=notes)
     # Its matrices are small: BLAS with threads of its own only gets in the workers' way.
     with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(max_workers=workers) as pool:
@@ -169,8 +171,9 @@ def explain_gap(
         ),
         linear=path[0].fit.structure.model(path[0].fit.theta),
         model=replace(model, terms=_in_order(model.terms, effects)),
-        training=tuple(run.id for run in study.training),
-        held_out=tuple(run.id for run in study.held_out),
+        training=tuple(dict.fromkeys(run.id for run in study.training)),
+        held_out=tuple(dict.fromkeys(run.id for run in study.held_out)),
+        interventions=interventions,
         traces=traces,
         chain_std=chain_std(final),
         chain_covariance=chain_covariance(final),

@@ -13,6 +13,7 @@ from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.effects import AugmentedChain, Term, find_effect
 from pipeline.results import Analysis, LeftOut
 from pipeline.results_json import chain_entry, provenance
+from pipeline.results_of_runs import Intervention
 from pipeline.schemas.base import fields_of, json_text
 from pipeline.schemas.gap import Gap as GapDocument
 from pipeline.schemas.gap import GapSubmission
@@ -68,6 +69,7 @@ def _gap(document: Mapping[str, Any]) -> Gap:
         training=tuple(document["training"]),
         held_out=tuple(document["held_out"]),
         left_out=tuple(LeftOut(**entry) for entry in document["left_out"]),
+        interventions=tuple(_intervention(entry) for entry in document["interventions"]),
         traces=(),
         chain_std=dict(document["chain_std"]),
         spread={int(cart): value for cart, value in document["friction_spread"].items()},
@@ -109,6 +111,16 @@ def _window(entry: Mapping[str, Any]) -> GapWindow:
         end=entry["to"],
         what=entry["what"],
         share=entry["share"],
+    )
+
+
+def _intervention(entry: Mapping[str, Any]) -> Intervention:
+    return Intervention(
+        experiment=entry["experiment"],
+        cart=entry["cart"],
+        start=entry["from"],
+        end=entry["to"],
+        held=entry["held"],
     )
 
 

@@ -6,6 +6,7 @@ from typing import Any, Literal
 from pipeline.arrays import Array
 from pipeline.plant.nonlinear.effects.base import AugmentedChain, Effect
 from pipeline.results import LeftOut
+from pipeline.results_of_runs import Intervention
 
 Verdict = Literal["named", "partial", "none", "ambiguous", "unexplained"]
 
@@ -143,6 +144,7 @@ class Gap:
         n_p) of the same, None where it could not be had or was read from a file.
     training, held_out : ids of the runs.
     left_out : recordings that the identification did not use, and why: no part of any figure here.
+    interventions : where a force that was not measured acts: no part of any fit or error.
     spread : learnt run-to-run spread of the dry friction, per cart, where the runs show any.
     notes : what a reader must know.
     contenders : unless one leaves no more than noise: the models that may be true, the chosen
@@ -172,5 +174,6 @@ class Gap:
     complete: bool = True
     notes: tuple[str, ...] = ()
     left_out: tuple[LeftOut, ...] = ()
+    interventions: tuple[Intervention, ...] = ()
     contenders: tuple[Contender, ...] = ()
     proposal: Proposal | None = None

@@ -105,6 +105,17 @@ class LeftOut(Document):
     ] = False
 
 
+class Intervention(Document):
+    """A stretch in which a force that was not measured, such as a hand, acts on a cart."""
+
+    experiment: str
+    cart: int
+    from_: Annotated[float, Field(alias="from", description="s")]
+    to: Annotated[float, Field(description="s")]
+    what: Annotated[str, Field(description="what the force does")]
+    held: Annotated[bool, Field(description="it keeps the cart at rest; else it moves it")]
+
+
 class GapSubmission(Document):
     """Which submission it is about."""
 
@@ -152,6 +163,9 @@ class Gap(Document):
     training: tuple[str, ...]
     held_out: tuple[str, ...]
     left_out: tuple[LeftOut, ...] = ()
+    interventions: Annotated[
+        tuple[Intervention, ...], Field(description="no part of any fit or error")
+    ] = ()
     friction_spread: Annotated[
         dict[str, float], Field(description="run-to-run spread of the dry friction, by cart")
     ]

@@ -82,7 +82,8 @@ class Run:
 def make_run(record: Record, *, n: int, in_motion: bool = False) -> Run:
     """Prepare one record of a bench with n carts; `in_motion`: it is cut from a longer one.
 
-    A decay starts after the hand has let go; a slow or held beginning is cut.
+    A decay starts after the hand has let go; a slow or held beginning is cut, unless the record
+    begins in motion.
     """
     rows = tuple(cart - 1 for cart in record.carts if cart in record.free)
     y = np.array([record.position(row + 1) for row in rows])
@@ -94,7 +95,7 @@ def make_run(record: Record, *, n: int, in_motion: bool = False) -> Run:
     quiet_end = bool(np.all(u[-tail.shape[1] :] == 0.0))
     frequency = _dominant_frequency(t, y)
     pace = min(1.0, _USUAL_FREQUENCY / frequency)
-    if record.kind == "decay":
+    if record.kind == "decay" and not in_motion:
         rest = np.where(settled, tail.mean(axis=1), np.median(y, axis=1))
         radians = 2 * np.pi * frequency * record.sample_time
         first = min(_release(y - rest[:, None], still, radians=radians), t.size // 2)

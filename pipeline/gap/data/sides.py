@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.errors import DataError
+from pipeline.estimation.interventions import between
 from pipeline.gap.data.runs import Run, cut_shots, make_run
 from pipeline.names import by_note
 from pipeline.results import LeftOut, Record
+from pipeline.results_of_runs import Intervention
 
 _LAST_SHARE = 0.4  # of a single run is held out
 _MOST_DWELLS = 4  # sine dwells used; they say little beyond their frequency
@@ -38,8 +40,16 @@ def drop_left_out(
     return kept, notes
 
 
-def prepare(records: Sequence[Record], *, springs: tuple[bool, ...], notes: list[str]) -> list[Run]:
+def prepare(
+    records: Sequence[Record],
+    *,
+    springs: tuple[bool, ...],
+    interventions: Sequence[Intervention],
+    notes: list[str],
+) -> list[Run]:
     """Return the runs worth fitting; what is left out is noted.
+
+    What a record shows behind an intervention is a run of its own.
 
     Raises
     ------
@@ -69,7 +79,9 @@ def prepare(records: Sequence[Record], *, springs: tuple[bool, ...], notes: list
         left_out = {r.id for i, r in enumerate(dwells) if i not in picked}
         usable = [r for r in usable if r.id not in left_out]
         notes.append(f"of {len(dwells)} sine dwells {_MOST_DWELLS} are used")
-    runs = [make_run(record, n=n) for record in usable]
+    runs = [run for record in usable for run in _free_runs(record, interventions, n=n)]
+    if not runs:
+        raise DataError("gap: no record shows half a second of motion without a hand in it")
     if not any(np.any(run.command) for run in runs):
         notes.append("no run has an input: forces are per unit of the first mass")
     kept = without_twins(runs)
@@ -79,6 +91,19 @@ def prepare(records: Sequence[Record], *, springs: tuple[bool, ...], notes: list
         notes.append("no springs: judged over windows of half a second, not by the drift")
         kept = [cut_shots(run, length=_WINDOW) for run in kept]
     return kept
+
+
+def _free_runs(record: Record, interventions: Sequence[Intervention], *, n: int) -> list[Run]:
+    """Return the record between interventions, each stretch that shows motion as a run."""
+    runs = []
+    for piece in between(record, interventions):
+        if _is_usable(piece):
+            later = piece.t[0] > record.t[0]
+            if later:
+                let_go = piece.u is None or not np.any(piece.u)
+                piece = replace(piece, kind="decay" if let_go else "sweep")
+            runs.append(make_run(piece, n=n, in_motion=later))
+    return runs
 
 
 def _is_usable(record: Record) -> bool:
