@@ -9,7 +9,7 @@ from pipeline.gap.follow.records import Records
 
 _RIDGE = 1e-10  # of the diagonal
 _SHOWN = 1e-20  # of the strongest parameter's power: a weaker one is not shown
-_CONTACTS = {forces.STOP, forces.BACKLASH}
+_CONTACTS = {forces.BACKLASH}
 
 
 def is_rough(follow: Follow) -> bool:
@@ -28,7 +28,7 @@ def criterion(follow: Follow, news: float) -> float:
     return (
         news * float(np.log(max(follow.total, 1e-300) / follow.points))
         + size * float(np.log(news))
-        + len(follow.laws.groups()) * limits.BIC_DROP
+        + len(follow.laws.groups()) * limits.SAME_LAW
     )
 
 
@@ -83,7 +83,7 @@ def _needless(follow: Follow, records: Records) -> list[int]:
             mine = [where[i] for i in at.tolist() if i in where]
             d = off[active[mine]]
             rise = float(d @ np.linalg.solve(inverse[np.ix_(mine, mine)], d))
-            price = limits.BIC_DROP + len(follow.laws.whole_group(g)) * np.log(count)
+            price = limits.SAME_LAW + len(follow.laws.whole_group(g)) * np.log(count)
             if rough and (g < 0 or follow.laws.keys[g][0] not in _CONTACTS):
                 # Without it, twice of what is now beyond the noise would be left, at least.
                 beyond = max(cost - follow.points, 0.0) * (1.0 / limits.CONTACT_GAIN - 1.0)

@@ -140,6 +140,8 @@ def _news(fit: Fit, runs: Sequence[Run]) -> float:
 
     What a model leaves that is not noise swings with the carts: few of its points are news.
     """
+    if not np.isfinite(fit.cost):
+        return 1.0
     alone = sum(independent(row) for left in _residuals(fit, runs) for row in left)
     return min(alone, fit.n_points / limits.THINNING)
 
@@ -162,6 +164,6 @@ def lowers_error(child: Hypothesis, parent: Hypothesis, study: Study) -> bool:
 
 
 def worth_it(child: Hypothesis, parent: Hypothesis, study: Study) -> bool:
-    """Does a further effect help, on runs the model has not seen too?"""
-    drop = limits.BIC_DROP if child.size != parent.size else limits.SAME_LAW
+    """Do further effects help, on runs the model has not seen too?"""
+    drop = limits.BIC_DROP * (child.size - parent.size) or limits.SAME_LAW
     return lowers_error(child, parent, study) and evidence(child, parent) > drop

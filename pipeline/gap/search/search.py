@@ -12,8 +12,8 @@ from contextlib import suppress
 import numpy as np
 
 from pipeline.gap.fit.baseline import first_chain
-from pipeline.gap.fit.levenberg_marquardt import Fit, fit_model
-from pipeline.gap.fit.structure import Candidate
+from pipeline.gap.fit.levenberg_marquardt import Fit
+from pipeline.gap.fit.structure import Candidate, Model
 from pipeline.gap.fit.uncertainty import covariance
 from pipeline.gap.follow.choose import Records, choose_laws, rivals_of
 from pipeline.gap.follow.fit import Follow
@@ -22,10 +22,10 @@ from pipeline.gap.limits import SURE
 from pipeline.gap.search.deadline import OutOfTime
 from pipeline.gap.search.hypothesis import Hypothesis, Study, judge, lowers_error, worth_it
 from pipeline.gap.search.translate import as_model, filled, make_candidate
-from pipeline.gap.search.whole import fit_whole
+from pipeline.gap.search.whole import fit_on, fit_whole
 from pipeline.plant.nonlinear.effects import find_effect
 
-_IN_THE_RUNNING = 3.0  # times the chosen model's misfit while following: a rival that may still win
+_FEW = 4  # effects tried at a time: least sure means only roughly least missed
 
 
 def search(baseline: Hypothesis, study: Study) -> tuple[Hypothesis, list[Hypothesis]]:
@@ -45,11 +45,10 @@ def search(baseline: Hypothesis, study: Study) -> tuple[Hypothesis, list[Hypothe
         lean = choose_laws(records, springs=study.springs, chains=[chain, own], tell=study.tell)
         if not lean.laws.groups():
             return baseline, found
-        found.append(_judged(lean, study))
+        found.append(judge(fit_whole(_as_model(lean, study), study), study))
         study.tell(f"{found[-1].size} laws are left: error {found[-1].error:.1%}")
         for rival in rivals_of(lean, records):
-            close = rival.total < _IN_THE_RUNNING * lean.total
-            found.append(_judged(rival, study, finish=close))
+            found.append(judge(fit_whole(_as_model(rival, study), study), study))
         found[1:] = [h for h in found[1:] if np.isfinite(h.error) and h.sound]
         leading = min(found[1:], key=lambda h: h.bic, default=baseline)
         return prune(leading, study, found), [h for h in found if h.sound]
@@ -57,33 +56,38 @@ def search(baseline: Hypothesis, study: Study) -> tuple[Hypothesis, list[Hypothe
     return min(worth, key=lambda h: h.bic, default=baseline), found
 
 
-def _judged(follow: Follow, study: Study, *, finish: bool = True) -> Hypothesis:
-    """Return what a following model says, fitted to whole runs: to the end, or by a few steps."""
-    start = as_model(follow, springs=study.springs, catalogue=study.catalogue, runs=study.training)
-    if finish:
-        return judge(fit_whole(start, study), study)
-    fit = fit_model(start, study.training, iterations=4, scatter_free=False, mapper=study.mapper)
-    return judge(fit, study)
+def _as_model(follow: Follow, study: Study) -> Model:
+    """Return what a following model says, in effects of the catalogue."""
+    return as_model(follow, springs=study.springs, catalogue=study.catalogue, runs=study.training)
 
 
 def prune(chosen: Hypothesis, study: Study, found: list[Hypothesis]) -> Hypothesis:
     """Drop effects, and richer laws, that the others have made needless; all tried are `found`.
 
-    And those that are nothing within their error. The least sure goes first.
+    And those that are nothing within their error. Of the least sure few, what is missed least
+    goes first; what is lost adds up, so each is compared with the best so far.
     """
+    best = chosen
     while chosen.key:
         effects = chosen.fit.structure.effects
         sure = sureness(covariance(chosen.fit, study.training, mapper=study.mapper))
-        for index in np.argsort(sure, kind="stable").tolist():
-            plainer = _plainer(chosen, effects[index], study)
-            without = found[0] if len(effects) == 1 else _without(chosen, effects[index], study)
-            found += [h for h in (plainer, without) if h is not None and h is not found[0]]
-            if plainer is not None and plainer.sound and plainer.bic < chosen.bic:
-                chosen = plainer
-                break
-            needless = _as_good(without, chosen, study) or sure[index] < SURE
-            if needless and without.sound:
-                chosen = without
+        order: list[int] = np.argsort(sure, kind="stable").tolist()
+        for few in (order[:_FEW], order[_FEW:]):
+            needless = []
+            for index in few:
+                plainer = _plainer(chosen, effects[index], study)
+                if plainer is not None:
+                    found.append(plainer)
+                    needless += [plainer] if plainer.sound and plainer.bic < chosen.bic else []
+                without = found[0]
+                if len(effects) > 1:
+                    without = _without(chosen, effects[index], study)
+                    found.append(without)
+                if without.sound and (_as_good(without, best, study) or sure[index] < SURE):
+                    needless.append(without)
+            if needless:
+                chosen = min(needless, key=lambda h: h.bic)
+                best = min(best, chosen, key=lambda h: h.error)
                 break
         else:
             break
@@ -125,9 +129,9 @@ def sureness(fit: Fit) -> list[float]:
 
 
 def _without(hypothesis: Hypothesis, effect: Candidate, study: Study) -> Hypothesis:
+    """Return the hypothesis without one of its effects, fitted from where it is."""
     index = hypothesis.fit.structure.effects.index(effect)
-    fit = fit_whole(hypothesis.fit.without(index), study, near=True)
-    return judge(fit, study)
+    return judge(fit_on(hypothesis.fit, hypothesis.fit.without(index), study), study)
 
 
 def _plainer(hypothesis: Hypothesis, rich: Candidate, study: Study) -> Hypothesis | None:
@@ -140,8 +144,8 @@ def _plainer(hypothesis: Hypothesis, rich: Candidate, study: Study) -> Hypothesi
               for name in effect.names]  # fmt: skip
     chain = hypothesis.fit.structure.chain(hypothesis.fit.theta)
     plain = make_candidate(effect, rich.place, values, runs=study.training, chain=chain)
-    fit = fit_whole(hypothesis.fit.without(index).with_effect(plain, values), study)
-    return judge(fit, study)
+    model = hypothesis.fit.without(index).with_effect(plain, values)
+    return judge(fit_on(hypothesis.fit, model, study), study)
 
 
 def steps_to(

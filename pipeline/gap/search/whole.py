@@ -16,16 +16,27 @@ _LENGTHS = (0.3, 0.6, 1.2, 2.4)  # s of a piece: behind a contact the misfit of 
 # Times a contact's size and its damping: what follows is rigid, a bench is not quite.
 _VARIED = ((1.0, 1.0), (1.2, 1.0), (1.0, 0.65), (1.2, 0.65))
 _KEPT = 2  # of them
+_NEAR = 8  # iterations of a fit that begins near its end
 
 
-def fit_whole(start: Model, study: Study, *, near: bool = False) -> Fit:
-    """Fit whole runs; friction first with one size for all runs, then run by run.
+def fit_on(fit: Fit, model: Model, study: Study) -> Fit:
+    """Fit a model a little different from a fitted one: from where that left every run."""
+    return fit_model(
+        model,
+        study.training,
+        nuisance=fit.nuisance,
+        spread=fit.spread,
+        scatter_free=any(np.any(nuisance.scatter != 1.0) for nuisance in fit.nuisance),
+        iterations=_NEAR,
+        mapper=study.mapper,
+    )
 
-    `near`: a contact is already where whole runs have it.
-    """
+
+def fit_whole(start: Model, study: Study) -> Fit:
+    """Fit whole runs; friction first with one size for all runs, then run by run."""
     whole, structure = study.training, start.structure
     fit = fit_model(start, whole, scatter_free=False, mapper=study.mapper)
-    if structure.has_contact and not near and fit.chi > AT_FLOOR:
+    if fit.chi > AT_FLOOR and any(c.effect.has_play for c in structure.effects):
         fit = min(fit, _grown_contact(start, study), key=lambda one: one.cost)
     for attempt in range(_FRICTION_ROUNDS):
         if not structure.many_rests or fit.chi < AT_FLOOR:

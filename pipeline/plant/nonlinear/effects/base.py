@@ -149,6 +149,11 @@ class Effect:
         return self._fills(*DRY, Drive.COGGING)
 
     @cached_property
+    def has_play(self) -> bool:
+        """Whether the motor may leave cart 1."""
+        return self._fills(Drive.BACKLASH)
+
+    @cached_property
     def hides_mass(self) -> bool:
         """Whether something moves that no sensor reads."""
         return self._fills(Cart.HIDDEN_MASS)
