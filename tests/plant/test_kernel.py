@@ -99,7 +99,7 @@ def test_friction_decay_follows_the_events(rate):
     m, k, force = 2e-4, 0.035, 0.004
     chain = Chain(m=np.array([m]), c=np.array([0.0]), k=np.array([k, 0.0]))
     tables = linear_tables(chain)
-    tables[0][0, Cart.COULOMB] = force
+    tables[0][0, Cart.COULOMB_FRICTION_FORCE] = force
     t = sample_times(round(4 * rate), 1 / rate)
 
     got = simulate(tables, t, 0 * t, x0=[2.0])[0]
@@ -112,7 +112,7 @@ def test_friction_decay_follows_the_events(rate):
 def test_cart_stays_where_friction_holds_it():
     """A force below the dry friction moves nothing at all; one above it does."""
     tables = linear_tables(PRESETS["throne-1dof"])
-    tables[0][0, Cart.COULOMB] = 0.01
+    tables[0][0, Cart.COULOMB_FRICTION_FORCE] = 0.01
     t = sample_times(500, 0.004)
 
     assert np.all(simulate(tables, t, np.full(t.size, 0.0099)) == 0.0)
@@ -237,7 +237,7 @@ def test_batch_gives_what_single_runs_give():
     tables = linear_tables(chain)
     forces = (0.0, 0.001, 0.003)
     carts = np.repeat(tables[0][None], 3, axis=0)
-    carts[:, 0, Cart.COULOMB] = forces
+    carts[:, 0, Cart.COULOMB_FRICTION_FORCE] = forces
     together = simulate_batch(
         carts,
         np.repeat(tables[1][None], 3, axis=0),
@@ -253,7 +253,7 @@ def test_batch_gives_what_single_runs_give():
         1.0,
     )
     for i, force in enumerate(forces):
-        tables[0][0, Cart.COULOMB] = force
+        tables[0][0, Cart.COULOMB_FRICTION_FORCE] = force
         assert np.array_equal(together[i], simulate(tables, t, u))
 
 
