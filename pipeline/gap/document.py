@@ -22,6 +22,7 @@ def gap_json(gap: Gap, *, position_unit: str = "cm", input_unit: str = "V") -> d
         "gap": fields_of(schema.Errors, gap),
         "repeatability": gap.repeatability,
         "by_record": [fields_of(schema.RecordErrors, one) for one in gap.by_record],
+        "free_run": [fields_of(schema.FreeRun, one) for one in gap.free_run],
         "where": [_window(window) for window in gap.where],
         "left": [_window(window) for window in gap.left],
         "next_experiment": gap.next_experiment,

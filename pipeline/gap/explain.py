@@ -19,7 +19,7 @@ from pipeline.gap.fit.uncertainty import covariance
 from pipeline.gap.search.deadline import Deadline, OutOfTime
 from pipeline.gap.search.hypothesis import Hypothesis, Study, judge
 from pipeline.gap.search.search import search, steps_to
-from pipeline.gap.search.whole import fit_whole
+from pipeline.gap.search.whole import FINISHED, fit_whole
 from pipeline.gap.types import FoundEffect, Gap
 from pipeline.gap.verdict.account import (
     chain_covariance,
@@ -32,6 +32,7 @@ from pipeline.gap.verdict.account import (
     repeatability,
 )
 from pipeline.gap.verdict.decision import choose_experiment, reach_verdict
+from pipeline.gap.verdict.free_run import free_runs
 from pipeline.gap.verdict.offset import find_offset
 from pipeline.gap.verdict.where import find_windows
 from pipeline.plant.linear.chain import Chain
@@ -77,6 +78,7 @@ def explain_gap(
     notes: list[str] = []
     runs = prepare(records, springs=tuple(springs), notes=notes)
     training, held_out = take_sides(runs, notes=notes)
+    in_time = training[-1].id == held_out[0].id
     # Its matrices are small: BLAS with threads of its own only gets in the workers' way.
     with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(max_workers=workers) as pool:
         deadline = Deadline(pool.map, seconds=budget)
@@ -125,6 +127,14 @@ def explain_gap(
         final = covariance(chosen.fit, study.training, mapper=pool.map)
         chosen = replace(chosen, fit=final)
         path = (*path[:-1], chosen)
+        judged_runs = [*study.training, *study.held_out]
+        nuisance = [*chosen.fit.nuisance, *chosen.held.nuisance]
+        if in_time and not any(springs):
+            # What adds up, a constant force say, shows over the whole record alone.
+            whole = [_with_noise(run, sigma) for run in runs]
+            final = fit_model(final, whole, scatter_free=False, mapper=pool.map, **FINISHED)
+            final = covariance(final, whole, mapper=pool.map)
+            judged_runs, nuisance = whole, list(final.nuisance)
     if verdict == "named" and not study.explains(chosen):
         verdict = "partial"
     if verdict not in ("none", "unexplained") and not study.explains(chosen):
@@ -151,7 +161,7 @@ def explain_gap(
         input_unit=input_unit if driven else f"{position_unit}/s^2",  # the first mass is one
     )
     traces = make_traces(path[0], chosen, study)
-    model = chosen.fit.structure.model(chosen.fit.theta)
+    model = final.structure.model(final.theta)
     enough = verdict in ("none", "named")
     settled = enough and study.is_noise(chosen)
     left = () if enough else find_windows(chosen.fit, study.training)
@@ -177,6 +187,7 @@ def explain_gap(
         spread=_learnt_spread(chosen.fit),
         suspects=list_suspects(found, effects) if verdict == "unexplained" else (),
         left=left,
+        free_run=free_runs(final, judged_runs, nuisance),
         complete=not deadline.cut,
         notes=tuple(notes),
         contenders=() if settled else list_contenders(chosen, close or found),

@@ -8,7 +8,16 @@ from pydantic import ValidationError
 
 from pipeline.errors import ConfigError
 from pipeline.gap.document import gap_json
-from pipeline.gap.types import Contender, FoundEffect, Gap, GapWindow, NamedValue, RecordGap, Rival
+from pipeline.gap.types import (
+    Contender,
+    FoundEffect,
+    FreeRun,
+    Gap,
+    GapWindow,
+    NamedValue,
+    RecordGap,
+    Rival,
+)
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.effects import AugmentedChain, Term, find_effect
 from pipeline.results import Analysis, LeftOut
@@ -62,6 +71,7 @@ def _gap(document: Mapping[str, Any]) -> Gap:
         repeatability=_or_none(document["repeatability"]),
         by_record=tuple(RecordGap(**entry) for entry in document["by_record"]),
         where=tuple(_window(entry) for entry in document["where"]),
+        free_run=tuple(FreeRun(**entry) for entry in document["free_run"]),
         next_experiment=str(document["next_experiment"]),
         linear=AugmentedChain(chain=_chain(document["linear"])),
         model=_model(document["model"]),

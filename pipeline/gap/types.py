@@ -74,6 +74,17 @@ class GapWindow:
     share: float
 
 
+@dataclass(frozen=True, kw_only=True)
+class FreeRun:
+    """Root-mean-square error (position unit) of one simulation of a whole record.
+
+    None where the carts run away.
+    """
+
+    experiment: str
+    error: float | None
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Trace:
     """One cart in one run, for figures: measured, the linear model, the final model (n,).
@@ -136,6 +147,7 @@ class Gap:
     baseline, final, noise_floor : relative errors pooled over the held-out runs.
     repeatability : the same between runs with the same input, or None without repeats.
     suspects : under `unexplained`, the single effects that help most, the best first.
+    free_run : of each run, the error of one simulation from its first readings to its end.
     where, left : where the linear model departs most; and the final one, unless it is enough.
     complete : False where the time allowed ended the search: the best answer so far.
     linear, model : the linear chain that fits best, and the chain with the effects.
@@ -169,6 +181,7 @@ class Gap:
     spread: dict[int, float] = field(default_factory=dict)
     suspects: tuple[Rival, ...] = ()
     left: tuple[GapWindow, ...] = ()
+    free_run: tuple[FreeRun, ...] = ()
     complete: bool = True
     notes: tuple[str, ...] = ()
     left_out: tuple[LeftOut, ...] = ()

@@ -62,6 +62,15 @@ class RecordErrors(Document):
     noise_floor: Number
 
 
+class FreeRun(Document):
+    """One simulation of a whole record, started from its first readings."""
+
+    experiment: str
+    error: Annotated[
+        Number, Field(description="root mean square, position unit; null: the carts run away")
+    ]
+
+
 class Window(Document):
     """Where a run departs from a model most."""
 
@@ -132,6 +141,9 @@ class Gap(Document):
     gap: Errors
     repeatability: Annotated[Number, Field(description="between runs of the same input")]
     by_record: tuple[RecordErrors, ...]
+    free_run: Annotated[
+        tuple[FreeRun, ...], Field(description="of each run, how far one simulation strays")
+    ] = ()
     where: Annotated[tuple[Window, ...], Field(description="where the linear model fails most")]
     left: Annotated[
         tuple[Window, ...],

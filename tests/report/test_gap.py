@@ -14,6 +14,7 @@ from pipeline.errors import ConfigError
 from pipeline.gap.stored import gap_text, read_gap
 from pipeline.gap.types import (
     FoundEffect,
+    FreeRun,
     Gap,
     GapWindow,
     NamedValue,
@@ -117,6 +118,7 @@ def make_gap(verdict: Verdict = "named", keys=("coulomb_friction",)) -> Gap:
         final=float(errors[-1]),
         noise_floor=0.03,
         repeatability=None,
+        free_run=(FreeRun(experiment="step-a", error=0.012), FreeRun(experiment="step-b", error=None)),
         by_record=tuple(
             RecordGap(
                 experiment=t.experiment, cart=t.cart, held_out=t.held_out, baseline=0.153,
