@@ -118,9 +118,9 @@ def make_gap(verdict: Verdict = "named", keys=("coulomb_friction",)) -> Gap:
         final=float(errors[-1]),
         noise_floor=0.03,
         repeatability=None,
-        free_run=(
-            FreeRun(experiment="step-a", error=0.012), FreeRun(experiment="step-b", error=None),
-        ),  # fmt: skip
+        free_run=tuple(
+            FreeRun(experiment=run, error=error) for run, error in (("step-a", 0.1), ("step-b", None))
+        ),
         by_record=tuple(
             RecordGap(
                 experiment=t.experiment, cart=t.cart, held_out=t.held_out, baseline=0.153,
