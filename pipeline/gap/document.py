@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from pipeline.gap.types import FoundEffect, Gap, GapWindow, NamedValue, Rival
+from pipeline.gap.types import FoundEffect, Gap, GapWindow, NamedValue, Residual, Rival
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.effects.base import AugmentedChain
 from pipeline.schemas import gap as schema
@@ -25,6 +25,7 @@ def gap_json(gap: Gap, *, position_unit: str = "cm", input_unit: str = "V") -> d
         "free_run": [fields_of(schema.FreeRun, one) for one in gap.free_run],
         "where": [_window(window) for window in gap.where],
         "left": [_window(window) for window in gap.left],
+        "residual": [_residual(one) for one in gap.residual],
         "next_experiment": gap.next_experiment,
         "next_recording": gap.proposal.recording if gap.proposal else None,
         "next_limits": gap.proposal.limits if gap.proposal else None,
@@ -72,6 +73,23 @@ def _values(values: dict[str, NamedValue]) -> dict[str, Any]:
 
 def _window(window: GapWindow) -> dict[str, Any]:
     return fields_of(schema.Window, window, from_=window.start, to=window.end)
+
+
+def _residual(residual: Residual) -> dict[str, Any]:
+    formula = residual.formula
+    return {
+        "cart": residual.cart,
+        "unit": residual.unit,
+        "against": [fields_of(schema.ForceAgainst, one) for one in residual.against],
+        "formula": None
+        if formula is None
+        else {
+            "text": formula.text,
+            "terms": [fields_of(schema.FormulaTerm, term) for term in formula.terms],
+            "explains": formula.explains,
+            "in_catalogue": False,
+        },
+    }
 
 
 def _rival(rival: Rival) -> dict[str, Any]:

@@ -33,7 +33,9 @@ from pipeline.gap.verdict.account import (
 )
 from pipeline.gap.verdict.decision import choose_experiment, reach_verdict
 from pipeline.gap.verdict.free_run import free_runs
+from pipeline.gap.verdict.left_force import left_forces
 from pipeline.gap.verdict.offset import find_offset
+from pipeline.gap.verdict.residual_map import map_residual
 from pipeline.gap.verdict.where import find_windows
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.effects import CATALOGUE
@@ -153,18 +155,21 @@ def explain_gap(
             "beside a contact (a backlash, a stop) the stated errors are the least they can be"
         )
     driven = any(np.any(run.command) for run in study.training)
+    force_unit = input_unit if driven else f"{position_unit}/s^2"  # the first mass is one
     effects = list_effects(
         path,
         final,
         found,
         position_unit=position_unit,
-        input_unit=input_unit if driven else f"{position_unit}/s^2",  # the first mass is one
+        input_unit=force_unit,
     )
     traces = make_traces(path[0], chosen, study)
     model = final.structure.model(final.theta)
     enough = verdict in ("none", "named")
     settled = enough and study.is_noise(chosen)
     left = () if enough else find_windows(chosen.fit, study.training)
+    settled_name = enough or (verdict == "ambiguous" and study.explains(chosen))
+    forces = () if settled_name else left_forces(final, judged_runs, nuisance)
     return Gap(
         verdict=verdict,
         effects=effects,
@@ -187,6 +192,8 @@ def explain_gap(
         spread=_learnt_spread(chosen.fit),
         suspects=list_suspects(found, effects) if verdict == "unexplained" else (),
         left=left,
+        residual=map_residual(forces, springs=springs, position=position_unit, drive=force_unit),
+        left_forces=forces,
         free_run=free_runs(final, judged_runs, nuisance),
         complete=not deadline.cut,
         notes=tuple(notes),

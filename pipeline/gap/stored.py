@@ -10,12 +10,16 @@ from pipeline.errors import ConfigError
 from pipeline.gap.document import gap_json
 from pipeline.gap.types import (
     Contender,
+    ForceAgainst,
+    ForceFormula,
+    FormulaTerm,
     FoundEffect,
     FreeRun,
     Gap,
     GapWindow,
     NamedValue,
     RecordGap,
+    Residual,
     Rival,
 )
 from pipeline.plant.linear.chain import Chain
@@ -72,6 +76,7 @@ def _gap(document: Mapping[str, Any]) -> Gap:
         by_record=tuple(RecordGap(**entry) for entry in document["by_record"]),
         where=tuple(_window(entry) for entry in document["where"]),
         free_run=tuple(FreeRun(**entry) for entry in document["free_run"]),
+        residual=tuple(_residual(entry) for entry in document["residual"]),
         next_experiment=str(document["next_experiment"]),
         linear=AugmentedChain(chain=_chain(document["linear"])),
         model=_model(document["model"]),
@@ -119,6 +124,21 @@ def _window(entry: Mapping[str, Any]) -> GapWindow:
         end=entry["to"],
         what=entry["what"],
         share=entry["share"],
+    )
+
+
+def _residual(entry: Mapping[str, Any]) -> Residual:
+    formula = entry["formula"]
+    return Residual(
+        cart=entry["cart"],
+        unit=entry["unit"],
+        against=tuple(ForceAgainst(**one) for one in entry["against"]),
+        formula=None
+        if formula is None
+        else ForceFormula(
+            terms=tuple(FormulaTerm(**term) for term in formula["terms"]),
+            explains=formula["explains"],
+        ),
     )
 
 

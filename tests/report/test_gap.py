@@ -119,7 +119,8 @@ def make_gap(verdict: Verdict = "named", keys=("coulomb_friction",)) -> Gap:
         noise_floor=0.03,
         repeatability=None,
         free_run=tuple(
-            FreeRun(experiment=run, error=error) for run, error in (("step-a", 0.1), ("step-b", None))
+            FreeRun(experiment=run, error=error)
+            for run, error in (("step-a", 0.1), ("step-b", None))
         ),
         by_record=tuple(
             RecordGap(

@@ -136,6 +136,26 @@ def _cut(t: Array, *, length: float) -> np.ndarray | None:
     return first[:, None] + np.arange(width)
 
 
+def window_weights(t: Array) -> tuple[Array, Array, Array]:
+    """Return the weights (windows, samples) that average over windows, and their derivatives.
+
+    The first and the second by time; `t` (windows, samples). Each has its sample's share of time.
+    """
+    span = t[:, -1:] - t[:, :1]
+    w, w1, w2 = bump((t - t[:, :1]) / span, span=span)
+    dt = np.gradient(t, axis=1)
+    size = (w * dt).sum(1, keepdims=True)
+    w, w1, w2 = (weight * dt / size for weight in (w, w1, w2))
+    # Few samples integrate w'' badly: made exact for parabolas, whatever their place and slope.
+    tau = t - (w * t).sum(1, keepdims=True)
+    spread = (w * tau**2).sum(1, keepdims=True)
+    w2 = w2 - w * w2.sum(1, keepdims=True) - w * tau * (w2 * tau).sum(1, keepdims=True) / spread
+    w2 = 2 * w2 / (w2 * tau**2).sum(1, keepdims=True)
+    w1 = w1 - w * w1.sum(1, keepdims=True)
+    w1 = -w1 / (w1 * tau).sum(1, keepdims=True)
+    return w, w1, w2
+
+
 def _average(
     windows: np.ndarray,
     t: Array,
@@ -148,21 +168,9 @@ def _average(
     noise: float,
 ) -> _Means:
     local = t[windows]
-    span = local[:, -1:] - local[:, :1]
-    s = (local - local[:, :1]) / span
-    # The weight, its first and second derivative by time, and the share of time of each sample.
-    w, w1, w2 = bump(s, span=span)
-    dt = np.gradient(local, axis=1)
-    size = (w * dt).sum(1, keepdims=True)
-    w, w1, w2 = (weight * dt / size for weight in (w, w1, w2))
-    # Few samples integrate w'' badly: made exact for parabolas, whatever their place and slope.
-    tau = local - (w * local).sum(1, keepdims=True)
-    spread = (w * tau**2).sum(1, keepdims=True)
-    w2 = w2 - w * w2.sum(1, keepdims=True) - w * tau * (w2 * tau).sum(1, keepdims=True) / spread
-    w2 = 2 * w2 / (w2 * tau**2).sum(1, keepdims=True)
-    w1 = w1 - w * w1.sum(1, keepdims=True)
-    w1 = -w1 / (w1 * tau).sum(1, keepdims=True)
+    w, w1, w2 = window_weights(local)
     # An input is held over the interval that follows its sample: the weight's exact share of it.
+    s = (local - local[:, :1]) / (local[:, -1:] - local[:, :1])
     held = np.diff(bump_integral(s), axis=1) / bump_integral(np.ones(1))
     pushes = np.array([(held * u[windows[:, :-1]]).sum(1) for u in inputs])
     i = cart - 1
