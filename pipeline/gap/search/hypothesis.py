@@ -34,6 +34,12 @@ class Hypothesis:
     at_floor: bool
 
     @property
+    def bic_of_all(self) -> float:
+        """The criterion with the likelihood of the held-out runs, to which nothing is fitted."""
+        points = self.held.n_points / limits.THINNING
+        return self.bic + points * float(np.log(max(self.held.chi, 1e-300)))
+
+    @property
     def key(self) -> frozenset[tuple[str, int]]:
         """Which effects act where."""
         return frozenset(c.key for c in self.fit.structure.effects)
