@@ -149,8 +149,11 @@ def _news(fit: Fit, runs: Sequence[Run]) -> float:
 
     What a model leaves that is not noise swings with the carts: few of its points are news.
     """
+    most = fit.n_points / limits.THINNING
+    if not any(fit.structure.springs):
+        return most
     alone = sum(independent(row) for left in _residuals(fit, runs) for row in left)
-    return min(alone, fit.n_points / limits.THINNING)
+    return min(alone, most)
 
 
 def evidence(fuller: Hypothesis, other: Hypothesis) -> float:
