@@ -8,7 +8,20 @@ from pydantic import ValidationError
 
 from pipeline.errors import ConfigError
 from pipeline.gap.document import gap_json
-from pipeline.gap.types import Contender, FoundEffect, Gap, GapWindow, NamedValue, RecordGap, Rival
+from pipeline.gap.types import (
+    Contender,
+    ForceAgainst,
+    ForceFormula,
+    FormulaTerm,
+    FoundEffect,
+    FreeRun,
+    Gap,
+    GapWindow,
+    NamedValue,
+    RecordGap,
+    Residual,
+    Rival,
+)
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.effects import AugmentedChain, Term, find_effect
 from pipeline.results import Analysis, LeftOut
@@ -63,6 +76,8 @@ def _gap(document: Mapping[str, Any]) -> Gap:
         repeatability=_or_none(document["repeatability"]),
         by_record=tuple(RecordGap(**entry) for entry in document["by_record"]),
         where=tuple(_window(entry) for entry in document["where"]),
+        free_run=tuple(FreeRun(**entry) for entry in document["free_run"]),
+        residual=tuple(_residual(entry) for entry in document["residual"]),
         next_experiment=str(document["next_experiment"]),
         linear=AugmentedChain(chain=_chain(document["linear"])),
         model=_model(document["model"]),
@@ -121,6 +136,21 @@ def _intervention(entry: Mapping[str, Any]) -> Intervention:
         start=entry["from"],
         end=entry["to"],
         held=entry["held"],
+    )
+
+
+def _residual(entry: Mapping[str, Any]) -> Residual:
+    formula = entry["formula"]
+    return Residual(
+        cart=entry["cart"],
+        unit=entry["unit"],
+        against=tuple(ForceAgainst(**one) for one in entry["against"]),
+        formula=None
+        if formula is None
+        else ForceFormula(
+            terms=tuple(FormulaTerm(**term) for term in formula["terms"]),
+            explains=formula["explains"],
+        ),
     )
 
 

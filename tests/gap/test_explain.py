@@ -252,8 +252,10 @@ def test_no_motion_is_one_clear_error():
         explain_gap([still], springs=(True, False))
 
 
-def positioning_stage(*, friction: float, seed: int, reference) -> Record:
+def positioning_stage(*, friction: float, seed: int, reference, push: float = 0.0) -> Record:
     """Return one run of a cart on no spring under PD feedback, stepped at 80 µs.
+
+    `push` is a constant force, V.
 
     u = 0.05 e + 0.004 de/dt (V, cm), sampled at 250 Hz; m = 2e-4, c = 5e-4 in V, s, cm.
     """
@@ -268,7 +270,7 @@ def positioning_stage(*, friction: float, seed: int, reference) -> Record:
         u[k] = 0.05 * error + 0.004 * (error - last) * 250.0 * (k > 0)
         last = error
         for _ in range(50):
-            target = v + h / m * (u[k] - c * v)
+            target = v + h / m * (u[k] + push - c * v)
             most = friction * h / m
             v = 0.0 if abs(target) <= most else target - np.sign(target) * most
             x += h * v
@@ -284,27 +286,51 @@ def positioning_stage(*, friction: float, seed: int, reference) -> Record:
     )
 
 
+REFERENCES = (
+    lambda t: 1.0 * (t > 0.2) - 1.5 * (t > 2.0) + 1.0 * (t > 4.0),
+    lambda t: 0.8 * np.sin(2 * np.pi * 0.7 * t),
+    lambda t: -0.7 * (t > 0.2) + 1.2 * (t > 2.5),
+    lambda t: 0.6 * np.sin(2 * np.pi * (0.3 + 0.15 * t) * t),
+)
+
+
 @pytest.mark.parametrize("friction", [0.0, 0.003])
 def test_a_rigid_body_under_feedback(friction):
-    """Without any spring friction is found (or not) from feedback runs, judged over windows."""
-    references = (
-        lambda t: 1.0 * (t > 0.2) - 1.5 * (t > 2.0) + 1.0 * (t > 4.0),
-        lambda t: 0.8 * np.sin(2 * np.pi * 0.7 * t),
-        lambda t: -0.7 * (t > 0.2) + 1.2 * (t > 2.5),
-        lambda t: 0.6 * np.sin(2 * np.pi * (0.3 + 0.15 * t) * t),
-    )
+    """Without any spring friction is found (or not) from feedback runs, each judged as a whole.
+
+    One simulation of a whole run, nothing of it fitted, then ends within two encoder counts: the
+    start is read to half a count, and errors of the numbers add up.
+    """
     records = [
-        positioning_stage(friction=friction, seed=i, reference=r) for i, r in enumerate(references)
+        positioning_stage(friction=friction, seed=i, reference=r) for i, r in enumerate(REFERENCES)
     ]
 
     gap = explain_gap(records, springs=(False, False))
 
-    assert any("windows" in note for note in gap.notes)
+    assert any("as a whole" in note for note in gap.notes)
+    assert [run.experiment for run in gap.free_run] == [record.id for record in records]
+    assert all(run.error is not None and run.error < 2 * 0.00227 for run in gap.free_run)
     if friction:
         assert names(gap) == [("coulomb_friction", 1)]
         assert gap.effects[0].parameters["force"].value == pytest.approx(friction, rel=0.03)
     else:
         assert gap.verdict == "none"
+
+
+def test_a_constant_force_without_springs():
+    """A tilted track shows as a drift, which only whole runs have: friction and force are named."""
+    records = [
+        positioning_stage(friction=0.003, push=0.0008, seed=i, reference=r)
+        for i, r in enumerate(REFERENCES)
+    ]
+
+    gap = explain_gap(records, springs=(False, False))
+
+    assert gap.verdict == "named"
+    assert sorted(names(gap)) == [("coulomb_friction", 1), ("force_offset", 1)]
+    sizes = {f.effect.key: f.parameters["force"].value for f in gap.effects}
+    assert sizes["coulomb_friction"] == pytest.approx(0.003, rel=0.03)
+    assert sizes["force_offset"] == pytest.approx(0.0008, rel=0.03)
 
 
 def test_a_single_decay_is_cut_where_it_still_moves():

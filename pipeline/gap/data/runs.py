@@ -35,6 +35,7 @@ class Run:
     free : (n,) which carts move.
     knots, command : the input, held from knot to knot.
     at_rest : the carts do not move at the first sample.
+    start_known : the first readings tell the start; else it is fitted, as springs forget it.
     start, slope : (n,) first reading and velocity of each cart.
     rest : (n,) where the carts rest, as read.
     zero, zero_std : (n,) where the encoder's zero is expected, and how far off it may be.
@@ -67,6 +68,15 @@ class Run:
     shots: tuple[int, ...]
     shot_x: Array
     shot_v: Array
+    start_known: bool = False
+
+    @property
+    def start_std(self) -> tuple[Array, Array]:
+        """(n,) how well the first readings tell `start` and `slope`; infinite where fitted."""
+        known = np.full(self.zero.size, np.inf)
+        if self.start_known:
+            known[list(self.rows)] = self.sigma
+        return known, 2.0 * known / (_SMOOTHING * self.pace)
 
     @property
     def swing(self) -> Array:

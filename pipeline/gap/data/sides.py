@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.errors import DataError
 from pipeline.estimation.interventions import between
-from pipeline.gap.data.runs import Run, cut_shots, make_run
+from pipeline.gap.data.runs import Run, make_run
 from pipeline.names import by_note
 from pipeline.results import LeftOut, Record
 from pipeline.results_of_runs import Intervention
@@ -18,8 +18,8 @@ _MOST_DWELLS = 4  # sine dwells used; they say little beyond their frequency
 _LEAST_MOTION = 8.0  # encoder steps
 _STILL = 3.0  # encoder steps within which a cart stands still
 _FEWEST, _SHORTEST = 50, 0.5  # samples, s
+_PINNED = 1e-3  # noises that a known zero may be off
 _SAME_SIZE = 0.06  # relative; sizes closer than this are repeats
-_WINDOW = 0.5  # s; a chain without springs drifts, so it is judged over windows
 
 
 def drop_left_out(
@@ -88,8 +88,8 @@ def prepare(
     if len(kept) < len(runs):
         notes.append(f"duplicate files left out: {len(runs) - len(kept)}")
     if not any(springs):
-        notes.append("no springs: judged over windows of half a second, not by the drift")
-        kept = [cut_shots(run, length=_WINDOW) for run in kept]
+        notes.append("no springs: each run is judged as a whole, from its first readings")
+        kept = [_on_no_spring(run) for run in kept]
     return kept
 
 
@@ -104,6 +104,15 @@ def _free_runs(record: Record, interventions: Sequence[Intervention], *, n: int)
                 piece = replace(piece, kind="decay" if let_go else "sweep")
             runs.append(make_run(piece, n=n, in_motion=later))
     return runs
+
+
+def _on_no_spring(run: Run) -> Run:
+    """Return a run whose readings are positions, as no rest tells a zero, and tell the start.
+
+    No spring forgets a start: a free one would take up what a model lacks.
+    """
+    known = np.full(run.zero.size, _PINNED * float(run.sigma.min()))
+    return replace(run, start_known=True, zero=np.zeros(run.zero.size), zero_std=known)
 
 
 def _is_usable(record: Record) -> bool:
@@ -158,8 +167,15 @@ def take_sides(runs: list[Run], *, notes: list[str]) -> tuple[list[Run], list[Ru
         )
         starts = piece.start == 0 and run.record.kind != "decay"
         part = make_run(record, n=run.zero.size, in_motion=not starts)
-        moving = replace(part, zero=run.zero, zero_std=run.zero_std, rest=run.rest)
-        pieces.append(moving if len(run.shots) == 2 else cut_shots(moving, length=_WINDOW))
+        pieces.append(
+            replace(
+                part,
+                zero=run.zero,
+                zero_std=run.zero_std,
+                rest=run.rest,
+                start_known=run.start_known,
+            )
+        )
     others = [r for i, r in enumerate(runs) if i != longest]
     return [*others, pieces[0]], [pieces[1]]
 
@@ -218,7 +234,12 @@ def split(runs: Sequence[Run]) -> tuple[list[int], list[int]]:
 
 
 def _size(run: Run) -> float:
-    """How hard a run was driven: its extreme input, or where a free decay starts."""
+    """How hard a run was driven: its extreme input, or where a free decay starts.
+
+    Of a run under feedback its reference: the input is the controller's answer.
+    """
+    if run.record.reference is not None:
+        return float(np.ptp(run.record.reference))
     if np.any(run.command):
         return float(run.command[np.argmax(np.abs(run.command))])
     offset = run.start - run.zero

@@ -328,6 +328,10 @@ def start_prior(layout: Layout, run: Run, sizes: tuple[Array, Array], *, inflate
     position, velocity = sizes
     weight = 1.0 / np.concatenate([position[list(layout.x0)], velocity[list(layout.v0)]])
     prior = np.tile(np.diag(_HOME * inflate * weight), (len(run.shots) - 1, 1, 1))
+    # What hides on a cart no reading tells.
+    known = [np.append(1.0 / std, np.zeros(std.size)) for std in run.start_std]
+    known_start = np.concatenate([known[0][list(layout.x0)], known[1][list(layout.v0)]])
+    prior[0] += np.diag(inflate * known_start)
     if not layout.first_v0:
         for j in range(len(layout.x0), weight.size):
             prior[0, j, j] = _HELD * weight[j]

@@ -64,6 +64,7 @@ def start_follow(
 def weigh(follow: Follow, tracks: Sequence[Track], *, mapper: Mapper = map) -> Follow:
     """Return it with its cost: infinite where the model runs away."""
     laws, dry = follow.laws, follow.laws.dry
+    on_springs = any(laws.bench.springs)
 
     def one(pair: tuple[Track, Own]) -> tuple[float, float, float]:
         track, own = pair
@@ -72,7 +73,8 @@ def weigh(follow: Follow, tracks: Sequence[Track], *, mapper: Mapper = map) -> F
             return np.inf, np.inf, 1.0
         left = run[0] * track.weight
         prior = track.prior(own, dry)[1]
-        news = sum(independent(row) for row in left[:, track.seen].T)
+        rows = left[:, track.seen].T
+        news = sum(independent(row) for row in rows) if on_springs else rows.size
         return float((left**2).sum()), float((prior**2).sum()), news
 
     costs = np.array(list(mapper(one, zip(tracks, follow.own, strict=True))))

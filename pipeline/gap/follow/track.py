@@ -47,6 +47,7 @@ class Track:
     zero: Array
     zero_std: Array
     at_rest: bool
+    start_std: tuple[Array, Array]
     longest: float
     swing: float
 
@@ -67,7 +68,8 @@ class Track:
         """Return (4 n,) weights of the priors on its own parameters, and their residuals."""
         n = self.free.size
         start = np.full(n, _SURE if self.at_rest else 1.0 / max(_START * self.swing, 1e-12))
-        speed = np.where(self.free & (not self.at_rest), 0.0, _SURE)
+        speed = np.where(self.free & (not self.at_rest), 1.0 / self.start_std[1], _SURE)
+        start = np.where(np.isfinite(self.start_std[0]), 1.0 / self.start_std[0], start)
         factor = np.where(dry, 1.0 / _SPREAD, _SURE)
         weight = np.concatenate([1.0 / self.zero_std, start, speed, factor])
         off = [self.zero - own.zero, -own.shift, self.slope - own.v0, 1.0 - own.factor]
@@ -110,6 +112,7 @@ def make_track(run: Run, *, rate: float = _RATE) -> Track:
         zero=np.where(free, run.zero, 0.0),
         zero_std=run.zero_std,
         at_rest=run.at_rest,
+        start_std=run.start_std,
         longest=_LONGEST * run.pace,
         swing=float(run.swing.max()),
     )
@@ -171,7 +174,7 @@ def compile_follower() -> None:
     track = Track(
         t=two, y=np.zeros((2, 1)), weight=np.ones((2, 1)), free=one > 0.0, seen=one > 0.0,
         knots=two, command=np.zeros(2), start=np.zeros(1), slope=np.zeros(1), zero=np.zeros(1),
-        zero_std=one, at_rest=True, longest=_LONGEST, swing=1.0,
+        zero_std=one, at_rest=True, start_std=(one, one), longest=_LONGEST, swing=1.0,
     )  # fmt: skip
     chain = Chain(m=one, c=one, k=np.array([1.0, 0.0]))
     bench = Bench(chain=chain, springs=(True, False), largest=1.0, free=((True,),))

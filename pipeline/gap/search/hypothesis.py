@@ -34,6 +34,12 @@ class Hypothesis:
     at_floor: bool
 
     @property
+    def bic_of_all(self) -> float:
+        """The criterion with the likelihood of the held-out runs, to which nothing is fitted."""
+        points = self.held.n_points / limits.THINNING
+        return self.bic + points * float(np.log(max(self.held.chi, 1e-300)))
+
+    @property
     def key(self) -> frozenset[tuple[str, int]]:
         """Which effects act where."""
         return frozenset(c.key for c in self.fit.structure.effects)
@@ -77,7 +83,9 @@ class Hypothesis:
 class Study:
     """What every step of the search needs: runs, springs, catalogue, and who maps over runs.
 
-    `repeatability` is the relative error between runs with the same input, 0 without any.
+    `repeatability` is the relative error between runs with the same input, 0 without any. `whole`
+    are the training runs with the end of the one whose end is held out, where what adds up over a
+    whole run must show in the numbers: on no spring.
     """
 
     training: tuple[Run, ...]
@@ -87,6 +95,7 @@ class Study:
     repeatability: float
     mapper: Mapper
     tell: Callable[[str], None]
+    whole: tuple[Run, ...] = ()
 
     @property
     def floor(self) -> float:
@@ -140,10 +149,12 @@ def _news(fit: Fit, runs: Sequence[Run]) -> float:
 
     What a model leaves that is not noise swings with the carts: few of its points are news.
     """
-    if not np.isfinite(fit.cost):
-        return 1.0
+    most = fit.n_points / limits.THINNING
+    # The correlation of a drift says nothing of its news; nor does what ran away.
+    if not any(fit.structure.springs) or not np.isfinite(fit.cost):
+        return most
     alone = sum(independent(row) for left in _residuals(fit, runs) for row in left)
-    return min(alone, fit.n_points / limits.THINNING)
+    return min(alone, most)
 
 
 def evidence(fuller: Hypothesis, other: Hypothesis) -> float:

@@ -1,5 +1,7 @@
 """Fit a model to whole runs, from a start that is nearly right."""
 
+from typing import Any
+
 import numpy as np
 
 from pipeline.arrays import Array
@@ -7,6 +9,7 @@ from pipeline.gap.data.runs import cut_shots
 from pipeline.gap.fit.levenberg_marquardt import Fit, fit_model
 from pipeline.gap.fit.restart import restart_runs
 from pipeline.gap.fit.structure import Model
+from pipeline.gap.fit.uncertainty import covariance
 from pipeline.gap.limits import AT_FLOOR
 from pipeline.gap.search.hypothesis import Study
 
@@ -16,7 +19,9 @@ _LENGTHS = (0.3, 0.6, 1.2, 2.4)  # s of a piece: behind a contact the misfit of 
 # Times a contact's size and its damping: what follows is rigid, a bench is not quite.
 _VARIED = ((1.0, 1.0), (1.2, 1.0), (1.0, 0.65), (1.2, 0.65))
 _KEPT = 2  # of them
-_NEAR = 8  # iterations of a fit that begins near its end
+_NEAR: dict[str, Any] = {"iterations": 8}  # of a fit that begins near its end
+# On no spring the misfit of a whole run is rugged throughout: small gains add up.
+_FINISHED: dict[str, Any] = {"iterations": 60, "tolerance": 1e-6}
 
 
 def fit_on(fit: Fit, model: Model, study: Study) -> Fit:
@@ -27,15 +32,16 @@ def fit_on(fit: Fit, model: Model, study: Study) -> Fit:
         nuisance=fit.nuisance,
         spread=fit.spread,
         scatter_free=any(np.any(nuisance.scatter != 1.0) for nuisance in fit.nuisance),
-        iterations=_NEAR,
         mapper=study.mapper,
+        **(_NEAR if any(study.springs) else _FINISHED),
     )
 
 
 def fit_whole(start: Model, study: Study) -> Fit:
     """Fit whole runs; friction first with one size for all runs, then run by run."""
     whole, structure = study.training, start.structure
-    fit = fit_model(start, whole, scatter_free=False, mapper=study.mapper)
+    steps = {} if any(study.springs) else _FINISHED
+    fit = fit_model(start, whole, scatter_free=False, mapper=study.mapper, **steps)
     if fit.chi > AT_FLOOR and any(c.effect.has_play for c in structure.effects):
         fit = min(fit, _grown_contact(start, study), key=lambda one: one.cost)
     for attempt in range(_FRICTION_ROUNDS):
@@ -55,6 +61,14 @@ def fit_whole(start: Model, study: Study) -> Fit:
             mapper=study.mapper,
         )
     return fit
+
+
+def finish(fit: Fit, study: Study) -> Fit:
+    """Return a fit with its covariance, its numbers from whole runs to their end."""
+    if not study.whole:
+        return covariance(fit, study.training, mapper=study.mapper)
+    fit = fit_model(fit, study.whole, scatter_free=False, mapper=study.mapper, **_FINISHED)
+    return covariance(fit, study.whole, mapper=study.mapper)
 
 
 def _grown_contact(start: Model, study: Study) -> Fit:

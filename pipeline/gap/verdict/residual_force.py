@@ -151,6 +151,7 @@ def _average(
     s = (local - local[:, :1]) / (local[:, -1:] - local[:, :1])
     w, w1, w2 = window_weights(local)
     # An input is held over the interval that follows its sample: the weight's exact share of it.
+    s = (local - local[:, :1]) / (local[:, -1:] - local[:, :1])
     held = np.diff(bump_integral(s), axis=1) / bump_integral(np.ones(1))
     pushes = np.array([(held * u[windows[:, :-1]]).sum(1) for u in inputs])
     i = cart - 1

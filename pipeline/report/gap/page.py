@@ -18,6 +18,7 @@ from pipeline.report.figures.gap import (
     before_after_figure,
     by_record_figure,
     force_figure,
+    force_left_figure,
     predicted_figure,
     spectrum_figure,
     timing_figure,
@@ -97,6 +98,7 @@ def build_gap_document(
     made = WORDS.text("made" if gap.complete else "made_so_far", version=__version__)
     parts += [
         ("runs", "Measured against simulated", lambda page: _runs(page, gap, worst[1:])),
+        ("force-left", "What force is left", lambda page: _force_left(page, gap)),
         ("apart", "What would tell the explanations apart", lambda page: _apart(page, gap)),
         ("model", capital(whole_model(gap)), lambda page: _model(page, gap)),
         ("method", "How this was found", lambda page: _method(gap)),
@@ -226,6 +228,36 @@ def _runs(page: Page, gap: Gap, worst: Sequence[Trace]) -> list[Block]:
     ]
     if gap.left and gap.effects:
         blocks.append(window_table(page, gap.left, model=whole_model(gap)))
+    return blocks
+
+
+def _force_left(page: Page, gap: Gap) -> list[Block]:
+    """Show what no law of the model explains, cart by cart, and the formula for it."""
+    if not gap.residual:
+        return []
+    model = whole_model(gap) if gap.effects else WORDS.text("linear_model")
+    blocks: list[Block] = [paragraph(WORDS.spans("force_left", model=model))]
+    for residual in gap.residual:
+        cart = str(residual.cart)
+        if residual.formula is None:
+            said = WORDS.spans("force_left_no_formula", cart=cart)
+        else:
+            said = WORDS.spans(
+                "force_left_formula",
+                formula=residual.formula.text,
+                unit=residual.unit,
+                position=page.position,
+                drive=page.drive,
+                share=percent(100 * residual.formula.explains),
+            )
+        line = WORDS.text("force_left_formula_line") if residual.formula else ""
+        caption = WORDS.text("force_left_caption", cart=cart, formula=line)
+        quantities = listing([shown.quantity for shown in residual.against])
+        text = "".join(span.text for span in said)
+        alt = WORDS.text("force_left_alt", cart=cart, quantities=quantities, formula=text)
+        figure = force_left_figure(residual)
+        blocks.append(page.picture(f"force-left-{cart}", figure, caption=caption, alt=alt))
+        blocks.append(paragraph(said))
     return blocks
 
 
