@@ -16,7 +16,7 @@ LEVELS = (
     ("__init__", "arrays", "errors", "garbage", "names", "resources", "plant.limits"),
     ("output", "results_of_runs", "schemas"),
     ("lock", "processes", "web"),
-    ("plant.linear",),
+    ("plant.linear", "plant.nonlinear.columns"),
     ("plant.loop", "plant.nonlinear.tables"),
     ("plant.nonlinear.effects", "plant.nonlinear.simulator"),
     ("plant", "plant.nonlinear"),

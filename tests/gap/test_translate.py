@@ -10,7 +10,6 @@ from pipeline.gap.follow.laws import COLUMNS, DRIVE_COLUMNS, Bench, column_set, 
 from pipeline.gap.search.translate import filled, make_candidate, values_of
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.plant.nonlinear.effects import CATALOGUE
-from pipeline.plant.nonlinear.tables import Drive
 from tests.truth.cases import make_case
 
 ALL = frozenset().union(*(filled(effect) for effect in CATALOGUE))
@@ -44,8 +43,7 @@ def test_values_are_read_back_from_the_columns(effect):
 def test_every_effect_has_its_law(effect):
     """Whatever an effect fills, a law that can be followed fills too, or it cannot be found."""
     laws = column_set([column for columns in COLUMNS for column in columns])
-    details = {Drive.CONTACT_STIFFNESS, Drive.CONTACT_DAMPING}
-    assert filled(effect) <= laws | column_set(DRIVE_COLUMNS) | column_set(details)
+    assert filled(effect) <= laws | column_set(DRIVE_COLUMNS)
 
 
 @pytest.mark.parametrize("effect", CATALOGUE, ids=lambda effect: effect.key)

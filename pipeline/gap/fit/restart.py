@@ -68,6 +68,7 @@ def _rest_band(fit: Fit) -> Array:
 def holding_force(tables: Tables) -> Array:
     """Return (n,) the largest force against which friction or cogging still holds each cart."""
     cart, _, drive = tables
-    force = cart[:, Cart.COULOMB] + cart[:, Cart.STATIC] + cart[:, Cart.DAHL]
-    force[0] += drive[Drive.COGGING]
+    dry = np.maximum(cart[:, Cart.COULOMB_FRICTION_FORCE], cart[:, Cart.STICTION_STATIC_FORCE])
+    force = dry + cart[:, Cart.PRESLIDING_FRICTION_FORCE]
+    force[0] += drive[Drive.COGGING_FORCE]
     return force

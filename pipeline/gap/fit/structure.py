@@ -159,11 +159,11 @@ class Structure:
     def visible(self, theta: Array) -> bool:
         """Do the hidden masses, if any, swing slowly enough to be told from the carts?"""
         cart, _, _ = self.model(theta).tables()
-        hidden = cart[:, Cart.HIDDEN_MASS] > 0.0
+        hidden = cart[:, Cart.EXTRA_MODE_MASS] > 0.0
         if not hidden.any():
             return True
         of_cart = np.diag(self.chain(theta).stiffness) / cart[:, Cart.MASS]
-        rate = cart[hidden, Cart.HIDDEN_STIFFNESS] / cart[hidden, Cart.HIDDEN_MASS]
+        rate = cart[hidden, Cart.EXTRA_MODE_STIFFNESS] / cart[hidden, Cart.EXTRA_MODE_MASS]
         return bool(
             np.all((of_cart[hidden] == 0.0) | (rate < _FASTEST_HIDDEN**2 * of_cart[hidden]))
         )

@@ -26,6 +26,7 @@ from pipeline.gap.follow.forces import (
     add_forces,
     add_slopes,
     pull,
+    reach,
     tie,
 )
 from pipeline.plant.nonlinear.simulator.state import jit
@@ -45,15 +46,15 @@ def follow_run(
     `p` holds masses, dampings, springs (n + 1), the drive (4) and the laws' parameters; behind
     them the lanes of the run's own: zeros, starts, velocities, factors on dry friction (n each).
     `held` (3, 2, knots) is the shaped input and its derivatives by dead zone and limit, with
-    their integrals. `x`, `v` (n,) start and are used up; `aux` (laws, 2) starts at zero.
+    their integrals. `x`, `v` (n,) start and are used up; `aux` (laws, ROOM) starts at zero.
     """
     own = p.size  # where the lanes of the run begin
     lanes = DX.shape[1]
     drive, L = 3 * n + 1, kinds.size
     delay, lag = p[drive + 2], max(p[drive + 3], 1e-7)
-    xm, f, R, Rv = work[0], work[1], work[2], work[3]
-    K, C = work[4 : 4 + n], work[4 + n : 4 + 2 * n]
-    lagged, dlag = held[0, 0, 0], work[4 + 2 * n]
+    xm, f, R = work[0], work[1], work[2]
+    K, C = work[3 : 3 + n], work[3 + n : 3 + 2 * n]
+    lagged, dlag = held[0, 0, 0], work[3 + 2 * n]
     for q in range(DRIVE):
         dlag[q] = 0.0
     position = 0
@@ -135,7 +136,7 @@ def follow_run(
             share = lag / h * (1.0 - decay)
             mean = u + (lagged - u) * share
             by_lag = (lagged - u) * ((1.0 - decay) / h - decay / lag)
-            du = work[5 + 2 * n]
+            du = work[4 + 2 * n]
             du[0] = u_w * (1.0 - share) + dlag[0] * share
             du[1] = u_l * (1.0 - share) + dlag[1] * share
             du[2] = u_t * (1.0 - share) + dlag[2] * share
@@ -148,11 +149,11 @@ def follow_run(
             u = mean
             while on < knots.size - 1 and knots[on + 1] <= now + 0.5 * h:
                 on += 1
-            braking = 1.0 if command[on] != 0.0 else 0.0
+            powered = 1.0 if command[on] != 0.0 else 0.0
             # ------------------------------------------------ forces in the middle of the step
             for i in range(n):
                 xm[i] = x[i] + 0.5 * h * v[i]
-                f[i] = R[i] = Rv[i] = 0.0
+                f[i] = R[i] = 0.0
                 for j in range(n):
                     K[i, j] = C[i, j] = 0.0
                 if derive:
@@ -165,16 +166,13 @@ def follow_run(
             before = v[0]
             for j in range(n + 1):
                 k = p[2 * n + j]
-                d = (xm[j] if j < n else 0.0) - (xm[j - 1] if j > 0 else 0.0)
-                pull(f, j, n, k * d)
+                pull(f, j, n, k * reach(xm, j, n))
                 tie(K, j, n, k)
-            add_forces(
-                p, n, kinds, places, first, factor, u, braking, h, v, xm, aux, f, K, C, R, Rv
-            )
+            add_forces(p, n, kinds, places, first, factor, u, powered, h, v, xm, aux, f, K, C, R)
             if derive:
                 add_slopes(
-                    p, n, kinds, places, first, factor, u, du, braking, crossing, h, v, xm, aux, K,
-                    C, R, Rv, DX, DV, DF, DR, DA,
+                    p, n, kinds, places, first, factor, du, crossing, h, v, xm, aux, K, C, R, DX,
+                    DV, DF, DR, DA,
                 )  # fmt: skip
             for law in range(L):
                 if kinds[law] == HIDDEN:

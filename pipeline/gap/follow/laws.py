@@ -10,7 +10,10 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.gap.follow import forces
 from pipeline.plant.linear.chain import Chain
-from pipeline.plant.nonlinear.tables import Cart, Drive, Spring
+from pipeline.plant.nonlinear.effects import CATALOGUE
+from pipeline.plant.nonlinear.effects.law import Force, Friction
+from pipeline.plant.nonlinear.simulator.laws import COEFFICIENTS
+from pipeline.plant.nonlinear.tables import TABLES, Drive
 
 _CHAIN = (0.005, 20.0)  # times the largest first estimate: how far masses and springs may go
 _REACH = 0.3  # of a mass or spring, in one step, …
@@ -21,43 +24,29 @@ _LEAST_LIMIT = 0.2  # of the largest input
 _SHORT = 0.01  # s: how far a delay or lag may go in one step
 _CONTACT, _CONTACT_DAMPING = 40.0, 0.5  # of cart 1's springs, and of critical damping
 _SLACK = 0.95  # of a spring that goes slack, at most
-# Other parameters than the first that are a force or a share of one, and vanish with the effect;
-# what is left is its shape.
-_MORE = {forces.STOP: (0, 2), forces.COGGING: (0, 1)}
-COEFFICIENTS = tuple(_MORE.get(kind, (0,)) for kind in range(len(forces.SIZES)))
-POSITIVE = {
-    forces.COULOMB,
-    forces.LOAD,
-    forces.DRAG,
-    forces.COUPLING,
-    forces.STOP,
-    forces.STRIBECK,
-    forces.DAHL,
-    forces.HIDDEN,
-    forces.BACKLASH,
-}
-DRY = (forces.COULOMB, forces.LOAD, forces.STRIBECK, forces.DAHL)
+# By kind, the order of the catalogue: in which coordinates each grows from nothing.
+GROWTHS = tuple(effect.grown for effect in CATALOGUE)
+SIZES = tuple(len(growth.coordinates) for growth in GROWTHS)
+POSITIVE = {kind for kind, growth in enumerate(GROWTHS) if not growth.signed}
+DRY = tuple(kind for kind, effect in enumerate(CATALOGUE) if effect.dry)
 SIDED = (forces.STOP, forces.SLACK)  # with a position whose sign is the side
-# The columns of the simulator's tables that the laws fill, in the order of `forces`.
-COLUMNS: tuple[tuple[IntEnum, ...], ...] = (
-    (Cart.COULOMB,),
-    (Cart.LOAD,),
-    (Cart.DRAG,),
-    (Cart.OFFSET,),
-    (Spring.CUBIC,),
-    (Spring.CHANGE, Spring.STRETCH),
-    (Spring.COUPLING,),
-    (Drive.DAMPING,),
-    (Cart.STOP_STIFFNESS, Cart.STOP, Cart.STOP_DAMPING),
-    (Cart.STATIC, Cart.STRIBECK),
-    (Cart.DAHL, Cart.DISTANCE),
-    (Cart.HIDDEN_MASS, Cart.HIDDEN_STIFFNESS, Cart.HIDDEN_DAMPING),
-    (Drive.COGGING, Drive.PHASE, Drive.PITCH),
-    (Cart.GAIN,),
-    (Drive.BACKLASH, Drive.MOTOR_MASS),
+# The columns of the simulator's tables that the laws fill.
+COLUMNS = tuple(
+    tuple(effect.columns(dict.fromkeys((p.name for p in effect.own), 1.0))) for effect in CATALOGUE
+)
+# The laws that need no shape: they can start from nothing.
+PLAIN = tuple(
+    kind
+    for kind, effect in enumerate(CATALOGUE)
+    if isinstance(effect.law, Force | Friction) and len(COEFFICIENTS[kind]) == SIZES[kind]
 )
 Column = tuple[type[IntEnum], int]  # columns of different tables are equal as numbers
-DRIVE_COLUMNS = (Drive.DEAD_ZONE, Drive.LIMIT, Drive.DELAY, Drive.LAG)
+DRIVE_COLUMNS = (
+    Drive.DEAD_ZONE_WIDTH,
+    Drive.SATURATION_LIMIT,
+    Drive.INPUT_DELAY_DELAY,
+    Drive.ACTUATOR_LAG_TIME_CONSTANT,
+)
 DEAD_ZONE, LIMIT, DELAY, LAG = range(forces.DRIVE)
 
 
@@ -154,13 +143,13 @@ class Laws:
     @cached_property
     def first(self) -> np.ndarray:
         """(laws,) where the parameters of each begin."""
-        sizes = [forces.SIZES[kind] for kind, _ in self.keys]
+        sizes = [SIZES[kind] for kind, _ in self.keys]
         return self.base + np.cumsum([0, *sizes])[:-1].astype(np.int64)
 
     @cached_property
     def size(self) -> int:
         """How long the vector is."""
-        return self.base + sum(forces.SIZES[kind] for kind, _ in self.keys)
+        return self.base + sum(SIZES[kind] for kind, _ in self.keys)
 
     @cached_property
     def dry(self) -> np.ndarray:
@@ -220,10 +209,8 @@ class Laws:
                 low[d + q] = high[d + q] = neutral[q]
         for (kind, place), o in zip(self.keys, self.first, strict=True):
             if kind in POSITIVE:
-                low[o] = 0.0
-            if kind == forces.STOP:
-                low[o + 2] = 0.0
-            elif kind == forces.SLACK:
+                low[[o + q for q in COEFFICIENTS[kind]]] = 0.0
+            if kind == forces.SLACK:
                 low[o] = -_SLACK * max(chain.k[place], _SMALL * chain.k.max())
             elif kind == forces.GAIN:
                 low[o], high[o] = -0.5, 0.5
@@ -233,7 +220,7 @@ class Laws:
         """Return bounds and steps with the shapes of the laws kept near where they are."""
         low, high, reach = self.bounds()
         for (kind, _), o in zip(self.keys, self.first, strict=True):
-            for q in range(forces.SIZES[kind]):
+            for q in range(SIZES[kind]):
                 if q in COEFFICIENTS[kind]:
                     continue
                 value = abs(p[o + q])
@@ -258,7 +245,7 @@ class Laws:
         for q, value in enumerate(self.neutral_drive()):
             if not drive[q]:
                 base[self.drive_at + q] = value
-        parts = [p[self.first[i] : self.first[i] + forces.SIZES[self.keys[i][0]]] for i in kept]
+        parts = [p[self.first[i] : self.first[i] + SIZES[self.keys[i][0]]] for i in kept]
         return laws, np.concatenate([base, *parts])
 
     def groups(self) -> dict[int, np.ndarray]:
@@ -273,13 +260,23 @@ class Laws:
         if group < 0:
             return np.array([self.drive_at - 1 - group])
         o = self.first[group]
-        return np.arange(o, o + forces.SIZES[self.keys[group][0]])
+        return np.arange(o, o + SIZES[self.keys[group][0]])
 
     def neutral(self) -> Array:
         """Return the vector's neutral values (0 but for the limit)."""
         out = np.zeros(self.size)
         out[self.drive_at + LIMIT] = self.bench.largest
         return out
+
+    def _shared(self, kind: int, place: int, p: Array) -> dict[str, float]:
+        """Return, by symbol, the parameters of the friction within a law: 0 where it is not."""
+        law = CATALOGUE[kind].law
+        if not (isinstance(law, Friction) and law.beyond):
+            return {}
+        within = next(i for i, effect in enumerate(CATALOGUE) if effect.key == law.beyond)
+        there = dict(zip(self.keys, self.first, strict=True)).get((within, place))
+        symbols = GROWTHS[within].coordinates
+        return {s: 0.0 if there is None else float(p[there + q]) for q, s in enumerate(symbols)}
 
     def columns(self, p: Array) -> dict[tuple[type[IntEnum], int], dict[IntEnum, float]]:
         """Return what the laws fill of the simulator's tables: by table and row (0 for a drive)."""
@@ -289,24 +286,19 @@ class Laws:
             if self.drive[q]:
                 out.setdefault((Drive, 0), {})[column] = float(p[self.drive_at + q])
         for (kind, place), o in zip(self.keys, self.first, strict=True):
-            values = [float(v) for v in p[o : o + forces.SIZES[kind]]]
-            if kind == forces.SLACK:
-                values[0] /= p[2 * n + place]
-            elif kind == forces.HIDDEN:
-                values[1:] = [values[0] * v for v in values[1:]]
-            elif kind == forces.COGGING:
-                a, b, pitch = values
-                values = [float(np.hypot(a, b)), float(np.arctan2(b, a)), pitch]
-            elif kind == forces.GAIN:
-                values[0] += 1.0
-            table = type(COLUMNS[kind][0])
+            effect, own = CATALOGUE[kind], self._shared(kind, place, p)
+            if effect.place == "spring":
+                own["k"] = float(p[2 * n + place])
+            own |= zip(GROWTHS[kind].coordinates, p[o : o + SIZES[kind]].tolist(), strict=True)
+            table = TABLES[effect.place]
             row = out.setdefault((table, 0 if table is Drive else place), {})
-            row.update(zip(COLUMNS[kind], values, strict=True))
+            row.update(effect.columns(effect.grown_values(own)))
             if kind == forces.BACKLASH:
                 # What follows is rigid; a bench is not quite.
                 firm = _CONTACT * float(p[2 * n] + p[2 * n + 1])
-                row[Drive.CONTACT_STIFFNESS] = firm
-                row[Drive.CONTACT_DAMPING] = _CONTACT_DAMPING * float(np.sqrt(firm * values[1]))
+                row[Drive.BACKLASH_CONTACT_STIFFNESS] = firm
+                damping = _CONTACT_DAMPING * float(np.sqrt(firm * own["m_m"]))
+                row[Drive.BACKLASH_CONTACT_DAMPING] = damping
         return out
 
 
@@ -316,16 +308,22 @@ def smooth_laws(bench: Bench, *, columns: frozenset[Column]) -> Laws:
     `columns` are those that effects may fill.
     """
     n, driven = bench.n, bench.largest > 0.0
-    keys: list[tuple[int, int]] = []
-    for i in range(n):
-        if bench.shown[i]:
-            keys += [(forces.COULOMB, i), (forces.DRAG, i)]
-            keys += [(forces.LOAD, i)] if driven else []
-            keys += [] if any(bench.springs) else [(forces.OFFSET, i)]
+
+    def here(place: str) -> list[int]:
+        """Return the kinds of a place that the runs may show."""
+        return [
+            kind
+            for kind in PLAIN
+            if (effect := CATALOGUE[kind]).place == place
+            and (driven or not effect.needs_drive)
+            and not (effect.only_rest and any(bench.springs))
+        ]
+
+    keys = [(kind, i) for i in range(n) if bench.shown[i] for kind in here("cart")]
     for j in bench.rows:
-        keys.append((forces.CUBIC, j))
-        keys += [(forces.COUPLING, j)] if 0 < j < n else []
-    keys += [(forces.BRAKING, 0)] if driven else []
+        ends = 0 < j < n
+        keys += [(kind, j) for kind in here("spring") if ends or not CATALOGUE[kind].between_carts]
+    keys += [(kind, 0) for kind in here("input")]
     kept = tuple(key for key in keys if column_set(COLUMNS[key[0]]) <= columns)
     drive = tuple(driven and (Drive, int(column)) in columns for column in DRIVE_COLUMNS)
     return Laws(bench=bench, keys=kept, drive=drive)

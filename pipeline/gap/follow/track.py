@@ -135,10 +135,10 @@ def errors_of(
     for i in np.flatnonzero(track.free) if derive else ():
         DX[i, p.size + i], DX[i, p.size + n + i], DV[i, p.size + 2 * n + i] = -1.0, 1.0, 1.0
     count = len(laws.keys)
-    aux, DA = np.zeros((count, 2)), np.zeros((2 * count, lanes))
+    aux, DA = np.zeros((count, forces.ROOM)), np.zeros((2 * count, lanes))
     for law, (kind, place) in enumerate(laws.keys):
         if kind in (forces.HIDDEN, forces.BACKLASH):
-            aux[law] = x[place], own.v0[place]
+            aux[law, : forces.OWN] = x[place], own.v0[place]
             DA[2 * law], DA[2 * law + 1] = DX[place], DV[place]
     room = np.zeros((n, lanes)), np.zeros((n, lanes)), DA, np.zeros((6 + 2 * n, max(n, 4)))
     longest = track.longest * (1.0 if gain > _FOLLOWS else _FREELY)

@@ -15,7 +15,7 @@ from pipeline.estimation.noise import high_frequency_noise
 from pipeline.gap.types import Gap, Trace
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.effects.base import AugmentedChain
-from pipeline.plant.nonlinear.tables import Drive
+from pipeline.plant.nonlinear.simulator.laws import arriving
 
 _WINDOWS = (0.05, 0.07, 0.1, 0.15, 0.2, 0.3)  # s; half of one weighs anything
 _FEWEST = 9  # samples in a window
@@ -122,8 +122,7 @@ class _Means:
 def _arriving(u: Array, model: AugmentedChain) -> Array:
     """Return what the drive passes on of the input, delays and lags apart."""
     _, _, drive = model.tables()
-    past = np.maximum(np.abs(u) - drive[Drive.DEAD_ZONE], 0.0)
-    return np.sign(u) * np.minimum(past, drive[Drive.LIMIT])
+    return np.array([arriving(drive, float(one)) for one in u])
 
 
 def _cut(t: Array, *, length: float) -> np.ndarray | None:

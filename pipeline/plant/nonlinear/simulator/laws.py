@@ -1,0 +1,342 @@
+"""The laws of the effects: what the compiled simulators know of them.
+
+Made by `python -m codegen` from the laws of the effects.
+"""
+
+from enum import IntEnum
+from math import cos, exp, inf, pi, sin
+
+from pipeline.plant.nonlinear.columns import Cart, Drive, Spring
+from pipeline.plant.nonlinear.simulator.state import inlined, jit
+
+
+@inlined
+def cart_force(cart, i, x, v, u):
+    """Return the nonlinear force of cart i."""
+    f = 0.0
+    if cart[i, Cart.QUADRATIC_DRAG_COEFFICIENT] != 0.0:
+        f += -cart[i, Cart.QUADRATIC_DRAG_COEFFICIENT] * v * abs(v)
+    if cart[i, Cart.FORCE_OFFSET_FORCE] != 0.0:
+        f += cart[i, Cart.FORCE_OFFSET_FORCE]
+    return f
+
+
+@inlined
+def cart_slopes(cart, i, x, v, u):
+    """Return the derivatives of `cart_force` by position and velocity."""
+    by_x = by_v = 0.0
+    if cart[i, Cart.QUADRATIC_DRAG_COEFFICIENT] != 0.0:
+        by_v += -2 * cart[i, Cart.QUADRATIC_DRAG_COEFFICIENT] * abs(v)
+    return by_x, by_v
+
+
+@inlined
+def spring_force(spring, j, d, rate):
+    """Return the nonlinear tension of spring j, beyond its stiffness."""
+    f = 0.0
+    if spring[j, Spring.CUBIC_SPRING_COEFFICIENT] != 0.0:
+        f += d**3 * spring[j, Spring.CUBIC_SPRING_COEFFICIENT]
+    return f
+
+
+@inlined
+def spring_slopes(spring, j, d, rate):
+    """Return the derivatives of `spring_force` by position and velocity."""
+    by_x = by_v = 0.0
+    if spring[j, Spring.CUBIC_SPRING_COEFFICIENT] != 0.0:
+        by_x += 3 * d**2 * spring[j, Spring.CUBIC_SPRING_COEFFICIENT]
+    return by_x, by_v
+
+
+@inlined
+def drive_force(drive, x, v, u, on):
+    """Return the nonlinear force of cart 1."""
+    f = 0.0
+    if drive[Drive.DRIVE_DAMPING_COEFFICIENT] != 0.0:
+        f += -drive[Drive.DRIVE_DAMPING_COEFFICIENT] * on * v
+    return f
+
+
+@inlined
+def drive_slopes(drive, x, v, u, on):
+    """Return the derivatives of `drive_force` by position and velocity."""
+    by_x = by_v = 0.0
+    if drive[Drive.DRIVE_DAMPING_COEFFICIENT] != 0.0:
+        by_v += -drive[Drive.DRIVE_DAMPING_COEFFICIENT] * on
+    return by_x, by_v
+
+
+@inlined
+def motor_force(drive, x, v, u, on):
+    """Return the nonlinear force of the motor."""
+    f = 0.0
+    if drive[Drive.COGGING_FORCE] != 0.0:
+        f += drive[Drive.COGGING_FORCE] * sin(
+            drive[Drive.COGGING_PHASE] + 2 * pi * x / drive[Drive.COGGING_PITCH]
+        )
+    return f
+
+
+@inlined
+def motor_slopes(drive, x, v, u, on):
+    """Return the derivatives of `motor_force` by position and velocity."""
+    by_x = by_v = 0.0
+    if drive[Drive.COGGING_FORCE] != 0.0:
+        by_x += (
+            2
+            * pi
+            * drive[Drive.COGGING_FORCE]
+            * cos(drive[Drive.COGGING_PHASE] + 2 * pi * x / drive[Drive.COGGING_PITCH])
+            / drive[Drive.COGGING_PITCH]
+        )
+    return by_x, by_v
+
+
+@inlined
+def cart_matrix(cart, i):
+    """Return what linear laws add to the stiffness and damping of a cart."""
+    stiffness = damping = 0.0
+    return stiffness, damping
+
+
+@inlined
+def spring_matrix(spring, j):
+    """Return what linear laws add to the stiffness and damping of a spring."""
+    stiffness = damping = 0.0
+    damping += spring[j, Spring.COUPLING_DAMPER_COEFFICIENT]
+    return stiffness, damping
+
+
+@inlined
+def sliding(cart, i, u):
+    """Return the dry friction on cart i that is the same at any speed."""
+    return cart[i, Cart.COULOMB_FRICTION_FORCE] + cart[i, Cart.LOAD_FRICTION_COEFFICIENT] * abs(u)
+
+
+@inlined
+def dropping(cart, i, v, u):
+    """Return the dry friction that changes with the speed."""
+    size = 0.0
+    if cart[i, Cart.STICTION_STATIC_FORCE] > cart[i, Cart.COULOMB_FRICTION_FORCE]:
+        size += (-cart[i, Cart.COULOMB_FRICTION_FORCE] + cart[i, Cart.STICTION_STATIC_FORCE]) * exp(
+            -(v**2) / cart[i, Cart.STICTION_VELOCITY] ** 2
+        )
+    return size
+
+
+@inlined
+def drop_slope(cart, i, v, u):
+    """Return the derivative of `dropping` by the velocity."""
+    slope = 0.0
+    if cart[i, Cart.STICTION_STATIC_FORCE] > cart[i, Cart.COULOMB_FRICTION_FORCE]:
+        slope += (
+            2
+            * v
+            * (cart[i, Cart.COULOMB_FRICTION_FORCE] - cart[i, Cart.STICTION_STATIC_FORCE])
+            * exp(-(v**2) / cart[i, Cart.STICTION_VELOCITY] ** 2)
+            / cart[i, Cart.STICTION_VELOCITY] ** 2
+        )
+    return slope
+
+
+@inlined
+def arriving(drive, u):
+    """Return what dead zone, saturation and the like leave of an input."""
+    if drive[Drive.DEAD_ZONE_WIDTH] != 0.0:
+        u = (1.0 if u > 0.0 else -1.0) * max(0, -drive[Drive.DEAD_ZONE_WIDTH] + abs(u))
+    if drive[Drive.SATURATION_LIMIT] != 0.0:
+        u = min(drive[Drive.SATURATION_LIMIT], max(u, -drive[Drive.SATURATION_LIMIT]))
+    return u
+
+
+ON_CARTS, ON_SPRINGS, ON_DRIVE = 1, 2, 4  # where smooth forces are: a sum of these
+
+
+@jit
+def reach_of(cart, spring, drive):
+    """Return the longest step for the laws, in s, and where there are smooth forces."""
+    longest, smooth = inf, 0
+    for i in range(cart.shape[0]):
+        if cart[i, Cart.STICTION_STATIC_FORCE] > cart[i, Cart.COULOMB_FRICTION_FORCE]:
+            longest = min(longest, 0.0012)
+        if cart[i, Cart.PRESLIDING_FRICTION_FORCE] != 0.0:
+            longest = min(longest, 0.0023)
+        if cart[i, Cart.QUADRATIC_DRAG_COEFFICIENT] != 0.0:
+            longest = min(longest, 0.0025)
+            smooth |= ON_CARTS
+        if cart[i, Cart.FORCE_OFFSET_FORCE] != 0.0:
+            longest = min(longest, 0.0025)
+            smooth |= ON_CARTS
+    for j in range(spring.shape[0]):
+        if spring[j, Spring.CUBIC_SPRING_COEFFICIENT] != 0.0:
+            longest = min(longest, 0.0025)
+            smooth |= ON_SPRINGS
+    if drive[Drive.DRIVE_DAMPING_COEFFICIENT] != 0.0:
+        smooth |= ON_DRIVE
+    if drive[Drive.COGGING_FORCE] != 0.0:
+        longest = min(longest, 0.001)
+        smooth |= ON_DRIVE
+    return longest, smooth
+
+
+class Kind(IntEnum):
+    """The effects, in the order of the catalogue."""
+
+    COULOMB_FRICTION = 0
+    STICTION = 1
+    PRESLIDING_FRICTION = 2
+    LOAD_FRICTION = 3
+    QUADRATIC_DRAG = 4
+    FORCE_OFFSET = 5
+    CUBIC_SPRING = 6
+    SLACK_SPRING = 7
+    COUPLING_DAMPER = 8
+    DRIVE_DAMPING = 9
+    DEAD_ZONE = 10
+    SATURATION = 11
+    INPUT_DELAY = 12
+    ACTUATOR_LAG = 13
+    BACKLASH = 14
+    COGGING = 15
+    END_STOP = 16
+    SENSOR_GAIN = 17
+    EXTRA_MODE = 18
+
+
+# By kind: which coordinates vanish with the effect; the others are its shape.
+COEFFICIENTS = (
+    (0,),
+    (0,),
+    (0,),
+    (0,),
+    (0,),
+    (0,),
+    (0,),
+    (0,),
+    (0,),
+    (0,),
+    (0,),
+    (0,),
+    (0,),
+    (0,),
+    (0,),
+    (0, 1),
+    (0, 2),
+    (0,),
+    (0,),
+)
+ON_SPRING = (
+    Kind.CUBIC_SPRING,
+    Kind.SLACK_SPRING,
+    Kind.COUPLING_DAMPER,
+)
+FRICTION = (
+    Kind.COULOMB_FRICTION,
+    Kind.STICTION,
+    Kind.LOAD_FRICTION,
+)
+# Of the force or friction: itself, by position, velocity and input, by each coordinate.
+TERMS = 7
+
+
+@jit
+def terms(kind, p, o, x, v, k, u, on, out):
+    """Fill `out` with the law of a kind, its coordinates from p[o], and derivatives.
+
+    `x` and `v` are those of a cart or of a spring's stretch, `k` its stiffness.
+    """
+    if kind == Kind.COULOMB_FRICTION:
+        out[0] = p[o]
+        out[1] = 0
+        out[2] = 0
+        out[3] = 0
+        out[4] = 1
+    elif kind == Kind.STICTION:
+        x0 = p[o + 1] ** (-2)
+        x1 = v**2
+        x2 = exp(-x0 * x1)
+        x3 = p[o] * x2
+        x4 = 2 * x3
+        out[0] = x3
+        out[1] = 0
+        out[2] = -v * x0 * x4
+        out[3] = 0
+        out[4] = x2
+        out[5] = x1 * x4 / p[o + 1] ** 3
+    elif kind == Kind.LOAD_FRICTION:
+        x0 = abs(u)
+        out[0] = p[o] * x0
+        out[1] = 0
+        out[2] = 0
+        out[3] = p[o] * (1.0 if u > 0.0 else -1.0)
+        out[4] = x0
+    elif kind == Kind.QUADRATIC_DRAG:
+        x0 = abs(v)
+        x1 = v * x0
+        out[0] = -p[o] * x1
+        out[1] = 0
+        out[2] = -2 * p[o] * x0
+        out[3] = 0
+        out[4] = -x1
+    elif kind == Kind.FORCE_OFFSET:
+        out[0] = p[o]
+        out[1] = 0
+        out[2] = 0
+        out[3] = 0
+        out[4] = 1
+    elif kind == Kind.CUBIC_SPRING:
+        x0 = x**3
+        out[0] = p[o] * x0
+        out[1] = 3 * p[o] * x**2
+        out[2] = 0
+        out[3] = 0
+        out[4] = x0
+    elif kind == Kind.SLACK_SPRING:
+        x0 = -p[o + 1] + x
+        if (x - p[o + 1]) * p[o + 1] > 0.0:
+            out[0] = p[o] * x0
+            out[1] = p[o]
+            out[2] = 0
+            out[3] = 0
+            out[4] = x0
+            out[5] = -p[o]
+        else:
+            out[:6] = 0.0
+    elif kind == Kind.COUPLING_DAMPER:
+        out[0] = p[o] * v
+        out[1] = 0
+        out[2] = p[o]
+        out[3] = 0
+        out[4] = v
+    elif kind == Kind.DRIVE_DAMPING:
+        x0 = on * p[o]
+        out[0] = -v * x0
+        out[1] = 0
+        out[2] = -x0
+        out[3] = 0
+        out[4] = -on * v
+    elif kind == Kind.COGGING:
+        x0 = 2 * pi / p[o + 2]
+        x1 = x * x0
+        x2 = cos(x1)
+        x3 = sin(x1)
+        x4 = p[o + 1] * x3 - p[o] * x2
+        out[0] = p[o + 1] * x2 + p[o] * x3
+        out[1] = -x0 * x4
+        out[2] = 0
+        out[3] = 0
+        out[4] = x3
+        out[5] = x2
+        out[6] = 2 * pi * x * x4 / p[o + 2] ** 2
+    elif kind == Kind.END_STOP:
+        x0 = p[o + 1] - x
+        if (x - p[o + 1]) * p[o + 1] > 0.0 and (-p[o + 2] * v + p[o] * x0) * p[o + 1] <= 0.0:
+            out[0] = -p[o + 2] * v + p[o] * x0
+            out[1] = -p[o]
+            out[2] = -p[o + 2]
+            out[3] = 0
+            out[4] = x0
+            out[5] = p[o]
+            out[6] = -v
+        else:
+            out[:7] = 0.0
