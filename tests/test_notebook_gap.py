@@ -59,7 +59,11 @@ def test_the_systems_are_those_of_the_models(gap):
 
     t = np.linspace(0.0, 8.0, 801)
     response = control.input_output_response(
-        gap.system, t, np.zeros(t.size), [2.0, 0.0, 0.0], solve_ivp_method="LSODA"
+        gap.system,
+        t,
+        np.zeros(t.size),  # pyright: ignore[reportArgumentType]
+        [2.0, 0.0, 0.0],  # pyright: ignore[reportArgumentType]
+        solve_ivp_method="LSODA",
     )
 
     (x,) = np.atleast_2d(response.outputs)

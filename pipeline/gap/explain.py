@@ -15,11 +15,10 @@ from pipeline.gap.fit.baseline import fit_baseline, measure_noise
 from pipeline.gap.fit.levenberg_marquardt import Fit, fit_model
 from pipeline.gap.fit.restart import holding_force
 from pipeline.gap.fit.structure import Candidate
-from pipeline.gap.fit.uncertainty import covariance
 from pipeline.gap.search.deadline import Deadline, OutOfTime
 from pipeline.gap.search.hypothesis import Hypothesis, Study, judge
 from pipeline.gap.search.search import search, steps_to
-from pipeline.gap.search.whole import FINISHED, fit_whole
+from pipeline.gap.search.whole import finish, fit_whole
 from pipeline.gap.types import FoundEffect, Gap
 from pipeline.gap.verdict.account import (
     chain_covariance,
@@ -80,7 +79,7 @@ def explain_gap(
     notes: list[str] = []
     runs = prepare(records, springs=tuple(springs), notes=notes)
     training, held_out = take_sides(runs, notes=notes)
-    in_time = training[-1].id == held_out[0].id
+    whole = runs if training[-1].id == held_out[0].id and not any(springs) else []
     # Its matrices are small: BLAS with threads of its own only gets in the workers' way.
     with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(max_workers=workers) as pool:
         deadline = Deadline(pool.map, seconds=budget)
@@ -96,6 +95,7 @@ def explain_gap(
             repeatability=repeatability([*training, *held_out]) or 0.0,
             mapper=pool.map,
             tell=tell,
+            whole=tuple(_with_noise(run, sigma) for run in whole),
         )
         chosen, found = _investigate(fit, study, deadline)
         for _ in range(_NOISE_ROUNDS):
@@ -126,17 +126,14 @@ def explain_gap(
         chosen = path[-1]
         with suppress(OutOfTime):
             chosen = _settled(chosen, replace(study, mapper=deadline.map))
-        final = covariance(chosen.fit, study.training, mapper=pool.map)
-        chosen = replace(chosen, fit=final)
-        path = (*path[:-1], chosen)
-        judged_runs = [*study.training, *study.held_out]
-        nuisance = [*chosen.fit.nuisance, *chosen.held.nuisance]
-        if in_time and not any(springs):
-            # What adds up, a constant force say, shows over the whole record alone.
-            whole = [_with_noise(run, sigma) for run in runs]
-            final = fit_model(final, whole, scatter_free=False, mapper=pool.map, **FINISHED)
-            final = covariance(final, whole, mapper=pool.map)
-            judged_runs, nuisance = whole, list(final.nuisance)
+        final = finish(chosen.fit, study)
+        if study.whole:
+            judged_runs, nuisance = study.whole, final.nuisance
+        else:
+            chosen = replace(chosen, fit=final)
+            path = (*path[:-1], chosen)
+            judged_runs = (*study.training, *study.held_out)
+            nuisance = (*final.nuisance, *chosen.held.nuisance)
     if verdict == "named" and not study.explains(chosen):
         verdict = "partial"
     if verdict not in ("none", "unexplained") and not study.explains(chosen):
@@ -248,7 +245,8 @@ def _quieter(study: Study, best: Hypothesis) -> Study:
     training = measure_noise(best.fit, study.training, study.training)
     sigma = {row: s for run in training for row, s in zip(run.rows, run.sigma, strict=True)}
     held_out = tuple(_with_noise(run, sigma) for run in study.held_out)
-    return replace(study, training=tuple(training), held_out=held_out)
+    whole = tuple(_with_noise(run, sigma) for run in study.whole)
+    return replace(study, training=tuple(training), held_out=held_out, whole=whole)
 
 
 def _with_noise(run: Run, sigma: dict[int, float]) -> Run:

@@ -79,7 +79,9 @@ class Hypothesis:
 class Study:
     """What every step of the search needs: runs, springs, catalogue, and who maps over runs.
 
-    `repeatability` is the relative error between runs with the same input, 0 without any.
+    `repeatability` is the relative error between runs with the same input, 0 without any. `whole`
+    are the training runs with the end of the one whose end is held out, where what adds up over a
+    whole run must show in the numbers: on no spring.
     """
 
     training: tuple[Run, ...]
@@ -89,6 +91,7 @@ class Study:
     repeatability: float
     mapper: Mapper
     tell: Callable[[str], None]
+    whole: tuple[Run, ...] = ()
 
     @property
     def floor(self) -> float:

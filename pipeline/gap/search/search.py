@@ -14,7 +14,6 @@ import numpy as np
 from pipeline.gap.fit.baseline import first_chain
 from pipeline.gap.fit.levenberg_marquardt import Fit, fit_model
 from pipeline.gap.fit.structure import Candidate
-from pipeline.gap.fit.uncertainty import covariance
 from pipeline.gap.follow.choose import Records, choose_laws, rivals_of
 from pipeline.gap.follow.fit import Follow
 from pipeline.gap.follow.track import make_track
@@ -22,7 +21,7 @@ from pipeline.gap.limits import SURE
 from pipeline.gap.search.deadline import OutOfTime
 from pipeline.gap.search.hypothesis import Hypothesis, Study, judge, lowers_error, worth_it
 from pipeline.gap.search.translate import as_model, filled, make_candidate
-from pipeline.gap.search.whole import fit_whole
+from pipeline.gap.search.whole import finish, fit_whole
 from pipeline.plant.nonlinear.effects import find_effect
 
 _LOOSER = (0.02, 0.01, 0.005, 0.002, 0.0)  # gains
@@ -89,7 +88,7 @@ def prune(chosen: Hypothesis, study: Study, found: list[Hypothesis]) -> Hypothes
         as_good += [h for h in plainer if h.bic < chosen.bic]
         as_good = [h for h in as_good if h.sound]
         if not as_good:
-            nothing = is_nothing(covariance(chosen.fit, study.training, mapper=study.mapper))
+            nothing = is_nothing(finish(chosen.fit, study))
             as_good = [h for h, none in zip(without, nothing, strict=True) if none and h.sound]
         if not as_good:
             break

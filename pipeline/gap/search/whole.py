@@ -9,6 +9,7 @@ from pipeline.gap.data.runs import cut_shots
 from pipeline.gap.fit.levenberg_marquardt import Fit, fit_model
 from pipeline.gap.fit.restart import restart_runs
 from pipeline.gap.fit.structure import Model
+from pipeline.gap.fit.uncertainty import covariance
 from pipeline.gap.limits import AT_FLOOR
 from pipeline.gap.search.hypothesis import Study
 
@@ -19,7 +20,7 @@ _LENGTHS = (0.3, 0.6, 1.2, 2.4)  # s of a piece: behind a contact the misfit of 
 _VARIED = ((1.0, 1.0), (1.2, 1.0), (1.0, 0.65), (1.2, 0.65))
 _KEPT = 2  # of them
 # On no spring the misfit of a whole run is rugged throughout: small gains add up.
-FINISHED: dict[str, Any] = {"iterations": 60, "tolerance": 1e-6}
+_FINISHED: dict[str, Any] = {"iterations": 60, "tolerance": 1e-6}
 
 
 def fit_whole(start: Model, study: Study, *, near: bool = False) -> Fit:
@@ -28,7 +29,7 @@ def fit_whole(start: Model, study: Study, *, near: bool = False) -> Fit:
     `near`: a contact is already where whole runs have it.
     """
     whole, structure = study.training, start.structure
-    steps = {} if any(study.springs) else FINISHED
+    steps = {} if any(study.springs) else _FINISHED
     fit = fit_model(start, whole, scatter_free=False, mapper=study.mapper, **steps)
     if structure.has_contact and not near and fit.chi > AT_FLOOR:
         fit = min(fit, _grown_contact(start, study), key=lambda one: one.cost)
@@ -49,6 +50,14 @@ def fit_whole(start: Model, study: Study, *, near: bool = False) -> Fit:
             mapper=study.mapper,
         )
     return fit
+
+
+def finish(fit: Fit, study: Study) -> Fit:
+    """Return a fit with its covariance, its numbers from whole runs to their end."""
+    if not study.whole:
+        return covariance(fit, study.training, mapper=study.mapper)
+    fit = fit_model(fit, study.whole, scatter_free=False, mapper=study.mapper, **_FINISHED)
+    return covariance(fit, study.whole, mapper=study.mapper)
 
 
 def _grown_contact(start: Model, study: Study) -> Fit:
