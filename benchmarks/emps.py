@@ -87,7 +87,7 @@ _NOTE = """
 cartlab holds the end of the training record out to choose by, and fits its numbers to all of it in
 the end; it never sees the test record. "Cogging" is a force that repeats over 33 mm of travel.
 
-*Published:* by the same rule and measure, not run here; cited at second hand. "Baselines": M. D. Champneys, G. I.
-Beintema, R. Tóth, M. Schoukens, T. J. Rogers, *Baseline results for selected nonlinear system
-identification benchmarks*, IFAC-PapersOnLine 58(15), 2024.
+*Published:* by the same rule and measure, not run here; cited at second hand. "Baselines": M. D.
+Champneys, G. I. Beintema, R. Tóth, M. Schoukens, T. J. Rogers, *Baseline results for selected
+nonlinear system identification benchmarks*, IFAC-PapersOnLine 58(15), 2024.
 """

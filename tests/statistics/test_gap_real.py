@@ -92,7 +92,8 @@ def test_an_axis_on_no_spring_is_simulated_over_a_whole_record(real_data):
     keys = {found.effect.key for found in gap.effects}
     assert {"coulomb_friction", "force_offset"} <= keys
     (own,) = gap.free_run
-    assert own.error is not None and own.error < 2e-3
+    assert own.error is not None
+    assert own.error < 2e-3
     assert free_run(gap.model, test) < 4.6e-3
 
 
