@@ -12,7 +12,7 @@ import sympy
 from sympy.printing.pycode import PythonCodePrinter
 
 from pipeline.plant.nonlinear.effects.base import Effect, Parameter
-from pipeline.plant.nonlinear.effects.law import Contact, Force, Friction, Input
+from pipeline.plant.nonlinear.effects.law import Contact, Force, Friction, Hysteresis, Input
 
 Expr = Any  # sympy's own annotations are partial
 
@@ -33,14 +33,14 @@ _FUNCTIONS = {
     "clip": lambda a, low, high: sympy.Min(sympy.Max(a, low), high),
     "π": sympy.pi,
 }
-_QUANTITIES = ("x", "v", "d", "rate", "k", "u", "on")
+_QUANTITIES = ("x", "v", "d", "rate", "k", "u", "on", "z")
 
 
 def _symbol(name: str) -> sympy.Symbol:
     return sympy.Symbol(name, real=True)
 
 
-x, v, d, rate, k, u, on = map(_symbol, _QUANTITIES)
+x, v, d, rate, k, u, on, z = map(_symbol, _QUANTITIES)
 
 
 class _Printer(PythonCodePrinter):
@@ -161,6 +161,7 @@ def laws_source(catalogue: Sequence[Effect]) -> str:
     for place in ("cart", "spring"):
         out += _matrix(catalogue, place)
     out += _friction(catalogue)
+    out += _hysteresis(catalogue)
     out += _input(catalogue)
     out += _steps(catalogue)
     out += _followed(catalogue)
@@ -263,6 +264,33 @@ def _own_size(effect: Effect, catalogue: Iterable[Effect]) -> Expr:
     return size
 
 
+def settling(effect: Effect) -> tuple[Expr, Expr, Expr]:
+    """Return the force against z, where z tends to at a velocity, and at which pace (1/s)."""
+    law = effect.law
+    assert isinstance(law, Hysteresis)
+    rate = parse(law.rate, effect)
+    pace = sympy.simplify(-sympy.diff(rate, z))
+    target = sympy.simplify(rate.subs(z, 0) / pace).subs(v / sympy.Abs(v), sympy.sign(v))
+    return -sympy.diff(parse(law.force, effect), z), target, pace
+
+
+def _hysteresis(catalogue: Iterable[Effect]) -> Iterator[str]:
+    mine = [effect for effect in catalogue if isinstance(effect.law, Hysteresis)]
+    yield "\n@inlined\ndef settling(cart, i, v):"
+    yield '    """Return the most that hysteresis holds, where its state tends to, how fast."""'
+    for effect in mine:
+        values = ", ".join(code(in_table(one, effect)) for one in settling(effect))
+        yield f"    if {_gate(effect)}:\n        return {values}"
+    yield "    return 0.0, 0.0, 0.0\n"
+    yield "\n@inlined\ndef settling_slopes(cart, i, v):"
+    yield '    """Return the derivatives by the velocity of where the state tends to, how fast."""'
+    for effect in mine:
+        slopes = (derivative(one, v) for one in settling(effect)[1:])
+        values = ", ".join(code(in_table(one, effect)) for one in slopes)
+        yield f"    if {_gate(effect)}:\n        return {values}"
+    yield "    return 0.0, 0.0\n"
+
+
 def _input(catalogue: Iterable[Effect]) -> Iterator[str]:
     yield "\n@inlined\ndef arriving(drive, u):"
     yield '    """Return what dead zone, saturation and the like leave of an input."""'
@@ -321,14 +349,16 @@ def _followed(catalogue: Sequence[Effect]) -> Iterator[str]:
     yield f"COEFFICIENTS = {tuple(shapes)!r}"
     on_spring = [e.key for e in catalogue if e.place == "spring"]
     friction = [e.key for e in catalogue if isinstance(e.law, Friction)]
-    for name, keys in (("ON_SPRING", on_spring), ("FRICTION", friction)):
+    bristles = [e.key for e in catalogue if isinstance(e.law, Hysteresis)]
+    for name, keys in (("ON_SPRING", on_spring), ("FRICTION", friction), ("HYSTERESIS", bristles)):
         yield f"{name} = ({''.join(f'Kind.{key.upper()}, ' for key in keys)})"
-    most = max(len(e.grown.coordinates) for e in catalogue)
-    yield "# Of the force or friction: itself, by position, velocity and input, by each coordinate."
-    yield f"TERMS = {4 + most}\n"
+    sizes = [(isinstance(e.law, Hysteresis), len(e.grown.coordinates)) for e in catalogue]
+    yield "# How many numbers `terms` or `settle` fills, at most."
+    yield f"TERMS = {max(5 + 3 * size if bristle else 4 + size for bristle, size in sizes)}\n"
     yield "\n@jit\ndef terms(kind, p, o, x, v, k, u, on, out):"
     yield '    """Fill `out` with the law of a kind, its coordinates from p[o], and derivatives.\n'
-    yield "    `x` and `v` are those of a cart or of a spring's stretch, `k` its stiffness."
+    yield "    By position, velocity and input, then by each coordinate. `x` and `v` are those of a"
+    yield "    cart or of a spring's stretch, `k` its stiffness."
     yield '    """'
     branch = "if"
     for effect in catalogue:
@@ -337,6 +367,24 @@ def _followed(catalogue: Sequence[Effect]) -> Iterator[str]:
         yield f"    {branch} kind == Kind.{effect.key.upper()}:"
         branch = "elif"
         yield from _terms_of(effect, catalogue)
+    yield "\n\n@jit\ndef settle(kind, p, o, v, out):"
+    yield '    """Fill `out` with `settling`, its slopes, and its three by each coordinate."""'
+    branch = "if"
+    for effect in catalogue:
+        if isinstance(effect.law, Hysteresis):
+            yield f"    {branch} kind == Kind.{effect.key.upper()}:"
+            branch = "elif"
+            yield from _settling_of(effect)
+
+
+def _settling_of(effect: Effect) -> Iterator[str]:
+    coordinates = [_parameter(name) for name in effect.grown.coordinates]
+    values = {c: _symbol(f"p[o + {q}]" if q else "p[o]") for q, c in enumerate(coordinates)}
+    three = settling(effect)
+    wanted = [*three, *(derivative(one, v) for one in three[1:])]
+    wanted += [derivative(one, by) for by in coordinates for one in three]
+    for i, one in enumerate(wanted):
+        yield f"        out[{i}] = {code(one.subs(values))}"
 
 
 def _terms_of(effect: Effect, catalogue: Sequence[Effect]) -> Iterator[str]:

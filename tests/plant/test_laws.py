@@ -14,7 +14,14 @@ from numpy.testing import assert_allclose
 from codegen.__main__ import MADE, ROOM
 from codegen.laws import columns_source, laws_source
 from pipeline.plant.nonlinear.effects import CATALOGUE, Effect, find_effect
-from pipeline.plant.nonlinear.effects.law import Contact, Force, Friction, Input
+from pipeline.plant.nonlinear.effects.law import (
+    Contact,
+    Force,
+    Friction,
+    Hysteresis,
+    Input,
+    evaluate,
+)
 from pipeline.plant.nonlinear.simulator import laws
 from pipeline.plant.nonlinear.tables import TABLES
 from tests.helpers.effects import SIZES
@@ -61,6 +68,37 @@ def test_derivatives_are_those_of_the_law(effect, state):
     by = (np.array(sides[0]) - sides[1]) / (2 * step)
     # Differences of numbers near one over 2e-6: rounding leaves 1e-10, curvature less.
     assert_allclose(out[1 : 4 + p.size], by, rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("v", [0.7, -0.3])
+def test_hysteresis_settles_as_its_rate_says(v):
+    """Its state goes to a place at a pace; both simulators have the same, and its derivatives."""
+    effect = find_effect("presliding_friction")
+    law = effect.law
+    assert isinstance(law, Hysteresis)
+    kind, p = CATALOGUE.index(effect), np.array([0.3, 0.8])
+
+    def settled(p, v):
+        out = np.zeros(laws.TERMS)
+        laws.settle(kind, p, 0, v, out)
+        return out
+
+    out = settled(p, v)
+    for z in (-0.4, 0.9):
+        named = {"F": p[0], "δ": p[1], "v": v, "z": z, "abs": abs}
+        assert out[2] * (out[1] - z) == pytest.approx(evaluate(law.rate, named), rel=1e-12)
+        assert -out[0] * z == pytest.approx(evaluate(law.force, named), rel=1e-12)
+    cart = np.zeros((1, len(TABLES["cart"])))
+    for column, value in effect.columns({"force": p[0], "distance": p[1]}).items():
+        cart[0, column] = value
+    assert_allclose(laws.settling(cart, 0, v), out[:3], rtol=1e-12)
+    assert_allclose(laws.settling_slopes(cart, 0, v), out[3:5], rtol=1e-12)
+    step = 1e-6
+    by_v = (settled(p, v + step) - settled(p, v - step)) / (2 * step)
+    assert_allclose(out[3:5], by_v[1:3], atol=1e-8)
+    for q, unit in enumerate(np.eye(2)):
+        by_q = (settled(p + step * unit, v) - settled(p - step * unit, v)) / (2 * step)
+        assert_allclose(out[5 + 3 * q : 8 + 3 * q], by_q[:3], atol=1e-8)
 
 
 @pytest.mark.parametrize("state", STATES)
@@ -170,6 +208,7 @@ def test_a_new_effect_is_its_file_alone(tmp_path, monkeypatch):
     [
         ("coulomb_friction", r"f = -F \operatorname{sign} v, \quad |f| \le F \text{ at rest}"),
         ("quadratic_drag", "f = -q v |v|"),
+        ("presliding_friction", r"f = -F z, \quad \dot z = (v - |v| z)/\delta"),
         ("cubic_spring", "f = k d + a d^3"),
         ("cogging", r"f = F \sin(2 \pi x_1/\lambda + \phi)"),
         ("drive_damping", r"f = -c v_1 \text{ while } u \ne 0"),

@@ -2,8 +2,16 @@
 
 from math import exp
 
-from pipeline.plant.nonlinear.simulator.laws import FRICTION, ON_SPRING, TERMS, Kind, terms
-from pipeline.plant.nonlinear.simulator.state import inlined
+from pipeline.plant.nonlinear.simulator.laws import (
+    FRICTION,
+    HYSTERESIS,
+    ON_SPRING,
+    TERMS,
+    Kind,
+    settle,
+    terms,
+)
+from pipeline.plant.nonlinear.simulator.state import inlined, tie
 
 # Laws by their effect; that of stiction is what it has beyond Coulomb's friction.
 COULOMB, STRIBECK, LOAD = Kind.COULOMB_FRICTION, Kind.STICTION, Kind.LOAD_FRICTION
@@ -12,20 +20,8 @@ CUBIC, SLACK, COUPLING = Kind.CUBIC_SPRING, Kind.SLACK_SPRING, Kind.COUPLING_DAM
 BRAKING, COGGING, BACKLASH = Kind.DRIVE_DAMPING, Kind.COGGING, Kind.BACKLASH
 STOP, GAIN, HIDDEN = Kind.END_STOP, Kind.SENSOR_GAIN, Kind.EXTRA_MODE
 DRIVE = 4  # parameters of the drive: dead zone, limit, delay, lag
-OWN = 2  # numbers of a law's own state, its friction's or a body's; behind them its `terms`
+OWN = 2  # numbers of a law's own state, its friction's or a body's; behind them its terms
 ROOM = OWN + TERMS
-
-
-@inlined
-def tie(M, j, n, value):
-    """Add `value` between both ends of spring j (0 to n) of n carts to a symmetric matrix."""
-    if j < n:
-        M[j, j] += value
-    if j > 0:
-        M[j - 1, j - 1] += value
-    if 0 < j < n:
-        M[j, j - 1] -= value
-        M[j - 1, j] -= value
 
 
 @inlined
@@ -65,11 +61,10 @@ def add_forces(p, n, kinds, places, first, factor, u, on, h, v, xm, aux, f, K, C
             pull(f, at, n, out[0])
             tie(K, at, n, out[1])
             tie(C, at, n, out[2])
-        elif kind == DAHL:
-            side = 1.0 if v[at] > 0.0 else -1.0
-            half = exp(-0.5 * abs(v[at]) * h / p[o + 1])
-            aux[law, 1] = side + (aux[law, 0] - side) * half
-            f[at] -= factor[at] * p[o] * aux[law, 1]
+        elif kind in HYSTERESIS:
+            settle(kind, p, o, v[at], out)
+            aux[law, 1] = out[1] + (aux[law, 0] - out[1]) * exp(-0.5 * h * out[2])
+            f[at] -= factor[at] * out[0] * aux[law, 1]
         elif kind == HIDDEN:
             rise = p[o + 1] * (aux[law, 0] + 0.5 * h * aux[law, 1] - xm[at])
             rise += p[o + 2] * (aux[law, 1] - v[at])
@@ -126,17 +121,17 @@ def add_slopes(
             if out[2] != 0.0:
                 for q in range(lanes):
                     DR[at, q] += factor[at] * out[2] * DV[at, q]
-        elif kind == DAHL:
-            side = 1.0 if v[at] > 0.0 else -1.0
-            half = exp(-0.5 * abs(v[at]) * h / p[o + 1])
-            slope = (aux[law, 0] - side) * half
-            by_v = -slope * side * 0.5 * h / p[o + 1]
-            fa = factor[at] * p[o]
+        elif kind in HYSTERESIS:
+            left = exp(-0.5 * h * out[2])
+            fading = 0.5 * h * left * (aux[law, 0] - out[1])
+            by_v = out[3] * (1.0 - left) - fading * out[4]
+            most = factor[at] * out[0]
             for q in range(lanes):
-                DF[at, q] -= fa * (half * DA[2 * law, q] + by_v * DV[at, q])
-            DF[at, o] -= factor[at] * aux[law, 1]
-            DF[at, o + 1] -= fa * slope * 0.5 * abs(v[at]) * h / p[o + 1] ** 2
-            DF[at, own + 3 * n + at] -= p[o] * aux[law, 1]
+                DF[at, q] -= most * (left * DA[2 * law, q] + by_v * DV[at, q])
+            for q in range(size):
+                by_q = out[6 + 3 * q] * (1.0 - left) - fading * out[7 + 3 * q]
+                DF[at, o + q] -= factor[at] * out[5 + 3 * q] * aux[law, 1] + most * by_q
+            DF[at, own + 3 * n + at] -= out[0] * aux[law, 1]
         elif kind == HIDDEN:
             a = p[o]
             apart = aux[law, 0] + 0.5 * h * aux[law, 1] - xm[at]
@@ -162,3 +157,22 @@ def add_slopes(
             if out[3] != 0.0:
                 for q in range(DRIVE):
                     DF[at, drive + q] += out[3] * du[q]
+
+
+@inlined
+def settle_friction(p, n, kinds, places, first, h, v, aux, derive, DV, DA):
+    """Let the states of presliding friction move on by a step of h s, at its last velocities."""
+    for law in range(kinds.size):
+        kind, at, o, out = kinds[law], places[law], first[law], aux[law, OWN:]
+        if kind in HYSTERESIS:
+            settle(kind, p, o, v[at], out)
+            left = exp(-h * out[2])
+            fading = h * left * (aux[law, 0] - out[1])
+            if derive:
+                by_v = out[3] * (1.0 - left) - fading * out[4]
+                for q in range(DA.shape[1]):
+                    DA[2 * law, q] = left * DA[2 * law, q] + by_v * DV[at, q]
+                size = (first[law + 1] if law + 1 < kinds.size else p.size) - o
+                for q in range(size):
+                    DA[2 * law, o + q] += out[6 + 3 * q] * (1.0 - left) - fading * out[7 + 3 * q]
+            aux[law, 0] = out[1] + left * (aux[law, 0] - out[1])

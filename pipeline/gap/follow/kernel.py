@@ -19,7 +19,6 @@ from math import ceil, exp
 
 from pipeline.gap.follow.forces import (
     BACKLASH,
-    DAHL,
     DRIVE,
     GAIN,
     HIDDEN,
@@ -27,9 +26,9 @@ from pipeline.gap.follow.forces import (
     add_slopes,
     pull,
     reach,
-    tie,
+    settle_friction,
 )
-from pipeline.plant.nonlinear.simulator.state import jit
+from pipeline.plant.nonlinear.simulator.state import jit, tie
 
 VELOCITY_GAIN = 0.3  # of the square of the position's: a little over critical
 _LEAST_SHARE = 0.02  # of cart 1's mass: what is left of it without the motor's
@@ -267,16 +266,5 @@ def follow_run(
                             DA[at, q], DA[vat, q] = DX[0, q], DV[0, q]
                         DA[at, o] += 0.5 * side_of
                     side_of = 0.0
-            for law in range(L):
-                if kinds[law] == DAHL:
-                    at, o = places[law], first[law]
-                    side = 1.0 if v[at] > 0.0 else -1.0
-                    whole = exp(-abs(v[at]) * h / p[o + 1])
-                    slope = (aux[law, 0] - side) * whole
-                    if derive:
-                        by_v = -slope * side * h / p[o + 1]
-                        for q in range(lanes):
-                            DA[2 * law, q] = whole * DA[2 * law, q] + by_v * DV[at, q]
-                        DA[2 * law, o + 1] += slope * abs(v[at]) * h / p[o + 1] ** 2
-                    aux[law, 0] = side + slope
+            settle_friction(p, n, kinds, places, first, h, v, aux, derive, DV, DA)
     return True

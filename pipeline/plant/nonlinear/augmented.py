@@ -16,7 +16,7 @@ from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.effects.base import AugmentedChain
 from pipeline.plant.nonlinear.simulator import kernel
 from pipeline.plant.nonlinear.simulator.contacts import guard, switch
-from pipeline.plant.nonlinear.simulator.laws import arriving, reach_of
+from pipeline.plant.nonlinear.simulator.laws import arriving, reach_of, settling
 from pipeline.plant.nonlinear.simulator.sensitivity import make_sensitivities
 from pipeline.plant.nonlinear.simulator.step import advance, smooth_forces
 from pipeline.plant.nonlinear.tables import DRY, Cart, Drive, Spring, Tables
@@ -263,7 +263,7 @@ class SteppedBench:
     def _bend_presliding(self) -> None:
         """Bend the presliding friction as far as it holds what acts on the carts at rest."""
         net = self._static_forces()
-        most = self._cart[:, Cart.PRESLIDING_FRICTION_FORCE]
+        most = np.array([settling(self._cart, i, 0.0)[0] for i in range(self._n)])
         for i in np.flatnonzero(most):
             self._state[kernel.Z, i] = np.clip(net[i] / most[i], -1.0, 1.0)
 

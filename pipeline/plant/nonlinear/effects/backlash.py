@@ -9,8 +9,7 @@ EFFECT = Effect(
     sentence="Pinion and rack have play: at each reversal the motor runs free through a gap.",
     place="input",
     law=Built(
-        "play",
-        r"f_1 = k_c (|d| - g/2) \operatorname{sign} d, \quad d = x_m - x_1, \ |d| > g/2",
+        "play", r"f_1 = k_c (|d| - g/2) \operatorname{sign} d, \quad d = x_m - x_1, \ |d| > g/2"
     ),
     growth=Growth(("g", "m_m")),
     parameters=(

@@ -16,6 +16,7 @@ from pipeline.plant.nonlinear.effects.law import (
     Force,
     Friction,
     Growth,
+    Hysteresis,
     Input,
     Law,
     equation_of,
@@ -157,7 +158,7 @@ class Effect:
     @property
     def dry(self) -> bool:
         """Whether it is friction whose size differs from run to run."""
-        return isinstance(self.law, Friction) or self.is_built("presliding")
+        return isinstance(self.law, Friction | Hysteresis)
 
     @property
     def many_rests(self) -> bool:

@@ -1,9 +1,11 @@
 """The law of an effect, written once: expressions in Python's syntax, over symbols.
 
-On a cart, and on cart 1 for the input: `x`, `v`; on a spring: its stretch `d`, `rate` and stiffness
-`k`. Everywhere `u`, the force that arrives from the drive, and `on`, 1 while the drive is powered
-and 0 else. All other names are symbols of parameters. Functions: abs, sign, exp, sin, cos, min,
-max, clip. `python -m codegen` turns the laws into compiled code with all derivatives.
+Quantities on a cart (of cart 1, for the input): `x`, `v`. On a spring: its stretch `d`, `rate` and
+stiffness `k`. Everywhere: `u`, the force that arrives from the drive; `on`, 1 while the drive is
+powered and 0 else; `z`, a state of the law's own. All other names are symbols of parameters. The
+functions are abs, sign, exp, sin, cos, min, max, clip.
+
+`python -m codegen` makes compiled code, with all derivatives.
 """
 
 import ast
@@ -51,6 +53,16 @@ class Friction:
 
 
 @dataclass(frozen=True)
+class Hysteresis:
+    """Dry friction with a state `z`, from -1 to 1, of its own: force and rate are linear in it."""
+
+    force: str
+    _: KW_ONLY
+    rate: str
+    step: float = inf
+
+
+@dataclass(frozen=True)
 class Contact:
     """A force past a position (or stretch), whose sign is the side; it may only push, or pull too.
 
@@ -76,12 +88,12 @@ class Input:
 class Built:
     """A law with a state of its own, which the simulators have built in; its equation in TeX."""
 
-    kind: Literal["presliding", "hidden mass", "play", "delay", "lag", "reading"]
+    kind: Literal["hidden mass", "play", "delay", "lag", "reading"]
     equation: str
     step: float = inf
 
 
-Law = Force | Friction | Contact | Input | Built
+Law = Force | Friction | Hysteresis | Contact | Input | Built
 
 
 @dataclass(frozen=True)
@@ -124,6 +136,8 @@ def equation_of(law: Law, *, place: str, unseen: set[str]) -> str:
         case Force():
             while_on = r" \text{ while } u \ne 0" if "on" in names_in(law.force) else ""
             return f"f = {before}{tex(law.force)}{while_on}"
+        case Hysteresis():
+            return rf"f = {tex(law.force)}, \quad \dot z = {tex(law.rate)}"
         case Contact():
             never = "" if law.pulls else r", \text{ never pulling}"
             return rf"f = {before}{tex(law.force)} \text{{ past }} {tex(law.past)}{never}"

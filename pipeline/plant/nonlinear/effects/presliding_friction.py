@@ -2,14 +2,14 @@
 
 from pipeline.plant.nonlinear.effects.base import Effect, Parameter
 from pipeline.plant.nonlinear.effects.coulomb_friction import FORCE
-from pipeline.plant.nonlinear.effects.law import Built
+from pipeline.plant.nonlinear.effects.law import Hysteresis
 
 EFFECT = Effect(
     key="presliding_friction",
     title="Presliding (Dahl) friction",
     sentence="Dry friction that builds up like a spring over a short distance after each reversal.",
     place="cart",
-    law=Built("presliding", r"f = -F z, \quad \dot z = (v - |v| z)/\delta", step=2.3e-3),
+    law=Hysteresis("-F * z", rate="(v - abs(v) * z) / δ", step=2.3e-3),
     parameters=(
         FORCE,
         Parameter(

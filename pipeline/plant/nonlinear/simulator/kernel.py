@@ -32,7 +32,9 @@ from pipeline.plant.nonlinear.simulator.sensitivity import (
 from pipeline.plant.nonlinear.simulator.step import advance, smooth_forces
 
 # isort: off
-from pipeline.plant.nonlinear.simulator.laws import arriving, cart_matrix, reach_of, spring_matrix
+from pipeline.plant.nonlinear.simulator.laws import (
+    arriving, cart_matrix, reach_of, settling, spring_matrix,
+)  # fmt: skip
 from pipeline.plant.nonlinear.simulator.state import (
     ACC, FIX, FORCE, INV, MID_V, MID_X, ROWS, V, X, Z, jit, pair, tie,
 )  # fmt: skip
@@ -117,7 +119,7 @@ def _simulate(
             row += abs(K[i, j])
         fastest = max(fastest, row * s[INV, i])
     for i in range(n):
-        presliding += cart[i, Cart.PRESLIDING_FRICTION_FORCE]
+        presliding += settling(cart, i, 0.0)[0]
         for column in DRY:
             rubbing += cart[i, column]
         contact = max(contact, cart[i, Cart.END_STOP_STIFFNESS] * s[INV, i])
@@ -176,17 +178,16 @@ def _simulate(
                 s[MID_X, i], s[MID_V, i], s[FORCE, i] = s[X, i], s[V, i], s[FIX, i]
             smooth_forces(cart, spring, drive, driven, n, s, held[0, 0], 0.0, smooth)
             for i in range(n):
-                if cart[i, Cart.PRESLIDING_FRICTION_FORCE] > 0.0:
+                most, _, _ = settling(cart, i, 0.0)
+                if most > 0.0:
                     net = s[FORCE, i] + (held[0, 0] if i == 0 else 0.0)
                     for j in range(N):
                         net -= K[i, j] * s[X, j]
-                    s[Z, i] = min(
-                        max(net / (scatter[i] * cart[i, Cart.PRESLIDING_FRICTION_FORCE]), -1.0), 1.0
-                    )
+                    s[Z, i] = min(max(net / (scatter[i] * most), -1.0), 1.0)
                     if abs(s[V, i]) > 0.0:
                         s[Z, i] = 1.0 if s[V, i] > 0.0 else -1.0
                     elif abs(s[Z, i]) < 1.0:
-                        bend_presliding(lanes, T, s, K, cart, scatter, i, n, N)
+                        bend_presliding(lanes, T, s, K, most, scatter, i, n, N)
         for sample in range(first, end):
             for i in range(n):
                 y[i, sample] = cart[i, Cart.SENSOR_GAIN_GAIN] * s[X, i]

@@ -140,6 +140,26 @@ def drop_slope(cart, i, v, u):
 
 
 @inlined
+def settling(cart, i, v):
+    """Return the most that hysteresis holds, where its state tends to, how fast."""
+    if cart[i, Cart.PRESLIDING_FRICTION_FORCE] != 0.0:
+        return (
+            cart[i, Cart.PRESLIDING_FRICTION_FORCE],
+            (1.0 if v > 0.0 else -1.0),
+            abs(v) / cart[i, Cart.PRESLIDING_FRICTION_DISTANCE],
+        )
+    return 0.0, 0.0, 0.0
+
+
+@inlined
+def settling_slopes(cart, i, v):
+    """Return the derivatives by the velocity of where the state tends to, how fast."""
+    if cart[i, Cart.PRESLIDING_FRICTION_FORCE] != 0.0:
+        return 0, (1.0 if v > 0.0 else -1.0) / cart[i, Cart.PRESLIDING_FRICTION_DISTANCE]
+    return 0.0, 0.0
+
+
+@inlined
 def arriving(drive, u):
     """Return what dead zone, saturation and the like leave of an input."""
     if drive[Drive.DEAD_ZONE_WIDTH] != 0.0:
@@ -235,15 +255,17 @@ FRICTION = (
     Kind.STICTION,
     Kind.LOAD_FRICTION,
 )
-# Of the force or friction: itself, by position, velocity and input, by each coordinate.
-TERMS = 7
+HYSTERESIS = (Kind.PRESLIDING_FRICTION,)
+# How many numbers `terms` or `settle` fills, at most.
+TERMS = 11
 
 
 @jit
 def terms(kind, p, o, x, v, k, u, on, out):
     """Fill `out` with the law of a kind, its coordinates from p[o], and derivatives.
 
-    `x` and `v` are those of a cart or of a spring's stretch, `k` its stiffness.
+    By position, velocity and input, then by each coordinate. `x` and `v` are those of a
+    cart or of a spring's stretch, `k` its stiffness.
     """
     if kind == Kind.COULOMB_FRICTION:
         out[0] = p[o]
@@ -340,3 +362,20 @@ def terms(kind, p, o, x, v, k, u, on, out):
             out[6] = -v
         else:
             out[:7] = 0.0
+
+
+@jit
+def settle(kind, p, o, v, out):
+    """Fill `out` with `settling`, its slopes, and its three by each coordinate."""
+    if kind == Kind.PRESLIDING_FRICTION:
+        out[0] = p[o]
+        out[1] = 1.0 if v > 0.0 else -1.0
+        out[2] = abs(v) / p[o + 1]
+        out[3] = 0
+        out[4] = (1.0 if v > 0.0 else -1.0) / p[o + 1]
+        out[5] = 1
+        out[6] = 0
+        out[7] = 0
+        out[8] = 0
+        out[9] = 0
+        out[10] = -abs(v) / p[o + 1] ** 2

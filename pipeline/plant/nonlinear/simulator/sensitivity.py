@@ -16,12 +16,12 @@ from math import exp
 
 import numpy as np
 
-from pipeline.plant.nonlinear.columns import Cart, Spring
+from pipeline.plant.nonlinear.columns import Spring
 
 # isort: off
 from pipeline.plant.nonlinear.simulator.laws import (
     ON_CARTS, ON_DRIVE, ON_SPRINGS, cart_slopes, drive_slopes, drop_slope, motor_slopes,
-    spring_slopes,
+    settling, settling_slopes, spring_slopes,
 )  # fmt: skip
 from pipeline.plant.nonlinear.simulator.state import (
     ACC, BEFORE, D2, D3, DECAY, GRIP, HALF_A, HALF_V, HALF_X, MID_V, MID_X, PAST, RUB, SIDE,
@@ -102,12 +102,10 @@ def carry(lanes, T, phi, work, s, K, C, N, n, cart, spring, scatter, push, whole
             T[moved + row, block, 2] = c
             T[moved + row, block, 3] = d
     for i in range(n):
-        if cart[i, Cart.PRESLIDING_FRICTION_FORCE] > 0.0:
-            sign = 1.0 if s[MID_V, i] > 0.0 else -1.0
-            decay = exp(-abs(s[MID_V, i]) * step / cart[i, Cart.PRESLIDING_FRICTION_DISTANCE])
-            slope = (
-                (1.0 - sign * s[Z, i]) * decay * step / cart[i, Cart.PRESLIDING_FRICTION_DISTANCE]
-            )
+        most, target, pace = settling(cart, i, s[MID_V, i])
+        if most > 0.0:
+            decay = exp(-pace * step)
+            slope = _settled(cart, i, s, target, decay, step)
             _add(T, 2 * N + i, decay - 1.0, 2 * N + i)
             _add(T, 2 * N + i, 0.5 * slope, N + i)
             _add(T, 2 * N + i, 0.5 * slope, moved + N + i)
@@ -195,18 +193,18 @@ def _kick(lanes, T, s, N, n, cart, spring, scatter, push, whole, span):
             by_x, by_v = cart_slopes(cart, i, s[MID_X, i], s[MID_V, i], u)
         if s[SIDE, i] != 0.0 and s[V, i] != 0.0:
             by_v -= scatter[i] * drop_slope(cart, i, abs(s[MID_V, i]), u)
-        if cart[i, Cart.PRESLIDING_FRICTION_FORCE] > 0.0:
-            force = scatter[i] * cart[i, Cart.PRESLIDING_FRICTION_FORCE] * s[DECAY, i]
-            sign = 1.0 if s[MID_V, i] > 0.0 else -1.0
-            by_v -= (
-                force
-                * (1.0 - sign * s[Z, i])
-                * 0.5
-                * whole
-                / cart[i, Cart.PRESLIDING_FRICTION_DISTANCE]
-            )
-            _add(T, N + i, -s[GRIP, i] * span * force, 2 * N + i)
+        most, target, _ = settling(cart, i, s[MID_V, i])
+        if most > 0.0:
+            by_v -= scatter[i] * most * _settled(cart, i, s, target, s[DECAY, i], 0.5 * whole)
+            _add(T, N + i, -s[GRIP, i] * span * scatter[i] * most * s[DECAY, i], 2 * N + i)
         _bend(T, s, N, i, i, span, by_x, by_v)
+
+
+@jit
+def _settled(cart, i, s, target, decay, span):
+    """Return what the presliding state of cart i is, `span` s later, by the velocity."""
+    by_target, by_pace = settling_slopes(cart, i, s[MID_V, i])
+    return by_target * (1.0 - decay) - (s[Z, i] - target) * decay * span * by_pace
 
 
 @jit
@@ -266,7 +264,7 @@ def restart(lanes, T, shot, free, parent, motor, n, N):
 
 
 @jit
-def bend_presliding(lanes, T, s, K, cart, scatter, i, n, N):
+def bend_presliding(lanes, T, s, K, most, scatter, i, n, N):
     """Start the presliding state of cart i where the others' sensitivities bend it."""
     for lane in range(lanes.shape[1]):
         kind, at, block, q = lanes[0, lane], lanes[1, lane], lane // _BLOCK, lane % _BLOCK
@@ -275,6 +273,6 @@ def bend_presliding(lanes, T, s, K, cart, scatter, i, n, N):
             net -= K[i, j] * T[j, block, q]
         if kind == BY_STIFFNESS and (at == i or at == i + 1):
             net += stretch(s, X, at, n) * (1.0 if at == i + 1 else -1.0)
-        T[2 * N + i, block, q] = net / (scatter[i] * cart[i, Cart.PRESLIDING_FRICTION_FORCE])
+        T[2 * N + i, block, q] = net / (scatter[i] * most)
         if kind == BY_FRICTION and at == i:
             T[2 * N + i, block, q] -= s[Z, i] / scatter[i]

@@ -4,14 +4,13 @@ from math import exp
 
 import numpy as np
 
-from pipeline.plant.nonlinear.columns import Cart
 from pipeline.plant.nonlinear.simulator.contacts import contact, guard, position, switch, velocity
 from pipeline.plant.nonlinear.simulator.sensitivity import carry, meet, stop
 
 # isort: off
 from pipeline.plant.nonlinear.simulator.laws import (
-    ON_CARTS, ON_DRIVE, ON_SPRINGS, cart_force, drive_force, dropping, motor_force, sliding,
-    spring_force,
+    ON_CARTS, ON_DRIVE, ON_SPRINGS, cart_force, drive_force, dropping, motor_force, settling,
+    sliding, spring_force,
 )  # fmt: skip
 from pipeline.plant.nonlinear.simulator.state import (
     ACC, D2, D3, D4, DECAY, FIX, FORCE, GRIP, INV, MID_V, MID_X, RUB, SIDE, V, X, Z, inlined,
@@ -44,12 +43,10 @@ def rub(cart, s, K, C, scatter, u, n, N, step):
     """Add dry friction to the forces; a cart that it holds gets no inverse mass."""
     for i in range(n):
         s[RUB, i] = 0.0
-        if cart[i, Cart.PRESLIDING_FRICTION_FORCE] > 0.0 and s[INV, i] > 0.0:
-            sign = 1.0 if s[MID_V, i] > 0.0 else -1.0
-            path = 0.5 * abs(s[MID_V, i]) * step / cart[i, Cart.PRESLIDING_FRICTION_DISTANCE]
-            s[DECAY, i] = exp(-path)
-            held = sign + (s[Z, i] - sign) * s[DECAY, i]
-            s[RUB, i] -= cart[i, Cart.PRESLIDING_FRICTION_FORCE] * held
+        most, target, pace = settling(cart, i, s[MID_V, i])
+        if most > 0.0 and s[INV, i] > 0.0:
+            s[DECAY, i] = exp(-0.5 * pace * step)
+            s[RUB, i] -= most * (target + (s[Z, i] - target) * s[DECAY, i])
     for i in range(n):
         # side: the direction the cart slides in, 0 where nothing dry acts on it.
         s[SIDE, i] = 0.0
@@ -199,14 +196,10 @@ def advance(
             s[ACC, i] = s[D2, i] + step * (s[D3, i] + 0.5 * step * s[D4, i])
         if dry:
             for i in range(n):
-                if cart[i, Cart.PRESLIDING_FRICTION_FORCE] > 0.0:
-                    sign = 1.0 if s[MID_V, i] > 0.0 else -1.0
-                    decay = s[DECAY, i] * s[DECAY, i]
-                    if step < whole:
-                        decay = exp(
-                            -abs(s[MID_V, i]) * step / cart[i, Cart.PRESLIDING_FRICTION_DISTANCE]
-                        )
-                    s[Z, i] = sign + (s[Z, i] - sign) * decay
+                most, target, pace = settling(cart, i, s[MID_V, i])
+                if most > 0.0:
+                    decay = s[DECAY, i] * s[DECAY, i] if step == whole else exp(-pace * step)
+                    s[Z, i] = target + (s[Z, i] - target) * decay
                 if s[SIDE, i] != 0.0 and s[SIDE, i] * s[V, i] < 0.0:
                     s[V, i] = 0.0
         if stopping != none:
