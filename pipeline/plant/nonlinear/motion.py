@@ -23,7 +23,7 @@ from scipy.special import factorial
 from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.plant.nonlinear.effects.base import AugmentedChain, Term
-from pipeline.plant.nonlinear.effects.law import Built, Contact, Force, Friction, Input
+from pipeline.plant.nonlinear.effects.law import Built, Contact, Force, Friction, Hysteresis, Input
 
 if TYPE_CHECKING:
     import control
@@ -117,6 +117,13 @@ class Motion:
         for term in terms:
             if isinstance(term.effect.law, Built):
                 self._add(term, term.effect.law.kind)
+        self._bristles = [
+            (term.place - 1, _expression(term.effect.law.force, term),
+             _expression(term.effect.law.rate, term), len(self.states) + q)
+            for q, term in enumerate(t for t in terms if isinstance(t.effect.law, Hysteresis))
+            if isinstance(term.effect.law, Hysteresis)
+        ]  # fmt: skip
+        self.states += [f"z{i + 1}" for i, *_ in self._bristles]
 
     def _spring(self, term: Term) -> dict[str, float]:
         return {"k": float(self._k[term.place - 1])} if term.effect.place == "spring" else {}
@@ -126,8 +133,6 @@ class Motion:
         match kind:
             case "reading":
                 self.gains[i - 1] = term.values[0]
-            case "presliding":
-                own = [f"z{i}"]
             case "hidden mass":
                 own = [f"x{i}_hidden", f"v{i}_hidden"]
             case "play":
@@ -158,8 +163,8 @@ class Motion:
         for _, at in self._built.get("play", []):
             state[at] = x0[0]
         pull = self._m * self.rate(state, 0.0)[1 : 2 * self.n : 2]
-        for term, at in self._built.get("presliding", []):
-            state[at] = np.clip(pull[term.place - 1] / term.values[0], -1.0, 1.0)
+        for i, force, _, at in self._bristles:
+            state[at] = np.clip(-pull[i] / force(x=state[2 * i], v=0.0, z=1.0), -1.0, 1.0)
         return state
 
     def rate(self, state: Array, command: float, *, stop: float = STOP_TIME) -> Array:
@@ -201,10 +206,9 @@ class Motion:
             push = self._across(play[0], state, push, out, x[0], v[0])
         force[0] += push
         force += np.diff(tension)
-        for term, at in self._built.get("presliding", []):
-            i, (size, distance) = term.place - 1, term.values
-            force[i] -= size * state[at]
-            out[at] = (v[i] - abs(v[i]) * state[at]) / distance
+        for i, law, bend, at in self._bristles:
+            force[i] += law(x=x[i], v=v[i], z=state[at])
+            out[at] = bend(x=x[i], v=v[i], z=state[at])
         slide = np.zeros(n)
         for i, law in self._frictions:
             slide[i] += law(v=v[i], u=u, x=x[i])
