@@ -67,7 +67,7 @@ HOMES = {
     "tomlkit": ("submission", "ingest", "bench.host", "desk.student"),
     "starlette": ("web", "bench.live", "desk"),
     "uvicorn": ("web",),
-    "control": ("plant.linear", "plant.loop", "checks", "notebook"),
+    "control": ("plant.linear", "plant.loop", "plant.nonlinear.motion", "checks", "notebook"),
     "sqlalchemy": ("grading.gradebook",),
     "pandas": ("exchange", "grading", "notebook"),
 }

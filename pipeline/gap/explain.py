@@ -168,8 +168,8 @@ def explain_gap(
     enough = verdict in ("none", "named")
     settled = enough and study.is_noise(chosen)
     left = () if enough else find_windows(chosen.fit, study.training)
-    settled_name = enough or (verdict == "ambiguous" and study.explains(chosen))
-    forces = () if settled_name else left_forces(final, judged_runs, nuisance)
+    told = enough or (verdict == "ambiguous" and study.explains(chosen))
+    forces = left_forces(final, judged_runs, nuisance)
     return Gap(
         verdict=verdict,
         effects=effects,
@@ -193,7 +193,9 @@ def explain_gap(
         spread=_learnt_spread(chosen.fit),
         suspects=list_suspects(found, effects) if verdict == "unexplained" else (),
         left=left,
-        residual=map_residual(forces, springs=springs, position=position_unit, drive=force_unit),
+        residual=()
+        if told
+        else map_residual(forces, springs=springs, position=position_unit, drive=force_unit),
         left_forces=forces,
         free_run=free_runs(final, judged_runs, nuisance),
         complete=not deadline.cut,

@@ -230,8 +230,8 @@ class Gap:
     baseline, final, noise_floor : relative errors pooled over the held-out runs.
     repeatability : the same between runs with the same input, or None without repeats.
     suspects : under `unexplained`, the single effects that help most, the best first.
-    residual, left_forces : under `partial` and `unexplained`, what is left on each cart, and the
-        force behind it run by run.
+    left_forces : the force that the model does not explain, run by run; residual : what it is on
+        each cart, where more is left than a name may leave.
     free_run : of each run, the error of one simulation from its first readings to its end.
     where, left : where the linear model departs most; and the final one, unless it is enough.
     complete : False where the time allowed ended the search: the best answer so far.

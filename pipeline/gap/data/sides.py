@@ -238,7 +238,7 @@ def _size(run: Run) -> float:
 
     Of a run under feedback its reference: the input is the controller's answer.
     """
-    if run.record.reference is not None:
+    if run.record.reference is not None and np.ptp(run.record.reference) > 0.0:
         return float(np.ptp(run.record.reference))
     if np.any(run.command):
         return float(run.command[np.argmax(np.abs(run.command))])
