@@ -70,6 +70,30 @@ def test_derivatives_are_those_of_the_law(effect, state):
     assert_allclose(out[1 : 4 + p.size], by, rtol=1e-6, atol=1e-8)
 
 
+@pytest.mark.parametrize("key", ["end_stop", "slack_spring"])
+def test_contacts_are_those_of_the_law(key):
+    """Stiffness, damping and where it begins give the force of the law, either side of it."""
+    effect = find_effect(key)
+    law, kind = effect.law, CATALOGUE.index(effect)
+    assert isinstance(law, Contact)
+    row = np.zeros((1, len(TABLES[effect.place])))
+    row[0, 0] = 0.1  # the spring's stiffness
+    values = {"r": 0.5, "s": 0.4} if key == "slack_spring" else {"k": 2.0, "p": 0.4, "c": 0.1}
+    named = {p.name: values[p.symbol] for p in effect.parameters}
+    for column, value in effect.columns(named).items():
+        row[0, column] = value
+    if key == "slack_spring":
+        k, at, share = laws.slack_of(row, 0)
+        p, c, sign = np.array([0.5 * 0.1, 0.4]), 0.0, 1.0
+        assert share == 0.5
+    else:
+        k, c, at = laws.stop_of(row, 0)
+        p, sign = np.array([2.0, 0.4, 0.1]), -1.0
+    past = sign * (k * (0.6 - at) + c * 0.3)
+    assert terms_of(kind, p, 0.6, 0.3, 0.0, 0.0)[0] == pytest.approx(past, rel=1e-12)
+    assert terms_of(kind, p, 0.3, 0.3, 0.0, 0.0)[0] == 0.0
+
+
 @pytest.mark.parametrize("v", [0.7, -0.3])
 def test_hysteresis_settles_as_its_rate_says(v):
     """Its state goes to a place at a pace; both simulators have the same, and its derivatives."""

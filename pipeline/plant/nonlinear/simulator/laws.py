@@ -160,6 +160,30 @@ def settling_slopes(cart, i, v):
 
 
 @inlined
+def stop_of(cart, i):
+    """Return stiffness, damping and (signed) position of what stops cart i."""
+    if cart[i, Cart.END_STOP_STIFFNESS] != 0.0:
+        return (
+            cart[i, Cart.END_STOP_STIFFNESS],
+            cart[i, Cart.END_STOP_DAMPING],
+            cart[i, Cart.END_STOP_POSITION],
+        )
+    return 0.0, 0.0, 0.0
+
+
+@inlined
+def slack_of(spring, j):
+    """Return what spring j has more, past which stretch, and how by its stiffness."""
+    if spring[j, Spring.SLACK_SPRING_STIFFNESS_CHANGE] != 0.0:
+        return (
+            spring[j, Spring.SLACK_SPRING_STIFFNESS_CHANGE] * spring[j, Spring.STIFFNESS],
+            spring[j, Spring.SLACK_SPRING_STRETCH],
+            spring[j, Spring.SLACK_SPRING_STIFFNESS_CHANGE],
+        )
+    return 0.0, 0.0, 0.0
+
+
+@inlined
 def arriving(drive, u):
     """Return what dead zone, saturation and the like leave of an input."""
     if drive[Drive.DEAD_ZONE_WIDTH] != 0.0:
