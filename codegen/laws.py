@@ -155,7 +155,7 @@ def laws_source(catalogue: Sequence[Effect]) -> str:
     """Return the source of the laws."""
     out = [
         _HEAD.format("The laws of the effects: what the compiled simulators know of them."),
-        "from enum import IntEnum\nfrom math import cos, exp, inf, pi, sin\n",
+        "from math import cos, exp, inf, pi, sin\n",
         "from pipeline.plant.nonlinear.columns import Cart, Drive, Spring",
         "from pipeline.plant.nonlinear.simulator.state import inlined, jit\n",
     ]
@@ -168,7 +168,17 @@ def laws_source(catalogue: Sequence[Effect]) -> str:
     out += _contacts(catalogue)
     out += _input(catalogue)
     out += _steps(catalogue)
-    out += _followed(catalogue)
+    return "\n".join(out) + "\n"
+
+
+def terms_source(catalogue: Sequence[Effect]) -> str:
+    """Return the source of the laws in their coordinates, for a model that follows."""
+    out = [
+        _HEAD.format("The laws of the effects in the coordinates of a fit, with derivatives."),
+        "from enum import IntEnum\nfrom math import cos, exp, pi, sin\n",
+        "from pipeline.plant.nonlinear.simulator.state import jit\n",
+        *_followed(catalogue),
+    ]
     return "\n".join(out) + "\n"
 
 

@@ -12,7 +12,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from codegen.__main__ import MADE, ROOM
-from codegen.laws import columns_source, laws_source
+from codegen.laws import columns_source, laws_source, terms_source
 from pipeline.plant.nonlinear.effects import CATALOGUE, Effect, find_effect
 from pipeline.plant.nonlinear.effects.law import (
     Contact,
@@ -22,7 +22,7 @@ from pipeline.plant.nonlinear.effects.law import (
     Input,
     evaluate,
 )
-from pipeline.plant.nonlinear.simulator import laws
+from pipeline.plant.nonlinear.simulator import laws, terms
 from pipeline.plant.nonlinear.tables import TABLES
 from tests.helpers.effects import SIZES
 
@@ -45,8 +45,8 @@ def coordinates_of(effect: Effect) -> np.ndarray:
 
 def terms_of(kind: int, p: np.ndarray, x: float, v: float, u: float, on: float) -> np.ndarray:
     """Return the law of a kind and its derivatives: those by x, v, u and each coordinate."""
-    out = np.zeros(laws.TERMS)
-    laws.terms(kind, p, 0, x, v, 0.1, u, on, out)
+    out = np.zeros(terms.TERMS)
+    terms.terms(kind, p, 0, x, v, 0.1, u, on, out)
     return out
 
 
@@ -103,8 +103,8 @@ def test_hysteresis_settles_as_its_rate_says(v):
     kind, p = CATALOGUE.index(effect), np.array([0.3, 0.8])
 
     def settled(p, v):
-        out = np.zeros(laws.TERMS)
-        laws.settle(kind, p, 0, v, out)
+        out = np.zeros(terms.TERMS)
+        terms.settle(kind, p, 0, v, out)
         return out
 
     out = settled(p, v)
@@ -157,7 +157,7 @@ def test_simulator_and_follower_have_the_same_law(effect, state):
 def test_a_law_vanishes_with_its_coefficients(effect):
     """The coordinates that a drop takes out leave nothing of the law; its shape alone is none."""
     kind, p = CATALOGUE.index(effect), coordinates_of(effect)
-    p[list(laws.COEFFICIENTS[kind])] = 0.0
+    p[list(terms.COEFFICIENTS[kind])] = 0.0
     assert all(terms_of(kind, p, *state)[0] == 0.0 for state in STATES)
 
 
@@ -210,6 +210,7 @@ def test_a_new_effect_is_its_file_alone(tmp_path, monkeypatch):
     load(columns_source(catalogue), "new_columns", tmp_path)
     source = laws_source(catalogue).replace("pipeline.plant.nonlinear.columns", "new_columns")
     new = load(source, "new_laws", tmp_path)
+    followed = load(terms_source(catalogue), "new_terms", tmp_path)
     columns = sys.modules["new_columns"]
     cart = np.zeros((1, len(columns.Cart)))
     cart[0, columns.Cart.CUBIC_DRAG_COEFFICIENT] = 0.5
@@ -220,10 +221,10 @@ def test_a_new_effect_is_its_file_alone(tmp_path, monkeypatch):
     assert new.cart_slopes(cart, 0, 0.3, -2.0, 0.0) == pytest.approx((0.0, -6.0))
     assert new.arriving(drive, 1.0) == pytest.approx(0.8)
     assert new.reach_of(cart, np.zeros((2, len(columns.Spring))), drive) == (inf, new.ON_CARTS)
-    out = np.zeros(new.TERMS)
-    new.terms(new.Kind.CUBIC_DRAG, np.array([0.5]), 0, 0.3, -2.0, 0.0, 0.0, 0.0, out)
+    out = np.zeros(followed.TERMS)
+    followed.terms(followed.Kind.CUBIC_DRAG, np.array([0.5]), 0, 0.3, -2.0, 0.0, 0.0, 0.0, out)
     assert_allclose(out[:5], [4.0, 0.0, -6.0, 0.0, 8.0])
-    for name in ("new_columns", "new_laws"):
+    for name in ("new_columns", "new_laws", "new_terms"):
         monkeypatch.delitem(sys.modules, name)
 
 
