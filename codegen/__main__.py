@@ -4,13 +4,17 @@ import subprocess
 import sys
 from pathlib import Path
 
-from codegen.laws import columns_source, laws_source
+from codegen.laws import columns_source, laws_source, terms_source
 from pipeline.output import write_file
 from pipeline.plant import nonlinear
 from pipeline.plant.nonlinear.effects import CATALOGUE
 
 ROOM = Path(nonlinear.__file__).parent
-MADE = {"columns.py": columns_source, "simulator/laws.py": laws_source}
+MADE = {
+    "columns.py": columns_source,
+    "simulator/laws.py": laws_source,
+    "simulator/terms.py": terms_source,
+}
 STORED = ("plant/nonlinear/simulator", "gap/follow")  # whose compiled functions call the laws
 
 

@@ -95,6 +95,8 @@ def derivative(expr: Expr, by: sympy.Symbol) -> Expr:
 def in_table(expr: Expr, effect: Effect) -> Expr:
     """Return an expression with its parameters read from the tables."""
     places = {_parameter(p.symbol): _cell(effect, p) for p in effect.parameters}
+    if effect.place == "spring":
+        places[k] = "spring[j, Spring.STIFFNESS]"
     return expr.subs({symbol: sympy.Symbol(cell, real=True) for symbol, cell in places.items()})
 
 
@@ -104,7 +106,8 @@ def _cell(effect: Effect, parameter: Parameter) -> str:
 
 def _gate(effect: Effect) -> str:
     """Return the condition under which an effect is there."""
-    first = _cell(effect, effect.parameters[0])
+    sizes = [p for p in effect.parameters if p.neutral == 0.0]
+    first = _cell(effect, (sizes or effect.parameters)[0])
     if isinstance(effect.law, Friction) and effect.law.beyond:
         held = in_table(parse(effect.law.at_rest or effect.law.size, effect), effect)
         return f"{code(held)} > {first}"
@@ -152,7 +155,7 @@ def laws_source(catalogue: Sequence[Effect]) -> str:
     """Return the source of the laws."""
     out = [
         _HEAD.format("The laws of the effects: what the compiled simulators know of them."),
-        "from enum import IntEnum\nfrom math import cos, exp, inf, pi, sin\n",
+        "from math import cos, exp, inf, pi, sin\n",
         "from pipeline.plant.nonlinear.columns import Cart, Drive, Spring",
         "from pipeline.plant.nonlinear.simulator.state import inlined, jit\n",
     ]
@@ -162,9 +165,20 @@ def laws_source(catalogue: Sequence[Effect]) -> str:
         out += _matrix(catalogue, place)
     out += _friction(catalogue)
     out += _hysteresis(catalogue)
+    out += _contacts(catalogue)
     out += _input(catalogue)
     out += _steps(catalogue)
-    out += _followed(catalogue)
+    return "\n".join(out) + "\n"
+
+
+def terms_source(catalogue: Sequence[Effect]) -> str:
+    """Return the source of the laws in their coordinates, for a model that follows."""
+    out = [
+        _HEAD.format("The laws of the effects in the coordinates of a fit, with derivatives."),
+        "from enum import IntEnum\nfrom math import cos, exp, pi, sin\n",
+        "from pipeline.plant.nonlinear.simulator.state import jit\n",
+        *_followed(catalogue),
+    ]
     return "\n".join(out) + "\n"
 
 
@@ -289,6 +303,30 @@ def _hysteresis(catalogue: Iterable[Effect]) -> Iterator[str]:
         values = ", ".join(code(in_table(one, effect)) for one in slopes)
         yield f"    if {_gate(effect)}:\n        return {values}"
     yield "    return 0.0, 0.0\n"
+
+
+def _contacts(catalogue: Iterable[Effect]) -> Iterator[str]:
+    stops, slacks = [], []
+    for effect in catalogue:
+        if not isinstance(effect.law, Contact):
+            continue
+        force, at = parse(effect.law.force, effect), parse(effect.law.past, effect)
+        if effect.place == "cart":
+            wanted = [-derivative(force, x), -derivative(force, v), at]
+        else:
+            stiffness = derivative(force, d)
+            wanted = [stiffness, at, derivative(stiffness, k)]
+        values = ", ".join(code(in_table(one, effect)) for one in wanted)
+        mine = stops if effect.place == "cart" else slacks
+        mine.append(f"    if {_gate(effect)}:\n        return {values}")
+    yield "\n@inlined\ndef stop_of(cart, i):"
+    yield '    """Return stiffness, damping and (signed) position of what stops cart i."""'
+    yield from stops
+    yield "    return 0.0, 0.0, 0.0\n"
+    yield "\n@inlined\ndef slack_of(spring, j):"
+    yield '    """Return what spring j has more, past which stretch, and how by its stiffness."""'
+    yield from slacks
+    yield "    return 0.0, 0.0, 0.0\n"
 
 
 def _input(catalogue: Iterable[Effect]) -> Iterator[str]:

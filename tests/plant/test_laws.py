@@ -12,7 +12,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from codegen.__main__ import MADE, ROOM
-from codegen.laws import columns_source, laws_source
+from codegen.laws import columns_source, laws_source, terms_source
 from pipeline.plant.nonlinear.effects import CATALOGUE, Effect, find_effect
 from pipeline.plant.nonlinear.effects.law import (
     Contact,
@@ -22,7 +22,7 @@ from pipeline.plant.nonlinear.effects.law import (
     Input,
     evaluate,
 )
-from pipeline.plant.nonlinear.simulator import laws
+from pipeline.plant.nonlinear.simulator import laws, terms
 from pipeline.plant.nonlinear.tables import TABLES
 from tests.helpers.effects import SIZES
 
@@ -45,8 +45,8 @@ def coordinates_of(effect: Effect) -> np.ndarray:
 
 def terms_of(kind: int, p: np.ndarray, x: float, v: float, u: float, on: float) -> np.ndarray:
     """Return the law of a kind and its derivatives: those by x, v, u and each coordinate."""
-    out = np.zeros(laws.TERMS)
-    laws.terms(kind, p, 0, x, v, 0.1, u, on, out)
+    out = np.zeros(terms.TERMS)
+    terms.terms(kind, p, 0, x, v, 0.1, u, on, out)
     return out
 
 
@@ -70,6 +70,30 @@ def test_derivatives_are_those_of_the_law(effect, state):
     assert_allclose(out[1 : 4 + p.size], by, rtol=1e-6, atol=1e-8)
 
 
+@pytest.mark.parametrize("key", ["end_stop", "slack_spring"])
+def test_contacts_are_those_of_the_law(key):
+    """Stiffness, damping and where it begins give the force of the law, either side of it."""
+    effect = find_effect(key)
+    law, kind = effect.law, CATALOGUE.index(effect)
+    assert isinstance(law, Contact)
+    row = np.zeros((1, len(TABLES[effect.place])))
+    row[0, 0] = 0.1  # the spring's stiffness
+    values = {"r": 0.5, "s": 0.4} if key == "slack_spring" else {"k": 2.0, "p": 0.4, "c": 0.1}
+    named = {p.name: values[p.symbol] for p in effect.parameters}
+    for column, value in effect.columns(named).items():
+        row[0, column] = value
+    if key == "slack_spring":
+        k, at, share = laws.slack_of(row, 0)
+        p, c, sign = np.array([0.5 * 0.1, 0.4]), 0.0, 1.0
+        assert share == 0.5
+    else:
+        k, c, at = laws.stop_of(row, 0)
+        p, sign = np.array([2.0, 0.4, 0.1]), -1.0
+    past = sign * (k * (0.6 - at) + c * 0.3)
+    assert terms_of(kind, p, 0.6, 0.3, 0.0, 0.0)[0] == pytest.approx(past, rel=1e-12)
+    assert terms_of(kind, p, 0.3, 0.3, 0.0, 0.0)[0] == 0.0
+
+
 @pytest.mark.parametrize("v", [0.7, -0.3])
 def test_hysteresis_settles_as_its_rate_says(v):
     """Its state goes to a place at a pace; both simulators have the same, and its derivatives."""
@@ -79,8 +103,8 @@ def test_hysteresis_settles_as_its_rate_says(v):
     kind, p = CATALOGUE.index(effect), np.array([0.3, 0.8])
 
     def settled(p, v):
-        out = np.zeros(laws.TERMS)
-        laws.settle(kind, p, 0, v, out)
+        out = np.zeros(terms.TERMS)
+        terms.settle(kind, p, 0, v, out)
         return out
 
     out = settled(p, v)
@@ -133,7 +157,7 @@ def test_simulator_and_follower_have_the_same_law(effect, state):
 def test_a_law_vanishes_with_its_coefficients(effect):
     """The coordinates that a drop takes out leave nothing of the law; its shape alone is none."""
     kind, p = CATALOGUE.index(effect), coordinates_of(effect)
-    p[list(laws.COEFFICIENTS[kind])] = 0.0
+    p[list(terms.COEFFICIENTS[kind])] = 0.0
     assert all(terms_of(kind, p, *state)[0] == 0.0 for state in STATES)
 
 
@@ -186,6 +210,7 @@ def test_a_new_effect_is_its_file_alone(tmp_path, monkeypatch):
     load(columns_source(catalogue), "new_columns", tmp_path)
     source = laws_source(catalogue).replace("pipeline.plant.nonlinear.columns", "new_columns")
     new = load(source, "new_laws", tmp_path)
+    followed = load(terms_source(catalogue), "new_terms", tmp_path)
     columns = sys.modules["new_columns"]
     cart = np.zeros((1, len(columns.Cart)))
     cart[0, columns.Cart.CUBIC_DRAG_COEFFICIENT] = 0.5
@@ -196,10 +221,10 @@ def test_a_new_effect_is_its_file_alone(tmp_path, monkeypatch):
     assert new.cart_slopes(cart, 0, 0.3, -2.0, 0.0) == pytest.approx((0.0, -6.0))
     assert new.arriving(drive, 1.0) == pytest.approx(0.8)
     assert new.reach_of(cart, np.zeros((2, len(columns.Spring))), drive) == (inf, new.ON_CARTS)
-    out = np.zeros(new.TERMS)
-    new.terms(new.Kind.CUBIC_DRAG, np.array([0.5]), 0, 0.3, -2.0, 0.0, 0.0, 0.0, out)
+    out = np.zeros(followed.TERMS)
+    followed.terms(followed.Kind.CUBIC_DRAG, np.array([0.5]), 0, 0.3, -2.0, 0.0, 0.0, 0.0, out)
     assert_allclose(out[:5], [4.0, 0.0, -6.0, 0.0, 8.0])
-    for name in ("new_columns", "new_laws"):
+    for name in ("new_columns", "new_laws", "new_terms"):
         monkeypatch.delitem(sys.modules, name)
 
 

@@ -2,7 +2,8 @@
 
 from math import exp
 
-from pipeline.plant.nonlinear.simulator.laws import (
+from pipeline.plant.nonlinear.simulator.state import inlined, tie
+from pipeline.plant.nonlinear.simulator.terms import (
     FRICTION,
     HYSTERESIS,
     ON_SPRING,
@@ -11,7 +12,6 @@ from pipeline.plant.nonlinear.simulator.laws import (
     settle,
     terms,
 )
-from pipeline.plant.nonlinear.simulator.state import inlined, tie
 
 # Laws by their effect; that of stiction is what it has beyond Coulomb's friction.
 COULOMB, STRIBECK, LOAD = Kind.COULOMB_FRICTION, Kind.STICTION, Kind.LOAD_FRICTION

@@ -12,7 +12,7 @@ from pipeline.gap.follow import forces
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.effects import CATALOGUE
 from pipeline.plant.nonlinear.effects.law import Force, Friction
-from pipeline.plant.nonlinear.simulator.laws import COEFFICIENTS
+from pipeline.plant.nonlinear.simulator.terms import COEFFICIENTS
 from pipeline.plant.nonlinear.tables import TABLES, Drive
 
 _CHAIN = (0.005, 20.0)  # times the largest first estimate: how far masses and springs may go

@@ -33,7 +33,7 @@ from pipeline.plant.nonlinear.simulator.step import advance, smooth_forces
 
 # isort: off
 from pipeline.plant.nonlinear.simulator.laws import (
-    arriving, cart_matrix, reach_of, settling, spring_matrix,
+    arriving, cart_matrix, reach_of, settling, slack_of, spring_matrix, stop_of,
 )  # fmt: skip
 from pipeline.plant.nonlinear.simulator.state import (
     ACC, FIX, FORCE, INV, MID_V, MID_X, ROWS, V, X, Z, jit, pair, tie,
@@ -47,8 +47,11 @@ _BLOWN_UP = 1e9  # positions beyond this are a diverged model
 
 
 @jit
-def _assemble(cart, spring, drive, free, s, K, C, parent):
-    """Fill the linear matrices; returns how many bodies there are, and the motor's row or -1."""
+def _assemble(cart, spring, drive, free, s, K, C, parent, switches):
+    """Fill the linear matrices and the numbers of what switches.
+
+    Returns how many bodies there are, the motor's row or -1, and how many switches.
+    """
     n = cart.shape[0]
     for i in range(n):
         s[INV, i] = 1.0 / cart[i, Cart.MASS] if free[i] else 0.0
@@ -75,7 +78,18 @@ def _assemble(cart, spring, drive, free, s, K, C, parent):
             pair(C, i, N, cart[i, Cart.EXTRA_MODE_DAMPING])
             parent[N] = i
             N += 1
-    return N, motor
+    count = 0
+    for which in range(2 * n + 3):
+        if which < n:
+            there = stop_of(cart, which)[0] > 0.0
+        elif which <= 2 * n:
+            there = slack_of(spring, which - n)[0] != 0.0
+        else:
+            there = motor >= 0
+        if there:
+            switches[count] = which
+            count += 1
+    return N, motor, count
 
 
 @jit
@@ -122,11 +136,11 @@ def _simulate(
         presliding += settling(cart, i, 0.0)[0]
         for column in DRY:
             rubbing += cart[i, column]
-        contact = max(contact, cart[i, Cart.END_STOP_STIFFNESS] * s[INV, i])
+        contact = max(contact, stop_of(cart, i)[0] * s[INV, i])
     for j in range(n + 1):
-        if spring[j, Spring.SLACK_SPRING_STIFFNESS_CHANGE] > 0.0:
+        extra = slack_of(spring, j)[0]
+        if extra > 0.0:
             # A spring that hardens past its gap is the faster one.
-            extra = spring[j, Spring.SLACK_SPRING_STIFFNESS_CHANGE] * spring[j, Spring.STIFFNESS]
             heavier = max(s[INV, j] if j < n else 0.0, s[INV, j - 1] if j > 0 else 0.0)
             fastest += extra * heavier
     reach, smooth = reach_of(cart, spring, drive)
@@ -255,14 +269,10 @@ def assemble(cart: Array, spring: Array, drive: Array, free: NDArray[np.bool_]) 
     size = 2 * n + 1
     s, K, C = np.zeros((ROWS, size)), np.zeros((size, size)), np.zeros((size, size))
     parent = np.full(size, -1)
-    N, motor = _assemble(cart, spring, drive, free, s, K, C, parent)
-    switches = [i for i in range(n) if cart[i, Cart.END_STOP_STIFFNESS] > 0.0]
-    switches += [
-        n + j for j in range(n + 1) if spring[j, Spring.SLACK_SPRING_STIFFNESS_CHANGE] != 0.0
-    ]
-    switches += [2 * n + 1, 2 * n + 2] if motor >= 0 else []
-    numbers = np.array(switches, dtype=np.int64)
-    return Bodies(N, motor, parent, s, K, C, numbers, np.zeros(numbers.size, dtype=np.bool_))
+    numbers = np.empty(2 * n + 3, dtype=np.int64)
+    N, motor, count = _assemble(cart, spring, drive, free, s, K, C, parent, numbers)
+    switches = numbers[:count]
+    return Bodies(N, motor, parent, s, K, C, switches, np.zeros(count, dtype=np.bool_))
 
 
 NO_LANES = np.zeros((2, 0), dtype=np.int64)

@@ -16,12 +16,10 @@ from math import exp
 
 import numpy as np
 
-from pipeline.plant.nonlinear.columns import Spring
-
 # isort: off
 from pipeline.plant.nonlinear.simulator.laws import (
     ON_CARTS, ON_DRIVE, ON_SPRINGS, cart_slopes, drive_slopes, drop_slope, motor_slopes,
-    settling, settling_slopes, spring_slopes,
+    settling, settling_slopes, slack_of, spring_slopes,
 )  # fmt: skip
 from pipeline.plant.nonlinear.simulator.state import (
     ACC, BEFORE, D2, D3, DECAY, GRIP, HALF_A, HALF_V, HALF_X, MID_V, MID_X, PAST, RUB, SIDE,
@@ -155,9 +153,8 @@ def _force(kind, at, s, n, spring):
         return s[RUB, at]
     reach = stretch(s, HALF_X, at, n)
     if s[PAST, at] != 0.0:
-        reach += spring[at, Spring.SLACK_SPRING_STIFFNESS_CHANGE] * (
-            reach - spring[at, Spring.SLACK_SPRING_STRETCH]
-        )
+        _, past, share = slack_of(spring, at)
+        reach += share * (reach - past)
     return -reach
 
 
