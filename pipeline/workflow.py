@@ -62,7 +62,7 @@ def analyse(
     log.warn(reading_remarks(data, unit=position))
 
     interventions = find_interventions(data.records)
-    log.warn(hand_remarks(interventions))
+    log.warn(hand_remarks(interventions, records=data.records))
     found, left_out = identify_from_sound(
         data, interventions=interventions, system=system, progress=progress
     )

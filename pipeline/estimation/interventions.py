@@ -93,7 +93,6 @@ def _bursts(cart: int, records: Sequence[Record]) -> list[Intervention]:
                         cart=cart,
                         start=max(float(times[first]) - _REACH, float(times[0])),
                         end=min(float(times[last]) + _REACH, float(times[-1])),
-                        held=bool(np.mean(force.idle[inside]) > _MOST),
                     )
                 )
     return found

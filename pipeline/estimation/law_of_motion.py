@@ -27,6 +27,7 @@ _LAGS = (0.0, 0.02, 0.05)  # s that the input may come late
 _JUMP = 0.3  # of the input's range from one sample to the next
 _STATIC = 3.0  # times dry friction in motion: what may hold a cart at rest
 _ROUNDS = 30  # of weighing anew
+_SINGULAR = 1e-12  # of the normal equations: what is less is nothing
 _PER_UNKNOWN = 3  # windows, at least
 _BULK = 2.0  # standard deviations of the bulk: beyond, the loss lets go
 
@@ -182,13 +183,13 @@ def _fit(design: Array, target: Array, *, least: float) -> tuple[Array, float]:
     size = np.linalg.norm(design, axis=0)
     used = size > 0.0
     scaled = design[:, used] / size[used]
-    law = np.linalg.lstsq(scaled, target, rcond=1e-8)[0]
-    bulk = least
+    weight, bulk, law = np.ones(target.size), least, np.zeros(scaled.shape[1])
     for _ in range(_ROUNDS):
+        weighed = scaled.T * weight**2
+        law = np.linalg.lstsq(weighed @ scaled, weighed @ target, rcond=_SINGULAR)[0]
         left = target - scaled @ law
         bulk = max(_BULK * MEDIAN_TO_SIGMA * float(np.median(np.abs(left))), least)
         weight = 1.0 / (1.0 + (left / bulk) ** 2)
-        law = np.linalg.lstsq(scaled * weight[:, None], target * weight, rcond=1e-8)[0]
     out = np.zeros(size.size)
     out[used] = law / size[used]
     return out, bulk
