@@ -26,7 +26,7 @@ _MOVES = 3.0  # smallest changes in a window: with less the cart rests
 _LAGS = (0.0, 0.02, 0.05)  # s that the input may come late
 _JUMP = 0.3  # of the input's range from one sample to the next
 _STATIC = 3.0  # times dry friction in motion: what may hold a cart at rest
-_ROUNDS = 30  # of weighing anew
+_ROUNDS, _SETTLED = 30, 1e-3  # of weighing anew; relative change of the bulk that ends it
 _SINGULAR = 1e-12  # of the normal equations: what is less is nothing
 _PER_UNKNOWN = 3  # windows, at least
 _BULK = 2.0  # standard deviations of the bulk: beyond, the loss lets go
@@ -183,12 +183,15 @@ def _fit(design: Array, target: Array, *, least: float) -> tuple[Array, float]:
     size = np.linalg.norm(design, axis=0)
     used = size > 0.0
     scaled = design[:, used] / size[used]
-    weight, bulk, law = np.ones(target.size), least, np.zeros(scaled.shape[1])
+    weight, bulk, law = np.ones(target.size), np.inf, np.zeros(scaled.shape[1])
     for _ in range(_ROUNDS):
         weighed = scaled.T * weight**2
         law = np.linalg.lstsq(weighed @ scaled, weighed @ target, rcond=_SINGULAR)[0]
         left = target - scaled @ law
+        before = bulk
         bulk = max(_BULK * MEDIAN_TO_SIGMA * float(np.median(np.abs(left))), least)
+        if abs(bulk - before) < _SETTLED * bulk:
+            break
         weight = 1.0 / (1.0 + (left / bulk) ** 2)
     out = np.zeros(size.size)
     out[used] = law / size[used]
