@@ -158,7 +158,13 @@ def take_sides(runs: list[Run], *, notes: list[str]) -> tuple[list[Run], list[Ru
         )
         starts = piece.start == 0 and run.record.kind != "decay"
         part = make_run(record, n=run.zero.size, in_motion=not starts)
-        moving = replace(part, zero=run.zero, zero_std=run.zero_std, rest=run.rest)
+        moving = replace(
+            part,
+            guided=run.guided[:, piece],
+            zero=run.zero,
+            zero_std=run.zero_std,
+            rest=run.rest,
+        )
         pieces.append(moving if len(run.shots) == 2 else cut_shots(moving, length=_WINDOW))
     others = [r for i, r in enumerate(runs) if i != longest]
     return [*others, pieces[0]], [pieces[1]]
