@@ -6,13 +6,13 @@ speed and the input are the same. A knock of two bodies is over in an instant. S
 hand where it lasts, where it moves the cart, and in a state in which elsewhere the law holds.
 """
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter1d
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from pipeline.arrays import Array
 from pipeline.estimation.law_of_motion import HOP, ForceLeft, forces_left
@@ -28,6 +28,7 @@ _GAP = 0.1  # s: nearer bursts are one
 _LASTS = 0.06  # s above half its peak; a knock has 0.04, the width of a window
 _KNOWN = 0.03  # s of a burst in a state that is known
 _SWINGS = 3  # times that the force of a hand changes sides: an effect's does so all the time
+_INSTANT = 0.03  # s: nobody pushes twice at the same time to within that
 _BINS, _MOST, _VISITS = 20, 0.5, 5  # of a state's range; share, and number, of its quiet windows
 
 
@@ -95,7 +96,17 @@ def _bursts(cart: int, records: Sequence[Record]) -> list[Intervention]:
                         end=min(float(times[last]) + _REACH, float(times[-1])),
                     )
                 )
-    return found
+    driven = {record.id for record in records if record.u is not None and np.any(record.u)}
+    return [one for one in found if not (one.experiment in driven and _recurs(one, found, driven))]
+
+
+def _recurs(one: Intervention, found: Sequence[Intervention], driven: Set[str]) -> bool:
+    """Tell whether it happens at the same instant in another driven run: no hand is as exact."""
+    return any(
+        abs(one.start - other.start) < _INSTANT
+        for other in found
+        if other.experiment != one.experiment and other.experiment in driven
+    )
 
 
 def _share(force: ForceLeft, size: float) -> Array:
@@ -126,7 +137,10 @@ def _known(forces: Sequence[ForceLeft], size: float) -> list[NDArray[np.bool_]]:
         calm = np.bincount(at[follows & quiet], minlength=_BINS + 1)
         known &= inside & ((calm >= _MOST * visits) & (calm >= _VISITS))[at]
     bounds = np.cumsum([0, *(force.t.size for force in forces)])
-    parts = [known[first:stop] for first, stop in pairwise(bounds)]
+    # A window sees a little of its neighbours.
+    parts = [
+        minimum_filter1d(known[first:stop].astype(int), 3) > 0 for first, stop in pairwise(bounds)
+    ]
     return [part | force.idle for part, force in zip(parts, forces, strict=True)]
 
 
