@@ -1,9 +1,9 @@
 """Interventions: stretches in which a force that nobody measured, such as a hand, moves a cart.
 
-What the law of motion leaves bursts where a hand acts. An effect that the law does not have shows
-as well: but again and again, in proportion to the motion, wherever the cart, its springs, its
-speed and the input are the same. A knock of two bodies is over in an instant. So a burst is a
-hand where it lasts, where it moves the cart, and in a state in which elsewhere the law holds.
+The force that a law of motion does not explain bursts where a hand acts. An effect that the law
+lacks shows as well, but it shows again and again: in proportion to the motion, wherever position,
+stretch, speed and input are the same. A knock of two bodies is over in an instant. So a burst is
+a hand if it lasts, moves the cart, and acts in a state in which the law holds at other times.
 """
 
 from collections.abc import Sequence, Set
@@ -78,7 +78,7 @@ def _bursts(cart: int, records: Sequence[Record]) -> list[Intervention]:
     for force, share, known in zip(forces, shares, _known(forces, size), strict=True):
         left = np.abs(force.left)
         bulk = size
-        if force.follows.any():  # a record that does not follow the law tells of no hand
+        if force.follows.any():  # a record that does not follow the law cannot show a hand
             own = _BULK * MEDIAN_TO_SIGMA * float(np.median(left[force.follows]))
             bulk = max(size, own)
         strong = (left > _FAR * bulk) & (share > least) & ~force.jumps
@@ -119,8 +119,8 @@ def _known(forces: Sequence[ForceLeft], size: float) -> list[NDArray[np.bool_]]:
     """Return for each window whether the law holds wherever the cart is in such a state.
 
     Position, stretches, velocity and input are looked at one by one: most windows at about the
-    same value must be quiet. A cart that rests without an input can be held by nothing but
-    friction, whatever the state.
+    same value must be quiet. A cart that rests without an input can be held by friction
+    only, whatever the state.
     """
     state = np.concatenate([force.state for force in forces], axis=1)
     follows = np.concatenate([force.follows for force in forces])

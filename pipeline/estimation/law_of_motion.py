@@ -34,7 +34,7 @@ _BULK = 2.0  # standard deviations of the bulk: beyond, the loss lets go
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ForceLeft:
-    """What the law leaves of one cart in one record, over windows centred at `t` (n,).
+    """The force on one cart in one record that the law does not explain, over windows at `t` (n,).
 
     Attributes
     ----------
@@ -91,10 +91,10 @@ class _Windows:
 
 
 def forces_left(cart: int, records: Sequence[Record]) -> tuple[list[ForceLeft], float]:
-    """Return what one law leaves of a cart in each record, and the size of the bulk of it.
+    """Return the force in each record that one law of a cart does not explain, and its usual size.
 
-    Records in which a free neighbour was not measured are left out. Without enough motion for
-    the law, none is returned.
+    Records in which a free neighbour was not measured are left out. The list is empty if the cart
+    moves too little to fit the law.
     """
     cut = [_cut(record, cart) for record in records if cart in record.free]
     windows = [one for one in cut if one is not None]
