@@ -9,6 +9,7 @@ from scipy.signal import savgol_filter
 
 from pipeline.arrays import Array
 from pipeline.estimation.noise import difference_noise
+from pipeline.estimation.peaks import extrema
 from pipeline.plant.linear.simulate import interpolate_band_limited
 from pipeline.results import Record
 
@@ -86,8 +87,8 @@ class Run:
 def make_run(record: Record, *, n: int, in_motion: bool = False) -> Run:
     """Prepare one record of a bench with n carts; `in_motion`: it is cut from a longer one.
 
-    A decay starts after the hand has let go; a slow or held beginning is cut, unless the record
-    begins in motion.
+    A decay starts after the hand has let go; a slow or held beginning is cut. One that begins in
+    motion starts at its first turning point: no hand follows that far.
     """
     rows = tuple(cart - 1 for cart in record.carts if cart in record.free)
     y = np.array([record.position(row + 1) for row in rows])
@@ -100,10 +101,15 @@ def make_run(record: Record, *, n: int, in_motion: bool = False) -> Run:
     quiet_end = bool(np.all(u[-tail.shape[1] :] == 0.0))
     frequency = _dominant_frequency(t, y)
     pace = min(1.0, _USUAL_FREQUENCY / frequency)
-    if record.kind == "decay" and not in_motion:
+    if record.kind == "decay":
         rest = np.where(settled, tail.mean(axis=1), np.median(y, axis=1))
         radians = 2 * np.pi * frequency * record.sample_time
-        first = min(_release(y - rest[:, None], still, radians=radians), t.size // 2)
+        offset = y - rest[:, None]
+        if in_motion:
+            first = _first_turn(offset, still)
+        else:
+            first = _release(offset, still, radians=radians)
+        first = min(first, t.size // 2)
         t, u, y, guided = t[first:], u[first:], y[:, first:], guided[:, first:]
     # The input may already act between the samples: the first two are before its effect.
     quiet = max(2, int(np.argmax(u != u[0])) + 1)
@@ -258,6 +264,13 @@ def _dominant_frequency(t: Array, y: Array) -> float:
         if power[at] > peak:
             best, peak = at / (uniform[-1] - uniform[0]), float(power[at])
     return best
+
+
+def _first_turn(offset: Array, still: Array) -> int:
+    """Return the first sample at which the cart that moves most turns."""
+    leader = int(np.argmax(np.ptp(offset, axis=1) / np.maximum(still, 1e-12)))
+    turning = extrema(offset[leader], prominence=float(still[leader]))
+    return turning[1] if len(turning) > 1 else 0
 
 
 def _release(offset: Array, still: Array, *, radians: float) -> int:
