@@ -26,6 +26,10 @@ _MOVES = 3.0  # smallest changes in a window: with less the cart rests
 _LAGS = (0.0, 0.02, 0.05)  # s that the input may come late
 _JUMP = 0.3  # of the input's range from one sample to the next
 _STATIC = 3.0  # times dry friction in motion: what may hold a cart at rest
+# Columns of the law: rest and gain of a record, positions, inputs; dampers, drag, braking; dry
+# friction, alone and in proportion to the input.
+_OWN, _POSITION = 2, 3
+_SPRINGS, _DAMPERS, _DRY = slice(0, 8), slice(8, 13), slice(13, 15)
 _ROUNDS, _SETTLED = 30, 1e-3  # of weighing anew; relative change of the bulk that ends it
 _SINGULAR = 1e-12  # of the normal equations: what is less is nothing
 _PER_UNKNOWN = 3  # windows, at least
@@ -76,18 +80,19 @@ class _Windows:
     moves: NDArray[np.bool_]
     jumps: NDArray[np.bool_]
 
-    def columns(self, *, driven: bool) -> tuple[Array, Array, Array]:
-        """Return what the law multiplies: springs and input, dampers, friction by its sign."""
-        v = self.v[1]
+    def columns(self, *, driven: bool) -> Array:
+        """Return (n, unknowns) the columns of the law: those of `_SPRINGS`, `_DAMPERS`, `_DRY`.
+
+        Each record has a rest of its own, and a gain: a drive does not treat all levels alike.
+        """
+        v, u = self.v[1], driven * self.u
         # Within a window in which the cart turns, it goes this way for longer.
         turning = np.maximum(np.abs(self.acceleration) * _WINDOW / 4.0, 1e-12 * np.abs(v).max())
         side = np.clip(v / np.maximum(turning, 1e-300), -1.0, 1.0)
+        rest = np.ones(v.size)
         dampers = [*self.v, np.abs(v) * v, v * self.on]
-        return (
-            np.array([*self.x, *(driven * self.u)]).T,
-            np.array(dampers).T,
-            np.array([side, side * np.abs(self.u[0])]).T,
-        )
+        dry = [side, side * np.abs(self.u[0])]
+        return np.array([rest, u[0], *self.x, *u, *dampers, *dry]).T
 
 
 def forces_left(cart: int, records: Sequence[Record]) -> tuple[list[ForceLeft], float]:
@@ -98,40 +103,30 @@ def forces_left(cart: int, records: Sequence[Record]) -> tuple[list[ForceLeft], 
     """
     cut = [_cut(record, cart) for record in records if cart in record.free]
     windows = [one for one in cut if one is not None]
+    if not windows:
+        return [], 0.0
+    columns = [one.columns(driven=cart == 1) for one in windows]
     usable = [one.moves & ~one.jumps for one in windows]
-    if not windows or not np.any(np.concatenate(usable)):
+    parts = [(c[use], w.acceleration[use])
+             for c, w, use in zip(columns, windows, usable, strict=True)]  # fmt: skip
+    unknowns = columns[0].shape[1] + _OWN * (len(windows) - 1)
+    if sum(target.size for _, target in parts) < _PER_UNKNOWN * unknowns:
         return [], 0.0
-    count = len(windows)
-    parts = []
-    for k, one in enumerate(windows):
-        springs, dampers, friction = one.columns(driven=cart == 1)
-        # Each record has a rest of its own, and a gain: what a drive makes of one level is not
-        # what it makes of another.
-        own = np.zeros((one.t.size, 2 * count))
-        own[:, k], own[:, count + k] = 1.0, springs[:, 3]
-        parts.append((np.hstack([springs, own]), dampers, friction))
-    design = np.vstack([np.hstack(part)[use] for part, use in zip(parts, usable, strict=True)])
-    target = np.concatenate([w.acceleration[use] for w, use in zip(windows, usable, strict=True)])
-    if target.size < _PER_UNKNOWN * design.shape[1]:
-        return [], 0.0
-    law, size = _fit(design, target, least=_BULK * float(np.median([w.noise for w in windows])))
+    laws, size = _fit(parts, least=_BULK * float(np.median([w.noise for w in windows])))
     found = []
-    for k, (one, part) in enumerate(zip(windows, parts, strict=True)):
-        springs, dampers, friction = part
-        n_springs, n_dampers = springs.shape[1], dampers.shape[1]
-        asked = springs @ law[:n_springs]
-        free = one.acceleration - asked - dampers @ law[n_springs : n_springs + n_dampers]
-        dry = law[n_springs + n_dampers :]
-        holds = _STATIC * (abs(dry[0]) + abs(dry[1]) * np.abs(one.u[0]))
+    for one, column, law in zip(windows, columns, laws, strict=True):
+        asked = column[:, _SPRINGS] @ law[_SPRINGS]
+        free = one.acceleration - asked - column[:, _DAMPERS] @ law[_DAMPERS]
+        rubs, by_load = np.abs(law[_DRY])
+        holds = _STATIC * (rubs + by_load * np.abs(one.u[0]))
         at_rest = np.sign(free) * np.maximum(np.abs(free) - holds, 0.0)
-        rest = 0.0
-        if -law[1] * np.ptp(one.x[1]) > size:
-            rest = -law[springs.shape[1] - 2 * count + k] / law[1]
+        offset, stiffness = law[0], -law[_POSITION]
+        rest = offset / stiffness if stiffness * np.ptp(one.x[1]) > size else 0.0
         found.append(
             ForceLeft(
                 record=one.record,
                 t=one.t,
-                left=np.where(one.moves, free - friction @ dry, at_rest),
+                left=np.where(one.moves, free - column[:, _DRY] @ law[_DRY], at_rest),
                 acting=np.maximum(np.abs(one.acceleration), np.abs(asked)),
                 state=np.array([one.x[1] - rest, *np.diff(one.x, axis=0), one.v[1], one.u[0]]),
                 moves=one.moves,
@@ -178,21 +173,35 @@ def _cut(record: Record, cart: int) -> _Windows | None:
     )
 
 
-def _fit(design: Array, target: Array, *, least: float) -> tuple[Array, float]:
-    """Return the law that the bulk of the windows follows, and the size of what it leaves there."""
-    size = np.linalg.norm(design, axis=0)
-    used = size > 0.0
-    scaled = design[:, used] / size[used]
-    weight, bulk, law = np.ones(target.size), np.inf, np.zeros(scaled.shape[1])
+def _fit(parts: Sequence[tuple[Array, Array]], *, least: float) -> tuple[list[Array], float]:
+    """Return the law that the bulk of the windows follows, by record, and the size of the rest.
+
+    Parameters
+    ----------
+    parts : columns (windows, unknowns) and accelerations (windows,) of each record; the first
+        columns belong to the record alone.
+    """
+    shared = parts[0][0].shape[1] - _OWN
+    behind = np.arange(_OWN * len(parts), _OWN * len(parts) + shared)
+    places = [np.append(np.arange(_OWN * k, _OWN * (k + 1)), behind) for k in range(len(parts))]
+    count = _OWN * len(parts) + shared
+    power = np.zeros(count)
+    for (columns, _), place in zip(parts, places, strict=True):
+        power[place] += (columns**2).sum(axis=0)
+    scale = 1.0 / np.sqrt(np.where(power > 0.0, power, np.inf))
+    weights, bulk, law = [np.ones(target.size) for _, target in parts], np.inf, np.zeros(count)
     for _ in range(_ROUNDS):
-        weighed = scaled.T * weight**2
-        law = np.linalg.lstsq(weighed @ scaled, weighed @ target, rcond=_SINGULAR)[0]
-        left = target - scaled @ law
+        H, b = np.zeros((count, count)), np.zeros(count)
+        for (columns, target), place, weight in zip(parts, places, weights, strict=True):
+            weighed = columns.T * weight**2
+            H[np.ix_(place, place)] += weighed @ columns
+            b[place] += weighed @ target
+        law = scale * np.linalg.lstsq(H * np.outer(scale, scale), scale * b, rcond=_SINGULAR)[0]
+        left = [target - columns @ law[place]
+                for (columns, target), place in zip(parts, places, strict=True)]  # fmt: skip
         before = bulk
-        bulk = max(_BULK * MEDIAN_TO_SIGMA * float(np.median(np.abs(left))), least)
+        bulk = max(_BULK * MEDIAN_TO_SIGMA * float(np.median(np.abs(np.concatenate(left)))), least)
         if abs(bulk - before) < _SETTLED * bulk:
             break
-        weight = 1.0 / (1.0 + (left / bulk) ** 2)
-    out = np.zeros(size.size)
-    out[used] = law / size[used]
-    return out, bulk
+        weights = [1.0 / (1.0 + (one / bulk) ** 2) for one in left]
+    return [law[place] for place in places], bulk
