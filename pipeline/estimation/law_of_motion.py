@@ -22,6 +22,7 @@ from pipeline.results_of_runs import Record
 HOP = 0.01  # s from window to window
 _WINDOW = 0.1  # s; the middle 0.04 s weigh most
 _FEWEST = 9  # samples in a window
+_AT_ONCE = 1000  # windows; more would need much memory in long recordings
 _MOVES = 3.0  # smallest changes in a window: with less the cart rests
 _LAGS = (0.0, 0.02, 0.05)  # s that the input may come late
 _JUMP = 0.3  # of the input's range from one sample to the next
@@ -147,29 +148,51 @@ def _cut(record: Record, cart: int) -> _Windows | None:
     if width >= t.size:
         return None
     first = np.arange(0, t.size - width + 1, max(1, round(HOP / interval)))
-    at = first[:, None] + np.arange(width)
-    local = t[at]
-    w, w1, w2 = window_weights(local)
-    s = (local - local[:, :1]) / (local[:, -1:] - local[:, :1])
-    held = np.diff(bump_integral(s), axis=1) / bump_integral(np.ones(1))
     still = np.zeros(t.size)
-    around = [record.position(c) if c in record.carts else still for c in neighbours]
+    around = np.array([record.position(c) if c in record.carts else still for c in neighbours])
     y, u = around[1], still if record.u is None else record.u
+    inputs = np.array([*(np.interp(t - lag, t, u) for lag in _LAGS), u != 0.0])
+    parts = np.array_split(first, -(-first.size // _AT_ONCE))
+    means = np.hstack([_means(t, around, inputs, part[:, None] + np.arange(width))
+                       for part in parts])  # fmt: skip
     step = grain(t, y, step=record.encoder_step(cart))
     reach = round(_LAGS[-1] / interval) + 1
     jump = np.abs(np.diff(u, prepend=u[0])) > _JUMP * np.ptp(u)
     lately = maximum_filter1d(jump.astype(int), width + reach, origin=(width + reach - 1) // 2)
     return _Windows(
         record=record,
-        t=(w * local).sum(1),
-        x=np.array([(w * x[at]).sum(1) for x in around]),
-        v=np.array([-(w1 * x[at]).sum(1) for x in around]),
-        acceleration=(w2 * y[at]).sum(1),
-        u=np.array([(held * np.interp(t - lag, t, u)[at[:, :-1]]).sum(1) for lag in _LAGS]),
-        on=(held * (u != 0.0)[at[:, :-1]]).sum(1),
-        noise=float(np.median(np.linalg.norm(w2, axis=1))) * step / np.sqrt(12.0),
-        moves=np.ptp(y[at], axis=1) > _MOVES * step,
-        jumps=np.array(lately[at[:, -1]] > 0, dtype=np.bool_),
+        t=means[0],
+        x=means[1:4],
+        v=means[4:7],
+        acceleration=means[7],
+        u=means[8:11],
+        on=means[11],
+        noise=float(np.median(means[12])) * step / np.sqrt(12.0),
+        moves=means[13] > _MOVES * step,
+        jumps=np.array(lately[first + width - 1] > 0, dtype=np.bool_),
+    )
+
+
+def _means(t: Array, around: Array, inputs: Array, at: NDArray[np.int64]) -> Array:
+    """Return (14, n) means over the windows whose samples are `at` (n, samples).
+
+    Time, positions, velocities, acceleration, inputs; how the acceleration scales white noise,
+    and by how much the reading moves.
+    """
+    local = t[at]
+    w, w1, w2 = window_weights(local)
+    s = (local - local[:, :1]) / (local[:, -1:] - local[:, :1])
+    held = np.diff(bump_integral(s), axis=1) / bump_integral(np.ones(1))
+    return np.array(
+        [
+            (w * local).sum(1),
+            *((w * x[at]).sum(1) for x in around),
+            *(-(w1 * x[at]).sum(1) for x in around),
+            (w2 * around[1][at]).sum(1),
+            *((held * u[at[:, :-1]]).sum(1) for u in inputs),
+            np.linalg.norm(w2, axis=1),
+            np.ptp(around[1][at], axis=1),
+        ]
     )
 
 
