@@ -44,7 +44,7 @@ def prepare(
     records: Sequence[Record],
     *,
     springs: tuple[bool, ...],
-    interventions: Sequence[Intervention],
+    interventions: Sequence[Intervention] = (),
     notes: list[str],
 ) -> list[Run]:
     """Return the runs worth fitting; what is left out is noted.
